@@ -39,9 +39,9 @@ class _TensorRecord:
         changes: dict[str, Any] = {}
         for field in fields(self):
             value = getattr(self, field.name)
-            if isinstance(value, (_TensorRecord, Tensor)):
-                changes[field.name] = value[index]
-            elif isinstance(value, tuple) and field.metadata.get("batched"):
+            if isinstance(value, (_TensorRecord, Tensor)) or (
+                isinstance(value, tuple) and field.metadata.get("batched")
+            ):
                 changes[field.name] = value[index]
         return replace(self, **changes)
 
@@ -73,8 +73,6 @@ def cat(records: Sequence[S]) -> S:
             changes[field.name] = cat(values)
         elif isinstance(values[0], Tensor):
             changes[field.name] = torch.cat(values)
-        elif isinstance(values[0], tuple) and field.metadata.get("batched"):
-            changes[field.name] = tuple(item for value in values for item in value)
         elif any(value != values[0] for value in values):
             raise ValueError(
                 f"cat: {type(first).__name__}.{field.name} differs between records: {values}"

@@ -1,0 +1,88 @@
+"""Where the config lies, and how an entry point starts, fails and says so."""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from hydra.errors import HydraException, InstantiationException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
+
+from gsgan.errors import GsganError
+
+FAILED = 1
+
+
+def config_folder() -> Path:
+    """conf/: inside the package when installed, beside src/ in a checkout.
+
+    Raises:
+        GsganError: when neither is there.
+    """
+    package = Path(__file__).resolve().parent
+    for folder in (package / "conf", package.parents[1] / "conf"):
+        if (folder / "train.yaml").is_file():
+            return folder
+    raise GsganError(f"{package / 'conf'}: the config folder is missing; install gsgan again")
+
+
+def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    """Makes a function of a config into a command: Hydra's grammar, errors as one sentence.
+
+    Args:
+        name: the config file, without ``.yaml``, and the command's name.
+    """
+
+    def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
+        @functools.wraps(task)
+        def run(config: DictConfig) -> None:
+            try:
+                task(config)
+            except KeyboardInterrupt:
+                _say("interrupted")
+                sys.exit(130)
+            except Exception as error:
+                sentence = one_sentence(error)
+                if sentence is None:
+                    raise
+                _say(sentence)
+                sys.exit(FAILED)
+
+        @functools.wraps(task)
+        def main() -> None:
+            import hydra  # here, so that importing an entry point stays light
+
+            command = hydra.main(
+                version_base="1.3", config_path=str(config_folder()), config_name=name
+            )(run)
+            command()
+
+        return main
+
+    return decorate
+
+
+def one_sentence(error: BaseException) -> str | None:
+    """What to tell the user, or None for a bug, whose traceback is worth more."""
+    if isinstance(error, GsganError):
+        return str(error)
+    if isinstance(error, InstantiationException):
+        cause = error.__cause__
+        if isinstance(cause, GsganError):
+            return str(cause)
+        where = str(error).rpartition("full_key: ")[2] or "the config"
+        if isinstance(cause, (ValueError, TypeError)):
+            return f"{where}: {cause}"
+        return f"{where}: {str(error).splitlines()[0]}"
+    if isinstance(error, (HydraException, OmegaConfBaseException)):
+        return str(error).splitlines()[0]
+    return None
+
+
+def _say(sentence: str) -> None:
+    console = Console(stderr=True, soft_wrap=True)
+    console.print(f"gsgan: {sentence}", style="bold red", markup=False, highlight=False)

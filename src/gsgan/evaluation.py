@@ -1,0 +1,129 @@
+"""Scores a run folder: table, metrics.json, pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from rich.console import Console
+from rich.progress import track
+from torch.utils.data import Subset
+
+from gsgan.data.datamodule import GsganData
+from gsgan.errors import ConfigError
+from gsgan.metrics.evaluation import empty_split, evaluate_split
+from gsgan.metrics.image import lpips
+from gsgan.metrics.tables import Results, print_table, write_results
+from gsgan.model.avatar import Avatar
+from gsgan.pictures import grid_rows, write_grid
+from gsgan.runs import load_avatar, load_config
+
+SPLITS = ("novel_view", "novel_pose")
+
+
+def evaluate_run(
+    folder: Path,
+    config: DictConfig,
+    console: Console,
+    *,
+    data: GsganData,
+    avatar: Avatar,
+    marks: list[str],
+    splits: Sequence[str] = SPLITS,
+    pictures: int = 4,
+) -> Results:
+    """Scores an avatar on held-out cameras and poses and writes it all into the run folder.
+
+    Args:
+        folder: the run folder: ``metrics.json``, ``metrics.md`` and ``pictures/`` go there.
+        config: for ``lpips.net`` and ``lpips.path``.
+        console: prints the table.
+        data: of the run.
+        avatar: in eval mode.
+        marks: notes that the tables must carry.
+        splits: which of ``novel_view`` and ``novel_pose``.
+        pictures: rows of the grid written per split.
+
+    Returns:
+        ``{split: {variant: {metric: value}}}``, as in metrics.json.
+
+    Raises:
+        ConfigError: on an unknown split.
+    """
+    unknown = sorted(set(splits) - set(SPLITS))
+    if unknown:
+        raise ConfigError(f"splits must be among {', '.join(SPLITS)}; got {', '.join(unknown)}")
+    score, reason = lpips(config.lpips.net, config.lpips.path)
+    results: Results = {}
+    for split in splits:
+        dataset = data.dataset(split)
+        if len(dataset) == 0:
+            results[split] = empty_split(data.reasons.get(split, "no frames"), marks)
+            continue
+        frames = (dataset[i] for i in range(len(dataset)))
+        shown = track(frames, f"scoring {split}", len(dataset), console=console, transient=True)
+        results[split] = evaluate_split(
+            avatar, shown, lpips=score, lpips_reason=reason, marks=marks
+        )
+        write_pictures(avatar, data, split, folder / "pictures" / f"{split}.png", pictures)
+    title = f"{folder.name}: held-out cameras (novel_view) and poses (novel_pose)"
+    write_results(results, folder, title)
+    print_table(results, console, title)
+    return results
+
+
+def write_pictures(avatar: Avatar, data: GsganData, split: str, path: Path, rows: int) -> None:
+    """A grid of ``rows`` frames spread over a split."""
+    dataset = data.dataset(split)
+    rows = min(rows, len(dataset))
+    if rows == 0:
+        return
+    device = next(avatar.parameters()).device
+    chosen = [round((i + 0.5) * len(dataset) / rows - 0.5) for i in range(rows)]
+    grid = []
+    for i in range(rows):
+        frame = Subset(dataset, chosen)[i].to(device)
+        with torch.no_grad():
+            grid += grid_rows(frame, avatar.paint(frame))
+    write_grid(grid, path)
+
+
+def evaluate_folder(config: DictConfig) -> Results:
+    """``gsgan.evaluate``: rebuilds the avatar of ``config.run`` and scores it.
+
+    Raises:
+        ConfigError: when ``run`` is not set.
+        DataError: when the folder, its checkpoint or its data is not what it should be.
+    """
+    if config.run is None:
+        raise ConfigError("run is not set: give run=<the folder that gsgan.train printed>")
+    folder = Path(config.run).expanduser()
+    stored = load_config(folder)
+    if config.data_root is not None:
+        OmegaConf.update(stored, "data.root", config.data_root)
+    data: GsganData = instantiate(stored.data)
+    data.prepare_data()
+    data.setup("test")
+    avatar, marks = load_avatar(folder, stored, data)
+    return evaluate_run(
+        folder,
+        config,
+        Console(),
+        data=data,
+        avatar=avatar.to(_device(config.device)),
+        marks=marks,
+        splits=list(config.splits),
+        pictures=config.pictures,
+    )
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(f"device={name}: not usable here; try device=cpu") from error

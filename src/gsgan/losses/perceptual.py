@@ -1,0 +1,113 @@
+"""L_perc: distance between features of a pretrained VGG-16, or of a marked stand-in."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gsgan.errors import ConfigError, DataError
+from gsgan.losses.weights import find_weights, how_to_get, load_weights
+
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+VGG_TAPS = (3, 8, 15, 22)  # relu1_2, relu2_2, relu3_3, relu4_3 in torchvision's vgg16.features
+
+
+class Perceptual(nn.Module):
+    """Squared feature distance, the layers weighted by the inverse of their first losses.
+
+    No layer weights are published for this set of layers, so they are measured: over the first
+    ``warmup`` calls each layer's weight is the inverse of its mean loss (weights sum to 1), then
+    frozen and stored in the checkpoint.
+
+    Args:
+        weights: ``vgg16`` (its file must be at hand), ``auto`` (vgg16 where at hand, else a small
+            network of fixed random weights, marked as such), or ``random``.
+        path: the weight file or its folder; None looks in the torch cache.
+        warmup: calls over which layer weights are measured.
+        width: channels of the stand-in's first layer.
+
+    Raises:
+        ConfigError: on an unknown ``weights``.
+        DataError: when ``vgg16`` was asked for and its file is not there.
+
+    Source: paper Sec. 3.6; method.md § 7; architecture.md § 4.
+    """
+
+    def __init__(
+        self,
+        weights: str = "auto",
+        path: str | None = None,
+        *,
+        warmup: int = 50,
+        width: int = 16,
+    ) -> None:
+        super().__init__()
+        if weights not in ("vgg16", "auto", "random"):
+            raise ConfigError(f"perceptual.weights must be vgg16, auto or random; got {weights!r}")
+        found = None if weights == "random" else find_weights("vgg16", path)
+        if weights == "vgg16" and found is None:
+            raise DataError(f"VGG-16's weights are not at hand: {how_to_get('vgg16')}")
+        self.stages = _vgg_stages(found) if found else _random_stages(width)
+        self.mark: str | None = None
+        if not found:
+            self.mark = "perceptual loss: fixed random network, not VGG-16"
+        self.requires_grad_(False)
+        self.warmup = warmup
+        self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1))
+        self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1))
+        self.register_buffer("layer_loss", torch.zeros(len(self.stages)))
+        self.register_buffer("calls", torch.zeros((), dtype=torch.long))
+
+    def features(self, image: Tensor) -> list[Tensor]:
+        """Feature maps of pictures ``[B, 3, H, W]`` in [0, 1]."""
+        x, maps = (image - self.mean) / self.std, []
+        for stage in self.stages:
+            x = stage(x)
+            maps.append(x)
+        return maps
+
+    def forward(self, image: Tensor, target: Tensor) -> Tensor:
+        """The weighted distance; the target's features take no gradient."""
+        with torch.no_grad():
+            wanted = self.features(target)
+        losses = torch.stack(
+            [functional.mse_loss(a, b) for a, b in zip(self.features(image), wanted, strict=True)]
+        )
+        if self.training and int(self.calls) < self.warmup:
+            self.calls += 1
+            self.layer_loss += (losses.detach() - self.layer_loss) / self.calls
+        inverse = 1 / self.layer_loss.clamp_min(1e-12)
+        return (losses * inverse / inverse.sum()).sum()
+
+
+def _vgg_stages(path: Path) -> nn.ModuleList:
+    from torchvision.models import vgg16  # heavy: only where it is used
+
+    network = vgg16(weights=None)
+    try:
+        network.load_state_dict(load_weights(path))
+    except RuntimeError as error:
+        raise DataError(f"{path}: these are not torchvision's VGG-16 weights") from error
+    layers = list(network.features)
+    for layer in layers:
+        if isinstance(layer, nn.ReLU):
+            layer.inplace = False
+    bounds = [0, *(tap + 1 for tap in VGG_TAPS)]
+    return nn.ModuleList(nn.Sequential(*layers[a:b]) for a, b in pairwise(bounds))
+
+
+def _random_stages(width: int) -> nn.ModuleList:
+    """Three small stages of fixed weights: the same for everybody, whatever the run's seed."""
+    generator = torch.Generator().manual_seed(20250717)
+    stages, channels = [], [3, width, 2 * width, 4 * width]
+    for i, (a, b) in enumerate(pairwise(channels)):
+        conv = nn.Conv2d(a, b, 3, stride=1 if i == 0 else 2, padding=1)
+        with torch.no_grad():
+            conv.weight.normal_(0, (2 / (9 * a)) ** 0.5, generator=generator)
+            conv.bias.zero_()  # type: ignore[union-attr]
+        stages.append(nn.Sequential(conv, nn.LeakyReLU(0.2)))
+    return nn.ModuleList(stages)

@@ -1,0 +1,86 @@
+"""Results for people (a table) and for programs (metrics.json)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from gsgan.files import write_atomically
+from gsgan.metrics.evaluation import METRICS
+
+Results = dict[str, dict[str, dict[str, Any]]]
+HEADINGS = {
+    "psnr": "PSNR dB ↑",
+    "ssim": "SSIM ↑",
+    "lpips": "LPIPS ↓",
+    "edge_f1": "edge F1 ↑",
+    "miou": "mIoU ↑",
+}
+_DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "edge_f1": 3, "miou": 3}
+_VARIANTS = {
+    "full": "I_pred",
+    "splat": "Step I's colour",
+    "floor": "all-background picture (floor)",
+}
+
+
+def rows(results: Results) -> list[list[str]]:
+    """One row per split and variant, every value formatted; what cannot be had is ``n/a``."""
+    return [
+        [split, _VARIANTS.get(variant, variant), str(scores["images"])]
+        + [_format(metric, scores[metric]) for metric in METRICS]
+        for split, variants in results.items()
+        for variant, scores in variants.items()
+    ]
+
+
+def _format(metric: str, value: float | None) -> str:
+    return "n/a" if value is None else f"{value:.{_DIGITS[metric]}f}"
+
+
+def notes(results: Results) -> list[str]:
+    """Every reason and mark behind the table, once each."""
+    found: dict[str, None] = {}
+    for split, variants in results.items():
+        scored = variants["full"]
+        for mark in scored["marks"]:
+            found[f"marked: {mark}"] = None
+        if not scored["images"]:
+            found[f"{split}: {scored['psnr_reason']}"] = None
+            continue
+        for metric in METRICS:
+            if scored[metric] is None:
+                found[f"{metric} n/a: {scored[f'{metric}_reason']}"] = None
+    return list(found)
+
+
+def print_table(results: Results, console: Console, title: str) -> None:
+    """The rich table with its notes underneath."""
+    table = Table(title=title)
+    for name in ("split", "picture", "images"):
+        table.add_column(name)
+    for metric in METRICS:
+        table.add_column(HEADINGS[metric], justify="right")
+    for row in rows(results):
+        table.add_row(*row)
+    console.print(table)
+    for note in notes(results):
+        console.print(f"  {note}", markup=False, highlight=False)
+
+
+def markdown(results: Results, title: str) -> str:
+    """The same table in Markdown."""
+    header = ["split", "picture", "images", *(HEADINGS[m] for m in METRICS)]
+    lines = [f"# {title}", "", "| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    lines += ["| " + " | ".join(row) + " |" for row in rows(results)]
+    return "\n".join([*lines, "", *(f"- {note}" for note in notes(results)), ""])
+
+
+def write_results(results: Results, folder: Path, title: str) -> None:
+    """``metrics.json`` and ``metrics.md`` in the run folder, each whole or not at all."""
+    write_atomically(folder / "metrics.json", json.dumps(results, indent=2, allow_nan=False))
+    write_atomically(folder / "metrics.md", markdown(results, title))

@@ -1,0 +1,195 @@
+"""The avatar: skeleton and camera in, picture out; its forward reads like the paper's figure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor, nn
+
+from gsgan.body import free_body
+from gsgan.model.deformation import Deformation
+from gsgan.model.generator import Generator
+from gsgan.model.segmentation import Segmentation
+from gsgan.scene import BodyPose, Camera, Frame, Gaussians
+from gsgan.skeleton import (
+    MEDIAPIPE33,
+    Densify,
+    bone_frames,
+    draw_skeleton,
+    omega,
+    sanitise,
+)
+from gsgan.splat import Accuracy, rasterise
+
+if TYPE_CHECKING:
+    from gsgan.data.datamodule import SceneInfo  # loads Lightning
+
+SKELETON_CHANNELS = len(MEDIAPIPE33.draw_groups)
+
+
+@dataclass(frozen=True)
+class Painting:
+    """What an avatar makes of one pose seen by one camera.
+
+    Args:
+        image: ``[B, 3, H, W]`` I_pred on black, not clamped; None when only Step I was asked for.
+        features: ``[B, C, H, W]`` F on black; the first three channels are Step I's colour.
+        alpha: ``[B, 1, H, W]``.
+        segmentation: ``[B, classes, H, W]`` S, or None where it was not built.
+        gaussians: Ĝ.
+    """
+
+    image: Tensor | None
+    features: Tensor
+    alpha: Tensor
+    segmentation: Tensor | None
+    gaussians: Gaussians
+
+    @property
+    def colour(self) -> Tensor:
+        """``[B, 3, H, W]`` Step I's picture C on black."""
+        return self.features[:, :3]
+
+
+class Avatar(nn.Module):
+    """One person: Gaussians, segmentation, pose code and generator put together.
+
+    Parts whose sizes depend on the scene arrive as functions of those sizes (``_partial_`` in the
+    config), so each config file names one constructor per part.
+
+    Args:
+        scene: what the training data is like: body height, whether it has a body pose.
+        densify: skeleton to points.
+        deformation: Ψ, given rest points, body height and number of joints.
+        segmentation: S, given a body; None leaves it out (``wo_seg``).
+        pose_encoder: Ω (or the flat skeleton) to g; None in ``splat_only``.
+        generator: the UNet, given its channel counts; None makes Step I's colour the picture.
+        accuracy: the rasteriser's settings for F.
+        twist: how bone frames turn about their bones, ``none`` or ``hinge``.
+
+    Source: paper Fig. 2 and Sec. 3; architecture.md § 4.
+    """
+
+    def __init__(
+        self,
+        scene: SceneInfo,
+        densify: Densify,
+        deformation: Callable[..., Deformation],
+        segmentation: Callable[..., Segmentation] | None,
+        pose_encoder: nn.Module | None,
+        generator: Callable[..., Generator] | None,
+        accuracy: Accuracy,
+        twist: str = "none",
+    ) -> None:
+        super().__init__()
+        self.template, self.accuracy, self.twist = MEDIAPIPE33, accuracy, twist
+        self.limb_sum = float(scene.body_height)
+        # Stature, from limb lengths: what the skeleton measures and no pose changes.
+        self.body_height = self.limb_sum * self.template.stature / self.template.limb_length_sum
+        self.densify = densify
+        self.deformation = deformation(
+            rest_points=densify.rest_points,
+            body_height=self.body_height,
+            joints=len(self.template.names),
+        )
+        self.effects: dict[str, tuple[bool, str]] = {}
+        self.segmentation = self._build_segmentation(scene, segmentation)
+        self.pose_encoder = pose_encoder
+        self.generator: Generator | None = None
+        if generator is not None and pose_encoder is not None:
+            self.generator = generator(
+                feature_channels=3 + self.deformation.features,
+                segmentation_channels=self.segmentation.classes if self.segmentation else 0,
+                skeleton_channels=SKELETON_CHANNELS,
+                pose_channels=pose_encoder.channels,
+            )
+        self.effects["generator"] = (
+            self.generator is not None,
+            "the model has a UNet" if self.generator else "the model paints Step I's colour",
+        )
+        degree = self.deformation.sh_degree
+        self.effects["view-dependent colour"] = (
+            degree > 0,
+            f"model.deformation.sh_degree={degree}",
+        )
+
+    def _build_segmentation(
+        self, scene: SceneInfo, build: Callable[..., Segmentation] | None
+    ) -> Segmentation | None:
+        if build is None:
+            self.effects["segmentation S"] = (False, "the model leaves it out")
+            return None
+        if not scene.has_body_pose:
+            self.effects["segmentation S"] = (False, "the data has no body pose")
+            return None
+        self.effects["segmentation S"] = (True, "the data has a body pose")
+        return build(body=free_body())
+
+    def forward(
+        self,
+        skeleton: Tensor,
+        visibility: Tensor,
+        camera: Camera,
+        body: BodyPose | None = None,
+        *,
+        pose_noise: Tensor | None = None,
+        paint: bool = True,
+        detach_features: bool = False,
+    ) -> Painting:
+        """Paints the pose.
+
+        Args:
+            skeleton: ``[B, J, 3]`` metres, world.
+            visibility: ``[B, J]`` in [0, 1]; 0 marks a joint that was not seen.
+            camera: B cameras.
+            body: pose of the skinned body; needed when S was built.
+            pose_noise: ``[B, J, 3]`` body heights, added to Ψ's pose code (training only).
+            paint: False stops after F (Step I needs no more).
+            detach_features: keep Step II's gradient out of Ψ.
+
+        Returns:
+            I_pred with all that led to it.
+        """
+        p, valid = sanitise(skeleton, visibility, self.template, self.limb_sum)
+        frames = bone_frames(p, valid, self.template, twist=self.twist)
+
+        points = self.densify(p, valid, frames)  # Alg. 1: G
+        gaussians = self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
+            p, points, camera.centre, frames.hubs[:, 0], pose_noise
+        )
+        raster = rasterise(gaussians, camera, settings=self.accuracy)
+        F = raster.features
+
+        S = self.segment(body, camera) if paint or self.generator is None else None  # Sec. 3.4
+        image = None
+        if self.generator is None:
+            image = F[:, :3]
+        elif paint:  # Sec. 3.5
+            g = self.pose_encoder(*self.pose_inputs(p, valid, frames, camera))  # type: ignore[misc]
+            p2d = draw_skeleton(p, valid, camera, self.template)
+            image = self.generator(F.detach() if detach_features else F, S, p2d, g)
+        return Painting(image, F, raster.alpha, S, gaussians)
+
+    def paint(self, frame: Frame) -> Painting:
+        """`forward` for a frame of a dataset."""
+        return self(frame.skeleton, frame.visibility, frame.camera, frame.body)
+
+    def segment(self, body: BodyPose | None, camera: Camera) -> Tensor | None:
+        """S, without gradient: it is trained on its own (method.md § 3) and then frozen."""
+        if self.segmentation is None:
+            return None
+        if body is None:
+            raise ValueError("Avatar: this model was built with S and needs the frame's body pose")
+        with torch.no_grad():
+            return self.segmentation(body, camera)
+
+    def pose_inputs(
+        self, p: Tensor, valid: Tensor, frames: object, camera: Camera
+    ) -> tuple[Tensor, Tensor]:
+        """Ω ``[B, J, 6]``, and the joints about the root in camera axes and body heights."""
+        root = p[:, 23:25].mean(dim=1, keepdim=True)
+        in_camera = (p - root) @ camera.R.mT / self.body_height
+        return omega(p, valid, camera.R, self.template, frames=frames), in_camera

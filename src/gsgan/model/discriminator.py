@@ -1,0 +1,85 @@
+"""The multi-scale patch discriminator, whose features also serve L_feat (paper Sec. 3.6)."""
+
+from __future__ import annotations
+
+from torch import Tensor, nn
+from torch.nn import functional
+
+SLOPE = 0.2
+
+
+class PatchDiscriminator(nn.Module):
+    """One scale: 4×4 convolutions down to a map of logits.
+
+    Args:
+        base: channels of the first layer.
+        layers: feature layers; all but the last two halve the picture.
+
+    Source: method.md § 7 (the pix2pixHD family).
+    """
+
+    def __init__(self, base: int = 64, layers: int = 4) -> None:
+        super().__init__()
+        if layers < 2:
+            raise ValueError(f"PatchDiscriminator: layers must be at least 2, got {layers}")
+        widths = [base * min(2**i, 8) for i in range(layers)]
+        blocks: list[nn.Module] = []
+        previous = 3
+        for i, channels in enumerate(widths):
+            stride = 2 if i < layers - 1 else 1
+            conv = nn.Conv2d(previous, channels, 4, stride=stride, padding=2 if stride == 1 else 1)
+            norm: list[nn.Module] = [nn.InstanceNorm2d(channels)] if i > 0 else []
+            blocks.append(nn.Sequential(conv, *norm, nn.LeakyReLU(SLOPE)))
+            previous = channels
+        self.blocks = nn.ModuleList(blocks)
+        self.logits = nn.Conv2d(previous, 1, 4, padding=2)
+
+    def forward(self, image: Tensor) -> list[Tensor]:
+        """Feature maps, then the logits, of a picture ``[B, 3, H, W]``."""
+        maps = [image]
+        for block in self.blocks:
+            maps.append(block(maps[-1]))
+        return [*maps[1:], self.logits(maps[-1])]
+
+
+class Discriminator(nn.Module):
+    """The same judge at several scales, unconditional (the picture only).
+
+    Args:
+        scales: judges; each sees the picture halved once more.
+        base, layers: as `PatchDiscriminator`.
+
+    Source: paper Sec. 3.6; method.md § 7.
+    """
+
+    def __init__(self, *, scales: int = 2, base: int = 64, layers: int = 4) -> None:
+        super().__init__()
+        self.judges = nn.ModuleList(PatchDiscriminator(base, layers) for _ in range(scales))
+        self.stride = 2 ** (layers - 1 + scales - 1)
+        self.apply(_initialise)
+
+    def forward(self, image: Tensor) -> list[list[Tensor]]:
+        """For each scale its feature maps with the logits last.
+
+        Raises:
+            ValueError: when the picture is so small that the coarsest map has a single pixel,
+                where instance normalisation would erase it.
+        """
+        if min(image.shape[-2:]) < 2 * self.stride:
+            raise ValueError(
+                f"Discriminator: a picture of {tuple(image.shape[-2:])} is too small for "
+                f"{len(self.judges)} scales of {len(self.judges[0].blocks)} layers: "
+                f"at least {2 * self.stride} pixels, or fewer layers"
+            )
+        results = []
+        for judge in self.judges:
+            results.append(judge(image))
+            image = functional.avg_pool2d(image, 3, stride=2, padding=1, count_include_pad=False)
+        return results
+
+
+def _initialise(module: nn.Module) -> None:
+    if isinstance(module, nn.Conv2d):
+        nn.init.normal_(module.weight, 0.0, 0.02)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)

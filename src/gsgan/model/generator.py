@@ -1,0 +1,169 @@
+"""The generator: a UNet with two encoders, styled by the pose (paper Sec. 3.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+NORM_FLOOR = 1e-6  # inside the root: an all-zero pixel (empty background) stays zero
+SLOPE = 0.2
+
+
+class Encoder(nn.Module):
+    """A pyramid: 3×3 stem, then stride-2 levels; returns every level, finest first."""
+
+    def __init__(self, inputs: int, channels: Sequence[int]) -> None:
+        super().__init__()
+        self.stem = nn.Conv2d(inputs, channels[0], 3, padding=1)
+        self.down = nn.ModuleList(
+            nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(channels)
+        )
+        self.refine = nn.ModuleList(nn.Conv2d(c, c, 3, padding=1) for c in channels[1:])
+
+    def forward(self, x: Tensor) -> list[Tensor]:
+        """``[B, inputs, H, W]`` to levels ``[B, channels[l], H / 2^l, W / 2^l]``."""
+        levels = [_activate(self.stem(x))]
+        for down, refine in zip(self.down, self.refine, strict=True):
+            levels.append(_activate(refine(_activate(down(levels[-1])))))
+        return levels
+
+
+class Style(nn.Module):
+    """Per-pixel normalisation, then scale and shift from E_s's level and the pose code g.
+
+    Normalising over channels at each pixel (not over the picture) keeps colours independent of how
+    much of the frame is background. Both maps start at zero: the style starts as the identity.
+    """
+
+    def __init__(self, channels: int, style_channels: int, pose_channels: int) -> None:
+        super().__init__()
+        self.from_map = nn.Conv2d(style_channels, 2 * channels, 1)
+        self.from_pose = nn.Linear(pose_channels, 2 * channels)
+        for layer in (self.from_map, self.from_pose):
+            nn.init.zeros_(layer.weight)
+            nn.init.zeros_(layer.bias)
+
+    def forward(self, h: Tensor, style: Tensor, g: Tensor) -> Tensor:
+        """``h`` ``[B, C, h, w]`` styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]``."""
+        modulation = self.from_map(style) + self.from_pose(g)[:, :, None, None]
+        gamma, beta = modulation.chunk(2, dim=1)
+        h = h * torch.rsqrt(h.square().mean(dim=1, keepdim=True) + NORM_FLOOR)
+        return h * (1 + gamma) + beta
+
+
+class DecoderLevel(nn.Module):
+    """Reduce, upsample, join the skip, then two styled convolutions."""
+
+    def __init__(self, inputs: int, channels: int, style_channels: int, pose: int) -> None:
+        super().__init__()
+        self.reduce = nn.Conv2d(inputs, channels, 1)  # at low resolution, where it is cheap
+        self.convs = nn.ModuleList(
+            nn.Conv2d(c, channels, 3, padding=1) for c in (2 * channels, channels)
+        )
+        self.styles = nn.ModuleList(Style(channels, style_channels, pose) for _ in range(2))
+
+    def forward(self, h: Tensor, skip: Tensor, style: Tensor, g: Tensor) -> Tensor:
+        # Nearest + convolution: transposed convolutions leave a checkerboard.
+        h = functional.interpolate(self.reduce(h), scale_factor=2.0, mode="nearest")
+        h = torch.cat([h, skip], dim=1)
+        for conv, styled in zip(self.convs, self.styles, strict=True):
+            h = _activate(styled(conv(h), style, g))
+        return h
+
+
+class Generator(nn.Module):
+    """F ⊕ S ⊕ p₂D and g to the picture.
+
+    Args:
+        feature_channels: channels of F, colour included.
+        segmentation_channels: channels of S; 0 leaves S out (``wo_seg``).
+        skeleton_channels: channels of p₂D.
+        pose_channels: length of g.
+        base: channels at full resolution.
+        multipliers: channels of each level in units of ``base``; one level a halving.
+        style_share: E_s's width as a share of E_c's.
+        rgb_skip: paint a correction of Step I's colour instead of the whole picture; the last
+            layer then starts at zero, and training from Step I's picture.
+        output: ``linear`` (clamped only when shown: an all-black start can recover) or
+            ``sigmoid``.
+        feature_bound: F is clamped to ± this before it enters (half precision overflows).
+
+    Source: paper Sec. 3.5; method.md § 4 (sizes, style), § 13 (linear output).
+    """
+
+    def __init__(
+        self,
+        feature_channels: int,
+        segmentation_channels: int,
+        skeleton_channels: int,
+        pose_channels: int,
+        *,
+        base: int = 32,
+        multipliers: Sequence[int] = (1, 2, 4, 8, 8),
+        style_share: float = 0.5,
+        rgb_skip: bool = False,
+        output: str = "linear",
+        feature_bound: float = 1e3,
+    ) -> None:
+        super().__init__()
+        if output not in ("linear", "sigmoid"):
+            raise ValueError(f"Generator: output must be linear or sigmoid, got {output!r}")
+        if rgb_skip and output == "sigmoid":
+            raise ValueError("Generator: rgb_skip adds to a colour, so output must be linear")
+        channels = [base * m for m in multipliers]
+        style = [max(1, round(style_share * c)) for c in channels]
+        inputs = feature_channels + segmentation_channels + skeleton_channels
+        self.stride = 2 ** (len(channels) - 1)
+        self.rgb_skip, self.output, self.feature_bound = rgb_skip, output, feature_bound
+        self.content = Encoder(inputs, channels)
+        self.style = Encoder(feature_channels, style)
+        self.mid = nn.ModuleList(nn.Conv2d(channels[-1], channels[-1], 3, padding=1) for _ in "ab")
+        self.mid_style = nn.ModuleList(Style(channels[-1], style[-1], pose_channels) for _ in "ab")
+        self.up = nn.ModuleList(
+            DecoderLevel(channels[i + 1], channels[i], style[i], pose_channels)
+            for i in reversed(range(len(channels) - 1))
+        )
+        self.paint = nn.Conv2d(channels[0], 3, 3, padding=1)
+        if rgb_skip:
+            nn.init.zeros_(self.paint.weight)
+            nn.init.zeros_(self.paint.bias)
+
+    def forward(self, F: Tensor, S: Tensor | None, p2d: Tensor, g: Tensor) -> Tensor:
+        """I_pred ``[B, 3, H, W]``, not clamped.
+
+        Args:
+            F: ``[B, C, H, W]`` rendered features, the first three channels Step I's colour.
+            S: ``[B, classes, H, W]`` part probabilities, or None when built without.
+            p2d: ``[B, 8, H, W]`` the drawn skeleton.
+            g: ``[B, 35]`` the pose code.
+        """
+        height, width = F.shape[-2:]
+        features = F.clamp(-self.feature_bound, self.feature_bound)
+        content = torch.cat([x for x in (features, S, p2d) if x is not None], dim=1)
+        content, features = (_pad(x, self.stride) for x in (content, features))
+        content = content.contiguous(memory_format=torch.channels_last)
+        features = features.contiguous(memory_format=torch.channels_last)
+        skips, styles = self.content(content), self.style(features)
+        h = skips[-1]
+        for conv, style in zip(self.mid, self.mid_style, strict=True):
+            h = _activate(style(conv(h), styles[-1], g))
+        for i, level in enumerate(self.up):
+            h = level(h, skips[-2 - i], styles[-2 - i], g)
+        painted = self.paint(h)[..., :height, :width]
+        if self.rgb_skip:
+            return F[:, :3] + painted
+        return torch.sigmoid(painted) if self.output == "sigmoid" else painted
+
+
+def _activate(x: Tensor) -> Tensor:
+    return functional.leaky_relu(x, SLOPE)
+
+
+def _pad(x: Tensor, stride: int) -> Tensor:
+    """Zeros on the right and below, up to a multiple of ``stride``."""
+    height, width = x.shape[-2:]
+    return functional.pad(x, (0, -width % stride, 0, -height % stride))

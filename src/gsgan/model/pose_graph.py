@@ -1,0 +1,109 @@
+"""The pose encoder: skeleton to the global style code g ∈ R³⁵ (paper Sec. 3.5)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gsgan.model.encoding import encoded_size, positional_encoding
+from gsgan.skeleton import MEDIAPIPE33, SkeletonTemplate
+
+
+class GraphLayer(nn.Module):
+    """One graph convolution with weights of its own for every joint.
+
+    ``h' = (A ∘ W_A) (h_j W_j) + b``: the adjacency's entries are learned where the mask allows.
+
+    Args:
+        mask: ``[J, J]`` of 0 and 1, the diagonal set; an identity mask makes a per-joint layer.
+        inputs, outputs: channels.
+        neighbour: initial weight of an edge; the diagonal starts at 1.
+
+    Source: method.md § 5 (DANBO's layers, restated).
+    """
+
+    def __init__(self, mask: Tensor, inputs: int, outputs: int, neighbour: float = 0.05) -> None:
+        super().__init__()
+        joints = mask.shape[0]
+        self.register_buffer("mask", mask, persistent=False)
+        identity = torch.eye(joints)
+        self.adjacency = nn.Parameter(identity + neighbour * (mask - identity))
+        self.weight = nn.Parameter(torch.empty(joints, inputs, outputs))
+        bound = 1 / math.sqrt(inputs)
+        nn.init.uniform_(self.weight, -bound, bound)
+        self.bias = nn.Parameter(torch.zeros(outputs))
+
+    def forward(self, h: Tensor) -> Tensor:
+        """``[B, J, inputs]`` to ``[B, J, outputs]``."""
+        h = torch.bmm(h.transpose(0, 1), self.weight).transpose(0, 1)
+        return (self.adjacency * self.mask) @ h + self.bias
+
+
+class PoseGraph(nn.Module):
+    """Graph network over joint rotations Ω, pooled to one number per skeleton edge.
+
+    Args:
+        template: the skeleton's joints and edges.
+        width: channels of the hidden layers.
+        joint_channels: channels a joint ends with.
+        octaves: positional encoding of Ω.
+
+    Source: paper Sec. 3.5; method.md § 5, ``readout=edge``: 35 is the number of MediaPipe edges.
+    """
+
+    def __init__(
+        self,
+        template: SkeletonTemplate = MEDIAPIPE33,
+        *,
+        width: int = 128,
+        joint_channels: int = 32,
+        octaves: int = 5,
+    ) -> None:
+        super().__init__()
+        joints = len(template.names)
+        mask = torch.eye(joints)
+        for a, b in template.gnn_edges:
+            mask[a, b] = mask[b, a] = 1
+        alone = torch.eye(joints)
+        self.octaves = octaves
+        self.layers = nn.ModuleList(
+            [
+                GraphLayer(mask, encoded_size(6, octaves), width),
+                GraphLayer(mask, width, width),
+                GraphLayer(alone, width, width),
+                GraphLayer(alone, width, joint_channels),
+            ]
+        )
+        self.register_buffer("edges", torch.tensor(template.edges).long(), persistent=False)
+        self.channels = len(template.edges)
+        self.readout = nn.Parameter(torch.randn(self.channels, 2 * joint_channels) * 0.1)
+        self.readout_bias = nn.Parameter(torch.zeros(self.channels))
+
+    def forward(self, omega: Tensor, pose: Tensor) -> Tensor:
+        """g ``[B, 35]`` from Ω ``[B, J, 6]``; ``pose`` is the other encoder's input, unused."""
+        h = positional_encoding(omega, self.octaves)
+        for layer in self.layers[:-1]:
+            h = functional.relu(layer(h))
+        h = self.layers[-1](h)
+        pairs = torch.cat([h[:, self.edges[:, 0]], h[:, self.edges[:, 1]]], dim=-1)
+        return (pairs * self.readout).sum(-1) + self.readout_bias
+
+
+class PoseLinear(nn.Module):
+    """The ablation ``wo_gcn``: g = W p + b on the flattened skeleton (paper Sec. 4, ablation).
+
+    Args:
+        template: the skeleton; g has one number per edge, as with the graph.
+    """
+
+    def __init__(self, template: SkeletonTemplate = MEDIAPIPE33) -> None:
+        super().__init__()
+        self.channels = len(template.edges)
+        self.linear = nn.Linear(3 * len(template.names), self.channels)
+
+    def forward(self, omega: Tensor, pose: Tensor) -> Tensor:
+        """g ``[B, 35]`` from ``pose`` ``[B, J, 3]`` (camera axes, body heights); Ω is unused."""
+        return self.linear(pose.flatten(1))

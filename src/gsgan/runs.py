@@ -1,0 +1,124 @@
+"""A run folder: its config, its checkpoint, and the avatar that comes out of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+
+from gsgan.errors import ConfigError, DataError
+from gsgan.model.avatar import Avatar
+
+if TYPE_CHECKING:
+    from gsgan.data.datamodule import GsganData
+
+CHECKPOINT = Path("checkpoints") / "last.ckpt"
+# What may differ between a run and its continuation: where and how it runs, not what it learns.
+FREE_KEYS = ("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips")
+
+
+def record(config: DictConfig) -> dict[str, Any]:
+    """The config as plain values, without the keys a continuation may change."""
+    plain = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(plain, dict)
+    return {str(key): value for key, value in plain.items() if key not in FREE_KEYS}
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """A checkpoint of gsgan, read without unrestricted pickle.
+
+    Raises:
+        DataError: when the file is damaged or is no checkpoint of gsgan.
+    """
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such file; the run has no checkpoint yet") from error
+    except Exception as error:
+        raise DataError(
+            f"{path}: not a readable checkpoint ({type(error).__name__}); it may be cut off: "
+            "remove it to start over"
+        ) from error
+    if not isinstance(checkpoint, dict) or "gsgan" not in checkpoint:
+        raise DataError(f"{path}: not a checkpoint of gsgan (it has no 'gsgan' entry)")
+    return checkpoint
+
+
+def checkpoint_to_resume(folder: Path, config: DictConfig) -> Path | None:
+    """The checkpoint of an earlier part of this very run, or None.
+
+    Raises:
+        ConfigError: when the folder holds a run with other settings.
+        DataError: when its checkpoint cannot be read.
+    """
+    path = folder / CHECKPOINT
+    if not path.is_file():
+        return None
+    before, now = read_checkpoint(path)["gsgan"]["record"], record(config)
+    changed = sorted(set(_differences(before, now)))
+    if changed:
+        shown = ", ".join(changed[:5]) + (" …" if len(changed) > 5 else "")
+        raise ConfigError(
+            f"{folder} holds a run with other settings ({shown}); choose another hydra.run.dir, "
+            "or resume=false to start over there"
+        )
+    return path
+
+
+def _differences(before: Any, now: Any, at: str = "") -> list[str]:
+    if isinstance(before, dict) and isinstance(now, dict):
+        keys = sorted(set(before) | set(now), key=str)
+        found = []
+        for key in keys:
+            found += _differences(before.get(key), now.get(key), f"{at}.{key}" if at else str(key))
+        return found
+    return [] if before == now else [at]
+
+
+def load_config(folder: Path) -> DictConfig:
+    """The config a run was started with.
+
+    Raises:
+        DataError: when the folder is not a run folder.
+    """
+    path = folder / ".hydra" / "config.yaml"
+    if not path.is_file():
+        raise DataError(
+            f"{folder}: not a run folder (no .hydra/config.yaml); give run=<the folder that "
+            "gsgan.train printed>"
+        )
+    config = OmegaConf.load(path)
+    assert isinstance(config, DictConfig)
+    return config
+
+
+def build_avatar(config: DictConfig, data: GsganData) -> Avatar:
+    """The untrained avatar of a config, sized to the data."""
+    return instantiate(config.model)(scene=data.info)
+
+
+def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avatar, list[str]]:
+    """The trained avatar of a run folder, in eval mode, and the marks its tables must carry.
+
+    Raises:
+        DataError: when the checkpoint is missing, damaged, or of another model.
+    """
+    path = folder / CHECKPOINT
+    checkpoint = read_checkpoint(path)
+    avatar = build_avatar(config, data)
+    prefix = "avatar."
+    state = {
+        key.removeprefix(prefix): value
+        for key, value in checkpoint["state_dict"].items()
+        if key.startswith(prefix)
+    }
+    try:
+        avatar.load_state_dict(state)
+    except RuntimeError as error:
+        raise DataError(
+            f"{path}: its weights do not fit the config beside it ({folder / '.hydra'})"
+        ) from error
+    return avatar.eval(), list(checkpoint["gsgan"]["marks"])

@@ -1,0 +1,367 @@
+"""The training scheme of the paper as one LightningModule (Alg. 2), manually optimised."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from lightning import LightningModule
+from torch import Tensor, nn
+
+from gsgan.errors import ConfigError, GsganError
+from gsgan.losses.adversarial import discriminator_loss, feature_matching, generator_loss
+from gsgan.losses.perceptual import Perceptual
+from gsgan.losses.photometric import photometric
+from gsgan.metrics.image import psnr
+from gsgan.model.avatar import Avatar, Painting
+from gsgan.model.discriminator import Discriminator
+from gsgan.model.segmentation import segmentation_loss
+from gsgan.scene import Frame
+from gsgan.training.optimisers import Recipe, clip, set_rate
+from gsgan.training.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
+
+SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
+
+
+@dataclass(frozen=True)
+class StepOneLoss:
+    """L_Ψ = l1 · L1(C, I) + ssim · (1 - SSIM(C, I)), over a background.
+
+    Args:
+        l1, ssim: weights (paper: 0.8, 0.2).
+        feature_head: weight of the same loss on a linear readout of F; without it F's further
+            channels get no gradient in Step I. 0 builds no readout.
+        random_background: composite both pictures over a random colour, so that black clothes do
+            not become transparent; False composites over black.
+
+    Source: paper Sec. 3.6; method.md § 2.
+    """
+
+    l1: float = 0.8
+    ssim: float = 0.2
+    feature_head: float = 0.5
+    random_background: bool = True
+
+
+@dataclass(frozen=True)
+class StepTwoLoss:
+    """Weights of the generator's loss; a term of weight 0 is not computed.
+
+    Args:
+        l1, l2, ssim: photometric terms on I_pred (the paper's footnote: l2 reconstruction).
+        perceptual: L_perc.
+        perceptual_every: compute L_perc only every so many iterations (its weight is multiplied
+            by as much); VGG is the costliest term on a CPU.
+        adversarial: L_GAN.
+        feature_matching: L_feat, between the discriminator's features.
+        gan: ``logistic``, ``hinge`` or ``lsgan``.
+        anchor: weight of L_Ψ, which keeps C a picture while Ψ learns from the generator.
+        detach_features: keep the generator's gradient out of Ψ (ablation).
+
+    Source: paper Sec. 3.6; method.md § 7, § 13.
+    """
+
+    l1: float = 1.0
+    l2: float = 0.0
+    ssim: float = 0.2
+    perceptual: float = 1.0
+    perceptual_every: int = 1
+    adversarial: float = 1.0
+    feature_matching: float = 10.0
+    gan: str = "logistic"
+    anchor: float = 1.0
+    detach_features: bool = False
+
+    @property
+    def plays(self) -> bool:
+        """Whether a discriminator is needed at all."""
+        return bool(self.adversarial or self.feature_matching)
+
+
+class AvatarTraining(LightningModule):
+    """Trains S, then Ψ (Step I), then generator and discriminator with Ψ (Step II).
+
+    Args:
+        avatar: what is trained.
+        discriminator: the judge; None, or no adversarial weight, leaves the GAN out.
+        perceptual: L_perc; None leaves it out.
+        schedule: iterations of each phase; phases whose part was not built go to Step I, so that
+            every variant of a study trains equally long.
+        recipes: optimisers by name: segmentation, psi, generator, discriminator.
+        step_one, step_two: loss weights.
+        pose_noise: standard deviation, body heights, of the noise on Ψ's pose code.
+        seed: with the iteration it determines every random number drawn here, so a resumed run
+            draws the same ones.
+        max_skipped: non-finite gradients that are skipped before the run is stopped.
+        log_every: iterations between logged values.
+        record: plain config values stored with every checkpoint.
+
+    Source: paper Alg. 2; method.md § 7.
+    """
+
+    def __init__(
+        self,
+        avatar: Avatar,
+        discriminator: Discriminator | None,
+        perceptual: Perceptual | None,
+        schedule: Schedule,
+        recipes: dict[str, Recipe],
+        step_one: StepOneLoss,
+        step_two: StepTwoLoss,
+        *,
+        pose_noise: float = 0.01,
+        seed: int = 0,
+        max_skipped: int = 20,
+        log_every: int = 20,
+        record: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.avatar = avatar
+        paints = avatar.generator is not None
+        self.discriminator = discriminator if paints and step_two.plays else None
+        self.perceptual = perceptual if paints and step_two.perceptual else None
+        self.schedule = _fit_schedule(schedule, avatar)
+        self.recipes, self.step_one, self.step_two = recipes, step_one, step_two
+        self.pose_noise, self.seed, self.log_every = pose_noise, seed, log_every
+        self.max_skipped, self.record = max_skipped, record or {}
+        channels = 3 + avatar.deformation.features
+        self.feature_head = nn.Conv2d(channels, 3, 1) if step_one.feature_head else None
+        self.step = 0  # iterations done: Lightning's global_step counts every optimiser's steps
+        self.skipped = 0
+        self.start_psnr: float | None = None
+
+    @property
+    def marks(self) -> list[str]:
+        """Notes that every table of this run must carry."""
+        mark = self.perceptual.mark if self.perceptual is not None else None
+        return [mark] if mark else []
+
+    # -- optimisers
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        groups = self._parameter_groups()
+        missing = sorted(set(groups) - set(self.recipes))
+        if missing:
+            raise ConfigError(f"training.recipes lacks {', '.join(missing)}")
+        self._names = list(groups)
+        return [self.recipes[name].build(groups[name]) for name in self._names]
+
+    def _parameter_groups(self) -> dict[str, list[tuple[list[nn.Parameter], float]]]:
+        avatar, groups = self.avatar, {}
+        if avatar.segmentation is not None:
+            s = avatar.segmentation
+            # method.md § 3: quats 1e-3, log scales 5e-3, opacity logits 5e-2
+            groups["segmentation"] = [
+                ([s.quats], 1.0), ([s.log_scales], 5.0), ([s.logit_opacities], 50.0),
+            ]  # fmt: skip
+        head = list(self.feature_head.parameters()) if self.feature_head else []
+        groups["psi"] = [([*avatar.deformation.parameters(), *head], 1.0)]
+        if avatar.generator is not None and avatar.pose_encoder is not None:
+            pose = list(avatar.pose_encoder.parameters())
+            groups["generator"] = [([*avatar.generator.parameters(), *pose], 1.0)]
+        if self.discriminator is not None:
+            groups["discriminator"] = [(list(self.discriminator.parameters()), 1.0)]
+        return groups
+
+    def _optimiser(self, name: str) -> Any:
+        found = self.optimizers()
+        return (found if isinstance(found, list) else [found])[self._names.index(name)]
+
+    def _descend(self, loss: Tensor, *names: str) -> None:
+        """One backward pass, then one step of each named optimiser, unless a gradient is not
+        finite: then no parameter moves and the iteration is counted as skipped."""
+        optimisers = [self._optimiser(name) for name in names]
+        for optimiser in optimisers:
+            optimiser.zero_grad(set_to_none=True)
+        self.manual_backward(loss)
+        norms = [
+            clip(optimiser.optimizer, self.recipes[name].clip)
+            for name, optimiser in zip(names, optimisers, strict=True)
+        ]
+        if not bool(torch.isfinite(torch.stack(norms)).all()):
+            self._skip(names)
+            return
+        for name, optimiser in zip(names, optimisers, strict=True):
+            set_rate(optimiser, self._rate(name))
+            optimiser.step()
+
+    def _rate(self, name: str) -> float:
+        start, end = self.schedule.bounds(SEGMENTATION if name == "segmentation" else STEP_TWO)
+        if name == "psi":  # one span over both steps: restarting the rate costs quality
+            start = self.schedule.bounds(STEP_ONE)[0]
+        return self.recipes[name].rate.at(self.step, start, end)
+
+    def _skip(self, names: tuple[str, ...]) -> None:
+        self.skipped += 1
+        self.print(
+            f"iteration {self.step}: a gradient of {', '.join(names)} was not finite; skipped "
+            f"({self.skipped} of at most {self.max_skipped})"
+        )
+        if self.skipped >= self.max_skipped:
+            raise GsganError(
+                f"training stopped at iteration {self.step}: {self.skipped} iterations had "
+                "gradients that were not finite; check the data, or lower the learning rates "
+                "(training.recipes.*.rate.peak)"
+            )
+
+    # -- one iteration
+
+    def training_step(self, frame: Frame, batch_idx: int) -> None:
+        if self.step >= self.schedule.total:
+            return
+        phase = self.schedule.phase(self.step)
+        if phase == SEGMENTATION:
+            self._train_segmentation(frame)
+        elif phase == STEP_ONE:
+            self._train_step_one(frame)
+        else:
+            self._train_step_two(frame)
+        self.step += 1
+
+    def _train_segmentation(self, frame: Frame) -> None:
+        if frame.labels is None or frame.body is None:
+            return  # nothing to learn from: S keeps its initial Gaussians
+        segmentation = self.avatar.segmentation(frame.body, frame.camera)  # type: ignore[misc]
+        loss = segmentation_loss(segmentation, frame.labels)
+        self._descend(loss, "segmentation")
+        self._log("segmentation/nll", loss)
+
+    def _train_step_one(self, frame: Frame) -> None:
+        painting = self._paint(frame, paint=False)
+        loss = self.step_one_loss(painting, frame)
+        self._descend(loss, "psi")
+        self._log("step_one/loss", loss)
+
+    def _train_step_two(self, frame: Frame) -> None:
+        painting = self._paint(frame, paint=True)
+        play = self.discriminator is not None and self.schedule.adversarial(self.step)
+        if self.discriminator is not None:
+            self.discriminator.requires_grad_(False)
+        terms = self.step_two_terms(painting, frame, play)
+        self._descend(torch.stack(list(terms.values())).sum(), "psi", "generator")
+        for name, term in terms.items():
+            self._log(f"step_two/{name}", term)
+        if play:
+            self._train_discriminator(painting, frame)
+
+    def _train_discriminator(self, painting: Painting, frame: Frame) -> None:
+        assert self.discriminator is not None
+        assert painting.image is not None
+        self.discriminator.requires_grad_(True)
+        real = self.discriminator(frame.image)
+        fake = self.discriminator(painting.image.detach())
+        loss = discriminator_loss(real, fake, self.step_two.gan)
+        self._descend(loss, "discriminator")
+        self._log("step_two/discriminator", loss)
+
+    def _paint(self, frame: Frame, *, paint: bool) -> Painting:
+        return self.avatar(
+            frame.skeleton,
+            frame.visibility,
+            frame.camera,
+            frame.body,
+            pose_noise=self._pose_noise(frame.skeleton),
+            paint=paint,
+            detach_features=self.step_two.detach_features,
+        )
+
+    # -- losses
+
+    def step_one_loss(self, painting: Painting, frame: Frame) -> Tensor:
+        """L_Ψ of Step I's colour, and of the linear readout of F."""
+        weights = self.step_one
+        background = self._background(frame)
+        target = frame.image + (1 - frame.mask) * background
+        behind = (1 - painting.alpha) * background
+        loss = photometric(painting.colour + behind, target, l1=weights.l1, ssim=weights.ssim)
+        if self.feature_head is not None:
+            # No bias where nothing is: the readout commutes with alpha blending.
+            read = nn.functional.conv2d(painting.features, self.feature_head.weight)
+            read = read + painting.alpha * self.feature_head.bias.view(1, 3, 1, 1)  # type: ignore[union-attr]
+            loss = loss + weights.feature_head * photometric(
+                read + behind, target, l1=weights.l1, ssim=weights.ssim
+            )
+        return loss
+
+    def step_two_terms(self, painting: Painting, frame: Frame, play: bool) -> dict[str, Tensor]:
+        """The generator's losses, weighted, by name."""
+        w, image, target = self.step_two, painting.image, frame.image
+        assert image is not None
+        terms = {"photometric": photometric(image, target, l1=w.l1, l2=w.l2, ssim=w.ssim)}
+        if w.anchor:
+            terms["anchor"] = w.anchor * self.step_one_loss(painting, frame)
+        if self.perceptual is not None and self.step % w.perceptual_every == 0:
+            scale = w.perceptual * w.perceptual_every
+            terms["perceptual"] = scale * self.perceptual(image, target)
+        if play:
+            assert self.discriminator is not None
+            fake = self.discriminator(image)
+            if w.adversarial:
+                terms["adversarial"] = w.adversarial * generator_loss(fake, w.gan)
+            if w.feature_matching:
+                with torch.no_grad():
+                    real = self.discriminator(target)
+                terms["feature_matching"] = w.feature_matching * feature_matching(real, fake)
+        return terms
+
+    # -- randomness: from (seed, iteration, rank), so that resuming changes nothing
+
+    def _random(self, salt: int) -> torch.Generator:
+        rank = self.trainer.global_rank if self._trainer is not None else 0
+        state = (self.seed * SEED_STRIDE + self.step) * 64 + 2 * (rank % 32) + salt
+        return torch.Generator().manual_seed(state % (2**63))
+
+    def _background(self, frame: Frame) -> Tensor:
+        shape = (len(frame), 3, 1, 1)
+        if not self.step_one.random_background:
+            return frame.image.new_zeros(shape)
+        return torch.rand(shape, generator=self._random(0)).to(frame.image)
+
+    def _pose_noise(self, skeleton: Tensor) -> Tensor | None:
+        if not self.pose_noise:
+            return None
+        noise = torch.randn(skeleton.shape, generator=self._random(1))
+        return self.pose_noise * noise.to(skeleton)
+
+    # -- validation and checkpoints
+
+    def validation_step(self, frame: Frame, batch_idx: int) -> Painting:
+        painting = self.avatar.paint(frame)
+        assert painting.image is not None
+        for name, picture in (("psnr", painting.image), ("psnr_splat", painting.colour)):
+            score = psnr(picture.clamp(0, 1), frame.image).mean()
+            self.log(f"val/{name}", score, batch_size=len(frame), sync_dist=True)
+        return painting
+
+    def on_validation_epoch_end(self) -> None:
+        if self.start_psnr is None:
+            self.start_psnr = float(self.trainer.callback_metrics["val/psnr"])
+
+    def _log(self, name: str, value: Tensor) -> None:
+        if self.step % self.log_every == 0 and self._trainer is not None:
+            self.log(name, value.detach())
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["gsgan"] = {
+            "step": self.step,
+            "skipped": self.skipped,
+            "start_psnr": self.start_psnr,
+            "marks": self.marks,
+            "record": self.record,
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        state = checkpoint["gsgan"]
+        self.step, self.skipped = state["step"], state["skipped"]
+        self.start_psnr = state["start_psnr"]
+
+
+def _fit_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
+    if avatar.segmentation is None:
+        schedule = replace(schedule, segmentation=0)
+    if avatar.generator is None:
+        both = schedule.step_one + schedule.step_two
+        schedule = replace(schedule, step_one=both, step_two=0)
+    return schedule

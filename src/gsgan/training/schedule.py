@@ -1,0 +1,96 @@
+"""When what is trained, and at which rate: pure maps from the iteration to a value."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from gsgan.errors import ConfigError
+
+SEGMENTATION, STEP_ONE, STEP_TWO = "segmentation", "step I", "step II"
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Iterations of each phase, in the order segmentation, Step I, Step II.
+
+    Args:
+        segmentation: iterations of S alone (0 where S is not built).
+        step_one: iterations of Ψ alone.
+        step_two: iterations in which generator, discriminator and Ψ learn together.
+        discriminator_start: iterations into Step II before the GAN starts.
+        epoch: iterations between checkpoints; Lightning's epoch is this many sampled batches.
+
+    Source: paper Alg. 2; method.md § 7 and § 13 (why Ψ goes on learning in Step II).
+    """
+
+    segmentation: int
+    step_one: int
+    step_two: int
+    discriminator_start: int = 0
+    epoch: int = 250
+
+    def __post_init__(self) -> None:
+        for name in ("segmentation", "step_one", "step_two", "discriminator_start"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"schedule.{name} must be 0 or more, got {getattr(self, name)}")
+        if self.epoch < 1:
+            raise ConfigError(f"schedule.epoch must be 1 or more, got {self.epoch}")
+        if self.total == 0:
+            raise ConfigError("schedule: every phase has 0 iterations, so there is nothing to do")
+
+    @property
+    def epochs(self) -> int:
+        """Epochs the whole run takes, the last one perhaps cut short."""
+        return math.ceil(self.total / self.epoch)
+
+    @property
+    def total(self) -> int:
+        """Iterations of the whole run."""
+        return self.segmentation + self.step_one + self.step_two
+
+    def phase(self, step: int) -> str:
+        """The phase that iteration ``step`` (from 0) belongs to."""
+        if step < self.segmentation:
+            return SEGMENTATION
+        return STEP_ONE if step < self.segmentation + self.step_one else STEP_TWO
+
+    def bounds(self, phase: str) -> tuple[int, int]:
+        """First iteration of a phase, and the first after it."""
+        ends = {
+            SEGMENTATION: (0, self.segmentation),
+            STEP_ONE: (self.segmentation, self.segmentation + self.step_one),
+            STEP_TWO: (self.segmentation + self.step_one, self.total),
+        }
+        return ends[phase]
+
+    def adversarial(self, step: int) -> bool:
+        """Whether the discriminator plays at this iteration."""
+        start = self.segmentation + self.step_one + self.discriminator_start
+        return self.phase(step) == STEP_TWO and step >= start
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A learning rate over one span: warm-up, constant, then a half cosine down.
+
+    Args:
+        peak: the rate.
+        hold: share of the span before the descent begins.
+        final: rate at the end, as a share of the peak.
+        warmup: iterations of linear warm-up.
+    """
+
+    peak: float
+    hold: float = 0.5
+    final: float = 0.0
+    warmup: int = 0
+
+    def at(self, step: int, start: int, end: int) -> float:
+        """The rate at iteration ``step`` of the span [start, end)."""
+        done = (step - start) / max(1, end - start)
+        scale = min(1.0, (step - start + 1) / (self.warmup + 1))
+        if done > self.hold:
+            phase = min(1.0, (done - self.hold) / max(1e-9, 1 - self.hold))
+            scale *= self.final + (1 - self.final) * 0.5 * (1 + math.cos(math.pi * phase))
+        return self.peak * scale
