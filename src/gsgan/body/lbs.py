@@ -1,0 +1,178 @@
+"""Linear blend skinning: joint rotations to bone transforms to one affine map a vertex.
+
+Convention: metres; column vectors, ``x_posed = A @ x_rest + t``; the batch first. Every joint's
+rest frame is aligned with the world's axes, so a zero rotation everywhere is the rest pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+
+def axis_angle_to_matrix(axis_angle: Tensor, small: float = 1e-6) -> Tensor:
+    """Rotation matrices ``[..., 3, 3]`` of axis-angle vectors ``[..., 3]`` in radians.
+
+    Rodrigues' formula, with its series below ``small`` squared radians: values and gradients are
+    finite at zero rotation.
+
+    Args:
+        axis_angle: ``[..., 3]`` unit axis times angle, radians.
+        small: squared angle under which the Taylor series replaces the quotients.
+
+    Returns:
+        ``[..., 3, 3]`` rotations, det +1.
+    """
+    squared = (axis_angle * axis_angle).sum(-1)[..., None, None]
+    is_small = squared < small
+    angle = torch.where(is_small, torch.ones_like(squared), squared).sqrt()
+    a = torch.where(is_small, 1 - squared / 6, angle.sin() / angle)
+    # (1 - cos x) / x² written with the half angle keeps its digits near zero
+    half = torch.sin(angle / 2) / angle
+    b = torch.where(is_small, 0.5 - squared / 24, 2 * half * half)
+    K = _cross_matrix(axis_angle)
+    eye = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
+    return eye + a * K + b * (K @ K)
+
+
+def _cross_matrix(v: Tensor) -> Tensor:
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+
+
+def kinematic_levels(parents: Sequence[int]) -> list[list[int]]:
+    """The joints grouped by depth, roots first: a level needs only the levels before it.
+
+    Args:
+        parents: parent of each joint, -1 for a root, each parent before its children.
+
+    Raises:
+        ValueError: when a parent does not come before its child.
+    """
+    depth: list[int] = []
+    for joint, parent in enumerate(parents):
+        if not -1 <= parent < joint:
+            raise ValueError(
+                f"kinematic_levels: parents must come before their children, "
+                f"got parent {parent} for joint {joint}"
+            )
+        depth.append(0 if parent < 0 else depth[parent] + 1)
+    return [[j for j, d in enumerate(depth) if d == level] for level in range(max(depth) + 1)]
+
+
+def forward_kinematics(
+    joints: Tensor, parents: Sequence[int], rotations: Tensor, transl: Tensor
+) -> Tensor:
+    """World transform of each bone relative to the rest pose.
+
+    Args:
+        joints: ``[J, 3]`` rest positions, metres.
+        parents: parent of each joint, -1 for the root, each parent before its children.
+        rotations: ``[B, J, 3, 3]`` of each joint relative to its parent.
+        transl: ``[B, 3]`` metres, added after the root's rotation about its own joint.
+
+    Returns:
+        ``[B, J, 4, 4]``: a rest point x moves rigidly with bone j to ``T[:, j] @ (x, 1)``.
+
+    Raises:
+        ValueError: on shapes that do not fit, naming the argument.
+    """
+    J = len(parents)
+    if joints.shape != (J, 3):
+        raise ValueError(
+            f"forward_kinematics: joints must have shape [{J}, 3] (one per parent), "
+            f"got {list(joints.shape)}"
+        )
+    if rotations.ndim != 4 or rotations.shape[1:] != (J, 3, 3):
+        raise ValueError(
+            f"forward_kinematics: rotations must have shape [B, {J}, 3, 3], "
+            f"got {list(rotations.shape)}"
+        )
+    if transl.shape != (len(rotations), 3):
+        raise ValueError(
+            f"forward_kinematics: transl must have shape [{len(rotations)}, 3], "
+            f"got {list(transl.shape)}"
+        )
+    R, position = _accumulate(joints, parents, rotations, transl)
+    shift = position - (R @ joints[None, :, :, None]).squeeze(-1)
+    top = torch.cat([R, shift.unsqueeze(-1)], dim=-1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:2], 1, 4)
+    return torch.cat([top, bottom], dim=-2)
+
+
+def _accumulate(
+    joints: Tensor, parents: Sequence[int], rotations: Tensor, transl: Tensor
+) -> tuple[Tensor, Tensor]:
+    """World rotations ``[B, J, 3, 3]`` and positions ``[B, J, 3]``, one level at a time."""
+    world_R: dict[int, Tensor] = {}
+    world_p: dict[int, Tensor] = {}
+    for level in kinematic_levels(parents):
+        R = rotations[:, level]
+        p = joints[level].expand(len(rotations), -1, -1)
+        above = [parents[j] for j in level]
+        if above[0] < 0:
+            p = p + transl.unsqueeze(1)
+        else:
+            parent_R = torch.stack([world_R[j] for j in above], dim=1)
+            parent_p = torch.stack([world_p[j] for j in above], dim=1)
+            offset = (joints[level] - joints[above])[None, :, :, None]
+            p = parent_p + (parent_R @ offset).squeeze(-1)
+            R = parent_R @ R
+        world_R.update(zip(level, R.unbind(1), strict=True))
+        world_p.update(zip(level, p.unbind(1), strict=True))
+    order = range(len(parents))
+    return (
+        torch.stack([world_R[j] for j in order], dim=1),
+        torch.stack([world_p[j] for j in order], dim=1),
+    )
+
+
+def blend_transforms(
+    transforms: Tensor, bone_index: Tensor, bone_weight: Tensor
+) -> tuple[Tensor, Tensor]:
+    """The affine map of each vertex: its bones' transforms averaged by weight.
+
+    Weights are divided by their sum first. ``A`` is a rotation only where one bone holds all the
+    weight: elsewhere it also shears and shrinks, so shapes that ride on a vertex move as
+    covariances, ``A Σ Aᵀ``.
+
+    Args:
+        transforms: ``[B, J, 4, 4]`` from :func:`forward_kinematics`.
+        bone_index: ``[V, n]`` int64, bones of each vertex.
+        bone_weight: ``[V, n]`` non-negative.
+
+    Returns:
+        ``A [B, V, 3, 3]`` and ``t [B, V, 3]``.
+
+    Raises:
+        ValueError: when the two tables differ in shape, or a vertex has no weight at all.
+
+    Source: paper Sec. 3.4, ``x_o = (Σ_b w_b ΔB_b) x_c``.
+    """
+    if bone_index.shape != bone_weight.shape or bone_index.ndim != 2:
+        raise ValueError(
+            f"blend_transforms: bone_index and bone_weight must share a shape [V, n], "
+            f"got {list(bone_index.shape)} and {list(bone_weight.shape)}"
+        )
+    weight = bone_weight.to(transforms.dtype)
+    total = weight.sum(-1, keepdim=True)
+    if not bool((total > 0).all()):
+        raise ValueError(
+            f"blend_transforms: bone_weight must have a positive sum for every vertex, "
+            f"got {int((total <= 0).sum())} vertices without"
+        )
+    weight = weight / total
+    rows = transforms[:, :, :3].flatten(2)
+    blended = rows.new_zeros(len(rows), len(bone_index), rows.shape[-1])
+    for k in range(bone_index.shape[1]):  # one bone at a time: a quarter of the memory
+        blended = blended + weight[:, k, None] * rows[:, bone_index[:, k]]
+    affine = blended.unflatten(-1, (3, 4))
+    return affine[..., :3], affine[..., 3]
+
+
+def skin(vertices: Tensor, A: Tensor, t: Tensor) -> Tensor:
+    """Posed vertices ``[B, V, 3]``: rest ones ``[V, 3]`` under ``A [B,V,3,3]``, ``t [B,V,3]``."""
+    return (A @ vertices[..., None]).squeeze(-1) + t

@@ -1,0 +1,223 @@
+"""A capture as a torch dataset of `Frame`, one camera and one moment an item."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from gsgan.data import crop as cropping
+from gsgan.data.crop import PersonCrop, Window
+from gsgan.data.files import read_colour, read_grey
+from gsgan.data.layout import IGNORE_LABEL, CameraEntry, Layout
+from gsgan.data.splits import Item
+from gsgan.errors import ConfigError, DataError
+from gsgan.scene import BodyPose, Camera, Frame
+
+Bytes = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Decoded, undistorted, cropped and resized pixels, still bytes: what the cache holds.
+
+    Args:
+        image: ``[3, H, W]`` RGB on black.
+        mask: ``[H, W]`` 0..255.
+        labels: ``[H, W]`` part numbers, or None.
+    """
+
+    image: Bytes
+    mask: Bytes
+    labels: Bytes | None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held."""
+        return self.image.nbytes + self.mask.nbytes + (0 if self.labels is None else self.mask.size)
+
+
+class PictureCache:
+    """The most recently used pictures, within a bound on their bytes.
+
+    Args:
+        limit: bytes; 0 keeps nothing.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        self.nbytes = 0
+        self._held: OrderedDict[Item, Picture] = OrderedDict()
+
+    def get(self, key: Item) -> Picture | None:
+        """The picture, if it is still held."""
+        if key in self._held:
+            self._held.move_to_end(key)
+        return self._held.get(key)
+
+    def put(self, key: Item, picture: Picture) -> None:
+        """Holds a picture, letting go of the longest unused ones; too large a one is not held."""
+        if picture.nbytes > self.limit or key in self._held:
+            return
+        self._held[key] = picture
+        self.nbytes += picture.nbytes
+        while self.nbytes > self.limit:
+            self.nbytes -= self._held.popitem(last=False)[1].nbytes
+
+
+class CaptureDataset(Dataset[Frame]):
+    """Items of a capture as `Frame` with batch size 1; collate them with `gsgan.scene.cat`.
+
+    Images are RGB in [0, 1] on black, undistorted with K kept (``camera.dist`` is None), cut to the
+    window and scaled; K follows. The window comes from the skeleton and camera alone. Labels keep
+    255 as "ignore".
+
+    Args:
+        layout: the capture.
+        items: (camera, frame) pairs, as in `Splits.items`.
+        size: side of the square pictures in pixels, or None for the window as it is.
+        crop: None for the full picture, padded to a square when a size is given.
+        cache: shared between datasets of one layout, size and crop; None decodes every time.
+
+    Raises:
+        ConfigError: when the size is not a positive number.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        items: Sequence[Item],
+        size: int | None = None,
+        crop: PersonCrop | None = None,
+        cache: PictureCache | None = None,
+    ) -> None:
+        if size is not None and (not isinstance(size, int) or size < 1):
+            raise ConfigError(f"data.size must be a whole number of pixels above 0, got {size!r}")
+        self.layout = layout
+        self.items = tuple(items)
+        self.size = size
+        self.crop = crop
+        self.cache = cache or PictureCache(0)
+        self._indices = {name: i for i, name in enumerate(layout.camera_names)}
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def __getitem__(self, index: int) -> Frame:
+        """The item as a `Frame`.
+
+        Raises:
+            DataError: when one of its files is damaged, naming the file.
+        """
+        name, frame = item = self.items[index]
+        picture = self.cache.get(item)
+        if picture is None:
+            picture = self._load(item)
+            self.cache.put(item, picture)
+        landmarks = self.layout.landmarks
+        return Frame(
+            image=_unit(picture.image)[None],
+            mask=_unit(picture.mask)[None, None],
+            camera=self.camera(item),
+            skeleton=_float(landmarks.p[frame]),
+            visibility=_float(landmarks.visibility[frame]),
+            frame_id=torch.tensor([frame]),
+            camera_index=torch.tensor([self._indices[name]]),
+            body=self._body(frame),
+            labels=_labels(picture.labels),
+        )
+
+    def window(self, item: Item) -> Window:
+        """Which part of the undistorted picture an item shows."""
+        camera = self.layout.cameras[item[0]]
+        if self.crop is not None:
+            joints = self.layout.landmarks.p[item[1]]
+            return self.crop.window(camera, joints, self.layout.landmarks.visibility[item[1]] > 0)
+        if self.size is not None:
+            return cropping.square_window(camera.size)
+        return Window(0, 0, camera.size)
+
+    def camera(self, item: Item) -> Camera:
+        """The camera of the item's picture: window and scale are in its K."""
+        window = self.window(item)
+        camera = _camera(self.layout.cameras[item[0]])
+        camera = camera.crop(window.top, window.left, window.size)
+        if self.size is not None:
+            camera = camera.resize((self.size, self.size))
+        return camera.to(torch.float32)
+
+    def _load(self, item: Item) -> Picture:
+        name, frame = item
+        camera, window = self.layout.cameras[name], self.window(item)
+        mapping = None
+        if camera.distorted:
+            mapping = cropping.undistort_map(camera.K, camera.dist, window)
+        size = window.size if self.size is None else (self.size, self.size)
+        mask = self._mask(item)
+        image = read_colour(self.layout.image_path(name, frame))
+        # Blacked out before anything is interpolated, so that no background bleeds in.
+        image = cropping.black_out(image, mask, self.layout.meta.composed)
+        image, mask = (
+            cropping.resize(cropping.take(p, window, mapping, exact=False), size, exact=False)
+            for p in (image, mask)
+        )
+        labels = self._label_picture(item)
+        if labels is not None:
+            labels = cropping.take(labels, window, mapping, exact=True)
+            labels = cropping.resize(labels, size, exact=True)
+        return Picture(np.ascontiguousarray(image.transpose(2, 0, 1)), mask, labels)
+
+    def _mask(self, item: Item) -> Bytes:
+        path = self.layout.mask_path(*item)
+        mask = read_grey(path)
+        if mask.max() == 1:
+            raise DataError(
+                f"{path} holds 0 and 1; expected alpha from 0 to 255 (multiply it by 255)"
+            )
+        return mask
+
+    def _label_picture(self, item: Item) -> Bytes | None:
+        if not self.layout.labels:
+            return None
+        path = self.layout.label_path(*item)
+        if path is None:
+            return np.full(self.layout.cameras[item[0]].size, IGNORE_LABEL, np.uint8)
+        labels = read_grey(path)
+        names = self.layout.meta.label_names
+        if names is not None:
+            used = labels[labels != IGNORE_LABEL]
+            if used.size and used.max() >= len(names):
+                raise DataError(
+                    f"{path} holds the label {used.max()}; meta.json names {len(names)} labels, "
+                    f"so expected 0 to {len(names) - 1}, or {IGNORE_LABEL} for 'ignore'"
+                )
+        return labels
+
+    def _body(self, frame: int) -> BodyPose | None:
+        poses = self.layout.poses
+        if poses is None:
+            return None
+        return BodyPose(theta=_float(poses.theta[frame]), transl=_float(poses.transl[frame]))
+
+
+def _camera(entry: CameraEntry) -> Camera:
+    K, R, t = (torch.from_numpy(a)[None] for a in (entry.K, entry.R, entry.t))
+    return Camera(K, R, t, entry.size)
+
+
+def _unit(pixels: Bytes) -> Tensor:
+    return torch.from_numpy(pixels).to(torch.float32).div_(255)
+
+
+def _float(array: NDArray[np.float64]) -> Tensor:
+    return torch.from_numpy(array).to(torch.float32)[None]
+
+
+def _labels(labels: Bytes | None) -> Tensor | None:
+    return None if labels is None else torch.from_numpy(labels).to(torch.int64)[None]

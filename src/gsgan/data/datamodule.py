@@ -1,0 +1,456 @@
+"""The LightningDataModule: one capture, its splits, its loaders, and what the scene is like."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NoReturn
+
+import gsgan.compat  # noqa: F401  (must come before lightning)
+
+# isort: split
+import cv2
+import numpy as np
+import torch
+from lightning import LightningDataModule
+from torch.utils.data import DataLoader, Dataset, Subset
+from torch.utils.data.distributed import DistributedSampler
+
+from gsgan.data.capture import CaptureDataset, PictureCache
+from gsgan.data.crop import PersonCrop
+from gsgan.data.files import read_grey
+from gsgan.data.layout import IGNORE_LABEL, Checks, Layout
+from gsgan.data.splits import SPLITS, Item, Splits, make_splits
+from gsgan.errors import ConfigError, DataError
+from gsgan.scene import Frame, cat
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class SceneInfo:
+    """What the training split tells about the scene; plain values, so a checkpoint can hold it.
+
+    Args:
+        camera_names: all cameras; `Frame.camera_index` counts in this order.
+        n_train_cameras: cameras that train.
+        has_distortion: a lens coefficient is not zero (pictures are undistorted on reading).
+        has_labels: there are part labels.
+        has_body_pose: there is a body pose for every frame.
+        body: name of the skinned body, or None.
+        skeleton: name of the landmark set.
+        n_labels: part labels, background included; 0 without labels.
+        label_names: their names where the capture gives them.
+        foreground: mean RGB in [0, 1] of the person, by train camera name.
+        body_height: metres, median over frames of the summed limb lengths.
+        centre: metres, median position of the person: the middle of the capture volume.
+        up_axis: of the world, e.g. "z" or "-y".
+        fps: frames a second, or None.
+        frames: how many frames train.
+    """
+
+    camera_names: tuple[str, ...]
+    n_train_cameras: int
+    has_distortion: bool
+    has_labels: bool
+    has_body_pose: bool
+    body: str | None
+    skeleton: str
+    n_labels: int
+    label_names: tuple[str, ...]
+    foreground: dict[str, tuple[float, float, float]]
+    body_height: float
+    centre: tuple[float, float, float]
+    up_axis: str
+    fps: float | None
+    frames: int
+
+
+def scene_info(layout: Layout, splits: Splits, dataset: CaptureDataset, samples: int) -> SceneInfo:
+    """What the training split tells about the scene.
+
+    Args:
+        layout: the capture.
+        splits: of the capture.
+        dataset: of the training items; its cache keeps what is decoded here.
+        samples: pictures a camera from which the foreground colour is taken, evenly spaced.
+    """
+    frames = sorted({frame for _, frame in splits.items["train"]})
+    p = torch.from_numpy(np.stack([layout.landmarks.p[f] for f in frames]))
+    valid = torch.from_numpy(np.stack([layout.landmarks.visibility[f] for f in frames])) > 0
+    middles = torch.stack([q[v].mean(0) for q, v in zip(p, valid, strict=True)])
+    cameras = {camera for camera, _ in splits.items["train"]}
+    return SceneInfo(
+        camera_names=layout.camera_names,
+        n_train_cameras=len(cameras),
+        has_distortion=any(layout.cameras[name].distorted for name in cameras),
+        has_labels=bool(layout.labels),
+        has_body_pose=layout.poses is not None,
+        body=layout.meta.body,
+        skeleton=layout.meta.skeleton,
+        n_labels=count_labels(layout, splits.items["train"]),
+        label_names=layout.meta.label_names or (),
+        foreground=foreground_colours(dataset, samples),
+        body_height=_body_height(p, valid),
+        centre=_triple(middles.median(0).values),
+        up_axis=layout.meta.up_axis,
+        fps=layout.meta.fps,
+        frames=len(frames),
+    )
+
+
+def _body_height(p: torch.Tensor, valid: torch.Tensor) -> float:
+    from gsgan.skeleton import limb_length_sum
+
+    return float(limb_length_sum(p, valid).nanmedian())
+
+
+def _triple(values: torch.Tensor) -> tuple[float, float, float]:
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def count_labels(layout: Layout, items: tuple[Item, ...]) -> int:
+    """Part labels, background included: as meta.json names them, else the highest one found.
+
+    Without names every label picture of the items is read once.
+    """
+    if not layout.labels:
+        return 0
+    if layout.meta.label_names is not None:
+        return len(layout.meta.label_names)
+    highest = 0
+    for item in items:
+        if path := layout.label_path(*item):
+            labels = read_grey(path)
+            highest = max(highest, int(labels.max(where=labels != IGNORE_LABEL, initial=0)))
+    return highest + 1
+
+
+def foreground_colours(
+    dataset: CaptureDataset, samples: int
+) -> dict[str, tuple[float, float, float]]:
+    """Mean RGB of the person in [0, 1], mask-weighted, by camera name.
+
+    Args:
+        dataset: whose cameras to look at.
+        samples: pictures a camera, evenly spaced over its frames.
+    """
+    by_camera: dict[str, list[int]] = {}
+    for index, (camera, _) in enumerate(dataset.items):
+        by_camera.setdefault(camera, []).append(index)
+    colours = {}
+    for camera, indices in by_camera.items():
+        chosen = {round(i) for i in np.linspace(0, len(indices) - 1, samples)}
+        frames = [dataset[indices[i]] for i in sorted(chosen)]
+        total = sum(f.image.double().sum((0, 2, 3)) for f in frames)
+        weight = sum(float(f.mask.double().sum()) for f in frames)
+        colours[camera] = _triple(torch.as_tensor(total) / max(weight, 1.0))
+    return colours
+
+
+class StepSampler(DistributedSampler[int]):
+    """Draws the item of every global step from (seed, step) alone.
+
+    An epoch is ``steps`` batches. Draws run through shuffled passes over all items, each item once
+    a pass, across epoch borders; so a resumed run sees the order of an unbroken one. It is a
+    `DistributedSampler` because Lightning would wrap and reshuffle anything else on several
+    processes; the processes share the draws of a step between them.
+
+    Args:
+        items: number of items.
+        batch_size: items a batch and process.
+        steps: batches an epoch.
+        seed: of the shuffles.
+        replicas: number of processes.
+        rank: of this process.
+    """
+
+    def __init__(
+        self, items: int, batch_size: int, steps: int, seed: int, replicas: int = 1, rank: int = 0
+    ) -> None:
+        super().__init__(_Count(items), num_replicas=replicas, rank=rank, shuffle=True, seed=seed)
+        self.items, self.batch_size, self.steps = items, batch_size, steps
+
+    def __len__(self) -> int:
+        return self.steps * self.batch_size
+
+    def __iter__(self) -> Iterator[int]:
+        order, shuffled = torch.empty(0), -1
+        for step in range(self.epoch * self.steps, (self.epoch + 1) * self.steps):
+            first = (step * self.num_replicas + self.rank) * self.batch_size
+            for draw in range(first, first + self.batch_size):
+                if draw // self.items != shuffled:
+                    shuffled = draw // self.items
+                    order = pass_order(self.items, self.seed, shuffled)
+                yield int(order[draw % self.items])
+
+
+class _Count(Dataset[int]):
+    """A length; `DistributedSampler` asks its dataset for nothing else."""
+
+    def __init__(self, length: int) -> None:
+        self.length = length
+
+    def __len__(self) -> int:
+        return self.length
+
+
+def pass_order(items: int, seed: int, number: int) -> torch.Tensor:
+    """``[items]`` the order of a shuffled pass, a pure function of its arguments."""
+    mixed = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]
+    generator = torch.Generator().manual_seed(int(mixed) >> 1)
+    return torch.randperm(items, generator=generator)
+
+
+def _quiet_worker(_: int) -> None:
+    cv2.setNumThreads(0)  # one thread a worker process; OpenCV's pool does not survive a fork
+
+
+class GsganData(LightningDataModule):
+    """A capture in the bring-your-own layout, from a folder or made by ``source``.
+
+    Args:
+        root: the folder; or None when ``source`` makes it.
+        source: called without arguments, makes the dataset if need be and returns its folder.
+        size: side of the square pictures in pixels; None keeps them as they are.
+        crop: "person" or a `PersonCrop` cuts round the person; None keeps the full picture.
+        batch_size: items a batch.
+        train_cameras, test_cameras, train_frames, test_frames, test_share: see `make_splits`.
+        val_pictures: pictures watched while training.
+        steps_per_epoch: batches an epoch; None is one pass over the training items.
+        workers: loading processes; 0 loads in this one.
+        seed: of the order of training items.
+        cache_mb: bound on decoded pictures kept in memory, all loading processes together.
+        info_samples: pictures a camera from which the mean foreground colour is taken.
+        min_joints: a frame with fewer usable joints is dropped.
+        wanted: what the root should be, for the message when it is not set.
+
+    Raises:
+        ConfigError: when neither root nor source is given, or a number is out of range.
+    """
+
+    def __init__(
+        self,
+        root: str | None = None,
+        source: Callable[[], Path] | None = None,
+        size: int | None = None,
+        crop: PersonCrop | str | None = None,
+        batch_size: int = 1,
+        train_cameras: Any = None,
+        test_cameras: Any = None,
+        train_frames: Any = None,
+        test_frames: Any = None,
+        test_share: float = 0.2,
+        val_pictures: int = 24,
+        steps_per_epoch: int | None = None,
+        workers: int = 0,
+        seed: int = 0,
+        cache_mb: float = 1024,
+        info_samples: int = 8,
+        min_joints: int = Checks.min_joints,
+        wanted: str = "a capture in the bring-your-own layout",
+    ) -> None:
+        super().__init__()
+        if root is None and source is None:
+            raise ConfigError(_root_not_set(wanted))
+        self.root = root
+        self.source = source
+        self.size = size
+        self.crop = _crop(crop)
+        self.batch_size = _at_least("batch_size", batch_size, 1)
+        self.split_keys = {
+            "train_cameras": train_cameras,
+            "test_cameras": test_cameras,
+            "train_frames": train_frames,
+            "test_frames": test_frames,
+            "test_share": test_share,
+        }
+        if steps_per_epoch is not None:
+            _at_least("steps_per_epoch", steps_per_epoch, 1)
+        self.steps_per_epoch = steps_per_epoch
+        self.val_pictures = _at_least("val_pictures", val_pictures, 1)
+        self.workers = _at_least("workers", workers, 0)
+        self.seed = _at_least("seed", seed, 0)
+        self.cache_mb = _at_least("cache_mb", cache_mb, 0)
+        self.info_samples = _at_least("info_samples", info_samples, 1)
+        self.checks = replace(Checks(), min_joints=_at_least("min_joints", min_joints, 1))
+        self._datasets: dict[str, CaptureDataset] | None = None
+        self._layout: Layout | None = None
+        self._splits: Splits | None = None
+        self._info: SceneInfo | None = None
+
+    def prepare_data(self) -> None:
+        """Makes the dataset where a ``source`` does; one process a machine."""
+        self._folder()
+
+    def setup(self, stage: str | None = None) -> None:
+        """Reads and checks the layout, once; logs what was converted or dropped.
+
+        Raises:
+            DataError: see `Layout.read` and `make_splits`.
+        """
+        if self._datasets is not None:
+            return
+        self._layout = layout = Layout.read(self._folder(), self.checks)
+        self._splits = splits = make_splits(layout, **self.split_keys)
+        for note in (*layout.notes, *splits.notes):
+            log.warning("%s: %s", layout.root, note)
+        limit = int(self.cache_mb * 2**20) // (self.workers + 1)  # every process has its own
+        cache = PictureCache(limit)
+        self._datasets = {
+            name: CaptureDataset(layout, splits.items[name], self.size, self.crop, cache)
+            for name in SPLITS
+        }
+        self._check_one_size()
+
+    def _folder(self) -> str | Path:
+        if self.root is not None:
+            return self.root
+        assert self.source is not None  # __init__ saw to it
+        return self.source()
+
+    def _check_one_size(self) -> None:
+        sizes = {camera.size: name for name, camera in self.layout.cameras.items()}
+        if self.size is None and self.batch_size > 1 and (self.crop or len(sizes) > 1):
+            raise ConfigError(
+                "data.size is not set and pictures differ in size, so batches of "
+                f"{self.batch_size} cannot be made; set data.size (e.g. 512) or data.batch_size=1"
+            )
+
+    @property
+    def layout(self) -> Layout:
+        """The capture, read on first use."""
+        self.setup()
+        assert self._layout is not None
+        return self._layout
+
+    @property
+    def splits(self) -> Splits:
+        """Who trains and who tests."""
+        self.setup()
+        assert self._splits is not None
+        return self._splits
+
+    @property
+    def reasons(self) -> dict[str, str]:
+        """Why a split is empty, for those that are."""
+        return self.splits.reasons
+
+    @property
+    def info(self) -> SceneInfo:
+        """What the training split tells about the scene, found on first use."""
+        if self._info is None:
+            train = self.dataset("train")
+            self._info = scene_info(self.layout, self.splits, train, self.info_samples)
+        return self._info
+
+    @property
+    def eval_names(self) -> tuple[str, ...]:
+        """The splits behind `test_dataloader`, in their order."""
+        return tuple(name for name in SPLITS[1:] if self.splits.items[name])
+
+    def dataset(self, split: str) -> CaptureDataset:
+        """The dataset of a split: "train", "novel_view" or "novel_pose".
+
+        Raises:
+            ValueError: for another name.
+        """
+        if split not in SPLITS:
+            raise ValueError(f"dataset: split must be one of {', '.join(SPLITS)}, got {split!r}")
+        self.setup()
+        assert self._datasets is not None
+        return self._datasets[split]
+
+    def train_dataloader(self) -> DataLoader[Frame]:
+        """Batches of `Frame` in `StepSampler` order."""
+        dataset = self.dataset("train")
+        replicas, rank, epoch = self._place()
+        per_pass = math.ceil(len(dataset) / (self.batch_size * replicas))
+        steps = self.steps_per_epoch or per_pass
+        sampler = StepSampler(len(dataset), self.batch_size, steps, self.seed, replicas, rank)
+        sampler.set_epoch(epoch)
+        return self._loader(dataset, sampler)
+
+    def val_dataloader(self) -> DataLoader[Frame]:
+        """Pictures watched while training: evenly spaced over held-out poses.
+
+        Without held-out poses they come from held-out cameras; without those, from training.
+        """
+        name = next((n for n in ("novel_pose", "novel_view") if self.splits.items[n]), "train")
+        dataset = self.dataset(name)
+        count = min(self.val_pictures, len(dataset))
+        chosen = [(2 * i + 1) * len(dataset) // (2 * count) for i in range(count)]
+        return self._loader(Subset(dataset, chosen))
+
+    def test_dataloader(self) -> list[DataLoader[Frame]]:
+        """One loader a held-out split that is not empty, as in `eval_names`."""
+        return [self._loader(self.dataset(name)) for name in self.eval_names]
+
+    def transfer_batch_to_device(
+        self, batch: Frame, device: torch.device, dataloader_idx: int
+    ) -> Frame:
+        """The batch on the device; Lightning's own walk cannot rebuild frozen records."""
+        return batch.to(device)
+
+    def _place(self) -> tuple[int, int, int]:
+        """Number of processes, rank of this one, epoch: 1, 0, 0 without a trainer."""
+        if self.trainer is None:
+            return 1, 0, 0
+        return self.trainer.world_size, self.trainer.global_rank, self.trainer.current_epoch
+
+    def _loader(
+        self, dataset: Dataset[Frame], sampler: StepSampler | None = None
+    ) -> DataLoader[Frame]:
+        return DataLoader(
+            dataset,
+            batch_size=self.batch_size,
+            sampler=sampler,
+            collate_fn=cat,
+            num_workers=self.workers,
+            worker_init_fn=_quiet_worker,
+            persistent_workers=self.workers > 0 and sampler is not None,
+        )
+
+
+def _root_not_set(wanted: str) -> str:
+    return f"data.root is not set: give the folder of {wanted}, e.g. data.root=/path/to/capture"
+
+
+def _crop(crop: PersonCrop | str | None) -> PersonCrop | None:
+    if crop is None or isinstance(crop, PersonCrop):
+        return crop
+    if crop == "person":
+        return PersonCrop()
+    raise ConfigError(f"data.crop must be null or person, got {crop!r}")
+
+
+def _at_least(name: str, value: Any, least: int) -> Any:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= least:
+        raise ConfigError(f"data.{name} must be a number of at least {least}, got {value!r}")
+    return value
+
+
+def unsupported(layout: str, wanted: str, root: str | None = None) -> NoReturn:
+    """Stands where the reader of a layout is still missing.
+
+    Args:
+        layout: its name.
+        wanted: what the root should be, for the message when it is not set.
+        root: the folder.
+
+    Raises:
+        ConfigError: when the root is not set.
+        DataError: when it does not exist, and else always, saying what to do instead.
+    """
+    if root is None:
+        raise ConfigError(_root_not_set(wanted))
+    if not Path(root).expanduser().is_dir():
+        raise DataError(f"data.root={root} does not exist; expected the folder of {wanted}")
+    raise DataError(
+        f"data.root={root}: reading the {layout} layout is not supported yet; convert it to the "
+        "bring-your-own layout (README, data layout) and use data=capture"
+    )

@@ -1,0 +1,269 @@
+"""Files as a dataset holds them: picture headers, pictures, JSON, arrays.
+
+Every function turns what can be wrong with a file into one `DataError` that names the file, what
+was expected and what was found. Nothing here unpickles.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+import re
+import struct
+import zipfile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsgan.errors import DataError
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
+PNG_PALETTE = 3
+JPEG_SIGNATURE = b"\xff\xd8"
+JPEG_END = b"\xff\xd9"
+JPEG_SCAN = 0xDA
+# Start-of-frame markers carry the size; C4, C8 and CC in the same range mean something else.
+JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+JPEG_WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xD9)})
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a picture file says about itself before it is decoded.
+
+    Args:
+        size: ``(H, W)`` pixels.
+        depth: bits a channel.
+        channels: 1 grey, 3 colour, 2 and 4 with an alpha channel (4 in a JPEG is CMYK).
+        palette: colours are looked up, values are not intensities.
+        jpeg: a JPEG, else a PNG.
+    """
+
+    size: tuple[int, int]
+    depth: int
+    channels: int
+    palette: bool
+    jpeg: bool
+
+
+def read_header(path: Path) -> Header:
+    """The header of a PNG or JPEG, a few hundred bytes read.
+
+    Raises:
+        DataError: when the file is missing, empty, cut inside its header, or neither format.
+    """
+    try:
+        with path.open("rb") as stream:
+            header = _png_header(stream) or _jpeg_header(stream)
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
+    except (struct.error, LookupError, ValueError):
+        header = None
+    if header is None:
+        raise DataError(f"{path} is not a whole PNG or JPEG file; copy or export it again")
+    return header
+
+
+def _png_header(stream: BinaryIO) -> Header | None:
+    stream.seek(0)
+    start = stream.read(26)
+    if start[:8] != PNG_SIGNATURE:
+        return None
+    width, height, depth, kind = struct.unpack(">IIBB", start[16:26])
+    return Header((height, width), depth, PNG_CHANNELS[kind], kind == PNG_PALETTE, jpeg=False)
+
+
+def _jpeg_header(stream: BinaryIO) -> Header | None:
+    stream.seek(0)
+    if stream.read(2) != JPEG_SIGNATURE:
+        return None
+    while (marker := _jpeg_marker(stream)) != JPEG_SCAN:
+        if marker in JPEG_WITHOUT_LENGTH:
+            continue
+        (length,) = struct.unpack(">H", stream.read(2))
+        if marker in JPEG_FRAMES:
+            depth, height, width, channels = struct.unpack(">BHHB", stream.read(6))
+            return Header((height, width), depth, channels, palette=False, jpeg=True)
+        stream.seek(length - 2, 1)
+    return None
+
+
+def _jpeg_marker(stream: BinaryIO) -> int:
+    if stream.read(1) != b"\xff":
+        raise ValueError("a JPEG segment must start with FF")
+    while (byte := stream.read(1)) == b"\xff":  # fill bytes before a marker are legal
+        pass
+    return byte[0]
+
+
+def check_picture(path: Path, kind: str, size: tuple[int, int], expected_by: str) -> None:
+    """Refuses a picture whose header does not fit its use, without decoding it.
+
+    Args:
+        path: the file.
+        kind: "image", "mask" or "labels".
+        size: ``(H, W)`` that it must have.
+        expected_by: who says so, for the message.
+
+    Raises:
+        DataError: on a wrong size, bit depth, or channel layout.
+    """
+    header = read_header(path)
+    if header.size != size:
+        raise DataError(
+            f"{path} is {_wh(header.size)} pixels (width x height), but {expected_by} says "
+            f"{_wh(size)}; scale one of them so that they agree"
+        )
+    if header.depth > 8 or (kind == "labels" and header.depth != 8):
+        raise DataError(f"{path} has {header.depth} bits a channel; expected 8 (save it as 8-bit)")
+    if header.jpeg and header.channels == 4:
+        raise DataError(f"{path} is a CMYK JPEG; expected RGB or grey (convert it to RGB)")
+    if header.palette and kind != "image":
+        raise DataError(f"{path} is a palette PNG; expected 8-bit grey values for a {kind} file")
+    if kind == "labels" and header.channels != 1:
+        raise DataError(
+            f"{path} has {header.channels} channels; expected one channel of part numbers"
+        )
+
+
+def _wh(size: tuple[int, int]) -> str:
+    return f"{size[1]}x{size[0]}"
+
+
+def read_colour(path: Path) -> NDArray[np.uint8]:
+    """``[H, W, 3]`` uint8 RGB, as stored: an EXIF rotation is not applied, calibration knows none.
+
+    Raises:
+        DataError: when the file is missing, damaged or cut off.
+    """
+    picture = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+def read_grey(path: Path) -> NDArray[np.uint8]:
+    """``[H, W]`` uint8, a colour file converted.
+
+    Raises:
+        DataError: when the file is missing, damaged or cut off.
+    """
+    return _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+
+
+def _decode(path: Path, flags: int) -> NDArray[np.uint8]:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
+    picture = None
+    if data and not cut_off(data):
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if picture is None:
+        raise DataError(
+            f"{path} is damaged or cut off after {len(data)} bytes; copy or export it again"
+        )
+    return np.asarray(picture, np.uint8)
+
+
+def cut_off(data: bytes) -> bool:
+    """Whether a JPEG lacks its end marker; some decoders fill the rest with grey, silently."""
+    scan = data.rfind(bytes([0xFF, JPEG_SCAN]))
+    return data[:2] == JPEG_SIGNATURE and (scan < 0 or data.find(JPEG_END, scan) < 0)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The object in a JSON file.
+
+    Raises:
+        DataError: when the file is missing, is not JSON, or holds something else than an object.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DataError(
+            f"{path} does not exist; the bring-your-own layout needs it (README, data layout)"
+        ) from None
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
+    except json.JSONDecodeError as error:
+        raise DataError(
+            f"{path} is not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}"
+        ) from None
+    except UnicodeDecodeError:
+        raise DataError(f"{path} is not valid JSON: it is not UTF-8 text") from None
+    if not isinstance(content, dict):
+        raise DataError(f"{path} must hold a JSON object, found {type(content).__name__}")
+    return content
+
+
+def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """The named arrays of an npz file, those that are there.
+
+    Raises:
+        DataError: when the file is missing, is no npz, or holds pickled objects.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in names if name in archive}
+    except FileNotFoundError:
+        raise DataError(
+            f"{path} does not exist; the bring-your-own layout needs it (README, data layout)"
+        ) from None
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
+    except (ValueError, TypeError, EOFError, zipfile.BadZipFile, pickle.UnpicklingError) as error:
+        if "allow_pickle" in str(error):
+            raise DataError(
+                f"{path} holds pickled Python objects, which can run code when read and are "
+                "refused; save plain numeric arrays with numpy.savez"
+            ) from None
+        raise DataError(f"{path} is not a whole npz file of plain arrays ({error})") from None
+
+
+def expect_array(
+    arrays: dict[str, NDArray[Any]], name: str, shape: tuple[int | None, ...], path: Path
+) -> NDArray[Any]:
+    """One numeric array of the given shape, None standing for any length.
+
+    Raises:
+        DataError: when it is missing, has another shape, or holds no numbers.
+    """
+    wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+    if name not in arrays:
+        raise DataError(f"{path} has no array '{name}'; expected one of shape {wanted}")
+    array = arrays[name]
+    if array.ndim != len(shape) or any(
+        want is not None and want != have for want, have in zip(shape, array.shape, strict=True)
+    ):
+        raise DataError(f"{path}: '{name}' must have shape {wanted}, found {array.shape}")
+    if array.dtype.kind not in "iuf":
+        raise DataError(f"{path}: '{name}' must hold numbers, found {array.dtype}")
+    return array
+
+
+def frame_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, str]:
+    """File names by frame number, the last group of digits in the name.
+
+    Raises:
+        DataError: when a name has no number, or two names have the same.
+    """
+    found: dict[int, str] = {}
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in suffixes or path.name.startswith("."):
+            continue
+        digits = re.findall(r"[0-9]+", path.stem)
+        if not digits:
+            raise DataError(f"{path} has no frame number in its name; expected e.g. 000012.png")
+        number = int(digits[-1])
+        if number in found:
+            raise DataError(
+                f"{folder} holds frame {number} twice, as {found[number]} and {path.name}; "
+                "keep one of them"
+            )
+        found[number] = path.name
+    return found

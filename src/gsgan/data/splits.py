@@ -1,0 +1,186 @@
+"""Which cameras and frames train, and which are held out."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+from gsgan.data.layout import Layout, spans
+from gsgan.errors import ConfigError, DataError
+
+T = TypeVar("T", int, str)
+
+SPLITS = ("train", "novel_view", "novel_pose")
+Item = tuple[str, int]  # camera name, frame number
+
+
+@dataclass(frozen=True)
+class Splits:
+    """Held-in and held-out cameras and frames.
+
+    ``train`` is train cameras × train frames, ``novel_view`` test cameras × train frames,
+    ``novel_pose`` train cameras × test frames.
+
+    Args:
+        items: (camera, frame) pairs that exist, by split, in a fixed order.
+        reasons: why a split is empty, for those that are.
+        notes: requested frames that the capture lacks.
+    """
+
+    train_cameras: tuple[str, ...]
+    test_cameras: tuple[str, ...]
+    train_frames: tuple[int, ...]
+    test_frames: tuple[int, ...]
+    items: dict[str, tuple[Item, ...]]
+    reasons: dict[str, str]
+    notes: tuple[str, ...] = ()
+
+
+def make_splits(
+    layout: Layout,
+    train_cameras: Any = None,
+    test_cameras: Any = None,
+    train_frames: Any = None,
+    test_frames: Any = None,
+    test_share: float = 0.2,
+) -> Splits:
+    """Splits a capture by cameras and by frames.
+
+    For cameras, and likewise for frames: what the config gives comes first, then what meta.json
+    gives, else all cameras train and the last ``test_share`` of the frames test. Where only one
+    side of a pair is given, the other takes the rest.
+
+    Args:
+        layout: the capture.
+        train_cameras: names, or None.
+        test_cameras: names, or None.
+        train_frames: numbers and "a-b" ranges (both ends included), or None.
+        test_frames: the same.
+        test_share: in [0, 1), the share of frames held out when nothing says which.
+
+    Raises:
+        DataError: when a camera does not exist, or nothing is left to train on.
+        ConfigError: on a malformed value, or one camera or frame on both sides.
+    """
+    if not 0 <= test_share < 1:
+        raise ConfigError(f"data.test_share must be in [0, 1), got {test_share}")
+    meta, notes = layout.meta.splits, list[str]()
+    cameras = _pair(
+        layout.camera_names,
+        (train_cameras, test_cameras),
+        (meta.get("train_cameras"), meta.get("test_cameras")),
+        default=(layout.camera_names, ()),
+        parse=parse_names,
+        name="cameras",
+    )
+    for camera in (*cameras[0], *cameras[1]):
+        if camera not in layout.cameras:
+            raise DataError(
+                f"{layout.root} has no camera {camera}; it has {', '.join(layout.camera_names)}"
+            )
+    cut = len(layout.frames) - int(len(layout.frames) * test_share)
+    wanted = _pair(
+        layout.frames,
+        (train_frames, test_frames),
+        (meta.get("train_frames"), meta.get("test_frames")),
+        default=(layout.frames[:cut], layout.frames[cut:]),
+        parse=parse_frames,
+        name="frames",
+    )
+    known = set(layout.frames)
+    train, test = (tuple(f for f in side if f in known) for side in wanted)
+    if lacking := [f for side in wanted for f in side if f not in known]:
+        notes.append(
+            f"{len(lacking)} frames of the splits are not usable or not there: {spans(lacking)}"
+        )
+    items = {
+        "train": _items(layout, cameras[0], train),
+        "novel_view": _items(layout, cameras[1], train),
+        "novel_pose": _items(layout, cameras[0], test),
+    }
+    if not items["train"]:
+        raise DataError(
+            f"{layout.root}: nothing to train on with cameras {', '.join(cameras[0]) or 'none'} "
+            f"and {len(train)} train frames; the capture has cameras "
+            f"{', '.join(layout.camera_names)} and frames {spans(list(layout.frames))}"
+        )
+    reasons = {}
+    if not items["novel_view"]:
+        reasons["novel_view"] = "no camera is held out (data.test_cameras)"
+    if not items["novel_pose"]:
+        reasons["novel_pose"] = "no frame is held out (data.test_frames)"
+    return Splits(*cameras, train, test, items, reasons, tuple(notes))
+
+
+def _items(layout: Layout, cameras: Sequence[str], frames: Sequence[int]) -> tuple[Item, ...]:
+    return tuple((c, f) for c in cameras for f in frames if f in layout.images[c])
+
+
+def _pair(
+    everything: tuple[T, ...],
+    config: tuple[Any, Any],
+    meta: tuple[Any, Any],
+    default: tuple[tuple[T, ...], tuple[T, ...]],
+    parse: Callable[[Any, str], tuple[T, ...]],
+    name: str,
+) -> tuple[tuple[T, ...], tuple[T, ...]]:
+    """The train and test side of cameras or of frames, wholly from the first source that speaks."""
+    for values, where in ((config, "data."), (meta, "meta.json, splits.")):
+        train, test = (
+            None if value is None else parse(value, f"{where}{side}_{name}")
+            for value, side in zip(values, ("train", "test"), strict=True)
+        )
+        if train is None and test is None:
+            continue
+        if train is None:
+            train = tuple(x for x in everything if x not in (test or ()))
+        if test is None:
+            test = tuple(x for x in everything if x not in train)
+        if both := sorted(set(train) & set(test)):
+            raise ConfigError(
+                f"{where}train_{name} and {where}test_{name} share {both[0]}; what is tested must "
+                "not train"
+            )
+        return train, test
+    return default
+
+
+def parse_names(value: Any, where: str) -> tuple[str, ...]:
+    """Camera names from a list or a comma-separated string.
+
+    Raises:
+        ConfigError: when it is neither.
+    """
+    if isinstance(value, str):
+        return tuple(name.strip() for name in value.split(",") if name.strip())
+    if isinstance(value, int):
+        return (str(value),)
+    if not isinstance(value, Iterable):
+        raise ConfigError(f"{where} must be a list of camera names, got {value!r}")
+    return tuple(dict.fromkeys(str(name) for name in value))
+
+
+def parse_frames(value: Any, where: str) -> tuple[int, ...]:
+    """Frame numbers from numbers, "a-b" ranges (both ends included) and lists of them, rising.
+
+    Raises:
+        ConfigError: when a part is neither.
+    """
+    if isinstance(value, bool) or not isinstance(value, (int, str, Iterable)):
+        raise ConfigError(f"{where} must be frame numbers or ranges such as 0-55, got {value!r}")
+    if isinstance(value, int):
+        return (value,)
+    parts = value.split(",") if isinstance(value, str) else list(value)
+    frames: set[int] = set()
+    for part in parts:
+        if isinstance(part, int) and not isinstance(part, bool):
+            frames.add(part)
+            continue
+        match = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", str(part))
+        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
+        if last < first:
+            raise ConfigError(f"{where} must be frame numbers or ranges such as 0-55, got {part!r}")
+        frames.update(range(first, last + 1))
+    return tuple(sorted(frames))

@@ -1,0 +1,305 @@
+"""Ray tracing of the posed person: picture, alpha and part labels of one camera.
+
+An independent renderer: the splatting that gsgan is about has no part in its own training data.
+
+Convention: metres, world frame; OpenCV cameras, pixel centres at +0.5; pictures are RGB, sRGB in
+[0, 1], premultiplied on black.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsgan.data.synthetic.identity import Identity, Marks, albedo
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+GAMMA = 2.2
+
+
+@dataclass(frozen=True)
+class Light:
+    """A sun and a sky; a person in the open.
+
+    Args:
+        direction: towards the sun, any length.
+        sun: strength of the sun.
+        sky: ambient strength from above.
+        ground: ambient strength from below.
+        shadow_offset: metres along the normal at which shadow rays start; less gives speckles.
+        fold: how much of the light a fold at full flexion takes or adds.
+        fold_period: metres from one fold to the next.
+        fold_reach: metres over which a joint's folds fade.
+    """
+
+    direction: tuple[float, float, float] = (0.5, -0.75, 0.9)
+    sun: float = 0.85
+    sky: float = 0.62
+    ground: float = 0.36
+    shadow_offset: float = 2e-3
+    fold: float = 0.38
+    fold_period: float = 0.045
+    fold_reach: float = 0.12
+
+
+@dataclass(frozen=True)
+class Person:
+    """What does not change from frame to frame, in numpy.
+
+    Args:
+        vertices: ``[V, 3]`` rest positions.
+        faces: ``[F, 3]``.
+        labels: ``[F]`` part of each face.
+        surface: ``[F]`` material of each face.
+        fold_centre: ``[K, 3]`` rest positions of the joints that crease clothes.
+        fold_axis: ``[K, 3]`` unit directions across their folds.
+        identity: colours and patterns.
+        marks: where the patterns hang.
+    """
+
+    vertices: Array
+    faces: Ints
+    labels: Ints
+    surface: Ints
+    fold_centre: Array
+    fold_axis: Array
+    identity: Identity
+    marks: Marks
+
+
+@dataclass(frozen=True)
+class View:
+    """One pinhole camera: ``K [3,3]``, ``R [3,3]``, ``t [3]``, ``size`` (H, W)."""
+
+    K: Array
+    R: Array
+    t: Array
+    size: tuple[int, int]
+
+    @property
+    def centre(self) -> Array:
+        return -self.R.T @ self.t
+
+    def project(self, points: Array) -> Array:
+        """``[N, 2]`` pixels of world points ``[N, 3]``, all of them before the camera."""
+        x = (points @ self.R.T + self.t) @ self.K.T
+        return x[:, :2] / x[:, 2:]
+
+
+class Tracer(Protocol):
+    """Finds the first triangle along rays."""
+
+    def first(self, origins: Array, directions: Array) -> tuple[Ints, Array]:
+        """Face index ``[N]``, -1 for a miss, and barycentric (u, v) ``[N, 2]``."""
+
+
+class EmbreeTracer:
+    """embreex, called directly on a triangle soup."""
+
+    def __init__(self, triangles: Array) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self._scene = EmbreeScene()
+        self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles, dtype=np.float32))
+
+    def first(self, origins: Array, directions: Array) -> tuple[Ints, Array]:
+        # OCCLUDED misreports, so that shadow rays ask for the first hit as well
+        hit = self._scene.run(
+            np.ascontiguousarray(origins, dtype=np.float32),
+            np.ascontiguousarray(directions, dtype=np.float32),
+            query="INTERSECT",
+            output=1,
+        )
+        return hit["primID"].astype(np.int64), np.stack([hit["u"], hit["v"]], axis=1)
+
+
+class PlainTracer:
+    """Every ray against every triangle of its batch, in numpy: slow, needs nothing."""
+
+    def __init__(self, triangles: Array, batch: int = 16) -> None:
+        self._corner = triangles[:, 0]
+        self._edge1 = triangles[:, 1] - triangles[:, 0]
+        self._edge2 = triangles[:, 2] - triangles[:, 0]
+        self._batch = batch
+
+    def first(self, origins: Array, directions: Array) -> tuple[Ints, Array]:
+        face = np.full(len(origins), -1, dtype=np.int64)
+        uv = np.zeros((len(origins), 2))
+        for start in range(0, len(origins), self._batch):
+            part = slice(start, start + self._batch)
+            face[part], uv[part] = self._some(origins[part], directions[part])
+        return face, uv
+
+    def _some(self, origins: Array, directions: Array) -> tuple[Ints, Array]:
+        p = np.cross(directions[:, None], self._edge2[None])
+        determinant = (p * self._edge1).sum(-1)
+        inverse = 1 / np.where(np.abs(determinant) < 1e-14, np.inf, determinant)
+        offset = origins[:, None] - self._corner
+        u = (offset * p).sum(-1) * inverse
+        q = np.cross(offset, self._edge1[None])
+        v = (q * directions[:, None]).sum(-1) * inverse
+        distance = (q * self._edge2).sum(-1) * inverse
+        ok = (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 0) & (inverse != 0)
+        distance = np.where(ok, distance, np.inf)
+        nearest = distance.argmin(axis=1)
+        rows = np.arange(len(origins))
+        face = np.where(np.isfinite(distance[rows, nearest]), nearest, -1)
+        return face, np.stack([u[rows, nearest], v[rows, nearest]], axis=1)
+
+
+def make_tracer(triangles: Array) -> Tracer:
+    """The fast tracer, or the plain one with a warning where embreex is missing."""
+    try:
+        return EmbreeTracer(triangles)
+    except ImportError:
+        warnings.warn(
+            "embreex is not installed, so the synthetic person is traced in plain numpy, hundreds "
+            "of times slower: pip install embreex",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+        return PlainTracer(triangles)
+
+
+class PosedPerson:
+    """One moment: the tracer over the posed triangles, and what shading needs of them.
+
+    Args:
+        person: what does not change.
+        vertices: ``[V, 3]`` posed positions.
+        flexion: ``[K]`` radians, how far each fold joint is bent.
+        light: see :class:`Light`.
+    """
+
+    def __init__(self, person: Person, vertices: Array, flexion: Array, light: Light) -> None:
+        self.person, self.vertices, self.flexion, self.light = person, vertices, flexion, light
+        triangles = vertices[person.faces]
+        self.normals = vertex_normals(triangles, person.faces, len(vertices))
+        self.tracer = make_tracer(triangles)
+
+    def render(self, view: View, rays: int) -> tuple[Array, Array, Ints]:
+        """Picture ``[H,W,3]``, alpha ``[H,W]`` and labels ``[H,W]`` seen by a camera.
+
+        ``rays`` per pixel; rays are cast only in the person's box. A pixel has the label most of
+        its rays hit, and background unless at least half of them hit the person.
+        """
+        H, W = view.size
+        image, alpha = np.zeros((H, W, 3)), np.zeros((H, W))
+        labels = np.zeros((H, W), dtype=np.int64)
+        left, top, right, bottom = self._box(view)
+        if right <= left or bottom <= top:
+            return image, alpha, labels
+        origin, directions = pixel_rays(view, (left, top, right, bottom), rays)
+        face, colour = self._shoot(origin, directions)
+        shape = (bottom - top, right - left, rays)
+        window = (slice(top, bottom), slice(left, right))
+        image[window] = colour.reshape(*shape, 3).mean(axis=2)
+        alpha[window] = (face >= 0).reshape(shape).mean(axis=2)
+        part = np.where(face >= 0, self.person.labels[face], 0).reshape(shape)
+        labels[window] = majority(part, int(self.person.labels.max()) + 1)
+        return image, alpha, labels
+
+    def _box(self, view: View, margin: int = 1) -> tuple[int, int, int, int]:
+        H, W = view.size
+        pixels = view.project(self.vertices)
+        low, high = np.floor(pixels.min(axis=0)) - margin, np.ceil(pixels.max(axis=0)) + margin
+        left, top = np.clip(low, 0, [W, H]).astype(int)
+        right, bottom = np.clip(high, 0, [W, H]).astype(int)
+        return int(left), int(top), int(right), int(bottom)
+
+    def _shoot(self, origin: Array, directions: Array) -> tuple[Ints, Array]:
+        face, uv = self.tracer.first(np.broadcast_to(origin, directions.shape), directions)
+        hit = face >= 0
+        colour = np.zeros((len(face), 3))
+        colour[hit] = self._shade(face[hit], uv[hit], directions[hit])
+        return face, colour
+
+    def _shade(self, face: Ints, uv: Array, directions: Array) -> Array:
+        """sRGB of surface points: Lambert sun with cast shadow, hemisphere ambient, folds."""
+        person, light = self.person, self.light
+        corners = person.faces[face]
+        weight = np.concatenate([1 - uv.sum(axis=1, keepdims=True), uv], axis=1)[:, :, None]
+        rest = (weight * person.vertices[corners]).sum(axis=1)
+        here = (weight * self.vertices[corners]).sum(axis=1)
+        normal = (weight * self.normals[corners]).sum(axis=1)
+        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+        normal *= np.where((normal * directions).sum(axis=1) > 0, -1.0, 1.0)[:, None]
+        sun = np.asarray(light.direction) / np.linalg.norm(light.direction)
+        facing = np.maximum(normal @ sun, 0)
+        facing *= self._lit(here + light.shadow_offset * normal, sun, facing > 0)
+        up = 0.5 + 0.5 * normal[:, 2]
+        irradiance = light.sun * facing + light.ground + (light.sky - light.ground) * up
+        irradiance *= self._folds(rest, person.surface[face])
+        paint = albedo(person.identity, person.marks, rest, person.surface[face]) ** GAMMA
+        return np.clip(paint * irradiance[:, None], 0, 1) ** (1 / GAMMA)
+
+    def _lit(self, points: Array, sun: Array, ask: NDArray[np.bool_]) -> Array:
+        """1 where the sun is seen, 0 in the shadow, for the points asked about."""
+        lit = np.zeros(len(points))
+        if ask.any():
+            count = int(ask.sum())
+            face, _ = self.tracer.first(points[ask], np.broadcast_to(sun, (count, 3)))
+            lit[ask] = face < 0
+        return lit
+
+    def _folds(self, rest: Array, surface: Ints) -> Array:
+        """Factor on the light: creases that deepen as the joint beneath them bends."""
+        light, factor = self.light, np.ones(len(rest))
+        cloth = (surface == 3) | (surface == 4)
+        p = rest[cloth]
+        crease = np.zeros(len(p))
+        for centre, axis, bend in zip(
+            self.person.fold_centre, self.person.fold_axis, self.flexion, strict=True
+        ):
+            off = p - centre
+            near = np.exp(-(off * off).sum(axis=1) / light.fold_reach**2)
+            wave = np.sin(2 * np.pi * (off @ axis) / light.fold_period + 9.0 * off[:, 0])
+            crease += np.tanh(bend) * near * wave
+        factor[cloth] = 1 + light.fold * np.clip(crease, -1, 1)
+        return factor
+
+
+def vertex_normals(triangles: Array, faces: Ints, vertices: int) -> Array:
+    """``[V, 3]`` unit normals, faces weighted by their area."""
+    face = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    out = np.stack(
+        [
+            np.bincount(faces.ravel(), np.repeat(face[:, axis], 3), minlength=vertices)
+            for axis in range(3)
+        ],
+        axis=1,
+    )
+    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-20)
+
+
+def pixel_offsets(rays: int) -> Array:
+    """``[rays, 2]`` places in a pixel in [0, 1): the centre first, then an even spread (R2)."""
+    g = 1.32471795724474602596  # the plastic number: x³ = x + 1
+    step = np.array([1 / g, 1 / g**2])
+    return np.mod(0.5 + np.arange(rays)[:, None] * step, 1.0)
+
+
+def pixel_rays(view: View, box: tuple[int, int, int, int], rays: int) -> tuple[Array, Array]:
+    """Origin ``[3]`` and unit directions ``[h*w*rays, 3]`` of the pixels of a box."""
+    left, top, right, bottom = box
+    y, x = np.mgrid[top:bottom, left:right].astype(np.float64)
+    offset = pixel_offsets(rays)
+    x = (x[..., None] + offset[:, 0]).ravel()
+    y = (y[..., None] + offset[:, 1]).ravel()
+    pixel = np.stack([x, y, np.ones_like(x)], axis=1)
+    directions = pixel @ np.linalg.inv(view.K).T @ view.R
+    return view.centre, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def majority(part: Ints, classes: int) -> Ints:
+    """``[h, w]`` most frequent part of ``[h, w, rays]``; 0 where over half the rays miss."""
+    votes = np.stack([(part == c).sum(axis=-1) for c in range(1, classes)], axis=-1)
+    solid = 2 * (part > 0).sum(axis=-1) >= part.shape[-1]
+    return np.where(solid, votes.argmax(axis=-1) + 1, 0)

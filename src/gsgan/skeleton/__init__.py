@@ -1,0 +1,24 @@
+"""From 3D joints to body points, bone frames, the 6D pose code and the drawn skeleton."""
+
+from gsgan.skeleton.densify import Densify, Points
+from gsgan.skeleton.draw import draw_skeleton
+from gsgan.skeleton.frames import BoneFrames, bone_frames, omega
+from gsgan.skeleton.rotation6d import rotation_from_6d, rotation_to_6d
+from gsgan.skeleton.sanitise import limb_length_sum, recentre, sanitise
+from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
+
+__all__ = [
+    "MEDIAPIPE33",
+    "BoneFrames",
+    "Densify",
+    "Points",
+    "SkeletonTemplate",
+    "bone_frames",
+    "draw_skeleton",
+    "limb_length_sum",
+    "omega",
+    "recentre",
+    "rotation_from_6d",
+    "rotation_to_6d",
+    "sanitise",
+]

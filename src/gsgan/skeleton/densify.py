@@ -1,0 +1,303 @@
+"""Algorithm 1: a few thousand surface points on the bones, the same body points in every pose."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from gsgan.errors import ConfigError
+from gsgan.skeleton import sampling
+from gsgan.skeleton.frames import (
+    MIN_LENGTH,
+    BoneFrames,
+    Swing,
+    Twist,
+    bone_frames,
+    check_skeleton,
+    constants,
+)
+from gsgan.skeleton.template import HEAD, MEDIAPIPE33, SkeletonTemplate
+
+Torso = Literal["fit", "cube"]
+Sampler = Literal["even", "trimesh"]
+Limbs = Literal["paper22", "all26"]
+
+
+@dataclass(frozen=True)
+class Points:
+    """Where the body's points are in one batch of poses.
+
+    Args:
+        means: ``[B, N, 3]`` metres, world frame.
+        rotations: ``[B, P, 3, 3]`` frames of the parts: limbs, then face, then torso.
+        origins: ``[B, P, 3]`` metres, world frame: where each part's frame sits.
+        scales: ``[B, N]`` metres, initial standard deviation, the same in all directions.
+        valid: ``[B, N]`` bool, False on parts whose joints were not seen.
+        part_id: ``[N]`` int64 into the parts.
+    """
+
+    means: Tensor
+    rotations: Tensor
+    origins: Tensor
+    scales: Tensor
+    valid: Tensor
+    part_id: Tensor
+
+    @property
+    def frames(self) -> Tensor:
+        """``[B, N, 3, 3]``: each point's part frame."""
+        return self.rotations.index_select(1, self.part_id)
+
+    def local(self) -> Tensor:
+        """``[B, N, 3]`` metres: the points in their parts' frames, free of any rigid motion."""
+        offset = self.means - self.origins.index_select(1, self.part_id)
+        return (offset.unsqueeze(-2) @ self.frames).squeeze(-2)
+
+
+class Densify(nn.Module):
+    """Cylinders on the limbs, a sphere round the face, a box round the trunk.
+
+    Convention: unit shapes are sampled once in their part's frame and moved by similarity
+    transforms, so that index k is the same body point in every pose. The layout is frozen: limb
+    l has ``[n l, n (l + 1))`` with ``n = points_per_limb``, then the face, then the torso; 5400
+    points by default. Nothing is learned; nothing depends on earlier calls.
+
+    Args:
+        template: names joints and limbs.
+        points_per_limb: on each limb's cylinder.
+        face_points: on the sphere.
+        torso_points: on the box.
+        radius_ratio: cylinder radius over its length.
+        face_radius_scale: sphere radius over the longest distance between face joints.
+        torso: ``fit`` (as wide as shoulders or hips, as high as the spine, half as deep as wide)
+            or ``cube`` (edges as long as the longest distance between shoulders and hips).
+        sampler: ``even`` (low discrepancy) or ``trimesh`` (shipped random surface samples).
+        limbs: ``paper22``, or ``all26`` with the trunk's four edges.
+        sigma: initial standard deviation over the mean spacing ``sqrt(area / points)``.
+        torso_range: the box's edges stay within these multiples of the rest pose's (``fit``).
+        twist: see :func:`gsgan.skeleton.bone_frames`.
+        min_length: metres, see :func:`gsgan.skeleton.bone_frames`.
+        dtype: of the buffers; None: torch's default.
+
+    Raises:
+        ConfigError: on an unknown option or a count below 1.
+
+    Source: Algorithm 1; counts and radii from the paper, sphere and box from its prose, the box's
+    extents ours (the paper's "radius" of a cuboid is not defined).
+    """
+
+    part_id: Tensor
+    template_points: Tensor
+    normals: Tensor
+    rest_points: Tensor
+    _limb_points: Tensor
+    _face_points: Tensor
+    _torso_points: Tensor
+    _face_pairs: Tensor
+    _torso_pairs: Tensor
+    _face: Tensor
+    _torso_rest: Tensor
+
+    def __init__(
+        self,
+        template: SkeletonTemplate = MEDIAPIPE33,
+        points_per_limb: int = 200,
+        face_points: int = 500,
+        torso_points: int = 500,
+        radius_ratio: float = 0.1,
+        face_radius_scale: float = 1.0,
+        torso: Torso = "fit",
+        sampler: Sampler = "even",
+        limbs: Limbs = "paper22",
+        *,
+        sigma: float = 0.6,
+        torso_range: tuple[float, float] = (0.25, 4.0),
+        twist: Twist = "none",
+        min_length: float = MIN_LENGTH,
+        dtype: torch.dtype | None = None,
+    ) -> None:
+        super().__init__()
+        _check_options(torso=torso, sampler=sampler, limbs=limbs, twist=twist)
+        counts = (points_per_limb, face_points, torso_points)
+        if min(counts) < 1:
+            raise ConfigError(f"Densify: every part needs at least one point, got {counts}")
+        if min(radius_ratio, face_radius_scale, sigma, min_length) <= 0:
+            raise ConfigError(
+                "Densify: radius_ratio, face_radius_scale, sigma and min_length must be positive, "
+                f"got {radius_ratio}, {face_radius_scale}, {sigma}, {min_length}"
+            )
+        self.template = template if limbs == "paper22" else template.with_torso_limbs()
+        self.counts = counts
+        self.radius_ratio, self.face_radius_scale = radius_ratio, face_radius_scale
+        self.torso, self.twist = torso, twist
+        self.sigma, self.torso_range, self.min_length = sigma, tuple(torso_range), min_length
+        self._make_buffers(sampler, dtype or torch.get_default_dtype())
+
+    @property
+    def n_points(self) -> int:
+        """Points of all parts together, N."""
+        return len(self.part_id)
+
+    def _make_buffers(self, sampler: str, dtype: torch.dtype) -> None:
+        t, (n_limb, n_face, n_torso) = self.template, self.counts
+        torso_rest = t.rest_torso
+        cylinder, sphere, box = _unit_shapes(sampler, self.counts, torso_rest, self.torso)
+        along = _limb_axes(t)
+        limb_points = (cylinder[0] * [self.radius_ratio, self.radius_ratio, 1.0]) @ along.mT.numpy()
+        limb_normals = cylinder[1] @ along.mT.numpy()
+        n_limbs = len(t.limbs)
+
+        def buffer(name: str, value: object) -> None:
+            tensor = torch.as_tensor(np.asarray(value))
+            self.register_buffer(
+                name,
+                tensor.to(dtype) if tensor.is_floating_point() else tensor,
+                persistent=not name.startswith("_"),
+            )
+
+        parts = np.repeat(np.arange(n_limbs + 2), [n_limb] * n_limbs + [n_face, n_torso])
+        buffer("part_id", parts)
+        buffer("template_points", np.concatenate([*limb_points, sphere[0], box[0]]))
+        buffer("normals", np.concatenate([*limb_normals, sphere[1], box[1]]))
+        buffer("_limb_points", limb_points)
+        buffer("_face_points", sphere[0])
+        buffer("_torso_points", box[0])
+        buffer("_torso_rest", torso_rest)
+        buffer("_face", t.face)
+        buffer("_face_pairs", np.array(list(combinations(t.face, 2))).T)
+        buffer("_torso_pairs", np.array(list(combinations(t.torso, 2))).T)
+        rest = torch.tensor(t.rest_positions, dtype=dtype).unsqueeze(0)
+        with torch.no_grad():
+            means = self(rest).means[0]
+        root = rest[0, list(t.hips)].mean(0)
+        self.register_buffer("rest_points", (means - root) / t.stature)
+
+    def forward(
+        self, p: Tensor, valid: Tensor | None = None, frames: BoneFrames | None = None
+    ) -> Points:
+        """Moves the points to a pose.
+
+        Convention: metres, world frame; differentiable in p. Far from the world's origin the
+        result has the grain of its dtype (1 mm at 1e4 m in float32): see
+        :func:`gsgan.skeleton.recentre`.
+
+        Args:
+            p: ``[B, J, 3]`` finite joints (see :func:`gsgan.skeleton.sanitise`).
+            valid: ``[B, J]`` bool, False where a joint is a stand-in; None: all seen.
+            frames: of these very skeletons, when they are at hand already.
+
+        Returns:
+            Points. A part counts as seen when both ends of a limb, any face joint, or three of
+            shoulders and hips were.
+
+        Raises:
+            ValueError: on a shape that does not fit the template.
+        """
+        valid = check_skeleton("Densify", p, valid, self.template)
+        c = constants(self.template, p.device, p.dtype)
+        if frames is None or frames.limbs.shape[1] != len(self.template.limbs):
+            frames = bone_frames(
+                p, valid, self.template, twist=self.twist, min_length=self.min_length
+            )
+        root = p[:, self.template.hips[0], None].detach()
+        q = p - root
+        face, torso = q.index_select(1, self._face), q.index_select(1, c.torso)
+        head_R, trunk_R = frames.hubs[:, HEAD], frames.torso
+        centres = torch.stack([face.mean(1), torso.mean(1)], dim=1)
+        origins = torch.cat([q.index_select(1, c.starts), centres], dim=1)
+        radius = self._longest(q, self._face_pairs) * self.face_radius_scale
+        edges = self._torso_edges(q, torso)
+
+        limbs = self._limb_points @ (frames.limbs * frames.lengths[..., None, None]).mT
+        limbs = (limbs + origins[:, :-2, None]).flatten(1, 2)
+        head = self._face_points @ (head_R * radius[:, None, None]).mT + origins[:, -2:-1]
+        trunk = self._torso_points @ (trunk_R * edges.unsqueeze(1)).mT + origins[:, -1:]
+        spread = torch.cat([frames.lengths * self._limb_sigma(), self._hub_sigma(radius, edges)], 1)
+        return Points(
+            means=torch.cat([limbs, head, trunk], dim=1) + root,
+            rotations=torch.cat([frames.limbs, head_R.unsqueeze(1), trunk_R.unsqueeze(1)], dim=1),
+            origins=origins + root,
+            scales=spread.index_select(1, self.part_id),
+            valid=self._seen(valid).index_select(1, self.part_id),
+            part_id=self.part_id,
+        )
+
+    def _seen(self, valid: Tensor) -> Tensor:
+        c = constants(self.template, valid.device, self.template_points.dtype)
+        limbs = valid.index_select(1, c.starts) & valid.index_select(1, c.ends)
+        face = valid.index_select(1, self._face).any(1, keepdim=True)
+        torso = valid.index_select(1, c.torso).sum(1, keepdim=True) >= 3
+        return torch.cat([limbs, face, torso], dim=1)
+
+    def _longest(self, q: Tensor, pairs: Tensor) -> Tensor:
+        """``[B]``: the longest distance, never zero."""
+        d = q.index_select(1, pairs[0]) - q.index_select(1, pairs[1])
+        return (d.square().sum(-1).amax(-1) + self.min_length**2).sqrt()
+
+    def _torso_edges(self, q: Tensor, torso: Tensor) -> Tensor:
+        """``[B, 3]`` metres: left-right, up, front."""
+        if self.torso == "cube":
+            return self._longest(q, self._torso_pairs).unsqueeze(1).expand(-1, 3)
+        l_sh, r_sh, l_hip, r_hip = torso.unbind(1)
+        lines = torch.stack([l_sh - r_sh, l_hip - r_hip, (l_sh + r_sh - l_hip - r_hip) * 0.5], 1)
+        lengths = (lines.square().sum(-1) + self.min_length**2).sqrt()
+        width, height = lengths[:, :2].amax(1), lengths[:, 2]
+        low, high = self.torso_range
+        edges = torch.stack([width, height, 0.5 * width], dim=1)
+        return edges.clamp(self._torso_rest * low, self._torso_rest * high)
+
+    def _limb_sigma(self) -> float:
+        """Per metre of limb: ``sigma sqrt(area / n)`` with lateral area ``2 pi r h²``."""
+        return float(self.sigma * (2 * np.pi * self.radius_ratio / self.counts[0]) ** 0.5)
+
+    def _hub_sigma(self, radius: Tensor, edges: Tensor) -> Tensor:
+        """``[B, 2]`` metres: of face and torso."""
+        x, y, z = edges.unbind(-1)
+        face = radius * float(self.sigma * (4 * np.pi / self.counts[1]) ** 0.5)
+        torso = self.sigma * (2 * (x * y + y * z + z * x) / self.counts[2]).sqrt()
+        return torch.stack([face, torso], dim=1)
+
+
+def _check_options(**options: str) -> None:
+    known = {"torso": Torso, "sampler": Sampler, "limbs": Limbs, "twist": Twist}
+    for name, value in options.items():
+        if value not in get_args(known[name]):
+            raise ConfigError(
+                f"Densify: {name} must be one of {', '.join(get_args(known[name]))}, got {value!r}"
+            )
+
+
+def _limb_axes(template: SkeletonTemplate) -> Tensor:
+    """``[L, 3, 3]`` float64: constant rotations taking z to the limbs' rest directions."""
+    up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    rest = torch.tensor(template.rest_directions, dtype=torch.float64)
+    return Swing.of(up).to(rest.unsqueeze(1)).squeeze(1)
+
+
+def _unit_shapes(
+    sampler: str,
+    counts: tuple[int, int, int],
+    torso_rest: tuple[float, float, float],
+    torso: str,
+) -> tuple[sampling.Samples, sampling.Samples, sampling.Samples]:
+    n_limb, n_face, n_torso = counts
+    if sampler == "trimesh":
+        try:
+            return (
+                sampling.shipped("cylinder", n_limb),
+                sampling.shipped("sphere", n_face),
+                sampling.shipped("box" if torso == "cube" else "box_fit", n_torso),
+            )
+        except ValueError as error:
+            raise ConfigError(f"Densify: {error}") from None
+    extents = (1.0, 1.0, 1.0) if torso == "cube" else torso_rest
+    return (
+        sampling.even_cylinder(n_limb),
+        sampling.even_sphere(n_face),
+        sampling.even_box(n_torso, extents),
+    )

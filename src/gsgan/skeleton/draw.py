@@ -1,0 +1,122 @@
+"""p₂D: the skeleton projected and drawn as soft limbs, one channel a body part."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from gsgan.scene import Camera
+from gsgan.skeleton.frames import check_skeleton
+from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
+
+MIN_SEGMENT_PX = 1e-2
+"""Pixels: a shorter segment is drawn as a point, with a finite slope."""
+MIN_EXPONENT = -60.0
+"""Where a line fades to zero: at 1e-26, eleven sigmas off."""
+
+
+def draw_skeleton(
+    p: Tensor,
+    valid: Tensor | None,
+    camera: Camera,
+    template: SkeletonTemplate = MEDIAPIPE33,
+    sigma_px: float = 2.5,
+    near: float = 0.01,
+    downscale: int = 1,
+    *,
+    min_sigma_px: float = 0.8,
+) -> Tensor:
+    """Draws the skeleton as the camera sees it.
+
+    Convention: a channel is the largest ``exp(-d² / 2 sigma²)`` over its group's segments, d the
+    distance of the pixel's centre in pixels; 1 on the bone. ``sigma = sigma_px H / 512``, at least
+    ``min_sigma_px`` pixels of the grid it is computed on. Left out: segments with an end unseen or
+    nearer than ``near``. Lens distortion is not applied. Differentiable in p and the camera.
+
+    Args:
+        p: ``[B, J, 3]`` finite joints, metres, world frame.
+        valid: ``[B, J]`` bool or None.
+        camera: ``B`` cameras; its size is the picture's.
+        template: names the groups; MediaPipe's are head, torso, left and right arm, hand, leg.
+        sigma_px: line width at a picture height of 512.
+        near: metres.
+        downscale: computes at 1/downscale of the size and upsamples bilinearly.
+        min_sigma_px: floor of the line width.
+
+    Returns:
+        ``[B, groups, H, W]`` in [0, 1].
+
+    Raises:
+        ValueError: on a wrong shape, batch size or ``downscale``.
+
+    Source: Sec. 3.4 (p₂D is not specified there); method notes, section 4.
+    """
+    valid = check_skeleton("draw_skeleton", p, valid, template)
+    if len(camera) != len(p):
+        raise ValueError(f"draw_skeleton: camera must hold {len(p)} cameras, got {len(camera)}")
+    if downscale < 1:
+        raise ValueError(f"draw_skeleton: downscale must be at least 1, got {downscale}")
+    H, W = camera.size
+    h, w = -(-H // downscale), -(-W // downscale)
+    grid = camera.resize((h, w)) if downscale > 1 else camera
+    sigma = max(sigma_px * H / 512 / downscale, min_sigma_px)
+
+    pixels, depth = grid.project(p, near)
+    drawn = valid & (depth > near)
+    segments = [edge for _, group in template.draw_groups for edge in group]
+    ends = torch.tensor(segments, device=p.device).T
+    shown = (drawn.index_select(1, ends[0]) & drawn.index_select(1, ends[1])).unsqueeze(-1)
+    a, b = (pixels.index_select(1, end) for end in ends)
+    # on the inputs: a far-off or meaningless pixel must not reach the arithmetic
+    a, b = torch.where(shown, a, 0.0), torch.where(shown, b, 0.0)
+    distance2 = _distance2(a, b, shown, (h, w), [len(g) for _, g in template.draw_groups])
+    # below the floor the value is an exact zero: denormals would slow this and all that follows
+    exponent = (distance2 * (-0.5 / sigma**2)).clamp_min(MIN_EXPONENT)
+    image = exponent.exp() - math.exp(MIN_EXPONENT)
+    if downscale > 1:
+        image = F.interpolate(image, size=(H, W), mode="bilinear", align_corners=False)
+    return image
+
+
+def _distance2(
+    a: Tensor, b: Tensor, shown: Tensor, size: tuple[int, int], counts: list[int]
+) -> Tensor:
+    """``[B, groups, h, w]`` squared pixels to each group's nearest segment; huge where none is.
+
+    In a segment's own axes a pixel is ``along`` lengths from its middle and ``across`` pixels
+    off its line. Both are affine: a column term plus a row term, summed per pixel.
+    """
+    h, w = size
+    d = b - a
+    length2 = d.square().sum(-1, keepdim=True)
+    short = length2 < MIN_SEGMENT_PX**2
+    length2 = torch.where(short, MIN_SEGMENT_PX**2, length2)
+    d = torch.where(short, d.new_tensor([MIN_SEGMENT_PX, 0.0]), d)
+    # an unseen segment is put so far off its line that its value is an exact zero
+    away = torch.where(shown, 0.0, 1e4 * float(max(h, w)))
+
+    x = torch.arange(w, device=a.device, dtype=a.dtype) + 0.5 - a[..., :1]  # [B, S, w]
+    y = torch.arange(h, device=a.device, dtype=a.dtype) + 0.5 - a[..., 1:]  # [B, S, h]
+    forward, sideways = d / length2, d * length2.rsqrt()
+    along = (x * forward[..., :1] - 0.5, y * forward[..., 1:])
+    across = (x * sideways[..., 1:] + away, y * -sideways[..., :1])
+
+    parts = ((col.unsqueeze(-2), row.unsqueeze(-1)) for col, row in (along, across))
+    (along_x, along_y), (across_x, across_y) = parts
+    terms = (along_x, along_y, across_x, across_y, length2.sqrt().unsqueeze(-1))
+    # group by group: the [B, segments, h, w] temporaries stay small enough for the cache
+    return torch.stack(
+        [_nearest(*group) for group in zip(*(t.split(counts, 1) for t in terms), strict=True)], 1
+    )
+
+
+def _nearest(
+    along_x: Tensor, along_y: Tensor, across_x: Tensor, across_y: Tensor, length: Tensor
+) -> Tensor:
+    """``[B, h, w]`` squared pixels to the nearest of one group's segments ``[B, S, ...]``."""
+    beyond = F.softshrink(along_x + along_y, 0.5) * length  # 0 between the ends
+    across = across_x + across_y
+    return torch.addcmul(across * across, beyond, beyond).amin(1)

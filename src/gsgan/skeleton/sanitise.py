@@ -1,0 +1,220 @@
+"""Skeletons made whole: what was not seen is stood in for before any arithmetic touches it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from gsgan.scene import Camera
+from gsgan.skeleton.frames import BoneFrames, bone_frames, check_skeleton, constants
+from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, SkeletonTemplate
+
+MIN_TRUNK_JOINTS = 3
+"""Of the two shoulders and two hips: with fewer there is no trunk to hang the rest on."""
+
+
+def limb_length_sum(
+    p: Tensor, valid: Tensor | None = None, template: SkeletonTemplate = MEDIAPIPE33
+) -> Tensor:
+    """The summed limb lengths, h_body: a measure of the subject's size that no pose changes.
+
+    Convention: metres; about 2.4 times the stature. Limbs with an unseen end are made up for by
+    the share they have of the rest skeleton's sum; with no limb seen the result is NaN, so that a
+    nanmedian over frames passes it by.
+
+    Args:
+        p: ``[B, J, 3]`` metres; unseen joints may hold anything.
+        valid: ``[B, J]`` bool or None.
+        template: names the limbs.
+
+    Returns:
+        ``[B]`` metres.
+
+    Raises:
+        ValueError: on a shape that does not fit the template.
+
+    Source: method notes, section 2 (one constant a subject, the median over training frames).
+    """
+    valid = check_skeleton("limb_length_sum", p, valid, template)
+    c = constants(template, p.device, p.dtype)
+    seen = valid.index_select(1, c.starts) & valid.index_select(1, c.ends)
+    bones = p.index_select(1, c.ends) - p.index_select(1, c.starts)
+    lengths = torch.where(seen.unsqueeze(-1), bones, 0.0).norm(dim=-1).sum(-1)
+    rest = (c.rest[c.ends] - c.rest[c.starts]).norm(dim=-1)
+    return lengths * rest.sum() / (seen * rest).sum(-1)
+
+
+def sanitise(
+    p: Tensor,
+    visibility: Tensor | None = None,
+    template: SkeletonTemplate = MEDIAPIPE33,
+    body_height: Tensor | float | None = None,
+    *,
+    min_visibility: float = 0.0,
+    min_trunk_joints: int = MIN_TRUNK_JOINTS,
+) -> tuple[Tensor, Tensor]:
+    """Replaces joints that were not seen, and says which.
+
+    Convention: metres, world frame. A joint is unseen when a coordinate is NaN or infinite or its
+    visibility is not above ``min_visibility``. One lost shoulder or hip is completed from the other
+    three; a face joint is set by the head's frame; any other at the end of its rest bone in its
+    parent's frame. Stand-ins move with the seen joints and pass gradients to them. Seen joints are
+    returned bit for bit. The check costs one device synchronisation.
+
+    Args:
+        p: ``[B, J, 3]``.
+        visibility: ``[B, J]`` or None (all visible).
+        template: names the joints and holds the rest pose.
+        body_height: the subject's h_body as :func:`limb_length_sum` measures it, a number or
+            ``[B]``: how long the missing bones are. None: from the limbs that were seen.
+        min_visibility: at or below it a joint is unseen.
+        min_trunk_joints: shoulders and hips that must have been seen, 3 or 4.
+
+    Returns:
+        ``p [B, J, 3]`` finite, and ``valid [B, J]`` bool.
+
+    Raises:
+        ValueError: on a wrong shape, or when too few shoulders and hips were seen, naming batch
+            items and joints.
+
+    Source: method notes, sections 1 and 10 (our decision; the paper does not treat lost joints).
+    """
+    check_skeleton("sanitise", p, None, template)
+    valid = torch.isfinite(p).all(-1)
+    if visibility is not None:
+        if visibility.shape != valid.shape:
+            raise ValueError(
+                f"sanitise: visibility must have shape {list(valid.shape)}, "
+                f"got {list(visibility.shape)}"
+            )
+        valid = valid & (visibility > min_visibility)
+    if bool(valid.all()):
+        return p, valid
+    _refuse_without_trunk(valid, template, min_trunk_joints)
+    return _filled(p, valid, template, body_height), valid
+
+
+def recentre(
+    p: Tensor, camera: Camera, template: SkeletonTemplate = MEDIAPIPE33
+) -> tuple[Tensor, Camera, Tensor]:
+    """Moves the world's origin to the left hip; the picture stays the same.
+
+    Convention: a float32 number at 1e4 m has a grain of 1 mm. A capture in far-off coordinates
+    (survey, geographic) is right in float32 only if it is recentred in float64 first, joints and
+    cameras together.
+
+    Args:
+        p: ``[B, J, 3]`` metres, finite.
+        camera: of the same batch.
+        template: names the hips.
+
+    Returns:
+        The moved joints, the moved camera, and the old position ``[B, 3]`` of the new origin.
+    """
+    root = p[:, template.hips[0]].detach()
+    shift = (camera.R @ root.to(camera.R).unsqueeze(-1)).squeeze(-1)
+    return p - root.unsqueeze(1), replace(camera, t=camera.t + shift), root
+
+
+def _refuse_without_trunk(valid: Tensor, template: SkeletonTemplate, least: int) -> None:
+    if least not in (3, 4):
+        raise ValueError(f"sanitise: min_trunk_joints must be 3 or 4, got {least}")
+    trunk = valid[:, list(template.torso)]
+    bad = (trunk.sum(-1) < least).nonzero().flatten().tolist()
+    if bad:
+        lost = "; ".join(
+            f"item {b}: "
+            + ", ".join(template.names[j] for j in template.torso if not bool(valid[b, j]))
+            for b in bad
+        )
+        raise ValueError(
+            f"sanitise: p needs {least} of the four shoulders and hips, but in {len(bad)} of "
+            f"{len(valid)} skeletons too many are NaN or invisible ({lost}); leave these frames out"
+        )
+
+
+def _filled(
+    p: Tensor, valid: Tensor, template: SkeletonTemplate, body_height: Tensor | float | None
+) -> Tensor:
+    c = constants(template, p.device, p.dtype)
+    root = _seen_trunk_joint(p, valid, template)
+    q = torch.where(valid.unsqueeze(-1), p, 0.0)
+    q = torch.where(valid.unsqueeze(-1), q - root, 0.0)
+    if body_height is None:
+        scale = limb_length_sum(q, valid, template) / template.limb_length_sum
+        scale = torch.where(scale.isnan(), 1.0, scale)
+    else:
+        scale = torch.as_tensor(body_height, dtype=p.dtype, device=p.device)
+        scale = (scale / template.limb_length_sum).expand(len(p))
+
+    rest_frames = _rest_frames(template, p.device, p.dtype)
+    q = _complete_trunk(q, valid, template, c.rest)
+    q = _complete_face(q, valid, template, c.rest, scale)
+    tree = set(template.incoming.values())
+    for level in template.levels:
+        limbs = [limb for limb in level if limb in tree]
+        starts, ends = (c.starts[limbs], c.ends[limbs])
+        frames = bone_frames(q, valid, template)
+        now, at_rest = (
+            torch.cat([f.hubs, f.limbs], dim=1)[:, [template.limb_parents[i] for i in limbs]]
+            for f in (frames, rest_frames)
+        )
+        bone = (now @ at_rest.mT @ (c.rest[ends] - c.rest[starts]).unsqueeze(-1)).squeeze(-1)
+        q = _put(q, valid, ends, q[:, starts] + bone * scale[:, None, None])
+    return torch.where(valid.unsqueeze(-1), p, q + root)
+
+
+def _rest_frames(
+    template: SkeletonTemplate, device: torch.device, dtype: torch.dtype
+) -> BoneFrames:
+    return bone_frames(constants(template, device, dtype).rest.unsqueeze(0), None, template)
+
+
+def _put(q: Tensor, valid: Tensor, joints: Tensor, where_to: Tensor) -> Tensor:
+    """``q`` with the unseen ones of ``joints`` at ``where_to [B, len(joints), 3]``."""
+    new = torch.where(valid[:, joints].unsqueeze(-1), q[:, joints], where_to)
+    return q.index_copy(1, joints, new)
+
+
+def _seen_trunk_joint(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Tensor:
+    """``[B, 1, 3]``: a shoulder or hip that was seen, to measure the rest from."""
+    order = torch.tensor([*template.hips, *template.shoulders], device=p.device)
+    first = order[valid[:, order].to(torch.uint8).argmax(-1)]
+    return p.gather(1, first[:, None, None].expand(-1, 1, 3)).detach()
+
+
+def _complete_trunk(q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: Tensor) -> Tensor:
+    """One lost corner: its partner plus the other line, at the rest skeleton's ratio."""
+    (l_sh, r_sh), (l_hip, r_hip) = template.shoulders, template.hips
+    ratio = (rest[l_sh] - rest[r_sh]).norm() / (rest[l_hip] - rest[r_hip]).norm()
+    hips, shoulders = q[:, l_hip] - q[:, r_hip], q[:, l_sh] - q[:, r_sh]
+    corners = torch.tensor(template.torso, device=q.device)
+    where_to = torch.stack(
+        [
+            q[:, r_sh] + hips * ratio,
+            q[:, l_sh] - hips * ratio,
+            q[:, r_hip] + shoulders / ratio,
+            q[:, l_hip] - shoulders / ratio,
+        ],
+        dim=1,
+    )
+    return _put(q, valid, corners, where_to)
+
+
+def _complete_face(
+    q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: Tensor, scale: Tensor
+) -> Tensor:
+    """Unseen face joints, on the rest face laid over the seen ones, else over the shoulders."""
+    hubs = bone_frames(q, valid, template).hubs
+    face = torch.tensor(template.face, device=q.device)
+    seen = valid[:, face].to(q.dtype).unsqueeze(-1)
+    anchored = seen.any(1)  # [B, 1]
+    weight = seen / seen.sum(1, keepdim=True).clamp_min(1.0)
+    shoulders = list(template.shoulders)
+    now = torch.where(anchored, (q[:, face] * weight).sum(1), q[:, shoulders].mean(1))
+    at_rest = torch.where(anchored, (rest[face] * weight).sum(1), rest[shoulders].mean(0))
+    R = torch.where(anchored.unsqueeze(-1), hubs[:, HEAD], hubs[:, CHEST])
+    offset = (rest[face] - at_rest.unsqueeze(1)) @ R.mT
+    return _put(q, valid, face, now.unsqueeze(1) + offset * scale[:, None, None])

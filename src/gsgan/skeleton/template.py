@@ -1,0 +1,291 @@
+"""What a skeleton is: joint names, bones, rest shape. Constants only, no tensors.
+
+Convention: body axes are x = the subject's left, y = up, z = out of the chest (right-handed),
+metres. Left and right are the person's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+Vector = tuple[float, float, float]
+Edge = tuple[int, int]
+
+PELVIS, CHEST, HEAD = 0, 1, 2
+"""Positions of the hub frames; frame ``N_HUBS + l`` is that of limb ``l``."""
+N_HUBS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class SkeletonTemplate:
+    """Joints, bones and rest shape of one kind of skeleton.
+
+    Compared and hashed by identity, so tensors made from it can be cached by it.
+
+    Args:
+        names: of the ``J`` joints.
+        edges: the connections as the landmark detector draws them.
+        limbs: (parent joint, child joint) of the bones that carry a cylinder.
+        limb_parents: per limb, the frame its own is measured from: 0 pelvis, 1 chest, 2 head,
+            ``3 + l`` limb ``l``.
+        rest_directions: per limb, unit, in its parent's frame. Not the rest pose: they are placed
+            so that the opposite direction, where the swing is undefined, is out of reach.
+        hinges: (upper limb, lower limb) pairs that bend about one axis.
+        hinge_axes: per hinge, unit, in the upper limb's frame, across its rest direction.
+        rest_positions: ``J`` points of an A-pose on the ground y = 0.
+        stature: metres, sole to crown of the rest pose.
+        shoulders, hips, ears, eyes: (left, right) joints the hub frames are built from.
+        nose: joint that tells the front of the head.
+        face: joints the head's sphere encloses.
+        mirror: per joint, its twin on the other side (itself on the midline).
+        draw_groups: (name, segments) of the channels of the drawn skeleton.
+        gnn_edges: the edges joined to one component, for message passing.
+
+    Source: method notes, sections 1, 5 and 6; the paper names MediaPipe Pose and Algorithm 1.
+    """
+
+    names: tuple[str, ...]
+    edges: tuple[Edge, ...]
+    limbs: tuple[Edge, ...]
+    limb_parents: tuple[int, ...]
+    rest_directions: tuple[Vector, ...]
+    hinges: tuple[Edge, ...]
+    hinge_axes: tuple[Vector, ...]
+    rest_positions: tuple[Vector, ...]
+    stature: float
+    shoulders: Edge
+    hips: Edge
+    ears: Edge
+    eyes: Edge
+    nose: int
+    face: tuple[int, ...]
+    mirror: tuple[int, ...]
+    draw_groups: tuple[tuple[str, tuple[Edge, ...]], ...]
+    gnn_edges: tuple[Edge, ...]
+
+    @property
+    def torso(self) -> tuple[int, int, int, int]:
+        """The joints of the trunk: left and right shoulder, left and right hip."""
+        return (*self.shoulders, *self.hips)
+
+    @property
+    def levels(self) -> tuple[tuple[int, ...], ...]:
+        """Limbs by depth: every limb's parent frame is a hub or in an earlier level."""
+        depth: dict[int, int] = {}
+        for limb, parent in enumerate(self.limb_parents):
+            depth[limb] = 0 if parent < N_HUBS else depth[parent - N_HUBS] + 1
+        return tuple(
+            tuple(limb for limb in depth if depth[limb] == level)
+            for level in range(max(depth.values()) + 1)
+        )
+
+    @property
+    def incoming(self) -> dict[int, int]:
+        """Per joint that ends a bone, the first limb listed that ends there."""
+        found: dict[int, int] = {}
+        for limb, (_, child) in enumerate(self.limbs):
+            if child not in self.torso:
+                found.setdefault(child, limb)
+        return found
+
+    @property
+    def limb_length_sum(self) -> float:
+        """Metres: the summed limb lengths of the rest pose, the unit ``h_body`` is measured in."""
+        rest = np.asarray(self.rest_positions)
+        return float(sum(np.linalg.norm(rest[j] - rest[i]) for i, j in self.limbs))
+
+    @property
+    def rest_torso(self) -> Vector:
+        """Metres: edges (left-right, up, front) of the trunk's box in the rest pose."""
+        l_sh, r_sh, l_hip, r_hip = np.asarray(self.rest_positions)[list(self.torso)]
+        width = float(max(np.linalg.norm(l_sh - r_sh), np.linalg.norm(l_hip - r_hip)))
+        return width, float(np.linalg.norm((l_sh + r_sh - l_hip - r_hip) / 2)), width / 2
+
+    def with_torso_limbs(self) -> SkeletonTemplate:
+        """The same skeleton with a cylinder on the four trunk edges too (``all26``)."""
+        (l_sh, r_sh), (l_hip, r_hip) = self.shoulders, self.hips
+        extra = ((l_sh, r_sh), (l_sh, l_hip), (r_sh, r_hip), (l_hip, r_hip))
+        rest = np.asarray(self.rest_positions)
+        return replace(
+            self,
+            limbs=self.limbs + extra,
+            limb_parents=(*self.limb_parents, CHEST, CHEST, CHEST, PELVIS),
+            rest_directions=self.rest_directions
+            + tuple(_unit(*(rest[j] - rest[i]).tolist()) for i, j in extra),
+        )
+
+
+def _unit(x: float, y: float, z: float) -> Vector:
+    norm = (x * x + y * y + z * z) ** 0.5
+    return (x / norm, y / norm, z / norm)
+
+
+def _mirrored(v: Vector) -> Vector:
+    return (-v[0], v[1], v[2])
+
+
+def _across(axis: Vector, direction: Vector) -> Vector:
+    """The part of ``axis`` across the unit ``direction``, normalised."""
+    along = sum(a * d for a, d in zip(axis, direction, strict=True))
+    return _unit(*(a - along * d for a, d in zip(axis, direction, strict=True)))
+
+
+_NAMES = (
+    "nose",
+    *("left_eye_inner", "left_eye", "left_eye_outer"),
+    *("right_eye_inner", "right_eye", "right_eye_outer"),
+    *("left_ear", "right_ear", "mouth_left", "mouth_right"),
+    *("left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist"),
+    *("left_pinky", "right_pinky", "left_index", "right_index", "left_thumb", "right_thumb"),
+    *("left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle"),
+    *("left_heel", "right_heel", "left_foot_index", "right_foot_index"),
+)
+_FACE_EDGES = ((0, 1), (1, 2), (2, 3), (3, 7), (0, 4), (4, 5), (5, 6), (6, 8), (9, 10))
+_TORSO_EDGES = ((11, 12), (11, 23), (12, 24), (23, 24))
+_L_ARM, _R_ARM = ((11, 13), (13, 15)), ((12, 14), (14, 16))
+_L_HAND, _R_HAND = (
+    ((15, 17), (15, 19), (15, 21), (17, 19)),
+    ((16, 18), (16, 20), (16, 22), (18, 20)),
+)
+_L_LEG, _R_LEG = ((23, 25), (25, 27)), ((24, 26), (26, 28))
+_L_FOOT, _R_FOOT = ((27, 29), (27, 31), (29, 31)), ((28, 30), (28, 32), (30, 32))
+_LIMBS = _L_ARM + _R_ARM + _L_HAND + _R_HAND + _L_LEG + _R_LEG + _L_FOOT + _R_FOOT
+_EDGES = (
+    *_FACE_EDGES[:8],
+    (9, 10),
+    (11, 12),
+    *((11, 13), (13, 15), (15, 17), (15, 19), (15, 21), (17, 19)),
+    *((12, 14), (14, 16), (16, 18), (16, 20), (16, 22), (18, 20)),
+    *((11, 23), (12, 24), (23, 24), (23, 25), (24, 26), (25, 27), (26, 28)),
+    *((27, 29), (28, 30), (29, 31), (30, 32), (27, 31), (28, 32)),
+)
+
+# Left half and midline of an A-pose; the right half is its mirror image.
+_LEFT_REST: dict[str, Vector] = {
+    "nose": (0.0, 1.555, 0.125),
+    "left_eye_inner": (0.016, 1.590, 0.105),
+    "left_eye": (0.032, 1.592, 0.100),
+    "left_eye_outer": (0.046, 1.588, 0.088),
+    "left_ear": (0.075, 1.555, 0.020),
+    "mouth_left": (0.026, 1.515, 0.105),
+    "left_shoulder": (0.175, 1.390, 0.0),
+    "left_elbow": (0.330, 1.155, -0.010),
+    "left_wrist": (0.455, 0.943, 0.030),
+    "left_pinky": (0.503, 0.865, 0.004),
+    "left_index": (0.500, 0.862, 0.062),
+    "left_thumb": (0.478, 0.893, 0.085),
+    "left_hip": (0.095, 0.920, 0.0),
+    "left_knee": (0.110, 0.500, 0.010),
+    "left_ankle": (0.120, 0.085, -0.020),
+    "left_heel": (0.120, 0.030, -0.065),
+    "left_foot_index": (0.145, 0.020, 0.140),
+}
+
+
+def _twin(name: str) -> str:
+    if "left" in name:
+        return name.replace("left", "right")
+    return name.replace("right", "left")
+
+
+def _rest_positions() -> tuple[Vector, ...]:
+    return tuple(
+        _LEFT_REST[n] if n in _LEFT_REST else _mirrored(_LEFT_REST[_twin(n)]) for n in _NAMES
+    )
+
+
+def _about_x(v: Vector, cos: float, sin: float) -> Vector:
+    return (v[0], cos * v[1] - sin * v[2], sin * v[1] + cos * v[2])
+
+
+def _rest_directions() -> dict[Edge, Vector]:
+    """Where each bone points when its swing is nil, in the frame it is measured from.
+
+    Upper arm and thigh point where their opposite is out of reach; elbow, knee and fingers go
+    straight on (opposite = folded back on themselves); the foot and the line across the palm take
+    their neutral direction, carried into the shin's and forearm's frame.
+    """
+    arm: Vector = _unit(0.6, -0.6, 0.5)
+    leg: Vector = _unit(0.0, -0.8, 0.6)
+    rest = dict(zip(_NAMES, _rest_positions(), strict=True))
+
+    def neutral(a: str, b: str) -> Vector:
+        offset = [y - x for x, y in zip(rest[a], rest[b], strict=True)]
+        # the swing that takes straight down to the shin's rest direction
+        return _about_x(_unit(*offset), cos=-leg[1], sin=-leg[2])
+
+    left: dict[Edge, Vector] = dict.fromkeys((*_L_ARM, *_L_HAND[:3]), arm)
+    left[(17, 19)] = _across((0.0, 0.0, 1.0), arm)  # thumb side forward, halfway through pronation
+    left |= dict.fromkeys(_L_LEG, leg)
+    left[(27, 29)] = neutral("left_ankle", "left_heel")
+    left[(27, 31)] = neutral("left_ankle", "left_foot_index")
+    left[(29, 31)] = neutral("left_heel", "left_foot_index")
+    right = {(a + 1, b + 1): _mirrored(v) for (a, b), v in left.items()}
+    return left | right
+
+
+def _mediapipe33() -> SkeletonTemplate:
+    directions = _rest_directions()
+    index = {limb: i for i, limb in enumerate(_LIMBS)}
+
+    def parent(limb: Edge) -> int:
+        a = limb[0]
+        if a in (11, 12):
+            return CHEST
+        if a in (23, 24):
+            return PELVIS
+        # fingers and the foot's three bones hang on the forearm and the shin
+        base = {17: 15, 18: 16, 29: 27, 30: 28}.get(a, a)
+        return N_HUBS + next(i for (_, b), i in index.items() if b == base)
+
+    arm_l, arm_r = directions[(11, 13)], directions[(12, 14)]
+    return SkeletonTemplate(
+        names=_NAMES,
+        edges=_EDGES,
+        limbs=_LIMBS,
+        limb_parents=tuple(parent(limb) for limb in _LIMBS),
+        rest_directions=tuple(directions[limb] for limb in _LIMBS),
+        hinges=tuple(
+            (index[a], index[b])
+            for a, b in (
+                ((11, 13), (13, 15)),
+                ((12, 14), (14, 16)),
+                ((23, 25), (25, 27)),
+                ((24, 26), (26, 28)),
+            )
+        ),
+        # upper x lower: elbows bend forwards (-x), knees backwards (+x)
+        hinge_axes=(
+            _across((-1.0, 0.0, 0.0), arm_l),
+            _across((-1.0, 0.0, 0.0), arm_r),
+            (1.0, 0.0, 0.0),
+            (1.0, 0.0, 0.0),
+        ),
+        rest_positions=_rest_positions(),
+        stature=1.7,
+        shoulders=(11, 12),
+        hips=(23, 24),
+        ears=(7, 8),
+        eyes=(2, 5),
+        nose=0,
+        face=tuple(range(11)),
+        mirror=tuple(_NAMES.index(_twin(n)) if _twin(n) in _NAMES else 0 for n in _NAMES),
+        draw_groups=(
+            ("head", (*_FACE_EDGES, (7, 8))),
+            ("torso", _TORSO_EDGES),
+            ("left_arm", _L_ARM),
+            ("right_arm", _R_ARM),
+            ("left_hand", _L_HAND),
+            ("right_hand", _R_HAND),
+            ("left_leg", _L_LEG + _L_FOOT),
+            ("right_leg", _R_LEG + _R_FOOT),
+        ),
+        # without these the face, the mouth and the body are three separate components
+        gnn_edges=(*_EDGES, (0, 9), (0, 10), (0, 11), (0, 12)),
+    )
+
+
+MEDIAPIPE33 = _mediapipe33()
+"""MediaPipe Pose: 33 joints, 35 edges, 22 limbs."""

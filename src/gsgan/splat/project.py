@@ -1,0 +1,239 @@
+"""From 3D Gaussians to ellipses on the picture (EWA projection), shared by every backend."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsgan.scene import Camera, Gaussians
+from gsgan.splat.settings import Accuracy
+
+# exp(-745.2) is the smallest double above zero: beyond this a Gaussian is exactly 0.
+_EXP_UNDERFLOW = 746.0
+# Extents are rounded up by this much, so that rounding never loses a pixel that alpha_min keeps.
+_EXTENT_MARGIN = 1e-3
+# Below this a quaternion is noise, and its gradient 1/|q| would not fit into float32.
+_QUAT_MIN = 1e-20
+
+
+@dataclass(frozen=True)
+class Projected:
+    """A batch of Gaussians as ellipses on the picture; what every backend composites.
+
+    Convention: pixels, x right and y down; the centre of pixel (row i, column j) is
+    ``(j + 0.5, i + 0.5)``. Entries of invisible Gaussians are finite and mean nothing.
+
+    Args:
+        means: ``[B, N, 2]`` pixels.
+        conics: ``[B, N, 3]`` (a, b, c), the inverse 2D covariance:
+            ``q = a dx² + 2 b dx dy + c dy²`` and ``alpha = min(alpha_max, o exp(-q / 2))``.
+        opacities: ``[B, N]``, anti-aliasing already in them.
+        features: ``[B, N, C]``.
+        depths: ``[B, N]`` metres along the viewing axis.
+        extents: ``[B, N, 2]`` pixels, half-width and half-height of the footprint; 0 where not
+            visible; carries no gradient.
+        visible: ``[B, N]`` bool.
+    """
+
+    means: Tensor
+    conics: Tensor
+    opacities: Tensor
+    features: Tensor
+    depths: Tensor
+    extents: Tensor
+    visible: Tensor
+
+
+def project(
+    gaussians: Gaussians, camera: Camera, settings: Accuracy, keep: Tensor | None = None
+) -> Projected:
+    """Projects Gaussians onto the picture.
+
+    Convention: differentiable in means, quats, scales, covariances, opacities, features, K, R, t.
+    Geometry is computed in float64 where the device has it (the world offset of the camera
+    cancels there, and so does the determinant of a needle), then rounded to
+    ``promote_types(input dtype, settings dtype)``. ``camera.dist`` is not applied.
+
+    Args:
+        gaussians: N Gaussians per batch item.
+        camera: one camera per batch item.
+        settings: cut-offs, see ``Accuracy``.
+        keep: ``[B, N]`` bool; the others are made invisible, whatever they hold.
+
+    Returns:
+        The ellipses; invisible ones pass exactly zero gradients back.
+
+    Source: paper Sec. 3.1; Zwicker et al., EWA splatting.
+    """
+    dtype = torch.promote_types(gaussians.means.dtype, settings.torch_dtype)
+    wide = torch.float64 if gaussians.means.device.type != "mps" else dtype
+    if keep is not None:
+        gaussians = _without(gaussians, ~keep)
+    # In here the N Gaussians are the last dimension: contiguous vectors, few large operations.
+    K, R, t = camera.K.to(wide), camera.R.to(wide), camera.t.to(wide)
+    x_cam = R @ gaussians.means.to(wide).mT + t.unsqueeze(-1)
+    in_front = x_cam.detach()[:, 2] > settings.near
+    if keep is not None:
+        in_front = in_front & keep
+    x_cam = torch.where(in_front.unsqueeze(1), x_cam, x_cam.new_tensor([[0.0], [0.0], [1.0]]))
+    depths = x_cam[:, 2]
+    ratios = x_cam[:, :2] / depths.unsqueeze(1)
+    means = K[:, :2, :2] @ ratios + K[:, :2, 2:]
+    limits = _field_of_view(K, camera.size, settings.fov_clamp)
+    a, b, c, det_before = _covariance_2d(gaussians, _jacobian(K, R, ratios, depths, limits))
+    low = settings.low_pass
+    det = det_before + low * (a + c) + low * low
+    a, c = a + low, c + low
+    if gaussians.covariances is not None:
+        # The same number, unless rounding or the covariance itself is not positive definite: then
+        # this form is.
+        a = (b * b + det) / c
+    conics = torch.stack([c, -b, a], dim=-1) / det.unsqueeze(-1)
+    opacities = gaussians.opacities.to(wide)
+    if settings.antialias:
+        opacities = opacities * _safe_sqrt(det_before / det)
+    with torch.no_grad():
+        extents, visible = _footprint(means, a, c, opacities, in_front, camera.size, settings)
+    return Projected(
+        means.mT.to(dtype),
+        conics.to(dtype),
+        opacities.to(dtype),
+        gaussians.features.to(dtype),
+        depths.to(dtype),
+        extents.to(dtype),
+        visible,
+    )
+
+
+def rotations(quats: Tensor) -> Tensor:
+    """Rotation matrices of quaternions of any length.
+
+    Convention: w x y z. Quaternions whose largest component is below 1e-20 (zero ones too) give
+    the identity and no gradient.
+
+    Args:
+        quats: ``[..., 4]``.
+
+    Returns:
+        ``[..., 3, 3]``.
+    """
+    return torch.stack(_rotation_entries(quats, -1), dim=-1).unflatten(-1, (3, 3))
+
+
+def _rotation_entries(quats: Tensor, dim: int) -> list[Tensor]:
+    """The nine entries, row by row, of the rotations of quaternions along ``dim``."""
+    # The length is divided out in two steps, so that squares neither underflow nor overflow.
+    # The first divisor needs no gradient: the result does not depend on the length.
+    largest = quats.detach().abs().amax(dim, keepdim=True)
+    usable = largest > _QUAT_MIN
+    w, x, y, z = (quats / torch.where(usable, largest, 1.0)).unbind(dim)
+    noise = ~usable.squeeze(dim)
+    w, x, y, z = w.masked_fill(noise, 1.0), *(i.masked_fill(noise, 0.0) for i in (x, y, z))
+    xx, yy, zz = x * x, y * y, z * z
+    two = 2 / (w * w + xx + yy + zz)
+    xy, xz, yz, wx, wy, wz = x * y, x * z, y * z, w * x, w * y, w * z
+    return [
+        *(1 - two * (yy + zz), two * (xy - wz), two * (xz + wy)),
+        *(two * (xy + wz), 1 - two * (xx + zz), two * (yz - wx)),
+        *(two * (xz - wy), two * (yz + wx), 1 - two * (xx + yy)),
+    ]
+
+
+def _without(gaussians: Gaussians, invalid: Tensor) -> Gaussians:
+    """Harmless numbers in place of the invalid ones, through which no gradient flows."""
+    changes: dict[str, Any] = {}
+    for name, value in vars(gaussians).items():
+        if value is not None:
+            mask = invalid.reshape(invalid.shape + (1,) * (value.ndim - 2))
+            changes[name] = torch.where(mask, 1.0 if name == "scales" else 0.0, value)
+    return replace(gaussians, **changes)
+
+
+def _covariance_2d(gaussians: Gaussians, JW: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Entries a, b, c of ``J W Σ Wᵀ Jᵀ`` (square pixels) and its determinant, each ``[B, N]``."""
+    wide = JW.dtype
+    if gaussians.covariances is None:
+        assert gaussians.quats is not None
+        assert gaussians.scales is not None
+        quats, scales = gaussians.quats.to(wide).mT.contiguous(), gaussians.scales.to(wide).mT
+        R = torch.stack(_rotation_entries(quats, 1), dim=1).unflatten(1, (3, 3))
+        u, v = (_row_times_matrix(JW[:, i], R) * scales for i in range(2))
+        # The determinant of M Mᵀ is |u x v|²: a sum of squares, where a c - b² cancels.
+        cross = torch.linalg.cross(u, v, dim=1)
+        det = (cross * cross).sum(1)
+        return (u * u).sum(1), (u * v).sum(1), (v * v).sum(1), det
+    covariances = gaussians.covariances.to(wide).movedim(1, -1).contiguous()
+    u, v = (_row_times_matrix(JW[:, i], covariances) for i in range(2))
+    a, c = (u * JW[:, 0]).sum(1).clamp_min(0), (v * JW[:, 1]).sum(1).clamp_min(0)
+    b = 0.5 * ((u * JW[:, 1]).sum(1) + (v * JW[:, 0]).sum(1))
+    return a, b, c, (a * c - b * b).clamp_min(0)
+
+
+def _row_times_matrix(row: Tensor, matrix: Tensor) -> Tensor:
+    """``[B, 3, N]`` times ``[B, 3, 3, N]``, item by item."""
+    return (row.unsqueeze(2) * matrix).sum(1)
+
+
+def _jacobian(
+    K: Tensor, R: Tensor, ratios: Tensor, depths: Tensor, limits: tuple[Tensor, Tensor]
+) -> Tensor:
+    """``[B, 2, 3, N]`` pixels per metre of world: the projection's Jacobian times R."""
+    A, clamped = K[:, :2, :2], torch.minimum(torch.maximum(ratios, limits[0]), limits[1])
+    # J = A [1/z 0 -x/z²; 0 1/z -y/z²], multiplied out so that no small matrices are batched.
+    towards = (A @ R[:, :2]).unsqueeze(-1)
+    away = (A @ clamped).unsqueeze(2) * R[:, None, 2, :, None]
+    return (towards - away) / depths[:, None, None]
+
+
+def _field_of_view(K: Tensor, size: tuple[int, int], widen: float) -> tuple[Tensor, Tensor]:
+    """Least and greatest x/z and y/z, each ``[B, 2, 1]``, of the picture widened about its middle.
+
+    The corners of the picture bound them, which holds with skew and an off-centre principal point.
+    """
+    H, W = size
+    corners = K.new_tensor([[0, W, 0, W], [0, 0, H, H]]) - K[:, :2, 2:]
+    ratios = torch.linalg.inv(K[:, :2, :2]) @ corners
+    low, high = ratios.amin(-1, keepdim=True), ratios.amax(-1, keepdim=True)
+    middle, half = (low + high) / 2, (high - low) / 2
+    return middle - widen * half, middle + widen * half
+
+
+def _footprint(
+    means: Tensor,
+    a: Tensor,
+    c: Tensor,
+    opacities: Tensor,
+    in_front: Tensor,
+    size: tuple[int, int],
+    settings: Accuracy,
+) -> tuple[Tensor, Tensor]:
+    """Half-sizes ``[B, N, 2]`` of the box that holds the footprint, and who is visible ``[B, N]``.
+
+    ``means`` are ``[B, 2, N]``; a and c, the diagonal of the 2D covariance, ``[B, N]``.
+    """
+    H, W = size
+    if settings.extent == "sigma":
+        reach = torch.full_like(opacities, settings.radius_sigmas)
+    elif settings.extent == "opacity" and settings.alpha_min > 0:
+        # alpha >= alpha_min where q <= 2 ln(o / alpha_min), and |dx| <= sqrt(q Σ_xx).
+        reach = (2 * torch.log(opacities / settings.alpha_min).clamp_min(0)).sqrt()
+    else:
+        reach = torch.full_like(opacities, math.sqrt(2 * _EXP_UNDERFLOW))
+    if settings.extent != "sigma":
+        reach = reach * (1 + _EXTENT_MARGIN) + _EXTENT_MARGIN
+    extents = reach.unsqueeze(1) * torch.stack([a, c], dim=1).sqrt()
+    # The outermost pixel centres are half a pixel inside the picture.
+    last = means.new_tensor([[W - 0.5], [H - 0.5]])
+    inside = ((means + extents >= 0.5) & (means - extents <= last)).all(1)
+    visible = in_front & inside & (opacities >= settings.alpha_min)
+    return torch.where(visible.unsqueeze(-1), extents.mT, 0.0), visible
+
+
+def _safe_sqrt(x: Tensor) -> Tensor:
+    """Square root whose gradient at 0 is 0."""
+    positive = x > 0
+    return torch.where(positive, torch.where(positive, x, 1.0).sqrt(), 0.0)

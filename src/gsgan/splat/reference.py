@@ -1,0 +1,122 @@
+"""The judge: every Gaussian at every pixel, plain autograd, no tiles."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from gsgan.splat.project import Projected
+from gsgan.splat.settings import Accuracy
+
+# Pixels x Gaussians held at once and item; the graph keeps a handful of such arrays per chunk.
+CHUNK_ELEMENTS = 1 << 22
+
+
+def composite(
+    projected: Projected, size: tuple[int, int], settings: Accuracy, want_depth: bool
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Blends ellipses front to back, ties by index.
+
+    Args:
+        projected: the ellipses.
+        size: (H, W) pixels.
+        settings: honours alpha_min, transmittance_min, alpha_max and a ``sigma`` extent.
+        want_depth: whether to blend depths too.
+
+    Returns:
+        features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``, depth ``[B, 1, H, W]`` or
+        None.
+
+    Source: paper Sec. 3.1, ``C = Σ c_i α_i Π_{j<i} (1 - α_j)``.
+    """
+    front_to_back = _sorted(projected)
+    values = front_to_back.features
+    if want_depth:
+        values = torch.cat([values, front_to_back.depths.unsqueeze(-1)], dim=-1)
+    chunks = []
+    for pixels in _pixel_chunks(projected, size):
+        weights, left = _blend(_alphas(front_to_back, pixels, settings), settings)
+        chunks.append(torch.cat([weights @ values, 1 - left], dim=-1))
+    picture = torch.cat(chunks, dim=1).mT.unflatten(-1, size)
+    C = front_to_back.features.shape[-1]
+    return picture[:, :C], picture[:, -1:], picture[:, C : C + 1] if want_depth else None
+
+
+def error_bound(projected: Projected, size: tuple[int, int], settings: Accuracy) -> Tensor:
+    """How far, per pixel, a setting's picture can be from the one without cut-offs.
+
+    Convention: for features in [0, 1]; leaves the rounding of the arithmetic out.
+
+    Taking a layer away changes a pixel by at most its own weight, so skipped layers cost at most
+    the sum of their weights; capping an alpha costs at most the weight of what the cap takes; a
+    stopped pixel leaves out less than ``transmittance_min``.
+
+    Args:
+        projected: the ellipses, projected without cut-offs.
+        size: (H, W) pixels.
+        settings: whose error is to be bounded.
+
+    Returns:
+        ``[B, 1, H, W]``.
+    """
+    front_to_back = _sorted(projected)
+    chunks = []
+    with torch.no_grad():
+        for pixels in _pixel_chunks(projected, size):
+            whole = _alphas(front_to_back, pixels, None)
+            lost = whole - _alphas(front_to_back, pixels, settings)
+            before = torch.cat([torch.ones_like(whole[..., :1]), 1 - whole], -1).cumprod(-1)
+            chunks.append((before[..., :-1] * lost).sum(-1) + settings.transmittance_min)
+    return torch.cat(chunks, dim=1).unflatten(-1, size).unsqueeze(1)
+
+
+def _sorted(projected: Projected) -> Projected:
+    order = projected.depths.detach().argsort(dim=1, stable=True)
+
+    def take(x: Tensor) -> Tensor:
+        index = order if x.ndim == 2 else order.unsqueeze(-1).expand_as(x)
+        return x.gather(1, index)
+
+    return Projected(**{name: take(value) for name, value in vars(projected).items()})
+
+
+def _pixel_chunks(projected: Projected, size: tuple[int, int]) -> tuple[Tensor, ...]:
+    """Pixel centres ``[P, 2]``, row by row, as many at a time as the memory is meant for."""
+    H, W = size
+    rows = torch.arange(H, device=projected.means.device, dtype=projected.means.dtype) + 0.5
+    columns = torch.arange(W, device=projected.means.device, dtype=projected.means.dtype) + 0.5
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    per_chunk = max(1, CHUNK_ELEMENTS // max(1, projected.depths.numel()))
+    return torch.stack([x, y], dim=-1).reshape(-1, 2).split(per_chunk)
+
+
+def _alphas(projected: Projected, pixels: Tensor, settings: Accuracy | None) -> Tensor:
+    """``[B, P, N]``; without settings, before any cut-off but visibility."""
+    d = pixels[:, None] - projected.means.unsqueeze(1)
+    dx, dy = d.unbind(-1)
+    a, b, c = (k.unsqueeze(1) for k in projected.conics.unbind(-1))
+    q = a * dx * dx + 2 * b * dx * dy + c * dy * dy
+    # Masked before exp: an invisible Gaussian then passes exact zeros back, never 0 * inf.
+    drawn = projected.visible.unsqueeze(1).expand_as(q)
+    if settings is not None and settings.extent == "sigma":
+        drawn = drawn & (d.detach().abs() <= projected.extents.unsqueeze(1)).all(-1)
+    q = torch.where(drawn, q, 0.0)
+    alpha = torch.where(drawn, projected.opacities.unsqueeze(1), 0.0) * torch.exp(-0.5 * q)
+    if settings is None:
+        return alpha
+    alpha = torch.where(alpha >= settings.alpha_min, alpha, 0.0)
+    return alpha.clamp(max=settings.alpha_max)
+
+
+def _blend(alpha: Tensor, settings: Accuracy) -> tuple[Tensor, Tensor]:
+    """Weights ``[B, P, N]`` and the transmittance ``[B, P, 1]`` that is left at the end."""
+    if settings.transmittance_min > 0:
+        before = _transmittances(alpha.detach())[..., :-1]
+        alpha = torch.where(before >= settings.transmittance_min, alpha, 0.0)
+    transmittances = _transmittances(alpha)
+    return transmittances[..., :-1] * alpha, transmittances[..., -1:]
+
+
+def _transmittances(alpha: Tensor) -> Tensor:
+    """``[B, P, N + 1]``: before each layer, and after the last."""
+    return torch.cat([torch.ones_like(alpha[..., :1]), 1 - alpha], dim=-1).cumprod(dim=-1)

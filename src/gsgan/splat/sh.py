@@ -1,0 +1,101 @@
+"""Real spherical harmonics to degree 3: colour that depends on the direction of view."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+# Normalisations such that the integral of each squared function over the sphere is 1; the signs
+# are those of 3D Gaussian splatting (Condon-Shortley phase), so that its .ply files read as is.
+_C0 = math.sqrt(1 / (4 * math.pi))
+_C1 = math.sqrt(3 / (4 * math.pi))
+_C2 = tuple(math.sqrt(k / math.pi) for k in (15 / 4, 5 / 16, 15 / 16))
+_C3 = tuple(math.sqrt(k / math.pi) for k in (35 / 32, 105 / 4, 21 / 32, 7 / 16, 105 / 16))
+
+MAX_DEGREE = 3
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """The real spherical harmonics of unit directions.
+
+    Convention: order (0,0), (1,-1), (1,0), (1,1), (2,-2), … with the signs of 3D Gaussian
+    splatting: degree 1 is ``(-y, z, -x)`` times a constant.
+
+    Args:
+        directions: ``[..., 3]`` unit vectors.
+        degree: 0 to 3.
+
+    Returns:
+        ``[..., (degree + 1)²]``.
+
+    Raises:
+        ValueError: when the degree is not 0 to 3.
+    """
+    if degree not in range(MAX_DEGREE + 1):
+        raise ValueError(f"sh_basis: degree must be 0 to {MAX_DEGREE}, got {degree}")
+    x, y, z = directions.unbind(-1)
+    basis = [torch.full_like(x, _C0)]
+    if degree >= 1:
+        basis += [-_C1 * y, _C1 * z, -_C1 * x]
+    if degree >= 2:
+        basis += _degree_2(x, y, z)
+    if degree >= 3:
+        basis += _degree_3(x, y, z)
+    return torch.stack(basis, dim=-1)
+
+
+def sh_to_colour(sh: Tensor, directions: Tensor) -> Tensor:
+    """Colours seen along directions.
+
+    Convention: the sum of the series plus 0.5, not clamped (the caller clamps at 0). Directions
+    run from the camera to the Gaussian, in the frame the coefficients are given in.
+
+    Args:
+        sh: ``[B, N, (d+1)², 3]`` coefficients, d from 0 to 3.
+        directions: ``[B, N, 3]``, of any length but 0; a zero one gives a finite colour.
+
+    Returns:
+        ``[B, N, 3]``.
+
+    Raises:
+        ValueError: when the number of coefficients is no (d+1)² with d from 0 to 3.
+
+    Source: paper Sec. 3.1; Kerbl et al., 3D Gaussian splatting.
+    """
+    degree = math.isqrt(sh.shape[-2]) - 1
+    if (degree + 1) ** 2 != sh.shape[-2] or degree not in range(MAX_DEGREE + 1):
+        raise ValueError(
+            "sh_to_colour: sh must have shape [B, N, (d+1)², 3] with d from 0 to "
+            f"{MAX_DEGREE}, got {list(sh.shape)}"
+        )
+    if degree == 0:  # needs no direction: view-dependent colour is off
+        return _C0 * sh[..., 0, :] + 0.5
+    basis = sh_basis(torch.nn.functional.normalize(directions, dim=-1), degree)
+    return (basis.unsqueeze(-1) * sh).sum(-2) + 0.5
+
+
+def _degree_2(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+    k0, k1, k2 = _C2
+    return [
+        k0 * x * y,
+        -k0 * y * z,
+        k1 * (2 * z * z - x * x - y * y),
+        -k0 * x * z,
+        k2 * (x * x - y * y),
+    ]
+
+
+def _degree_3(x: Tensor, y: Tensor, z: Tensor) -> list[Tensor]:
+    k0, k1, k2, k3, k4 = _C3
+    xx, yy, zz = x * x, y * y, z * z
+    return [
+        -k0 * y * (3 * xx - yy),
+        k1 * x * y * z,
+        -k2 * y * (4 * zz - xx - yy),
+        k3 * z * (2 * zz - 3 * xx - 3 * yy),
+        -k2 * x * (4 * zz - xx - yy),
+        k4 * z * (xx - yy),
+        -k0 * x * (xx - 3 * yy),
+    ]

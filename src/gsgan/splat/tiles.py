@@ -1,0 +1,431 @@
+"""The portable fast path: tiles of pixels, vectorised torch, a hand-written backward.
+
+The picture is cut into square tiles, and each tile gets the list of ellipses that reach it, front
+to back. Lists are walked in blocks of some layers, all tiles of a chunk at once, so that nearly
+all arithmetic happens in large arrays ``[tiles, layers, pixels]``. Only two recurrences run layer
+by layer, one operation each: the transmittance on the way in, and what is seen behind a layer on
+the way back. Neither takes a logarithm nor divides by ``1 - alpha``, so an opaque layer
+(alpha = 1) and thousands of layers are no special cases.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
+
+from gsgan.splat.project import Projected
+from gsgan.splat.settings import Accuracy
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """How the work is cut up; changes the time and the memory, never the result.
+
+    Args:
+        tile: pixels along the side of a tile.
+        layers: ellipses of a tile's list that are blended at once.
+        block_elements: tiles x layers x pixels held at once, in each of about eight arrays.
+    """
+
+    tile: int = 8
+    layers: int = 16
+    block_elements: int = 1 << 19
+
+    @classmethod
+    def for_device(cls, device: torch.device) -> Tiling:
+        """Blocks that stay in the cache of a CPU, or that fill a GPU."""
+        return cls() if device.type == "cpu" else cls(layers=32, block_elements=1 << 24)
+
+
+def composite(
+    projected: Projected,
+    size: tuple[int, int],
+    settings: Accuracy,
+    want_depth: bool,
+    tiling: Tiling | None = None,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Blends ellipses front to back, ties by index.
+
+    Args:
+        projected: the ellipses.
+        size: (H, W) pixels.
+        settings: alpha_min, transmittance_min, alpha_max, and the extent that ``projected`` holds.
+        want_depth: whether to blend depths too.
+        tiling: how to cut up the work; by default what suits the device.
+
+    Returns:
+        features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``, depth ``[B, 1, H, W]`` or
+        None.
+
+    Source: paper Sec. 3.1; Kerbl et al., 3D Gaussian splatting (tiles).
+    """
+    tiling = tiling or Tiling.for_device(projected.means.device)
+    C = projected.features.shape[-1]
+    # Depth and alpha are blended like features; the value of alpha is 1 in every layer.
+    values = [projected.features, torch.ones_like(projected.depths).unsqueeze(-1)]
+    if want_depth:
+        values.append(projected.depths.unsqueeze(-1))
+    geometry = [projected.means, projected.conics, projected.opacities.unsqueeze(-1)]
+    with torch.no_grad():
+        lists = _tile_lists(projected, size, settings, tiling)
+    blended = _Composite.apply(
+        torch.cat(geometry, dim=-1), torch.cat(values, dim=-1), lists, settings, tiling
+    )
+    alpha = blended[:, C : C + 1]
+    # Rounding may sum the weights to 1 + 1e-7; the gradient is not to stop there.
+    alpha = alpha - (alpha.detach() - 1).clamp_min(0)
+    return blended[:, :C], alpha, blended[:, C + 1 :] if want_depth else None
+
+
+@contextmanager
+def full_precision(device: torch.device) -> Iterator[None]:
+    """Keeps matrix products at the precision of their dtype: no autocast, TF32 or bfloat16."""
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")
+    try:
+        with torch.autocast(device.type, enabled=False):
+            yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+@dataclass(frozen=True)
+class _TileLists:
+    """Who reaches which tile, front to back.
+
+    ``ids[starts[i] : starts[i] + counts[i]]`` are the rows (batch item x N + index) of the i-th
+    listed tile, ``tiles[i]`` its place among all (item, row, column); most layers first.
+    """
+
+    size: tuple[int, int]
+    grid: tuple[int, int]
+    ids: Tensor
+    tiles: Tensor
+    starts: Tensor
+    counts: Tensor
+    box: Tensor | None  # [B * N + 1, 2] half-sizes outside of which nothing is drawn
+
+
+def _tile_lists(
+    projected: Projected, size: tuple[int, int], settings: Accuracy, tiling: Tiling
+) -> _TileLists:
+    (H, W), side = size, tiling.tile
+    grid = (-(-H // side), -(-W // side))
+    B, N = projected.depths.shape
+    order = projected.depths.argsort(dim=1, stable=True)
+    order = (order + N * torch.arange(B, device=order.device).unsqueeze(1)).flatten()
+    order = order[projected.visible.flatten()[order]]
+    first, last = _pixel_box(projected, size, order)
+    first, last = first // side, last // side
+    spans = (last - first + 1).clamp_min(0)
+    rows, tile_xy = _pairs(order, first, spans)
+    if settings.alpha_min > 0:
+        reached = _reaches(projected, rows, tile_xy, size, settings, tiling)
+        rows, tile_xy = rows[reached], tile_xy[reached]
+    tile = (rows // max(N, 1) * grid[0] + tile_xy[:, 1]) * grid[1] + tile_xy[:, 0]
+    tile, by_tile = tile.to(torch.int32).sort(stable=True)
+    tiles, counts = tile.unique_consecutive(return_counts=True)
+    starts = counts.cumsum(0) - counts
+    deepest = counts.argsort(descending=True, stable=True)
+    box = None
+    if settings.extent == "sigma":
+        box = functional.pad(projected.extents.flatten(0, 1), (0, 0, 0, 1))
+    return _TileLists(
+        *(size, grid, rows[by_tile], tiles.long()[deepest], starts[deepest], counts[deepest], box)
+    )
+
+
+def _pixel_box(projected: Projected, size: tuple[int, int], rows: Tensor) -> tuple[Tensor, Tensor]:
+    """First and last pixel (x, y) whose centre is in the footprint, each ``[M, 2]`` int64."""
+    means = projected.means.flatten(0, 1)[rows]
+    extents = projected.extents.flatten(0, 1)[rows]
+    edge = means.new_tensor([size[1], size[0]])
+    # Clamped as floats: footprints reach far beyond what integers hold. Far means are off by
+    # pixels in float32; that is why the box is rounded outwards, not to the nearest.
+    first = torch.minimum((means - extents - 0.5).floor().clamp_min(0), edge)
+    last = torch.minimum((means + extents - 0.5).ceil(), edge - 1).clamp_min(-1)
+    return first.long(), last.long()
+
+
+def _pairs(rows: Tensor, first: Tensor, spans: Tensor) -> tuple[Tensor, Tensor]:
+    """Every (ellipse, tile) pair: rows ``[M]`` in the given order, tiles (x, y) ``[M, 2]``."""
+    counts = spans[:, 0] * spans[:, 1]
+    which = torch.arange(len(rows), device=rows.device).repeat_interleave(counts)
+    step = torch.arange(len(which), device=rows.device) - (counts.cumsum(0) - counts)[which]
+    width = spans[:, 0][which]
+    return rows[which], first[which] + torch.stack([step % width, step // width], dim=-1)
+
+
+def _reaches(
+    projected: Projected,
+    rows: Tensor,
+    tile_xy: Tensor,
+    size: tuple[int, int],
+    settings: Accuracy,
+    tiling: Tiling,
+) -> Tensor:
+    """Whether the ellipse ``alpha >= alpha_min`` meets the pixel centres of the tile.
+
+    The least q over a rectangle lies on the edges that face the mean: a point each, in closed form.
+    """
+    a, b, c = projected.conics.flatten(0, 1)[rows].unbind(-1)
+    opacities = projected.opacities.flatten(0, 1)[rows]
+    low = tile_xy * tiling.tile + 0.5 - projected.means.flatten(0, 1)[rows]
+    high = low + (tiling.tile - 1)
+    (x0, y0), (x1, y1) = low.unbind(-1), high.unbind(-1)
+    x, y = torch.zeros_like(x0).clamp(x0, x1), torch.zeros_like(y0).clamp(y0, y1)
+    y_at_x, x_at_y = (-b * x / c).clamp(y0, y1), (-b * y / a).clamp(x0, x1)
+    q = torch.minimum(
+        a * x * x + 2 * b * x * y_at_x + c * y_at_x * y_at_x,
+        a * x_at_y * x_at_y + 2 * b * x_at_y * y + c * y * y,
+    )
+    # The margin covers the rounding of q itself, which grows with the terms that cancel in it.
+    rounding = 64 * torch.finfo(q.dtype).eps * (1 + a * low.square()[:, 0] + c * low.square()[:, 1])
+    return q <= 2 * torch.log(opacities / settings.alpha_min) + rounding
+
+
+class _Composite(torch.autograd.Function):
+    """``geometry [B, N, 6]`` (x, y, a, b, c, opacity), ``values [B, N, V]`` → ``[B, V, H, W]``."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        geometry: Tensor,
+        values: Tensor,
+        lists: _TileLists,
+        settings: Accuracy,
+        tiling: Tiling,
+    ) -> Tensor:
+        B, _, V = values.shape
+        walk = _Walk(geometry, values, lists, settings, tiling)
+        needs_grad = any(ctx.needs_input_grad)
+        canvas = values.new_zeros(B * lists.grid[0] * lists.grid[1], V, tiling.tile**2)
+        saved: list[list[tuple[Tensor, Tensor]]] = []
+        for chunk in walk.chunks():
+            sums, blocks = walk.forward(chunk, needs_grad)
+            canvas[lists.tiles[chunk]] = sums
+            saved.append(blocks)
+        ctx.save_for_backward(geometry, values)
+        ctx.saved, ctx.lists, ctx.settings, ctx.tiling = saved, lists, settings, tiling
+        return _from_tiles(canvas, B, lists, tiling)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        geometry, values = ctx.saved_tensors
+        walk = _Walk(geometry, values, ctx.lists, ctx.settings, ctx.tiling)
+        canvas = _to_tiles(grad, ctx.lists, ctx.tiling)
+        with full_precision(grad.device):
+            for chunk, blocks in zip(walk.chunks(), ctx.saved, strict=True):
+                walk.backward(chunk, blocks, canvas[ctx.lists.tiles[chunk]])
+        return *walk.gradients(), None, None, None
+
+
+class _Walk:
+    """Walks the lists of tiles block by block, forwards or backwards."""
+
+    def __init__(
+        self,
+        geometry: Tensor,
+        values: Tensor,
+        lists: _TileLists,
+        settings: Accuracy,
+        tiling: Tiling,
+    ) -> None:
+        self.shape = geometry.shape[:2]
+        # One row more, transparent, fills up the last block of each list.
+        self.geometry = _with_empty_row(geometry)
+        self.values = _with_empty_row(values)
+        self.lists, self.settings, self.tiling = lists, settings, tiling
+        self.pixels = tiling.tile**2
+        dtype, device = geometry.dtype, geometry.device
+        axis = torch.arange(tiling.tile, dtype=dtype, device=device) - (tiling.tile - 1) / 2
+        y, x = (axis_.flatten() for axis_ in torch.meshgrid(axis, axis, indexing="ij"))
+        self.xy = torch.stack([x, y])
+        # q is a polynomial of the pixel's place in the tile: one small matrix product gives it.
+        self.basis = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
+        tile = lists.tiles % (lists.grid[0] * lists.grid[1])
+        corner = torch.stack([tile % lists.grid[1], tile // lists.grid[1]], dim=-1)
+        self.centres = (corner * tiling.tile + tiling.tile / 2).to(dtype)
+        # exp of less is 0 or subnormal: slow, and below every alpha_min. Above 0 is rounding.
+        self.least_exponent = math.log(torch.finfo(dtype).tiny)
+        # threshold() keeps what is greater; alphas equal to alpha_min are to be kept.
+        alpha_min = torch.tensor(settings.alpha_min, dtype=dtype)
+        self.below_alpha_min = torch.nextafter(alpha_min, alpha_min - 1).item()
+        self.geometry_grad = torch.zeros_like(self.geometry)
+        self.values_grad = torch.zeros_like(self.values)
+
+    def gradients(self) -> tuple[Tensor, Tensor]:
+        """``[B, N, 6]`` and ``[B, N, V]``."""
+        geometry, values = self.geometry_grad[:-1], self.values_grad[:-1]
+        return geometry.unflatten(0, self.shape), values.unflatten(0, self.shape)
+
+    def chunks(self) -> Iterator[slice]:
+        """Ranges of listed tiles that are walked together."""
+        tiles = max(1, self.tiling.block_elements // (self.tiling.layers * self.pixels))
+        for start in range(0, len(self.lists.tiles), tiles):
+            yield slice(start, min(start + tiles, len(self.lists.tiles)))
+
+    def forward(self, chunk: slice, save: bool) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
+        """Blended values ``[T, V, P]``, and for each block its tiles and incoming transmittance."""
+        starts, counts = self.lists.starts[chunk], self.lists.counts[chunk]
+        sums = self.values.new_zeros(len(starts), self.values.shape[-1], self.pixels)
+        before = self.values.new_ones(len(starts), self.pixels)
+        rows = torch.arange(len(starts), device=starts.device)
+        blocks: list[tuple[Tensor, Tensor]] = []
+        # Most layers first: the tiles that still have some are the first ones.
+        for offset in range(0, int(counts[0]), self.tiling.layers):
+            going = counts[rows] > offset
+            if self.settings.transmittance_min > 0:
+                going &= before.amax(-1) >= self.settings.transmittance_min
+            rows, before = rows[going], before[going]
+            if not len(rows):
+                break
+            if save:
+                blocks.append((rows, before))
+            ids = self._ids(starts[rows], counts[rows], offset)
+            alpha = self._alpha(self._exponential(ids, rows, chunk), ids)[0]
+            weights, before = self._weights(alpha, before)
+            sums.index_add_(0, rows, self.values[ids].mT @ weights)
+        return sums, blocks
+
+    def backward(self, chunk: slice, blocks: list[tuple[Tensor, Tensor]], grad: Tensor) -> None:
+        """Adds a chunk's part of the gradients; ``grad [T, V, P]`` is that of its sums."""
+        starts, counts = self.lists.starts[chunk], self.lists.counts[chunk]
+        # What is seen behind the blocks walked so far, times the gradient: front layers hide it.
+        behind = torch.zeros_like(grad[:, 0])
+        for number, (rows, before) in reversed(list(enumerate(blocks))):
+            ids = self._ids(starts[rows], counts[rows], number * self.tiling.layers)
+            exponential = self._exponential(ids, rows, chunk)
+            alpha, passes = self._alpha(exponential, ids, want_mask=True)
+            assert passes is not None
+            values, grad_here = self.values[ids], grad[rows]
+            transmittance = self._transmittances(alpha, before)[0]
+            if self.settings.transmittance_min > 0:
+                keep = _indicator(transmittance, self.settings.transmittance_min)
+                alpha.mul_(keep)
+                passes.mul_(keep)
+            seen = values @ grad_here
+            hidden, behind[rows] = _behind(alpha, seen, behind[rows])
+            # d picture / d alpha = T (what is here - what is behind).
+            d_alpha = seen.sub_(hidden).mul_(transmittance).mul_(passes)
+            self._add(self.values_grad, ids, alpha.mul_(transmittance) @ grad_here.mT)
+            moments = d_alpha.mul_(exponential).flatten(0, 1) @ self.basis.mT
+            geometry = self._local_geometry(ids, rows, chunk)
+            self._add(self.geometry_grad, ids, _geometry_gradient(geometry, moments))
+
+    def _ids(self, starts: Tensor, counts: Tensor, offset: int) -> Tensor:
+        """``[T, K]`` rows of the ellipses of one block; the empty row past the end of a list."""
+        place = offset + torch.arange(self.tiling.layers, device=starts.device)
+        inside = place < counts.unsqueeze(1)
+        place = torch.where(inside, starts.unsqueeze(1) + place, 0)
+        return torch.where(inside, self.lists.ids[place], len(self.geometry) - 1)
+
+    def _local_geometry(self, ids: Tensor, rows: Tensor, chunk: slice) -> Tensor:
+        """``[T, K, 6]`` with means relative to the middle of the tile."""
+        geometry = self.geometry[ids]
+        geometry[..., :2] -= self.centres[chunk][rows].unsqueeze(1)
+        return geometry
+
+    def _exponential(self, ids: Tensor, rows: Tensor, chunk: slice) -> Tensor:
+        """``exp(-q / 2)``, ``[T, K, P]``."""
+        geometry = self._local_geometry(ids, rows, chunk)
+        x, y, a, b, c, _ = geometry.unbind(-1)
+        to_x, to_y = a * x + b * y, b * x + c * y
+        coefficients = [-0.5 * (x * to_x + y * to_y), to_x, to_y, -0.5 * a, -b, -0.5 * c]
+        q = torch.stack(coefficients, dim=-1).flatten(0, 1) @ self.basis
+        exponential = q.clamp_(self.least_exponent, 0.0).exp_().unflatten(0, ids.shape)
+        if self.lists.box is not None:
+            box = self.lists.box[ids]
+            for axis in range(2):
+                distance = self.xy[axis] - geometry[..., axis, None]
+                exponential.mul_(_indicator(-distance.abs(), -box[..., axis, None]))
+        return exponential
+
+    def _alpha(
+        self, exponential: Tensor, ids: Tensor, want_mask: bool = False
+    ) -> tuple[Tensor, Tensor | None]:
+        """Alphas ``[T, K, P]`` after the cut-offs, and where gradients pass (1 or 0)."""
+        alpha = exponential * self.geometry[:, 5][ids].unsqueeze(-1)
+        passes = None
+        if want_mask:
+            passes = _indicator(alpha, self.settings.alpha_min)
+            if self.settings.alpha_max < 1:
+                passes.mul_(torch.le(alpha, self.settings.alpha_max, out=torch.empty_like(alpha)))
+        if self.settings.alpha_min > 0:
+            alpha = functional.threshold(alpha, self.below_alpha_min, 0.0, inplace=True)
+        return alpha.clamp_(max=self.settings.alpha_max), passes
+
+    def _weights(self, alpha: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights ``[T, K, P]`` and the transmittance ``[T, P]`` behind the block."""
+        weights, after = self._transmittances(alpha, before)
+        if self.settings.transmittance_min > 0:
+            alpha = alpha.mul_(_indicator(weights, self.settings.transmittance_min))
+        return weights.mul_(alpha), after
+
+    def _transmittances(self, alpha: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
+        """Before each layer ``[T, K, P]``, and after the last ``[T, P]``; never stopped."""
+        through, layers = 1 - alpha, torch.empty_like(alpha)
+        layers[:, 0] = before
+        for k in range(1, alpha.shape[1]):
+            torch.mul(layers[:, k - 1], through[:, k - 1], out=layers[:, k])
+        return layers, layers[:, -1] * through[:, -1]
+
+    def _add(self, total: Tensor, ids: Tensor, part: Tensor) -> None:
+        total.index_add_(0, ids.flatten(), part.reshape(-1, part.shape[-1]))
+
+
+def _behind(alpha: Tensor, seen: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
+    """What lies behind each layer ``[T, K, P]``, and behind the layer in front of the block."""
+    layers = torch.empty_like(alpha)
+    layers[:, -1] = behind
+    for k in range(alpha.shape[1] - 1, 0, -1):
+        torch.lerp(layers[:, k], seen[:, k], alpha[:, k], out=layers[:, k - 1])
+    return layers, torch.lerp(layers[:, 0], seen[:, 0], alpha[:, 0])
+
+
+def _geometry_gradient(geometry: Tensor, moments: Tensor) -> Tensor:
+    """Gradients of (x, y, a, b, c, opacity) from sums over pixels of ``dL/dalpha exp(-q/2)``.
+
+    ``moments [T * K, 6]`` are those sums times 1, x, y, x², xy, y².
+    """
+    x, y, a, b, c, opacity = geometry.flatten(0, 1).unbind(-1)
+    one, mx, my, mxx, mxy, myy = moments.unbind(-1)
+    dx, dy = mx - x * one, my - y * one  # first moments about the mean
+    dxx = mxx - x * (mx + dx)
+    dxy = mxy - x * my - y * dx
+    dyy = myy - y * (my + dy)
+    shape = torch.stack([a * dx + b * dy, b * dx + c * dy, -0.5 * dxx, -dxy, -0.5 * dyy], dim=-1)
+    return torch.cat([shape * opacity.unsqueeze(-1), one.unsqueeze(-1)], dim=-1)
+
+
+def _indicator(x: Tensor, least: float | Tensor) -> Tensor:
+    """1 where ``x >= least``, else 0, as numbers: multiplying is faster than selecting."""
+    return torch.ge(x, least, out=torch.empty_like(x))
+
+
+def _with_empty_row(x: Tensor) -> Tensor:
+    return functional.pad(x.detach().flatten(0, 1), (0, 0, 0, 1))
+
+
+def _from_tiles(canvas: Tensor, B: int, lists: _TileLists, tiling: Tiling) -> Tensor:
+    """``[B * rows * columns, V, P]`` → ``[B, V, H, W]``."""
+    (H, W), side = lists.size, tiling.tile
+    tiles = canvas.view(B, *lists.grid, -1, side, side)
+    return tiles.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)[..., :H, :W].contiguous()
+
+
+def _to_tiles(picture: Tensor, lists: _TileLists, tiling: Tiling) -> Tensor:
+    """``[B, V, H, W]`` → ``[B * rows * columns, V, P]``, zeros beyond the edge."""
+    (H, W), side, (rows, columns) = lists.size, tiling.tile, lists.grid
+    padded = functional.pad(picture, (0, columns * side - W, 0, rows * side - H))
+    tiles = padded.unflatten(3, (columns, side)).unflatten(2, (rows, side))
+    return tiles.permute(0, 2, 4, 1, 3, 5).flatten(4, 5).flatten(0, 2)

@@ -1,0 +1,151 @@
+"""Linear blend skinning against what it must be in closed form."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from gsgan.body.lbs import (
+    axis_angle_to_matrix,
+    blend_transforms,
+    forward_kinematics,
+    kinematic_levels,
+    skin,
+)
+
+torch.set_num_threads(1)
+D = torch.float64
+
+
+def rz(degrees: float) -> torch.Tensor:
+    a = math.radians(degrees)
+    c, s = math.cos(a), math.sin(a)
+    return torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=D)
+
+
+CHAIN = torch.tensor([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]], dtype=D)
+
+
+def test_axis_angle_quarter_turn_about_z():
+    R = axis_angle_to_matrix(torch.tensor([0.0, 0.0, math.pi / 2], dtype=D))
+    torch.testing.assert_close(R, rz(90), atol=1e-15, rtol=0)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 9.9e-4, 1.01e-3, 1.0, math.pi, 6.0])
+def test_axis_angle_matches_matrix_exponential(angle):
+    v = angle * torch.tensor([1.0, 2.0, -2.0], dtype=D) / 3
+    K = torch.tensor([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]], dtype=D)
+    torch.testing.assert_close(
+        axis_angle_to_matrix(v), torch.linalg.matrix_exp(K), atol=1e-12, rtol=0
+    )
+
+
+def test_axis_angle_gradient_at_zero_is_the_cross_matrix():
+    v = torch.zeros(3, dtype=D, requires_grad=True)
+    J = torch.autograd.functional.jacobian(axis_angle_to_matrix, v)
+    assert J[2, 1, 0] == 1
+    assert J[1, 2, 0] == -1
+    assert J[0, 0].abs().max() == 0
+
+
+def test_axis_angle_float32_keeps_its_digits_for_small_angles():
+    v = torch.tensor([2e-3, 0.0, 0.0])
+    one_minus_cos = 1 - axis_angle_to_matrix(v.double())[1, 1]
+    error = (1 - axis_angle_to_matrix(v)[1, 1].double()) - one_minus_cos
+    assert error.abs() < 1e-7
+
+
+def test_bent_chain_has_its_end_where_trigonometry_says():
+    rotations = torch.stack([rz(0), rz(90), rz(0)])[None]
+    T = forward_kinematics(CHAIN, (-1, 0, 1), rotations, torch.tensor([[0.0, 0, 5]], dtype=D))
+    tip = T[0, 2] @ torch.tensor([3.0, 0, 0, 1], dtype=D)
+    torch.testing.assert_close(tip, torch.tensor([1.0, 2, 5, 1], dtype=D), atol=1e-15, rtol=0)
+
+
+def test_root_turns_about_its_own_joint():
+    joints = torch.tensor([[1.0, 0, 0]], dtype=D)
+    T = forward_kinematics(joints, (-1,), rz(180)[None, None], torch.zeros(1, 3, dtype=D))
+    end = T[0, 0] @ torch.tensor([2.0, 0, 0, 1], dtype=D)
+    torch.testing.assert_close(end[:3], torch.zeros(3, dtype=D), atol=1e-15, rtol=0)
+
+
+def test_rest_pose_is_the_identity():
+    eye = torch.eye(3, dtype=D).expand(2, 3, 3, 3)
+    T = forward_kinematics(CHAIN, (-1, 0, 1), eye, torch.zeros(2, 3, dtype=D))
+    assert torch.equal(T, torch.eye(4, dtype=D).expand(2, 3, 4, 4))
+
+
+def test_siblings_do_not_move_each_other():
+    joints = torch.tensor([[0.0, 0, 0], [1, 0, 0], [-1, 0, 0]], dtype=D)
+    rotations = torch.stack([rz(0), rz(40), rz(0)])[None]
+    T = forward_kinematics(joints, (-1, 0, 0), rotations, torch.zeros(1, 3, dtype=D))
+    torch.testing.assert_close(T[0, 2], torch.eye(4, dtype=D))
+    assert not torch.allclose(T[0, 1], torch.eye(4, dtype=D))
+
+
+def test_half_and_half_weights_average_the_two_bones():
+    a, b = torch.eye(4, dtype=D), torch.eye(4, dtype=D)
+    a[:3, 3] = torch.tensor([2.0, 0, 0])
+    b[:3, :3] = rz(180)
+    A, t = blend_transforms(
+        torch.stack([a, b])[None], torch.tensor([[0, 1]]), torch.tensor([[0.5, 0.5]], dtype=D)
+    )
+    expected = torch.diag(torch.tensor([0.0, 0.0, 1.0], dtype=D))  # the collapse LBS is known for
+    torch.testing.assert_close(A[0, 0], expected, atol=1e-15, rtol=0)
+    torch.testing.assert_close(t[0, 0], torch.tensor([1.0, 0, 0], dtype=D))
+
+
+def test_weights_are_renormalised():
+    T = torch.eye(4, dtype=D).repeat(1, 2, 1, 1)
+    T[0, 1, 0, 3] = 4
+    _, t = blend_transforms(T, torch.tensor([[0, 1]]), torch.tensor([[30, 90]], dtype=torch.uint8))
+    assert t[0, 0, 0] == 3
+
+
+def test_skin_applies_the_affine_map():
+    A, t = 2 * torch.eye(3, dtype=D).expand(1, 1, 3, 3), torch.ones(1, 1, 3, dtype=D)
+    assert skin(torch.tensor([[1.0, 2, 3]], dtype=D), A, t).tolist() == [[[3, 5, 7]]]
+
+
+def test_gradients_agree_with_finite_differences():
+    index = torch.tensor([[0, 1], [1, 2], [2, 0]])
+    weight = torch.tensor([[0.5, 0.5], [0.2, 0.8], [1.0, 0.0]], dtype=D)
+    points = torch.tensor([[0.5, 0.1, 0], [1.5, 0, 0.2], [2.5, 0.3, 0]], dtype=D)
+
+    def posed(theta, transl):
+        T = forward_kinematics(CHAIN, (-1, 0, 1), axis_angle_to_matrix(theta), transl)
+        return skin(points, *blend_transforms(T, index, weight))
+
+    generator = torch.Generator().manual_seed(0)
+    theta = torch.randn(2, 3, 3, dtype=D, generator=generator)
+    theta[0, 1] = 0
+    transl = torch.randn(2, 3, dtype=D, generator=generator)
+    assert torch.autograd.gradcheck(
+        posed, (theta.requires_grad_(), transl.requires_grad_()), atol=1e-6
+    )
+
+
+def test_levels_put_parents_first():
+    assert kinematic_levels((-1, 0, 0, 1, 3)) == [[0], [1, 2], [3], [4]]
+    with pytest.raises(ValueError, match="parent 2 for joint 1"):
+        kinematic_levels((-1, 2, 0))
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments"),
+    [
+        ("joints", (CHAIN[:2], (-1, 0, 1), torch.zeros(1, 3, 3, 3), torch.zeros(1, 3))),
+        ("rotations", (CHAIN, (-1, 0, 1), torch.zeros(1, 2, 3, 3), torch.zeros(1, 3))),
+        ("transl", (CHAIN, (-1, 0, 1), torch.zeros(2, 3, 3, 3), torch.zeros(1, 3))),
+    ],
+)
+def test_wrong_shapes_name_the_argument(name, arguments):
+    with pytest.raises(ValueError, match=name):
+        forward_kinematics(*arguments)
+
+
+def test_vertices_without_weight_are_refused():
+    with pytest.raises(ValueError, match="1 vertices without"):
+        blend_transforms(torch.eye(4).repeat(1, 1, 1, 1), torch.tensor([[0]]), torch.zeros(1, 1))

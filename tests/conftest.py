@@ -1,0 +1,82 @@
+"""Fixtures of all tests: few threads, a tiny capture, a tiny avatar's config."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from omegaconf import DictConfig
+
+import gsgan.compat  # noqa: F401  (before anything imports torchvision)
+
+sys.path.insert(0, str(Path(__file__).parent / "data"))
+torch.set_num_threads(1)  # tensors here are tiny: more threads only wait for each other
+
+
+@pytest.fixture(scope="session")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small capture with labels and body poses: 3 cameras (one held out), 6 frames (2 held)."""
+    from make import write_tiny_capture
+
+    splits = {
+        "train_cameras": ["cam00", "cam01"],
+        "test_cameras": ["cam02"],
+        "train_frames": [0, 1, 2, 3],
+        "test_frames": [4, 5],
+    }
+    return write_tiny_capture(
+        tmp_path_factory.mktemp("capture"),
+        cameras=3,
+        frames=6,
+        size=(48, 48),
+        labels=True,
+        body_pose=True,
+        splits=splits,
+    )
+
+
+@pytest.fixture
+def compose():
+    """Composes a config as the command line does: ``compose("train", "model=wo_seg")``."""
+    from hydra import compose as hydra_compose
+    from hydra import initialize_config_dir
+
+    from gsgan.config import config_folder
+
+    def run(name: str, *overrides: str) -> DictConfig:
+        with initialize_config_dir(str(config_folder()), version_base="1.3"):
+            return hydra_compose(name, overrides=list(overrides))
+
+    return run
+
+
+TINY = ("size=tiny", "training=smoke", "data=capture", "data.size=32", "data.crop=null")
+
+
+@pytest.fixture
+def tiny(compose, capture):
+    """The tiny training config on the tiny capture, with further overrides."""
+
+    def run(*overrides: str) -> DictConfig:
+        return compose("train", *TINY, f"data.root={capture}", *overrides)
+
+    return run
+
+
+@pytest.fixture
+def build(tiny):
+    """(data, avatar, frame) of a tiny config: everything real, everything small."""
+    from hydra.utils import instantiate
+
+    from gsgan.runs import build_avatar
+
+    def run(*overrides: str):
+        torch.manual_seed(0)
+        config = tiny(*overrides)
+        data = instantiate(config.data)
+        data.setup()
+        return data, build_avatar(config, data), data.dataset("train")[0]
+
+    return run

@@ -1,0 +1,451 @@
+"""Splits, sampling order, loaders, what the scene is said to be like, and the config files."""
+
+from __future__ import annotations
+
+import functools
+import json
+import logging
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from make import skeletons, write_landmarks, write_tiny_capture
+
+from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order, unsupported
+from gsgan.data.layout import Layout
+from gsgan.data.splits import make_splits, parse_frames, parse_names
+from gsgan.errors import ConfigError, DataError, GsganError
+from gsgan.scene import Frame
+
+# isort: split
+import lightning
+from hydra import compose, initialize_config_dir
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+from torch import nn
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three cameras, ten frames, labels and poses."""
+    root = tmp_path_factory.mktemp("data") / "capture"
+    return write_tiny_capture(root, cameras=3, frames=10, labels=True, body_pose=True)
+
+
+@pytest.fixture(scope="module")
+def layout(capture: Path) -> Layout:
+    return Layout.read(capture)
+
+
+# --- splits -------------------------------------------------------------------------------------
+
+
+def test_default_splits_hold_out_the_last_frames(layout: Layout) -> None:
+    splits = make_splits(layout)
+    assert splits.train_cameras == ("cam00", "cam01", "cam02")
+    assert splits.train_frames == tuple(range(8))
+    assert splits.test_frames == (8, 9)
+    assert len(splits.items["train"]) == 24
+    assert splits.items["novel_view"] == ()
+    assert splits.reasons == {"novel_view": "no camera is held out (data.test_cameras)"}
+    assert set(splits.items["novel_pose"]) == {(c, f) for c in layout.cameras for f in (8, 9)}
+    assert make_splits(layout, test_share=0).reasons["novel_pose"].startswith("no frame")
+
+
+def test_splits_of_the_config_with_ranges_and_the_rest(layout: Layout) -> None:
+    splits = make_splits(layout, test_cameras=["cam01"], train_frames=["0-2", 5])
+    assert splits.train_cameras == ("cam00", "cam02")
+    assert splits.test_frames == (3, 4, 6, 7, 8, 9)
+    assert set(splits.items["novel_view"]) == {("cam01", f) for f in (0, 1, 2, 5)}
+    assert {f for _, f in splits.items["novel_pose"]} == {3, 4, 6, 7, 8, 9}
+    assert splits.reasons == {}
+    assert make_splits(layout, train_cameras=["cam02"]).test_cameras == ("cam00", "cam01")
+    assert make_splits(layout, test_frames="4-5").train_frames == (0, 1, 2, 3, 6, 7, 8, 9)
+
+
+def test_splits_of_meta_json_give_way_to_the_config(tmp_path: Path) -> None:
+    held = {"test_cameras": ["cam01"], "train_frames": [0, 1], "test_frames": [2, 3]}
+    layout = Layout.read(write_tiny_capture(tmp_path, splits=held))
+    splits = make_splits(layout)
+    assert (splits.train_cameras, splits.test_cameras) == (("cam00",), ("cam01",))
+    assert (splits.train_frames, splits.test_frames) == ((0, 1), (2, 3))
+    mine = make_splits(layout, test_cameras=[], test_frames=[0])
+    assert (mine.train_cameras, mine.test_cameras) == (("cam00", "cam01"), ())
+    assert (mine.train_frames, mine.test_frames) == ((1, 2, 3), (0,))
+
+
+def test_frames_that_are_not_there_are_noted(layout: Layout) -> None:
+    splits = make_splits(layout, train_frames="5-20", test_frames=[0, 99])
+    assert (splits.train_frames, splits.test_frames) == ((5, 6, 7, 8, 9), (0,))
+    assert splits.notes == ("12 frames of the splits are not usable or not there: 10-20, 99",)
+
+
+@pytest.mark.parametrize(
+    ("keys", "error", "message"),
+    [
+        ({"train_cameras": ["cam9"]}, DataError, "has no camera cam9; it has cam00, cam01, cam02"),
+        ({"test_cameras": "cam9"}, DataError, "has no camera cam9; it has cam00, cam01, cam02"),
+        ({"train_frames": "50-60"}, DataError, "nothing to train on .* 0 train frames; .* 0-9"),
+        ({"train_cameras": []}, DataError, "nothing to train on with cameras none"),
+        (
+            {"train_cameras": ["cam00"], "test_cameras": ["cam00"]},
+            ConfigError,
+            "data.train_cameras and data.test_cameras share cam00",
+        ),
+        ({"train_frames": "0-5", "test_frames": "5-9"}, ConfigError, "share 5"),
+        ({"train_frames": "5-0"}, ConfigError, "data.train_frames must be frame numbers .*'5-0'"),
+        ({"train_frames": "all"}, ConfigError, "data.train_frames must be frame numbers .*'all'"),
+        ({"test_frames": 0.5}, ConfigError, "data.test_frames must be frame numbers .* 0.5"),
+        ({"train_cameras": 1.5}, ConfigError, "data.train_cameras must be a list of camera names"),
+        ({"test_share": 1.0}, ConfigError, r"data.test_share must be in \[0, 1\)"),
+    ],
+)
+def test_splits_that_cannot_be(
+    layout: Layout, keys: dict[str, Any], error: type[GsganError], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        make_splits(layout, **keys)
+
+
+def test_frames_and_names_are_parsed() -> None:
+    assert parse_frames("3-5, 1,4", "x") == (1, 3, 4, 5)
+    assert parse_frames([2, "7", "0-1"], "x") == (0, 1, 2, 7)
+    assert parse_frames(6, "x") == (6,)
+    assert parse_frames(OmegaConf.create([3, "5-6"]), "x") == (3, 5, 6)
+    assert parse_names("a, b", "x") == ("a", "b")
+    assert parse_names(OmegaConf.create(["a", "a", 7]), "x") == ("a", "7")
+    assert parse_names(7, "x") == ("7",)
+
+
+# --- order --------------------------------------------------------------------------------------
+
+
+def draws(sampler: StepSampler, epochs: Iterator[int] | range) -> list[int]:
+    order = []
+    for epoch in epochs:
+        sampler.set_epoch(epoch)
+        order += list(sampler)
+    return order
+
+
+def test_every_pass_takes_each_item_once_across_epochs() -> None:
+    order = draws(StepSampler(items=7, batch_size=2, steps=5, seed=3), range(7))
+    assert len(order) == 70
+    passes = [order[i : i + 7] for i in range(0, 70, 7)]
+    assert all(sorted(p) == list(range(7)) for p in passes)
+    assert len({tuple(p) for p in passes}) > 5
+
+
+def test_a_resumed_run_sees_the_order_of_an_unbroken_one() -> None:
+    whole = draws(StepSampler(7, 2, 5, seed=3), range(6))
+    assert draws(StepSampler(7, 2, 5, seed=3), range(4, 6)) == whole[40:]
+    assert draws(StepSampler(7, 2, 5, seed=4), range(6)) != whole
+    assert torch.equal(pass_order(9, 0, 5), pass_order(9, 0, 5))
+    assert not torch.equal(pass_order(9, 0, 5), pass_order(9, 1, 4))
+
+
+def test_processes_share_the_draws_of_a_step() -> None:
+    alone = draws(StepSampler(11, 4, 6, seed=0), range(2))
+    pair = [draws(StepSampler(11, 2, 6, seed=0, replicas=2, rank=r), range(2)) for r in (0, 1)]
+    joined = [pair[r][2 * s + i] for s in range(12) for r in (0, 1) for i in (0, 1)]
+    assert joined == alone
+
+
+class Recorder(lightning.LightningModule):
+    """Notes which pictures come in which order."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(()))
+        self.seen: list[tuple[int, int]] = []
+        self.validated: list[int] = []
+
+    def training_step(self, batch: Frame, index: int) -> torch.Tensor:
+        assert isinstance(batch, Frame)
+        self.seen += zip(batch.camera_index.tolist(), batch.frame_id.tolist(), strict=True)
+        return self.weight * batch.image.mean()
+
+    def validation_step(self, batch: Frame, index: int, dataloader_idx: int = 0) -> None:
+        self.validated.append(dataloader_idx)
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def fit(capture: Path, folder: Path, epochs: int, ckpt: Path | None = None) -> Recorder:
+    data = GsganData(str(capture), batch_size=2, steps_per_epoch=3, seed=5, test_cameras=["cam01"])
+    model = Recorder()
+    trainer = lightning.Trainer(
+        default_root_dir=folder,
+        max_epochs=epochs,
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+    )
+    trainer.fit(model, datamodule=data, ckpt_path=ckpt)
+    trainer.save_checkpoint(folder / "last.ckpt")
+    return model
+
+
+def test_lightning_trains_validates_and_resumes_in_order(capture: Path, tmp_path: Path) -> None:
+    whole = fit(capture, tmp_path / "whole", 4)
+    assert len(whole.seen) == 4 * 3 * 2
+    assert len(whole.validated) == 4 * 2  # 4 held-out pictures in twos, every epoch
+    assert len(set(whole.seen[:16])) == 16  # 2 cameras × 8 frames, one pass
+    first = fit(capture, tmp_path / "part", 2)
+    second = fit(capture, tmp_path / "part", 4, ckpt=tmp_path / "part" / "last.ckpt")
+    assert first.seen + second.seen == whole.seen
+
+
+# --- the module ---------------------------------------------------------------------------------
+
+
+def test_loaders_and_datasets(capture: Path) -> None:
+    data = GsganData(str(capture), size=16, batch_size=2, test_cameras=["cam02"], crop="person")
+    batch = next(iter(data.train_dataloader()))
+    assert isinstance(batch, Frame)
+    assert batch.image.shape == (2, 3, 16, 16)
+    assert len(data.train_dataloader()) == 8  # 2 cameras × 8 frames in twos
+    assert data.eval_names == ("novel_view", "novel_pose")
+    assert data.reasons == {}
+    views, poses = data.test_dataloader()
+    assert [int(i) for frame in views for i in frame.camera_index] == [2] * 8
+    assert [int(i) for frame in poses for i in frame.frame_id] == [8, 9, 8, 9]
+    with pytest.raises(ValueError, match="split must be one of train, novel_view, novel_pose"):
+        data.dataset("test")
+
+
+def test_workers_load_the_same(capture: Path) -> None:
+    alone = GsganData(str(capture), size=16, batch_size=2, steps_per_epoch=2)
+    helped = GsganData(str(capture), size=16, batch_size=2, steps_per_epoch=2, workers=1)
+    for a, b in zip(alone.train_dataloader(), helped.train_dataloader(), strict=True):
+        assert torch.equal(a.image, b.image)
+        assert torch.equal(a.frame_id, b.frame_id)
+    assert alone.dataset("train").cache.limit == 2 * helped.dataset("train").cache.limit
+
+
+def test_empty_split_has_no_loader_but_a_reason(capture: Path) -> None:
+    data = GsganData(str(capture), test_share=0)
+    assert data.test_dataloader() == []
+    assert set(data.reasons) == {"novel_view", "novel_pose"}
+
+
+def watched(**keys: Any) -> list[tuple[int, int]]:
+    frames = list(GsganData(**keys).val_dataloader())
+    return [(int(f.camera_index), int(f.frame_id)) for f in frames]
+
+
+def test_pictures_watched_while_training_are_spread_over_held_out_poses(capture: Path) -> None:
+    keys = {"root": str(capture), "test_frames": "5-9"}
+    assert watched(**keys, val_pictures=99) == [(c, f) for c in range(3) for f in range(5, 10)]
+    assert watched(**keys, val_pictures=3) == [(0, 7), (1, 7), (2, 7)]
+    # without held-out poses: held-out cameras, and without those: training
+    none = {"root": str(capture), "test_share": 0, "val_pictures": 2}
+    assert {c for c, _ in watched(**none, test_cameras=["cam01"])} == {1}
+    assert len(watched(**none)) == 2
+
+
+def test_the_source_is_called_when_data_is_needed_only(capture: Path) -> None:
+    calls = []
+
+    def make(root: Path) -> Path:
+        calls.append(root)
+        return root
+
+    data = GsganData(source=functools.partial(make, capture))
+    assert calls == []
+    data.prepare_data()
+    assert calls == [capture]
+    assert data.layout.root == capture
+
+
+def test_notes_reach_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    root = write_tiny_capture(tmp_path, frames=4, unit="mm")
+    with caplog.at_level(logging.WARNING, logger="gsgan"):
+        GsganData(str(root), test_frames=[3, 77]).setup()
+    assert "lengths converted from mm to metres" in caplog.text
+    assert "1 frames of the splits are not usable or not there: 77" in caplog.text
+
+
+def test_scene_info(capture: Path) -> None:
+    info = GsganData(str(capture), size=24, test_cameras=["cam02"]).info
+    assert info.camera_names == ("cam00", "cam01", "cam02")
+    assert info.n_train_cameras == 2
+    assert not info.has_distortion
+    assert info.has_labels
+    assert info.n_labels == 3
+    assert info.has_body_pose
+    assert info.body is None
+    assert info.skeleton == "mediapipe33"
+    assert (info.up_axis, info.fps, info.frames) == ("z", 30.0, 8)
+    expected = skeletons(10)[:8].mean(1)
+    assert np.allclose(info.centre, np.median(expected, axis=0), atol=0.02)
+    # arms and legs of the stick figure: (0.278 + 0.224 + 0.45 + 0.4) metres a side, hands and feet
+    assert 3.0 < info.body_height < 4.5
+    assert set(info.foreground) == {"cam00", "cam01"}
+    red, _, blue = info.foreground["cam00"]
+    assert red == pytest.approx(200 / 255, abs=0.03)
+    assert blue == pytest.approx(60 / 255, abs=0.03)
+    json.dumps(asdict(info))  # plain values, so that a checkpoint can hold it
+
+
+def test_scene_info_sees_the_lens_of_training_cameras_only(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path, meta={"body": "free"})
+    rig = json.loads((root / "cameras.json").read_text())
+    rig["cam01"]["dist"] = [0.1, 0, 0, 0]
+    (root / "cameras.json").write_text(json.dumps(rig))
+    assert GsganData(str(root)).info.has_distortion
+    info = GsganData(str(root), test_cameras=["cam01"]).info
+    assert not info.has_distortion
+    assert not info.has_labels
+    assert not info.has_body_pose
+    assert info.n_labels == 0
+    assert info.body == "free"
+
+
+def test_labels_are_counted_without_the_ignore_value(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path, cameras=1, frames=2, labels=True)
+    cv2.imwrite(str(root / "labels/cam00/000001.png"), np.full((24, 32), 255, np.uint8))
+    layout = Layout.read(root)
+    assert count_labels(layout, (("cam00", 0), ("cam00", 1))) == 3
+    assert count_labels(layout, (("cam00", 1),)) == 1
+    names = write_tiny_capture(tmp_path / "n", labels=True, meta={"label_names": list("abcde")})
+    assert count_labels(Layout.read(names), ()) == 5
+
+
+def test_body_height_passes_over_frames_with_holes(tmp_path: Path) -> None:
+    whole = GsganData(str(write_tiny_capture(tmp_path, frames=9))).info.body_height
+    p = skeletons(9)
+    p[:3, 27:] = np.nan
+    write_landmarks(tmp_path, p=p, frame_id=np.arange(9))
+    assert GsganData(str(tmp_path)).info.body_height == pytest.approx(whole, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"batch_size": 0}, "data.batch_size must be a number of at least 1, got 0"),
+        ({"steps_per_epoch": 0}, "data.steps_per_epoch must be a number of at least 1"),
+        ({"workers": -1}, "data.workers must be a number of at least 0"),
+        ({"seed": -1}, "data.seed must be a number of at least 0"),
+        ({"cache_mb": "much"}, "data.cache_mb must be a number of at least 0, got 'much'"),
+        ({"crop": "face"}, "data.crop must be null or person, got 'face'"),
+        ({"root": None}, "data.root is not set: give the folder of a capture"),
+    ],
+)
+def test_config_values_out_of_range(capture: Path, keys: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        GsganData(**({"root": str(capture)} | keys))
+
+
+def test_batches_need_one_size(capture: Path) -> None:
+    GsganData(str(capture), batch_size=2).setup()
+    with pytest.raises(ConfigError, match=r"data.size is not set and pictures differ in size"):
+        GsganData(str(capture), batch_size=2, crop="person").setup()
+
+
+# --- config files -------------------------------------------------------------------------------
+
+
+def conf(name: str, *overrides: str) -> Any:
+    """The data group as the entry points compose it, keys of the group itself overridden."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        chosen = [f"+data={name}", *(o if o[0] == "+" else f"data.{o}" for o in overrides)]
+        return compose(overrides=chosen).data
+
+
+@pytest.mark.parametrize("name", ["capture", "zju_mocap", "thuman4"])
+def test_a_dataset_without_root_says_so(name: str) -> None:
+    with pytest.raises(InstantiationException) as caught:
+        instantiate(conf(name))
+    cause = caught.value.__cause__
+    assert isinstance(cause, ConfigError)
+    assert str(cause).startswith("data.root is not set: give the folder of a ")
+
+
+def test_capture_config_builds_and_reads(capture: Path) -> None:
+    data = instantiate(conf("capture", f"root={capture}", "size=20", "train_frames=0-3"))
+    assert len(data.dataset("train")) == 12
+    assert data.dataset("train")[0].image.shape == (1, 3, 20, 20)
+    assert data.crop.margin == conf("capture").crop.margin
+    wide = instantiate(conf("capture", f"root={capture}", "crop.margin=0.5"))
+    assert wide.crop.margin == 0.5
+    assert instantiate(conf("capture", f"root={capture}", "crop=null")).crop is None
+    assert instantiate(conf("capture", f"root={capture}", "crop=person")).crop is not None
+
+
+def test_synthetic_config_reads_what_the_generator_would_make(capture: Path) -> None:
+    """The generator is not run here: its parameters are checked, its folder replaced."""
+    from gsgan.data.synthetic.scene_setup import Settings
+
+    data = instantiate(conf("synthetic", "size=48", "source.frames=12", "source.test_frames=3"))
+    assert data.source.func.__name__ == "ensure_synthetic"
+    given = dict(data.source.keywords)
+    assert given.pop("workers") == 2
+    settings = Settings.from_parameters(given)
+    assert (settings.size, settings.frames) == (48, 12)
+    made = instantiate(conf("synthetic", f"root={capture}"))
+    assert made.dataset("train")[0].image.shape[-2:] == (128, 128)
+
+
+@pytest.mark.parametrize("name", ["capture", "synthetic"])
+def test_other_groups_set_size_seed_and_length_of_an_epoch(name: str) -> None:
+    alone = conf(name)
+    assert (alone.seed, alone.steps_per_epoch) == (0, None)
+    among = conf(name, "+seed=7", "+training={schedule: {epoch: 250}}")
+    assert (among.seed, among.steps_per_epoch) == (7, 250)
+    with_group = conf(name, "+size=tiny")
+    assert with_group.size == 32
+    assert conf(name, "size=77").size == 77
+    assert conf(name).size in (128, 256)
+    if name == "synthetic":
+        assert with_group.source.size == 32
+
+
+def test_a_wrong_root_says_so(tmp_path: Path) -> None:
+    data = instantiate(conf("capture", f"root={tmp_path / 'no'}"))
+    with pytest.raises(DataError, match=r"data.root=.*no does not exist"):
+        data.setup()
+
+
+@pytest.mark.parametrize("name", ["zju_mocap", "thuman4"])
+def test_layouts_that_are_not_read_yet(name: str, tmp_path: Path) -> None:
+    for root, message in [
+        (tmp_path / "no", "does not exist; expected the folder of a "),
+        (tmp_path, "is not supported yet; convert it to the bring-your-own layout"),
+    ]:
+        with pytest.raises(InstantiationException) as caught:
+            instantiate(conf(name, f"root={root}"))
+        assert isinstance(caught.value.__cause__, DataError)
+        assert message in str(caught.value.__cause__)
+
+
+def test_unsupported_names_the_layout(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="reading the ZJU-MoCap layout is not supported yet"):
+        unsupported("ZJU-MoCap", "a subject", str(tmp_path))
+
+
+# --- the real capture ---------------------------------------------------------------------------
+
+
+def test_real_capture_splits_and_scene(real_capture: Path) -> None:
+    data = GsganData(str(real_capture), size=64, crop="person", info_samples=2)
+    assert len(data.dataset("train")) == 4 * 56
+    assert data.splits.test_frames == tuple(range(56, 70))
+    assert set(data.reasons) == {"novel_view"}
+    assert len(data.dataset("novel_pose")) == 4 * 14
+    assert data.info.n_train_cameras == 4
+    assert 3.4 < data.info.body_height < 4.8  # 2.4 times the stature, about
+    colours = np.array(list(data.info.foreground.values()))
+    assert np.ptp(colours, axis=0).max() > 0.02  # white balance differs between the cameras

@@ -1,0 +1,137 @@
+"""Generator, discriminator, pose encoders, encoding: shapes, starts, gradients, hard inputs."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsgan.model.discriminator import Discriminator
+from gsgan.model.encoding import encoded_size, positional_encoding
+from gsgan.model.generator import Generator, Style
+from gsgan.model.pose_graph import PoseGraph, PoseLinear
+from gsgan.skeleton import MEDIAPIPE33
+
+
+def generator(**options) -> Generator:
+    return Generator(5, 4, 8, 35, base=4, **options)
+
+
+def inputs(height: int, width: int, batch: int = 2):
+    torch.manual_seed(0)
+    F = torch.rand(batch, 5, height, width)
+    S = torch.rand(batch, 4, height, width)
+    return F, S, torch.rand(batch, 8, height, width), torch.randn(batch, 35)
+
+
+@pytest.mark.parametrize("size", [(32, 32), (17, 33), (16, 1)])
+def test_generator_takes_any_size(size):
+    image = generator()(*inputs(*size))
+    assert image.shape == (2, 3, *size)
+    assert torch.isfinite(image).all()
+
+
+def test_generator_with_rgb_skip_starts_at_step_one_colour():
+    F, S, p2d, g = inputs(16, 16)
+    torch.testing.assert_close(generator(rgb_skip=True)(F, S, p2d, g), F[:, :3], rtol=0, atol=0)
+
+
+def test_generator_without_segmentation_has_fewer_inputs():
+    F, _, p2d, g = inputs(16, 16)
+    without = Generator(5, 0, 8, 35, base=4)
+    assert without(F, None, p2d, g).shape == (2, 3, 16, 16)
+    assert without.content.stem.in_channels == generator().content.stem.in_channels - 4
+
+
+def test_generator_uses_every_input():
+    """Each of F, S, p2D and g moves the picture once the style has left its zero start."""
+    torch.manual_seed(1)
+    net = generator()
+    for style in [m for m in net.modules() if isinstance(m, Style)]:
+        torch.nn.init.normal_(style.from_pose.weight, std=0.1)
+        torch.nn.init.normal_(style.from_map.weight, std=0.1)
+    given = [x.requires_grad_() for x in inputs(16, 16)]
+    net(*given).square().sum().backward()
+    assert all(x.grad is not None and float(x.grad.abs().max()) > 0 for x in given)
+
+
+def test_generator_on_empty_pixels_is_finite_with_finite_gradients():
+    F, S, p2d, g = (torch.zeros_like(x).requires_grad_() for x in inputs(16, 16))
+    net = generator()
+    net(F, S, p2d, g).sum().backward()
+    assert all(torch.isfinite(p.grad).all() for p in net.parameters() if p.grad is not None)
+
+
+def test_generator_clamps_unbounded_features():
+    F, S, p2d, g = inputs(16, 16)
+    net = generator(feature_bound=10.0)
+    torch.testing.assert_close(net(F * 1e9, S, p2d, g), net(F.clamp_min(1) * 1e3, S, p2d, g))
+
+
+def test_generator_sigmoid_stays_in_range():
+    image = generator(output="sigmoid")(*inputs(16, 16))
+    assert ((image > 0) & (image < 1)).all()
+
+
+@pytest.mark.parametrize("options", [{"output": "tanh"}, {"rgb_skip": True, "output": "sigmoid"}])
+def test_generator_refuses_contradictions(options):
+    with pytest.raises(ValueError, match="output"):
+        generator(**options)
+
+
+def test_style_starts_as_plain_normalisation():
+    style = Style(6, 3, 35)
+    h = torch.randn(1, 6, 4, 4)
+    out = style(h, torch.randn(1, 3, 4, 4), torch.randn(1, 35))
+    torch.testing.assert_close(out.square().mean(1), torch.ones(1, 4, 4), atol=1e-4, rtol=0)
+    assert torch.isfinite(style(h * 0, torch.randn(1, 3, 4, 4), torch.randn(1, 35))).all()
+
+
+def test_discriminator_judges_every_scale():
+    maps = Discriminator(scales=2, base=4, layers=3)(torch.rand(2, 3, 32, 32))
+    assert len(maps) == 2
+    assert [len(scale) for scale in maps] == [4, 4]  # three feature maps and the logits
+    assert maps[0][-1].shape[1] == 1
+    assert maps[0][0].shape[-1] == 2 * maps[1][0].shape[-1]
+
+
+def test_discriminator_refuses_pictures_that_normalisation_would_erase():
+    with pytest.raises(ValueError, match="too small"):
+        Discriminator(scales=2, base=4, layers=4)(torch.rand(1, 3, 16, 16))
+
+
+def test_pose_graph_spreads_along_edges_only():
+    """Two graph layers: the left hand cannot reach the right foot's number."""
+    torch.manual_seed(0)
+    graph = PoseGraph(width=8, joint_channels=4, octaves=1)
+    omega = torch.randn(1, 33, 6, requires_grad=True)
+    g = graph(omega, torch.zeros(1, 33, 3))
+    assert g.shape == (1, 35)
+    edge = MEDIAPIPE33.edges.index((30, 32))
+    g[0, edge].backward()
+    touched = omega.grad.abs().sum(-1)[0] > 0
+    assert bool(touched[32])
+    assert not bool(touched[19])
+
+
+def test_pose_graph_connects_face_and_body():
+    graph = PoseGraph(width=4, joint_channels=2, octaves=0)
+    reach = graph.layers[0].mask
+    for _ in range(33):
+        reach = ((reach @ reach) > 0).float()
+    assert bool((reach > 0).all())
+
+
+def test_pose_linear_has_the_papers_size():
+    """g = W p + b: 99 x 35 + 35 numbers."""
+    linear = PoseLinear()
+    assert sum(p.numel() for p in linear.parameters()) == 99 * 35 + 35
+    assert linear(torch.zeros(2, 33, 6), torch.randn(2, 33, 3)).shape == (2, 35)
+
+
+def test_positional_encoding_values():
+    x = torch.tensor([[0.25, -0.5]])
+    code = positional_encoding(x, 2)
+    assert code.shape[-1] == encoded_size(2, 2)
+    expected = torch.tensor([0.25 * torch.pi, 0.5 * torch.pi, -0.5 * torch.pi, -torch.pi]).sin()
+    torch.testing.assert_close(code[0, 2:6], expected)
+    assert positional_encoding(x, 0) is x

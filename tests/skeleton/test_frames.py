@@ -1,0 +1,289 @@
+"""Bone frames and Ω: rotations everywhere, motion with the body, finite at the singular poses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skeleton_poses import DEGENERATE, REST, assert_rotation, noisy, rest, rotation
+from torch import Tensor
+
+from gsgan.skeleton import MEDIAPIPE33, bone_frames, omega, rotation_from_6d
+from gsgan.skeleton.frames import BoneFrames, Swing
+from gsgan.skeleton.template import CHEST, HEAD, N_HUBS, PELVIS
+
+LIMB = {limb: k for k, limb in enumerate(MEDIAPIPE33.limbs)}
+TWISTS: tuple[Any, ...] = ("none", "hinge")
+
+
+def all_rotations(f: BoneFrames) -> Tensor:
+    return torch.cat([f.hubs, f.limbs, f.local, f.torso.unsqueeze(1)], dim=1)
+
+
+def test_rest_hubs_are_the_body_axes() -> None:
+    f = bone_frames(rest())
+    eye = torch.eye(3, dtype=torch.float64)
+    torch.testing.assert_close(f.hubs[0], eye.expand(3, 3, 3), atol=1e-12, rtol=0)
+    torch.testing.assert_close(f.torso[0], eye, atol=1e-12, rtol=0)
+
+
+def test_limb_frames_point_along_the_bones() -> None:
+    p = noisy(0, batch=3)
+    f = bone_frames(p)
+    start, end = (list(x) for x in zip(*MEDIAPIPE33.limbs, strict=True))
+    bones = p[:, end] - p[:, start]
+    directions = torch.tensor(MEDIAPIPE33.rest_directions, dtype=torch.float64)
+    pointing = (f.limbs @ directions.unsqueeze(-1)).squeeze(-1)
+    torch.testing.assert_close(pointing, torch.nn.functional.normalize(bones, dim=-1))
+    torch.testing.assert_close(f.lengths, (bones.square().sum(-1) + 1e-6).sqrt())
+
+
+def test_local_rotation_is_relative_to_the_parent() -> None:
+    f = bone_frames(noisy(1), twist="hinge")
+    frames = torch.cat([f.hubs, f.limbs], dim=1)
+    parents = frames[:, list(MEDIAPIPE33.limb_parents)]
+    torch.testing.assert_close(parents @ f.local, frames[:, N_HUBS:])
+
+
+def test_swing_is_the_shortest_rotation() -> None:
+    """Against Rodrigues: I + [v]x + [v]x² / (1 + c)."""
+    a = torch.nn.functional.normalize(torch.tensor([[0.6, -0.6, 0.5]], dtype=torch.float64))
+    b = (rotation(3) @ a.mT).mT
+    v = torch.linalg.cross(a, b)[0]
+    K = torch.stack([torch.linalg.cross(v, e) for e in torch.eye(3, dtype=torch.float64)], dim=-1)
+    expected = torch.eye(3, dtype=torch.float64) + K + K @ K / (1 + (a * b).sum())
+    torch.testing.assert_close(Swing.of(a).to(b.unsqueeze(0))[0, 0], expected)
+
+
+@given(angle=st.floats(-0.05, 0.05), roll=st.floats(0, 6.28))
+@settings(max_examples=50, deadline=None)
+def test_swing_near_the_antipode_still_hits_its_target(angle: float, roll: float) -> None:
+    a = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
+    x, y = torch.tensor([roll], dtype=torch.float64).cos(), torch.tensor([roll]).sin()
+    s, c = torch.tensor([angle]).sin(), torch.tensor([angle]).cos()
+    b = torch.stack([s * x, s * y, -c], dim=-1).to(torch.float64)
+    b = torch.nn.functional.normalize(b, dim=-1)
+    R = Swing.of(a).to(b.unsqueeze(0))
+    assert_rotation(R)
+    torch.testing.assert_close((R @ a.unsqueeze(-1))[0, :, :, 0], b, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("twist", TWISTS)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_poses_stay_finite(name: str, dtype: torch.dtype, twist: Any) -> None:
+    p = DEGENERATE[name].clone().to(dtype).requires_grad_()
+    f = bone_frames(p, twist=twist)
+    code = omega(p, None, rotation(0).to(dtype).unsqueeze(0), frames=f)
+    assert_rotation(all_rotations(f).detach(), 1e-5)
+    assert_rotation(rotation_from_6d(code.detach()), 1e-5)
+    weights = torch.linspace(-1, 1, f.limbs.numel(), dtype=dtype).view_as(f.limbs)
+    ((f.limbs * weights).sum() + f.lengths.sum() + (code * code.detach().cos()).sum()).backward()
+    assert p.grad is not None
+    assert p.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("twist", TWISTS)
+@given(seed=st.integers(0, 10_000))
+@settings(max_examples=20, deadline=None)
+def test_frames_turn_with_the_body(seed: int, twist: Any) -> None:
+    p, R = noisy(seed, sigma=0.06), rotation(seed + 1)
+    shift = torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)
+    a, b = bone_frames(p, twist=twist), bone_frames(p @ R.mT + shift, twist=twist)
+    torch.testing.assert_close(b.limbs, R @ a.limbs, atol=1e-9, rtol=0)
+    torch.testing.assert_close(b.hubs, R @ a.hubs, atol=1e-9, rtol=0)
+    torch.testing.assert_close(b.torso, R @ a.torso, atol=1e-9, rtol=0)
+    torch.testing.assert_close(b.local, a.local, atol=1e-9, rtol=0)
+    torch.testing.assert_close(b.lengths, a.lengths, atol=1e-9, rtol=0)
+
+
+def test_only_hub_omega_sees_a_rigid_motion() -> None:
+    p, R, R_cam = noisy(5), rotation(6), rotation(7).unsqueeze(0)
+    a, b = omega(p, None, R_cam), omega(p @ R.mT + 1.0, None, R_cam)
+    hubs = [*MEDIAPIPE33.shoulders, *MEDIAPIPE33.hips]
+    others = [j for j in range(33) if j not in hubs]
+    torch.testing.assert_close(a[:, others], b[:, others], atol=1e-9, rtol=0)
+    assert (a - b)[:, hubs].abs().amax(-1).min() > 0.1
+    # a camera that turns with the body sees the same code
+    torch.testing.assert_close(omega(p @ R.mT, None, R_cam @ R.mT), a, atol=1e-9, rtol=0)
+
+
+def test_omega_layout() -> None:
+    p, R_cam = noisy(8), rotation(9).unsqueeze(0)
+    f = bone_frames(p)
+    code = rotation_from_6d(omega(p, None, R_cam))[0]
+    world = rotation_from_6d(omega(p, None, None, frame="world"))[0]
+    for j in (11, 12):
+        torch.testing.assert_close(code[j], R_cam[0] @ f.hubs[0, CHEST])
+        torch.testing.assert_close(world[j], f.hubs[0, CHEST])
+    for j in (23, 24):
+        torch.testing.assert_close(code[j], R_cam[0] @ f.hubs[0, PELVIS])
+    torch.testing.assert_close(code[0], f.hubs[0, CHEST].mT @ f.hubs[0, HEAD])
+    for limb in ((11, 13), (14, 16), (15, 19), (27, 31)):
+        torch.testing.assert_close(code[limb[1]], f.local[0, LIMB[limb]])
+    # a face joint's code takes its rest line from the ears to its line now, in the head's frame
+    ears = (p[0, 7] + p[0, 8]) / 2
+    now = torch.nn.functional.normalize(p[0, 9] - ears, dim=0)
+    at_rest = torch.nn.functional.normalize(REST[9] - REST[[7, 8]].mean(0), dim=0)
+    torch.testing.assert_close(f.hubs[0, HEAD] @ code[9] @ at_rest, now)
+
+
+def test_omega_is_identity_where_nothing_swings() -> None:
+    """A pose built from the rest directions: every limb and face code is the identity."""
+    p = rest()
+    for (a, b), d in zip(MEDIAPIPE33.limbs, MEDIAPIPE33.rest_directions, strict=True):
+        if (a, b) not in ((17, 19), (18, 20), (29, 31), (30, 32)):
+            p[0, b] = p[0, a] + 0.2 * torch.tensor(d, dtype=torch.float64)
+    code = rotation_from_6d(omega(p, None, None, frame="world"))[0]
+    eye = torch.eye(3, dtype=torch.float64).expand_as(code)
+    torch.testing.assert_close(code, eye, atol=1e-9, rtol=0)
+
+
+def test_head_falls_back_to_eyes_then_chest() -> None:
+    """With eyes for ears the frame is the same on a rigid head; with neither it is the chest's."""
+    R, p = rotation(2), rest()
+    face = list(MEDIAPIPE33.face)
+    p[:, face] = p[:, face] @ R.mT + 0.1
+    seen = torch.ones(1, 33, dtype=torch.bool)
+    by_ears = bone_frames(p, seen).hubs[0, HEAD]
+    torch.testing.assert_close(by_ears, R)
+    seen[0, 7] = False
+    p[0, 7] = 0.0
+    torch.testing.assert_close(bone_frames(p, seen).hubs[0, HEAD], R)
+    seen[0, 2] = False
+    f = bone_frames(p, seen)
+    torch.testing.assert_close(f.hubs[0, HEAD], f.hubs[0, CHEST])
+
+
+def test_a_line_along_the_spine_borrows_the_other() -> None:
+    R = rotation(4)
+    f = bone_frames(DEGENERATE["collinear_shoulders"] @ R.mT)
+    torch.testing.assert_close(f.hubs[0, CHEST], R, atol=1e-9, rtol=0)
+    torch.testing.assert_close(f.hubs[0, PELVIS], R, atol=1e-9, rtol=0)
+
+
+def test_zero_length_bone_keeps_its_parents_frame() -> None:
+    f = bone_frames(DEGENERATE["zero_length"])
+    eye = torch.eye(3, dtype=torch.float64)
+    torch.testing.assert_close(f.local[0, LIMB[(13, 15)]], eye, atol=1e-12, rtol=0)
+    assert f.lengths[0, LIMB[(13, 15)]] == pytest.approx(1e-3)
+
+
+def test_a_bone_through_zero_length_does_not_jump() -> None:
+    """The elbow's bone shrinks, turns its direction round and grows: frames step by step."""
+    s = torch.linspace(-0.01, 0.01, 2001, dtype=torch.float64)
+    p = rest(len(s))
+    p[:, 15] = p[:, 13] + s[:, None] * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
+    f = bone_frames(p)
+    turn = (all_rotations(f)[1:] - all_rotations(f)[:-1]).flatten(2).norm(dim=-1).max()
+    assert turn < 5 * 1e-5 / 1e-3  # a step over min_length
+
+
+@pytest.mark.parametrize("twist", TWISTS)
+def test_gradcheck(twist: Any) -> None:
+    p = noisy(11, sigma=0.05).requires_grad_()
+    R_cam = rotation(1).unsqueeze(0)
+
+    def values(p: Tensor) -> tuple[Tensor, ...]:
+        f = bone_frames(p, twist=twist)
+        return f.hubs, f.limbs, f.lengths, f.torso, omega(p, None, R_cam, frames=f)
+
+    assert torch.autograd.gradcheck(values, (p,), fast_mode=True)
+
+
+@pytest.mark.parametrize("twist", TWISTS)
+def test_roll_is_continuous_on_a_random_walk(twist: Any) -> None:
+    """Small steps of the joints make small steps of every frame."""
+    generator = torch.Generator().manual_seed(4)
+    step, steps = 1e-3, 300
+    noise = step * torch.randn(steps, 33, 3, generator=generator, dtype=torch.float64)
+    walk = REST + noise.cumsum(0).clamp(-0.1, 0.1)
+    f = bone_frames(walk, twist=twist)
+    shortest = f.lengths.min()
+    turn = (all_rotations(f)[1:] - all_rotations(f)[:-1]).flatten(2).norm(dim=-1).max()
+    # a joint's step (about 5 step at most) over the shortest bone, gathered over three levels
+    assert turn < 3 * 2**0.5 * 10 * step / shortest
+
+
+def test_an_arm_through_the_fold_moves_without_a_jump_off_the_fold() -> None:
+    """The forearm sweeps past its antipode at 2 degrees: frames move by bounded steps."""
+    t = torch.linspace(-0.5, 0.5, 2001, dtype=torch.float64)
+    p = rest(len(t))
+    back = torch.nn.functional.normalize(p[:, 11] - p[:, 13], dim=-1)
+    side = torch.nn.functional.normalize(
+        torch.linalg.cross(back, torch.tensor([[0.0, 0.0, 1.0]]).to(back).expand_as(back)), dim=-1
+    )
+    front = torch.linalg.cross(side, back)
+    d = back + 0.035 * side + t[:, None] * front
+    p[:, 15] = p[:, 13] + 0.25 * torch.nn.functional.normalize(d, dim=-1)
+    R = bone_frames(p).limbs[:, LIMB[(13, 15)]]
+    turn = (R[1:] - R[:-1]).flatten(1).norm(dim=-1).max()
+    assert turn < 2 * 2**0.5 * 5e-4 / 0.035 * 1.5  # 2 x the path's angular step round the antipode
+
+
+def test_hinge_twist_follows_the_bend_plane() -> None:
+    """Elbow bent square: the upper arm's hinge axis lies along the bend normal."""
+    p = rest()
+    p[0, 13] = p[0, 11] + 0.28 * torch.tensor([0.6, -0.6, 0.5], dtype=torch.float64)
+    upper = torch.nn.functional.normalize(p[0, 13] - p[0, 11], dim=0)
+    axis = torch.tensor(MEDIAPIPE33.hinge_axes[0], dtype=torch.float64)
+    for angle in torch.linspace(-2.5, 2.5, 7, dtype=torch.float64):
+        n = axis * angle.cos() + torch.linalg.cross(upper, axis) * angle.sin()
+        p[0, 15] = p[0, 13] + 0.25 * torch.linalg.cross(n, upper)
+        f = bone_frames(p, twist="hinge")
+        torch.testing.assert_close(f.limbs[0, LIMB[(11, 13)]] @ axis, n, atol=1e-6, rtol=0)
+        torch.testing.assert_close(f.limbs[0, LIMB[(13, 15)]] @ axis, n, atol=1e-6, rtol=0)
+        untwisted = bone_frames(p).limbs[0, LIMB[(11, 13)]] @ axis
+        torch.testing.assert_close(untwisted, axis, atol=1e-6, rtol=0)
+
+
+def test_hinge_leaves_a_straight_limb_alone() -> None:
+    p = DEGENERATE["straight"]
+    torch.testing.assert_close(
+        bone_frames(p, twist="hinge").limbs, bone_frames(p).limbs, atol=1e-6, rtol=0
+    )
+
+
+def test_float32_far_from_the_origin_matches_its_own_quantised_input() -> None:
+    """Nothing is lost beyond the grain of the input: differences are taken first."""
+    p = (noisy(3) + 1e4).float()
+    a, b = bone_frames(p), bone_frames(p.double())
+    torch.testing.assert_close(a.limbs.double(), b.limbs, atol=2e-5, rtol=0)
+    torch.testing.assert_close(a.hubs.double(), b.hubs, atol=2e-5, rtol=0)
+
+
+def test_inference_mode_does_not_spoil_later_training() -> None:
+    from gsgan.skeleton.frames import constants
+
+    constants.cache_clear()
+    with torch.inference_mode():
+        bone_frames(rest())
+    p = rest().requires_grad_()
+    bone_frames(p).limbs.sum().backward()
+    assert p.grad is not None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"p": torch.zeros(1, 32, 3)}, r"p must .*\[B, 33, 3\].*\[1, 32, 3\]"),
+        ({"p": torch.zeros(33, 3)}, r"p must .*\[33, 3\]"),
+        ({"p": torch.zeros(1, 33, 3, dtype=torch.int64)}, r"p must be a float.*int64"),
+        ({"valid": torch.ones(1, 33)}, r"valid must be a bool.*float32"),
+        ({"valid": torch.ones(2, 33, dtype=torch.bool)}, r"valid must.*\[2, 33\]"),
+        ({"twist": "free"}, r"twist must be 'none' or 'hinge', got 'free'"),
+    ],
+)
+def test_misuse_is_named(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        bone_frames(**({"p": rest()} | change))
+
+
+def test_omega_misuse_is_named() -> None:
+    with pytest.raises(ValueError, match=r"R_cam must have shape \[1, 3, 3\], got None"):
+        omega(rest(), None, None)
+    with pytest.raises(ValueError, match="frame must be 'camera' or 'world', got 'body'"):
+        omega(rest(), None, None, frame="body")  # type: ignore[arg-type]

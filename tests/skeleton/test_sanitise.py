@@ -1,0 +1,179 @@
+"""Sanitise: every joint finite, seen ones untouched, stand-ins where a body would have them."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from skeleton_poses import NAMES, REST, joint, noisy, rest, rotation
+
+from gsgan.skeleton import (
+    MEDIAPIPE33,
+    Densify,
+    bone_frames,
+    limb_length_sum,
+    omega,
+    sanitise,
+)
+
+NAN = float("nan")
+HANDS_FEET_HEAD = [*range(11), *range(17, 23), *range(29, 33)]
+
+
+def lose(p: torch.Tensor, joints: list[int], value: float = NAN) -> torch.Tensor:
+    p = p.clone()
+    p[:, joints] = value
+    return p
+
+
+def test_a_whole_skeleton_passes_untouched() -> None:
+    p = noisy(0)
+    q, valid = sanitise(p, torch.ones(1, 33))
+    assert torch.equal(p, q)
+    assert bool(valid.all())
+
+
+@pytest.mark.parametrize("value", [NAN, float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", NAMES)
+def test_each_joint_alone_comes_back_to_its_rest_place(name: str, value: float) -> None:
+    """On the rest pose, turned and moved, the stand-in is the joint itself."""
+    R = rotation(3)
+    p = rest() @ R.mT + torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64)
+    q, valid = sanitise(lose(p, [joint(name)], value))
+    assert (~valid).nonzero().tolist() == [[0, joint(name)]]
+    torch.testing.assert_close(q, p, atol=1e-9, rtol=0)
+
+
+def test_everything_but_the_trunk_comes_back_at_the_subjects_size() -> None:
+    trunk = list(MEDIAPIPE33.torso)
+    gone = [j for j in range(33) if j not in trunk]
+    p = rest() * 1.25
+    q, valid = sanitise(lose(p, gone), body_height=1.25 * MEDIAPIPE33.limb_length_sum)
+    torch.testing.assert_close(q, p, atol=1e-9, rtol=0)
+    assert valid[0].nonzero().flatten().tolist() == sorted(trunk)
+
+
+def test_size_is_taken_from_the_seen_limbs() -> None:
+    p = rest() * 0.8
+    q, _ = sanitise(lose(p, HANDS_FEET_HEAD))
+    torch.testing.assert_close(q, p, atol=1e-9, rtol=0)
+
+
+def test_stand_ins_hang_on_the_bent_limb() -> None:
+    """A lost hand goes where the forearm points, not where the rest pose has it."""
+    p = rest()
+    R = rotation(5)
+    arm = [13, 15, 17, 19, 21]
+    p[:, arm] = (p[:, arm] - p[:, 11:12]) @ R.mT + p[:, 11:12]
+    q, _ = sanitise(lose(p, [17, 19, 21]))
+    forearm = torch.nn.functional.normalize(p[0, 15] - p[0, 13], dim=0)
+    assert ((q[0, [17, 19, 21]] - q[0, 15]) @ forearm > 0.02).all()
+    lengths = (q[0, [17, 19, 21]] - q[0, 15]).norm(dim=-1)
+    torch.testing.assert_close(lengths, (REST[[17, 19, 21]] - REST[15]).norm(dim=-1))
+
+
+def test_face_stands_on_the_joints_that_were_seen() -> None:
+    """A turned head with one ear lost: eyes and nose tell its frame, and where the ear is."""
+    R = rotation(6)
+    p = rest()
+    p[:, :11] = p[:, :11] @ R.mT
+    q, _ = sanitise(lose(p, [8]))
+    torch.testing.assert_close(q, p, atol=1e-9, rtol=0)
+
+
+def test_visibility_counts_as_loss() -> None:
+    p, visibility = noisy(1), torch.ones(1, 33)
+    visibility[0, 13], visibility[0, 14], visibility[0, 16] = 0.0, NAN, 0.2
+    _, valid = sanitise(p, visibility)
+    assert (~valid[0]).nonzero().flatten().tolist() == [13, 14]
+    q, valid = sanitise(p, visibility, min_visibility=0.5)
+    assert (~valid[0]).nonzero().flatten().tolist() == [13, 14, 16]
+    assert torch.equal(q[valid], p[valid])
+    assert not torch.equal(q[~valid], p[~valid])
+
+
+@given(
+    seed=st.integers(0, 1000),
+    lost=st.sets(st.sampled_from([j for j in range(33) if j not in (11, 12, 23)])),
+)
+@settings(max_examples=40, deadline=None)
+def test_any_loss_moves_with_the_body(seed: int, lost: set[int]) -> None:
+    p, R = noisy(seed), rotation(seed + 1)
+    q, valid = sanitise(lose(p, sorted(lost)))
+    moved, _ = sanitise(lose(p @ R.mT + 2.0, sorted(lost)))
+    assert q.isfinite().all()
+    assert torch.equal(q[valid], p[valid])
+    torch.testing.assert_close(moved, q @ R.mT + 2.0, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_through_stand_ins_are_finite(dtype: torch.dtype) -> None:
+    """NaN joints get a zero gradient, their neighbours a finite one, through the whole chain."""
+    gone = [0, 7, 13, 16, 17, 24, 27, 28]
+    p = lose(noisy(2), gone).to(dtype).requires_grad_()
+    q, valid = sanitise(p)
+    f = bone_frames(q, valid)
+    points = Densify(dtype=dtype)(q, valid, f)
+    code = omega(q, valid, rotation(0).to(dtype).unsqueeze(0), frames=f)
+    assert code.isfinite().all()
+    (points.means.square().sum() + points.scales.sum() + (code * code.detach()).sum()).backward()
+    assert p.grad is not None
+    assert p.grad.isfinite().all()
+    assert (p.grad[0, gone] == 0).all()
+    assert (p.grad[0, [11, 12, 23]].abs().sum(-1) > 0).all()
+
+
+def test_gradcheck() -> None:
+    gone = [5, 14, 19, 23, 31]
+    keep = [j for j in range(33) if j not in gone]
+
+    def values(seen: torch.Tensor) -> torch.Tensor:
+        p = torch.full((1, 33, 3), NAN, dtype=torch.float64).index_copy(1, torch.tensor(keep), seen)
+        return sanitise(p)[0]
+
+    assert torch.autograd.gradcheck(values, (noisy(3)[:, keep].requires_grad_(),), fast_mode=True)
+
+
+def test_far_from_the_origin_in_float32() -> None:
+    p = (rest() + 1e4).float()
+    q, _ = sanitise(lose(p, HANDS_FEET_HEAD))
+    torch.testing.assert_close(q, p, atol=2e-2, rtol=0)
+
+
+def test_a_skeleton_without_a_trunk_is_refused_by_name() -> None:
+    p = lose(noisy(0, batch=3), [])
+    p[1, [11, 24]] = NAN
+    with pytest.raises(
+        ValueError, match=r"in 1 of 3 skeletons .*item 1: left_shoulder, right_hip\)"
+    ):
+        sanitise(p)
+    with pytest.raises(ValueError, match="needs 4 of the four shoulders and hips"):
+        sanitise(lose(noisy(0), [11]), min_trunk_joints=4)
+
+
+def test_misuse_is_named() -> None:
+    with pytest.raises(ValueError, match=r"sanitise: p must .*\[B, 33, 3\]"):
+        sanitise(torch.zeros(1, 24, 3))
+    with pytest.raises(ValueError, match=r"visibility must have shape \[1, 33\], got \[33\]"):
+        sanitise(noisy(0), torch.ones(33))
+    with pytest.raises(ValueError, match="min_trunk_joints must be 3 or 4, got 2"):
+        sanitise(lose(noisy(0), [0]), min_trunk_joints=2)
+
+
+def test_limb_length_sum() -> None:
+    p = noisy(4, batch=2)
+    start, end = (list(x) for x in zip(*MEDIAPIPE33.limbs, strict=True))
+    expected = (p[:, end] - p[:, start]).norm(dim=-1).sum(-1)
+    torch.testing.assert_close(limb_length_sum(p), expected)
+    assert limb_length_sum(rest()).item() == pytest.approx(MEDIAPIPE33.limb_length_sum)
+
+
+def test_limb_length_sum_makes_up_for_lost_limbs() -> None:
+    p = rest(2) * 1.1
+    p[0, [15, 31, 22]] = NAN
+    valid = p.isfinite().all(-1)
+    valid[1] = False
+    height = limb_length_sum(p, valid)
+    assert height[0].item() == pytest.approx(1.1 * MEDIAPIPE33.limb_length_sum)
+    assert height[1].isnan()

@@ -1,0 +1,91 @@
+"""The constants: counts and structure as MediaPipe and the method notes state them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsgan.skeleton import MEDIAPIPE33 as T
+from gsgan.skeleton.template import N_HUBS
+
+
+def test_counts() -> None:
+    assert len(T.names) == len(set(T.names)) == 33
+    assert len(T.edges) == len(set(T.edges)) == 35
+    assert len(T.limbs) == len(set(T.limbs)) == 22
+    assert len(T.gnn_edges) == 39
+    assert [name for name, _ in T.draw_groups] == [
+        *("head", "torso", "left_arm", "right_arm"),
+        *("left_hand", "right_hand", "left_leg", "right_leg"),
+    ]
+    assert [len(T.with_torso_limbs().limbs), len(T.with_torso_limbs().rest_directions)] == [26, 26]
+
+
+def test_limbs_are_the_edges_off_face_and_trunk() -> None:
+    off = [e for e in T.edges if max(e) > 10 and not set(e) <= set(T.torso)]
+    assert sorted(off) == sorted(T.limbs)
+
+
+def test_every_segment_is_drawn_once() -> None:
+    drawn = [edge for _, group in T.draw_groups for edge in group]
+    assert sorted(drawn) == sorted([*T.edges, T.ears])
+
+
+def _components(edges: tuple[tuple[int, int], ...]) -> int:
+    label = list(range(33))
+    for a, b in edges:
+        label = [label[a] if x == label[b] else x for x in label]
+    return len(set(label))
+
+
+def test_gnn_edges_join_the_three_components() -> None:
+    assert _components(T.edges) == 3
+    assert _components(T.gnn_edges) == 1
+
+
+def test_parents_come_first_and_hold_the_joint() -> None:
+    for level, limbs in enumerate(T.levels):
+        for limb in limbs:
+            parent = T.limb_parents[limb]
+            assert (parent < N_HUBS) == (level == 0)
+            if level:
+                assert parent - N_HUBS in T.levels[level - 1]
+    assert [len(level) for level in T.levels] == [4, 4, 14]
+    by_limb = dict(zip(T.limbs, T.limb_parents, strict=True))
+    assert T.limbs[by_limb[(13, 15)] - N_HUBS] == (11, 13)
+    assert T.limbs[by_limb[(18, 20)] - N_HUBS] == (14, 16)
+    assert T.limbs[by_limb[(29, 31)] - N_HUBS] == (25, 27)
+
+
+def test_every_joint_below_the_trunk_ends_one_bone() -> None:
+    assert sorted(T.incoming) == [*range(13, 23), *range(25, 33)]
+    assert T.limbs[T.incoming[19]] == (15, 19)  # not from the little finger
+    assert T.limbs[T.incoming[31]] == (27, 31)  # not from the heel
+
+
+def test_mirror_swaps_sides_of_the_rest_pose() -> None:
+    rest, mirror = np.asarray(T.rest_positions), list(T.mirror)
+    np.testing.assert_allclose(rest[mirror] * [-1, 1, 1], rest)
+    assert [mirror[m] for m in mirror] == list(range(33))
+    assert [T.names[mirror[7]], mirror[0]] == ["right_ear", 0]
+    left = np.array([name.startswith("left") or name.endswith("left") for name in T.names])
+    assert (rest[left, 0] > 0).all()
+
+
+def test_rest_pose_is_a_person() -> None:
+    rest = np.asarray(T.rest_positions)
+    assert 0 < rest[:, 1].min() < 0.05
+    assert 1.5 < rest[:, 1].max() < T.stature == 1.7
+    assert rest[0, 2] > rest[7, 2] > rest[28, 2]  # z out of the chest
+    assert rest[31, 2] > rest[29, 2]  # toes before heels
+    assert T.limb_length_sum == pytest.approx(4.298279, abs=1e-5)
+
+
+def test_rest_directions_are_unit_and_mirrored() -> None:
+    directions = np.asarray(T.rest_directions)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1, atol=1e-12)
+    for (a, b), d in zip(T.limbs, directions, strict=True):
+        twin = T.limbs.index((T.mirror[a], T.mirror[b]))
+        np.testing.assert_allclose(directions[twin], d * [-1, 1, 1], atol=1e-12)
+    for (upper, _), axis in zip(T.hinges, T.hinge_axes, strict=True):
+        assert abs(np.dot(axis, directions[upper])) < 1e-12

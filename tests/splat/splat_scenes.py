@@ -1,0 +1,166 @@
+"""Small scenes and comparisons shared by the rasteriser's tests."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import fields, replace
+
+import torch
+from torch import Tensor
+
+from gsgan.scene import Camera, Gaussians, Raster
+from gsgan.splat import resolve_backend
+from gsgan.splat.settings import ACCURACY
+
+torch.set_num_threads(1)
+
+BACKENDS = ["reference", "torch"]
+if resolve_backend("native", torch.device("cpu"), ACCURACY["high"])[0] == "native":
+    BACKENDS.append("native")
+
+
+def camera(
+    size: tuple[int, int] = (24, 32),
+    *,
+    focal: float = 30.0,
+    batch: int = 1,
+    dtype: torch.dtype = torch.float64,
+) -> Camera:
+    """At the origin, looking along +z, principal point in the middle of the picture."""
+    H, W = size
+    K = torch.tensor([[focal, 0, W / 2], [0, focal, H / 2], [0, 0, 1]], dtype=dtype)
+    R, t = torch.eye(3, dtype=dtype), torch.zeros(3, dtype=dtype)
+    return Camera(K.repeat(batch, 1, 1), R.repeat(batch, 1, 1), t.repeat(batch, 1), size)
+
+
+def cloud(
+    n: int = 40,
+    channels: int = 3,
+    *,
+    batch: int = 1,
+    seed: int = 0,
+    scale: float = 0.08,
+    opacity: tuple[float, float] = (0.05, 0.95),
+    dtype: torch.dtype = torch.float64,
+) -> Gaussians:
+    """Random Gaussians two metres in front of ``camera()``."""
+    g = torch.Generator().manual_seed(seed)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(batch, n, *shape, generator=g, dtype=torch.float64)
+
+    low, high = opacity
+    return Gaussians(
+        means=(rand(3) - 0.5) * torch.tensor([1.6, 1.2, 1.0]) + torch.tensor([0.0, 0.0, 2.0]),
+        quats=rand(4) * 2 - 1,
+        scales=scale * torch.exp(rand(3) * 2 - 1),
+        opacities=low + (high - low) * rand(),
+        features=rand(channels),
+    ).to(dtype)
+
+
+def one(
+    mean: tuple[float, float, float] = (0.0, 0.0, 2.0),
+    *,
+    scale: tuple[float, float, float] = (0.1, 0.1, 0.1),
+    quat: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
+    opacity: float = 0.8,
+    features: tuple[float, ...] = (1.0,),
+    dtype: torch.dtype = torch.float64,
+) -> Gaussians:
+    """A single Gaussian."""
+    return Gaussians(
+        torch.tensor([[mean]], dtype=dtype),
+        torch.tensor([[quat]], dtype=dtype),
+        torch.tensor([[scale]], dtype=dtype),
+        torch.tensor([[opacity]], dtype=dtype),
+        torch.tensor([[features]], dtype=dtype),
+    )
+
+
+def join(*parts: Gaussians) -> Gaussians:
+    """All Gaussians of the parts in one item."""
+    names = ("means", "quats", "scales", "opacities", "features")
+    return Gaussians(*(torch.cat([getattr(p, n) for p in parts], dim=1) for n in names))
+
+
+def with_covariances(gaussians: Gaussians) -> Gaussians:
+    """The same shapes, given as covariances."""
+    from gsgan.splat.project import rotations
+
+    M = rotations(gaussians.quats) * gaussians.scales.unsqueeze(-2)
+    return replace(gaussians, quats=None, scales=None, covariances=M @ M.mT)
+
+
+def leaves(record):
+    """A copy whose tensors are leaves that collect gradients."""
+    tensors = {f.name: getattr(record, f.name) for f in fields(record)}
+    return replace(
+        record,
+        **{
+            k: v.detach().clone().requires_grad_() for k, v in tensors.items() if torch.is_tensor(v)
+        },
+    )
+
+
+def loss(raster: Raster) -> Tensor:
+    """A fixed random weighting of all outputs."""
+    g = torch.Generator().manual_seed(7)
+    outputs = [x for x in (raster.features, raster.alpha, raster.depth) if x is not None]
+    weights = [torch.randn(x.shape, generator=g, dtype=torch.float64).to(x) for x in outputs]
+    return sum((x * w).sum() for x, w in zip(outputs, weights, strict=True))
+
+
+def gradients(*records) -> dict[str, Tensor]:
+    """Gradients by field name."""
+    return {
+        f.name: getattr(r, f.name).grad
+        for r in records
+        for f in fields(r)
+        if torch.is_tensor(getattr(r, f.name))
+    }
+
+
+def error(a: Tensor, b: Tensor) -> float:
+    """Largest difference, relative to the largest entry of ``b`` where that is above 1."""
+    a, b = a.detach().double(), b.detach().double()
+    return float((a - b).abs().max() / b.abs().max().clamp_min(1.0))
+
+
+def naive(gaussians: Gaussians, cam: Camera, low_pass: float = 0.3) -> tuple[Tensor, Tensor]:
+    """The paper's formulas with loops and a matrix inverse: independent of gsgan.splat.
+
+    For Gaussians inside the field of view and in front of the camera.
+    """
+    H, W = cam.size
+    K, R, t = cam.K[0], cam.R[0], cam.t[0]
+    order = sorted(
+        range(gaussians.means.shape[1]), key=lambda i: float(R[2] @ gaussians.means[0, i] + t[2])
+    )
+    picture = torch.zeros(gaussians.features.shape[-1], H, W, dtype=torch.float64)
+    left = torch.ones(H, W, dtype=torch.float64)
+    y, x = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
+    pixels = torch.stack([x, y], -1).double()
+    for i in order:
+        p = R @ gaussians.means[0, i] + t
+        z = float(p[2])
+        x_z, y_z = (p[:2] / z).tolist()
+        J = torch.tensor([[1, 0, -x_z], [0, 1, -y_z]], dtype=torch.float64) / z
+        J = K[:2, :2] @ J @ R
+        if gaussians.covariances is None:
+            w, qx, qy, qz = (gaussians.quats[0, i] / gaussians.quats[0, i].norm()).tolist()
+            angle = 2 * math.atan2(math.hypot(qx, qy, qz), w)
+            n = math.hypot(qx, qy, qz) or 1.0
+            skew = [[0, -qz, qy], [qz, 0, -qx], [-qy, qx, 0]]
+            skew = torch.tensor(skew, dtype=torch.float64) / n
+            M = torch.matrix_exp(angle * skew) @ torch.diag(gaussians.scales[0, i])
+            cov3 = M @ M.T
+        else:
+            cov3 = gaussians.covariances[0, i]
+        cov = J @ cov3 @ J.T + low_pass * torch.eye(2, dtype=torch.float64)
+        d = pixels - (K @ (p / z))[:2]
+        q = torch.einsum("hwi,ij,hwj->hw", d, torch.linalg.inv(cov), d)
+        alpha = gaussians.opacities[0, i] * torch.exp(-q / 2)
+        picture += gaussians.features[0, i][:, None, None] * (left * alpha)
+        left = left * (1 - alpha)
+    return picture, 1 - left

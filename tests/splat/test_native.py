@@ -1,0 +1,590 @@
+"""The compiled kernel against a dense float64 composite, and the ways it may be missing."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsgan.splat import native
+from gsgan.splat.project import Projected
+from gsgan.splat.settings import ACCURACY, Accuracy
+
+needs_kernel = pytest.mark.skipif(not native.available(), reason=native.why_not() or "available")
+
+
+EXACT, HIGH, STANDARD, DRAFT = (ACCURACY[n] for n in ("exact", "high", "standard", "draft"))
+LEAVES = ("means", "conics", "opacities", "features", "depths")
+
+Composite = Callable[..., tuple[Tensor, Tensor, Tensor | None]]
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def dense(
+    p: Projected, size: tuple[int, int], cut: Accuracy, want_depth: bool
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Every Gaussian at every pixel, one after the other."""
+    H, W = size
+    rows, columns = (torch.arange(n, dtype=p.means.dtype) + 0.5 for n in size)
+    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    values = torch.cat([p.features, p.depths.unsqueeze(-1)], dim=-1)
+    pictures, alphas = [], []
+    for b in range(len(p.means)):
+        left = torch.ones(H, W, dtype=p.means.dtype)
+        picture = torch.zeros(values.shape[-1], H, W, dtype=p.means.dtype)
+        for i in p.depths[b].detach().argsort(stable=True).tolist():
+            dx, dy = x - p.means[b, i, 0], y - p.means[b, i, 1]
+            A, B, C = p.conics[b, i]
+            raw = p.opacities[b, i] * torch.exp(
+                -0.5 * (A * dx * dx + 2 * B * dx * dy + C * dy * dy)
+            )
+            drawn = (dx.abs() <= p.extents[b, i, 0]) & (dy.abs() <= p.extents[b, i, 1])
+            drawn = drawn & p.visible[b, i] & (raw >= cut.alpha_min)
+            drawn = drawn & (left >= cut.transmittance_min)
+            alpha = torch.where(drawn, raw.clamp(max=cut.alpha_max), 0.0)
+            picture = picture + values[b, i][:, None, None] * alpha * left
+            left = left * (1 - alpha)
+        pictures.append(picture)
+        alphas.append(1 - left)
+    picture = torch.stack(pictures)
+    return picture[:, :-1], torch.stack(alphas)[:, None], picture[:, -1:] if want_depth else None
+
+
+def scene(
+    B: int = 1,
+    N: int = 40,
+    C: int = 3,
+    size: tuple[int, int] = (21, 35),
+    cut: Accuracy = EXACT,
+    dtype: torch.dtype = torch.float64,
+    seed: int = 0,
+    sigmas: tuple[float, float] = (0.5, 5.0),
+) -> Projected:
+    """Random ellipses in and around the picture; depths in steps, so that some are equal."""
+    g = torch.Generator().manual_seed(seed)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=g, dtype=torch.float64)
+
+    means = (rand(B, N, 2) * 1.4 - 0.2) * torch.tensor([size[1], size[0]])
+    low, high = sigmas
+    s, t, angle = low + (high - low) * rand(B, N), low + (high - low) * rand(B, N), 3.2 * rand(B, N)
+    cos, sin = angle.cos(), angle.sin()
+    a = (cos * s) ** 2 + (sin * t) ** 2
+    b = cos * sin * (s**2 - t**2)
+    c = (sin * s) ** 2 + (cos * t) ** 2
+    det = a * c - b * b
+    conics = torch.stack([c / det, -b / det, a / det], dim=-1)
+    opacities = 0.02 + 0.97 * rand(B, N)
+    reach = torch.full_like(opacities, 40.0)
+    if cut.alpha_min:
+        reach = (2 * (opacities / cut.alpha_min).log().clamp_min(0)).sqrt() * 1.001 + 1e-3
+    extents = reach.unsqueeze(-1) * torch.stack([a, c], dim=-1).sqrt()
+    visible = rand(B, N) > 0.1
+    depths = 1 + (8 * rand(B, N)).floor() / 8
+    features = rand(B, N, C) - 0.3
+    p = Projected(means, conics, opacities, features, depths, extents, visible)
+    return in_dtype(p, dtype)
+
+
+def one(
+    mean: tuple[float, float],
+    opacity: float,
+    sigma: float,
+    n: int = 1,
+    dtype: torch.dtype = torch.float64,
+) -> Projected:
+    """n coincident round Gaussians of one channel, features 1, depths 1."""
+    ones = torch.ones(1, n, dtype=dtype)
+    return Projected(
+        means=torch.tensor(mean, dtype=dtype).expand(1, n, 2),
+        conics=torch.stack([ones / sigma**2, 0 * ones, ones / sigma**2], dim=-1),
+        opacities=opacity * ones,
+        features=ones.unsqueeze(-1),
+        depths=ones,
+        extents=torch.full((1, n, 2), 1e6, dtype=dtype),
+        visible=torch.ones(1, n, dtype=torch.bool),
+    )
+
+
+def with_leaves(p: Projected) -> tuple[list[Tensor], Projected]:
+    leaves = [getattr(p, name).detach().clone().requires_grad_() for name in LEAVES]
+    return leaves, replace(p, **dict(zip(LEAVES, leaves, strict=True)))
+
+
+def values_and_gradients(
+    composite: Composite, p: Projected, size: tuple[int, int], cut: Accuracy
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Pictures, and the gradients of one random weighted sum of all of them."""
+    leaves, q = with_leaves(p)
+    pictures = [x for x in composite(q, size, cut, True) if x is not None]
+    g = torch.Generator().manual_seed(1)
+    loss = sum(
+        (x * torch.randn(x.shape, generator=g, dtype=torch.float64).to(x.dtype)).sum()
+        for x in pictures
+    )
+    assert isinstance(loss, Tensor)
+    return [x.detach() for x in pictures], list(torch.autograd.grad(loss, leaves))
+
+
+def in_dtype(p: Projected, dtype: torch.dtype) -> Projected:
+    return Projected(**{k: v.to(dtype) if v.is_floating_point() else v for k, v in vars(p).items()})
+
+
+def assert_same(
+    p: Projected, size: tuple[int, int], cut: Accuracy, tolerance: float, gradient_tolerance: float
+) -> None:
+    """Native, in the scene's dtype, against dense in float64; gradients relative to the largest."""
+    got, got_gradients = values_and_gradients(native.composite, p, size, cut)
+    want, want_gradients = values_and_gradients(dense, in_dtype(p, torch.float64), size, cut)
+    for name, x, y in zip(("features", "alpha", "depth"), got, want, strict=True):
+        error = (x.double() - y).abs().max().item()
+        assert error <= tolerance, f"{name}: {error:.2e}"
+    for name, x, y in zip(LEAVES, got_gradients, want_gradients, strict=True):
+        largest = y.abs().max().item()
+        error = (x.double() - y).abs().max().item()
+        assert error <= gradient_tolerance * largest + 1e-300, f"gradient of {name}: {error:.2e}"
+
+
+@needs_kernel
+@pytest.mark.parametrize("channels", [1, 3, 5, 16, 32, 64])
+def test_every_number_of_channels(channels: int) -> None:
+    assert_same(scene(N=12, C=channels), (21, 35), EXACT, 1e-13, 1e-13)
+
+
+@needs_kernel
+@pytest.mark.parametrize("cut", [EXACT, HIGH, STANDARD, DRAFT])
+def test_every_setting_and_batches(cut: Accuracy) -> None:
+    p = scene(B=2, N=50, cut=cut)
+    assert_same(p, (21, 35), cut, 1e-13, 1e-13)
+
+
+@needs_kernel
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (17, 3), (16, 16), (33, 50)])
+def test_every_size(size: tuple[int, int]) -> None:
+    assert_same(scene(N=15, size=size), size, EXACT, 1e-13, 1e-13)
+
+
+@needs_kernel
+@pytest.mark.parametrize("cut", [EXACT, HIGH])
+def test_float32(cut: Accuracy) -> None:
+    p = scene(N=60, cut=cut, dtype=torch.float32)
+    # Nothing lies within float32 rounding of a cut-off that would matter: 1e-6 is below it.
+    assert_same(p, (21, 35), cut, 4e-6, 1e-5)
+
+
+@needs_kernel
+def test_needles_reach_every_tile_they_cross() -> None:
+    p = scene(N=20, size=(70, 90), cut=STANDARD, sigmas=(0.3, 30.0), seed=3)
+    assert_same(p, (70, 90), STANDARD, 1e-13, 1e-12)
+
+
+@needs_kernel
+def test_box_extent_cuts_at_the_pixel() -> None:
+    p = scene(N=20, seed=4)
+    p = replace(p, extents=torch.full_like(p.extents, 3.5))
+    assert_same(p, (21, 35), EXACT, 1e-13, 1e-13)
+
+
+@needs_kernel
+def test_gradcheck() -> None:
+    p = scene(N=7, C=2, size=(9, 18), sigmas=(1.0, 4.0))
+    # Equal depths would change places under the finite differences.
+    apart = torch.tensor([[4.0, 2.0, 7.0, 1.0, 5.0, 3.0, 6.0]], dtype=torch.float64)
+    p = replace(p, depths=apart)
+    leaves, _ = with_leaves(p)
+
+    def pictures(*values: Tensor) -> tuple[Tensor, ...]:
+        q = replace(p, **dict(zip(LEAVES, values, strict=True)))
+        out = native.composite(q, (9, 18), EXACT, True)
+        return tuple(x for x in out if x is not None)
+
+    assert torch.autograd.gradcheck(pictures, leaves)
+
+
+@needs_kernel
+def test_one_gaussian_is_the_formula() -> None:
+    p = one((8.5, 4.5), 0.5, 2.0)
+    features, alpha, depth = native.composite(p, (9, 17), EXACT, True)
+    column, row = torch.arange(17.0, dtype=torch.float64), torch.arange(9.0, dtype=torch.float64)
+    squared = (column - 8) ** 2 + (row[:, None] - 4) ** 2
+    want = 0.5 * torch.exp(-squared / 8)
+    for picture in (features, alpha, depth):
+        assert picture is not None
+        torch.testing.assert_close(picture[0, 0], want, rtol=1e-15, atol=2e-16)
+
+
+@needs_kernel
+@pytest.mark.parametrize(
+    ("dtype", "ulps"), [(torch.float32, 4), (torch.float64, 4)], ids=["float32", "float64"]
+)
+def test_exponential_to_the_last_places(dtype: torch.dtype, ulps: int) -> None:
+    # 4001 pixels in a row of one Gaussian whose mean is on the first centre: -q/2 = -(x / 317)^2.
+    # Squares of integers times a power of two keep q exact.
+    p = one((0.5, 0.5), 1.0, 256.0, dtype=dtype)
+    alpha = native.composite(p, (1, 2400), EXACT, False)[1][0, 0, 0]
+    q = torch.arange(2400, dtype=torch.float64) ** 2 / 256.0**2
+    want = torch.exp(-0.5 * q)
+    relative = (alpha.double() - want).abs() / want
+    assert want.min() < 1e-19
+    # Alpha is 1 - (1 - alpha): weights are what the exponential itself shows.
+    features = native.composite(p, (1, 2400), EXACT, False)[0][0, 0, 0]
+    relative = (features.double() - want).abs() / want
+    # q itself is rounded once: half an ulp of the exponent's size, up to 44.
+    allowed = torch.finfo(dtype).eps * (ulps + 0.5 * q)
+    assert (relative <= allowed).all()
+
+
+@needs_kernel
+def test_cap_stops_value_and_gradient() -> None:
+    leaves, q = with_leaves(one((0.5, 0.5), 1.0, 3.0))
+    features, alpha, _ = native.composite(q, (1, 1), replace(EXACT, alpha_max=0.9), False)
+    assert features.item() == pytest.approx(0.9)
+    assert alpha.item() == pytest.approx(0.9)
+    gradients = torch.autograd.grad(features.sum() + alpha.sum(), leaves[:4])
+    assert all((g == 0).all() for g in gradients[:3])
+    assert gradients[3].item() == pytest.approx(0.9)
+
+
+@needs_kernel
+def test_alpha_one_has_the_gradient_of_what_it_hides() -> None:
+    # Front: alpha 1 exactly. Behind: alpha 0.5, feature 2. dC/do = 1 - 0.5 * 2 at the front.
+    p = one((0.5, 0.5), 1.0, 3.0, n=2)
+    p = replace(
+        p,
+        opacities=torch.tensor([[1.0, 0.5]], dtype=torch.float64),
+        features=torch.tensor([[[1.0], [2.0]]], dtype=torch.float64),
+    )
+    leaves, q = with_leaves(p)
+    features = native.composite(q, (1, 1), EXACT, False)[0]
+    _, _, opacities, colours = torch.autograd.grad(features.sum(), leaves[:4])
+    assert opacities.tolist() == [[0.0, 0.0]]
+    assert colours.flatten().tolist() == [1.0, 0.0]
+    alpha = native.composite(q, (1, 1), EXACT, False)[1]
+    assert torch.autograd.grad(alpha.sum(), leaves[2])[0].tolist() == [[0.5, 0.0]]
+
+
+@needs_kernel
+def test_equal_depths_are_ordered_by_index() -> None:
+    p = one((0.5, 0.5), 0.5, 3.0, n=3)
+    p = replace(p, features=torch.eye(3, dtype=torch.float64)[None])
+    features = native.composite(p, (1, 1), EXACT, False)[0]
+    assert features.flatten().tolist() == [0.5, 0.25, 0.125]
+
+
+@needs_kernel
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_depth_order_of_any_sign(dtype: torch.dtype) -> None:
+    depths = torch.tensor([[3.0, -1.0, 0.0, -0.0, 1e-30, -2.5, 1e30]], dtype=dtype)
+    p = one((0.5, 0.5), 0.5, 3.0, n=7, dtype=dtype)
+    p = replace(p, features=torch.eye(7, dtype=dtype)[None], depths=depths)
+    features = native.composite(p, (1, 1), EXACT, False)[0].flatten()
+    assert features.argsort(descending=True).tolist() == [5, 1, 2, 3, 4, 0, 6]
+
+
+@needs_kernel
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("opacity", [0.001, 0.5])
+def test_five_thousand_layers(dtype: torch.dtype, opacity: float) -> None:
+    # Alike layers: C = 1 - (1 - o)^n, dC/do of layer i = T_i (1 - what shines behind it).
+    n = 5000
+    p = one((0.5, 0.5), opacity, 3.0, n=n, dtype=dtype)
+    leaves, q = with_leaves(p)
+    features = native.composite(q, (1, 1), EXACT, False)[0]
+    rounded = p.opacities[0, 0].double()
+    log_left = torch.log1p(-rounded)
+    tolerance = 1e-12 if dtype == torch.float64 else 2e-4
+    assert features.item() == pytest.approx(-torch.expm1(n * log_left).item(), rel=tolerance)
+    _, _, opacities, colours = torch.autograd.grad(features.sum(), leaves[:4])
+    i = torch.arange(n, dtype=torch.float64)
+    want = torch.exp((n - 1) * log_left).expand(n)
+    torch.testing.assert_close(opacities[0].double(), want, rtol=tolerance, atol=1e-7)
+    want = rounded * torch.exp(i * log_left)
+    torch.testing.assert_close(colours[0, :, 0].double(), want, rtol=tolerance, atol=1e-37)
+
+
+@needs_kernel
+def test_stop_is_by_incoming_transmittance() -> None:
+    # T before each layer: 1, 0.5, 0.25, 0.125; a bound of 0.25 keeps three, 0.26 keeps two.
+    p = one((0.5, 0.5), 0.5, 3.0, n=9)
+    for bound, want in ((0.25, 0.875), (0.26, 0.75)):
+        leaves, q = with_leaves(p)
+        alpha = native.composite(q, (1, 1), replace(EXACT, transmittance_min=bound), False)[1]
+        assert alpha.item() == want
+        (g,) = torch.autograd.grad(alpha.sum(), leaves[2])
+        assert (g[0] != 0).sum() == (3 if bound == 0.25 else 2)
+
+
+@needs_kernel
+def test_opacity_zero_draws_nothing_and_has_a_gradient() -> None:
+    leaves, q = with_leaves(one((0.5, 0.5), 0.0, 3.0))
+    features = native.composite(q, (1, 1), EXACT, False)[0]
+    assert features.item() == 0
+    assert torch.autograd.grad(features.sum(), leaves[2])[0].item() == 1
+
+
+@needs_kernel
+@pytest.mark.parametrize("n", [0, 3])
+def test_nothing_to_draw(n: int) -> None:
+    p = scene(N=n)
+    p = replace(p, visible=torch.zeros_like(p.visible))
+    values, gradients = values_and_gradients(native.composite, p, (5, 7), HIGH)
+    assert [list(x.shape) for x in values] == [[1, 3, 5, 7], [1, 1, 5, 7], [1, 1, 5, 7]]
+    assert all((x == 0).all() for x in (*values, *gradients))
+
+
+@needs_kernel
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_same_bits_whatever_the_threads(dtype: torch.dtype) -> None:
+    p = scene(B=2, N=3000, C=5, size=(60, 70), cut=HIGH, dtype=dtype)
+    results = []
+    for threads in (1, 2, 3, 2):
+        torch.set_num_threads(threads)
+        values, gradients = values_and_gradients(native.composite, p, (60, 70), HIGH)
+        results.append([*values, *gradients])
+    for other in results[1:]:
+        assert all(torch.equal(x, y) for x, y in zip(results[0], other, strict=True))
+
+
+@needs_kernel
+def test_memory_budget_of_the_backward_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    p = scene(B=2, N=50, size=(64, 80), sigmas=(2.0, 20.0))
+    whole = values_and_gradients(native.composite, p, (64, 80), EXACT)[1]
+    for budget in (0, 20_000):
+        monkeypatch.setattr(native, "SLOT_BYTES", budget)
+        parts = values_and_gradients(native.composite, p, (64, 80), EXACT)[1]
+        assert all(torch.equal(x, y) for x, y in zip(whole, parts, strict=True))
+
+
+@needs_kernel
+def test_a_batch_is_its_items() -> None:
+    p = scene(B=3, N=30, cut=STANDARD)
+    together = native.composite(p, (21, 35), STANDARD, False)[0]
+    for b in range(3):
+        item = Projected(**{name: value[b : b + 1] for name, value in vars(p).items()})
+        assert torch.equal(
+            native.composite(item, (21, 35), STANDARD, False)[0], together[b : b + 1]
+        )
+
+
+@needs_kernel
+def test_gradient_of_one_output_only_and_twice() -> None:
+    leaves, q = with_leaves(scene(N=10))
+    features, alpha, depth = native.composite(q, (21, 35), EXACT, True)
+    assert depth is not None
+    first = torch.autograd.grad(alpha.sum(), leaves[2], retain_graph=True)[0]
+    again = torch.autograd.grad(alpha.sum(), leaves[2], retain_graph=True)[0]
+    assert torch.equal(first, again)
+    assert torch.autograd.grad(features.sum(), leaves[4], allow_unused=True)[0] is None
+    with torch.no_grad():
+        assert not native.composite(q, (21, 35), EXACT, False)[0].requires_grad
+
+
+@needs_kernel
+def test_strided_inputs_and_gradients() -> None:
+    p = scene(B=2, N=10)
+    strided = Projected(
+        **{
+            name: value.transpose(0, 1).contiguous().transpose(0, 1)
+            for name, value in vars(p).items()
+        }
+    )
+    leaves, q = with_leaves(strided)
+    features = native.composite(q, (21, 35), EXACT, False)[0]
+    assert torch.equal(features, native.composite(p, (21, 35), EXACT, False)[0])
+    (strange,) = torch.autograd.grad(features.sum(), leaves[3], retain_graph=True)
+    (plain,) = torch.autograd.grad(features, leaves[3], torch.ones_like(features))
+    assert torch.equal(strange, plain)
+
+
+@needs_kernel
+@pytest.mark.parametrize("name", ["means", "conics", "opacities", "depths"])
+def test_not_finite_is_refused_by_name(name: str) -> None:
+    p = scene(B=2, N=5)
+    value = getattr(p, name).clone()
+    value[1, 3] = float("nan")
+    p = replace(p, **{name: value, "visible": torch.ones(2, 5, dtype=torch.bool)})
+    with pytest.raises(ValueError, match="Gaussian 3 of batch item 1"):
+        native.composite(p, (21, 35), HIGH, False)
+    hidden = replace(p, visible=torch.tensor([[True] * 5, [False] * 5]))
+    assert native.composite(hidden, (21, 35), HIGH, False)[0].isfinite().all()
+
+
+@needs_kernel
+def test_misuse_is_named() -> None:
+    p = scene(N=5)
+    with pytest.raises(ValueError, match=r"conics must be \[1, 5, 3\], got \[1, 5, 4\]"):
+        native.composite(replace(p, conics=torch.zeros(1, 5, 4)), (4, 4), HIGH, False)
+    with pytest.raises(ValueError, match=r"depths must be torch\.float64 like means"):
+        native.composite(replace(p, depths=p.depths.float()), (4, 4), HIGH, False)
+    with pytest.raises(ValueError, match="float32 or float64"):
+        native.composite(in_dtype(p, torch.float16), (4, 4), HIGH, False)
+    with pytest.raises(ValueError, match="size"):
+        native.composite(p, (0, 4), HIGH, False)
+
+
+@needs_kernel
+def test_extents_without_bound() -> None:
+    p = scene(N=6)
+    p = replace(p, extents=torch.full_like(p.extents, float("inf")))
+    assert_same(p, (21, 35), EXACT, 1e-13, 1e-13)
+
+
+# ------------------------------------------------------------------------------- build and load
+
+REPORT = "from gsgan.splat import native; print(native.available(), native.why_not(), sep='|')"
+
+
+def report(cache: Path, **environment: str) -> tuple[bool, str]:
+    """available() and why_not() of a fresh process."""
+    done = subprocess.run(
+        [sys.executable, "-c", REPORT],
+        env={**os.environ, "GSGAN_CACHE": str(cache), "OMP_NUM_THREADS": "1", **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=True,
+    )
+    yes, _, reason = done.stdout.strip().partition("|")
+    return yes == "True", reason
+
+
+Load = Callable[..., tuple[bool, str]]
+
+
+@pytest.fixture
+def load_afresh(monkeypatch: pytest.MonkeyPatch) -> Load:
+    """report() without the new process."""
+
+    def load(cache: Path, **environment: str) -> tuple[bool, str]:
+        monkeypatch.setenv("GSGAN_CACHE", str(cache))
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        library, reason = native._load_once.__wrapped__()
+        return library is not None, reason
+
+    return load
+
+
+def is_one_sentence(text: str) -> bool:
+    return text[:1].isupper() and text.endswith(".") and "\n" not in text
+
+
+def test_compiler_that_fails(tmp_path: Path) -> None:
+    yes, reason = report(tmp_path, CXX="/bin/false", PATH="")
+    assert not yes
+    assert "/bin/false" in reason
+    assert is_one_sentence(reason)
+
+
+def test_no_compiler(tmp_path: Path, load_afresh: Load) -> None:
+    yes, reason = load_afresh(tmp_path, CXX="", PATH=str(tmp_path))
+    assert not yes
+    assert "No C++ compiler is found" in reason
+    assert is_one_sentence(reason)
+
+
+def test_compiler_that_cannot_compile(tmp_path: Path, load_afresh: Load) -> None:
+    # Answers --version like a compiler, then fails with a message.
+    fake = tmp_path / "fake"
+    fake.write_text(
+        '#!/bin/sh\n[ "$1" = --version ] && exit 0\necho "x.cpp:1: error: no luck" >&2\nexit 1\n'
+    )
+    fake.chmod(0o755)
+    yes, reason = load_afresh(tmp_path, CXX=str(fake))
+    assert not yes
+    assert "no luck" in reason
+    assert is_one_sentence(reason)
+    assert list((tmp_path / "native").iterdir()) == []
+
+
+def test_cache_that_cannot_be_written(tmp_path: Path, load_afresh: Load) -> None:
+    (tmp_path / "file").write_text("")
+    yes, reason = load_afresh(tmp_path / "file")
+    assert not yes
+    assert "GSGAN_CACHE" in reason
+    assert is_one_sentence(reason)
+
+
+@pytest.fixture(scope="module")
+def quick_compiler(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A compiler that knows this one program, has no OpenMP, and takes ``SLOW`` seconds."""
+    folder = tmp_path_factory.mktemp("compiler")
+    library = shutil.copy(native._library()._name, folder)
+    fake = folder / "fake"
+    fake.write_text(
+        "#!/bin/sh\n"
+        'for f in "$@"; do\n'
+        '  [ "$f" = --version ] && exit 0\n'
+        '  [ "$f" = -fopenmp ] && exit 1\n'
+        '  last="$f"\n'
+        "done\n"
+        f"sleep ${{SLOW:-0}}; cp {library} $last\n"
+    )
+    fake.chmod(0o755)
+    return fake
+
+
+@needs_kernel
+def test_without_openmp_it_is_built_without(
+    tmp_path: Path, quick_compiler: Path, load_afresh: Load
+) -> None:
+    assert load_afresh(tmp_path, CXX=str(quick_compiler)) == (True, "")
+
+
+@needs_kernel
+def test_one_thread_without_openmp(tmp_path: Path) -> None:
+    command = [*native._compiler(), *native._BASE, str(native.SOURCE), "-o", f"{tmp_path}/x.so"]
+    assert subprocess.run(command, check=False).returncode == 0
+    library = native._open(tmp_path / "x.so")
+    assert library is not None
+    assert library.gsgan_has_openmp() == 0
+
+
+@needs_kernel
+def test_two_processes_build_at_once(tmp_path: Path, quick_compiler: Path) -> None:
+    answers: list[tuple[bool, str]] = []
+
+    def build() -> None:
+        answers.append(report(tmp_path, CXX=str(quick_compiler), SLOW="2"))
+
+    builders = [threading.Thread(target=build) for _ in range(2)]
+    for builder in builders:
+        builder.start()
+    for builder in builders:
+        builder.join()
+    assert answers == [(True, ""), (True, "")]
+    assert len(list((tmp_path / "native").iterdir())) == 1
+
+
+@needs_kernel
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.999])
+def test_damaged_cache_is_rebuilt(
+    tmp_path: Path, quick_compiler: Path, load_afresh: Load, kept: float
+) -> None:
+    folder = tmp_path / "native"
+    folder.mkdir()
+    whole = next(quick_compiler.parent.glob("*.so")).read_bytes()
+    # What a build would leave, had it been cut short or the disk been full.
+    key = native._key([str(quick_compiler)])
+    built = folder / f"{key}-{hashlib.sha256(whole).hexdigest()[:24]}.so"
+    built.write_bytes(whole[: int(kept * len(whole))])
+    assert load_afresh(tmp_path, CXX=str(quick_compiler)) == (True, "")
+    assert [path.read_bytes() for path in folder.iterdir()] == [whole]

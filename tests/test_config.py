@@ -1,0 +1,132 @@
+"""Configs compose, match their constructors key for key, and ablations differ by a line or two."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from gsgan.config import config_folder, one_sentence
+from gsgan.errors import ConfigError, DataError
+
+SRC = Path(__file__).parents[1] / "src" / "gsgan"
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (config_folder() / group).glob("*.yaml"))
+
+
+@pytest.mark.parametrize("model", options("model"))
+@pytest.mark.parametrize("data", options("data"))
+def test_every_model_composes_with_every_data(compose, model, data):
+    config = compose("train", f"model={model}", f"data={data}")
+    assert OmegaConf.to_container(config.model, resolve=True)["_target_"].startswith("gsgan.")
+
+
+@pytest.mark.parametrize(
+    "group", ["trainer", "logger", "size", "training", "accuracy", "experiment"]
+)
+def test_every_option_composes(compose, group):
+    assert options(group)
+    for option in options(group):
+        OmegaConf.to_container(compose("train", f"{group}={option}").training, resolve=True)
+
+
+def test_the_names_that_the_readme_promises_exist():
+    assert {"full", "wo_seg", "wo_gcn", "wo_feat", "splat_only"} <= set(options("model"))
+    assert {"synthetic", "capture", "zju_mocap", "thuman4"} <= set(options("data"))
+    assert {"cpu", "gpu", "ddp"} <= set(options("trainer"))
+    assert "demo" in options("experiment")
+
+
+def differences(a, b, at: str = "") -> set[str]:
+    if isinstance(a, dict) and isinstance(b, dict):
+        keys = set(a) | set(b)
+        return {x for k in keys for x in differences(a.get(k), b.get(k), f"{at}.{k}".strip("."))}
+    return set() if a == b else {at}
+
+
+@pytest.mark.parametrize("experiment", [None, "demo", "smoke"])
+@pytest.mark.parametrize(
+    ("model", "changed"),
+    [
+        ("wo_seg", {"model.segmentation"}),
+        ("wo_feat", {"training.step_two.feature_matching"}),
+        ("wo_gcn", {"model.pose_encoder"}),
+        ("splat_only", {"model.segmentation", "model.pose_encoder", "model.generator"}),
+    ],
+)
+def test_an_ablation_changes_what_it_says_and_nothing_else(compose, model, changed, experiment):
+    chosen = [] if experiment is None else [f"experiment={experiment}"]
+    full = OmegaConf.to_container(compose("train", *chosen))
+    other = OmegaConf.to_container(compose("train", *chosen, f"model={model}"))
+    found = {".".join(key.split(".")[:3]) for key in differences(full, other)}
+    assert {next(c for c in changed if key.startswith(c)) for key in found} == changed
+
+
+def test_demo_is_what_train_does_by_default(compose):
+    assert compose("train") == compose("train", "experiment=demo")
+
+
+def test_every_top_level_key_is_read_by_code(compose):
+    code = "\n".join(path.read_text() for path in SRC.rglob("*.py"))
+    yaml = "\n".join(path.read_text() for path in config_folder().rglob("*.yaml"))
+    for name in ("train", "evaluate"):
+        for key in compose(name):
+            read = re.search(rf"(config|stored)\.{key}\b", code) or f"${{{key}" in yaml
+            assert read, f"conf/{name}.yaml: {key} is read by nothing"
+
+
+def test_every_size_key_is_used(compose):
+    yaml = "\n".join(path.read_text() for path in config_folder().rglob("*.yaml"))
+    for size in options("size"):
+        keys = compose("train", f"size={size}").size
+        assert set(keys) == set(compose("train").size), size
+        for key in keys:
+            assert f"${{size.{key}}}" in yaml, f"size.{key} is read by nothing"
+
+
+def test_unknown_keys_do_not_pass_silently(tiny):
+    from hydra.utils import instantiate
+
+    config = tiny("+data.sizes=3")
+    with pytest.raises(Exception, match="sizes"):
+        instantiate(config.data)
+
+
+def test_missing_config_folder_is_said(monkeypatch, tmp_path):
+    import gsgan.config as module
+
+    monkeypatch.setattr(module, "__file__", str(tmp_path / "a" / "b" / "config.py"))
+    with pytest.raises(Exception, match="config folder is missing"):
+        config_folder()
+
+
+def test_bugs_keep_their_traceback_and_mistakes_get_a_sentence():
+    assert one_sentence(DataError("x.png: missing")) == "x.png: missing"
+    assert one_sentence(ConfigError("run is not set")) == "run is not set"
+    assert one_sentence(ZeroDivisionError("a bug")) is None
+
+
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ("model.deformation.sh_degree=7", "sh_degree must be 0, 1, 2 or 3, got 7"),
+        ("model.generator.output=tanh", "output must be linear or sigmoid"),
+        ("training.schedule.epoch=0", "schedule.epoch must be 1 or more"),
+        ("training.perceptual.weights=resnet", "vgg16, auto or random"),
+        ("data.crop=car", "data.crop must be null or person"),
+    ],
+)
+def test_unknown_values_become_one_sentence(tiny, override, named):
+    from hydra.utils import instantiate
+
+    from gsgan.runs import build_avatar
+
+    config = tiny(override)
+    with pytest.raises(Exception) as caught:  # noqa: PT011 (the sentence is what is checked)
+        data = instantiate(config.data)
+        instantiate(config.training)(build_avatar(config, data))
+    assert named in (one_sentence(caught.value) or "")

@@ -1,0 +1,170 @@
+"""The training scheme: every phase learns what it should, guards hold, randomness is derived."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from hydra.utils import instantiate
+from lightning import Trainer
+
+from gsgan.errors import GsganError
+from gsgan.runs import build_avatar
+from gsgan.training.module import AvatarTraining
+
+
+@pytest.fixture
+def make(tiny, tmp_path):
+    """(module, trainer, data) of the tiny config; the trainer fits the whole smoke schedule."""
+
+    def run(*overrides: str, **trainer) -> tuple[AvatarTraining, Trainer, object]:
+        config = tiny(*overrides)
+        data = instantiate(config.data)
+        data.setup()
+        torch.manual_seed(0)
+        module = instantiate(config.training)(build_avatar(config, data))
+        options = {
+            "max_epochs": module.schedule.epochs, "accelerator": "cpu", "logger": False,
+            "enable_checkpointing": False, "enable_progress_bar": False,
+            "enable_model_summary": False, "num_sanity_val_steps": 0,
+        }  # fmt: skip
+        return module, Trainer(**(options | trainer), default_root_dir=tmp_path), data
+
+    return run
+
+
+def snapshot(module: torch.nn.Module) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in module.state_dict().items()}
+
+
+def moved(before: dict[str, torch.Tensor], module: torch.nn.Module, part: str) -> bool:
+    after = module.state_dict()
+    return any(
+        not torch.equal(before[name], after[name]) for name in before if name.startswith(part)
+    )
+
+
+PARTS = {
+    "segmentation": "avatar.segmentation",
+    "psi": "avatar.deformation",
+    "generator": "avatar.generator",
+    "pose": "avatar.pose_encoder",
+    "discriminator": "discriminator",
+}
+
+
+@pytest.mark.parametrize(
+    ("schedule", "learning"),
+    [
+        ((3, 0, 0), {"segmentation"}),
+        ((0, 3, 0), {"psi"}),
+        ((0, 0, 3), {"psi", "generator", "pose", "discriminator"}),
+    ],
+)
+def test_each_phase_moves_its_own_parts_only(make, schedule, learning):
+    s, one, two = schedule
+    module, trainer, data = make(
+        f"training.schedule.segmentation={s}", f"training.schedule.step_one={one}",
+        f"training.schedule.step_two={two}", "training.schedule.discriminator_start=0",
+        "size.rgb_skip=false",  # with it, only the last layer moves in the first steps
+    )  # fmt: skip
+    before = snapshot(module)
+    trainer.fit(module, data)
+    assert {name for name, part in PARTS.items() if moved(before, module, part)} == learning
+    assert module.step == sum(schedule)
+
+
+def test_a_short_run_improves_step_one(make):
+    module, trainer, data = make(
+        "training.schedule.segmentation=0", "training.schedule.step_one=40",
+        "training.schedule.step_two=0", "training.recipes.psi.rate.peak=0.01",
+    )  # fmt: skip
+    frame = data.dataset("train")[0]
+    with torch.no_grad():
+        before = float((module.avatar.paint(frame).colour - frame.image).abs().mean())
+    trainer.fit(module, data)
+    with torch.no_grad():
+        after = float((module.avatar.paint(frame).colour - frame.image).abs().mean())
+    assert after < 0.7 * before
+
+
+def test_variants_build_only_what_they_use(make):
+    full, _, _ = make()
+    splat, _, _ = make("model=splat_only")
+    assert splat.discriminator is None
+    assert splat.perceptual is None
+    assert splat.schedule.step_two == 0
+    assert splat.schedule.step_one == full.schedule.step_one + full.schedule.step_two
+    wo_feat, _, _ = make("model=wo_feat")
+    assert wo_feat.step_two.feature_matching == 0
+    assert wo_feat.discriminator is not None
+    wo_seg, _, _ = make("model=wo_seg")
+    assert wo_seg.avatar.segmentation is None
+    assert wo_seg.schedule.segmentation == 0
+    no_gan, _, _ = make("training.step_two.adversarial=0", "model=wo_feat")
+    assert no_gan.discriminator is None
+
+
+def test_detached_features_keep_the_generator_out_of_psi(make):
+    module, trainer, data = make(
+        "training.step_two.detach_features=true", "training.step_two.anchor=0",
+        "training.schedule.segmentation=0", "training.schedule.step_one=0",
+    )  # fmt: skip
+    before = snapshot(module)
+    trainer.fit(module, data)
+    assert not moved(before, module, "avatar.deformation")
+    assert moved(before, module, "avatar.generator")
+
+
+def test_a_nan_gradient_skips_its_step_and_a_second_one_stops_the_run(make, capsys):
+    module, trainer, data = make("training.schedule.segmentation=0", "training.max_skipped=2")
+    poisoned = {1, 3}
+
+    def loss(painting, frame):
+        value = painting.features.sum()
+        return value * float("nan") if module.step in poisoned else value * 0
+
+    module.step_one_loss = loss
+    before = snapshot(module.avatar.deformation)
+    with pytest.raises(GsganError, match="2 iterations had gradients that were not finite"):
+        trainer.fit(module, data)
+    assert module.step == 3
+    assert "skipped (1 of at most 2)" in capsys.readouterr().out
+    assert not moved(before, module.avatar.deformation, "")
+
+
+def test_randomness_follows_from_seed_and_step(make):
+    module, _, data = make()
+    frame = data.dataset("train")[0]
+    first = module._background(frame), module._pose_noise(frame.skeleton)
+    again = module._background(frame), module._pose_noise(frame.skeleton)
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    module.step = 1
+    assert not torch.equal(module._background(frame), first[0])
+    module.step, module.seed = 0, 1
+    assert not torch.equal(module._pose_noise(frame.skeleton), first[1])
+    module.step_one = replace(module.step_one, random_background=False)
+    assert (module._background(frame) == 0).all()
+
+
+def test_feature_head_commutes_with_blending(make):
+    """The readout of F on a background is the background where nothing is."""
+    module, _, data = make()
+    frame = data.dataset("train")[0]
+    torch.nn.init.ones_(module.feature_head.bias)
+    painting = module.avatar.paint(frame)
+    empty = replace(painting, features=painting.features * 0, alpha=painting.alpha * 0)
+    blank = replace(frame, image=frame.image * 0, mask=frame.mask * 0)
+    assert float(module.step_one_loss(empty, blank).detach()) == pytest.approx(0, abs=1e-5)
+
+
+def test_pose_noise_can_be_off(make):
+    module, _, data = make("training.pose_noise=0")
+    assert module._pose_noise(data.dataset("train")[0].skeleton) is None
+
+
+def test_wrong_gan_name_is_one_sentence(make):
+    module, trainer, data = make("training.step_two.gan=wasserstein")
+    with pytest.raises(GsganError, match="logistic, hinge, lsgan"):
+        trainer.fit(module, data)
