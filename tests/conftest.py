@@ -68,15 +68,11 @@ def tiny(compose, capture):
 @pytest.fixture
 def build(tiny):
     """(data, avatar, frame) of a tiny config: everything real, everything small."""
-    from hydra.utils import instantiate
-
-    from gsgan.runs import build_avatar
+    from gsgan.runs import build_avatar, build_data
 
     def run(*overrides: str):
-        torch.manual_seed(0)
         config = tiny(*overrides)
-        data = instantiate(config.data)
-        data.setup()
+        data = build_data(config)
         return data, build_avatar(config, data), data.dataset("train")[0]
 
     return run

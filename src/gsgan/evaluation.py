@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.progress import track
 from torch.utils.data import Subset
 
+from gsgan.console import make_console
 from gsgan.data.datamodule import GsganData
 from gsgan.errors import ConfigError
 from gsgan.metrics.evaluation import empty_split, evaluate_split
@@ -19,7 +19,7 @@ from gsgan.metrics.image import lpips
 from gsgan.metrics.tables import Results, print_table, write_results
 from gsgan.model.avatar import Avatar
 from gsgan.pictures import grid_rows, write_grid
-from gsgan.runs import load_avatar, load_config
+from gsgan.runs import build_data, load_avatar, load_config
 
 SPLITS = ("novel_view", "novel_pose")
 
@@ -104,14 +104,12 @@ def evaluate_folder(config: DictConfig) -> Results:
     stored = load_config(folder)
     if config.data_root is not None:
         OmegaConf.update(stored, "data.root", config.data_root)
-    data: GsganData = instantiate(stored.data)
-    data.prepare_data()
-    data.setup("test")
+    data = build_data(stored)
     avatar, marks = load_avatar(folder, stored, data)
     return evaluate_run(
         folder,
         config,
-        Console(),
+        make_console(),
         data=data,
         avatar=avatar.to(_device(config.device)),
         marks=marks,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +16,7 @@ from gsgan.model.avatar import Avatar
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
+    from gsgan.training.module import AvatarTraining
 
 CHECKPOINT = Path("checkpoints") / "last.ckpt"
 # What may differ between a run and its continuation: where and how it runs, not what it learns.
@@ -22,9 +25,13 @@ FREE_KEYS = ("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips")
 
 def record(config: DictConfig) -> dict[str, Any]:
     """The config as plain values, without the keys a continuation may change."""
-    plain = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(plain, dict)
-    return {str(key): value for key, value in plain.items() if key not in FREE_KEYS}
+    return {
+        str(key): OmegaConf.to_container(value, resolve=True)
+        if OmegaConf.is_config(value := config[key])
+        else value
+        for key in config
+        if key not in FREE_KEYS
+    }
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -95,9 +102,48 @@ def load_config(folder: Path) -> DictConfig:
     return config
 
 
+def build_data(config: DictConfig) -> GsganData:
+    """The data module of a config, its dataset made if need be, read and checked."""
+    data: GsganData = instantiate(config.data)
+    data.prepare_data()
+    data.setup()
+    return data
+
+
 def build_avatar(config: DictConfig, data: GsganData) -> Avatar:
-    """The untrained avatar of a config, sized to the data."""
-    return instantiate(config.model)(scene=data.info)
+    """The untrained avatar of a config, sized to the data, its weights from ``config.seed``.
+
+    Raises:
+        ConfigError: when a value under ``model`` is not one the parts can take.
+    """
+    torch.manual_seed(config.seed)
+    with _naming("model"):
+        return instantiate(config.model)(scene=data.info)
+
+
+def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
+    """Data and training module of a config.
+
+    Raises:
+        GsganError: on a dataset or a value that cannot be used.
+    """
+    data = build_data(config)
+    avatar = build_avatar(config, data)
+    with _naming("training"):
+        return data, instantiate(config.training)(avatar, record=record(config))
+
+
+@contextmanager
+def _naming(group: str) -> Iterator[None]:
+    """A value a constructor refuses becomes a sentence that names the config group."""
+    try:
+        yield
+    except TypeError as error:
+        if "unexpected keyword argument" not in str(error):
+            raise
+        raise ConfigError(f"{group}: {error}") from error
+    except ValueError as error:
+        raise ConfigError(f"{group}: {error}") from error
 
 
 def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avatar, list[str]]:

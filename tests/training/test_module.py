@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hydra.utils import instantiate
 from lightning import Trainer
 
 from gsgan.errors import GsganError
-from gsgan.runs import build_avatar
+from gsgan.runs import build_training
 from gsgan.training.module import AvatarTraining
 
 
@@ -19,11 +18,7 @@ def make(tiny, tmp_path):
     """(module, trainer, data) of the tiny config; the trainer fits the whole smoke schedule."""
 
     def run(*overrides: str, **trainer) -> tuple[AvatarTraining, Trainer, object]:
-        config = tiny(*overrides)
-        data = instantiate(config.data)
-        data.setup()
-        torch.manual_seed(0)
-        module = instantiate(config.training)(build_avatar(config, data))
+        data, module = build_training(tiny(*overrides))
         options = {
             "max_epochs": module.schedule.epochs, "accelerator": "cpu", "logger": False,
             "enable_checkpointing": False, "enable_progress_bar": False,

@@ -24,7 +24,7 @@ _DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "edge_f1": 3, "miou": 3}
 _VARIANTS = {
     "full": "I_pred",
     "splat": "Step I's colour",
-    "floor": "all-background picture (floor)",
+    "floor": "floor: all background",
 }
 
 
@@ -62,7 +62,7 @@ def print_table(results: Results, console: Console, title: str) -> None:
     """The rich table with its notes underneath."""
     table = Table(title=title)
     for name in ("split", "picture", "images"):
-        table.add_column(name)
+        table.add_column(name, no_wrap=True)
     for metric in METRICS:
         table.add_column(HEADINGS[metric], justify="right")
     for row in rows(results):

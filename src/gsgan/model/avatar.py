@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +23,7 @@ from gsgan.skeleton import (
     sanitise,
 )
 from gsgan.splat import Accuracy, rasterise
+from gsgan.window import Window, body_window
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import SceneInfo  # loads Lightning
@@ -53,6 +54,21 @@ class Painting:
         """``[B, 3, H, W]`` Step I's picture C on black."""
         return self.features[:, :3]
 
+    def pasted(self, window: Window) -> Painting:
+        """The same in the whole picture, all background outside the window."""
+        parts = None
+        if self.segmentation is not None:
+            parts = window.paste(self.segmentation)
+            inside = window.paste(torch.ones_like(self.alpha))
+            parts = torch.cat([parts[:, :1] + (1 - inside), parts[:, 1:]], dim=1)
+        return replace(
+            self,
+            image=None if self.image is None else window.paste(self.image),
+            features=window.paste(self.features),
+            alpha=window.paste(self.alpha),
+            segmentation=parts,
+        )
+
 
 class Avatar(nn.Module):
     """One person: Gaussians, segmentation, pose code and generator put together.
@@ -69,6 +85,8 @@ class Avatar(nn.Module):
         generator: the UNet, given its channel counts; None makes Step I's colour the picture.
         accuracy: the rasteriser's settings for F.
         twist: how bone frames turn about their bones, ``none`` or ``hinge``.
+        window_margin: metres round the joints that are painted; None paints whole pictures.
+        window_multiple: the window's sides are multiples of so many pixels.
 
     Source: paper Fig. 2 and Sec. 3; architecture.md § 4.
     """
@@ -82,10 +100,13 @@ class Avatar(nn.Module):
         pose_encoder: nn.Module | None,
         generator: Callable[..., Generator] | None,
         accuracy: Accuracy,
-        twist: str = "none",
+        twist: Literal["none", "hinge"] = "none",
+        window_margin: float | None = 0.25,
+        window_multiple: int = 16,
     ) -> None:
         super().__init__()
         self.template, self.accuracy, self.twist = MEDIAPIPE33, accuracy, twist
+        self.window_margin, self.window_multiple = window_margin, window_multiple
         self.limb_sum = float(scene.body_height)
         # Stature, from limb lengths: what the skeleton measures and no pose changes.
         self.body_height = self.limb_sum * self.template.stature / self.template.limb_length_sum
@@ -174,8 +195,20 @@ class Avatar(nn.Module):
         return Painting(image, F, raster.alpha, S, gaussians)
 
     def paint(self, frame: Frame) -> Painting:
-        """`forward` for a frame of a dataset."""
-        return self(frame.skeleton, frame.visibility, frame.camera, frame.body)
+        """The whole picture of a frame of a dataset: its window painted, background around it."""
+        window = self.window(frame)
+        if window is None:
+            return self(frame.skeleton, frame.visibility, frame.camera, frame.body)
+        camera = window.camera(frame.camera)
+        return self(frame.skeleton, frame.visibility, camera, frame.body).pasted(window)
+
+    def window(self, frame: Frame) -> Window | None:
+        """The part of a frame's picture that holds the person; None means all of it."""
+        if self.window_margin is None:
+            return None
+        p, _ = sanitise(frame.skeleton, frame.visibility, self.template, self.limb_sum)
+        near = self.accuracy.near
+        return body_window(p, frame.camera, self.window_margin, self.window_multiple, near)
 
     def segment(self, body: BodyPose | None, camera: Camera) -> Tensor | None:
         """S, without gradient: it is trained on its own (method.md § 3) and then frozen."""

@@ -81,4 +81,4 @@ class Narrator(Callback):
             spent = time.monotonic() - self._clock
             left = spent / done * (total - step)
             line += f"  {done / spent:5.1f} it/s, {left / 60:4.1f} min left"
-        self.console.print(line, highlight=False)
+        self.console.print(line, highlight=False, soft_wrap=True)

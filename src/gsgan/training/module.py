@@ -211,6 +211,8 @@ class AvatarTraining(LightningModule):
     def training_step(self, frame: Frame, batch_idx: int) -> None:
         if self.step >= self.schedule.total:
             return
+        window = self.avatar.window(frame)
+        frame = frame if window is None else window.frame(frame)
         phase = self.schedule.phase(self.step)
         if phase == SEGMENTATION:
             self._train_segmentation(frame)

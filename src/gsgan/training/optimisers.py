@@ -33,7 +33,7 @@ class Recipe:
             [{"params": p, "lr": self.rate.peak * k, "multiplier": k} for p, k in groups if p],
             betas=tuple(self.betas),  # type: ignore[arg-type]
             eps=self.eps,
-            foreach=True,
+            fused=True,
         )
 
 

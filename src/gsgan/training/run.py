@@ -16,10 +16,11 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
+from gsgan.console import make_console
 from gsgan.data.datamodule import GsganData
 from gsgan.evaluation import evaluate_run
 from gsgan.model.avatar import Avatar
-from gsgan.runs import CHECKPOINT, build_avatar, checkpoint_to_resume, record
+from gsgan.runs import CHECKPOINT, build_training, checkpoint_to_resume
 from gsgan.training.callbacks import Narrator, PictureGrid
 from gsgan.training.module import AvatarTraining
 
@@ -30,20 +31,16 @@ def run_training(config: DictConfig) -> None:
     Raises:
         GsganError: see `gsgan.runs.checkpoint_to_resume` and the data module.
     """
-    console = Console()
+    console = make_console()
     folder = Path(HydraConfig.get().runtime.output_dir)
     _quiet_lightning()
+    torch.set_flush_denormal(True)  # black background decays into denormals, which CPUs are slow at
     seed_everything(config.seed, workers=True, verbose=False)
 
-    data: GsganData = instantiate(config.data)
-    data.prepare_data()
-    data.setup("fit")
-    seed_everything(config.seed, workers=True, verbose=False)  # whether the data was made or read
-    avatar = build_avatar(config, data)
-    module: AvatarTraining = instantiate(config.training)(avatar, record=record(config))
+    data, module = build_training(config)
     resume = checkpoint_to_resume(folder, config) if config.resume else None
 
-    describe(console, folder, data, avatar, module)
+    describe(console, folder, data, module)
     if resume is not None:
         console.print(f"going on from {resume}")
     trainer = build_trainer(config, folder, module, console)
@@ -54,7 +51,9 @@ def run_training(config: DictConfig) -> None:
         return
     console.print(f"\nheld-out PSNR: {_psnr(module.start_psnr)} at the start")
     if config.evaluate:
-        evaluate_run(folder, config, console, data=data, avatar=avatar.eval(), marks=module.marks)
+        evaluate_run(
+            folder, config, console, data=data, avatar=module.avatar.eval(), marks=module.marks
+        )
     console.print(f"run folder: {folder}", soft_wrap=True)
 
 
@@ -91,11 +90,9 @@ def build_trainer(
     )
 
 
-def describe(
-    console: Console, folder: Path, data: GsganData, avatar: Avatar, module: AvatarTraining
-) -> None:
+def describe(console: Console, folder: Path, data: GsganData, module: AvatarTraining) -> None:
     """What is trained on what, which effects are on and why, which stand-ins are in use."""
-    info = data.info
+    info, avatar = data.info, module.avatar
     held_out = ", ".join(f"{len(data.dataset(name))} {name}" for name in data.eval_names)
     table = Table(title=f"gsgan: {folder}", show_header=False)
     table.add_row(
@@ -148,3 +145,5 @@ def _quiet_lightning() -> None:
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
     warnings.filterwarnings("ignore", message=".*Checkpoint directory .* exists.*")
+    warnings.filterwarnings("ignore", message=".*is smaller than the logging interval.*")
+    warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")

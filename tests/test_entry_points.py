@@ -1,0 +1,304 @@
+"""The commands as a user types them: real processes, tiny runs, and every way to go wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[1]
+TINY = ["size=tiny", "training=smoke", "data=capture", "data.size=32", "data.crop=null"]
+METRICS = {"psnr", "ssim", "lpips", "edge_f1", "miou"}
+
+
+def gsgan(command: str, *args: str, cwd: Path, timeout: int = 300):
+    """Runs ``python -m gsgan.<command>`` from another directory, as an installed user would."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
+    return subprocess.run(
+        [sys.executable, "-m", f"gsgan.{command}", *args],
+        cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout,
+    )  # fmt: skip
+
+
+def train(capture: Path, run: Path, *args: str, cwd: Path | None = None):
+    given = [*TINY, f"data.root={capture}", f"hydra.run.dir={run}", *args]
+    return gsgan("train", *given, cwd=cwd or run.parent)
+
+
+def refused(result, *words: str) -> None:
+    """One sentence on stderr, a non-zero exit, no traceback."""
+    assert result.returncode != 0, result.stdout
+    assert "Traceback" not in result.stderr + result.stdout
+    text = " ".join(result.stderr.split())
+    for word in words:
+        assert word in text, text
+
+
+@pytest.fixture(scope="module")
+def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished tiny run, made by the real command."""
+    folder = tmp_path_factory.mktemp("runs") / "one"
+    result = train(capture, folder)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert f"run folder: {folder}" in result.stdout.replace("\n", "")
+    assert "floor" in result.stdout
+    assert "marked: perceptual loss" in result.stdout
+    return folder
+
+
+def test_a_run_leaves_metrics_pictures_config_log_and_checkpoint(run):
+    metrics = json.loads((run / "metrics.json").read_text())
+    assert set(metrics) == {"novel_view", "novel_pose"}
+    for split in metrics.values():
+        assert set(split) == {"full", "splat", "floor"}
+        for scores in split.values():
+            assert set(scores) >= METRICS
+            for metric in METRICS:
+                assert scores[metric] is not None or scores[f"{metric}_reason"]
+    assert metrics["novel_pose"]["full"]["psnr"] > 5
+    assert metrics["novel_pose"]["full"]["miou"] is not None
+    assert (run / "metrics.md").is_file()
+    assert (run / ".hydra" / "config.yaml").is_file()
+    assert (run / "checkpoints" / "last.ckpt").is_file()
+    assert (run / "logs" / "metrics.csv").is_file()
+    names = {path.name for path in (run / "pictures").iterdir()}
+    assert {"step_000000.png", "novel_view.png", "novel_pose.png"} <= names
+
+
+def test_the_checkpoint_loads_without_pickle(run):
+    checkpoint = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
+    assert checkpoint["gsgan"]["step"] == 16
+    assert not any("perceptual.stages" in key for key in checkpoint["state_dict"])
+
+
+def test_evaluate_gives_the_same_numbers_again(run, tmp_path):
+    before = json.loads((run / "metrics.json").read_text())
+    (run / "metrics.json").unlink()
+    result = gsgan("evaluate", f"run={run}", "device=cpu", cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert json.loads((run / "metrics.json").read_text()) == before
+    assert "floor" in result.stdout
+    assert not list(tmp_path.iterdir())  # nothing of its own left behind
+
+
+def test_evaluate_finds_a_dataset_that_moved(run, capture, tmp_path):
+    moved = shutil.copytree(capture, tmp_path / "moved")
+    arguments = [f"run={run}", f"data_root={moved}", "splits=[novel_pose]"]
+    kept = (run / "metrics.json").read_text()
+    result = gsgan("evaluate", *arguments, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    scores = json.loads((run / "metrics.json").read_text())
+    assert scores["novel_pose"] == json.loads(kept)["novel_pose"]
+
+
+def test_evaluate_refuses_what_is_no_run(run, tmp_path):
+    refused(gsgan("evaluate", cwd=tmp_path), "run is not set")
+    refused(gsgan("evaluate", f"run={tmp_path}", cwd=tmp_path), "not a run folder")
+    refused(gsgan("evaluate", f"run={run}", "device=abacus", cwd=tmp_path), "device=abacus")
+    refused(
+        gsgan("evaluate", f"run={run}", "splits=[training]", cwd=tmp_path), "splits", "novel_pose"
+    )
+    broken = shutil.copytree(run, tmp_path / "broken")
+    checkpoint = broken / "checkpoints" / "last.ckpt"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    refused(gsgan("evaluate", f"run={broken}", cwd=tmp_path), "last.ckpt", "not a readable")
+    checkpoint.unlink()
+    refused(gsgan("evaluate", f"run={broken}", cwd=tmp_path), "last.ckpt", "no checkpoint yet")
+
+
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+def test_help(command, tmp_path):
+    result = gsgan(command, "--help", cwd=tmp_path)
+    assert result.returncode == 0
+    assert "hydra.run.dir" in result.stdout
+
+
+def test_the_list_of_commands(tmp_path):
+    result = subprocess.run(
+        [sys.executable, "-m", "gsgan"], cwd=tmp_path, capture_output=True, text=True, check=True
+    )
+    assert "gsgan.train" in result.stdout
+    assert "gsgan.evaluate" in result.stdout
+
+
+def weights(run: Path) -> dict[str, torch.Tensor]:
+    return torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+def test_same_seed_same_numbers_other_seed_others(run, capture, tmp_path):
+    again, other = tmp_path / "again", tmp_path / "other"
+    assert train(capture, again, "evaluate=false").returncode == 0
+    assert train(capture, other, "evaluate=false", "seed=1").returncode == 0
+    assert same(weights(run), weights(again))
+    assert not same(weights(run), weights(other))
+
+
+KILL = """
+import os, signal, sys
+from gsgan.training.module import AvatarTraining
+from gsgan.train import main
+step = AvatarTraining.training_step
+def dying(self, *args):
+    if self.step == 10:  # in the middle of the third of four epochs
+        os.kill(os.getpid(), signal.SIGKILL)
+    return step(self, *args)
+AvatarTraining.training_step = dying
+main()
+"""
+
+
+def test_killed_half_way_and_resumed_ends_with_the_same_weights(run, capture, tmp_path):
+    folder = tmp_path / "killed"
+    given = [*TINY, f"data.root={capture}", f"hydra.run.dir={folder}", "evaluate=false"]
+    killed = subprocess.run(
+        [sys.executable, "-c", KILL, *given], cwd=tmp_path, capture_output=True, timeout=300
+    )
+    assert killed.returncode == -9
+    assert not (folder / "metrics.json").exists()
+    assert torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["gsgan"]["step"] == 8
+    resumed = train(capture, folder, "evaluate=false")
+    assert resumed.returncode == 0, resumed.stderr
+    assert "going on from" in resumed.stdout
+    assert same(weights(run), weights(folder))
+
+
+def test_a_folder_with_another_run_is_not_overwritten(run, capture):
+    before = (run / "checkpoints" / "last.ckpt").read_bytes()
+    result = train(capture, run, "training.pose_noise=0.5")
+    refused(result, "other settings", "training.pose_noise", "resume=false")
+    assert (run / "checkpoints" / "last.ckpt").read_bytes() == before
+
+
+def test_multirun_leaves_one_results_file_each(capture, tmp_path):
+    models = ["full", "wo_seg", "wo_gcn"]
+    result = gsgan(
+        "train", "-m", f"model={','.join(models)}", *TINY, f"data.root={capture}",
+        f"hydra.sweep.dir={tmp_path / 'sweep'}", cwd=tmp_path,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stdout + result.stderr
+    found = list((tmp_path / "sweep").rglob("metrics.json"))
+    assert len(found) == 3
+    for model in models:
+        assert any(f"model={model}" in str(path) for path in found)
+
+
+def test_the_papers_command_fails_only_for_the_missing_path(tmp_path):
+    refused(gsgan("train", "model=full", "data=thuman4", cwd=tmp_path), "data.root is not set")
+    missing = gsgan("train", "data=zju_mocap", "data.root=/nowhere", cwd=tmp_path)
+    refused(missing, "/nowhere", "does not exist")
+
+
+def break_camera(root: Path) -> None:
+    cameras = json.loads((root / "cameras.json").read_text())
+    del cameras["cam01"]
+    (root / "cameras.json").write_text(json.dumps(cameras))
+
+
+def break_mask(root: Path) -> None:
+    import cv2
+
+    cv2.imwrite(str(root / "masks" / "cam00" / "000001.png"), np.zeros((5, 5), np.uint8))
+
+
+def break_joints(root: Path) -> None:
+    arrays = dict(np.load(root / "landmarks3d.npz"))
+    arrays["p"][:] = np.nan
+    np.savez(root / "landmarks3d.npz", **arrays)
+
+
+def break_frames(root: Path) -> None:
+    for path in (root / "images").rglob("*.*"):
+        path.unlink()
+
+
+def cut_image(root: Path) -> None:
+    path = next((root / "images" / "cam00").iterdir())
+    path.write_bytes(path.read_bytes()[:60])
+
+
+@pytest.mark.parametrize(
+    ("corrupt", "words"),
+    [
+        (break_camera, ("cam01", "cameras.json")),
+        (break_mask, ("masks/cam00/000001.png",)),
+        (break_joints, ("landmarks3d.npz",)),
+        (break_frames, ("images",)),
+        (cut_image, ("images/cam00",)),
+    ],
+)
+def test_bad_data_ends_in_one_sentence_and_leaves_nothing(capture, tmp_path, corrupt, words):
+    root = shutil.copytree(capture, tmp_path / "data")
+    corrupt(root)
+    refused(train(root, tmp_path / "run"), *words)
+    assert not (tmp_path / "run" / "metrics.json").exists()
+    assert not (tmp_path / "run" / "checkpoints" / "last.ckpt").exists()
+
+
+@pytest.mark.parametrize(
+    ("argument", "words"),
+    [
+        ("data.root=/nowhere/at/all", ("/nowhere/at/all",)),
+        ("model=huge", ("model/huge",)),
+        ("model.deformation.sh_degree=9", ("sh_degree must be 0, 1, 2 or 3, got 9",)),
+        ("modle=full", ("modle",)),
+        ("trainer.precision=3-bits", ("3-bits",)),
+    ],
+)
+def test_a_wrong_value_ends_in_one_sentence(capture, tmp_path, argument, words):
+    refused(train(capture, tmp_path / "run", argument), *words)
+
+
+def test_splat_only_and_wo_feat_run_to_the_end(capture, tmp_path):
+    for model in ("splat_only", "wo_feat"):
+        result = train(capture, tmp_path / model, f"model={model}")
+        assert result.returncode == 0, result.stdout + result.stderr
+    metrics = json.loads((tmp_path / "splat_only" / "metrics.json").read_text())
+    scores = metrics["novel_pose"]
+    assert scores["full"]["psnr"] == scores["splat"]["psnr"]
+    assert scores["full"]["miou_reason"] == "the model has no segmentation"
+
+
+def documented() -> list[str]:
+    """Every ``python -m gsgan…`` of README and docs, once."""
+    text = "\n".join(p.read_text() for p in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+    blocks = re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
+    lines = [line.split("#")[0].strip() for block in blocks for line in block.splitlines()]
+    return sorted({line for line in lines if line.startswith("python -m gsgan")})
+
+
+@pytest.mark.parametrize("line", documented())
+def test_every_documented_command_runs(line, run, capture, tmp_path):
+    """As written, but tiny: placeholders filled in, the default person replaced by a capture."""
+    line = line.replace("/path/to/capture", str(capture)).replace("<run folder>", str(run))
+    _, _, module, *arguments = line.split()
+    if module == "gsgan.train":
+        given = [a for a in arguments if a != "experiment=demo"]
+        if not any(a.startswith("data=") for a in given):
+            given.append("data=capture")
+        if "data=capture" not in given:  # readers still to come: the promise is a clear refusal
+            refused(gsgan("train", *given, cwd=tmp_path), "data.root")
+            return
+        given += [t for t in TINY if not t.startswith("data=")]
+        if not any(a.startswith("data.root=") for a in given):
+            given.append(f"data.root={capture}")
+        # One kind of machine runs the tests.
+        given = [a for a in given if a not in ("trainer=gpu", "trainer=ddp")]
+        result = gsgan("train", *given, cwd=tmp_path)
+    else:
+        name = module.removeprefix("gsgan").lstrip(".")
+        if not name:
+            return  # the bare list of commands: test_the_list_of_commands
+        result = gsgan(name, *arguments, cwd=tmp_path)
+    assert result.returncode == 0, result.stdout + result.stderr
