@@ -34,6 +34,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
         labels=True,
         body_pose=True,
         splits=splits,
+        meta={"body": "free"},
     )
 
 

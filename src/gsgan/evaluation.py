@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -53,6 +54,7 @@ def evaluate_run(
     Raises:
         ConfigError: on an unknown split.
     """
+    splits = [splits] if isinstance(splits, str) else splits
     unknown = sorted(set(splits) - set(SPLITS))
     if unknown:
         raise ConfigError(f"splits must be among {', '.join(SPLITS)}; got {', '.join(unknown)}")
@@ -69,10 +71,24 @@ def evaluate_run(
             avatar, shown, lpips=score, lpips_reason=reason, marks=marks
         )
         write_pictures(avatar, data, split, folder / "pictures" / f"{split}.png", pictures)
+    results = _earlier(folder, marks) | results
     title = f"{folder.name}: held-out cameras (novel_view) and poses (novel_pose)"
     write_results(results, folder, title)
     print_table(results, console, title)
     return results
+
+
+def _earlier(folder: Path, marks: list[str]) -> Results:
+    """Splits scored before, so that scoring one of them does not lose the other."""
+    path = folder / "metrics.json"
+    if not path.is_file():
+        return {}
+    try:
+        found: Results = json.loads(path.read_text())
+        same = all(v["marks"] == marks for split in found.values() for v in split.values())
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return {}
+    return {split: found[split] for split in SPLITS if split in found} if same else {}
 
 
 def write_pictures(avatar: Avatar, data: GsganData, split: str, path: Path, rows: int) -> None:
@@ -113,7 +129,7 @@ def evaluate_folder(config: DictConfig) -> Results:
         data=data,
         avatar=avatar.to(_device(config.device)),
         marks=marks,
-        splits=list(config.splits),
+        splits=config.splits,
         pictures=config.pictures,
     )
 

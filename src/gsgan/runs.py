@@ -18,20 +18,32 @@ if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
     from gsgan.training.module import AvatarTraining
 
+DISCRIMINATOR_SALT = 1000
 CHECKPOINT = Path("checkpoints") / "last.ckpt"
 # What may differ between a run and its continuation: where and how it runs, not what it learns.
-FREE_KEYS = ("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips")
+FREE_KEYS = (
+    *("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips"),
+    *("data.root", "data.workers", "data.cache_mb", "data.val_pictures", "data.source.workers"),
+)
 
 
 def record(config: DictConfig) -> dict[str, Any]:
     """The config as plain values, without the keys a continuation may change."""
-    return {
+    plain: dict[str, Any] = {
         str(key): OmegaConf.to_container(value, resolve=True)
         if OmegaConf.is_config(value := config[key])
         else value
         for key in config
         if key not in FREE_KEYS
     }
+    for key in FREE_KEYS:
+        *groups, last = key.split(".")
+        node: Any = plain
+        for group in groups:
+            node = node.get(group) if isinstance(node, dict) else None
+        if isinstance(node, dict):
+            node.pop(last, None)
+    return plain
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
@@ -54,7 +66,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return checkpoint
 
 
-def checkpoint_to_resume(folder: Path, config: DictConfig) -> Path | None:
+def checkpoint_to_resume(folder: Path, config: DictConfig, marks: list[str]) -> Path | None:
     """The checkpoint of an earlier part of this very run, or None.
 
     Raises:
@@ -64,7 +76,14 @@ def checkpoint_to_resume(folder: Path, config: DictConfig) -> Path | None:
     path = folder / CHECKPOINT
     if not path.is_file():
         return None
-    before, now = read_checkpoint(path)["gsgan"]["record"], record(config)
+    state = read_checkpoint(path)["gsgan"]
+    if state["marks"] != marks:
+        raise ConfigError(
+            f"{folder} holds a run whose stand-ins were other ones "
+            f"({'; '.join(state['marks']) or 'none'}; now {'; '.join(marks) or 'none'}); set "
+            "training.perceptual.weights as it was, or resume=false to start over there"
+        )
+    before, now = state["record"], record(config)
     changed = sorted(set(_differences(before, now)))
     if changed:
         shown = ", ".join(changed[:5]) + (" …" if len(changed) > 5 else "")
@@ -99,6 +118,10 @@ def load_config(folder: Path) -> DictConfig:
         )
     config = OmegaConf.load(path)
     assert isinstance(config, DictConfig)
+    root = OmegaConf.select(config, "data.root")
+    if root is not None and not Path(root).expanduser().is_absolute():
+        started = OmegaConf.load(folder / ".hydra" / "hydra.yaml").hydra.runtime.cwd
+        OmegaConf.update(config, "data.root", str(Path(started) / root))
     return config
 
 
@@ -127,8 +150,11 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     Raises:
         GsganError: on a dataset or a value that cannot be used.
     """
+    if not isinstance(config.seed, int) or config.seed < 0:
+        raise ConfigError(f"seed must be a whole number of at least 0, got {config.seed!r}")
     data = build_data(config)
     avatar = build_avatar(config, data)
+    torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
     with _naming("training"):
         return data, instantiate(config.training)(avatar, record=record(config))
 
@@ -138,11 +164,7 @@ def _naming(group: str) -> Iterator[None]:
     """A value a constructor refuses becomes a sentence that names the config group."""
     try:
         yield
-    except TypeError as error:
-        if "unexpected keyword argument" not in str(error):
-            raise
-        raise ConfigError(f"{group}: {error}") from error
-    except ValueError as error:
+    except (TypeError, ValueError, RuntimeError) as error:
         raise ConfigError(f"{group}: {error}") from error
 
 

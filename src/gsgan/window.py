@@ -65,7 +65,9 @@ class Window:
         return torch.cat(pasted)
 
 
-def body_window(p: Tensor, camera: Camera, margin: float, multiple: int, near: float) -> Window:
+def body_window(
+    p: Tensor, camera: Camera, *, margin: float, multiple: int, least: int, near: float
+) -> Window:
     """The boxes round the projected joints.
 
     They depend on skeleton and camera only, never on a mask, so a picture that is yet to be painted
@@ -76,10 +78,11 @@ def body_window(p: Tensor, camera: Camera, margin: float, multiple: int, near: f
         camera: B cameras.
         margin: metres kept round every joint (hair, fingertips, clothes).
         multiple: sides are rounded up to multiples of so many pixels, where the picture has room.
+        least: pixels, the shortest side, where the picture has room.
         near: metres; with a joint nearer than this the whole picture is the box.
 
     Returns:
-        Boxes inside the picture, at least one multiple wide where the picture is.
+        Boxes inside the picture.
     """
     height, width = camera.size
     pixels, depth = camera.project(p)
@@ -92,8 +95,8 @@ def body_window(p: Tensor, camera: Camera, margin: float, multiple: int, near: f
     low = torch.where(behind, torch.zeros_like(low), low).clamp_min(0).minimum(everywhere - 1)
     high = torch.where(behind, everywhere.expand_as(high), high).clamp_min(1).minimum(everywhere)
     bounds = torch.cat([low, high], dim=-1).long().tolist()
-    w = _side(max(x1 - x0 for x0, _, x1, _ in bounds), multiple, width)
-    h = _side(max(y1 - y0 for _, y0, _, y1 in bounds), multiple, height)
+    w = _side(max(least, *(x1 - x0 for x0, _, x1, _ in bounds)), multiple, width)
+    h = _side(max(least, *(y1 - y0 for _, y0, _, y1 in bounds)), multiple, height)
     corners = tuple(
         (_start(y0, y1, h, height), _start(x0, x1, w, width)) for x0, y0, x1, y1 in bounds
     )

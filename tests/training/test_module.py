@@ -159,7 +159,35 @@ def test_pose_noise_can_be_off(make):
     assert module._pose_noise(data.dataset("train")[0].skeleton) is None
 
 
-def test_wrong_gan_name_is_one_sentence(make):
-    module, trainer, data = make("training.step_two.gan=wasserstein")
-    with pytest.raises(GsganError, match="logistic, hinge, lsgan"):
+def test_a_vanished_person_stops_the_run_before_its_checkpoint(make, tmp_path):
+    """The collapse of method.md § 13: every opacity falls to nothing, and no NaN says so."""
+    from lightning.pytorch.callbacks import ModelCheckpoint
+
+    keep = ModelCheckpoint(tmp_path / "kept", save_on_train_epoch_end=True)
+    module, trainer, data = make(enable_checkpointing=True, callbacks=[keep])
+    module.avatar.deformation.logit_bound = 20.0
+    module.avatar.deformation.table.data[:, 10] = -18.0
+    with pytest.raises(GsganError, match="has vanished"):
         trainer.fit(module, data)
+    assert module.step < module.schedule.total
+    assert not keep.best_model_path or "step=4" not in keep.best_model_path
+
+
+def test_every_phase_runs_under_bf16_autocast(make):
+    """Geometry, rasteriser and SSIM stay in float32: F is the same with and without autocast."""
+    module, _, data = make()
+    frame = data.dataset("train")[0]
+    plain = module.avatar.paint(frame)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert module.avatar.window(frame) is not None
+        mixed = module.avatar.paint(frame)
+        terms = module.step_two_terms(mixed, frame, play=True)
+        torch.stack(list(terms.values())).sum().backward()
+    assert torch.equal(plain.features, mixed.features)
+    assert mixed.image.dtype == torch.float32
+    assert float((plain.image - mixed.image).abs().max().detach()) < 0.05
+
+
+def test_wrong_gan_name_is_one_sentence(make):
+    with pytest.raises(Exception, match="logistic, hinge, lsgan"):
+        make("training.step_two.gan=wasserstein")

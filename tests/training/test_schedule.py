@@ -35,6 +35,20 @@ def test_rate_holds_then_descends_to_its_end():
     assert values == sorted(values, reverse=True)
 
 
+@pytest.mark.parametrize(("shape", "half"), [("linear", 0.505), ("exponential", 0.1)])
+def test_rate_shapes(shape, half):
+    rate = Rate(peak=1.0, hold=0.0, until=0.5, final=0.01, shape=shape)
+    assert math.isclose(rate.at(25, 0, 100), half, rel_tol=1e-9)
+    assert math.isclose(rate.at(50, 0, 100), 0.01, rel_tol=1e-9)
+    assert math.isclose(rate.at(99, 0, 100), 0.01, rel_tol=1e-9)
+
+
+@pytest.mark.parametrize("wrong", [{"shape": "step"}, {"hold": 0.9, "until": 0.5}])
+def test_impossible_rates_are_refused(wrong):
+    with pytest.raises(ConfigError, match="rate"):
+        Rate(**({"peak": 1.0} | wrong))
+
+
 def test_rate_warms_up():
     rate = Rate(peak=1.0, hold=1.0, warmup=3)
     assert [rate.at(i, 10, 20) for i in range(10, 15)] == [0.25, 0.5, 0.75, 1.0, 1.0]

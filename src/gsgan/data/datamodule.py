@@ -452,5 +452,5 @@ def unsupported(layout: str, wanted: str, root: str | None = None) -> NoReturn:
         raise DataError(f"data.root={root} does not exist; expected the folder of {wanted}")
     raise DataError(
         f"data.root={root}: reading the {layout} layout is not supported yet; convert it to the "
-        "bring-your-own layout (README, data layout) and use data=capture"
+        "bring-your-own layout (docs/data.md) and use data=capture"
     )

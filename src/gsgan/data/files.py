@@ -186,7 +186,7 @@ def read_json(path: Path) -> dict[str, Any]:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise DataError(
-            f"{path} does not exist; the bring-your-own layout needs it (README, data layout)"
+            f"{path} does not exist; the bring-your-own layout needs it (docs/data.md)"
         ) from None
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
@@ -212,7 +212,7 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
             return {name: archive[name] for name in names if name in archive}
     except FileNotFoundError:
         raise DataError(
-            f"{path} does not exist; the bring-your-own layout needs it (README, data layout)"
+            f"{path} does not exist; the bring-your-own layout needs it (docs/data.md)"
         ) from None
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from None

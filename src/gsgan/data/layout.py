@@ -45,6 +45,9 @@ MASK_SUFFIXES = (".png",)
 IGNORE_LABEL = 255
 
 
+FREE_BODY_BONES = 56
+
+
 @dataclass(frozen=True)
 class Checks:
     """What a capture must satisfy; each threshold can be set.
@@ -481,7 +484,8 @@ def read_poses(path: Path, meta: Meta) -> Poses:
         DataError: on wrong arrays.
     """
     arrays = read_arrays(path, ("theta", "transl", "frame_id"))
-    theta = expect_array(arrays, "theta", (None, None, 3), path).astype(np.float64)
+    bones = FREE_BODY_BONES if meta.body == "free" else None
+    theta = expect_array(arrays, "theta", (None, bones, 3), path).astype(np.float64)
     transl = expect_array(arrays, "transl", (len(theta), 3), path).astype(np.float64) * meta.scale
     ids = _frame_ids(arrays, len(theta), path)
     finite = np.isfinite(theta).all((1, 2)) & np.isfinite(transl).all(1)

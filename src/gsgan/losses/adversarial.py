@@ -14,7 +14,7 @@ Maps = Sequence[Sequence[Tensor]]  # per scale: feature maps, the logits last
 
 
 def _mean_over_scales(term: Callable[[Tensor], Tensor], maps: Maps) -> Tensor:
-    return torch.stack([term(scale[-1]).mean() for scale in maps]).sum()
+    return torch.stack([term(scale[-1].float()).mean() for scale in maps]).sum()
 
 
 # name: (on real logits, on fake logits, generator's on fake logits)
@@ -29,9 +29,12 @@ _FORMS: dict[str, tuple[Callable[[Tensor], Tensor], ...]] = {
 }
 
 
+FORMS = tuple(_FORMS)
+
+
 def _form(name: str) -> tuple[Callable[[Tensor], Tensor], ...]:
     if name not in _FORMS:
-        raise ConfigError(f"loss.gan must be one of {', '.join(_FORMS)}; got {name!r}")
+        raise ConfigError(f"training.step_two.gan must be one of {', '.join(_FORMS)}; got {name!r}")
     return _FORMS[name]
 
 
@@ -54,13 +57,13 @@ def generator_loss(fake: Maps, form: str = "logistic") -> Tensor:
 def feature_matching(real: Maps, fake: Maps) -> Tensor:
     """L_feat: L1 between the judges' features (logits left out), real ones detached.
 
-    Weighted as pix2pixHD: 4 / (layers + 1) for each map, mean over scales.
+    Weighted as pix2pixHD: 4 / (number of maps) for each map, mean over scales.
 
     Source: paper Sec. 3.6; method.md § 7.
     """
     loss = real[0][0].new_zeros(())
     for real_scale, fake_scale in zip(real, fake, strict=True):
-        weight = 4 / (len(real_scale) * len(real))
+        weight = 4 / ((len(real_scale) - 1) * len(real))
         for a, b in zip(real_scale[:-1], fake_scale[:-1], strict=True):
             loss = loss + weight * functional.l1_loss(b, a.detach())
     return loss

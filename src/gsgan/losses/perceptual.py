@@ -38,6 +38,11 @@ class Perceptual(nn.Module):
     Source: paper Sec. 3.6; method.md § 7; architecture.md § 4.
     """
 
+    mean: Tensor
+    std: Tensor
+    layer_loss: Tensor
+    calls: Tensor
+
     def __init__(
         self,
         weights: str = "auto",

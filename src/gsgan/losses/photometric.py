@@ -5,6 +5,8 @@ from __future__ import annotations
 from kornia.losses import ssim_loss
 from torch import Tensor
 
+from gsgan.precision import full_precision
+
 SSIM_WINDOW = 11
 
 
@@ -13,7 +15,8 @@ def d_ssim(image: Tensor, target: Tensor) -> Tensor:
 
     kornia returns (1 - SSIM) / 2; 3DGS and this paper weigh 1 - SSIM, so it is doubled.
     """
-    return 2 * ssim_loss(image, target, SSIM_WINDOW)
+    with full_precision(image):  # variances are differences of near-equal numbers
+        return 2 * ssim_loss(image, target, SSIM_WINDOW)
 
 
 def photometric(

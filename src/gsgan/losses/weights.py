@@ -37,8 +37,8 @@ def find_weights(name: str, path: str | Path | None = None) -> Path | None:
 def how_to_get(name: str) -> str:
     """One clause telling a user how to put the weights in place."""
     return (
-        f"put torchvision's {FILES[name]} into {Path(torch.hub.get_dir()) / 'checkpoints'} "
-        "or give its path"
+        f"put torchvision's {FILES[name]} into $TORCH_HOME/hub/checkpoints "
+        "(~/.cache/torch/hub/checkpoints unless set) or give its path"
     )
 
 

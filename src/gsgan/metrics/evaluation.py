@@ -53,7 +53,7 @@ class PictureScores:
     def update(self, image: Tensor, target: Tensor) -> None:
         """Adds pictures ``[B, 3, H, W]``; they are clamped to [0, 1] as they would be shown."""
         image = image.clamp(0, 1)
-        scores = {"psnr": psnr, "ssim": ssim, "edge_f1": edge_f1}
+        scores: dict[str, Score] = {"psnr": psnr, "ssim": ssim, "edge_f1": edge_f1}
         if self.lpips is not None:
             scores["lpips"] = self.lpips
         for name, score in scores.items():

@@ -74,6 +74,18 @@ def _edge_f1(edges: np.ndarray, truth: np.ndarray, tolerance: int) -> float:
 Score = Callable[[Tensor, Tensor], Tensor]
 
 
+def check_lpips(net: str, path: str | None) -> Path | None:
+    """The backbone's weight file, or None where it is not at hand.
+
+    Raises:
+        ConfigError: on an unknown net.
+        DataError: when a given path does not hold the weights.
+    """
+    if net not in _BACKBONES:
+        raise ConfigError(f"lpips.net must be vgg or alex; got {net!r}")
+    return find_weights(_BACKBONES[net], path)
+
+
 def lpips(net: str = "vgg", path: str | None = None) -> tuple[Score | None, str]:
     """LPIPS with pretrained weights, or None with the reason it cannot be had.
 
@@ -90,11 +102,9 @@ def lpips(net: str = "vgg", path: str | None = None) -> tuple[Score | None, str]
         ConfigError: on an unknown net.
         DataError: when a given path does not hold the weights.
     """
-    if net not in _BACKBONES:
-        raise ConfigError(f"lpips.net must be vgg or alex; got {net!r}")
-    backbone = _BACKBONES[net]
-    found = find_weights(backbone, path)
+    found = check_lpips(net, path)
     if found is None:
+        backbone = _BACKBONES[net]
         return None, f"{backbone} weights are not at hand: {how_to_get(backbone)}"
     load_weights(found)  # refuses anything but a plain state dict before torchvision reads it
     metric = _build_lpips(net, found)

@@ -10,12 +10,15 @@ import torch
 from torch import Tensor, nn
 
 from gsgan.body import free_body
+from gsgan.errors import DataError
 from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
 from gsgan.model.segmentation import Segmentation
+from gsgan.precision import full_precision
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians
 from gsgan.skeleton import (
     MEDIAPIPE33,
+    BoneFrames,
     Densify,
     bone_frames,
     draw_skeleton,
@@ -28,6 +31,7 @@ from gsgan.window import Window, body_window
 if TYPE_CHECKING:
     from gsgan.data.datamodule import SceneInfo  # loads Lightning
 
+LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in a picture 512 high (method.md § 4)
 SKELETON_CHANNELS = len(MEDIAPIPE33.draw_groups)
 
 
@@ -87,6 +91,7 @@ class Avatar(nn.Module):
         twist: how bone frames turn about their bones, ``none`` or ``hinge``.
         window_margin: metres round the joints that are painted; None paints whole pictures.
         window_multiple: the window's sides are multiples of so many pixels.
+        window_least: pixels, its shortest side (a discriminator cannot judge less).
 
     Source: paper Fig. 2 and Sec. 3; architecture.md § 4.
     """
@@ -103,14 +108,19 @@ class Avatar(nn.Module):
         twist: Literal["none", "hinge"] = "none",
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
+        window_least: int = 32,
     ) -> None:
         super().__init__()
         self.template, self.accuracy, self.twist = MEDIAPIPE33, accuracy, twist
-        self.window_margin, self.window_multiple = window_margin, window_multiple
+        self.window_margin = window_margin
+        self.window_multiple, self.window_least = window_multiple, window_least
         self.limb_sum = float(scene.body_height)
         # Stature, from limb lengths: what the skeleton measures and no pose changes.
         self.body_height = self.limb_sum * self.template.stature / self.template.limb_length_sum
         self.densify = densify
+        # Each part draws from a seed of its own: leaving one out does not change the others' start.
+        seed = torch.initial_seed()
+        torch.manual_seed(seed + 1)
         self.deformation = deformation(
             rest_points=densify.rest_points,
             body_height=self.body_height,
@@ -120,6 +130,9 @@ class Avatar(nn.Module):
         self.segmentation = self._build_segmentation(scene, segmentation)
         self.pose_encoder = pose_encoder
         self.generator: Generator | None = None
+        if (generator is None) != (pose_encoder is None):
+            raise ValueError("Avatar: generator and pose_encoder go together; got only one of them")
+        torch.manual_seed(seed + 2)
         if generator is not None and pose_encoder is not None:
             self.generator = generator(
                 feature_channels=3 + self.deformation.features,
@@ -146,8 +159,19 @@ class Avatar(nn.Module):
         if not scene.has_body_pose:
             self.effects["segmentation S"] = (False, "the data has no body pose")
             return None
+        if scene.body != "free":
+            why = f"the data's poses are of the body {scene.body!r}, which has no mesh here yet"
+            self.effects["segmentation S"] = (False, why)
+            return None
+        body = free_body()
+        if scene.n_labels > len(body.label_names):
+            raise DataError(
+                f"labels: the pictures hold {scene.n_labels} parts, the free body has "
+                f"{len(body.label_names)} ({', '.join(body.label_names)}); map them to these ids, "
+                "or choose model=wo_seg"
+            )
         self.effects["segmentation S"] = (True, "the data has a body pose")
-        return build(body=free_body())
+        return build(body=body)
 
     def forward(
         self,
@@ -159,6 +183,7 @@ class Avatar(nn.Module):
         pose_noise: Tensor | None = None,
         paint: bool = True,
         detach_features: bool = False,
+        picture_height: int | None = None,
     ) -> Painting:
         """Paints the pose.
 
@@ -170,28 +195,32 @@ class Avatar(nn.Module):
             pose_noise: ``[B, J, 3]`` body heights, added to Ψ's pose code (training only).
             paint: False stops after F (Step I needs no more).
             detach_features: keep Step II's gradient out of Ψ.
+            picture_height: pixels of the whole picture, when ``camera`` sees a window of it: the
+                drawn skeleton's lines are as wide as they would be there.
 
         Returns:
             I_pred with all that led to it.
         """
-        p, valid = sanitise(skeleton, visibility, self.template, self.limb_sum)
-        frames = bone_frames(p, valid, self.template, twist=self.twist)
+        paints = paint and self.generator is not None
+        with full_precision(skeleton):
+            p, valid = sanitise(skeleton, visibility, self.template, self.limb_sum)
+            frames = bone_frames(p, valid, self.template, twist=self.twist)
 
-        points = self.densify(p, valid, frames)  # Alg. 1: G
-        gaussians = self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
-            p, points, camera.centre, frames.hubs[:, 0], pose_noise
-        )
-        raster = rasterise(gaussians, camera, settings=self.accuracy)
+            points = self.densify(p, valid, frames)  # Alg. 1: G
+            gaussians = self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
+                p, points, camera.centre, frames.hubs[:, 0], pose_noise
+            )
+            raster = rasterise(gaussians, camera, settings=self.accuracy)
+            S = self.segment(body, camera) if paints else None  # Sec. 3.4
+            p2d = self.draw(p, valid, camera, picture_height) if paints else None
+            pose = self.pose_inputs(p, valid, frames, camera) if paints else None
+
         F = raster.features
-
-        S = self.segment(body, camera) if paint or self.generator is None else None  # Sec. 3.4
-        image = None
-        if self.generator is None:
-            image = F[:, :3]
-        elif paint:  # Sec. 3.5
-            g = self.pose_encoder(*self.pose_inputs(p, valid, frames, camera))  # type: ignore[misc]
-            p2d = draw_skeleton(p, valid, camera, self.template)
-            image = self.generator(F.detach() if detach_features else F, S, p2d, g)
+        image = F[:, :3] if self.generator is None else None
+        if paints:  # Sec. 3.5
+            g = self.pose_encoder(*pose)  # type: ignore[misc]
+            seen = F.detach() if detach_features else F
+            image = self.generator(seen, S, p2d, g).to(F.dtype)  # type: ignore[misc]
         return Painting(image, F, raster.alpha, S, gaussians)
 
     def paint(self, frame: Frame) -> Painting:
@@ -199,16 +228,29 @@ class Avatar(nn.Module):
         window = self.window(frame)
         if window is None:
             return self(frame.skeleton, frame.visibility, frame.camera, frame.body)
-        camera = window.camera(frame.camera)
-        return self(frame.skeleton, frame.visibility, camera, frame.body).pasted(window)
+        painting = self(
+            frame.skeleton,
+            frame.visibility,
+            window.camera(frame.camera),
+            frame.body,
+            picture_height=window.picture[0],
+        )
+        return painting.pasted(window)
 
     def window(self, frame: Frame) -> Window | None:
         """The part of a frame's picture that holds the person; None means all of it."""
         if self.window_margin is None:
             return None
-        p, _ = sanitise(frame.skeleton, frame.visibility, self.template, self.limb_sum)
-        near = self.accuracy.near
-        return body_window(p, frame.camera, self.window_margin, self.window_multiple, near)
+        with full_precision(frame.skeleton):
+            p, _ = sanitise(frame.skeleton, frame.visibility, self.template, self.limb_sum)
+            return body_window(
+                p,
+                frame.camera,
+                margin=self.window_margin,
+                multiple=self.window_multiple,
+                least=self.window_least,
+                near=self.accuracy.near,
+            )
 
     def segment(self, body: BodyPose | None, camera: Camera) -> Tensor | None:
         """S, without gradient: it is trained on its own (method.md § 3) and then frozen."""
@@ -219,8 +261,13 @@ class Avatar(nn.Module):
         with torch.no_grad():
             return self.segmentation(body, camera)
 
+    def draw(self, p: Tensor, valid: Tensor, camera: Camera, picture_height: int | None) -> Tensor:
+        """p₂D ``[B, 8, H, W]``, its lines scaled to the whole picture's height."""
+        share = (picture_height or camera.size[0]) / camera.size[0]
+        return draw_skeleton(p, valid, camera, self.template, LINE_WIDTH * share)
+
     def pose_inputs(
-        self, p: Tensor, valid: Tensor, frames: object, camera: Camera
+        self, p: Tensor, valid: Tensor, frames: BoneFrames, camera: Camera
     ) -> tuple[Tensor, Tensor]:
         """Ω ``[B, J, 6]``, and the joints about the root in camera axes and body heights."""
         root = p[:, 23:25].mean(dim=1, keepdim=True)

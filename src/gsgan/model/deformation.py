@@ -61,6 +61,8 @@ class Deformation(nn.Module):
     Source: paper Sec. 3.3; method.md § 2 and § 13 (the table beside the MLP).
     """
 
+    rest_code: Tensor
+
     def __init__(
         self,
         rest_points: Tensor,

@@ -68,7 +68,7 @@ class Discriminator(nn.Module):
         if min(image.shape[-2:]) < 2 * self.stride:
             raise ValueError(
                 f"Discriminator: a picture of {tuple(image.shape[-2:])} is too small for "
-                f"{len(self.judges)} scales of {len(self.judges[0].blocks)} layers: "
+                f"{len(self.judges)} scales: "
                 f"at least {2 * self.stride} pixels, or fewer layers"
             )
         results = []

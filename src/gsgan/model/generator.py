@@ -44,8 +44,7 @@ class Style(nn.Module):
         self.from_map = nn.Conv2d(style_channels, 2 * channels, 1)
         self.from_pose = nn.Linear(pose_channels, 2 * channels)
         for layer in (self.from_map, self.from_pose):
-            nn.init.zeros_(layer.weight)
-            nn.init.zeros_(layer.bias)
+            start_at_zero(layer)
 
     def forward(self, h: Tensor, style: Tensor, g: Tensor) -> Tensor:
         """``h`` ``[B, C, h, w]`` styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]``."""
@@ -129,8 +128,7 @@ class Generator(nn.Module):
         )
         self.paint = nn.Conv2d(channels[0], 3, 3, padding=1)
         if rgb_skip:
-            nn.init.zeros_(self.paint.weight)
-            nn.init.zeros_(self.paint.bias)
+            start_at_zero(self.paint)
 
     def forward(self, F: Tensor, S: Tensor | None, p2d: Tensor, g: Tensor) -> Tensor:
         """I_pred ``[B, 3, H, W]``, not clamped.
@@ -157,6 +155,12 @@ class Generator(nn.Module):
         if self.rgb_skip:
             return F[:, :3] + painted
         return torch.sigmoid(painted) if self.output == "sigmoid" else painted
+
+
+def start_at_zero(layer: nn.Module) -> None:
+    """Weight and bias 0: the layer adds nothing until training finds it useful."""
+    for parameter in layer.parameters():
+        nn.init.zeros_(parameter)
 
 
 def _activate(x: Tensor) -> Tensor:

@@ -25,6 +25,8 @@ class GraphLayer(nn.Module):
     Source: method.md § 5 (DANBO's layers, restated).
     """
 
+    mask: Tensor
+
     def __init__(self, mask: Tensor, inputs: int, outputs: int, neighbour: float = 0.05) -> None:
         super().__init__()
         joints = mask.shape[0]
@@ -53,6 +55,8 @@ class PoseGraph(nn.Module):
 
     Source: paper Sec. 3.5; method.md § 5, ``readout=edge``: 35 is the number of MediaPipe edges.
     """
+
+    edges: Tensor
 
     def __init__(
         self,

@@ -10,7 +10,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsgan.body import Body, axis_angle_to_matrix, blend_transforms, forward_kinematics
+from gsgan.precision import full_precision
 from gsgan.scene import BodyPose, Camera, Gaussians
+from gsgan.splat import accuracy as named_accuracy
 from gsgan.splat import rasterise
 
 IGNORE = 255
@@ -33,6 +35,12 @@ class Segmentation(nn.Module):
     Source: paper Sec. 3.4; method.md § 3.
     """
 
+    joints: Tensor
+    bone_index: Tensor
+    bone_weight: Tensor
+    means: Tensor
+    one_hot: Tensor
+
     def __init__(
         self,
         body: Body,
@@ -43,7 +51,7 @@ class Segmentation(nn.Module):
         accuracy: str = "standard",
     ) -> None:
         super().__init__()
-        self.accuracy, self.parents = accuracy, body.parents
+        self.accuracy, self.parents = named_accuracy(accuracy), body.parents
         vertices = body.vertices.float()
         count = len(vertices) if points is None else min(points, len(vertices))
         chosen = farthest_points(vertices, count)
@@ -81,7 +89,8 @@ class Segmentation(nn.Module):
 
     def forward(self, pose: BodyPose, camera: Camera) -> Tensor:
         """S ``[B, classes, H, W]``: probabilities, channel 0 the background (1 - alpha)."""
-        raster = rasterise(self.gaussians(pose), camera, settings=self.accuracy)
+        with full_precision(pose.theta):
+            raster = rasterise(self.gaussians(pose), camera, settings=self.accuracy)
         return torch.cat([(1 - raster.alpha).clamp_min(0), raster.features], dim=1)
 
 

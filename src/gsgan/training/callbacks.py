@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from lightning import Callback, LightningModule, Trainer
 from rich.console import Console
@@ -13,6 +13,13 @@ from torch import Tensor
 from gsgan.model.avatar import Painting
 from gsgan.pictures import grid_rows, write_grid
 from gsgan.scene import Frame
+
+if TYPE_CHECKING:
+    from gsgan.training.module import AvatarTraining
+
+
+def _training(module: LightningModule) -> AvatarTraining:
+    return cast("AvatarTraining", module)
 
 
 class PictureGrid(Callback):
@@ -53,7 +60,7 @@ class PictureGrid(Callback):
 
     def on_validation_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
         if self._collected:
-            write_grid(self._collected, self.folder / f"step_{module.step:06d}.png")
+            write_grid(self._collected, self.folder / f"step_{_training(module).step:06d}.png")
 
 
 class Narrator(Callback):
@@ -65,11 +72,12 @@ class Narrator(Callback):
         self._first = 0
 
     def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
-        self._clock, self._first = time.monotonic(), module.step
+        self._clock, self._first = time.monotonic(), _training(module).step
 
     def on_validation_end(self, trainer: Trainer, module: LightningModule) -> None:
         if not trainer.is_global_zero:
             return
+        module = _training(module)
         step, total = module.step, module.schedule.total
         scores = trainer.callback_metrics
         line = f"{step:>6}/{total} {module.schedule.phase(max(0, step - 1)):<12}"

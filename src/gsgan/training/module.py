@@ -10,13 +10,14 @@ from lightning import LightningModule
 from torch import Tensor, nn
 
 from gsgan.errors import ConfigError, GsganError
-from gsgan.losses.adversarial import discriminator_loss, feature_matching, generator_loss
+from gsgan.losses.adversarial import FORMS, discriminator_loss, feature_matching, generator_loss
 from gsgan.losses.perceptual import Perceptual
 from gsgan.losses.photometric import photometric
 from gsgan.metrics.image import psnr
 from gsgan.model.avatar import Avatar, Painting
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.segmentation import segmentation_loss
+from gsgan.precision import full_precision
 from gsgan.scene import Frame
 from gsgan.training.optimisers import Recipe, clip, set_rate
 from gsgan.training.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
@@ -73,6 +74,17 @@ class StepTwoLoss:
     anchor: float = 1.0
     detach_features: bool = False
 
+    def __post_init__(self) -> None:
+        if self.gan not in FORMS:
+            raise ConfigError(
+                f"training.step_two.gan must be one of {', '.join(FORMS)}; got {self.gan!r}"
+            )
+        if self.perceptual_every < 1:
+            raise ConfigError(
+                "training.step_two.perceptual_every must be at least 1, "
+                f"got {self.perceptual_every}"
+            )
+
     @property
     def plays(self) -> bool:
         """Whether a discriminator is needed at all."""
@@ -86,8 +98,8 @@ class AvatarTraining(LightningModule):
         avatar: what is trained.
         discriminator: the judge; None, or no adversarial weight, leaves the GAN out.
         perceptual: L_perc; None leaves it out.
-        schedule: iterations of each phase; phases whose part was not built go to Step I, so that
-            every variant of a study trains equally long.
+        schedule: iterations of each phase. Without S its phase is left out; without a generator
+            Step I gets Step II's iterations, so that Ψ trains equally long in every variant.
         recipes: optimisers by name: segmentation, psi, generator, discriminator.
         step_one, step_two: loss weights.
         pose_noise: standard deviation, body heights, of the noise on Ψ's pose code.
@@ -95,10 +107,14 @@ class AvatarTraining(LightningModule):
             draws the same ones.
         max_skipped: non-finite gradients that are skipped before the run is stopped.
         log_every: iterations between logged values.
+        collapse: the run is stopped when the rendered alpha, averaged over an epoch, falls below
+            this share of the masks': opacities can all fall to 0 for good without a NaN.
         record: plain config values stored with every checkpoint.
 
     Source: paper Alg. 2; method.md § 7.
     """
+
+    coverage: Tensor
 
     def __init__(
         self,
@@ -114,6 +130,7 @@ class AvatarTraining(LightningModule):
         seed: int = 0,
         max_skipped: int = 20,
         log_every: int = 20,
+        collapse: float = 0.05,
         record: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
@@ -125,12 +142,17 @@ class AvatarTraining(LightningModule):
         self.schedule = _fit_schedule(schedule, avatar)
         self.recipes, self.step_one, self.step_two = recipes, step_one, step_two
         self.pose_noise, self.seed, self.log_every = pose_noise, seed, log_every
-        self.max_skipped, self.record = max_skipped, record or {}
+        if log_every < 1:
+            raise ConfigError(f"training.log_every must be at least 1, got {log_every}")
+        self.max_skipped, self.record, self.collapse = max_skipped, record or {}, collapse
+        # Sums over the epoch: rendered alpha, and what the masks say it should be.
+        self.register_buffer("coverage", torch.zeros(2), persistent=False)
         channels = 3 + avatar.deformation.features
         self.feature_head = nn.Conv2d(channels, 3, 1) if step_one.feature_head else None
         self.step = 0  # iterations done: Lightning's global_step counts every optimiser's steps
         self.skipped = 0
         self.start_psnr: float | None = None
+        self.last_psnr: float | None = None
 
     @property
     def marks(self) -> list[str]:
@@ -177,7 +199,7 @@ class AvatarTraining(LightningModule):
             optimiser.zero_grad(set_to_none=True)
         self.manual_backward(loss)
         norms = [
-            clip(optimiser.optimizer, self.recipes[name].clip)
+            clip(optimiser.optimizer, self.recipes[name].clip).to(loss.device)
             for name, optimiser in zip(names, optimisers, strict=True)
         ]
         if not bool(torch.isfinite(torch.stack(norms)).all()):
@@ -212,14 +234,15 @@ class AvatarTraining(LightningModule):
         if self.step >= self.schedule.total:
             return
         window = self.avatar.window(frame)
+        height = frame.camera.size[0]
         frame = frame if window is None else window.frame(frame)
         phase = self.schedule.phase(self.step)
         if phase == SEGMENTATION:
             self._train_segmentation(frame)
         elif phase == STEP_ONE:
-            self._train_step_one(frame)
+            self._train_step_one(frame, height)
         else:
-            self._train_step_two(frame)
+            self._train_step_two(frame, height)
         self.step += 1
 
     def _train_segmentation(self, frame: Frame) -> None:
@@ -230,14 +253,14 @@ class AvatarTraining(LightningModule):
         self._descend(loss, "segmentation")
         self._log("segmentation/nll", loss)
 
-    def _train_step_one(self, frame: Frame) -> None:
-        painting = self._paint(frame, paint=False)
+    def _train_step_one(self, frame: Frame, height: int) -> None:
+        painting = self._paint(frame, height, paint=False)
         loss = self.step_one_loss(painting, frame)
         self._descend(loss, "psi")
         self._log("step_one/loss", loss)
 
-    def _train_step_two(self, frame: Frame) -> None:
-        painting = self._paint(frame, paint=True)
+    def _train_step_two(self, frame: Frame, height: int) -> None:
+        painting = self._paint(frame, height, paint=True)
         play = self.discriminator is not None and self.schedule.adversarial(self.step)
         if self.discriminator is not None:
             self.discriminator.requires_grad_(False)
@@ -258,8 +281,8 @@ class AvatarTraining(LightningModule):
         self._descend(loss, "discriminator")
         self._log("step_two/discriminator", loss)
 
-    def _paint(self, frame: Frame, *, paint: bool) -> Painting:
-        return self.avatar(
+    def _paint(self, frame: Frame, height: int, *, paint: bool) -> Painting:
+        painting: Painting = self.avatar(
             frame.skeleton,
             frame.visibility,
             frame.camera,
@@ -267,12 +290,30 @@ class AvatarTraining(LightningModule):
             pose_noise=self._pose_noise(frame.skeleton),
             paint=paint,
             detach_features=self.step_two.detach_features,
+            picture_height=height,
         )
+        self.coverage += torch.stack([painting.alpha.detach().mean(), frame.mask.mean()])
+        return painting
+
+    def on_train_epoch_end(self) -> None:
+        """Stops a run whose person has vanished, before its checkpoint is overwritten."""
+        alpha, mask = self.coverage.tolist()
+        self.coverage.zero_()
+        if alpha < self.collapse * mask:
+            raise GsganError(
+                f"training stopped at iteration {self.step}: the rendered person has vanished "
+                f"(alpha is {alpha / mask:.1%} of the masks'); the checkpoint before it is kept; "
+                "start again with a lower training.recipes.psi.rate.peak"
+            )
 
     # -- losses
 
     def step_one_loss(self, painting: Painting, frame: Frame) -> Tensor:
         """L_Ψ of Step I's colour, and of the linear readout of F."""
+        with full_precision(painting.features):
+            return self._step_one_loss(painting, frame)
+
+    def _step_one_loss(self, painting: Painting, frame: Frame) -> Tensor:
         weights = self.step_one
         background = self._background(frame)
         target = frame.image + (1 - frame.mask) * background
@@ -329,7 +370,9 @@ class AvatarTraining(LightningModule):
 
     # -- validation and checkpoints
 
-    def validation_step(self, frame: Frame, batch_idx: int) -> Painting:
+    def validation_step(  # type: ignore[override]
+        self, frame: Frame, batch_idx: int
+    ) -> Painting:
         painting = self.avatar.paint(frame)
         assert painting.image is not None
         for name, picture in (("psnr", painting.image), ("psnr_splat", painting.colour)):
@@ -338,8 +381,9 @@ class AvatarTraining(LightningModule):
         return painting
 
     def on_validation_epoch_end(self) -> None:
+        self.last_psnr = float(self.trainer.callback_metrics["val/psnr"])
         if self.start_psnr is None:
-            self.start_psnr = float(self.trainer.callback_metrics["val/psnr"])
+            self.start_psnr = self.last_psnr
 
     def _log(self, name: str, value: Tensor) -> None:
         if self.step % self.log_every == 0 and self._trainer is not None:

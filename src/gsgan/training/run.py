@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import warnings
 from pathlib import Path
@@ -12,6 +13,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
+from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
@@ -19,10 +21,15 @@ from rich.table import Table
 from gsgan.console import make_console
 from gsgan.data.datamodule import GsganData
 from gsgan.evaluation import evaluate_run
+from gsgan.files import write_atomically
+from gsgan.metrics.image import check_lpips
 from gsgan.model.avatar import Avatar
-from gsgan.runs import CHECKPOINT, build_training, checkpoint_to_resume
+from gsgan.runs import CHECKPOINT, build_training, checkpoint_to_resume, read_checkpoint
 from gsgan.training.callbacks import Narrator, PictureGrid
+from gsgan.training.checkpoints import AtomicCheckpoints
 from gsgan.training.module import AvatarTraining
+
+PROGRESS = "progress.json"
 
 
 def run_training(config: DictConfig) -> None:
@@ -32,29 +39,57 @@ def run_training(config: DictConfig) -> None:
         GsganError: see `gsgan.runs.checkpoint_to_resume` and the data module.
     """
     console = make_console()
+    console.quiet = getattr(rank_zero_only, "rank", 0) != 0
     folder = Path(HydraConfig.get().runtime.output_dir)
     _quiet_lightning()
-    torch.set_flush_denormal(True)  # black background decays into denormals, which CPUs are slow at
-    seed_everything(config.seed, workers=True, verbose=False)
+    torch.set_flush_denormal(True)  # black background decays into denormals: slow on CPUs
+    check_lpips(config.lpips.net, config.lpips.path)  # now, not after hours of training
 
     data, module = build_training(config)
-    resume = checkpoint_to_resume(folder, config) if config.resume else None
+    seed_everything(config.seed, workers=True, verbose=False)
+    resume = checkpoint_to_resume(folder, config, module.marks) if config.resume else None
+    if resume is None:
+        remove_old_results(folder)
 
     describe(console, folder, data, module)
     if resume is not None:
-        console.print(f"going on from {resume}")
-    trainer = build_trainer(config, folder, module, console)
-    fit(trainer, module, data, resume)
-    if trainer.interrupted:
-        raise KeyboardInterrupt
+        console.print(f"going on from {resume}", soft_wrap=True)
+    trainer = build_trainer(config, folder, module, data, console, resume)
+    try:
+        fit(trainer, module, data, resume)
+    except SystemExit:  # Lightning's answer to Ctrl-C
+        console.print(
+            f"interrupted at iteration {module.step}; the same command with "
+            f"hydra.run.dir={folder} goes on from its last checkpoint",
+            soft_wrap=True,
+        )
+        raise
     if not trainer.is_global_zero:
         return
-    console.print(f"\nheld-out PSNR: {_psnr(module.start_psnr)} at the start")
+    report_progress(console, folder, module)
     if config.evaluate:
-        evaluate_run(
-            folder, config, console, data=data, avatar=module.avatar.eval(), marks=module.marks
-        )
+        module.to(trainer.strategy.root_device)  # Lightning leaves it on the CPU
+        avatar = module.avatar.eval()
+        evaluate_run(folder, config, console, data=data, avatar=avatar, marks=module.marks)
     console.print(f"run folder: {folder}", soft_wrap=True)
+
+
+def remove_old_results(folder: Path) -> None:
+    """Removes what an earlier run left in a folder that starts over."""
+    for name in ("metrics.json", "metrics.md", PROGRESS, CHECKPOINT):
+        (folder / name).unlink(missing_ok=True)
+
+
+def report_progress(console: Console, folder: Path, module: AvatarTraining) -> None:
+    """Held-out PSNR at the start and at the end, on the pictures watched while training."""
+    start, end = module.start_psnr, module.last_psnr
+    if start is None or end is None:
+        return
+    progress = {"start_psnr": start, "end_psnr": end, "iterations": module.step}
+    write_atomically(folder / PROGRESS, json.dumps(progress, indent=2))
+    console.print(
+        f"\nheld-out PSNR while training: {start:.2f} dB at the start, {end:.2f} at the end"
+    )
 
 
 def fit(trainer: Trainer, module: AvatarTraining, data: GsganData, resume: Path | None) -> None:
@@ -66,9 +101,14 @@ def fit(trainer: Trainer, module: AvatarTraining, data: GsganData, resume: Path 
 
 
 def build_trainer(
-    config: DictConfig, folder: Path, module: AvatarTraining, console: Console
+    config: DictConfig,
+    folder: Path,
+    module: AvatarTraining,
+    data: GsganData,
+    console: Console,
+    resume: Path | None,
 ) -> Trainer:
-    """The Trainer of the config, its length set by the schedule."""
+    """The Trainer of the config; schedule and loader set its length."""
     callbacks: list[Any] = [
         PictureGrid(folder / "pictures", config.grid_rows),
         Narrator(console),
@@ -83,9 +123,13 @@ def build_trainer(
         callbacks.append(RichProgressBar())
     return instantiate(
         config.trainer,
-        max_epochs=module.schedule.epochs,
+        max_epochs=-(-module.schedule.total // len(data.train_dataloader())),
         callbacks=callbacks,
-        logger=instantiate(config.logger),
+        plugins=[AtomicCheckpoints()],
+        # A logger starts its files anew: each part of a resumed run has a folder of its own.
+        logger=instantiate(
+            config.logger, version="logs" if resume is None else f"logs_{_step_of(resume):06d}"
+        ),
         enable_progress_bar=console.is_terminal,
     )
 
@@ -135,8 +179,8 @@ def effects(data: GsganData, avatar: Avatar) -> dict[str, tuple[bool, str]]:
     }
 
 
-def _psnr(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.2f} dB"
+def _step_of(checkpoint: Path) -> int:
+    return int(read_checkpoint(checkpoint)["gsgan"]["step"])
 
 
 def _quiet_lightning() -> None:

@@ -70,27 +70,49 @@ class Schedule:
         return self.phase(step) == STEP_TWO and step >= start
 
 
+_SHAPES = {
+    "cosine": lambda x, final: final + (1 - final) * 0.5 * (1 + math.cos(math.pi * x)),
+    "linear": lambda x, final: 1 + (final - 1) * x,
+    "exponential": lambda x, final: final**x,
+}
+
+
 @dataclass(frozen=True)
 class Rate:
-    """A learning rate over one span: warm-up, constant, then a half cosine down.
+    """A learning rate over one span: warm-up, constant, descent, constant.
 
     Args:
         peak: the rate.
         hold: share of the span before the descent begins.
+        until: share of the span at which it ends.
         final: rate at the end, as a share of the peak.
         warmup: iterations of linear warm-up.
+        shape: of the descent, ``cosine``, ``linear`` or ``exponential``.
+
+    Raises:
+        ConfigError: on an unknown shape, or shares out of order.
     """
 
     peak: float
     hold: float = 0.5
+    until: float = 1.0
     final: float = 0.0
     warmup: int = 0
+    shape: str = "cosine"
+
+    def __post_init__(self) -> None:
+        if self.shape not in _SHAPES:
+            raise ConfigError(f"rate.shape must be one of {', '.join(_SHAPES)}; got {self.shape!r}")
+        if not 0 <= self.hold <= self.until <= 1:
+            raise ConfigError(
+                f"rate: 0 <= hold <= until <= 1 must hold, got hold={self.hold}, until={self.until}"
+            )
 
     def at(self, step: int, start: int, end: int) -> float:
         """The rate at iteration ``step`` of the span [start, end)."""
         done = (step - start) / max(1, end - start)
         scale = min(1.0, (step - start + 1) / (self.warmup + 1))
         if done > self.hold:
-            phase = min(1.0, (done - self.hold) / max(1e-9, 1 - self.hold))
-            scale *= self.final + (1 - self.final) * 0.5 * (1 + math.cos(math.pi * phase))
+            fallen = min(1.0, (done - self.hold) / max(1e-9, self.until - self.hold))
+            scale *= _SHAPES[self.shape](fallen, self.final)
         return self.peak * scale

@@ -1,0 +1,11 @@
+"""Where mixed precision must not reach: geometry, rasteriser, SSIM."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def full_precision(like: Tensor) -> torch.autocast:
+    """A context without autocast on the device of ``like``: bf16 projections are off by pixels."""
+    return torch.autocast(like.device.type, enabled=False)

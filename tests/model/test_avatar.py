@@ -1,0 +1,113 @@
+"""The whole avatar: shapes, starts, gradients to every part, and the window's promise."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+
+def test_paints_every_part(build):
+    _, avatar, frame = build()
+    painting = avatar.paint(frame)
+    assert painting.image.shape == frame.image.shape
+    assert painting.features.shape[1] == 3 + avatar.deformation.features
+    assert painting.segmentation.shape[1] == avatar.segmentation.classes
+    torch.testing.assert_close(
+        painting.segmentation.sum(1),
+        torch.ones_like(painting.segmentation[:, 0]),
+        atol=1e-4,
+        rtol=0,
+    )
+    assert torch.equal(painting.image, painting.colour)  # rgb_skip starts at Step I's picture
+
+
+def test_the_window_changes_nothing_about_step_one(build):
+    _, avatar, frame = build()
+    inside = avatar.paint(frame)
+    avatar.window_margin = None
+    whole = avatar.paint(frame)
+    box = build()[1].window(frame)
+    seen = box.paste(torch.ones(1, 1, *box.size)) > 0
+    assert box.size != frame.camera.size or seen.all()
+    difference = ((inside.colour - whole.colour).abs() * seen).max()
+    assert float(difference.detach()) < 1e-4
+
+
+def test_gradients_reach_every_trained_part(build):
+    _, avatar, frame = build("size.rgb_skip=false")
+    with torch.no_grad():  # leave the zero starts, behind which gradients cannot pass
+        for parameter in avatar.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter))
+    avatar.paint(frame).image.square().sum().backward()
+    for part in ("deformation", "pose_encoder", "generator"):
+        grads = [p.grad for p in getattr(avatar, part).parameters()]
+        assert any(g is not None and float(g.abs().max()) > 0 for g in grads), part
+    assert all(p.grad is None for p in avatar.segmentation.parameters())  # trained on its own
+
+
+def test_a_missing_joint_still_paints(build):
+    _, avatar, frame = build()
+    skeleton, visibility = frame.skeleton.clone(), frame.visibility.clone()
+    skeleton[0, 15], visibility[0, 15] = float("nan"), 0
+    painting = avatar.paint(dataclasses.replace(frame, skeleton=skeleton, visibility=visibility))
+    assert torch.isfinite(painting.image).all()
+
+
+def test_segmentation_needs_its_body_pose(build):
+    _, avatar, frame = build()
+    with pytest.raises(ValueError, match="body pose"):
+        avatar.paint(dataclasses.replace(frame, body=None))
+
+
+@pytest.mark.parametrize(
+    ("model", "absent"),
+    [
+        ("wo_seg", ["segmentation"]),
+        ("splat_only", ["segmentation", "pose_encoder", "generator"]),
+    ],
+)
+def test_what_is_off_builds_no_parameter(build, model, absent):
+    _, avatar, frame = build(f"model={model}")
+    names = [name for name, _ in avatar.named_parameters()]
+    for part in absent:
+        assert not any(name.startswith(part) for name in names)
+    painting = avatar.paint(frame)
+    assert painting.segmentation is None
+    assert painting.image is not None
+    assert avatar.effects["segmentation S"] == (False, "the model leaves it out")
+
+
+def test_data_without_body_pose_turns_segmentation_off(build, tmp_path):
+    from make import write_tiny_capture
+
+    root = write_tiny_capture(tmp_path / "bare", cameras=2, frames=4, size=(48, 48))
+    _, avatar, frame = build(f"data.root={root}")
+    assert avatar.segmentation is None
+    assert avatar.effects["segmentation S"] == (False, "the data has no body pose")
+    assert torch.isfinite(avatar.paint(frame).image).all()
+
+
+def test_batches_are_independent(build):
+    from gsgan.scene import cat
+
+    data, avatar, frame = build()
+    other = data.dataset("train")[5]
+    with torch.no_grad():
+        for parameter in avatar.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter))
+        avatar.window_margin = None
+        both = avatar.paint(cat([frame, other])).image
+        torch.testing.assert_close(both[1:], avatar.paint(other).image, atol=2e-4, rtol=1e-4)
+
+
+def test_the_deformation_follows_the_pose(build):
+    """The same person in another pose is another picture."""
+    data, avatar, frame = build()
+    other = data.dataset("train")[3]
+    assert not torch.equal(other.skeleton, frame.skeleton)
+    moved = dataclasses.replace(frame, skeleton=other.skeleton, body=other.body)
+    assert (
+        float((avatar.paint(frame).image - avatar.paint(moved).image).abs().max().detach()) > 0.01
+    )
