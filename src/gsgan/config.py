@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -50,6 +52,7 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
                 if sentence is None:
                     raise
                 _say(sentence)
+                _remove_unused_folder()
                 sys.exit(FAILED)
 
         @functools.wraps(task)
@@ -81,6 +84,17 @@ def one_sentence(error: BaseException) -> str | None:
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error).splitlines()[0]
     return None
+
+
+def _remove_unused_folder() -> None:
+    """Takes back the run folder that Hydra made, when nothing of a run is in it."""
+    settings = HydraConfig.get()
+    subfolder = settings.output_subdir
+    if subfolder is None:  # this command has no folder of its own
+        return
+    folder = Path(settings.runtime.output_dir)
+    if {path.name for path in folder.iterdir()} <= {subfolder, f"{settings.job.name}.log"}:
+        shutil.rmtree(folder)
 
 
 def _say(sentence: str) -> None:
