@@ -511,7 +511,7 @@ def _drop_frames(
     gone = {frame for ids in dropped.values() for frame in ids}
     if len(gone) == len(frames):
         raise DataError(
-            f"{root}: landmarks3d.npz leaves no usable frame (metres, NaN where missing): "
+            f"{root} (landmarks3d.npz) has no usable frame: "
             + "; ".join(f"{len(ids)} {reason}" for reason, ids in dropped.items())
         )
     if unseen := len(set(landmarks.p) - set(frames)):
