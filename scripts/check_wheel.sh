@@ -11,10 +11,10 @@ python3 -m venv "$work/venv"
   -c "$repo/constraints.txt" "$(ls -t "$repo"/dist/gsgan-*.whl | head -1)"
 cd "$work"
 export GSGAN_CACHE="$work/cache" # nothing made by the checkout may help
+inside=$(venv/bin/python -m zipfile -l "$(ls -t "$repo"/dist/gsgan-*.whl | head -1)")
 for file in gsgan/conf/train.yaml gsgan/body/assets/free_body.npz gsgan/body/assets/ATTRIBUTION.md \
   gsgan/splat/native.cpp gsgan/skeleton/templates.npz; do
-  venv/bin/python -m zipfile -l "$(ls -t "$repo"/dist/gsgan-*.whl | head -1)" | grep -q "$file" ||
-    { echo "the wheel lacks $file"; exit 1; }
+  [[ $inside == *"$file"* ]] || { echo "the wheel lacks $file"; exit 1; }
 done
 "$work/venv/bin/python" -m gsgan.train experiment=demo training=smoke \
   hydra.run.dir="$work/run"
