@@ -299,6 +299,15 @@ def test_a_wrong_value_ends_in_one_sentence(capture, tmp_path, inside, argument,
     refused(inside("train", *arguments(capture, tmp_path / "run"), argument), *words)
 
 
+def test_two_processes_train_together_and_one_scores(capture, tmp_path):
+    """trainer=ddp on two CPU processes (gloo)."""
+    given = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
+    result = train(capture, tmp_path / "ddp", *given, "trainer.precision=32-true")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert (tmp_path / "ddp" / "metrics.json").is_file()
+    assert result.stdout.count("run folder:") == 1
+
+
 def test_a_name_that_hydra_does_not_know_ends_in_a_sentence(capture, tmp_path):
     """In a process without coverage: under a tracer, Hydra shows its developers' view."""
     untraced = {k: v for k, v in ENVIRONMENT.items() if not k.startswith("COVERAGE")}

@@ -77,7 +77,8 @@ class SegmentationScores:
     """mIoU from one confusion matrix over the split, over the classes its truth contains."""
 
     def __init__(self, classes: int) -> None:
-        self.matrix = MulticlassConfusionMatrix(classes, ignore_index=IGNORE)
+        # Only one process scores: waiting for the others, which have ended, would hang or fail.
+        self.matrix = MulticlassConfusionMatrix(classes, ignore_index=IGNORE, sync_on_compute=False)
 
     def update(self, segmentation: Tensor, labels: Tensor) -> None:
         """Adds S ``[B, classes, H, W]`` against labels ``[B, H, W]``."""
