@@ -67,7 +67,9 @@ def test_dropped_gaussians_get_zero_gradients(backend):
 def test_large_but_finite_numbers_pass():
     gaussians = cloud(5, dtype=torch.float32)
     gaussians = replace(gaussians, features=torch.full_like(gaussians.features, 3e38))
-    rasterise(gaussians, camera(dtype=torch.float32))
+    raster = rasterise(gaussians, camera(dtype=torch.float32))
+    assert torch.isfinite(raster.alpha).all()
+    assert float(raster.features.max()) > 0
 
 
 def test_covariances_must_be_finite():

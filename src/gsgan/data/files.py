@@ -176,6 +176,14 @@ def cut_off(data: bytes) -> bool:
     return data[:2] == JPEG_SIGNATURE and (scan < 0 or data.find(JPEG_END, scan) < 0)
 
 
+def _absent(path: Path) -> DataError:
+    return DataError(f"{path} does not exist; the bring-your-own layout needs it (docs/data.md)")
+
+
+def _unreadable(path: Path, error: OSError) -> DataError:
+    return DataError(f"{path} cannot be read: {error.strerror or error}")
+
+
 def read_json(path: Path) -> dict[str, Any]:
     """The object in a JSON file.
 
@@ -185,11 +193,9 @@ def read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise DataError(
-            f"{path} does not exist; the bring-your-own layout needs it (docs/data.md)"
-        ) from None
+        raise _absent(path) from None
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise _unreadable(path, error) from None
     except json.JSONDecodeError as error:
         raise DataError(
             f"{path} is not valid JSON: {error.msg} in line {error.lineno}, column {error.colno}"
@@ -211,11 +217,9 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
         with np.load(path, allow_pickle=False) as archive:
             return {name: archive[name] for name in names if name in archive}
     except FileNotFoundError:
-        raise DataError(
-            f"{path} does not exist; the bring-your-own layout needs it (docs/data.md)"
-        ) from None
+        raise _absent(path) from None
     except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
+        raise _unreadable(path, error) from None
     except (ValueError, TypeError, EOFError, zipfile.BadZipFile, pickle.UnpicklingError) as error:
         if "allow_pickle" in str(error):
             raise DataError(
