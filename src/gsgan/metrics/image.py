@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from torchmetrics.functional.image import structural_similarity_index_measure
 
 from gsgan.errors import ConfigError
+from gsgan.losses.photometric import d_ssim_map
 from gsgan.losses.weights import FILES, find_weights, how_to_get, load_weights
 
 _BACKBONES = {"vgg": "vgg16", "alex": "alexnet"}
@@ -30,9 +30,11 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
 
 
 def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity, torchmetrics' definition (Gaussian window 11, sigma 1.5)."""
-    score = structural_similarity_index_measure(image, target, data_range=1.0, reduction="none")
-    return score.reshape(len(image))  # type: ignore[union-attr]
+    """Structural similarity as torchmetrics defines it (Gaussian window 11, sigma 1.5).
+
+    Not by torchmetrics' arithmetic, which in float32 gives two equal grey pictures 0.9991.
+    """
+    return 1 - d_ssim_map(image, target).flatten(1).mean(dim=1)
 
 
 def edge_f1(

@@ -50,8 +50,10 @@ class Style(nn.Module):
         """``h`` ``[B, C, h, w]`` styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]``."""
         modulation = self.from_map(style) + self.from_pose(g)[:, :, None, None]
         gamma, beta = modulation.chunk(2, dim=1)
-        h = h * torch.rsqrt(h.square().mean(dim=1, keepdim=True) + NORM_FLOOR)
-        return h * (1 + gamma) + beta
+        # Squares in float32 at least: half precision loses them above 256 and below 2e-4.
+        wide = h.to(torch.promote_types(h.dtype, torch.float32))
+        wide = wide * torch.rsqrt(wide.square().mean(dim=1, keepdim=True) + NORM_FLOOR)
+        return wide.to(h.dtype) * (1 + gamma) + beta
 
 
 class DecoderLevel(nn.Module):

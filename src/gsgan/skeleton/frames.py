@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from gsgan.skeleton.rotation6d import orthogonal_to, rotation_to_6d
+from gsgan.skeleton.rotation6d import orthogonal_to, rotation_from_6d, rotation_to_6d
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, N_HUBS, PELVIS, SkeletonTemplate
 
 Twist = Literal["none", "hinge"]
@@ -196,7 +196,7 @@ def _cross_matrix(v: Tensor) -> Tensor:
 def _two_axes(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Unit first axis, unit part of the second across it, and their cross product (2 x 1)."""
     e1 = _unit(first)
-    e2 = _unit(second - e1 * (e1 * second).sum(-1, keepdim=True))
+    e2 = _unit(_across(e1, second))
     return e1, e2, torch.linalg.cross(e2, e1)
 
 
@@ -244,10 +244,14 @@ def bone_frames(
     """The frames of trunk, head and limbs.
 
     Convention: metres, world frame; everything but the last-resort fallbacks turns with the
-    skeleton. The swing of a bone shorter than ``min_length`` fades to none with its length, so a
-    bone that vanishes and grows again does not jump. The head needs nose and
-    ears, else nose and eyes, else it takes the chest's frame. Shoulders and hips in line with the
-    spine borrow each other's baseline, then a world axis.
+    skeleton. The head needs nose and ears, else nose and eyes, else it takes the chest's frame.
+    Shoulders and hips in line with the spine borrow each other's baseline, then a world axis.
+    Below ``min_length`` a bone's swing fades to none and a baseline to its stand-in, so that what
+    vanishes and grows again does not jump: a joint's step moves a frame by at most a few times
+    ``step / min_length``. Four places must jump, for no continuous choice exists: a limb folded
+    right back, shoulders turned right back over the hips, a baseline that passes its stand-in's
+    exact opposite below ``min_length``, and the world axis that a trunk without width falls back
+    to.
 
     Args:
         p: ``[B, J, 3]`` finite joints (see :func:`gsgan.skeleton.sanitise`).
@@ -256,7 +260,8 @@ def bone_frames(
         twist: ``hinge`` turns arms and legs about their bones towards the bend plane, by a weight
             that grows from 0 when straight as sin²(bend); ``none`` leaves the swing alone.
         min_length: metres, below which a bone has no full direction.
-        folded: ``1 + cos`` below which a swing counts as folded back.
+        folded: ``1 + cos`` below which two directions count as opposite: a swing as folded back,
+            shoulders as turned back over the hips.
 
     Returns:
         BoneFrames.
@@ -273,12 +278,12 @@ def bone_frames(
     c = constants(template, p.device, p.dtype)
     # baselines are differences of nearby points: exact once the root is taken off
     q = p - p[:, template.hips[0], None].detach()
-    trunk = _trunk(q, c, min_length)
+    trunk = _trunk(q, c, min_length, folded)
     hubs = torch.cat([trunk[:, :2], _head(q, valid, trunk[:, 1], c, min_length)], dim=1)
 
     bones = q.index_select(1, c.ends) - q.index_select(1, c.starts)
     length2 = bones.square().sum(-1, keepdim=True)
-    directions = bones * length2.clamp_min(min_length**2).rsqrt()
+    directions, _ = _shortened(bones, min_length)
     lengths = (length2.squeeze(-1) + min_length**2).sqrt()
 
     known, relative = hubs, []
@@ -300,7 +305,7 @@ def bone_frames(
     )
 
 
-def _trunk(q: Tensor, c: Constants, min_length: float) -> Tensor:
+def _trunk(q: Tensor, c: Constants, min_length: float, folded: float) -> Tensor:
     """``[B, 3, 3, 3]`` frames of pelvis, chest and the box between them.
 
     They share the up axis, the long baseline from hips to shoulders; left comes from the hips, the
@@ -308,46 +313,70 @@ def _trunk(q: Tensor, c: Constants, min_length: float) -> Tensor:
     """
     l_sh, r_sh, l_hip, r_hip = q.index_select(1, c.torso).unbind(1)
     spine = (l_sh + r_sh - l_hip - r_hip) * 0.5
-    spine_ok = spine.square().sum(-1, keepdim=True) >= min_length**2
-    up = _unit(torch.where(spine_ok, spine, c.axes[1])).unsqueeze(1)
+    up = _faded(spine, c.axes[1], min_length, folded).unsqueeze(1)
 
     lines = torch.stack([l_hip - r_hip, l_sh - r_sh], dim=1)
-    lines = lines - up * (up * lines).sum(-1, keepdim=True)
-    usable = lines.square().sum(-1, keepdim=True) >= min_length**2
+    lines = _across(up, lines)
     least = c.axes[up.detach().abs().argmin(-1).squeeze(1)].unsqueeze(1)
     # the world's x axis unless the spine lies along it
-    stray = torch.where(up[..., :1].abs() < 0.9, c.axes[0], least)
-    stray = stray - up * (up * stray).sum(-1, keepdim=True)
-    lines = torch.where(usable, lines, torch.where(usable.flip(1), lines.flip(1), stray))
-    lines = _unit(lines)
+    stray = _unit(_across(up, torch.where(up[..., :1].abs() < 0.9, c.axes[0], least)))
+    other = _faded(lines.flip(1), stray, min_length, folded)
+    lines = _faded(lines, other, min_length, folded)
+    # once more: a line nearly along the spine has kept the rounding of its long part
+    lines = _unit(_across(up, lines))
     both = lines.sum(1, keepdim=True)
-    opposed = both.square().sum(-1, keepdim=True) < min_length**2  # turned back to front
+    opposed = both.square().sum(-1, keepdim=True) < 2 * folded  # turned back to front
     left = torch.cat([lines, _unit(torch.where(opposed, lines[:, :1], both))], dim=1)
     up = up.expand_as(left)
     return torch.stack([left, up, torch.linalg.cross(left, up)], dim=-1)
 
 
 def _head(q: Tensor, valid: Tensor, chest: Tensor, c: Constants, min_length: float) -> Tensor:
-    """``[B, 1, 3, 3]`` from ears and nose, else eyes and nose, else the chest's frame."""
+    """``[B, 1, 3, 3]`` from ears and nose, else eyes and nose, else the chest's frame.
+
+    A baseline that shrinks below ``min_length`` hands over to the next frame little by little.
+    """
     points = q.index_select(1, c.head_points)
     seen = valid.index_select(1, c.head_points)
     pairs, nose = points[:, :4].unflatten(1, (2, 2)), points[:, 4:]
-    line = pairs[:, :, 0] - pairs[:, :, 1]
-    front = nose - (pairs[:, :, 0] + pairs[:, :, 1]) * 0.5
     seen_pair = seen[:, :4].unflatten(1, (2, 2)).all(-1) & seen[:, 4:]
 
-    wide = line.square().sum(-1, keepdim=True) >= min_length**2
-    line = _unit(torch.where(wide, line, c.axes[0]))
-    across = front - line * (line * front).sum(-1, keepdim=True)
-    deep = across.square().sum(-1, keepdim=True) >= min_length**2
-    usable = seen_pair.unsqueeze(-1) & wide & deep
-    line = torch.where(usable, line, c.axes[0])
-    across = _unit(torch.where(usable, across, c.axes[2]))
-    frames = torch.stack([line, torch.linalg.cross(across, line), across], dim=-1)
+    left, wide = _shortened(pairs[:, :, 0] - pairs[:, :, 1], min_length)
+    front = nose - (pairs[:, :, 0] + pairs[:, :, 1]) * 0.5
+    front, deep = _shortened(_across(left, front), min_length)
+    frames = torch.stack([left, torch.linalg.cross(front, left), front], dim=-1)
+    share = torch.where(seen_pair.unsqueeze(-1), wide * deep, 0.0).unsqueeze(-1)
 
-    by_ears, by_eyes = usable.unsqueeze(-1).unbind(1)
-    head = torch.where(by_eyes, frames[:, 1] @ c.head_from_eyes, chest)
-    return torch.where(by_ears, frames[:, 0], head).unsqueeze(1)
+    (by_ears, by_eyes), (ears, eyes) = share.unbind(1), frames.unbind(1)
+    head = by_eyes * (eyes @ c.head_from_eyes) + (1 - by_eyes) * chest
+    head = rotation_from_6d(rotation_to_6d(by_ears * ears + (1 - by_ears) * head))
+    return head.unsqueeze(1)
+
+
+def _faded(v: Tensor, fallback: Tensor, min_length: float, folded: float) -> Tensor:
+    """Unit v; below ``min_length`` it leans towards the unit ``fallback``, which it is at 0.
+
+    No map from the ball to the sphere is the identity on the surface and continuous throughout, so
+    one place must jump: here the single v, opposite to the fallback, where the two cancel.
+    """
+    v = v / min_length
+    v = v + (1 - v.square().sum(-1, keepdim=True)).clamp_min(0) * fallback
+    lost = v.square().sum(-1, keepdim=True) < folded
+    return _unit(torch.where(lost, fallback, v))
+
+
+def _shortened(v: Tensor, min_length: float) -> tuple[Tensor, Tensor]:
+    """v by the larger of its length and ``min_length``, and its squared length then."""
+    length2 = v.square().sum(-1, keepdim=True)
+    return (
+        v * length2.clamp_min(min_length**2).rsqrt(),
+        (length2 / min_length**2).clamp_max(1),
+    )
+
+
+def _across(axis: Tensor, v: Tensor) -> Tensor:
+    """The part of v across a unit ``axis``."""
+    return v - axis * (axis * v).sum(-1, keepdim=True)
 
 
 def _towards_hinge(R: Tensor, upper: Tensor, lower: Tensor, level: _Level) -> Tensor:

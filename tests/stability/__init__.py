@@ -1,0 +1,1 @@
+"""A package, because other folders of tests hold modules of the same names."""

@@ -1,0 +1,45 @@
+"""Hard inputs of the generator, and what half precision may and may not change."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsgan.model.generator import Style
+from gsgan.stability.generator import GENERATOR
+from stability.judged import assert_as_expected, each
+
+HALVES = (torch.bfloat16, torch.float16)
+
+
+@each(GENERATOR)
+def test_float32(case, backend):
+    assert_as_expected(case, backend)
+
+
+@pytest.mark.parametrize("size", [1e-4, 1.0, 300.0, 6e4])
+def test_half_precision_normalises_what_its_squares_cannot_hold(size):
+    """fp16 squares overflow above 256 and vanish below 2e-4; the norm is one all the same."""
+    style = Style(4, 2, 3)
+    h = torch.tensor([1.0, -1.0, 1.0, -1.0]).view(1, 4, 1, 1) * size
+    with torch.autocast("cpu", dtype=torch.float16):
+        out = style(h.half(), torch.zeros(1, 2, 1, 1), torch.zeros(1, 3))
+    expected = h / (size**2 + 1e-6) ** 0.5
+    torch.testing.assert_close(out.float(), expected, rtol=2e-3, atol=0)
+
+
+@pytest.mark.parametrize("half", HALVES)
+def test_geometry_and_rasteriser_stay_in_float32_under_autocast(build, half):
+    """F, alpha, S and Ĝ bit for bit; the picture to the type's own rounding."""
+    _, avatar, frame = build("size.rgb_skip=false")  # else the picture starts as F itself
+    with torch.no_grad():
+        plain = avatar.paint(frame)
+        with torch.autocast("cpu", dtype=half):
+            mixed = avatar.paint(frame)
+    for name in ("features", "alpha", "segmentation"):
+        assert torch.equal(getattr(mixed, name), getattr(plain, name)), name
+    assert torch.equal(mixed.gaussians.means, plain.gaussians.means)
+    assert torch.equal(mixed.gaussians.covariances, plain.gaussians.covariances)
+    assert mixed.image.dtype == torch.float32
+    limit = 0.05 if half == torch.bfloat16 else 0.02
+    assert float((mixed.image - plain.image).abs().max()) < limit

@@ -1,0 +1,157 @@
+"""Training survives: bad gradients move nothing and are counted; hard skeletons stay finite."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from lightning import Trainer
+from torch.utils.data import DataLoader
+
+from gsgan.errors import GsganError
+from gsgan.runs import build_training
+from gsgan.scene import Frame, cat
+from gsgan.stability.poses import DEGENERATE
+from gsgan.training.module import AvatarTraining
+
+TO_WORLD = torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+"""Body axes (y up, facing z) to the capture's (z up, facing -y)."""
+
+
+@pytest.fixture
+def make(tiny, tmp_path):
+    """(module, a frame, fit): ``fit(frames)`` trains one iteration on each."""
+
+    def run(phases: tuple[int, int, int], *overrides: str):
+        names = ("segmentation", "step_one", "step_two")
+        schedule = [f"training.schedule.{k}={n}" for k, n in zip(names, phases, strict=True)]
+        data, module = build_training(
+            tiny(
+                *schedule,
+                "training.schedule.discriminator_start=0",
+                "size.rgb_skip=false",
+                *overrides,
+            )
+        )
+        trainer = Trainer(
+            max_epochs=1,
+            accelerator="cpu",
+            logger=False,
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            default_root_dir=tmp_path,
+        )
+        frame = data.dataset("train")[0]
+        return (
+            module,
+            frame,
+            lambda frames: trainer.fit(module, DataLoader(frames, batch_size=None)),
+        )
+
+    return run
+
+
+def with_pose(frame: Frame, name: str) -> Frame:
+    return replace(frame, skeleton=DEGENERATE[name].float() @ TO_WORLD.mT)
+
+
+def assert_finite(module: AvatarTraining) -> None:
+    assert module.skipped == 0
+    for name, value in module.state_dict().items():
+        assert value.isfinite().all(), name
+    for optimiser in module.trainer.optimizers:
+        for state in optimiser.state.values():
+            assert all(torch.as_tensor(v).isfinite().all() for v in state.values())
+
+
+PARTS = {
+    "segmentation": ((3, 0, 0), "avatar.segmentation.quats"),
+    "psi": ((0, 3, 0), "avatar.deformation.head.weight"),
+    "generator": ((0, 0, 3), "avatar.generator.paint.weight"),
+    "discriminator": ((0, 0, 3), "discriminator.judges.0.logits.weight"),
+}
+
+
+def poison(module: AvatarTraining, name: str, steps: set[int], value: float) -> torch.Tensor:
+    """Makes one number of a parameter's gradient ``value`` at these iterations; the parameter."""
+    parameter = dict(module.named_parameters())[name]
+
+    def spoil(gradient: torch.Tensor) -> torch.Tensor:
+        if module.step in steps:
+            gradient = gradient.clone()
+            gradient[(0,) * gradient.ndim] = value
+        return gradient
+
+    parameter.register_hook(spoil)
+    return parameter
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("part", PARTS)
+def test_a_gradient_that_is_not_finite_skips_its_step_and_is_counted(make, part, value):
+    """The second of three iterations is spoiled: the part rests there, and learns after it."""
+    phases, name = PARTS[part]
+    module, frame, fit = make(phases)
+    parameter = poison(module, name, {1}, value)
+    seen = []
+    step = module.training_step
+
+    def watched(*args):
+        step(*args)
+        seen.append(parameter.detach().clone())
+
+    module.training_step = watched
+    fit([frame] * 3)
+    assert module.step == 3
+    assert module.skipped == 1
+    assert torch.equal(seen[0], seen[1])
+    assert not torch.equal(seen[1], seen[2])
+    module.skipped = 0
+    assert_finite(module)
+
+
+def test_when_it_recurs_the_run_stops_with_a_clear_message(make, capsys):
+    module, frame, fit = make((0, 5, 0), "training.max_skipped=2")
+    poison(module, PARTS["psi"][1], {1, 2}, float("nan"))
+    with pytest.raises(GsganError, match=r"stopped at iteration 2: 2 iterations .* not finite"):
+        fit([frame] * 5)
+    assert "skipped (1 of at most 2)" in capsys.readouterr().out
+    checkpoint: dict = {}
+    module.on_save_checkpoint(checkpoint)
+    assert checkpoint["gsgan"]["skipped"] == 2
+
+
+def test_a_frame_without_a_person_is_learned_from_without_a_nan(make):
+    """Empty mask, black picture, no label: every loss is finite, and nothing is skipped."""
+    module, frame, fit = make((2, 2, 2), "training.collapse=0")
+    labels = torch.full_like(frame.labels, 255)
+    empty = replace(frame, image=frame.image * 0, mask=frame.mask * 0, labels=labels)
+    fit([empty] * 6)
+    assert module.step == 6
+    assert_finite(module)
+
+
+def test_a_few_steps_from_all_hard_skeletons_stay_finite(make):
+    """All of them as one batch, through every phase."""
+    module, frame, fit = make((1, 2, 2), "training.collapse=0")
+    batch = cat([with_pose(frame, name) for name in DEGENERATE])
+    before = [p.detach().clone() for p in module.avatar.deformation.parameters()]
+    fit([batch] * 5)
+    assert module.step == 5
+    assert_finite(module)
+    after = module.avatar.deformation.parameters()
+    assert not all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_a_hundred_steps_from_each_hard_skeleton_stay_finite(make, name):
+    module, frame, fit = make((10, 50, 40), "training.collapse=0")
+    fit([with_pose(frame, name)] * 100)
+    assert module.step == 100
+    assert_finite(module)
+    with torch.no_grad():
+        painting = module.avatar.paint(with_pose(frame, name))
+    assert painting.image.isfinite().all()
