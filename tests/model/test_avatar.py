@@ -89,6 +89,24 @@ def test_data_without_body_pose_turns_segmentation_off(build, tmp_path):
     assert torch.isfinite(avatar.paint(frame).image).all()
 
 
+def test_segmentation_of_a_model_file(build, tiny, tmp_path):
+    from hydra.utils import instantiate
+    from writers.smpl import write_smpl
+
+    write_smpl(tmp_path / "smpl.pkl", vertices=500)
+    data, _, frame = build()
+    bare = {"body": "smpl", "label_names": (), "n_labels": 0}
+    scene = dataclasses.replace(data.info, **bare, body_file=str(tmp_path / "smpl.pkl"))
+    avatar = instantiate(tiny().model)(scene=scene)
+    assert avatar.effects["segmentation S"] == (True, "the data has a body pose")
+    pose = dataclasses.replace(frame.body, theta=torch.zeros(1, 24, 3))
+    painting = avatar.paint(dataclasses.replace(frame, body=pose))
+    assert painting.segmentation.shape[1] == 13
+    without = instantiate(tiny().model)(scene=dataclasses.replace(data.info, **bare))
+    assert without.segmentation is None
+    assert "no model file" in without.effects["segmentation S"][1]
+
+
 def test_batches_are_independent(build):
     from gsgan.scene import cat
 

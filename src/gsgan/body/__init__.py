@@ -1,14 +1,21 @@
-"""Skinned bodies: linear blend skinning and the free body."""
+"""Skinned bodies: linear blend skinning, the free body, and SMPL files of the user's own.
+
+Models of the SMPL family are in `gsgan.body.smpl`.
+"""
 
 from gsgan.body.free import Body, free_body, read_body
 from gsgan.body.lbs import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from gsgan.body.skinned import SkinnedBody
+from gsgan.body.source import open_body
 
 __all__ = [
     "Body",
+    "SkinnedBody",
     "axis_angle_to_matrix",
     "blend_transforms",
     "forward_kinematics",
     "free_body",
+    "open_body",
     "read_body",
     "skin",
 ]

@@ -1,4 +1,4 @@
-"""The free body, a clothed person without a licence gate, and the record of any skinned body.
+"""The free body, a clothed person without a licence gate.
 
 Convention: metres; Z up, the person faces -Y, the person's left is +X; rest pose with the arms held
 away from the trunk. The asset beside this file is made by scripts/bake_free_body.py.
@@ -7,36 +7,27 @@ away from the trunk. The asset beside this file is made by scripts/bake_free_bod
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsgan.body.lbs import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from gsgan.body.skinned import SkinnedBody, carry
 from gsgan.errors import DataError
 from gsgan.scene import BodyPose
 
 
-@dataclass(frozen=True)
-class Body:
-    """A skinned body with part labels and landmarks, unbatched.
+@dataclass(frozen=True, kw_only=True)
+class Body(SkinnedBody):
+    """The free body: a skinned body with materials and landmarks, unbatched.
 
     Args:
-        vertices: ``[V, 3]`` rest positions, metres.
-        faces: ``[F, 3]`` int64, counter-clockwise seen from outside.
-        bone_index: ``[V, 4]`` int64.
-        bone_weight: ``[V, 4]``, rows sum to 1.
-        joints: ``[J, 3]`` rest positions, metres.
-        parents: parent of each joint, -1 for the root.
-        joint_names: names of the joints.
         face_labels: ``[F]`` int64 part of each face, see ``label_names``; 0 is the background's.
-        vertex_labels: ``[V]`` int64, the part most of a vertex's faces have.
-        label_names: name of each part, background first.
+            A vertex has the part that most of its faces have.
         face_surface: ``[F]`` int64 material of each face, see ``surface_names``.
         surface_names: skin, hair, eye and the garments.
         landmarks: ``[33, 3]`` rest positions of the MediaPipe pose landmarks.
@@ -47,16 +38,7 @@ class Body:
         hand_names: 42 names.
     """
 
-    vertices: Tensor
-    faces: Tensor
-    bone_index: Tensor
-    bone_weight: Tensor
-    joints: Tensor
-    parents: tuple[int, ...]
-    joint_names: tuple[str, ...]
     face_labels: Tensor
-    vertex_labels: Tensor
-    label_names: tuple[str, ...]
     face_surface: Tensor
     surface_names: tuple[str, ...]
     landmarks: Tensor
@@ -66,60 +48,13 @@ class Body:
     hand_bone: Tensor
     hand_names: tuple[str, ...]
 
-    def to(self, *args: Any, **kwargs: Any) -> Body:
-        """A copy on another device or with another float dtype; integers keep their dtype."""
-        changes: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, Tensor):
-                moved = value.to(*args, **kwargs)
-                floating = value.is_floating_point()
-                changes[field.name] = moved if floating else moved.to(value.dtype)
-        return replace(self, **changes)
-
-    def transforms(self, pose: BodyPose) -> Tensor:
-        """``[B, J, 4, 4]`` world transform of each bone relative to rest.
-
-        Raises:
-            ValueError: when ``pose.theta`` has another number of joints than the body.
-        """
-        if pose.theta.ndim != 3 or pose.theta.shape[1:] != (len(self.parents), 3):
-            raise ValueError(
-                f"Body.transforms: pose.theta must have shape [B, {len(self.parents)}, 3], "
-                f"got {list(pose.theta.shape)}"
-            )
-        rotations = axis_angle_to_matrix(pose.theta)
-        return forward_kinematics(
-            self.joints.to(rotations), self.parents, rotations, pose.transl.to(rotations)
-        )
-
-    def pose(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
-        """Affine map of each vertex, ``A [B, V, 3, 3]`` and ``t [B, V, 3]`` (paper Sec. 3.4)."""
-        return blend_transforms(self.transforms(pose), self.bone_index, self.bone_weight)
-
-    def posed_vertices(self, pose: BodyPose) -> Tensor:
-        """``[B, V, 3]`` metres, world frame."""
-        A, t = self.pose(pose)
-        return skin(self.vertices.to(A), A, t)
-
-    def posed_joints(self, pose: BodyPose) -> Tensor:
-        """``[B, J, 3]`` metres, world frame."""
-        own = torch.arange(len(self.parents), device=self.joints.device)
-        return _carry(self.transforms(pose), self.joints, own)
-
     def posed_landmarks(self, pose: BodyPose) -> Tensor:
         """``[B, 33, 3]`` MediaPipe pose landmarks, metres, world frame."""
-        return _carry(self.transforms(pose), self.landmarks, self.landmark_bone)
+        return carry(self.transforms(pose), self.landmarks, self.landmark_bone)
 
     def posed_hands(self, pose: BodyPose) -> Tensor:
         """``[B, 42, 3]`` MediaPipe hand landmarks, left then right, metres, world frame."""
-        return _carry(self.transforms(pose), self.hand_landmarks, self.hand_bone)
-
-
-def _carry(transforms: Tensor, points: Tensor, bones: Tensor) -> Tensor:
-    """Points ``[N, 3]`` moved rigidly, each with its bone: ``[B, N, 3]``."""
-    T = transforms[:, bones]
-    return (T[..., :3, :3] @ points.to(T)[..., None]).squeeze(-1) + T[..., :3, 3]
+        return carry(self.transforms(pose), self.hand_landmarks, self.hand_bone)
 
 
 def majority_vertex_labels(faces: Tensor, face_labels: Tensor, vertices: int) -> Tensor:

@@ -69,7 +69,7 @@ def forward_kinematics(
     """World transform of each bone relative to the rest pose.
 
     Args:
-        joints: ``[J, 3]`` rest positions, metres.
+        joints: ``[J, 3]`` rest positions, metres; or ``[B, J, 3]``, another body for each pose.
         parents: parent of each joint, -1 for the root, each parent before its children.
         rotations: ``[B, J, 3, 3]`` of each joint relative to its parent.
         transl: ``[B, 3]`` metres, added after the root's rotation about its own joint.
@@ -81,10 +81,10 @@ def forward_kinematics(
         ValueError: on shapes that do not fit, naming the argument.
     """
     J = len(parents)
-    if joints.shape != (J, 3):
+    if joints.shape not in ((J, 3), (len(rotations), J, 3)):
         raise ValueError(
-            f"forward_kinematics: joints must have shape [{J}, 3] (one per parent), "
-            f"got {list(joints.shape)}"
+            f"forward_kinematics: joints must have shape [{J}, 3] (one per parent) or "
+            f"[{len(rotations)}, {J}, 3], got {list(joints.shape)}"
         )
     if rotations.ndim != 4 or rotations.shape[1:] != (J, 3, 3):
         raise ValueError(
@@ -97,7 +97,7 @@ def forward_kinematics(
             f"got {list(transl.shape)}"
         )
     R, position = _accumulate(joints, parents, rotations, transl)
-    shift = position - (R @ joints[None, :, :, None]).squeeze(-1)
+    shift = position - (R @ joints.unsqueeze(-1)).squeeze(-1)
     top = torch.cat([R, shift.unsqueeze(-1)], dim=-1)
     bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:2], 1, 4)
     return torch.cat([top, bottom], dim=-2)
@@ -111,15 +111,15 @@ def _accumulate(
     world_p: dict[int, Tensor] = {}
     for level in kinematic_levels(parents):
         R = rotations[:, level]
-        p = joints[level].expand(len(rotations), -1, -1)
+        p = joints[..., level, :].expand(len(rotations), -1, -1)
         above = [parents[j] for j in level]
         if above[0] < 0:
             p = p + transl.unsqueeze(1)
         else:
             parent_R = torch.stack([world_R[j] for j in above], dim=1)
             parent_p = torch.stack([world_p[j] for j in above], dim=1)
-            offset = (joints[level] - joints[above])[None, :, :, None]
-            p = parent_p + (parent_R @ offset).squeeze(-1)
+            offset = joints[..., level, :] - joints[..., above, :]
+            p = parent_p + (parent_R @ offset.unsqueeze(-1)).squeeze(-1)
             R = parent_R @ R
         world_R.update(zip(level, R.unbind(1), strict=True))
         world_p.update(zip(level, p.unbind(1), strict=True))
@@ -148,7 +148,8 @@ def blend_transforms(
         ``A [B, V, 3, 3]`` and ``t [B, V, 3]``.
 
     Raises:
-        ValueError: when the two tables differ in shape, or a vertex has no weight at all.
+        ValueError: when the two tables differ in shape, or a vertex has no weight at all or a
+            negative one.
 
     Source: paper Sec. 3.4, ``x_o = (Σ_b w_b ΔB_b) x_c``.
     """
@@ -159,10 +160,11 @@ def blend_transforms(
         )
     weight = bone_weight.to(transforms.dtype)
     total = weight.sum(-1, keepdim=True)
-    if not bool((total > 0).all()):
+    good = (total > 0) & (weight >= 0).all(-1, keepdim=True)
+    if not bool(good.all()):
         raise ValueError(
-            f"blend_transforms: bone_weight must have a positive sum for every vertex, "
-            f"got {int((total <= 0).sum())} vertices without"
+            f"blend_transforms: bone_weight must be non-negative with a positive sum for every "
+            f"vertex, got {int((~good).sum())} vertices without"
         )
     weight = weight / total
     rows = transforms[:, :, :3].flatten(2)
@@ -174,5 +176,5 @@ def blend_transforms(
 
 
 def skin(vertices: Tensor, A: Tensor, t: Tensor) -> Tensor:
-    """Posed vertices ``[B, V, 3]``: rest ones ``[V, 3]`` under ``A [B,V,3,3]``, ``t [B,V,3]``."""
+    """Posed vertices ``[B, V, 3]``: rest ``[V, 3]`` (or a batch) by ``A [B,V,3,3], t [B,V,3]``."""
     return (A @ vertices[..., None]).squeeze(-1) + t

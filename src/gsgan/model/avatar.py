@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor, nn
 
-from gsgan.body import free_body
+from gsgan.body import open_body
 from gsgan.errors import DataError
 from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
@@ -159,14 +159,16 @@ class Avatar(nn.Module):
         if not scene.has_body_pose:
             self.effects["segmentation S"] = (False, "the data has no body pose")
             return None
-        if scene.body != "free":
-            why = f"the data's poses are of the body {scene.body!r}, which has no mesh here yet"
+        body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
+        if body is None:
+            why = (
+                f"the data's poses are of the body {scene.body!r}, of which there is no model file"
+            )
             self.effects["segmentation S"] = (False, why)
             return None
-        body = free_body()
         if scene.n_labels > len(body.label_names):
             raise DataError(
-                f"labels: the pictures hold {scene.n_labels} parts, the free body has "
+                f"labels: the pictures hold {scene.n_labels} parts, the {scene.body} body has "
                 f"{len(body.label_names)} ({', '.join(body.label_names)}); map them to these ids, "
                 "or choose model=wo_seg"
             )

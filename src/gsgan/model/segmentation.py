@@ -9,7 +9,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.body import Body, axis_angle_to_matrix, blend_transforms, forward_kinematics
+from gsgan.body import SkinnedBody, axis_angle_to_matrix, blend_transforms, forward_kinematics
 from gsgan.precision import full_precision
 from gsgan.scene import BodyPose, Camera, Gaussians
 from gsgan.splat import accuracy as named_accuracy
@@ -43,7 +43,7 @@ class Segmentation(nn.Module):
 
     def __init__(
         self,
-        body: Body,
+        body: SkinnedBody,
         *,
         points: int | None = None,
         opacity: float = 0.9,
@@ -97,7 +97,8 @@ class Segmentation(nn.Module):
 def segmentation_loss(segmentation: Tensor, labels: Tensor, floor: float = 1e-6) -> Tensor:
     """Cross-entropy of rendered probabilities: mean of -log(P of the true class + floor).
 
-    The maps are probabilities already, so there is no softmax. Pixels labelled 255 are left out.
+    The maps are probabilities already, so there is no softmax. Pixels labelled 255 are left out;
+    with no other pixel the loss is 0.
 
     Args:
         segmentation: ``[B, classes, H, W]``.
@@ -106,7 +107,9 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor, floor: float = 1e-6)
 
     Source: method.md § 3, § 10.
     """
-    return functional.nll_loss((segmentation + floor).log(), labels, ignore_index=IGNORE)
+    log = (segmentation + floor).log()
+    total = functional.nll_loss(log, labels, ignore_index=IGNORE, reduction="sum")
+    return total / (labels != IGNORE).sum().clamp_min(1)
 
 
 def farthest_points(vertices: Tensor, count: int) -> Tensor:

@@ -1,0 +1,89 @@
+"""The record of any skinned body: vertices, bones, part labels, and how a pose moves them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+from gsgan.body.lbs import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from gsgan.scene import BodyPose
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkinnedBody:
+    """A skinned body with part labels, unbatched: all that a body's segmentation needs.
+
+    Convention: metres; the axes are the body's own (the free body has Z up, SMPL's have Y up); the
+    root turns about its own joint.
+
+    Args:
+        vertices: ``[V, 3]`` rest positions, metres.
+        faces: ``[F, 3]`` int64, counter-clockwise seen from outside.
+        bone_index: ``[V, n]`` int64.
+        bone_weight: ``[V, n]``, rows sum to 1.
+        joints: ``[J, 3]`` rest positions, metres.
+        parents: parent of each joint, -1 for the root.
+        joint_names: names of the joints.
+        vertex_labels: ``[V]`` int64 part of each vertex, see ``label_names``.
+        label_names: name of each part, background first.
+    """
+
+    vertices: Tensor
+    faces: Tensor
+    bone_index: Tensor
+    bone_weight: Tensor
+    joints: Tensor
+    parents: tuple[int, ...]
+    joint_names: tuple[str, ...]
+    vertex_labels: Tensor
+    label_names: tuple[str, ...]
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """A copy on another device or with another float dtype; integers keep their dtype."""
+        changes: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, Tensor):
+                moved = value.to(*args, **kwargs)
+                floating = value.is_floating_point()
+                changes[field.name] = moved if floating else moved.to(value.dtype)
+        return replace(self, **changes)
+
+    def transforms(self, pose: BodyPose) -> Tensor:
+        """``[B, J, 4, 4]`` world transform of each bone relative to rest.
+
+        Raises:
+            ValueError: when ``pose.theta`` has another number of joints than the body.
+        """
+        if pose.theta.ndim != 3 or pose.theta.shape[1:] != (len(self.parents), 3):
+            raise ValueError(
+                f"{type(self).__name__}.transforms: pose.theta must have shape "
+                f"[B, {len(self.parents)}, 3], got {list(pose.theta.shape)}"
+            )
+        rotations = axis_angle_to_matrix(pose.theta)
+        return forward_kinematics(
+            self.joints.to(rotations), self.parents, rotations, pose.transl.to(rotations)
+        )
+
+    def pose(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
+        """Affine map of each vertex, ``A [B, V, 3, 3]`` and ``t [B, V, 3]`` (paper Sec. 3.4)."""
+        return blend_transforms(self.transforms(pose), self.bone_index, self.bone_weight)
+
+    def posed_vertices(self, pose: BodyPose) -> Tensor:
+        """``[B, V, 3]`` metres, world frame."""
+        A, t = self.pose(pose)
+        return skin(self.vertices.to(A), A, t)
+
+    def posed_joints(self, pose: BodyPose) -> Tensor:
+        """``[B, J, 3]`` metres, world frame."""
+        own = torch.arange(len(self.parents), device=self.joints.device)
+        return carry(self.transforms(pose), self.joints, own)
+
+
+def carry(transforms: Tensor, points: Tensor, bones: Tensor) -> Tensor:
+    """Points ``[N, 3]`` moved rigidly, each with its bone: ``[B, N, 3]``."""
+    T = transforms[:, bones]
+    return (T[..., :3, :3] @ points.to(T)[..., None]).squeeze(-1) + T[..., :3, 3]

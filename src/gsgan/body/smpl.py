@@ -1,0 +1,266 @@
+"""Skinned body models of the SMPL family, as the user's own files hold them.
+
+Convention: metres; the rest pose has Y up and faces +Z, the person's left is +X; axis-angle
+rotations relative to the parent joint; the root turns about its own joint and is then moved by
+``transl``. Hands take full rotations (no PCA) and zero means the flat hand: SMPL-X parameters made
+with ``flat_hand_mean=False`` need the model's mean hand pose added first.
+
+Source: the blend skinning of SMPL and SMPL-X, written from their published equations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from gsgan.body.lbs import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from gsgan.body.skinned import SkinnedBody
+from gsgan.body.smpl_files import Floats, SmplArrays, read_arrays
+from gsgan.body.smpl_names import JOINT_NAMES, Parts, part_names, part_of_joint
+
+KINDS = {24: "smpl", 55: "smplx"}
+
+
+@dataclass(frozen=True, eq=False)
+class SkinnedModel:
+    """A body model with shape and pose blend shapes, in float64 on the CPU.
+
+    Args:
+        kind: "smpl" (24 joints), "smplx" (55) or "generic".
+        v_template: ``[V, 3]`` metres, the mean shape.
+        shapedirs: ``[V, 3, S]``.
+        expression_dirs: ``[V, 3, E]``; E is 0 but for SMPL-X.
+        posedirs: ``[V, 3, 9 (J - 1)]``, by the row-major entries of each joint's ``R - 1``.
+        J_regressor: ``[J, V]``.
+        weights: ``[V, J]``, rows sum to 1.
+        parents: parent of each joint, -1 for the root.
+        faces: ``[F, 3]`` int64.
+    """
+
+    kind: str
+    v_template: Tensor
+    shapedirs: Tensor
+    expression_dirs: Tensor
+    posedirs: Tensor
+    J_regressor: Tensor
+    weights: Tensor
+    parents: tuple[int, ...]
+    faces: Tensor
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """Names of the joints; numbers for a model that is neither SMPL nor SMPL-X."""
+        numbered = tuple(f"joint{j}" for j in range(len(self.parents)))
+        return JOINT_NAMES.get(self.kind, numbered)
+
+    @cached_property
+    def bones(self) -> tuple[Tensor, Tensor]:
+        """``[V, n]`` joints and weights of each vertex, n the most that any vertex has: exact."""
+        n = int((self.weights > 0).sum(dim=1).max())
+        weight, index = self.weights.sort(dim=1, descending=True, stable=True)
+        return index[:, :n].contiguous(), weight[:, :n].contiguous()
+
+    @cached_property
+    def _joint_shapes(self) -> tuple[Tensor, Tensor, Tensor]:
+        """The joints of the mean shape ``[J, 3]``, and what shape and expression add to them."""
+        mean, shape, face = (
+            (self.J_regressor @ of_vertices.flatten(1)).unflatten(1, of_vertices.shape[1:])
+            for of_vertices in (self.v_template, self.shapedirs, self.expression_dirs)
+        )
+        return mean, shape, face
+
+    def rest_vertices(self, betas: Tensor, expression: Tensor | None = None) -> Tensor:
+        """``[B, V, 3]`` metres, the shaped body at rest.
+
+        Args:
+            betas: ``[B, s]`` shape coefficients, ``s <= S``; those not given are 0.
+            expression: ``[B, e]``, ``e <= E``; None for a neutral face.
+
+        Raises:
+            ValueError: when there are more coefficients than the model has.
+        """
+        shaped = _add("betas", self.v_template, self.shapedirs, betas)
+        return _add("expression", shaped, self.expression_dirs, expression)
+
+    def rest_joints(self, betas: Tensor, expression: Tensor | None = None) -> Tensor:
+        """``[B, J, 3]`` metres, the joints of the shaped body at rest; arguments as above."""
+        mean, shape, face = self._joint_shapes
+        return _add("expression", _add("betas", mean, shape, betas), face, expression)
+
+    def pose(
+        self,
+        theta: Tensor,
+        betas: Tensor,
+        transl: Tensor,
+        expression: Tensor | None = None,
+        *,
+        pose_blend: bool = True,
+    ) -> tuple[Tensor, Tensor]:
+        """The posed body.
+
+        Args:
+            theta: ``[B, J, 3]`` axis-angle of each joint relative to its parent, the root's first.
+            betas: ``[B, s]`` or ``[1, s]`` shape coefficients.
+            transl: ``[B, 3]`` metres.
+            expression: ``[B, e]``, or None.
+            pose_blend: add the pose blend shapes (bulging muscles, sharp elbows).
+
+        Returns:
+            ``[B, V, 3]`` vertices and ``[B, J, 3]`` joints, metres, world frame.
+
+        Raises:
+            ValueError: on shapes that do not fit, naming the argument.
+        """
+        transforms, rotations, rest = self._transforms(theta, betas, transl, expression)
+        vertices = self.rest_vertices(betas, expression)
+        if pose_blend:
+            eye = torch.eye(3, dtype=rotations.dtype)
+            feature = (rotations[:, 1:] - eye).flatten(1)
+            vertices = vertices + _directed(self.posedirs, feature)
+        return skin(vertices, *blend_transforms(transforms, *self.bones)), _moved(transforms, rest)
+
+    def posed_joints(
+        self, theta: Tensor, betas: Tensor, transl: Tensor, expression: Tensor | None = None
+    ) -> Tensor:
+        """``[B, J, 3]`` joints as :meth:`pose` gives them, without posing a vertex."""
+        transforms, _, rest = self._transforms(theta, betas, transl, expression)
+        return _moved(transforms, rest)
+
+    def as_body(self, betas: ArrayLike = (), parts: Parts = "clothes") -> SkinnedBody:
+        """The shaped body as segmentation wants it: float32, one part a vertex, no blend shapes.
+
+        A vertex belongs to the part of the joint with its largest skinning weight, of equal ones
+        to the first joint.
+
+        Args:
+            betas: ``[s]`` shape coefficients.
+            parts: "clothes", the free body's parts; "cihp", the 20 ids of ZJU-MoCap's labels;
+                "joints", one part a joint.
+
+        Raises:
+            ValueError: when a model of another kind is asked for parts other than its joints.
+        """
+        if parts != "joints" and self.kind not in JOINT_NAMES:
+            raise ValueError(
+                f"SkinnedModel.as_body: parts must be 'joints' for a model of "
+                f"{len(self.parents)} joints, got {parts!r}"
+            )
+        shape = torch.from_numpy(np.atleast_2d(np.asarray(betas, np.float64)))
+        names = part_names(parts, self.joint_names)
+        own = [names.index(part_of_joint(parts, joint)) for joint in self.joint_names]
+        first = torch.from_numpy(self.weights.numpy().argmax(axis=1))  # the first of equals
+        index, weight = self.bones
+        return SkinnedBody(
+            vertices=self.rest_vertices(shape)[0].float(),
+            faces=self.faces,
+            bone_index=index,
+            bone_weight=weight.float(),
+            joints=self.rest_joints(shape)[0].float(),
+            parents=self.parents,
+            joint_names=self.joint_names,
+            vertex_labels=torch.tensor(own)[first],
+            label_names=names,
+        )
+
+    def _transforms(
+        self, theta: Tensor, betas: Tensor, transl: Tensor, expression: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Bone transforms ``[B, J, 4, 4]``, rotations ``[B, J, 3, 3]``, rest joints."""
+        J = len(self.parents)
+        if theta.ndim != 3 or theta.shape[1:] != (J, 3):
+            raise ValueError(
+                f"SkinnedModel: theta must have shape [B, {J}, 3], got {list(theta.shape)}"
+            )
+        rotations = axis_angle_to_matrix(theta.to(self.v_template))
+        rest = self.rest_joints(betas, expression).expand(len(theta), -1, -1)
+        moved = forward_kinematics(rest, self.parents, rotations, transl.to(rest))
+        return moved, rotations, rest
+
+
+def _directed(directions: Tensor, coefficients: Tensor) -> Tensor:
+    """``[B, N, 3]``: directions ``[N, 3, n]`` times coefficients ``[B, n]``."""
+    return (directions @ coefficients.mT).permute(2, 0, 1)
+
+
+def _add(name: str, base: Tensor, directions: Tensor, coefficients: Tensor | None) -> Tensor:
+    """``base`` moved along the first directions; the coefficients not given are 0."""
+    if coefficients is None:
+        return base
+    most = directions.shape[-1]
+    if coefficients.ndim != 2 or coefficients.shape[1] > most:
+        raise ValueError(
+            f"SkinnedModel: {name} must have shape [B, n] with n at most {most}, "
+            f"got {list(coefficients.shape)}"
+        )
+    given = coefficients.to(base)
+    return base + _directed(directions[..., : given.shape[1]], given)
+
+
+def _moved(transforms: Tensor, joints: Tensor) -> Tensor:
+    """Joints ``[B, J, 3]``, each with its own bone."""
+    return (transforms[..., :3, :3] @ joints[..., None]).squeeze(-1) + transforms[..., :3, 3]
+
+
+def read_smpl(path: Path | str) -> SkinnedModel:
+    """A body model from the user's file: SMPL's .pkl, chumpy or cleaned, or an .npz.
+
+    Args:
+        path: the model file; nothing in it is run (see gsgan.data.pickles).
+
+    Raises:
+        DataError: when the file is missing, damaged, refused, or not such a model.
+    """
+    return model_from(read_arrays(Path(path)))
+
+
+def model_from(arrays: SmplArrays) -> SkinnedModel:
+    """The model of checked arrays; its kind follows from the number of joints."""
+    return SkinnedModel(
+        kind=KINDS.get(len(arrays.parents), "generic"),
+        v_template=torch.from_numpy(arrays.v_template),
+        shapedirs=torch.from_numpy(arrays.shapedirs),
+        expression_dirs=torch.from_numpy(arrays.expression_dirs),
+        posedirs=torch.from_numpy(arrays.posedirs),
+        J_regressor=torch.from_numpy(arrays.J_regressor),
+        weights=torch.from_numpy(arrays.weights),
+        parents=arrays.parents,
+        faces=torch.from_numpy(arrays.faces),
+    )
+
+
+def from_zju(Rh: ArrayLike, Th: ArrayLike, J0: ArrayLike) -> tuple[Floats, Floats]:
+    """Root rotation and translation of :class:`SkinnedModel` from EasyMocap's and ZJU-MoCap's.
+
+    Convention: theirs is ``R(Rh) x + Th`` of the body posed with an unrotated root, about the
+    model's origin; ours turns about the root joint: ``transl = Th + R J0 - J0``.
+
+    Args:
+        Rh: ``[..., 3]`` axis-angle.
+        Th: ``[..., 3]`` metres.
+        J0: ``[..., 3]`` metres, root joint of the shaped body at rest.
+
+    Returns:
+        ``global_orient [..., 3]`` and ``transl [..., 3]``.
+
+    Source: formats.md § 1.1.
+    """
+    orient, turned, root = _turned_root(Rh, J0)
+    return orient, np.asarray(Th, np.float64) + turned - root
+
+
+def to_zju(global_orient: ArrayLike, transl: ArrayLike, J0: ArrayLike) -> tuple[Floats, Floats]:
+    """The inverse of :func:`from_zju`: ``Rh`` and ``Th``."""
+    orient, turned, root = _turned_root(global_orient, J0)
+    return orient, np.asarray(transl, np.float64) - turned + root
+
+
+def _turned_root(rotation: ArrayLike, J0: ArrayLike) -> tuple[Floats, Floats, Floats]:
+    orient, root = np.asarray(rotation, np.float64), np.asarray(J0, np.float64)
+    R = axis_angle_to_matrix(torch.from_numpy(orient)).numpy()
+    return orient, (R @ root[..., None])[..., 0], root

@@ -1,0 +1,84 @@
+"""SMPL's and SMPL-X's joints and parts by name. Constants only.
+
+Source: formats.md § 1.1, § 4 and § 5 (facts that public loaders state).
+"""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+Parts = Literal["clothes", "cihp", "joints"]
+
+_BODY = (
+    *("pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2"),
+    *("left_ankle", "right_ankle", "spine3", "left_foot", "right_foot", "neck"),
+    *("left_collar", "right_collar", "head", "left_shoulder", "right_shoulder"),
+    *("left_elbow", "right_elbow", "left_wrist", "right_wrist"),
+)
+_FINGERS = ("index", "middle", "pinky", "ring", "thumb")  # SMPL-X's order, not MediaPipe's
+_HANDS = tuple(
+    f"{side}_{finger}{joint}"
+    for side in ("left", "right")
+    for finger in _FINGERS
+    for joint in (1, 2, 3)
+)
+SMPL_JOINTS = (*_BODY, "left_hand", "right_hand")
+SMPLX_JOINTS = (*_BODY, "jaw", "left_eye", "right_eye", *_HANDS)
+
+JOINT_NAMES = {"smpl": SMPL_JOINTS, "smplx": SMPLX_JOINTS}
+
+CLOTHES = (
+    *("background", "hair", "face_neck", "upper_clothes", "lower_clothes"),
+    *("left_arm", "right_arm", "left_hand", "right_hand"),
+    *("left_leg", "right_leg", "left_shoe", "right_shoe"),
+)
+"""The free body's parts, in its order."""
+
+CIHP = (
+    *("background", "hat", "hair", "glove", "sunglasses", "upper_clothes", "dress", "coat"),
+    *("socks", "pants", "torso_skin", "scarf", "skirt", "face", "left_arm", "right_arm"),
+    *("left_leg", "right_leg", "left_shoe", "right_shoe"),
+)
+"""ZJU-MoCap's ``mask_cihp``, ids 0 to 19; there is no hand among them."""
+
+
+def part_names(parts: Parts, joint_names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of a set of parts, background first."""
+    if parts == "joints":
+        return ("background", *joint_names)
+    return CLOTHES if parts == "clothes" else CIHP
+
+
+def fitting_parts(label_names: tuple[str, ...], joint_names: tuple[str, ...]) -> Parts:
+    """The set whose names these are; the free body's when it is none of them."""
+    return next(
+        (p for p in get_args(Parts) if part_names(p, joint_names) == label_names), "clothes"
+    )
+
+
+def part_of_joint(parts: Parts, joint: str) -> str:
+    """The part that what moves with a joint most often belongs to.
+
+    Convention: a body in a shirt, trousers and shoes; the head is face (a body model does not know
+    where hair starts), the shins are legs.
+
+    Args:
+        parts: the set of parts.
+        joint: a name of `SMPL_JOINTS` or `SMPLX_JOINTS`.
+    """
+    if parts == "joints":
+        return joint
+    side, _, limb = joint.partition("_")
+    if joint in ("neck", "head", "jaw") or limb == "eye":
+        return "face_neck" if parts == "clothes" else "face"
+    if limb in ("foot", "ankle"):
+        return f"{side}_shoe"
+    if limb == "knee":
+        return f"{side}_leg"
+    if limb == "elbow":
+        return f"{side}_arm"
+    if joint == "pelvis" or limb == "hip":
+        return "lower_clothes" if parts == "clothes" else "pants"
+    if limb in ("wrist", "hand") or limb[:-1] in _FINGERS:
+        return f"{side}_hand" if parts == "clothes" else f"{side}_arm"
+    return "upper_clothes"

@@ -1,0 +1,293 @@
+"""Pickled data read without running it: SMPL files, ``annots.npy``, caches of other projects.
+
+A pickle is a program. Here it may build dicts, lists, numbers, text and numpy arrays, and name the
+few classes in `ALLOWED`, each replaced by a stand-in of ours; anything else is refused by name
+before it is called. Whatever is wrong with a file becomes one `DataError`.
+
+Source: formats.md § 4 (the classes that occur in such files).
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+import pickletools
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsgan.data import pickle_types as types
+from gsgan.data.pickle_types import Budget, Call, StandIn
+from gsgan.errors import DataError
+
+GROWTH, SPARE_BYTES = 4, 2**28
+"""Arrays may take ``GROWTH`` times the file's size and ``SPARE_BYTES`` more (sparse matrices)."""
+LARGEST_MEMBER = 2**30  # bytes of one array in an npz, unpacked
+REFUSED_OPCODES = frozenset(
+    {"EXT1", "EXT2", "EXT4", "PERSID", "BINPERSID", "NEXT_BUFFER", "READONLY_BUFFER"}
+)
+LENGTH_BYTES = {
+    pickletools.TAKEN_FROM_ARGUMENT1: 1,
+    pickletools.TAKEN_FROM_ARGUMENT4: 4,
+    pickletools.TAKEN_FROM_ARGUMENT4U: 4,
+    pickletools.TAKEN_FROM_ARGUMENT8U: 8,
+}
+OPCODES = {op.code.encode("latin1"): op for op in pickletools.opcodes}
+SPARSE = {"csc": types.SparseColumns, "csr": types.SparseRows, "coo": types.Sparse}
+
+Name = tuple[str, str]
+
+
+def _allowed() -> dict[Name, Callable[[Budget], Any]]:
+    """What a pickle may name: (module, name) to what it gets, given the file's budget."""
+    core = ("numpy.core", "numpy._core")
+    table: dict[Name, Callable[[Budget], Any]] = {
+        ("numpy", "ndarray"): lambda _: types.ARRAY_TYPE,
+        ("numpy", "dtype"): lambda _: Call(types.DType),
+        ("_codecs", "encode"): lambda budget: Call(partial(types.encode, budget)),
+        ("chumpy.ch", "Ch"): lambda _: types.Chumpy,
+        ("chumpy.reordering", "Select"): lambda _: types.ChumpySelect,
+    }
+    for module in core:
+        table |= {
+            (f"{module}.multiarray", "_reconstruct"): lambda b: Call(partial(types.reconstruct, b)),
+            (f"{module}.multiarray", "scalar"): lambda _: Call(types.scalar),
+            (f"{module}.numeric", "_frombuffer"): lambda b: Call(partial(types.from_buffer, b)),
+        }
+    for kind, stand_in in SPARSE.items():
+        for module in (f"scipy.sparse.{kind}", f"scipy.sparse._{kind}"):
+            for name in (f"{kind}_matrix", f"{kind}_array"):
+                table[module, name] = lambda _, stand_in=stand_in: stand_in  # type: ignore[misc]
+    for module in ("copyreg", "copy_reg"):
+        table[module, "_reconstructor"] = lambda _: Call(types.reconstructor)
+    for module in ("builtins", "__builtin__"):
+        table |= {(module, "object"): lambda _: object, (module, "set"): lambda _: set}
+    return table
+
+
+ALLOWED = _allowed()
+
+
+class _Refused(pickle.UnpicklingError):
+    """The pickle asks for something that is not on the list."""
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, data: bytes, budget: Budget) -> None:
+        super().__init__(io.BytesIO(data), encoding="latin1")
+        self.budget = budget
+
+    def find_class(self, module: str, name: str) -> Any:
+        make = ALLOWED.get((module, name))
+        if make is None:
+            raise _Refused(f"{module}.{name}")
+        return make(self.budget)
+
+
+@contextmanager
+def _as_data_error(path: Path, what: str) -> Iterator[None]:
+    """Anything that goes wrong inside becomes a sentence that names the file."""
+    try:
+        yield
+    except DataError:
+        raise
+    except FileNotFoundError:
+        raise DataError(f"{path} does not exist") from None
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
+    except _Refused as error:
+        raise DataError(
+            f"{path} asks for {error}, which is not on the list of harmless classes (a pickle can "
+            "run code); nothing was run: save its content as plain arrays with numpy.savez"
+        ) from None
+    except Exception as error:
+        raise DataError(
+            f"{path} is not a whole {what} ({_reason(error)}); copy or export it again"
+        ) from None
+
+
+def _reason(error: Exception) -> str:
+    text = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+    text = " ".join(text.split())[:160]
+    return text or type(error).__name__
+
+
+def read_pickle(path: Path) -> Any:
+    """What a .pkl file holds, sparse matrices and chumpy's values as plain arrays.
+
+    Convention: text and bytes of Python 2 are read as latin1; arrays deep inside tuples may be of a
+    subclass of ndarray.
+
+    Args:
+        path: a pickle of any protocol.
+
+    Raises:
+        DataError: when the file is missing, damaged, or names a class that is not allowed.
+    """
+    with _as_data_error(path, "pickle"):
+        return _load(path.read_bytes())
+
+
+def _load(data: bytes) -> Any:
+    scan(data)
+    budget = Budget(GROWTH * len(data) + SPARE_BYTES)
+    return _plain(_Unpickler(data, budget).load(), budget)
+
+
+def scan(data: bytes) -> None:
+    """Checks a pickle's instructions one by one without following them.
+
+    Every length must lie within the file and every memo index below the number of instructions:
+    the unpickler would otherwise reserve whatever memory a damaged number asks for.
+
+    Raises:
+        pickle.UnpicklingError: on an unknown or refused instruction, or a number out of bounds.
+    """
+    stream, size, count = io.BytesIO(data), len(data), 0
+    while True:
+        count += 1
+        opcode = OPCODES.get(stream.read(1))
+        if opcode is None:
+            raise pickle.UnpicklingError("it ends early" if stream.tell() >= size else "no pickle")
+        if opcode.name in REFUSED_OPCODES:
+            raise _Refused(f"objects kept outside the file ({opcode.name})")
+        if opcode.name == "STOP":
+            return
+        if opcode.arg is not None:
+            number = _argument(stream, opcode.arg.n, lines=2 if "pair" in opcode.arg.name else 1)
+            bound = count if opcode.name.endswith("PUT") else size - stream.tell()
+            if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT", "FRAME") and int(number) > bound:
+                raise pickle.UnpicklingError(f"{opcode.name} asks for more than the file holds")
+
+
+def _argument(stream: BinaryIO, kind: int, lines: int) -> int | bytes:
+    """Skips an instruction's argument; its number, where it is one."""
+    if kind == pickletools.UP_TO_NEWLINE:
+        text = [stream.readline() for _ in range(lines)]
+        if not all(line.endswith(b"\n") for line in text):
+            raise pickle.UnpicklingError("it ends early")
+        return text[0]
+    width = LENGTH_BYTES.get(kind, kind)
+    content = stream.read(width)
+    if len(content) != width:
+        raise pickle.UnpicklingError("it ends early")
+    number = int.from_bytes(content, "little")
+    if kind in LENGTH_BYTES and len(_skip(stream, number)) < min(number, 1):
+        raise pickle.UnpicklingError("it ends early")
+    return number
+
+
+def _skip(stream: BinaryIO, count: int) -> bytes:
+    """Moves on by ``count`` bytes; the last of them, empty when the stream ends before."""
+    if count == 0:
+        return b""
+    stream.seek(min(count - 1, 2**62), io.SEEK_CUR)
+    return stream.read(1)
+
+
+def _plain(root: Any, budget: Budget) -> Any:
+    """The same with stand-ins as arrays, in dicts, lists and arrays of objects."""
+    box = [root]
+    todo: list[Any] = [box]
+    seen: set[int] = set()
+    while todo:
+        holder = todo.pop()
+        if isinstance(holder, np.ndarray):
+            holder = holder.reshape(-1)
+        entries = list(holder.items()) if isinstance(holder, dict) else list(enumerate(holder))
+        for key, value in entries:
+            new = value
+            if isinstance(value, StandIn):
+                new = types.as_array(value, budget)
+            if isinstance(new, types.Array):
+                new = new.view(np.ndarray)
+            if new is not value:
+                holder[key] = new
+            if _holds_objects(new) and id(new) not in seen:
+                seen.add(id(new))
+                todo.append(new)
+    return box[0]
+
+
+def _holds_objects(value: Any) -> bool:
+    return isinstance(value, dict | list) or (
+        isinstance(value, np.ndarray) and value.dtype.hasobject
+    )
+
+
+def read_npy(path: Path) -> Any:
+    """What a .npy file holds: a plain array, or the object of a 0-d array of objects.
+
+    Args:
+        path: of numpy's format 1 or 2; ``annots.npy`` gives its dict.
+
+    Raises:
+        DataError: when the file is missing, damaged, shorter or longer than its header promises,
+            or names a class that is not allowed.
+    """
+    with _as_data_error(path, ".npy file"), path.open("rb") as stream:
+        return _read_array(stream, path.stat().st_size)
+
+
+def read_npz(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
+    """The arrays of an .npz file by name, objects through the same gate as a pickle.
+
+    Args:
+        path: of numpy's format.
+        names: the arrays wanted (those that are not there are left out); None for all.
+
+    Raises:
+        DataError: when the file is missing or damaged, an array would unpack to more than
+            `LARGEST_MEMBER` bytes, or names a class that is not allowed.
+    """
+    with _as_data_error(path, ".npz file"), zipfile.ZipFile(path) as archive:
+        members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+        found = {}
+        for name in members if names is None else names:
+            if (info := members.get(name)) is None:
+                continue
+            if info.file_size > LARGEST_MEMBER:
+                raise ValueError(f"{name} would unpack to {info.file_size} bytes")
+            with archive.open(info) as stream:
+                found[name] = _read_array(io.BytesIO(stream.read()), info.file_size)
+        return found
+
+
+def _read_array(stream: BinaryIO, size: int) -> Any:
+    shape, fortran, dtype = _header(stream)
+    if dtype.hasobject:
+        return _objects(stream.read(), shape, dtype)
+    held, promised = size - stream.tell(), math.prod(shape) * dtype.itemsize
+    if held != promised or dtype.itemsize == 0 or min(shape, default=0) < 0:
+        raise ValueError(
+            f"its header promises {promised} bytes of {dtype} {shape}, {held} are there"
+        )
+    content = np.frombuffer(bytearray(stream.read(promised)), dtype)  # writable
+    return content.reshape(shape, order="F" if fortran else "C")
+
+
+def _header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    version = np.lib.format.read_magic(stream)
+    readers = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    if version not in readers:
+        raise ValueError(f"version {version} of the format, expected 1 or 2")
+    return readers[version](stream)
+
+
+def _objects(data: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
+    content = _load(data)
+    fits = isinstance(content, np.ndarray) and content.dtype == dtype and content.shape == shape
+    if not fits:
+        raise ValueError("its header and its content differ")
+    array: NDArray[Any] = content
+    return array.item() if array.ndim == 0 else array

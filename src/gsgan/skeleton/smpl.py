@@ -1,0 +1,157 @@
+"""MediaPipe's 33 pose landmarks from the joints, and where given the vertices, of SMPL or SMPL-X.
+
+Convention: metres, any frame; what the body model does not know is NaN with confidence 0, never
+zero. Confidence 1 is a point that means the same in both; 0.5 one that lies near it.
+
+Source: formats.md § 5; vertex numbers as public loaders state them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from gsgan.skeleton.template import MEDIAPIPE33
+
+SAME, NEAR = 1.0, 0.5
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Where landmarks come from in one kind of body; later entries go before earlier ones.
+
+    Args:
+        counts: numbers of joints and of vertices.
+        joints: landmark to (joint, confidence).
+        vertices: landmark to (vertex, confidence).
+        midpoints: landmark to (joint, vertex) between which it lies, near enough.
+    """
+
+    counts: tuple[int, int]
+    joints: dict[str, tuple[int, float]]
+    vertices: dict[str, tuple[int, float]]
+    midpoints: dict[str, tuple[int, int]]
+
+
+def _sides(names: dict[str, tuple[int, int]], confidence: float) -> dict[str, tuple[int, float]]:
+    """Left and right landmark from one name: ``{"hip": (1, 2)}``."""
+    return {
+        f"{side}_{name}": (number, confidence)
+        for name, pair in names.items()
+        for side, number in zip(("left", "right"), pair, strict=True)
+    }
+
+
+def _eyes(left: int, right: int) -> dict[str, tuple[int, float]]:
+    """The eye, and its two corners as copies of it."""
+    corners = {"eye_inner": (left, right), "eye_outer": (left, right)}
+    return _sides({"eye": (left, right)}, SAME) | _sides(corners, NEAR)
+
+
+_LIMBS = _sides(
+    {
+        "shoulder": (16, 17),
+        "elbow": (18, 19),
+        "wrist": (20, 21),
+        "hip": (1, 2),
+        "knee": (4, 5),
+        "ankle": (7, 8),
+    },
+    SAME,
+) | _sides({"foot_index": (10, 11)}, NEAR)
+
+TABLES = {
+    "smpl": Table(
+        counts=(24, 6890),
+        joints=_LIMBS | _sides({"index": (22, 23)}, NEAR),
+        vertices={
+            "nose": (332, SAME),
+            **_eyes(2800, 6260),
+            **_sides(
+                {"ear": (583, 4071), "heel": (3387, 6787), "foot_index": (3216, 6617)},
+                SAME,
+            ),
+        },
+        # MediaPipe's three hand points are knuckles: about halfway to the finger tip
+        midpoints={
+            "left_index": (20, 2319),
+            "left_pinky": (20, 2673),
+            "left_thumb": (20, 2746),
+            "right_index": (21, 5782),
+            "right_pinky": (21, 6133),
+            "right_thumb": (21, 6191),
+        },
+    ),
+    "smplx": Table(
+        counts=(55, 10475),
+        joints=_LIMBS
+        | _sides({"index": (25, 40), "pinky": (31, 46), "thumb": (38, 53)}, SAME)
+        | {name: (number, NEAR) for name, (number, _) in _eyes(23, 24).items()},
+        vertices={
+            "nose": (9120, SAME),
+            **_eyes(9448, 9929),
+            **_sides(
+                {"ear": (6, 616), "heel": (8846, 8635), "foot_index": (5770, 8463)},
+                SAME,
+            ),
+        },
+        midpoints={},
+    ),
+}
+
+
+def to_mediapipe33(
+    joints: ArrayLike,
+    vertices: ArrayLike | None = None,
+    kind: Literal["smpl", "smplx"] = "smpl",
+) -> tuple[Floats, Floats]:
+    """MediaPipe's 33 landmarks of posed SMPL or SMPL-X bodies.
+
+    Args:
+        joints: ``[..., 24, 3]`` (smpl) or ``[..., 55, 3]`` (smplx) metres.
+        vertices: ``[..., 6890, 3]`` or ``[..., 10475, 3]``, or None: without them the face, the
+            heels and most of SMPL's hands are unknown.
+        kind: "smpl" or "smplx".
+
+    Returns:
+        ``p [..., 33, 3]``, NaN where unknown (the mouth always), and ``conf [..., 33]``. A joint
+        or vertex that is not finite makes its landmarks unknown too.
+
+    Raises:
+        ValueError: on a wrong shape or kind, naming the argument.
+    """
+    if kind not in TABLES:
+        raise ValueError(f"to_mediapipe33: kind must be one of {list(TABLES)}, got {kind!r}")
+    table = TABLES[kind]
+    j = _points("joints", joints, table.counts[0])
+    p = np.full((*j.shape[:-2], len(MEDIAPIPE33.names), 3), np.nan)
+    conf = np.zeros(p.shape[:-1])
+
+    def put(name: str, position: Floats, confidence: float) -> None:
+        landmark = MEDIAPIPE33.names.index(name)
+        p[..., landmark, :], conf[..., landmark] = position, confidence
+
+    for name, (joint, confidence) in table.joints.items():
+        put(name, j[..., joint, :], confidence)
+    if vertices is not None:
+        v = _points("vertices", vertices, table.counts[1])
+        for name, (vertex, confidence) in table.vertices.items():
+            put(name, v[..., vertex, :], confidence)
+        for name, (joint, vertex) in table.midpoints.items():
+            put(name, (j[..., joint, :] + v[..., vertex, :]) / 2, NEAR)
+    known = np.isfinite(p).all(axis=-1)
+    p[~known] = np.nan
+    return p, np.where(known, conf, 0.0)
+
+
+def _points(name: str, points: ArrayLike, count: int) -> Floats:
+    array = np.asarray(points, np.float64)
+    if array.ndim < 2 or array.shape[-2:] != (count, 3):
+        raise ValueError(
+            f"to_mediapipe33: {name} must have shape [..., {count}, 3], got {list(array.shape)}"
+        )
+    return array
