@@ -1,8 +1,11 @@
 """``python -m gsgan``: lists the commands."""
 
 COMMANDS = {
+    "gsgan.prepare": "make a dataset of your own videos: source=<folder> out=<folder>",
+    "gsgan.check": "look a dataset over before training: data=capture data.root=<folder>",
     "gsgan.train": "train an avatar, then score it on what was held out",
     "gsgan.evaluate": "score a trained run: run=<folder>",
+    "gsgan.bench": "measure what things cost: raster, stability",
 }
 
 

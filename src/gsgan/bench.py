@@ -1,0 +1,64 @@
+"""``python -m gsgan.bench <subject> [key=value]``: measure what things cost."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from omegaconf import DictConfig
+from rich.console import Console
+
+from gsgan.config import FAILED, entry
+
+# Each is a module of gsgan.benchmarks with run(config, folder), and a conf/bench_<subject>.yaml.
+SUBJECTS = {
+    "raster": "time against error of every backend and accuracy setting of the rasteriser",
+    "stability": "the float32 error of every hard case",
+}
+HELP = ("-h", "--help")
+
+
+def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
+    """The subject, which is the first word that is no option or override, and the rest."""
+    for i, word in enumerate(arguments):
+        if "=" not in word and not word.startswith(("-", "+", "~")):
+            return word, [*arguments[:i], *arguments[i + 1 :]]
+    return None, list(arguments)
+
+
+def subjects() -> str:
+    """One line a subject."""
+    lines = [f"  {name:<10} {what}" for name, what in SUBJECTS.items()]
+    return "\n".join(["python -m gsgan.bench <subject> [key=value], subjects:", *lines])
+
+
+def main() -> None:
+    """Hands the command line, less the subject, to Hydra."""
+    subject, rest = split(sys.argv[1:])
+    if subject is None and any(word in HELP for word in rest):
+        print(subjects())
+        print("Each answers --help with its whole config.")
+        return
+    if subject not in SUBJECTS:
+        known = ", ".join(SUBJECTS)
+        came = "nothing was given" if subject is None else f"{subject!r} is none"
+        sentence = f"gsgan: the first word must be a subject ({known}); {came}"
+        Console(stderr=True, soft_wrap=True).print(
+            sentence, style="bold red", markup=False, highlight=False
+        )
+        sys.exit(FAILED)
+    sys.argv = [sys.argv[0], *rest]
+
+    def bench(config: DictConfig) -> None:
+        from hydra.core.hydra_config import HydraConfig
+
+        folder = Path(HydraConfig.get().runtime.output_dir)
+        importlib.import_module(f"gsgan.benchmarks.{subject}").run(config, folder)
+
+    entry(f"bench_{subject}")(bench)()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What things cost: the subjects of ``python -m gsgan.bench``."""

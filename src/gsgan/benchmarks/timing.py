@@ -1,0 +1,82 @@
+"""Fair timing: every variant in turn, several rounds, medians."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable, Hashable, Mapping
+from typing import TypeVar
+
+import torch
+
+Key = TypeVar("Key", bound=Hashable)
+
+
+def interleaved(
+    actions: Mapping[Key, Callable[[], object]],
+    repeats: int,
+    *,
+    patience: float = float("inf"),
+    device: torch.device | None = None,
+    tick: Callable[[], None] | None = None,
+) -> dict[Key, list[float]]:
+    """Times actions round robin, so that whatever disturbs the machine disturbs them all alike.
+
+    Convention: milliseconds of wall clock, with everything the device was given done. Each action
+    is first called once to warm up; that call is not counted, except where it took longer than
+    ``patience``: then it is the only one.
+
+    Args:
+        actions: what to call, by name.
+        repeats: rounds, at least 1.
+        patience: seconds.
+        device: waited for before and after each call.
+        tick: called after each call.
+
+    Returns:
+        The samples of each action: ``repeats`` of them, or one.
+    """
+    if repeats < 1:
+        raise ValueError(f"interleaved: repeats must be at least 1, got {repeats}")
+    samples: dict[Key, list[float]] = {}
+    for name, action in actions.items():
+        first = _timed(action, device)
+        samples[name] = [first] if first > 1000 * patience else []
+        if tick:
+            tick()
+    quick = [name for name in actions if not samples[name]]
+    for _ in range(repeats):
+        for name in quick:
+            samples[name].append(_timed(actions[name], device))
+            if tick:
+                tick()
+    return samples
+
+
+def median(samples: list[float] | None) -> float | None:
+    """The median, or None of nothing."""
+    return statistics.median(samples) if samples else None
+
+
+def slope(x: list[float], y: list[float]) -> float | None:
+    """The exponent ``p`` of ``y ~ x^p`` by least squares on logarithms; None below two points."""
+    if len(set(x)) < 2:
+        return None
+    lx, ly = (torch.tensor(v, dtype=torch.float64).log() for v in (x, y))
+    lx, ly = lx - lx.mean(), ly - ly.mean()
+    return float((lx @ ly) / (lx @ lx))
+
+
+def _timed(action: Callable[[], object], device: torch.device | None) -> float:
+    _wait(device)
+    start = time.perf_counter()
+    result = action()
+    _wait(device)
+    took = 1000 * (time.perf_counter() - start)
+    del result  # freed outside the clock
+    return took
+
+
+def _wait(device: torch.device | None) -> None:
+    if device is not None and device.type == "cuda":
+        torch.cuda.synchronize(device)
