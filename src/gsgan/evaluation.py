@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from omegaconf import DictConfig, OmegaConf
@@ -14,6 +15,7 @@ from torch.utils.data import Subset
 
 from gsgan.console import make_console
 from gsgan.data.datamodule import GsganData
+from gsgan.devices import pick_device
 from gsgan.errors import ConfigError
 from gsgan.metrics.evaluation import empty_split, evaluate_split
 from gsgan.metrics.image import lpips
@@ -71,21 +73,29 @@ def evaluate_run(
             avatar, shown, lpips=score, lpips_reason=reason, marks=marks
         )
         write_pictures(avatar, data, split, folder / "pictures" / f"{split}.png", pictures)
-    results = _earlier(folder, marks) | results
+    protocol = data.protocol_record(config.lpips.net)
+    for variants in results.values():
+        for scores in variants.values():
+            scores["protocol"] = protocol
+    results = _earlier(folder, marks, protocol) | results
     title = f"{folder.name}: held-out cameras (novel_view) and poses (novel_pose)"
     write_results(results, folder, title)
     print_table(results, console, title)
     return results
 
 
-def _earlier(folder: Path, marks: list[str]) -> Results:
-    """Splits scored before, so that scoring one of them does not lose the other."""
+def _earlier(folder: Path, marks: list[str], protocol: dict[str, Any] | None) -> Results:
+    """Splits scored before in the same way, so that scoring one does not lose the other."""
     path = folder / "metrics.json"
     if not path.is_file():
         return {}
     try:
         found: Results = json.loads(path.read_text())
-        same = all(v["marks"] == marks for split in found.values() for v in split.values())
+        same = all(
+            v["marks"] == marks and v.get("protocol") == protocol
+            for split in found.values()
+            for v in split.values()
+        )
     except (ValueError, KeyError, TypeError, AttributeError):
         return {}
     return {split: found[split] for split in SPLITS if split in found} if same else {}
@@ -127,17 +137,8 @@ def evaluate_folder(config: DictConfig) -> Results:
         config,
         make_console(),
         data=data,
-        avatar=avatar.to(_device(config.device)),
+        avatar=avatar.to(pick_device(config.device)),
         marks=marks,
         splits=config.splits,
         pictures=config.pictures,
     )
-
-
-def _device(name: str) -> torch.device:
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        return torch.empty(0, device=name).device
-    except (RuntimeError, AssertionError) as error:
-        raise ConfigError(f"device={name}: not usable here; try device=cpu") from error

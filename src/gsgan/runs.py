@@ -23,7 +23,8 @@ CHECKPOINT = Path("checkpoints") / "last.ckpt"
 # What may differ between a run and its continuation: where and how it runs, not what it learns.
 FREE_KEYS = (
     *("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips"),
-    *("data.root", "data.workers", "data.cache_mb", "data.val_pictures", "data.source.workers"),
+    *("data.root", "data.smpl", "data.workers", "data.cache_mb", "data.val_pictures"),
+    "data.source.workers",
 )
 
 
@@ -118,10 +119,11 @@ def load_config(folder: Path) -> DictConfig:
         )
     config = OmegaConf.load(path)
     assert isinstance(config, DictConfig)
-    root = OmegaConf.select(config, "data.root")
-    if root is not None and not Path(root).expanduser().is_absolute():
-        started = OmegaConf.load(folder / ".hydra" / "hydra.yaml").hydra.runtime.cwd
-        OmegaConf.update(config, "data.root", str(Path(started) / root))
+    for key in ("data.root", "data.smpl"):
+        path = OmegaConf.select(config, key)
+        if path is not None and not Path(path).expanduser().is_absolute():
+            started = OmegaConf.load(folder / ".hydra" / "hydra.yaml").hydra.runtime.cwd
+            OmegaConf.update(config, key, str(Path(started) / path))
     return config
 
 

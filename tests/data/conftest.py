@@ -22,3 +22,40 @@ def real_capture() -> Path:
     if not (path / "cameras.json").exists():
         pytest.skip(f"no real capture at {path} (set GSGAN_REAL_CAPTURE)")
     return path
+
+
+@pytest.fixture(scope="session")
+def smpl_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file like SMPL's, of the default person."""
+    from writers.smpl import write_smpl
+
+    path = tmp_path_factory.mktemp("models") / "SMPL_NEUTRAL.pkl"
+    write_smpl(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def subject(smpl_file: Path):
+    """Three cameras, four frames, 40 x 40 pixels; do not write into it."""
+    from writers.common import make_subject
+
+    return make_subject(smpl_file)
+
+
+@pytest.fixture(scope="session")
+def _models_read() -> dict:
+    return {}
+
+
+@pytest.fixture
+def model_once(monkeypatch: pytest.MonkeyPatch, _models_read: dict):
+    """A model file is read once for all tests that share it: it has some 40 MB."""
+    from gsgan.body.smpl import read_smpl
+    from gsgan.data.formats import common
+
+    def read(path):
+        if path not in _models_read:
+            _models_read[path] = read_smpl(path)
+        return _models_read[path]
+
+    monkeypatch.setattr(common, "read_smpl", read)

@@ -1,5 +1,6 @@
-"""Datasets: the bring-your-own layout, its reader, its splits, and the default person.
+"""Datasets: readers of their formats, splits and protocols, and the default person.
 
-Import what you need from the modules: `gsgan.data.layout`, `gsgan.data.capture`,
+Import what you need from the modules: `gsgan.data.layout` (what every reader yields),
+`gsgan.data.formats` (the readers), `gsgan.data.capture` (the torch dataset),
 `gsgan.data.datamodule`; the last one loads Lightning.
 """

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -13,9 +14,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from gsgan.data import crop as cropping
+from gsgan.data import pixels
+from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import PersonCrop, Window
-from gsgan.data.files import read_colour, read_grey
-from gsgan.data.layout import IGNORE_LABEL, CameraEntry, Layout
+from gsgan.data.layout import Layout
+from gsgan.data.pixels import IGNORE_LABEL
 from gsgan.data.splits import Item
 from gsgan.errors import ConfigError, DataError
 from gsgan.scene import BodyPose, Camera, Frame
@@ -60,6 +63,11 @@ class PictureCache:
         if key in self._held:
             self._held.move_to_end(key)
         return self._held.get(key)
+
+    def clear(self) -> None:
+        """Lets go of all."""
+        self._held.clear()
+        self.nbytes = 0
 
     def put(self, key: Item, picture: Picture) -> None:
         """Holds a picture, letting go of the longest unused ones; too large a one is not held."""
@@ -153,50 +161,49 @@ class CaptureDataset(Dataset[Frame]):
         return camera.to(torch.float32)
 
     def _load(self, item: Item) -> Picture:
-        name, frame = item
-        camera, window = self.layout.cameras[name], self.window(item)
+        camera, window = self.layout.cameras[item[0]], self.window(item)
+        rules = self.layout.pixels
         mapping = None
         if camera.distorted:
             mapping = cropping.undistort_map(camera.K, camera.dist, window)
         size = window.size if self.size is None else (self.size, self.size)
-        mask = self._mask(item)
-        image = read_colour(self.layout.image_path(name, frame))
+
+        def fit(picture: Bytes, exact: bool) -> Bytes:
+            return cropping.resize(cropping.take(picture, window, mapping, exact), size, exact)
+
+        mask = pixels.read_mask(self.layout.mask_files(*item), rules)
+        image = pixels.read_image(self.layout.image_path(*item), rules)
+        self._check_size(self.layout.image_path(*item), image, camera)
+        self._check_size(self.layout.mask_path(*item), mask, camera)
         # Blacked out before anything is interpolated, so that no background bleeds in.
-        image = cropping.black_out(image, mask, self.layout.meta.composed)
-        image, mask = (
-            cropping.resize(cropping.take(p, window, mapping, exact=False), size, exact=False)
-            for p in (image, mask)
-        )
+        image = fit(cropping.black_out(image, mask, rules.composed), exact=False)
         labels = self._label_picture(item)
         if labels is not None:
-            labels = cropping.take(labels, window, mapping, exact=True)
-            labels = cropping.resize(labels, size, exact=True)
+            labels = fit(pixels.with_ignored_border(labels, mask, rules.ignore_band), exact=True)
+        mask = fit(mask, exact=rules.mask_sampling == "nearest")
         return Picture(np.ascontiguousarray(image.transpose(2, 0, 1)), mask, labels)
 
-    def _mask(self, item: Item) -> Bytes:
-        path = self.layout.mask_path(*item)
-        mask = read_grey(path)
-        if mask.max() == 1:
+    @staticmethod
+    def _check_size(path: Path, picture: Bytes, camera: CameraEntry) -> None:
+        """Headers are checked before anything starts, but not all where there are very many."""
+        if picture.shape[:2] != camera.size:
+            h, w = picture.shape[:2]
             raise DataError(
-                f"{path} holds 0 and 1; expected alpha from 0 to 255 (multiply it by 255)"
+                f"{path} is {w}x{h} pixels (width x height), but camera {camera.name} has "
+                f"{camera.size[1]}x{camera.size[0]}; scale one of them so that they agree"
             )
-        return mask
 
     def _label_picture(self, item: Item) -> Bytes | None:
         if not self.layout.labels:
             return None
-        path = self.layout.label_path(*item)
+        path, camera = self.layout.label_path(*item), self.layout.cameras[item[0]]
         if path is None:
-            return np.full(self.layout.cameras[item[0]].size, IGNORE_LABEL, np.uint8)
-        labels = read_grey(path)
-        names = self.layout.meta.label_names
-        if names is not None:
-            used = labels[labels != IGNORE_LABEL]
-            if used.size and used.max() >= len(names):
-                raise DataError(
-                    f"{path} holds the label {used.max()}; meta.json names {len(names)} labels, "
-                    f"so expected 0 to {len(names) - 1}, or {IGNORE_LABEL} for 'ignore'"
-                )
+            return np.full(camera.size, IGNORE_LABEL, np.uint8)
+        meta = self.layout.meta
+        labels = pixels.read_labels(
+            path, self.layout.pixels, meta.label_names, meta.labels_named_by
+        )
+        self._check_size(path, labels, camera)
         return labels
 
     def _body(self, frame: int) -> BodyPose | None:

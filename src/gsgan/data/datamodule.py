@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -13,197 +13,35 @@ import gsgan.compat  # noqa: F401  (must come before lightning)
 
 # isort: split
 import cv2
-import numpy as np
 import torch
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, Subset
-from torch.utils.data.distributed import DistributedSampler
 
 from gsgan.data.capture import CaptureDataset, PictureCache
 from gsgan.data.crop import PersonCrop
-from gsgan.data.files import read_grey
-from gsgan.data.layout import IGNORE_LABEL, Checks, Layout
-from gsgan.data.splits import SPLITS, Item, Splits, make_splits
+from gsgan.data.formats.capture import read_capture
+from gsgan.data.layout import Checks, Layout
+from gsgan.data.protocol import Protocol
+from gsgan.data.sampler import StepSampler, pass_order
+from gsgan.data.scene_info import SceneInfo, count_labels, scene_info
+from gsgan.data.splits import SPLITS, Splits, make_splits, protocol_splits
 from gsgan.errors import ConfigError, DataError
 from gsgan.scene import Frame, cat
 
+__all__ = [
+    "GsganData",
+    "SceneInfo",
+    "StepSampler",
+    "count_labels",
+    "pass_order",
+    "scene_info",
+    "unsupported",
+]
+
 log = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True)
-class SceneInfo:
-    """What the training split tells about the scene; plain values, so a checkpoint can hold it.
-
-    Args:
-        camera_names: all cameras; `Frame.camera_index` counts in this order.
-        n_train_cameras: cameras that train.
-        has_distortion: a lens coefficient is not zero (pictures are undistorted on reading).
-        has_labels: there are part labels.
-        has_body_pose: there is a body pose for every frame.
-        body: name of the skinned body, or None.
-        skeleton: name of the landmark set.
-        n_labels: part labels, background included; 0 without labels.
-        label_names: their names where the capture gives them.
-        foreground: mean RGB in [0, 1] of the person, by train camera name.
-        body_height: metres, median over frames of the summed limb lengths.
-        centre: metres, median position of the person: the middle of the capture volume.
-        up_axis: of the world, e.g. "z" or "-y".
-        fps: frames a second, or None.
-        frames: how many frames train.
-    """
-
-    camera_names: tuple[str, ...]
-    n_train_cameras: int
-    has_distortion: bool
-    has_labels: bool
-    has_body_pose: bool
-    body: str | None
-    skeleton: str
-    n_labels: int
-    label_names: tuple[str, ...]
-    foreground: dict[str, tuple[float, float, float]]
-    body_height: float
-    centre: tuple[float, float, float]
-    up_axis: str
-    fps: float | None
-    frames: int
-
-
-def scene_info(layout: Layout, splits: Splits, dataset: CaptureDataset, samples: int) -> SceneInfo:
-    """What the training split tells about the scene.
-
-    Args:
-        layout: the capture.
-        splits: of the capture.
-        dataset: of the training items; its cache keeps what is decoded here.
-        samples: pictures a camera from which the foreground colour is taken, evenly spaced.
-    """
-    frames = sorted({frame for _, frame in splits.items["train"]})
-    p = torch.from_numpy(np.stack([layout.landmarks.p[f] for f in frames]))
-    valid = torch.from_numpy(np.stack([layout.landmarks.visibility[f] for f in frames])) > 0
-    middles = torch.stack([q[v].mean(0) for q, v in zip(p, valid, strict=True)])
-    cameras = {camera for camera, _ in splits.items["train"]}
-    return SceneInfo(
-        camera_names=layout.camera_names,
-        n_train_cameras=len(cameras),
-        has_distortion=any(layout.cameras[name].distorted for name in cameras),
-        has_labels=bool(layout.labels),
-        has_body_pose=layout.poses is not None,
-        body=layout.meta.body,
-        skeleton=layout.meta.skeleton,
-        n_labels=count_labels(layout, splits.items["train"]),
-        label_names=layout.meta.label_names or (),
-        foreground=foreground_colours(dataset, samples),
-        body_height=_body_height(p, valid),
-        centre=_triple(middles.median(0).values),
-        up_axis=layout.meta.up_axis,
-        fps=layout.meta.fps,
-        frames=len(frames),
-    )
-
-
-def _body_height(p: torch.Tensor, valid: torch.Tensor) -> float:
-    from gsgan.skeleton import limb_length_sum
-
-    return float(limb_length_sum(p, valid).nanmedian())
-
-
-def _triple(values: torch.Tensor) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z
-
-
-def count_labels(layout: Layout, items: tuple[Item, ...]) -> int:
-    """Part labels, background included: as meta.json names them, else the highest one found.
-
-    Without names every label picture of the items is read once.
-    """
-    if not layout.labels:
-        return 0
-    if layout.meta.label_names is not None:
-        return len(layout.meta.label_names)
-    highest = 0
-    for item in items:
-        if path := layout.label_path(*item):
-            labels = read_grey(path)
-            highest = max(highest, int(labels.max(where=labels != IGNORE_LABEL, initial=0)))
-    return highest + 1
-
-
-def foreground_colours(
-    dataset: CaptureDataset, samples: int
-) -> dict[str, tuple[float, float, float]]:
-    """Mean RGB of the person in [0, 1], mask-weighted, by camera name.
-
-    Args:
-        dataset: whose cameras to look at.
-        samples: pictures a camera, evenly spaced over its frames.
-    """
-    by_camera: dict[str, list[int]] = {}
-    for index, (camera, _) in enumerate(dataset.items):
-        by_camera.setdefault(camera, []).append(index)
-    colours = {}
-    for camera, indices in by_camera.items():
-        chosen = {round(i) for i in np.linspace(0, len(indices) - 1, samples)}
-        frames = [dataset[indices[i]] for i in sorted(chosen)]
-        total = sum(f.image.double().sum((0, 2, 3)) for f in frames)
-        weight = sum(float(f.mask.double().sum()) for f in frames)
-        colours[camera] = _triple(torch.as_tensor(total) / max(weight, 1.0))
-    return colours
-
-
-class StepSampler(DistributedSampler[int]):
-    """Draws the item of every global step from (seed, step) alone.
-
-    An epoch is ``steps`` batches. Draws run through shuffled passes over all items, each item once
-    a pass, across epoch borders; so a resumed run sees the order of an unbroken one. It is a
-    `DistributedSampler` because Lightning would wrap and reshuffle anything else on several
-    processes; the processes share the draws of a step between them.
-
-    Args:
-        items: number of items.
-        batch_size: items a batch and process.
-        steps: batches an epoch.
-        seed: of the shuffles.
-        replicas: number of processes.
-        rank: of this process.
-    """
-
-    def __init__(
-        self, items: int, batch_size: int, steps: int, seed: int, replicas: int = 1, rank: int = 0
-    ) -> None:
-        super().__init__(_Count(items), num_replicas=replicas, rank=rank, shuffle=True, seed=seed)
-        self.items, self.batch_size, self.steps = items, batch_size, steps
-
-    def __len__(self) -> int:
-        return self.steps * self.batch_size
-
-    def __iter__(self) -> Iterator[int]:
-        order, shuffled = torch.empty(0), -1
-        for step in range(self.epoch * self.steps, (self.epoch + 1) * self.steps):
-            first = (step * self.num_replicas + self.rank) * self.batch_size
-            for draw in range(first, first + self.batch_size):
-                if draw // self.items != shuffled:
-                    shuffled = draw // self.items
-                    order = pass_order(self.items, self.seed, shuffled)
-                yield int(order[draw % self.items])
-
-
-class _Count(Dataset[int]):
-    """A length; `DistributedSampler` asks its dataset for nothing else."""
-
-    def __init__(self, length: int) -> None:
-        self.length = length
-
-    def __len__(self) -> int:
-        return self.length
-
-
-def pass_order(items: int, seed: int, number: int) -> torch.Tensor:
-    """``[items]`` the order of a shuffled pass, a pure function of its arguments."""
-    mixed = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]
-    generator = torch.Generator().manual_seed(int(mixed) >> 1)
-    return torch.randperm(items, generator=generator)
+Reader = Callable[[str | Path, Checks, str | None], Layout]
+"""A dataset's folder, what it must satisfy, the user's body model file: the layout."""
 
 
 def _quiet_worker(_: int) -> None:
@@ -211,10 +49,14 @@ def _quiet_worker(_: int) -> None:
 
 
 class GsganData(LightningDataModule):
-    """A capture in the bring-your-own layout, from a folder or made by ``source``.
+    """A dataset in any format that has a reader, from a folder or made by ``source``.
 
     Args:
         root: the folder; or None when ``source`` makes it.
+        reader: of the dataset's format (`gsgan.data.formats`).
+        smpl: the user's SMPL or SMPL-X model file, for datasets whose poses need one.
+        protocol: who trains and who tests, as a publication has it; None leaves it to the data
+            and the keys below.
         source: called without arguments, makes the dataset if need be and returns its folder.
         size: side of the square pictures in pixels; None keeps them as they are.
         crop: "person" or a `PersonCrop` cuts round the person; None keeps the full picture.
@@ -237,6 +79,9 @@ class GsganData(LightningDataModule):
         self,
         root: str | None = None,
         source: Callable[[], Path] | None = None,
+        reader: Reader = read_capture,
+        smpl: str | None = None,
+        protocol: Protocol | None = None,
         size: int | None = None,
         crop: PersonCrop | str | None = None,
         batch_size: int = 1,
@@ -259,6 +104,9 @@ class GsganData(LightningDataModule):
             raise ConfigError(_root_not_set(wanted))
         self.root = root
         self.source = source
+        self.reader = reader
+        self.smpl = smpl
+        self.protocol = protocol
         self.size = size
         self.crop = _crop(crop)
         self.batch_size = _at_least("batch_size", batch_size, 1)
@@ -291,12 +139,12 @@ class GsganData(LightningDataModule):
         """Reads and checks the layout, once; logs what was converted or dropped.
 
         Raises:
-            DataError: see `Layout.read` and `make_splits`.
+            DataError: see the reader and `make_splits`.
         """
         if self._datasets is not None:
             return
-        self._layout = layout = Layout.read(self._folder(), self.checks)
-        self._splits = splits = make_splits(layout, **self.split_keys)
+        self._layout = layout = self.reader(self._folder(), self.checks, self.smpl)
+        self._splits = splits = self._split(layout)
         for note in (*layout.notes, *splits.notes):
             log.warning("%s: %s", layout.root, note)
         limit = int(self.cache_mb * 2**20) // (self.workers + 1)  # every process has its own
@@ -312,6 +160,31 @@ class GsganData(LightningDataModule):
             return self.root
         assert self.source is not None  # __init__ saw to it
         return self.source()
+
+    def _split(self, layout: Layout) -> Splits:
+        if self.protocol is None:
+            return make_splits(layout, **self.split_keys)
+        given = [k for k, v in self.split_keys.items() if k != "test_share" and v is not None]
+        if given:
+            raise ConfigError(
+                f"data.{given[0]} is set, but protocol {self.protocol.name} says who trains and "
+                "who tests; leave one of them out"
+            )
+        return protocol_splits(layout, self.protocol)
+
+    def protocol_record(self, lpips_net: str) -> dict[str, Any] | None:
+        """What is written beside every score: the protocol and where this run departs from it.
+
+        Args:
+            lpips_net: the backbone that LPIPS is computed with.
+        """
+        if self.protocol is None:
+            return None
+        sides = [max(c.size) for c in self.layout.cameras.values()]
+        scale = None if self.crop is not None else (self.size or sides[0]) / sides[0]
+        return self.protocol.record() | {
+            "departures": list(self.protocol.departures(lpips_net=lpips_net, scale=scale))
+        }
 
     def _check_one_size(self) -> None:
         sizes = {camera.size: name for name, camera in self.layout.cameras.items()}

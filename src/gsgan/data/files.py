@@ -6,12 +6,12 @@ was expected and what was found. Nothing here unpickles.
 
 from __future__ import annotations
 
+import contextlib
 import json
-import pickle
+import os
 import re
 import struct
-import zipfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -155,19 +155,32 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
     return _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
-def _decode(path: Path, flags: int) -> NDArray[np.uint8]:
+def read_stored(path: Path) -> NDArray[np.uint8]:
+    """``[H, W]`` or ``[H, W, 3]`` uint8 as stored; an alpha channel is left out.
+
+    Raises:
+        DataError: when the file is missing, damaged, cut off or not 8-bit.
+    """
+    picture = _decode(path, cv2.IMREAD_UNCHANGED)
+    if picture.dtype != np.uint8:
+        raise DataError(f"{path} holds {picture.dtype} values; expected 8 bits (save it as 8-bit)")
+    return picture[..., :3] if picture.ndim == 3 else picture
+
+
+def _decode(path: Path, flags: int) -> NDArray[Any]:
     try:
         data = path.read_bytes()
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
     picture = None
     if data and not cut_off(data):
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+        with contextlib.suppress(cv2.error):  # e.g. a header that claims 2³¹ pixels
+            picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     if picture is None:
         raise DataError(
             f"{path} is damaged or cut off after {len(data)} bytes; copy or export it again"
         )
-    return np.asarray(picture, np.uint8)
+    return picture
 
 
 def cut_off(data: bytes) -> bool:
@@ -190,8 +203,20 @@ def read_json(path: Path) -> dict[str, Any]:
     Raises:
         DataError: when the file is missing, is not JSON, or holds something else than an object.
     """
+    content = read_json_value(path)
+    if not isinstance(content, dict):
+        raise DataError(f"{path} must hold a JSON object, found {type(content).__name__}")
+    return content
+
+
+def read_json_value(path: Path) -> Any:
+    """What a JSON file holds, of whatever type.
+
+    Raises:
+        DataError: when the file is missing or is not JSON.
+    """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise _absent(path) from None
     except OSError as error:
@@ -202,9 +227,8 @@ def read_json(path: Path) -> dict[str, Any]:
         ) from None
     except UnicodeDecodeError:
         raise DataError(f"{path} is not valid JSON: it is not UTF-8 text") from None
-    if not isinstance(content, dict):
-        raise DataError(f"{path} must hold a JSON object, found {type(content).__name__}")
-    return content
+    except (ValueError, RecursionError) as error:  # a number of 5000 digits, 1000 brackets
+        raise DataError(f"{path} cannot be read as JSON: {error}") from None
 
 
 def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
@@ -220,13 +244,14 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
         raise _absent(path) from None
     except OSError as error:
         raise _unreadable(path, error) from None
-    except (ValueError, TypeError, EOFError, zipfile.BadZipFile, pickle.UnpicklingError) as error:
+    except Exception as error:  # zip, zlib, numpy and tokenize each raise what they like
         if "allow_pickle" in str(error):
             raise DataError(
                 f"{path} holds pickled Python objects, which can run code when read and are "
                 "refused; save plain numeric arrays with numpy.savez"
             ) from None
-        raise DataError(f"{path} is not a whole npz file of plain arrays ({error})") from None
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
+        raise DataError(f"{path} is not a whole npz file of plain arrays ({reason})") from None
 
 
 def expect_array(
@@ -250,24 +275,53 @@ def expect_array(
     return array
 
 
-def frame_files(folder: Path, suffixes: tuple[str, ...]) -> dict[int, str]:
-    """File names by frame number, the last group of digits in the name.
+def frame_files(
+    root: Path,
+    folder: str,
+    suffixes: tuple[str, ...],
+    number: Callable[[str], int | None] | None = None,
+) -> dict[int, str]:
+    """Paths relative to ``root`` of the pictures in one of its folders, by frame number.
+
+    Args:
+        root: the dataset.
+        folder: relative to it; empty when it does not exist.
+        suffixes: of the files to take, lower case.
+        number: frame number of a file's stem; by default the last group of digits.
 
     Raises:
         DataError: when a name has no number, or two names have the same.
     """
-    found: dict[int, str] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in suffixes or path.name.startswith("."):
+    place, found = root / folder, dict[int, str]()
+    if not place.is_dir():
+        return found
+    with os.scandir(place) as entries:
+        names = sorted(entry.name for entry in entries)
+    for name in names:
+        stem, suffix = os.path.splitext(name)
+        if suffix.lower() not in suffixes or name.startswith("."):
             continue
-        digits = re.findall(r"[0-9]+", path.stem)
-        if not digits:
-            raise DataError(f"{path} has no frame number in its name; expected e.g. 000012.png")
-        number = int(digits[-1])
-        if number in found:
+        frame = (number or last_number)(stem)
+        if frame is None:
             raise DataError(
-                f"{folder} holds frame {number} twice, as {found[number]} and {path.name}; "
-                "keep one of them"
+                f"{place / name} has no frame number in its name; expected e.g. 000012.png"
             )
-        found[number] = path.name
+        if frame in found:
+            raise DataError(
+                f"{place} holds frame {frame} twice, as {found[frame].rpartition('/')[2]} and "
+                f"{name}; keep one of them"
+            )
+        found[frame] = f"{folder}/{name}"
     return found
+
+
+def last_number(stem: str) -> int | None:
+    """The last group of digits in a file's stem."""
+    digits = re.findall(r"[0-9]+", stem)
+    return int(digits[-1]) if digits else None
+
+
+def natural_order(name: str) -> tuple[tuple[int, str | int], ...]:
+    """Sort key by which ``Camera_B2`` comes before ``Camera_B10``."""
+    parts = re.split(r"([0-9]+)", name)
+    return tuple((1, int(part)) if part.isdigit() else (0, part) for part in parts if part)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from gsgan.data.layout import Layout, spans
+from gsgan.data.protocol import Protocol
 from gsgan.errors import ConfigError, DataError
 
 T = TypeVar("T", int, str)
@@ -100,12 +101,7 @@ def make_splits(
         "novel_view": _items(layout, cameras[1], train),
         "novel_pose": _items(layout, cameras[0], test),
     }
-    if not items["train"]:
-        raise DataError(
-            f"{layout.root}: nothing to train on with cameras {', '.join(cameras[0]) or 'none'} "
-            f"and {len(train)} train frames; the capture has cameras "
-            f"{', '.join(layout.camera_names)} and frames {spans(list(layout.frames))}"
-        )
+    _need_training(layout, items, cameras[0], train)
     reasons = {}
     if not items["novel_view"]:
         reasons["novel_view"] = "no camera is held out (data.test_cameras)"
@@ -114,8 +110,106 @@ def make_splits(
     return Splits(*cameras, train, test, items, reasons, tuple(notes))
 
 
+def _need_training(
+    layout: Layout, items: dict[str, tuple[Item, ...]], cameras: Sequence[str], train: Sequence[int]
+) -> None:
+    if not items["train"]:
+        raise DataError(
+            f"{layout.root}: nothing to train on with cameras {', '.join(cameras) or 'none'} "
+            f"and {len(train)} train frames; the capture has cameras "
+            f"{', '.join(layout.camera_names)} and frames {spans(list(layout.frames))}"
+        )
+
+
 def _items(layout: Layout, cameras: Sequence[str], frames: Sequence[int]) -> tuple[Item, ...]:
     return tuple((c, f) for c in cameras for f in frames if f in layout.images[c])
+
+
+def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:
+    """Splits a capture as a published protocol does.
+
+    Train cameras × train frames train; test cameras × test frames test: as ``novel_view`` where
+    the frame trains (from other cameras), else as ``novel_pose``.
+
+    Args:
+        layout: the capture.
+        protocol: its cameras are names, or indices into `Layout.camera_names`.
+
+    Raises:
+        DataError: when a camera does not exist, or nothing is left to train on.
+        ConfigError: when a picture would both train and test, or a value is malformed.
+    """
+    train_cameras, test_cameras = _protocol_cameras(layout, protocol)
+    wanted = [
+        parse_frames(value, f"protocol.{side}_frames")
+        for value, side in ((protocol.frames("train"), "train"), (protocol.frames("test"), "test"))
+    ]
+    known = set(layout.frames)
+    train, test = (tuple(f for f in side if f in known) for side in wanted)
+    lacking = sorted({f for side in wanted for f in side if f not in known})
+    notes = (
+        [
+            f"{len(lacking)} frames that protocol {protocol.name} asks for are not usable or not "
+            f"there: {spans(lacking)}"
+        ]
+        if lacking
+        else []
+    )
+    trained = set(train)
+    both = set(train_cameras) & set(test_cameras)
+    if both and trained & set(test):
+        raise ConfigError(
+            f"protocol {protocol.name}: camera {min(both)} trains and tests frame "
+            f"{min(trained & set(test))}; what is tested must not train"
+        )
+    items = {
+        "train": _items(layout, train_cameras, train),
+        "novel_view": _items(layout, test_cameras, [f for f in test if f in trained]),
+        "novel_pose": _items(layout, test_cameras, [f for f in test if f not in trained]),
+    }
+    _need_training(layout, items, train_cameras, train)
+    why = f"protocol {protocol.name} tests none"
+    reasons = {name: why for name in SPLITS[1:] if not items[name]}
+    return Splits(train_cameras, test_cameras, train, test, items, reasons, tuple(notes))
+
+
+def _protocol_cameras(
+    layout: Layout, protocol: Protocol
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Both sides by name; None on one side means all cameras that the other does not name."""
+    sides = [
+        None if side is None else tuple(camera_name(layout, c, protocol.name) for c in side)
+        for side in (protocol.train_cameras, protocol.test_cameras)
+    ]
+    train, test = sides
+    everything = layout.camera_names
+    if train is None:
+        train = tuple(c for c in everything if c not in (test or ()))
+    if test is None:
+        test = tuple(c for c in everything if c not in train)
+    return train, test
+
+
+def camera_name(layout: Layout, camera: str | int, protocol: str) -> str:
+    """The name of a camera given by name or by its index in `Layout.camera_names`.
+
+    Raises:
+        DataError: when there is no such camera, listing those there are.
+    """
+    names = layout.camera_names
+    listed = ", ".join(names)
+    if isinstance(camera, int):
+        if not 0 <= camera < len(names):
+            raise DataError(
+                f"{layout.root}: protocol {protocol} asks for the camera of index {camera}, but "
+                f"there are {len(names)}, 0 to {len(names) - 1}: {listed}"
+            )
+        return names[camera]
+    if camera not in layout.cameras:
+        raise DataError(
+            f"{layout.root}: protocol {protocol} asks for camera {camera}; there are {listed}"
+        )
+    return camera
 
 
 def _pair(
@@ -163,7 +257,9 @@ def parse_names(value: Any, where: str) -> tuple[str, ...]:
 
 
 def parse_frames(value: Any, where: str) -> tuple[int, ...]:
-    """Frame numbers from numbers, "a-b" ranges (both ends included) and lists of them, rising.
+    """Frame numbers from numbers, ranges and lists of them, rising.
+
+    A range is "a-b", both ends included, or "a-b:n" for every n-th of it.
 
     Raises:
         ConfigError: when a part is neither.
@@ -178,9 +274,10 @@ def parse_frames(value: Any, where: str) -> tuple[int, ...]:
         if isinstance(part, int) and not isinstance(part, bool):
             frames.add(part)
             continue
-        match = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?", str(part))
+        match = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?(?::\s*(\d+)\s*)?", str(part))
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
-        if last < first:
+        step = int(match[3] or 1) if match else 1
+        if last < first or step < 1:
             raise ConfigError(f"{where} must be frame numbers or ranges such as 0-55, got {part!r}")
-        frames.update(range(first, last + 1))
+        frames.update(range(first, last + 1, step))
     return tuple(sorted(frames))

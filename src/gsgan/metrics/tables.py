@@ -49,6 +49,10 @@ def notes(results: Results) -> list[str]:
         scored = variants["full"]
         for mark in scored["marks"]:
             found[f"marked: {mark}"] = None
+        if protocol := scored.get("protocol"):
+            found[f"protocol: {protocol['name']} ({protocol['source']})"] = None
+            for departure in protocol["departures"]:
+                found[f"departs from {protocol['name']}: {departure}"] = None
         if not scored["images"]:
             found[f"{split}: {scored['psnr_reason']}"] = None
             continue

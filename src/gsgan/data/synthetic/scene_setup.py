@@ -124,7 +124,8 @@ def dataset_key(settings: Settings) -> str:
     digest = hashlib.sha256(repr(sorted(asdict(settings).items())).encode())
     here = Path(__file__).resolve().parent
     body = here.parents[1] / "body"
-    sources = [*sorted(here.glob("*.py")), body / "free.py", body / "lbs.py", free_body_path()]
+    moves = [body / name for name in ("free.py", "lbs.py", "skinned.py")]
+    sources = [*sorted(here.glob("*.py")), *moves, free_body_path()]
     for path in sources:
         digest.update(path.name.encode() + path.read_bytes())
     return f"person{settings.identity}-{settings.size}-{digest.hexdigest()[:12]}"

@@ -1,0 +1,163 @@
+"""One calibrated camera, and what is wrong with a calibration, in one sentence."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsgan.errors import DataError
+
+Float = NDArray[np.float64]
+
+DISTORTION_LENGTHS = (4, 5, 8)
+EXPECTED = "K, R, t, dist and size"
+
+
+@dataclass(frozen=True)
+class CameraEntry:
+    """One calibrated camera, float64 numpy.
+
+    Args:
+        name: as in the calibration and, mostly, in the folder names.
+        K: ``[3, 3]`` pixels, pixel centres at +0.5.
+        R: ``[3, 3]`` world to camera.
+        t: ``[3]`` metres.
+        dist: ``[8]`` OpenCV order, zero-padded.
+        size: ``(H, W)``.
+    """
+
+    name: str
+    K: Float
+    R: Float
+    t: Float
+    dist: Float
+    size: tuple[int, int]
+
+    @property
+    def centre(self) -> Float:
+        """``[3]`` metres: where the camera stands."""
+        return -self.R.T @ self.t
+
+    @property
+    def distorted(self) -> bool:
+        """Whether any distortion coefficient is not zero."""
+        return bool(np.any(self.dist != 0))
+
+
+def make_camera(
+    where: str,
+    name: str,
+    *,
+    K: Any,
+    R: Any,
+    t: Any,
+    dist: Any,
+    size: tuple[int, int],
+    scale: float = 1.0,
+    pixel_centre: float = 0.5,
+    rotation_tolerance: float = 1e-3,
+) -> CameraEntry:
+    """A camera from raw calibration values (lists, columns, arrays), checked and converted.
+
+    Args:
+        where: file and camera, for messages.
+        name: of the camera.
+        K: ``[3, 3]``.
+        R: ``[3, 3]`` world to OpenCV camera axes.
+        t: 3 numbers in the file's unit.
+        dist: 0, 4, 5 or 8 numbers, or None.
+        size: ``(H, W)`` pixels.
+        scale: metres in one unit of the file.
+        pixel_centre: where the file's K puts the centre of the first pixel, 0 or 0.5.
+        rotation_tolerance: largest entry of ``R Rᵀ - I`` allowed.
+
+    Raises:
+        DataError: naming the camera and what is wrong.
+    """
+    K = _intrinsics(where, K)
+    K[:2, 2] += 0.5 - pixel_centre
+    R = numbers(where, R, "R", (3, 3))
+    check_rotation(where, R, rotation_tolerance)
+    return CameraEntry(
+        name, K, R, numbers(where, t, "t", (3,)) * scale, distortion(where, dist), size
+    )
+
+
+def _intrinsics(where: str, raw: Any) -> Float:
+    K = numbers(where, raw, "K", (3, 3))
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise DataError(
+            f"{where}: the focal lengths in K must be above 0, found {K[0, 0]:g} and {K[1, 1]:g}"
+        )
+    if K[1, 0] != 0 or not np.array_equal(K[2], [0, 0, 1]):
+        raise DataError(
+            f"{where}: K must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {K.tolist()}"
+        )
+    return K
+
+
+def numbers(where: str, raw: Any, key: str, shape: tuple[int, ...]) -> Float:
+    """Finite float64 numbers of a shape; a column or row where a vector is due is flattened.
+
+    Raises:
+        DataError: when they are something else.
+    """
+    try:
+        array = np.array(raw, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        array = np.full(1, np.nan)
+    if array.size == int(np.prod(shape)) and array.ndim > len(shape):
+        array = array.reshape(shape)  # a translation is often written as a column
+    if array.shape != shape or not np.isfinite(array).all():
+        raise DataError(
+            f"{where}: '{key}' must hold finite numbers of shape {shape}, found {_short(raw)}"
+        )
+    return array
+
+
+def _short(raw: Any, limit: int = 120) -> str:
+    text = " ".join(repr(raw).split())
+    return text if len(text) <= limit else text[:limit] + "…"
+
+
+def check_rotation(where: str, R: Float, tolerance: float) -> None:
+    """Refuses what is no rotation.
+
+    Raises:
+        DataError: on a sheared or mirrored matrix.
+    """
+    error = np.abs(R @ R.T - np.eye(3)).max()
+    if error > tolerance:
+        raise DataError(
+            f"{where}: R is not a rotation, R Rᵀ differs from the identity by {error:.3g} "
+            f"(allowed {tolerance:g})"
+        )
+    if np.linalg.det(R) < 0:
+        raise DataError(
+            f"{where}: R mirrors (determinant -1); expected a rotation, world to OpenCV camera axes"
+        )
+
+
+def distortion(where: str, raw: Any) -> Float:
+    """``[8]`` OpenCV lens coefficients, zero-padded; None and an empty list mean none.
+
+    Raises:
+        DataError: on another count, or numbers that are not finite.
+    """
+    padded = np.zeros(8)
+    if raw is None or (isinstance(raw, (list, tuple)) and not raw):
+        return padded
+    try:
+        dist = np.array(raw, np.float64).reshape(-1)
+    except (TypeError, ValueError, OverflowError):
+        dist = np.full(1, np.nan)
+    if len(dist) not in DISTORTION_LENGTHS or not np.isfinite(dist).all():
+        raise DataError(
+            f"{where}: dist must hold 4, 5 or 8 finite numbers (k1 k2 p1 p2 k3 ...), "
+            f"found {_short(raw)}"
+        )
+    padded[: len(dist)] = dist
+    return padded

@@ -1,0 +1,260 @@
+"""What a capture must satisfy before it is used, whatever its format: thresholds with names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gsgan.data.cameras import CameraEntry
+from gsgan.data.crop import NEAR, inside, project
+from gsgan.data.files import check_picture
+from gsgan.data.pixels import MaskFile
+from gsgan.data.skeletons import HUBS, Landmarks, Poses
+from gsgan.errors import DataError
+
+Index = Mapping[str, Mapping[int, str]]
+"""Paths relative to the root, by camera name and frame number."""
+
+
+@dataclass(frozen=True)
+class Checks:
+    """What a capture must satisfy; each threshold can be set.
+
+    Args:
+        min_joints: a frame with fewer usable joints is dropped.
+        min_hubs: the same for shoulders and hips, of which there are four.
+        min_joints_in_view: a camera that sees fewer joints of a frame does not use that frame.
+        max_reach: metres from the median joint; a joint further out counts as missing.
+        rotation_tolerance: largest entry of ``R Rᵀ - I`` allowed.
+        distance: metres, least and greatest median distance from the cameras to the person; units
+            are wrong outside it.
+        max_behind: share of joints behind a camera from which its pose counts as wrong.
+        max_missing_masks: share of pictures without a mask that may be left out; above it, and
+            with 0 at the first one, reading stops.
+        header_stride: the header of every n-th picture of a camera is checked before anything
+            starts; 1 checks all, at about 0.1 ms a file. Sizes are checked again on decoding.
+    """
+
+    min_joints: int = 12
+    min_hubs: int = 3
+    min_joints_in_view: int = 4
+    max_reach: float = 3.0
+    rotation_tolerance: float = 1e-3
+    distance: tuple[float, float] = (0.3, 30.0)
+    max_behind: float = 0.05
+    max_missing_masks: float = 0.0
+    header_stride: int = 1
+
+
+def drop_frames(
+    root: Path,
+    images: Index,
+    landmarks: Landmarks,
+    poses: Poses | None,
+    checks: Checks,
+    notes: list[str],
+) -> Index:
+    """The images without the frames that lack a usable skeleton or pose, each reason noted.
+
+    Raises:
+        DataError: when no frame is left.
+    """
+    frames = sorted({frame for files in images.values() for frame in files})
+    dropped: dict[str, list[int]] = {}
+    for frame in frames:
+        if reason := _unusable(frame, landmarks, poses, checks):
+            dropped.setdefault(reason, []).append(frame)
+    for reason, ids in dropped.items():
+        notes.append(f"{len(ids)} of {len(frames)} frames dropped, {reason}: {spans(ids)}")
+    gone = {frame for ids in dropped.values() for frame in ids}
+    if len(gone) == len(frames):
+        raise DataError(
+            f"{root} ({landmarks.source}) has no usable frame: "
+            + "; ".join(f"{len(ids)} {reason}" for reason, ids in dropped.items())
+        )
+    if unseen := len(set(landmarks.p) - set(frames)):
+        notes.append(f"{unseen} frames in {landmarks.source} have no picture and are not used")
+    uneven = [f"{name} {len(files)}" for name, files in images.items() if len(files) < len(frames)]
+    if uneven:
+        notes.append(
+            f"cameras with fewer than the {len(frames)} frames of all together: "
+            f"{', '.join(uneven)} (matched by frame number)"
+        )
+    return {name: {f: files[f] for f in files if f not in gone} for name, files in images.items()}
+
+
+def _unusable(frame: int, landmarks: Landmarks, poses: Poses | None, checks: Checks) -> str | None:
+    if frame not in landmarks.visibility:
+        return f"without a row in {landmarks.source}"
+    valid = landmarks.visibility[frame] > 0
+    if valid.sum() < checks.min_joints:
+        return f"with fewer than {checks.min_joints} joints (NaN or confidence 0)"
+    if valid[list(HUBS)].sum() < checks.min_hubs:
+        return f"with fewer than {checks.min_hubs} of the shoulders and hips"
+    if poses is not None and frame not in poses.theta:
+        return f"without a finite row in {poses.source}"
+    return None
+
+
+def spans(ids: list[int]) -> str:
+    """Numbers as ranges: [1, 2, 3, 7] is "1-3, 7"."""
+    ids = sorted(ids)
+    starts = [i for i in range(len(ids)) if i == 0 or ids[i] != ids[i - 1] + 1]
+    ends = [*(i - 1 for i in starts[1:]), len(ids) - 1]
+    parts = [
+        f"{ids[a]}" if a == b else f"{ids[a]}-{ids[b]}" for a, b in zip(starts, ends, strict=True)
+    ]
+    return ", ".join(parts)
+
+
+def check_geometry(
+    root: Path,
+    cameras: Mapping[str, CameraEntry],
+    images: Index,
+    landmarks: Landmarks,
+    checks: Checks,
+    calibration: Path,
+    unit_hint: str,
+) -> None:
+    """Cameras must stand at a believable distance and look at the person.
+
+    Args:
+        calibration: the file to name.
+        unit_hint: what to look at when the distance is not believable.
+
+    Raises:
+        DataError: when they do not, naming the camera.
+    """
+    frames = sorted({f for files in images.values() for f in files})
+    joints = np.stack([landmarks.p[f] for f in frames])
+    valid = np.stack([landmarks.visibility[f] for f in frames]) > 0
+    centre = np.median(joints[valid], axis=0)
+    distance = float(np.median([np.linalg.norm(c.centre - centre) for c in cameras.values()]))
+    low, high = checks.distance
+    if not low <= distance <= high:
+        raise DataError(
+            f"{root}: cameras stand {distance:.3g} m from the person (median), expected "
+            f"{low:g}-{high:g} m; {unit_hint}"
+        )
+    for camera in cameras.values():
+        depth = project(camera, joints)[1][valid]
+        behind = float((depth <= NEAR).mean())
+        if behind > checks.max_behind:
+            raise DataError(
+                f"{calibration}, camera {camera.name}: {behind:.0%} of the joints lie "
+                "behind it; R and t must map world to camera (x_cam = R x + t), z forward"
+            )
+
+
+def drop_unseen(
+    cameras: Mapping[str, CameraEntry],
+    images: Index,
+    landmarks: Landmarks,
+    checks: Checks,
+    calibration: Path,
+    notes: list[str],
+) -> Index:
+    """The images without those in which too few joints are in view.
+
+    Raises:
+        DataError: when a camera never sees the person.
+    """
+    kept: dict[str, Mapping[int, str]] = {}
+    for name, files in images.items():
+        frames = list(files)
+        if not frames:
+            kept[name] = {}
+            continue
+        seen = inside(cameras[name], np.stack([landmarks.p[f] for f in frames]))
+        seen &= np.stack([landmarks.visibility[f] for f in frames]) > 0
+        enough = seen.sum(1) >= checks.min_joints_in_view
+        if not enough.any():
+            raise DataError(
+                f"{calibration}, camera {name}: no frame has "
+                f"{checks.min_joints_in_view} joints inside the picture; check K, and that R and t "
+                "map world to camera (x_cam = R x + t)"
+            )
+        if not enough.all():
+            lost = [f for f, ok in zip(frames, enough, strict=True) if not ok]
+            notes.append(
+                f"camera {name}: {len(lost)} frames dropped, fewer than "
+                f"{checks.min_joints_in_view} joints in view: {spans(lost)}"
+            )
+        kept[name] = {f: files[f] for f, ok in zip(frames, enough, strict=True) if ok}
+    return kept
+
+
+def drop_unmasked(
+    images: Index,
+    masks: Mapping[str, Mapping[int, tuple[MaskFile, ...]]],
+    expected: Mapping[str, Path],
+    checks: Checks,
+    notes: list[str],
+) -> Index:
+    """The images that have a mask.
+
+    Args:
+        images: what is left so far.
+        masks: those found.
+        expected: the folder in which a camera's masks should be.
+        checks: for the share that may be missing.
+        notes: gains how many were left out.
+
+    Raises:
+        DataError: when more are missing than allowed.
+    """
+    lacking = {c: [f for f in files if not masks[c].get(f)] for c, files in images.items()}
+    pictures = sum(len(files) for files in images.values())
+    missing = sum(len(frames) for frames in lacking.values())
+    if missing == 0:
+        return images
+    camera = next(c for c, frames in lacking.items() if frames)
+    frame = lacking[camera][0]
+    path = (expected[camera] / Path(images[camera][frame]).name).with_suffix(".png")
+    count = f"{len(lacking[camera])} of the {len(images[camera])} of camera {camera} are missing"
+    if checks.max_missing_masks == 0:
+        raise DataError(f"{path} does not exist; every picture needs a mask, and {count}")
+    share = missing / pictures
+    if share > checks.max_missing_masks:
+        raise DataError(
+            f"{path} does not exist, and {share:.0%} of all {pictures} pictures have no mask "
+            f"({count}); at most {checks.max_missing_masks:.0%} may be left out: get the whole "
+            "masks, or raise max_missing_masks"
+        )
+    notes.append(
+        f"{missing} of {pictures} pictures have no mask and are left out "
+        f"(first: camera {camera}, frame {frame})"
+    )
+    gone = {c: set(frames) for c, frames in lacking.items()}
+    return {
+        c: {f: path for f, path in files.items() if f not in gone[c]} for c, files in images.items()
+    }
+
+
+def check_pictures(
+    root: Path,
+    cameras: Mapping[str, CameraEntry],
+    images: Index,
+    masks: Mapping[str, Mapping[int, tuple[MaskFile, ...]]],
+    labels: Index,
+    stride: int,
+    calibration: Path,
+) -> None:
+    """Sizes and channel layouts, from the headers alone.
+
+    Raises:
+        DataError: on the first file that does not fit.
+    """
+    for name, files in images.items():
+        size = cameras[name].size
+        for frame in list(files)[::stride]:
+            image = root / files[frame]
+            check_picture(image, "image", size, str(calibration))
+            by = f"the picture {image}"
+            for mask in masks[name][frame]:
+                check_picture(root / mask.path, "mask", size, by)
+            if label := labels.get(name, {}).get(frame):
+                check_picture(root / label, "labels", size, by)

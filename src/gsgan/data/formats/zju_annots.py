@@ -1,0 +1,211 @@
+"""``annots.npy`` of ZJU-MoCap: cameras in millimetres, and which folder is which camera's."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from gsgan.data.cameras import CameraEntry, make_camera
+from gsgan.data.files import frame_files, last_number, natural_order
+from gsgan.data.formats.common import picture_size
+from gsgan.data.pickles import read_npy
+from gsgan.errors import DataError
+
+ANNOTS = ("annots.npy", "annots_new.npy")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
+MILLIMETRES = 1e-3
+NAMED_FRAME = re.compile(r"\)_(\d+)")  # CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592
+CAMERA_FOLDER = re.compile(r"(Camera[_ ]?\(?B?\d+\)?|\d{1,3})")
+
+
+@dataclass(frozen=True)
+class Annots:
+    """What annots.npy says, raw.
+
+    Args:
+        path: the file.
+        K, R, T, D: one entry a camera.
+        folders: the picture folder of each camera relative to the root; None where the file lists
+            no pictures.
+    """
+
+    path: Path
+    K: Sequence[Any]
+    R: Sequence[Any]
+    T: Sequence[Any]
+    D: Sequence[Any]
+    folders: tuple[str, ...] | None
+
+
+def frame_number(stem: str) -> int | None:
+    """The frame number in a picture's name, 313's and 315's long names included."""
+    named = NAMED_FRAME.search(stem)
+    return int(named[1]) if named else last_number(stem)
+
+
+def read_annots(root: Path) -> Annots:
+    """The first of `ANNOTS` that is there.
+
+    Raises:
+        DataError: when it is damaged or its cameras are not whole.
+    """
+    path = next(root / name for name in ANNOTS if (root / name).exists())
+    content = read_npy(path)
+    cams = content.get("cams") if isinstance(content, dict) else None
+    if not isinstance(cams, dict):
+        raise DataError(f"{path} has no 'cams'; expected a dict with cams and ims")
+    lists = {}
+    for key in ("K", "R", "T", "D"):
+        entries = _as_list(cams.get(key))
+        if entries is None:
+            raise DataError(f"{path}: cams has no list '{key}', one entry a camera")
+        lists[key] = entries
+    counts = {key: len(value) for key, value in lists.items()}
+    if len(set(counts.values())) != 1 or counts["K"] == 0:
+        said = ", ".join(f"{n} {key}" for key, n in counts.items())
+        raise DataError(f"{path}: cams must hold one K, R, T and D a camera, found {said}")
+    folders = _folders(path, content.get("ims"), counts["K"])
+    return Annots(path, lists["K"], lists["R"], lists["T"], lists["D"], folders)
+
+
+def _as_list(value: Any) -> list[Any] | None:
+    """The entries of a list or array, None for what is neither."""
+    if isinstance(value, np.ndarray) and value.ndim > 0:
+        return list(value)
+    return list(value) if isinstance(value, (list, tuple)) else None
+
+
+def _folders(path: Path, ims: Any, cameras: int) -> tuple[str, ...] | None:
+    """The folder of each camera, the same in every frame, or None without a list of pictures."""
+    first: tuple[str, ...] | None = None
+    for number, entry in enumerate(_as_list(ims) or ()):
+        names = _as_list(entry.get("ims")) if isinstance(entry, Mapping) else None
+        if names is None:
+            raise DataError(f"{path}: ims[{number}] has no list 'ims' of picture names")
+        folders = tuple(str(PurePosixPath(str(name).replace("\\", "/")).parent) for name in names)
+        if len(folders) != cameras:
+            raise DataError(
+                f"{path}: ims[{number}] lists {len(folders)} pictures, but cams has {cameras} "
+                f"cameras; the pictures' folders are {', '.join(folders[:30])}"
+            )
+        if first is None:
+            first = folders
+        elif folders != first:
+            other = next(i for i in range(cameras) if folders[i] != first[i])
+            raise DataError(
+                f"{path}: ims[{number}] has {folders[other]} where ims[0] has {first[other]}; "
+                "pictures must be listed in the order of the cameras"
+            )
+    if first is not None and len(set(first)) != len(first):
+        raise DataError(f"{path}: two cameras share the picture folder {first[0]}")
+    return first
+
+
+def camera_folders(root: Path, annots: Annots, notes: list[str]) -> dict[str, str]:
+    """Picture folder by camera name, in the order of annots.npy.
+
+    A camera's name is its folder's name. Folders come from the list of pictures; where that is
+    empty, from the folders there are, which must be as many as the cameras.
+
+    Raises:
+        DataError: when cameras and folders cannot be matched, listing both.
+    """
+    if annots.folders is not None:
+        places = [_place(root, folder) for folder in annots.folders]
+        return {PurePosixPath(place).name: place for place in places}
+    found = _folders_there(root)
+    if len(found) != len(annots.K):
+        raise DataError(
+            f"{annots.path} has {len(annots.K)} cameras and lists no pictures, but there are "
+            f"{len(found)} picture folders ({', '.join(found) or 'none'}); get the annots.npy that "
+            "lists them"
+        )
+    notes.append(f"{annots.path.name} lists no pictures; the index is rebuilt from the folders")
+    return found
+
+
+def _place(root: Path, folder: str) -> str:
+    """Where a folder that annots.npy names really lies; copies are often arranged anew."""
+    parts = PurePosixPath(folder).parts
+    if not parts or ".." in parts or PurePosixPath(folder).is_absolute():
+        raise DataError(f"{root}: annots lists pictures in {folder!r}, which is not a folder in it")
+    for place in (folder, parts[-1], f"images/{parts[-1]}"):
+        if (root / place).is_dir():
+            return place
+    return folder
+
+
+def _folders_there(root: Path) -> dict[str, str]:
+    base = "images/" if (root / "images").is_dir() else ""
+    names = [p.name for p in (root / base).iterdir() if p.is_dir()]
+    named = sorted((n for n in names if CAMERA_FOLDER.fullmatch(n)), key=natural_order)
+    return {name: base + name for name in named}
+
+
+def index_images(
+    root: Path, folders: Mapping[str, str], notes: list[str]
+) -> dict[str, dict[int, str]]:
+    """The pictures of each camera by frame number.
+
+    Raises:
+        DataError: when there is none at all.
+    """
+    images = {
+        name: frame_files(root, folder, IMAGE_SUFFIXES, frame_number)
+        for name, folder in folders.items()
+    }
+    if empty := [name for name, files in images.items() if not files]:
+        if len(empty) == len(images):
+            raise DataError(
+                f"{root}: no camera folder holds pictures; expected e.g. "
+                f"{next(iter(folders.values()))}/000000.jpg"
+            )
+        notes.append(
+            f"{len(empty)} of {len(images)} cameras have no pictures here: {', '.join(empty)}"
+        )
+    return images
+
+
+def annots_cameras(
+    root: Path,
+    annots: Annots,
+    images: Mapping[str, Mapping[int, str]],
+    pixel_centre: float,
+    rotation_tolerance: float,
+    translation: tuple[float, float],
+) -> dict[str, CameraEntry]:
+    """The cameras by name in metres, in the order of annots.npy.
+
+    Args:
+        translation: metres, least and greatest median length of t; units are wrong outside it.
+
+    Raises:
+        DataError: naming the camera whose calibration is wrong.
+    """
+    pictures = next(files for files in images.values() if files)
+    cameras = {}
+    for i, (name, files) in enumerate(images.items()):
+        cameras[name] = make_camera(
+            f"{annots.path}, camera {name} (index {i})",
+            name,
+            K=annots.K[i],
+            R=annots.R[i],
+            t=annots.T[i],
+            dist=annots.D[i],
+            size=picture_size(root, files or pictures),
+            scale=MILLIMETRES,
+            pixel_centre=pixel_centre,
+            rotation_tolerance=rotation_tolerance,
+        )
+    length = float(np.median([np.linalg.norm(camera.t) for camera in cameras.values()]))
+    if not translation[0] <= length <= translation[1]:
+        raise DataError(
+            f"{annots.path}: T is {length:.3g} m long (median, taken as millimetres), expected "
+            f"{translation[0]:g}-{translation[1]:g} m; this file's T is not in millimetres"
+        )
+    return cameras

@@ -1,0 +1,167 @@
+"""How the pixels of a dataset become RGB, alpha and part numbers: named rules, applied on reading.
+
+Convention: a mask rule says what the numbers in a mask file mean; several masks of one picture are
+joined (a pixel is the person's when any of them says so). All results are uint8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsgan.data.files import read_colour, read_grey, read_stored
+from gsgan.errors import DataError
+
+Bytes = NDArray[np.uint8]
+
+IGNORE_LABEL = 255
+MASK_RULES = ("grey", "nonzero", "threshold", "label")
+"""grey: alpha 0..255. nonzero: any channel above 0 is the person. threshold: at least
+`PixelRules.threshold` is. label: part numbers, all but 0 are."""
+
+
+class MaskFile(NamedTuple):
+    """One mask of one picture.
+
+    Args:
+        rule: one of `MASK_RULES`.
+        path: relative to the dataset's root.
+    """
+
+    rule: str
+    path: str
+
+
+@dataclass(frozen=True)
+class PixelRules:
+    """How a format's files are to be understood.
+
+    Args:
+        colour_order: of the stored pictures; a file is nearly always "rgb", whatever library
+            reads it.
+        composed: pictures are already composed on black by their mask.
+        threshold: for the mask rule of that name.
+        mask_sampling: how masks are undistorted and resized: "linear" for soft alphas, "nearest"
+            for masks of two values.
+        label_table: 256 part numbers, what each stored label becomes; None keeps them.
+        ignore_band: pixels of the stored picture, side of the square by which the mask is dilated
+            and eroded; labels in the band between become "ignore". 0 leaves it out.
+    """
+
+    colour_order: Literal["rgb", "bgr"] = "rgb"
+    composed: bool = False
+    threshold: int = 128
+    mask_sampling: Literal["linear", "nearest"] = "linear"
+    label_table: tuple[int, ...] | None = None
+    ignore_band: int = 0
+
+    def __post_init__(self) -> None:
+        if self.label_table is not None and len(self.label_table) != 256:
+            raise ValueError(
+                f"PixelRules: label_table must have 256 entries, got {len(self.label_table)}"
+            )
+
+
+def read_image(path: Path, rules: PixelRules) -> Bytes:
+    """``[H, W, 3]`` RGB.
+
+    Raises:
+        DataError: when the file is missing or damaged.
+    """
+    image = read_colour(path)
+    return image if rules.colour_order == "rgb" else image[..., ::-1]
+
+
+def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
+    """``[H, W]`` 0..255: the masks of one picture, each by its rule, joined by their maximum.
+
+    Args:
+        files: (rule, path), at least one.
+        rules: of the dataset.
+
+    Raises:
+        DataError: when a file is missing, damaged, or does not fit its rule or the others' size.
+    """
+    joined = _one_mask(*files[0], rules)
+    for rule, path in files[1:]:
+        mask = _one_mask(rule, path, rules)
+        if mask.shape != joined.shape:
+            raise DataError(
+                f"{path} is {mask.shape[1]}x{mask.shape[0]} pixels (width x height), but "
+                f"{files[0][1]} is {joined.shape[1]}x{joined.shape[0]}; both are masks of one "
+                "picture and must agree"
+            )
+        joined = np.maximum(joined, mask)
+    return joined
+
+
+def _one_mask(rule: str, path: Path, rules: PixelRules) -> Bytes:
+    if rule == "grey":
+        mask = read_grey(path)
+        if mask.max() == 1:
+            raise DataError(
+                f"{path} holds 0 and 1; expected alpha from 0 to 255 (multiply it by 255)"
+            )
+        return mask
+    if rule == "threshold":
+        return _at_least(read_grey(path), rules.threshold)
+    if rule in ("nonzero", "label"):
+        stored = read_stored(path)
+        if stored.ndim == 3:
+            stored = stored[..., 0] | stored[..., 1] | stored[..., 2]
+        return _at_least(stored, 1)
+    raise ValueError(f"read_mask: rule must be one of {', '.join(MASK_RULES)}, got {rule!r}")
+
+
+def _at_least(values: Bytes, least: int) -> Bytes:
+    """255 where a value is ``least`` or more, else 0."""
+    return np.asarray(cv2.threshold(values, least - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
+
+
+def read_labels(
+    path: Path, rules: PixelRules, names: Sequence[str] | None, named_by: str = "meta.json"
+) -> Bytes:
+    """``[H, W]`` part numbers, mapped by the rules' table; 255 is "ignore".
+
+    Args:
+        path: the label picture.
+        rules: of the dataset.
+        names: the parts, background first; None when their number is not known.
+        named_by: who names them, for the message.
+
+    Raises:
+        DataError: when the file is damaged or holds a part that has no name.
+    """
+    labels = read_grey(path)
+    if rules.label_table is not None:
+        labels = np.asarray(cv2.LUT(labels, np.array(rules.label_table, np.uint8)), np.uint8)
+    if names is not None:
+        highest = int(labels.max(where=labels != IGNORE_LABEL, initial=0))
+        if highest >= len(names):
+            raise DataError(
+                f"{path} holds the label {highest}; {named_by} names {len(names)} labels, "
+                f"so expected 0 to {len(names) - 1}, or {IGNORE_LABEL} for 'ignore'"
+            )
+    return labels
+
+
+def with_ignored_border(labels: Bytes, mask: Bytes, band: int) -> Bytes:
+    """Labels with "ignore" along the outline of a mask of the same size.
+
+    Args:
+        labels: ``[H, W]``.
+        mask: ``[H, W]`` 0..255.
+        band: side of the square that dilates and erodes the mask; 0 changes nothing.
+    """
+    if band == 0:
+        return labels
+    person = (mask > 127).astype(np.uint8)
+    kernel = np.ones((band, band), np.uint8)
+    outline = cv2.dilate(person, kernel) != cv2.erode(person, kernel)
+    return np.where(outline, np.uint8(IGNORE_LABEL), labels)

@@ -1,0 +1,133 @@
+"""Skeletons and body poses by frame number, with their holes filled by stand-ins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsgan.errors import DataError
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+
+SKELETONS = {"mediapipe33": 33}
+HUBS = (11, 12, 23, 24)  # shoulders and hips: the bone frames of the whole body hang on them
+
+
+@dataclass(frozen=True)
+class Landmarks:
+    """Skeletons by frame: ``p [J, 3]`` metres, finite, ``visibility [J]`` in [0, 1].
+
+    A joint of visibility 0 is a stand-in for one that was not seen. ``source`` names the file or
+    folder they come from, for messages.
+    """
+
+    p: Mapping[int, Float]
+    visibility: Mapping[int, Float]
+    source: str = "landmarks3d.npz"
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Body poses by frame: ``theta [bones, 3]`` axis-angle, ``transl [3]`` metres."""
+
+    theta: Mapping[int, Float]
+    transl: Mapping[int, Float]
+    source: str = "body_pose.npz"
+
+
+def make_landmarks(
+    ids: NDArray[np.int64],
+    p: Float,
+    conf: Float,
+    max_reach: float,
+    notes: list[str],
+    source: str = "landmarks3d.npz",
+) -> Landmarks:
+    """Skeletons of all frames, holes filled with stand-ins of visibility 0.
+
+    A joint is missing where it is not finite, its confidence is not above 0, or it lies further
+    than ``max_reach`` from the rest of the body. It then stands where it was in the nearest frame
+    that has it, or at the mean of the frame's joints.
+
+    Args:
+        ids: ``[F]`` frame numbers in any order, each once.
+        p: ``[F, J, 3]`` metres.
+        conf: ``[F, J]``.
+        max_reach: metres from the median joint.
+        notes: gains a sentence when joints are too far.
+        source: where they come from, for messages.
+    """
+    visibility = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0).clip(0, 1)
+    far = _far_joints(p, visibility > 0, max_reach)
+    if far.any():
+        visibility[far] = 0
+        notes.append(
+            f"{int(far.sum())} joints further than {max_reach:g} m from the body are taken "
+            "as missing"
+        )
+    order = np.argsort(ids)
+    p, visibility, ids = p[order], visibility[order], ids[order]
+    p = fill_missing(p, visibility > 0, ids)
+    frames = [int(i) for i in ids]
+    return Landmarks(
+        dict(zip(frames, p, strict=True)), dict(zip(frames, visibility, strict=True)), source
+    )
+
+
+def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
+    """Frame numbers, whole and each once.
+
+    Raises:
+        DataError: when they are not.
+    """
+    with np.errstate(invalid="ignore"):
+        ids = np.asarray(raw, np.int64)
+    if not np.array_equal(ids, raw):
+        raise DataError(f"{where}: 'frame_id' must hold whole numbers")
+    values, counts = np.unique(ids, return_counts=True)
+    if len(values) != len(ids):
+        raise DataError(f"{where}: frame_id {values[counts > 1][0]} appears more than once")
+    return ids
+
+
+def _far_joints(p: Float, valid: Bool, reach: float) -> Bool:
+    centre = np.zeros((len(p), 1, 3))
+    some = valid.any(-1)
+    centre[some, 0] = np.nanmedian(np.where(valid[some, :, None], p[some], np.nan), axis=1)
+    with np.errstate(over="ignore"):  # absurdly far is far
+        distance = np.linalg.norm(np.nan_to_num(p, posinf=0, neginf=0) - centre, axis=-1)
+    return valid & (distance > reach)
+
+
+def fill_missing(p: Float, valid: Bool, ids: NDArray[np.int64]) -> Float:
+    """Finite stand-ins for missing joints.
+
+    Args:
+        p: ``[F, J, 3]``, anything where not valid.
+        valid: ``[F, J]``.
+        ids: ``[F]`` rising frame numbers: what counts as near in time.
+
+    Returns:
+        ``[F, J, 3]``: the joint of the nearest frame that has it (the earlier of two), else the
+        mean of the frame's valid joints, else 0.
+    """
+    filled = np.where(valid[..., None], p, 0.0)
+    count = valid.sum(1, keepdims=True).clip(1)
+    means = filled.sum(1) / count
+    for joint in range(p.shape[1]):
+        known = np.flatnonzero(valid[:, joint])
+        holes = np.flatnonzero(~valid[:, joint])
+        if len(known) == 0:
+            filled[:, joint] = means
+            continue
+        after = np.searchsorted(known, holes).clip(0, len(known) - 1)
+        before = (np.searchsorted(known, holes) - 1).clip(0)
+        back = np.abs(ids[holes] - ids[known[before]])
+        ahead = np.abs(ids[known[after]] - ids[holes])
+        filled[holes, joint] = p[known[np.where(back <= ahead, before, after)], joint]
+    return filled

@@ -1,0 +1,53 @@
+"""Every format that has a reader, each with the writer that tests it: add yours to `FORMATS`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from make import write_tiny_capture
+from writers import zju
+from writers.common import Subject
+
+from gsgan.data.checks import Checks
+from gsgan.data.formats.capture import read_capture
+from gsgan.data.formats.zju import ZjuReader
+from gsgan.data.layout import Layout
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format on disk.
+
+    Args:
+        name: for the test's name.
+        write: a subject into a folder that does not exist yet.
+        read: the folder, with the subject's model file.
+    """
+
+    name: str
+    write: Callable[[Path, Subject], object]
+    read: Callable[[Path, Path], Layout]
+
+
+def _zju(root: Path, smpl: Path) -> Layout:
+    return ZjuReader()(root, Checks(), str(smpl))
+
+
+def _odd(root: Path, subject: Subject) -> None:
+    zju.write_313(root, subject, tuple(range(1, len(subject.cameras) + 1)))
+
+
+def _capture(root: Path, subject: Subject) -> None:
+    write_tiny_capture(root, labels=True, body_pose=True, meta={"body": "free"}, suffix="jpg")
+
+
+FORMATS = (
+    Format("capture", _capture, lambda root, smpl: read_capture(root)),
+    Format("zju_original", zju.write_original, _zju),
+    Format("zju_313", _odd, _zju),
+    Format("zju_refined", zju.write_refined, _zju),
+    Format("zju_humannerf", zju.write_humannerf, _zju),
+    Format("zju_arah", zju.write_arah, _zju),
+)

@@ -1,0 +1,102 @@
+"""What the numbers in image, mask and label files mean."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from gsgan.data.pixels import PixelRules, read_image, read_labels, read_mask, with_ignored_border
+from gsgan.errors import DataError
+
+VALUES = np.array([[0, 1, 127], [128, 200, 255]], np.uint8)
+RULES = PixelRules()
+
+
+@pytest.fixture
+def grey(tmp_path: Path) -> Path:
+    path = tmp_path / "grey.png"
+    cv2.imwrite(str(path), VALUES)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("rule", "expected"),
+    [
+        ("grey", VALUES),
+        ("nonzero", [[0, 255, 255], [255, 255, 255]]),
+        ("label", [[0, 255, 255], [255, 255, 255]]),
+        ("threshold", [[0, 0, 0], [255, 255, 255]]),
+    ],
+)
+def test_mask_rules(grey: Path, rule: str, expected: object) -> None:
+    assert np.array_equal(read_mask([(rule, grey)], RULES), expected)
+
+
+def test_the_threshold_is_a_setting(grey: Path) -> None:
+    mask = read_mask([("threshold", grey)], PixelRules(threshold=201))
+    assert np.array_equal(mask, [[0, 0, 0], [0, 0, 255]])
+
+
+def test_masks_are_joined_by_their_maximum_and_must_agree_in_size(
+    grey: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other.png"
+    cv2.imwrite(str(other), VALUES[:, ::-1])
+    mask = read_mask([("threshold", grey), ("threshold", other)], RULES)
+    assert np.array_equal(mask, [[0, 0, 0], [255, 255, 255]])
+    mixed = read_mask([("grey", grey), ("threshold", other)], RULES)
+    assert np.array_equal(mixed, np.maximum(VALUES, [[0, 0, 0], [255, 255, 255]]))
+    cv2.imwrite(str(other), VALUES.T)
+    with pytest.raises(DataError, match=r"other.png is 2x3 pixels .*grey.png is 3x2"):
+        read_mask([("grey", grey), ("grey", other)], RULES)
+
+
+def test_a_mask_of_0_and_1_is_no_alpha(tmp_path: Path) -> None:
+    path = tmp_path / "ones.png"
+    cv2.imwrite(str(path), np.eye(3, dtype=np.uint8))
+    with pytest.raises(DataError, match="holds 0 and 1; expected alpha from 0 to 255"):
+        read_mask([("grey", path)], RULES)
+    assert np.array_equal(read_mask([("nonzero", path)], RULES), 255 * np.eye(3))
+
+
+def test_any_channel_counts_but_not_transparency(tmp_path: Path) -> None:
+    path = tmp_path / "colour.png"
+    picture = np.zeros((1, 3, 4), np.uint8)
+    picture[0, 1, 2], picture[..., 3] = 9, 255
+    cv2.imwrite(str(path), picture)
+    assert np.array_equal(read_mask([("nonzero", path)], RULES), [[0, 255, 0]])
+
+
+def test_unknown_rules_and_tables_are_refused(grey: Path) -> None:
+    with pytest.raises(ValueError, match="rule must be one of grey, nonzero"):
+        read_mask([("bright", grey)], RULES)
+    with pytest.raises(ValueError, match="label_table must have 256 entries, got 2"):
+        PixelRules(label_table=(0, 1))
+
+
+def test_labels_go_through_their_table(grey: Path) -> None:
+    table = [255] * 256
+    table[0], table[1], table[200] = 0, 2, 1
+    labels = read_labels(grey, PixelRules(label_table=tuple(table)), ["none", "a", "b"])
+    assert np.array_equal(labels, [[0, 2, 255], [255, 1, 255]])
+    with pytest.raises(DataError, match=r"grey.png holds the label 200; CIHP names 2 labels"):
+        read_labels(grey, RULES, ["none", "a"], "CIHP")
+
+
+def test_colour_order_is_that_of_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "red.png"
+    cv2.imwrite(str(path), np.array([[[0, 0, 255]]], np.uint8))  # OpenCV: red last
+    assert read_image(path, RULES)[0, 0].tolist() == [255, 0, 0]
+    assert read_image(path, PixelRules(colour_order="bgr"))[0, 0].tolist() == [0, 0, 255]
+
+
+def test_the_band_lies_on_both_sides_of_the_outline() -> None:
+    mask = np.zeros((11, 11), np.uint8)
+    mask[3:8, 3:8] = 255
+    labels = (mask > 0).astype(np.uint8)
+    assert with_ignored_border(labels, mask, 0) is labels
+    found = with_ignored_border(labels, mask, 3)
+    assert found[5].tolist() == [0, 0, 255, 255, 1, 1, 1, 255, 255, 0, 0]

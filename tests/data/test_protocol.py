@@ -1,0 +1,233 @@
+"""Protocols: who trains, who tests, and what is written beside the numbers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from make import write_tiny_capture
+
+from gsgan.config import config_folder
+from gsgan.data.datamodule import GsganData
+from gsgan.data.layout import Layout
+from gsgan.data.protocol import MEASURED, Protocol
+from gsgan.data.splits import camera_name, make_splits, parse_frames, protocol_splits
+from gsgan.errors import ConfigError, DataError
+
+NAMES = sorted(path.stem for path in (config_folder() / "protocol").glob("*.yaml"))
+ONE = Protocol("one", train_cameras=[0], test_cameras=None, train_frames="0-5", test_frames="0-9:4")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny_capture(tmp_path_factory.mktemp("capture"), cameras=4, frames=10)
+
+
+@pytest.fixture(scope="module")
+def layout(root: Path) -> Layout:
+    return Layout.read(root)
+
+
+def test_frames_may_have_a_step() -> None:
+    assert parse_frames("0-495:5", "x")[:3] == (0, 5, 10)
+    assert len(parse_frames("0-495:5", "x")) == 100
+    assert len(parse_frames("0-480:30", "x")) == 17
+    assert parse_frames(["0-6:3", 1], "x") == (0, 1, 3, 6)
+    with pytest.raises(ConfigError, match="x must be frame numbers or ranges"):
+        parse_frames("0-9:0", "x")
+
+
+def test_one_camera_trains_and_the_others_test_every_fourth_frame(layout: Layout) -> None:
+    splits = protocol_splits(layout, ONE)
+    assert splits.train_cameras == ("cam00",)
+    assert splits.test_cameras == ("cam01", "cam02", "cam03")
+    assert splits.items["train"] == tuple(("cam00", f) for f in range(6))
+    # 0 and 4 train (from another camera): a novel view; 8 does not: a novel pose
+    assert splits.items["novel_view"] == tuple((f"cam0{c}", f) for c in (1, 2, 3) for f in (0, 4))
+    assert splits.items["novel_pose"] == tuple((f"cam0{c}", 8) for c in (1, 2, 3))
+    assert splits.reasons == {}
+
+
+def test_new_poses_seen_by_a_camera_that_trains(layout: Layout) -> None:
+    protocol = Protocol(
+        "poses",
+        train_cameras=["cam00", "cam02", "cam03"],
+        test_cameras=["cam02"],
+        train_frames="0-6",
+        test_frames="7-99",
+    )
+    splits = protocol_splits(layout, protocol)
+    assert splits.items["novel_pose"] == (("cam02", 7), ("cam02", 8), ("cam02", 9))
+    assert splits.reasons == {"novel_view": "protocol poses tests none"}
+    assert "90 frames that protocol poses asks for are not usable or not there: 10-99" in (
+        splits.notes
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        (
+            {"train_cameras": [21]},
+            DataError,
+            "protocol one asks for the camera of index 21, but there are 4, 0 to 3: cam00, cam01",
+        ),
+        ({"train_cameras": [-1]}, DataError, "camera of index -1"),
+        ({"test_cameras": ["cam9"]}, DataError, "asks for camera cam9; there are cam00, cam01"),
+        ({"test_cameras": [0]}, ConfigError, "camera cam00 trains and tests frame 0"),
+        ({"train_frames": "50-60"}, DataError, "nothing to train on with cameras cam00"),
+        ({"train_frames": {"377": "0-3"}}, ConfigError, "protocol.subject is None: the frames"),
+        ({"test_frames": "x"}, ConfigError, "protocol.test_frames must be frame numbers"),
+    ],
+)
+def test_protocols_that_do_not_fit(
+    layout: Layout, changes: dict[str, Any], error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        protocol_splits(layout, replace(ONE, **changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scale": 0}, "protocol.scale must be in"),
+        ({"background": "grey"}, "protocol.background must be black or white, got 'grey'"),
+        ({"train_cameras": None}, "both null; name one of them"),
+    ],
+)
+def test_protocols_that_cannot_be(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        replace(ONE, **changes)
+
+
+def test_frames_by_subject() -> None:
+    protocol = replace(ONE, train_frames={377: "0-569"}, test_frames={377: "0-569:30"})
+    assert replace(protocol, subject="377").frames("train") == "0-569"
+    assert replace(protocol, subject=377).record()["test_frames"] == "0-569:30"
+    with pytest.raises(ConfigError, match=r"protocol.subject is 378: .* one of 377"):
+        replace(protocol, subject=378).frames("test")
+
+
+def test_camera_names_and_indices(layout: Layout) -> None:
+    assert camera_name(layout, 2, "p") == "cam02"
+    assert camera_name(layout, "cam02", "p") == "cam02"
+
+
+def test_departures_are_said() -> None:
+    same = replace(ONE, scale=0.5)
+    assert list(same.departures(lpips_net="vgg", scale=0.5)) == []
+    other = replace(ONE, background="white", lpips_range=(0, 1), region="box")
+    said = list(other.departures(lpips_net="alex", scale=0.25))
+    assert said == [
+        "region is full picture, asked for: box",
+        "background is black, asked for: white",
+        "lpips range is -1 to 1, asked for: 0 to 1",
+        "LPIPS backbone is alex, asked for: vgg",
+        "pictures are scored at scale 0.25, asked for: 1 (data.size)",
+    ]
+    assert "cut round the person" in next(ONE.departures(lpips_net="vgg", scale=None))
+    assert set(MEASURED) <= set(ONE.record())
+
+
+def test_the_data_follows_the_protocol_and_records_it(root: Path) -> None:
+    data = GsganData(str(root), size=16, protocol=replace(ONE, scale=0.5))
+    assert len(data.dataset("train")) == 6
+    assert data.eval_names == ("novel_view", "novel_pose")
+    record = data.protocol_record("vgg")
+    assert record is not None
+    assert json.loads(json.dumps(record)) == record  # plain values
+    assert record["name"] == "one"
+    assert record["departures"] == []  # 16 of 32 pixels
+    assert GsganData(str(root)).protocol_record("vgg") is None
+    cut = GsganData(str(root), size=16, crop="person", protocol=ONE).protocol_record("vgg")
+    assert cut is not None
+    assert len(cut["departures"]) == 1
+
+
+def test_splits_are_given_once(root: Path) -> None:
+    data = GsganData(str(root), protocol=ONE, test_cameras=["cam02"])
+    with pytest.raises(ConfigError, match=r"data.test_cameras is set, but protocol one says who"):
+        data.setup()
+
+
+def test_without_a_protocol_nothing_changes(layout: Layout) -> None:
+    assert make_splits(layout).train_frames == tuple(range(8))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_protocol_composes_and_is_whole(compose, name: str) -> None:
+    from hydra.utils import instantiate
+
+    overrides = ["data=capture", "data.root=/none", f"protocol={name}", "size=tiny"]
+    if "humannerf" in name or name == "paper_zju":
+        overrides.append("protocol.subject=394")
+    config = compose("train", *overrides)
+    data = instantiate(config.data)
+    assert data.crop is None
+    assert data.protocol.name == name
+    assert data.size == (512 if "zju" in name else None)
+    record = json.loads(json.dumps(data.protocol.record()))
+    assert record["source"]
+    for side in ("train_frames", "test_frames"):
+        assert parse_frames(record[side], side)
+    assert (
+        len(parse_frames(record["test_frames"], "x"))
+        == {
+            "zju_humannerf": 16,
+            "paper_zju": 16,
+            "zju_gauhuman": 17,
+            "thuman4_posevocab": 500,
+            "paper_thuman4": 500,
+        }[name]
+    )
+
+
+def test_the_frames_of_zju_are_those_that_were_scored(compose) -> None:
+    """ceil(n / 30) pictures a camera: the published counts."""
+    config = compose("train", "data=capture", "protocol=zju_humannerf")
+    counts = {k: len(parse_frames(v, k)) for k, v in config.protocol.test_frames.items()}
+    assert counts == {377: 19, 386: 18, 387: 18, 392: 19, 393: 22, 394: 16}
+
+
+def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> None:
+    """metrics.json and the table name the protocol and what differs from it."""
+    import io
+
+    from rich.console import Console
+
+    from gsgan.evaluation import evaluate_run
+    from gsgan.runs import build_avatar, build_data
+
+    config = compose(
+        "train",
+        *("size=tiny", "training=smoke", "model=splat_only", "data=capture"),
+        *(f"data.root={root}", "protocol=zju_gauhuman", "protocol.train_cameras=[1]"),
+        *("data.size=16", "protocol.train_frames=0-9:5", "protocol.test_frames=0-5:5"),
+        *("protocol.test_cameras=[2]", "lpips.net=alex"),
+    )
+    data = build_data(config)
+    avatar = build_avatar(config, data).eval()
+    text = io.StringIO()
+    results = evaluate_run(
+        tmp_path,
+        config,
+        Console(file=text, width=200),
+        data=data,
+        avatar=avatar,
+        marks=[],
+        pictures=0,
+    )
+    written = json.loads((tmp_path / "metrics.json").read_text())
+    assert written == json.loads(json.dumps(results))
+    assert written["novel_view"]["full"]["images"] == 2
+    record = written["novel_view"]["full"]["protocol"]
+    assert (record["name"], record["train_cameras"]) == ("zju_gauhuman", [1])
+    assert any("region is full picture" in said for said in record["departures"])
+    assert any("LPIPS backbone is alex" in said for said in record["departures"])
+    assert "protocol: zju_gauhuman (GauHuman's public code)" in text.getvalue()
+    assert "departs from zju_gauhuman: lpips range is -1 to 1" in (
+        (tmp_path / "metrics.md").read_text()
+    )
