@@ -127,7 +127,8 @@ def evaluate_split(
             painting = avatar.paint(frame)
         assert painting.image is not None
         pictures["full"].update(painting.image, frame.image)
-        pictures["splat"].update(painting.colour, frame.image)
+        if painting.colour is not None:
+            pictures["splat"].update(painting.colour, frame.image)
         pictures[FLOOR].update(torch.zeros_like(frame.image), frame.image)
         if painting.segmentation is not None and frame.labels is None:
             reason = "the data has no part labels"

@@ -69,7 +69,7 @@ def run_training(config: DictConfig) -> None:
     report_progress(console, folder, module)
     if config.evaluate:
         module.to(trainer.strategy.root_device)  # Lightning leaves it on the CPU
-        avatar = module.avatar.eval()
+        avatar = module.shown.eval()
         evaluate_run(folder, config, console, data=data, avatar=avatar, marks=module.marks)
     console.print(f"run folder: {folder}", soft_wrap=True)
 
@@ -161,6 +161,7 @@ def parts(avatar: Avatar, module: AvatarTraining) -> dict[str, torch.nn.Module]:
     """The trained parts by name; those not built are absent."""
     found = {
         "Ψ": avatar.deformation,
+        "surface": avatar.surface,
         "segmentation": avatar.segmentation,
         "pose encoder": avatar.pose_encoder,
         "generator": avatar.generator,
