@@ -62,6 +62,7 @@ class Painting:
 
     def pasted(self, window: Window) -> Painting:
         """The same in the whole picture, all background outside the window."""
+
         def paste(x: Tensor | None) -> Tensor | None:
             return None if x is None else window.paste(x)
 
