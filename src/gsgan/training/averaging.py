@@ -8,6 +8,8 @@ from torch.optim.swa_utils import AveragedModel
 
 from gsgan.errors import ConfigError
 
+Tensors = tuple[Tensor, ...] | list[Tensor]
+
 
 class MovingAverage(nn.Module):
     """An exponential moving average of a module's parameters.
@@ -47,7 +49,7 @@ class MovingAverage(nn.Module):
         """Takes the module's present weights into the average."""
         self.copy.update_parameters(module)
 
-    def _blend(self, averaged: list[Tensor], current: list[Tensor], count: Tensor | int) -> None:
+    def _blend(self, averaged: Tensors, current: Tensors, count: Tensor | int) -> None:
         n = int(count)
         decay = min(self.decay, (1 + n) / (10 + n))
         with torch.no_grad():
