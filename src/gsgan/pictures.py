@@ -24,7 +24,6 @@ PALETTE = torch.tensor(
         [140, 210, 110], [120, 80, 170], [190, 150, 230],
     ]
 )  # fmt: skip
-COLUMNS = ("truth", "Step I colour", "S", "I_pred", f"error x{ERROR_GAIN:g}")
 
 
 def colour_labels(labels: Tensor) -> Tensor:
@@ -45,40 +44,32 @@ def error_heat(image: Tensor, target: Tensor) -> Tensor:
     return torch.from_numpy(np.stack(heat)).permute(0, 3, 1, 2).to(image) / 255
 
 
-def grid_rows(frame: Frame, painting: Painting) -> list[list[Tensor]]:
-    """One row a batch item: truth, Step-I colour, S, I_pred, error; pictures ``[3, H, W]``."""
+def grid_rows(frame: Frame, painting: Painting) -> list[dict[str, Tensor]]:
+    """One row a batch item: pictures ``[3, H, W]`` by caption; what was not painted is absent."""
     assert painting.image is not None
-    image = painting.image.clamp(0, 1)
-    if painting.segmentation is None:
-        parts = torch.zeros_like(image)
-    else:
-        parts = colour_labels(painting.segmentation.argmax(dim=1))
-    columns = (
-        frame.image,
-        painting.colour.clamp(0, 1),
-        parts,
-        image,
-        error_heat(image, frame.image),
-    )
-    return [[column[i].detach().cpu() for column in columns] for i in range(len(frame))]
+    image, colour, parts = painting.image.clamp(0, 1), painting.colour, painting.segmentation
+    columns = {
+        "truth": frame.image,
+        "Step I colour": None if colour is None else colour.clamp(0, 1),
+        "S": None if parts is None else colour_labels(parts.argmax(dim=1)),
+        "I_pred": image,
+        f"error x{ERROR_GAIN:g}": error_heat(image, frame.image),
+    }
+    shown = {name: column.detach().cpu() for name, column in columns.items() if column is not None}
+    return [{name: column[i] for name, column in shown.items()} for i in range(len(frame))]
 
 
-def write_grid(
-    rows: Sequence[Sequence[Tensor]],
-    path: Path,
-    captions: Sequence[str] = COLUMNS,
-    least: int = 160,
-) -> Path:
+def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) -> Path:
     """Writes rows of pictures ``[3, H, W]`` as one PNG with a caption over each column.
 
     Args:
-        rows: at least one row; all pictures of one size.
+        rows: at least one row, each with the same captions; all pictures of one size.
         path: the PNG.
-        captions: one a column.
         least: pixels; smaller pictures are enlarged by a whole factor to at least this width.
     """
-    scale = max(1, -(-least // rows[0][0].shape[-1]))
-    body = torch.cat([torch.cat(list(row), dim=-1) for row in rows], dim=-2)
+    captions = list(rows[0])
+    scale = max(1, -(-least // rows[0][captions[0]].shape[-1]))
+    body = torch.cat([torch.cat(list(row.values()), dim=-1) for row in rows], dim=-2)
     body = body.clamp(0, 1).repeat_interleave(scale, -1).repeat_interleave(scale, -2)
     pixels = (body * 255).round().byte().permute(1, 2, 0).numpy()
     header = np.full((CAPTION_HEIGHT, pixels.shape[1], 3), 255, np.uint8)

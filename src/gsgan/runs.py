@@ -179,7 +179,7 @@ def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avat
     path = folder / CHECKPOINT
     checkpoint = read_checkpoint(path)
     avatar = build_avatar(config, data)
-    prefix = "avatar."
+    prefix = "average.copy.module." if checkpoint["gsgan"].get("averaged") else "avatar."
     state = {
         key.removeprefix(prefix): value
         for key, value in checkpoint["state_dict"].items()

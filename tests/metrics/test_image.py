@@ -10,13 +10,23 @@ import torch
 from gsgan.errors import ConfigError
 from gsgan.losses.weights import FILES
 from gsgan.metrics.evaluation import Mean, PictureScores, SegmentationScores
-from gsgan.metrics.image import edge_f1, lpips, psnr, ssim
+from gsgan.metrics.image import edge_f1, high_frequencies, lpips, psnr, psnr_person, ssim
+from gsgan.scene import Camera, Frame
 
 
 def square(at: int, size: int = 40) -> torch.Tensor:
     image = torch.zeros(1, 3, size, size)
     image[..., at : at + 12, at : at + 12] = 1.0
     return image
+
+
+def picture_frame(image: torch.Tensor) -> Frame:
+    """A frame whose truth is the picture, all of it person."""
+    size = tuple(image.shape[-2:])
+    camera = Camera(torch.eye(3)[None], torch.eye(3)[None], torch.zeros(1, 3), size)
+    number = torch.zeros(1, dtype=torch.int64)
+    skeleton, seen = torch.zeros(1, 33, 3), torch.ones(1, 33)
+    return Frame(image, torch.ones(1, 1, *size), camera, skeleton, seen, number, number)
 
 
 def test_psnr_closed_form_and_one_score_a_picture():
@@ -33,6 +43,29 @@ def test_equal_pictures_are_infinite_and_kept_out_of_the_mean():
     assert mean.value == 25.0
     assert (mean.count, mean.left_out) == (2, 2)
     assert Mean().value is None
+
+
+def test_the_persons_box_leaves_the_background_out():
+    target, mask = torch.zeros(1, 3, 20, 20), torch.zeros(1, 1, 20, 20)
+    mask[..., 5:15, 8:12] = 1.0
+    image = target.clone()
+    image[..., 5:15, 8:12] = 0.1
+    torch.testing.assert_close(psnr_person(image, target, mask), torch.tensor([20.0]))
+    assert float(psnr(image, target)) == pytest.approx(20 + 10 * math.log10(10))  # 40 of 400 pixels
+    assert math.isnan(float(psnr_person(image, target, torch.zeros_like(mask))))
+
+
+def test_high_frequencies_of_known_waves():
+    x = torch.arange(32.0)
+    slow, fast = (torch.cos(2 * math.pi * f * x) for f in (0.125, 0.375))
+
+    def picture(a: float, b: float) -> torch.Tensor:
+        return (a * slow + b * fast).expand(1, 3, 32, 32)
+
+    share = high_frequencies(picture(1.0, 0.5), picture(0.3, 1.0))  # energies 0.25 of 1
+    torch.testing.assert_close(share, torch.tensor([0.25], dtype=torch.float64))
+    assert float(high_frequencies(picture(2.0, 1.0), picture(1.0, 1.0))) == pytest.approx(1.0)
+    assert math.isnan(float(high_frequencies(picture(0, 0), picture(0, 0))))
 
 
 def test_ssim_of_equal_pictures_is_one():
@@ -62,7 +95,7 @@ def test_lpips_without_weights_is_none_with_the_reason(monkeypatch, tmp_path):
 def test_picture_scores_name_a_reason_for_every_none():
     scores = PictureScores(None, "no weights")
     image = torch.zeros(1, 3, 16, 16)
-    scores.update(image, image)  # PSNR infinite, no edges
+    scores.update(image, picture_frame(image))  # PSNR infinite, no edges
     result = scores.compute()
     assert result["psnr"] is None
     assert result["psnr_left_out"] == 1

@@ -9,7 +9,8 @@ import torch
 from lightning import Trainer
 
 from gsgan.errors import GsganError
-from gsgan.runs import build_training
+from gsgan.runs import build_training, load_avatar
+from gsgan.training.averaging import MovingAverage
 from gsgan.training.module import AvatarTraining
 
 
@@ -159,18 +160,118 @@ def test_pose_noise_can_be_off(make):
     assert module._pose_noise(data.dataset("train")[0].skeleton) is None
 
 
-def test_a_vanished_person_stops_the_run_before_its_checkpoint(make, tmp_path):
+def push_opacities_down(module, until: int) -> None:
+    """Ψ's rate is wild and its gradient makes every opacity fall, until the run came back so often;
+    all else in Ψ stands still."""
+    deformation = module.avatar.deformation.requires_grad_(False)
+    deformation.logit_bound = 40.0
+    deformation.table.requires_grad_(True)
+
+    def push(gradient: torch.Tensor) -> torch.Tensor:
+        pushed = torch.zeros_like(gradient)
+        pushed[:, 10] = float(module.rollback.done < until)  # after means 3, quats 4, scales 3
+        return pushed
+
+    deformation.table.register_hook(push)
+
+
+LONGER = (
+    "training.schedule.segmentation=0", "training.schedule.step_one=16",
+    "training.schedule.step_two=8", "training.recipes.psi.rate.peak=1.0",
+    "training.recipes.psi.rate.hold=1.0", "training.recipes.psi.clip=null",
+    "training.rollback.memory=0",
+)  # fmt: skip
+
+
+def alpha_share(module, frame) -> float:
+    with torch.no_grad():
+        return float(module.avatar.paint(frame).alpha.mean() / frame.mask.mean())
+
+
+def test_a_run_driven_into_the_collapse_is_caught_and_brought_back(make, capsys):
     """The collapse of method.md § 13: every opacity falls to nothing, and no NaN says so."""
+    module, trainer, data = make(*LONGER)
+    frame, seen = data.dataset("train")[0], []
+    push_opacities_down(module, until=1)
+    restore = module.rollback.restore
+
+    def watched(*args):
+        seen.append(alpha_share(module, frame))
+        back = restore(*args)
+        seen.append(alpha_share(module, frame))
+        return back
+
+    module.rollback.restore = watched
+    trainer.fit(module, data)
+    assert module.rollback.done == 1
+    assert seen[0] < 0.05 < 0.5 < seen[1]
+    assert module.rollback.rate == 0.5
+    assert "back to the last good state" in capsys.readouterr().out
+    assert module.step == module.schedule.total
+
+
+def test_a_person_that_keeps_vanishing_stops_the_run_before_its_checkpoint(make, tmp_path):
     from lightning.pytorch.callbacks import ModelCheckpoint
 
     keep = ModelCheckpoint(tmp_path / "kept", save_on_train_epoch_end=True)
-    module, trainer, data = make(enable_checkpointing=True, callbacks=[keep])
-    module.avatar.deformation.logit_bound = 20.0
-    module.avatar.deformation.table.data[:, 10] = -18.0
+    module, trainer, data = make(*LONGER, enable_checkpointing=True, callbacks=[keep])
+    module.rollback.most = 1
+    push_opacities_down(module, until=9)
     with pytest.raises(GsganError, match="has vanished"):
         trainer.fit(module, data)
-    assert module.step < module.schedule.total
-    assert "epoch=0" in keep.best_model_path  # S's epoch, before the person vanished
+    assert module.rollback.done == 1
+    kept = torch.load(keep.best_model_path, weights_only=True)["state_dict"]
+    assert float(kept["avatar.deformation.table"][:, 10].min()) > -20
+
+
+def test_the_average_is_scored_and_comes_back_from_a_checkpoint(make, tmp_path, tiny):
+    module, trainer, data = make("training.average=0.9", "training.schedule.step_one=0")
+    frame = data.dataset("train")[0]
+    assert module.shown is module.avatar
+    trainer.fit(module, data)
+    assert module.shown is not module.avatar
+    averaged = dict(module.shown.named_parameters())
+    moving = {
+        name: value
+        for name, value in module.avatar.named_parameters()
+        if not torch.equal(value, averaged[name])
+    }
+    assert any(name.startswith("generator") for name in moving)
+    assert all(not p.requires_grad for p in averaged.values())
+    trainer.save_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=False)
+    config = tiny("training.average=0.9", "training.schedule.step_one=0")
+    loaded, _ = load_avatar(tmp_path / "run", config, data)
+    with torch.no_grad():
+        expected, found = module.shown.paint(frame).image, loaded.paint(frame).image
+    torch.testing.assert_close(found, expected)
+
+
+def test_the_average_follows_its_formula():
+    layer = torch.nn.Linear(1, 1)
+    average = MovingAverage(layer, 0.5)
+    values = []
+    for step in range(4):
+        torch.nn.init.constant_(layer.weight, float(step))
+        average.update(layer)
+        values.append(float(average.module.weight.detach()))
+    # a copy first; then decay min(0.5, (1 + n) / (10 + n)) with n = 1, 2, 3
+    expected = [0.0]
+    for n in (1, 2, 3):
+        decay = min(0.5, (1 + n) / (10 + n))
+        expected.append(decay * expected[-1] + (1 - decay) * n)
+    assert values == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("model", ["lbs_splat", "image_to_image", "splat_only"])
+def test_baselines_train_with_the_same_schedule(make, model):
+    module, trainer, data = make(f"model={model}")
+    before = snapshot(module)
+    trainer.fit(module, data)
+    both = module.schedule.step_one + module.schedule.step_two
+    assert both == 12
+    assert module.step == both
+    part = {"lbs_splat": "avatar.surface", "image_to_image": "avatar.generator"}
+    assert moved(before, module, part.get(model, "avatar.deformation"))
 
 
 def test_every_phase_runs_under_bf16_autocast(make):

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 from torchmetrics.classification import MulticlassConfusionMatrix
 
-from gsgan.metrics.image import Score, edge_f1, psnr, ssim
+from gsgan.metrics.image import Score, edge_f1, high_frequencies, psnr, psnr_person, ssim
 from gsgan.model.avatar import Avatar
 from gsgan.model.segmentation import IGNORE
 from gsgan.scene import Frame
 
-METRICS = ("psnr", "ssim", "lpips", "edge_f1", "miou")
+PICTURE_METRICS = ("psnr", "psnr_person", "ssim", "lpips", "edge_f1", "high_frequencies")
+METRICS = (*PICTURE_METRICS, "miou")
 FLOOR = "floor"  # the all-background picture
 VARIANTS = ("full", "splat", FLOOR)
 
@@ -44,25 +45,32 @@ class Mean:
 
 @dataclass
 class PictureScores:
-    """PSNR, SSIM, edge F1 and LPIPS of one variant, mean per image."""
+    """The scores of one variant's pictures, mean per image."""
 
     lpips: Score | None
     lpips_reason: str
     means: dict[str, Mean] = field(default_factory=dict)
 
-    def update(self, image: Tensor, target: Tensor) -> None:
+    def update(self, image: Tensor, frame: Frame) -> None:
         """Adds pictures ``[B, 3, H, W]``; they are clamped to [0, 1] as they would be shown."""
-        image = image.clamp(0, 1)
-        scores: dict[str, Score] = {"psnr": psnr, "ssim": ssim, "edge_f1": edge_f1}
+        image, target = image.clamp(0, 1), frame.image
+        scores: dict[str, Score] = {
+            "psnr": psnr,
+            "ssim": ssim,
+            "edge_f1": edge_f1,
+            "high_frequencies": high_frequencies,
+        }
         if self.lpips is not None:
             scores["lpips"] = self.lpips
         for name, score in scores.items():
             self.means.setdefault(name, Mean()).update(score(image, target))
+        person = psnr_person(image, target, frame.mask)
+        self.means.setdefault("psnr_person", Mean()).update(person)
 
     def compute(self) -> dict[str, Any]:
         """``{metric: value or None, metric_reason: …}``; scores left out are counted."""
         result: dict[str, Any] = {}
-        for name in ("psnr", "ssim", "lpips", "edge_f1"):
+        for name in PICTURE_METRICS:
             mean = self.means.get(name, Mean())
             result[name] = mean.value
             if mean.left_out:
@@ -126,18 +134,22 @@ def evaluate_split(
         with torch.no_grad():
             painting = avatar.paint(frame)
         assert painting.image is not None
-        pictures["full"].update(painting.image, frame.image)
-        pictures["splat"].update(painting.colour, frame.image)
-        pictures[FLOOR].update(torch.zeros_like(frame.image), frame.image)
+        pictures["full"].update(painting.image, frame)
+        if painting.colour is not None:
+            pictures["splat"].update(painting.colour, frame)
+        pictures[FLOOR].update(torch.zeros_like(frame.image), frame)
         if painting.segmentation is not None and frame.labels is None:
             reason = "the data has no part labels"
         elif painting.segmentation is not None and frame.labels is not None:
             parts = parts or SegmentationScores(painting.segmentation.shape[1])
             parts.update(painting.segmentation, frame.labels)
         count += len(frame)
+    if avatar.splats is None:  # there is no Step I
+        del pictures["splat"]
     result = {name: scores.compute() for name, scores in pictures.items()}
     result["full"] |= parts.compute() if parts else _none("miou", reason)
-    result["splat"] |= _none("miou", "Step I's colour is not a segmentation")
+    if "splat" in result:
+        result["splat"] |= _none("miou", "Step I's colour is not a segmentation")
     result[FLOOR] |= _none("miou", "an all-background picture is not a segmentation")
     for scores in result.values():
         scores["images"] = count

@@ -29,6 +29,49 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
     return -10 * error.log10()
 
 
+def psnr_person(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+    """PSNR inside the person's box, dB: the smallest box that holds the mask; NaN without one.
+
+    A frame that is mostly background scores high whatever the person looks like.
+
+    Args:
+        image, target: pictures.
+        mask: ``[B, 1, H, W]`` in [0, 1]; the person is where it is at least one half.
+    """
+    scores = []
+    for a, b, m in zip(image, target, mask[:, 0] >= 0.5, strict=True):
+        rows, columns = (m.any(dim=d).nonzero().flatten() for d in (1, 0))
+        if len(rows) == 0:
+            scores.append(image.new_tensor(float("nan")))
+            continue
+        box = (..., slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
+        scores.append(psnr(a[box][None], b[box][None])[0])
+    return torch.stack(scores)
+
+
+def high_frequencies(image: Tensor, target: Tensor, *, above: float = 0.25) -> Tensor:
+    """Energy of the fine detail as a share of the truth's: 1 is as sharp, below 1 is blurred.
+
+    Args:
+        image, target: pictures; their grey values are compared.
+        above: cycles a pixel from which a frequency counts as high (Nyquist is 0.5).
+
+    Returns:
+        The ratio; NaN where the truth has no such detail.
+    """
+    height, width = image.shape[-2:]
+    rows = torch.fft.fftfreq(height, device=image.device)[:, None]
+    columns = torch.fft.rfftfreq(width, device=image.device)[None]
+    high = (rows.square() + columns.square()).sqrt() > above
+
+    def energy(picture: Tensor) -> Tensor:
+        spectrum = torch.fft.rfft2(picture.double().mean(dim=1))
+        return (spectrum.abs().square() * high).sum(dim=(-2, -1))
+
+    truth = energy(target)
+    return torch.where(truth > 0, energy(image) / truth, torch.nan)
+
+
 def ssim(image: Tensor, target: Tensor) -> Tensor:
     """Structural similarity as torchmetrics defines it (Gaussian window 11, sigma 1.5).
 

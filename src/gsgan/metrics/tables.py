@@ -14,13 +14,18 @@ from gsgan.metrics.evaluation import METRICS
 
 Results = dict[str, dict[str, dict[str, Any]]]
 HEADINGS = {
-    "psnr": "PSNR dB ↑",
+    "psnr": "PSNR ↑",
+    "psnr_person": "in box ↑",
     "ssim": "SSIM ↑",
     "lpips": "LPIPS ↓",
     "edge_f1": "edge F1 ↑",
+    "high_frequencies": "detail →1",
     "miou": "mIoU ↑",
 }
-_DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "edge_f1": 3, "miou": 3}
+_DIGITS = {
+    "psnr": 2, "psnr_person": 2, "ssim": 4, "lpips": 4, "edge_f1": 3, "high_frequencies": 2,
+    "miou": 3,
+}  # fmt: skip
 _VARIANTS = {
     "full": "I_pred",
     "splat": "Step I's colour",
@@ -65,12 +70,16 @@ def notes(results: Results) -> list[str]:
 def print_table(results: Results, console: Console, title: str) -> None:
     """The rich table with its notes underneath."""
     table = Table(title=title)
-    for name in ("split", "picture", "images"):
-        table.add_column(name, no_wrap=True)
+    table.add_column("picture", no_wrap=True)
     for metric in METRICS:
-        table.add_column(HEADINGS[metric], justify="right")
-    for row in rows(results):
-        table.add_row(*row)
+        table.add_column(HEADINGS[metric], justify="right", no_wrap=True)
+    previous = None
+    for split, picture, images, *scores in rows(results):
+        if split != previous:  # a column of its own would not fit a narrow terminal
+            table.add_section()
+            table.add_row(f"[bold]{split}[/bold], {images} images")
+            previous = split
+        table.add_row(picture, *scores)
     console.print(table)
     for note in notes(results):
         console.print(f"  {note}", markup=False, highlight=False)

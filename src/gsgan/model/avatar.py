@@ -14,6 +14,7 @@ from gsgan.errors import DataError
 from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
 from gsgan.model.segmentation import Segmentation
+from gsgan.model.surface import SurfaceGaussians
 from gsgan.precision import full_precision
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians
 from gsgan.skeleton import (
@@ -41,35 +42,39 @@ class Painting:
 
     Args:
         image: ``[B, 3, H, W]`` I_pred on black, not clamped; None when only Step I was asked for.
-        features: ``[B, C, H, W]`` F on black; the first three channels are Step I's colour.
+        features: ``[B, C, H, W]`` F on black; the first three channels are Step I's colour. None,
+            like alpha and gaussians, where nothing is splatted (``image_to_image``).
         alpha: ``[B, 1, H, W]``.
         segmentation: ``[B, classes, H, W]`` S, or None where it was not built.
         gaussians: Ĝ.
     """
 
     image: Tensor | None
-    features: Tensor
-    alpha: Tensor
+    features: Tensor | None
+    alpha: Tensor | None
     segmentation: Tensor | None
-    gaussians: Gaussians
+    gaussians: Gaussians | None
 
     @property
-    def colour(self) -> Tensor:
+    def colour(self) -> Tensor | None:
         """``[B, 3, H, W]`` Step I's picture C on black."""
-        return self.features[:, :3]
+        return None if self.features is None else self.features[:, :3]
 
     def pasted(self, window: Window) -> Painting:
         """The same in the whole picture, all background outside the window."""
-        parts = None
-        if self.segmentation is not None:
-            parts = window.paste(self.segmentation)
-            inside = window.paste(torch.ones_like(self.alpha))
+
+        def paste(x: Tensor | None) -> Tensor | None:
+            return None if x is None else window.paste(x)
+
+        parts = paste(self.segmentation)
+        if parts is not None:
+            inside = window.paste(torch.ones_like(self.segmentation[:, :1]))  # type: ignore[index]
             parts = torch.cat([parts[:, :1] + (1 - inside), parts[:, 1:]], dim=1)
         return replace(
             self,
-            image=None if self.image is None else window.paste(self.image),
-            features=window.paste(self.features),
-            alpha=window.paste(self.alpha),
+            image=paste(self.image),
+            features=paste(self.features),
+            alpha=paste(self.alpha),
             segmentation=parts,
         )
 
@@ -83,7 +88,11 @@ class Avatar(nn.Module):
     Args:
         scene: what the training data is like: body height, whether it has a body pose.
         densify: skeleton to points.
-        deformation: Ψ, given rest points, body height and number of joints.
+        deformation: Ψ, given rest points, body height and number of joints. None, like densify,
+            in the baselines that have no Ψ.
+        surface: in place of Ψ, Gaussians on the body's surface, given the body (``lbs_splat``).
+            Without either nothing is splatted, and the UNet paints the drawn skeleton alone
+            (``image_to_image``).
         segmentation: S, given a body; None leaves it out (``wo_seg``).
         pose_encoder: Ω (or the flat skeleton) to g; None in ``splat_only``.
         generator: the UNet, given its channel counts; None makes Step I's colour the picture.
@@ -99,12 +108,13 @@ class Avatar(nn.Module):
     def __init__(
         self,
         scene: SceneInfo,
-        densify: Densify,
-        deformation: Callable[..., Deformation],
+        densify: Densify | None,
+        deformation: Callable[..., Deformation] | None,
         segmentation: Callable[..., Segmentation] | None,
         pose_encoder: nn.Module | None,
         generator: Callable[..., Generator] | None,
         accuracy: Accuracy,
+        surface: Callable[..., SurfaceGaussians] | None = None,
         twist: Literal["none", "hinge"] = "none",
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
@@ -117,15 +127,24 @@ class Avatar(nn.Module):
         self.limb_sum = float(scene.body_height)
         # Stature, from limb lengths: what the skeleton measures and no pose changes.
         self.body_height = self.limb_sum * self.template.stature / self.template.limb_length_sum
-        self.densify = densify
         # Each part draws from a seed of its own: leaving one out does not change the others' start.
         seed = torch.initial_seed()
         torch.manual_seed(seed + 1)
-        self.deformation = deformation(
-            rest_points=densify.rest_points,
-            body_height=self.body_height,
-            joints=len(self.template.names),
-        )
+        self.densify = densify
+        self.deformation: Deformation | None = None
+        if (deformation is None) != (densify is None):
+            raise ValueError("Avatar: densify and deformation go together; got only one of them")
+        if densify is not None and deformation is not None:
+            if surface is not None:
+                raise ValueError("Avatar: give a deformation or a surface, got both")
+            self.deformation = deformation(
+                rest_points=densify.rest_points,
+                body_height=self.body_height,
+                joints=len(self.template.names),
+            )
+        self.surface = self._build_surface(scene, surface)
+        if self.splats is None and generator is None:
+            raise ValueError("Avatar: nothing paints; give a deformation, a surface or a generator")
         self.effects: dict[str, tuple[bool, str]] = {}
         self.segmentation = self._build_segmentation(scene, segmentation)
         self.pose_encoder = pose_encoder
@@ -135,20 +154,42 @@ class Avatar(nn.Module):
         torch.manual_seed(seed + 2)
         if generator is not None and pose_encoder is not None:
             self.generator = generator(
-                feature_channels=3 + self.deformation.features,
+                feature_channels=self.splat_channels or SKELETON_CHANNELS,
                 segmentation_channels=self.segmentation.classes if self.segmentation else 0,
-                skeleton_channels=SKELETON_CHANNELS,
+                skeleton_channels=SKELETON_CHANNELS if self.splats else 0,
                 pose_channels=pose_encoder.channels,
             )
         self.effects["generator"] = (
             self.generator is not None,
             "the model has a UNet" if self.generator else "the model paints Step I's colour",
         )
-        degree = self.deformation.sh_degree
-        self.effects["view-dependent colour"] = (
-            degree > 0,
-            f"model.deformation.sh_degree={degree}",
-        )
+        degree = self.splats.sh_degree if self.splats else 0
+        self.effects["view-dependent colour"] = (degree > 0, f"spherical harmonics degree {degree}")
+
+    @property
+    def splats(self) -> Deformation | SurfaceGaussians | None:
+        """The part that makes Gaussians and learns in Step I."""
+        return self.deformation or self.surface
+
+    @property
+    def splat_channels(self) -> int:
+        """Channels of F, colour included; 0 where nothing is splatted."""
+        return 0 if self.splats is None else 3 + self.splats.features
+
+    def _build_surface(
+        self, scene: SceneInfo, build: Callable[..., SurfaceGaussians] | None
+    ) -> SurfaceGaussians | None:
+        if build is None:
+            return None
+        body = None
+        if scene.has_body_pose:
+            body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
+        if body is None:
+            raise DataError(
+                "model.surface: Gaussians on the body need a body pose for every frame and the "
+                "body's mesh, and this data lacks one; choose model=splat_only or model=full"
+            )
+        return build(body=body, body_height=self.body_height)
 
     def _build_segmentation(
         self, scene: SceneInfo, build: Callable[..., Segmentation] | None
@@ -208,22 +249,45 @@ class Avatar(nn.Module):
             p, valid = sanitise(skeleton, visibility, self.template, self.limb_sum)
             frames = bone_frames(p, valid, self.template, twist=self.twist)
 
-            points = self.densify(p, valid, frames)  # Alg. 1: G
-            gaussians = self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
-                p, points, camera.centre, frames.hubs[:, 0], pose_noise
-            )
-            raster = rasterise(gaussians, camera, settings=self.accuracy)
+            gaussians = self.splat(p, valid, frames, camera, body, pose_noise)
+            raster = None
+            if gaussians is not None:
+                raster = rasterise(gaussians, camera, settings=self.accuracy)
             S = self.segment(body, camera) if paints else None  # Sec. 3.4
             p2d = self.draw(p, valid, camera, picture_height) if paints else None
             pose = self.pose_inputs(p, valid, frames, camera) if paints else None
 
-        F = raster.features
-        image = F[:, :3] if self.generator is None else None
+        F = None if raster is None else raster.features
+        image = F[:, :3] if self.generator is None and F is not None else None
         if paints:  # Sec. 3.5
             g = self.pose_encoder(*pose)  # type: ignore[misc]
-            seen = F.detach() if detach_features else F
-            image = self.generator(seen, S, p2d, g).to(F.dtype)  # type: ignore[misc]
-        return Painting(image, F, raster.alpha, S, gaussians)
+            if F is None:  # image_to_image: the drawing stands in F's place
+                image = self.generator(p2d, S, None, g).to(skeleton.dtype)  # type: ignore[misc]
+            else:
+                seen = F.detach() if detach_features else F
+                image = self.generator(seen, S, p2d, g).to(F.dtype)  # type: ignore[misc]
+        return Painting(image, F, None if raster is None else raster.alpha, S, gaussians)
+
+    def splat(
+        self,
+        p: Tensor,
+        valid: Tensor,
+        frames: BoneFrames,
+        camera: Camera,
+        body: BodyPose | None,
+        pose_noise: Tensor | None,
+    ) -> Gaussians | None:
+        """Ĝ, or None where nothing is splatted."""
+        if self.surface is not None:
+            if body is None:
+                raise ValueError("Avatar: this model's Gaussians sit on the body; give its pose")
+            return self.surface(body, camera.centre)
+        if self.densify is None or self.deformation is None:
+            return None
+        points = self.densify(p, valid, frames)  # Alg. 1: G
+        return self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
+            p, points, camera.centre, frames.hubs[:, 0], pose_noise
+        )
 
     def paint(self, frame: Frame) -> Painting:
         """The whole picture of a frame of a dataset: its window painted, background around it."""

@@ -109,6 +109,10 @@ class Deformation(nn.Module):
         nn.init.zeros_(self.head.bias)
         self.table = nn.Parameter(torch.zeros(points, sum(self.parts))) if free_table else None
 
+    def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
+        """(parameters, multiplier of the learning rate)."""
+        return [(list(self.parameters()), 1.0)]
+
     def residuals(self, points: Points, pose: Tensor, root: Tensor) -> Residuals:
         """ΔG of posed points.
 

@@ -132,13 +132,13 @@ class Generator(nn.Module):
         if rgb_skip:
             start_at_zero(self.paint)
 
-    def forward(self, F: Tensor, S: Tensor | None, p2d: Tensor, g: Tensor) -> Tensor:
+    def forward(self, F: Tensor, S: Tensor | None, p2d: Tensor | None, g: Tensor) -> Tensor:
         """I_pred ``[B, 3, H, W]``, not clamped.
 
         Args:
             F: ``[B, C, H, W]`` rendered features, the first three channels Step I's colour.
             S: ``[B, classes, H, W]`` part probabilities, or None when built without.
-            p2d: ``[B, 8, H, W]`` the drawn skeleton.
+            p2d: ``[B, 8, H, W]`` the drawn skeleton; None when it is F already (image_to_image).
             g: ``[B, 35]`` the pose code.
         """
         height, width = F.shape[-2:]

@@ -9,7 +9,8 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.body import SkinnedBody, axis_angle_to_matrix, blend_transforms, forward_kinematics
+from gsgan.body import SkinnedBody
+from gsgan.model.skinned_points import SkinnedPoints
 from gsgan.precision import full_precision
 from gsgan.scene import BodyPose, Camera, Gaussians
 from gsgan.splat import accuracy as named_accuracy
@@ -35,10 +36,6 @@ class Segmentation(nn.Module):
     Source: paper Sec. 3.4; method.md § 3.
     """
 
-    joints: Tensor
-    bone_index: Tensor
-    bone_weight: Tensor
-    means: Tensor
     one_hot: Tensor
 
     def __init__(
@@ -51,35 +48,26 @@ class Segmentation(nn.Module):
         accuracy: str = "standard",
     ) -> None:
         super().__init__()
-        self.accuracy, self.parents = named_accuracy(accuracy), body.parents
-        vertices = body.vertices.float()
-        count = len(vertices) if points is None else min(points, len(vertices))
-        chosen = farthest_points(vertices, count)
-        self.register_buffer("joints", body.joints.float(), persistent=False)
-        self.register_buffer("bone_index", body.bone_index[chosen], persistent=False)
-        self.register_buffer("bone_weight", body.bone_weight[chosen].float(), persistent=False)
-        self.register_buffer("means", vertices[chosen], persistent=False)
-        labels = body.vertex_labels[chosen].long()
+        self.accuracy = named_accuracy(accuracy)
+        self.points = SkinnedPoints(body, points)
+        labels = body.vertex_labels[self.points.chosen].long()
         self.classes = len(body.label_names)  # background included
         one_hot = functional.one_hot(labels, self.classes)[:, 1:].float()
         self.register_buffer("one_hot", one_hot, persistent=False)
-        self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1))
-        spacing = _nearest_distance(self.means)
+        self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(labels), 1))
+        spacing = self.points.spacing
         self.log_scales = nn.Parameter((scale * spacing).log().unsqueeze(-1).repeat(1, 3))
         logit = math.log(opacity / (1 - opacity))
-        self.logit_opacities = nn.Parameter(torch.full((count,), logit))
+        self.logit_opacities = nn.Parameter(torch.full((len(labels),), logit))
 
     def gaussians(self, pose: BodyPose) -> Gaussians:
         """The body's Gaussians in pose: covariances A Σ Aᵀ, features = one-hot class."""
-        bones = forward_kinematics(
-            self.joints, self.parents, axis_angle_to_matrix(pose.theta), pose.transl
-        )
-        A, t = blend_transforms(bones, self.bone_index, self.bone_weight)
+        A, t = self.points.blend(pose)
         batch = A.shape[0]
         rotation = quaternion_to_rotation_matrix(functional.normalize(self.quats, dim=-1, eps=1e-6))
         axes = A @ (rotation * self.log_scales.exp().unsqueeze(-2))
         return Gaussians(
-            means=(A @ self.means.unsqueeze(-1)).squeeze(-1) + t,
+            means=(A @ self.points.means.unsqueeze(-1)).squeeze(-1) + t,
             quats=None,
             scales=None,
             covariances=axes @ axes.mT,
@@ -110,33 +98,3 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor, floor: float = 1e-6)
     log = (segmentation + floor).log()
     total = functional.nll_loss(log, labels, ignore_index=IGNORE, reduction="sum")
     return total / (labels != IGNORE).sum().clamp_min(1)
-
-
-def farthest_points(vertices: Tensor, count: int) -> Tensor:
-    """``[count]`` indices of vertices far from each other, the first one first.
-
-    Meshes are dense in faces and hands; a subset in list order would leave arms and legs thin.
-
-    Args:
-        vertices: ``[V, 3]``.
-        count: at most V; V keeps the mesh's own order.
-    """
-    if count == len(vertices):
-        return torch.arange(count)
-    chosen = torch.zeros(count, dtype=torch.long)
-    nearest = torch.full((len(vertices),), math.inf)
-    for i in range(1, count):
-        nearest = torch.minimum(nearest, (vertices - vertices[chosen[i - 1]]).square().sum(-1))
-        chosen[i] = nearest.argmax()
-    return chosen
-
-
-def _nearest_distance(points: Tensor, chunk: int = 1024) -> Tensor:
-    """``[V]`` metres from each point to its nearest other point; coincident points get 1e-4."""
-    nearest = []
-    for start in range(0, len(points), chunk):
-        distance = torch.cdist(points[start : start + chunk], points)
-        rows = torch.arange(len(distance))
-        distance[rows, rows + start] = math.inf
-        nearest.append(distance.amin(dim=1))
-    return torch.cat(nearest).clamp_min(1e-4)

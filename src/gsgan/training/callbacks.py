@@ -32,7 +32,7 @@ class PictureGrid(Callback):
 
     def __init__(self, folder: Path, rows: int = 4) -> None:
         self.folder, self.rows = folder, rows
-        self._collected: list[list[Tensor]] = []
+        self._collected: list[dict[str, Tensor]] = []
 
     def on_validation_epoch_start(self, trainer: Trainer, module: LightningModule) -> None:
         self._collected = []
@@ -82,7 +82,7 @@ class Narrator(Callback):
         scores = trainer.callback_metrics
         line = f"{step:>6}/{total} {module.schedule.phase(max(0, step - 1)):<12}"
         line += f" held-out PSNR {float(scores['val/psnr']):5.2f} dB"
-        if module.avatar.generator is not None:
+        if module.avatar.generator is not None and "val/psnr_splat" in scores:
             line += f" (Step I's colour {float(scores['val/psnr_splat']):5.2f})"
         done = step - self._first
         if done:

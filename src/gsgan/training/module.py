@@ -19,7 +19,9 @@ from gsgan.model.discriminator import Discriminator
 from gsgan.model.segmentation import segmentation_loss
 from gsgan.precision import full_precision
 from gsgan.scene import Frame
+from gsgan.training.averaging import MovingAverage
 from gsgan.training.optimisers import Recipe, clip, set_rate
+from gsgan.training.rollback import Rollback
 from gsgan.training.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
 
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
@@ -107,14 +109,13 @@ class AvatarTraining(LightningModule):
             draws the same ones.
         max_skipped: non-finite gradients that are skipped before the run is stopped.
         log_every: iterations between logged values.
-        collapse: the run is stopped when the rendered alpha, averaged over an epoch, falls below
-            this share of the masks': opacities can all fall to 0 for good without a NaN.
+        average: decay of the moving average of Step II's weights, which is what gets scored; None
+            scores the weights as they are.
+        rollback: what is done when the rendered person vanishes.
         record: plain config values stored with every checkpoint.
 
     Source: paper Alg. 2; method.md § 7.
     """
-
-    coverage: Tensor
 
     def __init__(
         self,
@@ -130,7 +131,8 @@ class AvatarTraining(LightningModule):
         seed: int = 0,
         max_skipped: int = 20,
         log_every: int = 20,
-        collapse: float = 0.05,
+        average: float | None = None,
+        rollback: Rollback | None = None,
         record: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
@@ -144,11 +146,11 @@ class AvatarTraining(LightningModule):
         self.pose_noise, self.seed, self.log_every = pose_noise, seed, log_every
         if log_every < 1:
             raise ConfigError(f"training.log_every must be at least 1, got {log_every}")
-        self.max_skipped, self.record, self.collapse = max_skipped, record or {}, collapse
-        # Sums over the epoch: rendered alpha, and what the masks say it should be.
-        self.register_buffer("coverage", torch.zeros(2), persistent=False)
-        channels = 3 + avatar.deformation.features
-        self.feature_head = nn.Conv2d(channels, 3, 1) if step_one.feature_head else None
+        self.max_skipped, self.record = max_skipped, record or {}
+        self.rollback = rollback or Rollback()
+        self.average = MovingAverage(avatar, average) if paints and average is not None else None
+        wanted = step_one.feature_head and avatar.splat_channels > 3
+        self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1) if wanted else None
         self.step = 0  # iterations done: Lightning's global_step counts every optimiser's steps
         self.skipped = 0
         self.start_psnr: float | None = None
@@ -179,7 +181,8 @@ class AvatarTraining(LightningModule):
                 ([s.quats], 1.0), ([s.log_scales], 5.0), ([s.logit_opacities], 50.0),
             ]  # fmt: skip
         head = list(self.feature_head.parameters()) if self.feature_head else []
-        groups["psi"] = [([*avatar.deformation.parameters(), *head], 1.0)]
+        if avatar.splats is not None:
+            groups["psi"] = [*avatar.splats.parameter_groups(), (head, 1.0)]
         if avatar.generator is not None and avatar.pose_encoder is not None:
             pose = list(avatar.pose_encoder.parameters())
             groups["generator"] = [([*avatar.generator.parameters(), *pose], 1.0)]
@@ -213,7 +216,8 @@ class AvatarTraining(LightningModule):
         start, end = self.schedule.bounds(SEGMENTATION if name == "segmentation" else STEP_TWO)
         if name == "psi":  # one span over both steps: restarting the rate costs quality
             start = self.schedule.bounds(STEP_ONE)[0]
-        return self.recipes[name].rate.at(self.step, start, end)
+        rate = self.recipes[name].rate.at(self.step, start, end)
+        return rate * self.rollback.rate if name == "psi" else rate
 
     def _skip(self, names: tuple[str, ...]) -> None:
         self.skipped += 1
@@ -265,7 +269,10 @@ class AvatarTraining(LightningModule):
         if self.discriminator is not None:
             self.discriminator.requires_grad_(False)
         terms = self.step_two_terms(painting, frame, play)
-        self._descend(torch.stack(list(terms.values())).sum(), "psi", "generator")
+        learning = ("psi", "generator") if self.avatar.splats else ("generator",)
+        self._descend(torch.stack(list(terms.values())).sum(), *learning)
+        if self.average is not None:
+            self.average.update(self.avatar)
         for name, term in terms.items():
             self._log(f"step_two/{name}", term)
         if play:
@@ -292,31 +299,44 @@ class AvatarTraining(LightningModule):
             detach_features=self.step_two.detach_features,
             picture_height=height,
         )
-        self.coverage += torch.stack([painting.alpha.detach().mean(), frame.mask.mean()])
+        if painting.alpha is not None:
+            self.rollback.watch(painting.alpha, frame.mask)
         return painting
 
     def on_train_epoch_end(self) -> None:
-        """Stops a run whose person has vanished, before its checkpoint is overwritten."""
-        alpha, mask = self.coverage.tolist()
-        self.coverage.zero_()
-        if alpha < self.collapse * mask:
+        """Goes back to the last good state when the person has vanished, before it is saved."""
+        if self.rollback.share >= self.rollback.collapse:
+            self.rollback.keep(self)
+            return
+        found = self.optimizers()
+        optimisers = [o.optimizer for o in (found if isinstance(found, list) else [found])]
+        share = float(self.rollback.share)
+        what = f"the rendered person has vanished (alpha is {share:.1%} of the masks')"
+        if not self.rollback.restore(self, optimisers):
             raise GsganError(
-                f"training stopped at iteration {self.step}: the rendered person has vanished "
-                f"(alpha is {alpha / mask:.1%} of the masks'); the checkpoint before it is kept; "
+                f"training stopped at iteration {self.step}: {what}, also after "
+                f"{self.rollback.done} returns to a good state; the last good checkpoint is kept; "
                 "start again with a lower training.recipes.psi.rate.peak"
             )
+        self.print(
+            f"iteration {self.step}: {what}; back to the last good state, Ψ's learning rate times "
+            f"{self.rollback.rate:g} from here ({self.rollback.done} of at most "
+            f"{self.rollback.most})"
+        )
 
     # -- losses
 
     def step_one_loss(self, painting: Painting, frame: Frame) -> Tensor:
         """L_Ψ of Step I's colour, and of the linear readout of F."""
-        with full_precision(painting.features):
+        with full_precision(frame.image):
             return self._step_one_loss(painting, frame)
 
     def _step_one_loss(self, painting: Painting, frame: Frame) -> Tensor:
         weights = self.step_one
         background = self._background(frame)
         target = frame.image + (1 - frame.mask) * background
+        assert painting.features is not None and painting.alpha is not None  # noqa: PT018
+        assert painting.colour is not None
         behind = (1 - painting.alpha) * background
         loss = photometric(painting.colour + behind, target, l1=weights.l1, ssim=weights.ssim)
         if self.feature_head is not None:
@@ -333,7 +353,7 @@ class AvatarTraining(LightningModule):
         w, image, target = self.step_two, painting.image, frame.image
         assert image is not None
         terms = {"photometric": photometric(image, target, l1=w.l1, l2=w.l2, ssim=w.ssim)}
-        if w.anchor:
+        if w.anchor and painting.features is not None:
             terms["anchor"] = w.anchor * self.step_one_loss(painting, frame)
         if self.perceptual is not None and self.step % w.perceptual_every == 0:
             scale = w.perceptual * w.perceptual_every
@@ -373,12 +393,20 @@ class AvatarTraining(LightningModule):
     def validation_step(  # type: ignore[override]
         self, frame: Frame, batch_idx: int
     ) -> Painting:
-        painting = self.avatar.paint(frame)
-        assert painting.image is not None
+        painting: Painting = self.shown.paint(frame)
         for name, picture in (("psnr", painting.image), ("psnr_splat", painting.colour)):
+            if picture is None:
+                continue
             score = psnr(picture.clamp(0, 1), frame.image).mean()
             self.log(f"val/{name}", score, batch_size=len(frame), sync_dist=True)
         return painting
+
+    @property
+    def shown(self) -> Avatar:
+        """The avatar that is watched and scored: the average, once there is one."""
+        if self.average is None or not self.average.started:
+            return self.avatar
+        return self.average.module.eval()  # type: ignore[return-value]
 
     def on_validation_epoch_end(self) -> None:
         self.last_psnr = float(self.trainer.callback_metrics["val/psnr"])
@@ -393,6 +421,8 @@ class AvatarTraining(LightningModule):
         checkpoint["gsgan"] = {
             "step": self.step,
             "skipped": self.skipped,
+            "rollbacks": self.rollback.done,
+            "averaged": self.average is not None and self.average.started,
             "start_psnr": self.start_psnr,
             "marks": self.marks,
             "record": self.record,
@@ -401,13 +431,16 @@ class AvatarTraining(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         state = checkpoint["gsgan"]
         self.step, self.skipped = state["step"], state["skipped"]
+        self.rollback.done = state["rollbacks"]
         self.start_psnr = state["start_psnr"]
 
 
 def _fit_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
     if avatar.segmentation is None:
         schedule = replace(schedule, segmentation=0)
+    both = schedule.step_one + schedule.step_two
     if avatar.generator is None:
-        both = schedule.step_one + schedule.step_two
         schedule = replace(schedule, step_one=both, step_two=0)
+    if avatar.splats is None:
+        schedule = replace(schedule, step_one=0, step_two=both)
     return schedule

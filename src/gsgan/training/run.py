@@ -17,6 +17,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
+from torch.utils.flop_counter import FlopCounterMode
 
 from gsgan.console import make_console
 from gsgan.data.datamodule import GsganData
@@ -69,7 +70,7 @@ def run_training(config: DictConfig) -> None:
     report_progress(console, folder, module)
     if config.evaluate:
         module.to(trainer.strategy.root_device)  # Lightning leaves it on the CPU
-        avatar = module.avatar.eval()
+        avatar = module.shown.eval()
         evaluate_run(folder, config, console, data=data, avatar=avatar, marks=module.marks)
     console.print(f"run folder: {folder}", soft_wrap=True)
 
@@ -146,6 +147,7 @@ def describe(console: Console, folder: Path, data: GsganData, module: AvatarTrai
     )
     for name, part in parts(avatar, module).items():
         table.add_row(name, f"{sum(p.numel() for p in part.parameters()):,} parameters")
+    table.add_row("a picture costs", cost(avatar, data))
     for effect, (on, why) in effects(data, avatar).items():
         table.add_row(effect, f"{'on' if on else 'off'}: {why}")
     s = module.schedule
@@ -161,12 +163,26 @@ def parts(avatar: Avatar, module: AvatarTraining) -> dict[str, torch.nn.Module]:
     """The trained parts by name; those not built are absent."""
     found = {
         "Ψ": avatar.deformation,
+        "surface": avatar.surface,
         "segmentation": avatar.segmentation,
         "pose encoder": avatar.pose_encoder,
         "generator": avatar.generator,
         "discriminator": module.discriminator,
     }
     return {name: part for name, part in found.items() if part is not None}
+
+
+def cost(avatar: Avatar, data: GsganData) -> str:
+    """Arithmetic of the networks for one training picture, counted by running it once.
+
+    The rasterisers are not in it: what they do depends on the settings (`python -m gsgan.bench`).
+    """
+    frame = data.dataset("train")[0].to(next(avatar.parameters()).device)
+    with torch.no_grad(), FlopCounterMode(display=False) as counter:
+        avatar.paint(frame)
+    window = avatar.window(frame)
+    height, width = frame.camera.size if window is None else window.size
+    return f"{counter.get_total_flops() / 1e9:.2f} GFLOP in the networks, {width} x {height} pixels"
 
 
 def effects(data: GsganData, avatar: Avatar) -> dict[str, tuple[bool, str]]:
