@@ -1,0 +1,1 @@
+"""From calibrated, synchronised videos to a capture that `data=capture` reads."""

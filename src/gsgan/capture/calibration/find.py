@@ -1,0 +1,115 @@
+"""Which calibration format a file holds, and where one may lie in a capture folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from gsgan.capture.calibration.opencv_yaml import read_opencv_yaml
+from gsgan.capture.calibration.own_json import read_own_json
+from gsgan.capture.calibration.qualisys import read_qualisys
+from gsgan.capture.calibration.toml_tables import read_toml
+from gsgan.data.cameras import CameraEntry
+from gsgan.errors import DataError
+
+HEAD = 65536  # bytes enough to tell the formats apart
+PATTERNS = ("cameras.json", "intri.yml", "intri.yaml", "*.qca.txt", "*.qca", "*.toml")
+KNOWN = (
+    "OpenCV YAML (intri.yml beside extri.yml), TOML of Pose2Sim or aniposelib, Qualisys .qca.txt, "
+    "or cameras.json"
+)
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The cameras of a calibration file.
+
+    Args:
+        path: the file.
+        format: its name in words.
+        cameras: by name, metres, K with pixel centres at +0.5; a size of (0, 0) is not known.
+        notes: one sentence for each thing left out or unusual.
+    """
+
+    path: Path
+    format: str
+    cameras: dict[str, CameraEntry]
+    notes: tuple[str, ...] = ()
+
+
+class Reader(Protocol):
+    """Reads one format: path, metres in a unit (None: the format's own), K's pixel centre."""
+
+    def __call__(
+        self, path: Path, scale: float | None, pixel_centre: float
+    ) -> tuple[dict[str, CameraEntry], list[str]]: ...
+
+
+FORMATS: dict[str, tuple[Callable[[str], bool], Reader]] = {
+    "OpenCV YAML": (lambda head: head.lstrip().startswith("%YAML"), read_opencv_yaml),
+    "Qualisys": (lambda head: "<calibration" in head and "<camera" in head, read_qualisys),
+    "cameras.json": (lambda head: head.lstrip().startswith("{"), read_own_json),
+    "TOML": (lambda head: "[" in head and "matrix" in head, read_toml),
+}
+
+
+def read_calibration(
+    path: Path, unit_scale: float | None = None, pixel_centre: float = 0.0
+) -> Calibration:
+    """The cameras of a calibration file, whichever of the known formats it is.
+
+    Args:
+        path: the file; for OpenCV YAML either of the two.
+        unit_scale: metres in one unit of its lengths, None for the format's own (Qualisys mm,
+            else m; cameras.json says it in meta.json).
+        pixel_centre: where K puts the first pixel's centre, 0 or 0.5; cameras.json says it itself.
+
+    Raises:
+        DataError: when it is none of the formats, or what it says cannot be.
+    """
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(HEAD).decode("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise DataError(
+            f"{path} cannot be read ({error.strerror or error}); give the calibration file"
+        ) from None
+    for name, (fits, reader) in FORMATS.items():
+        if fits(head):
+            cameras, notes = reader(path, unit_scale, pixel_centre)
+            if not cameras:
+                raise DataError(f"{path} ({name}) lists no camera that can be used")
+            return Calibration(path, name, cameras, tuple(notes))
+    raise DataError(f"{path} is not a calibration that is known; expected {KNOWN}")
+
+
+def find_calibration(folder: Path) -> Path:
+    """The one calibration file in a capture folder, or in a folder in it named like calibration.
+
+    Raises:
+        DataError: when there is none, or more than one.
+    """
+    places = [folder, *sorted(p for p in folder.glob("*") if p.is_dir() and _named_so(p))]
+    found = sorted({p for place in places for pattern in PATTERNS for p in place.glob(pattern)})
+    found = [p for p in found if p.suffix != ".toml" or "matrix" in _text(p)]  # not a config file
+    if not found:
+        raise DataError(f"{folder} holds no calibration; give calibration=<file>: {KNOWN}")
+    if len(found) > 1:
+        names = ", ".join(str(p.relative_to(folder)) for p in found)
+        raise DataError(
+            f"{folder} holds more than one calibration ({names}); give calibration=<file>"
+        )
+    return found[0]
+
+
+def _named_so(folder: Path) -> bool:
+    return "calib" in folder.name.lower()
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(errors="replace")
+    except OSError:
+        return ""

@@ -1,0 +1,121 @@
+"""OpenCV YAML in two files, intri.yml and extri.yml, as EasyMocap writes them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from gsgan.data.cameras import CameraEntry, make_camera, numbers
+from gsgan.errors import DataError
+
+SAME_ROTATION = 1e-3  # largest entry in which Rot_ and R_ of one camera may differ
+
+
+def read_opencv_yaml(
+    path: Path, scale: float | None, pixel_centre: float
+) -> tuple[dict[str, CameraEntry], list[str]]:
+    """Cameras by name: K, dist (or D), H, W from intri; Rot, R (Rodrigues), T from extri.
+
+    Convention: metres; world to camera. The two files list names in different orders and with
+    "none" entries, so cameras are paired by name alone. Without H and W the size is (0, 0).
+
+    Raises:
+        DataError: when one file or one camera's half is missing, or they contradict each other.
+    """
+    intri_path, extri_path = _both(path)
+    intri, extri = _open(intri_path), _open(extri_path)
+    names, notes = _names(intri), list[str]()
+    cameras = {}
+    for name in names:
+        where = f"{intri_path}, camera {name}"
+        rotation, T = _rotation(extri, extri_path, name), _matrix(extri, f"T_{name}")
+        if rotation is None or T is None:
+            raise DataError(
+                f"{extri_path} lacks Rot_{name} (or R_{name}) and T_{name}, but {intri_path} "
+                f"lists the camera {name}; calibrate it, or take it out of both"
+            )
+        dist = _matrix(intri, f"dist_{name}")
+        if dist is None:
+            dist = _matrix(intri, f"D_{name}")
+        if dist is None:
+            notes.append(f"{intri_path} says no lens distortion for {name}: taken as none")
+        cameras[name] = make_camera(
+            where,
+            name,
+            K=_matrix(intri, f"K_{name}"),
+            R=rotation,
+            t=T,
+            dist=None if dist is None else dist.reshape(-1)[:8].tolist(),
+            size=(_integer(intri, f"H_{name}"), _integer(intri, f"W_{name}")),
+            scale=scale or 1.0,
+            pixel_centre=pixel_centre,
+        )
+    return cameras, notes
+
+
+def _both(path: Path) -> tuple[Path, Path]:
+    pair = []
+    for own, other in (("intri", "extri"), ("extri", "intri")):
+        if own in path.name.lower():
+            pair = [path, path.with_name(path.name.replace(own, other))]
+            pair = pair if own == "intri" else pair[::-1]
+    if not pair:
+        raise DataError(f"{path}: expected OpenCV YAML named intri.yml beside extri.yml")
+    for file in pair:
+        if not file.is_file():
+            raise DataError(f"{file} does not exist; intri.yml and extri.yml belong together")
+    return pair[0], pair[1]
+
+
+def _open(path: Path) -> Any:
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        if storage.isOpened() and storage.root().isMap():
+            return storage
+    except (cv2.error, SystemError):
+        pass
+    raise DataError(f"{path} is not readable as OpenCV YAML; it may be cut off: export it again")
+
+
+def _names(intri: Any) -> list[str]:
+    node = intri.getNode("names")
+    listed = [node.at(i).string() for i in range(node.size())] if node.isSeq() else []
+    if not listed:
+        keys: tuple[str, ...] = intri.root().keys()
+        listed = [key[2:] for key in keys if key.startswith("K_")]
+    return [name for name in dict.fromkeys(listed) if name and name != "none"]
+
+
+def _matrix(storage: Any, key: str) -> np.ndarray | None:
+    node = storage.getNode(key)
+    if node.empty():
+        return None
+    try:
+        value = node.mat()
+    except cv2.error:
+        value = None
+    return np.full(1, np.nan) if value is None else np.asarray(value, np.float64)
+
+
+def _integer(storage: Any, key: str) -> int:
+    node = storage.getNode(key)
+    return max(0, int(node.real())) if node.isInt() or node.isReal() else 0
+
+
+def _rotation(extri: Any, path: Path, name: str) -> np.ndarray | None:
+    matrix, vector = _matrix(extri, f"Rot_{name}"), _matrix(extri, f"R_{name}")
+    if vector is None:
+        return matrix
+    turned = cv2.Rodrigues(numbers(f"{path}, camera {name}", vector, f"R_{name}", (3,)))[0]
+    if matrix is None:
+        return turned
+    matrix = numbers(f"{path}, camera {name}", matrix, f"Rot_{name}", (3, 3))
+    if np.abs(matrix - turned).max() > SAME_ROTATION:
+        raise DataError(
+            f"{path}, camera {name}: Rot_{name} and R_{name} are different rotations (by "
+            f"{np.abs(matrix - turned).max():.3g}); keep the right one"
+        )
+    return matrix

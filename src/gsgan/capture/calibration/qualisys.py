@@ -1,0 +1,93 @@
+"""Qualisys Track Manager's calibration, .qca.txt, which is XML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from gsgan.data.cameras import CameraEntry, make_camera
+from gsgan.data.files import natural_order
+from gsgan.errors import DataError
+
+SUBPIXELS = 64  # parts of a pixel in which focal lengths and centres are written
+MILLIMETRE = 1e-3
+VIDEO_MODELS = ("video", "hybrid", "none")  # the others see markers only
+OPENCV_AXES = np.diag([1.0, -1.0, -1.0])  # Qualisys cameras look along -z, y up
+
+
+def read_qualisys(
+    path: Path, scale: float | None, pixel_centre: float
+) -> tuple[dict[str, CameraEntry], list[str]]:
+    """Video cameras by serial, in natural order.
+
+    Convention: positions in mm (or ``scale``); ``R = diag(1, -1, -1) r`` with r as the rows of the
+    file say, ``t = -R C``; focal lengths and centre in 1/64 pixel, the centre counted from the
+    sensor's corner, so the video window's left and top come off.
+
+    Raises:
+        DataError: when it is no such file, or a number is missing or cannot be.
+    """
+    try:
+        root = ElementTree.fromstring(path.read_bytes())
+    except (ElementTree.ParseError, OSError, ValueError, LookupError) as error:
+        raise DataError(f"{path} is not readable as a Qualisys calibration: {error}") from None
+    found, notes = {}, list[str]()
+    for node in root.iter("camera"):
+        serial = node.get("serial", "")
+        model = node.get("model", "none").lower()
+        if not any(word in model for word in VIDEO_MODELS):
+            notes.append(f"{path}: camera {serial} ({model}) takes no video and is left out")
+            continue
+        found[serial] = _camera(path, serial, node, scale or MILLIMETRE, pixel_centre)
+        if node.get("viewrotation", "0") != "0":
+            notes.append(
+                f"{path}: camera {serial} is turned by {node.get('viewrotation')} degrees; its "
+                "video must be stored as the sensor saw it"
+            )
+    return {name: found[name] for name in sorted(found, key=natural_order)}, notes
+
+
+def _camera(
+    path: Path, serial: str, node: ElementTree.Element, scale: float, pixel_centre: float
+) -> CameraEntry:
+    where = f"{path}, camera {serial}"
+
+    def part(tag: str) -> Mapping[str, str]:
+        child = node.find(tag)
+        if child is None:
+            raise DataError(f"{where}: <{tag}> is missing; export the calibration again")
+        return child.attrib
+
+    intrinsic, transform, window = part("intrinsic"), part("transform"), part("fov_video")
+    try:
+        f_u, f_v, c_u, c_v = (
+            float(intrinsic[f"{kind}{axis}"]) / SUBPIXELS
+            for kind in ("focalLength", "centerPoint")
+            for axis in "UV"
+        )
+        skew = float(intrinsic.get("skew", 0)) / SUBPIXELS
+        lens = [f"radialDistortion{i}" for i in (1, 2)]
+        lens += [f"tangentalDistortion{i}" for i in (1, 2)] + ["radialDistortion3"]
+        dist = [float(intrinsic[key]) for key in lens]
+        r = np.array([[float(transform[f"r{i}{j}"]) for j in (1, 2, 3)] for i in (1, 2, 3)])
+        C = np.array([float(transform[axis]) for axis in "xyz"])
+        left, top, right, bottom = (
+            int(float(window[side])) for side in ("left", "top", "right", "bottom")
+        )
+    except (KeyError, ValueError, OverflowError) as error:
+        raise DataError(f"{where}: a number is missing or unreadable ({error})") from None
+    R = OPENCV_AXES @ r
+    return make_camera(
+        where,
+        serial,
+        K=[[f_u, skew, c_u - left], [0, f_v, c_v - top], [0, 0, 1]],
+        R=R,
+        t=-R @ C,
+        dist=dist,
+        size=(bottom - top + 1, right - left + 1),
+        scale=scale,
+        pixel_centre=pixel_centre,
+    )

@@ -1,0 +1,185 @@
+"""Whose calibration is wrong, and what that usually means: the cameras' scores in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from gsgan.checking.calibration import (
+    EXTRINSICS,
+    INVERSE,
+    MIRRORED,
+    WHOLE,
+    CameraScore,
+    Rival,
+    known_mean,
+)
+from gsgan.checking.findings import Finding, Level, listed
+from gsgan.checking.settings import Limits
+
+ADVICE = {
+    MIRRORED: "mirror its pictures and masks back",
+    INVERSE: "invert its R and t: x_cam = R x + t is expected",
+    EXTRINSICS: "check its R, t and folder name",
+    WHOLE: "check its calibration and folder name",
+}
+
+
+def beaten(score: CameraScore, limits: Limits) -> bool:
+    """Whether another calibration explains the masks better, and well."""
+    margin = score.overlap + limits.better_fit
+    return score.rival_overlap > max(margin, limits.credible_overlap)
+
+
+def shifted(score: CameraScore, limits: Limits) -> bool:
+    """Whether the masks lie beside the skeleton, by more than bodies and skeletons differ."""
+    gain = score.shift_overlap - score.overlap
+    return score.shift_metres > limits.shift and gain > limits.better_fit
+
+
+def wrong_cameras(scores: Sequence[CameraScore], limits: Limits) -> frozenset[str]:
+    """The cameras whose calibration or masks are wrong as a whole."""
+    return frozenset(
+        s.name for s in scores if not s.inside >= limits.inside_error or beaten(s, limits)
+    )
+
+
+def misfits(scores: Sequence[CameraScore], limits: Limits) -> frozenset[str]:
+    """The cameras whose masks do not fit the skeleton as a whole, for whatever reason."""
+    beside = frozenset(s.name for s in scores if shifted(s, limits) or s.lag)
+    return beside | wrong_cameras(scores, limits)
+
+
+def judge_cameras(
+    scores: Sequence[CameraScore], limits: Limits, told: Iterable[str] = ()
+) -> list[Finding]:
+    """What is wrong with which camera, and what that usually means.
+
+    Args:
+        scores: of all cameras.
+        limits: from where on something is wrong.
+        told: cameras of which a plainer reason was told already.
+    """
+    found, told = list[Finding](), set(told)
+    best = {s.name: s for s in scores if beaten(s, limits)}
+    for one, other in combinations(best.values(), 2):
+        ours, theirs = _claim(one, other, limits), _claim(other, one, limits)
+        if ours and theirs and not {one.name, other.name} & told:
+            found.append(_swapped((one, ours), (other, theirs)))
+            told |= {one.name, other.name}
+    wrong = wrong_cameras(scores, limits)
+    if len(scores) > 1 and not best and len(wrong) == len(scores):
+        return [_all_wrong(scores, limits)]
+    if len(scores) > 1 and all(shifted(s, limits) for s in scores):
+        return [_all_beside(scores, "error" if wrong else "warning")]
+    for score in scores:
+        if score.name in best and score.name not in told:
+            found.append(_explained(score, scores, limits))
+        elif score.lag:
+            found.append(_out_of_step(score, "error" if score.name in wrong else "warning"))
+        elif score.name not in told:
+            found += _unexplained(score, scores, limits)
+    return found
+
+
+def _seen(score: CameraScore, scores: Sequence[CameraScore]) -> str:
+    others = known_mean([s.inside for s in scores if s.name != score.name])
+    seen = f"{score.inside:.0%} of the joints lie inside its masks"
+    return f"{seen}, {others:.0%} in the other cameras" if len(scores) > 1 else seen
+
+
+def _claim(score: CameraScore, other: CameraScore, limits: Limits) -> Rival | None:
+    """The other camera's calibration, where it explains the masks about as well as anything."""
+    for rival in score.rivals:
+        if rival.other == other.name and rival.overlap > score.rival_overlap - limits.better_fit:
+            return rival
+    return None
+
+
+def _explained(score: CameraScore, scores: Sequence[CameraScore], limits: Limits) -> Finding:
+    best = score.rivals[0]
+    close = [r for r in score.rivals if r.overlap > best.overlap - limits.better_fit]
+    what = dict.fromkeys(f"{r.kind} {r.other}".strip() for r in close)
+    kinds = {rival.kind for rival in close}
+    advice = [text for kind, text in ADVICE.items() if kind in kinds]
+    return Finding(
+        "error", "calibration",
+        f"camera {score.name}: {' or '.join(what)} would fit its masks better (overlap "
+        f"{best.overlap:.2f}) than its own calibration ({score.overlap:.2f}); "
+        f"{_seen(score, scores)}; {', or '.join(dict.fromkeys(advice))}",
+    )  # fmt: skip
+
+
+def _unexplained(
+    score: CameraScore, scores: Sequence[CameraScore], limits: Limits
+) -> list[Finding]:
+    if np.isnan(score.inside):
+        text = (
+            f"camera {score.name}: its masks are empty, or no joint lies in its pictures; check "
+            "both folders and K"
+        )
+        return [Finding("error", "calibration", text)]
+    level: Level = "error" if not score.inside >= limits.inside_error else "warning"
+    if shifted(score, limits):
+        text = (
+            f"camera {score.name}: its masks lie {_pixels(score)} pixels (right, down) beside the "
+            f"skeleton; {_seen(score, scores)}. A crop or resize that K does not follow, or masks "
+            "of other pictures, do this"
+        )
+    elif not score.inside >= limits.inside_warning:
+        text = (
+            f"camera {score.name}: only {_seen(score, scores)}. One camera alone points to its "
+            "extrinsics, to exchanged folder names, to lens distortion left out, or to masks of "
+            "other pictures; look at its overlays"
+        )
+    else:
+        return []
+    return [Finding(level, "calibration", text)]
+
+
+def _pixels(score: CameraScore) -> str:
+    return f"{score.shift[0]:+.0f}, {score.shift[1]:+.0f}"
+
+
+def _swapped(one: tuple[CameraScore, Rival], other: tuple[CameraScore, Rival]) -> Finding:
+    (a, of_a), (b, of_b) = one, other
+    what = "R and t" if of_a.kind == EXTRINSICS else "calibration"
+    return Finding(
+        "error", "calibration",
+        f"cameras {a.name} and {b.name} look exchanged: the {what} of the other would fit the "
+        f"masks of each better (overlap {of_a.overlap:.2f} and {of_b.overlap:.2f}) than its own "
+        f"({a.overlap:.2f} and {b.overlap:.2f}); exchange them in the calibration, or rename the "
+        "folders",
+    )  # fmt: skip
+
+
+def _all_beside(scores: Sequence[CameraScore], level: Level) -> Finding:
+    return Finding(
+        level, "calibration",
+        "in every camera the masks lie beside the skeleton, by pixels right, down: "
+        f"{listed(f'{s.name} {_pixels(s)}' for s in scores)}; the skeleton is moved or of another "
+        "size, or pictures were cropped and K did not follow",
+    )  # fmt: skip
+
+
+def _all_wrong(scores: Sequence[CameraScore], limits: Limits) -> Finding:
+    if all(shifted(s, limits) for s in scores):
+        return _all_beside(scores, "error")
+    return Finding(
+        "error", "calibration",
+        f"in every camera joints lie outside the masks (inside: "
+        f"{listed(f'{s.name} {s.inside:.0%}' for s in scores)}): the skeleton's axes, unit or "
+        "frame numbers do not fit the cameras, or the masks belong to other pictures",
+    )  # fmt: skip
+
+
+def _out_of_step(score: CameraScore, level: Level) -> Finding:
+    when = "later" if score.lag > 0 else "earlier"
+    return Finding(
+        level, "synchronisation",
+        f"camera {score.name}: its pictures fit the skeleton {abs(score.lag)} frame(s) {when} "
+        f"better (joints {100 * score.lag_outside:.1f} cm outside the masks instead of "
+        f"{100 * score.outside:.1f}); its clock or its numbering is off: add {score.lag:+d}",
+    )  # fmt: skip
