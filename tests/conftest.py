@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
 
@@ -11,7 +12,8 @@ from omegaconf import DictConfig
 
 import gsgan.compat  # noqa: F401  (before anything imports torchvision)
 
-sys.path.insert(0, str(Path(__file__).parent / "data"))
+for folder in ("data", "capture"):  # what tests of other folders share with them
+    sys.path.insert(0, str(Path(__file__).parent / folder))
 torch.set_num_threads(1)  # tensors here are tiny: more threads only wait for each other
 
 
@@ -77,3 +79,38 @@ def build(tiny):
         return data, build_avatar(config, data), data.dataset("train")[0]
 
     return run
+
+
+@pytest.fixture
+def inside(tmp_path, monkeypatch, capfd):
+    """The same in this process, for the many ways to go wrong: seconds less each."""
+    from types import SimpleNamespace
+
+    def run(command: str, *args: str):
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("COLUMNS", "120")
+        monkeypatch.setattr(sys, "argv", [f"gsgan.{command}", *args])
+        capfd.readouterr()
+        code = 0
+        try:
+            importlib.import_module(f"gsgan.{command}").main()
+        except SystemExit as end:
+            code = 0 if end.code is None else end.code
+        out, err = capfd.readouterr()
+        return SimpleNamespace(returncode=code, stdout=out, stderr=err)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished tiny run, made by the real command."""
+    from commands import train
+
+    folder = tmp_path_factory.mktemp("runs") / "one"
+    result = train(capture, folder)
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert f"run folder: {folder}" in result.stdout.replace("\n", "")
+    assert "floor" in result.stdout
+    assert "marked: perceptual loss" in result.stdout
+    return folder

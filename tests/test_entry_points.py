@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import json
-import os
-import re
 import shutil
 import subprocess
 import sys
@@ -14,73 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from commands import ENVIRONMENT, TINY, arguments, gsgan, refused, train
 
-ROOT = Path(__file__).parents[1]
-TINY = ["size=tiny", "training=smoke", "data=capture", "data.size=32", "data.crop=null"]
 METRICS = {"psnr", "ssim", "lpips", "edge_f1", "miou"}
-
-
-# One thread: sums are rounded in another order with another number of threads.
-ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
-
-
-def gsgan(command: str, *args: str, cwd: Path, timeout: int = 300, environment: dict = ENVIRONMENT):
-    """Runs ``python -m gsgan.<command>`` from another directory, as an installed user would."""
-    return subprocess.run(
-        [sys.executable, "-m", f"gsgan.{command}", *args],
-        cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout,
-    )  # fmt: skip
-
-
-def train(capture: Path, run: Path, *args: str, cwd: Path | None = None):
-    return gsgan("train", *arguments(capture, run), *args, cwd=cwd or run.parent)
-
-
-def arguments(capture: Path, run: Path) -> list[str]:
-    """Of a tiny training run."""
-    return [*TINY, f"data.root={capture}", f"hydra.run.dir={run}"]
-
-
-@pytest.fixture
-def inside(tmp_path, monkeypatch, capfd):
-    """The same in this process, for the many ways to go wrong: seconds less each."""
-    from types import SimpleNamespace
-
-    def run(command: str, *args: str):
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setenv("COLUMNS", "120")
-        monkeypatch.setattr(sys, "argv", [f"gsgan.{command}", *args])
-        capfd.readouterr()
-        code = 0
-        try:
-            importlib.import_module(f"gsgan.{command}").main()
-        except SystemExit as end:
-            code = 0 if end.code is None else end.code
-        out, err = capfd.readouterr()
-        return SimpleNamespace(returncode=code, stdout=out, stderr=err)
-
-    return run
-
-
-def refused(result, *words: str) -> None:
-    """One sentence on stderr, a non-zero exit, no traceback."""
-    assert result.returncode != 0, result.stdout
-    assert "Traceback" not in result.stderr + result.stdout
-    text = " ".join(result.stderr.split())
-    for word in words:
-        assert word in text, text
-
-
-@pytest.fixture(scope="module")
-def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished tiny run, made by the real command."""
-    folder = tmp_path_factory.mktemp("runs") / "one"
-    result = train(capture, folder)
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert f"run folder: {folder}" in result.stdout.replace("\n", "")
-    assert "floor" in result.stdout
-    assert "marked: perceptual loss" in result.stdout
-    return folder
 
 
 def test_a_run_leaves_metrics_pictures_config_log_and_checkpoint(run):
@@ -324,37 +257,3 @@ def test_splat_only_and_wo_feat_run_to_the_end(capture, tmp_path, inside):
     scores = metrics["novel_pose"]
     assert scores["full"]["psnr"] == scores["splat"]["psnr"]
     assert scores["full"]["miou_reason"] == "the model has no segmentation"
-
-
-def documented() -> list[str]:
-    """Every ``python -m gsgan…`` of README and docs, once."""
-    text = "\n".join(p.read_text() for p in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
-    blocks = re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
-    lines = [line.split("#")[0].strip() for block in blocks for line in block.splitlines()]
-    return sorted({line for line in lines if line.startswith("python -m gsgan")})
-
-
-@pytest.mark.parametrize("line", documented())
-def test_every_documented_command_runs(line, run, capture, inside):
-    """As written, but tiny: placeholders filled in, the default person replaced by a capture."""
-    line = line.replace("/path/to/capture", str(capture)).replace("<run folder>", str(run))
-    _, _, module, *arguments = line.split()
-    if module == "gsgan.train":
-        given = [a for a in arguments if a != "experiment=demo"]
-        if not any(a.startswith("data=") for a in given):
-            given.append("data=capture")
-        if "data=capture" not in given:  # readers still to come: the promise is a clear refusal
-            refused(inside("train", *given), "data.root")
-            return
-        given += [t for t in TINY if not t.startswith("data=")]
-        if not any(a.startswith("data.root=") for a in given):
-            given.append(f"data.root={capture}")
-        # One kind of machine runs the tests.
-        given = [a for a in given if a not in ("trainer=gpu", "trainer=ddp")]
-        result = inside("train", *given)
-    else:
-        name = module.removeprefix("gsgan").lstrip(".")
-        if not name:
-            return  # the bare list of commands: test_the_list_of_commands
-        result = inside(name, *arguments)
-    assert result.returncode == 0, result.stdout + result.stderr

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from make import ring_camera, skeletons
+from make import distorted_pixels, ring_camera, skeletons, write_tiny_capture
 
 from gsgan.capture.rig import Rig
 from gsgan.data.cameras import CameraEntry, make_camera
@@ -138,3 +138,27 @@ def write_own(path: Path, cameras: Sequence[CameraEntry]) -> Path:
     }
     path.write_text(json.dumps(content))
     return path
+
+
+def write_project(
+    root: Path, cameras: int = 3, frames: int = 6, size: tuple[int, int] = (96, 80)
+) -> Path:
+    """A folder with videos, calibration, 2D landmarks (pose/) and masks of a known person."""
+    write_tiny_capture(
+        root, cameras=cameras, frames=frames, size=size, dist=[-0.1, 0.05, 0.001, -0.001, 0.0]
+    )
+    truth, rig = skeletons(frames), json.loads((root / "cameras.json").read_text())
+    (root / "videos").mkdir()
+    (root / "pose").mkdir()
+    for name, camera in rig.items():
+        video = cv2.VideoWriter(
+            str(root / "videos" / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30, size
+        )
+        for path in sorted((root / "images" / name).iterdir()):
+            video.write(cv2.imread(str(path)))
+        video.release()
+        px = np.stack([distorted_pixels(camera, p) for p in truth])
+        conf, ids = np.ones(px.shape[:2]), np.arange(frames)
+        np.savez(root / "pose" / f"{name}.npz", px=px, conf=conf, frame_id=ids)
+    (root / "landmarks3d.npz").unlink()
+    return root

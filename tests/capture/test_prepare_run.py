@@ -9,7 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from make import distorted_pixels, skeletons, write_tiny_capture
+from capture_scenes import write_project
+from make import skeletons
 from rich.console import Console
 from test_prepare_points3d import write_trc
 
@@ -22,30 +23,12 @@ from gsgan.errors import ConfigError, DataError, GsganError
 from gsgan.prepare import prepare as command
 
 CAMERAS, FRAMES, SIZE = 3, 6, (96, 80)
-LENS = [-0.1, 0.05, 0.001, -0.001, 0.0]
 
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     """A project folder: videos, calibration, 2D landmarks and masks of a person that is known."""
-    root = tmp_path / "project"
-    write_tiny_capture(root, cameras=CAMERAS, frames=FRAMES, size=SIZE, dist=LENS)
-    truth, rig = skeletons(FRAMES), json.loads((root / "cameras.json").read_text())
-    (root / "videos").mkdir()
-    (root / "pose").mkdir()
-    for name, camera in rig.items():
-        video = cv2.VideoWriter(
-            str(root / "videos" / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30, SIZE
-        )
-        for path in sorted((root / "images" / name).iterdir()):
-            video.write(cv2.imread(str(path)))
-        video.release()
-        px = np.stack([distorted_pixels(camera, p) for p in truth])
-        conf, ids = np.ones(px.shape[:2]), np.arange(FRAMES)
-        np.savez(root / "pose" / f"{name}.npz", px=px, conf=conf, frame_id=ids)
-    for file in root.glob("landmarks3d.npz"):
-        file.unlink()
-    return root
+    return write_project(tmp_path / "project", CAMERAS, FRAMES, SIZE)
 
 
 def options(project: Path, **more) -> Options:

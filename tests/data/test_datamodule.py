@@ -16,7 +16,7 @@ import pytest
 import torch
 from make import skeletons, write_landmarks, write_tiny_capture
 
-from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order, unsupported
+from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order
 from gsgan.data.layout import Layout
 from gsgan.data.splits import make_splits, parse_frames, parse_names
 from gsgan.errors import ConfigError, DataError, GsganError
@@ -377,13 +377,13 @@ def conf(name: str, *overrides: str) -> Any:
         return compose(overrides=chosen).data
 
 
-@pytest.mark.parametrize("name", ["capture", "zju_mocap", "thuman4"])
+@pytest.mark.parametrize("name", ["capture", "zju_mocap", "thuman4", "avatarrex", "easymocap"])
 def test_a_dataset_without_root_says_so(name: str) -> None:
     with pytest.raises(InstantiationException) as caught:
         instantiate(conf(name))
     cause = caught.value.__cause__
     assert isinstance(cause, ConfigError)
-    assert str(cause).startswith("data.root is not set: give the folder of a ")
+    assert str(cause).startswith("data.root is not set: give the folder of a")
 
 
 def test_capture_config_builds_and_reads(capture: Path) -> None:
@@ -429,23 +429,6 @@ def test_a_wrong_root_says_so(tmp_path: Path) -> None:
     data = instantiate(conf("capture", f"root={tmp_path / 'no'}"))
     with pytest.raises(DataError, match=r"data.root=.*no does not exist"):
         data.setup()
-
-
-@pytest.mark.parametrize("name", ["thuman4"])
-def test_layouts_that_are_not_read_yet(name: str, tmp_path: Path) -> None:
-    for root, message in [
-        (tmp_path / "no", "does not exist; expected the folder of a "),
-        (tmp_path, "is not supported yet; convert it to the bring-your-own layout"),
-    ]:
-        with pytest.raises(InstantiationException) as caught:
-            instantiate(conf(name, f"root={root}"))
-        assert isinstance(caught.value.__cause__, DataError)
-        assert message in str(caught.value.__cause__)
-
-
-def test_unsupported_names_the_layout(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="reading the ZJU-MoCap layout is not supported yet"):
-        unsupported("ZJU-MoCap", "a subject", str(tmp_path))
 
 
 # --- the real capture ---------------------------------------------------------------------------

@@ -1,0 +1,41 @@
+"""Commands as a user types them: what the tests of entry points share."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+TINY = ["size=tiny", "training=smoke", "data=capture", "data.size=32", "data.crop=null"]
+
+
+# One thread: sums are rounded in another order with another number of threads.
+ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
+
+
+def gsgan(command: str, *args: str, cwd: Path, timeout: int = 300, environment: dict = ENVIRONMENT):
+    """Runs ``python -m gsgan.<command>`` from another directory, as an installed user would."""
+    return subprocess.run(
+        [sys.executable, "-m", f"gsgan.{command}", *args],
+        cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout,
+    )  # fmt: skip
+
+
+def train(capture: Path, run: Path, *args: str, cwd: Path | None = None):
+    return gsgan("train", *arguments(capture, run), *args, cwd=cwd or run.parent)
+
+
+def arguments(capture: Path, run: Path) -> list[str]:
+    """Of a tiny training run."""
+    return [*TINY, f"data.root={capture}", f"hydra.run.dir={run}"]
+
+
+def refused(result, *words: str) -> None:
+    """One sentence on stderr, a non-zero exit, no traceback."""
+    assert result.returncode != 0, result.stdout
+    assert "Traceback" not in result.stderr + result.stdout
+    text = " ".join(result.stderr.split())
+    for word in words:
+        assert word in text, text

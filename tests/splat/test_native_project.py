@@ -1,0 +1,163 @@
+"""The compiled projection against the portable one: values, gradients, untouched Gaussians."""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import replace
+
+import pytest
+import torch
+from splat_scenes import camera, cloud, join, leaves, one, with_covariances
+
+from gsgan.scene import Camera, Gaussians
+from gsgan.splat import ACCURACY, Accuracy, build, native, native_project, project
+from gsgan.splat.project import Projected
+
+pytestmark = pytest.mark.skipif(not native.available(), reason=native.why_not() or "available")
+
+DRAWN = ("means", "factors", "opacities", "depths")
+WIDE = {name: replace(setting, dtype="float64") for name, setting in ACCURACY.items()}
+
+
+def turned(cam: Camera) -> Camera:
+    """Skew, an off-centre principal point, non-square pixels, a turn and a shift."""
+    axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=torch.float64)
+    K = cam.K.clone()
+    K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = 3.0, K[:, 0, 2] + 2.5, K[:, 1, 1] * 0.8
+    shift = torch.tensor([0.1, -0.05, 0.3], dtype=torch.float64)
+    return replace(cam, K=K, R=torch.matrix_exp(axis).expand_as(cam.R).clone(), t=cam.t + shift)
+
+
+def scene(shape: str) -> tuple[Gaussians, Camera]:
+    """Gaussians in front, behind, far off-axis (where the Jacobian is clamped) and degenerate."""
+    odd = [
+        one((0.0, 0.0, -2.0)),
+        one((9.0, 0.1, 2.0), scale=(0.1, 2.0, 0.5), quat=(0.3, 0.1, 0.9, -0.2)),
+        one((-9.0, -7.0, 2.0), scale=(3.0, 0.2, 4.0), quat=(0.3, -0.1, 0.9, 0.2)),
+        one((0.1, 9.0, 2.0), scale=(0.1, 0.2, 9.0)),
+        one((0.0, 0.0, 2.0), quat=(0.0, 0.0, 0.0, 0.0), scale=(0.1, 0.2, 0.3)),
+        one((0.1, 0.2, 2.0), quat=(1e-15, 3e-15, 0.0, 1e-15), scale=(0.1, 0.2, 0.3)),
+        one((0.1, 0.2, 2.0), quat=(0.9, 0.1, 0.2, 0.3), scale=(20.0, 2e-3, 2e-3)),
+        one((0.1, 0.2, 2.0), opacity=0.0),
+    ]
+    gaussians = join(*odd, cloud(300, 1))
+    gaussians = Gaussians(*(torch.cat([x, x.flip(1)]) for x in list(vars(gaussians).values())[:5]))
+    if shape == "covariances":
+        gaussians = with_covariances(gaussians)
+        skew = 0.01 * torch.randn(2, 308, 3, 3, generator=torch.Generator().manual_seed(0)).double()
+        # Not symmetric, and some not positive definite: what a caller may hand in.
+        gaussians = replace(gaussians, covariances=gaussians.covariances + 0.1 * skew)
+    return gaussians, turned(camera(batch=2))
+
+
+def with_gradients(run, gaussians: Gaussians, cam: Camera, settings: Accuracy):
+    gaussians, cam = leaves(gaussians), leaves(cam)
+    p: Projected = run(gaussians, cam, settings)
+    g = torch.Generator().manual_seed(1)
+    # Backends pass nothing back to what is not seen.
+    total = torch.zeros((), dtype=torch.float64)
+    for name in DRAWN:
+        value = getattr(p, name)
+        seen = p.visible.reshape(p.visible.shape + (1,) * (value.ndim - 2))
+        weight = torch.randn(value.shape, generator=g, dtype=torch.float64)
+        total = total + torch.where(seen, value * weight, 0.0).sum()
+    total.backward()
+    tensors = {**vars(gaussians), **vars(cam)}
+    return p, {k: v.grad for k, v in tensors.items() if torch.is_tensor(v) and k != "features"}
+
+
+@pytest.mark.parametrize("name", list(ACCURACY))
+@pytest.mark.parametrize("antialias", [False, True])
+@pytest.mark.parametrize("shape", ["quats", "covariances"])
+def test_equals_the_portable_projection(name, antialias, shape):
+    settings = replace(WIDE[name], antialias=antialias)
+    got, got_grads = with_gradients(native_project.project, *scene(shape), settings)
+    want, want_grads = with_gradients(project, *scene(shape), settings)
+    assert torch.equal(got.visible, want.visible)
+    assert 100 < got.visible.sum() < got.visible.numel()
+    for field in (*DRAWN, "extents"):
+        a, b = getattr(got, field)[got.visible], getattr(want, field)[want.visible]
+        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12, msg=field)
+    for field, grad in want_grads.items():
+        off = (got_grads[field] - grad).abs().max() / grad.abs().max()
+        assert off < 1e-9, field
+
+
+@pytest.mark.parametrize("shape", ["quats", "covariances"])
+def test_gradcheck(shape):
+    gaussians, cam = cloud(3, 1, scale=0.15), turned(camera((5, 6), focal=6.0))
+    # The second is where the Jacobian is clamped: its gradient reaches K through the field of view.
+    gaussians.means[0, 1] = torch.tensor([4.0, -3.0, 2.0])
+    gaussians = with_covariances(gaussians) if shape == "covariances" else gaussians
+    names = [k for k, v in vars(gaussians).items() if v is not None and k != "features"]
+    settings = replace(WIDE["exact"], antialias=True)
+
+    def function(*tensors):
+        g = replace(gaussians, **dict(zip(names, tensors, strict=False)))
+        K, R, t = tensors[len(names) :]
+        p = native_project.project(g, replace(cam, K=K, R=R, t=t), settings)
+        return tuple(getattr(p, name) for name in DRAWN)
+
+    inputs = [getattr(gaussians, n) for n in names] + [cam.K, cam.R, cam.t]
+    inputs = [x.clone().requires_grad_() for x in inputs]
+    assert torch.autograd.gradcheck(function, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
+
+
+def test_float32_is_rounded_once():
+    gaussians, cam = (x.to(torch.float32) for x in scene("quats"))
+    got = native_project.project(gaussians, cam, ACCURACY["high"])
+    wide = native_project.project(gaussians.to(torch.float64), cam.to(torch.float64), WIDE["high"])
+    assert torch.equal(got.means[got.visible], wide.means[got.visible])
+    assert torch.equal(got.factors[got.visible], wide.factors[got.visible])
+    assert torch.equal(got.opacities, wide.opacities.float())
+    assert got.extents.dtype == got.depths.dtype == torch.float32
+
+
+def test_what_is_not_kept_may_hold_anything():
+    gaussians, cam = scene("quats")
+    keep = torch.ones(2, 308, dtype=torch.bool)
+    keep[:, 40] = False
+    for value in (float("nan"), float("inf"), 0.0):
+        spoilt = leaves(gaussians)
+        for name in ("means", "quats", "scales", "opacities"):
+            getattr(spoilt, name).data[:, 40] = value
+        p = native_project.project(spoilt, cam, WIDE["high"], keep)
+        assert not p.visible[:, 40].any()
+        assert all(getattr(p, name).isfinite().all() for name in (*DRAWN, "extents"))
+        sum(getattr(p, name).sum() for name in DRAWN).backward()
+        for name in ("means", "quats", "scales", "opacities"):
+            grad = getattr(spoilt, name).grad
+            assert not grad[:, 40].any()
+            assert grad[:, 41].any()
+
+
+def test_same_bits_whatever_the_threads():
+    gaussians, cam = cloud(3000, 1, batch=2), turned(camera(batch=2))
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            p, grads = with_gradients(native_project.project, gaussians, cam, WIDE["high"])
+            results.append([p.means, p.factors, *grads.values()])
+    finally:
+        torch.set_num_threads(before)
+    for other in results[1:]:
+        pairs = zip(results[0], other, strict=True)
+        assert all(x is y is None or torch.equal(x, y) for x, y in pairs)
+
+
+def test_no_gaussians():
+    gaussians, cam = leaves(cloud(0, 2, batch=2)), leaves(camera(batch=2))
+    p = native_project.project(gaussians, cam, ACCURACY["high"])
+    assert p.means.shape == (2, 0, 2)
+    p.means.sum().backward()
+    assert not cam.K.grad.any()
+
+
+@pytest.mark.parametrize("module", [native, native_project])
+def test_the_job_has_the_layout_that_the_library_expects(module):
+    library, _ = build.library()
+    name = "gsgan_job_size" if module is native else "gsgan_project_job_size"
+    size = getattr(library, name)
+    size.restype = ctypes.c_int64
+    assert size() == ctypes.sizeof(module._Job)

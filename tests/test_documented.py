@@ -1,0 +1,128 @@
+"""Every command of the README and the docs is run: as written, but tiny."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from commands import ROOT, TINY
+
+# A GPU's settings: one kind of machine runs the tests.
+ELSEWHERE = ("trainer=gpu", "trainer=ddp")
+SMALL_RASTER = [
+    *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "reference.gaussians=300"),
+    *("reference.size=32", "judge_at=[300]", "windows=1", "window=16", "dense=false"),
+    "memory=false",
+]
+
+
+def documented() -> list[str]:
+    """Every ``python -m gsgan…`` of README and docs, once."""
+    text = "\n".join(p.read_text() for p in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+    blocks = re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
+    lines = [line.split("#")[0].strip() for block in blocks for line in block.splitlines()]
+    return sorted({line for line in lines if line.startswith("python -m gsgan")})
+
+
+@pytest.fixture(scope="session")
+def smpl_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Model files like SMPL's and SMPL-X's, of the default person, made when asked for."""
+    from writers.smpl import write_smpl
+
+    folder, made = tmp_path_factory.mktemp("models"), {}
+
+    class Files(dict):
+        def __missing__(self, kind: str) -> Path:
+            suffix = "pkl" if kind == "smpl" else "npz"
+            made[kind] = self[kind] = folder / f"{kind}.{suffix}"
+            write_smpl(made[kind], kind=kind)
+            return made[kind]
+
+    return Files()
+
+
+@pytest.fixture
+def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
+    """Puts real, tiny files in the place of a documented line's placeholders."""
+
+    def folder() -> Path:
+        return tmp_path_factory.mktemp("documented")
+
+    def zju() -> Path:
+        from writers import zju
+        from writers.common import make_subject
+
+        return zju.write_original(folder() / "CoreView_377", make_subject(smpl_files["smpl"]))
+
+    def videos() -> Path:
+        from capture_scenes import write_project
+
+        return write_project(folder() / "videos")
+
+    makers: dict[str, Callable[[], Path | str]] = {
+        "out=/path/to/capture": lambda: f"out={folder() / 'capture'}",
+        "/path/to/capture": lambda: capture,
+        "<run folder>": lambda: run,
+        "/path/to/CoreView_377": zju,
+        "/path/to/SMPL_NEUTRAL.pkl": lambda: smpl_files["smpl"],
+        "/path/to/SMPLX_NEUTRAL.npz": lambda: smpl_files["smplx"],
+        "/path/to/videos": videos,
+    }
+
+    def fill(line: str) -> str:
+        for text, make in makers.items():
+            if text in line:
+                line = line.replace(text, str(make()))
+        assert "/path/to" not in line, f"no stand-in for a placeholder of: {line}"
+        return line
+
+    return fill
+
+
+def tiny_training(arguments: list[str], capture: Path) -> list[str]:
+    given = [a for a in arguments if a != "experiment=demo" and a not in ELSEWHERE]
+    if not any(a.startswith("data=") for a in given):
+        given.append("data=capture")
+    given += [t for t in TINY if not t.startswith("data=") and not fixed(given, t)]
+    if not any(a.startswith("data.root=") for a in given):
+        given.append(f"data.root={capture}")
+    return given
+
+
+def fixed(given: list[str], option: str) -> bool:
+    """Whether a protocol says already what the option would say."""
+    protocol = any(a.startswith("protocol=") for a in given)
+    return protocol and option.startswith(("data.size", "data.crop"))
+
+
+def tiny_bench(arguments: list[str], tmp_path: Path) -> list[str]:
+    given = []
+    for argument in arguments:
+        if argument.startswith("docs="):
+            page = tmp_path / "page.md"
+            shutil.copy(ROOT / argument.removeprefix("docs="), page)
+            given.append(f"docs={page}")
+        elif argument.split("=")[0] not in {"repeats", "gaussians", "sizes", "dense"}:
+            given.append(argument.strip("'"))
+    return given + SMALL_RASTER if given[0] == "raster" else given
+
+
+@pytest.mark.parametrize("line", documented())
+def test_every_documented_command_runs(line, place, capture, inside, tmp_path):
+    _, _, module, *arguments = place(line).split()
+    name = module.removeprefix("gsgan").lstrip(".")
+    if not name:
+        return  # the bare list of commands: test_the_list_of_commands
+    if name == "train":
+        arguments = tiny_training(arguments, capture)
+    if name == "bench":
+        arguments = tiny_bench(arguments, tmp_path)
+    if name == "prepare":  # MediaPipe is not at hand: its output is given
+        source = next(a for a in arguments if a.startswith("source=")).removeprefix("source=")
+        arguments = [a for a in arguments if a != "setup=true"]
+        arguments += [f"landmarks={source}/pose", f"masks={source}/masks"]
+    result = inside(name, *arguments)
+    assert result.returncode == 0, result.stdout + result.stderr
