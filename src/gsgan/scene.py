@@ -257,6 +257,7 @@ class Frame(_TensorRecord):
         camera_index: ``[B]`` int64 into the dataset's camera names.
         body: pose of the skinned body, or None when the data has none.
         labels: ``[B, H, W]`` int64 part labels, 0 = background, or None.
+        unsure: ``[B, 1, H, W]`` 1 where the colours are not to be learned from, or None.
     """
 
     image: Tensor
@@ -268,6 +269,7 @@ class Frame(_TensorRecord):
     camera_index: Tensor
     body: BodyPose | None = None
     labels: Tensor | None = None
+    unsure: Tensor | None = None
 
     def __len__(self) -> int:
         return self.image.shape[0]

@@ -43,6 +43,22 @@ def subject(smpl_file: Path):
 
 
 @pytest.fixture(scope="session")
+def smplx_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file like SMPL-X's, of the default person."""
+    from writers.smplx_rig import write_smplx
+
+    return write_smplx(tmp_path_factory.mktemp("models") / "SMPLX_NEUTRAL.npz")
+
+
+@pytest.fixture(scope="session")
+def smplx_subject(smplx_file: Path):
+    """Three cameras, four frames, 52 x 44 pixels; do not write into it."""
+    from writers.smplx_rig import smplx_subject
+
+    return smplx_subject(smplx_file)
+
+
+@pytest.fixture(scope="session")
 def _models_read() -> dict:
     return {}
 

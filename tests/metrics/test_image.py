@@ -11,22 +11,12 @@ from gsgan.errors import ConfigError
 from gsgan.losses.weights import FILES
 from gsgan.metrics.evaluation import Mean, PictureScores, SegmentationScores
 from gsgan.metrics.image import edge_f1, high_frequencies, lpips, psnr, psnr_person, ssim
-from gsgan.scene import Camera, Frame
 
 
 def square(at: int, size: int = 40) -> torch.Tensor:
     image = torch.zeros(1, 3, size, size)
     image[..., at : at + 12, at : at + 12] = 1.0
     return image
-
-
-def picture_frame(image: torch.Tensor) -> Frame:
-    """A frame whose truth is the picture, all of it person."""
-    size = tuple(image.shape[-2:])
-    camera = Camera(torch.eye(3)[None], torch.eye(3)[None], torch.zeros(1, 3), size)
-    number = torch.zeros(1, dtype=torch.int64)
-    skeleton, seen = torch.zeros(1, 33, 3), torch.ones(1, 33)
-    return Frame(image, torch.ones(1, 1, *size), camera, skeleton, seen, number, number)
 
 
 def test_psnr_closed_form_and_one_score_a_picture():
@@ -95,7 +85,7 @@ def test_lpips_without_weights_is_none_with_the_reason(monkeypatch, tmp_path):
 def test_picture_scores_name_a_reason_for_every_none():
     scores = PictureScores(None, "no weights")
     image = torch.zeros(1, 3, 16, 16)
-    scores.update(image, picture_frame(image))  # PSNR infinite, no edges
+    scores.update(image, image)  # PSNR infinite, no edges
     result = scores.compute()
     assert result["psnr"] is None
     assert result["psnr_left_out"] == 1

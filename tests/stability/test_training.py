@@ -125,7 +125,7 @@ def test_when_it_recurs_the_run_stops_with_a_clear_message(make, capsys):
 
 def test_a_frame_without_a_person_is_learned_from_without_a_nan(make):
     """Empty mask, black picture, no label: every loss is finite, and nothing is skipped."""
-    module, frame, fit = make((2, 2, 2), "training.collapse=0")
+    module, frame, fit = make((2, 2, 2), "training.rollback.collapse=0")
     labels = torch.full_like(frame.labels, 255)
     empty = replace(frame, image=frame.image * 0, mask=frame.mask * 0, labels=labels)
     fit([empty] * 6)
@@ -135,7 +135,7 @@ def test_a_frame_without_a_person_is_learned_from_without_a_nan(make):
 
 def test_a_few_steps_from_all_hard_skeletons_stay_finite(make):
     """All of them as one batch, through every phase."""
-    module, frame, fit = make((1, 2, 2), "training.collapse=0")
+    module, frame, fit = make((1, 2, 2), "training.rollback.collapse=0")
     batch = cat([with_pose(frame, name) for name in DEGENERATE])
     before = [p.detach().clone() for p in module.avatar.deformation.parameters()]
     fit([batch] * 5)
@@ -148,7 +148,7 @@ def test_a_few_steps_from_all_hard_skeletons_stay_finite(make):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DEGENERATE)
 def test_a_hundred_steps_from_each_hard_skeleton_stay_finite(make, name):
-    module, frame, fit = make((10, 50, 40), "training.collapse=0")
+    module, frame, fit = make((10, 50, 40), "training.rollback.collapse=0")
     fit([with_pose(frame, name)] * 100)
     assert module.step == 100
     assert_finite(module)

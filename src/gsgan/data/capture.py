@@ -34,16 +34,19 @@ class Picture:
         image: ``[3, H, W]`` RGB on black.
         mask: ``[H, W]`` 0..255.
         labels: ``[H, W]`` part numbers, or None.
+        unsure: ``[H, W]`` 255 where the colours are not to be learned from, or None.
     """
 
     image: Bytes
     mask: Bytes
     labels: Bytes | None
+    unsure: Bytes | None = None
 
     @property
     def nbytes(self) -> int:
         """Bytes held."""
-        return self.image.nbytes + self.mask.nbytes + (0 if self.labels is None else self.mask.size)
+        parts = (self.image, self.mask, self.labels, self.unsure)
+        return sum(part.nbytes for part in parts if part is not None)
 
 
 class PictureCache:
@@ -139,6 +142,7 @@ class CaptureDataset(Dataset[Frame]):
             camera_index=torch.tensor([self._indices[name]]),
             body=self._body(frame),
             labels=_labels(picture.labels),
+            unsure=None if picture.unsure is None else _unit(picture.unsure)[None, None],
         )
 
     def window(self, item: Item) -> Window:
@@ -171,7 +175,9 @@ class CaptureDataset(Dataset[Frame]):
         def fit(picture: Bytes, exact: bool) -> Bytes:
             return cropping.resize(cropping.take(picture, window, mapping, exact), size, exact)
 
-        mask = pixels.read_mask(self.layout.mask_files(*item), rules)
+        mask_files = self.layout.mask_files(*item)
+        mask = pixels.read_mask(mask_files, rules)
+        unsure = pixels.read_unsure(mask_files, mask, rules)
         image = pixels.read_image(self.layout.image_path(*item), rules)
         self._check_size(self.layout.image_path(*item), image, camera)
         self._check_size(self.layout.mask_path(*item), mask, camera)
@@ -180,8 +186,10 @@ class CaptureDataset(Dataset[Frame]):
         labels = self._label_picture(item)
         if labels is not None:
             labels = fit(pixels.with_ignored_border(labels, mask, rules.ignore_band), exact=True)
+        if unsure is not None:
+            unsure = fit(unsure, exact=True)
         mask = fit(mask, exact=rules.mask_sampling == "nearest")
-        return Picture(np.ascontiguousarray(image.transpose(2, 0, 1)), mask, labels)
+        return Picture(np.ascontiguousarray(image.transpose(2, 0, 1)), mask, labels, unsure)
 
     @staticmethod
     def _check_size(path: Path, picture: Bytes, camera: CameraEntry) -> None:

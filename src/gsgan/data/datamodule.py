@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import gsgan.compat  # noqa: F401  (must come before lightning)
 
@@ -25,7 +25,7 @@ from gsgan.data.protocol import Protocol
 from gsgan.data.sampler import StepSampler, pass_order
 from gsgan.data.scene_info import SceneInfo, count_labels, scene_info
 from gsgan.data.splits import SPLITS, Splits, make_splits, protocol_splits
-from gsgan.errors import ConfigError, DataError
+from gsgan.errors import ConfigError
 from gsgan.scene import Frame, cat
 
 __all__ = [
@@ -35,7 +35,6 @@ __all__ = [
     "count_labels",
     "pass_order",
     "scene_info",
-    "unsupported",
 ]
 
 log = logging.getLogger(__name__)
@@ -305,25 +304,3 @@ def _at_least(name: str, value: Any, least: int) -> Any:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= least:
         raise ConfigError(f"data.{name} must be a number of at least {least}, got {value!r}")
     return value
-
-
-def unsupported(layout: str, wanted: str, root: str | None = None) -> NoReturn:
-    """Stands where the reader of a layout is still missing.
-
-    Args:
-        layout: its name.
-        wanted: what the root should be, for the message when it is not set.
-        root: the folder.
-
-    Raises:
-        ConfigError: when the root is not set.
-        DataError: when it does not exist, and else always, saying what to do instead.
-    """
-    if root is None:
-        raise ConfigError(_root_not_set(wanted))
-    if not Path(root).expanduser().is_dir():
-        raise DataError(f"data.root={root} does not exist; expected the folder of {wanted}")
-    raise DataError(
-        f"data.root={root}: reading the {layout} layout is not supported yet; convert it to the "
-        "bring-your-own layout (docs/data.md) and use data=capture"
-    )

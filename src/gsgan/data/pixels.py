@@ -52,6 +52,8 @@ class PixelRules:
         label_table: 256 part numbers, what each stored label becomes; None keeps them.
         ignore_band: pixels of the stored picture, side of the square by which the mask is dilated
             and eroded; labels in the band between become "ignore". 0 leaves it out.
+        unsure_band: the same for colours: pixels in that band are not to be learned from.
+        unsure_alpha: nor are those whose alpha lies strictly between these two; None leaves it out.
     """
 
     colour_order: Literal["rgb", "bgr"] = "rgb"
@@ -60,6 +62,8 @@ class PixelRules:
     mask_sampling: Literal["linear", "nearest"] = "linear"
     label_table: tuple[int, ...] | None = None
     ignore_band: int = 0
+    unsure_band: int = 0
+    unsure_alpha: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         if self.label_table is not None and len(self.label_table) != 256:
@@ -161,7 +165,34 @@ def with_ignored_border(labels: Bytes, mask: Bytes, band: int) -> Bytes:
     """
     if band == 0:
         return labels
-    person = (mask > 127).astype(np.uint8)
-    kernel = np.ones((band, band), np.uint8)
-    outline = cv2.dilate(person, kernel) != cv2.erode(person, kernel)
-    return np.where(outline, np.uint8(IGNORE_LABEL), labels)
+    return np.where(outline(mask, band), np.uint8(IGNORE_LABEL), labels)
+
+
+def outline(mask: Bytes, band: int) -> NDArray[np.bool_]:
+    """``[H, W]`` where the mask dilated and eroded by a square of this side differ; 0: nowhere."""
+    if band == 0:
+        return np.zeros(mask.shape, np.bool_)
+    person, kernel = (mask > 127).astype(np.uint8), np.ones((band, band), np.uint8)
+    return np.asarray(cv2.dilate(person, kernel) != cv2.erode(person, kernel))
+
+
+def read_unsure(files: Sequence[tuple[str, Path]], mask: Bytes, rules: PixelRules) -> Bytes | None:
+    """``[H, W]`` 255 at pixels that are not to be learned from, or None when the rules know none.
+
+    Args:
+        files: (rule, path) of the masks, which are decoded again when the rules ask for alphas.
+        mask: ``[H, W]`` 0..255, what `read_mask` made of them.
+        rules: of the dataset.
+
+    Raises:
+        DataError: when a file is missing or damaged.
+    """
+    if rules.unsure_band == 0 and rules.unsure_alpha is None:
+        return None
+    unsure = outline(mask, rules.unsure_band)
+    if rules.unsure_alpha is not None:
+        low, high = rules.unsure_alpha
+        for _, path in files:
+            alpha = read_grey(path)
+            unsure |= (alpha > low) & (alpha < high)
+    return np.where(unsure, np.uint8(255), np.uint8(0))

@@ -61,9 +61,22 @@ def d_ssim_map(
 
 
 def photometric(
-    image: Tensor, target: Tensor, *, l1: float = 0.8, l2: float = 0.0, ssim: float = 0.2
+    image: Tensor,
+    target: Tensor,
+    *,
+    l1: float = 0.8,
+    l2: float = 0.0,
+    ssim: float = 0.2,
+    unsure: Tensor | None = None,
 ) -> Tensor:
-    """Weighted L1, squared error and D-SSIM; a term of weight 0 is not computed."""
+    """Weighted L1, squared error and D-SSIM; a term of weight 0 is not computed.
+
+    Args:
+        image, target: ``[B, 3, H, W]``.
+        l1, l2, ssim: weights.
+        unsure: see `without_unsure`.
+    """
+    target = without_unsure(target, image, unsure)
     difference = image - target
     loss = difference.new_zeros(())
     if l1:
@@ -73,3 +86,16 @@ def photometric(
     if ssim:
         loss = loss + ssim * d_ssim(image, target)
     return loss
+
+
+def without_unsure(target: Tensor, image: Tensor, unsure: Tensor | None) -> Tensor:
+    """The target, with the image itself where pixels are not to be learned from.
+
+    Convention: there a loss by pixels is exactly 0, gradient included; what looks at several
+    pixels at once (SSIM, networks) still sees their neighbours.
+
+    Args:
+        target, image: ``[B, 3, H, W]``.
+        unsure: ``[B, 1, H, W]`` above 0 at those pixels, or None for none.
+    """
+    return target if unsure is None else torch.where(unsure > 0, image.detach(), target)

@@ -51,9 +51,12 @@ class PictureScores:
     lpips_reason: str
     means: dict[str, Mean] = field(default_factory=dict)
 
-    def update(self, image: Tensor, frame: Frame) -> None:
-        """Adds pictures ``[B, 3, H, W]``; they are clamped to [0, 1] as they would be shown."""
-        image, target = image.clamp(0, 1), frame.image
+    def update(self, image: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
+        """Adds pictures ``[B, 3, H, W]``; they are clamped to [0, 1] as they would be shown.
+
+        Without a mask ``[B, 1, H, W]`` there is no score in the person's box.
+        """
+        image = image.clamp(0, 1)
         scores: dict[str, Score] = {
             "psnr": psnr,
             "ssim": ssim,
@@ -64,8 +67,9 @@ class PictureScores:
             scores["lpips"] = self.lpips
         for name, score in scores.items():
             self.means.setdefault(name, Mean()).update(score(image, target))
-        person = psnr_person(image, target, frame.mask)
-        self.means.setdefault("psnr_person", Mean()).update(person)
+        if mask is not None:
+            person = psnr_person(image, target, mask)
+            self.means.setdefault("psnr_person", Mean()).update(person)
 
     def compute(self) -> dict[str, Any]:
         """``{metric: value or None, metric_reason: …}``; scores left out are counted."""
@@ -134,10 +138,10 @@ def evaluate_split(
         with torch.no_grad():
             painting = avatar.paint(frame)
         assert painting.image is not None
-        pictures["full"].update(painting.image, frame)
+        pictures["full"].update(painting.image, frame.image, frame.mask)
         if painting.colour is not None:
-            pictures["splat"].update(painting.colour, frame)
-        pictures[FLOOR].update(torch.zeros_like(frame.image), frame)
+            pictures["splat"].update(painting.colour, frame.image, frame.mask)
+        pictures[FLOOR].update(torch.zeros_like(frame.image), frame.image, frame.mask)
         if painting.segmentation is not None and frame.labels is None:
             reason = "the data has no part labels"
         elif painting.segmentation is not None and frame.labels is not None:

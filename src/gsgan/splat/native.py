@@ -1,63 +1,36 @@
 """The compiled compositing kernel for CPUs: native.cpp, built on first use, called through ctypes.
 
-The shared library is compiled by the system's compiler into a user cache (``GSGAN_CACHE``, else
-``$XDG_CACHE_HOME/gsgan``, else ``~/.cache/gsgan``; subfolder ``native``) and loaded from there
-later. Where that cannot be done ``available()`` is False, ``why_not()`` says why, nothing raises.
+Where it cannot be built ``available()`` is False, ``why_not()`` says why, nothing raises.
 """
 
 from __future__ import annotations
 
 import ctypes
-import functools
-import hashlib
-import os
-import platform
-import shlex
-import shutil
-import subprocess
-import tempfile
-import threading
-from collections.abc import Iterator
-from pathlib import Path
+import math
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy
 import torch
 from torch import Tensor
+
+from gsgan.splat import build
 
 if TYPE_CHECKING:
     from gsgan.splat.project import Projected
     from gsgan.splat.settings import Accuracy
 
-SOURCE = Path(__file__).with_name("native.cpp")
-COMPILERS = ("c++", "g++", "clang++")
-COMPILE_SECONDS = 300.0
 # Memory the backward pass may use for gradients per (tile, Gaussian) before it adds them up.
 SLOT_BYTES = 1 << 28
+CACHE_LINE = 64  # bytes
 
-# No -ffast-math: NaN and infinity keep their meaning, sums keep their order.
-_BASE = (
-    *("-std=c++17", "-O3", "-fPIC", "-shared", "-fopenmp-simd"),
-    *("-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"),
-)
-# Tried in this order: some compilers lack OpenMP (Apple's clang), some the flag for the own CPU.
-_FLAGS = (
-    ("-march=native", "-mprefer-vector-width=512", "-fopenmp"),
-    ("-march=native", "-fopenmp"),
-    ("-mcpu=native", "-fopenmp"),
-    ("-mcpu=native",),
-    ("-march=native",),
-    ("-fopenmp",),
-    (),
-)
-
-_DTYPES = {torch.float32: "float32", torch.float64: "float64"}
 _OUT_OF_MEMORY, _NOT_FINITE = 1, 2
 
-_SIZES = ("B", "N", "C", "H", "W", "threads", "keep", "slot_bytes")
-_INPUTS = ("means", "conics", "opacities", "features", "depths", "extents")
+_SIZES = ("B", "N", "C", "H", "W", "threads", "keep", "box", "slot_bytes")
+_INPUTS = ("means", "factors", "opacities", "features", "depths", "extents")
 _OUTPUTS = ("out_features", "out_alpha", "out_depth")
 _GRADS_OUT = ("g_features", "g_alpha", "g_depth")
-_GRADS_IN = ("d_means", "d_conics", "d_opacities", "d_features", "d_depths")
+_GRADS_IN = ("d_means", "d_factors", "d_opacities", "d_features", "d_depths")
 
 
 class _Job(ctypes.Structure):
@@ -72,20 +45,13 @@ class _Job(ctypes.Structure):
     )
 
 
-class _Unavailable(Exception):
-    """Why there is no kernel, in one sentence."""
-
-
-# ------------------------------------------------------------------------------------------ use
-
-
 def available() -> bool:
     """Whether the kernel can be used here; the first call may compile it (seconds).
 
     Returns:
         False where no compiler is found or works; ``why_not()`` then says why.
     """
-    return _load()[0] is not None
+    return build.library()[0] is not None
 
 
 def why_not() -> str:
@@ -94,7 +60,7 @@ def why_not() -> str:
     Returns:
         One sentence; empty where the kernel is available.
     """
-    return _load()[1]
+    return build.library()[1]
 
 
 def composite(
@@ -109,15 +75,15 @@ def composite(
     (``torch.get_num_threads()``).
 
     Args:
-        projected: the ellipses, float32 or float64, on the CPU.
+        projected: the ellipses on the CPU; features float32 or float64, of which the arithmetic is.
         size: (H, W) pixels.
-        settings: alpha_min, transmittance_min and alpha_max are read; the extent is already in
-            ``projected.extents``.
+        settings: alpha_min, transmittance_min, alpha_max, and whether the extent is ``sigma``:
+            only then ``projected.extents`` cut at the pixel.
         want_depth: whether to blend depths too.
 
     Returns:
         features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``, depth ``[B, 1, H, W]`` or
-        None. Differentiable once in means, conics, opacities, features, and in depths through the
+        None. Differentiable once in means, factors, opacities, features, and in depths through the
         depth output.
 
     Raises:
@@ -130,18 +96,32 @@ def composite(
     _check(projected, size)
     features, alpha, depth = _Composite.apply(
         projected.means,
-        projected.conics,
+        projected.factors,
         projected.opacities,
         projected.features,
         projected.depths,
         projected.extents,
         projected.visible,
-        size,
-        (settings.alpha_min, settings.transmittance_min, settings.alpha_max),
-        want_depth,
-        torch.is_grad_enabled(),
+        _Options(
+            size,
+            (settings.alpha_min, settings.transmittance_min, settings.alpha_max),
+            settings.extent == "sigma",
+            want_depth,
+            torch.is_grad_enabled(),
+        ),
     )
     return features, alpha, depth
+
+
+@dataclass(frozen=True)
+class _Options:
+    """What is not a tensor."""
+
+    size: tuple[int, int]
+    cutoffs: tuple[float, float, float]
+    box: bool
+    want_depth: bool
+    grad_enabled: bool
 
 
 def _check(projected: Projected, size: tuple[int, int]) -> None:
@@ -149,14 +129,16 @@ def _check(projected: Projected, size: tuple[int, int]) -> None:
     C = projected.features.shape[-1]
     shapes = {
         "means": (B, N, 2),
-        "conics": (B, N, 3),
+        "factors": (B, N, 3),
         "opacities": (B, N),
         "features": (B, N, C),
         "depths": (B, N),
         "extents": (B, N, 2),
         "visible": (B, N),
     }
-    dtype = projected.means.dtype
+    dtype = projected.features.dtype
+    if dtype not in build.DTYPES:
+        raise ValueError(f"composite: features must be float32 or float64, got {dtype}")
     for name, shape in shapes.items():
         value: Tensor = getattr(projected, name)
         if tuple(value.shape) != shape:
@@ -165,10 +147,11 @@ def _check(projected: Projected, size: tuple[int, int]) -> None:
             raise ValueError(
                 f"composite: the native backend needs {name} on the CPU, got {value.device}"
             )
-        if value.dtype != (torch.bool if name == "visible" else dtype):
-            raise ValueError(f"composite: {name} must be {dtype} like means, got {value.dtype}")
-    if dtype not in _DTYPES:
-        raise ValueError(f"composite: means must be float32 or float64, got {dtype}")
+        want = {"visible": torch.bool, "means": torch.float64, "factors": torch.float64}
+        if value.dtype != want.get(name, dtype):
+            raise ValueError(
+                f"composite: {name} must be {want.get(name, dtype)}, got {value.dtype}"
+            )
     if len(size) != 2 or min(size) < 1:
         raise ValueError(f"composite: size must be (H, W) with both at least 1, got {size}")
 
@@ -176,9 +159,9 @@ def _check(projected: Projected, size: tuple[int, int]) -> None:
 class _Plan:
     """What the backward pass needs of the forward pass; memory of the library, freed with it."""
 
-    def __init__(self, library: ctypes.CDLL, suffix: str) -> None:
+    def __init__(self, dtype: torch.dtype) -> None:
         self.pointer = ctypes.c_void_p()
-        self._free = getattr(library, f"gsgan_free_{suffix}")
+        self._free = build.function("free", dtype)
 
     def __del__(self) -> None:
         if self.pointer:
@@ -190,39 +173,30 @@ class _Composite(torch.autograd.Function):
     def forward(
         ctx: Any,
         means: Tensor,
-        conics: Tensor,
+        factors: Tensor,
         opacities: Tensor,
         features: Tensor,
         depths: Tensor,
         extents: Tensor,
         visible: Tensor,
-        size: tuple[int, int],
-        cutoffs: tuple[float, float, float],
-        want_depth: bool,
-        grad_enabled: bool,
+        options: _Options,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
-        inputs = [
-            x.detach().contiguous() for x in (means, conics, opacities, features, depths, extents)
-        ]
+        tensors = [means, factors, opacities, features, depths, extents]
+        inputs = [x.detach().contiguous() for x in tensors]
         shown = visible.contiguous()
-        (B, N, C), (H, W) = features.shape, size
-        library = _library()
-        suffix = _DTYPES[means.dtype]
-        outputs = [means.new_empty(B, C, H, W), means.new_empty(B, 1, H, W)]
-        if want_depth:
-            outputs.append(means.new_empty(B, 1, H, W))
-        keep = grad_enabled and any(ctx.needs_input_grad)
-        job = _job(B, N, C, size, cutoffs, inputs, shown)
-        job.keep = keep
-        _point(job, _OUTPUTS, outputs)
-        plan = _Plan(library, suffix)
-        status = getattr(library, f"gsgan_forward_{suffix}")(
-            ctypes.byref(job), ctypes.byref(plan.pointer)
-        )
-        _raise_for(status, job)
-        if keep:
-            ctx.save_for_backward(means, conics, opacities, features, depths, extents, visible)
-            ctx.plan, ctx.size, ctx.cutoffs = plan, size, cutoffs
+        (B, _, C), (H, W) = features.shape, options.size
+        dtype = features.dtype
+        channels = [C, 1, 1] if options.want_depth else [C, 1]
+        outputs = [_zeros((B, c, H, W), dtype) for c in channels]
+        job = _job(options, inputs, shown)
+        job.keep = options.grad_enabled and any(ctx.needs_input_grad)
+        point(job, _OUTPUTS, outputs)
+        plan = _Plan(dtype)
+        run = build.function("forward", dtype)
+        _raise_for(run(ctypes.byref(job), ctypes.byref(plan.pointer)), job)
+        if job.keep:
+            ctx.save_for_backward(*tensors, visible)
+            ctx.plan, ctx.options = plan, options
             ctx.set_materialize_grads(False)
         features_out, alpha, *rest = outputs
         return features_out, alpha, rest[0] if rest else None
@@ -233,20 +207,16 @@ class _Composite(torch.autograd.Function):
         *tensors, visible = ctx.saved_tensors
         inputs = [x.detach().contiguous() for x in tensors]
         shown = visible.contiguous()
-        B, N, C = inputs[3].shape
-        job = _job(B, N, C, ctx.size, ctx.cutoffs, inputs, shown)
+        job = _job(ctx.options, inputs, shown)
         incoming = [None if g is None else g.contiguous() for g in grads]
-        _point(job, _GRADS_OUT, incoming)
+        point(job, _GRADS_OUT, incoming)
         with_depth = incoming[2] is not None
         outgoing: list[Tensor | None] = [
             torch.zeros_like(x) for x in inputs[: 5 if with_depth else 4]
         ]
-        _point(job, _GRADS_IN, outgoing)
-        suffix = _DTYPES[inputs[0].dtype]
-        status = getattr(_library(), f"gsgan_backward_{suffix}")(
-            ctypes.byref(job), ctx.plan.pointer
-        )
-        _raise_for(status, job)
+        point(job, _GRADS_IN, outgoing)
+        run = build.function("backward", inputs[3].dtype)
+        _raise_for(run(ctypes.byref(job), ctx.plan.pointer), job)
         if not with_depth:
             outgoing.append(None)
         wanted = [
@@ -255,22 +225,31 @@ class _Composite(torch.autograd.Function):
         return (*wanted, *[None] * (len(ctx.needs_input_grad) - len(wanted)))
 
 
-def _job(
-    B: int,
-    N: int,
-    C: int,
-    size: tuple[int, int],
-    cutoffs: tuple[float, float, float],
-    inputs: list[Tensor],
-    visible: Tensor,
-) -> _Job:
-    job = _Job(B, N, C, *size, max(1, torch.get_num_threads()), 0, SLOT_BYTES, *cutoffs)
-    _point(job, (*_INPUTS, "visible"), [*inputs, visible])
+def _zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """Zeros; numpy's, because it has large arrays in huge pages that the system clears on use.
+
+    A picture of 32 channels and 512 x 512 pixels is 8192 small pages, new ones in every call:
+    touching them took longer than drawing on them. Rows of tiles are whole cache lines.
+    """
+    name, count = build.DTYPES[dtype], math.prod(shape)
+    line = CACHE_LINE // dtype.itemsize
+    whole = torch.from_numpy(numpy.zeros(count + line, name))
+    first = -whole.data_ptr() % CACHE_LINE // dtype.itemsize
+    return whole[first : first + count].view(shape)
+
+
+def _job(options: _Options, inputs: list[Tensor], visible: Tensor) -> _Job:
+    threads = max(1, torch.get_num_threads())
+    sizes = (*inputs[3].shape, *options.size, threads, 0, options.box, SLOT_BYTES)
+    job = _Job(*sizes, *options.cutoffs)
+    point(job, (*_INPUTS, "visible"), [*inputs, visible])
     return job
 
 
-def _point(job: _Job, names: tuple[str, ...], tensors: list[Tensor] | list[Tensor | None]) -> None:
-    # The pointers do not keep the tensors alive: the caller holds them until the call returns.
+def point(
+    job: ctypes.Structure, names: tuple[str, ...], tensors: list[Tensor] | list[Tensor | None]
+) -> None:
+    """Sets fields of a job to where tensors are; the caller keeps those alive during the call."""
     for name, tensor in zip(names, tensors, strict=False):
         setattr(job, name, None if tensor is None else tensor.data_ptr())
 
@@ -281,8 +260,8 @@ def _raise_for(status: int, job: _Job) -> None:
     if status == _NOT_FINITE:
         b, n = divmod(job.bad, job.N)
         raise ValueError(
-            f"composite: visible Gaussians must be finite, got NaN or infinity in the mean, conic, "
-            f"opacity, depth or extent of Gaussian {n} of batch item {b}"
+            "composite: visible Gaussians must be finite, got NaN or infinity in the mean, "
+            f"factors, opacity, depth or extent of Gaussian {n} of batch item {b}"
         )
     if status == _OUT_OF_MEMORY:
         raise MemoryError("composite: out of memory; use a smaller picture, batch or extent")
@@ -290,180 +269,3 @@ def _raise_for(status: int, job: _Job) -> None:
         f"composite: {job.B} pictures of {job.H} x {job.W} with {job.N} Gaussians make more than "
         "2^32 pairs of tile and Gaussian; use a smaller picture, batch or extent"
     )
-
-
-# ---------------------------------------------------------------------------------- build and load
-
-_LOCK = threading.Lock()
-
-
-def _library() -> ctypes.CDLL:
-    library, reason = _load()
-    if library is None:
-        raise RuntimeError(f"composite: the native kernel is not available: {reason}")
-    return library
-
-
-def _load() -> tuple[ctypes.CDLL | None, str]:
-    with _LOCK:  # two threads must not compile at once
-        return _load_once()
-
-
-@functools.lru_cache(maxsize=1)
-def _load_once() -> tuple[ctypes.CDLL | None, str]:
-    try:
-        compiler = _compiler()
-        folder = _cache_folder()
-        key = _key(compiler)
-        for path in _cached(folder, key):
-            library = _open(path)
-            if library is not None:
-                return library, ""
-        library = _open(_build(compiler, folder, key))
-    except _Unavailable as reason:
-        return None, str(reason)
-    except OSError as error:
-        return None, f"The native kernel cannot be built: {error}."
-    if library is None:
-        return None, "The native kernel was compiled but cannot be loaded."
-    return library, ""
-
-
-def _compiler() -> list[str]:
-    """The command of the compiler; ``CXX`` is a choice that is not second-guessed."""
-    named = shlex.split(os.environ.get("CXX", ""))
-    if named:
-        if shutil.which(named[0]) is None:
-            raise _Unavailable(f"The compiler that CXX names, {named[0]!r}, is not found.")
-        return named
-    for name in COMPILERS:
-        if (path := shutil.which(name)) is not None:
-            return [path]
-    raise _Unavailable(
-        f"No C++ compiler is found (looked for {', '.join(COMPILERS)}); install one or set CXX."
-    )
-
-
-def _cache_folder() -> Path:
-    """Where compiled kernels live; created, for this user only, when missing."""
-    root = os.environ.get("GSGAN_CACHE") or None
-    if root is None:
-        base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-        root = os.path.join(base, "gsgan")
-    folder = Path(root) / "native"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise _Unavailable(
-            f"The cache folder {folder} cannot be created ({error.strerror}); set GSGAN_CACHE to a "
-            "folder that can be written."
-        ) from error
-    return folder
-
-
-def _key(compiler: list[str]) -> str:
-    """Names what a compiled kernel depends on: source, flags, compiler, CPU."""
-    parts = (_source(), repr(_BASE), repr(_FLAGS), repr(compiler), _version(compiler), _cpu())
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
-
-
-def _source() -> str:
-    if not SOURCE.is_file():
-        raise _Unavailable(f"The kernel's source {SOURCE} is missing; reinstall gsgan.")
-    return SOURCE.read_text(encoding="utf-8")
-
-
-def _version(compiler: list[str]) -> str:
-    done = _run([*compiler, "--version"])
-    if done.returncode != 0:
-        raise _Unavailable(f"The compiler {shlex.join(compiler)!r} does not run.")
-    return done.stdout
-
-
-def _cpu() -> str:
-    """What -march=native stands for here: a home folder may be shared by unlike machines."""
-    lines = [platform.machine(), platform.processor()]
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        wanted = ("model name", "flags", "CPU implementer", "CPU part", "Features")
-        lines += sorted(
-            {x for x in info.read_text(errors="replace").splitlines() if x.startswith(wanted)}
-        )
-    return "\n".join(lines)
-
-
-def _cached(folder: Path, key: str) -> Iterator[Path]:
-    """Whole files of that key. A file's name ends with its own hash: loading a damaged one would
-    crash the process, so those are deleted."""
-    for path in sorted(folder.glob(f"{key}-*.so")):
-        if path.stem.rpartition("-")[2] == _digest(path):
-            yield path
-        else:
-            path.unlink(missing_ok=True)
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:24]
-
-
-def _build(compiler: list[str], folder: Path, key: str) -> Path:
-    """Compiles beside the cache and renames when whole: a process that looks sees all or nothing.
-
-    Returns:
-        The shared library.
-
-    Raises:
-        _Unavailable: when no set of flags compiles.
-    """
-    message = ""
-    with tempfile.TemporaryDirectory(dir=folder, prefix="build-") as work:
-        target = Path(work) / "native.so"
-        for flags in _FLAGS:
-            done = _run([*compiler, *_BASE, *flags, str(SOURCE), "-o", str(target)])
-            if done.returncode == 0 and target.is_file():
-                final = folder / f"{key}-{_digest(target)}.so"
-                os.replace(target, final)
-                return final
-            message = message or _first_error(done.stderr)
-    raise _Unavailable(
-        f"The compiler {shlex.join(compiler)!r} failed on the native kernel{message}."
-    )
-
-
-def _first_error(stderr: str) -> str:
-    lines = [line.strip().rstrip(".") for line in stderr.splitlines() if "error" in line.lower()]
-    return f": {lines[0]}" if lines else ""
-
-
-def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
-    try:
-        return subprocess.run(
-            command, capture_output=True, text=True, timeout=COMPILE_SECONDS, check=False
-        )
-    except subprocess.TimeoutExpired as error:
-        raise _Unavailable(
-            f"The compiler {command[0]!r} did not finish in {COMPILE_SECONDS:.0f} s."
-        ) from error
-
-
-def _open(path: Path) -> ctypes.CDLL | None:
-    """The library with its functions declared, or None where it cannot be loaded."""
-    try:
-        library = ctypes.CDLL(str(path))
-        library.gsgan_job_size.restype = ctypes.c_int64
-        if library.gsgan_job_size() != ctypes.sizeof(_Job):
-            return None
-        for suffix in _DTYPES.values():
-            getattr(library, f"gsgan_forward_{suffix}").argtypes = (
-                ctypes.POINTER(_Job),
-                ctypes.POINTER(ctypes.c_void_p),
-            )
-            getattr(library, f"gsgan_backward_{suffix}").argtypes = (
-                ctypes.POINTER(_Job),
-                ctypes.c_void_p,
-            )
-            getattr(library, f"gsgan_free_{suffix}").argtypes = (ctypes.c_void_p,)
-            getattr(library, f"gsgan_free_{suffix}").restype = None
-    except (OSError, AttributeError):
-        return None
-    return library

@@ -13,11 +13,11 @@ from gsgan.scene import Camera, Gaussians
 from gsgan.splat.settings import Accuracy
 
 # exp(-745.2) is the smallest double above zero: beyond this a Gaussian is exactly 0.
-_EXP_UNDERFLOW = 746.0
+EXP_UNDERFLOW = 746.0
 # Extents are rounded up by this much, so that rounding never loses a pixel that alpha_min keeps.
-_EXTENT_MARGIN = 1e-3
+EXTENT_MARGIN = 1e-3
 # Below this a quaternion is noise, and its gradient 1/|q| would not fit into float32.
-_QUAT_MIN = 1e-20
+QUAT_MIN = 1e-20
 
 
 @dataclass(frozen=True)
@@ -25,12 +25,16 @@ class Projected:
     """A batch of Gaussians as ellipses on the picture; what every backend composites.
 
     Convention: pixels, x right and y down; the centre of pixel (row i, column j) is
-    ``(j + 0.5, i + 0.5)``. Entries of invisible Gaussians are finite and mean nothing.
+    ``(j + 0.5, i + 0.5)``. ``means`` and ``factors`` stay in float64 where the device has it, for
+    backends to round what is relative to a tile; the rest has the dtype of the arithmetic. Entries
+    of invisible Gaussians are finite and mean nothing.
 
     Args:
         means: ``[B, N, 2]`` pixels.
-        conics: ``[B, N, 3]`` (a, b, c), the inverse 2D covariance:
-            ``q = a dx² + 2 b dx dy + c dy²`` and ``alpha = min(alpha_max, o exp(-q / 2))``.
+        factors: ``[B, N, 3]`` (p, k, r), a triangular factor of the inverse 2D covariance:
+            ``q = (p (dx + k dy))² + (r dy)²`` and ``alpha = min(alpha_max, o exp(-q / 2))``.
+            A sum of squares: written out as ``a dx² + 2 b dx dy + c dy²`` the terms of a needle
+            cancel, and rounding a, b, c to float32 moves its edge.
         opacities: ``[B, N]``, anti-aliasing already in them.
         features: ``[B, N, C]``.
         depths: ``[B, N]`` metres along the viewing axis.
@@ -40,7 +44,7 @@ class Projected:
     """
 
     means: Tensor
-    conics: Tensor
+    factors: Tensor
     opacities: Tensor
     features: Tensor
     depths: Tensor
@@ -55,8 +59,8 @@ def project(
 
     Convention: differentiable in means, quats, scales, covariances, opacities, features, K, R, t.
     Geometry is computed in float64 where the device has it (the world offset of the camera
-    cancels there, and so does the determinant of a needle), then rounded to
-    ``promote_types(input dtype, settings dtype)``. ``camera.dist`` is not applied.
+    cancels there, and so does the determinant of a needle); what is not ``means`` or ``factors`` is
+    then rounded to ``promote_types(input dtype, settings dtype)``. ``camera.dist`` is not applied.
 
     Args:
         gaussians: N Gaussians per batch item.
@@ -83,24 +87,24 @@ def project(
     depths = x_cam[:, 2]
     ratios = x_cam[:, :2] / depths.unsqueeze(1)
     means = K[:, :2, :2] @ ratios + K[:, :2, 2:]
-    limits = _field_of_view(K, camera.size, settings.fov_clamp)
+    limits = field_of_view(K, camera.size, settings.fov_clamp)
     a, b, c, det_before = _covariance_2d(gaussians, _jacobian(K, R, ratios, depths, limits))
     low = settings.low_pass
     det = det_before + low * (a + c) + low * low
     a, c = a + low, c + low
-    if gaussians.covariances is not None:
-        # The same number, unless rounding or the covariance itself is not positive definite: then
-        # this form is.
-        a = (b * b + det) / c
-    conics = torch.stack([c, -b, a], dim=-1) / det.unsqueeze(-1)
+    # With Σ = [a b; b c]: Σ⁻¹ = [c -b; -b a] / det, whose factor needs no difference.
+    factors = torch.stack([(c / det).sqrt(), -b / c, c.rsqrt()], dim=-1)
     opacities = gaussians.opacities.to(wide)
     if settings.antialias:
         opacities = opacities * _safe_sqrt(det_before / det)
     with torch.no_grad():
+        # Twice the same variance, unless a covariance that was given is not positive definite: then
+        # the factors stand for this one.
+        a = (b * b + det) / c
         extents, visible = _footprint(means, a, c, opacities, in_front, camera.size, settings)
     return Projected(
-        means.mT.to(dtype),
-        conics.to(dtype),
+        means.mT,
+        factors,
         opacities.to(dtype),
         gaussians.features.to(dtype),
         depths.to(dtype),
@@ -129,7 +133,7 @@ def _rotation_entries(quats: Tensor, dim: int) -> list[Tensor]:
     # The length is divided out in two steps, so that squares neither underflow nor overflow.
     # The first divisor needs no gradient: the result does not depend on the length.
     largest = quats.detach().abs().amax(dim, keepdim=True)
-    usable = largest > _QUAT_MIN
+    usable = largest > QUAT_MIN
     w, x, y, z = (quats / torch.where(usable, largest, 1.0)).unbind(dim)
     noise = ~usable.squeeze(dim)
     w, x, y, z = w.masked_fill(noise, 1.0), *(i.masked_fill(noise, 0.0) for i in (x, y, z))
@@ -189,7 +193,7 @@ def _jacobian(
     return (towards - away) / depths[:, None, None]
 
 
-def _field_of_view(K: Tensor, size: tuple[int, int], widen: float) -> tuple[Tensor, Tensor]:
+def field_of_view(K: Tensor, size: tuple[int, int], widen: float) -> tuple[Tensor, Tensor]:
     """Least and greatest x/z and y/z, each ``[B, 2, 1]``, of the picture widened about its middle.
 
     The corners of the picture bound them, which holds with skew and an off-centre principal point.
@@ -222,9 +226,9 @@ def _footprint(
         # alpha >= alpha_min where q <= 2 ln(o / alpha_min), and |dx| <= sqrt(q Σ_xx).
         reach = (2 * torch.log(opacities / settings.alpha_min).clamp_min(0)).sqrt()
     else:
-        reach = torch.full_like(opacities, math.sqrt(2 * _EXP_UNDERFLOW))
+        reach = torch.full_like(opacities, math.sqrt(2 * EXP_UNDERFLOW))
     if settings.extent != "sigma":
-        reach = reach * (1 + _EXTENT_MARGIN) + _EXTENT_MARGIN
+        reach = reach * (1 + EXTENT_MARGIN) + EXTENT_MARGIN
     extents = reach.unsqueeze(1) * torch.stack([a, c], dim=1).sqrt()
     # The outermost pixel centres are half a pixel inside the picture.
     last = means.new_tensor([[W - 0.5], [H - 0.5]])

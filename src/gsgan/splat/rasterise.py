@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.splat import reference, tiles
-from gsgan.splat.project import project
+from gsgan.splat.project import Projected, project
 from gsgan.splat.settings import Accuracy, accuracy
 
 BACKENDS = ("auto", "reference", "torch", "native")
@@ -67,8 +67,9 @@ def rasterise(
         _say_once(reason)
     out = gaussians.means.dtype
     with tiles.full_precision(gaussians.means.device):
-        projected = project(gaussians, camera, settings, keep)
-        features, alpha, z = _COMPOSITE[name](projected, camera.size, settings, depth)
+        projector, composite = _backend(name)
+        projected = projector(gaussians, camera, settings, keep)
+        features, alpha, z = composite(projected, camera.size, settings, depth)
     return Raster(features.to(out), alpha.to(out), None if z is None else z.to(out))
 
 
@@ -113,15 +114,13 @@ def _why_native_is_missing() -> str:
         return f"the native backend cannot be imported ({error})."
 
 
-def _native_composite(*args: Any) -> tuple[Tensor, Tensor, Tensor | None]:
-    return importlib.import_module("gsgan.splat.native").composite(*args)
-
-
-_COMPOSITE: dict[str, Callable[..., tuple[Tensor, Tensor, Tensor | None]]] = {
-    "reference": reference.composite,
-    "torch": tiles.composite,
-    "native": _native_composite,
-}
+def _backend(name: str) -> tuple[Callable[..., Projected], Callable[..., Any]]:
+    """How a backend projects, and how it composites."""
+    if name == "native":
+        native_project = importlib.import_module("gsgan.splat.native_project")
+        native = importlib.import_module("gsgan.splat.native")
+        return native_project.project, native.composite
+    return project, {"reference": reference.composite, "torch": tiles.composite}[name]
 
 
 def _say_once(sentence: str) -> None:

@@ -83,19 +83,17 @@ def _sorted(projected: Projected) -> Projected:
 def _pixel_chunks(projected: Projected, size: tuple[int, int]) -> tuple[Tensor, ...]:
     """Pixel centres ``[P, 2]``, row by row, as many at a time as the memory is meant for."""
     H, W = size
-    rows = torch.arange(H, device=projected.means.device, dtype=projected.means.dtype) + 0.5
-    columns = torch.arange(W, device=projected.means.device, dtype=projected.means.dtype) + 0.5
-    y, x = torch.meshgrid(rows, columns, indexing="ij")
+    y, x = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
     per_chunk = max(1, CHUNK_ELEMENTS // max(1, projected.depths.numel()))
-    return torch.stack([x, y], dim=-1).reshape(-1, 2).split(per_chunk)
+    return torch.stack([x, y], dim=-1).to(projected.features).reshape(-1, 2).split(per_chunk)
 
 
 def _alphas(projected: Projected, pixels: Tensor, settings: Accuracy | None) -> Tensor:
     """``[B, P, N]``; without settings, before any cut-off but visibility."""
-    d = pixels[:, None] - projected.means.unsqueeze(1)
+    d = pixels[:, None] - projected.means.to(pixels).unsqueeze(1)
     dx, dy = d.unbind(-1)
-    a, b, c = (k.unsqueeze(1) for k in projected.conics.unbind(-1))
-    q = a * dx * dx + 2 * b * dx * dy + c * dy * dy
+    p, k, r = (x.unsqueeze(1) for x in projected.factors.to(pixels).unbind(-1))
+    q = (p * (dx + k * dy)).square() + (r * dy).square()
     # Masked before exp: an invisible Gaussian then passes exact zeros back, never 0 * inf.
     drawn = projected.visible.unsqueeze(1).expand_as(q)
     if settings is not None and settings.extent == "sigma":

@@ -24,6 +24,11 @@ from torch.nn import functional
 from gsgan.splat.project import Projected
 from gsgan.splat.settings import Accuracy
 
+# Rounding errors, in units of the last place, that q may have gathered where tiles are listed.
+ROUNDING = 64
+# u and v this large are far beyond every cut-off, and their squares still fit into float32.
+U_MAX = 1e15
+
 
 @dataclass(frozen=True)
 class Tiling:
@@ -73,11 +78,11 @@ def composite(
     values = [projected.features, torch.ones_like(projected.depths).unsqueeze(-1)]
     if want_depth:
         values.append(projected.depths.unsqueeze(-1))
-    geometry = [projected.means, projected.conics, projected.opacities.unsqueeze(-1)]
+    geometry = torch.cat([projected.means, projected.factors], dim=-1)
     with torch.no_grad():
         lists = _tile_lists(projected, size, settings, tiling)
     blended = _Composite.apply(
-        torch.cat(geometry, dim=-1), torch.cat(values, dim=-1), lists, settings, tiling
+        geometry, projected.opacities, torch.cat(values, dim=-1), lists, settings, tiling
     )
     alpha = blended[:, C : C + 1]
     # Rounding may sum the weights to 1 + 1e-7; the gradient is not to stop there.
@@ -137,7 +142,7 @@ def _tile_lists(
     deepest = counts.argsort(descending=True, stable=True)
     box = None
     if settings.extent == "sigma":
-        box = functional.pad(projected.extents.flatten(0, 1), (0, 0, 0, 1))
+        box = _with_empty_row(projected.extents)
     return _TileLists(
         *(size, grid, rows[by_tile], tiles.long()[deepest], starts[deepest], counts[deepest], box)
     )
@@ -146,10 +151,10 @@ def _tile_lists(
 def _pixel_box(projected: Projected, size: tuple[int, int], rows: Tensor) -> tuple[Tensor, Tensor]:
     """First and last pixel (x, y) whose centre is in the footprint, each ``[M, 2]`` int64."""
     means = projected.means.flatten(0, 1)[rows]
-    extents = projected.extents.flatten(0, 1)[rows]
+    extents = projected.extents.flatten(0, 1)[rows].to(means)
     edge = means.new_tensor([size[1], size[0]])
-    # Clamped as floats: footprints reach far beyond what integers hold. Far means are off by
-    # pixels in float32; that is why the box is rounded outwards, not to the nearest.
+    # Clamped as floats: footprints reach far beyond what integers hold. Extents are rounded: the
+    # box is rounded outwards, not to the nearest.
     first = torch.minimum((means - extents - 0.5).floor().clamp_min(0), edge)
     last = torch.minimum((means + extents - 0.5).ceil(), edge - 1).clamp_min(-1)
     return first.long(), last.long()
@@ -176,36 +181,39 @@ def _reaches(
 
     The least q over a rectangle lies on the edges that face the mean: a point each, in closed form.
     """
-    a, b, c = projected.conics.flatten(0, 1)[rows].unbind(-1)
+    p, k, r = projected.factors.flatten(0, 1)[rows].unbind(-1)
     opacities = projected.opacities.flatten(0, 1)[rows]
     low = tile_xy * tiling.tile + 0.5 - projected.means.flatten(0, 1)[rows]
     high = low + (tiling.tile - 1)
     (x0, y0), (x1, y1) = low.unbind(-1), high.unbind(-1)
     x, y = torch.zeros_like(x0).clamp(x0, x1), torch.zeros_like(y0).clamp(y0, y1)
-    y_at_x, x_at_y = (-b * x / c).clamp(y0, y1), (-b * y / a).clamp(x0, x1)
+    w = p * k
+    y_at_x = (-p * w * x / (w * w + r * r)).clamp(y0, y1)
+    x_at_y = (-k * y).clamp(x0, x1)
     q = torch.minimum(
-        a * x * x + 2 * b * x * y_at_x + c * y_at_x * y_at_x,
-        a * x_at_y * x_at_y + 2 * b * x_at_y * y + c * y * y,
+        (p * x + w * y_at_x).square() + (r * y_at_x).square(),
+        (p * x_at_y + w * y).square() + (r * y).square(),
     )
-    # The margin covers the rounding of q itself, which grows with the terms that cancel in it.
-    rounding = 64 * torch.finfo(q.dtype).eps * (1 + a * low.square()[:, 0] + c * low.square()[:, 1])
-    return q <= 2 * torch.log(opacities / settings.alpha_min) + rounding
+    rounding = ROUNDING * torch.finfo(opacities.dtype).eps
+    level = 2 * torch.log(opacities.to(q.dtype) / settings.alpha_min)
+    return q <= level + rounding * (1 + level)
 
 
 class _Composite(torch.autograd.Function):
-    """``geometry [B, N, 6]`` (x, y, a, b, c, opacity), ``values [B, N, V]`` → ``[B, V, H, W]``."""
+    """Geometry ``[B, N, 5]`` (x y p k r), opacities, values ``[B, N, V]`` → ``[B, V, H, W]``."""
 
     @staticmethod
     def forward(
         ctx: Any,
         geometry: Tensor,
+        opacities: Tensor,
         values: Tensor,
         lists: _TileLists,
         settings: Accuracy,
         tiling: Tiling,
     ) -> Tensor:
         B, _, V = values.shape
-        walk = _Walk(geometry, values, lists, settings, tiling)
+        walk = _Walk(geometry, opacities, values, lists, settings, tiling)
         needs_grad = any(ctx.needs_input_grad)
         canvas = values.new_zeros(B * lists.grid[0] * lists.grid[1], V, tiling.tile**2)
         saved: list[list[tuple[Tensor, Tensor]]] = []
@@ -213,20 +221,34 @@ class _Composite(torch.autograd.Function):
             sums, blocks = walk.forward(chunk, needs_grad)
             canvas[lists.tiles[chunk]] = sums
             saved.append(blocks)
-        ctx.save_for_backward(geometry, values)
+        ctx.save_for_backward(geometry, opacities, values)
         ctx.saved, ctx.lists, ctx.settings, ctx.tiling = saved, lists, settings, tiling
         return _from_tiles(canvas, B, lists, tiling)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        geometry, values = ctx.saved_tensors
-        walk = _Walk(geometry, values, ctx.lists, ctx.settings, ctx.tiling)
+        geometry, opacities, values = ctx.saved_tensors
+        walk = _Walk(geometry, opacities, values, ctx.lists, ctx.settings, ctx.tiling)
         canvas = _to_tiles(grad, ctx.lists, ctx.tiling)
         with full_precision(grad.device):
             for chunk, blocks in zip(walk.chunks(), ctx.saved, strict=True):
                 walk.backward(chunk, blocks, canvas[ctx.lists.tiles[chunk]])
         return *walk.gradients(), None, None, None
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Ellipses seen from the middle of a tile: ``u + p x + w y`` and ``v + r y`` at (x, y) from it.
+
+    ``q`` is the sum of their squares. Each ``[T, K]``.
+    """
+
+    u: Tensor
+    v: Tensor
+    p: Tensor
+    w: Tensor
+    r: Tensor
 
 
 class _Walk:
@@ -235,6 +257,7 @@ class _Walk:
     def __init__(
         self,
         geometry: Tensor,
+        opacities: Tensor,
         values: Tensor,
         lists: _TileLists,
         settings: Accuracy,
@@ -243,30 +266,34 @@ class _Walk:
         self.shape = geometry.shape[:2]
         # One row more, transparent, fills up the last block of each list.
         self.geometry = _with_empty_row(geometry)
+        self.opacities = _with_empty_row(opacities.unsqueeze(-1)).squeeze(-1)
         self.values = _with_empty_row(values)
         self.lists, self.settings, self.tiling = lists, settings, tiling
         self.pixels = tiling.tile**2
-        dtype, device = geometry.dtype, geometry.device
+        dtype, device = values.dtype, values.device
         axis = torch.arange(tiling.tile, dtype=dtype, device=device) - (tiling.tile - 1) / 2
         y, x = (axis_.flatten() for axis_ in torch.meshgrid(axis, axis, indexing="ij"))
         self.xy = torch.stack([x, y])
         # q is a polynomial of the pixel's place in the tile: one small matrix product gives it.
         self.basis = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
+        self.parts_of_q = x.new_tensor([-0.5, -1, -1, -0.5, -1, -0.5])
         tile = lists.tiles % (lists.grid[0] * lists.grid[1])
         corner = torch.stack([tile % lists.grid[1], tile // lists.grid[1]], dim=-1)
-        self.centres = (corner * tiling.tile + tiling.tile / 2).to(dtype)
+        self.centres = (corner * tiling.tile + tiling.tile / 2).to(geometry.dtype)
         # exp of less is 0 or subnormal: slow, and below every alpha_min. Above 0 is rounding.
         self.least_exponent = math.log(torch.finfo(dtype).tiny)
         # threshold() keeps what is greater; alphas equal to alpha_min are to be kept.
         alpha_min = torch.tensor(settings.alpha_min, dtype=dtype)
         self.below_alpha_min = torch.nextafter(alpha_min, alpha_min - 1).item()
-        self.geometry_grad = torch.zeros_like(self.geometry)
+        self.sums = self.values.new_zeros(len(self.values), 6)
         self.values_grad = torch.zeros_like(self.values)
 
-    def gradients(self) -> tuple[Tensor, Tensor]:
-        """``[B, N, 6]`` and ``[B, N, V]``."""
-        geometry, values = self.geometry_grad[:-1], self.values_grad[:-1]
-        return geometry.unflatten(0, self.shape), values.unflatten(0, self.shape)
+    def gradients(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Of geometry ``[B, N, 5]``, opacities ``[B, N]`` and values ``[B, N, V]``."""
+        sums, opacities = self.sums[:-1].to(self.geometry), self.opacities[:-1].to(self.geometry)
+        geometry = _geometry_gradient(self.geometry[:-1], opacities, sums)
+        grads = (geometry, self.sums[:-1, 0], self.values_grad[:-1])
+        return tuple(grad.unflatten(0, self.shape) for grad in grads)  # type: ignore[return-value]
 
     def chunks(self) -> Iterator[slice]:
         """Ranges of listed tiles that are walked together."""
@@ -292,7 +319,8 @@ class _Walk:
             if save:
                 blocks.append((rows, before))
             ids = self._ids(starts[rows], counts[rows], offset)
-            alpha = self._alpha(self._exponential(ids, rows, chunk), ids)[0]
+            place = self._place(ids, rows, chunk)
+            alpha = self._alpha(self._exponential(ids, place, rows, chunk), ids)[0]
             weights, before = self._weights(alpha, before)
             sums.index_add_(0, rows, self.values[ids].mT @ weights)
         return sums, blocks
@@ -304,7 +332,8 @@ class _Walk:
         behind = torch.zeros_like(grad[:, 0])
         for number, (rows, before) in reversed(list(enumerate(blocks))):
             ids = self._ids(starts[rows], counts[rows], number * self.tiling.layers)
-            exponential = self._exponential(ids, rows, chunk)
+            place = self._place(ids, rows, chunk)
+            exponential = self._exponential(ids, place, rows, chunk)
             alpha, passes = self._alpha(exponential, ids, want_mask=True)
             assert passes is not None
             values, grad_here = self.values[ids], grad[rows]
@@ -319,8 +348,7 @@ class _Walk:
             d_alpha = seen.sub_(hidden).mul_(transmittance).mul_(passes)
             self._add(self.values_grad, ids, alpha.mul_(transmittance) @ grad_here.mT)
             moments = d_alpha.mul_(exponential).flatten(0, 1) @ self.basis.mT
-            geometry = self._local_geometry(ids, rows, chunk)
-            self._add(self.geometry_grad, ids, _geometry_gradient(geometry, moments))
+            self._add(self.sums, ids, _whitened_sums(place, moments))
 
     def _ids(self, starts: Tensor, counts: Tensor, offset: int) -> Tensor:
         """``[T, K]`` rows of the ellipses of one block; the empty row past the end of a list."""
@@ -329,24 +357,25 @@ class _Walk:
         place = torch.where(inside, starts.unsqueeze(1) + place, 0)
         return torch.where(inside, self.lists.ids[place], len(self.geometry) - 1)
 
-    def _local_geometry(self, ids: Tensor, rows: Tensor, chunk: slice) -> Tensor:
-        """``[T, K, 6]`` with means relative to the middle of the tile."""
-        geometry = self.geometry[ids]
-        geometry[..., :2] -= self.centres[chunk][rows].unsqueeze(1)
-        return geometry
+    def _place(self, ids: Tensor, rows: Tensor, chunk: slice) -> _Place:
+        x, y, p, k, r = self.geometry[ids].unbind(-1)
+        centre_x, centre_y = self.centres[chunk][rows].unsqueeze(1).unbind(-1)
+        dx, dy = centre_x - x, centre_y - y
+        u, v = (p * (dx + k * dy)).clamp_(-U_MAX, U_MAX), (r * dy).clamp_(-U_MAX, U_MAX)
+        return _Place(*(i.to(self.values.dtype) for i in (u, v, p, p * k, r)))
 
-    def _exponential(self, ids: Tensor, rows: Tensor, chunk: slice) -> Tensor:
+    def _exponential(self, ids: Tensor, place: _Place, rows: Tensor, chunk: slice) -> Tensor:
         """``exp(-q / 2)``, ``[T, K, P]``."""
-        geometry = self._local_geometry(ids, rows, chunk)
-        x, y, a, b, c, _ = geometry.unbind(-1)
-        to_x, to_y = a * x + b * y, b * x + c * y
-        coefficients = [-0.5 * (x * to_x + y * to_y), to_x, to_y, -0.5 * a, -b, -0.5 * c]
-        q = torch.stack(coefficients, dim=-1).flatten(0, 1) @ self.basis
+        u, v, p, w, r = vars(place).values()
+        halves = [u * u + v * v, u * p, u * w + v * r, p * p, p * w, w * w + r * r]
+        coefficients = torch.stack(halves, dim=-1).mul_(self.parts_of_q).flatten(0, 1)
+        q = coefficients @ self.basis
         exponential = q.clamp_(self.least_exponent, 0.0).exp_().unflatten(0, ids.shape)
         if self.lists.box is not None:
-            box = self.lists.box[ids]
+            box, means = self.lists.box[ids], self.geometry[ids][..., :2]
+            place_of_mean = (means - self.centres[chunk][rows].unsqueeze(1)).to(box)
             for axis in range(2):
-                distance = self.xy[axis] - geometry[..., axis, None]
+                distance = self.xy[axis] - place_of_mean[..., axis, None]
                 exponential.mul_(_indicator(-distance.abs(), -box[..., axis, None]))
         return exponential
 
@@ -354,7 +383,7 @@ class _Walk:
         self, exponential: Tensor, ids: Tensor, want_mask: bool = False
     ) -> tuple[Tensor, Tensor | None]:
         """Alphas ``[T, K, P]`` after the cut-offs, and where gradients pass (1 or 0)."""
-        alpha = exponential * self.geometry[:, 5][ids].unsqueeze(-1)
+        alpha = exponential * self.opacities[ids].unsqueeze(-1)
         passes = None
         if want_mask:
             passes = _indicator(alpha, self.settings.alpha_min)
@@ -392,19 +421,26 @@ def _behind(alpha: Tensor, seen: Tensor, behind: Tensor) -> tuple[Tensor, Tensor
     return layers, torch.lerp(layers[:, 0], seen[:, 0], alpha[:, 0])
 
 
-def _geometry_gradient(geometry: Tensor, moments: Tensor) -> Tensor:
-    """Gradients of (x, y, a, b, c, opacity) from sums over pixels of ``dL/dalpha exp(-q/2)``.
+def _whitened_sums(place: _Place, moments: Tensor) -> Tensor:
+    """``[T * K, 6]`` sums over pixels of ``g = dL/dalpha exp(-q/2)`` times 1, u, v, u², u v, v².
 
-    ``moments [T * K, 6]`` are those sums times 1, x, y, x², xy, y².
+    ``moments [T * K, 6]`` are those of g times 1, x, y, x², x y, y², about the middle of the tile.
     """
-    x, y, a, b, c, opacity = geometry.flatten(0, 1).unbind(-1)
-    one, mx, my, mxx, mxy, myy = moments.unbind(-1)
-    dx, dy = mx - x * one, my - y * one  # first moments about the mean
-    dxx = mxx - x * (mx + dx)
-    dxy = mxy - x * my - y * dx
-    dyy = myy - y * (my + dy)
-    shape = torch.stack([a * dx + b * dy, b * dx + c * dy, -0.5 * dxx, -dxy, -0.5 * dyy], dim=-1)
-    return torch.cat([shape * opacity.unsqueeze(-1), one.unsqueeze(-1)], dim=-1)
+    u, v, p, w, r = (i.flatten() for i in vars(place).values())
+    one, x, y, xx, xy, yy = moments.unbind(-1)
+    along_u, along_v = p * x + w * y, r * y  # g times what u and v add to their value at the middle
+    sum_u, sum_v = u * one + along_u, v * one + along_v
+    uu = u * (sum_u + along_u) + p * (p * xx + 2 * w * xy) + w * w * yy
+    uv = u * sum_v + v * along_u + r * (p * xy + w * yy)
+    vv = v * (sum_v + along_v) + r * r * yy
+    return torch.stack([one, sum_u, sum_v, uu, uv, vv], dim=-1)
+
+
+def _geometry_gradient(geometry: Tensor, opacities: Tensor, sums: Tensor) -> Tensor:
+    """Gradients of (x, y, p, k, r), ``[M, 5]``, from the sums over all pixels, ``[M, 6]``."""
+    _, _, p, k, r = geometry.unbind(-1)
+    _, u, v, uu, uv, vv = (sums * opacities.unsqueeze(-1)).unbind(-1)
+    return torch.stack([p * u, p * k * u + r * v, -uu / p, -uv * p / r, -vv / r], dim=-1)
 
 
 def _indicator(x: Tensor, least: float | Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from gsgan.errors import ConfigError, GsganError
 from gsgan.losses.adversarial import FORMS, discriminator_loss, feature_matching, generator_loss
 from gsgan.losses.perceptual import Perceptual
-from gsgan.losses.photometric import photometric
+from gsgan.losses.photometric import photometric, without_unsure
 from gsgan.metrics.image import psnr
 from gsgan.model.avatar import Avatar, Painting
 from gsgan.model.discriminator import Discriminator
@@ -24,6 +24,7 @@ from gsgan.training.optimisers import Recipe, clip, set_rate
 from gsgan.training.rollback import Rollback
 from gsgan.training.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
 
+PSNR_CAP = 100.0  # dB: one picture equal to the truth would make a watched mean infinite
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
 
 
@@ -338,20 +339,22 @@ class AvatarTraining(LightningModule):
         assert painting.features is not None and painting.alpha is not None  # noqa: PT018
         assert painting.colour is not None
         behind = (1 - painting.alpha) * background
-        loss = photometric(painting.colour + behind, target, l1=weights.l1, ssim=weights.ssim)
+        pixels = {"l1": weights.l1, "ssim": weights.ssim}
+        loss = photometric(painting.colour + behind, target, unsure=frame.unsure, **pixels)
         if self.feature_head is not None:
             # No bias where nothing is: the readout commutes with alpha blending.
             read = nn.functional.conv2d(painting.features, self.feature_head.weight)
             read = read + painting.alpha * self.feature_head.bias.view(1, 3, 1, 1)  # type: ignore[union-attr]
             loss = loss + weights.feature_head * photometric(
-                read + behind, target, l1=weights.l1, ssim=weights.ssim
+                read + behind, target, unsure=frame.unsure, **pixels
             )
         return loss
 
     def step_two_terms(self, painting: Painting, frame: Frame, play: bool) -> dict[str, Tensor]:
         """The generator's losses, weighted, by name."""
-        w, image, target = self.step_two, painting.image, frame.image
+        w, image = self.step_two, painting.image
         assert image is not None
+        target = without_unsure(frame.image, image, frame.unsure)
         terms = {"photometric": photometric(image, target, l1=w.l1, l2=w.l2, ssim=w.ssim)}
         if w.anchor and painting.features is not None:
             terms["anchor"] = w.anchor * self.step_one_loss(painting, frame)
@@ -397,7 +400,7 @@ class AvatarTraining(LightningModule):
         for name, picture in (("psnr", painting.image), ("psnr_splat", painting.colour)):
             if picture is None:
                 continue
-            score = psnr(picture.clamp(0, 1), frame.image).mean()
+            score = psnr(picture.clamp(0, 1), frame.image).clamp_max(PSNR_CAP).mean()
             self.log(f"val/{name}", score, batch_size=len(frame), sync_dist=True)
         return painting
 

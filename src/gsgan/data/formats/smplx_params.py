@@ -101,7 +101,9 @@ def _rows(arrays: dict[str, Any], key: str, width: int | None, path: Path) -> Fl
         values = np.asarray(raw, np.float64)
     except (TypeError, ValueError, OverflowError):
         values = np.zeros(0)
-    values = values.reshape(len(values), -1) if values.ndim > 1 and values.size else np.zeros((0, 0))
+    values = (
+        values.reshape(len(values), -1) if values.ndim > 1 and values.size else np.zeros((0, 0))
+    )
     if not values.size or width not in (None, values.shape[1]):
         raise DataError(f"{path}: {_expectation(key, width, values.shape[1], raw)}")
     return values

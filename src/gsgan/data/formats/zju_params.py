@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,13 +82,17 @@ def read_motion(
             f"{root / fit.params} has no parameters of any frame that has pictures; it holds "
             f"{len(files)} files ({', '.join(some) or 'none'})"
         )
-    rows = [_parameters(root / files[i]) for i in ids]
+    rows = [fit_parameters(read_npy(root / files[i]), str(root / files[i])) for i in ids]
     poses, shapes, Rh, Th = (np.stack(column) for column in zip(*rows, strict=True))
     return to_motion(np.array(ids, np.int64), poses, shapes, Rh, Th, model, notes)
 
 
-def _parameters(path: Path) -> tuple[Float, Float, Float, Float]:
-    content, where = read_npy(path), str(path)
+def fit_parameters(content: Any, where: str) -> tuple[Float, Float, Float, Float]:
+    """``poses [72]``, ``shapes [10]``, ``Rh [3]`` and ``Th [3]`` of one frame.
+
+    Raises:
+        DataError: when one is missing, of another length, or not finite.
+    """
     poses = parameter(content, "poses", POSES, where)
     if len(poses) == POSES[1]:
         poses = np.concatenate([np.zeros(3), poses])
