@@ -1,0 +1,228 @@
+"""Compiles the kernels on first use and loads them: no build step that a user sees.
+
+The shared library is compiled by the system's compiler into a user cache (``GSGAN_CACHE``, else
+``$XDG_CACHE_HOME/gsgan``, else ``~/.cache/gsgan``; subfolder ``native``) and loaded from there
+later. A file's name says what it was made from and what it holds, so that nothing stale or damaged
+is ever loaded.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import tempfile
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import torch
+
+SOURCE = Path(__file__).with_name("native.cpp")
+HEADERS = SOURCE.with_name("kernels")
+COMPILERS = ("c++", "g++", "clang++")
+COMPILE_SECONDS = 300.0
+
+# No -ffast-math: NaN and infinity keep their meaning, sums keep their order.
+BASE_FLAGS = (
+    *("-std=c++17", "-O3", "-fPIC", "-shared", "-fopenmp-simd"),
+    *("-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"),
+)
+# Tried in this order: some compilers lack OpenMP (Apple's clang), some the flag for the own CPU.
+_FLAGS = (
+    ("-march=native", "-mprefer-vector-width=512", "-fopenmp"),
+    ("-march=native", "-fopenmp"),
+    ("-mcpu=native", "-fopenmp"),
+    ("-mcpu=native",),
+    ("-march=native",),
+    ("-fopenmp",),
+    (),
+)
+
+DTYPES = {torch.float32: "float32", torch.float64: "float64"}
+# Functions of the library, one for each dtype; each takes a job and at most one more pointer.
+_FUNCTIONS = ("forward", "backward", "free", "project", "project_backward")
+
+_LOCK = threading.Lock()
+
+
+class Unavailable(Exception):
+    """Why there is no kernel, in one sentence."""
+
+
+def library() -> tuple[ctypes.CDLL | None, str]:
+    """The kernels, from the cache or compiled now (seconds); loaded once in a process.
+
+    Returns:
+        The library and "", or None and one sentence of reason.
+    """
+    with _LOCK:  # two threads must not compile at once
+        return _load_once()
+
+
+def function(name: str, dtype: torch.dtype) -> Any:
+    """A function of the library, for numbers of that dtype.
+
+    Raises:
+        RuntimeError: where there is no library.
+    """
+    loaded, reason = library()
+    if loaded is None:
+        raise RuntimeError(f"The native kernel is not available: {reason}")
+    return getattr(loaded, f"gsgan_{name}_{DTYPES[dtype]}")
+
+
+@functools.lru_cache(maxsize=1)
+def _load_once() -> tuple[ctypes.CDLL | None, str]:
+    try:
+        command = compiler()
+        folder, key = _cache_folder(), cache_key(command)
+        for path in _cached(folder, key):
+            loaded = open_library(path)
+            if loaded is not None:
+                return loaded, ""
+        loaded = open_library(_build(command, folder, key))
+    except Unavailable as reason:
+        return None, str(reason)
+    except OSError as error:
+        return None, f"The native kernel cannot be built: {error}."
+    if loaded is None:
+        return None, "The native kernel was compiled but cannot be loaded."
+    return loaded, ""
+
+
+def compiler() -> list[str]:
+    """The command of the compiler; ``CXX`` is a choice that is not second-guessed."""
+    named = shlex.split(os.environ.get("CXX", ""))
+    if named:
+        if shutil.which(named[0]) is None:
+            raise Unavailable(f"The compiler that CXX names, {named[0]!r}, is not found.")
+        return named
+    for name in COMPILERS:
+        if (path := shutil.which(name)) is not None:
+            return [path]
+    raise Unavailable(
+        f"No C++ compiler is found (looked for {', '.join(COMPILERS)}); install one or set CXX."
+    )
+
+
+def _cache_folder() -> Path:
+    """Where compiled kernels live; created, for this user only, when missing."""
+    root = os.environ.get("GSGAN_CACHE") or None
+    if root is None:
+        base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+        root = os.path.join(base, "gsgan")
+    folder = Path(root) / "native"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise Unavailable(
+            f"The cache folder {folder} cannot be created ({error.strerror}); set GSGAN_CACHE to a "
+            "folder that can be written."
+        ) from error
+    return folder
+
+
+def cache_key(command: list[str]) -> str:
+    """Names what a compiled kernel depends on: source, flags, compiler, CPU."""
+    parts = (_source(), repr(BASE_FLAGS), repr(_FLAGS), repr(command), _version(command), _cpu())
+    return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
+
+
+def _source() -> str:
+    headers = sorted(HEADERS.glob("*.h"))
+    if not SOURCE.is_file() or not headers:
+        raise Unavailable(f"The kernel's source {SOURCE} or {HEADERS} is missing; reinstall gsgan.")
+    return "\0".join(path.read_text(encoding="utf-8") for path in (SOURCE, *headers))
+
+
+def _version(command: list[str]) -> str:
+    done = _run([*command, "--version"])
+    if done.returncode != 0:
+        raise Unavailable(f"The compiler {shlex.join(command)!r} does not run.")
+    return done.stdout
+
+
+def _cpu() -> str:
+    """What -march=native stands for here: a home folder may be shared by unlike machines."""
+    lines = [platform.machine(), platform.processor()]
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        wanted = ("model name", "flags", "CPU implementer", "CPU part", "Features")
+        lines += sorted(
+            {x for x in info.read_text(errors="replace").splitlines() if x.startswith(wanted)}
+        )
+    return "\n".join(lines)
+
+
+def _cached(folder: Path, key: str) -> Iterator[Path]:
+    """Whole files of that key. A file's name ends with its own hash: loading a damaged one would
+    crash the process, so those are deleted."""
+    for path in sorted(folder.glob(f"{key}-*.so")):
+        if path.stem.rpartition("-")[2] == _digest(path):
+            yield path
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:24]
+
+
+def _build(command: list[str], folder: Path, key: str) -> Path:
+    """Compiles beside the cache and renames when whole: a process that looks sees all or nothing.
+
+    Returns:
+        The shared library.
+
+    Raises:
+        Unavailable: when no set of flags compiles.
+    """
+    message = ""
+    with tempfile.TemporaryDirectory(dir=folder, prefix="build-") as work:
+        target = Path(work) / "native.so"
+        for flags in _FLAGS:
+            done = _run([*command, *BASE_FLAGS, *flags, str(SOURCE), "-o", str(target)])
+            if done.returncode == 0 and target.is_file():
+                final = folder / f"{key}-{_digest(target)}.so"
+                os.replace(target, final)
+                return final
+            message = message or _first_error(done.stderr)
+    raise Unavailable(f"The compiler {shlex.join(command)!r} failed on the native kernel{message}.")
+
+
+def _first_error(stderr: str) -> str:
+    lines = [line.strip().rstrip(".") for line in stderr.splitlines() if "error" in line.lower()]
+    return f": {lines[0]}" if lines else ""
+
+
+def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(
+            command, capture_output=True, text=True, timeout=COMPILE_SECONDS, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise Unavailable(
+            f"The compiler {command[0]!r} did not finish in {COMPILE_SECONDS:.0f} s."
+        ) from error
+
+
+def open_library(path: Path) -> ctypes.CDLL | None:
+    """The library with its functions declared, or None where it cannot be loaded."""
+    try:
+        loaded = ctypes.CDLL(str(path))
+        for name in _FUNCTIONS:
+            for dtype in DTYPES.values():
+                declared = getattr(loaded, f"gsgan_{name}_{dtype}")
+                count = 2 if name in ("forward", "backward") else 1
+                declared.argtypes = (ctypes.c_void_p,) * count
+                declared.restype = None if name == "free" else ctypes.c_int
+    except (OSError, AttributeError):
+        return None
+    return loaded

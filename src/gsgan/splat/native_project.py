@@ -1,0 +1,153 @@
+"""The compiled projection for CPUs: what ``project`` computes, in one pass over the Gaussians.
+
+The many small operations of :func:`gsgan.splat.project.project` take as long as the compositing
+kernel does. They stay the portable path, and what this one is tested against.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsgan.scene import Camera, Gaussians
+from gsgan.splat import build
+from gsgan.splat.native import point
+from gsgan.splat.project import (
+    EXP_UNDERFLOW,
+    EXTENT_MARGIN,
+    QUAT_MIN,
+    Projected,
+    field_of_view,
+)
+from gsgan.splat.settings import Accuracy
+
+_INPUTS = ("means", "quats", "scales", "covariances", "opacities")
+_CAMERA = ("K", "R", "t", "limits")
+_OUTPUTS = ("means", "factors", "opacities", "depths")
+_SIZES = ("B", "N", "H", "W", "threads", "antialias")
+_NUMBERS = ("near", "low_pass", "alpha_min", "reach", "extent_margin", "quat_min")
+
+
+class _Job(ctypes.Structure):
+    """Mirrors ``struct ProjectJob`` of kernels/lens.h field by field."""
+
+    _fields_ = (
+        *((name, ctypes.c_int64) for name in _SIZES),
+        *((name, ctypes.c_double) for name in _NUMBERS),
+        *((name, ctypes.c_void_p) for name in (*_INPUTS, "keep", *_CAMERA)),
+        *((f"out_{name}", ctypes.c_void_p) for name in (*_OUTPUTS, "extents")),
+        ("visible", ctypes.c_void_p),
+        *((f"g_{name}", ctypes.c_void_p) for name in _OUTPUTS),
+        *((f"d_{name}", ctypes.c_void_p) for name in (*_INPUTS, *_CAMERA)),
+    )
+
+
+def project(
+    gaussians: Gaussians, camera: Camera, settings: Accuracy, keep: Tensor | None = None
+) -> Projected:
+    """Projects Gaussians onto the picture, on the CPU; see ``gsgan.splat.project.project``.
+
+    Convention: differentiable once, in the same inputs. Same input, same bits, whatever the number
+    of threads.
+
+    Args:
+        gaussians: N Gaussians per batch item.
+        camera: one camera per batch item.
+        settings: cut-offs, see ``Accuracy``.
+        keep: ``[B, N]`` bool; the others are made invisible, whatever they hold.
+
+    Returns:
+        The ellipses; invisible ones pass exactly zero gradients back.
+
+    Raises:
+        RuntimeError: where there is no compiled kernel.
+
+    Source: paper Sec. 3.1; Zwicker et al., EWA splatting; gradients derived in kernels/lens.h.
+    """
+    dtype = torch.promote_types(gaussians.means.dtype, settings.torch_dtype)
+    K, R, t = (x.to(torch.float64) for x in (camera.K, camera.R, camera.t))
+    limits = torch.cat(field_of_view(K, camera.size, settings.fov_clamp), dim=1).squeeze(-1)
+    shape: tuple[Tensor | None, ...] = (gaussians.quats, gaussians.scales, None)
+    if gaussians.covariances is not None:
+        shape = (None, None, gaussians.covariances)
+    inputs = (gaussians.means, *shape, gaussians.opacities)
+    outputs = _Project.apply(
+        *(None if x is None else x.to(dtype) for x in inputs),
+        *(K, R, t, limits, keep, camera.size, settings),
+    )
+    means, factors, opacities, depths, extents, visible = outputs
+    features = gaussians.features.to(dtype)
+    return Projected(means, factors, opacities, features, depths, extents, visible)
+
+
+class _Project(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, ...]:
+        *tensors, size, settings = arguments
+        job, held = _job(tensors, size, settings)
+        means, opacities = held[0], held[4]
+        assert means is not None
+        assert opacities is not None
+        B, N = opacities.shape
+        outputs = [
+            *(means.new_empty(B, N, n, dtype=torch.float64) for n in (2, 3)),
+            *(means.new_empty(B, N) for _ in range(2)),
+            means.new_empty(B, N, 2),
+        ]
+        visible = torch.empty(B, N, dtype=torch.bool)
+        point(job, tuple(f"out_{name}" for name in (*_OUTPUTS, "extents")), outputs)
+        point(job, ("visible",), [visible])
+        build.function("project", means.dtype)(ctypes.byref(job))
+        ctx.save_for_backward(*tensors)
+        ctx.size, ctx.settings = size, settings
+        ctx.mark_non_differentiable(outputs[-1], visible)
+        ctx.set_materialize_grads(False)
+        return (*outputs, visible)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        job, held = _job(ctx.saved_tensors, ctx.size, ctx.settings)
+        incoming = [None if g is None else g.contiguous() for g in grads[: len(_OUTPUTS)]]
+        point(job, tuple(f"g_{name}" for name in _OUTPUTS), incoming)
+        needed = ctx.needs_input_grad
+        # The camera's gradients are few numbers: always computed, handed on where wanted.
+        outgoing = [
+            None if x is None or not (need or i >= len(_INPUTS)) else torch.zeros_like(x)
+            for i, (x, need) in enumerate(zip(held[:-1], needed, strict=False))
+        ]
+        point(job, tuple(f"d_{name}" for name in (*_INPUTS, *_CAMERA)), outgoing)
+        assert held[0] is not None
+        if build.function("project_backward", held[0].dtype)(ctypes.byref(job)):
+            raise MemoryError("project: out of memory")
+        wanted = [g if need else None for g, need in zip(outgoing, needed, strict=False)]
+        return (*wanted, *[None] * (len(needed) - len(wanted)))
+
+
+def _job(
+    tensors: Any, size: tuple[int, int], settings: Accuracy
+) -> tuple[_Job, list[Tensor | None]]:
+    """The job without its outputs, and the tensors it points to."""
+    held = [None if x is None else x.detach().contiguous() for x in tensors]
+    opacities = held[len(_INPUTS) - 1]
+    assert opacities is not None
+    reach, margin = _reach(settings)
+    job = _Job(
+        *(*opacities.shape, *size, max(1, torch.get_num_threads()), settings.antialias),
+        *(settings.near, settings.low_pass, settings.alpha_min, reach, margin, QUAT_MIN),
+    )
+    point(job, (*_INPUTS, *_CAMERA, "keep"), held)
+    return job, held
+
+
+def _reach(settings: Accuracy) -> tuple[float, float]:
+    """Half-size of the footprint in standard deviations (-1: by opacity), and its margin."""
+    if settings.extent == "sigma":
+        return settings.radius_sigmas, 0.0
+    if settings.extent == "opacity" and settings.alpha_min > 0:
+        return -1.0, EXTENT_MARGIN
+    return math.sqrt(2 * EXP_UNDERFLOW), EXTENT_MARGIN
