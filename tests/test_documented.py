@@ -57,6 +57,20 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
 
         return zju.write_original(folder() / "CoreView_377", make_subject(smpl_files["smpl"]))
 
+    def rig(name: str) -> Path:
+        from writers.avatarrex import write_avatarrex
+        from writers.smplx_rig import smplx_subject
+        from writers.thuman4 import write_thuman4
+
+        write = write_thuman4 if name == "subject00" else write_avatarrex
+        return write(folder() / name, smplx_subject(smpl_files["smplx"]))
+
+    def take() -> Path:
+        from writers.common import make_subject
+        from writers.easymocap import write_easymocap
+
+        return write_easymocap(folder() / "take", make_subject(smpl_files["smpl"]))
+
     def videos() -> Path:
         from capture_scenes import write_project
 
@@ -69,6 +83,9 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
         "/path/to/CoreView_377": zju,
         "/path/to/SMPL_NEUTRAL.pkl": lambda: smpl_files["smpl"],
         "/path/to/SMPLX_NEUTRAL.npz": lambda: smpl_files["smplx"],
+        "/path/to/subject00": lambda: rig("subject00"),
+        "/path/to/avatarrex_zzr": lambda: rig("avatarrex_zzr"),
+        "/path/to/take": take,
         "/path/to/videos": videos,
     }
 

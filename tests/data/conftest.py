@@ -43,11 +43,11 @@ def subject(smpl_file: Path):
 
 
 @pytest.fixture(scope="session")
-def smplx_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def smplx_file() -> Path:
     """A file like SMPL-X's, of the default person."""
-    from writers.smplx_rig import write_smplx
+    from writers.smplx_rig import smplx_once
 
-    return write_smplx(tmp_path_factory.mktemp("models") / "SMPLX_NEUTRAL.npz")
+    return smplx_once()
 
 
 @pytest.fixture(scope="session")

@@ -8,10 +8,17 @@ from pathlib import Path
 
 from make import write_tiny_capture
 from writers import zju
+from writers.avatarrex import write_avatarrex
 from writers.common import Subject
+from writers.easymocap import write_easymocap
+from writers.smplx_rig import smplx_once, smplx_subject
+from writers.thuman4 import write_thuman4
 
 from gsgan.data.checks import Checks
+from gsgan.data.formats.avatarrex import AvatarrexReader
 from gsgan.data.formats.capture import read_capture
+from gsgan.data.formats.easymocap import EasymocapReader
+from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.formats.zju import ZjuReader
 from gsgan.data.layout import Layout
 
@@ -43,6 +50,14 @@ def _capture(root: Path, subject: Subject) -> None:
     write_tiny_capture(root, labels=True, body_pose=True, meta={"body": "free"}, suffix="jpg")
 
 
+def _thuman4(root: Path, _: Subject) -> None:
+    write_thuman4(root, smplx_subject(smplx_once()), ("cam01\\00000002.jpg",))
+
+
+def _avatarrex(root: Path, _: Subject) -> None:
+    write_avatarrex(root, smplx_subject(smplx_once()))
+
+
 FORMATS = (
     Format("capture", _capture, lambda root, smpl: read_capture(root)),
     Format("zju_original", zju.write_original, _zju),
@@ -50,4 +65,16 @@ FORMATS = (
     Format("zju_refined", zju.write_refined, _zju),
     Format("zju_humannerf", zju.write_humannerf, _zju),
     Format("zju_arah", zju.write_arah, _zju),
+    Format("thuman4", _thuman4, lambda root, _: Thuman4Reader()(root, Checks(), str(smplx_once()))),
+    Format(
+        "avatarrex",
+        _avatarrex,
+        lambda root, _: AvatarrexReader()(root, Checks(), str(smplx_once())),
+    ),
+    Format("easymocap", write_easymocap, lambda root, _: EasymocapReader()(root, Checks())),
+    Format(
+        "easymocap_smpl",
+        write_easymocap,
+        lambda root, smpl: EasymocapReader()(root, Checks(), str(smpl)),
+    ),
 )

@@ -119,7 +119,7 @@ def one(
         factors=torch.tensor([1 / sigma, 0, 1 / sigma], dtype=torch.float64).expand(1, n, 3),
         opacities=opacity * ones,
         features=ones.unsqueeze(-1),
-        depths=ones,
+        depths=ones.double(),
         extents=torch.full((1, n, 2), 1e6, dtype=dtype),
         visible=torch.ones(1, n, dtype=torch.bool),
     )
@@ -147,7 +147,7 @@ def values_and_gradients(
 
 def in_dtype(p: Projected, dtype: torch.dtype) -> Projected:
     """What is not geometry in that dtype, as ``project`` leaves it."""
-    names = ("opacities", "features", "depths", "extents")
+    names = ("opacities", "features", "extents")
     return replace(p, **{name: getattr(p, name).to(dtype) for name in names})
 
 
@@ -295,7 +295,7 @@ def test_equal_depths_are_ordered_by_index() -> None:
 @needs_kernel
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_depth_order_of_any_sign(dtype: torch.dtype) -> None:
-    depths = torch.tensor([[3.0, -1.0, 0.0, -0.0, 1e-30, -2.5, 1e30]], dtype=dtype)
+    depths = torch.tensor([[3.0, -1.0, 0.0, -0.0, 1e-30, -2.5, 1e30]], dtype=torch.float64)
     p = one((0.5, 0.5), 0.5, 3.0, n=7, dtype=dtype)
     p = replace(p, features=torch.eye(7, dtype=dtype)[None], depths=depths)
     features = native.composite(p, (1, 1), EXACT, False)[0].flatten()

@@ -28,6 +28,7 @@ _OUT_OF_MEMORY, _NOT_FINITE = 1, 2
 
 _SIZES = ("B", "N", "C", "H", "W", "threads", "keep", "box", "slot_bytes")
 _INPUTS = ("means", "factors", "opacities", "features", "depths", "extents")
+_WIDE = ("means", "factors", "depths")  # always float64, see Projected
 _OUTPUTS = ("out_features", "out_alpha", "out_depth")
 _GRADS_OUT = ("g_features", "g_alpha", "g_depth")
 _GRADS_IN = ("d_means", "d_factors", "d_opacities", "d_features", "d_depths")
@@ -147,7 +148,7 @@ def _check(projected: Projected, size: tuple[int, int]) -> None:
             raise ValueError(
                 f"composite: the native backend needs {name} on the CPU, got {value.device}"
             )
-        want = {"visible": torch.bool, "means": torch.float64, "factors": torch.float64}
+        want = {"visible": torch.bool} | dict.fromkeys(_WIDE, torch.float64)
         if value.dtype != want.get(name, dtype):
             raise ValueError(
                 f"composite: {name} must be {want.get(name, dtype)}, got {value.dtype}"

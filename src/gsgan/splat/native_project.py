@@ -95,7 +95,8 @@ class _Project(torch.autograd.Function):
         B, N = opacities.shape
         outputs = [
             *(means.new_empty(B, N, n, dtype=torch.float64) for n in (2, 3)),
-            *(means.new_empty(B, N) for _ in range(2)),
+            means.new_empty(B, N),
+            means.new_empty(B, N, dtype=torch.float64),
             means.new_empty(B, N, 2),
         ]
         visible = torch.empty(B, N, dtype=torch.bool)

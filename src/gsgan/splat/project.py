@@ -25,9 +25,10 @@ class Projected:
     """A batch of Gaussians as ellipses on the picture; what every backend composites.
 
     Convention: pixels, x right and y down; the centre of pixel (row i, column j) is
-    ``(j + 0.5, i + 0.5)``. ``means`` and ``factors`` stay in float64 where the device has it, for
-    backends to round what is relative to a tile; the rest has the dtype of the arithmetic. Entries
-    of invisible Gaussians are finite and mean nothing.
+    ``(j + 0.5, i + 0.5)``. ``means``, ``factors`` and ``depths`` stay in float64 where the device
+    has it, for backends to round what is relative to a tile, and to tell apart layers that float32
+    would make equally deep; the rest has the dtype of the arithmetic. Entries of invisible
+    Gaussians are finite and mean nothing.
 
     Args:
         means: ``[B, N, 2]`` pixels.
@@ -59,8 +60,9 @@ def project(
 
     Convention: differentiable in means, quats, scales, covariances, opacities, features, K, R, t.
     Geometry is computed in float64 where the device has it (the world offset of the camera
-    cancels there, and so does the determinant of a needle); what is not ``means`` or ``factors`` is
-    then rounded to ``promote_types(input dtype, settings dtype)``. ``camera.dist`` is not applied.
+    cancels there, and so does the determinant of a needle); what is not ``means``, ``factors`` or
+    ``depths`` is then rounded to ``promote_types(input dtype, settings dtype)``. ``camera.dist`` is
+    not applied.
 
     Args:
         gaussians: N Gaussians per batch item.
@@ -107,7 +109,7 @@ def project(
         factors,
         opacities.to(dtype),
         gaussians.features.to(dtype),
-        depths.to(dtype),
+        depths,
         extents.to(dtype),
         visible,
     )

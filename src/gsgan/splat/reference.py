@@ -32,7 +32,8 @@ def composite(
     front_to_back = _sorted(projected)
     values = front_to_back.features
     if want_depth:
-        values = torch.cat([values, front_to_back.depths.unsqueeze(-1)], dim=-1)
+        depths = front_to_back.depths.to(values.dtype)
+        values = torch.cat([values, depths.unsqueeze(-1)], dim=-1)
     chunks = []
     for pixels in _pixel_chunks(projected, size):
         weights, left = _blend(_alphas(front_to_back, pixels, settings), settings)

@@ -75,9 +75,9 @@ def composite(
     tiling = tiling or Tiling.for_device(projected.means.device)
     C = projected.features.shape[-1]
     # Depth and alpha are blended like features; the value of alpha is 1 in every layer.
-    values = [projected.features, torch.ones_like(projected.depths).unsqueeze(-1)]
+    values = [projected.features, torch.ones_like(projected.features[..., :1])]
     if want_depth:
-        values.append(projected.depths.unsqueeze(-1))
+        values.append(projected.depths.to(projected.features.dtype).unsqueeze(-1))
     geometry = torch.cat([projected.means, projected.factors], dim=-1)
     with torch.no_grad():
         lists = _tile_lists(projected, size, settings, tiling)

@@ -30,7 +30,7 @@ VERDICTS = (RIGHT, WARNED, REFUSED, FINITE_ONLY, NOT_FINITE)
 
 # Tolerances are stated for float32; other types are allowed the same number of their own roundings,
 # up to this much per 1: a float64 result is never asked for more than float64 can give.
-_LEAST_TOLERANCE = 1e-11
+_LEAST_TOLERANCE = 1e-10
 
 
 @dataclass(frozen=True)

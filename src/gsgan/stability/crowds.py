@@ -110,7 +110,9 @@ def _plane(n: int) -> Inputs:
     """Gaussians on a plane across the turned camera's axis, their depths equal but for rounding."""
     camera = pinhole(axis_angle=(0.3, -0.4, 0.2), t=(0.1, 0.2, 0.3))
     scene = cloud(n, scale=0.2, extent=(1.6, 1.2, 0.0))
-    return {**scene, "means": (scene["means"] - camera["t"]) @ camera["R"][0]}
+    means = (scene["means"] - camera["t"]) @ camera["R"][0]
+    # As float32 holds them, in float64 too: else the order would be that of float64's rounding.
+    return {**scene, "means": means.float().double()}
 
 
 def _close_depths() -> Inputs:

@@ -9,14 +9,15 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from writers.common import Camera, draw, ring_camera, write_picture
+from writers.common import MIDDLE, Camera, draw, ring_camera, write_picture
 from writers.smpl import smpl_arrays, write_smpl
 
 from gsgan.body.smpl import SkinnedModel, read_smpl
@@ -48,18 +49,25 @@ class SmplxSubject:
     alphas: list[list[np.ndarray]]
 
 
-def write_smplx(path: Path) -> Path:
-    """A file like SMPL-X's, of the default person, half the size by float32."""
+@cache
+def _folder() -> TemporaryDirectory[str]:
+    return TemporaryDirectory()  # goes when the tests end
+
+
+@cache
+def smplx_once() -> Path:
+    """A file like SMPL-X's, of the default person: 64 MB, so it is written once for all tests."""
+    path = Path(_folder().name) / "SMPLX_NEUTRAL.npz"
     bulges = smpl_arrays("smplx")["posedirs"].astype(np.float32)
     write_smpl(path, "smplx", replace={"posedirs": bulges})
     return path
 
 
-@lru_cache(maxsize=1)
+@cache
 def smplx_subject(smplx: Path, cameras: int = 3, frames: int = 4) -> SmplxSubject:
     """A subject who turns, lifts the arms and closes the hands; do not write into it."""
     model = read_smpl(smplx)
-    params = smplx_params(frames)
+    params = smplx_params(model, frames)
     vertices, joints = _posed(model, params)
     rig = [ring_camera(2 * np.pi * i / cameras + 0.1, SIZE, STRAIGHT) for i in range(cameras)]
     ones = np.full(len(model.v_template), 5)
@@ -82,8 +90,9 @@ def _alpha(person: np.ndarray) -> np.ndarray:
     return np.asarray(cv2.GaussianBlur(full, (3, 3), 0.5), np.uint8)
 
 
-def smplx_params(frames: int) -> dict[str, np.ndarray]:
+def smplx_params(model: SkinnedModel, frames: int) -> dict[str, np.ndarray]:
     """The arrays of smpl_params.npz, float32 as released; the world's z axis points down."""
+    J0 = model.rest_joints(torch.zeros(1, 10).double())[0, 0].numpy()
     time = np.linspace(0, 1, frames)
     upright = cv2.Rodrigues(np.array([-np.pi / 2, 0, 0]))[0]
     turns = [cv2.Rodrigues(np.array([0, 0, 0.3 + 0.5 * t]))[0] @ upright for t in time]
@@ -96,7 +105,7 @@ def smplx_params(frames: int) -> dict[str, np.ndarray]:
     arrays = {
         "betas": betas,
         "global_orient": np.stack([cv2.Rodrigues(R)[0][:, 0] for R in turns]),
-        "transl": np.stack([0.2 * time, 0.1 - 0.1 * time, np.full(frames, 0.05)], axis=1),
+        "transl": np.stack([0.2 * time, 0.1 - 0.1 * time, np.full(frames, -MIDDLE)], axis=1) - J0,
         "body_pose": body.reshape(frames, 63),
         "jaw_pose": np.stack([0.2 * time, 0 * time, 0 * time], axis=1),
         "expression": np.stack([time] + [0 * time] * 9, axis=1),

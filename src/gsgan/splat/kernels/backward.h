@@ -164,7 +164,7 @@ void reduce(const Job& job, const Plan<T>& plan, const T* slots, int64_t from, i
   const int64_t total = job.B * job.N, channels = job.C + (job.g_depth != nullptr);
   const int64_t stride = GEOMETRY + channels;
   T* d_features = static_cast<T*>(job.d_features);
-  T* d_depths = static_cast<T*>(job.d_depths);
+  double* d_depths = job.d_depths;
 #pragma omp parallel for schedule(static) num_threads(int(job.threads))
   for (int64_t i = 0; i < total; ++i) {
     for (; cursor[i] < plan.gaussian_start[i + 1]; ++cursor[i]) {

@@ -31,14 +31,8 @@ template <class T> T reach(T opacity, T alpha_min) {
   return opacity > 0 ? std::log2(opacity / alpha_min) : -T(1);
 }
 
-template <class T> uint64_t sort_key(T depth);
-template <> inline uint64_t sort_key<float>(float depth) {
-  depth += 0.0f;  // -0 and 0 are one depth
-  uint32_t u;
-  std::memcpy(&u, &depth, 4);
-  return u & 0x80000000u ? uint32_t(~u) : u | 0x80000000u;
-}
-template <> inline uint64_t sort_key<double>(double depth) {
+// Rises with the depth; -0 and 0 are one depth.
+inline uint64_t sort_key(double depth) {
   depth += 0.0;
   uint64_t u;
   std::memcpy(&u, &depth, 8);
@@ -157,10 +151,10 @@ template <class T> Status fill_lists(const Job& job, Plan<T>& plan) {
       order.reserve(job.N);
       for (int64_t i = b * job.N; i < (b + 1) * job.N; ++i)
         if (plan.gaussian_start[i + 1] > plan.gaussian_start[i]) {
-          keys.push_back(sort_key<T>(in.depths[i]));
+          keys.push_back(sort_key(in.depths[i]));
           order.push_back(int32_t(i));
         }
-      sort_by_key(keys, order, int(sizeof(T)) * 8);
+      sort_by_key(keys, order, 64);
       for (int32_t i : order)
         for (int64_t k = plan.gaussian_start[i]; k < plan.gaussian_start[i + 1]; ++k) {
           const int64_t to = cursor[plan.position[k]]++;

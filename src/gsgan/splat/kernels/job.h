@@ -19,12 +19,15 @@ struct Job {
   int64_t slot_bytes;  // of per-entry gradients that the backward pass may hold at once
   double alpha_min, transmittance_min, alpha_max;
   const double *means, *factors;
-  const void *opacities, *features, *depths, *extents;
+  const void *opacities, *features;
+  const double* depths;  // T would make close ones equal
+  const void* extents;
   const uint8_t* visible;
   void *out_features, *out_alpha, *out_depth;  // zeros on entry
   const void *g_features, *g_alpha, *g_depth;
   double *d_means, *d_factors;
-  void *d_opacities, *d_features, *d_depths;
+  void *d_opacities, *d_features;
+  double* d_depths;
   int64_t bad;  // out: index of a Gaussian that is not finite
 };
 
@@ -65,12 +68,12 @@ template <class T> struct Inputs {
   explicit Inputs(const Job& j)
       : means(j.means),
         factors(j.factors),
+        depths(j.depths),
         opacities(static_cast<const T*>(j.opacities)),
         features(static_cast<const T*>(j.features)),
-        depths(static_cast<const T*>(j.depths)),
         extents(static_cast<const T*>(j.extents)) {}
-  const double *means, *factors;
-  const T *opacities, *features, *depths, *extents;
+  const double *means, *factors, *depths;
+  const T *opacities, *features, *extents;
 };
 
 // A Gaussian, ready for the tiles: one cache line in float. With dx, dy from its mean,

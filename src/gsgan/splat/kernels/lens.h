@@ -20,10 +20,13 @@ struct ProjectJob {
   const uint8_t* keep;
   const double *K, *R, *t, *limits;  // [B, 3, 3] twice, [B, 3], [B, 4]: least and greatest x/z, y/z
   double *out_means, *out_factors;
-  void *out_opacities, *out_depths, *out_extents;
+  void* out_opacities;
+  double* out_depths;
+  void* out_extents;
   uint8_t* visible;
   const double *g_means, *g_factors;
-  const void *g_opacities, *g_depths;
+  const void* g_opacities;
+  const double* g_depths;
   void *d_means, *d_quats, *d_scales, *d_covariances, *d_opacities;
   double *d_K, *d_R, *d_t, *d_limits;
 };

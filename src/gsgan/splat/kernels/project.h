@@ -63,7 +63,7 @@ template <class T> void project_one(const ProjectJob& job, const Camera& camera,
   job.out_means[2 * i + 1] = y;
   write3(job.out_factors + 3 * i, {p, k, r});
   as<T>(job.out_opacities)[i] = T(opacity);
-  as<T>(job.out_depths)[i] = T(at.z);
+  job.out_depths[i] = at.z;
   as<T>(job.out_extents)[2 * i] = T(seen ? ex : 0);
   as<T>(job.out_extents)[2 * i + 1] = T(seen ? ey : 0);
   job.visible[i] = seen;
@@ -77,7 +77,7 @@ void project_one_backward(const ProjectJob& job, const Camera& camera, int64_t i
   const double g_y = job.g_means ? job.g_means[2 * i + 1] : 0;
   const Vec3 g = job.g_factors ? read3(job.g_factors + 3 * i) : Vec3{};
   const double g_o = job.g_opacities ? double(as<T>(job.g_opacities)[i]) : 0;
-  const double g_z = job.g_depths ? double(as<T>(job.g_depths)[i]) : 0;
+  const double g_z = job.g_depths ? job.g_depths[i] : 0;
   if (g_x == 0 && g_y == 0 && g.x == 0 && g.y == 0 && g.z == 0 && g_o == 0 && g_z == 0) return;
   const Vec3 in = in_camera<T>(job, camera, i);
   if (!usable(job, i, in.z)) return;

@@ -126,7 +126,7 @@ void load_chunk(const Job& job, const Inputs<T>& in, const Plan<T>& plan, const 
     s.ey[k] = g.ey;
     T* f = s.features.get() + k * channels;
     for (int64_t j = 0; j < job.C; ++j) f[j] = in.features[i * job.C + j];
-    if (channels > job.C) f[job.C] = in.depths[i];
+    if (channels > job.C) f[job.C] = T(in.depths[i]);
     uint32_t mask = again ? plan.cells[start + k]
                           : reached_cells(s.place[k], g.ex, g.ey, g.level);
     if (job.keep) plan.cells[start + k] = uint16_t(mask);

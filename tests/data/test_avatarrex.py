@@ -1,0 +1,113 @@
+"""AvatarReX: where it differs from THuman4.0 (tests of what they share are in test_thuman4)."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from make import edit_json
+from writers.avatarrex import SERIALS, write_avatarrex
+from writers.common import write_picture
+from writers.smplx_rig import SmplxSubject
+
+from gsgan.data.checks import Checks
+from gsgan.data.formats.avatarrex import AvatarrexReader
+from gsgan.data.layout import Layout
+from gsgan.data.pixels import read_image, read_mask
+from gsgan.errors import DataError
+from gsgan.skeleton.smpl import to_mediapipe33
+
+pytestmark = pytest.mark.usefixtures("model_once")
+
+
+def read(root: Path, smplx: Path) -> Layout:
+    return AvatarrexReader()(root, Checks(), str(smplx))
+
+
+@pytest.fixture
+def root(tmp_path: Path, smplx_subject: SmplxSubject) -> Path:
+    return write_avatarrex(tmp_path / "avatarrex_zzr", smplx_subject)
+
+
+def refused(root: Path, smplx: Path, *parts: str) -> None:
+    with pytest.raises(DataError) as caught:
+        read(root, smplx)
+    for part in (*parts,):
+        assert part in str(caught.value), caught.value
+    assert "\n" not in str(caught.value)
+
+
+def test_read_equals_written(root: Path, smplx_subject: SmplxSubject, smplx_file: Path) -> None:
+    layout = read(root, smplx_file)
+    assert layout.notes == ()  # a lens of zeros and a list that is not there need no note
+    assert layout.camera_names == SERIALS  # the calibration's order, which indices count
+    s = smplx_subject
+    for c, (name, camera) in enumerate(zip(SERIALS, s.cameras, strict=True)):
+        assert np.allclose(layout.cameras[name].t, camera.t, atol=1e-6)
+        assert np.allclose(layout.cameras[name].R, camera.R, atol=1e-6)
+        assert layout.cameras[name].size == camera.size[::-1]
+        assert layout.image_path(name, 1) == root / name / "00000001.jpg"
+        assert layout.mask_path(name, 1) == root / name / "mask/pha/00000001.jpg"
+        image = read_image(layout.image_path(name, 1), layout.pixels).astype(int)
+        assert np.abs(image - s.images[1][c]).mean() < 12
+        alpha = s.alphas[1][c].astype(int)
+        clear = np.abs(alpha - 127.5) > 12
+        mask = read_mask(layout.mask_files(name, 1), layout.pixels)
+        assert np.array_equal(mask[clear], np.where(alpha > 127, 255, 0)[clear])
+    for i, frame in enumerate(s.frames):
+        p, conf = to_mediapipe33(s.joints[i], s.vertices[i], "smplx")
+        assert np.allclose(layout.landmarks.p[frame][conf > 0], p[conf > 0], atol=1e-5)
+    assert layout.meta.layout == "AvatarReX"
+
+
+def test_other_folders_beside_the_cameras_do_no_harm(root: Path, smplx_file: Path) -> None:
+    write_picture(root / "smpl_pos_map" / "00000000.jpg", np.zeros((4, 4), np.uint8))
+    assert read(root, smplx_file).camera_names == SERIALS
+
+
+def test_the_list_of_missing_files_is_optional_and_names_serials(
+    root: Path, smplx_file: Path
+) -> None:
+    (root / "missing_img_files.txt").write_text(
+        f"D:\\avatarrex_zzr\\{SERIALS[1]}\\00000002.jpg\n{SERIALS[0]}/mask/pha/00000000.jpg\n"
+    )
+    layout = read(root, smplx_file)
+    assert list(layout.images[SERIALS[1]]) == [0, 1, 3]
+    assert list(layout.images[SERIALS[0]]) == [1, 2, 3]
+
+
+def test_a_camera_without_a_folder_or_without_calibration(root: Path, smplx_file: Path) -> None:
+    shutil.copytree(root / SERIALS[0], root / "22000000")
+    refused(root, smplx_file, "calibration_full.json", "4 have a folder", "22000000 is not calib")
+    shutil.rmtree(root / "22000000")
+    shutil.rmtree(root / SERIALS[2])
+    refused(root, smplx_file, "lists 3 cameras, but 2", f"{SERIALS[2]} lacks one")
+
+
+def test_a_transposed_size(root: Path, smplx_file: Path) -> None:
+    edit_json(root / "calibration_full.json", lambda c: c[SERIALS[0]].update(imgSize=[44, 52]))
+    refused(root, smplx_file, SERIALS[0], "transposed")
+
+
+def test_a_mask_of_another_size(root: Path, smplx_file: Path) -> None:
+    write_picture(root / SERIALS[1] / "mask/pha/00000000.jpg", np.zeros((22, 26), np.uint8))
+    refused(root, smplx_file, f"{SERIALS[1]}/mask/pha/00000000.jpg is 26x22")
+
+
+def test_another_folder_is_told(root: Path, smplx_file: Path) -> None:
+    (root / "calibration_full.json").rename(root / "calibration.json")
+    refused(root, smplx_file, "calibration_full.json does not exist; a folder of AvatarReX holds")
+
+
+def test_the_config_reads_it(root: Path, smplx_file: Path, compose) -> None:
+    from hydra.utils import instantiate
+
+    config = compose(
+        "train", "data=avatarrex", f"data.root={root}", f"data.smpl={smplx_file}", "data.size=16",
+        "data.test_cameras=[22010708]",
+    )  # fmt: skip
+    data = instantiate(config.data)
+    assert data.dataset("novel_view")[0].camera_index.item() == 1
+    assert data.dataset("train")[0].image.shape == (1, 3, 16, 16)
