@@ -230,6 +230,16 @@ def test_joints_not_seen_are_named(copy, check):
     assert "few joints were seen in 1 of 12 frames: 8" in only(check(copy), "warning")
 
 
+def test_joints_that_the_source_never_knows_are_no_fault(copy, check):
+    """OpenPose's 25 points leave a third of the 33 open."""
+
+    def lose(p):
+        p[:, [1, 3, 4, 6, 9, 10, *range(17, 23)]] = np.nan
+
+    edit_landmarks(copy, lose)
+    assert not any("joints were seen" in f.sentence for f in check(copy).findings)
+
+
 def test_a_darker_camera_is_named(copy, check):
     for path in (copy / "images" / "cam01").iterdir():
         image = cv2.imread(str(path))

@@ -54,7 +54,7 @@ class Motion:
         frozen: ``[F, J]``.
         exchanged: ``[F]`` by body part.
         facing: ``[F]`` below 0 where the front looks backwards.
-        seen: ``[F]`` share of joints.
+        seen: ``[F]`` share of the joints that any frame has.
     """
 
     jump: Float
@@ -92,7 +92,7 @@ def motion_of(subject: Subject, limits: Limits) -> Motion:
             for name, pairs in body_parts(template).items()
         },
         facing=facing(p, visible, template),
-        seen=visible.mean(1),
+        seen=visible.sum(1) / max(int(visible.any(0).sum()), 1),
     )
 
 

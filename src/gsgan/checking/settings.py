@@ -87,7 +87,7 @@ class Limits:
         frozen_frames: equal frames in a row.
         rigid_share: a joint whose bones keep their length to this share is a computed one, which
             may stand exactly still.
-        seen_share: joints of a frame that must have been seen.
+        seen_share: joints of a frame that must have been seen, of those that any frame has.
         swap_ratio, swap_metres: left and right count as swapped when exchanging them brings a body
             part this many times nearer to, and this much nearer along, its own track.
         mirrored: share of frames that face backwards.

@@ -20,8 +20,7 @@ class AvatarrexReader(SmplxRigReader):
 
     places: ClassVar[Places] = Places(
         layout="AvatarReX",
-        expected="an AvatarReX subject: calibration_full.json, smpl_params.npz and a folder for "
-        "each camera",
+        contents="calibration_full.json, smpl_params.npz and a folder for each camera",
         calibration="calibration_full.json",
         images="{camera}",
         masks="{camera}/mask/pha",

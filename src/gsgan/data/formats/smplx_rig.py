@@ -42,7 +42,7 @@ class Places:
 
     Args:
         layout: its name.
-        expected: what its folder holds, for messages.
+        contents: what its folder holds, for messages.
         calibration: file of the cameras.
         images, masks: folder of a camera's files, with ``{camera}``.
         cameras: pattern whose ``*`` is the name of a camera that has files.
@@ -50,7 +50,7 @@ class Places:
     """
 
     layout: str
-    expected: str
+    contents: str
     calibration: str
     images: str
     masks: str
@@ -112,7 +112,7 @@ class SmplxRigReader:
         Raises:
             DataError: for whatever is missing, damaged or contradictory, naming the file.
         """
-        folder = dataset_folder(root, self.places.expected)
+        folder = dataset_folder(root, self.places.contents)
         checks = replace(
             checks,
             distance=(self.distance[0], self.distance[1]),
@@ -121,7 +121,10 @@ class SmplxRigReader:
         )
         for name in (self.places.calibration, PARAMETERS):
             if not (folder / name).is_file():
-                raise DataError(f"{folder / name} does not exist; expected {self.places.expected}")
+                raise DataError(
+                    f"{folder / name} does not exist; a folder of {self.places.layout} holds "
+                    f"{self.places.contents}"
+                )
         given = body_model(smpl, "smplx")
         if given is None:
             raise no_joints(folder, "SMPL-X parameters", "SMPL-X (SMPLX_NEUTRAL.npz)")

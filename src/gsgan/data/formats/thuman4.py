@@ -20,7 +20,7 @@ class Thuman4Reader(SmplxRigReader):
 
     places: ClassVar[Places] = Places(
         layout="THuman4.0",
-        expected="a THuman4.0 subject: calibration.json, smpl_params.npz, images/ and masks/",
+        contents="calibration.json, smpl_params.npz, images/ and masks/",
         calibration="calibration.json",
         images="images/{camera}",
         masks="masks/{camera}",
