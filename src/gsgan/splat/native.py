@@ -6,15 +6,14 @@ Where it cannot be built ``available()`` is False, ``why_not()`` says why, nothi
 from __future__ import annotations
 
 import ctypes
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy
 import torch
 from torch import Tensor
 
 from gsgan.splat import build
+from gsgan.splat.buffers import zeros
 
 if TYPE_CHECKING:
     from gsgan.splat.project import Projected
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
 
 # Memory the backward pass may use for gradients per (tile, Gaussian) before it adds them up.
 SLOT_BYTES = 1 << 28
-CACHE_LINE = 64  # bytes
 
 _OUT_OF_MEMORY, _NOT_FINITE = 1, 2
 
@@ -188,7 +186,7 @@ class _Composite(torch.autograd.Function):
         (B, _, C), (H, W) = features.shape, options.size
         dtype = features.dtype
         channels = [C, 1, 1] if options.want_depth else [C, 1]
-        outputs = [_zeros((B, c, H, W), dtype) for c in channels]
+        outputs = [zeros((B, c, H, W), dtype) for c in channels]
         job = _job(options, inputs, shown)
         job.keep = options.grad_enabled and any(ctx.needs_input_grad)
         point(job, _OUTPUTS, outputs)
@@ -224,19 +222,6 @@ class _Composite(torch.autograd.Function):
             g if need else None for g, need in zip(outgoing, ctx.needs_input_grad, strict=False)
         ]
         return (*wanted, *[None] * (len(ctx.needs_input_grad) - len(wanted)))
-
-
-def _zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """Zeros; numpy's, because it has large arrays in huge pages that the system clears on use.
-
-    A picture of 32 channels and 512 x 512 pixels is 8192 small pages, new ones in every call:
-    touching them took longer than drawing on them. Rows of tiles are whole cache lines.
-    """
-    name, count = build.DTYPES[dtype], math.prod(shape)
-    line = CACHE_LINE // dtype.itemsize
-    whole = torch.from_numpy(numpy.zeros(count + line, name))
-    first = -whole.data_ptr() % CACHE_LINE // dtype.itemsize
-    return whole[first : first + count].view(shape)
 
 
 def _job(options: _Options, inputs: list[Tensor], visible: Tensor) -> _Job:
