@@ -17,7 +17,17 @@ the command line (`key=value`), every group's choice exchanged (`group=choice`),
 comma-separated list with `-m` runs every combination. `python -m gsgan.train --help` prints the
 same for the config as composed.
 """
-ORDER = ("prepare", "check", "train", "evaluate", "bench_raster", "bench_stability", "hydra_run", "hydra_help")
+ORDER = (
+    "prepare",
+    "check",
+    "train",
+    "evaluate",
+    "bench_raster",
+    "bench_stability",
+    "bench_loader",
+    "hydra_run",
+    "hydra_help",
+)
 
 
 def page() -> str:

@@ -12,11 +12,14 @@ from commands import ROOT, TINY
 
 # A GPU's settings: one kind of machine runs the tests.
 ELSEWHERE = ("trainer=gpu", "trainer=ddp")
-SMALL_RASTER = [
-    *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "reference.gaussians=300"),
-    *("reference.size=32", "judge_at=[300]", "windows=1", "window=16", "dense=false"),
-    "memory=false",
-]
+SMALL_BENCH = {
+    "raster": [
+        *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "reference.gaussians=300"),
+        *("reference.size=32", "judge_at=[300]", "windows=1", "window=16", "dense=false"),
+        "memory=false",
+    ],
+    "loader": ["data.size=32", "batches=2", "workers=[0,1]"],
+}
 
 
 def documented() -> list[str]:
@@ -124,7 +127,7 @@ def tiny_bench(arguments: list[str], tmp_path: Path) -> list[str]:
             given.append(f"docs={page}")
         elif argument.split("=")[0] not in {"repeats", "gaussians", "sizes", "dense"}:
             given.append(argument.strip("'"))
-    return given + SMALL_RASTER if given[0] == "raster" else given
+    return given + SMALL_BENCH.get(given[0], [])
 
 
 @pytest.mark.parametrize("line", documented())

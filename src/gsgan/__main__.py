@@ -5,7 +5,7 @@ COMMANDS = {
     "gsgan.check": "look a dataset over before training: data=capture data.root=<folder>",
     "gsgan.train": "train an avatar, then score it on what was held out",
     "gsgan.evaluate": "score a trained run: run=<folder>",
-    "gsgan.bench": "measure what things cost: raster, stability",
+    "gsgan.bench": "measure what things cost: raster, stability, loader",
 }
 
 

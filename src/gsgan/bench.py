@@ -16,6 +16,7 @@ from gsgan.config import FAILED, entry
 SUBJECTS = {
     "raster": "time against error of every backend and accuracy setting of the rasteriser",
     "stability": "the float32 error of every hard case",
+    "loader": "training pictures a second from disk",
 }
 HELP = ("-h", "--help")
 

@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import pytest
 import torch
-from splat_scenes import BACKENDS, camera, cloud, gradients, leaves, loss
+from splat_scenes import BACKENDS, camera, cloud, gradients, leaves, loss, with_covariances
 
+from gsgan.scene import Gaussians
 from gsgan.splat import rasterise
 
 
@@ -80,6 +81,94 @@ def test_covariances_must_be_finite():
         rasterise(replace(gaussians, quats=None, scales=None, covariances=covariances), camera())
 
 
+def test_what_is_not_used_may_hold_anything():
+    gaussians = with_covariances(cloud(5))
+    unused = replace(gaussians, quats=torch.full((1, 5, 4), float("nan")).double())
+    want = rasterise(gaussians, camera())
+    assert torch.equal(rasterise(unused, camera()).features, want.features)
+
+
+def test_invalid_covariances_are_dropped():
+    gaussians = with_covariances(cloud(5))
+    gaussians.covariances[0, 2, 1, 1] = float("inf")
+    with pytest.warns(UserWarning, match="dropped 1 of 5 invalid Gaussians"):
+        got = rasterise(gaussians, camera(), on_invalid="drop")
+    rest = {k: v[:, [0, 1, 3, 4]] for k, v in vars(gaussians).items() if v is not None}
+    rest = Gaussians(**{"quats": None, "scales": None, **rest})
+    assert torch.equal(got.features, rasterise(rest, camera()).features)
+
+
+def test_a_gaussian_wrong_in_several_ways_counts_once():
+    gaussians = spoilt("means", float("nan"))
+    gaussians.scales[0, 2], gaussians.opacities[0, 4] = -1.0, 2.0
+    with pytest.warns(UserWarning, match="dropped 2 of 5 invalid Gaussians"):
+        rasterise(gaussians, camera(), on_invalid="drop")
+
+
+@pytest.mark.parametrize(
+    ("field", "shape", "message"),
+    [
+        ("means", (1, 5, 2), r"means must have shape \[B, N, 3\], got \[1, 5, 2\]"),
+        ("means", (5, 3), r"means must have shape \[B, N, 3\], got \[5, 3\]"),
+        ("quats", (1, 5, 3), r"quats must have shape \[1, 5, 4\], got \[1, 5, 3\]"),
+        ("quats", (2, 5, 4), r"quats must have shape \[1, 5, 4\], got \[2, 5, 4\]"),
+        ("scales", (1, 5), r"scales must have shape \[1, 5, 3\], got \[1, 5\]"),
+        ("opacities", (1, 5, 1), r"opacities must have shape \[1, 5\], got \[1, 5, 1\]"),
+        ("features", (1, 4, 3), r"features must have shape \[1, 5, C\], got \[1, 4, 3\]"),
+        ("features", (1, 5, 0), r"features must have at least one channel, got 0"),
+        ("covariances", (1, 5, 6), r"covariances must have shape \[1, 5, 3, 3\], got \[1, 5, 6\]"),
+        ("K", (1, 4, 4), r"Camera: K must have shape \[B, 3, 3\], got \[1, 4, 4\]"),
+        ("K", (3, 3), r"Camera: K must have shape \[B, 3, 3\], got \[3, 3\]"),
+        ("R", (1, 4), r"Camera: R must have shape \[B, 3, 3\], got \[1, 4\]"),
+        ("t", (1, 3, 1), r"Camera: t must have shape \[B, 3\], got \[1, 3, 1\]"),
+        ("t", (2, 3), r"Camera: K, R, t and dist must share one batch size, got 1, 1, 2"),
+    ],
+)
+def test_wrong_shapes_are_refused(field, shape, message):
+    record = camera() if field in ("K", "R", "t") else cloud(5)
+    with pytest.raises(ValueError, match=message):
+        replace(record, **{field: torch.zeros(shape).double()})
+
+
+@pytest.mark.parametrize("size", [(0, 32), (24, 0), (-1, 4), (2.5, 4), (24,)])
+def test_pictures_without_pixels_are_refused(size):
+    with pytest.raises(ValueError, match=r"size must be \(H, W\) with both at least 1, got \("):
+        replace(camera(), size=size)
+
+
+def test_half_a_shape_is_refused():
+    with pytest.raises(ValueError, match="give quats and scales, or covariances"):
+        replace(cloud(5), scales=None)
+
+
+@pytest.mark.parametrize("field", ["quats", "scales", "opacities", "features", "K", "R", "t"])
+def test_mixed_devices_are_refused(field):
+    records = {"Gaussians": cloud(5), "Camera": camera()}
+    owner = "Camera" if field in ("K", "R", "t") else "Gaussians"
+    moved = getattr(records[owner], field).to("meta")
+    records[owner] = replace(records[owner], **{field: moved})
+    message = f"{owner}.{field} must have the device of Gaussians.means, cpu, got meta"
+    with pytest.raises(ValueError, match=message):
+        rasterise(*records.values())
+
+
+@pytest.mark.parametrize("field", ["quats", "scales", "opacities", "features", "K", "R", "t"])
+def test_mixed_dtypes_are_refused(field):
+    records = {"Gaussians": cloud(5), "Camera": camera()}
+    owner = "Camera" if field in ("K", "R", "t") else "Gaussians"
+    rounded = getattr(records[owner], field).float()
+    records[owner] = replace(records[owner], **{field: rounded})
+    message = f"{owner}.{field} must have the dtype of .*, torch.float64, got torch.float32"
+    with pytest.raises(ValueError, match=message):
+        rasterise(*records.values())
+
+
+def test_whole_numbers_are_refused():
+    whole = {k: v.long() for k, v in vars(cloud(5)).items() if v is not None}
+    with pytest.raises(ValueError, match=r"means must be floating point, got torch.int64"):
+        rasterise(Gaussians(**whole), camera())
+
+
 def cam_with(**changes):
     """A camera with entries of its tensors replaced: name = (index, value)."""
     cam = camera()
@@ -108,12 +197,8 @@ def test_bad_cameras_are_refused(cam, message):
         rasterise(cloud(5), cam)
 
 
-def test_types_and_choices_are_checked():
+def test_choices_are_checked():
     gaussians = cloud(5)
-    with pytest.raises(ValueError, match=r"Gaussians.features must have the dtype"):
-        rasterise(replace(gaussians, features=gaussians.features.float()), camera())
-    with pytest.raises(ValueError, match=r"Gaussians.scales must have the device .* got meta"):
-        rasterise(replace(gaussians, scales=gaussians.scales.to("meta")), camera())
     with pytest.raises(ValueError, match="on_invalid must be error or drop, got 'skip'"):
         rasterise(gaussians, camera(), on_invalid="skip")
     with pytest.raises(ValueError, match="expected one of exact"):

@@ -78,7 +78,7 @@ def project(
     dtype = torch.promote_types(gaussians.means.dtype, settings.torch_dtype)
     wide = torch.float64 if gaussians.means.device.type != "mps" else dtype
     if keep is not None:
-        gaussians = _without(gaussians, ~keep)
+        gaussians = without(gaussians, ~keep)
     # In here the N Gaussians are the last dimension: contiguous vectors, few large operations.
     K, R, t = camera.K.to(wide), camera.R.to(wide), camera.t.to(wide)
     x_cam = R @ gaussians.means.to(wide).mT + t.unsqueeze(-1)
@@ -149,7 +149,7 @@ def _rotation_entries(quats: Tensor, dim: int) -> list[Tensor]:
     ]
 
 
-def _without(gaussians: Gaussians, invalid: Tensor) -> Gaussians:
+def without(gaussians: Gaussians, invalid: Tensor) -> Gaussians:
     """Harmless numbers in place of the invalid ones, through which no gradient flows."""
     changes: dict[str, Any] = {}
     for name, value in vars(gaussians).items():

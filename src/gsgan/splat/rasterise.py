@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians, Raster
-from gsgan.splat import reference, tiles
+from gsgan.splat import gsplat_backend, reference, tiles
 from gsgan.splat.project import Projected, project
 from gsgan.splat.settings import Accuracy, accuracy
 
-BACKENDS = ("auto", "reference", "torch", "native")
+BACKENDS = ("auto", "reference", "torch", "native", "gsplat")
 _log = logging.getLogger(__name__)
 _said: set[str] = set()
 
@@ -42,7 +42,8 @@ def rasterise(
         camera: one camera per batch item, of the Gaussians' dtype and device.
         settings: an ``Accuracy``, or the name of a preset.
         backend: ``auto`` (the fastest there is for the device and settings), ``reference``,
-            ``torch`` or ``native``.
+            ``torch``, ``native`` or ``gsplat``. One that cannot draw this gives way to ``torch``,
+            and says why once.
         depth: whether to return the depth (metres times alpha).
         on_invalid: ``error`` refuses Gaussians that are not finite or have a scale <= 0; ``drop``
             leaves them out and warns with their number.
@@ -63,13 +64,13 @@ def rasterise(
     _check_camera(camera, rotation_tolerance)
     keep = _check_gaussians(gaussians, on_invalid)
     name, reason = resolve_backend(backend, gaussians.means.device, settings)
+    if name == "gsplat" and (why_not := gsplat_backend.unsuited(gaussians, camera)):
+        name, reason = _torch_instead_of_gsplat(why_not)
     if reason:
         _say_once(reason)
     out = gaussians.means.dtype
     with tiles.full_precision(gaussians.means.device):
-        projector, composite = _backend(name)
-        projected = projector(gaussians, camera, settings, keep)
-        features, alpha, z = composite(projected, camera.size, settings, depth)
+        features, alpha, z = _draw(name, gaussians, camera, settings, keep, depth)
     return Raster(features.to(out), alpha.to(out), None if z is None else z.to(out))
 
 
@@ -93,6 +94,8 @@ def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tupl
         return name, ""
     if name == "auto" and settings.is_dense:
         return "reference", ""
+    if name == "gsplat" or (name == "auto" and gsplat_backend.expected(settings, device)):
+        return _gsplat_or_torch(name, device, settings)
     if device.type != "cpu":
         asked = name == "native"
         return (
@@ -105,6 +108,23 @@ def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tupl
     return "native", ""
 
 
+def _gsplat_or_torch(name: str, device: torch.device, settings: Accuracy) -> tuple[str, str]:
+    """Where ``auto`` takes gsplat it says what that costs: its stop is not that of ``Accuracy``."""
+    why_not = gsplat_backend.why_not(settings, device)
+    if why_not:
+        return _torch_instead_of_gsplat(why_not)
+    lost, meant = gsplat_backend.stop_loss(settings), settings.transmittance_min
+    price = (
+        f"Drawing with gsplat, where a stopped pixel may lack {lost:.2g} of its light, not "
+        f"{meant:.2g}; backend=torch keeps to the settings."
+    )
+    return "gsplat", price * (name == "auto")
+
+
+def _torch_instead_of_gsplat(why_not: str) -> tuple[str, str]:
+    return "torch", f"Drawing with the torch backend: {why_not}"
+
+
 def _why_native_is_missing() -> str:
     """Empty where the native backend can be used."""
     try:
@@ -112,6 +132,22 @@ def _why_native_is_missing() -> str:
         return "" if native.available() else native.why_not()
     except ImportError as error:
         return f"the native backend cannot be imported ({error})."
+
+
+def _draw(
+    name: str,
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: Accuracy,
+    keep: Tensor | None,
+    depth: bool,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Features, alpha and depth by one backend."""
+    if name == "gsplat":
+        return gsplat_backend.draw(gaussians, camera, settings, keep, depth)
+    projector, composite = _backend(name)
+    projected = projector(gaussians, camera, settings, keep)
+    return composite(projected, camera.size, settings, depth)
 
 
 def _backend(name: str) -> tuple[Callable[..., Projected], Callable[..., Any]]:

@@ -1,0 +1,231 @@
+"""Drawing with gsplat's CUDA kernels, where the package is installed and draws what is asked for.
+
+gsplat has its cut-offs compiled in. What is known of them here was read in the sources of gsplat
+1.5.3; the cap on alphas, which differs between versions (0.999 in 1.5.3, 0.99 after it), is
+measured. This module was tested against a stand-in for the package and has never been run on a GPU.
+
+Where gsplat differs from ``Accuracy`` all the same:
+
+- It stops a pixel one layer earlier, before the layer that would leave ``transmittance_min`` or
+  less. That layer may weigh up to ``transmittance_min / (1 - alpha_max)``, see ``stop_loss``.
+- It computes in float32 throughout (the camera's place in the world is taken off in float64 before)
+  with approximate exponentials: needles lose digits.
+- Gradients are summed in no fixed order: their last bits change from run to run.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import math
+from functools import lru_cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsgan.scene import Camera, Gaussians
+from gsgan.splat.project import QUAT_MIN, without
+from gsgan.splat.settings import Accuracy
+
+DEVICE = "cuda"
+# What gsplat 1.5.3 has compiled in. Its boxes reach to the alpha cut-off: the extent "opacity".
+COMPILED_IN: dict[str, float | str] = {
+    "alpha_min": 1 / 255,
+    "transmittance_min": 1e-4,
+    "extent": "opacity",
+    "dtype": "float32",
+    "fov_clamp": 1.3,
+}
+TOLERANCE = 1e-5  # relative, between a setting and what is compiled in
+
+
+def expected(settings: Accuracy, device: torch.device) -> bool:
+    """Whether this is a case for gsplat, were it installed."""
+    return device.type == DEVICE and not _mismatch(settings)
+
+
+def why_not(settings: Accuracy, device: torch.device) -> str:
+    """Why gsplat cannot draw with these settings here; the first call may compile it (minutes).
+
+    Returns:
+        One sentence; empty where it can.
+    """
+    if device.type != DEVICE:
+        return f"gsplat runs on CUDA only, the Gaussians are on {device}."
+    found = _mismatch(settings)
+    if found:
+        return found
+    cap, problem = _measured_cap(device)
+    if cap is None:
+        return problem
+    return "" if _equal(settings.alpha_max, cap) else _differs(settings, "alpha_max", cap)
+
+
+def unsuited(gaussians: Gaussians, camera: Camera) -> str:
+    """Why gsplat cannot draw these very Gaussians with this camera.
+
+    Returns:
+        One sentence; empty where it can.
+    """
+    if gaussians.means.dtype == torch.float64:
+        return "gsplat computes in float32, the Gaussians are float64."
+    if gaussians.opacities.numel() == 0:
+        return "there are no Gaussians, which gsplat is not made for."
+    if torch.is_grad_enabled() and camera.K.requires_grad:
+        return "gsplat has no gradient for Camera.K, which requires one."
+    if camera.K[:, 0, 1].any():
+        return "gsplat knows no skew, and Camera.K has some."
+    return ""
+
+
+def stop_loss(settings: Accuracy) -> float:
+    """The most light that a stopped pixel may lack: the layer at which it stops, and what is left.
+
+    A layer of alpha ``a`` stops the pixel where ``T (1 - a) <= transmittance_min``, and takes all
+    of ``T`` along: with alphas up to ``alpha_max`` that is the returned part of the light.
+    """
+    if settings.alpha_max == 1:
+        return 1.0
+    return min(1.0, settings.transmittance_min / (1 - settings.alpha_max))
+
+
+def draw(
+    gaussians: Gaussians,
+    camera: Camera,
+    settings: Accuracy,
+    keep: Tensor | None,
+    want_depth: bool,
+) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Projects and blends in one go.
+
+    Convention: as ``gsgan.splat.rasterise``, for inputs with which ``why_not`` and ``unsuited`` are
+    empty. Differentiable in every tensor of the Gaussians and in the camera's R and t.
+
+    Args:
+        gaussians: N >= 1 Gaussians per batch item, of at most float32.
+        camera: one camera without skew per batch item.
+        settings: near, low_pass and antialias are passed on; the rest is compiled in.
+        keep: ``[B, N]`` bool; the others are not drawn, whatever they hold.
+        want_depth: whether to blend depths too.
+
+    Returns:
+        features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``, depth ``[B, 1, H, W]`` or
+        None.
+
+    Source: Ye et al., gsplat: An open-source library for Gaussian splatting (version 1.5.3).
+    """
+    if keep is not None:
+        gaussians = without(gaussians, ~keep)
+    (H, W), C = camera.size, gaussians.features.shape[-1]
+    means, viewmats = _seen_from_the_camera(gaussians.means, camera)
+    colours, alphas, _ = _rasterization()(
+        means=means,
+        **_shapes(gaussians),
+        opacities=gaussians.opacities.float(),
+        colors=gaussians.features.float(),
+        viewmats=viewmats.unsqueeze(1),
+        Ks=camera.K.detach().float().unsqueeze(1),
+        width=W,
+        height=H,
+        near_plane=settings.near,
+        far_plane=math.inf,
+        radius_clip=0.0,
+        eps2d=settings.low_pass,
+        packed=False,
+        backgrounds=None,
+        # "D" blends depths like colours; "ED" would divide them by alpha.
+        render_mode="RGB+D" if want_depth else "RGB",
+        rasterize_mode="antialiased" if settings.antialias else "classic",
+    )
+    picture = colours.squeeze(1).movedim(-1, 1)
+    depth = picture[:, C : C + 1] if want_depth else None
+    return picture[:, :C], alphas.squeeze(1).movedim(-1, 1), depth
+
+
+def _mismatch(settings: Accuracy) -> str:
+    """Names the first setting that no version of gsplat draws with; empty where there is none."""
+    for name, have in COMPILED_IN.items():
+        if not _equal(getattr(settings, name), have):
+            return _differs(settings, name, have)
+    return ""
+
+
+def _rasterization() -> Any:
+    return importlib.import_module("gsplat").rasterization
+
+
+def _shapes(gaussians: Gaussians) -> dict[str, Tensor | None]:
+    """The arguments that say how Gaussians are shaped."""
+    if gaussians.covariances is not None:
+        # gsplat reads the upper triangle; our convention is the symmetric part.
+        covariances = gaussians.covariances.float()
+        return {"quats": None, "scales": None, "covars": (covariances + covariances.mT) / 2}
+    assert gaussians.quats is not None
+    assert gaussians.scales is not None
+    return {"quats": _usable(gaussians.quats.float()), "scales": gaussians.scales.float()}
+
+
+def _usable(quats: Tensor) -> Tensor:
+    """Quaternions whose squares neither underflow nor overflow; the identity for zero ones."""
+    largest = quats.detach().abs().amax(-1, keepdim=True)
+    usable = largest > QUAT_MIN
+    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    return torch.where(usable, quats / torch.where(usable, largest, 1.0), identity)
+
+
+def _seen_from_the_camera(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
+    """Means ``[B, N, 3]`` about the camera's place, and the ``[B, 4, 4]`` transform from there.
+
+    In float64, so that a camera far from the origin costs no digits. The place is a constant that
+    cancels: gradients are those of the means, R and t themselves.
+    """
+    camera = camera.to(torch.float64)
+    place = camera.centre.detach()
+    left = camera.t.unsqueeze(-1) + camera.R @ place.unsqueeze(-1)
+    top = torch.cat([camera.R, left], dim=-1)
+    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(camera), 1, 4)
+    viewmats = torch.cat([top, bottom], dim=1)
+    return (means.double() - place.unsqueeze(1)).float(), viewmats.float()
+
+
+@lru_cache(maxsize=8)
+def _measured_cap(device: torch.device) -> tuple[float | None, str]:
+    """The alpha of an opaque Gaussian at its centre, or None and why there is none."""
+    if importlib.util.find_spec("gsplat") is None:
+        return None, "gsplat is not installed: pip install 'gsgan[gsplat]'."
+    gaussians = Gaussians(
+        means=torch.tensor([[[0.0, 0.0, 1.0]]], device=device),
+        quats=torch.tensor([[[1.0, 0.0, 0.0, 0.0]]], device=device),
+        scales=torch.ones(1, 1, 3, device=device),
+        opacities=torch.ones(1, 1, device=device),
+        features=torch.ones(1, 1, 1, device=device),
+    )
+    K = torch.tensor([[[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]]], device=device)
+    camera = Camera(K, torch.eye(3, device=device)[None], torch.zeros(1, 3, device=device), (1, 1))
+    try:
+        with torch.no_grad():
+            alpha = draw(gaussians, camera, _PROBE, None, want_depth=True)[1]
+        return float(alpha), ""
+    except Exception as error:  # no compiler, an unknown GPU, another version: torch draws instead
+        return None, f"gsplat is installed but cannot draw here ({_one_line(error)})."
+
+
+_PROBE = Accuracy("probe", 1 / 255, 1e-4, "opacity", "float32")
+
+
+def _one_line(error: Exception) -> str:
+    text = str(error).strip()
+    return f"{type(error).__name__}: {text.splitlines()[0]}" if text else type(error).__name__
+
+
+def _equal(a: float | str, b: float | str) -> bool:
+    if isinstance(a, str) or isinstance(b, str):
+        return a == b
+    return math.isclose(a, b, rel_tol=TOLERANCE)
+
+
+def _differs(settings: Accuracy, name: str, have: float | str) -> str:
+    want = getattr(settings, name)
+    have = have if isinstance(have, str) else f"{have:.6g}"
+    return f"gsplat draws with {name}={have}, the settings {settings.name!r} have {want}."

@@ -1,0 +1,97 @@
+"""Finite differences in float64 where test_backends.py does not look: colour, projection alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from splat_scenes import BACKENDS, camera, cloud, with_covariances
+
+from gsgan.scene import Camera
+from gsgan.splat import ACCURACY, project, rasterise, sh_to_colour
+
+EXACT = ACCURACY["exact"]
+DRAWN = ("means", "factors", "opacities", "features", "depths")
+
+every_backend = pytest.mark.parametrize("backend", BACKENDS)
+every_shape = pytest.mark.parametrize("shape", ["quats", "covariances"])
+
+
+def turned(cam: Camera) -> Camera:
+    """Skew, an off-centre principal point, non-square pixels, a turn and a shift."""
+    axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=torch.float64)
+    K = cam.K.clone()
+    K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = 0.7, K[:, 0, 2] + 0.5, K[:, 1, 1] * 0.8
+    R = torch.matrix_exp(axis).expand_as(cam.R).clone()
+    return replace(cam, K=K, R=R, t=cam.t + torch.tensor([0.1, -0.05, 0.3], dtype=torch.float64))
+
+
+def scene(shape: str, n: int = 3, batch: int = 1):
+    """Few Gaussians, a small picture, and the names of the tensors that are given."""
+    gaussians = cloud(n, 2, scale=0.15, batch=batch)
+    gaussians = with_covariances(gaussians) if shape == "covariances" else gaussians
+    names = [name for name, value in vars(gaussians).items() if value is not None]
+    return gaussians, turned(camera((5, 6), focal=6.0, batch=batch)), names
+
+
+def checked(function, *tensors) -> bool:
+    inputs = [x.detach().clone().requires_grad_() for x in tensors]
+    return torch.autograd.gradcheck(function, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
+
+
+def pinhole(K, like):
+    """Only the entries that a pinhole has: with others the rasteriser refuses K."""
+    entries = K.new_tensor([[1, 1, 1], [0, 1, 1], [0, 0, 0]])
+    return K * entries + like.K * (1 - entries)
+
+
+@every_backend
+@pytest.mark.parametrize("degree", [1, 3])
+def test_colours_that_depend_on_the_direction_of_view(backend, degree):
+    gaussians, cam, _ = scene("quats")
+    g = torch.Generator().manual_seed(1)
+    sh = 0.3 * torch.randn(1, 3, (degree + 1) ** 2, 3, generator=g, dtype=torch.float64)
+
+    def picture(sh, means, R, t):
+        seen_by = replace(cam, R=R, t=t)
+        colours = sh_to_colour(sh, means - seen_by.centre.unsqueeze(1))
+        seen = replace(gaussians, means=means, features=colours)
+        raster = rasterise(seen, seen_by, settings=EXACT, backend=backend, depth=True)
+        return raster.features, raster.depth
+
+    assert checked(picture, sh, gaussians.means, cam.R, cam.t)
+
+
+@every_backend
+@every_shape
+def test_antialiased_batches(backend, shape):
+    gaussians, cam, names = scene(shape, n=2, batch=2)
+    settings = replace(EXACT, antialias=True)
+
+    def picture(*tensors):
+        given = replace(gaussians, **dict(zip(names, tensors, strict=False)))
+        K, R, t = tensors[len(names) :]
+        seen_by = replace(cam, K=pinhole(K, cam), R=R, t=t)
+        raster = rasterise(given, seen_by, settings=settings, backend=backend, depth=True)
+        return raster.features, raster.alpha, raster.depth
+
+    assert checked(picture, *(getattr(gaussians, name) for name in names), cam.K, cam.R, cam.t)
+
+
+@every_shape
+@pytest.mark.parametrize("antialias", [False, True])
+def test_projection_alone(shape, antialias):
+    gaussians, cam, names = scene(shape)
+    # The second is where the Jacobian is clamped: its gradient reaches K through the field of view.
+    gaussians.means[0, 1] = torch.tensor([4.0, -3.0, 2.0])
+    settings = replace(EXACT, antialias=antialias)
+    assert project(gaussians, cam, settings).visible.all()
+
+    def ellipses(*tensors):
+        given = replace(gaussians, **dict(zip(names, tensors, strict=False)))
+        K, R, t = tensors[len(names) :]
+        projected = project(given, replace(cam, K=K, R=R, t=t), settings)
+        return tuple(getattr(projected, name) for name in DRAWN)
+
+    assert checked(ellipses, *(getattr(gaussians, name) for name in names), cam.K, cam.R, cam.t)

@@ -1,0 +1,375 @@
+"""The gsplat backend: its arguments against a stand-in that draws by our reference, its refusals.
+
+The stand-in has gsplat 1.5.3's signature and conventions as its documentation states them: skew is
+ignored, K gets no gradient, a covariance is read from its upper triangle. What it draws with the
+arguments it gets must be what our own backends draw.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from splat_scenes import camera, cloud, error, gradients, join, leaves, loss, one, with_covariances
+
+from gsgan.scene import Camera, Gaussians
+from gsgan.splat import ACCURACY, gsplat_backend, rasterise, resolve_backend
+
+CPU, CUDA = torch.device("cpu"), torch.device("cuda")
+STANDARD = ACCURACY["standard"]
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+
+
+class StandIn:
+    """In place of the package: ``rasterization`` and what it was called with last."""
+
+    def __init__(self, cap: float = 0.999) -> None:
+        self.cap, self.calls = cap, []
+
+    def rasterization(
+        self,
+        means,
+        quats,
+        scales,
+        opacities,
+        colors,
+        viewmats,
+        Ks,
+        width,
+        height,
+        near_plane=0.01,
+        far_plane=1e10,
+        radius_clip=0.0,
+        eps2d=0.3,
+        sh_degree=None,
+        packed=True,
+        tile_size=16,
+        backgrounds=None,
+        render_mode="RGB",
+        rasterize_mode="classic",
+        covars=None,
+    ):
+        self.calls.append(SimpleNamespace(**{k: v for k, v in locals().items() if k != "self"}))
+        B, N = opacities.shape
+        assert means.shape == (B, N, 3)
+        assert viewmats.shape == (B, 1, 4, 4)
+        assert Ks.shape == (B, 1, 3, 3)
+        tensors = (means, quats, scales, covars, opacities, colors, viewmats, Ks)
+        assert all(x.dtype == torch.float32 for x in tensors if x is not None)
+        assert torch.equal(viewmats[..., 3, :], torch.tensor([0.0, 0, 0, 1]).expand(B, 1, 4))
+        assert (sh_degree, backgrounds, radius_clip, tile_size) == (None, None, 0.0, 16)
+        assert far_plane >= 1e10
+        K = Ks[:, 0].detach() * torch.tensor([[1.0, 0, 1], [0, 1, 1], [0, 0, 1]])
+        if covars is not None:
+            quats = scales = None
+            covars = covars.triu() + covars.triu(1).mT
+        drawn = rasterise(
+            Gaussians(means, quats, scales, opacities, colors, covars),
+            Camera(K, viewmats[:, 0, :3, :3], viewmats[:, 0, :3, 3], (height, width)),
+            settings=replace(
+                STANDARD,
+                near=near_plane,
+                low_pass=eps2d,
+                antialias={"antialiased": True, "classic": False}[rasterize_mode],
+                alpha_max=self.cap,
+            ),
+            backend="reference",
+            depth=True,
+        )
+        layers = {
+            "RGB": [drawn.features],
+            "RGB+D": [drawn.features, drawn.depth],
+            "RGB+ED": [drawn.features, drawn.depth / drawn.alpha.clamp_min(1e-10)],
+        }[render_mode]
+        as_gsplat_has_it = [
+            x.movedim(1, -1).unsqueeze(1) for x in (torch.cat(layers, 1), drawn.alpha)
+        ]
+        return *as_gsplat_has_it, {}
+
+
+def install(monkeypatch, module, device="cpu"):
+    """Makes ``import gsplat`` give the module, on the device that gsplat is taken to run on."""
+    monkeypatch.setitem(sys.modules, "gsplat", module)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    monkeypatch.setattr(gsplat_backend, "DEVICE", device)
+    gsplat_backend._measured_cap.cache_clear()
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    module = StandIn()
+    install(monkeypatch, module)
+    yield module
+    gsplat_backend._measured_cap.cache_clear()
+
+
+def turned(cam: Camera) -> Camera:
+    """A turn, a shift, an off-centre principal point, non-square pixels; no skew."""
+    axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=torch.float64)
+    K = cam.K.clone()
+    K[:, 0, 2], K[:, 1, 1] = K[:, 0, 2] + 2.5, K[:, 1, 1] * 0.8
+    R = torch.matrix_exp(axis).to(cam.R).expand_as(cam.R).clone()
+    return replace(cam, K=K, R=R, t=cam.t + torch.tensor([0.1, -0.05, 0.3]).to(cam.t))
+
+
+def scene(shape: str = "quats", channels: int = 3, batch: int = 2) -> tuple[Gaussians, Camera]:
+    gaussians = cloud(30, channels, batch=batch)
+    if shape == "covariances":
+        gaussians = with_covariances(gaussians)
+        skew = torch.randn(batch, 30, 3, 3, generator=torch.Generator().manual_seed(0))
+        skewed = gaussians.covariances + 1e-3 * (skew - skew.mT).double()
+        gaussians = replace(gaussians, covariances=skewed)
+    return gaussians.to(torch.float32), turned(camera(batch=batch)).to(torch.float32)
+
+
+def drawn(gaussians, cam, backend, settings=STANDARD, depth=True):
+    """The raster and its gradients; K needs none, as gsplat has none."""
+    gaussians, cam = leaves(gaussians), leaves(cam)
+    cam.K.requires_grad_(False)
+    raster = rasterise(gaussians, cam, settings=settings, backend=backend, depth=depth)
+    loss(raster).backward()
+    return raster, gradients(gaussians, cam)
+
+
+def assert_same(got, want, tolerance=2e-5):
+    (raster, grads), (want_raster, want_grads) = got, want
+    for name, value in vars(want_raster).items():
+        assert error(getattr(raster, name), value) < tolerance, name
+    for name, grad in want_grads.items():
+        if name != "K":
+            off = (grads[name] - grad).abs().max() / grad.abs().max()
+            assert off < 10 * tolerance, name
+
+
+# --- what it is called with --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", ["quats", "covariances"])
+@pytest.mark.parametrize("channels", [1, 5])
+def test_values_and_gradients_are_those_of_the_reference(stand_in, shape, channels):
+    gaussians, cam = scene(shape, channels)
+    assert_same(drawn(gaussians, cam, "gsplat"), drawn(gaussians, cam, "reference"))
+    assert stand_in.calls[-1].packed is False
+    assert (stand_in.calls[-1].quats is None) == (shape == "covariances")
+
+
+@pytest.mark.parametrize("changes", [{"antialias": True}, {"low_pass": 1.0}, {"near": 2.0}])
+def test_the_settings_that_gsplat_takes_are_passed_on(stand_in, changes):
+    gaussians, cam = scene()
+    settings = replace(STANDARD, **changes)
+    plain = drawn(gaussians, cam, "reference")[0]
+    want = drawn(gaussians, cam, "reference", settings)
+    assert error(want[0].features, plain.features) > 1e-2
+    assert_same(drawn(gaussians, cam, "gsplat", settings), want)
+
+
+def test_without_depth_none_is_drawn(stand_in):
+    gaussians, cam = scene()
+    got, want = drawn(gaussians, cam, "gsplat", depth=False), drawn(gaussians, cam, "torch")
+    assert got[0].depth is None
+    assert stand_in.calls[-1].render_mode == "RGB"
+    assert error(got[0].features, want[0].features) < 2e-5
+
+
+def test_a_camera_far_from_the_origin_costs_no_digits(stand_in):
+    gaussians, cam = scene(batch=1)
+    offset = torch.tensor([8192.0, -4096.0, 16384.0])
+    gaussians = replace(gaussians, means=gaussians.means + offset)
+    cam = replace(cam, t=cam.t - cam.R @ offset)
+    assert_same(drawn(gaussians, cam, "gsplat"), drawn(gaussians, cam, "reference"))
+    assert stand_in.calls[-1].means.abs().max() < 10
+
+
+def test_unusable_quaternions_are_the_identity_and_length_does_not_matter(stand_in):
+    quats = [
+        (0.0, 0.0, 0.0, 0.0),
+        (1e-30, 0.0, 1e-30, 0.0),
+        (2e18, 1e18, 0.0, 0.0),
+        (1e-15, 0, 0, 1e-15),
+    ]
+    shapes = [(0.1, 0.2, 0.3)] * 4
+    gaussians = join(*(one(quat=q, scale=s) for q, s in zip(quats, shapes, strict=True)))
+    gaussians, cam = gaussians.to(torch.float32), scene(batch=1)[1]
+    got, want = drawn(gaussians, cam, "gsplat"), drawn(gaussians, cam, "reference")
+    assert error(got[0].features, want[0].features) < 2e-5
+    assert torch.equal(stand_in.calls[-1].quats[0, 0], torch.tensor(IDENTITY))
+    assert got[1]["quats"].isfinite().all()
+    assert not got[1]["quats"][0, :2].any()
+
+
+@pytest.mark.parametrize("shape", ["quats", "covariances"])
+@pytest.mark.filterwarnings("ignore:rasterise. dropped")
+def test_dropped_gaussians_never_reach_it(stand_in, shape):
+    gaussians, cam = scene(shape)
+    gaussians.means[1, 4], gaussians.opacities[0, 2] = float("nan"), 7.0
+
+    def run(backend):
+        g = leaves(gaussians)
+        raster = rasterise(
+            g, cam, settings=STANDARD, backend=backend, depth=True, on_invalid="drop"
+        )
+        loss(raster).backward()
+        return raster, gradients(g)
+
+    assert_same(run("gsplat"), run("reference"))
+    call = stand_in.calls[-1]
+    assert call.means.isfinite().all()
+    assert call.opacities[1, 4] == call.opacities[0, 2] == 0
+
+
+# --- when it draws, and when it does not ---------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"alpha_min": 1e-6}, "alpha_min=0.00392157, the settings 'standard' have 1e-06"),
+        ({"transmittance_min": 1e-6}, "transmittance_min=0.0001, the settings"),
+        ({"extent": "sigma"}, "extent=opacity, the settings 'standard' have sigma"),
+        ({"dtype": "float64"}, "dtype=float32, the settings 'standard' have float64"),
+        ({"fov_clamp": 1.5}, "fov_clamp=1.3, the settings 'standard' have 1.5"),
+        ({"alpha_max": 0.99}, "alpha_max=0.999, the settings 'standard' have 0.99"),
+    ],
+)
+def test_other_settings_are_left_to_torch(stand_in, changes, message):
+    name, reason = resolve_backend("gsplat", CPU, replace(STANDARD, **changes))
+    assert name == "torch"
+    assert message in reason
+    assert reason.count(". ") == 0  # one sentence
+
+
+def test_the_cap_is_that_of_the_version_at_hand(monkeypatch):
+    install(monkeypatch, StandIn(cap=0.99))
+    assert resolve_backend("gsplat", CPU, replace(STANDARD, alpha_max=0.99)) == ("gsplat", "")
+    name, reason = resolve_backend("gsplat", CPU, STANDARD)
+    assert name == "torch"
+    assert "alpha_max=0.99, the settings 'standard' have 0.999" in reason
+
+
+def test_auto_takes_it_where_the_settings_match_and_says_what_its_stop_costs(stand_in):
+    name, reason = resolve_backend("auto", CPU, STANDARD)
+    assert name == "gsplat"
+    assert "may lack 0.1 of its light, not 0.0001" in reason
+    assert resolve_backend("gsplat", CPU, STANDARD) == ("gsplat", "")
+    assert resolve_backend("auto", CPU, ACCURACY["high"])[0] != "gsplat"
+    assert resolve_backend("auto", CPU, ACCURACY["exact"]) == ("reference", "")
+    assert resolve_backend("torch", CPU, STANDARD) == ("torch", "")
+    assert resolve_backend("native", CPU, STANDARD)[0] != "gsplat"
+
+
+def test_the_stop_costs_at_most_what_it_is_said_to():
+    # T (1 - a) <= 1e-4 stops a pixel at T = 0.1 where a = 0.999: all of T is left out.
+    assert gsplat_backend.stop_loss(STANDARD) == pytest.approx(0.1)
+    assert gsplat_backend.stop_loss(replace(STANDARD, alpha_max=0.99)) == pytest.approx(0.01)
+    assert gsplat_backend.stop_loss(replace(STANDARD, alpha_max=1.0)) == 1
+
+
+def test_on_another_device_torch_draws(monkeypatch):
+    install(monkeypatch, StandIn(), device="cuda")
+    name, reason = resolve_backend("gsplat", CPU, STANDARD)
+    assert name == "torch"
+    assert "gsplat runs on CUDA only, the Gaussians are on cpu" in reason
+
+
+def test_where_it_is_not_installed_auto_says_how_to_install_it(monkeypatch):
+    install(monkeypatch, None, device="cuda")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    for backend in ("auto", "gsplat"):
+        name, reason = resolve_backend(backend, CUDA, STANDARD)
+        assert name == "torch"
+        assert "gsplat is not installed: pip install 'gsgan[gsplat]'" in reason
+    assert resolve_backend("auto", CUDA, ACCURACY["high"]) == ("torch", "")
+
+
+def broken(error):
+    def rasterization(**_):
+        raise error
+
+    return SimpleNamespace(rasterization=rasterization)
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        (None, "ModuleNotFoundError: import of gsplat halted"),  # what sys.modules does with None
+        (SimpleNamespace(), "AttributeError: "),
+        (
+            broken(RuntimeError("no kernel image\nfor this device")),
+            "RuntimeError: no kernel image).",
+        ),
+        (
+            broken(TypeError("unexpected keyword argument")),
+            "TypeError: unexpected keyword argument",
+        ),
+        (broken(AssertionError()), "(AssertionError)."),
+    ],
+)
+def test_a_broken_package_is_no_exception(monkeypatch, module, message):
+    install(monkeypatch, module)
+    name, reason = resolve_backend("gsplat", CPU, STANDARD)
+    assert name == "torch"
+    assert "gsplat is installed but cannot draw here" in reason
+    assert message in reason
+
+
+def unsuited_cases():
+    gaussians, cam = scene()
+    skewed = replace(cam, K=cam.K + torch.tensor([[0.0, 1e-3, 0], [0, 0, 0], [0, 0, 0]]))
+    none = Gaussians(*(x[:, :0] for x in list(vars(gaussians).values())[:5]))
+    wide = gaussians.to(torch.float64), cam.to(torch.float64)
+    return {
+        "Camera.K has some": (gaussians, skewed),
+        "Gaussians are float64": wide,
+        "no Gaussians": (none, cam),
+        "no gradient for Camera.K": (gaussians, replace(cam, K=cam.K.clone().requires_grad_())),
+    }
+
+
+@pytest.mark.parametrize("message", list(unsuited_cases()))
+def test_what_it_cannot_draw_torch_does_and_says_so_once(stand_in, caplog, monkeypatch, message):
+    monkeypatch.setattr(sys.modules["gsgan.splat.rasterise"], "_said", set())
+    gaussians, cam = unsuited_cases()[message]
+    resolve_backend("gsplat", CPU, STANDARD)  # measures the cap
+    calls = len(stand_in.calls)
+    with caplog.at_level(logging.WARNING, logger="gsgan"):
+        for _ in range(2):
+            got = rasterise(gaussians, cam, settings=STANDARD, backend="gsplat")
+    assert len(stand_in.calls) == calls
+    want = rasterise(gaussians, cam, settings=STANDARD, backend="torch")
+    assert torch.equal(got.features, want.features)
+    assert sum(message in record.message for record in caplog.records) == 1
+
+
+def test_without_gradients_a_camera_that_could_have_some_is_no_obstacle(stand_in):
+    gaussians, cam = scene()
+    with torch.no_grad():
+        rasterise(gaussians, leaves(cam), settings=STANDARD, backend="gsplat")
+    assert len(stand_in.calls) == 2  # the cap, and the picture
+
+
+# --- the package itself -------------------------------------------------------------------------
+
+needs_gsplat = pytest.mark.skipif(
+    not torch.cuda.is_available() or importlib.util.find_spec("gsplat") is None,
+    reason="needs a CUDA device and the gsplat package",
+)
+
+
+@needs_gsplat
+@pytest.mark.parametrize("shape", ["quats", "covariances"])
+@pytest.mark.parametrize("antialias", [False, True])
+def test_the_package_draws_what_torch_draws(shape, antialias):
+    gaussians, cam = (x.to(CUDA) for x in scene(shape))
+    # Faint, so that no pixel stops: there gsplat differs.
+    gaussians = replace(gaussians, opacities=gaussians.opacities * 0.3)
+    cap, problem = gsplat_backend._measured_cap(gaussians.means.device)
+    assert cap is not None, problem
+    settings = replace(STANDARD, alpha_max=cap, antialias=antialias)
+    assert resolve_backend("auto", gaussians.means.device, settings)[0] == "gsplat"
+    got = drawn(gaussians, cam, "gsplat", settings)
+    assert_same(got, drawn(gaussians, cam, "torch", settings), tolerance=1e-3)
