@@ -13,9 +13,15 @@ cd "$work"
 export GSGAN_CACHE="$work/cache" # nothing made by the checkout may help
 inside=$(venv/bin/python -m zipfile -l "$(ls -t "$repo"/dist/gsgan-*.whl | head -1)")
 for file in gsgan/conf/train.yaml gsgan/body/assets/free_body.npz gsgan/body/assets/ATTRIBUTION.md \
-  gsgan/splat/native.cpp gsgan/skeleton/templates.npz; do
+  gsgan/splat/native.cpp gsgan/splat/kernels/tile.h gsgan/skeleton/templates.npz; do
   [[ $inside == *"$file"* ]] || { echo "the wheel lacks $file"; exit 1; }
 done
+"$work/venv/bin/python" -c '
+import shutil
+from gsgan.splat import build, native
+if any(map(shutil.which, build.COMPILERS)):
+    assert native.available(), native.why_not()
+'
 "$work/venv/bin/python" -m gsgan.train experiment=demo training=smoke \
   hydra.run.dir="$work/run"
 test -s "$work/run/metrics.json"

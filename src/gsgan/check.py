@@ -7,17 +7,23 @@ import sys
 from omegaconf import DictConfig
 
 from gsgan.config import FAILED, entry
+from gsgan.errors import ConfigError
 
 
 def check(config: DictConfig) -> None:
     """Checks the dataset, prints and writes a report; ends with 1 when something is wrong.
+
+    With ``strict`` a warning is enough for that.
 
     Raises:
         GsganError: on a config value that does not fit.
     """
     from gsgan.checking.run import run_check
 
-    if run_check(config).errors:
+    if not isinstance(config.strict, bool):
+        raise ConfigError(f"strict must be true or false, got {config.strict!r}")
+    report = run_check(config)
+    if report.errors or (config.strict and report.warnings):
         sys.exit(FAILED)
 
 

@@ -72,7 +72,7 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
 def one_sentence(error: BaseException) -> str | None:
     """What to tell the user, or None for a bug, whose traceback is worth more."""
     if isinstance(error, GsganError):
-        return str(error)
+        return _without_worker(error)
     if isinstance(error, InstantiationException):
         cause = error.__cause__
         if isinstance(cause, GsganError):
@@ -84,6 +84,14 @@ def one_sentence(error: BaseException) -> str | None:
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         return str(error).splitlines()[0]
     return None
+
+
+def _without_worker(error: GsganError) -> str:
+    """The sentence alone, when a DataLoader's worker process put its traceback before it."""
+    text = str(error)
+    if not text.startswith("Caught "):
+        return text
+    return text.rpartition(f"{type(error).__name__}: ")[2].strip().splitlines()[-1]
 
 
 def _remove_unused_folder() -> None:

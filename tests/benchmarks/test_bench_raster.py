@@ -158,6 +158,14 @@ def test_figures_of_other_code_are_not_taken(config, tmp_path, measured, monkeyp
     assert len(measured) == 4
 
 
+def test_the_digest_of_the_code_covers_kernels_and_measuring(monkeypatch):
+    found = []
+    monkeypatch.setattr(raster, "source_digest", lambda paths: found.extend(paths))
+    raster._code()
+    names = {path.name for path in found}
+    assert {"native.cpp", "tile.h", "project.h", "tiles.py", "timing.py", "memory.py"} <= names
+
+
 def test_an_interrupted_run_keeps_its_finished_cells(config, tmp_path, measured):
     with pytest.raises(KeyboardInterrupt):
         raster.run(config("gaussians=[60,999]"), tmp_path)
@@ -188,8 +196,16 @@ def test_the_page_is_rewritten(config, tmp_path):
         ("channels=3", "channels must list whole numbers"),
         ("judge_at=8000", "judge_at must list whole numbers"),
         ("sizes=[64.5]", "sizes must list whole numbers"),
-        ("repeats=0", "repeats must be at least 1, got 0"),
-        ("backends=native", "backends must be auto or a list of reference, torch, native"),
+        ("repeats=0", "repeats must be a whole number of at least 1, got 0"),
+        ("repeats=2.5", "repeats must be a whole number of at least 1, got 2.5"),
+        ("threads=0", "threads must be a whole number of at least 1, got 0"),
+        ("patience=null", "patience must be a number of at least 0, got None"),
+        ("marks.growth=null", "marks.growth must be a number of at least 0, got None"),
+        ("exact_upto=0", "exact_upto must give the Gaussians by backend"),
+        ("exact_upto.native=null", "exact_upto.native must be a whole number"),
+        ("docs=nowhere.md", "docs=nowhere.md: no such page"),
+        ("backends=native", "backends must be auto or a list of torch, native"),
+        ("backends=[reference]", "backends must be auto or a list of torch, native"),
         ("backends=[abacus]", "backends must be auto or a list of"),
         ("shape=cubes", "shape must be one of quats, covariances, got cubes"),
         ("+reference.frames=3", "reference must have gaussians and size"),

@@ -63,6 +63,17 @@ def test_the_docs_have_one_line_a_case_with_its_worst_backend(run, tmp_path):
     assert "| mirror | – | – | refused | det -1 |" in text
 
 
+def test_an_infinite_error_is_shown_and_not_the_next_largest(run, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("<!-- bench:stability --><!-- end -->")
+    folder = run([row("needle", "torch"), row("needle", "native", error=math.inf)], f"docs={page}")
+    assert "| needle | ∞ | ∞ | right |  |" in page.read_text()
+    assert (
+        "| needle | scenes | native | ∞ | ∞ | means | right |  |"
+        in (folder / "stability.md").read_text()
+    )
+
+
 def test_an_unexpected_verdict_is_written_and_ends_in_an_error(run, tmp_path):
     bad = row("needle", "torch", "not finite", expected="right")
     with pytest.raises(GsganError, match=r"1 of 4 verdicts .* needle \(torch\): expected right"):

@@ -28,6 +28,12 @@ def test_a_rate_below_what_training_takes_says_so():
     assert rows([speed], None)[0][-1] == "–"
 
 
+def test_loading_in_the_training_process_is_not_called_enough():
+    speed = LoaderSpeed(frames=30, seconds=3.0, workers=0, size=(512, 512), first=0.5)
+    assert rows([speed], 8.0)[0][-1] == "in the training process, 8 are needed"
+    assert rows([speed], 12.5)[0][-1] == "no, 12.5 are needed"
+
+
 @pytest.mark.parametrize("wrong", ["batches=0", "seconds=-1", "workers=[]", "workers=[-1]"])
 def test_numbers_out_of_range_end_in_one_sentence(compose, capture, tmp_path, wrong):
     with pytest.raises(ConfigError, match=wrong.split("=")[0]):

@@ -59,7 +59,9 @@ def test_videos_become_a_capture_that_training_reads(project: Path):
     assert not layout.cameras["cam01"].distorted
     given = json.loads((project / "cameras.json").read_text())["cam01"]
     np.testing.assert_allclose(layout.cameras["cam01"].K, given["K"])
-    assert not (project.parent / "out" / "hands3d.npz").exists() or known.any()
+    hands = np.load(out / "hands3d.npz")  # no hands were given: there, and missing
+    assert np.isnan(hands["p"]).all()
+    assert (hands["conf"] == 0).all()
 
 
 def test_the_report_tells_every_stage_and_shows_overlays(project: Path):

@@ -79,6 +79,16 @@ def test_something_wrong_ends_with_1(copy, command, tmp_path):
     assert json.loads((tmp_path / "work" / "check.json").read_text())["errors"] == 1
 
 
+@pytest.mark.parametrize(("strict", "ends"), [("false", 0), ("true", 1)])
+def test_warnings_end_with_1_where_that_is_asked_for(good, command, tmp_path, strict, ends):
+    # at the usual limit the little man's forearm is a warning
+    code, *_ = command(f"data.root={good}", f"strict={strict}", *FEW)
+    numbers = json.loads((tmp_path / "work" / "check.json").read_text())
+    assert numbers["errors"] == 0
+    assert numbers["warnings"] > 0
+    assert code == ends
+
+
 def test_data_that_cannot_be_read_leave_a_report_too(copy, command):
     (copy / "meta.json").write_text("{")
     code, output, page = command(f"data.root={copy}", *FEW)
@@ -109,6 +119,13 @@ def test_settings_that_make_no_sense_are_one_sentence(good, command):
     assert code == 1
     assert "limits.flesh must be a number above 0" in output
     assert "Traceback" not in output
+
+
+def test_strict_must_be_true_or_false(good, command):
+    code, output, page = command(f"data.root={good}", "strict=maybe")
+    assert code == 1
+    assert "strict must be true or false, got 'maybe'" in output
+    assert page == ""
 
 
 def test_a_report_that_cannot_be_written_is_said(good, command, tmp_path):

@@ -125,9 +125,9 @@ def test_a_camera_out_of_step_is_named(copy, check):
             folder = copy / kind / "cam00"
             (folder / f"{frame + 1:06d}.png").replace(folder / f"{frame:06d}.png")
     report = check(copy, pixel_tolerance=0.5, joint_tolerance=0.02, joint_jump=1.0)
-    found = [f.sentence for f in report.findings if f.topic == "synchronisation"]
-    assert len(found) == 1
-    assert found[0].startswith("camera cam00: its pictures fit the skeleton 1 frame(s) later")
+    (found,) = (f for f in report.findings if f.topic == "synchronisation")
+    assert found.level == "error"
+    assert found.sentence.startswith("camera cam00: its pictures fit the skeleton 1 frame(s) later")
 
 
 def redraw(root: Path) -> None:

@@ -100,6 +100,34 @@ def test_reprojection_of_detections_is_measured_by_camera(subject, tmp_path):
     assert np.isnan(medians).all()
 
 
+class Counted(np.ndarray):
+    """An array that counts how often it is walked through."""
+
+    walks = 0
+
+    def __iter__(self):
+        Counted.walks += 1
+        return super().__iter__()
+
+
+def test_thousands_of_frames_are_indexed_once(subject, tmp_path):
+    (tmp_path / "landmarks2d").mkdir()
+    count = 3000
+    p = np.resize(subject.p, (count, *subject.p.shape[1:]))
+    for name, camera in subject.cameras.items():
+        pixels = project(camera, p)[0]
+        np.savez(tmp_path / f"landmarks2d/{name}.npz", p=pixels, frame_id=np.arange(count))
+    long = replace(
+        subject,
+        layout=replace(subject.layout, root=tmp_path),
+        frames=np.arange(count).view(Counted),
+        p=p,
+        visible=np.resize(subject.visible, p.shape[:2]),
+    )
+    assert read_reprojection(long).median == pytest.approx(0, abs=1e-3)
+    assert Counted.walks == 1
+
+
 def test_damaged_detections_are_said(subject, tmp_path):
     root = tmp_path / "capture"
     (root / "landmarks2d").mkdir(parents=True)

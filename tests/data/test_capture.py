@@ -17,7 +17,7 @@ from make import edit_json, ring_camera, skeletons, write_landmarks, write_tiny_
 
 from gsgan.data.capture import CaptureDataset, Picture, PictureCache
 from gsgan.data.crop import PersonCrop, Window, cut, square_window, undistort_map
-from gsgan.data.files import cut_off, read_header
+from gsgan.data.files import cut_off, last_number, read_header
 from gsgan.data.layout import Checks, Layout, fill_missing, spans
 from gsgan.errors import ConfigError, DataError
 from gsgan.scene import Frame, cat
@@ -513,6 +513,16 @@ def pickled(root: Path) -> None:
     np.savez(root / "landmarks3d.npz", p=np.array([{"a": 1}], dtype=object), frame_id=np.arange(4))
 
 
+def smpl_poses_of_free_body(root: Path) -> None:
+    meta(body="free")(root)
+    poses(theta=np.zeros((4, 24, 3)))(root)
+
+
+def blank_masks(root: Path) -> None:
+    for path in (root / "masks").rglob("*.png"):
+        cv2.imwrite(str(path), np.zeros((24, 32), np.uint8))
+
+
 STRETCHED = np.diag([1.0, 1.1, 1.0])
 BAD_INDEX = {
     "no cameras.json": (remove("cameras.json"), "cameras.json does not exist"),
@@ -590,6 +600,23 @@ BAD_INDEX = {
     "no common frame": (
         landmarks(frame_id=np.arange(100, 104)),
         "no usable frame: 4 without a row in landmarks3d.npz",
+    ),
+    "theta of another body": (
+        smpl_poses_of_free_body,
+        r"'theta' must have shape \(any, 56, 3\), found \(4, 24, 3\)",
+    ),
+    "unknown body": (meta(body="smplh"), "'body' is 'smplh'; expected one of free, smpl, smplx"),
+    "masks all empty": (
+        blank_masks,
+        "masks/cam00/000000.png shows no person, nor does any of the 6 masks looked at",
+    ),
+    "mask 16 bit": (
+        picture("masks/cam00/000001.png", np.zeros((24, 32), np.uint16)),
+        "000001.png has 16 bits a channel; expected 8",
+    ),
+    "frame of a date": (
+        write("images/cam00/20240131120000123456.png", b""),
+        "20240131120000123456.png has no frame number up to 1000000000 in its name",
     ),
     "theta shape": (poses(theta=np.zeros((4, 168))), r"'theta' must have shape \(any, any, 3\)"),
     "transl shape": (poses(transl=np.zeros((3, 3))), r"'transl' must have shape \(4, 3\)"),
@@ -685,6 +712,54 @@ def test_a_broken_picture_is_refused_when_it_is_read(tmp_path: Path, name: str) 
     with pytest.raises(DataError, match=message) as caught:
         dataset[1]
     assert "\n" not in str(caught.value)
+
+
+def test_an_empty_mask_is_noted(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path)
+    cv2.imwrite(str(root / "masks/cam00/000001.png"), np.zeros((24, 32), np.uint8))
+    (note,) = Layout.read(root).notes
+    assert note.startswith("camera cam00: the mask is empty at frames 1 of 4 looked at")
+
+
+def test_a_skewed_K_is_kept_and_undistorted_with_its_skew(tmp_path: Path) -> None:
+    """A dot drawn where lens and skew put a point is found where the pinhole camera puts it."""
+    root = write_tiny_capture(tmp_path, size=(200, 160), cameras=1)
+    content = json.loads((root / "cameras.json").read_text())["cam00"]
+    K = np.array(content["K"])
+    K[0, 1] = 40
+    k1 = -0.15
+    edit_json(
+        root / "cameras.json",
+        lambda rig: rig["cam00"].update(K=K.tolist(), dist=[k1, 0, 0, 0, 0]),
+    )
+    x, y = 0.2, -0.3
+    bend = 1 + k1 * (x * x + y * y)
+    u, v = (K @ [x * bend, y * bend, 1])[:2]
+    rows, columns = np.mgrid[:160, :200] + 0.5
+    dot = 255 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / 8)
+    cv2.imwrite(str(root / "images/cam00/000000.png"), np.repeat(dot[..., None], 3, -1))
+    cv2.imwrite(str(root / "masks/cam00/000000.png"), np.full((160, 200), 255, np.uint8))
+    frame = CaptureDataset(Layout.read(root), [("cam00", 0)])[0]
+    np.testing.assert_allclose(frame.camera.K[0], K, atol=1e-4)
+    weight = frame.image[0, 0].double().numpy()
+    found = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+    np.testing.assert_allclose(found, (K @ [x, y, 1])[:2], atol=0.15)
+
+
+def test_arrays_that_would_unpack_to_too_much_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = write_tiny_capture(tmp_path)
+    monkeypatch.setattr("gsgan.data.pickles.LARGEST_MEMBER", 1000)
+    with pytest.raises(DataError, match=r"landmarks3d.npz is not a whole npz file .p would"):
+        Layout.read(root)
+
+
+def test_frame_numbers_end() -> None:
+    assert last_number("frame_0000000000000012") == 12
+    assert last_number("1000000000") == 10**9
+    assert last_number("1000000001") is None
+    assert last_number("9" * 5000) is None
 
 
 def test_wrong_folder(tmp_path: Path) -> None:

@@ -8,7 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from gsgan.data.pixels import PixelRules, read_image, read_labels, read_mask, with_ignored_border
+from gsgan.data.pixels import (
+    MaskFile,
+    PixelRules,
+    mask_file,
+    read_image,
+    read_labels,
+    read_mask,
+    with_ignored_border,
+)
 from gsgan.errors import DataError
 
 VALUES = np.array([[0, 1, 127], [128, 200, 255]], np.uint8)
@@ -68,6 +76,27 @@ def test_any_channel_counts_but_not_transparency(tmp_path: Path) -> None:
     picture[0, 1, 2], picture[..., 3] = 9, 255
     cv2.imwrite(str(path), picture)
     assert np.array_equal(read_mask([("nonzero", path)], RULES), [[0, 255, 0]])
+
+
+def test_the_ringing_of_a_jpeg_is_no_person(tmp_path: Path) -> None:
+    mask = np.zeros((40, 40), np.uint8)
+    mask[10:27, 11:30] = 255
+    cv2.imwrite(str(tmp_path / "m.JPG"), mask)
+    ringing, sound = MaskFile("nonzero", "m.JPG"), mask_file("nonzero", "m.JPG")
+    first, second = (
+        read_mask([(f.rule, tmp_path / f.path)], PixelRules()) for f in (ringing, sound)
+    )
+    assert np.count_nonzero(first) > np.count_nonzero(mask)
+    np.testing.assert_array_equal(second, mask)
+    assert mask_file("nonzero", "m.png").rule == "nonzero"
+    assert mask_file("label", "m.jpg").rule == "label"
+
+
+def test_masks_of_floats_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "m.tiff"
+    cv2.imwrite(str(path), np.ones((4, 4), np.float32))
+    with pytest.raises(DataError, match=r"m.tiff holds float32 values; expected 8 bits"):
+        read_mask([("nonzero", path)], PixelRules())
 
 
 def test_unknown_rules_and_tables_are_refused(grey: Path) -> None:

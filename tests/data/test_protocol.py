@@ -40,6 +40,14 @@ def test_frames_may_have_a_step() -> None:
         parse_frames("0-9:0", "x")
 
 
+@pytest.mark.parametrize(
+    "value", ["0-99999999999", "5000000000", 10**10, "9" * 5000, ["0-9000000", "9000001-18000000"]]
+)
+def test_frames_without_end_are_refused(value: object) -> None:
+    with pytest.raises(ConfigError, match=r"^x"):
+        parse_frames(value, "x")
+
+
 def test_one_camera_trains_and_the_others_test_every_fourth_frame(layout: Layout) -> None:
     splits = protocol_splits(layout, ONE)
     assert splits.train_cameras == ("cam00",)
@@ -140,7 +148,11 @@ def test_the_data_follows_the_protocol_and_records_it(root: Path) -> None:
     assert record is not None
     assert json.loads(json.dumps(record)) == record  # plain values
     assert record["name"] == "one"
-    assert record["departures"] == []  # 16 of 32 pixels
+    (padded,) = record["departures"]  # 16 of 32 pixels, but the pictures are 32 x 24
+    assert padded.startswith("pictures are padded to squares with black")
+    whole = GsganData(str(root), protocol=ONE).protocol_record("vgg")
+    assert whole is not None
+    assert whole["departures"] == []
     assert GsganData(str(root)).protocol_record("vgg") is None
     cut = GsganData(str(root), size=16, crop="person", protocol=ONE).protocol_record("vgg")
     assert cut is not None

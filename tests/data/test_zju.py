@@ -546,6 +546,10 @@ BAD = {
         r"new_params has no parameters of any frame that has pictures; it holds 4 files",
     ),
     "poses of 66": (params(poses=np.zeros((1, 66))), r"2.npy: 'poses' must hold 72 or 69 numbers"),
+    "root turned twice": (
+        params(poses=np.full((1, 72), 0.1)),
+        "2.npy: the first 3 numbers of 'poses' must be 0, found up to 0.1; .* belongs in Rh",
+    ),
     "shapes of 16": (params(shapes=np.zeros((1, 16))), r"'shapes' must hold 10 numbers, found \(1"),
     "Th of 2": (params(Th=np.zeros((1, 2))), "'Th' must hold 3 numbers"),
     "Rh NaN": (params(Rh=np.full((1, 3), np.nan)), "'Rh' must hold finite numbers"),
@@ -618,6 +622,9 @@ def test_model_files_that_do_not_fit(written: Path, tmp_path: Path) -> None:
     write_smpl(tmp_path / "x.npz", "smplx", vertices=60)
     with pytest.raises(DataError, match=r"x.npz is a model of 55 joints.*SMPL \(24 joints\)"):
         read(written, tmp_path / "x.npz")
+    write_smpl(tmp_path / "small.pkl", vertices=60)
+    with pytest.raises(DataError, match=r"small.pkl has 60 vertices; expected the 6890 of SMPL"):
+        read(written, tmp_path / "small.pkl")
 
 
 @pytest.mark.parametrize(
@@ -642,11 +649,22 @@ def moving(path: Path) -> None:
     path.write_bytes(pickle.dumps(cameras))
 
 
+def turned_twice(path: Path) -> None:
+    infos = pickle.loads(path.read_bytes())
+    infos["frame_000002"]["poses"] = infos["frame_000002"]["poses"] + 0.1
+    path.write_bytes(pickle.dumps(infos))
+
+
 CACHE_DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "moving camera": (
         "humannerf",
         lambda root: moving(root / "cameras.pkl"),
         "cameras.pkl, frame 2: the camera moves",
+    ),
+    "root turned twice": (
+        "humannerf",
+        lambda root: turned_twice(root / "mesh_infos.pkl"),
+        "mesh_infos.pkl, frame 2: the first 3 numbers of 'poses' must be 0, found up to 0.1",
     ),
     "cameras cut": ("humannerf", cut("cameras.pkl", 0.5), "cameras.pkl is not a whole pickle"),
     "cameras a list": (

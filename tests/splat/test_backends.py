@@ -181,9 +181,10 @@ def test_error_of_a_setting_stays_under_its_bound(backend, settings, seed):
     bound = error_bound(project(gaussians, cam, DENSE), cam.size, ACCURACY[settings])
     got = rasterise(gaussians, cam, settings=settings, backend=backend).features
     want = rasterise(gaussians, cam, settings="exact").features
-    assert ((got - want).abs() <= bound + 1e-6).all()
-    # The bound says something: it is no wider than what the settings promise per layer.
-    assert bound.max() <= 300 * ACCURACY[settings].alpha_min + 0.05
+    off = (got - want).abs()
+    assert (off <= bound + 1e-12).all()
+    # The bound says something: it is not far above what is really lost, and 0 where nothing is.
+    assert bound.max() <= 5 * off.max()
 
 
 @every_backend

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import gc
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
+from splat_scenes import camera, cloud
 
-from gsgan.splat import buffers
+from gsgan.splat import buffers, rasterise
 
 SHAPE = (1, 8, 256, 256)  # 2 MB
 
 
 @pytest.fixture(autouse=True)
 def empty(monkeypatch):
-    monkeypatch.setattr(buffers, "_free", [])
+    monkeypatch.setattr(buffers, "_free", {})
 
 
 def test_memory_comes_back_clean_when_nobody_holds_it():
@@ -24,7 +26,7 @@ def test_memory_comes_back_clean_when_nobody_holds_it():
     part = first[0, 3]  # a view holds it too
     del first
     gc.collect()
-    assert not buffers._free
+    assert buffers.kept() == 0
     other = buffers.zeros(SHAPE, torch.float32)
     assert other.data_ptr() != where
     assert float(part[0, 0]) == 7.0
@@ -60,5 +62,39 @@ def test_no_more_is_kept_than_allowed(monkeypatch):
     tensors = [buffers.zeros(SHAPE, torch.float32) for _ in range(4)]
     del tensors
     gc.collect()
-    assert sum(m.nbytes for m in buffers._free) <= 5 << 20
-    assert buffers._free
+    assert 0 < buffers.kept() <= 5 << 20
+
+
+def test_sizes_that_are_no_longer_drawn_go_first(monkeypatch):
+    monkeypatch.setattr(buffers, "KEPT", 5 << 20)
+    for channels in (8, 8, 9, 7):  # 2, 2, 2.25 and 1.75 MB, one after the other
+        buffers.zeros((1, channels, 256, 256), torch.float32)
+        gc.collect()
+    assert sum(len(memories) for memories in buffers._free.values()) == 2
+    where = next(m for m in buffers._free.values() if m)[0].nbytes
+    assert where > 9 * 256 * 256 * 4
+
+
+def test_pictures_may_die_in_other_threads():
+    def draw(_: int) -> bool:
+        clean = True
+        for channels in (8, 9, 10, 8):
+            tensor = buffers.zeros((1, channels, 256, 256), torch.float32)
+            clean &= tensor.shape[1] == channels and not tensor.any()
+            tensor.fill_(1.0)
+        return clean
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(draw, range(12)))
+
+
+@pytest.mark.parametrize("backend", ["auto", "reference"])
+def test_a_picture_may_be_changed_in_place_by_its_caller(backend):
+    """The background is the caller's to add, also with +=."""
+    gaussians = cloud()
+    gaussians.means.requires_grad_()
+    raster = rasterise(gaussians, camera(), backend=backend)
+    picture = raster.features
+    picture += 0.5 * (1 - raster.alpha)
+    picture.sum().backward()
+    assert gaussians.means.grad.abs().max() > 0

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
-from splat_scenes import BACKENDS, camera, cloud
+from splat_scenes import camera, cloud, needs_native
 
 from gsgan.splat import ACCURACY, Accuracy, accuracy, rasterise, resolve_backend
 
@@ -81,7 +81,7 @@ def test_cuda_takes_torch():
     assert "CPU only" in reason
 
 
-@pytest.mark.skipif("native" not in BACKENDS, reason="no native kernel here")
+@needs_native
 def test_cpu_takes_native():
     assert resolve_backend("auto", CPU, ACCURACY["high"]) == ("native", "")
 

@@ -201,6 +201,10 @@ def test_choices_are_checked():
     gaussians = cloud(5)
     with pytest.raises(ValueError, match="on_invalid must be error or drop, got 'skip'"):
         rasterise(gaussians, camera(), on_invalid="skip")
+    with pytest.raises(ValueError, match="settings must be Accuracy, got dict"):
+        rasterise(gaussians, camera(), settings={"alpha_min": 0.1})
+    with pytest.raises(ValueError, match="camera must be Camera, got NoneType"):
+        rasterise(gaussians, None)
     with pytest.raises(ValueError, match="expected one of exact"):
         rasterise(gaussians, camera(), settings="fine")
     with pytest.raises(ValueError, match="backend must be one of"):

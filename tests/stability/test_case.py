@@ -112,6 +112,16 @@ def test_a_warning_is_a_verdict():
     assert row.note == "It says: x is odd"
 
 
+def test_a_warning_does_not_hide_a_wrong_result():
+    def run(inputs):
+        warnings.warn("x is odd", stacklevel=1)
+        return {"z": only_in_float32(inputs["x"], 1.1 * inputs["x"])}
+
+    row = judge(case(run))
+    assert row.verdict == "finite only"
+    assert row.note == "It says: x is odd"
+
+
 def test_equal_infinities_are_right_and_others_are_not():
     def infinite(sign):
         return lambda i: {"psnr": torch.full((2,), sign(i["x"].dtype) * math.inf), "z": i["x"]}

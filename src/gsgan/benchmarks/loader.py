@@ -66,13 +66,15 @@ def rows(found: Sequence[LoaderSpeed], needed: float | None) -> list[list[str]]:
             number(speed.rate),
             number(speed.rate_per_worker),
             number(speed.first),
-            _verdict(speed.rate, needed),
+            _verdict(speed, needed),
         ]
         for speed in found
     ]
 
 
-def _verdict(rate: float, needed: float | None) -> str:
+def _verdict(speed: LoaderSpeed, needed: float | None) -> str:
+    """Whether it is fast enough; what the training process loads itself adds to its own steps."""
     if needed is None:
         return "–"
-    return f"{'yes' if rate >= needed else 'no'}, {needed:g} are needed"
+    enough = "yes" if speed.workers else "in the training process"
+    return f"{enough if speed.rate >= needed else 'no'}, {needed:g} are needed"

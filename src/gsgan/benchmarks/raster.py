@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+import math
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,12 +27,16 @@ from gsgan.benchmarks.raster_cell import Cell, Job, Row, Variant, measure_cell
 from gsgan.benchmarks.raster_marks import Marks
 from gsgan.benchmarks.scene import LEAST, SHAPES
 from gsgan.benchmarks.store import Store, source_digest
+from gsgan.benchmarks.tables import check_block
 from gsgan.console import make_console
 from gsgan.devices import pick_device
 from gsgan.errors import ConfigError, GsganError
 from gsgan.splat import BACKENDS, Accuracy, resolve_backend
 
 MEASUREMENTS = "measurements.jsonl"
+# What figures depend on: another version of it measures anew.
+SOURCES = (".py", ".cpp", ".h")
+MEASURING = ("raster_cell", "judge", "scene", "timing", "memory")
 
 
 @dataclass(frozen=True)
@@ -97,15 +102,29 @@ class RasterBench:
         _check_list("judge_at", self.judge_at, 1)
         _check_list("dense_channels", self.dense_channels, 1)
         for name in ("repeats", "windows", "window"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name} must be at least 1, got {getattr(self, name)}")
+            _check_whole(name, getattr(self, name), 1)
+        if self.threads is not None:
+            _check_whole("threads", self.threads, 1)
+        _check_whole("seed", self.seed, 0)
+        _check_number("patience", self.patience, 0.0)
+        _check_number("rounding", self.rounding)
+        for field in fields(self.marks):
+            _check_number(f"marks.{field.name}", getattr(self.marks, field.name), 0.0)
+        if not isinstance(self.exact_upto, dict):
+            raise ConfigError(
+                "exact_upto must give the Gaussians by backend, e.g. exact_upto.native=8000, got "
+                f"{self.exact_upto!r}"
+            )
+        for backend, count in self.exact_upto.items():
+            _check_whole(f"exact_upto.{backend}", count, 0)
         if set(self.reference) != {"gaussians", "size"}:
             raise ConfigError(
                 f"reference must have gaussians and size, got {', '.join(self.reference)}"
             )
         if self.shape not in SHAPES:
             raise ConfigError(f"shape must be one of {', '.join(SHAPES)}, got {self.shape}")
-        known = [backend for backend in BACKENDS if backend != "auto"]
+        # The reference holds every Gaussian at every pixel: it judges, it is not timed.
+        known = [backend for backend in BACKENDS if backend not in ("auto", "reference")]
         listed = not isinstance(self.backends, str) and set(self.backends) <= set(known)
         if self.backends != "auto" and not listed:
             raise ConfigError(
@@ -146,6 +165,17 @@ class RasterBench:
         return found
 
 
+def _check_whole(name: str, value: object, least: int) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or value < least:
+        raise ConfigError(f"{name} must be a whole number of at least {least}, got {value!r}")
+
+
+def _check_number(name: str, value: object, least: float = -math.inf) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= least:
+        at_least = f" of at least {least:g}" if math.isfinite(least) else ""
+        raise ConfigError(f"{name} must be a number{at_least}, got {value!r}")
+
+
 def _check_list(name: str, value: object, least: int) -> None:
     if not isinstance(value, list) or any(not isinstance(n, int) or n < least for n in value):
         raise ConfigError(f"{name} must list whole numbers of at least {least}, got {value}")
@@ -169,6 +199,8 @@ def run(config: DictConfig, folder: Path) -> None:
     device, console = pick_device(bench.device), make_console()
     where = environment(device)
     console.print(where.sentence(), highlight=False)
+    if bench.docs is not None:
+        check_block(Path(bench.docs), "raster")  # now, not after measuring for an hour
     rows = measure(bench, device, where, Store(folder / MEASUREMENTS, fresh=bench.fresh), console)
     auto = _taken_by_auto(bench, device)
     report = raster_report.Report(rows, bench.reference, bench.marks, bench.rounding, auto, where)
@@ -223,8 +255,8 @@ def _code() -> str:
     package = Path(__file__).resolve().parents[1]
     return source_digest(
         [
-            *(p for p in (package / "splat").iterdir() if p.suffix in (".py", ".cpp")),
-            *(package / "benchmarks" / f"{n}.py" for n in ("raster_cell", "judge", "scene")),
+            *sorted(p for p in (package / "splat").rglob("*") if p.suffix in SOURCES),
+            *(package / "benchmarks" / f"{name}.py" for name in MEASURING),
         ]
     )
 

@@ -104,14 +104,14 @@ def _by_case(rows: Sequence[Row]) -> list[str]:
     differing = [f"{row.backend}: {row.verdict}" for row in rows if row.verdict != first.verdict]
     verdict = first.verdict if not differing else ", ".join([first.verdict, *differing])
     values, gradients = (
-        max((e for e in errors if math.isfinite(e)), default=math.nan)
+        max((e for e in errors if not math.isnan(e)), default=math.nan)
         for errors in ([r.value_error for r in rows], [r.gradient_error for r in rows])
     )
     return [first.case, _error(values), _error(gradients), verdict, first.note]
 
 
 def _error(value: float) -> str:
-    return number(_known(value), 2)
+    return "∞" if value == math.inf else number(_known(value), 2)
 
 
 def _plain(row: Row) -> dict[str, Any]:

@@ -43,6 +43,21 @@ def fill_block(page: Path, name: str, text: str) -> None:
     Raises:
         ConfigError: when the page is missing or has no such block.
     """
+    head, tail = _around(page, name)
+    write_atomically(page, f"{head}\n\n{text.strip()}\n\n{tail}")
+
+
+def check_block(page: Path, name: str) -> None:
+    """Whether ``fill_block`` will find its block, before anything long begins.
+
+    Raises:
+        ConfigError: as ``fill_block`` does.
+    """
+    _around(page, name)
+
+
+def _around(page: Path, name: str) -> tuple[str, str]:
+    """A page up to the start of a block, and from its end."""
     if not page.is_file():
         raise ConfigError(f"docs={page}: no such page; give a Markdown file or docs=null")
     start, end = f"<!-- bench:{name} -->", "<!-- end -->"
@@ -50,7 +65,7 @@ def fill_block(page: Path, name: str, text: str) -> None:
     _, closed, tail = rest.partition(end)
     if not found or not closed:
         raise ConfigError(f"docs={page}: expected a block {start} … {end}, found none; add one")
-    write_atomically(page, f"{head}{start}\n\n{text.strip()}\n\n{end}{tail}")
+    return head + start, end + tail
 
 
 def _cell(text: str) -> str:

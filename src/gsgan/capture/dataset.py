@@ -16,6 +16,7 @@ from gsgan.capture.joints import BODY, hand_names
 from gsgan.capture.pictures import PictureFiles
 from gsgan.capture.rig import Float, known
 from gsgan.capture.solve import Solution
+from gsgan.capture.writing import writing
 from gsgan.data.cameras import CameraEntry
 from gsgan.errors import DataError
 from gsgan.files import write_atomically
@@ -141,12 +142,14 @@ def write_npz(path: Path, **arrays: Any) -> None:
     """An npz that is there whole or not at all."""
     stream = io.BytesIO()
     np.savez_compressed(stream, **arrays)
-    write_atomically(path, stream.getvalue())
+    with writing(path):
+        write_atomically(path, stream.getvalue())
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """A JSON file that is there whole or not at all; NaN becomes null."""
-    write_atomically(path, json.dumps(_plain(content), indent=1) + "\n")
+    with writing(path):
+        write_atomically(path, json.dumps(_plain(content), indent=1) + "\n")
 
 
 def _plain(value: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 from gsgan.capture.cleanse import BODY_BONES, bone_lengths
 from gsgan.capture.joints import BODY, joint_names
 from gsgan.capture.landmarks import Detections
+from gsgan.capture.pictures import Written
 from gsgan.capture.rig import FOCAL, Float, known
 from gsgan.capture.solve import Solution, median
 from gsgan.capture.sources import Source
@@ -27,7 +28,9 @@ class Doubts:
         camera_move: metres by which refinement moved a camera.
         flips: share of frames in which a camera's sides were swapped.
         frozen_frames: frames in a row in which a detection stays the same to the last digit.
-        missing: share of frames in which a camera has no person, or a body joint is missing.
+        missing: share of frames in which a camera has no person or an empty mask, or a body joint
+            is missing.
+        undecoded: share of a video's frames that cannot be decoded; headers may be a few off.
         people: share of frames with more than one person.
         bone: share by which a limb's length may scatter (median deviation from its median).
         lag: frames tried either way when the clocks are compared; 0 skips it.
@@ -44,6 +47,7 @@ class Doubts:
     flips: float = 0.1
     frozen_frames: int = 8
     missing: float = 0.2
+    undecoded: float = 0.02
     people: float = 0.02
     bone: float = 0.1
     lag: int = 6
@@ -70,6 +74,21 @@ def doubts_about_sources(sources: Mapping[str, Source], limits: Doubts) -> list[
                 f"{name}: its metadata ask for a turn by {source.turned} degrees, which is not "
                 "obeyed; set apply_rotation=true if it was calibrated turned"
             )
+    return found
+
+
+def doubts_about_pictures(
+    sources: Mapping[str, Source], written: Mapping[str, Written], limits: Doubts
+) -> list[str]:
+    """Videos that end before their time, masks that show nobody."""
+    found = []
+    for name, one in written.items():
+        count, decoded = sources[name].count, one.decoded
+        if decoded is not None and decoded < (1 - limits.undecoded) * count:
+            found.append(f"{name}: only {decoded} of {count} frames can be decoded: is it damaged?")
+        empty = one.empty / max(1, len(one.frames))
+        if empty > limits.missing:
+            found.append(f"{name}: {empty:.0%} of the written masks are empty")
     return found
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from gsgan.capture.joints import ALL, BODY, FROM_HANDS, HAND, LEFT, RIGHT, SETS
 from gsgan.capture.rig import Float
 from gsgan.data.files import expect_array, last_number, read_arrays, read_json
+from gsgan.data.skeletons import whole_frame_ids
 from gsgan.errors import DataError
 
 PIXEL_CENTRE = 0.5  # added to detectors that count from the centre of the first pixel
@@ -77,9 +78,7 @@ def _read_npz(path: Path) -> Detections:
     arrays = read_arrays(path, ("px", "conf", "left", "right", "frame_id"))
     body = expect_array(arrays, "px", (None, BODY, 2), path).astype(np.float64)
     F = len(body)
-    frame_id = expect_array(arrays, "frame_id", (F,), path).astype(np.int64)
-    if len(np.unique(frame_id)) != F:
-        raise DataError(f"{path}: 'frame_id' lists a frame twice; keep one of them")
+    frame_id = whole_frame_ids(expect_array(arrays, "frame_id", (F,), path), str(path))
     px, conf = np.full((F, ALL, 2), np.nan), np.zeros((F, ALL))
     px[:, :BODY], conf[:, :BODY] = body, expect_array(arrays, "conf", (F, BODY), path)
     for name, part in (("left", LEFT), ("right", RIGHT)):
@@ -155,7 +154,7 @@ def _triples(path: Path, person: Mapping[str, Any], key: str) -> Float:
     """``[n, 3]`` x, y, confidence; OpenPose writes them flat, EasyMocap in rows."""
     try:
         flat = np.array(person.get(key) or [], np.float64).reshape(-1)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         flat = np.zeros(1)
     if len(flat) % 3:
         raise DataError(f"{path}: '{key}' must hold x, y, confidence for every joint")

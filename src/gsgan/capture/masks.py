@@ -11,11 +11,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.files import frame_files, last_number
+from gsgan.capture.overlays import sampled
+from gsgan.data.files import frame_files, last_number, read_grey
 from gsgan.errors import ConfigError, DataError
 
 Bytes = NDArray[np.uint8]
 SUFFIXES = (".png", ".jpg", ".jpeg")
+PROBED = 8  # masks of a camera that are looked at before any work is done
+PERSON = 128  # alpha that at least one pixel of them must have
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
     """Given masks by camera and frame number: <camera>/%06d.png, or %06d_<person>.png.
 
     Raises:
-        DataError: when a camera has none.
+        DataError: when a camera has none, or they hold labels instead of alpha.
     """
     found = {}
     for name in names:
@@ -75,7 +78,21 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
                 f"<camera>/000000.png and so on for {name}"
             )
         found[name] = {number: folder / path for number, path in files.items()}
+        _check_values(folder / name, [found[name][number] for number in sorted(found[name])])
     return found
+
+
+def _check_values(folder: Path, paths: list[Path]) -> None:
+    """Refuses 0 and 1, or part numbers, which would pass for a nearly transparent person.
+
+    A single faint mask is no proof (someone walks out), so several are looked at.
+    """
+    highest = max(int(read_grey(paths[i]).max()) for i in sampled(len(paths), PROBED))
+    if 0 < highest < PERSON:
+        raise DataError(
+            f"{folder} holds masks with values up to {highest}; small numbers are labels, expected "
+            "alpha from 0 to 255 (write the person as 255)"
+        )
 
 
 def _first_number(stem: str) -> int | None:

@@ -11,12 +11,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsgan.capture.sources import Source
+from gsgan.capture.writing import writing
 from gsgan.data.synthetic.make import cache_root
 from gsgan.errors import ConfigError, DataError
 
 TOOL = Path(__file__).parent / "mediapipe_tool"
 SCRIPT, REQUIREMENTS = TOOL / "detect.py", TOOL / "requirements.txt"
 NEWEST = (3, 12)  # the pinned MediaPipe has no build for later Pythons
+MARKER = ".gsgan-mediapipe"  # written first: a folder with it is ours to make again
 READY = ".ready"  # written last: an environment without it is half made
 
 
@@ -73,7 +75,8 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
     """The environment's Python; when it is missing, it is made if ``setup`` allows it.
 
     Raises:
-        ConfigError: when it is missing and may not be made, or no fitting Python is there.
+        ConfigError: when it is missing and may not be made, its folder holds something else, or no
+            fitting Python is there.
         DataError: when it cannot be made.
     """
     place = tool.environment
@@ -86,17 +89,31 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
             "setup=true to make it (some 400 MB are installed), or give landmarks=<folder> and "
             "masks=<folder>"
         )
-    say(f"making the MediaPipe environment at {place}, once")
-    if place.exists():
-        shutil.rmtree(place)  # half made
     base = _base_python(tool.python)
+    _claim(place)
+    say(f"making the MediaPipe environment at {place}, once")
     _run([base, "-m", "venv", str(place)], "the environment cannot be made")
     install = [str(python), "-m", "pip", "install", "--quiet", "--no-deps"]
     install += ["--disable-pip-version-check", "-r", str(REQUIREMENTS)]
     _run(install, "pip cannot install MediaPipe")
     _run([str(python), str(SCRIPT), "--help"], "MediaPipe does not start")
-    (place / READY).touch()
+    with writing(place):
+        (place / READY).touch()
     return python
+
+
+def _claim(place: Path) -> None:
+    """An empty folder with our marker; only an empty or half-made environment is taken away."""
+    with writing(place):
+        if place.exists():
+            if any(place.iterdir()) and not (place / MARKER).is_file():
+                raise ConfigError(
+                    f"mediapipe.folder={place} holds something else than an environment that gsgan "
+                    "made; give a new or empty folder"
+                )
+            shutil.rmtree(place)
+        place.mkdir(parents=True)
+        (place / MARKER).touch()
 
 
 def _base_python(given: str | None) -> str:

@@ -68,10 +68,17 @@ class Options:
             raise ConfigError(f"pixel_centre must be 0 or 0.5, got {self.pixel_centre!r}")
         if self.up_axis is not None and self.up_axis not in AXES:
             raise ConfigError(f"up_axis must be one of {', '.join(AXES)}, got {self.up_axis!r}")
-        if self.fps is not None and not self.fps > 0:
-            raise ConfigError(f"fps must be above 0, got {self.fps!r}")
-        if self.workers < 1:
-            raise ConfigError(f"workers must be at least 1, got {self.workers!r}")
+        if self.fps is not None and not (isinstance(self.fps, int | float) and self.fps > 0):
+            raise ConfigError(f"fps must be a number above 0, got {self.fps!r}")
+        if not isinstance(self.workers, int) or self.workers < 1:
+            raise ConfigError(f"workers must be a whole number, at least 1, got {self.workers!r}")
+        for name in ("cameras", "offsets"):
+            given = getattr(self, name)
+            if given is not None and not isinstance(given, Mapping):
+                raise ConfigError(f"{name} must be {{video name: value}}, got {given!r}")
+        for camera, frames in (self.offsets or {}).items():
+            if not isinstance(frames, int):
+                raise ConfigError(f"offsets: {camera} must have whole frames, got {frames!r}")
 
     def offset(self, camera: str) -> int:
         """Frames to add to a camera's own numbers."""

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from gsgan.capture.masks import MaskTidying, tidy
 from gsgan.capture.sources import Source
+from gsgan.capture.writing import writing
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Window, resize, take, undistort_map
 from gsgan.data.files import read_grey
@@ -59,6 +60,22 @@ class PictureFiles:
         return replace(camera, K=K, dist=np.zeros_like(camera.dist), size=size)
 
 
+@dataclass(frozen=True)
+class Written:
+    """What one camera's pictures came to.
+
+    Args:
+        frames: common numbers that are there now.
+        empty: how many of their masks show nobody.
+        decoded: pictures that the source gave before it ended; None when it was not read to its
+            end.
+    """
+
+    frames: list[int]
+    empty: int
+    decoded: int | None
+
+
 def write_pictures(
     root: Path,
     camera: CameraEntry,
@@ -69,7 +86,7 @@ def write_pictures(
     files: PictureFiles,
     tidying: MaskTidying,
     advance: Callable[[], None],
-) -> list[int]:
+) -> Written:
     """Writes images/{camera}/%06d and masks/{camera}/%06d.png; what is there already stays.
 
     Args:
@@ -83,23 +100,22 @@ def write_pictures(
         tidying: of the masks.
         advance: called after every frame of ``frames``.
 
-    Returns:
-        The common frame numbers that are there now.
-
     Raises:
         DataError: when a picture or mask is damaged or of the wrong size, or the disk is full.
     """
     image_folder, mask_folder = root / "images" / camera.name, root / "masks" / camera.name
     for folder in (image_folder, mask_folder):
-        folder.mkdir(parents=True, exist_ok=True)
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
     window = Window(0, 0, camera.size)
     mapping = undistort_map(camera.K, camera.dist, window) if camera.distorted else None
-    size, written = files.size(camera.size), list[int]()
+    size, written, empty, decoded = files.size(camera.size), list[int](), 0, 0
     last = max(frames, default=-1)
     for number, picture in source.pictures():
         frame = number + offset
         if frame > last:
-            break
+            return Written(written, empty, None)
+        decoded += 1
         if frame not in frames:
             continue
         advance()
@@ -109,8 +125,10 @@ def write_pictures(
         mask_path = mask_folder / f"{frame:06d}.png"
         written.append(frame)
         if image_path.exists() and mask_path.exists():
+            empty += not read_grey(mask_path).any()
             continue
         mask = tidy(read_grey(masks[number]), tidying)
+        empty += not mask.any()
         for pixels, path in ((picture, image_path), (mask, mask_path)):
             if pixels.shape[:2] != camera.size:
                 raise DataError(
@@ -120,7 +138,7 @@ def write_pictures(
                 )
             straight = resize(take(pixels, window, mapping, exact=False), size, exact=False)
             _write(path, straight, files)
-    return written
+    return Written(written, empty, decoded)
 
 
 def _write(path: Path, pixels: Bytes, files: PictureFiles) -> None:
@@ -131,8 +149,6 @@ def _write(path: Path, pixels: Bytes, files: PictureFiles) -> None:
     if not ok:
         raise DataError(f"{path} cannot be encoded; choose another pictures.format")
     part = path.with_name(f".{path.name}.part")  # no fsync: thousands of files, made again if lost
-    try:
+    with writing(path):
         part.write_bytes(data.tobytes())
         os.replace(part, path)
-    except OSError as error:
-        raise DataError(f"{path} cannot be written ({error.strerror or error})") from None

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from gsgan.capture.joints import BODY, SETS
 from gsgan.capture.rig import Float, known
 from gsgan.data.files import last_number
+from gsgan.data.skeletons import whole_frame_ids
 from gsgan.errors import DataError
 from gsgan.skeleton.template import MEDIAPIPE33
 
@@ -93,7 +94,7 @@ def _read_trc(path: Path) -> Points3D:
     for marker, name in enumerate(markers):
         if (joint := _joint(name)) is not None:
             p[:, joint] = read[:, marker]
-    return Points3D(table[:, 0].astype(np.int64), p, np.ones(p.shape[:2]))
+    return Points3D(whole_frame_ids(table[:, 0], str(path)), p, np.ones(p.shape[:2]))
 
 
 def _numbers(path: Path, line: str, markers: int) -> list[float]:
@@ -137,7 +138,7 @@ def _read_people(path: Path) -> Float:
     try:
         people: Any = json.loads(path.read_text(encoding="utf-8"))
         read = [np.array(person["keypoints3d"], np.float64) for person in people]
-    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+    except (OSError, ArithmeticError, ValueError, TypeError, LookupError, RecursionError) as error:
         raise DataError(
             f"{path} is no EasyMocap keypoints3d file: expected a list of persons ({error})"
         ) from None

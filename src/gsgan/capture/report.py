@@ -17,6 +17,7 @@ from gsgan.capture.options import Options
 from gsgan.capture.overlays import LEGEND, overlay_row, sampled
 from gsgan.capture.rig import FOCAL, Float
 from gsgan.capture.solve import Solution, stage_medians
+from gsgan.capture.writing import writing
 from gsgan.checking.findings import Figure, Finding, Report, Section, Table
 from gsgan.checking.page import page
 from gsgan.checking.terminal import print_report
@@ -65,7 +66,8 @@ class Outcome:
 def write_report(root: Path, outcome: Outcome, options: Options, console: Console) -> None:
     """Writes report.html and report.json into the dataset and prints the tables."""
     report = make_report(root, outcome, options)
-    write_atomically(root / "report.html", page(report))
+    with writing(root / "report.html"):
+        write_atomically(root / "report.html", page(report))
     write_json(root / "report.json", report.numbers)
     print_report(report, console)
 

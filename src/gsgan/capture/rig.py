@@ -14,6 +14,11 @@ from gsgan.data.layout import CameraEntry
 
 FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
 
+# OpenCV stops after 5 steps unless told otherwise, pixels off in the corners of a strong lens.
+CONVERGED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+# Only OpenCV 5 takes the criteria without "Iter".
+_undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
+
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
@@ -111,6 +116,8 @@ def undistort_points(camera: CameraEntry, px: Float) -> Float:
         return np.asarray(px, np.float64)
     out = np.full(px.shape, np.nan)
     rays = np.c_[px[seen], np.ones(seen.sum())] @ np.linalg.inv(camera.K).T
-    straight = cv2.undistortPoints(rays[:, None, :2], np.eye(3), camera.dist)[:, 0]
+    straight = _undistort(
+        rays[:, None, :2], np.eye(3), camera.dist, R=np.eye(3), P=np.eye(3), criteria=CONVERGED
+    )[:, 0]
     out[seen] = straight @ camera.K[:2, :2].T + camera.K[:2, 2]
     return out

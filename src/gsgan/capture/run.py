@@ -13,6 +13,7 @@ from rich.console import Console
 from gsgan.capture.dataset import is_there, standing_axis, write_small_files
 from gsgan.capture.doubts import (
     doubts_about_detections,
+    doubts_about_pictures,
     doubts_about_solution,
     doubts_about_sources,
 )
@@ -28,13 +29,14 @@ from gsgan.capture.inputs import (
 from gsgan.capture.joints import BODY
 from gsgan.capture.landmarks import Detections
 from gsgan.capture.options import MEDIAPIPE, Options
-from gsgan.capture.pictures import write_pictures
+from gsgan.capture.pictures import Written, write_pictures
 from gsgan.capture.progress import Bars
 from gsgan.capture.refine import camera_moves
 from gsgan.capture.report import Outcome, write_report
 from gsgan.capture.rig import Rig, known
 from gsgan.capture.solving import STAGE_VERSION, Solved, solve_detections, take_points
 from gsgan.capture.work import Work, digest
+from gsgan.capture.writing import writing
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.layout import Layout
 from gsgan.errors import DataError
@@ -72,7 +74,7 @@ def prepare(options: Options, console: Console) -> Path:
     write_report(root, outcome, options, console)
     _read_back(root)
     _publish(root, out)
-    work.forget("dataset")
+    work.forget_others()
     if not options.keep_work:
         work.remove()
     console.print(f"{out} is ready: python -m gsgan.train data=capture data.root={out}")
@@ -99,7 +101,7 @@ def _write_pictures(
     masks: Mapping[str, Mapping[int, Path]],
     solved: Solved,
     root: Path,
-) -> dict[str, list[int]]:
+) -> dict[str, Written]:
     """Pictures of every frame that has a skeleton; the frames written, by camera."""
     posed = known(solved.solution.p[:, :BODY]).any(1)
     frames = set(solved.frames[posed].tolist())
@@ -107,7 +109,7 @@ def _write_pictures(
     lock = threading.Lock()
     with Bars("writing pictures", names, len(frames)) as bars:
 
-        def one(index: int) -> list[int]:
+        def one(index: int) -> Written:
             name = names[index]
 
             def advance() -> None:
@@ -136,7 +138,7 @@ def _write_rest(
     cameras: Sequence[CameraEntry],
     detections: Mapping[str, Detections],
     solved: Solved,
-    written: Mapping[str, list[int]],
+    written: Mapping[str, Written],
     root: Path,
     key: str,
 ) -> Outcome:
@@ -156,6 +158,7 @@ def _write_rest(
     turned, moved = camera_moves(Rig.of(inputs.cameras), solution.rig)
     doubts = [
         *doubts_about_sources(inputs.sources, options.doubts),
+        *doubts_about_pictures(inputs.sources, written, options.doubts),
         *doubts_about_detections(detections, options.doubts),
         *doubts_about_solution(
             solution, names, turned, moved, solved.delay, solved.gain, options.doubts
@@ -165,7 +168,7 @@ def _write_rest(
         inputs=inputs,
         cameras=tuple(small),
         frames=tuple(solved.frames.tolist()),
-        written=written,
+        written={name: one.frames for name, one in written.items()},
         solution=solution,
         turned=turned,
         moved_mm=moved,
@@ -188,13 +191,16 @@ def _read_back(root: Path) -> None:
 
 
 def _publish(root: Path, out: Path) -> None:
-    """Lets the whole dataset appear in one step."""
+    """Lets the whole dataset appear in one step; when that fails, an earlier one stays."""
     old = out.with_name(f".{out.name}.old")
-    shutil.rmtree(old, ignore_errors=True)
-    try:
+    with writing(out):
         if out.exists():
+            shutil.rmtree(old, ignore_errors=True)
             os.replace(out, old)
-        os.replace(root, out)
-    except OSError as error:
-        raise DataError(f"{out} cannot be written ({error.strerror or error})") from None
+        try:
+            os.replace(root, out)
+        except OSError:
+            if old.exists():
+                os.replace(old, out)
+            raise
     shutil.rmtree(old, ignore_errors=True)

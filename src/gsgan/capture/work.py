@@ -7,13 +7,13 @@ import json
 import os
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from gsgan.data.files import read_arrays
+from gsgan.capture.writing import writing
 from gsgan.errors import DataError
 
 KEY_LENGTH = 12
@@ -25,11 +25,26 @@ def digest(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
 
 
+def _kept(path: Path) -> dict[str, np.ndarray] | None:
+    """All arrays of an npz; None when it is missing or damaged: it is then made again."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except Exception:  # zip, zlib, numpy and tokenize each raise what they like
+        return None
+
+
 @dataclass(frozen=True)
 class Work:
-    """A folder ``.<name>.prepare`` beside the dataset in the making."""
+    """A folder ``.<name>.prepare`` beside the dataset in the making.
+
+    Args:
+        folder: that one.
+        used: names of this run's results, by stage.
+    """
 
     folder: Path
+    used: dict[str, str] = field(default_factory=dict)
 
     @classmethod
     def beside(cls, out: Path) -> Work:
@@ -49,27 +64,38 @@ class Work:
 
     def place(self, stage: str, key: Any) -> Path:
         """Where a stage's result lies: its name says what it was made from."""
-        return self.folder / f"{stage}-{digest(key)}"
+        self.used[stage] = f"{stage}-{digest(key)}"
+        return self.folder / self.used[stage]
 
     def arrays(
         self, stage: str, key: Any, make: Callable[[], dict[str, Any]]
     ) -> dict[str, np.ndarray]:
-        """Arrays of an earlier run with the same key, or made and kept now."""
+        """Arrays of an earlier run with the same key, or made and kept now.
+
+        Raises:
+            DataError: when the disk does not take them.
+        """
         path = self.place(stage, key).with_suffix(".npz")
-        if not path.is_file():
-            arrays = make()
-            part = path.with_name(f".{path.name}.part")
+        if (kept := _kept(path)) is not None:
+            return kept
+        arrays = make()
+        part = path.with_name(f".{path.name}.part")
+        with writing(path):
             with part.open("wb") as stream:
                 np.savez(stream, **arrays)
             os.replace(part, path)
-        with np.load(path, allow_pickle=False) as archive:
-            names = list(archive.files)
-        return read_arrays(path, names)
+        return {name: np.asarray(array) for name, array in arrays.items()}
 
-    def forget(self, stage: str) -> None:
-        """Takes away what earlier runs with other keys left of a stage."""
-        for left in self.folder.glob(f"{stage}-*"):
-            shutil.rmtree(left, ignore_errors=True)
+    def forget_others(self) -> None:
+        """Takes away what runs with other keys left of the stages that this run came by."""
+        for left in list(self.folder.iterdir()):
+            stem = left.name.removesuffix(".npz")
+            if stem[: -KEY_LENGTH - 1] not in self.used or stem in self.used.values():
+                continue
+            if left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
 
     def remove(self) -> None:
         """Takes the folder away."""

@@ -78,7 +78,7 @@ def judge_cameras(
         if score.name in best and score.name not in told:
             found.append(_explained(score, scores, limits))
         elif score.lag:
-            found.append(_out_of_step(score, "error" if score.name in wrong else "warning"))
+            found.append(_out_of_step(score))
         elif score.name not in told:
             found += _unexplained(score, scores, limits)
     return found
@@ -175,10 +175,10 @@ def _all_wrong(scores: Sequence[CameraScore], limits: Limits) -> Finding:
     )  # fmt: skip
 
 
-def _out_of_step(score: CameraScore, level: Level) -> Finding:
+def _out_of_step(score: CameraScore) -> Finding:
     when = "later" if score.lag > 0 else "earlier"
     return Finding(
-        level, "synchronisation",
+        "error", "synchronisation",
         f"camera {score.name}: its pictures fit the skeleton {abs(score.lag)} frame(s) {when} "
         f"better (joints {100 * score.lag_outside:.1f} cm outside the masks instead of "
         f"{100 * score.outside:.1f}); its clock or its numbering is off: add {score.lag:+d}",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,12 +47,12 @@ class Subject:
     up: Float
     template: SkeletonTemplate = MEDIAPIPE33
 
-    @property
+    @cached_property
     def rows(self) -> dict[int, int]:
         """Row of ``p`` by frame number."""
         return {int(frame): row for row, frame in enumerate(self.frames)}
 
-    @property
+    @cached_property
     def step(self) -> int:
         """Frame numbers from one frame to the next: the median gap."""
         return max(1, int(np.median(np.diff(self.frames)))) if len(self.frames) > 1 else 1

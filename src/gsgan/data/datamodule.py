@@ -146,7 +146,8 @@ class GsganData(LightningDataModule):
         self._splits = splits = self._split(layout)
         for note in (*layout.notes, *splits.notes):
             log.warning("%s: %s", layout.root, note)
-        limit = int(self.cache_mb * 2**20) // (self.workers + 1)  # every process has its own
+        # every process has its own, and training and validation start their own workers
+        limit = int(self.cache_mb * 2**20) // (2 * self.workers + 1)
         cache = PictureCache(limit)
         self._datasets = {
             name: CaptureDataset(layout, splits.items[name], self.size, self.crop, cache)
@@ -181,9 +182,10 @@ class GsganData(LightningDataModule):
             return None
         sides = [max(c.size) for c in self.layout.cameras.values()]
         scale = None if self.crop is not None else (self.size or sides[0]) / sides[0]
-        return self.protocol.record() | {
-            "departures": list(self.protocol.departures(lpips_net=lpips_net, scale=scale))
-        }
+        oblong = any(c.size[0] != c.size[1] for c in self.layout.cameras.values())
+        padded = self.crop is None and self.size is not None and oblong
+        said = self.protocol.departures(lpips_net=lpips_net, scale=scale, padded=padded)
+        return self.protocol.record() | {"departures": list(said)}
 
     def _check_one_size(self) -> None:
         sizes = {camera.size: name for name, camera in self.layout.cameras.items()}

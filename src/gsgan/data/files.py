@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsgan.data.pickles import read_npz
 from gsgan.errors import DataError
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -30,6 +31,7 @@ JPEG_END = b"\xff\xd9"
 JPEG_SCAN = 0xDA
 # Start-of-frame markers carry the size; C4, C8 and CC in the same range mean something else.
 JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+LARGEST_FRAME = 10**9  # frame numbers beyond it are dates or damage
 JPEG_WITHOUT_LENGTH = frozenset({0x01, *range(0xD0, 0xD9)})
 
 
@@ -235,23 +237,11 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
     """The named arrays of an npz file, those that are there.
 
     Raises:
-        DataError: when the file is missing, is no npz, or holds pickled objects.
+        DataError: when the file is missing or no npz, an array is too large, or holds objects.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in names if name in archive}
-    except FileNotFoundError:
-        raise _absent(path) from None
-    except OSError as error:
-        raise _unreadable(path, error) from None
-    except Exception as error:  # zip, zlib, numpy and tokenize each raise what they like
-        if "allow_pickle" in str(error):
-            raise DataError(
-                f"{path} holds pickled Python objects, which can run code when read and are "
-                "refused; save plain numeric arrays with numpy.savez"
-            ) from None
-        reason = " ".join(str(error).split())[:160] or type(error).__name__
-        raise DataError(f"{path} is not a whole npz file of plain arrays ({reason})") from None
+    if not path.exists():
+        raise _absent(path)
+    return read_npz(path, names, objects=False)
 
 
 def expect_array(
@@ -304,7 +294,8 @@ def frame_files(
         frame = (number or last_number)(stem)
         if frame is None:
             raise DataError(
-                f"{place / name} has no frame number in its name; expected e.g. 000012.png"
+                f"{place / name} has no frame number up to {LARGEST_FRAME} in its name; expected "
+                "e.g. 000012.png"
             )
         if frame in found:
             raise DataError(
@@ -316,9 +307,17 @@ def frame_files(
 
 
 def last_number(stem: str) -> int | None:
-    """The last group of digits in a file's stem."""
+    """The last group of digits in a file's stem; None above `LARGEST_FRAME`."""
     digits = re.findall(r"[0-9]+", stem)
-    return int(digits[-1]) if digits else None
+    return frame_of(digits[-1]) if digits else None
+
+
+def frame_of(digits: str) -> int | None:
+    """The frame number that digits say; None above `LARGEST_FRAME`."""
+    digits = digits.lstrip("0") or "0"
+    if len(digits) > len(str(LARGEST_FRAME)):  # before int(), which refuses very long ones
+        return None
+    return number if (number := int(digits)) <= LARGEST_FRAME else None
 
 
 def natural_order(name: str) -> tuple[tuple[int, str | int], ...]:

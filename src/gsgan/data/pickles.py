@@ -236,18 +236,21 @@ def read_npy(path: Path) -> Any:
         return _read_array(stream, path.stat().st_size)
 
 
-def read_npz(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
+def read_npz(
+    path: Path, names: Iterable[str] | None = None, *, objects: bool = True
+) -> dict[str, Any]:
     """The arrays of an .npz file by name, objects through the same gate as a pickle.
 
     Args:
         path: of numpy's format.
         names: the arrays wanted (those that are not there are left out); None for all.
+        objects: whether an array may hold objects.
 
     Raises:
         DataError: when the file is missing or damaged, an array would unpack to more than
             `LARGEST_MEMBER` bytes, or names a class that is not allowed.
     """
-    with _as_data_error(path, ".npz file"), zipfile.ZipFile(path) as archive:
+    with _as_data_error(path, "npz file"), zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         found = {}
         for name in members if names is None else names:
@@ -256,8 +259,20 @@ def read_npz(path: Path, names: Iterable[str] | None = None) -> dict[str, Any]:
             if info.file_size > LARGEST_MEMBER:
                 raise ValueError(f"{name} would unpack to {info.file_size} bytes")
             with archive.open(info) as stream:
-                found[name] = _read_array(io.BytesIO(stream.read()), info.file_size)
+                content = io.BytesIO(stream.read())
+            if not objects:
+                _refuse_objects(content, path)
+            found[name] = _read_array(content, info.file_size)
         return found
+
+
+def _refuse_objects(stream: BinaryIO, path: Path) -> None:
+    if _header(stream)[2].hasobject:
+        raise DataError(
+            f"{path} holds pickled Python objects, which can run code when read and are refused; "
+            "save plain numeric arrays with numpy.savez"
+        )
+    stream.seek(0)
 
 
 def _read_array(stream: BinaryIO, size: int) -> Any:

@@ -24,6 +24,7 @@ IGNORE_LABEL = 255
 MASK_RULES = ("grey", "nonzero", "threshold", "label")
 """grey: alpha 0..255. nonzero: any channel above 0 is the person. threshold: at least
 `PixelRules.threshold` is. label: part numbers, all but 0 are."""
+JPEG_SUFFIXES = (".jpg", ".jpeg")
 
 
 class MaskFile(NamedTuple):
@@ -36,6 +37,12 @@ class MaskFile(NamedTuple):
 
     rule: str
     path: str
+
+
+def mask_file(rule: str, path: str) -> MaskFile:
+    """A mask by its rule; a JPEG's "nonzero" is "threshold", as compression rings round edges."""
+    jpeg = path.lower().endswith(JPEG_SUFFIXES)
+    return MaskFile("threshold" if jpeg and rule == "nonzero" else rule, path)
 
 
 @dataclass(frozen=True)

@@ -103,13 +103,16 @@ class Protocol:
             plain[side] = None if plain[side] is None else list(plain[side])
         return plain
 
-    def departures(self, *, lpips_net: str, scale: float | None) -> Iterator[str]:
+    def departures(
+        self, *, lpips_net: str, scale: float | None, padded: bool = False
+    ) -> Iterator[str]:
         """Where what is measured is not what the protocol asks for, one sentence each.
 
         Args:
             lpips_net: the backbone in use.
             scale: share of the stored size at which pictures are scored; None when they are cut
                 round the person.
+            padded: black is added to whole pictures to make them square.
         """
         for key, measured in MEASURED.items():
             asked = getattr(self, key)
@@ -121,6 +124,8 @@ class Protocol:
             yield "pictures are cut round the person, asked for: whole pictures (data.crop=null)"
         elif abs(scale - self.scale) > 1e-3:
             yield f"pictures are scored at scale {scale:.3g}, asked for: {self.scale:g} (data.size)"
+        if padded:
+            yield "pictures are padded to squares with black, asked for: as stored (data.size=null)"
 
 
 def _said(value: Any) -> str:

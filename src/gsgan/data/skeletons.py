@@ -30,6 +30,10 @@ class Landmarks:
     visibility: Mapping[int, Float]
     source: str = "landmarks3d.npz"
 
+    def seen(self, frame: int) -> Float:
+        """``[N, 3]`` the joints of a frame that are no stand-ins."""
+        return self.p[frame][self.visibility[frame] > 0]
+
 
 @dataclass(frozen=True)
 class Poses:

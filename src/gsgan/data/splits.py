@@ -7,12 +7,15 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from gsgan.data.files import LARGEST_FRAME
 from gsgan.data.layout import Layout, spans
 from gsgan.data.protocol import Protocol
 from gsgan.errors import ConfigError, DataError
 
 T = TypeVar("T", int, str)
 
+FRAME_RANGE = re.compile(r"\s*(\d{1,18})\s*(?:-\s*(\d{1,18})\s*)?(?::\s*(\d{1,18})\s*)?")
+MOST_FRAMES = 10**7  # bounds the memory that a range from a file can ask for
 SPLITS = ("train", "novel_view", "novel_pose")
 Item = tuple[str, int]  # camera name, frame number
 
@@ -267,17 +270,26 @@ def parse_frames(value: Any, where: str) -> tuple[int, ...]:
     if isinstance(value, bool) or not isinstance(value, (int, str, Iterable)):
         raise ConfigError(f"{where} must be frame numbers or ranges such as 0-55, got {value!r}")
     if isinstance(value, int):
-        return (value,)
+        value = [value]
     parts = value.split(",") if isinstance(value, str) else list(value)
     frames: set[int] = set()
     for part in parts:
         if isinstance(part, int) and not isinstance(part, bool):
             frames.add(part)
             continue
-        match = re.fullmatch(r"\s*(\d+)\s*(?:-\s*(\d+)\s*)?(?::\s*(\d+)\s*)?", str(part))
+        match = FRAME_RANGE.fullmatch(str(part))
         first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
         step = int(match[3] or 1) if match else 1
         if last < first or step < 1:
             raise ConfigError(f"{where} must be frame numbers or ranges such as 0-55, got {part!r}")
-        frames.update(range(first, last + 1, step))
+        some = range(first, last + 1, step)
+        if len(some) > MOST_FRAMES:
+            raise ConfigError(f"{where}: {part!r} is more than {MOST_FRAMES} frames")
+        frames.update(some)
+        if len(frames) > MOST_FRAMES:
+            raise ConfigError(f"{where} names more than {MOST_FRAMES} frames")
+    if frames and max(frames) > LARGEST_FRAME:
+        raise ConfigError(
+            f"{where} names frame {max(frames)}; frame numbers end at {LARGEST_FRAME}"
+        )
     return tuple(sorted(frames))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import weakref
+from collections import deque
 
 import numpy as np
 import torch
@@ -16,9 +17,11 @@ from torch import Tensor
 
 CACHE_LINE = 64  # bytes: rows of tiles are whole ones
 LARGE = 1 << 20  # bytes from which memory is kept
-KEPT = 1 << 28  # bytes that are kept at most while nobody uses them
+KEPT = 1 << 28  # bytes that a process keeps at most while nobody uses them
 
-_free: list[NDArray[np.uint8]] = []
+_NAMES = {torch.float32: "float32", torch.float64: "float64"}
+# By size in bytes. A deque's append and pop are atomic: finalisers run in any thread, at any time.
+_free: dict[int, deque[NDArray[np.uint8]]] = {}
 
 
 def zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
@@ -30,26 +33,40 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
         shape: of the tensor.
         dtype: float32 or float64.
     """
-    size = math.prod(shape) * dtype.itemsize + CACHE_LINE
+    used = math.prod(shape) * dtype.itemsize
+    size = used + CACHE_LINE
     kept = _take(size) if size >= LARGE else None
     # numpy's zeros: large ones are huge pages, which the system clears when they are touched.
     memory = np.zeros(size, np.uint8) if kept is None else kept
-    view = memory[:]  # lives as long as the tensors that share it
-    if size >= LARGE:
-        weakref.finalize(view, _give_back, memory).atexit = False
     first = -memory.ctypes.data % CACHE_LINE
-    tensor = torch.from_numpy(view)[first : first + size - CACHE_LINE].view(dtype).view(shape)
+    # Cut in numpy: a view made by torch could not be changed in place by who gets it from autograd.
+    array = memory[first : first + used].view(_NAMES[dtype]).reshape(shape)
+    if size >= LARGE:  # the array lives as long as the tensors that share its memory
+        weakref.finalize(array, _give_back, memory).atexit = False
+    tensor = torch.from_numpy(array)
     return tensor if kept is None else tensor.zero_()
 
 
+def kept() -> int:
+    """Bytes that are kept while nobody uses them."""
+    return sum(size * len(same) for size, same in list(_free.items()))
+
+
 def _take(size: int) -> NDArray[np.uint8] | None:
-    for i, memory in enumerate(_free):
-        if memory.nbytes == size:
-            return _free.pop(i)
-    return None
+    try:
+        return _free[size].pop()
+    except (KeyError, IndexError):
+        return None
 
 
 def _give_back(memory: NDArray[np.uint8]) -> None:
-    _free.append(memory)
-    while sum(m.nbytes for m in _free) > KEPT:
-        _free.pop(0)
+    same = _free.pop(memory.nbytes, None) or deque()
+    same.append(memory)
+    _free[memory.nbytes] = same  # sizes in the order of their last use
+    while kept() > KEPT:
+        for size, oldest in list(_free.items()):
+            try:
+                oldest.popleft()
+                break
+            except IndexError:  # all of this size are in use, or another thread was faster
+                _free.pop(size, None)

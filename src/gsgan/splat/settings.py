@@ -30,8 +30,8 @@ class Accuracy:
             higher one raise it.
         radius_sigmas: half-width of the ``sigma`` box, in standard deviations, > 0.
         near: metres, > 0; Gaussians whose mean is not farther than this are not drawn.
-        alpha_max: in (0, 1]; alphas are capped here. 1 only where ``dtype`` is float64: next to
-            it the gradient of what is hidden drowns in float32 rounding.
+        alpha_max: in (0, 1]; alphas are capped here. 1 is for float64: next to it the gradient of
+            what is hidden drowns in float32 rounding.
         low_pass: square pixels, > 0, added to the diagonal of every 2D covariance.
         fov_clamp: x/z and y/z are clamped to this many half fields of view (from the middle of
             the picture) where the Jacobian of the projection is formed, >= 1.

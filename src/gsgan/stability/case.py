@@ -111,8 +111,9 @@ class Row:
         worst_input: the input that ``gradient_error`` is of; empty where every gradient is exact.
         finite_values: whether outputs are finite wherever the judge's are.
         finite_gradients: likewise for gradients.
-        verdict: ``right`` (values and gradients within tolerance), ``warned`` (the code said that
-            something is wrong), ``refused`` (ValueError), ``finite only`` or ``not finite``.
+        verdict: ``right`` (values and gradients within tolerance), ``warned`` (right, and
+            the code said that something is odd), ``refused`` (ValueError), ``finite only`` or
+            ``not finite``.
         expected: the verdict that the case is to get.
         note: the case's note; for ``refused`` and ``warned`` also what the code said.
     """
@@ -228,10 +229,8 @@ def _compare(case: Case, dtype: torch.dtype, backend: str, got: _Result, want: _
     tolerance = case.tolerance.at(dtype)
     if not (finite_values and finite_gradients):
         verdict = NOT_FINITE
-    elif got.warned:
-        verdict = WARNED
     elif value_error <= tolerance.values and gradient_error <= tolerance.gradients:
-        verdict = RIGHT
+        verdict = WARNED if got.warned else RIGHT
     else:
         verdict = FINITE_ONLY
     return _row(

@@ -11,6 +11,7 @@ import numpy as np
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
 from gsgan.errors import DataError
 
+MAX_LENS = 8  # coefficients that are understood
 SAME_ROTATION = 1e-3  # largest entry in which Rot_ and R_ of one camera may differ
 
 
@@ -48,8 +49,8 @@ def read_opencv_yaml(
             K=_matrix(intri, f"K_{name}"),
             R=rotation,
             t=T,
-            dist=None if dist is None else dist.reshape(-1)[:8].tolist(),
-            size=(_integer(intri, f"H_{name}"), _integer(intri, f"W_{name}")),
+            dist=None if dist is None else _lens(dist),
+            size=(_integer(intri, where, f"H_{name}"), _integer(intri, where, f"W_{name}")),
             scale=scale or 1.0,
             pixel_centre=pixel_centre,
         )
@@ -100,9 +101,19 @@ def _matrix(storage: Any, key: str) -> np.ndarray | None:
     return np.full(1, np.nan) if value is None else np.asarray(value, np.float64)
 
 
-def _integer(storage: Any, key: str) -> int:
+def _lens(dist: np.ndarray) -> list[float]:
+    """All coefficients but a tail of zeros: thin prisms and tilts (12, 14) are to be refused."""
+    values: list[float] = dist.reshape(-1).tolist()
+    return values if any(values[MAX_LENS:]) else values[:MAX_LENS]
+
+
+def _integer(storage: Any, where: str, key: str) -> int:
     node = storage.getNode(key)
-    return max(0, int(node.real())) if node.isInt() or node.isReal() else 0
+    if not (node.isInt() or node.isReal()):
+        return 0
+    if not np.isfinite(node.real()):
+        raise DataError(f"{where}: '{key}' must be a number of pixels, found {node.real()}")
+    return max(0, int(node.real()))
 
 
 def _rotation(extri: Any, path: Path, name: str) -> np.ndarray | None:

@@ -78,13 +78,23 @@ def parse() -> argparse.Namespace:
 def open_source(path: Path, rotate: int) -> tuple[int, Iterator[tuple[int, Any]]]:
     """How many pictures (0: unknown), and an iterator of (frame number, BGR picture)."""
     if path.is_dir():
-        files = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURES)
-        return len(files), (
-            (int(re.findall(r"\d+", p.stem)[-1]), cv2.imread(str(p))) for p in files
-        )
+        files = {
+            int(re.findall(r"[0-9]+", p.stem)[-1]): p
+            for p in path.iterdir()
+            if p.suffix.lower() in PICTURES and not p.name.startswith(".")
+        }
+        return len(files), ((frame, read_picture(files[frame])) for frame in sorted(files))
     video = cv2.VideoCapture(str(path))
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(rotate))
     return int(video.get(cv2.CAP_PROP_FRAME_COUNT)), read_video(video)
+
+
+def read_picture(path: Path) -> Any:
+    """As stored: gsgan's calibration knows no EXIF rotation."""
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None:
+        raise SystemExit(f"{path} is damaged")
+    return picture
 
 
 def read_video(video: cv2.VideoCapture) -> Iterator[tuple[int, Any]]:

@@ -22,6 +22,7 @@ import numpy as np
 from gsgan.data.cameras import EXPECTED, CameraEntry, make_camera, numbers
 from gsgan.data.checks import Checks
 from gsgan.data.files import expect_array, frame_files, read_arrays, read_json
+from gsgan.data.formats.trust import Trust, check_boxes, watch_masks
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile, PixelRules
 from gsgan.data.skeletons import (
@@ -36,7 +37,9 @@ from gsgan.errors import DataError
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 MASK_SUFFIXES = (".png",)
-FREE_BODY_BONES = 56
+LOOKED_AT = Trust(min_box_iou=0.0)
+"""Landmarks lie inside the body and may lack limbs: their box says little about the mask's."""
+BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
 
 
 @dataclass(frozen=True)
@@ -54,13 +57,19 @@ class Conventions:
     composed: bool
 
 
-def read_capture(root: str | Path, checks: Checks | None = None, smpl: str | None = None) -> Layout:
-    """Reads and checks everything but the pictures' pixels.
+def read_capture(
+    root: str | Path,
+    checks: Checks | None = None,
+    smpl: str | None = None,
+    trust: Trust = LOOKED_AT,
+) -> Layout:
+    """Reads and checks everything but most pictures' pixels.
 
     Args:
         root: the folder that holds cameras.json.
         checks: thresholds, `Checks()` when None.
         smpl: the user's model file, for poses of an SMPL or SMPL-X body.
+        trust: which masks are looked at.
 
     Raises:
         DataError: for whatever is missing, damaged or contradictory, naming the file.
@@ -100,7 +109,14 @@ def read_capture(root: str | Path, checks: Checks | None = None, smpl: str | Non
         ),
         notes=tuple(notes),
     )
-    return assemble(found, checks)
+    layout = assemble(found, checks)
+    check_boxes(
+        layout,
+        layout.landmarks.seen,
+        trust,
+        "check that cameras, landmarks and masks belong together",
+    )
+    return replace(layout, notes=(*layout.notes, *watch_masks(layout, trust)))
 
 
 def read_meta(path: Path, smpl: str | None = None) -> tuple[Meta, Conventions]:
@@ -129,8 +145,8 @@ def read_meta(path: Path, smpl: str | None = None) -> tuple[Meta, Conventions]:
     if not isinstance(splits, dict):
         raise DataError(f"{path}: 'splits' must be an object with train_cameras, test_frames, ...")
     body = content.get("body")
-    if body is not None and not isinstance(body, str):
-        raise DataError(f"{path}: 'body' is {body!r}; expected the name of a body, e.g. free")
+    if body is not None and (not isinstance(body, str) or body not in BODY_BONES):
+        raise DataError(f"{path}: 'body' is {body!r}; expected one of {', '.join(BODY_BONES)}")
     meta = Meta(
         unit=unit,
         fps=None if fps is None else float(fps),
@@ -251,7 +267,7 @@ def read_poses(path: Path, meta: Meta, conventions: Conventions) -> Poses:
         DataError: on wrong arrays.
     """
     arrays = read_arrays(path, ("theta", "transl", "frame_id"))
-    bones = FREE_BODY_BONES if meta.body is not None and meta.body.kind == "free" else None
+    bones = None if meta.body is None else BODY_BONES[meta.body.kind]
     theta = expect_array(arrays, "theta", (None, bones, 3), path).astype(np.float64)
     transl = expect_array(arrays, "transl", (len(theta), 3), path).astype(np.float64)
     transl = transl * conventions.scale

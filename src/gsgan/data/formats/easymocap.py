@@ -16,9 +16,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from gsgan.capture.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.checks import Checks
@@ -34,8 +31,8 @@ from gsgan.data.formats.easymocap_skeleton import read_fits, read_keypoints, rea
 from gsgan.data.formats.smpl_motion import landmarks_of
 from gsgan.data.formats.trust import Trust, check_boxes, watch_masks
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, assemble, dataset_folder
-from gsgan.data.pixels import MASK_RULES, MaskFile, PixelRules
-from gsgan.data.skeletons import Landmarks, make_landmarks
+from gsgan.data.pixels import MASK_RULES, MaskFile, PixelRules, mask_file
+from gsgan.data.skeletons import make_landmarks
 from gsgan.errors import ConfigError, DataError
 
 CONTENTS = "intri.yml, extri.yml, images/, mask/, and keypoints3d/ or smpl/"
@@ -56,7 +53,7 @@ class EasymocapReader:
         person: whose skeleton, by EasyMocap's id, and whose masks where their names say it.
         masks: folder of the masks, relative to the root.
         mask_rule: what their numbers mean, one of `gsgan.data.pixels.MASK_RULES`.
-        threshold: for the rule of that name.
+        threshold: for the rule of that name, and for "nonzero" where masks are JPEGs.
         drop_frames: frames to leave out, e.g. "360-370", or None.
         distance: metres, see `Checks`.
         max_missing_masks: share of pictures without a mask that may be left out.
@@ -109,7 +106,7 @@ class EasymocapReader:
         layout = assemble(without_frames(found, self.drop_frames), checks)
         check_boxes(
             layout,
-            lambda frame: _seen(layout.landmarks, frame),
+            layout.landmarks.seen,
             self.trust,
             "check that calibration, skeleton and masks are of one recording and one person "
             "(data.reader.person)",
@@ -211,7 +208,7 @@ class EasymocapReader:
             for key, path in sorted(files.items()):  # a mask of nobody in particular comes first
                 frame, whose = divmod(key, PEOPLE)
                 if whose in (0, self.person + 1):
-                    own[frame] = (MaskFile(self.mask_rule, path),)
+                    own[frame] = (mask_file(self.mask_rule, path),)
             found[name] = own
         return found
 
@@ -241,8 +238,3 @@ def _frame_and_person(stem: str) -> int | None:
     if match is None:
         return None
     return int(match[1]) * PEOPLE + (int(match[2]) + 1 if match[2] else 0)
-
-
-def _seen(landmarks: Landmarks, frame: int) -> NDArray[np.float64]:
-    """``[N, 3]`` the landmarks that are no stand-ins."""
-    return landmarks.p[frame][landmarks.visibility[frame] > 0]

@@ -16,6 +16,7 @@ from gsgan.errors import DataError
 from gsgan.skeleton.smpl import TABLES, to_mediapipe33
 
 Float = NDArray[np.float64]
+MODEL_NAMES = {"smpl": "SMPL", "smplx": "SMPL-X"}
 CHUNK = 32  # frames posed at once: bounds memory, nothing else
 
 
@@ -72,16 +73,22 @@ def one_shape(betas: Float, tolerance: float, notes: list[str]) -> Float:
 
 
 def require_kind(model: SkinnedModel, kind: str, path: object) -> None:
-    """Refuses SMPL where SMPL-X is due, and the other way round.
+    """Refuses SMPL where SMPL-X is due, the other way round, and meshes of another topology.
 
     Raises:
         DataError: naming the file and what it holds.
     """
     if model.kind != kind:
-        wanted = {"smpl": "SMPL (24 joints)", "smplx": "SMPL-X (55 joints)"}[kind]
+        wanted = f"{MODEL_NAMES[kind]} ({TABLES[kind].counts[0]} joints)"
         raise DataError(
             f"{path} is a model of {len(model.parents)} joints; this dataset's parameters are of "
             f"{wanted}"
+        )
+    count, found = TABLES[kind].counts[1], len(model.v_template)
+    if found != count:
+        raise DataError(
+            f"{path} has {found} vertices; expected the {count} of {MODEL_NAMES[kind]}, "
+            "by whose numbers landmarks go: get the model from its own site"
         )
 
 

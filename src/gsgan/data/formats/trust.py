@@ -83,7 +83,7 @@ def box_iou(a: Box, b: Box) -> float:
 
 
 def check_boxes(layout: Layout, body: Callable[[int], Float], trust: Trust, hint: str) -> None:
-    """The projected body must lie where the masks are.
+    """The projected body must lie where the masks are, and not all of them may be empty.
 
     Args:
         layout: whose masks.
@@ -92,16 +92,26 @@ def check_boxes(layout: Layout, body: Callable[[int], Float], trust: Trust, hint
         hint: what to check when they do not.
 
     Raises:
-        DataError: naming the camera and frame that is furthest off.
+        DataError: naming the camera and frame that is furthest off, or the first empty mask.
     """
     found: list[tuple[float, str, int]] = []
+    empty: list[Path] = []
+    looked = 0
     for frame in spread(list(layout.frames), trust.frames):
         points = body(frame)
         for name in [c for c, files in layout.masks.items() if frame in files][:CAMERAS]:
             mask = read_mask(layout.mask_files(name, frame), layout.pixels)
             there, here = mask_box(mask), box_of(points, layout.cameras[name])
+            looked += 1
+            if not mask.any():
+                empty.append(layout.mask_path(name, frame))
             if there is not None and here is not None:
                 found.append((box_iou(here, there), name, frame))
+    if empty and len(empty) == looked:
+        raise DataError(
+            f"{empty[0]} shows no person, nor does any of the {looked} masks looked at; expected "
+            "values above 0 where the person is: check how the masks were written"
+        )
     if not found:
         return
     median = float(np.median([iou for iou, _, _ in found]))
@@ -115,22 +125,29 @@ def check_boxes(layout: Layout, body: Callable[[int], Float], trust: Trust, hint
 
 
 def watch_masks(layout: Layout, trust: Trust) -> list[str]:
-    """Notes on the frames at which the first camera's mask is much smaller or larger than usual."""
+    """Notes on the frames at which the first camera's mask is empty or of an unusual area."""
     camera = next((name for name, files in layout.masks.items() if files), None)
     if camera is None or trust.watched_masks == 0:
         return []
     frames = spread(sorted(layout.masks[camera]), trust.watched_masks)
     masks = (read_mask(layout.mask_files(camera, f), layout.pixels) for f in frames)
-    areas = np.array([np.count_nonzero(mask > 127) for mask in masks], np.float64)
-    usual = float(np.median(areas))
-    off = np.abs(areas - usual) > trust.mask_jump * usual
-    odd = [f for f, is_off in zip(frames, off, strict=True) if is_off]
-    if not odd:
-        return []
+    looked = [(mask.any(), np.count_nonzero(mask > 127)) for mask in masks]
+    seen, areas = np.array([s for s, _ in looked]), np.array([n for _, n in looked], np.float64)
+    usual = float(np.median(areas[seen])) if seen.any() else 0.0
+    off = seen & (np.abs(areas - usual) > trust.mask_jump * usual)
+    cases = {
+        "mask is empty": ~seen,
+        f"mask's area is more than {trust.mask_jump:.0%} off the usual": off,
+    }
+    odd = {
+        case: [f for f, is_it in zip(frames, at, strict=True) if is_it]
+        for case, at in cases.items()
+    }
     return [
-        f"camera {camera}: the mask's area is more than {trust.mask_jump:.0%} off the usual "
-        f"at frames {spans(odd)} of {len(frames)} looked at; look at them, and leave bad ones "
-        "out with data.reader.drop_frames"
+        f"camera {camera}: the {case} at frames {spans(at)} of {len(frames)} looked at; look at "
+        "them, and leave bad ones out with data.reader.drop_frames"
+        for case, at in odd.items()
+        if at
     ]
 
 

@@ -37,7 +37,7 @@ from gsgan.data.layout import (
     assemble,
     dataset_folder,
 )
-from gsgan.data.pixels import MaskFile, PixelRules
+from gsgan.data.pixels import MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
 from gsgan.errors import ConfigError, DataError
 
@@ -196,7 +196,7 @@ class ZjuReader:
                     labels[name] = {f: path for f, path in files.items() if path.endswith(".png")}
                 if self.masks in ("both", kind):
                     for frame, path in files.items():
-                        found[name].setdefault(frame, []).append(MaskFile(rule, path))
+                        found[name].setdefault(frame, []).append(mask_file(rule, path))
         if (root / "schp").is_dir():
             notes.append("schp/ holds colours in place of part numbers and is not used")
         masks = {

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsgan.data.cameras import CameraEntry, make_camera
-from gsgan.data.files import frame_files, last_number, natural_order
+from gsgan.data.files import frame_files, frame_of, last_number, natural_order
 from gsgan.data.formats.common import picture_size
 from gsgan.data.pickles import read_npy
 from gsgan.errors import DataError
@@ -45,7 +45,7 @@ class Annots:
 def frame_number(stem: str) -> int | None:
     """The frame number in a picture's name, 313's and 315's long names included."""
     named = NAMED_FRAME.search(stem)
-    return int(named[1]) if named else last_number(stem)
+    return frame_of(named[1]) if named else last_number(stem)
 
 
 def read_annots(root: Path) -> Annots:

@@ -18,9 +18,10 @@ from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, last_number, read_json
 from gsgan.data.formats.common import picture_size, up_axis
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, one_shape, parameter
+from gsgan.data.formats.zju_params import still_root
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pickles import read_npz, read_pickle
-from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules
+from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import Landmarks, make_landmarks
 from gsgan.errors import DataError
 from gsgan.skeleton.smpl import to_mediapipe33
@@ -60,7 +61,7 @@ def humannerf(
         ),
         cameras={HUMANNERF_CAMERA: camera},
         images=images,
-        masks={HUMANNERF_CAMERA: {f: (MaskFile("nonzero", p),) for f, p in masks.items()}},
+        masks={HUMANNERF_CAMERA: {f: (mask_file("nonzero", p),) for f, p in masks.items()}},
         mask_folders={HUMANNERF_CAMERA: root / "masks"},
         labels={},
         landmarks=_from_joints(motion.ids, joints, checks, notes, "mesh_infos.pkl"),
@@ -117,10 +118,11 @@ def _mesh_infos(path: Path) -> tuple[Motion, Float]:
     """The motion, and joints ``[F, 24, 3]`` in the world."""
     entries = _by_frame(path)
     rows = []
+    sizes = {"poses": 72, "Rh": 3, "Th": 3, "joints": 72, "tpose_joints": 72}
     for frame, entry in entries.items():
         where = f"{path}, frame {frame}"
-        sizes = {"poses": 72, "Rh": 3, "Th": 3, "joints": 72, "tpose_joints": 72}
         rows.append([parameter(entry, key, (size,), where) for key, size in sizes.items()])
+        still_root(rows[-1][0], where)
     poses, Rh, Th, joints, rest = (np.stack(column) for column in zip(*rows, strict=True))
     R = axis_angle_to_matrix(torch.from_numpy(Rh)).numpy()
     in_world = joints.reshape(-1, JOINTS, 3) @ R.transpose(0, 2, 1) + Th[:, None]

@@ -24,6 +24,7 @@ Float = NDArray[np.float64]
 
 SHAPES = 10
 POSES = (72, 69)  # 69: without the root, which Rh turns
+ROOT_TOLERANCE = 1e-6  # radians in poses[:3] that count as none
 SHAPE_TOLERANCE = 1e-4  # spread of a shape coefficient over frames that is not worth a note
 
 
@@ -91,14 +92,29 @@ def fit_parameters(content: Any, where: str) -> tuple[Float, Float, Float, Float
     """``poses [72]``, ``shapes [10]``, ``Rh [3]`` and ``Th [3]`` of one frame.
 
     Raises:
-        DataError: when one is missing, of another length, or not finite.
+        DataError: when one is missing, of another length, or not finite, or the root turns.
     """
     poses = parameter(content, "poses", POSES, where)
     if len(poses) == POSES[1]:
         poses = np.concatenate([np.zeros(3), poses])
+    still_root(poses, where)
     shapes = parameter(content, "shapes", (SHAPES,), where)
     Rh, Th = (parameter(content, key, (3,), where) for key in ("Rh", "Th"))
     return poses, shapes, Rh, Th
+
+
+def still_root(poses: Float, where: str) -> None:
+    """Refuses a pose ``[72]`` that turns the root, which Rh does in this convention.
+
+    Raises:
+        DataError: naming the file.
+    """
+    turn = float(np.abs(poses[:3]).max())
+    if turn > ROOT_TOLERANCE:
+        raise DataError(
+            f"{where}: the first 3 numbers of 'poses' must be 0, found up to {turn:.3g}; "
+            "the root's rotation belongs in Rh"
+        )
 
 
 def to_motion(

@@ -18,7 +18,7 @@ struct Range {  // inclusive
 // Pixels whose centre lies within centre +- extent, widened by rounding (of an extent given as T).
 template <class T> Range pixels(double centre, double extent, int64_t size) {
   const double rounding = double(std::numeric_limits<T>::epsilon());
-  const double pad = 1e-3 + rounding * (std::abs(centre) + 4 * extent);
+  const double pad = PAD + rounding * (std::abs(centre) + 4 * extent);
   const double low = std::max(0.0, std::ceil(centre - extent - 0.5 - pad));
   const double high = std::min(double(size - 1), std::floor(centre + extent - 0.5 + pad));
   if (!(low <= high)) return {0, -1};

@@ -43,13 +43,15 @@ constexpr int LANES = CELL * CELL;   // pixels per cell
 constexpr int PIXELS = TILE * TILE;  // per tile, stored cell by cell
 constexpr int CHUNK = 64;            // entries of a tile's list that are worked on at a time
 
-template <class T> class Buffer {  // 64-byte aligned, uninitialised
+template <class T> class Buffer {  // aligned to cache lines at least, uninitialised
  public:
   Buffer() = default;
   explicit Buffer(size_t n) { resize(n); }
   void resize(size_t n) {
     void* p = nullptr;
-    if (posix_memalign(&p, 64, std::max<size_t>(n, 1) * sizeof(T)) != 0) throw std::bad_alloc();
+    const size_t alignment = std::max<size_t>(64, alignof(T));
+    if (posix_memalign(&p, alignment, std::max<size_t>(n, 1) * sizeof(T)) != 0)
+      throw std::bad_alloc();
     data_.reset(static_cast<T*>(p));
   }
   T* get() const { return data_.get(); }

@@ -10,6 +10,10 @@
 
 namespace gsgan {
 
+// Pixels by which footprints are widened where tiles and cells are listed, beside the rounding of
+// the numbers themselves: it costs time, and changes no pixel.
+constexpr double PAD = 1e-3;
+
 // u and v at an origin; at (x, y) from it they are u + p x + w y and v + r y.
 template <class T> struct Place {
   T u, v, p, w, r;

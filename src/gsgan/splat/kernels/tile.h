@@ -89,7 +89,7 @@ template <class T> INLINE uint32_t reached_cells(const Place<T>& at, T ex, T ey,
   constexpr T HALF = T(0.5) * (TILE - 1);
   const Least<T> least(at);
   const T bound = level + least.margin(HALF);
-  const T slack = T(1e-3) + 8 * std::numeric_limits<T>::epsilon() *
+  const T slack = T(PAD) + 8 * std::numeric_limits<T>::epsilon() *
                                 (std::abs(at.dx) + std::abs(at.dy) + TILE);
   ex += slack;
   ey += slack;

@@ -1,0 +1,144 @@
+"""Who reaches which tile: the lists that the tiled path walks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from gsgan.splat.project import Projected
+from gsgan.splat.settings import Accuracy
+
+# Rounding errors, in units of the last place, that q may have gathered where tiles are listed.
+ROUNDING = 64
+
+
+@dataclass(frozen=True)
+class Tiling:
+    """How the work is cut up; changes the time and the memory, never the result.
+
+    Args:
+        tile: pixels along the side of a tile.
+        layers: ellipses of a tile's list that are blended at once.
+        block_elements: tiles x layers x pixels held at once, in each of about eight arrays.
+    """
+
+    tile: int = 8
+    layers: int = 16
+    block_elements: int = 1 << 19
+
+    @classmethod
+    def for_device(cls, device: torch.device) -> Tiling:
+        """Blocks that stay in the cache of a CPU, or that fill a GPU."""
+        return cls() if device.type == "cpu" else cls(layers=32, block_elements=1 << 24)
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Who reaches which tile, front to back.
+
+    ``ids[starts[i] : starts[i] + counts[i]]`` are the rows (batch item x N + index) of the i-th
+    listed tile, ``tiles[i]`` its place among all (item, row, column); most layers first.
+    """
+
+    size: tuple[int, int]
+    grid: tuple[int, int]
+    ids: Tensor
+    tiles: Tensor
+    starts: Tensor
+    counts: Tensor
+    box: Tensor | None  # [B * N + 1, 2] half-sizes outside of which nothing is drawn
+
+
+def tile_lists(
+    projected: Projected, size: tuple[int, int], settings: Accuracy, tiling: Tiling
+) -> TileLists:
+    """Lists the ellipses of each tile.
+
+    Args:
+        projected: the ellipses.
+        size: (H, W) pixels.
+        settings: alpha_min, and whether the extent is ``sigma``.
+        tiling: how large a tile is.
+    """
+    (H, W), side = size, tiling.tile
+    grid = (-(-H // side), -(-W // side))
+    B, N = projected.depths.shape
+    order = projected.depths.argsort(dim=1, stable=True)
+    order = (order + N * torch.arange(B, device=order.device).unsqueeze(1)).flatten()
+    order = order[projected.visible.flatten()[order]]
+    first, last = _pixel_box(projected, size, order)
+    first, last = first // side, last // side
+    spans = (last - first + 1).clamp_min(0)
+    rows, tile_xy = _pairs(order, first, spans)
+    if settings.alpha_min > 0:
+        reached = _reaches(projected, rows, tile_xy, settings, tiling)
+        rows, tile_xy = rows[reached], tile_xy[reached]
+    tile = (rows // max(N, 1) * grid[0] + tile_xy[:, 1]) * grid[1] + tile_xy[:, 0]
+    tile, by_tile = tile.to(torch.int32).sort(stable=True)
+    tiles, counts = tile.unique_consecutive(return_counts=True)
+    starts = counts.cumsum(0) - counts
+    deepest = counts.argsort(descending=True, stable=True)
+    box = None
+    if settings.extent == "sigma":
+        box = with_empty_row(projected.extents)
+    return TileLists(
+        *(size, grid, rows[by_tile], tiles.long()[deepest], starts[deepest], counts[deepest], box)
+    )
+
+
+def _pixel_box(projected: Projected, size: tuple[int, int], rows: Tensor) -> tuple[Tensor, Tensor]:
+    """First and last pixel (x, y) whose centre is in the footprint, each ``[M, 2]`` int64."""
+    means = projected.means.flatten(0, 1)[rows]
+    extents = projected.extents.flatten(0, 1)[rows].to(means)
+    edge = means.new_tensor([size[1], size[0]])
+    # Clamped as floats: footprints reach far beyond what integers hold. Extents are rounded: the
+    # box is rounded outwards, not to the nearest.
+    first = torch.minimum((means - extents - 0.5).floor().clamp_min(0), edge)
+    last = torch.minimum((means + extents - 0.5).ceil(), edge - 1).clamp_min(-1)
+    return first.long(), last.long()
+
+
+def _pairs(rows: Tensor, first: Tensor, spans: Tensor) -> tuple[Tensor, Tensor]:
+    """Every (ellipse, tile) pair: rows ``[M]`` in the given order, tiles (x, y) ``[M, 2]``."""
+    counts = spans[:, 0] * spans[:, 1]
+    which = torch.arange(len(rows), device=rows.device).repeat_interleave(counts)
+    step = torch.arange(len(which), device=rows.device) - (counts.cumsum(0) - counts)[which]
+    width = spans[:, 0][which]
+    return rows[which], first[which] + torch.stack([step % width, step // width], dim=-1)
+
+
+def _reaches(
+    projected: Projected,
+    rows: Tensor,
+    tile_xy: Tensor,
+    settings: Accuracy,
+    tiling: Tiling,
+) -> Tensor:
+    """Whether the ellipse ``alpha >= alpha_min`` meets the pixel centres of the tile.
+
+    The least q over a rectangle lies on the edges that face the mean: a point each, in closed form.
+    """
+    p, k, r = projected.factors.flatten(0, 1)[rows].unbind(-1)
+    opacities = projected.opacities.flatten(0, 1)[rows]
+    low = tile_xy * tiling.tile + 0.5 - projected.means.flatten(0, 1)[rows]
+    high = low + (tiling.tile - 1)
+    (x0, y0), (x1, y1) = low.unbind(-1), high.unbind(-1)
+    x, y = torch.zeros_like(x0).clamp(x0, x1), torch.zeros_like(y0).clamp(y0, y1)
+    w = p * k
+    y_at_x = (-p * w * x / (w * w + r * r)).clamp(y0, y1)
+    x_at_y = (-k * y).clamp(x0, x1)
+    q = torch.minimum(
+        (p * x + w * y_at_x).square() + (r * y_at_x).square(),
+        (p * x_at_y + w * y).square() + (r * y).square(),
+    )
+    rounding = ROUNDING * torch.finfo(opacities.dtype).eps
+    level = 2 * torch.log(opacities.to(q.dtype) / settings.alpha_min)
+    return q <= level + rounding * (1 + level)
+
+
+def with_empty_row(x: Tensor) -> Tensor:
+    """``[B, N, K]`` as rows ``[B N + 1, K]`` of which the last is 0."""
+    return functional.pad(x.detach().flatten(0, 1), (0, 0, 0, 1))
