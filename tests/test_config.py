@@ -110,28 +110,6 @@ def test_bugs_keep_their_traceback_and_mistakes_get_a_sentence():
     assert one_sentence(ZeroDivisionError("a bug")) is None
 
 
-def test_a_mistake_found_by_a_worker_process_is_still_one_sentence(tmp_path):
-    import sys
-
-    sys.path.insert(0, str(Path(__file__).parent / "data"))
-    from make import write_tiny_capture
-
-    from gsgan.data.datamodule import GsganData
-
-    root = write_tiny_capture(tmp_path, frames=4)
-    data = GsganData(str(root), workers=1)
-    data.setup()
-    path = root / "images/cam00/000000.png"
-    for picture in (root / "images").rglob("*.png"):
-        picture.write_bytes(picture.read_bytes()[:60])
-    with pytest.raises(DataError) as caught:
-        next(iter(data.test_dataloader()[0]))
-    said = one_sentence(caught.value) or ""
-    assert "\n" in str(caught.value)
-    assert said.startswith(str(path.parents[1]))
-    assert said.endswith("is damaged or cut off after 60 bytes; copy or export it again")
-
-
 @pytest.mark.parametrize(
     ("override", "named"),
     [

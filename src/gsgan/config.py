@@ -91,7 +91,7 @@ def _without_worker(error: GsganError) -> str:
     text = str(error)
     if not text.startswith("Caught "):
         return text
-    return text.rpartition(f"{type(error).__name__}: ")[2].strip().splitlines()[-1]
+    return text.rpartition(f"{type(error).__name__}: ")[2].strip().rpartition("\n")[2]
 
 
 def _remove_unused_folder() -> None:

@@ -91,6 +91,9 @@ def test_values_and_gradients_are_finite_and_alpha_in_0_to_1(backend, drawn):
 @given(scenes())
 def test_values_and_gradients_are_right(backend, accuracy, drawn):
     scene, size = drawn
+    # Below the cap of alpha: rounding decides which side of it an alpha is on, and the gradient
+    # jumps there (the cap itself is a case of its own).
+    scene = {**scene, "opacities": scene["opacities"].clamp(max=0.99)}
     # An alpha that rounding takes across alpha_min shows where a gradient is all but 0.
     case = raster_case(
         *("random", lambda: scene),

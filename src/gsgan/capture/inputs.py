@@ -10,7 +10,7 @@ from typing import TypeVar
 
 from gsgan.capture.calibration import Calibration, find_calibration, read_calibration
 from gsgan.capture.landmarks import Detections, find_landmarks, read_detections
-from gsgan.capture.masks import find_masks, made_masks
+from gsgan.capture.masks import check_values, find_masks, made_masks
 from gsgan.capture.mediapipe import detect, ensure_environment
 from gsgan.capture.options import MEDIAPIPE, Options
 from gsgan.capture.pairing import fit_size, pair_cameras
@@ -160,10 +160,13 @@ def read_masks(
     """Mask files of every camera by its own frame numbers.
 
     Raises:
-        DataError: when a camera has none.
+        DataError: when a camera has none, or they hold labels instead of alpha.
     """
     if options.masks != MEDIAPIPE:
-        return find_masks(options.folder("masks"), names)
+        given = find_masks(options.folder("masks"), names)
+        for name, files in given.items():
+            check_values(options.folder("masks") / name, files)
+        return given
     found = made_masks({name: made[name] for name in names})
     if empty := [name for name, files in found.items() if not files]:
         raise DataError(

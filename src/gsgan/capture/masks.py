@@ -65,7 +65,7 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
     """Given masks by camera and frame number: <camera>/%06d.png, or %06d_<person>.png.
 
     Raises:
-        DataError: when a camera has none, or they hold labels instead of alpha.
+        DataError: when a camera has none.
     """
     found = {}
     for name in names:
@@ -78,16 +78,19 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
                 f"<camera>/000000.png and so on for {name}"
             )
         found[name] = {number: folder / path for number, path in files.items()}
-        _check_values(folder / name, [found[name][number] for number in sorted(found[name])])
     return found
 
 
-def _check_values(folder: Path, paths: list[Path]) -> None:
+def check_values(folder: Path, files: Mapping[int, Path]) -> None:
     """Refuses 0 and 1, or part numbers, which would pass for a nearly transparent person.
 
     A single faint mask is no proof (someone walks out), so several are looked at.
+
+    Raises:
+        DataError: when no pixel of them reaches `PERSON`, or one is damaged.
     """
-    highest = max(int(read_grey(paths[i]).max()) for i in sampled(len(paths), PROBED))
+    paths = [files[number] for number in sorted(files)]
+    highest = max((int(read_grey(paths[i]).max()) for i in sampled(len(paths), PROBED)), default=0)
     if 0 < highest < PERSON:
         raise DataError(
             f"{folder} holds masks with values up to {highest}; small numbers are labels, expected "

@@ -73,10 +73,11 @@ def _both(path: Path) -> tuple[Path, Path]:
 
 def _open(path: Path) -> Any:
     try:
+        path.read_text(encoding="utf-8")  # OpenCV does not look, and fails later on the names
         storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
         if storage.isOpened() and storage.root().isMap():
             return storage
-    except (cv2.error, SystemError):
+    except (OSError, UnicodeDecodeError, cv2.error, SystemError):
         pass
     raise DataError(f"{path} is not readable as OpenCV YAML; it may be cut off: export it again")
 
