@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib
+import logging
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,6 +17,16 @@ import gsgan.compat  # noqa: F401  (before anything imports torchvision)
 for folder in ("data", "capture"):  # what tests of other folders share with them
     sys.path.insert(0, str(Path(__file__).parent / folder))
 torch.set_num_threads(1)  # tensors here are tiny: more threads only wait for each other
+
+
+@pytest.fixture(autouse=True)
+def _loggers_stay_on() -> Iterator[None]:
+    """A command run in this process configures logging, which may switch loggers off for good."""
+    yield
+    for logger in logging.root.manager.loggerDict.values():
+        if isinstance(logger, logging.Logger) and logger.name.startswith("gsgan"):
+            logger.disabled, logger.propagate = False, True
+            logger.setLevel(logging.NOTSET)
 
 
 @pytest.fixture(scope="session")
