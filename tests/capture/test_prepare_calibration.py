@@ -16,7 +16,7 @@ from capture_scenes import (
     write_toml,
 )
 
-from gsgan.capture.calibration import find_calibration, read_calibration
+from gsgan.data.calibration import find_calibration, read_calibration
 from gsgan.errors import DataError
 
 

@@ -18,9 +18,7 @@ from make import skeletons
 from test_prepare_points3d import write_trc
 
 import gsgan.capture.mediapipe as tool
-from gsgan.capture.calibration import read_calibration
 from gsgan.capture.doubts import Doubts, doubts_about_pictures
-from gsgan.capture.joints import BODY
 from gsgan.capture.landmarks import read_detections
 from gsgan.capture.masks import MaskTidying, check_values
 from gsgan.capture.options import Options
@@ -30,6 +28,8 @@ from gsgan.capture.rig import undistort_points
 from gsgan.capture.run import _publish
 from gsgan.capture.sources import Source
 from gsgan.capture.work import Work
+from gsgan.data.calibration import read_calibration
+from gsgan.data.joints import BODY
 from gsgan.errors import ConfigError, DataError, GsganError
 
 

@@ -18,12 +18,12 @@ from gsgan.capture.doubts import (
     doubts_about_sources,
     longest_runs,
 )
-from gsgan.capture.joints import ALL
 from gsgan.capture.landmarks import Detections
 from gsgan.capture.masks import MaskTidying, find_masks, tidy
 from gsgan.capture.overlays import sampled
 from gsgan.capture.solve import Settings, Solution, solve
 from gsgan.capture.sources import Source, find_sources
+from gsgan.data.joints import ALL
 from gsgan.errors import ConfigError, DataError
 
 LIMITS = Doubts()

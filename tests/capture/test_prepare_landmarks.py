@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsgan.capture.joints import BODY, HAND, LEFT, RIGHT, SETS, hand_names
 from gsgan.capture.landmarks import find_landmarks, gather, read_detections
+from gsgan.data.joints import BODY, HAND, LEFT, RIGHT, SETS, hand_names
 from gsgan.errors import DataError
 from gsgan.skeleton.template import MEDIAPIPE33
 

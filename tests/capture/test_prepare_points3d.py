@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from make import skeletons
 
-from gsgan.capture.joints import SETS
 from gsgan.capture.points3d import read_points3d, without_frozen
+from gsgan.data.joints import SETS
 from gsgan.errors import DataError
 
 MARKERS = {

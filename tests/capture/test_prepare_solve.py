@@ -10,12 +10,12 @@ from make import distorted_pixels, skeletons
 from gsgan.capture.cleanse import Cleansing, cleanse
 from gsgan.capture.desync import clock_errors
 from gsgan.capture.flips import FlipSearch, apply_flips, find_flips
-from gsgan.capture.joints import flip_groups
 from gsgan.capture.refine import Refinement, camera_moves, refine_rig
 from gsgan.capture.rig import Rig, undistort_points
 from gsgan.capture.smooth import smooth
 from gsgan.capture.solve import Settings, Solution, solve, stage_medians
 from gsgan.capture.triangulate import Triangulation, linear_points
+from gsgan.data.joints import flip_groups
 from gsgan.errors import ConfigError
 
 GROUPS = flip_groups(hands=False)

@@ -752,7 +752,7 @@ def test_arrays_that_would_unpack_to_too_much_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = write_tiny_capture(tmp_path)
-    monkeypatch.setattr("gsgan.data.pickles.LARGEST_MEMBER", 1000)
+    monkeypatch.setattr("gsgan.pickles.LARGEST_MEMBER", 1000)
     with pytest.raises(DataError, match=r"landmarks3d.npz is not a whole npz file .p would"):
         Layout.read(root)
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from writers import python2
 
-from gsgan.data.pickles import read_npy, read_npz, read_pickle
 from gsgan.errors import DataError
+from gsgan.pickles import read_npy, read_npz, read_pickle
 
 SAMPLE = {
     "poses": np.arange(72.0).reshape(1, 72),

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsgan.capture.joints import ALL, BODY, HAND, PALM
 from gsgan.capture.rig import Bool, Float, known
+from gsgan.data.joints import ALL, BODY, HAND, PALM
 from gsgan.errors import ConfigError
 
 # Bones that keep their length, by the end that is doubted when one does not.

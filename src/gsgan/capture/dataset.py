@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 import gsgan
-from gsgan.capture.joints import BODY, hand_names
 from gsgan.capture.pictures import PictureFiles
 from gsgan.capture.rig import Float, known
 from gsgan.capture.solve import Solution
 from gsgan.capture.writing import writing
 from gsgan.data.cameras import CameraEntry
+from gsgan.data.joints import BODY, hand_names
 from gsgan.errors import DataError
 from gsgan.files import write_atomically
 from gsgan.skeleton.template import MEDIAPIPE33

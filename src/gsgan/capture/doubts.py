@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsgan.capture.cleanse import BODY_BONES, bone_lengths
-from gsgan.capture.joints import BODY, joint_names
 from gsgan.capture.landmarks import Detections
 from gsgan.capture.pictures import Written
 from gsgan.capture.rig import FOCAL, Float, known
 from gsgan.capture.solve import Solution, median
 from gsgan.capture.sources import Source
 from gsgan.data.cameras import CameraEntry
+from gsgan.data.joints import BODY, joint_names
 from gsgan.errors import DataError
 
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from gsgan.capture.calibration import Calibration, find_calibration, read_calibration
 from gsgan.capture.landmarks import Detections, find_landmarks, read_detections
 from gsgan.capture.masks import check_values, find_masks, made_masks
 from gsgan.capture.mediapipe import detect, ensure_environment
@@ -17,6 +16,7 @@ from gsgan.capture.pairing import fit_size, pair_cameras
 from gsgan.capture.progress import Bars
 from gsgan.capture.sources import Source, find_sources
 from gsgan.capture.work import Work
+from gsgan.data.calibration import Calibration, find_calibration, read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.errors import ConfigError, DataError
 

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.capture.joints import ALL, BODY, FROM_HANDS, HAND, LEFT, RIGHT, SETS
+from gsgan.arrays import expect_array
 from gsgan.capture.rig import Float
-from gsgan.data.files import expect_array, last_number, read_arrays, read_json
+from gsgan.data.files import last_number, read_arrays, read_json
+from gsgan.data.joints import ALL, BODY, FROM_HANDS, HAND, LEFT, RIGHT, SETS
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.errors import DataError
 

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.capture.joints import BODY, SETS
 from gsgan.capture.rig import Float, known
 from gsgan.data.files import last_number
+from gsgan.data.joints import BODY, SETS
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.errors import DataError
 from gsgan.skeleton.template import MEDIAPIPE33

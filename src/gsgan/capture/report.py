@@ -12,7 +12,6 @@ from rich.console import Console
 
 from gsgan.capture.dataset import write_json
 from gsgan.capture.inputs import Inputs
-from gsgan.capture.joints import BODY
 from gsgan.capture.options import Options
 from gsgan.capture.overlays import LEGEND, overlay_row, sampled
 from gsgan.capture.rig import FOCAL, Float
@@ -22,6 +21,7 @@ from gsgan.checking.findings import Figure, Finding, Report, Section, Table
 from gsgan.checking.page import page
 from gsgan.checking.terminal import print_report
 from gsgan.data.cameras import CameraEntry
+from gsgan.data.joints import BODY
 from gsgan.files import write_atomically
 from gsgan.skeleton.template import MEDIAPIPE33
 

@@ -26,7 +26,6 @@ from gsgan.capture.inputs import (
     read_masks,
     run_tool,
 )
-from gsgan.capture.joints import BODY
 from gsgan.capture.landmarks import Detections
 from gsgan.capture.options import MEDIAPIPE, Options
 from gsgan.capture.pictures import Written, write_pictures
@@ -38,6 +37,7 @@ from gsgan.capture.solving import STAGE_VERSION, Solved, solve_detections, take_
 from gsgan.capture.work import Work, digest
 from gsgan.capture.writing import writing
 from gsgan.data.cameras import CameraEntry
+from gsgan.data.joints import BODY
 from gsgan.data.layout import Layout
 from gsgan.errors import DataError
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from gsgan.capture.cleanse import Cleansing, cleanse
 from gsgan.capture.flips import FlipSearch, apply_flips, find_flips
-from gsgan.capture.joints import ALL, BODY, flip_groups
 from gsgan.capture.refine import Refinement, refine_rig
 from gsgan.capture.rig import FOCAL, Bool, Float, Rig
 from gsgan.capture.smooth import Smoothing, smooth
 from gsgan.capture.triangulate import Points, Triangulation
+from gsgan.data.joints import ALL, BODY, flip_groups
 
 FIELDS = ("p", "conf", "views", "error", "uv", "flips")  # of a solution, kept as they are
 Say = Callable[[str], None]

@@ -16,7 +16,6 @@ from gsgan.capture.desync import clock_errors
 from gsgan.capture.doubts import check_distance
 from gsgan.capture.flips import apply_flips
 from gsgan.capture.inputs import Inputs, frame_rate
-from gsgan.capture.joints import BODY, flip_groups
 from gsgan.capture.landmarks import Detections, gather
 from gsgan.capture.options import Options
 from gsgan.capture.points3d import read_points3d, without_frozen
@@ -24,6 +23,7 @@ from gsgan.capture.rig import Bool, Float, Rig, known, undistort_points
 from gsgan.capture.smooth import smooth
 from gsgan.capture.solve import Solution, solve
 from gsgan.capture.work import Work
+from gsgan.data.joints import BODY, flip_groups
 from gsgan.data.splits import parse_frames
 from gsgan.errors import DataError
 

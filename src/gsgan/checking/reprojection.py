@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from gsgan.arrays import expect_array
 from gsgan.checking.findings import Finding
 from gsgan.checking.motion import nanmedian
 from gsgan.checking.settings import Limits
@@ -19,7 +20,7 @@ from gsgan.checking.silhouette import Float
 from gsgan.checking.subject import Subject
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import project
-from gsgan.data.files import expect_array, read_arrays
+from gsgan.data.files import read_arrays
 from gsgan.errors import DataError
 
 

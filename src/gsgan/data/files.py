@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.pickles import read_npz
 from gsgan.errors import DataError
+from gsgan.pickles import read_npz
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}
@@ -242,27 +242,6 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
     if not path.exists():
         raise _absent(path)
     return read_npz(path, names, objects=False)
-
-
-def expect_array(
-    arrays: dict[str, NDArray[Any]], name: str, shape: tuple[int | None, ...], path: Path
-) -> NDArray[Any]:
-    """One numeric array of the given shape, None standing for any length.
-
-    Raises:
-        DataError: when it is missing, has another shape, or holds no numbers.
-    """
-    wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
-    if name not in arrays:
-        raise DataError(f"{path} has no array '{name}'; expected one of shape {wanted}")
-    array = arrays[name]
-    if array.ndim != len(shape) or any(
-        want is not None and want != have for want, have in zip(shape, array.shape, strict=True)
-    ):
-        raise DataError(f"{path}: '{name}' must have shape {wanted}, found {array.shape}")
-    if array.dtype.kind not in "iuf":
-        raise DataError(f"{path}: '{name}' must hold numbers, found {array.dtype}")
-    return array
 
 
 def frame_files(

@@ -19,9 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from gsgan.arrays import expect_array
 from gsgan.data.cameras import EXPECTED, CameraEntry, make_camera, numbers
 from gsgan.data.checks import Checks
-from gsgan.data.files import expect_array, frame_files, read_arrays, read_json
+from gsgan.data.files import frame_files, read_arrays, read_json
 from gsgan.data.formats.trust import Trust, check_boxes, watch_masks
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile, PixelRules

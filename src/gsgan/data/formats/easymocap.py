@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from gsgan.capture.calibration import read_calibration
+from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, natural_order

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.body.smpl import SkinnedModel
-from gsgan.capture.joints import BODY, FROM_HANDS, HAND, SETS
 from gsgan.data.checks import spans
 from gsgan.data.files import frame_files, read_json_value
 from gsgan.data.formats.smpl_motion import Motion
 from gsgan.data.formats.zju_params import fit_parameters, to_motion
+from gsgan.data.joints import BODY, FROM_HANDS, HAND, SETS
 from gsgan.errors import DataError
 
 Float = NDArray[np.float64]

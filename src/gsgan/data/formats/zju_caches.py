@@ -20,10 +20,10 @@ from gsgan.data.formats.common import picture_size, up_axis
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, one_shape, parameter
 from gsgan.data.formats.zju_params import still_root
 from gsgan.data.layout import BodyModel, Found, Meta
-from gsgan.data.pickles import read_npz, read_pickle
 from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import Landmarks, make_landmarks
 from gsgan.errors import DataError
+from gsgan.pickles import read_npz, read_pickle
 from gsgan.skeleton.smpl import to_mediapipe33
 
 Float = NDArray[np.float64]

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from gsgan.capture.calibration.opencv_yaml import read_opencv_yaml
-from gsgan.capture.calibration.own_json import read_own_json
-from gsgan.capture.calibration.qualisys import read_qualisys
-from gsgan.capture.calibration.toml_tables import read_toml
+from gsgan.data.calibration.opencv_yaml import read_opencv_yaml
+from gsgan.data.calibration.own_json import read_own_json
+from gsgan.data.calibration.qualisys import read_qualisys
+from gsgan.data.calibration.toml_tables import read_toml
 from gsgan.data.cameras import CameraEntry
 from gsgan.errors import DataError
 

@@ -23,9 +23,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data import pickle_types as types
-from gsgan.data.pickle_types import Budget, Call, StandIn
+from gsgan import pickle_types as types
 from gsgan.errors import DataError
+from gsgan.pickle_types import Budget, Call, StandIn
 
 GROWTH, SPARE_BYTES = 4, 2**28
 """Arrays may take ``GROWTH`` times the file's size and ``SPARE_BYTES`` more (sparse matrices)."""

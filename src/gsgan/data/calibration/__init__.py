@@ -1,5 +1,5 @@
 """Calibration files of other tools, told apart by what is in them."""
 
-from gsgan.capture.calibration.find import Calibration, find_calibration, read_calibration
+from gsgan.data.calibration.find import Calibration, find_calibration, read_calibration
 
 __all__ = ["Calibration", "find_calibration", "read_calibration"]
