@@ -110,8 +110,8 @@ class AvatarTraining(LightningModule):
             draws the same ones.
         max_skipped: non-finite gradients that are skipped before the run is stopped.
         log_every: iterations between logged values.
-        average: decay of the moving average of Step II's weights, which is what gets scored; None
-            scores the weights as they are.
+        average: decay of the moving average of the last step's weights, which is what gets
+            scored; None scores the weights as they are.
         rollback: what is done when the rendered person vanishes.
         record: plain config values stored with every checkpoint.
 
@@ -149,7 +149,7 @@ class AvatarTraining(LightningModule):
             raise ConfigError(f"training.log_every must be at least 1, got {log_every}")
         self.max_skipped, self.record = max_skipped, record or {}
         self.rollback = rollback or Rollback()
-        self.average = MovingAverage(avatar, average) if paints and average is not None else None
+        self.average = MovingAverage(avatar, average) if average is not None else None
         wanted = step_one.feature_head and avatar.splat_channels > 3
         self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1) if wanted else None
         self.step = 0  # iterations done: Lightning's global_step counts every optimiser's steps
@@ -262,6 +262,8 @@ class AvatarTraining(LightningModule):
         painting = self._paint(frame, height, paint=False)
         loss = self.step_one_loss(painting, frame)
         self._descend(loss, "psi")
+        if self.average is not None and self.avatar.generator is None:  # this is its last step
+            self.average.update(self.avatar)
         self._log("step_one/loss", loss)
 
     def _train_step_two(self, frame: Frame, height: int) -> None:
@@ -441,9 +443,12 @@ class AvatarTraining(LightningModule):
 def _fit_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
     if avatar.segmentation is None:
         schedule = replace(schedule, segmentation=0)
-    both = schedule.step_one + schedule.step_two
+    one, two, start = (
+        round(n * schedule.stretch)
+        for n in (schedule.step_one, schedule.step_two, schedule.discriminator_start)
+    )
     if avatar.generator is None:
-        schedule = replace(schedule, step_one=both, step_two=0)
+        one, two = one + two, 0
     if avatar.splats is None:
-        schedule = replace(schedule, step_one=0, step_two=both)
-    return schedule
+        one, two = 0, one + two
+    return replace(schedule, step_one=one, step_two=two, discriminator_start=start)

@@ -51,6 +51,12 @@ def run_training(config: DictConfig) -> None:
     resume = checkpoint_to_resume(folder, config, module.marks) if config.resume else None
     if resume is None:
         remove_old_results(folder)
+    elif finished(folder, module, config):
+        console.print(
+            f"{folder}: trained and scored before; nothing to do (gsgan.evaluate scores it again)",
+            soft_wrap=True,
+        )
+        return
 
     describe(console, folder, data, module)
     if resume is not None:
@@ -73,6 +79,16 @@ def run_training(config: DictConfig) -> None:
         avatar = module.shown.eval()
         evaluate_run(folder, config, console, data=data, avatar=avatar, marks=module.marks)
     console.print(f"run folder: {folder}", soft_wrap=True)
+
+
+def finished(folder: Path, module: AvatarTraining, config: DictConfig) -> bool:
+    """Whether the run has all its iterations, and its scores where they are wanted: a sweep that
+    is started again passes over it."""
+    checkpoint, scores = folder / CHECKPOINT, folder / "metrics.json"
+    if _step_of(checkpoint) < module.schedule.total:
+        return False
+    newer = scores.is_file() and scores.stat().st_mtime >= checkpoint.stat().st_mtime
+    return newer or not config.evaluate
 
 
 def remove_old_results(folder: Path) -> None:

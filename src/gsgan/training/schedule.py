@@ -20,6 +20,8 @@ class Schedule:
         step_two: iterations in which generator, discriminator and Ψ learn together.
         discriminator_start: iterations into Step II before the GAN starts.
         epoch: iterations between checkpoints; Lightning's epoch is this many sampled batches.
+        stretch: factor on Steps I and II, for a variant whose iterations are cheaper: the same
+            time for every variant, where the same iterations would starve the simpler ones.
 
     Source: paper Alg. 2; method.md § 7 and § 13 (why Ψ goes on learning in Step II).
     """
@@ -29,8 +31,11 @@ class Schedule:
     step_two: int
     discriminator_start: int = 0
     epoch: int = 250
+    stretch: float = 1.0
 
     def __post_init__(self) -> None:
+        if self.stretch <= 0:
+            raise ConfigError(f"schedule.stretch must be above 0, got {self.stretch}")
         for name in ("segmentation", "step_one", "step_two", "discriminator_start"):
             if getattr(self, name) < 0:
                 raise ConfigError(f"schedule.{name} must be 0 or more, got {getattr(self, name)}")
