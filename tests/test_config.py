@@ -55,7 +55,13 @@ def differences(a, b, at: str = "") -> set[str]:
         ("wo_seg", {"model.segmentation"}),
         ("wo_feat", {"training.step_two.feature_matching"}),
         ("wo_gcn", {"model.pose_encoder"}),
-        ("splat_only", {"model.segmentation", "model.pose_encoder", "model.generator"}),
+        (
+            "splat_only",
+            {
+                *("model.segmentation", "model.pose_encoder", "model.generator"),
+                "training.schedule.stretch",
+            },
+        ),
     ],
 )
 def test_an_ablation_changes_what_it_says_and_nothing_else(compose, model, changed, experiment):

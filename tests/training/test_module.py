@@ -91,7 +91,8 @@ def test_variants_build_only_what_they_use(make):
     assert splat.discriminator is None
     assert splat.perceptual is None
     assert splat.schedule.step_two == 0
-    assert splat.schedule.step_one == full.schedule.step_one + full.schedule.step_two
+    both = full.schedule.step_one + full.schedule.step_two
+    assert splat.schedule.step_one == pytest.approx(3.0 * both, abs=1)  # in the same time
     wo_feat, _, _ = make("model=wo_feat")
     assert wo_feat.step_two.feature_matching == 0
     assert wo_feat.discriminator is not None
@@ -264,7 +265,7 @@ def test_the_average_follows_its_formula():
 
 @pytest.mark.parametrize("model", ["lbs_splat", "image_to_image", "splat_only"])
 def test_baselines_train_with_the_same_schedule(make, model):
-    module, trainer, data = make(f"model={model}")
+    module, trainer, data = make(f"model={model}", "training.schedule.stretch=1")
     before = snapshot(module)
     trainer.fit(module, data)
     both = module.schedule.step_one + module.schedule.step_two
@@ -272,6 +273,24 @@ def test_baselines_train_with_the_same_schedule(make, model):
     assert module.step == both
     part = {"lbs_splat": "avatar.surface", "image_to_image": "avatar.generator"}
     assert moved(before, module, part.get(model, "avatar.deformation"))
+
+
+def test_a_stretched_schedule_starts_the_gan_at_the_same_share(make):
+    plain, _, _ = make()
+    module, _, _ = make("training.schedule.stretch=2.5")
+    for name in ("step_one", "step_two", "discriminator_start"):
+        assert getattr(module.schedule, name) == round(2.5 * getattr(plain.schedule, name))
+    assert module.schedule.segmentation == plain.schedule.segmentation
+
+
+def test_every_variant_is_scored_by_its_moving_average(make):
+    module, trainer, data = make("model=splat_only", "training.schedule.stretch=1")
+    trainer.fit(module, data)
+    assert module.average.started
+    assert module.shown is module.average.module
+    live = dict(module.avatar.named_parameters())
+    averaged = dict(module.shown.named_parameters())
+    assert any(not torch.equal(live[name], averaged[name]) for name in live)
 
 
 def test_every_phase_runs_under_bf16_autocast(make):
