@@ -137,6 +137,14 @@ def test_killed_half_way_and_resumed_ends_with_the_same_weights(run, capture, tm
     assert same(weights(run), weights(folder))
 
 
+def test_a_finished_run_is_passed_over(run, capture, inside):
+    before = {path: path.stat().st_mtime_ns for path in run.rglob("*.json")}
+    result = inside("train", *arguments(capture, run))
+    assert result.returncode == 0, result.stderr
+    assert "trained and scored before; nothing to do" in " ".join(result.stdout.split())
+    assert {path: path.stat().st_mtime_ns for path in run.rglob("*.json")} == before
+
+
 def test_a_folder_with_another_run_is_not_overwritten(run, capture, inside):
     before = (run / "checkpoints" / "last.ckpt").read_bytes()
     result = inside("train", *arguments(capture, run), "training.pose_noise=0.5")
