@@ -7,16 +7,12 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from gsgan.errors import ConfigError
-from gsgan.files import write_atomically
+from gsgan import pages
+from gsgan.pages import markdown
+
+__all__ = ["NOTHING", "check_block", "csv_text", "fill_block", "markdown", "number"]
 
 NOTHING = "–"  # what was not measured
-
-
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table; bars within cells are escaped."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(_cell(c) for c in line) + " |" for line in lines)
 
 
 def csv_text(header: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
@@ -43,8 +39,7 @@ def fill_block(page: Path, name: str, text: str) -> None:
     Raises:
         ConfigError: when the page is missing or has no such block.
     """
-    head, tail = _around(page, name)
-    write_atomically(page, f"{head}\n\n{text.strip()}\n\n{tail}")
+    pages.fill_block(page, *_markers(name), text, key="docs")
 
 
 def check_block(page: Path, name: str) -> None:
@@ -53,20 +48,8 @@ def check_block(page: Path, name: str) -> None:
     Raises:
         ConfigError: as ``fill_block`` does.
     """
-    _around(page, name)
+    pages.check_block(page, *_markers(name), key="docs")
 
 
-def _around(page: Path, name: str) -> tuple[str, str]:
-    """A page up to the start of a block, and from its end."""
-    if not page.is_file():
-        raise ConfigError(f"docs={page}: no such page; give a Markdown file or docs=null")
-    start, end = f"<!-- bench:{name} -->", "<!-- end -->"
-    head, found, rest = page.read_text().partition(start)
-    _, closed, tail = rest.partition(end)
-    if not found or not closed:
-        raise ConfigError(f"docs={page}: expected a block {start} … {end}, found none; add one")
-    return head + start, end + tail
-
-
-def _cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")
+def _markers(name: str) -> tuple[str, str]:
+    return f"<!-- bench:{name} -->", "<!-- end -->"

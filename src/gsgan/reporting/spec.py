@@ -1,0 +1,123 @@
+"""What a table shows: rows, columns, splits, as ``conf/table`` says it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from gsgan.errors import ConfigError
+from gsgan.reporting.columns import METRICS
+
+PAINTED, SPLAT, FLOOR = "full", "splat", "floor"  # variants in metrics.json
+
+
+@dataclass(frozen=True)
+class RowSpec:
+    """One row: a model's (or method's) runs, one of their pictures.
+
+    Args:
+        label: what the row is called; None takes the name.
+        run: name of the model or method.
+        variant: ``full`` for the final picture, ``splat`` for Step I's colour.
+    """
+
+    run: str
+    label: str | None = None
+    variant: str = PAINTED
+
+    @property
+    def title(self) -> str:
+        """What stands in the row's first column."""
+        return self.run if self.label is None else self.label
+
+
+@dataclass(frozen=True)
+class TableSpec:
+    """One table.
+
+    Args:
+        name: of the table, its files' titles and its block in a page.
+        title: its heading.
+        metrics: columns, or one grid each where subjects are the columns.
+        splits: one grid each.
+        rows: in this order, each even where it has no run yet; None takes whatever there is.
+        variants: pictures that make rows, where ``rows`` is None.
+        subjects: columns, where each subject has its own; None for metrics as columns.
+        data: the data set that it is about; None takes any one.
+        apart: one set of grids for each data set and protocol, in place of a refusal.
+        reference: the row that others are compared with, seed by seed; None compares nothing.
+        paper: the entry in paper.yaml that goes with it, or None.
+
+    Raises:
+        ConfigError: on a metric that there is not, or a value that does not fit the others.
+    """
+
+    name: str
+    title: str
+    metrics: Sequence[str]
+    splits: Sequence[str]
+    rows: Sequence[RowSpec | Mapping[str, Any]] | None = None
+    variants: Sequence[str] = (PAINTED,)
+    subjects: Sequence[str] | None = None
+    data: str | None = None
+    apart: bool = False
+    reference: str | None = None
+    paper: str | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("metrics", "splits", "variants"):
+            held = getattr(self, name)
+            if isinstance(held, str) or not held:
+                raise ConfigError(f"table.{name} must be a list of at least one, got {held!r}")
+        unknown = [metric for metric in self.metrics if metric not in METRICS]
+        if unknown:
+            raise ConfigError(
+                f"table.metrics has {', '.join(map(str, unknown))}; known: {', '.join(METRICS)}"
+            )
+        if wrong := set(self.variants) - {PAINTED, SPLAT}:
+            raise ConfigError(
+                f"table.variants must be among full and splat, got {', '.join(map(str, wrong))}"
+            )
+        if self.rows is not None:
+            rows = [r if isinstance(r, RowSpec) else _row(r) for r in self.rows]
+            object.__setattr__(self, "rows", rows)
+        if self.subjects is not None:
+            object.__setattr__(self, "subjects", [str(s) for s in self.subjects])
+
+    @property
+    def layout(self) -> Literal["metrics", "subjects"]:
+        """What the columns are."""
+        return "metrics" if self.subjects is None else "subjects"
+
+    def row_specs(self, names: Sequence[str]) -> list[RowSpec]:
+        """The table's rows.
+
+        Args:
+            names: of the runs there are, for a table that takes whatever there is.
+        """
+        if self.rows is not None:
+            return [row for row in self.rows if isinstance(row, RowSpec)]
+        ordered = sorted(names, key=lambda name: (name != self.reference, name))
+        return [
+            RowSpec(name, f"{name}: Step I's colour" if variant == SPLAT else None, variant)
+            for name in ordered
+            for variant in self.variants
+        ]
+
+
+def _row(given: Mapping[str, Any]) -> RowSpec:
+    try:
+        row = RowSpec(**given)
+    except TypeError as error:
+        raise ConfigError(f"table.rows: {dict(given)}: {error}") from None
+    if row.variant not in (PAINTED, SPLAT):
+        raise ConfigError(f"table.rows: variant must be full or splat, got {row.variant!r}")
+    return row
+
+
+def subject_of(root: str | None, subjects: Sequence[str]) -> str | None:
+    """The subject whose folder this is: ``CoreView_377`` and ``my_377`` are both 377's."""
+    if root is None:
+        return None
+    return next((s for s in subjects if root == s or root.endswith(f"_{s}")), None)
