@@ -1,4 +1,4 @@
-"""``python -m gsgan.evaluate run=<folder>``: score a run on held-out cameras and poses."""
+"""``python -m gsgan.evaluate``: score a run, or any method's pictures, on what was held out."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from gsgan.config import entry
 
 
 def evaluate(config: DictConfig) -> None:
-    """Scores the run folder ``config.run``.
+    """Scores the run folder ``config.run``, or the pictures in ``config.predictions``.
 
     Raises:
         GsganError: on anything the user can put right.
     """
-    from gsgan.evaluation import evaluate_folder
+    from gsgan.scoring.command import evaluate_config
 
-    evaluate_folder(config)
+    evaluate_config(config)
 
 
 main = entry("evaluate")(evaluate)

@@ -1,16 +1,26 @@
-"""Scores: closed forms, and the cases in which a mean would lie."""
+"""Scores of pictures: closed forms, and torchmetrics called directly."""
 
 from __future__ import annotations
 
 import math
 
+import cv2
+import numpy as np
 import pytest
 import torch
+from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMeasure
 
-from gsgan.errors import ConfigError
-from gsgan.losses.weights import FILES
-from gsgan.metrics.evaluation import Mean, PictureScores, SegmentationScores
-from gsgan.metrics.image import edge_f1, high_frequencies, lpips, psnr, psnr_person, ssim
+from gsgan.metrics.image import (
+    edge_f1,
+    edge_ratio,
+    high_frequencies,
+    person_box,
+    psnr,
+    psnr_person,
+    psnr_where,
+    ssim,
+    ssim_person,
+)
 
 
 def square(at: int, size: int = 40) -> torch.Tensor:
@@ -19,20 +29,65 @@ def square(at: int, size: int = 40) -> torch.Tensor:
     return image
 
 
+def pair(count: int = 3, size: int = 32) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    shape = (count, 3, size, size + 5)
+    target = torch.rand(shape, generator=generator, dtype=torch.float64)
+    noise = torch.randn(shape, generator=generator, dtype=torch.float64)
+    scale = torch.tensor([0.02, 0.1, 0.5], dtype=torch.float64)[:count].view(-1, 1, 1, 1)
+    return (target + scale * noise).clamp(0, 1), target
+
+
 def test_psnr_closed_form_and_one_score_a_picture():
     target = torch.zeros(2, 3, 8, 8)
     image = torch.stack([torch.full((3, 8, 8), 0.1), torch.full((3, 8, 8), 0.01)])
     torch.testing.assert_close(psnr(image, target), torch.tensor([20.0, 40.0]))
 
 
-def test_equal_pictures_are_infinite_and_kept_out_of_the_mean():
+def test_psnr_pooled_by_channel_is_the_mean_of_their_psnrs():
+    image = (
+        torch.tensor([0.1, 0.01, 0.001], dtype=torch.float64).view(1, 3, 1, 1).expand(1, 3, 8, 8)
+    )
+    target = torch.zeros_like(image)
+    assert float(psnr(image, target, pooling="channels")) == pytest.approx(40.0, abs=1e-9)
+    together = -10 * math.log10((1e-2 + 1e-4 + 1e-6) / 3)
+    assert float(psnr(image, target)) == pytest.approx(together, abs=1e-9)
+
+
+def test_psnr_is_torchmetrics_mean_per_image():
+    image, target = pair()
+    metric = PeakSignalNoiseRatio(data_range=1.0, dim=(1, 2, 3)).double()
+    assert float(psnr(image, target).mean()) == pytest.approx(
+        float(metric(image, target)), abs=1e-6
+    )
+    pooled = PeakSignalNoiseRatio(data_range=1.0).double()
+    assert abs(float(pooled(image, target)) - float(psnr(image, target).mean())) > 1
+
+
+@pytest.mark.parametrize("value_range", [1.0, 2.0])
+def test_ssim_is_torchmetrics(value_range):
+    image, target = pair()
+    metric = StructuralSimilarityIndexMeasure(data_range=value_range).double()
+    ours = float(ssim(image, target, value_range=value_range).mean())
+    assert ours == pytest.approx(float(metric(image, target)), abs=1e-6)
+
+
+def test_a_wrong_range_makes_ssim_higher():
+    image, target = pair()
+    assert (ssim(image, target, value_range=2.0) > ssim(image, target)).all()
+
+
+def test_ssim_of_equal_pictures_is_one_and_of_slivers_undefined():
+    image = torch.rand(3, 3, 16, 16)
+    torch.testing.assert_close(ssim(image, image), torch.ones(3))
+    assert float(ssim(image, 1 - image).max()) < 0.5
+    assert bool(ssim(image[..., :5], image[..., :5]).isnan().all())
+    assert float(ssim(image[..., :6], image[..., :6]).min()) == 1.0
+
+
+def test_equal_pictures_are_infinite():
     image = torch.rand(1, 3, 16, 16)
     assert math.isinf(float(psnr(image, image)))
-    mean = Mean()
-    mean.update(torch.tensor([math.inf, 30.0, 20.0, math.nan]))
-    assert mean.value == 25.0
-    assert (mean.count, mean.left_out) == (2, 2)
-    assert Mean().value is None
 
 
 def test_the_persons_box_leaves_the_background_out():
@@ -43,6 +98,36 @@ def test_the_persons_box_leaves_the_background_out():
     torch.testing.assert_close(psnr_person(image, target, mask), torch.tensor([20.0]))
     assert float(psnr(image, target)) == pytest.approx(20 + 10 * math.log10(10))  # 40 of 400 pixels
     assert math.isnan(float(psnr_person(image, target, torch.zeros_like(mask))))
+    assert math.isnan(float(ssim_person(image, target, torch.zeros_like(mask))))
+
+
+def test_the_persons_box_is_filled_between_its_ends():
+    mask = torch.zeros(1, 1, 9, 9)
+    mask[0, 0, 2, 3], mask[0, 0, 6, 5], mask[0, 0, 0, 0] = 1.0, 0.5, 0.49
+    box = torch.zeros(1, 1, 9, 9, dtype=torch.bool)
+    box[..., 2:7, 3:6] = True
+    assert torch.equal(person_box(mask), box)
+
+
+def test_ssim_in_the_persons_box_is_its_map_there():
+    image, target = pair(1)
+    mask = torch.zeros(1, 1, *image.shape[-2:])
+    mask[..., 8:20, 10:22] = 1
+    _, full = StructuralSimilarityIndexMeasure(data_range=1.0, return_full_image=True).double()(
+        image, target
+    )
+    expected = float(full[..., 8:20, 10:22].mean())
+    assert float(ssim_person(image, target, mask)) == pytest.approx(expected, abs=1e-6)
+
+
+def test_psnr_of_chosen_pixels():
+    target, where = torch.zeros(2, 3, 8, 8), torch.zeros(2, 1, 8, 8, dtype=torch.bool)
+    where[0, 0, 1, 1] = True
+    image = target.clone()
+    image[0, :, 1, 1] = 0.1
+    scores = psnr_where(image, target, where)
+    assert float(scores[0]) == pytest.approx(20.0, abs=1e-5)
+    assert math.isnan(float(scores[1]))
 
 
 def test_high_frequencies_of_known_waves():
@@ -58,12 +143,6 @@ def test_high_frequencies_of_known_waves():
     assert math.isnan(float(high_frequencies(picture(0, 0), picture(0, 0))))
 
 
-def test_ssim_of_equal_pictures_is_one():
-    image = torch.rand(3, 3, 16, 16)
-    torch.testing.assert_close(ssim(image, image), torch.ones(3))
-    assert float(ssim(image, 1 - image).max()) < 0.5
-
-
 def test_edge_f1_tolerates_one_pixel_only():
     truth = square(10)
     assert float(edge_f1(truth, truth)) == 1.0
@@ -73,42 +152,17 @@ def test_edge_f1_tolerates_one_pixel_only():
     assert math.isnan(float(edge_f1(truth, torch.zeros_like(truth))))
 
 
-def test_lpips_without_weights_is_none_with_the_reason(monkeypatch, tmp_path):
-    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
-    score, reason = lpips("vgg")
-    assert score is None
-    assert FILES["vgg16"] in reason
-    with pytest.raises(ConfigError, match="vgg or alex"):
-        lpips("squeeze")
-
-
-def test_picture_scores_name_a_reason_for_every_none():
-    scores = PictureScores(None, "no weights")
-    image = torch.zeros(1, 3, 16, 16)
-    scores.update(image, image)  # PSNR infinite, no edges
-    result = scores.compute()
-    assert result["psnr"] is None
-    assert result["psnr_left_out"] == 1
-    assert "finite" in result["psnr_reason"]
-    assert result["lpips_reason"] == "no weights"
-    assert result["ssim"] == pytest.approx(1.0)
-
-
-def test_miou_counts_classes_of_the_truth_only():
-    """Class 1 half right, class 2 absent from the truth but predicted once, 255 ignored."""
-    labels = torch.tensor([[[0, 0, 1, 1, 255]]])
-    predicted = torch.tensor([[0, 2, 1, 0, 1]])
-    S = torch.nn.functional.one_hot(predicted, 3).float().permute(2, 0, 1).unsqueeze(0)
-    scores = SegmentationScores(3)
-    scores.update(S, labels)
-    result = scores.compute()
-    assert result["miou"] == pytest.approx(1 / 2)  # class 1: 1 of {2 true, 1 predicted}
-    assert result["miou_with_background"] == pytest.approx((1 / 3 + 1 / 2) / 2)
-
-
-def test_miou_of_a_split_without_parts_is_none():
-    scores = SegmentationScores(3)
-    S = torch.zeros(1, 3, 1, 2)
-    S[:, 0] = 1
-    scores.update(S, torch.zeros(1, 1, 2, dtype=torch.long))
-    assert scores.compute()["miou"] is None
+def test_edge_ratio_counts_opencvs_edge_pixels():
+    truth = square(10)
+    two = torch.maximum(square(2), square(22))
+    assert float(edge_ratio(truth, truth)) == 1.0
+    assert float(edge_ratio(two, truth)) == pytest.approx(2.0, abs=1e-9)
+    assert float(edge_ratio(torch.zeros_like(truth), truth)) == 0.0
+    assert math.isnan(float(edge_ratio(truth, torch.zeros_like(truth))))
+    image, target = (x.float() for x in pair(1))
+    grey = [
+        cv2.cvtColor((x[0] * 255).round().byte().permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY)
+        for x in (image, target)
+    ]
+    counts = [int(np.count_nonzero(cv2.Canny(g, 100, 200))) for g in grey]
+    assert float(edge_ratio(image, target)) == pytest.approx(counts[0] / counts[1], abs=1e-9)

@@ -1,4 +1,4 @@
-"""Tables: the floor and the marks always show, None is n/a, JSON is strict."""
+"""Tables: the floor, the marks and what was scored always show, None is n/a, JSON is strict."""
 
 from __future__ import annotations
 
@@ -6,44 +6,90 @@ import json
 
 from rich.console import Console
 
-from gsgan.metrics.evaluation import METRICS, empty_split
-from gsgan.metrics.tables import markdown, notes, print_table, write_results
+from gsgan.data.measures import Measures
+from gsgan.scoring.files import Scored, write_scored
+from gsgan.scoring.prepare import Stage
+from gsgan.scoring.scores import METRICS
+from gsgan.scoring.split import Scorer, empty_split
+from gsgan.scoring.tables import IN_TERMINAL, markdown, notes, print_table, rows
+
+FACTS = {
+    "method": "gsgan", "model": "wo_seg", "protocol": "zju_gauhuman", "seed": 3,
+    "data": {"name": "zju_mocap", "root": "my_377", "fingerprint": "0123456789ab"},
+    "commit": "abc", "dirty": True,
+}  # fmt: skip
 
 
 def results(marks=("perceptual loss: stand-in",)):
     scores = {
         "psnr": 30.123, "psnr_person": 28.0, "high_frequencies": 0.9, "ssim": 0.98,
-        "lpips": None, "lpips_reason": "no weights", "edge_f1": 0.5, "miou": 0.9,
+        "ssim_person": 0.9, "lpips": None, "lpips_reason": "no weights", "lpips_name": None,
+        "edge_f1": 0.5, "edge_ratio": 1.25, "miou": 0.9, "miou_with_background": 0.95,
         "images": 3, "marks": list(marks),
     }  # fmt: skip
+    scores["cameras"] = {"cam07": dict.fromkeys(METRICS) | {"psnr": 29.5}}
     split = {"full": dict(scores), "splat": dict(scores), "floor": dict(scores)}
-    return {"novel_view": empty_split("no camera is held out", list(marks)), "novel_pose": split}
+    scorer = Scorer(Stage(Measures(), None), None, "no weights", "LPIPS", list(marks))
+    return {
+        "novel_view": empty_split("no camera is held out", scorer).variants,
+        "novel_pose": split,
+    }
 
 
-def test_every_table_shows_floor_mark_and_reason(tmp_path):
+def test_every_table_shows_floor_mark_reason_and_what_was_scored():
     console = Console(record=True, width=140)
-    print_table(results(), console, "run")
-    for text in (console.export_text(), markdown(results(), "run")):
+    print_table(results(), FACTS, console, "run")
+    for text in (console.export_text(), markdown(results(), FACTS, "run")):
         assert "floor" in text
         assert "marked: perceptual loss: stand-in" in text
         assert "lpips n/a: no weights" in text
         assert "novel_view: no camera is held out" in text
         assert "30.12" in text
+        for said in ("protocol zju_gauhuman", "my_377, 0123456789ab", "1 seed (3)", "commit abc"):
+            assert said in text
+        assert "changed since" in text
+
+
+def test_the_table_fits_a_hundred_columns():
+    console = Console(record=True, width=100)
+    print_table(results(), FACTS, console, "run", "camera")
+    text = console.export_text()
+    assert "…" not in text
+    assert text.count("mIoU") == 1
+
+
+def test_cameras_have_rows_where_asked_for():
+    split = list(rows(results(), IN_TERMINAL))
+    cameras = list(rows(results(), IN_TERMINAL, "camera"))
+    assert len(cameras) == len(split) + 3  # one camera in three variants
+    assert cameras[4][1:4] == ["  cam07", "", "29.50"]
 
 
 def test_metrics_json_has_the_promised_shape(tmp_path):
-    write_results(results(), tmp_path, "run")
+    write_scored(Scored(results(), {}, FACTS), tmp_path, "run")
     stored = json.loads((tmp_path / "metrics.json").read_text())
     assert set(stored) == {"novel_view", "novel_pose"}
     for split in stored.values():
         assert {"full", "splat", "floor"} <= set(split)
         for scores in split.values():
             for metric in METRICS:
-                assert metric in scores
                 assert scores[metric] is not None or scores[f"{metric}_reason"]
+            for means in scores["cameras"].values():
+                assert set(means) == set(METRICS)
+    assert json.loads((tmp_path / "facts.json").read_text()) == FACTS
     assert not list(tmp_path.glob("*.part"))
 
 
 def test_notes_say_each_thing_once():
     said = notes(results())
     assert len(said) == len(set(said)) == 3
+
+
+def test_a_caption_names_what_is_not_known():
+    from gsgan.scoring.facts import caption
+
+    unknown = FACTS | {"model": None, "protocol": None, "seed": None, "commit": None, "dirty": None}
+    said = caption(unknown)
+    assert "protocol none" in said
+    assert "commit unknown" in said
+    assert said.startswith("gsgan · ")

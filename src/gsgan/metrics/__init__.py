@@ -1,3 +1,3 @@
-"""Scores of pictures and segmentations, and the evaluation that gathers them."""
+"""Scores of one picture or segmentation against the truth."""
 
 import gsgan.compat  # noqa: F401  (before torchmetrics, which imports torchvision)

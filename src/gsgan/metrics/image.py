@@ -1,4 +1,4 @@
-"""Scores of one picture against the truth: PSNR, SSIM, edge F1, LPIPS.
+"""Scores of one picture against the truth: PSNR, SSIM, fine detail, edges.
 
 Convention: pictures ``[B, 3, H, W]``, RGB in [0, 1]; every function returns one score a picture,
 ``[B]``, because papers report the mean over pictures, not the score of pooled errors.
@@ -6,47 +6,95 @@ Convention: pictures ``[B, 3, H, W]``, RGB in [0, 1]; every function returns one
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsgan.errors import ConfigError
 from gsgan.losses.photometric import d_ssim_map
-from gsgan.losses.weights import FILES, find_weights, how_to_get, load_weights
 
-_BACKBONES = {"vgg": "vgg16", "alex": "alexnet"}
-
-
-def psnr(image: Tensor, target: Tensor) -> Tensor:
-    """Peak signal to noise ratio, dB; infinite for equal pictures (keep those out of means)."""
-    error = (image - target).square().flatten(1).mean(dim=1)
-    return -10 * error.log10()
+Score = Callable[[Tensor, Tensor], Tensor]
+SSIM_CONSTANTS = (0.01, 0.03)
+LEAST_SIDE = 6  # pixels: half of SSIM's window and one, below which its border cannot be reflected
 
 
-def psnr_person(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """PSNR inside the person's box, dB: the smallest box that holds the mask; NaN without one.
-
-    A frame that is mostly background scores high whatever the person looks like.
+def psnr(
+    image: Tensor, target: Tensor, *, pooling: Literal["picture", "channels"] = "picture"
+) -> Tensor:
+    """Peak signal to noise ratio, dB; infinite for equal pictures (keep those out of means).
 
     Args:
         image, target: pictures.
-        mask: ``[B, 1, H, W]`` in [0, 1]; the person is where it is at least one half.
+        pooling: "picture", of one error for all channels; "channels", the mean of their PSNRs.
     """
-    scores = []
-    for a, b, m in zip(image, target, mask[:, 0] >= 0.5, strict=True):
-        rows, columns = (m.any(dim=d).nonzero().flatten() for d in (1, 0))
-        if len(rows) == 0:
-            scores.append(image.new_tensor(float("nan")))
-            continue
-        box = (..., slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1))
-        scores.append(psnr(a[box][None], b[box][None])[0])
+    error = (image - target).square().flatten(2).mean(dim=2)
+    if pooling == "picture":
+        error = error.mean(dim=1, keepdim=True)
+    return (-10 * error.log10()).mean(dim=1)
+
+
+def psnr_where(
+    image: Tensor,
+    target: Tensor,
+    where: Tensor,
+    *,
+    pooling: Literal["picture", "channels"] = "picture",
+) -> Tensor:
+    """PSNR of the pixels ``where [B, 1, H, W]`` alone, dB; NaN where there is none."""
+    scores = [
+        psnr(a[None, :, m, None], b[None, :, m, None], pooling=pooling)[0]
+        for a, b, m in zip(image, target, where[:, 0], strict=True)
+    ]
     return torch.stack(scores)
+
+
+def person_box(mask: Tensor) -> Tensor:
+    """``[B, 1, H, W]`` true in the smallest box that holds the person, who is where the mask
+    ``[B, 1, H, W]`` is at least one half."""
+    person = mask >= 0.5
+    return _reached(person, -1) & _reached(person, -2)
+
+
+def _reached(person: Tensor, along: int) -> Tensor:
+    """Rows (``along`` -1) or columns (-2) from the first to the last that hold the person."""
+    held = person.any(dim=along, keepdim=True).long()
+    across = -3 - along
+    before, after = held.cumsum(across), held.flip(across).cumsum(across).flip(across)
+    return (before > 0) & (after > 0)
+
+
+def psnr_person(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+    """PSNR inside the person's box, dB; NaN without a person in ``mask [B, 1, H, W]``.
+
+    A frame that is mostly background scores high whatever the person looks like.
+    """
+    return psnr_where(image, target, person_box(mask))
+
+
+def ssim_person(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+    """SSIM's mean over the pixels of the person's box; its windows see beyond. NaN without one."""
+    box = person_box(mask)
+    similar = (1 - d_ssim_map(image, target)).mean(dim=1, keepdim=True)
+    return (similar * box).flatten(1).sum(dim=1) / box.flatten(1).sum(dim=1)
+
+
+def ssim(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
+    """Structural similarity as torchmetrics defines it (Gaussian window 11, sigma 1.5).
+
+    Not by torchmetrics' arithmetic, which in float32 gives two equal grey pictures 0.9991.
+
+    Args:
+        image, target: pictures; NaN where a side is shorter than `LEAST_SIDE`.
+        value_range: of the values, as SSIM is told; 1 is right for [0, 1].
+    """
+    if min(image.shape[-2:]) < LEAST_SIDE:
+        return image.new_full((len(image),), torch.nan)
+    first, second = SSIM_CONSTANTS
+    k = (first * value_range, second * value_range)
+    return 1 - d_ssim_map(image, target, k=k).flatten(1).mean(dim=1)
 
 
 def high_frequencies(image: Tensor, target: Tensor, *, above: float = 0.25) -> Tensor:
@@ -72,14 +120,6 @@ def high_frequencies(image: Tensor, target: Tensor, *, above: float = 0.25) -> T
     return torch.where(truth > 0, energy(image) / truth, torch.nan)
 
 
-def ssim(image: Tensor, target: Tensor) -> Tensor:
-    """Structural similarity as torchmetrics defines it (Gaussian window 11, sigma 1.5).
-
-    Not by torchmetrics' arithmetic, which in float32 gives two equal grey pictures 0.9991.
-    """
-    return 1 - d_ssim_map(image, target).flatten(1).mean(dim=1)
-
-
 def edge_f1(
     image: Tensor, target: Tensor, *, low: float = 100.0, high: float = 200.0, tolerance: int = 1
 ) -> Tensor:
@@ -90,14 +130,28 @@ def edge_f1(
         low, high: Canny's hysteresis thresholds on 8-bit grey.
         tolerance: pixels an edge may be off.
     """
-    scores = [
-        _edge_f1(_canny(a, low, high), _canny(b, low, high), tolerance)
-        for a, b in zip(image, target, strict=True)
-    ]
-    return torch.tensor(scores)
+    return edge_scores(image, target, low=low, high=high, tolerance=tolerance)[0]
 
 
-def _canny(picture: Tensor, low: float, high: float) -> np.ndarray:
+def edge_ratio(image: Tensor, target: Tensor, *, low: float = 100.0, high: float = 200.0) -> Tensor:
+    """Canny edge pixels over the truth's, 1 is best; NaN where the truth has no edge."""
+    return edge_scores(image, target, low=low, high=high)[1]
+
+
+def edge_scores(
+    image: Tensor, target: Tensor, *, low: float = 100.0, high: float = 200.0, tolerance: int = 1
+) -> tuple[Tensor, Tensor]:
+    """`edge_f1` and `edge_ratio` with the edges found once."""
+    f1, ratio = [], []
+    for a, b in zip(image, target, strict=True):
+        edges, truth = canny(a, low, high), canny(b, low, high)
+        f1.append(_edge_f1(edges, truth, tolerance))
+        ratio.append(float(edges.sum() / truth.sum()) if truth.any() else float("nan"))
+    return torch.tensor(f1, dtype=torch.float64), torch.tensor(ratio, dtype=torch.float64)
+
+
+def canny(picture: Tensor, low: float = 100.0, high: float = 200.0) -> np.ndarray:
+    """``[H, W]`` bool: Canny's edges of one picture ``[3, H, W]``, found on 8-bit grey."""
     rgb = (picture.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
     return cv2.Canny(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), low, high) > 0
 
@@ -114,70 +168,3 @@ def _edge_f1(edges: np.ndarray, truth: np.ndarray, tolerance: int) -> float:
     recall = (truth & near_edges).sum() / truth.sum()
     total = precision + recall
     return float(2 * precision * recall / total) if total else 0.0
-
-
-Score = Callable[[Tensor, Tensor], Tensor]
-
-
-def check_lpips(net: str, path: str | None) -> Path | None:
-    """The backbone's weight file, or None where it is not at hand.
-
-    Raises:
-        ConfigError: on an unknown net.
-        DataError: when a given path does not hold the weights.
-    """
-    if net not in _BACKBONES:
-        raise ConfigError(f"lpips.net must be vgg or alex; got {net!r}")
-    return find_weights(_BACKBONES[net], path)
-
-
-def lpips(net: str = "vgg", path: str | None = None) -> tuple[Score | None, str]:
-    """LPIPS with pretrained weights, or None with the reason it cannot be had.
-
-    Never a score from random weights, and nothing is downloaded.
-
-    Args:
-        net: backbone, ``vgg`` or ``alex``.
-        path: the backbone's torchvision weight file or its folder; None looks in the torch cache.
-
-    Returns:
-        (score, "") or (None, reason). The score clamps pictures to [0, 1] and feeds [-1, 1].
-
-    Raises:
-        ConfigError: on an unknown net.
-        DataError: when a given path does not hold the weights.
-    """
-    found = check_lpips(net, path)
-    if found is None:
-        backbone = _BACKBONES[net]
-        return None, f"{backbone} weights are not at hand: {how_to_get(backbone)}"
-    load_weights(found)  # refuses anything but a plain state dict before torchvision reads it
-    metric = _build_lpips(net, found)
-
-    def score(image: Tensor, target: Tensor) -> Tensor:
-        metric.to(image.device)
-        pairs = zip(image.clamp(0, 1).split(1), target.clamp(0, 1).split(1), strict=True)
-        with torch.no_grad():
-            return torch.stack([metric(a, b) for a, b in pairs])
-
-    return score, ""
-
-
-def _build_lpips(net: str, weights: Path) -> torch.nn.Module:
-    """torchmetrics' LPIPS, its backbone read from ``weights`` wherever that file lies."""
-    from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
-
-    before = torch.hub.get_dir()
-    with tempfile.TemporaryDirectory() as folder:
-        cache = Path(folder) / "checkpoints"
-        cache.mkdir()
-        target = cache / FILES[_BACKBONES[net]]
-        try:
-            target.symlink_to(weights.resolve())
-        except OSError:  # no links on this file system
-            shutil.copyfile(weights, target)
-        torch.hub.set_dir(folder)
-        try:
-            return LearnedPerceptualImagePatchSimilarity(net_type=net, normalize=True).eval()  # type: ignore[arg-type]
-        finally:
-            torch.hub.set_dir(before)

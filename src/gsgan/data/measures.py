@@ -1,0 +1,70 @@
+"""What of a picture is scored, and how: the named choices in which published evaluations differ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from gsgan.errors import ConfigError
+
+CHOICES: dict[str, tuple[Any, ...]] = {
+    "region": ("full", "body_box_cleared", "body_box"),
+    "background": ("black", "white"),
+    "lpips_region": ("full", "mask_crop_512"),
+    "lpips_range": ((-1.0, 1.0), (0.0, 1.0)),
+    "ssim_range": (1.0, 2.0),
+    "psnr_pooling": ("picture", "channels"),
+    "eight_bits": ("none", "rounded", "cut"),
+}
+
+
+@dataclass(frozen=True)
+class Measures:
+    """What of a picture is scored, and how.
+
+    Args:
+        region: "full" picture; "body_box_cleared", the full picture with the prediction cleared to
+            the background outside the body's projected 3D box; "body_box", PSNR inside that box
+            only and SSIM on the rectangle round it, both pictures cleared outside.
+        background: on which truth and prediction are compared.
+        lpips_region: "full" picture, or "mask_crop_512": the truth's mask and 50 px, in a square of
+            the background, resized to 512.
+        lpips_range: values that the backbone is fed: [-1, 1] as it expects, or [0, 1] unscaled,
+            which comes out smaller.
+        ssim_range: of the values, as SSIM is told: 1, or 2 as tools assume that take floats for
+            -1 to 1, which comes out higher.
+        psnr_pooling: "picture", one error for all channels; "channels", the mean of their PSNRs.
+        eight_bits: whether predictions are "rounded" or "cut" to 8 bits first.
+
+    Raises:
+        ConfigError: on a value that is none of these.
+
+    Source: method.md § 9.
+    """
+
+    region: Literal["full", "body_box_cleared", "body_box"] = "full"
+    background: Literal["black", "white"] = "black"
+    lpips_region: Literal["full", "mask_crop_512"] = "full"
+    lpips_range: tuple[float, float] = (-1.0, 1.0)
+    ssim_range: float = 1.0
+    psnr_pooling: Literal["picture", "channels"] = "picture"
+    eight_bits: Literal["none", "rounded", "cut"] = "none"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.lpips_range, (list, tuple)):
+            object.__setattr__(self, "lpips_range", tuple(self.lpips_range))
+        for name, choices in CHOICES.items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or value not in choices:
+                raise ConfigError(
+                    f"protocol.measures.{name} must be {_listed(choices)}; got {value!r}"
+                )
+
+    @property
+    def needs_body_box(self) -> bool:
+        """Whether the body's projected box is asked for at all."""
+        return self.region != "full"
+
+
+def _listed(choices: tuple[Any, ...]) -> str:
+    return " or ".join(str(list(c)) if isinstance(c, tuple) else str(c) for c in choices)

@@ -1,0 +1,65 @@
+"""A body's axis-aligned 3D box and the pixels that its projection covers."""
+
+from __future__ import annotations
+
+import cv2
+import torch
+from torch import Tensor
+
+from gsgan.scene import Camera
+
+NEAR = 1e-2  # metres; what is nearer is not seen
+PAIRS = torch.combinations(torch.arange(8))
+
+
+def box_corners(points: Tensor, margin: float) -> Tensor:
+    """``[8, 3]`` corners of the box round points ``[M, 3]`` and a margin, metres, world axes."""
+    low, high = points.amin(0) - margin, points.amax(0) + margin
+    choice = torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3)
+    return torch.where(choice == 1, high, low)
+
+
+def box_mask(corners: Tensor, camera: Camera) -> Tensor:
+    """Which pixels see the box: those whose centre lies in the corners' projected convex hull.
+
+    What lies nearer than `NEAR` is cut off, so a box that reaches behind the camera is seen right.
+
+    Args:
+        corners: ``[8, 3]`` metres, world.
+        camera: of one picture; lens distortion is not applied.
+
+    Returns:
+        ``[1, H, W]`` bool; all false when the box is behind the camera.
+    """
+    height, width = camera.size
+    seen = in_front(camera.to_camera(corners.to(camera.K)[None])[0].double())
+    if len(seen) == 0:
+        return torch.zeros(1, height, width, dtype=torch.bool, device=corners.device)
+    pixels = (seen / seen[:, 2:]) @ camera.K[0].double().T
+    hull = cv2.convexHull(pixels[:, :2].float().cpu().numpy())[:, 0]
+    return inside_hull(torch.from_numpy(hull).double().to(corners.device), camera.size)
+
+
+def in_front(x_cam: Tensor, near: float = NEAR) -> Tensor:
+    """``[M, 3]`` points whose hull is that of the corners ``[8, 3]`` beyond the near plane."""
+    a, b = x_cam[PAIRS[:, 0]], x_cam[PAIRS[:, 1]]
+    crosses = (a[:, 2] > near) != (b[:, 2] > near)
+    a, b = a[crosses], b[crosses]
+    share = (near - a[:, 2:]) / (b[:, 2:] - a[:, 2:])
+    return torch.cat([x_cam[x_cam[:, 2] > near], a + share * (b - a)])
+
+
+def inside_hull(hull: Tensor, size: tuple[int, int]) -> Tensor:
+    """``[1, H, W]`` whether pixel centres lie in a convex polygon ``[n, 2]``, its border included.
+
+    Fewer than three points cover nothing.
+    """
+    y, x = (torch.arange(n, device=hull.device) + 0.5 for n in size)
+    if len(hull) < 3:
+        return torch.zeros(1, *size, dtype=torch.bool, device=hull.device)
+    sides = []
+    for start, end in zip(hull, hull.roll(-1, 0), strict=True):
+        along = end - start
+        sides.append(along[0] * (y - start[1])[:, None] - along[1] * (x - start[0]))
+    side = torch.stack(sides)
+    return ((side >= 0).all(0) | (side <= 0).all(0))[None]

@@ -1,0 +1,124 @@
+"""Results for people: a table in the terminal and in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from gsgan.scoring.facts import caption
+from gsgan.scoring.scores import METRICS
+
+Results = dict[str, dict[str, dict[str, Any]]]
+HEADINGS = {
+    "psnr": "PSNR ↑",
+    "psnr_person": "in box ↑",
+    "ssim": "SSIM ↑",
+    "ssim_person": "SSIM in box ↑",
+    "lpips": "LPIPS ↓",
+    "edge_f1": "edge F1 ↑",
+    "edge_ratio": "edges →1",
+    "high_frequencies": "detail →1",
+    "miou": "mIoU ↑",
+    "miou_with_background": "with background ↑",
+}
+IN_TERMINAL = tuple(m for m in METRICS if m not in ("ssim_person", "miou_with_background"))
+_DIGITS = {
+    "psnr": 2, "psnr_person": 2, "ssim": 4, "ssim_person": 4, "lpips": 4, "edge_f1": 3,
+    "edge_ratio": 2, "high_frequencies": 2, "miou": 3, "miou_with_background": 3,
+}  # fmt: skip
+_VARIANTS = {
+    "full": "picture",
+    "splat": "Step I's colour",
+    "floor": "floor: background",
+}
+PER = ("split", "camera")
+
+
+def rows(
+    results: Results, metrics: tuple[str, ...] = METRICS, per: str = "split"
+) -> Iterator[list[str]]:
+    """One row per split and variant, every value formatted; what cannot be had is ``n/a``.
+
+    Args:
+        results: as in metrics.json.
+        metrics: columns.
+        per: "camera" adds a row for each camera of a variant under it.
+    """
+    for split, variants in results.items():
+        for variant, scores in variants.items():
+            named = _VARIANTS.get(variant, variant)
+            yield [split, named, str(scores["images"]), *(_format(m, scores[m]) for m in metrics)]
+            for camera, means in scores["cameras"].items() if per == "camera" else ():
+                yield [split, f"  {camera}", "", *(_format(m, means[m]) for m in metrics)]
+
+
+def _format(metric: str, value: float | None) -> str:
+    return "n/a" if value is None else f"{value:.{_DIGITS[metric]}f}"
+
+
+def notes(results: Results) -> list[str]:
+    """Every reason and mark behind the table, once each."""
+    found: dict[str, None] = {}
+    for split, variants in results.items():
+        scored = variants["full"]
+        if name := scored.get("lpips_name"):
+            found[f"LPIPS is {name}"] = None
+        for mark in scored["marks"]:
+            found[f"marked: {mark}"] = None
+        if protocol := scored.get("protocol"):
+            found[f"protocol: {protocol['name']} ({protocol['source']})"] = None
+            for departure in protocol["departures"]:
+                found[f"departs from {protocol['name']}: {departure}"] = None
+        if not scored["images"]:
+            found[f"{split}: {scored['psnr_reason']}"] = None
+            continue
+        for metric in METRICS:
+            if metric != "miou_with_background" and scored[metric] is None:
+                found[f"{metric} n/a: {scored[f'{metric}_reason']}"] = None
+    return list(found)
+
+
+def print_table(
+    results: Results, held: dict[str, Any], console: Console, title: str, per: str = "split"
+) -> None:
+    """The rich table with its caption and notes underneath.
+
+    Args:
+        results: as in metrics.json.
+        held: as in facts.json.
+        console: to print on.
+        title: over it.
+        per: "split" or "camera".
+    """
+    table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("picture", no_wrap=True)
+    for metric in IN_TERMINAL:
+        table.add_column(HEADINGS[metric], justify="right", no_wrap=True)
+    previous = None
+    for split, picture, images, *scores in rows(results, IN_TERMINAL, per):
+        if split != previous:  # a column of its own would not fit a narrow terminal
+            table.add_section()
+            table.add_row(f"[bold]{split}[/bold], {images} images")
+            previous = split
+        table.add_row(picture, *scores)
+    console.print(table)
+    for line in (caption(held), *notes(results)):
+        console.print(f"  {line}", markup=False, highlight=False)
+
+
+def markdown(results: Results, held: dict[str, Any], title: str) -> str:
+    """The same table in Markdown, with every metric, and once more by camera."""
+    lines = [f"# {title}", "", caption(held), "", *_table(results, "split")]
+    lines += ["", *(f"- {note}" for note in notes(results))]
+    lines += ["", "## By camera", "", *_table(results, "camera")]
+    return "\n".join([*lines, ""])
+
+
+def _table(results: Results, per: str) -> list[str]:
+    header = ["split", "picture", "images", *(HEADINGS[m] for m in METRICS)]
+    table = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
+    return table + ["| " + " | ".join(row) + " |" for row in rows(results, per=per)]

@@ -1,0 +1,59 @@
+"""The body's projected box: cases that can be counted by hand."""
+
+from __future__ import annotations
+
+import torch
+
+from gsgan.metrics.body_box import box_corners, box_mask, inside_hull
+from gsgan.scene import Camera
+
+
+def camera(size: tuple[int, int] = (20, 20), focal: float = 10.0) -> Camera:
+    """At the origin, looking along +z, the axis through the picture's middle."""
+    K = torch.tensor([[[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1]]])
+    return Camera(K, torch.eye(3)[None], torch.zeros(1, 3), size)
+
+
+def test_corners_are_the_bounds_and_a_margin():
+    points = torch.tensor([[0.0, 1.0, 2.0], [1.0, 0.0, 4.0]])
+    corners = box_corners(points, 0.5)
+    assert corners.shape == (8, 3)
+    assert len({tuple(c) for c in corners.tolist()}) == 8
+    assert corners.amin(0).tolist() == [-0.5, -0.5, 1.5]
+    assert corners.amax(0).tolist() == [1.5, 1.5, 4.5]
+
+
+def test_a_box_before_the_camera_covers_its_near_face():
+    """Near face at z = 1 from -0.4 to 0.4: 4 pixels either side of the middle."""
+    points = torch.tensor([[-0.4, -0.4, 1.0], [0.4, 0.4, 2.0]])
+    mask = box_mask(box_corners(points, 0.0), camera())
+    expected = torch.zeros(1, 20, 20, dtype=torch.bool)
+    expected[:, 6:14, 6:14] = True
+    assert torch.equal(mask, expected)
+
+
+def test_a_box_behind_the_camera_covers_nothing_and_one_around_it_everything():
+    ahead = torch.tensor([[-0.4, -0.4, 1.0], [0.4, 0.4, 2.0]])
+    behind = ahead * torch.tensor([1.0, 1.0, -1.0])
+    assert not box_mask(box_corners(behind, 0.0), camera()).any()
+    assert box_mask(box_corners(torch.cat([ahead, behind]), 0.0), camera()).all()
+
+
+def test_a_box_that_reaches_behind_the_camera_is_cut_at_the_near_plane():
+    """To the right of the axis: x from 0.5 on; what is near covers all that is right of it."""
+    points = torch.tensor([[0.5, -100.0, -5.0], [0.6, 100.0, 1.0]])
+    mask = box_mask(box_corners(points, 0.0), camera())
+    expected = torch.zeros(1, 20, 20, dtype=torch.bool)
+    expected[:, :, 15:] = True  # at z = 1: 10 + 10 * 0.5
+    assert torch.equal(mask, expected)
+
+
+def test_pixel_centres_decide_and_flat_polygons_cover_nothing():
+    triangle = torch.tensor([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]])
+    assert inside_hull(triangle, (3, 3))[0].tolist() == [
+        [True, True, True],
+        [True, True, False],
+        [True, False, False],
+    ]
+    assert torch.equal(inside_hull(triangle.flip(0), (3, 3)), inside_hull(triangle, (3, 3)))
+    assert not inside_hull(triangle[:2], (3, 3)).any()

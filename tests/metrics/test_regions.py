@@ -1,0 +1,85 @@
+"""What is scored of a picture: closed forms of backgrounds, 8 bits, clearing and crops."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from gsgan.metrics.regions import (
+    cleared,
+    eight_bits,
+    mask_crop,
+    moved_background,
+    on_background,
+    rectangle,
+)
+
+
+def test_a_premultiplied_picture_lets_the_background_through():
+    image = torch.tensor([0.3, 0.0, 0.0]).view(1, 1, 1, 3).expand(1, 3, 1, 3)
+    alpha = torch.tensor([1.0, 0.5, 0.0]).view(1, 1, 1, 3)
+    assert on_background(image, alpha, 1.0)[0, 0, 0].tolist() == pytest.approx([0.3, 0.5, 1.0])
+    assert torch.equal(on_background(image, alpha, 0.0), image)
+
+
+def test_an_opaque_picture_moves_by_the_truths_mask():
+    image = torch.tensor([0.3, 0.0, 0.4, 0.0]).view(1, 1, 1, 4).expand(1, 3, 1, 4)
+    mask = torch.tensor([1.0, 1.0, 0.0, 0.0]).view(1, 1, 1, 4)
+    white = moved_background(image, mask, 0.0, 1.0)
+    # a hole inside stays black, what is painted outside is lost
+    assert white[0, 0, 0].tolist() == pytest.approx([0.3, 0.0, 1.0, 1.0])
+    back = moved_background(white, mask, 1.0, 0.0)
+    assert back[0, 0, 0].tolist() == pytest.approx([0.3, 0.0, 0.0, 0.0])
+
+
+def test_eight_bits():
+    image = torch.tensor([0.0, 0.9 / 255, 1.2 / 255, 1.0]).view(1, 1, 1, 4)
+    assert torch.equal(eight_bits(image, "none"), image)
+    rounded, cut = ((eight_bits(image, how) * 255).flatten().tolist() for how in ("rounded", "cut"))
+    assert rounded == pytest.approx([0, 1, 1, 255])
+    assert cut == pytest.approx([0, 0, 1, 255])
+
+
+@pytest.mark.parametrize("how", ["rounded", "cut"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_is_8_bit_already_stays(how, dtype):
+    stored = torch.arange(256).to(dtype).view(1, 1, 16, 16) / 255
+    assert torch.equal((eight_bits(stored, how) * 255).round(), (stored * 255).round())
+
+
+def test_cleared_pixels_are_background():
+    image = torch.full((1, 3, 2, 2), 0.5)
+    keep = torch.tensor([[True, False], [False, True]]).view(1, 1, 2, 2)
+    assert cleared(image, keep, 1.0)[0, 0].tolist() == [[0.5, 1.0], [1.0, 0.5]]
+
+
+def test_rectangle():
+    where = torch.zeros(1, 6, 7, dtype=torch.bool)
+    assert rectangle(where) is None
+    where[0, 2, 3] = where[0, 4, 1] = True
+    assert rectangle(where) == (slice(2, 5), slice(1, 4))
+
+
+def test_the_crop_is_square_centred_on_the_background():
+    """A mask of 2 x 4 pixels and a margin of 1: 4 x 6 pixels in a square of 6."""
+    picture, mask = torch.full((3, 20, 20), 0.25), torch.zeros(1, 20, 20)
+    mask[0, 5:7, 8:12] = 0.5
+    square = mask_crop(picture, mask, 1.0, margin=1, size=6)
+    expected = torch.full((3, 6, 6), 0.25)
+    expected[:, [0, 5]] = 1.0
+    assert torch.equal(square, expected)
+    large = mask_crop(picture, mask, 1.0, margin=1, size=12)
+    assert large.shape == (3, 12, 12)
+    assert large[:, 4:8].min() == large[:, 4:8].max() == 0.25
+    assert mask_crop(picture, torch.zeros(1, 20, 20), 1.0) is None
+
+
+def test_the_crops_margin_ends_at_the_pictures_border():
+    picture, mask = (
+        torch.arange(400.0).view(1, 20, 20).expand(3, 20, 20) / 400,
+        torch.zeros(1, 20, 20),
+    )
+    mask[0, 0:4, 18:20] = 1
+    square = mask_crop(picture, mask, 1.0, margin=2, size=6)
+    assert torch.equal(square[:, :, 1:5], picture[:, 0:6, 16:20])
+    assert bool((square[:, :, [0, 5]] == 1).all())
