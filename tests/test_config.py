@@ -26,7 +26,7 @@ def test_every_model_composes_with_every_data(compose, model, data):
 
 
 @pytest.mark.parametrize(
-    "group", ["trainer", "logger", "size", "training", "accuracy", "experiment"]
+    "group", ["effects", "trainer", "logger", "size", "training", "accuracy", "experiment"]
 )
 def test_every_option_composes(compose, group):
     assert options(group)
@@ -119,7 +119,7 @@ def test_bugs_keep_their_traceback_and_mistakes_get_a_sentence():
 @pytest.mark.parametrize(
     ("override", "named"),
     [
-        ("model.deformation.sh_degree=7", "sh_degree must be 0, 1, 2 or 3, got 7"),
+        ("effects.view_dependence=7", "effects.view_dependence must be one of"),
         ("model.generator.output=tanh", "output must be linear or sigmoid"),
         ("training.schedule.step_two=-1", "schedule.step_two must be 0 or more"),
         ("+model.densify.colour=1", "unexpected keyword argument 'colour'"),

@@ -19,6 +19,17 @@ SMALL_BENCH = {
         "memory=false",
     ],
     "loader": ["data.size=32", "batches=2", "workers=[0,1]"],
+    "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
+    "trade-off": [
+        "base=[" + ",".join(f"'{w}'" for w in [*TINY, "data.root=/path/to/capture"]) + "]",
+        *(f"factors.{f}=null" for f in ("points_per_limb", "channels_of_F", "generator_width")),
+        *("factors.model=null", "settings.accuracies=[draft]", "settings.scales=[0.5]"),
+        *("settings.backends=[]", "repeats=1", "pictures=1"),
+    ],
+    "effects": [
+        *("train=false", "only=[distortion]"),
+        "base=['size=tiny','data.source.frames=3','data.source.test_frames=1']",
+    ],
 }
 
 
@@ -79,7 +90,32 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
 
         return write_project(folder() / "videos")
 
+    def predictions() -> Path:
+        import cv2
+
+        from gsgan.data.datamodule import GsganData
+
+        root, data = folder() / "predictions", GsganData(str(capture))
+        for split in data.eval_names:
+            dataset = data.dataset(split)
+            for i, (camera, frame) in enumerate(dataset.items):
+                path = root / split / camera / f"{frame:06d}.png"
+                path.parent.mkdir(parents=True, exist_ok=True)
+                picture = (dataset[i].image[0] * 255).round().byte().permute(1, 2, 0).numpy()
+                cv2.imwrite(str(path), picture[..., ::-1])
+        return root
+
+    def report_page() -> Path:
+        page = folder() / "page.md"
+        page.write_text("# Page\n\n<!-- report:ablation -->\n<!-- /report -->\n")
+        return page
+
+    def another_run(name: str) -> Path:
+        return Path(shutil.copytree(run, folder() / name))
+
     makers: dict[str, Callable[[], Path | str]] = {
+        "/path/to/run_wo_gcn": lambda: another_run("run_wo_gcn"),
+        "/path/to/run_wo_seg": lambda: another_run("run_wo_seg"),
         "out=/path/to/capture": lambda: f"out={folder() / 'capture'}",
         "/path/to/capture": lambda: capture,
         "<run folder>": lambda: run,
@@ -90,6 +126,10 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
         "/path/to/avatarrex_zzr": lambda: rig("avatarrex_zzr"),
         "/path/to/take": take,
         "/path/to/videos": videos,
+        "/path/to/predictions": predictions,
+        "/path/to/sweep": lambda: run,
+        "runs=runs/ablation": lambda: f"runs={run.parent}",
+        "/path/to/page.md": report_page,
     }
 
     def fill(line: str) -> str:
@@ -118,16 +158,17 @@ def fixed(given: list[str], option: str) -> bool:
     return protocol and option.startswith(("data.size", "data.crop"))
 
 
-def tiny_bench(arguments: list[str], tmp_path: Path) -> list[str]:
+def tiny_bench(arguments: list[str], tmp_path: Path, capture: Path) -> list[str]:
     given = []
     for argument in arguments:
         if argument.startswith("docs="):
             page = tmp_path / "page.md"
             shutil.copy(ROOT / argument.removeprefix("docs="), page)
             given.append(f"docs={page}")
-        elif argument.split("=")[0] not in {"repeats", "gaussians", "sizes", "dense"}:
+        elif argument.split("=")[0] not in {"repeats", "gaussians", "sizes", "dense", "size"}:
             given.append(argument.strip("'"))
-    return given + SMALL_BENCH.get(given[0], [])
+    small = (w.replace("/path/to/capture", str(capture)) for w in SMALL_BENCH.get(given[0], []))
+    return [*given, *small]
 
 
 @pytest.mark.parametrize("line", documented())
@@ -139,7 +180,7 @@ def test_every_documented_command_runs(line, place, capture, inside, tmp_path):
     if name == "train":
         arguments = tiny_training(arguments, capture)
     if name == "bench":
-        arguments = tiny_bench(arguments, tmp_path)
+        arguments = tiny_bench(arguments, tmp_path, capture)
     if name == "prepare":  # MediaPipe is not at hand: its output is given
         source = next(a for a in arguments if a.startswith("source=")).removeprefix("source=")
         arguments = [a for a in arguments if a != "setup=true"]

@@ -227,7 +227,7 @@ def test_bad_data_ends_in_one_sentence_and_leaves_nothing(
     ("argument", "words"),
     [
         ("data.root=/nowhere/at/all", ("/nowhere/at/all",)),
-        ("model.deformation.sh_degree=9", ("sh_degree must be 0, 1, 2 or 3, got 9",)),
+        ("effects.view_dependence=9", ("view_dependence must be one of", "got 9")),
         ("trainer.precision=3-bits", ("3-bits",)),
         ("lpips.net=squeeze", ("lpips.net", "vgg or alex")),
         ("training.step_two.gan=wgan", ("training.step_two.gan", "logistic")),

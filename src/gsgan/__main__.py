@@ -4,8 +4,10 @@ COMMANDS = {
     "gsgan.prepare": "make a dataset of your own videos: source=<folder> out=<folder>",
     "gsgan.check": "look a dataset over before training: data=capture data.root=<folder>",
     "gsgan.train": "train an avatar, then score it on what was held out",
-    "gsgan.evaluate": "score a trained run: run=<folder>",
-    "gsgan.bench": "measure what things cost: raster, stability, loader",
+    "gsgan.evaluate": "score a run, run=<folder>, or any method's pictures, predictions=<folder>",
+    "gsgan.report": "tables of scored runs: runs=[<folder>,…] table=ablation",
+    "gsgan.figures": "the paper's figures of a run: run=<folder> compare=[<folder>,…]",
+    "gsgan.bench": "measure what things cost: raster, stability, loader, effects, speed, trade-off",
 }
 
 

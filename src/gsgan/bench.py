@@ -12,11 +12,15 @@ from rich.console import Console
 
 from gsgan.config import FAILED, entry
 
-# Each is a module of gsgan.benchmarks with run(config, folder), and a conf/bench_<subject>.yaml.
+# Each is a module of gsgan.benchmarks with run(config, folder), and a conf/bench_<subject>.yaml,
+# both with _ for the subject's -.
 SUBJECTS = {
     "raster": "time against error of every backend and accuracy setting of the rasteriser",
     "stability": "the float32 error of every hard case",
     "loader": "training pictures a second from disk",
+    "speed": "milliseconds from skeleton to picture, by stage",
+    "trade-off": "quality against time and memory, over settings and small trainings",
+    "effects": "what each effect gains where it is called for, and costs (trains for an hour)",
 }
 HELP = ("-h", "--help")
 
@@ -35,6 +39,11 @@ def subjects() -> str:
     return "\n".join(["python -m gsgan.bench <subject> [key=value], subjects:", *lines])
 
 
+def module_name(subject: str) -> str:
+    """Of its module, and after ``bench_`` of its config."""
+    return subject.replace("-", "_")
+
+
 def main() -> None:
     """Hands the command line, less the subject, to Hydra."""
     subject, rest = split(sys.argv[1:])
@@ -51,14 +60,15 @@ def main() -> None:
         )
         sys.exit(FAILED)
     sys.argv = [sys.argv[0], *rest]
+    name = module_name(subject)
 
     def bench(config: DictConfig) -> None:
         from hydra.core.hydra_config import HydraConfig
 
         folder = Path(HydraConfig.get().runtime.output_dir)
-        importlib.import_module(f"gsgan.benchmarks.{subject}").run(config, folder)
+        importlib.import_module(f"gsgan.benchmarks.{name}").run(config, folder)
 
-    entry(f"bench_{subject}")(bench)()
+    entry(f"bench_{name}")(bench)()
 
 
 if __name__ == "__main__":

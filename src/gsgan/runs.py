@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
 
+from gsgan.effects import Effects, EffectSettings, decide
 from gsgan.errors import ConfigError, DataError
 from gsgan.model.avatar import Avatar
 
@@ -129,21 +131,53 @@ def load_config(folder: Path) -> DictConfig:
 
 def build_data(config: DictConfig) -> GsganData:
     """The data module of a config, its dataset made if need be, read and checked."""
-    data: GsganData = instantiate(config.data)
+    lens = str(effect_settings(config).wish("distortion"))
+    data: GsganData = instantiate(config.data, distortion=lens)
     data.prepare_data()
     data.setup()
     return data
 
 
-def build_avatar(config: DictConfig, data: GsganData) -> Avatar:
+def effect_settings(config: DictConfig) -> EffectSettings:
+    """What a config asks of the effects; a run from before there were any asks nothing.
+
+    Raises:
+        ConfigError: on a value that no effect knows.
+    """
+    if config.get("effects") is None:
+        return EffectSettings()
+    settings: EffectSettings = instantiate(config.effects)
+    return settings
+
+
+def build_avatar(
+    config: DictConfig,
+    data: GsganData,
+    vertex_labels: Tensor | None = None,
+    effects: Effects | None = None,
+) -> Avatar:
     """The untrained avatar of a config, sized to the data, its weights from ``config.seed``.
+
+    Args:
+        config: of the run.
+        data: whose training split it is for.
+        vertex_labels: ``[V]`` the outcome of an earlier class vote; None holds it where it is
+            called for.
+        effects: decided earlier; None decides them from the training split.
 
     Raises:
         ConfigError: when a value under ``model`` is not one the parts can take.
     """
+    if effects is None:
+        effects = decide(data.info, effect_settings(config))
     torch.manual_seed(config.seed)
     with _naming("model"):
-        return instantiate(config.model)(scene=data.info)
+        return instantiate(config.model)(
+            scene=data.info,
+            pictures=data.labelled("train"),
+            vertex_labels=vertex_labels,
+            effects=effects,
+        )
 
 
 def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
@@ -178,13 +212,15 @@ def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avat
     """
     path = folder / CHECKPOINT
     checkpoint = read_checkpoint(path)
-    avatar = build_avatar(config, data)
     prefix = "average.copy.module." if checkpoint["gsgan"].get("averaged") else "avatar."
     state = {
         key.removeprefix(prefix): value
         for key, value in checkpoint["state_dict"].items()
         if key.startswith(prefix)
     }
+    decided = checkpoint["gsgan"].get("effects")
+    effects = None if decided is None else Effects.from_plain(decided)
+    avatar = build_avatar(config, data, state.get("segmentation.vertex_labels"), effects)
     try:
         avatar.load_state_dict(state)
     except RuntimeError as error:

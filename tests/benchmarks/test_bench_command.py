@@ -48,8 +48,9 @@ def test_the_first_word_is_the_subject(arguments, subject, rest):
 
 @pytest.mark.parametrize("subject", bench.SUBJECTS)
 def test_every_subject_has_code_and_a_config(subject):
-    assert (config_folder() / f"bench_{subject}.yaml").is_file()
-    run = importlib.import_module(f"gsgan.benchmarks.{subject}").run
+    name = bench.module_name(subject)
+    assert (config_folder() / f"bench_{name}.yaml").is_file()
+    run = importlib.import_module(f"gsgan.benchmarks.{name}").run
     assert list(inspect.signature(run).parameters) == ["config", "folder"]
 
 

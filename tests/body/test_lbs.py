@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
+from gsgan.body.free import free_body
 from gsgan.body.lbs import (
     axis_angle_to_matrix,
     blend_transforms,
+    check_weights,
     forward_kinematics,
     kinematic_levels,
     skin,
 )
+from gsgan.body.smpl import SkinnedModel
 
 torch.set_num_threads(1)
 D = torch.float64
@@ -146,6 +150,41 @@ def test_wrong_shapes_name_the_argument(name, arguments):
         forward_kinematics(*arguments)
 
 
-def test_vertices_without_weight_are_refused():
+@pytest.mark.parametrize("wrong", [[0.0, 0.0], [1.5, -0.5], [math.nan, 1.0], [math.inf, 1.0]])
+def test_vertices_without_weight_are_refused(wrong):
     with pytest.raises(ValueError, match="1 vertices without"):
-        blend_transforms(torch.eye(4).repeat(1, 1, 1, 1), torch.tensor([[0]]), torch.zeros(1, 1))
+        check_weights(torch.tensor([[0.5, 0.5], wrong]))
+
+
+def test_a_body_refuses_such_weights_when_it_is_made():
+    body = free_body()
+    weight = body.bone_weight.clone()
+    weight[7] = 0
+    with pytest.raises(ValueError, match="1 vertices without"):
+        replace(body, bone_weight=weight)
+
+
+def test_an_smpl_model_refuses_such_weights_when_it_is_made():
+    ones = torch.ones(2, 3, dtype=D)
+    with pytest.raises(ValueError, match="1 vertices without"):
+        SkinnedModel(
+            kind="generic", v_template=ones, shapedirs=ones[..., None],
+            expression_dirs=ones[..., None], posedirs=ones[..., None], J_regressor=ones[:1, :2],
+            weights=torch.tensor([[1.0], [0.0]], dtype=D), parents=(-1,),
+            faces=torch.zeros(1, 3, dtype=torch.long),
+        )  # fmt: skip
+
+
+def test_blending_looks_at_no_value():
+    """A look at a value makes the host wait for the device in every frame."""
+    from torch.utils._python_dispatch import TorchDispatchMode
+
+    class NoLook(TorchDispatchMode):
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            assert func is not torch.ops.aten._local_scalar_dense.default
+            return func(*args, **(kwargs or {}))
+
+    with NoLook():
+        blend_transforms(torch.eye(4)[None, None], torch.tensor([[0]]), torch.ones(1, 1))
+        with pytest.raises(AssertionError):
+            check_weights(torch.ones(1, 1))

@@ -244,8 +244,13 @@ def tool_npz(tmp_path: Path) -> Path:
     return tmp_path / "a.npz"
 
 
-# Not OpenCV's YAML: its own reader can corrupt memory on a damaged file, which ends the process.
+def extrinsics(tmp_path: Path) -> Path:
+    return write_easymocap(tmp_path, ring(dist=LENS)).with_name("extri.yml")
+
+
 READERS = {
+    "intri": (read_calibration, lambda p: write_easymocap(p, ring(dist=LENS))),
+    "extri": (read_calibration, extrinsics),
     "toml": (read_calibration, lambda p: write_toml(p / "Calib.toml", ring(dist=LENS))),
     "qualisys": (read_calibration, lambda p: write_qca(p / "rig.qca.txt", ring(dist=LENS))),
     "json": (read_calibration, lambda p: write_own(p / "cameras.json", ring(dist=LENS))),

@@ -167,6 +167,14 @@ def in_centimetres(project: Path) -> None:
     (project / "cameras.json").write_text(json.dumps(rig))
 
 
+def no_detections(project: Path) -> None:
+    for path in (project / "pose").iterdir():
+        with np.load(path) as held:
+            arrays = dict(held)
+        hand = arrays["px"][:, :21]  # hands alone do not make a person
+        np.savez(path, **arrays | {"px": np.full_like(arrays["px"], np.nan), "left": hand})
+
+
 @pytest.mark.parametrize(
     ("break_it", "more", "what"),
     [
@@ -178,6 +186,7 @@ def in_centimetres(project: Path) -> None:
         (lambda p: (p / "pose" / "cam01.npz").write_bytes(b"PK"), {}, r"cam01\.npz"),
         (lambda p: (p / "videos" / "cam01.avi").write_bytes(b"RIFF"), {}, r"cam01\.avi"),
         (lambda p: (p / "masks" / "cam00" / "000001.png").write_bytes(b"x"), {}, r"000001\.png"),
+        (no_detections, {}, "no body joint of any frame came out in 3D"),
         (lambda p: None, {"frames": "90-99"}, "no frame is left"),
         (lambda p: None, {"cameras": {"cam00": "cam01"}}, "more than one video"),
         (lambda p: None, {"unit": "inch"}, "unit must be one of"),

@@ -289,3 +289,51 @@ def test_lens_distortion_is_undone_before_anything_is_judged(tmp_path, check):
     lens = {"dist": (-0.3, 0.1, 0, 0, 0), "size": (96, 96)}
     root = write_tiny_capture(tmp_path / "lens", cameras=3, frames=4, **lens)
     assert min(c["inside"] for c in check(root).numbers["cameras"].values()) > 0.99
+
+
+def turn(root: Path, axis: tuple[float, float, float], degrees: float) -> None:
+    def change(cameras):
+        r = cv2.Rodrigues(np.radians(degrees) * np.array(axis))[0]
+        camera = cameras["cam01"]
+        camera["R"], camera["t"] = (r @ camera["R"]).tolist(), (r @ camera["t"]).tolist()
+
+    edit_json(root / "cameras.json", change)
+
+
+def scale_focal(root: Path, factor: float, *names: str, centre: bool = False) -> None:
+    def change(cameras):
+        for name in names:
+            K = np.array(cameras[name]["K"])
+            K[[0, 1], [0, 1]] *= factor
+            K[:2, 2] *= factor if centre else 1
+            cameras[name]["K"] = K.tolist()
+
+    edit_json(root / "cameras.json", change)
+
+
+def test_a_camera_that_is_nearly_right_is_named(copy, check):
+    turn(copy, (0, 0, 1), 12)
+    sentences = [f.sentence for f in check(copy, inside_warning=0.71).findings]
+    assert any(s.startswith("camera cam01: joints lie") for s in sentences)
+    assert not any("camera cam00" in s or "camera cam02" in s for s in sentences)
+
+
+def test_joints_just_outside_every_mask_are_told_once(copy, check):
+    scale_focal(copy, 1.12, *(f"cam{i:02d}" for i in range(4)))
+    told = [f.sentence for f in check(copy, inside_warning=0.71, outside_all=0.002).findings]
+    assert sum("in most cameras joints lie" in s for s in told) == 1
+
+
+def test_a_camera_that_training_refuses_is_explained_by_the_check(copy, check):
+    scale_focal(copy, 0.5, "cam01", centre=True)
+    report = check(copy)
+    assert report.numbers["readable"]
+    assert report.errors == 1
+    assert only(report, "error").startswith("camera cam01: ")
+
+
+def test_without_suspects_there_is_nothing_small_to_judge():
+    from gsgan.checking.blame import judge_small
+    from gsgan.checking.settings import Limits
+
+    assert judge_small([], Limits()) == []

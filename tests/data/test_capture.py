@@ -18,7 +18,7 @@ from make import edit_json, ring_camera, skeletons, write_landmarks, write_tiny_
 from gsgan.data.capture import CaptureDataset, Picture, PictureCache
 from gsgan.data.crop import PersonCrop, Window, cut, square_window, undistort_map
 from gsgan.data.files import cut_off, last_number, read_header
-from gsgan.data.formats.capture import read_capture
+from gsgan.data.formats.capture import LOOKED_AT, read_capture
 from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Checks, Layout, fill_missing, spans
 from gsgan.errors import ConfigError, DataError
@@ -33,8 +33,8 @@ def items(layout: Layout) -> list[tuple[str, int]]:
     return [(c, f) for c in layout.cameras for f in sorted(layout.images[c])]
 
 
-def every_frame(root: Path, **kwargs: object) -> list[Frame]:
-    layout = Layout.read(root)
+def every_frame(root: Path, trust: Trust = LOOKED_AT, **kwargs: object) -> list[Frame]:
+    layout = read_capture(root, trust=trust)
     dataset = CaptureDataset(layout, items(layout), **kwargs)  # type: ignore[arg-type]
     return [dataset[i] for i in range(len(dataset))]
 
@@ -109,9 +109,10 @@ def test_soft_masks_mix_with_black_once(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path, cameras=1, frames=1)
     cv2.imwrite(str(root / "images/cam00/000000.png"), np.full((24, 32, 3), 100, np.uint8))
     cv2.imwrite(str(root / "masks/cam00/000000.png"), np.full((24, 32), 51, np.uint8))
-    assert torch.allclose(every_frame(root)[0].image, torch.tensor(20 / 255))
+    trust = Trust(frames=0)  # no pixel of such a mask counts as the person
+    assert torch.allclose(every_frame(root, trust)[0].image, torch.tensor(20 / 255))
     edit_json(root / "meta.json", lambda meta: meta.update(background="black"))
-    assert torch.allclose(every_frame(root)[0].image, torch.tensor(100 / 255))
+    assert torch.allclose(every_frame(root, trust)[0].image, torch.tensor(100 / 255))
 
 
 @pytest.mark.parametrize("lens", [(), LENS, RATIONAL, LENS[:4]], ids=["none", "5", "8", "4"])
@@ -618,7 +619,7 @@ BAD_INDEX = {
     ),
     "frame of a date": (
         write("images/cam00/20240131120000123456.png", b""),
-        "20240131120000123456.png has no frame number up to 1000000000 in its name",
+        "20240131120000123456.png is named by a date or time stamp .*frames 0, 1, 2 … alike",
     ),
     "theta shape": (poses(theta=np.zeros((4, 168))), r"'theta' must have shape \(any, any, 3\)"),
     "transl shape": (poses(transl=np.zeros((3, 3))), r"'transl' must have shape \(4, 3\)"),

@@ -13,7 +13,8 @@ from make import write_tiny_capture
 from gsgan.config import config_folder
 from gsgan.data.datamodule import GsganData
 from gsgan.data.layout import Layout
-from gsgan.data.protocol import MEASURED, Protocol
+from gsgan.data.measures import CHOICES, Measures
+from gsgan.data.protocol import Protocol
 from gsgan.data.splits import camera_name, make_splits, parse_frames, protocol_splits
 from gsgan.errors import ConfigError, DataError
 
@@ -102,13 +103,36 @@ def test_protocols_that_do_not_fit(
     ("changes", "message"),
     [
         ({"scale": 0}, "protocol.scale must be in"),
-        ({"background": "grey"}, "protocol.background must be black or white, got 'grey'"),
         ({"train_cameras": None}, "both null; name one of them"),
     ],
 )
 def test_protocols_that_cannot_be(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         replace(ONE, **changes)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("region", "mask", "must be full or body_box_cleared or body_box; got 'mask'"),
+        ("background", "grey", "must be black or white; got 'grey'"),
+        ("lpips_region", None, "must be full or mask_crop_512; got None"),
+        ("lpips_range", [0, 255], r"must be \[-1.0, 1.0\] or \[0.0, 1.0\]; got \(0, 255\)"),
+        ("ssim_range", True, "must be 1.0 or 2.0; got True"),
+        ("psnr_pooling", "split", "must be picture or channels"),
+        ("eight_bits", True, "must be none or rounded or cut; got True"),
+    ],
+)
+def test_measures_are_named_ones(name: str, value: object, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"protocol.measures.{name} {message}"):
+        Measures(**{name: value})
+
+
+def test_measures_take_what_yaml_gives() -> None:
+    assert Measures(lpips_range=[0, 1]).lpips_range == (0.0, 1.0)  # type: ignore[arg-type]
+    assert Measures(ssim_range=2).ssim_range == 2
+    assert not Measures().needs_body_box
+    assert all(getattr(Measures(), name) == choices[0] for name, choices in CHOICES.items())
 
 
 def test_frames_by_subject() -> None:
@@ -127,17 +151,14 @@ def test_camera_names_and_indices(layout: Layout) -> None:
 def test_departures_are_said() -> None:
     same = replace(ONE, scale=0.5)
     assert list(same.departures(lpips_net="vgg", scale=0.5)) == []
-    other = replace(ONE, background="white", lpips_range=(0, 1), region="box")
+    other = replace(ONE, measures=Measures(background="white", lpips_range=(0, 1)))
     said = list(other.departures(lpips_net="alex", scale=0.25))
-    assert said == [
-        "region is full picture, asked for: box",
-        "background is black, asked for: white",
-        "lpips range is -1 to 1, asked for: 0 to 1",
+    assert said == [  # what the measures ask for is done
         "LPIPS backbone is alex, asked for: vgg",
         "pictures are scored at scale 0.25, asked for: 1 (data.size)",
     ]
     assert "cut round the person" in next(ONE.departures(lpips_net="vgg", scale=None))
-    assert set(MEASURED) <= set(ONE.record())
+    assert set(CHOICES) == set(ONE.record()["measures"])
 
 
 def test_the_data_follows_the_protocol_and_records_it(root: Path) -> None:
@@ -205,13 +226,13 @@ def test_the_frames_of_zju_are_those_that_were_scored(compose) -> None:
 
 
 def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> None:
-    """metrics.json and the table name the protocol and what differs from it."""
+    """metrics.json and the table name the protocol, what it asked for, and what differs from it."""
     import io
 
     from rich.console import Console
 
-    from gsgan.evaluation import evaluate_run
     from gsgan.runs import build_avatar, build_data
+    from gsgan.scoring.run import Wanted, evaluate_run
 
     config = compose(
         "train",
@@ -230,16 +251,17 @@ def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> Non
         data=data,
         avatar=avatar,
         marks=[],
-        pictures=0,
+        wanted=Wanted(pictures=0),
     )
     written = json.loads((tmp_path / "metrics.json").read_text())
     assert written == json.loads(json.dumps(results))
     assert written["novel_view"]["full"]["images"] == 2
     record = written["novel_view"]["full"]["protocol"]
     assert (record["name"], record["train_cameras"]) == ("zju_gauhuman", [1])
-    assert any("region is full picture" in said for said in record["departures"])
+    assert record["measures"]["region"] == "body_box_cleared"
+    assert any("20 cm round the joints" in said for said in record["departures"])  # no mesh here
     assert any("LPIPS backbone is alex" in said for said in record["departures"])
     assert "protocol: zju_gauhuman (GauHuman's public code)" in text.getvalue()
-    assert "departs from zju_gauhuman: lpips range is -1 to 1" in (
+    assert "departs from zju_gauhuman: LPIPS backbone is alex" in (
         (tmp_path / "metrics.md").read_text()
     )

@@ -22,8 +22,9 @@ from gsgan.body.smpl_names import CIHP
 from gsgan.data.capture import CaptureDataset
 from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, natural_order
+from gsgan.data.formats.meeting import box_iou, mask_box
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
-from gsgan.data.formats.trust import Trust, box_iou, mask_box
+from gsgan.data.formats.trust import Trust
 from gsgan.data.formats.zju import ZjuReader, layout_of
 from gsgan.data.formats.zju_annots import camera_folders, frame_number, read_annots
 from gsgan.data.layout import Layout
@@ -779,6 +780,8 @@ def test_the_config_trains_with_segmentation_on_cihp_labels(
     assert avatar.segmentation is not None
     painting = avatar.paint(data.dataset("train")[0])
     assert painting.segmentation is not None
-    assert painting.segmentation.shape == (1, 20, 32, 32)
+    assert "class vote over 9 pictures" in avatar.effects.segmentation.why
+    assert painting.segmentation.shape == (1, avatar.segmentation.classes, 32, 32)
+    assert set(avatar.segmentation.map.names) < set(CIHP)
     assert painting.image is not None
     assert torch.isfinite(painting.image).all()

@@ -113,6 +113,10 @@ def test_perceptual_layer_weights_are_measured_then_frozen(monkeypatch, tmp_path
     loss(picture(0), picture(0) * 0)
     assert torch.equal(loss.layer_loss, frozen)
     assert int(loss.calls) == 2
+    resumed = Perceptual("random", warmup=2)  # the weights are in the checkpoint
+    resumed.load_state_dict(loss.state_dict())
+    assert torch.equal(resumed(picture(3), picture(4)), loss(picture(3), picture(4)))
+    assert torch.equal(resumed.layer_loss, frozen)
 
 
 def test_perceptual_asked_for_vgg_without_weights_says_where_to_put_them(monkeypatch, tmp_path):
@@ -146,7 +150,7 @@ def test_perceptual_reads_vgg_from_a_path(vgg_file):
 
 
 def test_lpips_reads_its_backbone_from_a_path(vgg_file):
-    from gsgan.metrics.image import lpips
+    from gsgan.metrics.lpips import lpips
 
     score, reason = lpips("vgg", str(vgg_file))
     assert reason == ""

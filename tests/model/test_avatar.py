@@ -7,6 +7,8 @@ import dataclasses
 import pytest
 import torch
 
+from gsgan.effects import Effect
+
 
 def test_paints_every_part(build):
     _, avatar, frame = build()
@@ -76,7 +78,7 @@ def test_what_is_off_builds_no_parameter(build, model, absent):
     painting = avatar.paint(frame)
     assert painting.segmentation is None
     assert painting.image is not None
-    assert avatar.effects["segmentation S"] == (False, "the model leaves it out")
+    assert avatar.effects.segmentation == Effect("off", "the model leaves it out")
 
 
 def test_data_without_body_pose_turns_segmentation_off(build, tmp_path):
@@ -85,7 +87,7 @@ def test_data_without_body_pose_turns_segmentation_off(build, tmp_path):
     root = write_tiny_capture(tmp_path / "bare", cameras=2, frames=4, size=(48, 48))
     _, avatar, frame = build(f"data.root={root}")
     assert avatar.segmentation is None
-    assert avatar.effects["segmentation S"] == (False, "the data has no body pose")
+    assert avatar.effects.segmentation == Effect("off", "the data has no body pose")
     assert torch.isfinite(avatar.paint(frame).image).all()
 
 
@@ -95,16 +97,18 @@ def test_segmentation_of_a_model_file(build, tiny, tmp_path):
 
     write_smpl(tmp_path / "smpl.pkl", vertices=500)
     data, _, frame = build()
-    bare = {"body": "smpl", "label_names": (), "n_labels": 0}
+    bare = {"body": "smpl", "label_names": (), "n_labels": 0, "has_labels": False}
     scene = dataclasses.replace(data.info, **bare, body_file=str(tmp_path / "smpl.pkl"))
     avatar = instantiate(tiny().model)(scene=scene)
-    assert avatar.effects["segmentation S"] == (True, "the data has a body pose")
+    assert avatar.effects.segmentation.on
+    assert "parts by the body's joints" in avatar.effects.segmentation.why
     pose = dataclasses.replace(frame.body, theta=torch.zeros(1, 24, 3))
     painting = avatar.paint(dataclasses.replace(frame, body=pose))
-    assert painting.segmentation.shape[1] == 13
+    assert painting.segmentation.shape[1] == 12  # no joint has hair
+    assert avatar.segmentation.map.absent == ("hair",)
     without = instantiate(tiny().model)(scene=dataclasses.replace(data.info, **bare))
     assert without.segmentation is None
-    assert "no model file" in without.effects["segmentation S"][1]
+    assert "no model file" in without.effects.segmentation.why
 
 
 def test_batches_are_independent(build):

@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 
 from gsgan.body import free_body
+from gsgan.body.smpl_names import CIHP, CLOTHES, SMPLX_JOINTS
+from gsgan.errors import ConfigError
+from gsgan.model.classes import IGNORE, class_map
 from gsgan.model.segmentation import Segmentation, segmentation_loss
 from gsgan.scene import BodyPose, Camera
 
@@ -85,3 +89,126 @@ def test_loss_is_finite_where_a_class_was_never_hit_and_ignores_255():
     assert torch.isfinite(S.grad).all()
     assert float(S.grad[0, 1, 0, 0]) < 0  # there is a way out of zero
     assert (S.grad[..., 1] == 0).all()
+
+
+# --- classes -------------------------------------------------------------------------------------
+
+
+def crossed(**options):
+    """(S, all-parts S, names of all parts) of the rest pose seen from the front."""
+    body = free_body()
+    all_parts, some = Segmentation(body, points=1500), Segmentation(body, points=1500, **options)
+    with torch.no_grad():
+        return some(rest_pose(), facing_camera()), all_parts(rest_pose(), facing_camera()), some
+
+
+def test_hands_only_are_two_classes_and_all_else_background_that_hides():
+    S, whole, segmentation = crossed(mode="hands")
+    names = free_body().label_names
+    assert segmentation.map.names == ("background", "left_hand", "right_hand")
+    hands = [names.index("left_hand"), names.index("right_hand")]
+    torch.testing.assert_close(S[:, 1:], whole[:, hands], atol=1e-5, rtol=0)  # as hidden as before
+    torch.testing.assert_close(S.sum(1), torch.ones(1, SIZE, SIZE), atol=1e-4, rtol=0)
+    trunk = whole[:, names.index("upper_clothes")] > 0.9
+    assert trunk.any()
+    assert (S[:, 0][trunk] > 0.9).all()  # the body is background
+
+
+def test_the_trunk_hides_a_hand_behind_it():
+    """Seen from behind, hands before the belly: they must not shine through."""
+    body, K, t = free_body(), facing_camera().K, facing_camera().t
+    segmentation = Segmentation(body, points=2500, mode="hands")
+    back = Camera(K, torch.tensor([[[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]]]), t, (SIZE, SIZE))
+    pose = rest_pose()
+    with torch.no_grad():
+        points = segmentation.points
+        hand = body.vertex_labels[points.chosen] == body.label_names.index("left_hand")
+        # The hand's vertices moved before the trunk, at the front (the body faces -y).
+        chest = body.landmarks[[11, 12, 23, 24]].mean(0)
+        shift = chest + torch.tensor([0.0, -0.25, 0.0]) - points.means[hand].mean(0)
+        points.means[hand] += shift
+        before = segmentation(pose, facing_camera())[0, 1]
+        behind = segmentation(pose, back)[0, 1]
+    assert float(before.sum()) > 4
+    assert float(behind.sum()) < 0.02 * float(before.sum())
+
+
+def test_background_learns_from_the_body_in_hands_mode():
+    """Opacities of the trunk get a gradient, finite, where it is in the way of a hand."""
+    segmentation = Segmentation(free_body(), points=2000, mode="hands")
+    S = segmentation(rest_pose(), facing_camera())
+    labels = segmentation.truth(torch.full((1, SIZE, SIZE), 7))
+    loss = segmentation_loss(S, labels)
+    loss.backward()
+    assert all(torch.isfinite(p.grad).all() for p in segmentation.parameters())
+    assert float(segmentation.logit_opacities.grad.abs().max()) > 0
+
+
+def test_classes_of_modes_and_labels_without_a_vertex():
+    names = ("background", "hat", "left_hand", "coat", "right_hand", "face")
+    vertices = torch.tensor([2, 4, 4, 3])
+    parts = class_map(names, vertices)
+    assert parts.names == ("background", "left_hand", "coat", "right_hand")
+    assert parts.absent == ("hat", "face")
+    assert parts.table == (0, 4, 1, 2, 3, 5)
+    table = parts.as_table()
+    assert (int(table[255]), int(table[6])) == (IGNORE, IGNORE)
+    hands = class_map(names, vertices, "hands", face=True)
+    assert hands.names == ("background", "left_hand", "right_hand", "face_neck")
+    assert hands.table == (0, 0, 1, 0, 2, 3)
+    assert (hands.absent, hands.truth_classes) == ((), 4)
+
+
+def test_finger_joints_belong_to_their_hand():
+    names = ("background", *SMPLX_JOINTS)
+    table = class_map(names, torch.tensor([1]), "hands").table
+    named = {name: table[i] for i, name in enumerate(names)}
+    assert (named["left_index2"], named["left_wrist"], named["right_thumb3"]) == (1, 1, 2)
+    assert (named["left_elbow"], named["head"], named["background"]) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("mode", "names", "words"),
+    [
+        ("hands", CIHP, "no left_hand and no right_hand"),
+        ("hand", CLOTHES, "mode must be body, hands, none; got 'hand'"),
+    ],
+)
+def test_modes_that_cannot_be_are_one_sentence(mode, names, words):
+    with pytest.raises(ConfigError, match=words):
+        class_map(names, torch.tensor([1]), mode)
+
+
+def test_a_class_without_a_vertex_is_not_learned_and_scored_as_missed():
+    body = free_body()
+    hat = body.label_names.index("hair")
+    bald = torch.where(body.vertex_labels == hat, 2, body.vertex_labels)
+    segmentation = Segmentation(body.voted(bald, body.label_names), points=1000)
+    assert segmentation.map.absent == ("hair",)
+    with torch.no_grad():
+        S = segmentation(rest_pose(), facing_camera())
+    labels = torch.full((1, SIZE, SIZE), hat)
+    labels[0, 0] = 0
+    truth = segmentation.truth(labels)
+    alone = truth.clone()
+    alone[truth == segmentation.classes] = IGNORE
+    torch.testing.assert_close(segmentation_loss(S, truth), segmentation_loss(S, alone))
+    scored, to_find = segmentation.to_score(S, labels)
+    assert scored.shape[1] == segmentation.map.truth_classes == len(body.label_names)
+    assert int(to_find.max()) == len(body.label_names) - 1
+    assert not (scored.argmax(1) == to_find)[:, 1:].any()
+
+
+def test_no_part_is_built_with_mode_none(build):
+    _, avatar, _ = build("model.segmentation.mode=none")
+    assert avatar.segmentation is None
+    assert not avatar.effects.segmentation.on
+
+
+def test_hands_mode_from_the_config_paints(build):
+    _, avatar, frame = build("model.segmentation.mode=hands", "model.segmentation.hands_face=true")
+    painting = avatar.paint(frame)
+    assert painting.segmentation.shape[1] == 4
+    assert avatar.segmentation.map.names[-1] == "face_neck"
+    assert avatar.generator.content.stem.in_channels == 5 + 4 + 8
+    assert torch.isfinite(painting.image).all()

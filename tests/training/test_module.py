@@ -8,7 +8,7 @@ import pytest
 import torch
 from lightning import Trainer
 
-from gsgan.errors import GsganError
+from gsgan.errors import ConfigError, GsganError
 from gsgan.runs import build_training, load_avatar
 from gsgan.training.averaging import MovingAverage
 from gsgan.training.module import AvatarTraining
@@ -132,7 +132,7 @@ def test_a_nan_gradient_skips_its_step_and_a_second_one_stops_the_run(make, caps
 
 
 def test_randomness_follows_from_seed_and_step(make):
-    module, _, data = make()
+    module, _, data = make("effects.random_background=on")
     frame = data.dataset("train")[0]
     first = module._background(frame), module._pose_noise(frame.skeleton)
     again = module._background(frame), module._pose_noise(frame.skeleton)
@@ -141,7 +141,7 @@ def test_randomness_follows_from_seed_and_step(make):
     assert not torch.equal(module._background(frame), first[0])
     module.step, module.seed = 0, 1
     assert not torch.equal(module._pose_noise(frame.skeleton), first[1])
-    module.step_one = replace(module.step_one, random_background=False)
+    module.random_background = False
     assert (module._background(frame) == 0).all()
 
 
@@ -306,6 +306,18 @@ def test_every_phase_runs_under_bf16_autocast(make):
     assert torch.equal(plain.features, mixed.features)
     assert mixed.image.dtype == torch.float32
     assert float((plain.image - mixed.image).abs().max().detach()) < 0.05
+
+
+def test_float16_is_refused_before_anything_trains(make, monkeypatch):
+    """Said to a trainer as a GPU's would have it: on a CPU Lightning takes bf16 in its place."""
+    module, _, _ = make()
+    for precision in ("16-mixed", "16-true"):
+        module.trainer = Trainer(accelerator="cpu", logger=False)
+        monkeypatch.setattr(Trainer, "precision", precision)
+        with pytest.raises(ConfigError, match=f"precision={precision}: .* choose bf16-mixed"):
+            module.on_fit_start()
+    monkeypatch.setattr(Trainer, "precision", "bf16-mixed")
+    module.on_fit_start()
 
 
 def test_wrong_gan_name_is_one_sentence(make):

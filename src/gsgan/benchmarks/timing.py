@@ -40,15 +40,15 @@ def interleaved(
         raise ValueError(f"interleaved: repeats must be at least 1, got {repeats}")
     samples: dict[Key, list[float]] = {}
     for name, action in actions.items():
-        first = _timed(action, device)
+        first = timed(action, device)
         slow = first > 1000 * patience  # or a disturbance: one more call tells
-        samples[name] = [min(first, _timed(action, device))] if slow else []
+        samples[name] = [min(first, timed(action, device))] if slow else []
         if tick:
             tick()
     quick = [name for name in actions if not samples[name]]
     for _ in range(repeats):
         for name in quick:
-            samples[name].append(_timed(actions[name], device))
+            samples[name].append(timed(actions[name], device))
             if tick:
                 tick()
     return samples
@@ -68,16 +68,18 @@ def slope(x: list[float], y: list[float]) -> float | None:
     return float((lx @ ly) / (lx @ lx))
 
 
-def _timed(action: Callable[[], object], device: torch.device | None) -> float:
-    _wait(device)
+def timed(action: Callable[[], object], device: torch.device | None) -> float:
+    """Milliseconds of one call, with everything the device was given done."""
+    wait(device)
     start = time.perf_counter()
     result = action()
-    _wait(device)
+    wait(device)
     took = 1000 * (time.perf_counter() - start)
     del result  # freed outside the clock
     return took
 
 
-def _wait(device: torch.device | None) -> None:
+def wait(device: torch.device | None) -> None:
+    """Until the device has done all it was given; at once on a CPU."""
     if device is not None and device.type == "cuda":
         torch.cuda.synchronize(device)

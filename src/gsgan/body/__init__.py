@@ -4,7 +4,13 @@ Models of the SMPL family are in `gsgan.body.smpl`.
 """
 
 from gsgan.body.free import Body, free_body, read_body
-from gsgan.body.lbs import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from gsgan.body.lbs import (
+    axis_angle_to_matrix,
+    blend_transforms,
+    check_weights,
+    forward_kinematics,
+    skin,
+)
 from gsgan.body.skinned import SkinnedBody
 from gsgan.body.source import open_body
 
@@ -13,6 +19,7 @@ __all__ = [
     "SkinnedBody",
     "axis_angle_to_matrix",
     "blend_transforms",
+    "check_weights",
     "forward_kinematics",
     "free_body",
     "open_body",

@@ -130,6 +130,27 @@ def _accumulate(
     )
 
 
+def check_weights(bone_weight: Tensor) -> None:
+    """Refuses weights that no blend can be made of; called where weights are stored, once.
+
+    Not in :func:`blend_transforms`: looking at values makes the host wait for the device, which is
+    too dear for every frame.
+
+    Args:
+        bone_weight: ``[V, n]``.
+
+    Raises:
+        ValueError: when a vertex has no weight at all, a negative one, or one that is not finite.
+    """
+    total = bone_weight.sum(-1)
+    good = (total > 0) & total.isfinite() & (bone_weight >= 0).all(-1)
+    if not bool(good.all()):
+        raise ValueError(
+            f"check_weights: bone_weight must be finite and non-negative with a positive sum for "
+            f"every vertex, got {int((~good).sum())} vertices without"
+        )
+
+
 def blend_transforms(
     transforms: Tensor, bone_index: Tensor, bone_weight: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -142,14 +163,13 @@ def blend_transforms(
     Args:
         transforms: ``[B, J, 4, 4]`` from :func:`forward_kinematics`.
         bone_index: ``[V, n]`` int64, bones of each vertex.
-        bone_weight: ``[V, n]`` non-negative.
+        bone_weight: ``[V, n]`` that passed :func:`check_weights`; values are not looked at here.
 
     Returns:
         ``A [B, V, 3, 3]`` and ``t [B, V, 3]``.
 
     Raises:
-        ValueError: when the two tables differ in shape, or a vertex has no weight at all or a
-            negative one.
+        ValueError: when the two tables differ in shape.
 
     Source: paper Sec. 3.4, ``x_o = (Σ_b w_b ΔB_b) x_c``.
     """
@@ -159,14 +179,7 @@ def blend_transforms(
             f"got {list(bone_index.shape)} and {list(bone_weight.shape)}"
         )
     weight = bone_weight.to(transforms.dtype)
-    total = weight.sum(-1, keepdim=True)
-    good = (total > 0) & (weight >= 0).all(-1, keepdim=True)
-    if not bool(good.all()):
-        raise ValueError(
-            f"blend_transforms: bone_weight must be non-negative with a positive sum for every "
-            f"vertex, got {int((~good).sum())} vertices without"
-        )
-    weight = weight / total
+    weight = weight / weight.sum(-1, keepdim=True)
     rows = transforms[:, :, :3].flatten(2)
     blended = rows.new_zeros(len(rows), len(bone_index), rows.shape[-1])
     for k in range(bone_index.shape[1]):  # one bone at a time: a quarter of the memory

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor
 
-from gsgan.body.lbs import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from gsgan.body.lbs import (
+    axis_angle_to_matrix,
+    blend_transforms,
+    check_weights,
+    forward_kinematics,
+    skin,
+)
 from gsgan.scene import BodyPose
 
 
@@ -29,6 +36,11 @@ class SkinnedBody:
         joint_names: names of the joints.
         vertex_labels: ``[V]`` int64 part of each vertex, see ``label_names``.
         label_names: name of each part, background first.
+        label_source: where a vertex's part comes from: "own", the body's definition; "guess", its
+            joint, where the true part is a matter of clothes; "vote", the data's label pictures.
+
+    Raises:
+        ValueError: when a vertex has no skinning weight, or one that is negative or not finite.
     """
 
     vertices: Tensor
@@ -40,6 +52,10 @@ class SkinnedBody:
     joint_names: tuple[str, ...]
     vertex_labels: Tensor
     label_names: tuple[str, ...]
+    label_source: Literal["own", "guess", "vote"] = "own"
+
+    def __post_init__(self) -> None:
+        check_weights(self.bone_weight)
 
     def to(self, *args: Any, **kwargs: Any) -> Self:
         """A copy on another device or with another float dtype; integers keep their dtype."""
@@ -51,6 +67,27 @@ class SkinnedBody:
                 floating = value.is_floating_point()
                 changes[field.name] = moved if floating else moved.to(value.dtype)
         return replace(self, **changes)
+
+    def shares_labels(self, names: Sequence[str]) -> bool:
+        """Whether pictures with these labels are labelled by the body's own parts."""
+        return self.label_source == "own" and tuple(names) == self.label_names[: len(names)]
+
+    def voted(self, vertex_labels: Tensor, label_names: Sequence[str]) -> Self:
+        """The body with the data's labels on its vertices ``[V]``.
+
+        Raises:
+            ValueError: when there is not one label a vertex, each of them named.
+        """
+        shape, least, most = vertex_labels.shape, vertex_labels.min(), vertex_labels.max()
+        if shape != self.vertex_labels.shape or least < 0 or most >= len(label_names):
+            raise ValueError(
+                f"{type(self).__name__}.voted: vertex_labels must be {len(self.vertex_labels)} "
+                f"numbers from 0 to {len(label_names) - 1}, got {list(vertex_labels.shape)} from "
+                f"{int(least)} to {int(most)}"
+            )
+        labels = vertex_labels.to(self.vertex_labels)
+        names = tuple(label_names)
+        return replace(self, vertex_labels=labels, label_names=names, label_source="vote")
 
     def transforms(self, pose: BodyPose) -> Tensor:
         """``[B, J, 4, 4]`` world transform of each bone relative to rest.

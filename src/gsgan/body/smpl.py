@@ -19,7 +19,13 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from gsgan.body.lbs import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from gsgan.body.lbs import (
+    axis_angle_to_matrix,
+    blend_transforms,
+    check_weights,
+    forward_kinematics,
+    skin,
+)
 from gsgan.body.skinned import SkinnedBody
 from gsgan.body.smpl_files import Floats, SmplArrays, read_arrays
 from gsgan.body.smpl_names import JOINT_NAMES, Parts, part_names, part_of_joint
@@ -41,6 +47,9 @@ class SkinnedModel:
         weights: ``[V, J]``, rows sum to 1.
         parents: parent of each joint, -1 for the root.
         faces: ``[F, 3]`` int64.
+
+    Raises:
+        ValueError: when a vertex has no skinning weight, or one that is negative or not finite.
     """
 
     kind: str
@@ -52,6 +61,9 @@ class SkinnedModel:
     weights: Tensor
     parents: tuple[int, ...]
     faces: Tensor
+
+    def __post_init__(self) -> None:
+        check_weights(self.weights)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
@@ -136,7 +148,9 @@ class SkinnedModel:
         """The shaped body as segmentation wants it: float32, one part a vertex, no blend shapes.
 
         A vertex belongs to the part of the joint with its largest skinning weight, of equal ones
-        to the first joint.
+        to the first joint. The paper blends the shaped rest vertices, ``x_o = (Σ_b w_b ΔB_b) x_c``:
+        pose blend shapes (bulges round bent joints) are left to the learned scales, and cost no
+        table of 3 x 9 (J - 1) numbers a vertex.
 
         Args:
             betas: ``[s]`` shape coefficients.
@@ -166,6 +180,7 @@ class SkinnedModel:
             joint_names=self.joint_names,
             vertex_labels=torch.tensor(own)[first],
             label_names=names,
+            label_source="own" if parts == "joints" else "guess",
         )
 
     def _transforms(

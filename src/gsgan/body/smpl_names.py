@@ -82,3 +82,15 @@ def part_of_joint(parts: Parts, joint: str) -> str:
     if limb in ("wrist", "hand") or limb[:-1] in _FINGERS:
         return f"{side}_hand" if parts == "clothes" else f"{side}_arm"
     return "upper_clothes"
+
+
+def group_of_part(name: str) -> str:
+    """ "left_hand", "right_hand" or "face_neck" when a part (or what hangs on a joint) is one.
+
+    The empty string for any other part.
+    """
+    if name == "face":
+        return "face_neck"
+    joint = name in SMPL_JOINTS or name in SMPLX_JOINTS
+    group = part_of_joint("clothes", name) if joint else name
+    return group if group in ("left_hand", "right_hand", "face_neck") else ""

@@ -18,11 +18,12 @@ def open_body(
     betas: Sequence[float] = (),
     label_names: Sequence[str] = (),
 ) -> SkinnedBody | None:
-    """The body with part labels that fit the pictures', or None when there is no mesh of it here.
+    """The body with part labels of its own, or None when there is no mesh of it here.
 
     Convention: arguments are plain values, as `SceneInfo` and checkpoints hold them. A model file
     gets the set of parts that the pictures' labels name (the free body's, CIHP's, or one part a
-    joint); the free body's where they name none.
+    joint); the free body's where they name none of these. Clothes on a model file are a guess, and
+    the names need not be the pictures' at all: see `SkinnedBody.shares_labels`.
 
     Args:
         kind: "free", "smpl", "smplx", or what else the data calls it.
@@ -31,21 +32,13 @@ def open_body(
         label_names: the parts in the data's label pictures, background first; empty when unknown.
 
     Raises:
-        DataError: when the file cannot be read or is of another body, or when the labels name
-            parts that the body does not have in their order.
+        DataError: when the file cannot be read or is of another body.
     """
     if kind == "free":
-        body: SkinnedBody = free_body()
-    elif kind is None or file is None:
+        return free_body()
+    if kind is None or file is None:
         return None
-    else:
-        body = _from_file(kind, file, betas, tuple(label_names))
-    if tuple(label_names) != body.label_names[: len(label_names)]:
-        raise DataError(
-            f"labels: the pictures' parts are {', '.join(label_names)}, the {kind} body's "
-            f"{', '.join(body.label_names)}; map them to these ids, or choose model=wo_seg"
-        )
-    return body
+    return _from_file(kind, file, betas, tuple(label_names))
 
 
 def _from_file(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from gsgan.arrays import expect_array
 from gsgan.capture.rig import Float
-from gsgan.data.files import last_number, read_arrays, read_json
+from gsgan.data.files import frame_files, read_arrays, read_json
 from gsgan.data.joints import ALL, BODY, FROM_HANDS, HAND, LEFT, RIGHT, SETS
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.errors import DataError
@@ -91,16 +91,10 @@ def _read_npz(path: Path) -> Detections:
 
 
 def _read_folder(path: Path) -> Detections:
-    files: dict[int, Path] = {}
-    for file in sorted(path.glob("*.json")):
-        stem = file.stem.removesuffix("_keypoints")
-        number = last_number(stem)
-        if number is None or number in files:
-            raise DataError(f"{file}: expected one JSON file a frame, with its number in the name")
-        files[number] = file
+    files = frame_files(path.parent, path.name, (".json",))
     if not files:
         raise DataError(f"{path} holds no JSON files; expected one a frame")
-    frames = [_read_frame(file) for file in files.values()]
+    frames = [_read_frame(path.parent / file) for file in files.values()]
     return Detections(
         frame_id=np.array(list(files), np.int64),
         px=np.stack([px for px, _, _ in frames]),

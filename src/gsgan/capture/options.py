@@ -13,6 +13,7 @@ from gsgan.capture.mediapipe import MediaPipe
 from gsgan.capture.overlays import Overlays
 from gsgan.capture.pictures import PictureFiles
 from gsgan.capture.solve import Settings
+from gsgan.data.files import LARGEST_FRAME
 from gsgan.errors import ConfigError
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -77,8 +78,11 @@ class Options:
             if given is not None and not isinstance(given, Mapping):
                 raise ConfigError(f"{name} must be {{video name: value}}, got {given!r}")
         for camera, frames in (self.offsets or {}).items():
-            if not isinstance(frames, int):
-                raise ConfigError(f"offsets: {camera} must have whole frames, got {frames!r}")
+            if not isinstance(frames, int) or abs(frames) > LARGEST_FRAME:
+                raise ConfigError(
+                    f"offsets: {camera} must have whole frames up to {LARGEST_FRAME}, got "
+                    f"{frames!r}"
+                )
 
     def offset(self, camera: str) -> int:
         """Frames to add to a camera's own numbers."""

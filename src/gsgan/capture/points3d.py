@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.capture.rig import Float, known
-from gsgan.data.files import last_number
+from gsgan.data.files import frame_files
 from gsgan.data.joints import BODY, SETS
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.errors import DataError
@@ -123,12 +123,11 @@ def _joint(name: str) -> int | None:
 
 
 def _read_folder(path: Path) -> Points3D:
-    files = {last_number(file.stem): file for file in sorted(path.glob("*.json"))}
-    numbered = {number: file for number, file in files.items() if number is not None}
-    if not numbered:
-        raise DataError(f"{path} holds no JSON files with a frame number in their name")
-    frames = [_read_people(file) for file in numbered.values()]
-    ids = np.array(list(numbered), np.int64)
+    files = dict(sorted(frame_files(path.parent, path.name, (".json",)).items()))
+    if not files:
+        raise DataError(f"{path} holds no JSON files; expected one a frame, numbered")
+    frames = [_read_people(path.parent / file) for file in files.values()]
+    ids = np.array(list(files), np.int64)
     both = np.stack(frames)
     return Points3D(ids, both[..., :3], both[..., 3])
 

@@ -83,7 +83,7 @@ def make_report(root: Path, outcome: Outcome, options: Options) -> Report:
             tables=(_stage_table(outcome, options), _camera_table(outcome)),
             findings=findings,
         ),
-        Section("Overlays", (LEGEND,), figures=_figures(root, outcome, options)),
+        Section("Overlays", aside=(LEGEND,), figures=_figures(root, outcome, options)),
         Section("Joints", tables=(_joint_table(outcome),)),
         Section("Notes", outcome.inputs.notes + _count_notes(outcome)),
     )

@@ -77,7 +77,12 @@ def prepare(options: Options, console: Console) -> Path:
     work.forget_others()
     if not options.keep_work:
         work.remove()
-    console.print(f"{out} is ready: python -m gsgan.train data=capture data.root={out}")
+    told = (
+        f"{out} is ready; look at {out / 'report.html'}, then",
+        f"python -m gsgan.check data=capture data.root={out}",
+        f"python -m gsgan.train data=capture data.root={out}",
+    )
+    console.print("\n".join(told), markup=False, highlight=False, soft_wrap=True)
     return out
 
 
@@ -105,6 +110,12 @@ def _write_pictures(
     """Pictures of every frame that has a skeleton; the frames written, by camera."""
     posed = known(solved.solution.p[:, :BODY]).any(1)
     frames = set(solved.frames[posed].tolist())
+    if not frames:
+        raise DataError(
+            f"{options.landmarks3d or options.landmarks}: no body joint of any frame came out in "
+            "3D; expected landmarks that two cameras see at the same frame number, not NaN and "
+            "with confidence above 0"
+        )
     names = [camera.name for camera in cameras]
     lock = threading.Lock()
     with Bars("writing pictures", names, len(frames)) as bars:

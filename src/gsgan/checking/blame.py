@@ -81,7 +81,8 @@ def judge_cameras(
             found.append(_out_of_step(score))
         elif score.name not in told:
             found += _unexplained(score, scores, limits)
-    return found
+    blamed = told | misfits(scores, limits)
+    return found + judge_small(scores, limits, blamed)
 
 
 def _seen(score: CameraScore, scores: Sequence[CameraScore]) -> str:
@@ -182,4 +183,45 @@ def _out_of_step(score: CameraScore) -> Finding:
         f"camera {score.name}: its pictures fit the skeleton {abs(score.lag)} frame(s) {when} "
         f"better (joints {100 * score.lag_outside:.1f} cm outside the masks instead of "
         f"{100 * score.outside:.1f}); its clock or its numbering is off: add {score.lag:+d}",
+    )  # fmt: skip
+
+
+def judge_small(
+    scores: Sequence[CameraScore], limits: Limits, told: Iterable[str] = ()
+) -> list[Finding]:
+    """Calibrations that are nearly right: joints lie just outside the masks.
+
+    Args:
+        scores: of all cameras.
+        limits: from where on something is wrong.
+        told: cameras of which a plainer reason was told already.
+    """
+    told = set(told)
+    left = {s.name: s for s in scores if np.isfinite(s.outside) and s.name not in told}
+    if left and np.median([s.outside for s in left.values()]) > limits.outside_all:
+        return [_all_outside(float(np.median([s.outside for s in left.values()])))]
+    found = list[Finding]()
+    for name, score in left.items():
+        rest = [s.outside for other, s in left.items() if other != name]
+        others = float(np.median(rest)) if rest else np.inf
+        if score.outside > max(limits.outside, limits.outside_ratio * others):
+            found.append(_just_outside(score, others))
+    return found
+
+
+def _all_outside(metres: float) -> Finding:
+    return Finding(
+        "warning", "calibration",
+        f"in most cameras joints lie {100 * metres:.1f} cm outside the masks on the mean (good "
+        "captures: 0.1): a focal length or unit that is a little off in all of them, masks that "
+        "are too tight, or noisy landmarks",
+    )  # fmt: skip
+
+
+def _just_outside(score: CameraScore, others: float) -> Finding:
+    return Finding(
+        "warning", "calibration",
+        f"camera {score.name}: joints lie {100 * score.outside:.1f} cm outside its masks on the "
+        f"mean, {100 * others:.1f} in the other cameras; its R, t or focal length is off by a "
+        "little (some degrees, centimetres or per cent), or its masks are worse",
     )  # fmt: skip

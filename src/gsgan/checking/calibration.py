@@ -168,8 +168,11 @@ def _lag(looks: Sequence[Look], limits: Limits) -> tuple[int, float, float]:
     """The best lag, and the mean metres outside without and with it.
 
     A lag is held against none on the looks that know both: the first frames have none before them.
+    Empty masks say nothing.
     """
-    table = np.array([look.lagged for look in looks])
+    table = np.array([look.lagged for look in looks if look.mask.any()])
+    if len(table) == 0:
+        return 0, np.nan, np.nan
     reach = table.shape[1] // 2
     best, left = 0, known_mean(table[:, reach].tolist())
     outside, most = left, 0.0

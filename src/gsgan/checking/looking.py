@@ -17,12 +17,11 @@ from gsgan.checking.silhouette import (
     Placement,
     body_silhouette,
     box,
-    joint_distance,
-    mask_distance,
     overlap,
     placement,
 )
 from gsgan.checking.subject import Subject, evenly
+from gsgan.data.agreement import joint_distance, mask_distance
 from gsgan.data.capture import CaptureDataset
 from gsgan.data.crop import project
 from gsgan.data.splits import Item

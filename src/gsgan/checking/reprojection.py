@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from gsgan.arrays import expect_array
@@ -109,9 +108,7 @@ def _detected(subject: Subject, camera: CameraEntry, path: Path) -> Float:
 def _projected(camera: CameraEntry, p: Float, undistorted: bool) -> Float:
     if undistorted or not camera.distorted:
         return project(camera, p)[0]
-    turn = cv2.Rodrigues(camera.R)[0]
-    flat = cv2.projectPoints(p.reshape(-1, 3), turn, camera.t, camera.K, camera.dist)[0]
-    return np.asarray(flat, np.float64).reshape(*p.shape[:-1], 2)
+    return camera.stored_pixels(p.reshape(-1, 3)).reshape(*p.shape[:-1], 2)
 
 
 def try_reprojection(subject: Subject) -> tuple[Reprojection | None, list[Finding]]:

@@ -24,6 +24,7 @@ from gsgan.checking.settings import Limits, Sampling
 from gsgan.checking.subject import subject_of
 from gsgan.checking.suspects import suspicious
 from gsgan.console import make_console
+from gsgan.effects import EffectSettings
 from gsgan.errors import ConfigError, DataError
 from gsgan.files import write_atomically
 
@@ -34,7 +35,11 @@ Progress = Callable[[Iterable[Look | Broken], int], Iterable[Look | Broken]]
 
 
 def check_data(
-    data: GsganData, sampling: Sampling, limits: Limits, progress: Progress | None = None
+    data: GsganData,
+    sampling: Sampling,
+    limits: Limits,
+    progress: Progress | None = None,
+    effects: EffectSettings | None = None,
 ) -> Report:
     """Checks a dataset.
 
@@ -43,6 +48,7 @@ def check_data(
         sampling: how much is looked at.
         limits: from where on something is wrong.
         progress: wraps the results of the pass over the pictures, given their number.
+        effects: what training would be asked of the effects; None: the defaults.
 
     Returns:
         The report; a dataset that cannot be read gives one with the reader's sentence.
@@ -57,7 +63,8 @@ def check_data(
     items = chosen_items(subject, sampling.pictures)
     items = tuple(dict.fromkeys((*items, *suspicious(subject, sampling))))
     looks, broken = look_at(subject, items, limits, sampling, progress)
-    return sections(data, subject, looks, broken, sampling, limits)
+    asked = effects or EffectSettings()
+    return sections(data, subject, looks, broken, sampling, limits, asked)
 
 
 def run_check(config: DictConfig) -> Report:
@@ -103,7 +110,7 @@ def _checked(config: DictConfig, sampling: Sampling, limits: Limits, progress: P
         if isinstance(error.__cause__, DataError):
             return failed(config.data.get("root"), error.__cause__)
         raise
-    return check_data(data, sampling, limits, progress)
+    return check_data(data, sampling, limits, progress, instantiate(config.effects))
 
 
 def plain(report: Report) -> dict[str, Any]:

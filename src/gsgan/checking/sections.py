@@ -18,6 +18,8 @@ from gsgan.checking.looking import Broken, Look
 from gsgan.checking.reprojection import Reprojection, judge_reprojection, try_reprojection
 from gsgan.checking.settings import Limits, Sampling
 from gsgan.checking.subject import Subject, evenly
+from gsgan.effects import EffectSettings, decide
+from gsgan.effects.table import HEADERS, rows
 from gsgan.errors import DataError
 
 if TYPE_CHECKING:
@@ -75,6 +77,7 @@ def sections(
     broken: Sequence[Broken],
     sampling: Sampling,
     limits: Limits,
+    effects: EffectSettings,
 ) -> Report:
     """Asks every question of what was read and decoded."""
     cameras = score_cameras(subject, looks, limits, sampling)
@@ -107,6 +110,7 @@ def sections(
         _overlays(m),
         _frames(m),
         _colours(m),
+        _effects(data, effects),
         _limits(m),
     )
     return Report(str(subject.layout.root), parts, _numbers(m))
@@ -247,6 +251,18 @@ def _colours(m: Measured) -> Section:
         tables=(colours.colour_table(m.colours, m.limits),),
         findings=tuple(colours.judge_colours(m.colours, m.limits, m.wrong)),
     )
+
+
+def _effects(data: GsganData, settings: EffectSettings) -> Section:
+    """What training would turn on, by the rules it goes by."""
+    title = "Effects that the scene calls for"
+    try:
+        decided = decide(data.info, settings)
+    except DataError as error:  # named among the findings
+        return Section(title, text=(f"Not decided: {error}",))
+    aside = "What is off is neither built nor computed; effects.<name>= forces one (docs/effects.md)."
+    table = Table(HEADERS[:3], tuple(row[:3] for row in rows(decided)))
+    return Section(title, tables=(table,), aside=(aside,))
 
 
 def _limits(m: Measured) -> Section:

@@ -71,6 +71,9 @@ class Limits:
         shift: metres by which a camera's masks may lie beside its skeleton.
         lag_gain, lag_metres, lag_left: share and amount of the joints' mean distance from the mask
             that a shift in time must remove, and metres that it may leave.
+        outside, outside_ratio: metres that a camera's joints may lie outside its masks on the mean,
+            and times the other cameras' median; both must be passed.
+        outside_all: the same metres for all cameras together.
         hull_warning: share of a mask that the visual hull must fill, per camera.
         hull_gain: gain in that share, when one camera is left out, that names it.
         camera_distance: a camera this many times nearer or farther than the median is in doubt.
@@ -111,6 +114,9 @@ class Limits:
     lag_gain: float = 0.3
     lag_metres: float = 0.002
     lag_left: float = 0.01
+    outside: float = 0.004
+    outside_ratio: float = 3.0
+    outside_all: float = 0.008
     hull_warning: float = 0.9
     hull_gain: float = 0.1
     camera_distance: float = 4.0

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsgan.data.agreement import FAR_PIXELS
 from gsgan.data.crop import NEAR
 from gsgan.skeleton.template import SkeletonTemplate
 
@@ -19,7 +20,6 @@ Bool = NDArray[np.bool_]
 
 HEAD_RADIUS = 0.12  # metres round the middle of the face: half of a head's height
 BOX_TAIL = 0.5  # per cent of a mask's pixels left out on each side of its box: specks
-FAR_PIXELS = 1e4  # drawing coordinates are held within this: OpenCV's are 16 bit when shifted
 
 
 @dataclass(frozen=True)
@@ -50,37 +50,6 @@ def placement(K: Float, scaled_K: Float, size: tuple[int, int]) -> Placement:
     """How a crop and resize moved pixels, from the intrinsics ``[3, 3]`` before and after it."""
     moved = scaled_K @ np.linalg.inv(K)
     return Placement(np.array([moved[0, 0], moved[1, 1]]), moved[:2, 2], size)
-
-
-def mask_distance(mask: Bool) -> Float:
-    """``[H, W]`` pixels from every pixel to the mask; 0 in it, infinite when it is empty."""
-    if not mask.any():
-        return np.full(mask.shape, np.inf)
-    outside = (~mask).astype(np.uint8)
-    return cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(np.float64)
-
-
-def joint_distance(
-    distance: Float, pixels: Float, depth: Float, judged: Bool, focal: float
-) -> Float:
-    """``[J]`` metres by which joints lie outside the mask; NaN where they cannot be judged.
-
-    Args:
-        distance: ``[H, W]`` of `mask_distance`.
-        pixels: ``[J, 2]`` of the joints in that picture.
-        depth: ``[J]`` metres.
-        judged: ``[J]`` which joints were seen; those behind the camera or off the picture are left
-            out as well.
-        focal: pixels, of that picture.
-    """
-    known = np.where(np.isfinite(pixels), pixels, -1.0).clip(-1, FAR_PIXELS)
-    column, row = np.floor(known.T).astype(int)
-    height, width = distance.shape
-    judged = judged & (depth > NEAR) & (column >= 0) & (column < width) & (row >= 0)
-    judged &= row < height
-    metres = np.full(len(pixels), np.nan)
-    metres[judged] = distance[row[judged], column[judged]] * depth[judged] / focal
-    return metres
 
 
 def body_silhouette(

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
+from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Layout
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
 
@@ -66,9 +67,15 @@ class Subject:
 def subject_of(data: GsganData) -> Subject:
     """The capture behind a data module, read if need be.
 
+    The reader's own look at masks and joints is left out: the check looks closer, and says more.
+
     Raises:
         DataError: when it cannot be read.
     """
+    trust = getattr(data.reader, "trust", None)
+    if isinstance(trust, Trust):
+        reader: Any = data.reader  # one of the dataclasses of gsgan.data.formats
+        data.reader = replace(reader, trust=replace(trust, frames=0))
     layout = data.layout
     frames = np.array(layout.frames, np.int64)
     axis = layout.meta.up_axis

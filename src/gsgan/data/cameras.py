@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,6 +46,18 @@ class CameraEntry:
     def distorted(self) -> bool:
         """Whether any distortion coefficient is not zero."""
         return bool(np.any(self.dist != 0))
+
+    def stored_pixels(self, points: Float) -> Float:
+        """``[N, 2]`` where world points ``[N, 3]`` lie in the stored, distorted picture.
+
+        Skew counts, which OpenCV's own projection drops. Points behind the camera get meaningless
+        pixels: mask them by depth.
+        """
+        if len(points) == 0:
+            return np.zeros((0, 2))
+        turn = cv2.Rodrigues(self.R)[0]
+        bent = cv2.projectPoints(points, turn, self.t, np.eye(3), self.dist)[0][:, 0]
+        return np.asarray(bent @ self.K[:2, :2].T + self.K[:2, 2], np.float64)
 
 
 def make_camera(

@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -24,6 +25,7 @@ from gsgan.errors import ConfigError, DataError
 from gsgan.scene import BodyPose, Camera, Frame
 
 Bytes = NDArray[np.uint8]
+Lens = Literal["undistort", "ignore", "raw"]
 
 
 @dataclass(frozen=True)
@@ -85,8 +87,8 @@ class PictureCache:
 class CaptureDataset(Dataset[Frame]):
     """Items of a capture as `Frame` with batch size 1; collate them with `gsgan.scene.cat`.
 
-    Images are RGB in [0, 1] on black, undistorted with K kept (``camera.dist`` is None), cut to the
-    window and scaled; K follows. The window comes from the skeleton and camera alone. Labels keep
+    Images are RGB in [0, 1] on black, cut to the window and scaled; K follows. As a rule they are
+    undistorted with K kept, and ``camera.dist`` is None. The window comes from the skeleton and camera alone. Labels keep
     255 as "ignore".
 
     Args:
@@ -94,7 +96,10 @@ class CaptureDataset(Dataset[Frame]):
         items: (camera, frame) pairs, as in `Splits.items`.
         size: side of the square pictures in pixels, or None for the window as it is.
         crop: None for the full picture, padded to a square when a size is given.
-        cache: shared between datasets of one layout, size and crop; None decodes every time.
+        cache: shared between datasets of one layout, size and crop, without an item in two of them;
+            None decodes every time.
+        lens: ``undistort``; ``ignore`` takes pictures as a pinhole's; ``raw`` leaves them as taken
+            and says so in ``camera.dist`` (five coefficients).
 
     Raises:
         ConfigError: when the size is not a positive number.
@@ -107,6 +112,7 @@ class CaptureDataset(Dataset[Frame]):
         size: int | None = None,
         crop: PersonCrop | None = None,
         cache: PictureCache | None = None,
+        lens: Lens = "undistort",
     ) -> None:
         if size is not None and (not isinstance(size, int) or size < 1):
             raise ConfigError(f"data.size must be a whole number of pixels above 0, got {size!r}")
@@ -114,6 +120,7 @@ class CaptureDataset(Dataset[Frame]):
         self.items = tuple(items)
         self.size = size
         self.crop = crop
+        self.lens = lens
         self.cache = cache or PictureCache(0)
         self._indices = {name: i for i, name in enumerate(layout.camera_names)}
 
@@ -146,11 +153,12 @@ class CaptureDataset(Dataset[Frame]):
         )
 
     def window(self, item: Item) -> Window:
-        """Which part of the undistorted picture an item shows."""
+        """Which part of the (undistorted) picture an item shows."""
         camera = self.layout.cameras[item[0]]
         if self.crop is not None:
             joints = self.layout.landmarks.p[item[1]]
-            return self.crop.window(camera, joints, self.layout.landmarks.visibility[item[1]] > 0)
+            seen = self.layout.landmarks.visibility[item[1]] > 0
+            return self.crop.window(camera, joints, seen, camera.dist if self._raw(camera) else None)
         if self.size is not None:
             return cropping.square_window(camera.size)
         return Window(0, 0, camera.size)
@@ -158,17 +166,22 @@ class CaptureDataset(Dataset[Frame]):
     def camera(self, item: Item) -> Camera:
         """The camera of the item's picture: window and scale are in its K."""
         window = self.window(item)
-        camera = _camera(self.layout.cameras[item[0]])
+        entry = self.layout.cameras[item[0]]
+        camera = _camera(entry, self._raw(entry))
         camera = camera.crop(window.top, window.left, window.size)
         if self.size is not None:
             camera = camera.resize((self.size, self.size))
         return camera.to(torch.float32)
 
+    def _raw(self, camera: CameraEntry) -> bool:
+        """Whether the camera's pictures keep their distortion, and say so."""
+        return self.lens == "raw" and camera.distorted
+
     def _load(self, item: Item) -> Picture:
         camera, window = self.layout.cameras[item[0]], self.window(item)
         rules = self.layout.pixels
         mapping = None
-        if camera.distorted:
+        if camera.distorted and self.lens == "undistort":
             mapping = cropping.undistort_map(camera.K, camera.dist, window)
         size = window.size if self.size is None else (self.size, self.size)
 
@@ -221,9 +234,9 @@ class CaptureDataset(Dataset[Frame]):
         return BodyPose(theta=_float(poses.theta[frame]), transl=_float(poses.transl[frame]))
 
 
-def _camera(entry: CameraEntry) -> Camera:
+def _camera(entry: CameraEntry, raw: bool) -> Camera:
     K, R, t = (torch.from_numpy(a)[None] for a in (entry.K, entry.R, entry.t))
-    return Camera(K, R, t, entry.size)
+    return Camera(K, R, t, entry.size, torch.from_numpy(entry.dist[None, :5]) if raw else None)
 
 
 def _unit(pixels: Bytes) -> Tensor:

@@ -88,7 +88,9 @@ class PersonCrop:
         if not self.margin > 0:
             raise ConfigError(f"data.crop.margin must be above 0 metres, got {self.margin}")
 
-    def window(self, view: View, joints: Float, usable: NDArray[np.bool_]) -> Window:
+    def window(
+        self, view: View, joints: Float, usable: NDArray[np.bool_], dist: Float | None = None
+    ) -> Window:
         """The window round the usable joints, cut to the picture, then made square.
 
         A joint far outside the picture shows nothing, so the box does not follow it; the square
@@ -98,9 +100,12 @@ class PersonCrop:
             view: the camera.
             joints: ``[J, 3]`` metres, world frame, finite.
             usable: ``[J]`` which of them to go by; joints behind the camera are left out as well.
+            dist: ``[8]`` the lens, where the picture keeps its distortion; None: a pinhole's.
         """
         height, width = view.size
         pixels, depth = project(view, joints)
+        if dist is not None:
+            pixels = _through_lens(view.K, dist, pixels)
         taken = usable & (depth > NEAR)
         if not taken.any():
             return square_window(view.size)
@@ -169,15 +174,28 @@ def _opencv_map(K: Float, dist: Float, window: Window) -> tuple[Pixels, Pixels]:
 
 
 def _skewed_map(K: Float, dist: Float, window: Window) -> tuple[Pixels, Pixels]:
-    x, y = _rays(K, window)
+    x_d, y_d = _bent(dist, *_rays(K, window))
+    u = K[0, 0] * x_d + K[0, 1] * y_d + K[0, 2] - 0.5
+    v = K[1, 1] * y_d + K[1, 2] - 0.5
+    return u.astype(np.float32), v.astype(np.float32)
+
+
+def _bent(dist: Float, x: Float, y: Float) -> tuple[Float, Float]:
+    """Where the lens shows x/z and y/z."""
     p1, p2 = dist[2:4]
     r2 = x * x + y * y
     factor = _radial(dist, r2)
     x_d = x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     y_d = y * factor + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    u = K[0, 0] * x_d + K[0, 1] * y_d + K[0, 2] - 0.5
-    v = K[1, 1] * y_d + K[1, 2] - 0.5
-    return u.astype(np.float32), v.astype(np.float32)
+    return x_d, y_d
+
+
+def _through_lens(K: Float, dist: Float, pixels: Float) -> Float:
+    """``[M, 2]`` where the lens shows what a pinhole shows at pixels ``[M, 2]``."""
+    y = (pixels[:, 1] - K[1, 2]) / K[1, 1]
+    x = (pixels[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    x, y = _bent(dist, x, y)
+    return np.stack([K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]], axis=-1)
 
 
 def _rays(K: Float, window: Window) -> tuple[Float, Float]:

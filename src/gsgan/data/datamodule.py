@@ -17,9 +17,9 @@ import torch
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, Subset
 
-from gsgan.data.capture import CaptureDataset, PictureCache
+from gsgan.data.capture import CaptureDataset, Lens, PictureCache
 from gsgan.data.crop import PersonCrop
-from gsgan.data.formats.capture import read_capture
+from gsgan.data.formats.capture import CaptureReader
 from gsgan.data.layout import Checks, Layout
 from gsgan.data.protocol import Protocol
 from gsgan.data.sampler import StepSampler, pass_order
@@ -52,7 +52,7 @@ class GsganData(LightningDataModule):
 
     Args:
         root: the folder; or None when ``source`` makes it.
-        reader: of the dataset's format (`gsgan.data.formats`).
+        reader: of the dataset's format (`gsgan.data.formats`); None is the bring-your-own layout.
         smpl: the user's SMPL or SMPL-X model file, for datasets whose poses need one.
         protocol: who trains and who tests, as a publication has it; None leaves it to the data
             and the keys below.
@@ -68,6 +68,8 @@ class GsganData(LightningDataModule):
         cache_mb: bound on decoded pictures kept in memory, all loading processes together.
         info_samples: pictures a camera from which the mean foreground colour is taken.
         min_joints: a frame with fewer usable joints is dropped.
+        distortion: ``auto`` and ``undistort`` undistort pictures on reading; ``off`` takes them as a
+            pinhole's; ``project`` undistorts those that train and leaves the others as taken.
         wanted: what the root should be, for the message when it is not set.
 
     Raises:
@@ -78,7 +80,7 @@ class GsganData(LightningDataModule):
         self,
         root: str | None = None,
         source: Callable[[], Path] | None = None,
-        reader: Reader = read_capture,
+        reader: Reader | None = None,
         smpl: str | None = None,
         protocol: Protocol | None = None,
         size: int | None = None,
@@ -96,6 +98,7 @@ class GsganData(LightningDataModule):
         cache_mb: float = 1024,
         info_samples: int = 8,
         min_joints: int = Checks.min_joints,
+        distortion: str = "auto",
         wanted: str = "a capture in the bring-your-own layout",
     ) -> None:
         super().__init__()
@@ -103,7 +106,7 @@ class GsganData(LightningDataModule):
             raise ConfigError(_root_not_set(wanted))
         self.root = root
         self.source = source
-        self.reader = reader
+        self.reader = CaptureReader() if reader is None else reader
         self.smpl = smpl
         self.protocol = protocol
         self.size = size
@@ -125,6 +128,7 @@ class GsganData(LightningDataModule):
         self.cache_mb = _at_least("cache_mb", cache_mb, 0)
         self.info_samples = _at_least("info_samples", info_samples, 1)
         self.checks = replace(Checks(), min_joints=_at_least("min_joints", min_joints, 1))
+        self.lenses = _lenses(distortion)
         self._datasets: dict[str, CaptureDataset] | None = None
         self._layout: Layout | None = None
         self._splits: Splits | None = None
@@ -150,7 +154,9 @@ class GsganData(LightningDataModule):
         limit = int(self.cache_mb * 2**20) // (2 * self.workers + 1)
         cache = PictureCache(limit)
         self._datasets = {
-            name: CaptureDataset(layout, splits.items[name], self.size, self.crop, cache)
+            name: CaptureDataset(
+                layout, splits.items[name], self.size, self.crop, cache, self.lenses[name]
+            )
             for name in SPLITS
         }
         self._check_one_size()
@@ -219,7 +225,8 @@ class GsganData(LightningDataModule):
         """What the training split tells about the scene, found on first use."""
         if self._info is None:
             train = self.dataset("train")
-            self._info = scene_info(self.layout, self.splits, train, self.info_samples)
+            held_out = [self.dataset(name) for name in SPLITS[1:]]
+            self._info = scene_info(self.layout, self.splits, train, self.info_samples, held_out)
         return self._info
 
     @property
@@ -238,6 +245,11 @@ class GsganData(LightningDataModule):
         self.setup()
         assert self._datasets is not None
         return self._datasets[split]
+
+    def labelled(self, split: str) -> Subset[Frame]:
+        """The items of a split whose pictures have part labels; perhaps none."""
+        dataset, labels = self.dataset(split), self.layout.label_path
+        return Subset(dataset, [i for i, item in enumerate(dataset.items) if labels(*item)])
 
     def train_dataloader(self) -> DataLoader[Frame]:
         """Batches of `Frame` in `StepSampler` order."""
@@ -306,3 +318,20 @@ def _at_least(name: str, value: Any, least: int) -> Any:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= least:
         raise ConfigError(f"data.{name} must be a number of at least {least}, got {value!r}")
     return value
+
+
+def _lenses(distortion: str) -> dict[str, Lens]:
+    """What is done about the lens, by split."""
+    held_out: dict[str, Lens] = {
+        "auto": "undistort",
+        "on": "undistort",
+        "undistort": "undistort",
+        "off": "ignore",
+        "project": "raw",
+    }
+    if distortion not in held_out:
+        raise ConfigError(
+            f"effects.distortion must be one of {', '.join(held_out)}; got {distortion!r}"
+        )
+    lens = held_out[distortion]
+    return {"train": "undistort" if lens == "raw" else lens} | dict.fromkeys(SPLITS[1:], lens)

@@ -169,6 +169,21 @@ def read_stored(path: Path) -> NDArray[np.uint8]:
     return picture[..., :3] if picture.ndim == 3 else picture
 
 
+def read_with_alpha(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """``[H, W, 3]`` uint8 RGB as stored and ``[H, W]`` alpha, None where the file has none.
+
+    Raises:
+        DataError: when the file is missing, damaged, cut off, or is not an 8-bit colour picture.
+    """
+    picture = _decode(path, cv2.IMREAD_UNCHANGED)
+    if picture.dtype != np.uint8:
+        raise DataError(f"{path} holds {picture.dtype} values; expected 8 bits (save it as 8-bit)")
+    if picture.ndim != 3 or picture.shape[2] not in (3, 4):
+        raise DataError(f"{path} is a grey picture; expected RGB, with or without alpha")
+    rgb = np.ascontiguousarray(picture[..., 2::-1])
+    return rgb, np.ascontiguousarray(picture[..., 3]) if picture.shape[2] == 4 else None
+
+
 def _decode(path: Path, flags: int) -> NDArray[Any]:
     try:
         data = path.read_bytes()
@@ -272,10 +287,7 @@ def frame_files(
             continue
         frame = (number or last_number)(stem)
         if frame is None:
-            raise DataError(
-                f"{place / name} has no frame number up to {LARGEST_FRAME} in its name; expected "
-                "e.g. 000012.png"
-            )
+            raise unnumbered(place / name)
         if frame in found:
             raise DataError(
                 f"{place} holds frame {frame} twice, as {found[frame].rpartition('/')[2]} and "
@@ -283,6 +295,18 @@ def frame_files(
             )
         found[frame] = f"{folder}/{name}"
     return found
+
+
+def unnumbered(path: Path) -> DataError:
+    """The error for a file whose name holds no frame number, or one too large to be one."""
+    digits = re.findall(r"[0-9]+", path.stem)
+    if digits and frame_of(digits[-1]) is None:
+        return DataError(
+            f"{path} is named by a date or time stamp ({digits[-1][:24]}), not by a frame number "
+            f"up to {LARGEST_FRAME}; stamps differ between cameras: number the frames 0, 1, 2 … "
+            "alike in all of them"
+        )
+    return DataError(f"{path} has no frame number in its name; expected e.g. 000012{path.suffix}")
 
 
 def last_number(stem: str) -> int | None:

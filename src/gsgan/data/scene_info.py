@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from gsgan.data.cameras import CameraEntry
 from gsgan.data.capture import CaptureDataset
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
 from gsgan.data.splits import Item, Splits
+from gsgan.data.surface_colours import SurfaceColours, surface_colours
+
+SOLID = 0.9  # of the mask: pixels at the outline are darkened by the black behind them
 
 
 @dataclass(frozen=True)
@@ -20,7 +27,7 @@ class SceneInfo:
     Args:
         camera_names: all cameras; `Frame.camera_index` counts in this order.
         n_train_cameras: cameras that train.
-        has_distortion: a lens coefficient is not zero (pictures are undistorted on reading).
+        has_distortion: a lens coefficient of a training camera is not zero.
         has_labels: there are part labels.
         has_body_pose: there is a body pose for every frame.
         body: kind of the skinned body ("free", "smpl", "smplx"), or None.
@@ -36,6 +43,16 @@ class SceneInfo:
         skeleton_source: where the landmarks come from, e.g. "smpl24 -> mediapipe33".
         body_file: the user's model file of the body, None for the free body.
         betas: shape of that body.
+        train_cameras: names, in the order of ``camera_names``.
+        held_out_distortion: a lens coefficient of a held-out camera is not zero.
+        has_rational_lens: a lens has coefficients beyond the fifth (k4, k5, k6).
+        spread: degrees, the largest angle between two training cameras seen from ``centre``.
+        scale_train: pixels a metre at the person, smallest and largest of the training cameras'
+            medians.
+        scale_test: the same of held-out pictures; None without any.
+        surface: how colours differ between training cameras on the same surface, or None where
+            they share too little.
+        darkest: brightness in [0, 1] of the person's darkest percent.
     """
 
     camera_names: tuple[str, ...]
@@ -56,42 +73,70 @@ class SceneInfo:
     skeleton_source: str = "mediapipe33"
     body_file: str | None = None
     betas: tuple[float, ...] = ()
+    train_cameras: tuple[str, ...] = ()
+    held_out_distortion: bool = False
+    has_rational_lens: bool = False
+    spread: float = 0.0
+    scale_train: tuple[float, float] = (1.0, 1.0)
+    scale_test: tuple[float, float] | None = None
+    surface: SurfaceColours | None = None
+    darkest: float = 0.0
 
 
-def scene_info(layout: Layout, splits: Splits, dataset: CaptureDataset, samples: int) -> SceneInfo:
+def scene_info(
+    layout: Layout,
+    splits: Splits,
+    dataset: CaptureDataset,
+    samples: int,
+    held_out: Sequence[CaptureDataset] = (),
+) -> SceneInfo:
     """What the training split tells about the scene.
 
     Args:
         layout: the capture.
         splits: of the capture.
         dataset: of the training items; its cache keeps what is decoded here.
-        samples: pictures a camera from which the foreground colour is taken, evenly spaced.
+        samples: pictures a camera from which colours are taken, evenly spaced.
+        held_out: datasets of the held-out items; none of their pictures is looked at.
     """
     frames = sorted({frame for _, frame in splits.items["train"]})
     p = torch.from_numpy(np.stack([layout.landmarks.p[f] for f in frames]))
     valid = torch.from_numpy(np.stack([layout.landmarks.visibility[f] for f in frames])) > 0
     middles = torch.stack([q[v].mean(0) for q, v in zip(p, valid, strict=True)])
     cameras = {camera for camera, _ in splits.items["train"]}
+    tested = {camera for data in held_out for camera, _ in data.items} - cameras
     body = layout.meta.body
+    centre = _triple(middles.median(0).values)
+    foreground, darkest = foreground_colours(dataset, samples)
+    entries = {name: entry for name, entry in layout.cameras.items() if name in cameras}
+    scales = [_scales(data, samples) for data in held_out if data.items]
     return SceneInfo(
         camera_names=layout.camera_names,
         n_train_cameras=len(cameras),
-        has_distortion=any(layout.cameras[name].distorted for name in cameras),
+        has_distortion=any(entry.distorted for entry in entries.values()),
         has_labels=bool(layout.labels),
         has_body_pose=layout.poses is not None,
         body=None if body is None else body.kind,
         skeleton=layout.meta.skeleton,
         n_labels=count_labels(layout, splits.items["train"]),
         label_names=layout.meta.label_names or (),
-        foreground=foreground_colours(dataset, samples),
+        foreground=foreground,
         body_height=_body_height(p, valid),
-        centre=_triple(middles.median(0).values),
+        centre=centre,
         up_axis=layout.meta.up_axis,
         fps=layout.meta.fps,
         frames=len(frames),
         skeleton_source=layout.meta.skeleton_source,
         body_file=None if body is None else body.file,
         betas=() if body is None else body.betas,
+        train_cameras=tuple(entries),
+        held_out_distortion=any(layout.cameras[name].distorted for name in tested),
+        has_rational_lens=any((layout.cameras[n].dist[5:] != 0).any() for n in cameras | tested),
+        spread=_spread(list(entries.values()), np.array(centre)),
+        scale_train=_scales(dataset, samples),
+        scale_test=(min(s[0] for s in scales), max(s[1] for s in scales)) if scales else None,
+        surface=_shared_surface(layout, dataset, tuple(entries), samples),
+        darkest=darkest,
     )
 
 
@@ -125,21 +170,75 @@ def count_labels(layout: Layout, items: tuple[Item, ...]) -> int:
 
 def foreground_colours(
     dataset: CaptureDataset, samples: int
-) -> dict[str, tuple[float, float, float]]:
-    """Mean RGB of the person in [0, 1], mask-weighted, by camera name.
+) -> tuple[dict[str, tuple[float, float, float]], float]:
+    """Colours of the person in [0, 1].
 
     Args:
         dataset: whose cameras to look at.
         samples: pictures a camera, evenly spaced over its frames.
+
+    Returns:
+        Mean RGB, mask-weighted, by camera name; and the brightness of the darkest percent.
     """
-    by_camera: dict[str, list[int]] = {}
-    for index, (camera, _) in enumerate(dataset.items):
-        by_camera.setdefault(camera, []).append(index)
-    colours = {}
-    for camera, indices in by_camera.items():
-        chosen = {round(i) for i in np.linspace(0, len(indices) - 1, samples)}
-        frames = [dataset[indices[i]] for i in sorted(chosen)]
+    colours, brightness = {}, []
+    for camera, indices in _by_camera(dataset).items():
+        frames = [dataset[i] for i in _evenly(indices, samples)]
         total = sum(f.image.double().sum((0, 2, 3)) for f in frames)
         weight = sum(float(f.mask.double().sum()) for f in frames)
         colours[camera] = _triple(torch.as_tensor(total) / max(weight, 1.0))
-    return colours
+        brightness += [f.image.amax(1, keepdim=True)[f.mask > SOLID] for f in frames]
+    solid = torch.cat(brightness).numpy()
+    return colours, float(np.percentile(solid, 1)) if solid.size else 0.0
+
+
+def _by_camera(dataset: CaptureDataset) -> dict[str, list[int]]:
+    """Indices of the items of each camera."""
+    found: dict[str, list[int]] = {}
+    for index, (camera, _) in enumerate(dataset.items):
+        found.setdefault(camera, []).append(index)
+    return found
+
+
+def _evenly(values: Sequence[int], count: int) -> list[int]:
+    """At most ``count`` of the values, evenly spaced, first and last included."""
+    chosen = {round(i) for i in np.linspace(0, len(values) - 1, count)}
+    return [values[i] for i in sorted(chosen)]
+
+
+def _spread(cameras: Sequence[CameraEntry], centre: NDArray[np.float64]) -> float:
+    """Degrees between the two directions in which cameras stand furthest apart."""
+    ways = [camera.centre - centre for camera in cameras]
+    ways = [way / max(float(np.linalg.norm(way)), 1e-9) for way in ways]
+    cosines = [float(a @ b) for a, b in combinations(ways, 2)]
+    return float(np.degrees(np.arccos(np.clip(min(cosines, default=1.0), -1, 1))))
+
+
+def _scales(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
+    """Pixels a metre at the person: the smallest and the largest camera's median."""
+    medians = []
+    for indices in _by_camera(dataset).values():
+        each = []
+        for item in (dataset.items[i] for i in _evenly(indices, samples)):
+            camera = dataset.camera(item)
+            joints = torch.from_numpy(dataset.layout.landmarks.p[item[1]])[None].to(camera.K)
+            depth = float(camera.to_camera(joints)[..., 2].median())
+            each.append(float(camera.K[0, 0, 0]) / max(depth, 1e-2))
+        medians.append(float(np.median(each)))
+    return min(medians), max(medians)
+
+
+def _shared_surface(
+    layout: Layout, dataset: CaptureDataset, cameras: tuple[str, ...], samples: int
+) -> SurfaceColours | None:
+    """Colours compared in moments that every training camera saw; None with a single camera."""
+    from gsgan.body import open_body
+
+    index = {item: i for i, item in enumerate(dataset.items)}
+    shared = sorted({f for _, f in dataset.items if all((c, f) in index for c in cameras)})
+    if len(cameras) < 2 or not shared:
+        return None
+    moments = [[dataset[index[c, f]] for c in cameras] for f in _evenly(shared, samples)]
+    body, mesh = layout.meta.body, None
+    if body is not None and layout.poses is not None:
+        mesh = open_body(body.kind, body.file, body.betas)
+    return surface_colours(moments, mesh)

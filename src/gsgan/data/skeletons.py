@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from gsgan.data.files import LARGEST_FRAME
 from gsgan.errors import DataError
 
 Float = NDArray[np.float64]
@@ -93,6 +94,11 @@ def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
         ids = np.asarray(raw, np.int64)
     if not np.array_equal(ids, raw):
         raise DataError(f"{where}: 'frame_id' must hold whole numbers")
+    if len(ids) and ids.max() > LARGEST_FRAME:
+        raise DataError(
+            f"{where}: frame_id {ids.max()} is a time stamp, not a frame number up to "
+            f"{LARGEST_FRAME}; number the frames 0, 1, 2 … alike in pictures and landmarks"
+        )
     values, counts = np.unique(ids, return_counts=True)
     if len(values) != len(ids):
         raise DataError(f"{where}: frame_id {values[counts > 1][0]} appears more than once")

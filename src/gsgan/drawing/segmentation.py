@@ -19,7 +19,7 @@ from gsgan.drawing.measures import Numbers, where_from, written
 from gsgan.drawing.settings import Settings
 from gsgan.drawing.shots import Shot
 from gsgan.drawing.subjects import Subject
-from gsgan.model.segmentation import IGNORE
+from gsgan.model.segmentation import IGNORE, Segmentation
 from gsgan.pictures import colour_labels
 from gsgan.scoring.scores import SegmentationScores
 
@@ -40,11 +40,15 @@ def draw(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings)
     if not able:
         why = subjects[0].avatar.effects.segmentation.why
         raise Unavailable(f"{subjects[0].name} has no segmentation S: {why}")
+    maps = [_segmentation(subject).map for subject in able]
+    for subject, other in zip(able, maps, strict=True):
+        if other != maps[0]:
+            raise Unavailable(f"{able[0].name} and {subject.name} tell different parts apart")
     several = len(able) > 1
     titles = ["picture", "true parts"]
     for subject in able:
         titles += [f"{subject.name}\nS" if several else "S (ours)", "disagreement"]
-    names = _legend(_present(able, shots), subjects[0].data.info.label_names)
+    names = _legend(_present(able, shots), (*maps[0].names, *maps[0].absent))
     width = settings.page if several else settings.column
     in_line = max(1, int(width / LEGEND_WIDTH))
     grid = Grid(
@@ -58,14 +62,11 @@ def draw(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings)
     )
     numbers: dict[str, dict[str, Numbers]] = {}
     for row, shot in enumerate(shots):
-        assert shot.frame.labels is not None
-        labels = shot.window.cut(shot.frame.labels)
         grid.picture(row, 0, shot.truth)
-        grid.picture(row, 1, colour_labels(labels))
+        grid.picture(row, 1, colour_labels(_scored(able[0], shot)[1]))
         numbers[shot.name] = {}
         for place, subject in enumerate(able):
-            parts = subject.parts(shot)
-            assert parts is not None
+            parts, labels = _scored(subject, shot)
             ours = parts.argmax(dim=1)
             found = agreement(parts, labels)
             column = 2 + 2 * place
@@ -109,15 +110,26 @@ def disagreement(ours: Tensor, labels: Tensor) -> Tensor:
     return torch.where(wrong, rgb[None, :, None, None], picture)
 
 
+def _segmentation(subject: Subject) -> Segmentation:
+    assert subject.avatar.segmentation is not None
+    return subject.avatar.segmentation
+
+
+def _scored(subject: Subject, shot: Shot) -> tuple[Tensor, Tensor]:
+    """S and the true parts of a shot, both in the classes that the run tells apart."""
+    parts = subject.parts(shot)
+    assert parts is not None and shot.frame.labels is not None  # noqa: PT018
+    padded, truth = _segmentation(subject).to_score(parts, shot.window.cut(shot.frame.labels))
+    return padded, truth.to(parts.device)
+
+
 def _present(able: Sequence[Subject], shots: Sequence[Shot]) -> list[int]:
     """The parts in any of the pictures, background left out."""
     present: set[int] = set()
     for shot in shots:
-        assert shot.frame.labels is not None
-        present |= set(shot.window.cut(shot.frame.labels).unique().tolist())
         for subject in able:
-            parts = subject.parts(shot)
-            assert parts is not None
+            parts, labels = _scored(subject, shot)
+            present |= set(labels.unique().tolist())
             present |= set(parts.argmax(dim=1).unique().tolist())
     return sorted(present - {0})
 

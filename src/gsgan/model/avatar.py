@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -10,10 +11,15 @@ import torch
 from torch import Tensor, nn
 
 from gsgan.body import open_body
+from gsgan.effects import Effects, EffectSettings, decide
 from gsgan.errors import DataError
+from gsgan.lens import Bend
+from gsgan.model.class_vote import ClassVote, Pictures
+from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
-from gsgan.model.segmentation import Segmentation
+from gsgan.model.parts import labelled_body
+from gsgan.model.segmentation import Segmentation, mode_of
 from gsgan.model.surface import SurfaceGaussians
 from gsgan.precision import full_precision
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians
@@ -34,6 +40,12 @@ if TYPE_CHECKING:
 
 LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in a picture 512 high (method.md § 4)
 SKELETON_CHANNELS = len(MEDIAPIPE33.draw_groups)
+UNWATCHED: AbstractContextManager[None] = nullcontext()  # entering it costs next to nothing
+
+
+def unwatched(stage: str) -> AbstractContextManager[None]:
+    """What a stage of painting runs in while no bench times it."""
+    return UNWATCHED
 
 
 @dataclass(frozen=True)
@@ -47,6 +59,9 @@ class Painting:
         alpha: ``[B, 1, H, W]``.
         segmentation: ``[B, classes, H, W]`` S, or None where it was not built.
         gaussians: Ĝ.
+        corrected: ``[B, 3, H, W]`` Step I's colour as the camera takes it, where colours are
+            corrected; F stays as it was.
+        depth: ``[B, 1, H, W]`` metres times alpha, where the effect is on.
     """
 
     image: Tensor | None
@@ -54,10 +69,14 @@ class Painting:
     alpha: Tensor | None
     segmentation: Tensor | None
     gaussians: Gaussians | None
+    corrected: Tensor | None = None
+    depth: Tensor | None = None
 
     @property
     def colour(self) -> Tensor | None:
         """``[B, 3, H, W]`` Step I's picture C on black."""
+        if self.corrected is not None:
+            return self.corrected
         return None if self.features is None else self.features[:, :3]
 
     def pasted(self, window: Window) -> Painting:
@@ -76,6 +95,30 @@ class Painting:
             features=paste(self.features),
             alpha=paste(self.alpha),
             segmentation=parts,
+            corrected=paste(self.corrected),
+            depth=paste(self.depth),
+        )
+
+
+    def bent(self, bend: Bend) -> Painting:
+        """The same as lenses show it, all background where they show nothing."""
+
+        def through(x: Tensor | None) -> Tensor | None:
+            return None if x is None else bend(x)
+
+        parts = through(self.segmentation)
+        if parts is not None:
+            inside = bend(torch.ones_like(self.segmentation[:, :1]))  # type: ignore[index]
+            parts = torch.cat([parts[:, :1] + (1 - inside), parts[:, 1:]], dim=1).clamp_min(0)
+        alpha = through(self.alpha)
+        return replace(
+            self,
+            image=through(self.image),
+            features=through(self.features),
+            alpha=None if alpha is None else alpha.clamp(0, 1),  # cubic weights overshoot
+            segmentation=parts,
+            corrected=through(self.corrected),
+            depth=through(self.depth),
         )
 
 
@@ -101,9 +144,19 @@ class Avatar(nn.Module):
         window_margin: metres round the joints that are painted; None paints whole pictures.
         window_multiple: the window's sides are multiples of so many pixels.
         window_least: pixels, its shortest side (a discriminator cannot judge less).
+        class_vote: gives S's vertices their parts where the data's labels are not the body's own;
+            None votes with its own settings.
+        pictures: training frames with labels, for that vote.
+        vertex_labels: ``[V]`` int64, the outcome of an earlier vote, which then is not held again.
+        effects: what the scene calls for; None decides it here, with the settings' defaults. Those
+            that this model cannot have are taken out.
 
     Source: paper Fig. 2 and Sec. 3; architecture.md § 4.
     """
+
+    # Exchanged by benches: what each stage runs in, by its name, and who rasterises F.
+    stage: Callable[[str], AbstractContextManager[None]] = staticmethod(unwatched)
+    backend = "auto"
 
     def __init__(
         self,
@@ -119,8 +172,16 @@ class Avatar(nn.Module):
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
         window_least: int = 32,
+        class_vote: ClassVote | None = None,
+        pictures: Pictures | None = None,
+        vertex_labels: Tensor | None = None,
+        effects: Effects | None = None,
     ) -> None:
         super().__init__()
+        self.effects = decide(scene, EffectSettings()) if effects is None else effects
+        self.effects = _possible(self.effects, densify is not None, surface is not None)
+        if self.effects.antialias.on:
+            accuracy = replace(accuracy, antialias=True)
         self.template, self.accuracy, self.twist = MEDIAPIPE33, accuracy, twist
         self.window_margin = window_margin
         self.window_multiple, self.window_least = window_multiple, window_least
@@ -141,12 +202,14 @@ class Avatar(nn.Module):
                 rest_points=densify.rest_points,
                 body_height=self.body_height,
                 joints=len(self.template.names),
+                sh_degree=self.effects.degree,
             )
         self.surface = self._build_surface(scene, surface)
         if self.splats is None and generator is None:
             raise ValueError("Avatar: nothing paints; give a deformation, a surface or a generator")
-        self.effects: dict[str, tuple[bool, str]] = {}
-        self.segmentation = self._build_segmentation(scene, segmentation)
+        self.segmentation = self._build_segmentation(
+            scene, segmentation, class_vote or ClassVote(), pictures, vertex_labels
+        )
         self.pose_encoder = pose_encoder
         self.generator: Generator | None = None
         if (generator is None) != (pose_encoder is None):
@@ -159,12 +222,9 @@ class Avatar(nn.Module):
                 skeleton_channels=SKELETON_CHANNELS if self.splats else 0,
                 pose_channels=pose_encoder.channels,
             )
-        self.effects["generator"] = (
-            self.generator is not None,
-            "the model has a UNet" if self.generator else "the model paints Step I's colour",
-        )
-        degree = self.splats.sh_degree if self.splats else 0
-        self.effects["view-dependent colour"] = (degree > 0, f"spherical harmonics degree {degree}")
+        self.colour: ColourCorrection | None = None
+        if self.effects.colour_correction.on:
+            self.colour = ColourCorrection(self.effects.cameras, scene.camera_names)
 
     @property
     def splats(self) -> Deformation | SurfaceGaussians | None:
@@ -189,32 +249,34 @@ class Avatar(nn.Module):
                 "model.surface: Gaussians on the body need a body pose for every frame and the "
                 "body's mesh, and this data lacks one; choose model=splat_only or model=full"
             )
-        return build(body=body, body_height=self.body_height)
+        degree = self.effects.degree
+        return build(body=body, body_height=self.body_height, sh_degree=degree)
 
     def _build_segmentation(
-        self, scene: SceneInfo, build: Callable[..., Segmentation] | None
+        self,
+        scene: SceneInfo,
+        build: Callable[..., Segmentation] | None,
+        vote: ClassVote,
+        pictures: Pictures | None,
+        vertex_labels: Tensor | None,
     ) -> Segmentation | None:
-        if build is None:
-            self.effects["segmentation S"] = (False, "the model leaves it out")
+        if build is None or mode_of(build) == "none":
+            self.effects = self.effects.without("segmentation", "the model leaves it out")
+        wanted = self.effects.segmentation
+        if build is None or not wanted.on:
             return None
-        if not scene.has_body_pose:
-            self.effects["segmentation S"] = (False, "the data has no body pose")
-            return None
-        body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
+        body, why = labelled_body(scene, vote, pictures, vertex_labels)
         if body is None:
-            why = (
-                f"the data's poses are of the body {scene.body!r}, of which there is no model file"
-            )
-            self.effects["segmentation S"] = (False, why)
+            self.effects = self.effects.without("segmentation", why)
             return None
-        if scene.n_labels > len(body.label_names):
-            raise DataError(
-                f"labels: the pictures hold {scene.n_labels} parts, the {scene.body} body has "
-                f"{len(body.label_names)} ({', '.join(body.label_names)}); map them to these ids, "
-                "or choose model=wo_seg"
-            )
-        self.effects["segmentation S"] = (True, "the data has a body pose")
-        return build(body=body)
+        said_so = wanted.forced or wanted.value == "hands"
+        mode = str(wanted.value) if said_so else mode_of(build)
+        said = replace(wanted, value=mode, why=f"{wanted.why}; {why}")
+        self.effects = replace(self.effects, segmentation=said)
+        built = build(body=body, mode=mode)
+        if self.effects.antialias.on:
+            built.accuracy = replace(built.accuracy, antialias=True)
+        return built
 
     def forward(
         self,
@@ -227,6 +289,7 @@ class Avatar(nn.Module):
         paint: bool = True,
         detach_features: bool = False,
         picture_height: int | None = None,
+        camera_index: Tensor | None = None,
     ) -> Painting:
         """Paints the pose.
 
@@ -240,19 +303,28 @@ class Avatar(nn.Module):
             detach_features: keep Step II's gradient out of Ψ.
             picture_height: pixels of the whole picture, when ``camera`` sees a window of it: the
                 drawn skeleton's lines are as wide as they would be there.
+            camera_index: ``[B]`` which cameras these are, for their colours; None corrects none.
 
         Returns:
             I_pred with all that led to it.
         """
         paints = paint and self.generator is not None
         with full_precision(skeleton):
-            p, valid = sanitise(skeleton, visibility, self.template, self.limb_sum)
-            frames = bone_frames(p, valid, self.template, twist=self.twist)
+            with self.stage("skeleton"):
+                p, valid = sanitise(skeleton, visibility, self.template, self.limb_sum)
+                frames = bone_frames(p, valid, self.template, twist=self.twist)
 
             gaussians = self.splat(p, valid, frames, camera, body, pose_noise)
             raster = None
             if gaussians is not None:
-                raster = rasterise(gaussians, camera, settings=self.accuracy)
+                with self.stage("F"):
+                    raster = rasterise(
+                        gaussians,
+                        camera,
+                        settings=self.accuracy,
+                        backend=self.backend,
+                        depth=self.effects.depth.on,
+                    )
             S = self.segment(body, camera) if paints else None  # Sec. 3.4
             p2d = self.draw(p, valid, camera, picture_height) if paints else None
             pose = self.pose_inputs(p, valid, frames, camera) if paints else None
@@ -260,13 +332,31 @@ class Avatar(nn.Module):
         F = None if raster is None else raster.features
         image = F[:, :3] if self.generator is None and F is not None else None
         if paints:  # Sec. 3.5
-            g = self.pose_encoder(*pose)  # type: ignore[misc]
-            if F is None:  # image_to_image: the drawing stands in F's place
-                image = self.generator(p2d, S, None, g).to(skeleton.dtype)  # type: ignore[misc]
-            else:
-                seen = F.detach() if detach_features else F
-                image = self.generator(seen, S, p2d, g).to(F.dtype)  # type: ignore[misc]
-        return Painting(image, F, None if raster is None else raster.alpha, S, gaussians)
+            with self.stage("pose encoder"):
+                g = self.pose_encoder(*pose)  # type: ignore[misc]
+            with self.stage("UNet"):
+                if F is None:  # image_to_image: the drawing stands in F's place
+                    image = self.generator(p2d, S, None, g).to(skeleton.dtype)  # type: ignore[misc]
+                else:
+                    seen = F.detach() if detach_features else F
+                    image = self.generator(seen, S, p2d, g).to(F.dtype)  # type: ignore[misc]
+        if raster is None:
+            return Painting(image, F, None, S, gaussians)
+        painting = Painting(image, F, raster.alpha, S, gaussians, depth=raster.depth)
+        return self.as_taken(painting, camera_index)
+
+    def as_taken(self, painting: Painting, camera_index: Tensor | None) -> Painting:
+        """The painting in the colours of its cameras: the one place where they are corrected."""
+        if self.colour is None or camera_index is None or painting.features is None:
+            return painting
+        assert painting.alpha is not None
+        colour = self.colour(painting.features[:, :3], painting.alpha, camera_index)
+        image = painting.image
+        if self.generator is None:
+            image = colour
+        elif image is not None:
+            image = self.colour(image, painting.alpha, camera_index)
+        return replace(painting, image=image, corrected=colour)
 
     def splat(
         self,
@@ -281,33 +371,57 @@ class Avatar(nn.Module):
         if self.surface is not None:
             if body is None:
                 raise ValueError("Avatar: this model's Gaussians sit on the body; give its pose")
-            return self.surface(body, camera.centre)
+            with self.stage("surface"):
+                return self.surface(body, camera.centre)
         if self.densify is None or self.deformation is None:
             return None
-        points = self.densify(p, valid, frames)  # Alg. 1: G
-        return self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
-            p, points, camera.centre, frames.hubs[:, 0], pose_noise
-        )
+        with self.stage("densify"):
+            points = self.densify(p, valid, frames)  # Alg. 1: G
+        with self.stage("Ψ"):
+            return self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
+                p, points, camera.centre, frames.hubs[:, 0], pose_noise
+            )
 
     def paint(self, frame: Frame) -> Painting:
-        """The whole picture of a frame of a dataset: its window painted, background around it."""
+        """The whole picture of a frame of a dataset: its window painted, background around it.
+
+        Where the frame's camera has a lens (``camera.dist``) the picture is painted as a pinhole
+        sees it and then bent, see `gsgan.lens`.
+        """
+        if frame.camera.dist is None:
+            return self._paint(frame, frame.camera.size[0])
+        bend = Bend.of(frame.camera)
+        straight = replace(frame, camera=bend.straight)
+        return self._paint(straight, frame.camera.size[0]).bent(bend)
+
+    def _paint(self, frame: Frame, height: int) -> Painting:
+        """The whole picture of a frame's camera, p₂D's lines as wide as in one ``height`` high."""
         window = self.window(frame)
         if window is None:
-            return self(frame.skeleton, frame.visibility, frame.camera, frame.body)
+            return self(
+                frame.skeleton,
+                frame.visibility,
+                frame.camera,
+                frame.body,
+                picture_height=height,
+                camera_index=frame.camera_index,
+            )
         painting = self(
             frame.skeleton,
             frame.visibility,
             window.camera(frame.camera),
             frame.body,
-            picture_height=window.picture[0],
+            picture_height=height,
+            camera_index=frame.camera_index,
         )
-        return painting.pasted(window)
+        with self.stage("paste"):
+            return painting.pasted(window)
 
     def window(self, frame: Frame) -> Window | None:
         """The part of a frame's picture that holds the person; None means all of it."""
         if self.window_margin is None:
             return None
-        with full_precision(frame.skeleton):
+        with self.stage("window"), full_precision(frame.skeleton):
             p, _ = sanitise(frame.skeleton, frame.visibility, self.template, self.limb_sum)
             return body_window(
                 p,
@@ -324,18 +438,32 @@ class Avatar(nn.Module):
             return None
         if body is None:
             raise ValueError("Avatar: this model was built with S and needs the frame's body pose")
-        with torch.no_grad():
+        with self.stage("S"), torch.no_grad():
             return self.segmentation(body, camera)
 
     def draw(self, p: Tensor, valid: Tensor, camera: Camera, picture_height: int | None) -> Tensor:
         """p₂D ``[B, 8, H, W]``, its lines scaled to the whole picture's height."""
         share = (picture_height or camera.size[0]) / camera.size[0]
-        return draw_skeleton(p, valid, camera, self.template, LINE_WIDTH * share)
+        with self.stage("p₂D"):
+            return draw_skeleton(p, valid, camera, self.template, LINE_WIDTH * share)
 
     def pose_inputs(
         self, p: Tensor, valid: Tensor, frames: BoneFrames, camera: Camera
     ) -> tuple[Tensor, Tensor]:
         """Ω ``[B, J, 6]``, and the joints about the root in camera axes and body heights."""
-        root = p[:, 23:25].mean(dim=1, keepdim=True)
-        in_camera = (p - root) @ camera.R.mT / self.body_height
-        return omega(p, valid, camera.R, self.template, frames=frames), in_camera
+        with self.stage("Ω"):
+            root = p[:, 23:25].mean(dim=1, keepdim=True)
+            in_camera = (p - root) @ camera.R.mT / self.body_height
+            return omega(p, valid, camera.R, self.template, frames=frames), in_camera
+
+
+def _possible(effects: Effects, densifies: bool, on_surface: bool) -> Effects:
+    """Without the effects on points and Gaussians that this model does not have."""
+    if not densifies:
+        for name in ("hands", "face"):
+            effects = effects.without(name, "this model puts no points on the skeleton")
+    if densifies or on_surface:
+        return effects
+    for name in ("view_dependence", "antialias", "colour_correction", "random_background", "depth"):
+        effects = effects.without(name, "this model splats nothing")
+    return effects

@@ -93,6 +93,7 @@ class Deformation(nn.Module):
             raise ValueError(f"Deformation: layers must be at least 2, got {layers}")
         points = rest_points.shape[0]
         self.body_height, self.features, self.sh_degree = float(body_height), features, sh_degree
+        self.active_degree = sh_degree  # training raises it; what is above is not computed
         self.position_octaves, self.pose_frame = position_octaves, pose_frame
         self.opacity, self.mean_bound, self.logit_bound = opacity, mean_bound, logit_bound
         self.scale_range = (scale_min, scale_max)
@@ -127,11 +128,29 @@ class Deformation(nn.Module):
         x = functional.relu(x + self.from_pose(pose)[:, None])
         for layer in self.trunk:
             x = functional.relu(layer(x))
-        raw = self.head(x) if self.table is None else self.head(x) + self.table
-        means, quats, scales, opacities, sh, features = raw.split(self.parts, dim=-1)
+        raw, parts = self._head(x)
+        means, quats, scales, opacities, sh, features = raw.split(parts, dim=-1)
         return Residuals(
             means, quats, scales, opacities[..., 0], sh.unflatten(-1, (-1, 3)), features
         )
+
+    def _head(self, x: Tensor) -> tuple[Tensor, tuple[int, ...]]:
+        """The raw residuals ``[B, N, ...]`` and the sizes of their parts, without the harmonics
+        above the active degree. Those start at zero and get no gradient until they are active, so
+        that computing them all later changes nothing."""
+        if self.active_degree >= self.sh_degree:
+            raw = self.head(x)
+            return raw if self.table is None else raw + self.table, self.parts
+        colours = 3 * (self.active_degree + 1) ** 2
+        parts = (*self.parts[:4], colours, self.features)
+        first, last = sum(parts[:5]), sum(self.parts[:5])
+
+        def active(values: Tensor) -> Tensor:
+            return torch.cat([values[..., :first], values[..., last:]], dim=-1)
+
+        weight = active(self.head.weight.mT).mT
+        raw = functional.linear(x, weight, active(self.head.bias))
+        return raw if self.table is None else raw + active(self.table), parts
 
     def compose(self, points: Points, residuals: Residuals, eye: Tensor) -> Gaussians:
         """Ĝ = G + ΔG: bounds and activations, then colour as seen from ``eye`` ``[B, 3]``.
@@ -153,8 +172,10 @@ class Deformation(nn.Module):
         opacities = torch.sigmoid(
             (logit + residuals.opacities).clamp(-self.logit_bound, self.logit_bound)
         )
-        view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
-        view = (frames.mT @ view.unsqueeze(-1)).squeeze(-1)
+        view = means  # at degree 0 a colour has no direction
+        if residuals.sh.shape[-2] > 1:
+            view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
+            view = (frames.mT @ view.unsqueeze(-1)).squeeze(-1)
         colour = functional.relu(sh_to_colour(residuals.sh, view))
         return Gaussians(
             means=means,

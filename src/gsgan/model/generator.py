@@ -37,18 +37,22 @@ class Style(nn.Module):
 
     Normalising over channels at each pixel (not over the picture) keeps colours independent of how
     much of the frame is background. Both maps start at zero: the style starts as the identity.
+    Without style channels g alone scales and shifts.
     """
 
     def __init__(self, channels: int, style_channels: int, pose_channels: int) -> None:
         super().__init__()
-        self.from_map = nn.Conv2d(style_channels, 2 * channels, 1)
+        self.from_map = nn.Conv2d(style_channels, 2 * channels, 1) if style_channels else None
         self.from_pose = nn.Linear(pose_channels, 2 * channels)
         for layer in (self.from_map, self.from_pose):
-            start_at_zero(layer)
+            if layer is not None:
+                start_at_zero(layer)
 
-    def forward(self, h: Tensor, style: Tensor, g: Tensor) -> Tensor:
+    def forward(self, h: Tensor, style: Tensor | None, g: Tensor) -> Tensor:
         """``h`` ``[B, C, h, w]`` styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]``."""
-        modulation = self.from_map(style) + self.from_pose(g)[:, :, None, None]
+        modulation = self.from_pose(g)[:, :, None, None]
+        if self.from_map is not None:
+            modulation = self.from_map(style) + modulation
         gamma, beta = modulation.chunk(2, dim=1)
         # Squares in float32 at least: half precision loses them above 256 and below 2e-4.
         wide = h.to(torch.promote_types(h.dtype, torch.float32))
@@ -67,7 +71,7 @@ class DecoderLevel(nn.Module):
         )
         self.styles = nn.ModuleList(Style(channels, style_channels, pose) for _ in range(2))
 
-    def forward(self, h: Tensor, skip: Tensor, style: Tensor, g: Tensor) -> Tensor:
+    def forward(self, h: Tensor, skip: Tensor, style: Tensor | None, g: Tensor) -> Tensor:
         # Nearest + convolution: transposed convolutions leave a checkerboard.
         h = functional.interpolate(self.reduce(h), scale_factor=2.0, mode="nearest")
         h = torch.cat([h, skip], dim=1)
@@ -86,6 +90,8 @@ class Generator(nn.Module):
         pose_channels: length of g.
         base: channels at full resolution.
         multipliers: channels of each level in units of ``base``; one level a halving.
+        style: what scales and shifts the decoder: ``film``, at every pixel by E_s(F) and g, or
+            ``pose``, by g alone: E_s is then not built.
         style_share: E_s's width as a share of E_c's.
         rgb_skip: paint a correction of Step I's colour instead of the whole picture; the last
             layer then starts at zero, and training from Step I's picture.
@@ -105,6 +111,7 @@ class Generator(nn.Module):
         *,
         base: int = 32,
         multipliers: Sequence[int] = (1, 2, 4, 8, 8),
+        style: str = "film",
         style_share: float = 0.5,
         rgb_skip: bool = False,
         output: str = "linear",
@@ -115,17 +122,20 @@ class Generator(nn.Module):
             raise ValueError(f"Generator: output must be linear or sigmoid, got {output!r}")
         if rgb_skip and output == "sigmoid":
             raise ValueError("Generator: rgb_skip adds to a colour, so output must be linear")
+        if style not in ("film", "pose"):
+            raise ValueError(f"Generator: style must be film or pose, got {style!r}")
         channels = [base * m for m in multipliers]
-        style = [max(1, round(style_share * c)) for c in channels]
+        mapped = style == "film"
+        widths = [max(1, round(style_share * c)) if mapped else 0 for c in channels]
         inputs = feature_channels + segmentation_channels + skeleton_channels
         self.stride = 2 ** (len(channels) - 1)
         self.rgb_skip, self.output, self.feature_bound = rgb_skip, output, feature_bound
         self.content = Encoder(inputs, channels)
-        self.style = Encoder(feature_channels, style)
+        self.style = Encoder(feature_channels, widths) if mapped else None
         self.mid = nn.ModuleList(nn.Conv2d(channels[-1], channels[-1], 3, padding=1) for _ in "ab")
-        self.mid_style = nn.ModuleList(Style(channels[-1], style[-1], pose_channels) for _ in "ab")
+        self.mid_style = nn.ModuleList(Style(channels[-1], widths[-1], pose_channels) for _ in "ab")
         self.up = nn.ModuleList(
-            DecoderLevel(channels[i + 1], channels[i], style[i], pose_channels)
+            DecoderLevel(channels[i + 1], channels[i], widths[i], pose_channels)
             for i in reversed(range(len(channels) - 1))
         )
         self.paint = nn.Conv2d(channels[0], 3, 3, padding=1)
@@ -144,10 +154,8 @@ class Generator(nn.Module):
         height, width = F.shape[-2:]
         features = F.clamp(-self.feature_bound, self.feature_bound)
         content = torch.cat([x for x in (features, S, p2d) if x is not None], dim=1)
-        content, features = (_pad(x, self.stride) for x in (content, features))
-        content = content.contiguous(memory_format=torch.channels_last)
-        features = features.contiguous(memory_format=torch.channels_last)
-        skips, styles = self.content(content), self.style(features)
+        skips = self.content(self._padded(content))
+        styles = self.style(self._padded(features)) if self.style else [None] * len(skips)
         h = skips[-1]
         for conv, style in zip(self.mid, self.mid_style, strict=True):
             h = _activate(style(conv(h), styles[-1], g))
@@ -158,6 +166,12 @@ class Generator(nn.Module):
             return F[:, :3] + painted
         return torch.sigmoid(painted) if self.output == "sigmoid" else painted
 
+    def _padded(self, x: Tensor) -> Tensor:
+        """Zeros on the right and below, up to a multiple of the stride; channels last."""
+        height, width = x.shape[-2:]
+        padded = functional.pad(x, (0, -width % self.stride, 0, -height % self.stride))
+        return padded.contiguous(memory_format=torch.channels_last)
+
 
 def start_at_zero(layer: nn.Module) -> None:
     """Weight and bias 0: the layer adds nothing until training finds it useful."""
@@ -167,9 +181,3 @@ def start_at_zero(layer: nn.Module) -> None:
 
 def _activate(x: Tensor) -> Tensor:
     return functional.leaky_relu(x, SLOPE)
-
-
-def _pad(x: Tensor, stride: int) -> Tensor:
-    """Zeros on the right and below, up to a multiple of ``stride``."""
-    height, width = x.shape[-2:]
-    return functional.pad(x, (0, -width % stride, 0, -height % stride))

@@ -11,6 +11,8 @@ from torch.nn import functional
 from gsgan.model.encoding import encoded_size, positional_encoding
 from gsgan.skeleton import MEDIAPIPE33, SkeletonTemplate
 
+READOUT_START = 0.8  # standard deviation of g at the start, of joint channels' of 1
+
 
 class GraphLayer(nn.Module):
     """One graph convolution with weights of its own for every joint.
@@ -52,8 +54,13 @@ class PoseGraph(nn.Module):
         width: channels of the hidden layers.
         joint_channels: channels a joint ends with.
         octaves: positional encoding of Ω.
+        readout: ``edge``, each number of g from the two joints of its edge (35 is the number of
+            MediaPipe edges), or ``linear``, from all joints.
 
-    Source: paper Sec. 3.5; method.md § 5, ``readout=edge``: 35 is the number of MediaPipe edges.
+    Raises:
+        ValueError: on another readout.
+
+    Source: paper Sec. 3.5; method.md § 5: the paper does not say how joints become g.
     """
 
     edges: Tensor
@@ -65,8 +72,11 @@ class PoseGraph(nn.Module):
         width: int = 128,
         joint_channels: int = 32,
         octaves: int = 5,
+        readout: str = "edge",
     ) -> None:
         super().__init__()
+        if readout not in ("edge", "linear"):
+            raise ValueError(f"PoseGraph: readout must be edge or linear, got {readout!r}")
         joints = len(template.names)
         mask = torch.eye(joints)
         for a, b in template.gnn_edges:
@@ -83,7 +93,10 @@ class PoseGraph(nn.Module):
         )
         self.register_buffer("edges", torch.tensor(template.edges).long(), persistent=False)
         self.channels = len(template.edges)
-        self.readout = nn.Parameter(torch.randn(self.channels, 2 * joint_channels) * 0.1)
+        self.by_edge = readout == "edge"
+        inputs = (2 if self.by_edge else joints) * joint_channels
+        start = torch.randn(self.channels, inputs) * (READOUT_START / math.sqrt(inputs))
+        self.readout = nn.Parameter(start)
         self.readout_bias = nn.Parameter(torch.zeros(self.channels))
 
     def forward(self, omega: Tensor, pose: Tensor) -> Tensor:
@@ -92,6 +105,8 @@ class PoseGraph(nn.Module):
         for layer in self.layers[:-1]:
             h = functional.relu(layer(h))
         h = self.layers[-1](h)
+        if not self.by_edge:
+            return functional.linear(h.flatten(1), self.readout, self.readout_bias)
         pairs = torch.cat([h[:, self.edges[:, 0]], h[:, self.edges[:, 1]]], dim=-1)
         return (pairs * self.readout).sum(-1) + self.readout_bias
 

@@ -55,6 +55,7 @@ class SurfaceGaussians(nn.Module):
         self.points = SkinnedPoints(body, points)
         count = len(self.points)
         self.features, self.sh_degree, self.body_height = 0, sh_degree, float(body_height)
+        self.active_degree = sh_degree  # training raises it; what is above is not computed
         self.mean_bound, self.logit_bound = mean_bound, logit_bound
         self.scale_range = (scale_min, scale_max)
         self.offsets = nn.Parameter(torch.zeros(count, 3))
@@ -85,10 +86,12 @@ class SurfaceGaussians(nn.Module):
         low, high = (math.log(bound * self.body_height) for bound in self.scale_range)
         rotation = quaternion_to_rotation_matrix(functional.normalize(self.quats, dim=-1, eps=1e-6))
         axes = A @ (rotation * self.log_scales.clamp(low, high).exp().unsqueeze(-2))
-        # Seen from the canonical body, as in 3DGS-Avatar: a turned arm keeps its highlights.
-        view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
-        view = functional.normalize((A.mT @ view.unsqueeze(-1)).squeeze(-1), dim=-1, eps=1e-6)
-        sh = self.sh.expand(batch, -1, -1, -1)
+        sh = self.sh[:, : (self.active_degree + 1) ** 2].expand(batch, -1, -1, -1)
+        view = means  # at degree 0 a colour has no direction
+        if sh.shape[-2] > 1:
+            # Seen from the canonical body, as in 3DGS-Avatar: a turned arm keeps its highlights.
+            view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
+            view = functional.normalize((A.mT @ view.unsqueeze(-1)).squeeze(-1), dim=-1, eps=1e-6)
         logits = self.logit_opacities.clamp(-self.logit_bound, self.logit_bound)
         return Gaussians(
             means=means,

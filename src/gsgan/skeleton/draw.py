@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
@@ -66,8 +67,7 @@ def draw_skeleton(
 
     pixels, depth = grid.project(p, near)
     drawn = valid & (depth > near)
-    segments = [edge for _, group in template.draw_groups for edge in group]
-    ends = torch.tensor(segments, device=p.device).T
+    ends = _segment_ends(template, p.device)
     shown = (drawn.index_select(1, ends[0]) & drawn.index_select(1, ends[1])).unsqueeze(-1)
     a, b = (pixels.index_select(1, end) for end in ends)
     # on the inputs: a far-off or meaningless pixel must not reach the arithmetic
@@ -79,6 +79,15 @@ def draw_skeleton(
     if downscale > 1:
         image = F.interpolate(image, size=(H, W), mode="bilinear", align_corners=False)
     return image
+
+
+@lru_cache(maxsize=64)
+def _segment_ends(template: SkeletonTemplate, device: torch.device) -> Tensor:
+    """``[2, S]`` joints of all groups' segments; made once, not copied over in every frame."""
+    segments = [edge for _, group in template.draw_groups for edge in group]
+    # tensors born in inference mode could not be used for training later
+    with torch.inference_mode(False):
+        return torch.tensor(segments, device=device).T
 
 
 def _distance2(

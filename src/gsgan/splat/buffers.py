@@ -52,6 +52,11 @@ def kept() -> int:
     return sum(size * len(same) for size, same in list(_free.items()))
 
 
+def forget() -> None:
+    """Gives back what is kept: a bench of memory begins with none."""
+    _free.clear()
+
+
 def _take(size: int) -> NDArray[np.uint8] | None:
     try:
         return _free[size].pop()

@@ -202,10 +202,16 @@ def field_of_view(K: Tensor, size: tuple[int, int], widen: float) -> tuple[Tenso
     """
     H, W = size
     corners = K.new_tensor([[0, W, 0, W], [0, 0, H, H]]) - K[:, :2, 2:]
-    ratios = torch.linalg.inv(K[:, :2, :2]) @ corners
+    ratios = _inverse(K[:, :2, :2]) @ corners
     low, high = ratios.amin(-1, keepdim=True), ratios.amax(-1, keepdim=True)
     middle, half = (low + high) / 2, (high - low) / 2
     return middle - widen * half, middle + widen * half
+
+
+def _inverse(matrix: Tensor) -> Tensor:
+    """``torch.linalg.inv`` without its look at the result, for which the host would wait."""
+    inverse: Tensor = torch.linalg.inv_ex(matrix).inverse
+    return inverse
 
 
 def _footprint(

@@ -28,7 +28,7 @@ def _generator(dtype: torch.dtype, device: torch.device, biased: bool) -> Genera
         F, S, p2d = CHANNELS.values()
         made = Generator(F, S, p2d, POSE, base=4)
         for module in made.modules():
-            if isinstance(module, Style):
+            if isinstance(module, Style) and module.from_map is not None:
                 nn.init.normal_(module.from_map.weight, std=0.1)
                 nn.init.normal_(module.from_pose.weight, std=0.1)
     if not biased:

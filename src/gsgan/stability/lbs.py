@@ -9,7 +9,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsgan.body import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from gsgan.body import (
+    axis_angle_to_matrix,
+    blend_transforms,
+    check_weights,
+    forward_kinematics,
+    skin,
+)
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat import Accuracy, rasterise
 from gsgan.stability.case import REFUSED, Case, Inputs, Tolerance
@@ -36,6 +42,7 @@ def _arm(**changes: Any) -> Inputs:
 
 def _skinned(inputs: Inputs) -> dict[str, Tensor]:
     """Points and covariances ``[1, 4, ...]`` of the posed arm; bones scaled where asked."""
+    check_weights(inputs["weights"].detach())  # as every body does when it is made
     R = axis_angle_to_matrix(inputs["theta"])
     bones = forward_kinematics(inputs["joints"], PARENTS, R, torch.zeros_like(R[:, 0, 0]))
     if "bone scale" in inputs:

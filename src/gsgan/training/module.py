@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,6 +10,7 @@ import torch
 from lightning import LightningModule
 from torch import Tensor, nn
 
+from gsgan.effects import Effect, Effects
 from gsgan.errors import ConfigError, GsganError
 from gsgan.losses.adversarial import FORMS, discriminator_loss, feature_matching, generator_loss
 from gsgan.losses.perceptual import Perceptual
@@ -25,6 +27,7 @@ from gsgan.training.rollback import Rollback
 from gsgan.training.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
 
 PSNR_CAP = 100.0  # dB: one picture equal to the truth would make a watched mean infinite
+SPLATTING = ("psi", "colour")  # optimisers of what makes Step I's picture
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
 
 
@@ -36,8 +39,6 @@ class StepOneLoss:
         l1, ssim: weights (paper: 0.8, 0.2).
         feature_head: weight of the same loss on a linear readout of F; without it F's further
             channels get no gradient in Step I. 0 builds no readout.
-        random_background: composite both pictures over a random colour, so that black clothes do
-            not become transparent; False composites over black.
 
     Source: paper Sec. 3.6; method.md § 2.
     """
@@ -45,7 +46,6 @@ class StepOneLoss:
     l1: float = 0.8
     ssim: float = 0.2
     feature_head: float = 0.5
-    random_background: bool = True
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class AvatarTraining(LightningModule):
         perceptual: L_perc; None leaves it out.
         schedule: iterations of each phase. Without S its phase is left out; without a generator
             Step I gets Step II's iterations, so that Ψ trains equally long in every variant.
-        recipes: optimisers by name: segmentation, psi, generator, discriminator.
+        recipes: optimisers by name: segmentation, psi, colour, generator, discriminator.
         step_one, step_two: loss weights.
         pose_noise: standard deviation, body heights, of the noise on Ψ's pose code.
         seed: with the iteration it determines every random number drawn here, so a resumed run
@@ -150,12 +150,42 @@ class AvatarTraining(LightningModule):
         self.max_skipped, self.record = max_skipped, record or {}
         self.rollback = rollback or Rollback()
         self.average = MovingAverage(avatar, average) if average is not None else None
+        # Step I over a random colour, so that black clothes do not become transparent.
+        self.random_background = avatar.effects.random_background.on
         wanted = step_one.feature_head and avatar.splat_channels > 3
         self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1) if wanted else None
         self.step = 0  # iterations done: Lightning's global_step counts every optimiser's steps
         self.skipped = 0
         self.start_psnr: float | None = None
         self.last_psnr: float | None = None
+        self.seconds_before: float | None = 0.0  # None: an earlier part did not count them
+        self._began: float | None = None
+
+    @property
+    def train_seconds(self) -> float | None:
+        """Wall clock of the training so far, parts before an interruption included; None when one
+        of them did not say."""
+        if self.seconds_before is None or self._began is None:
+            return self.seconds_before
+        return self.seconds_before + time.monotonic() - self._began
+
+    def on_fit_start(self) -> None:
+        """Refuses float16: its scaled gradients would be clipped and guarded before unscaling.
+
+        Raises:
+            ConfigError: when ``trainer.precision`` is one of float16's.
+        """
+        if self.trainer.precision in ("16-true", "16-mixed"):
+            raise ConfigError(
+                f"trainer.precision={self.trainer.precision}: float16 loses this training's small "
+                "gradients, and scaled ones cannot be clipped; choose bf16-mixed or 32-true"
+            )
+
+    def on_train_start(self) -> None:
+        self._began = time.monotonic()
+
+    def on_train_end(self) -> None:
+        self.seconds_before, self._began = self.train_seconds, None
 
     @property
     def marks(self) -> list[str]:
@@ -184,6 +214,8 @@ class AvatarTraining(LightningModule):
         head = list(self.feature_head.parameters()) if self.feature_head else []
         if avatar.splats is not None:
             groups["psi"] = [*avatar.splats.parameter_groups(), (head, 1.0)]
+        if avatar.colour is not None:
+            groups["colour"] = [(list(avatar.colour.parameters()), 1.0)]
         if avatar.generator is not None and avatar.pose_encoder is not None:
             pose = list(avatar.pose_encoder.parameters())
             groups["generator"] = [([*avatar.generator.parameters(), *pose], 1.0)]
@@ -215,7 +247,7 @@ class AvatarTraining(LightningModule):
 
     def _rate(self, name: str) -> float:
         start, end = self.schedule.bounds(SEGMENTATION if name == "segmentation" else STEP_TWO)
-        if name == "psi":  # one span over both steps: restarting the rate costs quality
+        if name in SPLATTING:  # one span over both steps: restarting the rate costs quality
             start = self.schedule.bounds(STEP_ONE)[0]
         rate = self.recipes[name].rate.at(self.step, start, end)
         return rate * self.rollback.rate if name == "psi" else rate
@@ -238,6 +270,10 @@ class AvatarTraining(LightningModule):
     def training_step(self, frame: Frame, batch_idx: int) -> None:
         if self.step >= self.schedule.total:
             return
+        if self.avatar.splats is not None:
+            self.avatar.splats.active_degree = self.schedule.degree(
+                self.step, self.avatar.splats.sh_degree
+            )
         window = self.avatar.window(frame)
         height = frame.camera.size[0]
         frame = frame if window is None else window.frame(frame)
@@ -253,15 +289,17 @@ class AvatarTraining(LightningModule):
     def _train_segmentation(self, frame: Frame) -> None:
         if frame.labels is None or frame.body is None:
             return  # nothing to learn from: S keeps its initial Gaussians
-        segmentation = self.avatar.segmentation(frame.body, frame.camera)  # type: ignore[misc]
-        loss = segmentation_loss(segmentation, frame.labels)
+        segmentation = self.avatar.segmentation
+        assert segmentation is not None
+        labels = segmentation.truth(frame.labels)
+        loss = segmentation_loss(segmentation(frame.body, frame.camera), labels)
         self._descend(loss, "segmentation")
         self._log("segmentation/nll", loss)
 
     def _train_step_one(self, frame: Frame, height: int) -> None:
         painting = self._paint(frame, height, paint=False)
         loss = self.step_one_loss(painting, frame)
-        self._descend(loss, "psi")
+        self._descend(loss, *self._splatting())
         if self.average is not None and self.avatar.generator is None:  # this is its last step
             self.average.update(self.avatar)
         self._log("step_one/loss", loss)
@@ -272,14 +310,17 @@ class AvatarTraining(LightningModule):
         if self.discriminator is not None:
             self.discriminator.requires_grad_(False)
         terms = self.step_two_terms(painting, frame, play)
-        learning = ("psi", "generator") if self.avatar.splats else ("generator",)
-        self._descend(torch.stack(list(terms.values())).sum(), *learning)
+        self._descend(torch.stack(list(terms.values())).sum(), *self._splatting(), "generator")
         if self.average is not None:
             self.average.update(self.avatar)
         for name, term in terms.items():
             self._log(f"step_two/{name}", term)
         if play:
             self._train_discriminator(painting, frame)
+
+    def _splatting(self) -> tuple[str, ...]:
+        """The optimisers of what makes Step I's picture."""
+        return tuple(name for name in SPLATTING if name in self._names)
 
     def _train_discriminator(self, painting: Painting, frame: Frame) -> None:
         assert self.discriminator is not None
@@ -301,6 +342,7 @@ class AvatarTraining(LightningModule):
             paint=paint,
             detach_features=self.step_two.detach_features,
             picture_height=height,
+            camera_index=frame.camera_index,
         )
         if painting.alpha is not None:
             self.rollback.watch(painting.alpha, frame.mask)
@@ -383,7 +425,7 @@ class AvatarTraining(LightningModule):
 
     def _background(self, frame: Frame) -> Tensor:
         shape = (len(frame), 3, 1, 1)
-        if not self.step_one.random_background:
+        if not self.random_background:
             return frame.image.new_zeros(shape)
         return torch.rand(shape, generator=self._random(0)).to(frame.image)
 
@@ -414,6 +456,8 @@ class AvatarTraining(LightningModule):
         return self.average.module.eval()  # type: ignore[return-value]
 
     def on_validation_epoch_end(self) -> None:
+        if self.train_seconds is not None:  # the time axis of every curve
+            self.log("val/seconds", self.train_seconds, sync_dist=True)
         self.last_psnr = float(self.trainer.callback_metrics["val/psnr"])
         if self.start_psnr is None:
             self.start_psnr = self.last_psnr
@@ -429,15 +473,19 @@ class AvatarTraining(LightningModule):
             "rollbacks": self.rollback.done,
             "averaged": self.average is not None and self.average.started,
             "start_psnr": self.start_psnr,
+            "train_seconds": self.train_seconds,
             "marks": self.marks,
             "record": self.record,
+            "effects": self.avatar.effects.plain(),
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         state = checkpoint["gsgan"]
+        _same_effects(state.get("effects"), self.avatar.effects)
         self.step, self.skipped = state["step"], state["skipped"]
         self.rollback.done = state["rollbacks"]
         self.start_psnr = state["start_psnr"]
+        self.seconds_before = state.get("train_seconds")
 
 
 def _fit_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
@@ -447,8 +495,26 @@ def _fit_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
         round(n * schedule.stretch)
         for n in (schedule.step_one, schedule.step_two, schedule.discriminator_start)
     )
+    every = round(schedule.degree_every * schedule.stretch)
     if avatar.generator is None:
         one, two = one + two, 0
     if avatar.splats is None:
         one, two = 0, one + two
-    return replace(schedule, step_one=one, step_two=two, discriminator_start=start)
+    return replace(
+        schedule, step_one=one, step_two=two, discriminator_start=start, degree_every=every
+    )
+
+
+def _same_effects(stored: dict[str, Any] | None, now: Effects) -> None:
+    """Refuses to go on with a run whose data called for other effects when it began."""
+    if stored is None:
+        return
+    before = Effects.from_plain(stored)
+    for name, effect in now:
+        was: Effect = getattr(before, name)
+        if was.value != effect.value:
+            raise ConfigError(
+                f"effects.{name}: the run began with {was.value} ({was.why}), its data now calls "
+                f"for {effect.value} ({effect.why}); set effects.{name}={was.value}, or "
+                "resume=false to start over"
+            )

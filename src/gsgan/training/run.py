@@ -21,13 +21,17 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from gsgan.console import make_console
 from gsgan.data.datamodule import GsganData
-from gsgan.evaluation import evaluate_run
+from gsgan.effects.table import effects_table
 from gsgan.files import write_atomically
-from gsgan.metrics.image import check_lpips
+from gsgan.metrics.lpips import check_lpips
 from gsgan.model.avatar import Avatar
 from gsgan.runs import CHECKPOINT, build_training, checkpoint_to_resume, read_checkpoint
+from gsgan.scoring.facts import Method
+from gsgan.scoring.files import NAMES
+from gsgan.scoring.run import evaluate_run
 from gsgan.training.callbacks import Narrator, PictureGrid
 from gsgan.training.checkpoints import AtomicCheckpoints
+from gsgan.training.effects_cost import effect_costs
 from gsgan.training.module import AvatarTraining
 
 PROGRESS = "progress.json"
@@ -59,6 +63,8 @@ def run_training(config: DictConfig) -> None:
         return
 
     describe(console, folder, data, module)
+    costs = effect_costs(config, data, module.avatar, config.effects.measure)
+    console.print(effects_table(module.avatar.effects, costs))
     if resume is not None:
         console.print(f"going on from {resume}", soft_wrap=True)
     trainer = build_trainer(config, folder, module, data, console, resume)
@@ -77,7 +83,15 @@ def run_training(config: DictConfig) -> None:
     if config.evaluate:
         module.to(trainer.strategy.root_device)  # Lightning leaves it on the CPU
         avatar = module.shown.eval()
-        evaluate_run(folder, config, console, data=data, avatar=avatar, marks=module.marks)
+        method = Method(
+            "gsgan",
+            seed=config.seed,
+            iterations=module.step,
+            train_seconds=module.train_seconds,
+        )
+        evaluate_run(
+            folder, config, console, data=data, avatar=avatar, marks=module.marks, method=method
+        )
     console.print(f"run folder: {folder}", soft_wrap=True)
 
 
@@ -93,7 +107,7 @@ def finished(folder: Path, module: AvatarTraining, config: DictConfig) -> bool:
 
 def remove_old_results(folder: Path) -> None:
     """Removes what an earlier run left in a folder that starts over."""
-    for name in ("metrics.json", "metrics.md", PROGRESS, CHECKPOINT):
+    for name in (*NAMES, PROGRESS, CHECKPOINT):
         (folder / name).unlink(missing_ok=True)
 
 
@@ -152,7 +166,7 @@ def build_trainer(
 
 
 def describe(console: Console, folder: Path, data: GsganData, module: AvatarTraining) -> None:
-    """What is trained on what, which effects are on and why, which stand-ins are in use."""
+    """What is trained on what, and which stand-ins are in use."""
     info, avatar = data.info, module.avatar
     held_out = ", ".join(f"{len(data.dataset(name))} {name}" for name in data.eval_names)
     table = Table(title=f"gsgan: {folder}", show_header=False)
@@ -164,8 +178,6 @@ def describe(console: Console, folder: Path, data: GsganData, module: AvatarTrai
     for name, part in parts(avatar, module).items():
         table.add_row(name, f"{sum(p.numel() for p in part.parameters()):,} parameters")
     table.add_row("a picture costs", cost(avatar, data))
-    for effect, (on, why) in effects(data, avatar).items():
-        table.add_row(effect, f"{'on' if on else 'off'}: {why}")
     s = module.schedule
     table.add_row(
         "schedule", f"segmentation {s.segmentation}, Step I {s.step_one}, Step II {s.step_two}"
@@ -181,6 +193,7 @@ def parts(avatar: Avatar, module: AvatarTraining) -> dict[str, torch.nn.Module]:
         "Ψ": avatar.deformation,
         "surface": avatar.surface,
         "segmentation": avatar.segmentation,
+        "colour correction": avatar.colour,
         "pose encoder": avatar.pose_encoder,
         "generator": avatar.generator,
         "discriminator": module.discriminator,
@@ -199,16 +212,6 @@ def cost(avatar: Avatar, data: GsganData) -> str:
     window = avatar.window(frame)
     height, width = frame.camera.size if window is None else window.size
     return f"{counter.get_total_flops() / 1e9:.2f} GFLOP in the networks, {width} x {height} pixels"
-
-
-def effects(data: GsganData, avatar: Avatar) -> dict[str, tuple[bool, str]]:
-    """What this scene calls for: on or off, and why."""
-    distorted = data.info.has_distortion
-    lens = "a lens coefficient is not zero: pictures are undistorted on reading"
-    return {
-        **avatar.effects,
-        "lens distortion": (distorted, lens if distorted else "all lens coefficients are zero"),
-    }
 
 
 def _step_of(checkpoint: Path) -> int:

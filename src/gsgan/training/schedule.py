@@ -22,6 +22,8 @@ class Schedule:
         epoch: iterations between checkpoints; Lightning's epoch is this many sampled batches.
         stretch: factor on Steps I and II, for a variant whose iterations are cheaper: the same
             time for every variant, where the same iterations would starve the simpler ones.
+        degree_every: iterations of Steps I and II after which the degree of the spherical harmonics
+            rises by one, from 0; 0 takes them all at once.
 
     Source: paper Alg. 2; method.md § 7 and § 13 (why Ψ goes on learning in Step II).
     """
@@ -32,11 +34,15 @@ class Schedule:
     discriminator_start: int = 0
     epoch: int = 250
     stretch: float = 1.0
+    degree_every: int = 0
 
     def __post_init__(self) -> None:
         if self.stretch <= 0:
             raise ConfigError(f"schedule.stretch must be above 0, got {self.stretch}")
-        for name in ("segmentation", "step_one", "step_two", "discriminator_start"):
+        for name in (
+            *("segmentation", "step_one", "step_two", "discriminator_start"),
+            "degree_every",
+        ):
             if getattr(self, name) < 0:
                 raise ConfigError(f"schedule.{name} must be 0 or more, got {getattr(self, name)}")
         if self.epoch < 1:
@@ -59,6 +65,12 @@ class Schedule:
         if step < self.segmentation:
             return SEGMENTATION
         return STEP_ONE if step < self.segmentation + self.step_one else STEP_TWO
+
+    def degree(self, step: int, most: int) -> int:
+        """The degree of the spherical harmonics at an iteration, up to ``most``."""
+        if self.degree_every == 0:
+            return most
+        return min(most, max(0, step - self.segmentation) // self.degree_every)
 
     def bounds(self, phase: str) -> tuple[int, int]:
         """First iteration of a phase, and the first after it."""

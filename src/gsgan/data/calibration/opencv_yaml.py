@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
+from gsgan.data.calibration.opencv_storage import Storage, read_storage
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
 from gsgan.errors import DataError
 
@@ -27,30 +27,34 @@ def read_opencv_yaml(
         DataError: when one file or one camera's half is missing, or they contradict each other.
     """
     intri_path, extri_path = _both(path)
-    intri, extri = _open(intri_path), _open(extri_path)
+    intri, extri = read_storage(intri_path), read_storage(extri_path)
     names, notes = _names(intri), list[str]()
     cameras = {}
     for name in names:
-        where = f"{intri_path}, camera {name}"
-        rotation, T = _rotation(extri, extri_path, name), _matrix(extri, f"T_{name}")
+        where, K = f"{intri_path}, camera {name}", intri.matrix(f"K_{name}")
+        if K is None:
+            raise DataError(
+                f"{intri_path} lists the camera {name} but lacks K_{name}; export it again"
+            )
+        rotation, T = _rotation(extri, extri_path, name), extri.matrix(f"T_{name}")
         if rotation is None or T is None:
             raise DataError(
                 f"{extri_path} lacks Rot_{name} (or R_{name}) and T_{name}, but {intri_path} "
                 f"lists the camera {name}; calibrate it, or take it out of both"
             )
-        dist = _matrix(intri, f"dist_{name}")
+        dist = intri.matrix(f"dist_{name}")
         if dist is None:
-            dist = _matrix(intri, f"D_{name}")
+            dist = intri.matrix(f"D_{name}")
         if dist is None:
             notes.append(f"{intri_path} says no lens distortion for {name}: taken as none")
         cameras[name] = make_camera(
             where,
             name,
-            K=_matrix(intri, f"K_{name}"),
+            K=K,
             R=rotation,
             t=T,
             dist=None if dist is None else _lens(dist),
-            size=(_integer(intri, where, f"H_{name}"), _integer(intri, where, f"W_{name}")),
+            size=(_pixels(intri, where, f"H_{name}"), _pixels(intri, where, f"W_{name}")),
             scale=scale or 1.0,
             pixel_centre=pixel_centre,
         )
@@ -71,35 +75,9 @@ def _both(path: Path) -> tuple[Path, Path]:
     return pair[0], pair[1]
 
 
-def _open(path: Path) -> Any:
-    try:
-        path.read_text(encoding="utf-8")  # OpenCV does not look, and fails later on the names
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-        if storage.isOpened() and storage.root().isMap():
-            return storage
-    except (OSError, UnicodeDecodeError, cv2.error, SystemError):
-        pass
-    raise DataError(f"{path} is not readable as OpenCV YAML; it may be cut off: export it again")
-
-
-def _names(intri: Any) -> list[str]:
-    node = intri.getNode("names")
-    listed = [node.at(i).string() for i in range(node.size())] if node.isSeq() else []
-    if not listed:
-        keys: tuple[str, ...] = intri.root().keys()
-        listed = [key[2:] for key in keys if key.startswith("K_")]
+def _names(intri: Storage) -> list[str]:
+    listed = intri.strings("names") or [key[2:] for key in intri.nodes if key.startswith("K_")]
     return [name for name in dict.fromkeys(listed) if name and name != "none"]
-
-
-def _matrix(storage: Any, key: str) -> np.ndarray | None:
-    node = storage.getNode(key)
-    if node.empty():
-        return None
-    try:
-        value = node.mat()
-    except cv2.error:
-        value = None
-    return np.full(1, np.nan) if value is None else np.asarray(value, np.float64)
 
 
 def _lens(dist: np.ndarray) -> list[float]:
@@ -108,17 +86,17 @@ def _lens(dist: np.ndarray) -> list[float]:
     return values if any(values[MAX_LENS:]) else values[:MAX_LENS]
 
 
-def _integer(storage: Any, where: str, key: str) -> int:
-    node = storage.getNode(key)
-    if not (node.isInt() or node.isReal()):
+def _pixels(intri: Storage, where: str, key: str) -> int:
+    value = intri.number(key)
+    if value is None:
         return 0
-    if not np.isfinite(node.real()):
-        raise DataError(f"{where}: '{key}' must be a number of pixels, found {node.real()}")
-    return max(0, int(node.real()))
+    if not np.isfinite(value) or value != int(value):
+        raise DataError(f"{where}: '{key}' must be a number of pixels, found {value}")
+    return max(0, int(value))
 
 
-def _rotation(extri: Any, path: Path, name: str) -> np.ndarray | None:
-    matrix, vector = _matrix(extri, f"Rot_{name}"), _matrix(extri, f"R_{name}")
+def _rotation(extri: Storage, path: Path, name: str) -> np.ndarray | None:
+    matrix, vector = extri.matrix(f"Rot_{name}"), extri.matrix(f"R_{name}")
     if vector is None:
         return matrix
     turned = cv2.Rodrigues(numbers(f"{path}, camera {name}", vector, f"R_{name}", (3,)))[0]

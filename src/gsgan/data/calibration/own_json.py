@@ -7,7 +7,8 @@ from pathlib import Path
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.checks import Checks
 from gsgan.data.files import read_json
-from gsgan.data.formats.capture import Conventions, read_cameras, read_meta
+from gsgan.data.formats.capture import read_cameras
+from gsgan.data.formats.capture_meta import Conventions, read_meta
 
 
 def read_own_json(

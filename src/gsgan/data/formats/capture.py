@@ -23,8 +23,11 @@ from gsgan.arrays import expect_array
 from gsgan.data.cameras import EXPECTED, CameraEntry, make_camera, numbers
 from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, read_arrays, read_json
-from gsgan.data.formats.trust import Trust, check_boxes, watch_masks
-from gsgan.data.layout import BodyModel, Found, Layout, Meta, assemble, dataset_folder
+from gsgan.data.formats.capture_meta import BODY_BONES, Conventions, read_meta
+from gsgan.data.formats.common import without_frames
+from gsgan.data.formats.meeting import check_meeting
+from gsgan.data.formats.trust import Trust, watch_masks
+from gsgan.data.layout import Found, Layout, Meta, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile, PixelRules
 from gsgan.data.skeletons import (
     SKELETONS,
@@ -35,27 +38,27 @@ from gsgan.data.skeletons import (
 )
 from gsgan.errors import DataError
 
-METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 MASK_SUFFIXES = (".png",)
 LOOKED_AT = Trust(min_box_iou=0.0)
 """Landmarks lie inside the body and may lack limbs: their box says little about the mask's."""
-BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
 
 
 @dataclass(frozen=True)
-class Conventions:
-    """How the numbers of this capture are to be read, from meta.json.
+class CaptureReader:
+    """Reads a capture in the bring-your-own layout; what is looked at is a setting.
 
     Args:
-        scale: metres in one unit of the files.
-        pixel_centre: 0.5, or 0 when K counts from the centre of the first pixel.
-        composed: the images are already composed on black (``"background": "black"``).
+        drop_frames: frames to leave out, e.g. "360-370", or None.
+        trust: which pictures are looked at.
     """
 
-    scale: float
-    pixel_centre: float
-    composed: bool
+    drop_frames: Any = None
+    trust: Trust = LOOKED_AT
+
+    def __call__(self, root: str | Path, checks: Checks, smpl: str | None = None) -> Layout:
+        """See `read_capture`."""
+        return read_capture(root, checks, smpl, self.trust, self.drop_frames)
 
 
 def read_capture(
@@ -63,6 +66,7 @@ def read_capture(
     checks: Checks | None = None,
     smpl: str | None = None,
     trust: Trust = LOOKED_AT,
+    drop_frames: Any = None,
 ) -> Layout:
     """Reads and checks everything but most pictures' pixels.
 
@@ -70,7 +74,8 @@ def read_capture(
         root: the folder that holds cameras.json.
         checks: thresholds, `Checks()` when None.
         smpl: the user's model file, for poses of an SMPL or SMPL-X body.
-        trust: which masks are looked at.
+        trust: which pictures are looked at.
+        drop_frames: frames to leave out, e.g. "360-370", or None.
 
     Raises:
         DataError: for whatever is missing, damaged or contradictory, naming the file.
@@ -110,58 +115,14 @@ def read_capture(
         ),
         notes=tuple(notes),
     )
-    layout = assemble(found, checks)
-    check_boxes(
+    layout = assemble(without_frames(found, drop_frames), checks)
+    doubts = check_meeting(
         layout,
         layout.landmarks.seen,
         trust,
         "check that cameras, landmarks and masks belong together",
     )
-    return replace(layout, notes=(*layout.notes, *watch_masks(layout, trust)))
-
-
-def read_meta(path: Path, smpl: str | None = None) -> tuple[Meta, Conventions]:
-    """meta.json; only ``unit`` must be there.
-
-    Raises:
-        DataError: on a missing unit or a value out of its set.
-    """
-    content = read_json(path)
-
-    def choose(key: str, default: Any, allowed: tuple[Any, ...]) -> Any:
-        value = content.get(key, default)
-        if isinstance(value, (list, dict)) or value not in allowed:
-            names = ", ".join(map(str, allowed))
-            raise DataError(f"{path}: '{key}' is {value!r}; expected one of {names}")
-        return value
-
-    unit = choose("unit", None, tuple(METRES))
-    fps = content.get("fps")
-    if fps is not None and not (isinstance(fps, (int, float)) and fps > 0):
-        raise DataError(f"{path}: 'fps' is {fps!r}; expected a number above 0")
-    names = content.get("label_names")
-    if names is not None and not (isinstance(names, list) and len(names) > 1):
-        raise DataError(f"{path}: 'label_names' must list the background and every part by name")
-    splits = content.get("splits") or {}
-    if not isinstance(splits, dict):
-        raise DataError(f"{path}: 'splits' must be an object with train_cameras, test_frames, ...")
-    body = content.get("body")
-    if body is not None and (not isinstance(body, str) or body not in BODY_BONES):
-        raise DataError(f"{path}: 'body' is {body!r}; expected one of {', '.join(BODY_BONES)}")
-    meta = Meta(
-        unit=unit,
-        fps=None if fps is None else float(fps),
-        up_axis=choose("up_axis", "z", ("x", "y", "z", "-x", "-y", "-z")),
-        skeleton=choose("skeleton", "mediapipe33", tuple(SKELETONS)),
-        body=None if body is None else BodyModel(body, smpl if body != "free" else None),
-        label_names=None if names is None else tuple(map(str, names)),
-        splits=splits,
-    )
-    return meta, Conventions(
-        scale=METRES[unit],
-        pixel_centre=choose("pixel_centre", 0.5, (0, 0.5)),
-        composed=choose("background", "scene", ("scene", "black")) == "black",
-    )
+    return replace(layout, notes=(*layout.notes, *doubts, *watch_masks(layout, trust)))
 
 
 def read_cameras(

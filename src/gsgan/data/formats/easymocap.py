@@ -28,8 +28,9 @@ from gsgan.data.formats.common import (
     without_frames,
 )
 from gsgan.data.formats.easymocap_skeleton import read_fits, read_keypoints, read_people
+from gsgan.data.formats.meeting import check_meeting
 from gsgan.data.formats.smpl_motion import landmarks_of
-from gsgan.data.formats.trust import Trust, check_boxes, watch_masks
+from gsgan.data.formats.trust import Trust, watch_masks
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, assemble, dataset_folder
 from gsgan.data.pixels import MASK_RULES, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
@@ -104,14 +105,14 @@ class EasymocapReader:
         )
         found = self._find(folder, checks, smpl)
         layout = assemble(without_frames(found, self.drop_frames), checks)
-        check_boxes(
+        doubts = check_meeting(
             layout,
             layout.landmarks.seen,
             self.trust,
             "check that calibration, skeleton and masks are of one recording and one person "
             "(data.reader.person)",
         )
-        return replace(layout, notes=(*layout.notes, *watch_masks(layout, self.trust)))
+        return replace(layout, notes=(*layout.notes, *doubts, *watch_masks(layout, self.trust)))
 
     def _find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
         notes: list[str] = []

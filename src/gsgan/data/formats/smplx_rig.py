@@ -23,10 +23,11 @@ from gsgan.data.formats.common import (
     up_axis,
     without_frames,
 )
+from gsgan.data.formats.meeting import check_meeting
 from gsgan.data.formats.rig_files import Files, check_cameras, check_grey, index, leave_out
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
 from gsgan.data.formats.smplx_params import read_motion
-from gsgan.data.formats.trust import Trust, check_boxes, watch_masks
+from gsgan.data.formats.trust import Trust, watch_masks
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile, PixelRules
 from gsgan.data.skeletons import make_landmarks
@@ -131,14 +132,14 @@ class SmplxRigReader:
         found, motion = self._find(folder, checks, *given)
         layout = assemble(without_frames(found, self.drop_frames), checks)
         row = {int(f): i for i, f in enumerate(motion.ids)}
-        check_boxes(
+        doubts = check_meeting(
             layout,
             lambda frame: posed(given[1], motion.rows([row[frame]]))[0][0],
             self.trust,
             f"check that {self.places.calibration}, {PARAMETERS} and masks are of one subject, and "
             "that data.smpl is the neutral SMPL-X",
         )
-        return replace(layout, notes=(*layout.notes, *watch_masks(layout, self.trust)))
+        return replace(layout, notes=(*layout.notes, *doubts, *watch_masks(layout, self.trust)))
 
     def _find(
         self, root: Path, checks: Checks, smpl: Path, model: SkinnedModel

@@ -27,8 +27,9 @@ from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files
 from gsgan.data.formats import zju_annots, zju_caches, zju_params
 from gsgan.data.formats.common import body_model, no_joints, up_axis, without_frames
+from gsgan.data.formats.meeting import check_meeting
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
-from gsgan.data.formats.trust import Trust, check_boxes, highest_label, spread, watch_masks
+from gsgan.data.formats.trust import Trust, highest_label, spread, watch_masks
 from gsgan.data.layout import (
     BodyModel,
     Found,
@@ -117,9 +118,10 @@ class ZjuReader:
             found = cache(folder, checks, model, path, self.pixel_centre)
             found = replace(found, pixels=replace(found.pixels, ignore_band=self.ignore_band))
         layout = assemble(without_frames(found, self.drop_frames), checks)
-        if body is not None:
-            check_boxes(layout, body, self.trust, MIXED)
-        return self._looked_at(layout)
+        # the joints of a cache lie inside the body: their box says little about the mask's
+        trust = self.trust if body is not None else replace(self.trust, min_box_iou=0.0)
+        doubts = check_meeting(layout, body or layout.landmarks.seen, trust, MIXED)
+        return self._looked_at(replace(layout, notes=(*layout.notes, *doubts)))
 
     def _annots(
         self, root: Path, checks: Checks, model: SkinnedModel | None, smpl: Path | None

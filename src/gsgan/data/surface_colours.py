@@ -1,0 +1,178 @@
+"""Whether training cameras agree on the colour of surface that two of them see.
+
+Mean colours of the whole person do not tell: light from one side makes one camera's picture
+brighter. So the same surface is compared, in the same moment: the skinned body's where its mesh is
+at hand, else the visual hull's. What two cameras' colours differ by on the median is the cameras'
+doing; what is left about that median is highlights, and the noise of a surface that is not quite
+where it is taken to be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsgan.scene import Frame
+
+if TYPE_CHECKING:
+    from gsgan.body.skinned import SkinnedBody
+
+Float = NDArray[np.float64]
+
+VOXEL = 0.025  # metres, of the hull and of the grid that tells what is hidden
+AIR = 0.3  # metres of space round the joints that is carved
+BLUR = 0.03  # metres: surface is known to so much, so colours are compared as means over it
+WHOLE = 0.95  # of the blur must lie in the mask: outlines mix with what lies behind
+LEAST_POINTS = 30  # shared by two cameras in a moment: fewer lie at outlines, seen at a slant
+LEAST_MOMENTS = 3
+COARSEST = 0.03  # metres a pixel may cover: in coarser pictures every colour is a mixture
+RESIDUAL = 0.95  # the quantile: highlights cover little of a person
+
+
+@dataclass(frozen=True)
+class SurfaceColours:
+    """How training cameras differ on shared surface; colours in [0, 1].
+
+    Args:
+        difference: the largest median difference of two cameras, in any channel.
+        error: its standard error, from one moment to the next.
+        residual: 95th percentile of what brightness differs by beyond those medians.
+        points: compared in all.
+        source: ``body`` or ``hull``.
+    """
+
+    difference: float
+    error: float
+    residual: float
+    points: int
+    source: str
+
+
+def surface_colours(
+    moments: Sequence[Sequence[Frame]], body: SkinnedBody | None
+) -> SurfaceColours | None:
+    """Compares cameras two by two.
+
+    Args:
+        moments: of each, one frame a camera, the same cameras in the same order, pictures of any
+            size.
+        body: the mesh that the frames' poses move; None takes the visual hull.
+
+    Returns:
+        None where no two cameras share enough, or pictures are too coarse.
+    """
+    if not moments or max(map(_pixel, moments[0])) > COARSEST:
+        return None
+    found: dict[tuple[int, int], list[Float]] = {}
+    with torch.no_grad():
+        for frames in moments:
+            points = _hull(frames) if body is None else _skin(body, frames[0])
+            seen = [_colours(frame, points) for frame in frames]
+            for i, j in combinations(range(len(frames)), 2):
+                both = ~np.isnan(seen[i][:, 0] + seen[j][:, 0])
+                if np.count_nonzero(both) >= LEAST_POINTS:
+                    found.setdefault((i, j), []).append(seen[i][both] - seen[j][both])
+    pairs = [pair for pair in found.values() if len(pair) >= LEAST_MOMENTS]
+    if not pairs:
+        return None
+    worst, error = max((_difference(pair) for pair in pairs), key=lambda found: found[0])
+    left = [np.concatenate(pair) - np.median(np.concatenate(pair), axis=0) for pair in pairs]
+    brightness = np.abs(np.concatenate(left).mean(axis=1))
+    return SurfaceColours(
+        difference=worst,
+        error=error,
+        residual=float(np.quantile(brightness, RESIDUAL)),
+        points=len(brightness),
+        source="hull" if body is None else "body",
+    )
+
+
+def _pixel(frame: Frame) -> float:
+    """Metres that a pixel covers at the person."""
+    depth = float(frame.camera.to_camera(frame.skeleton)[..., 2].median())
+    return depth / float(frame.camera.K[0, 0, 0])
+
+
+def _difference(pair: list[Float]) -> tuple[float, float]:
+    """The largest median over the channels, and its standard error over the moments."""
+    median = np.median(np.concatenate(pair), axis=0)
+    channel = int(np.abs(median).argmax())
+    each = np.array([np.median(moment[:, channel]) for moment in pair])
+    return float(abs(median[channel])), float(each.std(ddof=1) / np.sqrt(len(each)))
+
+
+def _skin(body: SkinnedBody, frame: Frame) -> Float:
+    """``[V, 3]`` metres: the vertices in the frame's pose."""
+    from gsgan.body import axis_angle_to_matrix, blend_transforms, forward_kinematics
+
+    assert frame.body is not None
+    bones = forward_kinematics(
+        body.joints.float(), body.parents, axis_angle_to_matrix(frame.body.theta), frame.body.transl
+    )
+    A, t = blend_transforms(bones, body.bone_index, body.bone_weight.float())
+    points = (A @ body.vertices.float().unsqueeze(-1)).squeeze(-1) + t
+    return points[0].double().numpy()
+
+
+def _hull(frames: Sequence[Frame]) -> Float:
+    """``[V, 3]`` metres: voxels that no camera's mask carves off."""
+    joints = frames[0].skeleton[0][frames[0].visibility[0] > 0].double().numpy()
+    low, high = joints.min(0) - AIR, joints.max(0) + AIR
+    axes = [np.arange(a, b, VOXEL) for a, b in zip(low, high, strict=True)]
+    voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    for frame in frames:
+        pixels, inside, _ = _place(frame, voxels)
+        mask = frame.mask[0, 0].numpy() > 0.5
+        kept = ~inside  # what a camera does not show it cannot carve off
+        kept[inside] = mask[pixels[inside, 1], pixels[inside, 0]]
+        voxels = voxels[kept]
+    return voxels
+
+
+def _place(frame: Frame, points: Float) -> tuple[NDArray[np.int64], NDArray[np.bool_], Float]:
+    """Whole pixels ``[V, 2]``, whether they are in the picture ``[V]``, depths ``[V]``."""
+    height, width = frame.camera.size
+    at, depth = frame.camera.project(torch.from_numpy(points)[None].to(frame.camera.K))
+    pixels = np.floor(at[0].numpy()).clip(-1, max(height, width)).astype(np.int64)
+    inside = (depth[0].numpy() > VOXEL) & (pixels >= 0).all(1)
+    inside &= (pixels[:, 0] < width) & (pixels[:, 1] < height)
+    return pixels, inside, depth[0].double().numpy()
+
+
+def _colours(frame: Frame, points: Float) -> Float:
+    """``[V, 3]`` RGB about each point, NaN where it is hidden, off the picture or at an outline."""
+    result = np.full((len(points), 3), np.nan)
+    pixels, inside, depth = _place(frame, points)
+    if not inside.any():
+        return result
+    height, width = frame.camera.size
+    metre = float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside]))  # in pixels
+    # points are sparser than pixels: depths are compared on a grid as coarse as they are
+    cell = max(1, int(np.ceil(1.5 * VOXEL * metre)))
+    flat = (pixels[:, 1] // cell) * width + pixels[:, 0] // cell
+    nearest = np.full(height * width, np.inf)
+    np.minimum.at(nearest, flat[inside], depth[inside])
+    front = inside.copy()
+    front[inside] = depth[inside] < nearest[flat[inside]] + 1.5 * VOXEL
+    soft, picture = _blurred(frame, max(0.5, BLUR * metre))
+    rows, columns = pixels[front, 1], pixels[front, 0]
+    weight = soft[rows, columns]
+    colours = picture[rows, columns] / np.maximum(weight, WHOLE)[:, None]
+    colours[weight < WHOLE] = np.nan
+    result[front] = colours
+    return result
+
+
+def _blurred(frame: Frame, sigma: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    mask = frame.mask[0, 0].numpy()
+    picture = np.ascontiguousarray(frame.image[0].permute(1, 2, 0).numpy())
+    side = 2 * int(2 * sigma) + 1
+    blur = [cv2.GaussianBlur(x, (side, side), sigma) for x in (mask, picture)]
+    return np.asarray(blur[0], np.float32), np.asarray(blur[1], np.float32)

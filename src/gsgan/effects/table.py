@@ -1,0 +1,68 @@
+"""The table of effects that a run and a check begin with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from rich.table import Table
+
+from gsgan.effects.record import Effects
+
+HEADERS = ("effect", "", "why", "parameters", "ms")
+NAMED = {
+    "view_dependence": "view-dependent colour",
+    "distortion": "lens distortion",
+    "antialias": "anti-aliasing",
+    "colour_correction": "colour correction",
+    "segmentation": "segmentation S",
+    "random_background": "random background",
+    "depth": "depth",
+    "hands": "finger points",
+    "face": "face points",
+}
+UNKNOWN = "–"
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What an effect that is on adds.
+
+    Args:
+        parameters: to the model.
+        ms: to a picture, measured; None where it was not.
+    """
+
+    parameters: int = 0
+    ms: float | None = None
+
+
+def rows(effects: Effects, costs: Mapping[str, Cost] | None = None) -> list[tuple[str, ...]]:
+    """A row an effect: name, value, why, parameters and milliseconds added; nothing for off."""
+    found = []
+    for name, effect in effects:
+        value = str(effect.value) if effect.on else "off"
+        if name == "view_dependence" and effect.on:
+            value = f"degree {effect.value}"
+        cost = (costs or {}).get(name)
+        added = ("", "")
+        if effect.on:
+            ms = None if cost is None else cost.ms
+            added = (
+                UNKNOWN if cost is None else f"{cost.parameters:,}",
+                UNKNOWN if ms is None else f"{ms:.2f}",
+            )
+        found.append((NAMED[name], value, effect.why, *added))
+    return found
+
+
+def effects_table(effects: Effects, costs: Mapping[str, Cost] | None = None) -> Table:
+    """The rows for a terminal; without costs their columns are left out."""
+    shown = len(HEADERS) if costs is not None else 3
+    table = Table(title="effects", title_justify="left")
+    for header in HEADERS[:shown]:
+        right = header in HEADERS[3:]
+        table.add_column(header, justify="right" if right else "left", overflow="fold")
+    for (_, effect), row in zip(effects, rows(effects, costs), strict=True):
+        table.add_row(*row[:shown], style=None if effect.on else "dim")
+    return table

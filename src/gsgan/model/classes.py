@@ -1,0 +1,92 @@
+"""Which parts of the data's label pictures get a channel of S."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from gsgan.body.smpl_names import group_of_part
+from gsgan.errors import ConfigError
+
+IGNORE = 255
+MODES = ("body", "hands", "none")
+HANDS = ("left_hand", "right_hand")
+FACE = "face_neck"
+
+
+@dataclass(frozen=True)
+class ClassMap:
+    """The classes of S, and what the data's labels are among them.
+
+    Convention: class 0 is the background. Labels that no vertex carries are numbered after the
+    channels: S cannot learn them, and a score counts them as missed.
+
+    Args:
+        names: of the channels, background first.
+        absent: names of the labels without a vertex.
+        table: the class of each label.
+    """
+
+    names: tuple[str, ...]
+    absent: tuple[str, ...]
+    table: tuple[int, ...]
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def truth_classes(self) -> int:
+        """Classes that the truth may hold, those without a channel included."""
+        return len(self.names) + len(self.absent)
+
+    def as_table(self) -> Tensor:
+        """``[256]`` int64: the class of each label; unnamed ones and 255 are to be ignored."""
+        table = torch.full((256,), IGNORE)
+        table[: len(self.table)] = torch.tensor(self.table)
+        return table
+
+
+def class_map(
+    label_names: Sequence[str], vertex_labels: Tensor, mode: str = "body", face: bool = False
+) -> ClassMap:
+    """The classes of a mode.
+
+    Args:
+        label_names: of the data's labels, background first.
+        vertex_labels: ``[V]`` int64, the label of each vertex of the body.
+        mode: ``body``: every label that a vertex carries. ``hands``: the left and the right hand;
+            all else counts as background, and still hides what lies behind it.
+        face: with ``hands``, the face (and neck, where the labels join them) as a third class.
+
+    Raises:
+        ConfigError: on another mode, or when a hand or face is wanted that no label names.
+    """
+    if mode not in MODES[:2]:
+        raise ConfigError(f"model.segmentation.mode must be {', '.join(MODES)}; got {mode!r}")
+    if mode == "hands":
+        return _hands(label_names, face)
+    present = set(vertex_labels.unique().tolist()) - {0}
+    kept = [0, *sorted(present)]
+    absent = [label for label in range(1, len(label_names)) if label not in present]
+    number = {label: i for i, label in enumerate([*kept, *absent])}
+    return ClassMap(
+        names=tuple(label_names[label] for label in kept),
+        absent=tuple(label_names[label] for label in absent),
+        table=tuple(number[label] for label in range(len(label_names))),
+    )
+
+
+def _hands(label_names: Sequence[str], face: bool) -> ClassMap:
+    wanted = (*HANDS, FACE) if face else HANDS
+    groups = [group_of_part(name) for name in label_names]
+    lacking = [name for name in wanted if name not in groups]
+    if lacking:
+        raise ConfigError(
+            f"model.segmentation.mode=hands needs labels for {', '.join(wanted)}, but the labels "
+            f"name no {' and no '.join(lacking)} ({', '.join(label_names)}); choose mode=body"
+        )
+    table = tuple(1 + wanted.index(group) if group in wanted else 0 for group in groups)
+    return ClassMap(names=("background", *wanted), absent=(), table=table)

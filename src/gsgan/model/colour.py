@@ -1,0 +1,58 @@
+"""Per-camera colour correction: what exposure and white balance do to a painted picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+
+class ColourCorrection(nn.Module):
+    """An affine map of colours a training camera; cameras that never trained keep the picture.
+
+    Convention: pictures are on black, so the constant term is weighted by alpha and the background
+    stays black. The mean of all maps is the identity, exactly: else the person could take up one
+    tint and every map its inverse, and a camera that never trained would see that tint.
+
+    Args:
+        trained: names of the training cameras, the order of the parameters.
+        cameras: all names, in the order that `Frame.camera_index` counts.
+    """
+
+    rows: Tensor
+
+    def __init__(self, trained: Sequence[str], cameras: Sequence[str]) -> None:
+        super().__init__()
+        if len(trained) < 2:
+            raise ValueError(
+                f"ColourCorrection: expected at least two training cameras, got {list(trained)}"
+            )
+        self.offsets = nn.Parameter(torch.zeros(len(trained), 3, 4))
+        rows = [trained.index(name) if name in trained else len(trained) for name in cameras]
+        # names, not numbers, tie a map to a camera: other data may count them otherwise
+        self.register_buffer("rows", torch.tensor(rows), persistent=False)
+
+    @property
+    def affine(self) -> Tensor:
+        """``[C, 3, 4]`` the maps ``[A | b]``, of mean ``[1 | 0]``."""
+        identity = torch.eye(3, 4, dtype=self.offsets.dtype, device=self.offsets.device)
+        return identity + self.offsets - self.offsets.mean(dim=0)
+
+    def of_cameras(self, camera_index: Tensor) -> Tensor:
+        """``[B, 3, 4]`` the maps of cameras ``[B]``; the identity for one that never trained."""
+        affine = self.affine
+        identity = torch.eye(3, 4, dtype=affine.dtype, device=affine.device)
+        return torch.cat([affine, identity[None]])[self.rows[camera_index]]
+
+    def forward(self, picture: Tensor, alpha: Tensor, camera_index: Tensor) -> Tensor:
+        """The picture as these cameras take it: ``A c + b alpha``.
+
+        Args:
+            picture: ``[B, 3, H, W]`` RGB on black.
+            alpha: ``[B, 1, H, W]``.
+            camera_index: ``[B]`` int64.
+        """
+        affine = self.of_cameras(camera_index).to(picture.dtype)
+        mixed = torch.einsum("bij,bjhw->bihw", affine[..., :3], picture)
+        return mixed + affine[..., 3, None, None] * alpha

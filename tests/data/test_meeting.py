@@ -1,0 +1,141 @@
+"""Joints, cameras and masks that do not belong together are refused or named when data are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from make import edit_json, write_tiny_capture
+
+from gsgan.data.cameras import CameraEntry
+from gsgan.data.checks import Checks
+from gsgan.data.formats.capture import LOOKED_AT, CaptureReader
+from gsgan.data.formats.meeting import box_of, inside_share
+from gsgan.data.formats.trust import Trust
+from gsgan.data.layout import Layout
+from gsgan.errors import DataError
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_tiny_capture(tmp_path / "c", cameras=4, frames=3, size=(64, 96))
+
+
+def read(root: Path, trust: Trust = LOOKED_AT) -> Layout:
+    return CaptureReader(trust=trust)(root, Checks())
+
+
+def turn(axis: tuple[float, float, float], degrees: float) -> Callable[[dict], None]:
+    def change(rig: dict) -> None:
+        r = cv2.Rodrigues(np.radians(degrees) * np.array(axis))[0]
+        camera = rig["cam02"]
+        camera["R"] = (r @ camera["R"]).tolist()
+        camera["t"] = (r @ camera["t"]).tolist()
+
+    return change
+
+
+def scale_K(factor: float) -> Callable[[dict], None]:
+    def change(rig: dict) -> None:
+        K = np.array(rig["cam02"]["K"])
+        K[:2] *= factor
+        rig["cam02"]["K"] = K.tolist()
+
+    return change
+
+
+def in_mm(rig: dict) -> None:
+    rig["cam02"]["t"] = [1000 * x for x in rig["cam02"]["t"]]
+
+
+def exchanged(rig: dict) -> None:
+    for key in "Rt":
+        rig["cam01"][key], rig["cam02"][key] = rig["cam02"][key], rig["cam01"][key]
+
+
+def test_a_good_capture_needs_no_note(root: Path) -> None:
+    assert read(root).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (scale_K(0.5), r"inside: cam02 \d%; 100% in the other cameras\).*gsgan.check tells"),
+        (in_mm, r"camera cam02 stands 3\.13e\+03 m from the person, the median camera 3 m"),
+    ],
+)
+def test_a_camera_that_is_wholly_wrong_is_refused(
+    root: Path, change: Callable[[dict], None], message: str
+) -> None:
+    edit_json(root / "cameras.json", change)
+    with pytest.raises(DataError, match=message) as caught:
+        read(root)
+    assert "\n" not in str(caught.value)
+    assert str(root) in str(caught.value)
+    assert read(root, Trust(frames=0, min_box_iou=0)).notes == ()  # nothing was looked at
+
+
+@pytest.mark.parametrize("change", [turn((0, 1, 0), 5), exchanged])
+def test_a_camera_that_is_wrong_is_named_in_a_note(
+    root: Path, change: Callable[[dict], None]
+) -> None:
+    edit_json(root / "cameras.json", change)
+    (note,) = read(root, Trust(min_box_iou=0, least_inside=0)).notes
+    assert note.startswith("joints lie outside the masks (inside: ")
+    assert "cam02" in note
+    assert "cam00" not in note
+    with pytest.raises(DataError, match=r"inside: .*cam02"):
+        read(root, Trust(min_box_iou=0, least_inside=0.9))
+
+
+def test_frames_are_left_out(root: Path) -> None:
+    assert CaptureReader(drop_frames="1")(root, Checks()).frames == (0, 2)
+
+
+def test_the_share_of_joints_inside_a_mask() -> None:
+    K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+    camera = CameraEntry("c", K, np.eye(3), np.zeros(3), np.zeros(8), (100, 100))
+    mask = np.zeros((100, 100), np.uint8)
+    mask[40:60, 40:60] = 255
+    # at 2 m a pixel is 2 cm: 5 px, 11 px (1 px outside), 20 px and far off the middle
+    joints = np.array([[0.1, 0, 2], [0.22, 0, 2], [0.4, 0, 2], [9.0, 0, 2], [0, 0, -2]])
+    assert inside_share(mask, camera, joints, 0.05) == pytest.approx(2 / 3)
+    assert inside_share(mask, camera, joints, 0.5) == 1
+    assert np.isnan(inside_share(0 * mask, camera, joints, 0.05))
+    assert np.isnan(inside_share(mask, camera, joints[3:], 0.05))
+
+
+def test_boxes_follow_skew_and_lens(root: Path) -> None:
+    K = np.array([[100.0, 30, 50], [0, 100, 50], [0, 0, 1]])
+    dist = np.array([-0.1, *[0.0] * 7])
+    camera = CameraEntry("c", K, np.eye(3), np.zeros(3), dist, (100, 100))
+    x, y = 0.2, 0.3
+    bend = 1 - 0.1 * (x * x + y * y)
+    u, v = (K @ [x * bend, y * bend, 1])[:2]
+    points = np.array([[0.0, 0, 2], [2 * x, 2 * y, 2]])
+    assert box_of(points, camera) == pytest.approx((50, 50, u, v))
+    assert box_of(points * [1, 1, -1], camera) is None
+
+
+def test_the_config_passes_its_settings(root: Path, compose) -> None:
+    from hydra.utils import instantiate
+
+    edit_json(root / "cameras.json", scale_K(0.5))
+    keys = ("data.reader.trust.frames=0", "data.reader.drop_frames=1")
+    config = compose("train", "data=capture", f"data.root={root}", *keys)
+    assert instantiate(config.data).layout.frames == (0, 2)
+    config = compose("train", "data=capture", f"data.root={root}")
+    with pytest.raises(DataError, match="joints lie outside the masks"):
+        _ = instantiate(config.data).layout
+
+
+def test_timestamps_are_no_frame_numbers(root: Path) -> None:
+    with np.load(root / "landmarks3d.npz") as held:
+        arrays = dict(held)
+    arrays["frame_id"] = arrays["frame_id"] + 1_700_000_000_123
+    np.savez(root / "landmarks3d.npz", **arrays)
+    with pytest.raises(DataError, match="frame_id 1700000000125 is a time stamp"):
+        read(root)

@@ -1,0 +1,388 @@
+"""What an effect does to the avatar: built and computed when on, absent when off."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from gsgan.errors import ConfigError
+from gsgan.model.colour import ColourCorrection
+from gsgan.runs import build_training, load_avatar, read_checkpoint
+
+NONE = "effects=none"
+LENS = (-0.6, 0.2, 0.001, 0, 0)
+
+
+class Calls(TorchDispatchMode):
+    """Counts every operator."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count[str(func)] += 1
+        return func(*args, **(kwargs or {}))
+
+
+def calls(avatar, frame) -> Counter[str]:
+    avatar.paint(frame)  # what is built once is built
+    with Calls() as seen, torch.no_grad():
+        avatar.paint(frame)
+    return seen.count
+
+
+def parameters(avatar) -> int:
+    return sum(p.numel() for p in avatar.parameters())
+
+
+@pytest.mark.parametrize(
+    ("effect", "word", "adds"),
+    [
+        ("view_dependence", "1", True),
+        ("antialias", "on", False),
+        ("colour_correction", "on", True),
+        ("segmentation", "body", True),
+        ("depth", "on", False),
+    ],
+)
+def test_off_builds_no_parameter_and_calls_no_operator(build, effect, word, adds):
+    _, off, frame = build(NONE)
+    _, on, _ = build(NONE, f"effects.{effect}={word}")
+    assert (parameters(on) > parameters(off)) == adds
+    plain, more = calls(off, frame), calls(on, frame)
+    # the native rasteriser is one call whatever it does: anti-aliasing and depth show elsewhere
+    if adds:
+        assert sum(more.values()) > sum(plain.values())
+    if effect == "antialias":
+        assert on.accuracy.antialias
+        assert not off.accuracy.antialias
+    assert (on.paint(frame).depth is not None) == (effect == "depth")
+
+
+def test_all_off_is_the_plain_chain_operator_by_operator(build):
+    """The forward pass with effects off against its parts called one after the other."""
+    from gsgan.skeleton import bone_frames, sanitise
+    from gsgan.splat import rasterise
+
+    _, avatar, frame = build(NONE)
+    camera = frame.camera
+
+    def chain():
+        p, valid = sanitise(frame.skeleton, frame.visibility, avatar.template, avatar.limb_sum)
+        frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
+        points = avatar.densify(p, valid, frames)
+        gaussians = avatar.deformation(p, points, camera.centre, frames.hubs[:, 0], None)
+        F = rasterise(gaussians, camera, settings=avatar.accuracy).features
+        p2d = avatar.draw(p, valid, camera, None)
+        g = avatar.pose_encoder(*avatar.pose_inputs(p, valid, frames, camera))
+        return avatar.generator(F, None, p2d, g).to(F.dtype)
+
+    def whole():
+        return avatar(frame.skeleton, frame.visibility, camera, frame.body).image
+
+    counts = []
+    with torch.no_grad():
+        assert torch.equal(chain(), whole())
+        for paint in (chain, whole):
+            with Calls() as seen:
+                paint()
+            counts.append(seen.count)
+    assert counts[0] == counts[1]
+
+
+def test_degree_0_looks_in_no_direction(build):
+    _, avatar, frame = build(NONE)
+    moved = replace(frame.camera, t=frame.camera.t * 1.01)
+    with torch.no_grad():
+        avatar.deformation.head.weight.normal_(std=0.01)
+        colours = [
+            avatar(frame.skeleton, frame.visibility, c, paint=False).gaussians.features
+            for c in (frame.camera, moved)
+        ]
+    assert torch.equal(*colours)
+
+
+# --- colour correction
+
+
+def test_the_mean_of_all_maps_is_the_identity_and_unseen_cameras_keep_theirs():
+    colour = ColourCorrection(["b", "a", "d"], ["a", "b", "c", "d"])
+    torch.nn.init.normal_(colour.offsets, std=0.3)
+    identity = torch.eye(3, 4)
+    torch.testing.assert_close(colour.affine.mean(0), identity)
+    maps = colour.of_cameras(torch.tensor([0, 1, 2, 3]))
+    assert torch.equal(maps[2], identity)
+    assert torch.equal(maps[[1, 0, 3]], colour.affine)  # by name, whatever the order
+
+
+def test_pictures_are_mapped_and_the_background_stays_black():
+    colour = ColourCorrection(["a", "b"], ["a", "b"])
+    with torch.no_grad():
+        colour.offsets[0, 0, 0], colour.offsets[0, 1, 3] = 0.4, 0.2  # red gain, green offset
+    picture = torch.zeros(2, 3, 4, 4)
+    alpha = torch.zeros(2, 1, 4, 4)
+    picture[..., :2], alpha[..., :2] = 0.5, 1.0
+    mapped = colour(picture, alpha, torch.tensor([0, 1]))
+    assert torch.equal(mapped[..., 2:], picture[..., 2:])
+    assert mapped[0, :, 0, 0].tolist() == pytest.approx([0.6, 0.6, 0.5])  # halves: the mean stays
+    assert mapped[1, :, 0, 0].tolist() == pytest.approx([0.4, 0.4, 0.5])
+    double = ColourCorrection(["a", "b"], ["a", "b"]).double()
+    torch.nn.init.normal_(double.offsets, std=0.1)
+    inputs = (picture.double()[..., :2, :3].requires_grad_(), alpha.double()[..., :2, :3])
+    assert torch.autograd.gradcheck(
+        lambda p, o: torch.func.functional_call(
+            double, {"offsets": o}, (p, inputs[1], torch.tensor([0, 1]))
+        ),
+        (inputs[0], double.offsets.detach().requires_grad_()),
+    )
+
+
+def test_one_camera_has_nothing_to_correct():
+    with pytest.raises(ValueError, match="at least two training cameras"):
+        ColourCorrection(["a"], ["a", "b"])
+
+
+def test_correction_acts_on_both_pictures_and_leaves_f_alone(build):
+    _, avatar, frame = build("effects.colour_correction=on")
+    before = avatar.paint(frame)
+    assert torch.equal(before.image, before.colour)
+    with torch.no_grad():
+        avatar.colour.offsets[0, 0, 0] += 0.5
+    after = avatar.paint(frame)
+    assert torch.equal(after.features, before.features)
+    torch.testing.assert_close(after.colour[:, 0], 1.25 * before.features[:, 0])
+    torch.testing.assert_close(after.image[:, 0], 1.25 * before.image[:, 0])
+    unseen = avatar.paint(replace(frame, camera_index=torch.tensor([2])))  # cam02 is held out
+    torch.testing.assert_close(unseen.image, before.image)
+
+
+def test_tints_are_learned_in_training(tiny, tmp_path):
+    """Two cameras whose truth differs by a red gain: the maps find it, their mean stays."""
+    from lightning import Trainer
+
+    config = tiny(
+        "model=splat_only", "effects.colour_correction=on", "training.schedule.stretch=1",
+        "training.schedule.step_one=60", "training.schedule.step_two=0",
+        "training.recipes.colour.rate.peak=0.02",
+    )  # fmt: skip
+    data, module = build_training(config)
+    dataset = data.dataset("train")
+    plain = type(dataset).__getitem__
+
+    class Tinted(type(dataset)):
+        def __getitem__(self, index):
+            frame = plain(self, index)
+            gain = torch.tensor([1.2 if int(frame.camera_index) == 0 else 0.8, 1.0, 1.0])
+            return replace(frame, image=frame.image * gain.view(1, 3, 1, 1))
+
+    dataset.__class__ = Tinted
+    trainer = Trainer(
+        max_epochs=module.schedule.epochs, accelerator="cpu", logger=False,
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+        limit_val_batches=0, default_root_dir=tmp_path,
+    )  # fmt: skip
+    trainer.fit(module, data)
+    red = module.avatar.colour.affine[:, 0, 0]
+    print(module.avatar.colour.affine, module.step)
+    assert float((red[0] - red[1]).detach()) > 0.1
+    assert float(red.mean().detach()) == pytest.approx(1.0, abs=1e-6)
+
+
+# --- spherical harmonics, raised by degrees
+
+
+def test_degrees_above_the_active_one_are_neither_computed_nor_moved(build):
+    _, avatar, frame = build("effects.view_dependence=2")
+    psi = avatar.deformation
+    with torch.no_grad():
+        psi.head.weight[:14].normal_(std=0.01)  # all up to the constant colour
+        psi.table[:, :14].normal_(std=0.1)
+    full = avatar.paint(frame).colour
+    psi.active_degree = 0
+    masked = avatar.paint(frame)
+    # zeros above: the same picture, but for the rounding of a narrower product
+    torch.testing.assert_close(masked.colour, full, atol=1e-5, rtol=0)
+    masked.features.sum().backward()
+    above = slice(14, 11 + 3 * 9)
+    assert not psi.table.grad[:, above].any()
+    assert psi.table.grad[:, 11:14].any()
+    assert not psi.head.weight.grad[above].any()
+    psi.active_degree = 1
+    trunk = torch.zeros(1, len(psi.table), psi.head.in_features)
+    assert psi._head(trunk)[0].shape[-1] == sum(psi.parts) - 3 * (9 - 4)
+
+
+def test_the_degree_is_raised_by_the_schedule():
+    from gsgan.training.schedule import Schedule
+
+    schedule = Schedule(10, 30, 30, degree_every=20)
+    assert [schedule.degree(s, 3) for s in (0, 9, 29, 30, 49, 50, 69)] == [0, 0, 0, 1, 1, 2, 2]
+    assert schedule.degree(69, 1) == 1
+    assert Schedule(10, 30, 30).degree(0, 3) == 3  # 0: all at once
+    with pytest.raises(ConfigError, match="degree_every"):
+        Schedule(1, 1, 1, degree_every=-1)
+
+
+# --- lenses
+
+
+@pytest.fixture
+def bent(tmp_path):
+    """A small capture whose three cameras have a strong lens."""
+    from make import write_tiny_capture
+
+    return write_tiny_capture(
+        tmp_path / "bent", cameras=3, frames=5, size=(64, 64), dist=LENS,
+        splits={"train_cameras": ["cam00", "cam01"], "test_cameras": ["cam02"]},
+    )  # fmt: skip
+
+
+def test_pictures_are_taken_as_the_word_says(build, bent):
+    from make import distorted_pixels, ring_camera, skeletons
+
+    raw, _, _ = build(f"data.root={bent}", "data.size=64", "effects.distortion=project")
+    straight, _, _ = build(f"data.root={bent}", "data.size=64")
+    ignored, _, _ = build(f"data.root={bent}", "data.size=64", "effects.distortion=off")
+    views = [data.dataset("novel_view")[0] for data in (raw, straight, ignored)]
+    assert views[0].camera.dist is not None
+    assert views[1].camera.dist is None
+    assert views[2].camera.dist is None
+    assert torch.equal(views[0].image, views[2].image)  # the file's own pixels
+    assert not torch.equal(views[0].image, views[1].image)
+    assert torch.equal(raw.dataset("train")[0].image, straight.dataset("train")[0].image)
+    entry = ring_camera(4 * torch.pi / 3, (64, 64)) | {"dist": LENS}
+    wrist = distorted_pixels(entry, skeletons(5)[0][15:16])[0]
+    assert float(views[0].mask[0, 0, int(wrist[1]), int(wrist[0])]) == 1
+
+
+def test_a_raw_crop_follows_the_lens(build, bent):
+    """The person's window in a picture as taken holds the whole mask."""
+    word = ("effects.distortion=project", "data.crop=person", "data.size=48")
+    data, _, _ = build(f"data.root={bent}", *word)
+    frame = data.dataset("novel_view")[0]
+    assert frame.camera.dist is not None
+    border = torch.cat([frame.mask[0, 0, 0], frame.mask[0, 0, -1], frame.mask[0, 0, :, 0]])
+    assert not border.any()
+
+
+def test_paintings_are_bent_with_every_map(build, bent):
+    data, avatar, _ = build(
+        f"data.root={bent}", "data.size=64", "effects.distortion=project", "effects.depth=on"
+    )
+    frame = data.dataset("novel_view")[0]
+    with torch.no_grad():
+        painting = avatar.paint(frame)
+        pinhole = avatar.paint(replace(frame, camera=replace(frame.camera, dist=None)))
+    for name in ("image", "features", "alpha", "depth"):
+        assert getattr(painting, name).shape[-2:] == frame.image.shape[-2:]
+        assert torch.isfinite(getattr(painting, name)).all()
+    assert 0 <= float(painting.alpha.min()) <= float(painting.alpha.max()) <= 1
+
+    def overlap(alpha: torch.Tensor) -> float:
+        person, truth = alpha > 0.3, frame.mask > 0.5
+        return float((person & truth).sum() / (person | truth).sum())
+
+    assert overlap(painting.alpha) > overlap(pinhole.alpha) + 0.01
+
+
+# --- runs
+
+
+def test_decisions_are_stored_and_taken_up_again(capture, inside, tmp_path):
+    from commands import arguments
+
+    folder = tmp_path / "run"
+    words = ("effects.view_dependence=1", "effects.colour_correction=on", "effects.measure=1")
+    result = inside("train", *arguments(capture, folder), *words, "evaluate=false")
+    assert result.returncode == 0, result.stderr
+    assert "colour correction" in result.stdout
+    assert "degree 1" in result.stdout
+    stored = read_checkpoint(folder / "checkpoints" / "last.ckpt")["gsgan"]["effects"]
+    assert stored["view_dependence"]["value"] == 1
+    assert stored["cameras"] == ["cam00", "cam01"]
+    result = inside("evaluate", f"run={folder}", "splits=[novel_pose]", "pictures=1")
+    assert result.returncode == 0, result.stderr
+
+
+def test_a_trained_avatar_has_what_its_checkpoint_says_not_what_the_scene_says_now(run, tmp_path):
+    """The decision is made once: evaluation does not decide again."""
+    import shutil
+
+    from omegaconf import OmegaConf
+
+    from gsgan.runs import CHECKPOINT, build_data, load_config
+
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    config = load_config(copy)
+    OmegaConf.update(config, "effects.segmentation", "off")
+    avatar, _ = load_avatar(copy, config, build_data(config))
+    assert avatar.segmentation is not None
+    checkpoint = read_checkpoint(copy / CHECKPOINT)
+    del checkpoint["gsgan"]["effects"]  # of an older version: decided anew
+    torch.save(checkpoint, copy / CHECKPOINT)
+    avatar, _ = load_avatar(copy, load_config(copy), build_data(load_config(copy)))
+    assert avatar.effects.segmentation.on
+
+
+def test_a_run_whose_data_now_calls_for_other_effects_is_not_gone_on_with(tiny):
+    _, module = build_training(tiny())
+    checkpoint: dict = {}
+    module.on_save_checkpoint(checkpoint)
+    module.on_load_checkpoint(checkpoint)  # the same: nothing to say
+    checkpoint["gsgan"]["effects"]["antialias"]["value"] = "on"
+    with pytest.raises(ConfigError, match=r"effects\.antialias: the run began with on"):
+        module.on_load_checkpoint(checkpoint)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("effects.distortion=undistort",), "no camera of this data has a lens coefficient"),
+        (("effects.segmentation=body", "model=wo_seg"), "the model leaves it out"),
+        (("effects.depth=on", "model=image_to_image"), "this model splats nothing"),
+        (("effects.colour_correction=on", "data.train_cameras=[cam00]"), "one training camera"),
+    ],
+)
+def test_the_impossible_ends_a_command_in_one_sentence(capture, inside, tmp_path, words, said):
+    from commands import arguments, refused
+
+    refused(inside("train", *arguments(capture, tmp_path / "run"), *words), "not possible", said)
+
+
+def test_all_means_all_that_this_model_can_have(build):
+    _, avatar, frame = build("effects=all", "model=lbs_splat")
+    every = {"view_dependence", "antialias", "colour_correction", "random_background", "depth"}
+    assert {name for name, effect in avatar.effects if effect.on} == every
+    assert torch.isfinite(avatar.paint(frame).image).all()
+    _, avatar, frame = build("effects=all", "model=image_to_image")
+    assert {name for name, effect in avatar.effects if effect.on} == set()
+    assert torch.isfinite(avatar.paint(frame).image).all()
+
+
+def test_check_prints_the_same_decisions(capture, inside):
+    result = inside("check", "data=capture", f"data.root={capture}", "report=out.html")
+    assert "Effects that the scene calls for" in result.stdout
+    for name in ("view-dependent colour", "lens distortion", "colour correction"):
+        assert name in result.stdout
+    refused = inside("check", "data=capture", f"data.root={capture}", "effects.distortion=project")
+    assert "no camera of this data has a lens coefficient" in refused.stderr
+
+
+def test_the_real_capture_calls_for_colour_correction():
+    from pathlib import Path
+
+    from gsgan.data.datamodule import GsganData
+    from gsgan.effects import EffectSettings, decide
+
+    root = Path(__file__).parents[3] / "shared" / "data" / "real_capture"
+    if not root.is_dir():
+        pytest.skip("the real capture is not at hand")
+    effects = decide(GsganData(str(root), size=128, crop="person").info, EffectSettings())
+    assert effects.colour_correction.on
+    assert not effects.view_dependence.on

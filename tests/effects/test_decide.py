@@ -1,0 +1,212 @@
+"""The rules: pure decisions from what a scene is like and what the user says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from gsgan.data.scene_info import SceneInfo
+from gsgan.data.surface_colours import SurfaceColours
+from gsgan.effects import NAMES, Effects, EffectSettings, decide
+from gsgan.effects.settings import CHOICES
+from gsgan.effects.table import Cost, rows
+from gsgan.errors import ConfigError
+
+ALIKE = SurfaceColours(difference=0.01, error=0.001, residual=0.05, points=1000, source="body")
+CAMERAS = tuple(f"cam{i}" for i in range(6))
+
+
+def scene(**changes) -> SceneInfo:
+    """Six matt cameras that agree, one scale, no lens, a body pose, dark clothes."""
+    plain = SceneInfo(
+        camera_names=(*CAMERAS, "held_out"),
+        n_train_cameras=6,
+        has_distortion=False,
+        has_labels=False,
+        has_body_pose=True,
+        body="free",
+        skeleton="mediapipe33",
+        n_labels=0,
+        label_names=(),
+        foreground={},
+        body_height=4.0,
+        centre=(0.0, 0.0, 1.0),
+        up_axis="z",
+        fps=None,
+        frames=10,
+        train_cameras=CAMERAS,
+        spread=170.0,
+        scale_train=(50.0, 60.0),
+        scale_test=(51.0, 59.0),
+        surface=ALIKE,
+        darkest=0.1,
+    )
+    return replace(plain, **changes)
+
+
+def on(effects: Effects) -> set[str]:
+    return {name for name, effect in effects if effect.on} - {"face"}
+
+
+def test_a_plain_scene_calls_for_what_it_always_had():
+    assert on(decide(scene(), EffectSettings())) == {"segmentation", "random_background"}
+
+
+@pytest.mark.parametrize(
+    ("change", "effect", "value"),
+    [
+        ({"surface": replace(ALIKE, residual=0.12)}, "view_dependence", 2),
+        ({"surface": replace(ALIKE, difference=0.07)}, "colour_correction", "on"),
+        ({"has_distortion": True}, "distortion", "undistort"),
+        ({"held_out_distortion": True}, "distortion", "undistort"),
+        ({"scale_test": (25.0, 60.0)}, "antialias", "on"),  # half the scale
+        ({"scale_test": (50.0, 120.0)}, "antialias", "on"),  # double
+        ({"has_body_pose": False}, "segmentation", "off"),
+        ({"darkest": 0.4}, "random_background", "off"),
+    ],
+)
+def test_each_call_turns_on_its_own_effect_and_no_other(change, effect, value):
+    before, after = decide(scene(), EffectSettings()), decide(scene(**change), EffectSettings())
+    assert getattr(after, effect).value == value
+    assert {n for n in NAMES if getattr(before, n).value != getattr(after, n).value} == {effect}
+
+
+@pytest.mark.parametrize(
+    ("change", "effect"),
+    [
+        # medians move with highlights: half of what is left explains as much
+        ({"surface": replace(ALIKE, difference=0.05, residual=0.12)}, "colour_correction"),
+        ({"surface": replace(ALIKE, difference=0.05, error=0.02)}, "colour_correction"),  # chance
+        ({"surface": None}, "colour_correction"),
+        ({"surface": None}, "view_dependence"),
+        ({"surface": replace(ALIKE, residual=0.12), "spread": 10.0}, "view_dependence"),
+        ({"surface": replace(ALIKE, residual=0.12), "n_train_cameras": 1}, "view_dependence"),
+        ({"scale_test": None}, "antialias"),
+    ],
+)
+def test_what_could_be_taken_for_a_call_is_none(change, effect):
+    assert not getattr(decide(scene(**change), EffectSettings()), effect).on
+
+
+@pytest.mark.parametrize(("cameras", "degree"), [(2, 1), (3, 1), (4, 2), (7, 2), (8, 3), (30, 3)])
+def test_the_degree_follows_the_number_of_cameras(cameras, degree):
+    glossy = scene(n_train_cameras=cameras, surface=replace(ALIKE, residual=0.12))
+    assert decide(glossy, EffectSettings()).degree == degree
+
+
+@pytest.mark.parametrize(
+    ("name", "at", "setting"),
+    [
+        ("view_dependence", {"surface": replace(ALIKE, residual=0.06)}, {"view_residual": 0.055}),
+        ("view_dependence", {"surface": replace(ALIKE, residual=0.12), "spread": 10.0}, {"view_spread": 5}),
+        ("colour_correction", {"surface": replace(ALIKE, difference=0.026)}, {"colour_difference": 0.02}),
+        ("antialias", {"scale_test": (50.0, 70.0)}, {"scale_ratio": 1.1}),
+        ("random_background", {"darkest": 0.4}, {"dark": 0.5}),
+    ],
+)  # fmt: skip
+def test_every_threshold_is_read(name, at, setting):
+    assert not getattr(decide(scene(**at), EffectSettings()), name).on
+    assert getattr(decide(scene(**at), EffectSettings(**setting)), name).on
+
+
+@pytest.mark.parametrize(
+    ("setting", "change", "why"),
+    [
+        ({"distortion": "undistort"}, {}, "no camera of this data has a lens coefficient"),
+        ({"distortion": "project"}, {"has_distortion": True, "has_rational_lens": True}, "k4, k5"),
+        ({"colour_correction": "on"}, {"n_train_cameras": 1}, "one training camera"),
+        ({"segmentation": "body"}, {"has_body_pose": False}, "no body pose"),
+        ({"segmentation": "hands"}, {"label_names": ("background", "hat")}, "no part .* is a hand"),
+        ({"only": ["distortion"]}, {}, "effects.distortion=on is not possible"),
+    ],
+)
+def test_forcing_the_impossible_is_one_sentence_or_left_out(setting, change, why):
+    with pytest.raises(ConfigError, match=why) as caught:
+        decide(scene(**change), EffectSettings(**setting))
+    assert "\n" not in str(caught.value)
+    lenient = decide(scene(**change), EffectSettings(**setting, impossible="off"))
+    assert not getattr(lenient, next(iter(setting)), lenient.distortion).on
+
+
+def test_forced_words_win_over_the_scene():
+    settings = EffectSettings(view_dependence=3, antialias="on", random_background="off")
+    found = decide(scene(), settings)
+    assert found.degree == 3
+    assert on(found) == {"view_dependence", "antialias", "segmentation"}
+    assert decide(scene(), EffectSettings(view_dependence="on")).degree == 2
+
+
+def test_yamls_on_and_off_are_understood():
+    settings = EffectSettings(antialias=True, segmentation=False, impossible=False)
+    assert (settings.antialias, settings.segmentation, settings.impossible) == ("on", "off", "off")
+
+
+def test_a_list_turns_on_these_and_no_other():
+    found = decide(scene(), EffectSettings(only=["antialias", "depth"]))
+    assert on(found) == {"antialias", "depth"}
+    none = decide(scene(), EffectSettings(only=[]))
+    assert on(none) == set()
+
+
+def test_without_a_forced_effect_is_refused_and_a_wanted_one_goes():
+    auto = decide(scene(), EffectSettings())
+    assert not auto.without("segmentation", "no room").segmentation.on
+    forced = decide(scene(), EffectSettings(segmentation="body"))
+    with pytest.raises(ConfigError, match=r"effects\.segmentation=body is not possible: no room"):
+        forced.without("segmentation", "no room")
+    lenient = decide(scene(), EffectSettings(segmentation="body", impossible="off"))
+    assert not lenient.without("segmentation", "no room").segmentation.on
+
+
+def test_decisions_survive_a_checkpoint(tmp_path):
+    import torch
+
+    tinted = decide(scene(surface=replace(ALIKE, difference=0.07)), EffectSettings())
+    assert tinted.cameras == CAMERAS
+    torch.save(tinted.plain(), tmp_path / "effects.pt")
+    assert Effects.from_plain(torch.load(tmp_path / "effects.pt", weights_only=True)) == tinted
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        ({"antialias": "maybe"}, "effects.antialias must be one of auto, on, off"),
+        ({"view_dependence": 4}, "effects.view_dependence must be one of"),
+        ({"scale_ratio": 0.5}, "effects.scale_ratio must be a number of at least 1"),
+        ({"view_residual": float("nan")}, "effects.view_residual must be a number"),
+        ({"degree_cameras": [4, 2, 8]}, "three rising numbers"),
+        ({"only": ["colours"]}, "effects.only must list some of"),
+        ({"only": "antialias"}, "effects.only must list some of"),
+        ({"impossible": "maybe"}, "effects.impossible must be error or off"),
+    ],
+)
+def test_wrong_settings_are_named(wrong, named):
+    with pytest.raises(ConfigError, match=named):
+        EffectSettings(**wrong)
+
+
+def test_configs_say_what_their_names_say(compose):
+    from hydra.utils import instantiate
+
+    auto, none, every = (
+        instantiate(compose("train", f"effects={name}").effects) for name in ("auto", "none", "all")
+    )
+    assert auto == EffectSettings(degree_cameras=auto.degree_cameras)  # same values in code and yaml
+    assert on(decide(scene(), none)) == set()
+    found = on(decide(scene(has_distortion=True), every))
+    assert found == set(CHOICES)
+    assert on(decide(scene(), every)) == set(CHOICES) - {"distortion"}
+    listed = instantiate(compose("train", "effects.only=[depth]").effects)
+    assert on(decide(scene(), listed)) == {"depth"}
+
+
+def test_the_table_has_a_row_an_effect():
+    effects = decide(scene(), EffectSettings())
+    plain = rows(effects)
+    assert len(plain) == len(NAMES)
+    assert all(row[2] for row in plain)
+    costed = {row[0]: row for row in rows(effects, {"segmentation": Cost(4000, 1.234)})}
+    assert costed["segmentation S"][3:] == ("4,000", "1.23")
+    assert costed["random background"][3:] == ("–", "–")
+    assert costed["depth"][3:] == ("", "")

@@ -1,0 +1,257 @@
+"""``gsgan.evaluate predictions=``: any method's pictures, scored as a run's own are."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from commands import refused
+
+DATA = ("data=capture", "data.size=32", "data.crop=null", "size=tiny", "lpips.path=null")
+
+
+@pytest.fixture(scope="session")
+def given(capture: Path) -> list[str]:
+    return [*DATA, f"data.root={capture}"]
+
+
+@pytest.fixture(scope="session")
+def painted(run: Path, capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What the tiny run paints, as a method of someone else would leave it: 8-bit PNGs."""
+    from gsgan.runs import build_data, load_avatar, load_config
+
+    root = tmp_path_factory.mktemp("others") / "other"
+    data = build_data(load_config(run))
+    avatar, _ = load_avatar(run, load_config(run), data)
+    for split in ("novel_view", "novel_pose"):
+        dataset = data.dataset(split)
+        for i, (camera, frame) in enumerate(dataset.items):
+            with torch.no_grad():
+                image = avatar.paint(dataset[i]).image[0].clamp(0, 1)
+            pixels = (image * 255).round().byte().permute(1, 2, 0).numpy()
+            path = root / split / camera / f"{frame:04d}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), pixels[..., ::-1])
+    return root
+
+
+@pytest.fixture
+def copy(painted: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(painted, tmp_path / "mine" / "other")
+
+
+def scores(folder: Path) -> dict:
+    return json.loads((folder / "metrics.json").read_text())
+
+
+def test_pictures_of_a_run_score_as_the_run_does(run, painted, given, inside):
+    """Up to the rounding to 8 bits: 0.5/255 at most a value, and the floor is the very same."""
+    result = inside("evaluate", f"predictions={painted}", "method=other", *given)
+    assert result.returncode == 0, result.stderr
+    out = painted.with_name("other_scores")
+    own, others = scores(run), scores(out)
+    for split, variants in others.items():
+        assert set(variants) == {"full", "floor"}
+        assert variants["floor"] == {**own[split]["floor"], "marks": []}
+        for metric in ("psnr", "psnr_person", "ssim", "ssim_person"):
+            a, b = (x[split]["full"][metric] for x in (own, others))
+            assert a == pytest.approx(b, abs=0.05)
+        assert variants["full"]["miou_reason"] == "predictions are pictures, not a segmentation"
+        assert variants["full"]["images"] == own[split]["full"]["images"]
+    facts, runs = (json.loads((f / "facts.json").read_text()) for f in (out, run))
+    assert facts["data"] == runs["data"]
+    assert (facts["method"], facts["model"], facts["seed"]) == ("other", None, None)
+    assert (runs["method"], runs["model"], runs["seed"]) == ("gsgan", "full", 0)
+    assert runs["iterations"] == 16
+    assert 0 < runs["train_seconds"] < 600
+    assert "other" in result.stdout
+    assert {p.name for p in (out / "pictures").iterdir()} == {"novel_view.png", "novel_pose.png"}
+
+
+def test_the_csv_holds_every_picture_and_its_mean_is_the_score(run):
+    with (run / "scores.csv").open() as stream:
+        lines = list(csv.DictReader(stream))
+    for split, variants in scores(run).items():
+        for variant, means in variants.items():
+            held = [x for x in lines if (x["split"], x["variant"]) == (split, variant)]
+            assert len(held) == means["images"]
+            for metric in ("psnr", "psnr_person", "ssim", "ssim_person", "edge_ratio"):
+                values = [float(x[metric]) for x in held]
+                mean = sum(values) / len(values)
+                assert mean == pytest.approx(means[metric], abs=1e-9)
+            cameras = {x["camera"] for x in held}
+            assert cameras == set(means["cameras"])
+            for camera in cameras:
+                own = [float(x["psnr"]) for x in held if x["camera"] == camera]
+                expected = means["cameras"][camera]["psnr"]
+                assert sum(own) / len(own) == pytest.approx(expected, abs=1e-9)
+
+
+def test_rows_by_camera_are_printed_on_request(copy, given, inside):
+    result = inside("evaluate", f"predictions={copy}", "per=camera", "splits=[novel_pose]", *given)
+    assert result.returncode == 0, result.stderr
+    for camera in ("cam00", "cam01"):
+        assert f"  {camera}" in result.stdout
+    assert set(scores(copy.with_name("other_scores"))) == {"novel_pose"}
+
+
+def test_a_perfect_picture_and_its_white_background(capture, given, inside, tmp_path):
+    """On white, given as it is or as alpha: the truth scores nothing but its own 8-bit rounding."""
+    from gsgan.data.datamodule import GsganData
+    from gsgan.metrics.regions import on_background
+
+    data = GsganData(str(capture), size=32)
+    for kind in ("opaque", "alpha"):
+        for split in ("novel_view", "novel_pose"):
+            dataset = data.dataset(split)
+            for i, (camera, frame) in enumerate(dataset.items):
+                f = dataset[i]
+                cover = f.mask.clamp_min(1e-6)
+                colour = f.image / cover if kind == "alpha" else on_background(f.image, f.mask, 1.0)
+                planes = [colour[0], f.mask[0]] if kind == "alpha" else [colour[0]]
+                pixels = (torch.cat(planes).clamp(0, 1) * 255).round().byte().permute(1, 2, 0)
+                path = tmp_path / kind / f"{camera}_{frame}.png"
+                path.parent.mkdir(exist_ok=True)
+                order = [2, 1, 0, 3] if kind == "alpha" else [2, 1, 0]
+                cv2.imwrite(str(path), np.ascontiguousarray(pixels.numpy()[..., order]))
+    protocol = [
+        *("protocol=paper_thuman4", "protocol.train_cameras=[cam00,cam01]"),
+        *("protocol.test_cameras=[cam02]", "protocol.train_frames=0-3"),
+        *("protocol.test_frames=0-5", "data.size=32"),
+    ]
+    named = "predictions_pattern='{camera}_{frame}.png'"
+    for kind in ("opaque", "alpha"):
+        result = inside("evaluate", f"predictions={tmp_path / kind}", named, *given, *protocol)
+        # the protocol asks for frames 4 and 5 of cam02 too, which were not painted
+        refused(result, "lacks 2 of 6", "camera cam02, frame 4", "expected as cam02_000004.png")
+    protocol[-2] = "protocol.test_frames=0-3"
+    for kind in ("opaque", "alpha"):
+        result = inside("evaluate", f"predictions={tmp_path / kind}", named, *given, *protocol)
+        assert result.returncode == 0, result.stderr
+        found = scores(tmp_path / f"{kind}_scores")["novel_view"]
+        psnr = found["full"]["psnr"]
+        assert psnr is None or psnr > 45  # equal pictures are counted apart
+        assert 0 < found["floor"]["psnr"] < 25
+        record = found["full"]["protocol"]
+        assert record["measures"]["background"] == "white"
+        assert not any("alpha" in said for said in record["departures"])
+
+
+def test_pictures_under_wrong_names(capture, given, inside, tmp_path):
+    """The truth itself, one camera's frames exchanged: an error that names the frame."""
+    from gsgan.data.datamodule import GsganData
+
+    dataset = GsganData(str(capture), size=32).dataset("novel_view")
+    root = tmp_path / "truth" / "novel_view" / "cam02"
+    root.mkdir(parents=True)
+    for i, (_, frame) in enumerate(dataset.items):
+        pixels = (dataset[i].image[0] * 255).round().byte().permute(1, 2, 0).numpy()
+        cv2.imwrite(str(root / f"{frame}.png"), pixels[..., ::-1])
+    (root / "0.png").rename(root / "x.png")
+    (root / "3.png").rename(root / "0.png")
+    (root / "x.png").rename(root / "3.png")
+    arguments = [f"predictions={tmp_path / 'truth'}", "splits=[novel_view]", *given]
+    refused(inside("evaluate", *arguments), "0.png", "frame 0", "frame 3", "right names")
+    assert not (tmp_path / "truth_scores").exists()
+    result = inside("evaluate", *arguments, "predictions_margin=null")
+    assert result.returncode == 0, result.stderr
+    assert math.isfinite(scores(tmp_path / "truth_scores")["novel_view"]["full"]["psnr"])
+
+
+def resize(path: Path) -> None:
+    cv2.imwrite(str(path), np.zeros((16, 32, 3), np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (Path.unlink, ("lacks 1 of 8", "camera cam01, frame 5")),
+        (resize, ("camera cam01, frame 5", "32x16", "32x32", "never resized")),
+        (lambda path: path.write_bytes(path.read_bytes()[:70]), ("cam01/0005.png",)),
+        (lambda path: shutil.copy(path, path.with_name("5.png")), ("frame 5 twice",)),
+        (lambda path: path.write_bytes(b""), ("cam01/0005.png",)),
+    ],
+)
+def test_one_wrong_picture_is_named_and_nothing_is_written(copy, given, inside, damage, words):
+    damage(copy / "novel_pose" / "cam01" / "0005.png")
+    refused(inside("evaluate", f"predictions={copy}", *given), *words)
+    assert not copy.with_name("other_scores").exists()
+
+
+def test_what_does_not_fit_together_is_said(run, copy, given, inside):
+    here = f"predictions={copy}"
+    for arguments, words in (
+        ([], ("run is not set", "predictions=")),
+        ([f"run={run}", here], ("both set",)),
+        ([here], ("data is not set", "data.root")),
+        ([f"run={run}", *given], ("a run has its own data", "data_root=")),
+        ([f"run={run}", "method=x"], ("a run has its own method",)),
+        ([here, *given, "data_root=/x"], ("data_root is for run=",)),
+        ([here, *given, "per=frame"], ("per must be split or camera",)),
+        ([here, *given, "splits=[]"], ("splits must be among",)),
+        ([here, *given, "predictions_pattern=x.png"], ("{frame} once",)),
+        ([here, *given, "predictions_background=grey"], ("black, white or null",)),
+        ([here, *given, "predictions_margin=1"], ("above 1, or null",)),
+        ([here, *given, f"out={copy}/scores"], ("inside the predictions",)),
+        ([here, *given, f"out={run}"], ("is a run folder",)),
+        ([f"predictions={copy}/no", *given], ("other/no does not exist",)),
+    ):
+        refused(inside("evaluate", *arguments), *words)
+
+
+def test_another_methods_scores_are_not_overwritten(copy, given, inside):
+    arguments = [f"predictions={copy}", "splits=[novel_pose]", *given]
+    out = copy.parent / "kept"
+    assert inside("evaluate", *arguments, "method=one", f"out={out}").returncode == 0
+    refused(inside("evaluate", *arguments, "method=two", f"out={out}"), "scores of one, not of two")
+    (copy / "novel_pose" / "notes.txt").write_text("mine")
+    again = inside("evaluate", *arguments, "method=one", f"out={out}")
+    assert again.returncode == 0
+    assert "not asked for and not scored: novel_pose/notes.txt" in again.stdout
+
+
+def test_seconds_of_a_resumed_training_add_up(tiny, monkeypatch):
+    """Parts before an interruption count; an old checkpoint without them leaves it unknown."""
+    from types import SimpleNamespace
+
+    from gsgan.runs import build_training
+    from gsgan.training import module as training
+
+    clock = SimpleNamespace(now=100.0)
+    monkeypatch.setattr(training.time, "monotonic", lambda: clock.now)
+
+    def part(before: dict | None, seconds: float) -> dict:
+        _, module = build_training(tiny("model=splat_only"))
+        if before is not None:
+            module.on_load_checkpoint(before)
+        module.on_train_start()
+        clock.now += seconds
+        checkpoint: dict = {}
+        module.on_save_checkpoint(checkpoint)
+        module.on_train_end()
+        clock.now += 1000.0  # what comes after the training is not counted
+        assert module.train_seconds == checkpoint["gsgan"]["train_seconds"]
+        return checkpoint
+
+    first = part(None, 5.0)
+    assert first["gsgan"]["train_seconds"] == 5.0
+    assert part(first, 2.5)["gsgan"]["train_seconds"] == 7.5
+    del first["gsgan"]["train_seconds"]
+    assert part(first, 2.5)["gsgan"]["train_seconds"] is None
+
+
+def test_cameras_of_several_sizes_share_one_grid():
+    from gsgan.scoring.run import _one_size
+
+    small, large = torch.ones(3, 2, 5), torch.ones(3, 4, 3)
+    a, b = _one_size([{"x": small}, {"x": large}])
+    assert a["x"].shape == b["x"].shape == (3, 4, 5)
+    assert float(a["x"].sum()) == 30.0
+    assert torch.equal(a["x"][:, :2], small)
