@@ -129,7 +129,7 @@ class Bend:
 
 
 def _straight_pixels(camera: Camera) -> tuple[Tensor, Tensor]:
-    """``[B, H W, 2]`` where a pinhole would show what each pixel shows, and whether that is known."""
+    """``[B, H W, 2]`` where a pinhole shows what each pixel does, and whether that is known."""
     assert camera.dist is not None
     height, width = camera.size
     K = camera.K.double()

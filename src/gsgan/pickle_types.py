@@ -66,7 +66,7 @@ class DType:
 
     def __init__(self, spec: Any, *_align_and_copy: Any) -> None:
         if not isinstance(spec, str) or not DTYPE.fullmatch(spec):
-            raise pickle.UnpicklingError(f"it holds the array type {spec!r:.40}")
+            raise pickle.UnpicklingError(f"it holds the array type {_told(spec)}")
         self.value = np.dtype(spec)
         if self.value.kind not in KINDS or self.value.itemsize == 0:
             raise pickle.UnpicklingError(f"it holds the array type {spec!r:.40}")
@@ -77,6 +77,11 @@ class DType:
         _expect(order in ("<", ">", "|", "=") and record == [None] * 3, "it holds record arrays")
         if order in ("<", ">"):
             self.value = self.value.newbyteorder(order)
+
+
+def _told(spec: Any) -> str:
+    """At most 40 characters; what is no text may be endless to print."""
+    return f"{spec[:38]!r}" if isinstance(spec, str) else type(spec).__name__
 
 
 class Array(np.ndarray):
@@ -163,6 +168,17 @@ class StandIn:
 
     def __init__(self, *_arguments: Any) -> None:
         self.state: dict[Any, Any] = {}
+        self._value: Numbers | None = None
+
+    def value(self, budget: Budget) -> Numbers:
+        """The array it stands for, found once: selections of selections name it many times.
+
+        Raises:
+            Exception: as `array`.
+        """
+        if self._value is None:
+            self._value = self.array(budget)
+        return self._value
 
     def __setstate__(self, state: Any) -> None:
         _expect(isinstance(state, dict), f"a {type(self).__name__} has a broken state")
@@ -261,7 +277,10 @@ def _indices(value: Any, budget: Budget) -> Numbers:
 
 def as_array(value: Any, budget: Budget) -> Numbers:
     """A plain numeric array from an array or a stand-in."""
-    array = value.array(budget) if isinstance(value, StandIn) else np.asarray(value)
+    if isinstance(value, list | tuple):
+        flat = all(isinstance(number, bool | int | float) for number in value)
+        _expect(flat, "lists lie in one another where an array belongs")
+    array = value.value(budget) if isinstance(value, StandIn) else np.asarray(value)
     _expect(not array.dtype.hasobject, "an array holds objects where numbers belong")
     return array
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import io
 import math
 import pickle
-import pickletools
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -25,21 +24,12 @@ from numpy.typing import NDArray
 
 from gsgan import pickle_types as types
 from gsgan.errors import DataError
+from gsgan.pickle_scan import Refused, check_unfolded, scan
 from gsgan.pickle_types import Budget, Call, StandIn
 
 GROWTH, SPARE_BYTES = 4, 2**28
 """Arrays may take ``GROWTH`` times the file's size and ``SPARE_BYTES`` more (sparse matrices)."""
 LARGEST_MEMBER = 2**30  # bytes of one array in an npz, unpacked
-REFUSED_OPCODES = frozenset(
-    {"EXT1", "EXT2", "EXT4", "PERSID", "BINPERSID", "NEXT_BUFFER", "READONLY_BUFFER"}
-)
-LENGTH_BYTES = {
-    pickletools.TAKEN_FROM_ARGUMENT1: 1,
-    pickletools.TAKEN_FROM_ARGUMENT4: 4,
-    pickletools.TAKEN_FROM_ARGUMENT4U: 4,
-    pickletools.TAKEN_FROM_ARGUMENT8U: 8,
-}
-OPCODES = {op.code.encode("latin1"): op for op in pickletools.opcodes}
 SPARSE = {"csc": types.SparseColumns, "csr": types.SparseRows, "coo": types.Sparse}
 
 Name = tuple[str, str]
@@ -75,10 +65,6 @@ def _allowed() -> dict[Name, Callable[[Budget], Any]]:
 ALLOWED = _allowed()
 
 
-class _Refused(pickle.UnpicklingError):
-    """The pickle asks for something that is not on the list."""
-
-
 class _Unpickler(pickle.Unpickler):
     def __init__(self, data: bytes, budget: Budget) -> None:
         super().__init__(io.BytesIO(data), encoding="latin1")
@@ -87,7 +73,7 @@ class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         make = ALLOWED.get((module, name))
         if make is None:
-            raise _Refused(f"{module}.{name}")
+            raise Refused(f"{module}.{name}")
         return make(self.budget)
 
 
@@ -102,7 +88,7 @@ def _as_data_error(path: Path, what: str) -> Iterator[None]:
         raise DataError(f"{path} does not exist") from None
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
-    except _Refused as error:
+    except Refused as error:
         raise DataError(
             f"{path} asks for {error}, which is not on the list of harmless classes (a pickle can "
             "run code); nothing was run: save its content as plain arrays with numpy.savez"
@@ -138,58 +124,9 @@ def read_pickle(path: Path) -> Any:
 def _load(data: bytes) -> Any:
     scan(data)
     budget = Budget(GROWTH * len(data) + SPARE_BYTES)
-    return _plain(_Unpickler(data, budget).load(), budget)
-
-
-def scan(data: bytes) -> None:
-    """Checks a pickle's instructions one by one without following them.
-
-    Every length must lie within the file and every memo index below the number of instructions:
-    the unpickler would otherwise reserve whatever memory a damaged number asks for.
-
-    Raises:
-        pickle.UnpicklingError: on an unknown or refused instruction, or a number out of bounds.
-    """
-    stream, size, count = io.BytesIO(data), len(data), 0
-    while True:
-        count += 1
-        opcode = OPCODES.get(stream.read(1))
-        if opcode is None:
-            raise pickle.UnpicklingError("it ends early" if stream.tell() >= size else "no pickle")
-        if opcode.name in REFUSED_OPCODES:
-            raise _Refused(f"objects kept outside the file ({opcode.name})")
-        if opcode.name == "STOP":
-            return
-        if opcode.arg is not None:
-            number = _argument(stream, opcode.arg.n, lines=2 if "pair" in opcode.arg.name else 1)
-            bound = count if opcode.name.endswith("PUT") else size - stream.tell()
-            if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT", "FRAME") and int(number) > bound:
-                raise pickle.UnpicklingError(f"{opcode.name} asks for more than the file holds")
-
-
-def _argument(stream: BinaryIO, kind: int, lines: int) -> int | bytes:
-    """Skips an instruction's argument; its number, where it is one."""
-    if kind == pickletools.UP_TO_NEWLINE:
-        text = [stream.readline() for _ in range(lines)]
-        if not all(line.endswith(b"\n") for line in text):
-            raise pickle.UnpicklingError("it ends early")
-        return text[0]
-    width = LENGTH_BYTES.get(kind, kind)
-    content = stream.read(width)
-    if len(content) != width:
-        raise pickle.UnpicklingError("it ends early")
-    number = int.from_bytes(content, "little")
-    if kind in LENGTH_BYTES and len(_skip(stream, number)) < min(number, 1):
-        raise pickle.UnpicklingError("it ends early")
-    return number
-
-
-def _skip(stream: BinaryIO, count: int) -> bytes:
-    """Moves on by ``count`` bytes; the last of them, empty when the stream ends before."""
-    if count == 0:
-        return b""
-    stream.seek(min(count - 1, 2**62), io.SEEK_CUR)
-    return stream.read(1)
+    content = _Unpickler(data, budget).load()
+    check_unfolded(content, len(data))
+    return _plain(content, budget)
 
 
 def _plain(root: Any, budget: Budget) -> Any:

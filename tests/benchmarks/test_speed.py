@@ -182,6 +182,7 @@ def test_the_command_times_a_run_and_fills_the_page(run, tmp_path, inside):
     assert "old" not in page.read_text()
     assert "| UNet |" in page.read_text()
     assert (out / "speed.png").is_file()
+    assert torch.tensor([1e-310], dtype=torch.float64) * 1 > 0  # denormals are there again
 
 
 def test_the_command_times_an_untrained_avatar_at_its_size(capture, tmp_path, inside):

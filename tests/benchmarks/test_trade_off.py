@@ -18,6 +18,7 @@ from gsgan.benchmarks.trade_off_curves import Curve, curve
 from gsgan.benchmarks.trade_off_files import drawn
 from gsgan.benchmarks.trade_off_front import front, steps
 from gsgan.benchmarks.trade_off_measure import score
+from gsgan.benchmarks.trade_off_plots import within
 from gsgan.benchmarks.trade_off_points import Point, Trained, asked, found_runs, standard_run, sweep
 from gsgan.benchmarks.trade_off_report import Report, Row, make_rows
 from gsgan.errors import ConfigError, DataError, GsganError
@@ -181,6 +182,13 @@ def test_what_is_not_had_is_said():
     assert "LPIPS n/a" in text
     assert "no training times" in text
     assert "- a mark" in text
+
+
+def test_what_is_far_slower_stands_at_the_edge_with_its_time_and_keeps_it_in_the_table():
+    rows = [row("a", 10, 20), row("b", 10, 21), row("exact", 5000, 22)]
+    assert [r.ms for r in within(rows)] == [10, 10, 80]
+    assert within(rows)[2].label == "exact: 5000 ms →"
+    assert "5000" in report_of(*rows).table()
 
 
 def test_pictures_are_drawn_with_and_without_curves_and_scores():

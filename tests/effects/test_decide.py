@@ -14,7 +14,13 @@ from gsgan.effects.table import Cost, rows
 from gsgan.errors import ConfigError
 
 ALIKE = SurfaceColours(difference=0.01, error=0.001, residual=0.05, points=1000, source="body")
+GLOSSY = replace(ALIKE, residual=0.12)
+ONE = (1, 4, 8)  # degree 1 from one camera on
 CAMERAS = tuple(f"cam{i}" for i in range(6))
+
+
+def differing(difference: float, residual: float, error: float = 0.001) -> SurfaceColours:
+    return replace(ALIKE, difference=difference, residual=residual, error=error)
 
 
 def scene(**changes) -> SceneInfo:
@@ -56,7 +62,7 @@ def test_a_plain_scene_calls_for_what_it_always_had():
 @pytest.mark.parametrize(
     ("change", "effect", "value"),
     [
-        ({"surface": replace(ALIKE, residual=0.12)}, "view_dependence", 2),
+        ({"surface": GLOSSY}, "view_dependence", 2),
         ({"surface": replace(ALIKE, difference=0.07)}, "colour_correction", "on"),
         ({"has_distortion": True}, "distortion", "undistort"),
         ({"held_out_distortion": True}, "distortion", "undistort"),
@@ -80,8 +86,8 @@ def test_each_call_turns_on_its_own_effect_and_no_other(change, effect, value):
         ({"surface": replace(ALIKE, difference=0.05, error=0.02)}, "colour_correction"),  # chance
         ({"surface": None}, "colour_correction"),
         ({"surface": None}, "view_dependence"),
-        ({"surface": replace(ALIKE, residual=0.12), "spread": 10.0}, "view_dependence"),
-        ({"surface": replace(ALIKE, residual=0.12), "n_train_cameras": 1}, "view_dependence"),
+        ({"surface": GLOSSY, "spread": 10.0}, "view_dependence"),
+        ({"surface": GLOSSY, "n_train_cameras": 1}, "view_dependence"),
         ({"scale_test": None}, "antialias"),
     ],
 )
@@ -91,7 +97,7 @@ def test_what_could_be_taken_for_a_call_is_none(change, effect):
 
 @pytest.mark.parametrize(("cameras", "degree"), [(2, 1), (3, 1), (4, 2), (7, 2), (8, 3), (30, 3)])
 def test_the_degree_follows_the_number_of_cameras(cameras, degree):
-    glossy = scene(n_train_cameras=cameras, surface=replace(ALIKE, residual=0.12))
+    glossy = scene(n_train_cameras=cameras, surface=GLOSSY)
     assert decide(glossy, EffectSettings()).degree == degree
 
 
@@ -99,8 +105,11 @@ def test_the_degree_follows_the_number_of_cameras(cameras, degree):
     ("name", "at", "setting"),
     [
         ("view_dependence", {"surface": replace(ALIKE, residual=0.06)}, {"view_residual": 0.055}),
-        ("view_dependence", {"surface": replace(ALIKE, residual=0.12), "spread": 10.0}, {"view_spread": 5}),
-        ("colour_correction", {"surface": replace(ALIKE, difference=0.026)}, {"colour_difference": 0.02}),
+        ("view_dependence", {"surface": GLOSSY, "spread": 10.0}, {"view_spread": 5}),
+        ("view_dependence", {"surface": GLOSSY, "n_train_cameras": 1}, {"degree_cameras": ONE}),
+        ("colour_correction", {"surface": differing(0.026, 0.04)}, {"colour_difference": 0.02}),
+        ("colour_correction", {"surface": differing(0.05, 0.12)}, {"colour_share": 0.3}),
+        ("colour_correction", {"surface": differing(0.05, 0.05, 0.02)}, {"colour_errors": 1.0}),
         ("antialias", {"scale_test": (50.0, 70.0)}, {"scale_ratio": 1.1}),
         ("random_background", {"darkest": 0.4}, {"dark": 0.5}),
     ],
@@ -192,7 +201,9 @@ def test_configs_say_what_their_names_say(compose):
     auto, none, every = (
         instantiate(compose("train", f"effects={name}").effects) for name in ("auto", "none", "all")
     )
-    assert auto == EffectSettings(degree_cameras=auto.degree_cameras)  # same values in code and yaml
+    assert auto == EffectSettings(
+        degree_cameras=auto.degree_cameras
+    )  # same values in code and yaml
     assert on(decide(scene(), none)) == set()
     found = on(decide(scene(has_distortion=True), every))
     assert found == set(CHOICES)

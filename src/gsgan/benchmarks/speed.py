@@ -7,12 +7,13 @@ from typing import Any
 
 import torch
 from omegaconf import DictConfig
+from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gsgan.benchmarks import speed_report
 from gsgan.benchmarks.environment import environment
-from gsgan.benchmarks.speed_painter import Painter, Way, painting_memory
-from gsgan.benchmarks.speed_stages import measure
+from gsgan.benchmarks.speed_painter import Painter, Way, painting_memory, without_denormals
+from gsgan.benchmarks.speed_stages import Times, measure
 from gsgan.benchmarks.speed_subject import Subject, trained, untrained
 from gsgan.benchmarks.tables import check_block, fill_block
 from gsgan.console import make_console
@@ -42,31 +43,31 @@ def run(config: DictConfig, folder: Path) -> None:
     device, console = pick_device(config.device), make_console()
     where = environment(device)
     console.print(where.sentence(), highlight=False)
-    torch.set_flush_denormal(True)  # as in training
     subject = _subject(config, device)
     painter = Painter(subject.avatar, way)
+    with without_denormals():
+        times = _measure(config, painter, subject, console)
+        memory = painting_memory(painter, subject.frames)
+    settings = _settings(config, subject, device)
+    report = speed_report.Report(times, memory, where, settings, subject.marks)
+    speed_report.write(report, folder)
+    console.print(report.text(), markup=False, highlight=False)
+    if config.docs is not None:
+        fill_block(Path(config.docs), config.block, report.text())
+    console.print(f"table, picture and raw numbers: {folder}", markup=False, highlight=False)
+
+
+def _measure(config: DictConfig, painter: Painter, subject: Subject, console: Console) -> Times:
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
         task = progress.add_task("painting", total=config.warmup + config.frames)
-        times = measure(
+        return measure(
             painter,
             subject.frames,
             count=config.frames,
             warmup=config.warmup,
             tick=lambda: progress.advance(task),
         )
-    report = speed_report.Report(
-        times,
-        painting_memory(painter, subject.frames),
-        where,
-        _settings(config, subject, device),
-        subject.marks,
-    )
-    speed_report.write(report, folder)
-    console.print(report.text(), markup=False, highlight=False)
-    if config.docs is not None:
-        fill_block(Path(config.docs), config.block, report.text())
-    console.print(f"table, picture and raw numbers: {folder}", markup=False, highlight=False)
 
 
 def _subject(config: DictConfig, device: torch.device) -> Subject:

@@ -90,6 +90,16 @@ class Painter:
 
 
 @contextmanager
+def without_denormals() -> Iterator[None]:
+    """As trainings run: a black background decays into denormals, which are slow on CPUs."""
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)
+
+
+@contextmanager
 def changed(avatar: Avatar, way: Way) -> Iterator[None]:
     """The avatar paints that way in here, and as before afterwards."""
     before = avatar.accuracy, avatar.window_margin

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from gsgan.benchmarks.environment import Environment, environment
+from gsgan.benchmarks.speed_painter import without_denormals
 from gsgan.benchmarks.store import Store, source_digest
 from gsgan.benchmarks.tables import check_block
 from gsgan.benchmarks.trade_off_curves import curve
@@ -77,7 +78,6 @@ def run(config: DictConfig, folder: Path) -> None:
         train_all(trainings, console)
     where = environment(device)
     console.print(where.sentence(), highlight=False)
-    torch.set_flush_denormal(True)  # as in training
     stage = set_stage(
         list(dict.fromkeys(point.folder for point in points)),
         data_root=config.data_root,
@@ -88,8 +88,9 @@ def run(config: DictConfig, folder: Path) -> None:
     )
     store = Store(folder / MEASUREMENTS, fresh=config.fresh)
     conditions = _conditions(config, points, where, stage)
-    found = _qualities(stage, points, score, store, conditions, console)
-    samples = _times(config, stage, points, store, conditions, console)
+    with without_denormals():
+        found = _qualities(stage, points, score, store, conditions, console)
+        samples = _times(config, stage, points, store, conditions, console)
     curves = {t.folder: c for t in trainings if (c := curve(t.label, t.folder)) is not None}
     seconds = {at: c.seconds[-1] for at, c in curves.items()}
     report = Report(

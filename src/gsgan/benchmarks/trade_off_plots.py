@@ -41,7 +41,7 @@ def trade_off_picture(report: Report) -> bytes:
     figure = Figure(figsize=(6.4 * len(metrics), 5.6), dpi=120, layout="constrained")
     panels = figure.subplots(1, len(metrics), squeeze=False)[0]
     styles = _styles(report.rows)
-    report = replace(report, rows=_within(report.rows))
+    report = replace(report, rows=within(report.rows))
     for axes, metric in zip(panels, metrics, strict=True):
         _points(axes, report, metric, styles)
     handles, names = panels[0].get_legend_handles_labels()
@@ -62,7 +62,7 @@ def trade_off_picture(report: Report) -> bytes:
     return _png(figure)
 
 
-def _within(rows: Sequence[Row]) -> list[Row]:
+def within(rows: Sequence[Row]) -> list[Row]:
     """Rows as drawn: one far slower than the rest stands at the edge and says where it belongs."""
     edge = FAR * statistics.median(row.ms for row in rows)
     return [

@@ -260,7 +260,9 @@ def _effects(data: GsganData, settings: EffectSettings) -> Section:
         decided = decide(data.info, settings)
     except DataError as error:  # named among the findings
         return Section(title, text=(f"Not decided: {error}",))
-    aside = "What is off is neither built nor computed; effects.<name>= forces one (docs/effects.md)."
+    aside = (
+        "What is off is neither built nor computed; effects.<name>= forces one (docs/effects.md)."
+    )
     table = Table(HEADERS[:3], tuple(row[:3] for row in rows(decided)))
     return Section(title, tables=(table,), aside=(aside,))
 

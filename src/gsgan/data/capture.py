@@ -88,8 +88,8 @@ class CaptureDataset(Dataset[Frame]):
     """Items of a capture as `Frame` with batch size 1; collate them with `gsgan.scene.cat`.
 
     Images are RGB in [0, 1] on black, cut to the window and scaled; K follows. As a rule they are
-    undistorted with K kept, and ``camera.dist`` is None. The window comes from the skeleton and camera alone. Labels keep
-    255 as "ignore".
+    undistorted with K kept, and ``camera.dist`` is None. The window comes from the skeleton and
+    camera alone. Labels keep 255 as "ignore".
 
     Args:
         layout: the capture.
@@ -158,7 +158,9 @@ class CaptureDataset(Dataset[Frame]):
         if self.crop is not None:
             joints = self.layout.landmarks.p[item[1]]
             seen = self.layout.landmarks.visibility[item[1]] > 0
-            return self.crop.window(camera, joints, seen, camera.dist if self._raw(camera) else None)
+            return self.crop.window(
+                camera, joints, seen, camera.dist if self._raw(camera) else None
+            )
         if self.size is not None:
             return cropping.square_window(camera.size)
         return Window(0, 0, camera.size)

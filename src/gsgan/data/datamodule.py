@@ -68,8 +68,8 @@ class GsganData(LightningDataModule):
         cache_mb: bound on decoded pictures kept in memory, all loading processes together.
         info_samples: pictures a camera from which the mean foreground colour is taken.
         min_joints: a frame with fewer usable joints is dropped.
-        distortion: ``auto`` and ``undistort`` undistort pictures on reading; ``off`` takes them as a
-            pinhole's; ``project`` undistorts those that train and leaves the others as taken.
+        distortion: ``auto`` and ``undistort`` undistort pictures on reading; ``off`` takes them as
+            a pinhole's; ``project`` undistorts those that train and leaves the others as taken.
         wanted: what the root should be, for the message when it is not set.
 
     Raises:

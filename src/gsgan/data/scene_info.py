@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -16,6 +17,7 @@ from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, surface_colours
+from gsgan.errors import DataError
 
 SOLID = 0.9  # of the mask: pixels at the outline are darkened by the black behind them
 
@@ -240,5 +242,6 @@ def _shared_surface(
     moments = [[dataset[index[c, f]] for c in cameras] for f in _evenly(shared, samples)]
     body, mesh = layout.meta.body, None
     if body is not None and layout.poses is not None:
-        mesh = open_body(body.kind, body.file, body.betas)
+        with suppress(DataError):  # without the model file the visual hull has to do
+            mesh = open_body(body.kind, body.file, body.betas)
     return surface_colours(moments, mesh)

@@ -28,7 +28,7 @@ class EffectSettings:
     word forces the effect. YAML reads a bare on or off as true or false; both are understood.
 
     Args:
-        view_dependence: ``auto``, ``off``, ``on`` (the degree that the cameras can tell), or 0 to 3.
+        view_dependence: ``auto``, ``off``, ``on`` (the degree that the cameras can tell), 0 to 3.
         distortion: ``auto``, ``off`` (pictures are taken as a pinhole's), ``undistort`` (or ``on``:
             pictures are undistorted on reading), or ``project`` (those that are held out are not:
             what is painted is bent as their lens does).

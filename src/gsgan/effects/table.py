@@ -39,7 +39,7 @@ class Cost:
 
 def rows(effects: Effects, costs: Mapping[str, Cost] | None = None) -> list[tuple[str, ...]]:
     """A row an effect: name, value, why, parameters and milliseconds added; nothing for off."""
-    found = []
+    found: list[tuple[str, ...]] = []
     for name, effect in effects:
         value = str(effect.value) if effect.on else "off"
         if name == "view_dependence" and effect.on:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -18,6 +18,7 @@ from gsgan.model.class_vote import ClassVote, Pictures
 from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
+from gsgan.model.painting import Painting
 from gsgan.model.parts import labelled_body
 from gsgan.model.segmentation import Segmentation, mode_of
 from gsgan.model.surface import SurfaceGaussians
@@ -46,80 +47,6 @@ UNWATCHED: AbstractContextManager[None] = nullcontext()  # entering it costs nex
 def unwatched(stage: str) -> AbstractContextManager[None]:
     """What a stage of painting runs in while no bench times it."""
     return UNWATCHED
-
-
-@dataclass(frozen=True)
-class Painting:
-    """What an avatar makes of one pose seen by one camera.
-
-    Args:
-        image: ``[B, 3, H, W]`` I_pred on black, not clamped; None when only Step I was asked for.
-        features: ``[B, C, H, W]`` F on black; the first three channels are Step I's colour. None,
-            like alpha and gaussians, where nothing is splatted (``image_to_image``).
-        alpha: ``[B, 1, H, W]``.
-        segmentation: ``[B, classes, H, W]`` S, or None where it was not built.
-        gaussians: Ĝ.
-        corrected: ``[B, 3, H, W]`` Step I's colour as the camera takes it, where colours are
-            corrected; F stays as it was.
-        depth: ``[B, 1, H, W]`` metres times alpha, where the effect is on.
-    """
-
-    image: Tensor | None
-    features: Tensor | None
-    alpha: Tensor | None
-    segmentation: Tensor | None
-    gaussians: Gaussians | None
-    corrected: Tensor | None = None
-    depth: Tensor | None = None
-
-    @property
-    def colour(self) -> Tensor | None:
-        """``[B, 3, H, W]`` Step I's picture C on black."""
-        if self.corrected is not None:
-            return self.corrected
-        return None if self.features is None else self.features[:, :3]
-
-    def pasted(self, window: Window) -> Painting:
-        """The same in the whole picture, all background outside the window."""
-
-        def paste(x: Tensor | None) -> Tensor | None:
-            return None if x is None else window.paste(x)
-
-        parts = paste(self.segmentation)
-        if parts is not None:
-            inside = window.paste(torch.ones_like(self.segmentation[:, :1]))  # type: ignore[index]
-            parts = torch.cat([parts[:, :1] + (1 - inside), parts[:, 1:]], dim=1)
-        return replace(
-            self,
-            image=paste(self.image),
-            features=paste(self.features),
-            alpha=paste(self.alpha),
-            segmentation=parts,
-            corrected=paste(self.corrected),
-            depth=paste(self.depth),
-        )
-
-
-    def bent(self, bend: Bend) -> Painting:
-        """The same as lenses show it, all background where they show nothing."""
-
-        def through(x: Tensor | None) -> Tensor | None:
-            return None if x is None else bend(x)
-
-        parts = through(self.segmentation)
-        if parts is not None:
-            inside = bend(torch.ones_like(self.segmentation[:, :1]))  # type: ignore[index]
-            parts = torch.cat([parts[:, :1] + (1 - inside), parts[:, 1:]], dim=1).clamp_min(0)
-        alpha = through(self.alpha)
-        return replace(
-            self,
-            image=through(self.image),
-            features=through(self.features),
-            alpha=None if alpha is None else alpha.clamp(0, 1),  # cubic weights overshoot
-            segmentation=parts,
-            corrected=through(self.corrected),
-            depth=through(self.depth),
-        )
 
 
 class Avatar(nn.Module):
