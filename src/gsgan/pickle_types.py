@@ -166,9 +166,10 @@ def reconstructor(kind: Any, base: Any, state: Any) -> object:
 class StandIn:
     """An object of a class that is not loaded: it keeps its state and gives the array it meant."""
 
+    _value: Numbers | None = None
+
     def __init__(self, *_arguments: Any) -> None:
         self.state: dict[Any, Any] = {}
-        self._value: Numbers | None = None
 
     def value(self, budget: Budget) -> Numbers:
         """The array it stands for, found once: selections of selections name it many times.
@@ -278,7 +279,7 @@ def _indices(value: Any, budget: Budget) -> Numbers:
 def as_array(value: Any, budget: Budget) -> Numbers:
     """A plain numeric array from an array or a stand-in."""
     if isinstance(value, list | tuple):
-        flat = all(isinstance(number, bool | int | float) for number in value)
+        flat = all(isinstance(number, int | float | np.number) for number in value)
         _expect(flat, "lists lie in one another where an array belongs")
     array = value.value(budget) if isinstance(value, StandIn) else np.asarray(value)
     _expect(not array.dtype.hasobject, "an array holds objects where numbers belong")

@@ -49,6 +49,7 @@ class Window:
             image=self.cut(frame.image),
             mask=self.cut(frame.mask),
             labels=None if frame.labels is None else self.cut(frame.labels),
+            unsure=None if frame.unsure is None else self.cut(frame.unsure),
             camera=self.camera(frame.camera),
         )
 

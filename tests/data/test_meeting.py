@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from make import edit_json, write_tiny_capture
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.checks import Checks
 from gsgan.data.formats.capture import LOOKED_AT, CaptureReader
-from gsgan.data.formats.meeting import box_of, inside_share
+from gsgan.data.formats.meeting import box_of, inside_share, mask_beyond
 from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Layout
 from gsgan.errors import DataError
@@ -89,6 +90,32 @@ def test_a_camera_that_is_wrong_is_named_in_a_note(
     assert "cam00" not in note
     with pytest.raises(DataError, match=r"inside: .*cam02"):
         read(root, Trust(min_box_iou=0, least_inside=0.9))
+
+
+def test_a_camera_whose_focal_length_alone_is_halved_is_named(root: Path) -> None:
+    def halve(rig: dict) -> None:
+        for i in (0, 1):
+            rig["cam02"]["K"][i][i] /= 2
+
+    edit_json(root / "cameras.json", halve)
+    (note,) = read(root, Trust(min_box_iou=0, min_inside=0, least_inside=0)).notes
+    assert re.match(r"masks reach more than 0.3 m beyond .*cam02 \d\d% of .*; [0-3]% in the o", note)
+    assert read(root, Trust(min_box_iou=0, min_inside=0, least_inside=0, max_beyond=1)).notes == ()
+
+
+def test_the_share_of_a_mask_beyond_all_joints() -> None:
+    K = np.array([[100.0, 0, 50], [0, 200, 50], [0, 0, 1]])
+    camera = CameraEntry("c", K, np.eye(3), np.zeros(3), np.zeros(8), (100, 100))
+    mask = np.zeros((100, 100), np.uint8)
+    mask[50, 50:90] = 255
+    joints = np.array([[0.01, 0.005, 2], [5.0, 0, 2], [0, 0, -2]])
+    # at 2 m a pixel is 2 cm wide: 20 of 40 pixels lie within 0.39 m of the first joint
+    assert mask_beyond(mask, camera, joints, 0.39) == pytest.approx(20 / 40)
+    mask[50:90, 50] = 255  # and 1 cm high: those all do
+    assert mask_beyond(mask, camera, joints, 0.395) == pytest.approx(20 / 79)
+    assert mask_beyond(mask, camera, joints + [0.8, 0, 0], 0.39) == pytest.approx(59 / 79, abs=0.02)
+    assert np.isnan(mask_beyond(0 * mask, camera, joints, 0.3))
+    assert np.isnan(mask_beyond(mask, camera, joints[2:], 0.3))
 
 
 def test_frames_are_left_out(root: Path) -> None:

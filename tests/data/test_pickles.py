@@ -7,6 +7,7 @@ import io
 import os
 import pickle
 import struct
+import time
 import zipfile
 from pathlib import Path
 
@@ -293,16 +294,65 @@ def test_shared_bytes_do_not_grow_without_bound(tmp_path):
     refused(tmp_path, shared + b"(l" + 400 * one + b".", "larger than the file")
 
 
-def test_deep_nesting_and_cycles_end(tmp_path):
-    cycle: list[object] = []
-    cycle.append(cycle)
-    assert read_pickle(write(tmp_path, pickle.dumps(cycle)))[0][0] is not None
-    doubled: list[object] = []
-    for _ in range(64):  # 2^64 paths, 65 lists
-        doubled = [doubled, doubled]
-    assert len(read_pickle(write(tmp_path, pickle.dumps(doubled)))) == 2
-    deep = b"(l" * 100_000 + b"a" * 99_999 + b"."
-    assert isinstance(read_pickle(write(tmp_path, deep)), list)
+def nested(pair: bytes, levels: int) -> bytes:
+    """A tuple in a tuple, each twice: 2^levels entries by following every reference."""
+    return b"\x80\x02)" + pair * levels
+
+
+def lists_in_lists(levels: int, each: int = 2) -> bytes:
+    """Lists that hold the one before them several times over."""
+    parts = [b"(lp0\nI1\na"]
+    parts += [b"(lp%d\n" % i + each * (b"g%d\na" % (i - 1)) for i in range(1, levels)]
+    return b"".join(parts) + b"."
+
+
+def selections(levels: int) -> bytes:
+    """chumpy's selections, the array and the indices of each being the one before."""
+    first = python2.dumps(np.zeros(1, int))[:-1] + b"q\x00"
+    step = b"cchumpy.reordering\nSelect\n)\x81(dS'a'\nh%csS'idxs'\nh%csbq%c"
+    return first + b"".join(step % (i, i, i + 1) for i in range(levels)) + b"."
+
+
+ENDLESS = {
+    "a key of 2^60 entries": (b"\x80\x02}" + nested(b"2\x86", 60)[2:] + b"Ns.", "tuple of more"),
+    "a key that overruns the stack": (
+        b"\x80\x02}" + nested(b"\x85", 10**6)[2:] + b"Ns.",
+        "tuple of more",
+    ),
+    "such a key by the memo": (
+        b"\x80\x04})" + b"\x94h\x00\x86" + b"".join(b"\x94h%c\x86" % i for i in range(1, 60)) + b"Ns.",
+        "tuple of more",
+    ),
+    "such a key down to a mark": (
+        b"}(tp0\n" + b"".join(b"(g%d\ng%d\ntp%d\n" % (i, i, i + 1) for i in range(60)) + b"Ns.",
+        "tuple of more",
+    ),
+    "lists of 2^64 paths": (lists_in_lists(64), "unfolds"),
+    "lists in a tuple in lists": (lists_in_lists(30, 10), "unfolds"),
+    "100 000 lists in one another": (b"(l" * 100_000 + b"a" * 99_999 + b".", "unfolds"),
+    "a list that holds itself": (b"(lp0\ng0\na.", "holds itself"),
+    "an array type of 2^60 entries": (
+        b"cnumpy\ndtype\n(" + lists_in_lists(60)[:-1] + b"I0\nI1\ntR.",
+        "array type list",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", list(ENDLESS))
+def test_what_is_endless_once_unfolded_is_refused_at_once(tmp_path, name):
+    start = time.perf_counter()
+    refused(tmp_path, *ENDLESS[name])
+    assert time.perf_counter() - start < 20
+
+
+def test_selections_of_selections_are_found_once(tmp_path):
+    assert read_pickle(write(tmp_path, selections(100))).tolist() == [0]
+
+
+def test_shared_lists_and_tuples_of_honest_files_are_read(tmp_path):
+    shape, row = (24, 3), list(range(1000))
+    content = {"shapes": [shape] * 5000, (1, (2, 3)): [row] * 500}
+    assert read_pickle(write(tmp_path, pickle.dumps(content))) == content
 
 
 # --- damage ------------------------------------------------------------------------------------

@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from gsgan.reporting.build import build
-from gsgan.reporting.columns import METRICS
 from gsgan.reporting.folders import find_runs, read_runs
 from gsgan.reporting.grid import Grid, Report, Row
 from gsgan.reporting.paper import read_paper
-from gsgan.reporting.spec import TableSpec
+from gsgan.reporting.spec import METRICS, TableSpec
 
 FLOOR = {"psnr": 15.5, "ssim": 0.8, "miou_reason": "an all-background picture has no parts"}
 NO_LPIPS = "weights are not at hand"

@@ -142,7 +142,7 @@ def test_an_unfinished_run_and_a_broken_config_are_left_out(tmp_path, tiny):
 
 
 def test_every_score_of_the_evaluation_has_a_column():
-    from gsgan.reporting.columns import METRICS as SHOWN
+    from gsgan.reporting.spec import METRICS as SHOWN
     from gsgan.scoring.scores import METRICS as SCORED
 
     assert set(SHOWN) >= set(SCORED)

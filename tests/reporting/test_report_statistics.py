@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from gsgan.reporting.columns import shown
-from gsgan.reporting.statistics import paired, summarise
+from gsgan.reporting.cells import paired, summarise
+from gsgan.reporting.spec import shown
 
 
 def test_the_spread_is_the_sample_standard_deviation():
@@ -25,6 +25,7 @@ def test_differences_pair_only_the_seeds_that_both_have():
     assert (found.summary.n, found.agreeing) == (3, 2)  # +1, +2, -0.5
     assert found.summary.mean == pytest.approx(2.5 / 3)
     assert found.summary.spread == pytest.approx((19 / 12) ** 0.5)
+    assert found.by_seed == {0: 1.0, 1: 2.0, 2: -0.5}
     assert paired({0: 1.0}, {1: 1.0}) is None
 
 

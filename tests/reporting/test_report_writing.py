@@ -9,9 +9,9 @@ from html.parser import HTMLParser
 import pytest
 from rich.console import Console
 
-from gsgan.reporting import html, latex, machine, markdown
 from gsgan.reporting.grid import Cell, Grid, Report, Row, footnotes, letters
-from gsgan.reporting.terminal import print_report
+from gsgan.reporting.writers import html, latex, markdown, numbers
+from gsgan.reporting.writers.terminal import print_report
 
 NASTY = r"a_b & 50% <b>|x|</b> {y} #1 $2 ~ ^ \cmd *[z]* ± −"
 ORIGIN = ("3", "data_set, my_377", "none", "abc123")
@@ -40,6 +40,7 @@ def test_markdown_tables_have_as_many_cells_in_every_row(report):
     counts = [len(re.findall(r"(?<!\\)\|", line)) for line in lines]
     assert counts == [8] * 5 + [3] * 3
     assert r"\<b\>" in text
+    assert r"\$2 \~ ^" in text  # neither a formula nor struck out
     assert "bad_run" in text
     assert "<sup>a</sup>" in text
     assert "## Runs" not in markdown.block(report)
@@ -74,6 +75,8 @@ def test_latex_is_escaped_balanced_and_rectangular(report):
         ("−1", "$-$1"),
         ("[0, 1]", "{[}0, 1{]}"),
         ("a\nb", "a b"),
+        ("*a", "{*}a"),  # behind \\\\ it would be the starred command
+        ("é σ π", r"é $\sigma$ {[}U+03C0{]}"),
     ],
 )
 def test_latex_escapes(raw, spelled):
@@ -109,7 +112,7 @@ def test_html_is_well_formed_escaped_and_fetches_nothing(report):
 
 
 def test_json_holds_every_number(report):
-    held = json.loads(machine.text(report))
+    held = json.loads(numbers.text(report))
     first = held["grids"][0]["rows"][0]
     assert first["cells"]["PSNR ↑"] == {"text": "31.00 ± 1.00", "mean": 31.0, "notes": []}
     assert first["commit"] == "abc123"

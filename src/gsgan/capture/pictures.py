@@ -124,7 +124,7 @@ def write_pictures(
         image_path = image_folder / f"{frame:06d}.{files.format}"
         mask_path = mask_folder / f"{frame:06d}.png"
         written.append(frame)
-        if image_path.exists() and mask_path.exists():
+        if _there(image_path) and _there(mask_path):
             empty += not read_grey(mask_path).any()
             continue
         mask = tidy(read_grey(masks[number]), tidying)
@@ -139,6 +139,11 @@ def write_pictures(
             straight = resize(take(pixels, window, mapping, exact=False), size, exact=False)
             _write(path, straight, files)
     return Written(written, empty, decoded)
+
+
+def _there(path: Path) -> bool:
+    """Whether an earlier run wrote it; a file without content is what a power cut leaves."""
+    return path.is_file() and path.stat().st_size > 0
 
 
 def _write(path: Path, pixels: Bytes, files: PictureFiles) -> None:

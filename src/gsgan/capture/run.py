@@ -72,6 +72,7 @@ def prepare(options: Options, console: Console) -> Path:
     written = _write_pictures(options, inputs, cameras, masks, solved, root)
     outcome = _write_rest(options, inputs, cameras, detections, solved, written, root, key)
     write_report(root, outcome, options, console)
+    _forget_parts(root)
     _read_back(root)
     _publish(root, out)
     work.forget_others()
@@ -199,6 +200,13 @@ def _read_back(root: Path) -> None:
         Layout.read(root)
     except DataError as error:
         raise DataError(f"nothing was made, because training could not read it: {error}") from None
+
+
+def _forget_parts(root: Path) -> None:
+    """Takes away what a run that was killed in the middle of a file left of it."""
+    with writing(root):
+        for part in root.rglob(".*.part"):
+            part.unlink()
 
 
 def _publish(root: Path, out: Path) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 
 import numpy as np
+from matplotlib.ticker import MaxNLocator
 
 from gsgan.checking.rig import ground_axes
 from gsgan.checking.silhouette import Float
@@ -165,7 +166,7 @@ def series_chart(
         f'<rect width="{CHART_WIDTH}" height="{CHART_HEIGHT}" fill="#fff"/>',
         f'<text x="{left}" y="15" fill="{INK}" font-weight="bold">{escape(title)}</text>',
     ]
-    for value in np.linspace(low, high, 3):
+    for value in _round_values(low, high):
         _, y = at(first, float(value))
         parts.append(_line(np.array([[left, y], [right, y]]), FAINT, 1))
         parts.append(f'<text x="{left - 6}" y="{y + 4:.1f}" text-anchor="end">{value:.3g}</text>')
@@ -192,6 +193,12 @@ def series_chart(
         f'height="{CHART_HEIGHT}" xmlns="http://www.w3.org/2000/svg" font-family="sans-serif" '
         f'font-size="11">{"".join(parts)}</svg>'
     )
+
+
+def _round_values(low: float, high: float) -> list[float]:
+    """Two to five round numbers between two others."""
+    found = MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(low, high)
+    return [float(v) for v in found if low - 1e-9 <= v <= high + 1e-9]
 
 
 def _pieces(frames: Sequence[int], values: Sequence[float]) -> list[list[tuple[float, float]]]:

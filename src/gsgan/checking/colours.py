@@ -141,7 +141,8 @@ def judge_colours(
         Finding(
             "warning", "colour",
             f"cameras differ in exposure or white balance (times the median camera's, {where}): "
-            f"{'; '.join(told)}{doubt}. Per-camera colour correction is called for",
+            f"{'; '.join(told)}{doubt}. Whether training corrects it stands among the effects: "
+            "effects.colour_correction=auto goes by a finer measure of its own, on always does",
         )
     ]  # fmt: skip
 

@@ -1,4 +1,4 @@
-"""Do masks and projected joints belong together? How far joints lie outside a mask.
+"""Do masks and projected joints belong together? How far each lies from the other.
 
 Pure functions of arrays. Pixels have their centres at +0.5.
 """
@@ -14,6 +14,7 @@ from gsgan.data.crop import NEAR
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
+LOOKED_AT = 2000  # pixels of a mask whose distance from the joints is found
 FAR_PIXELS = 1e4  # drawing coordinates are held within this: OpenCV's are 16 bit when shifted
 
 
@@ -46,3 +47,21 @@ def joint_distance(
     metres = np.full(len(pixels), np.nan)
     metres[judged] = distance[row[judged], column[judged]] * depth[judged] / focal
     return metres
+
+
+def beyond_share(mask: Bool, pixels: Float, depth: Float, focal: Float, reach: float) -> float:
+    """Share of a mask that lies further than ``reach`` metres from every joint; NaN of nothing.
+
+    Args:
+        mask: ``[H, W]``; of a large one evenly spread pixels stand for all.
+        pixels: ``[J, 2]`` of the joints in that picture, or beside it.
+        depth: ``[J]`` metres; joints behind the camera are left out.
+        focal: ``[2]`` pixels along x and y, of that picture.
+        reach: metres.
+    """
+    person, joints = np.argwhere(mask), depth > NEAR
+    if len(person) == 0 or not joints.any():
+        return np.nan
+    person = person[:: -(-len(person) // LOOKED_AT), ::-1] + 0.5
+    metres = (person[:, None] - pixels[joints]) / focal * depth[joints, None]
+    return float((np.linalg.norm(metres, axis=-1).min(axis=1) > reach).mean())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import dataclass
 from typing import Any
 
@@ -131,8 +132,12 @@ def numbers(where: str, raw: Any, key: str, shape: tuple[int, ...]) -> Float:
     return array
 
 
+SHORT = reprlib.Repr()  # what is nested deeply or without end is not printed to its end
+SHORT.maxlevel, SHORT.maxlist, SHORT.maxtuple, SHORT.maxother = 4, 16, 16, 400
+
+
 def _short(raw: Any, limit: int = 120) -> str:
-    text = " ".join(repr(raw).split())
+    text = " ".join(SHORT.repr(raw).split())
     return text if len(text) <= limit else text[:limit] + "…"
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsgan.drawing.layout import VERMILLION, Drawing, Grid, Unavailable, aspect_of
-from gsgan.drawing.measures import decibels, measure, where_from
+from gsgan.drawing.measures import decibels, finite, measure, where_from
 from gsgan.drawing.settings import Settings
 from gsgan.drawing.shots import Shot
 from gsgan.drawing.subjects import Subject
@@ -43,7 +43,7 @@ def draw(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings)
         numbers[shot.name] = {}
         for column, (subject, picture) in enumerate(zip(subjects, runs, strict=True), start=1):
             found = measure(picture, shot.truth, settings)
-            found["psnr_detail"] = _psnr(picture[..., *box], shot.truth[..., *box])
+            found["psnr_detail"] = finite(psnr(picture[..., *box], shot.truth[..., *box]))
             numbers[shot.name][subject.name] = found
             _show(grid, 2 * row, column, picture, box, found)
     caption = (
@@ -52,11 +52,6 @@ def draw(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings)
         + where_from(shots, settings.margin)
     )
     return Drawing(grid.figure, caption, numbers)
-
-
-def _psnr(picture: Tensor, truth: Tensor) -> float | None:
-    value = float(psnr(picture, truth))
-    return value if value != float("inf") else None
 
 
 def _show(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -79,6 +80,7 @@ def draw_points(axes: Axes, densify: Densify, pose: Pose, shot: Shot) -> int:
 
     Those on the side of their part that the camera cannot see are pale.
     """
+    densify = deepcopy(densify).cpu()  # a copy: the avatar's own stays where it paints
     points = densify(pose.p, pose.valid, pose.frames)
     pixels, depth = (x[0].numpy() for x in shot.camera.project(points.means))
     keep = np.flatnonzero(points.valid[0].numpy() & (depth > NEAR))

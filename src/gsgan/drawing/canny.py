@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from matplotlib.colors import to_rgb
 from torch import Tensor
 
 from gsgan.drawing.layout import (
@@ -103,4 +104,4 @@ def paint_edges(edges: np.ndarray, truth: np.ndarray, tolerance: int) -> np.ndar
 
 
 def _rgb(colour: str) -> list[int]:
-    return [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return [round(255 * value) for value in to_rgb(colour)]

@@ -25,7 +25,7 @@ def draw(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings)
     subject = subjects[0]
     if subject.avatar.densify is None:
         raise Unavailable(f"{subject.name} has no densify: its model makes no points of a skeleton")
-    densify = subject.avatar.densify.to("cpu")
+    densify = subject.avatar.densify
     aspect = aspect_of([shot.truth for shot in shots])
     grid = Grid(len(shots), len(TITLES), aspect, settings, width=settings.page, titles=TITLES)
     numbers = {}

@@ -10,7 +10,7 @@ from torch import Tensor
 from gsgan.drawing.settings import Settings
 from gsgan.drawing.shots import Shot
 from gsgan.drawing.subjects import Subject
-from gsgan.metrics.image import canny, edge_f1, psnr
+from gsgan.metrics.image import edge_scores, psnr
 
 Numbers = dict[str, float | None]
 STEP_ONE = "Step I's colour"
@@ -23,17 +23,23 @@ def measure(picture: Tensor, truth: Tensor, settings: Settings) -> Numbers:
         ``psnr`` dB, ``edge_f1``, ``edge_ratio`` (edge pixels over the truth's); None where it is
         not defined: equal pictures, or a truth without edges.
     """
-    low, high = settings.canny_low, settings.canny_high
-    edges, true_edges = (canny(p[0], low, high).sum() for p in (picture, truth))
-    f1 = edge_f1(picture, truth, low=low, high=high, tolerance=settings.canny_tolerance)
+    f1, ratio = edge_scores(
+        picture,
+        truth,
+        low=settings.canny_low,
+        high=settings.canny_high,
+        tolerance=settings.canny_tolerance,
+    )
     return {
-        "psnr": _finite(float(psnr(picture, truth))),
-        "edge_f1": _finite(float(f1)),
-        "edge_ratio": float(edges / true_edges) if true_edges else None,
+        "psnr": finite(psnr(picture, truth)),
+        "edge_f1": finite(f1),
+        "edge_ratio": finite(ratio),
     }
 
 
-def _finite(value: float) -> float | None:
+def finite(score: Tensor) -> float | None:
+    """The number in a tensor of one; None where it is not finite."""
+    value = float(score)
     return value if math.isfinite(value) else None
 
 

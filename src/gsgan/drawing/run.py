@@ -42,6 +42,8 @@ def make_figures(config: DictConfig) -> Record:
     """
     folders, names = _folders(config), _list(config.names)
     wanted, formats = wanted_figures(config, several=len(folders) > 1), _formats(config.formats)
+    if config.settings is None or config.shots is None:
+        raise ConfigError("settings and shots are tables of values; leave them out, or set a key")
     settings: Settings = instantiate(config.settings)
     out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
     _prepare(out)
@@ -56,8 +58,10 @@ def make_figures(config: DictConfig) -> Record:
             progress.update(task, description=f"drawing {name}")
             try:
                 drawing = _draw(name, subjects, config, settings)
-                made[name] = _entry(drawing, subjects, config.split)
-                made[name]["files"] = _save(drawing, out / name, formats)
+                entry = _entry(drawing, subjects, config.split)
+                entry["files"] = _save(drawing, out / name, formats)
+                made[name] = entry
+                _write_record(out, made)  # now: a command that is stopped leaves no stale numbers
             except Unavailable as reason:
                 left_out[name] = str(reason)
             progress.advance(task)
@@ -68,7 +72,6 @@ def make_figures(config: DictConfig) -> Record:
             "no figure could be made: "
             + "; ".join(f"{name}: {why}" for name, why in left_out.items())
         )
-    _write_record(out, made)
     _tell(console, out, made)
     return made
 
@@ -168,7 +171,7 @@ def _progress(console: Console) -> Progress:
 
 def _entry(drawing: Drawing, subjects: Sequence[Subject], split: str) -> dict[str, Any]:
     shown = [s for s in subjects if any(s.name in panels for panels in drawing.numbers.values())]
-    marks = sorted({mark for subject in shown for mark in subject.marks})
+    marks = sorted({note for subject in shown for note in subject.notes})
     return {
         "caption": f"{drawing.caption} Split {split}.",
         "numbers": drawing.numbers,
@@ -196,10 +199,16 @@ def _write_record(out: Path, made: Record) -> None:
         before: Any = json.loads((out / RECORD).read_text())
     except (OSError, ValueError):
         before = {}
-    kept = before if isinstance(before, dict) else {}
+    kept = {k: v for k, v in before.items() if _whole(v)} if isinstance(before, dict) else {}
     record = {name: made.get(name) or kept[name] for name in KINDS if name in made or name in kept}
-    write_atomically(out / RECORD, json.dumps(record, indent=1) + "\n")
+    write_atomically(out / RECORD, json.dumps(record, indent=1, allow_nan=False) + "\n")
     write_atomically(out / CAPTIONS, _captions(record))
+
+
+def _whole(entry: Any) -> bool:
+    """Whether an entry of an earlier figures.json is one of `_entry`'s."""
+    kinds = {"caption": str, "numbers": dict, "runs": dict, "marks": list, "files": list}
+    return isinstance(entry, dict) and all(isinstance(entry.get(k), t) for k, t in kinds.items())
 
 
 def _captions(record: Record) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from matplotlib.colors import to_hex, to_rgb
 from torch import Tensor
 
 from gsgan.drawing.layout import (
@@ -106,7 +107,7 @@ def disagreement(ours: Tensor, labels: Tensor) -> Tensor:
     grey = torch.where((labels > 0) & (labels != IGNORE), 0.8, 1.0)
     picture = grey.unsqueeze(1).repeat(1, 3, 1, 1)
     wrong = ((ours != labels) & (labels != IGNORE)).unsqueeze(1)
-    rgb = torch.tensor([int(VERMILLION[i : i + 2], 16) / 255 for i in (1, 3, 5)])
+    rgb = torch.tensor(to_rgb(VERMILLION))
     return torch.where(wrong, rgb[None, :, None, None], picture)
 
 
@@ -140,7 +141,5 @@ def _legend(present: Sequence[int], names: Sequence[str]) -> dict[str, str]:
     for part in present:
         rgb = colour_labels(torch.full((1, 1, 1), part))[0, :, 0, 0]
         name = names[part].replace("_", " ") if part < len(names) else f"part {part}"
-        legend["not judged" if part == IGNORE else name] = "#" + "".join(
-            f"{round(float(v) * 255):02x}" for v in rgb
-        )
+        legend["not judged" if part == IGNORE else name] = to_hex(rgb.tolist())
     return legend

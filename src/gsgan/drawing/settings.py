@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from gsgan.errors import ConfigError
+
+MOST_INCHES, MOST_DPI = 50, 2400
 
 
 @dataclass(frozen=True)
@@ -23,10 +26,10 @@ class Settings:
         error_max: levels of 255 at the end of the error maps' scale; None takes the 99.5th
             percentile of the maps shown.
         sigmas: standard deviations at which a projected Gaussian's outline is drawn.
-        detail: side of the ablation's magnified box, as a share of the shorter side shown.
+        detail: sides of the ablation's magnified box, as a share of the picture's.
 
     Raises:
-        ConfigError: when a value is not a number above 0.
+        ConfigError: when a value is not a finite number above 0, or nothing readable fits.
     """
 
     column: float = 3.5
@@ -48,7 +51,7 @@ class Settings:
                 continue
             least = 0 if name == "canny_tolerance" else None
             number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not number or not (value > 0 or value == least):
+            if not number or not (0 < value < math.inf or value == least):
                 raise ConfigError(f"settings.{name} must be a number above 0, got {value!r}")
         whole = isinstance(self.canny_tolerance, int) and isinstance(self.dpi, int)
         if not whole or self.detail > 1 or self.canny_low > self.canny_high:
@@ -62,4 +65,10 @@ class Settings:
                 "settings: nothing readable fits; column must be at least 1 inch, page 2, tallest "
                 f"0.3 and font at most 20 points; got {self.column}, {self.page}, {self.tallest} "
                 f"and {self.font}"
+            )
+        if max(self.column, self.page, self.tallest) > MOST_INCHES or self.dpi > MOST_DPI:
+            raise ConfigError(
+                f"settings: column, page and tallest must be at most {MOST_INCHES} inches and dpi "
+                f"{MOST_DPI}, else a picture would not fit into memory; got {self.column}, "
+                f"{self.page}, {self.tallest} and {self.dpi}"
             )

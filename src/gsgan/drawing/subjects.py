@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
@@ -15,7 +16,8 @@ from gsgan.data.splits import Item
 from gsgan.drawing.shots import Shot
 from gsgan.errors import ConfigError, DataError
 from gsgan.model.avatar import Avatar, Painting
-from gsgan.runs import build_data, load_avatar, load_config
+from gsgan.runs import CHECKPOINT, build_data, load_avatar, load_config, read_checkpoint
+from gsgan.training.schedule import Schedule
 
 # A model's name in print.
 TITLES = {
@@ -41,6 +43,7 @@ class Subject:
         data: of the run.
         avatar: in eval mode, on the device that paints.
         marks: notes that whatever shows this run must carry.
+        step, total: iterations that it was trained, and that its config asks for.
     """
 
     name: str
@@ -50,6 +53,8 @@ class Subject:
     data: GsganData
     avatar: Avatar
     marks: list[str]
+    step: int = 0
+    total: int = 0
     _painted: dict[Item, Painting] = field(default_factory=dict, repr=False)
 
     def paint(self, shot: Shot) -> Painting:
@@ -63,9 +68,18 @@ class Subject:
             with torch.no_grad():
                 painting = self.avatar.paint(shot.frame.to(device))
             # of F only the colour is shown: thirty channels of every shot would fill the memory
-            kept = replace(painting, features=painting.colour, alpha=None)
+            kept = replace(
+                painting, features=painting.colour, alpha=None, corrected=None, depth=None
+            )
             self._painted[shot.item] = _finite(_on_cpu(kept), self.folder, shot)
         return self._painted[shot.item]
+
+    @property
+    def notes(self) -> list[str]:
+        """Its marks, and that it is unfinished where it is."""
+        if self.step >= self.total:
+            return self.marks
+        return [*self.marks, f"{self.name} is unfinished: {self.step} of {self.total} iterations"]
 
     def image(self, shot: Shot) -> Tensor:
         """``[1, 3, h, w]`` I_pred in [0, 1], as shown."""
@@ -117,7 +131,7 @@ def open_subjects(
         device: that paints.
 
     Raises:
-        ConfigError: on a wrong number of names, or a folder given twice.
+        ConfigError: on names that are not one text a run, or a folder given twice.
         DataError: when a run cannot be read, or was trained on other data than the first.
     """
     if names is not None and len(names) != len(folders):
@@ -125,6 +139,8 @@ def open_subjects(
             f"names: expected one a run, {len(folders)} in all (run first, then compare); got "
             f"{len(names)}"
         )
+    if names is not None and not all(isinstance(name, str | int | float) for name in names):
+        raise ConfigError(f"names must be texts, one a run; got {names}")
     if names is not None and len({str(name) for name in names}) < len(names):
         raise ConfigError(
             f"names must differ, else their pictures cannot be told apart; got {names}"
@@ -150,7 +166,16 @@ def _open(folder: Path, data_root: str | None, device: torch.device | str) -> Su
     avatar, marks = load_avatar(folder, config, data)
     model = _model(folder)
     name = TITLES.get(model, model)
-    return Subject(name, model, folder, config.seed, data, avatar.to(device), marks)
+    step = int(read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"])
+    total = _iterations(config, avatar)
+    return Subject(name, model, folder, config.seed, data, avatar.to(device), marks, step, total)
+
+
+def _iterations(config: DictConfig, avatar: Avatar) -> int:
+    """What a whole run takes: Steps I and II as stretched, S's phase where S is built."""
+    schedule: Schedule = instantiate(config.training.schedule)
+    stretched = sum(round(n * schedule.stretch) for n in (schedule.step_one, schedule.step_two))
+    return stretched + (0 if avatar.segmentation is None else schedule.segmentation)
 
 
 def _model(folder: Path) -> str:

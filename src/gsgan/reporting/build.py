@@ -15,8 +15,7 @@ from gsgan.reporting.mixing import (
 )
 from gsgan.reporting.origin import UNKNOWN, commit, names_of, runs_grid
 from gsgan.reporting.paper import MEAN, PaperTable
-from gsgan.reporting.parts import Part, groups, parts
-from gsgan.reporting.rows import grids
+from gsgan.reporting.parts import Part, grids, groups, parts
 from gsgan.reporting.scored import Run
 from gsgan.reporting.spec import TableSpec, subject_of
 

@@ -1,17 +1,16 @@
-"""From runs to cells: means over seeds, differences seed by seed, and why a value is not there."""
+"""From runs to cells: mean and spread over seeds, differences seed by seed, reasons for gaps."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from statistics import fmean
+from statistics import fmean, stdev
+from typing import Any
 
-from gsgan.reporting.columns import shown
 from gsgan.reporting.grid import NOT_HAD, Cell
 from gsgan.reporting.paper import MEAN
 from gsgan.reporting.scored import Run
-from gsgan.reporting.spec import PAINTED, subject_of
-from gsgan.reporting.statistics import Summary, paired, summarise
+from gsgan.reporting.spec import PAINTED, shown, subject_of
 
 BySeed = dict[int | None, float]  # predictions have no seed
 
@@ -93,7 +92,7 @@ class Source:
         summary = summarise(list(values.values()))
         if summary is None:
             return Cell(NOT_HAD, {"n": 0}, tuple(f"{NOT_HAD}: {note}" for note in notes))
-        numbers = {**_numbers(summary), "seeds": {str(k): v for k, v in values.items()}}
+        numbers = _numbers(summary, values)
         return Cell(_text(column.metric, summary), numbers, tuple(notes))
 
     def difference(self, column: Column, reference: Source) -> Cell:
@@ -106,7 +105,7 @@ class Source:
         if found is None:
             return Cell(NOT_HAD, {"n": 0}, ("n/a: no seed in which both have it",))
         text = _text(column.metric, found.summary, signed=True)
-        numbers = {**_numbers(found.summary), "agreeing": found.agreeing}
+        numbers = {**_numbers(found.summary, found.by_seed), "agreeing": found.agreeing}
         return Cell(f"{text} ({found.agreeing}/{found.summary.n})", numbers)
 
 
@@ -131,5 +130,58 @@ def _text(metric: str, summary: Summary, *, signed: bool = False) -> str:
     return mean if summary.spread is None else f"{mean} ± {shown(metric, summary.spread)}"
 
 
-def _numbers(summary: Summary) -> dict[str, float | int | None]:
-    return {"mean": summary.mean, "spread": summary.spread, "n": summary.n}
+def _numbers(summary: Summary, by_seed: Mapping[Any, float]) -> dict[str, Any]:
+    seeds = {str(seed): value for seed, value in by_seed.items()}
+    return {"mean": summary.mean, "spread": summary.spread, "n": summary.n, "seeds": seeds}
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Several seeds' values as one.
+
+    Args:
+        mean: of the values.
+        spread: their sample standard deviation (n − 1); None for one value, which has none.
+        n: how many.
+    """
+
+    mean: float
+    spread: float | None
+    n: int
+
+
+def summarise(values: Sequence[float]) -> Summary | None:
+    """Mean and sample standard deviation; None of no values."""
+    if not values:
+        return None
+    spread = stdev(values) if len(values) > 1 else None
+    return Summary(fmean(values), spread, len(values))
+
+
+@dataclass(frozen=True)
+class Difference:
+    """What one variant has over another, seed by seed.
+
+    Args:
+        summary: of the differences.
+        by_seed: each of them.
+        agreeing: how many of them have their mean's sign.
+    """
+
+    summary: Summary
+    by_seed: Mapping[int, float]
+    agreeing: int
+
+
+def paired(values: Mapping[int, float], reference: Mapping[int, float]) -> Difference | None:
+    """``values - reference`` over the seeds that both have; None where there is no such seed."""
+    found = {seed: values[seed] - reference[seed] for seed in sorted(set(values) & set(reference))}
+    summary = summarise(list(found.values()))
+    if summary is None:
+        return None
+    agreeing = sum(_sign(value) == _sign(summary.mean) for value in found.values())
+    return Difference(summary, found, agreeing)
+
+
+def _sign(value: float) -> int:
+    return (value > 0) - (value < 0)

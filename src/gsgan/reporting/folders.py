@@ -31,7 +31,9 @@ def find_runs(given: Sequence[str]) -> list[Path]:
     """
     found: dict[Path, None] = {}
     for entry in given:
-        runs = [run for folder in _expand(str(entry)) for run in _inside(folder)]
+        if not entry.strip():
+            raise ConfigError("runs: an entry is empty; give run folders, sweep folders or globs")
+        runs = [run for folder in _expand(entry) for run in _inside(folder)]
         if not runs:
             raise ConfigError(
                 f"runs: {entry} holds no run folder (none has metrics.json or .hydra/config.yaml)"

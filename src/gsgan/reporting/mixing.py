@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations, pairwise
+from itertools import combinations
 from typing import Any
 
 from gsgan.errors import ConfigError
@@ -37,7 +37,9 @@ def refuse_other_settings(runs: Sequence[Run], split: str, table: str) -> None:
         ConfigError: naming two runs and a setting in which they differ.
     """
     where = f"{table}, {split}"
-    for first, run in pairwise(runs):
+    for first, run in combinations(runs, 2):
+        if (first.seed is None) != (run.seed is None):
+            raise _mixture(where, first, run, "are a model trained here and a method's predictions")
         known = first.settings is not None and run.settings is not None
         changed = differing(first.settings or {}, run.settings or {}) if known else []
         if changed:
@@ -154,7 +156,8 @@ def lpips_name(run: Run, split: str) -> str | None:
 def data_name(run: Run) -> str:
     """The data set in a word or two."""
     root = run.data.get("root")
-    return f"{run.data.get('name')}, {root}" if root else str(run.data.get("name"))
+    name = str(run.data.get("name") or "unknown")
+    return f"{name}, {root}" if root else name
 
 
 def _images(run: Run, split: str) -> int:

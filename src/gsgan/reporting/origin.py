@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
-from gsgan.reporting.cells import Column
 from gsgan.reporting.grid import NO_RUN, Cell, Grid, Row, common
 from gsgan.reporting.mixing import data_name, differing
 from gsgan.reporting.scored import Run
@@ -19,12 +18,16 @@ HEADER = (
 )  # fmt: skip
 
 
-def provenance(runs: Sequence[Run], columns: Sequence[Column]) -> tuple[str, ...]:
-    """A row's ``PROVENANCE``."""
+def provenance(runs: Sequence[Run], counts: Collection[int]) -> tuple[str, ...]:
+    """A row's ``PROVENANCE``.
+
+    Args:
+        runs: that it shows.
+        counts: of seeds, one a column.
+    """
     if not runs:
         return ("0", NO_RUN, NO_RUN, NO_RUN)
-    counts = sorted({len(column.of(runs)) for column in columns if column.subjects == ()})
-    seeds = str(counts[0]) if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+    seeds = " to ".join(map(str, dict.fromkeys((min(counts), max(counts))))) if counts else ""
     data = common(map(data_name, runs))
     roots = {run.data.get("root") for run in runs}
     if len(roots) > 1:

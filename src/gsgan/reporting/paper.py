@@ -10,11 +10,10 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from gsgan.errors import ConfigError
-from gsgan.reporting.columns import METRICS, heading
 from gsgan.reporting.grid import NOT_HAD, Cell, Grid, Row
 from gsgan.reporting.mixing import data_name
 from gsgan.reporting.scored import Run
-from gsgan.reporting.spec import subject_of
+from gsgan.reporting.spec import METRICS, heading, subject_of
 
 FILE = Path(__file__).with_name("paper.yaml")
 MARK = "paper"  # in the label of every row that is the paper's
@@ -84,10 +83,15 @@ class PaperTable:
             held: the row.
             columns: (subject, metric) of each.
         """
-        origin = (NOT_HAD, self.data, f"the paper's, read as {self.protocol}", NOT_HAD)
         cells = [_printed(held.values.get(s, {}).get(metric)) for s, metric in columns]
         notes = (f"{MARK}: as printed in {self.title}" + (f"; {self.note}" if self.note else ""),)
-        return Row(f"{held.label} ({MARK})", cells, origin, "paper", notes)
+        return Row(f"{held.label} ({MARK})", cells, self._origin, "paper", notes)
+
+    @property
+    def _origin(self) -> tuple[str, ...]:
+        """`PROVENANCE` of its rows: seeds and commit are not the paper's to tell."""
+        read = f", read as {self.protocol}" if self.protocol else ""
+        return (NOT_HAD, self.data, f"the paper's{read}", NOT_HAD)
 
     def grid(self, why: str) -> Grid:
         """All of it by itself: a row for each of its rows and subjects."""
@@ -96,6 +100,7 @@ class PaperTable:
             Row(
                 f"{held.label}, {subject} ({MARK})",
                 [_printed(values.get(metric)) for metric in found],
+                self._origin,
                 kind="paper",
             )
             for held in self.rows

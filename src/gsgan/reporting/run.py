@@ -11,19 +11,19 @@ from gsgan.console import make_console
 from gsgan.errors import ConfigError
 from gsgan.files import write_atomically
 from gsgan.pages import check_block, fill_block
-from gsgan.reporting import html, latex, machine, markdown
 from gsgan.reporting.build import build
 from gsgan.reporting.folders import find_runs, read_runs
 from gsgan.reporting.grid import Report
 from gsgan.reporting.paper import read_paper
 from gsgan.reporting.spec import TableSpec
-from gsgan.reporting.terminal import print_report
+from gsgan.reporting.writers import html, latex, markdown, numbers
+from gsgan.reporting.writers.terminal import print_report
 
 WRITERS = {
     "report.md": markdown.page,
     "report.tex": latex.page,
     "report.html": html.page,
-    "report.json": machine.text,
+    "report.json": numbers.text,
 }
 BLOCK_END = "<!-- /report -->"
 

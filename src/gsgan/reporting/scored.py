@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsgan.errors import DataError
-from gsgan.reporting.columns import METRICS
+from gsgan.reporting.spec import METRICS
 
 METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"
 CONFIG = Path(".hydra") / "config.yaml"

@@ -1,15 +1,58 @@
-"""What a table shows: rows, columns, splits, as ``conf/table`` says it."""
+"""What a table shows: scores, rows, splits, as ``conf/table`` says it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from gsgan.errors import ConfigError
-from gsgan.reporting.columns import METRICS
 
 PAINTED, SPLAT, FLOOR = "full", "splat", "floor"  # variants in metrics.json
+NEEDED = ("name", "title")
+MINUS = "−"
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How one score is shown.
+
+    Args:
+        heading: of its column.
+        digits: after the point.
+        better: ``↑`` the higher, ``↓`` the lower, ``→1`` the nearer to one.
+    """
+
+    heading: str
+    digits: int
+    better: str
+
+
+METRICS = {
+    "psnr": Metric("PSNR dB", 2, "↑"),
+    "psnr_person": Metric("PSNR dB in box", 2, "↑"),
+    "ssim": Metric("SSIM", 4, "↑"),
+    "ssim_person": Metric("SSIM in box", 4, "↑"),
+    "lpips": Metric("LPIPS", 4, "↓"),
+    "edge_f1": Metric("edge F1", 3, "↑"),
+    "edge_ratio": Metric("edges", 3, "→1"),
+    "high_frequencies": Metric("detail", 3, "→1"),
+    "miou": Metric("mIoU", 4, "↑"),
+    "miou_with_background": Metric("mIoU with background", 4, "↑"),
+}
+
+
+def heading(metric: str) -> str:
+    """A column's heading with the direction that is better."""
+    return f"{METRICS[metric].heading} {METRICS[metric].better}"
+
+
+def shown(metric: str, value: float, *, signed: bool = False) -> str:
+    """A value with the metric's digits, and a real minus; never a minus before zero."""
+    text = f"{value:{'+' if signed else ''}.{METRICS[metric].digits}f}"
+    if float(text) == 0:
+        text = text.lstrip("+-")
+    return text.replace("-", MINUS)
 
 
 @dataclass(frozen=True)
@@ -66,10 +109,14 @@ class TableSpec:
     paper: str | None = None
 
     def __post_init__(self) -> None:
-        for name in ("metrics", "splits", "variants"):
+        for name in ("name", "title", "data", "reference", "paper"):
             held = getattr(self, name)
-            if isinstance(held, str) or not held:
-                raise ConfigError(f"table.{name} must be a list of at least one, got {held!r}")
+            if not (isinstance(held, str) and held) and (held is not None or name in NEEDED):
+                raise ConfigError(f"table.{name} must be a text, got {held!r}")
+        if not isinstance(self.apart, bool):
+            raise ConfigError(f"table.apart must be true or false, got {self.apart!r}")
+        for name in ("metrics", "splits", "variants", "subjects", "rows"):
+            self._check_list(name, getattr(self, name))
         unknown = [metric for metric in self.metrics if metric not in METRICS]
         if unknown:
             raise ConfigError(
@@ -85,10 +132,15 @@ class TableSpec:
         if self.subjects is not None:
             object.__setattr__(self, "subjects", [str(s) for s in self.subjects])
 
-    @property
-    def layout(self) -> Literal["metrics", "subjects"]:
-        """What the columns are."""
-        return "metrics" if self.subjects is None else "subjects"
+    def _check_list(self, name: str, held: Any) -> None:
+        if held is None and name in ("subjects", "rows"):
+            return
+        if isinstance(held, str) or not isinstance(held, Sequence) or not held:
+            raise ConfigError(f"table.{name} must be a list of at least one, got {held!r}")
+        if name != "rows" and not all(isinstance(entry, str | int) for entry in held):
+            raise ConfigError(f"table.{name} must be a list of names, got {list(held)}")
+        if twice := [entry for i, entry in enumerate(held) if entry in held[:i]]:
+            raise ConfigError(f"table.{name} has {twice[0]} twice")
 
     def row_specs(self, names: Sequence[str]) -> list[RowSpec]:
         """The table's rows.
@@ -109,8 +161,12 @@ class TableSpec:
 def _row(given: Mapping[str, Any]) -> RowSpec:
     try:
         row = RowSpec(**given)
-    except TypeError as error:
-        raise ConfigError(f"table.rows: {dict(given)}: {error}") from None
+    except TypeError:
+        raise ConfigError(
+            f"table.rows must be like {{run: wo_seg, label: w/o S, variant: full}}, got {given!r}"
+        ) from None
+    if not isinstance(row.run, str) or not isinstance(row.label, str | None):
+        raise ConfigError(f"table.rows: run and label must be texts, got {given!r}")
     if row.variant not in (PAINTED, SPLAT):
         raise ConfigError(f"table.rows: variant must be full or splat, got {row.variant!r}")
     return row

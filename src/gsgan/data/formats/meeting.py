@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.agreement import joint_distance, mask_distance
+from gsgan.data.agreement import beyond_share, joint_distance, mask_distance
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, project
 from gsgan.data.formats.trust import Trust, spread
@@ -35,6 +35,7 @@ class Meeting:
         empty: the mask shows nobody.
         iou: overlap of the boxes of mask and projected body; None when one of them is empty.
         inside: share of the seen joints inside the mask; NaN of none.
+        beyond: share of the mask far from every seen joint; NaN of none.
     """
 
     camera: str
@@ -43,6 +44,7 @@ class Meeting:
     empty: bool
     iou: float | None
     inside: float
+    beyond: float
 
 
 def check_meeting(
@@ -57,7 +59,7 @@ def check_meeting(
         hint: what to check when they do not.
 
     Returns:
-        A note on the cameras whose joints lie outside their masks.
+        Notes on the cameras whose joints lie outside their masks, or masks far from their joints.
 
     Raises:
         DataError: naming the camera and frame that is furthest off, cameras with hardly a joint
@@ -79,7 +81,8 @@ def check_meeting(
             f"{median:.2f}, expected {trust.min_box_iou:g}; worst in camera {worst.camera}, frame "
             f"{worst.frame}: {worst.mask}); {hint}"
         )
-    return judge_inside(layout.root, seen, trust, hint)
+    outside = judge_inside(layout.root, seen, trust, hint)
+    return outside or judge_beyond(seen, trust)
 
 
 def meetings(layout: Layout, body: Callable[[int], Float], trust: Trust) -> list[Meeting]:
@@ -93,8 +96,9 @@ def meetings(layout: Layout, body: Callable[[int], Float], trust: Trust) -> list
             there, here = mask_box(mask), box_of(points, camera)
             met = None if there is None or here is None else box_iou(here, there)
             inside = inside_share(mask, camera, landmarks, trust.joint_tolerance)
+            beyond = mask_beyond(mask, camera, landmarks, trust.joint_reach)
             path = layout.mask_path(name, frame)
-            found.append(Meeting(name, frame, path, not mask.any(), met, inside))
+            found.append(Meeting(name, frame, path, not mask.any(), met, inside, beyond))
     return found
 
 
@@ -123,11 +127,7 @@ def judge_inside(root: Path, seen: Sequence[Meeting], trust: Trust, hint: str) -
     Raises:
         DataError: naming those with hardly a joint inside.
     """
-    shares: dict[str, list[float]] = {}
-    for one in seen:
-        if np.isfinite(one.inside):
-            shares.setdefault(one.camera, []).append(one.inside)
-    means = {name: float(np.mean(values)) for name, values in shares.items()}
+    means = by_camera((one.camera, one.inside) for one in seen)
     off = {name: share for name, share in means.items() if share < trust.min_inside}
     if not off:
         return []
@@ -140,6 +140,39 @@ def judge_inside(root: Path, seen: Sequence[Meeting], trust: Trust, hint: str) -
             f"{root}: {told}; {hint}: python -m gsgan.check tells which of them is wrong"
         )
     return [f"{told}: python -m gsgan.check tells whether calibration, skeleton or masks are wrong"]
+
+
+def judge_beyond(seen: Sequence[Meeting], trust: Trust) -> list[str]:
+    """One note that names the cameras whose masks reach far beyond the joints, if there are any."""
+    means = by_camera((one.camera, one.beyond) for one in seen)
+    off = {name: share for name, share in means.items() if share > trust.max_beyond}
+    if not off:
+        return []
+    rest = [share for name, share in means.items() if name not in off]
+    others = f"; {np.mean(rest):.0%} in the other cameras" if rest else ""
+    text = ", ".join(f"{name} {share:.0%}" for name, share in off.items())
+    return [
+        f"masks reach more than {trust.joint_reach:g} m beyond all joints ({text} of the mask"
+        f"{others}): focal lengths that are too short do this, masks of more than the person, or a "
+        "skeleton that lacks limbs: python -m gsgan.check tells more"
+    ]
+
+
+def by_camera(values: Iterable[tuple[str, float]]) -> dict[str, float]:
+    """The mean of each camera's finite values."""
+    kept: dict[str, list[float]] = {}
+    for name, value in values:
+        if np.isfinite(value):
+            kept.setdefault(name, []).append(value)
+    return {name: float(np.mean(some)) for name, some in kept.items()}
+
+
+def mask_beyond(mask: Bytes, camera: CameraEntry, joints: Float, reach: float) -> float:
+    """Share of a stored mask further than ``reach`` metres from all world points ``[N, 3]``."""
+    step = max(1, -(-max(mask.shape) // LOOKED_AT))
+    focal = np.diag(camera.K)[:2] / step
+    pixels, depth = camera.stored_pixels(joints) / step, project(camera, joints)[1]
+    return beyond_share(np.asarray(mask[::step, ::step] > 127), pixels, depth, focal, reach)
 
 
 def inside_share(mask: Bytes, camera: CameraEntry, joints: Float, tolerance: float) -> float:

@@ -27,6 +27,8 @@ class Trust:
         far_camera: times by which a camera may stand farther than the median one, or nearer;
             reading stops beyond, as its ``t`` is in another unit.
         joint_tolerance: metres that a joint may lie outside the mask and count as inside.
+        max_beyond: share of a camera's masks beyond all joints above which a note names it.
+        joint_reach: metres from the nearest joint at which a pixel of the mask is beyond them.
         watched_masks: masks of the first camera looked at, evenly spaced; 0 looks at none. About
             6 ms each at 1024 x 1024.
         mask_jump: share of the median by which a mask's area may differ without a note.
@@ -38,6 +40,8 @@ class Trust:
     min_inside: float = 0.9
     far_camera: float = 10.0
     joint_tolerance: float = 0.05
+    max_beyond: float = 0.1
+    joint_reach: float = 0.3
     watched_masks: int = 48
     mask_jump: float = 0.5
 

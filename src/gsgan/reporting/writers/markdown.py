@@ -51,5 +51,5 @@ def _marks(letters: list[str]) -> str:
 
 def _escape(text: str) -> str:
     """Text without anything that Markdown or HTML would act on; bars are the table's matter."""
-    text = re.sub(r"([\\`*\[\]<>])", r"\\\1", text.replace("&", "&amp;"))
+    text = re.sub(r"([\\`*\[\]<>~$])", r"\\\1", text.replace("&", "&amp;"))
     return re.sub(r"(?<!\w)_|_(?!\w)", r"\\_", text)

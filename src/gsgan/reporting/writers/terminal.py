@@ -47,8 +47,9 @@ def _table(grid: Grid, notes: dict[str, str]) -> Table:
 
 
 def _origin(grid: Grid) -> str:
-    """Where the rows with runs are from: what all share once, else with the rows' names."""
+    """Where the rows with runs are from, else the paper's: what all share once, else by row."""
     rows = [row for row in grid.rows if row.kind == "run" and NO_RUN not in row.provenance]
+    rows = rows or [row for row in grid.rows if row.kind == "paper"]
     told = []
     for i, name in enumerate(grid.provenance):
         labels: dict[str, list[str]] = {}

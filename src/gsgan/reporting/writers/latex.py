@@ -17,6 +17,7 @@ ESCAPES = {
     "|": r"\textbar{}",
     "[": "{[}",  # behind \\ it would begin an optional argument
     "]": "{]}",
+    "*": "{*}",  # likewise
     "±": r"$\pm$",
     "−": "$-$",
     "×": r"$\times$",
@@ -29,6 +30,8 @@ ESCAPES = {
     "λ": r"$\lambda$",
     "…": r"\ldots{}",
     "–": "--",
+    "σ": r"$\sigma$",
+    "≥": r"$\geq$",
     "\n": " ",
 }
 
@@ -42,7 +45,13 @@ def page(report: Report) -> str:
 
 def escape(text: str) -> str:
     """Text with every character that TeX would act on, or that its fonts may lack, spelled out."""
-    return "".join(ESCAPES.get(character, character) for character in text)
+    return "".join(ESCAPES.get(character) or _letter(character) for character in text)
+
+
+def _letter(character: str) -> str:
+    """Itself where pdfLaTeX has it (ASCII, Latin letters), else its number."""
+    plain = character.isascii() or (character.isalpha() and character < "\u0180")
+    return character if plain else f"{{[}}U+{ord(character):04X}{{]}}"
 
 
 def _table(grid: Grid, report: Report) -> str:
