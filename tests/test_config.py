@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from gsgan.config import config_folder, one_sentence
+from gsgan.config import config_folder, one_sentence, spelled_out
 from gsgan.errors import ConfigError, DataError
 
 SRC = Path(__file__).parents[1] / "src" / "gsgan"
@@ -135,3 +135,17 @@ def test_unknown_values_become_one_sentence(tiny, override, named):
     with pytest.raises(Exception) as caught:  # noqa: PT011 (the sentence is what is checked)
         build_training(config)
     assert named in (one_sentence(caught.value) or "")
+
+
+@pytest.mark.parametrize(
+    ("said", "meant"),
+    [
+        ("effects=[depth,antialias]", "effects.only=[depth,antialias]"),
+        ("effects=[]", "effects.only=[]"),
+        ("effects=none", "effects=none"),
+        ("effects=[depth],[antialias]", "effects=[depth],[antialias]"),  # a sweep is Hydra's
+        ("data.train_cameras=[cam00]", "data.train_cameras=[cam00]"),
+    ],
+)
+def test_a_list_of_effects_is_a_value_and_no_list_of_files(said, meant):
+    assert spelled_out(said) == meant

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import re
 import shutil
 import sys
 from collections.abc import Callable
@@ -17,6 +18,7 @@ from rich.console import Console
 from gsgan.errors import GsganError
 
 FAILED = 1
+EFFECTS_LIST = re.compile(r"effects=(\[[^\[\]]*\])")
 
 
 def config_folder() -> Path:
@@ -59,6 +61,7 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
         def main() -> None:
             import hydra  # here, so that importing an entry point stays light
 
+            sys.argv[1:] = map(spelled_out, sys.argv[1:])
             command = hydra.main(
                 version_base="1.3", config_path=str(config_folder()), config_name=name
             )(run)
@@ -67,6 +70,12 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
         return main
 
     return decorate
+
+
+def spelled_out(argument: str) -> str:
+    """``effects=[depth]`` as ``effects.only=[depth]``: Hydra would look for files of these names."""
+    found = EFFECTS_LIST.fullmatch(argument)
+    return argument if found is None else f"effects.only={found[1]}"
 
 
 def one_sentence(error: BaseException) -> str | None:

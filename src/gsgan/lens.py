@@ -31,7 +31,8 @@ def undistort(points: Tensor, dist: Tensor, iterations: int = ITERATIONS) -> tup
     """The inverse of `distort`, by Newton's method.
 
     Convention: in float64 whatever the input's dtype. Beyond the radius at which a lens folds back
-    on itself there is no such point: then the second result is False and the first one finite.
+    on itself there is no such point, or one that the lens model shows again further out and no lens
+    does: then the second result is False and the first one finite.
 
     Args:
         points: ``[B, M, 2]`` as the lenses show them.
@@ -49,6 +50,8 @@ def undistort(points: Tensor, dist: Tensor, iterations: int = ITERATIONS) -> tup
         det = a * d - b * c
         det = torch.where(det.abs() < FOUND, torch.full_like(det, FOUND), det)
         error = bent - wanted
+        if bool((error.abs() < FOUND).all()):
+            break
         step = torch.stack(
             [d * error[..., 0] - b * error[..., 1], a * error[..., 1] - c * error[..., 0]], dim=-1
         )
@@ -56,8 +59,21 @@ def undistort(points: Tensor, dist: Tensor, iterations: int = ITERATIONS) -> tup
     bent, jacobian = _bent(x, lens)
     # past the fold the lens mirrors: a solution there is not what it shows
     upright = torch.linalg.det(jacobian) > 0
+    upright &= x.norm(dim=-1) < fold_radius(lens).unsqueeze(-1)
     found = ((bent - wanted).abs().amax(dim=-1) < FOUND) & upright
     return torch.where(found.unsqueeze(-1), x, wanted).to(points.dtype), found
+
+
+def fold_radius(dist: Tensor) -> Tensor:
+    """``[B]`` of x/z, y/z: where lenses ``[B, 5]`` first fold back, p1 and p2 aside; else inf."""
+    k1, k2, _, _, k3 = dist.double().unbind(-1)
+    # the slope 1 + 3 k1 s + 5 k2 s² + 7 k3 s³ by s = r², as a cubic in 1/s, whose first term is 1
+    companion = torch.zeros(*k1.shape, 3, 3, dtype=k1.dtype, device=k1.device)
+    companion[..., 0, :] = torch.stack([-3 * k1, -5 * k2, -7 * k3], dim=-1)
+    companion[..., 1, 0] = companion[..., 2, 1] = 1
+    roots = torch.linalg.eigvals(companion)
+    real = roots.imag.abs() < FOUND * roots.abs()
+    return torch.where(real, roots.real, 0).clamp_min(0).amax(dim=-1).rsqrt()
 
 
 def _bent(points: Tensor, dist: Tensor) -> tuple[Tensor, Tensor]:
@@ -106,7 +122,7 @@ class Bend:
             raise ValueError("Bend: expected cameras with dist, got pinholes")
         height, width = camera.size
         with full_precision(camera.K):
-            pixels, found = _straight_pixels(camera)
+            pixels, found = (x.flatten(1, 2) for x in straight_pixels(camera))
         reach = REACH * pixels.new_tensor([width, height])
         side = pixels.new_tensor([width, height])
         ahead = ((pixels >= -reach) & (pixels <= side + reach)).all(-1) & found
@@ -128,9 +144,14 @@ class Bend:
             ).to(picture.dtype)
 
 
-def _straight_pixels(camera: Camera) -> tuple[Tensor, Tensor]:
-    """``[B, H W, 2]`` where a pinhole shows what each pixel does, and whether that is known."""
-    assert camera.dist is not None
+def straight_pixels(camera: Camera) -> tuple[Tensor, Tensor]:
+    """Where a pinhole shows what each pixel of cameras with a lens does.
+
+    Returns:
+        Pixels ``[B, H, W, 2]`` float64, and whether there is such a place ``[B, H, W]``.
+    """
+    if camera.dist is None:
+        raise ValueError("straight_pixels: expected cameras with dist, got pinholes")
     height, width = camera.size
     K = camera.K.double()
     v, u = torch.meshgrid(
@@ -142,4 +163,5 @@ def _straight_pixels(camera: Camera) -> tuple[Tensor, Tensor]:
     shown = (seen @ torch.linalg.inv(K).mT)[..., :2]
     straight, found = undistort(shown, camera.dist)
     ones = torch.ones_like(straight[..., :1])
-    return (torch.cat([straight, ones], dim=-1) @ K.mT)[..., :2], found
+    pixels = (torch.cat([straight, ones], dim=-1) @ K.mT)[..., :2]
+    return pixels.unflatten(1, (height, width)), found.unflatten(1, (height, width))

@@ -1,10 +1,11 @@
-"""A process that is really killed (SIGKILL) at any stage: the next run ends with the same dataset."""
+"""A process that is really killed (SIGKILL), at any stage: the next run makes the same dataset."""
 
 from __future__ import annotations
 
 import io
 import os
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -13,7 +14,9 @@ import pytest
 from capture_scenes import write_project
 from rich.console import Console
 
+from gsgan.capture.inputs import in_parallel
 from gsgan.capture.options import Options
+from gsgan.capture.progress import Bars
 from gsgan.capture.run import prepare
 from gsgan.data.layout import Layout
 
@@ -110,3 +113,22 @@ def test_an_earlier_dataset_outlives_a_kill(
     prepare(again, quiet())
     assert pictures(out) == whole
     assert not (tmp_path / ".out.old").exists()
+
+
+def test_one_failure_or_an_interrupt_stops_the_other_cameras_at_their_next_picture() -> None:
+    steps: list[int] = []
+    with Bars("working", ["a", "b", "c"]) as bars:
+
+        def work(index: int) -> None:
+            if index == 0:
+                while not steps:
+                    time.sleep(0.001)
+                raise KeyboardInterrupt
+            for step in range(10**6):
+                bars.advance("b")
+                steps.append(step)
+                time.sleep(0.001)
+
+        with pytest.raises(KeyboardInterrupt):
+            in_parallel(work, range(3), 2, bars.stop)
+    assert 0 < len(steps) < 10**4

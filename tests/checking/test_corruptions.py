@@ -318,6 +318,17 @@ def test_a_camera_that_is_nearly_right_is_named(copy, check):
     assert not any("camera cam00" in s or "camera cam02" in s for s in sentences)
 
 
+@pytest.mark.parametrize("names", [("cam01",), ("cam01", "cam03")])
+def test_focal_lengths_of_half_are_named_for_what_they_are(copy, check, names):
+    scale_focal(copy, 0.5, *names)
+    # the tiny person is of thin discs, so all is smaller than in a capture
+    limits = {"fullness": 1.2, "inside_warning": 0.3, "inside_error": 0.2}
+    errors = [f.sentence for f in check(copy, **limits).findings if f.level == "error"]
+    (told,) = (s for s in errors if "far larger than the body" in s)
+    assert all(f"{name} " in told for name in names)
+    assert not any("clock" in s or "would fit" in s for s in errors)
+
+
 def test_joints_just_outside_every_mask_are_told_once(copy, check):
     scale_focal(copy, 1.12, *(f"cam{i:02d}" for i in range(4)))
     told = [f.sentence for f in check(copy, inside_warning=0.71, outside_all=0.002).findings]

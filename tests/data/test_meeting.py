@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -98,9 +99,12 @@ def test_a_camera_whose_focal_length_alone_is_halved_is_named(root: Path) -> Non
             rig["cam02"]["K"][i][i] /= 2
 
     edit_json(root / "cameras.json", halve)
-    (note,) = read(root, Trust(min_box_iou=0, min_inside=0, least_inside=0)).notes
-    assert re.match(r"masks reach more than 0.3 m beyond .*cam02 \d\d% of .*; [0-3]% in the o", note)
-    assert read(root, Trust(min_box_iou=0, min_inside=0, least_inside=0, max_beyond=1)).notes == ()
+    trust = Trust(min_box_iou=0, min_inside=0, least_inside=0)  # where joints stay inside as well
+    (note,) = read(root, trust).notes
+    assert re.match(r"masks reach .* beyond all joints \(cam02 \d\d% of .*; [0-3]% in the o", note)
+    assert read(root, replace(trust, max_beyond=1)).notes == ()
+    (other,) = read(root, replace(trust, min_inside=0.9)).notes
+    assert other.startswith("joints lie outside the masks (inside: cam02 ")
 
 
 def test_the_share_of_a_mask_beyond_all_joints() -> None:
@@ -113,7 +117,8 @@ def test_the_share_of_a_mask_beyond_all_joints() -> None:
     assert mask_beyond(mask, camera, joints, 0.39) == pytest.approx(20 / 40)
     mask[50:90, 50] = 255  # and 1 cm high: those all do
     assert mask_beyond(mask, camera, joints, 0.395) == pytest.approx(20 / 79)
-    assert mask_beyond(mask, camera, joints + [0.8, 0, 0], 0.39) == pytest.approx(59 / 79, abs=0.02)
+    moved = joints + np.array([0.8, 0, 0])
+    assert mask_beyond(mask, camera, moved, 0.39) == pytest.approx(59 / 79, abs=0.02)
     assert np.isnan(mask_beyond(0 * mask, camera, joints, 0.3))
     assert np.isnan(mask_beyond(mask, camera, joints[2:], 0.3))
 

@@ -320,7 +320,7 @@ ENDLESS = {
         "tuple of more",
     ),
     "such a key by the memo": (
-        b"\x80\x04})" + b"\x94h\x00\x86" + b"".join(b"\x94h%c\x86" % i for i in range(1, 60)) + b"Ns.",
+        b"\x80\x04})" + b"".join(b"\x94h%c\x86" % i for i in range(60)) + b"Ns.",
         "tuple of more",
     ),
     "such a key down to a mark": (

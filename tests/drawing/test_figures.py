@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,6 +14,7 @@ from commands import refused
 from omegaconf import OmegaConf
 
 from gsgan.drawing.registry import KINDS
+from gsgan.errors import DataError
 from gsgan.metrics.image import edge_f1, psnr
 from gsgan.runs import build_data, load_avatar, load_config
 
@@ -82,6 +84,7 @@ def test_the_same_figure_has_the_same_bytes_and_earlier_ones_are_kept(run, tmp_p
     given = (f"run={run}", f"out={tmp_path / 'out'}", "formats=[png,pdf]", *FEW)
     assert inside("figures", *given, "figures=canny").returncode == 0
     before = {p.name: p.read_bytes() for p in (tmp_path / "out").glob("canny.*")}
+    assert not json.loads((tmp_path / "out" / "figures.json").read_text())["canny"]["marks"][1:]
     (tmp_path / "out" / "figures.json").write_text('{"canny": ')  # cut off
     assert inside("figures", *given, "figures=[canny]", "frames=null").returncode == 0
     assert {p.name: p.read_bytes() for p in (tmp_path / "out").glob("canny.*")} == before
@@ -134,6 +137,36 @@ def test_a_run_on_other_pixels_is_refused(run, twin, capture, tmp_path, inside):
     refused(inside("figures", *given), "cannot be compared", "its pixels differ")
 
 
+def test_a_run_that_is_half_trained_is_said_to_be(twin, tmp_path, inside):
+    path = twin / "checkpoints" / "last.ckpt"
+    checkpoint = torch.load(path, weights_only=True)
+    total = checkpoint["gsgan"]["step"]
+    checkpoint["gsgan"]["step"] = 3
+    torch.save(checkpoint, path)
+    given = (f"run={twin}", f"out={tmp_path / 'out'}", "figures=strip", "formats=png", *FEW)
+    result = inside("figures", *given)
+    said = f"GaussianGAN is unfinished: 3 of {total} iterations"
+    assert said in result.stdout
+    assert said in (tmp_path / "out" / "captions.md").read_text()
+
+
+def test_a_figure_that_fails_leaves_the_others_numbers(run, tmp_path, inside, monkeypatch):
+    """As a stopped command does: pictures, captions and numbers are of one making."""
+
+    def fail(*_: object) -> None:
+        raise DataError("the last picture is damaged")
+
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "figures.json").write_text('{"strip": 3, "errors": {"caption": "old"}}')
+    monkeypatch.setitem(KINDS, "strip", replace(KINDS["strip"], draw=fail))
+    given = (f"run={run}", f"out={out}", "figures=[canny,strip]", "formats=png", *FEW)
+    refused(inside("figures", *given), "the last picture is damaged")
+    assert list(json.loads((out / "figures.json").read_text())) == ["canny"]
+    assert "## canny" in (out / "captions.md").read_text()
+    assert not (out / "strip.png").exists()
+
+
 def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
     path = twin / "checkpoints" / "last.ckpt"
     checkpoint = torch.load(path, weights_only=True)
@@ -161,6 +194,9 @@ def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
         (("camera=cam07",), ("cam07", "which has cam00")),
         (("shots.canny=0", "figures=canny"), ("shots.canny", "at least 1")),
         (("settings.dpi=-1",), ("settings.dpi",)),
+        (("settings=null",), ("settings and shots are tables",)),
+        (("shots=null",), ("settings and shots are tables",)),
+        (("names=[null]",), ("names must be texts",)),
         (("out={run}/metrics.json",), ("metrics.json", "cannot be written to")),
         (("data_root=/nowhere",), ("/nowhere",)),
     ],

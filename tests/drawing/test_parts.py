@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,6 +15,7 @@ from gsgan.drawing import ablation, canny, errors, segmentation
 from gsgan.drawing.body import ellipses, part_colours
 from gsgan.drawing.layout import LEAST_FONT, Grid, Unavailable, style
 from gsgan.drawing.measures import measure, written
+from gsgan.drawing.registry import KINDS
 from gsgan.drawing.run import wanted_figures
 from gsgan.drawing.settings import Settings
 from gsgan.drawing.shots import NARROWEST, choose_items, make_shots, spread
@@ -156,7 +158,8 @@ def test_a_panel_holds_its_picture_and_text_its_width():
 @pytest.mark.parametrize(
     ("key", "value"),
     [("font", 0), ("dpi", 1.5), ("canny_low", 300.0), ("detail", 2.0), ("page", "wide"),
-     ("canny_tolerance", -1), ("column", 0.1)],
+     ("canny_tolerance", -1), ("column", 0.1), ("page", math.inf), ("dpi", 10**8),
+     ("margin", math.nan)],
 )  # fmt: skip
 def test_settings_that_cannot_be_are_refused(key, value):
     with pytest.raises(ConfigError, match=key):
@@ -231,8 +234,6 @@ def subject_of(build, *overrides: str) -> Subject:
     ],
 )
 def test_what_a_model_cannot_have_is_said(build, model, figure, words):
-    from gsgan.drawing.registry import KINDS
-
     subject = subject_of(build, f"model={model}")
     shots = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)
     with style(SETTINGS), pytest.raises(Unavailable, match=words):
@@ -240,13 +241,56 @@ def test_what_a_model_cannot_have_is_said(build, model, figure, words):
 
 
 def test_data_without_labels_has_no_segmentation_figure(build):
-    from dataclasses import replace
-
     subject = subject_of(build)
     shot = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)[0]
     bare = replace(shot, frame=replace(shot.frame, labels=None))
     with pytest.raises(Unavailable, match="no part labels"):
         segmentation.draw([subject], [bare], SETTINGS)
+
+
+def test_drawing_leaves_the_avatar_where_it_paints(build, monkeypatch):
+    """On a GPU, points moved to the CPU for a figure would be missing for the next picture."""
+    subject = subject_of(build)
+    moved: set[int] = set()
+    apply = torch.nn.Module._apply
+
+    def watched(self, *given, **more):
+        moved.add(id(self))
+        return apply(self, *given, **more)
+
+    monkeypatch.setattr(torch.nn.Module, "_apply", watched)
+    shots = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)
+    with style(SETTINGS):
+        KINDS["densify"].draw([subject], shots, SETTINGS)
+    assert moved  # the copy was
+    assert not moved & {id(module) for module in subject.avatar.modules()}
+
+
+def test_what_is_kept_of_a_painting_is_on_the_cpu(build):
+    """Whatever of it shows; nothing else fills memory on the device that painted."""
+    subject = subject_of(build)
+    shot = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)[0]
+    paint = subject.avatar.paint
+
+    def painted(frame):
+        found = paint(frame)
+        tinted = None if found.colour is None else found.colour * 0.5
+        return replace(found, corrected=tinted, depth=found.alpha)
+
+    subject.avatar.paint = painted
+    kept = subject.paint(shot)
+    assert kept.corrected is None
+    assert kept.depth is None
+    assert kept.alpha is None
+    want = painted(shot.frame).corrected
+    assert torch.equal(subject.colour(shot), shot.window.cut(want).clamp(0, 1))
+
+
+def test_an_unfinished_run_is_marked(build):
+    subject = subject_of(build)
+    assert replace(subject, step=12, total=12).notes == []
+    half = replace(subject, step=3, total=12, marks=["stand-in"])
+    assert half.notes == ["stand-in", "full is unfinished: 3 of 12 iterations"]
 
 
 def test_a_splat_only_run_stands_for_splatting_alone(build):

@@ -265,6 +265,22 @@ def test_pictures_are_taken_as_the_word_says(build, bent):
     assert float(views[0].mask[0, 0, int(wrist[1]), int(wrist[0])]) == 1
 
 
+def test_a_lens_with_more_coefficients_is_undistorted_where_others_stay(tmp_path):
+    """What ``effects.impossible=off`` makes of ``project``: never a lens that is half known."""
+    from make import write_tiny_capture
+
+    from gsgan.data.capture import CaptureDataset
+    from gsgan.data.datamodule import GsganData
+
+    root = write_tiny_capture(
+        tmp_path / "rational", cameras=3, frames=2, size=(64, 64), dist=(*LENS, 0.01, 0, 0)
+    )
+    train = GsganData(str(root), size=64).dataset("train")
+    raw = CaptureDataset(train.layout, train.items, size=64, lens="raw")
+    assert raw[0].camera.dist is None
+    assert torch.equal(raw[0].image, train[0].image)
+
+
 def test_a_raw_crop_follows_the_lens(build, bent):
     """The person's window in a picture as taken holds the whole mask."""
     word = ("effects.distortion=project", "data.crop=person", "data.size=48")
@@ -351,6 +367,7 @@ def test_a_run_whose_data_now_calls_for_other_effects_is_not_gone_on_with(tiny):
         (("effects.distortion=undistort",), "no camera of this data has a lens coefficient"),
         (("effects.segmentation=body", "model=wo_seg"), "the model leaves it out"),
         (("effects.depth=on", "model=image_to_image"), "this model splats nothing"),
+        (("effects=[depth,distortion]",), "no camera of this data has a lens coefficient"),
         (("effects.colour_correction=on", "data.train_cameras=[cam00]"), "one training camera"),
     ],
 )

@@ -123,7 +123,6 @@ def test_every_threshold_is_read(name, at, setting):
     ("setting", "change", "why"),
     [
         ({"distortion": "undistort"}, {}, "no camera of this data has a lens coefficient"),
-        ({"distortion": "project"}, {"has_distortion": True, "has_rational_lens": True}, "k4, k5"),
         ({"colour_correction": "on"}, {"n_train_cameras": 1}, "one training camera"),
         ({"segmentation": "body"}, {"has_body_pose": False}, "no body pose"),
         ({"segmentation": "hands"}, {"label_names": ("background", "hat")}, "no part .* is a hand"),
@@ -136,6 +135,15 @@ def test_forcing_the_impossible_is_one_sentence_or_left_out(setting, change, why
     assert "\n" not in str(caught.value)
     lenient = decide(scene(**change), EffectSettings(**setting, impossible="off"))
     assert not getattr(lenient, next(iter(setting)), lenient.distortion).on
+
+
+def test_a_lens_that_painting_does_not_know_is_refused_or_undistorted():
+    rational = scene(has_distortion=True, has_rational_lens=True)
+    with pytest.raises(ConfigError, match=r"distortion=project is not possible: .*k4, k5, k6"):
+        decide(rational, EffectSettings(distortion="project"))
+    lenient = decide(rational, EffectSettings(distortion="project", impossible="off"))
+    assert lenient.distortion.value == "undistort"
+    assert "k4" in lenient.distortion.why
 
 
 def test_forced_words_win_over_the_scene():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsgan.lens import Bend, distort, undistort
+from gsgan.lens import Bend, distort, fold_radius, straight_pixels, undistort
 from gsgan.scene import Camera
 
 BARREL = [-0.28, 0.09, 0.001, -0.0008, -0.01]
@@ -37,6 +37,25 @@ def test_beyond_the_fold_nothing_is_found_and_all_is_finite():
     back, found = undistort(torch.tensor([[[0.5, 0.0], [0.56, 0.0], [0.0, 3.0]]]), lens)
     assert found[0].tolist() == [True, False, False]
     assert torch.isfinite(back).all()
+
+
+def test_what_the_model_shows_again_beyond_its_fold_is_not_found():
+    """1 - 0.8 r² + 0.2 r⁴ rises again beyond r = 1.36: no lens shows that a second time."""
+    lens = torch.tensor([[-0.8, 0.2, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    again = torch.tensor([[[0.3, 0.0], [1.9, 0.0], [1.5, 1.5]]], dtype=torch.float64)
+    assert undistort(distort(again, lens), lens)[1][0].tolist() == [True, False, False]
+
+
+def test_the_fold_is_where_the_slope_first_vanishes():
+    lenses = torch.tensor(
+        [[-0.5, 0, 0, 0, 0], [-0.8, 0.2, 0, 0, 0], [0.1, 0, 0, 0, -0.01], PINCUSHION, [0] * 5]
+    )
+    found = fold_radius(lenses)
+    # roots of 1 - 1.5 s; 1 - 2.4 s + s²; 1 + 0.3 s - 0.07 s³, by hand; the last two never fold
+    assert found[:2].tolist() == pytest.approx([(2 / 3) ** 0.5, (1.2 - 0.44**0.5) ** 0.5])
+    s = float(found[2]) ** 2
+    assert 1 + 0.3 * s - 0.07 * s**3 == pytest.approx(0, abs=1e-6)
+    assert found[3:].tolist() == [float("inf")] * 2
 
 
 def test_gradients_of_distort_are_finite_and_right():
@@ -83,5 +102,6 @@ def test_strong_lenses_stay_within_bounds():
 
 
 def test_a_pinhole_has_no_bend():
-    with pytest.raises(ValueError, match="expected cameras with dist"):
-        Bend.of(camera(None))
+    for function in (Bend.of, straight_pixels):
+        with pytest.raises(ValueError, match="expected cameras with dist"):
+            function(camera(None))

@@ -86,7 +86,9 @@ def test_highlights_are_what_is_left():
     assert glossy.residual > 2 * matt.residual
 
 
-@pytest.mark.parametrize("damage", ["far apart", "coarse", "few moments", "empty masks", "none"])
+@pytest.mark.parametrize(
+    "damage", ["far apart", "coarse", "few moments", "empty masks", "none", "astray", "unseen"]
+)
 def test_without_shared_surface_nothing_is_claimed(damage):
     from dataclasses import replace
 
@@ -99,6 +101,12 @@ def test_without_shared_surface_nothing_is_claimed(damage):
         frames = frames[:2]
     if damage == "empty masks":
         frames = [[replace(f, mask=f.mask * 0, image=f.image * 0) for f in m] for m in frames]
+    if damage == "astray":  # a joint 1 km off: carving so wide a box would take all memory
+        joints = frames[0][0].skeleton.clone()
+        joints[0, 0, 0] = 1000.0
+        frames = [[replace(f, skeleton=joints) for f in m] for m in frames]
+    if damage == "unseen":
+        frames = [[replace(f, visibility=f.visibility * 0) for f in m] for m in frames]
     if damage == "none":
         frames = []
     assert surface_colours(frames, None) is None

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
-from gsgan.metrics.body_box import box_corners, box_mask, inside_hull
+from gsgan.lens import distort
+from gsgan.metrics.body_box import box_corners, box_mask, inside_hull, pixel_centres
 from gsgan.scene import Camera
 
 
@@ -50,10 +53,28 @@ def test_a_box_that_reaches_behind_the_camera_is_cut_at_the_near_plane():
 
 def test_pixel_centres_decide_and_flat_polygons_cover_nothing():
     triangle = torch.tensor([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]])
-    assert inside_hull(triangle, (3, 3))[0].tolist() == [
+    centres = pixel_centres(camera((3, 3)))
+    assert centres[0, 2].tolist() == [2.5, 0.5]  # x, y
+    assert inside_hull(triangle, centres).tolist() == [
         [True, True, True],
         [True, True, False],
         [True, False, False],
     ]
-    assert torch.equal(inside_hull(triangle.flip(0), (3, 3)), inside_hull(triangle, (3, 3)))
-    assert not inside_hull(triangle[:2], (3, 3)).any()
+    assert torch.equal(inside_hull(triangle.flip(0), centres), inside_hull(triangle, centres))
+    assert not inside_hull(triangle[:2], centres).any()
+
+
+def test_a_lens_bends_the_box_with_the_picture():
+    """The face from -0.8 to 0.8 at z = 1: its sides and corners land where the lens shows them."""
+    points = torch.tensor([[-0.8, -0.8, 1.0], [0.8, 0.8, 1.0]])
+    corners = box_corners(points, 0.0)
+    pinhole = camera((200, 200), 100.0)
+    lens = torch.tensor([[-0.2, 0.0, 0.0, 0.0, 0.0]])
+    seen = box_mask(corners, replace(pinhole, dist=lens))[0]
+    nothing = replace(pinhole, dist=torch.zeros(1, 5))
+    assert torch.equal(box_mask(corners, nothing), box_mask(corners, pinhole))
+    shown = distort(torch.tensor([[[0.8, 0.0], [0.8, 0.8]]]), lens)[0] * 100 + 100
+    assert seen[100].nonzero().amax() == int(shown[0, 0] - 0.5)  # last centre left of the side
+    diagonal = seen.diagonal().nonzero().amax()
+    assert diagonal == int(shown[1, 0] - 0.5)
+    assert diagonal < seen[100].nonzero().amax()  # a barrel: corners are drawn in

@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import pytest
 from omegaconf import OmegaConf
-from report_folders import write_run
+from report_folders import report_of, row, table, texts, write_run
 
 from gsgan.errors import ConfigError, DataError
 from gsgan.reporting.folders import find_runs, read_runs
@@ -35,6 +37,13 @@ def test_what_is_no_run_is_refused(tmp_path, entry, said):
     (tmp_path / "empty").mkdir()
     with pytest.raises(ConfigError, match=said):
         find_runs([f"{tmp_path}/{entry}"])
+
+
+def test_an_empty_entry_is_not_the_folder_one_stands_in(tmp_path, monkeypatch):
+    write_run(tmp_path / "a")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="an entry is empty"):
+        find_runs([""])
 
 
 def test_facts_say_what_a_run_is(tmp_path):
@@ -154,3 +163,22 @@ def test_the_format_is_the_evaluations_own(run):
     assert (read.name, read.seed) == ("full", 0)
     assert read.data["fingerprint"] == facts["data"]["fingerprint"]
     assert read.settings["training.schedule.epoch"] == 4
+
+
+def test_predictions_that_were_scored_stand_beside_a_run(run, capture, tmp_path, inside):
+    """Black pictures of a method of someone else: its row has the floor's very scores."""
+    from gsgan.runs import build_data, load_config
+
+    for camera, frame in build_data(load_config(run)).dataset("novel_pose").items:
+        path = tmp_path / "black" / "novel_pose" / camera / f"{frame:06d}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(path), np.zeros((32, 32, 3), np.uint8))
+    given = ["data=capture", "data.size=32", "data.crop=null", f"data.root={capture}"]
+    given += ["splits=[novel_pose]"]
+    result = inside("evaluate", f"predictions={tmp_path / 'black'}", *given)
+    assert result.returncode == 0, result.stderr
+    report = report_of(table(metrics=["psnr"]), run, tmp_path / "black_scores")
+    (grid,) = report.grids
+    assert [r.label for r in grid.rows] == ["black", "full", "all background (floor)"]
+    assert texts(row(grid, "black")) == texts(row(grid, "all background (floor)"))
+    assert row(grid, "black").provenance[0] == "1"

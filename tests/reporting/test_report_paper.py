@@ -44,6 +44,8 @@ def test_elsewhere_they_stand_by_themselves_and_say_why(tmp_path, held, said):
     assert all(r.kind != "paper" for r in ours.rows)
     assert all(r.kind == "paper" and "(paper)" in r.label for r in paper.rows)
     assert said in paper.remarks[0]
+    told = ("n/a", "zju_mocap", "the paper's, read as paper_zju", "n/a")
+    assert all(r.provenance == told for r in paper.rows)
 
 
 def test_another_split_is_not_the_papers(tmp_path):

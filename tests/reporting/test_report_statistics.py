@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from report_folders import table
 
+from gsgan.errors import ConfigError
 from gsgan.reporting.cells import paired, summarise
 from gsgan.reporting.spec import shown
 
@@ -40,3 +42,31 @@ def test_equal_runs_differ_by_zero_without_a_sign():
 )
 def test_signs_and_digits(value, signed, text):
     assert shown("psnr", value, signed=signed) == text
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("name", None, "name must be a text"),
+        ("title", "", "title must be a text"),
+        ("data", 3, "data must be a text"),
+        ("apart", "maybe", "apart must be true or false"),
+        ("metrics", [], "metrics must be a list of at least one"),
+        ("metrics", [{"a": 1}], "metrics must be a list of names"),
+        ("metrics", ["psnr", "psnr"], "metrics has psnr twice"),
+        ("metrics", ["fid"], "fid; known: psnr"),
+        ("splits", "novel_pose", "splits must be a list"),
+        ("variants", ["floor"], "among full and splat"),
+        ("subjects", 377, "subjects must be a list"),
+        ("subjects", [], "subjects must be a list of at least one"),
+        ("rows", 3, "rows must be a list"),
+        ("rows", [3], "rows must be like"),
+        ("rows", [{"model": "full"}], "rows must be like"),
+        ("rows", [{"run": "full"}, {"run": "full"}], "twice"),
+        ("rows", [{"run": "full", "label": 3}], "run and label must be texts"),
+        ("rows", [{"run": "full", "variant": "floor"}], "variant must be full or splat"),
+    ],
+)
+def test_a_table_that_cannot_be_is_refused_by_key(key, value, said):
+    with pytest.raises(ConfigError, match=f"table.{said}|{said}"):
+        table(**{key: value})

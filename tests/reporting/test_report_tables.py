@@ -50,6 +50,25 @@ def test_differences_are_taken_seed_by_seed(tmp_path):
     assert [r.label for r in differences.rows] == ["w/o S"]
 
 
+def test_a_difference_says_how_many_seeds_it_is_of_and_names_both_commits(tmp_path):
+    runs = seeds(tmp_path)
+    for seed, psnr in ((1, 31.0), (2, 30.5), (7, 90.0)):
+        held = {"facts": {"commit": "def456"}, "psnr": psnr}
+        runs.append(write_run(tmp_path / f"b{seed}", "wo_seg", seed, **held))
+    scores, differences = report_of(table(reference="full"), *runs).grids
+    assert row(scores, "wo_seg").provenance[0] == "3"
+    found = row(differences, "wo_seg")
+    assert texts(found) == ["−0.75 ± 0.35 (2/2)"]  # −1, −0.5
+    assert found.cells[0].numbers["seeds"] == {"1": -1.0, "2": -0.5}
+    assert found.provenance == ("2", "synthetic, person", "none", "def456, abc123")
+
+
+def test_the_floor_has_no_seed_and_one_value(tmp_path):
+    report = report_of(table(), *seeds(tmp_path))
+    numbers = row(report.grids[0], "all background (floor)").cells[0].numbers
+    assert (numbers["n"], numbers["spread"]) == (1, None)
+
+
 def test_a_value_that_some_seeds_lack_is_counted_and_explained(tmp_path):
     runs = [*seeds(tmp_path, values=(30.0, 31.0), lpips=0.1)]
     runs.append(write_run(tmp_path / "x", "full", 2, psnr=32.0))
@@ -117,6 +136,24 @@ def test_seeds_of_one_row_are_of_one_thing(tmp_path, held, said):
     runs = [write_run(tmp_path / "a", psnr=30.0), write_run(tmp_path / "b", seed=1, **held)]
     with pytest.raises(ConfigError, match=said):
         report_of(table(), *runs)
+
+
+def test_every_pair_of_seeds_is_compared(tmp_path):
+    """One that does not tell its iterations must not hide that two others differ."""
+    runs = [
+        write_run(tmp_path / str(seed), seed=seed, psnr=30.0, facts={"iterations": done})
+        for seed, done in enumerate((7000, None, 10))
+    ]
+    with pytest.raises(ConfigError, match="trained 7000 and 10 iterations"):
+        report_of(table(), *runs)
+
+
+def test_a_method_of_a_models_name_is_not_pooled_with_it(tmp_path):
+    model = write_run(tmp_path / "a", psnr=30.0)
+    facts = {"method": "full", "iterations": None}
+    method = write_run(tmp_path / "b", None, None, psnr=20.0, facts=facts)
+    with pytest.raises(ConfigError, match="a model trained here and a method's predictions"):
+        report_of(table(), model, method)
 
 
 def trained(tmp_path, name, model, seed, **settings):

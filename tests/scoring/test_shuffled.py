@@ -6,17 +6,23 @@ import pytest
 import torch
 
 from gsgan.errors import ConfigError, DataError
-from gsgan.scoring.shuffled import Exchanged
+from gsgan.scoring.shuffled import THUMBNAIL, Exchanged, best_placing, moved
 
 CAMERAS, FRAMES = ("a", "b"), 6
 
 
 def truth(camera: str, frame: int, step: int = 3) -> torch.Tensor:
-    """A bar that moves with the frame, lower in camera b."""
+    """Someone who walks to the right, an arm now up, now down; lower in camera b."""
     picture = torch.zeros(1, 3, 48, 48)
-    top = 4 if camera == "a" else 26
-    picture[..., top : top + 16, 4 + step * frame : 12 + step * frame] = 0.8
+    top, left = 4 if camera == "a" else 26, 4 + step * frame
+    picture[..., top : top + 16, left : left + 8] = 0.8
+    arm = top + (0 if step == 0 else 5 * frame % 13)
+    picture[..., arm : arm + 4, left + 8 : left + 16] = 0.6
     return picture
+
+
+def placed(picture: torch.Tensor, right: float = 0, scale: float = 0, turn: float = 0):
+    return moved(picture, (right, 0.0, scale, turn)).clamp(0, 1)
 
 
 def watched(predict, step: int = 3, margin: float = 2.0) -> Exchanged:
@@ -58,9 +64,57 @@ def test_exchanged_cameras_are_found():
     assert len(found) == 2 * FRAMES
 
 
+def test_cameras_and_frames_exchanged_at_once_are_found():
+    found = watched(lambda c, f: noisy(truth("b" if c == "a" else "a", FRAMES - 1 - f))).found()
+    assert found["a", 1] == ("b", FRAMES - 2)
+    assert len(found) == 2 * FRAMES
+
+
+def test_many_predictions_are_compared_part_by_part(monkeypatch):
+    from gsgan.scoring import shuffled
+
+    monkeypatch.setattr(shuffled, "ROWS", 5)
+    found = watched(lambda c, f: noisy(truth(c, FRAMES - 1 - f))).found()
+    assert found == {(c, f): (c, FRAMES - 1 - f) for c in CAMERAS for f in range(FRAMES)}
+
+
+def test_nothing_seen_is_nothing_found():
+    assert Exchanged(2.0).found() == {}
+
+
+def test_pictures_are_moved_scaled_and_turned_about_their_middle():
+    picture = torch.zeros(1, 3, THUMBNAIL, THUMBNAIL)
+    picture[..., 14:18, 20:24] = 1.0  # to the right of the middle
+    right = moved(picture, (3.0, -2.0, 0.0, 0.0))
+    assert torch.allclose(right[..., 12:16, 23:27], torch.ones(1, 3, 4, 4), atol=1e-5)
+    half_as_far = moved(picture, (0.0, 0.0, -0.6931472, 0.0))
+    assert float(half_as_far[..., 15:17, 18:20].min()) > 0.9
+    quarter = moved(picture, (0.0, 0.0, 0.0, torch.pi / 2))
+    middles = [
+        float(quarter[0, 0].sum(d) @ torch.arange(32.0) / quarter[0, 0].sum()) for d in (1, 0)
+    ]
+    assert middles == pytest.approx([9.5, 15.5], abs=1e-3)  # above the middle
+
+
+def test_a_placing_is_found_again():
+    torch.manual_seed(0)
+    coarse = torch.nn.functional.interpolate(torch.rand(4, 3, 8, 8), THUMBNAIL, mode="bicubic")
+    wanted = (3.0, -1.5, 0.0625, -0.0625)
+    back = best_placing(coarse, moved(coarse, wanted))
+    assert back == pytest.approx(wanted, abs=0.6)
+    assert best_placing(coarse, coarse) == (0.0, 0.0, 0.0, 0.0)
+
+
 @pytest.mark.parametrize(
     "predict",
     [
+        lambda c, f: placed(truth(c, f), right=3),  # as far as she walks in a frame
+        lambda c, f: placed(truth(c, f), right=-4),
+        lambda c, f: placed(truth(c, f), right=3 if c == "a" else -3),
+        lambda c, f: placed(truth(c, f), right=3, scale=0.1),
+        lambda c, f: placed(truth(c, f), right=-3, turn=0.1),
+        lambda c, f: 0.5 * placed(noisy(truth(c, f)), right=2, scale=-0.1),
+        lambda c, f: 1 - truth(c, f),
         lambda c, f: truth(c, 2),  # one picture for all frames
         lambda c, f: torch.zeros(1, 3, 48, 48),
         lambda c, f: torch.stack([truth(c, i) for i in range(FRAMES)]).mean(0),  # one blur

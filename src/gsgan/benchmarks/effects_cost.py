@@ -11,7 +11,6 @@ import torch
 from torch import Tensor
 
 from gsgan.benchmarks.effects_case import Row, Training
-from gsgan.benchmarks.timing import interleaved, median
 from gsgan.data.capture import CaptureDataset
 from gsgan.data.datamodule import GsganData
 from gsgan.errors import GsganError
@@ -19,6 +18,7 @@ from gsgan.model.avatar import Avatar
 from gsgan.scene import Frame
 from gsgan.skeleton import bone_frames, sanitise
 from gsgan.splat import rasterise
+from gsgan.timing import interleaved, median
 
 
 def load(training: Training, folder: Path) -> tuple[Avatar, GsganData]:

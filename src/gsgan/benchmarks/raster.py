@@ -36,7 +36,7 @@ from gsgan.splat import BACKENDS, Accuracy, resolve_backend
 MEASUREMENTS = "measurements.jsonl"
 # What figures depend on: another version of it measures anew.
 SOURCES = (".py", ".cpp", ".h")
-MEASURING = ("raster_cell", "judge", "scene", "timing", "memory")
+MEASURING = ("raster_cell", "judge", "scene", "memory")
 
 
 @dataclass(frozen=True)
@@ -257,6 +257,7 @@ def _code() -> str:
         [
             *sorted(p for p in (package / "splat").rglob("*") if p.suffix in SOURCES),
             *(package / "benchmarks" / f"{name}.py" for name in MEASURING),
+            package / "timing.py",
         ]
     )
 

@@ -20,9 +20,9 @@ from gsgan.benchmarks.judge import (
 )
 from gsgan.benchmarks.memory import peak_memory
 from gsgan.benchmarks.scene import human_cloud, ring_camera
-from gsgan.benchmarks.timing import interleaved, median
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.splat import ACCURACY, Accuracy, rasterise
+from gsgan.timing import interleaved, median
 
 # Every Gaussian at every pixel as a user without tiles would do it: no cut-off, in float32.
 DENSE = replace(ACCURACY["exact"], name="float32", dtype="float32", alpha_max=0.999)
@@ -109,7 +109,7 @@ class Job:
     Args:
         cell: the scene.
         variants: ways to draw it.
-        repeats, patience: see :func:`gsgan.benchmarks.timing.interleaved`.
+        repeats, patience: see :func:`gsgan.timing.interleaved`.
         shape: ``quats`` or ``covariances``.
         seed: of scene, windows and loss.
         windows: how many and of how many pixels a side are judged; None: no errors.

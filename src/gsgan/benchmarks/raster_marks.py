@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from gsgan.benchmarks.raster_cell import Row
 from gsgan.benchmarks.tables import number
-from gsgan.benchmarks.timing import slope
+from gsgan.timing import slope
 
 TIMES = {"forward_ms": "forward", "both_ms": "forward + backward"}
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import torch
 
 from gsgan.benchmarks.speed_painter import Painter
-from gsgan.benchmarks.timing import timed, wait
 from gsgan.model.avatar import unwatched
 from gsgan.scene import Frame
+from gsgan.timing import timed, wait
 
 
 @dataclass(frozen=True)

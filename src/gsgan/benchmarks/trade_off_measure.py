@@ -16,13 +16,13 @@ from torch import Tensor
 
 from gsgan.benchmarks.speed_painter import Painter, painting_memory
 from gsgan.benchmarks.speed_subject import place, spread
-from gsgan.benchmarks.timing import interleaved
 from gsgan.benchmarks.trade_off_points import Point
 from gsgan.errors import ConfigError
 from gsgan.metrics.image import edge_f1, psnr, ssim
 from gsgan.model.avatar import Avatar
 from gsgan.runs import build_data, load_avatar, load_config
 from gsgan.scene import Frame
+from gsgan.timing import interleaved
 
 Score = Callable[[Tensor, Tensor], Tensor]
 # Of a run's data: what says how it is read and sampled, not what is in it.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -125,17 +126,25 @@ def run_tool(
                 advance=lambda done, count: bars.set(name, done, count),
             )
 
-        in_parallel(one, range(len(missing)), options.workers)
+        in_parallel(one, range(len(missing)), options.workers, bars.stop)
     return results, masks
 
 
-def in_parallel(task: Callable[[int], T], items: range, workers: int) -> list[T]:
-    """Runs a task on every item in threads; the first failure is raised, the rest not begun."""
+def in_parallel(
+    task: Callable[[int], T], items: range, workers: int, stop: threading.Event
+) -> list[T]:
+    """Runs a task on every item in threads; the first failure is raised, the rest not begun.
+
+    Args:
+        stop: set on a failure or an interrupt, for those that are running: a thread cannot be
+            ended from outside, and hours of pictures may lie before it.
+    """
     with ThreadPoolExecutor(workers) as pool:
         futures = [pool.submit(task, item) for item in items]
         try:
             return [future.result() for future in futures]
         except BaseException:
+            stop.set()
             for future in futures:
                 future.cancel()
             raise

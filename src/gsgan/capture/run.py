@@ -140,7 +140,7 @@ def _write_pictures(
                 advance,
             )
 
-        lists = in_parallel(one, range(len(names)), options.workers)
+        lists = in_parallel(one, range(len(names)), options.workers, bars.stop)
     return dict(zip(names, lists, strict=True))
 
 

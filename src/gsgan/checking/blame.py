@@ -19,6 +19,7 @@ from gsgan.checking.calibration import (
 from gsgan.checking.findings import Finding, Level, listed
 from gsgan.checking.settings import Limits
 
+SHARE_OF_ANY_CAMERA = 0.5  # of a standing person's joints lie in the mask whatever camera is taken
 ADVICE = {
     MIRRORED: "mirror its pictures and masks back",
     INVERSE: "invert its R and t: x_cam = R x + t is expected",
@@ -39,10 +40,17 @@ def shifted(score: CameraScore, limits: Limits) -> bool:
     return score.shift_metres > limits.shift and gain > limits.better_fit
 
 
+def oversized(score: CameraScore, limits: Limits) -> bool:
+    """Whether the masks are far larger than the body, and that body lies in them for the most."""
+    return score.fullness > limits.fullness and score.inside > SHARE_OF_ANY_CAMERA
+
+
 def wrong_cameras(scores: Sequence[CameraScore], limits: Limits) -> frozenset[str]:
     """The cameras whose calibration or masks are wrong as a whole."""
     return frozenset(
-        s.name for s in scores if not s.inside >= limits.inside_error or beaten(s, limits)
+        s.name
+        for s in scores
+        if not s.inside >= limits.inside_error or beaten(s, limits) or oversized(s, limits)
     )
 
 
@@ -63,6 +71,11 @@ def judge_cameras(
         told: cameras of which a plainer reason was told already.
     """
     found, told = list[Finding](), set(told)
+    big = [s for s in scores if oversized(s, limits) and s.name not in told]
+    if big:
+        found.append(_oversized(big))
+        told |= {s.name for s in big}
+        scores = [s for s in scores if s not in big]
     best = {s.name: s for s in scores if beaten(s, limits)}
     for one, other in combinations(best.values(), 2):
         ours, theirs = _claim(one, other, limits), _claim(other, one, limits)
@@ -70,9 +83,10 @@ def judge_cameras(
             found.append(_swapped((one, ours), (other, theirs)))
             told |= {one.name, other.name}
     wrong = wrong_cameras(scores, limits)
-    if len(scores) > 1 and not best and len(wrong) == len(scores):
+    together = len(scores) > 1 and not big
+    if together and not best and len(wrong) == len(scores):
         return [_all_wrong(scores, limits)]
-    if len(scores) > 1 and all(shifted(s, limits) for s in scores):
+    if together and all(shifted(s, limits) for s in scores):
         return [_all_beside(scores, "error" if wrong else "warning")]
     for score in scores:
         if score.name in best and score.name not in told:
@@ -83,6 +97,16 @@ def judge_cameras(
             found += _unexplained(score, scores, limits)
     blamed = told | misfits(scores, limits)
     return found + judge_small(scores, limits, blamed)
+
+
+def _oversized(big: Sequence[CameraScore]) -> Finding:
+    names = listed(f"{s.name} {s.fullness:.1f}" for s in big)
+    return Finding(
+        "error", "calibration",
+        "masks are far larger than the body that skeleton and camera foretell (times its area: "
+        f"{names}): a focal length that is too short, K of smaller pictures, a skeleton in another "
+        "unit, or masks of more than the person",
+    )  # fmt: skip
 
 
 def _seen(score: CameraScore, scores: Sequence[CameraScore]) -> str:

@@ -45,6 +45,7 @@ class CameraScore:
         name: the camera.
         inside: mean share of joints inside the mask.
         overlap: mean overlap of mask and foretold body.
+        fullness: median area of the mask over that of the foretold body.
         rivals: what else might explain the masks, best first.
         shift: ``(dx, dy)`` pixels of the whole picture by which masks lie beside the skeleton.
         shift_metres: its length at the person.
@@ -57,6 +58,7 @@ class CameraScore:
     name: str
     inside: float
     overlap: float
+    fullness: float
     rivals: tuple[Rival, ...]
     shift: tuple[float, float]
     shift_metres: float
@@ -107,6 +109,7 @@ def _score(
         name=name,
         inside=known_mean([look.inside(limits) for look in looks if look.mask.any()]),
         overlap=here,
+        fullness=float(np.median([look.fullness for look in looks])),
         rivals=tuple(rivals),
         shift=shift,
         shift_metres=metres,

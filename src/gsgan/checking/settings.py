@@ -66,6 +66,7 @@ class Limits:
         pixel_tolerance: the same in pixels of the measured mask; the larger of the two counts.
         flesh: metres of body round every bone, for the silhouette that a skeleton foretells.
         inside_warning, inside_error: share of joints inside the mask, per camera.
+        fullness: area of a camera's masks over that of the foretold body, median.
         better_fit, credible_overlap: gain in overlap, and overlap, that another calibration must
             reach to be named.
         shift: metres by which a camera's masks may lie beside its skeleton.
@@ -108,6 +109,7 @@ class Limits:
     flesh: float = 0.07
     inside_warning: float = 0.9
     inside_error: float = 0.7
+    fullness: float = 2.0
     better_fit: float = 0.05
     credible_overlap: float = 0.35
     shift: float = 0.06

@@ -62,6 +62,6 @@ def beyond_share(mask: Bool, pixels: Float, depth: Float, focal: Float, reach: f
     person, joints = np.argwhere(mask), depth > NEAR
     if len(person) == 0 or not joints.any():
         return np.nan
-    person = person[:: -(-len(person) // LOOKED_AT), ::-1] + 0.5
-    metres = (person[:, None] - pixels[joints]) / focal * depth[joints, None]
+    some = person[:: -(-len(person) // LOOKED_AT), ::-1] + 0.5
+    metres = (some[:, None] - pixels[joints]) / focal * depth[joints, None]
     return float((np.linalg.norm(metres, axis=-1).min(axis=1) > reach).mean())

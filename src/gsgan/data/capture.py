@@ -99,7 +99,7 @@ class CaptureDataset(Dataset[Frame]):
         cache: shared between datasets of one layout, size and crop, without an item in two of them;
             None decodes every time.
         lens: ``undistort``; ``ignore`` takes pictures as a pinhole's; ``raw`` leaves them as taken
-            and says so in ``camera.dist`` (five coefficients).
+            and says so in ``camera.dist`` (five coefficients; lenses with more are undistorted).
 
     Raises:
         ConfigError: when the size is not a positive number.
@@ -177,13 +177,13 @@ class CaptureDataset(Dataset[Frame]):
 
     def _raw(self, camera: CameraEntry) -> bool:
         """Whether the camera's pictures keep their distortion, and say so."""
-        return self.lens == "raw" and camera.distorted
+        return self.lens == "raw" and camera.distorted and not camera.dist[5:].any()
 
     def _load(self, item: Item) -> Picture:
         camera, window = self.layout.cameras[item[0]], self.window(item)
         rules = self.layout.pixels
         mapping = None
-        if camera.distorted and self.lens == "undistort":
+        if camera.distorted and self.lens != "ignore" and not self._raw(camera):
             mapping = cropping.undistort_map(camera.K, camera.dist, window)
         size = window.size if self.size is None else (self.size, self.size)
 

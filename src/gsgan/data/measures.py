@@ -12,9 +12,13 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "background": ("black", "white"),
     "lpips_region": ("full", "mask_crop_512"),
     "lpips_range": ((-1.0, 1.0), (0.0, 1.0)),
+    "lpips_channels": ("rgb", "bgr"),
+    "ssim_window": ("gaussian", "uniform"),
     "ssim_range": (1.0, 2.0),
     "psnr_pooling": ("picture", "channels"),
     "eight_bits": ("none", "rounded", "cut"),
+    "truth_eight_bits": ("none", "rounded", "cut"),
+    "truth_outline": ("soft", "hard"),
 }
 
 
@@ -31,10 +35,15 @@ class Measures:
             the background, resized to 512.
         lpips_range: values that the backbone is fed: [-1, 1] as it expects, or [0, 1] unscaled,
             which comes out smaller.
+        lpips_channels: their order; "bgr" as scripts feed it that read pictures by OpenCV.
+        ssim_window: "gaussian" of 11 pixels, or "uniform" of 7, scikit-image's default.
         ssim_range: of the values, as SSIM is told: 1, or 2 as tools assume that take floats for
             -1 to 1, which comes out higher.
         psnr_pooling: "picture", one error for all channels; "channels", the mean of their PSNRs.
         eight_bits: whether predictions are "rounded" or "cut" to 8 bits first.
+        truth_eight_bits: the same of the truth, where it was made smaller or put together.
+        truth_outline: "soft", put on the background by its mask as alpha; "hard", as it was taken
+            where the mask is at least one half, and the background elsewhere.
 
     Raises:
         ConfigError: on a value that is none of these.
@@ -46,9 +55,13 @@ class Measures:
     background: Literal["black", "white"] = "black"
     lpips_region: Literal["full", "mask_crop_512"] = "full"
     lpips_range: tuple[float, float] = (-1.0, 1.0)
+    lpips_channels: Literal["rgb", "bgr"] = "rgb"
+    ssim_window: Literal["gaussian", "uniform"] = "gaussian"
     ssim_range: float = 1.0
     psnr_pooling: Literal["picture", "channels"] = "picture"
     eight_bits: Literal["none", "rounded", "cut"] = "none"
+    truth_eight_bits: Literal["none", "rounded", "cut"] = "none"
+    truth_outline: Literal["soft", "hard"] = "soft"
 
     def __post_init__(self) -> None:
         if isinstance(self.lpips_range, (list, tuple)):

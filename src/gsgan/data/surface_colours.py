@@ -28,6 +28,7 @@ Float = NDArray[np.float64]
 
 VOXEL = 0.025  # metres, of the hull and of the grid that tells what is hidden
 AIR = 0.3  # metres of space round the joints that is carved
+WIDEST = 4.0  # metres: a skeleton wider than this holds a joint gone astray
 BLUR = 0.03  # metres: surface is known to so much, so colours are compared as means over it
 WHOLE = 0.95  # of the blur must lie in the mask: outlines mix with what lies behind
 LEAST_POINTS = 30  # shared by two cameras in a moment: fewer lie at outlines, seen at a slant
@@ -122,8 +123,10 @@ def _skin(body: SkinnedBody, frame: Frame) -> Float:
 
 
 def _hull(frames: Sequence[Frame]) -> Float:
-    """``[V, 3]`` metres: voxels that no camera's mask carves off."""
+    """``[V, 3]`` metres: voxels that no camera's mask carves off; none of a skeleton astray."""
     joints = frames[0].skeleton[0][frames[0].visibility[0] > 0].double().numpy()
+    if len(joints) == 0 or np.ptp(joints, axis=0).max() > WIDEST:
+        return np.zeros((0, 3))
     low, high = joints.min(0) - AIR, joints.max(0) + AIR
     axes = [np.arange(a, b, VOXEL) for a, b in zip(low, high, strict=True)]
     voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)

@@ -139,7 +139,7 @@ def _legend(present: Sequence[int], names: Sequence[str]) -> dict[str, str]:
     """Colours by the name of each part shown."""
     legend = {}
     for part in present:
-        rgb = colour_labels(torch.full((1, 1, 1), part))[0, :, 0, 0]
+        red, green, blue = colour_labels(torch.full((1, 1, 1), part)).flatten().tolist()
         name = names[part].replace("_", " ") if part < len(names) else f"part {part}"
-        legend["not judged" if part == IGNORE else name] = to_hex(rgb.tolist())
+        legend["not judged" if part == IGNORE else name] = to_hex((red, green, blue))
     return legend

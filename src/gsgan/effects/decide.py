@@ -95,6 +95,8 @@ def _distortion(info: SceneInfo, settings: EffectSettings, wish: str | int) -> E
         return Effect(OFF, "all lens coefficients are zero")
     if wish == "project":
         if info.has_rational_lens:
+            if settings.impossible == OFF:  # data.capture does the same
+                return Effect("undistort", "a lens has k4, k5 or k6, which painting does not know")
             raise Impossible(
                 "a lens has coefficients beyond the fifth (k4, k5, k6), which painting does not "
                 "know; choose effects.distortion=undistort"

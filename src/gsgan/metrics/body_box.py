@@ -6,6 +6,7 @@ import cv2
 import torch
 from torch import Tensor
 
+from gsgan.lens import straight_pixels
 from gsgan.scene import Camera
 
 NEAR = 1e-2  # metres; what is nearer is not seen
@@ -23,10 +24,11 @@ def box_mask(corners: Tensor, camera: Camera) -> Tensor:
     """Which pixels see the box: those whose centre lies in the corners' projected convex hull.
 
     What lies nearer than `NEAR` is cut off, so a box that reaches behind the camera is seen right.
+    Where the camera has a lens, each pixel is looked up where a pinhole shows what it does.
 
     Args:
         corners: ``[8, 3]`` metres, world.
-        camera: of one picture; lens distortion is not applied.
+        camera: of one picture.
 
     Returns:
         ``[1, H, W]`` bool; all false when the box is behind the camera.
@@ -37,7 +39,11 @@ def box_mask(corners: Tensor, camera: Camera) -> Tensor:
         return torch.zeros(1, height, width, dtype=torch.bool, device=corners.device)
     pixels = (seen / seen[:, 2:]) @ camera.K[0].double().T
     hull = cv2.convexHull(pixels[:, :2].float().cpu().numpy())[:, 0]
-    return inside_hull(torch.from_numpy(hull).double().to(corners.device), camera.size)
+    polygon = torch.from_numpy(hull).double().to(corners.device)
+    if camera.dist is None:
+        return inside_hull(polygon, pixel_centres(camera))[None]
+    straight, known = straight_pixels(camera)
+    return inside_hull(polygon, straight[0])[None] & known
 
 
 def in_front(x_cam: Tensor, near: float = NEAR) -> Tensor:
@@ -49,17 +55,22 @@ def in_front(x_cam: Tensor, near: float = NEAR) -> Tensor:
     return torch.cat([x_cam[x_cam[:, 2] > near], a + share * (b - a)])
 
 
-def inside_hull(hull: Tensor, size: tuple[int, int]) -> Tensor:
-    """``[1, H, W]`` whether pixel centres lie in a convex polygon ``[n, 2]``, its border included.
+def pixel_centres(camera: Camera) -> Tensor:
+    """``[H, W, 2]`` float64."""
+    y, x = (torch.arange(n, device=camera.K.device, dtype=torch.float64) + 0.5 for n in camera.size)
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
 
-    Fewer than three points cover nothing.
+
+def inside_hull(hull: Tensor, points: Tensor) -> Tensor:
+    """``[...]`` whether points ``[..., 2]`` lie in a convex polygon ``[n, 2]`` or on its border.
+
+    Fewer than three corners cover nothing.
     """
-    y, x = (torch.arange(n, device=hull.device) + 0.5 for n in size)
     if len(hull) < 3:
-        return torch.zeros(1, *size, dtype=torch.bool, device=hull.device)
+        return torch.zeros(points.shape[:-1], dtype=torch.bool, device=hull.device)
     sides = []
     for start, end in zip(hull, hull.roll(-1, 0), strict=True):
-        along = end - start
-        sides.append(along[0] * (y - start[1])[:, None] - along[1] * (x - start[0]))
+        along, away = end - start, points - start
+        sides.append(along[0] * away[..., 1] - along[1] * away[..., 0])
     side = torch.stack(sides)
-    return ((side >= 0).all(0) | (side <= 0).all(0))[None]
+    return (side >= 0).all(0) | (side <= 0).all(0)

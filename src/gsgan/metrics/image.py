@@ -13,12 +13,14 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from gsgan.losses.photometric import d_ssim_map
 
 Score = Callable[[Tensor, Tensor], Tensor]
 SSIM_CONSTANTS = (0.01, 0.03)
 LEAST_SIDE = 6  # pixels: half of SSIM's window and one, below which its border cannot be reflected
+UNIFORM_WINDOW = 7  # pixels, scikit-image's default
 
 
 def psnr(
@@ -95,6 +97,29 @@ def ssim(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
     first, second = SSIM_CONSTANTS
     k = (first * value_range, second * value_range)
     return 1 - d_ssim_map(image, target, k=k).flatten(1).mean(dim=1)
+
+
+def ssim_uniform(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
+    """Structural similarity as scikit-image defines it by default: a uniform window of 7 pixels,
+    sample covariances, windows that lie wholly inside.
+
+    Args:
+        image, target: pictures; NaN where a side is shorter than the window.
+        value_range: of the values, as SSIM is told; 1 is right for [0, 1].
+    """
+    window = UNIFORM_WINDOW
+    if min(image.shape[-2:]) < window:
+        return image.new_full((len(image),), torch.nan)
+    x, y = image.double(), target.double()
+    moments = torch.cat([x, y, x * x, y * y, x * y], dim=1)
+    mean_x, mean_y, xx, yy, xy = functional.avg_pool2d(moments, window, 1).chunk(5, dim=1)
+    sample = window**2 / (window**2 - 1)
+    both = sample * (xy - mean_x * mean_y)
+    spread = sample * (xx - mean_x.square() + yy - mean_y.square())
+    first, second = ((k * value_range) ** 2 for k in SSIM_CONSTANTS)
+    luminance = (2 * mean_x * mean_y + first) / (mean_x.square() + mean_y.square() + first)
+    similar = luminance * (2 * both + second) / (spread + second)
+    return similar.flatten(1).mean(dim=1).to(image.dtype)
 
 
 def high_frequencies(image: Tensor, target: Tensor, *, above: float = 0.25) -> Tensor:

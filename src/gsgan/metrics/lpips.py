@@ -30,11 +30,13 @@ def check_lpips(net: str, path: str | None) -> Path | None:
 
 
 def lpips_name(net: str, measures: Measures) -> str:
-    """What LPIPS' numbers are called: backbone, values it is fed, region, where not all of it."""
+    """What LPIPS' numbers are called: backbone, values it is fed, and order of channels and region
+    where those are not the usual ones."""
     backbone = {"vgg": "VGG", "alex": "Alex"}[net]
     low, high = measures.lpips_range
+    order = "" if measures.lpips_channels == "rgb" else " BGR"
     region = "" if measures.lpips_region == "full" else " mask crop 512"
-    return f"LPIPS-{backbone} [{low:g},{high:g}]{region}"
+    return f"LPIPS-{backbone} [{low:g},{high:g}]{order}{region}"
 
 
 def lpips(

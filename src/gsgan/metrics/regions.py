@@ -33,6 +33,13 @@ def moved_background(image: Tensor, mask: Tensor, old: float, new: float) -> Ten
     return (image + (1 - mask) * (new - old)).clamp(0, 1)
 
 
+def hard_outline(image: Tensor, mask: Tensor) -> Tensor:
+    """A picture on black, premultiplied by its mask, as it was taken before where the mask is at
+    least one half, and black elsewhere."""
+    inside = mask >= 0.5
+    return torch.where(inside, (image / mask.clamp_min(0.5)).clamp(0, 1), torch.zeros_like(image))
+
+
 def eight_bits(image: Tensor, how: Literal["none", "rounded", "cut"]) -> Tensor:
     """The values that an 8-bit file would hold, "rounded" or "cut"; "none" leaves them alone."""
     if how == "none":
@@ -64,6 +71,9 @@ def mask_crop(
 ) -> Tensor | None:
     """The person in a square: the mask's box and a margin, centred on the background, resized.
 
+    Convention: as the script's, whose box ends one pixel early, below and to the right, and which
+    resizes by interpolation between four pixels however much it shrinks.
+
     Args:
         picture: ``[3, H, W]``.
         mask: ``[1, H, W]``; the box holds where it is at least one half.
@@ -79,7 +89,7 @@ def mask_crop(
     box = rectangle(person_box(mask[None])[0])
     if box is None:
         return None
-    rows, columns = (slice(max(s.start - margin, 0), s.stop + margin) for s in box)
+    rows, columns = (slice(max(s.start - margin, 0), s.stop - 1 + margin) for s in box)
     part = picture[:, rows, columns]
     height, width = part.shape[-2:]
     side = max(height, width)
@@ -88,6 +98,6 @@ def mask_crop(
     square = functional.pad(part, border, value=background)[None]
     if side != size:
         square = functional.interpolate(
-            square, (size, size), mode="bilinear", align_corners=False, antialias=side > size
+            square, (size, size), mode="bilinear", align_corners=False
         )
     return square[0]

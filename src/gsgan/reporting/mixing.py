@@ -127,7 +127,9 @@ def _refuse_other_data(first: Run, run: Run, split: str, where: str) -> None:
                        "missing: gsgan.evaluate writes it)")  # fmt: skip
     if not same:
         names = [data_name(r) for r in (first, run)]
-        told = f"{names[0]} and {names[1]}" if names[0] != names[1] else f"two sets of {names[0]}"
+        told = f"{names[0]} and {names[1]}"
+        if names[0] == names[1]:
+            told = f"two sets of {names[0]} (cameras, frames, split, picture size or crop)"
         raise _mixture(where, first, run, f"are of different data: {told}")
     counts = [_images(r, split) for r in (first, run)]
     if counts[0] != counts[1]:

@@ -93,7 +93,7 @@ class TableSpec:
         paper: the entry in paper.yaml that goes with it, or None.
 
     Raises:
-        ConfigError: on a metric that there is not, or a value that does not fit the others.
+        ConfigError: on a metric that there is not, or a value that does not fit.
     """
 
     name: str

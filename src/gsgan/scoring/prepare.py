@@ -16,6 +16,7 @@ from gsgan.metrics.regions import (
     BACKGROUNDS,
     cleared,
     eight_bits,
+    hard_outline,
     moved_background,
     on_background,
 )
@@ -111,7 +112,11 @@ class Stage:
 
     def truth(self, frame: Frame) -> Tensor:
         """``[B, 3, H, W]`` the truth, which the data has on black."""
-        return on_background(frame.image, frame.mask, self.background)
+        image, mask = frame.image, frame.mask
+        if self.measures.truth_outline == "hard":
+            image, mask = hard_outline(image, mask), (mask >= 0.5).to(mask)
+        image = on_background(image, mask, self.background)
+        return eight_bits(image, self.measures.truth_eight_bits)
 
     def picture(
         self, prediction: Prediction, variant: str, frame: Frame, box: Tensor | None

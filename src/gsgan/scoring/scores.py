@@ -21,6 +21,7 @@ from gsgan.metrics.image import (
     psnr_where,
     ssim,
     ssim_person,
+    ssim_uniform,
 )
 from gsgan.metrics.regions import BACKGROUNDS, cleared, mask_crop, rectangle
 from gsgan.model.segmentation import IGNORE
@@ -112,10 +113,11 @@ class PictureScores:
     def _whole(self, image: Tensor, target: Tensor, box: Tensor | None) -> dict[str, Tensor]:
         """PSNR and SSIM of the region that the measures name."""
         pooling, value_range = self.measures.psnr_pooling, self.measures.ssim_range
+        similarity = ssim_uniform if self.measures.ssim_window == "uniform" else ssim
         if self.measures.region != "body_box":
             return {
                 "psnr": psnr(image, target, pooling=pooling),
-                "ssim": ssim(image, target, value_range=value_range),
+                "ssim": similarity(image, target, value_range=value_range),
             }
         assert box is not None
         background = BACKGROUNDS[self.measures.background]
@@ -127,7 +129,7 @@ class PictureScores:
                 similar.append(image.new_tensor(torch.nan))
                 continue
             a, b = (picture[i : i + 1, :, part[0], part[1]] for picture in pair)
-            similar.append(ssim(a, b, value_range=value_range)[0])
+            similar.append(similarity(a, b, value_range=value_range)[0])
         return {
             "psnr": psnr_where(image, target, box, pooling=pooling),
             "ssim": torch.stack(similar),
@@ -135,6 +137,8 @@ class PictureScores:
 
     def _lpips(self, image: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
         assert self.lpips is not None
+        if self.measures.lpips_channels == "bgr":
+            image, target = image.flip(1), target.flip(1)
         if self.measures.lpips_region == "full":
             return self.lpips(image, target)
         assert mask is not None

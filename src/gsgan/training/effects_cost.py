@@ -2,38 +2,60 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 
 import torch
 from omegaconf import DictConfig
 from torch import nn
 
-from gsgan.benchmarks.timing import interleaved, median
 from gsgan.data.capture import CaptureDataset
 from gsgan.data.datamodule import GsganData
 from gsgan.effects.table import Cost
 from gsgan.model.avatar import Avatar
 from gsgan.runs import build_avatar
 from gsgan.scene import Frame
+from gsgan.timing import interleaved, median
 
 IN_THE_MODEL = ("view_dependence", "antialias", "colour_correction", "segmentation", "depth")
 
 
+def training_device(accelerator: str) -> torch.device:
+    """Where Lightning will put the model of this process."""
+    if accelerator == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+
+
 def effect_costs(
-    config: DictConfig, data: GsganData, avatar: Avatar, rounds: int
+    config: DictConfig,
+    data: GsganData,
+    avatar: Avatar,
+    rounds: int,
+    device: torch.device | None = None,
 ) -> dict[str, Cost]:
     """Parameters and milliseconds that each effect adds to a picture.
 
     Convention: the model with and without the effect paint one picture in turn; for undistortion
     one picture is read. What acts on losses alone (random background) is not timed. Leaves the
-    random state as it was.
+    random state, and the avatar's device, as they were.
 
     Args:
         config: of the run.
         data: its dataset.
         avatar: as it will be trained, with its decided effects.
         rounds: of each; 0 measures no time.
+        device: where to measure; None: where the avatar is.
     """
+    home = next(avatar.parameters()).device
+    avatar.to(device or home)
+    try:
+        return _costs(config, data, avatar, rounds)
+    finally:
+        avatar.to(home)
+
+
+def _costs(config: DictConfig, data: GsganData, avatar: Avatar, rounds: int) -> dict[str, Cost]:
     frame = data.dataset("train")[0].to(next(avatar.parameters()).device)
     costs = {"random_background": Cost(), "face": Cost(), "hands": Cost()}
     with torch.random.fork_rng():

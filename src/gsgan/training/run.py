@@ -31,7 +31,7 @@ from gsgan.scoring.files import NAMES
 from gsgan.scoring.run import evaluate_run
 from gsgan.training.callbacks import Narrator, PictureGrid
 from gsgan.training.checkpoints import AtomicCheckpoints
-from gsgan.training.effects_cost import effect_costs
+from gsgan.training.effects_cost import effect_costs, training_device
 from gsgan.training.module import AvatarTraining
 
 PROGRESS = "progress.json"
@@ -63,7 +63,8 @@ def run_training(config: DictConfig) -> None:
         return
 
     describe(console, folder, data, module)
-    costs = effect_costs(config, data, module.avatar, config.effects.measure)
+    where = training_device(config.trainer.accelerator)
+    costs = effect_costs(config, data, module.avatar, config.effects.measure, where)
     console.print(effects_table(module.avatar.effects, costs))
     if resume is not None:
         console.print(f"going on from {resume}", soft_wrap=True)

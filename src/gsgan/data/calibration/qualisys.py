@@ -41,6 +41,8 @@ def read_qualisys(
         if not any(word in model for word in VIDEO_MODELS):
             notes.append(f"{path}: camera {serial} ({model}) takes no video and is left out")
             continue
+        if serial in found:
+            raise DataError(f"{path} holds the camera {serial} twice; take one of them out")
         found[serial] = _camera(path, serial, node, scale or MILLIMETRE, pixel_centre)
         if node.get("viewrotation", "0") != "0":
             notes.append(

@@ -81,8 +81,7 @@ def check_meeting(
             f"{median:.2f}, expected {trust.min_box_iou:g}; worst in camera {worst.camera}, frame "
             f"{worst.frame}: {worst.mask}); {hint}"
         )
-    outside = judge_inside(layout.root, seen, trust, hint)
-    return outside or judge_beyond(seen, trust)
+    return judge_inside(layout.root, seen, trust, hint) + judge_beyond(seen, trust)
 
 
 def meetings(layout: Layout, body: Callable[[int], Float], trust: Trust) -> list[Meeting]:
@@ -143,9 +142,14 @@ def judge_inside(root: Path, seen: Sequence[Meeting], trust: Trust, hint: str) -
 
 
 def judge_beyond(seen: Sequence[Meeting], trust: Trust) -> list[str]:
-    """One note that names the cameras whose masks reach far beyond the joints, if there are any."""
+    """One note that names the cameras whose masks reach far beyond the joints, if there are any.
+
+    Those whose joints lie outside their masks are named for that.
+    """
     means = by_camera((one.camera, one.beyond) for one in seen)
-    off = {name: share for name, share in means.items() if share > trust.max_beyond}
+    inside = by_camera((one.camera, one.inside) for one in seen)
+    told = {name for name, share in inside.items() if share < trust.min_inside}
+    off = {n: share for n, share in means.items() if share > trust.max_beyond and n not in told}
     if not off:
         return []
     rest = [share for name, share in means.items() if name not in off]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from gsgan.benchmarks import timing
-from gsgan.benchmarks.timing import interleaved, median, slope
+from gsgan import timing
+from gsgan.timing import interleaved, median, slope
 
 
 class Clock:
