@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -151,6 +152,8 @@ def test_the_real_capture_has_its_own_runs(bench, capture):
         ("only=[gloss]", "only must list some of"),
         ("only=antialias", "only must list some of"),
         ("only=[]", "only must list some of"),
+        ("timed=[antialias]", "timed must list some of segmentation"),
+        ("timed=depth", "timed must list some of"),
         ("repeats=0", "repeats must be"),
         ("frames=1.5", "frames must be"),
         ("off_ratio=0.5", "off_ratio must be"),
@@ -241,6 +244,31 @@ def test_an_effect_that_acts_when_off_is_found(build, monkeypatch):
 def test_frames_for_timing_are_spread():
     assert effects_cost.spread(10, 2) == [2, 7]
     assert effects_cost.spread(3, 8) == [0, 1, 2]
+
+
+def test_effects_without_a_scene_are_timed_on_and_off(compose, capture):
+    from gsgan.console import make_console
+
+    data = ("data=capture", f"data.root={capture}", "data.size=32")
+    base = ["size=tiny", "training=smoke", *data, *OFF]
+    quoted = ",".join(f"'{x}'" for x in base)
+    overrides = (f"base=[{quoted}]", "frames=1", "repeats=1", "timed=[segmentation,depth]")
+    bench = instantiate(compose("bench_effects", *overrides))
+    rows = {found.effect: found for found in effects.timed(bench, make_console())}
+    assert set(rows) == {"segmentation", "depth"}
+    for found in rows.values():
+        assert found.called == found.auto
+        assert found.paint_ms["off"] > 0
+        assert found.paint_ms["on"] > 0
+    assert rows["segmentation"].auto
+    assert rows["segmentation"].parameters["on"] > rows["segmentation"].parameters["off"]
+    assert rows["depth"].parameters["on"] == rows["depth"].parameters["off"]
+    report = Report(list(rows.values()), 1.0, 1.02, WHERE)
+    assert report.failures == []
+    assert "of models before training" in text(report)
+    assert "before training" not in text(Report([row()], 1.0, 1.02, WHERE))
+    assert effects.timed(replace(bench, only=["antialias"]), make_console()) == []
+    assert effects.timed(replace(bench, train=False), make_console()) == []
 
 
 def test_the_whole_bench_in_miniature(launched, compose, tmp_path, monkeypatch):

@@ -121,6 +121,9 @@ def test_protocols_that_cannot_be(changes: dict[str, Any], message: str) -> None
         ("ssim_range", True, "must be 1.0 or 2.0; got True"),
         ("psnr_pooling", "split", "must be picture or channels"),
         ("eight_bits", True, "must be none or rounded or cut; got True"),
+        ("truth_outline", 0.5, "must be soft or hard; got 0.5"),
+        ("ssim_window", 7, "must be gaussian or uniform; got 7"),
+        ("lpips_channels", "RGB", "must be rgb or bgr; got 'RGB'"),
     ],
 )
 def test_measures_are_named_ones(name: str, value: object, message: str) -> None:

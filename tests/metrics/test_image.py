@@ -20,6 +20,7 @@ from gsgan.metrics.image import (
     psnr_where,
     ssim,
     ssim_person,
+    ssim_uniform,
 )
 
 
@@ -83,6 +84,33 @@ def test_ssim_of_equal_pictures_is_one_and_of_slivers_undefined():
     assert float(ssim(image, 1 - image).max()) < 0.5
     assert bool(ssim(image[..., :5], image[..., :5]).isnan().all())
     assert float(ssim(image[..., :6], image[..., :6]).min()) == 1.0
+
+
+@pytest.mark.parametrize("value_range", [1.0, 2.0])
+def test_uniform_ssim_is_its_definition_window_by_window(value_range):
+    """Wang et al. with a 7 x 7 box and sample covariances, as scikit-image's documents say."""
+    image, target = (x[:2, :, :9, :10] for x in pair())
+    c1, c2 = (0.01 * value_range) ** 2, (0.03 * value_range) ** 2
+    scores = []
+    for a, b in zip(image.numpy(), target.numpy(), strict=True):
+        windows = []
+        for c, i, j in np.ndindex(3, 3, 4):
+            x, y = (v[c, i : i + 7, j : j + 7].ravel() for v in (a, b))
+            (xx, xy), (_, yy) = np.cov(x, y)  # divides by 48
+            top = (2 * x.mean() * y.mean() + c1) * (2 * xy + c2)
+            windows.append(top / ((x.mean() ** 2 + y.mean() ** 2 + c1) * (xx + yy + c2)))
+        scores.append(np.mean(windows))
+    found = ssim_uniform(image, target, value_range=value_range)
+    assert found.tolist() == pytest.approx(scores, abs=1e-9)
+
+
+def test_uniform_ssim_of_equal_pictures_is_one_and_of_slivers_undefined():
+    image = torch.rand(2, 3, 12, 12)
+    assert ssim_uniform(image, image).tolist() == [1.0, 1.0]
+    grey = torch.full((1, 3, 12, 12), 0.7)
+    assert ssim_uniform(grey, grey).dtype == torch.float32
+    assert float(ssim_uniform(grey, grey)) == 1.0
+    assert bool(ssim_uniform(image[..., :6], image[..., :6]).isnan().all())
 
 
 def test_equal_pictures_are_infinite():

@@ -102,7 +102,21 @@ def test_the_crop_is_what_the_backbone_sees(scores, direct, pictures):
     assert found[0] == found[1]
 
 
+def test_channels_are_fed_in_the_order_that_is_asked_for(scores, direct, pictures):
+    image, target = (x[:1] for x in pictures)
+    found = {}
+    for order in ("rgb", "bgr"):
+        held = PictureScores(scores[RANGES[0]], "", Measures(lpips_channels=order))
+        held.update(image, target)
+        found[order] = held.compute()["lpips"]
+    with torch.no_grad():
+        swapped = float(direct[RANGES[0]](image[:, [2, 1, 0]], target[:, [2, 1, 0]]))
+    assert found["bgr"] == pytest.approx(swapped, abs=1e-6)
+    assert abs(found["bgr"] - found["rgb"]) > 1e-4
+
+
 def test_the_name_says_backbone_range_and_region():
     assert lpips_name("vgg", Measures()) == "LPIPS-VGG [-1,1]"
     crop = Measures(lpips_range=(0, 1), lpips_region="mask_crop_512")
+    assert lpips_name("vgg", Measures(lpips_channels="bgr")) == "LPIPS-VGG [-1,1] BGR"
     assert lpips_name("alex", crop) == "LPIPS-Alex [0,1] mask crop 512"

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import cv2
+import numpy as np
 import pytest
 import torch
 
 from gsgan.metrics.regions import (
     cleared,
     eight_bits,
+    hard_outline,
     mask_crop,
     moved_background,
     on_background,
@@ -53,6 +56,14 @@ def test_cleared_pixels_are_background():
     assert cleared(image, keep, 1.0)[0, 0].tolist() == [[0.5, 1.0], [1.0, 0.5]]
 
 
+def test_a_hard_outline_is_the_picture_as_it_was_taken():
+    taken = torch.tensor([0.8, 0.8, 0.8, 0.8]).view(1, 1, 1, 4).expand(1, 3, 1, 4)
+    mask = torch.tensor([1.0, 0.5, 0.49, 0.0]).view(1, 1, 1, 4)
+    found = hard_outline(taken * mask, mask)
+    assert found[0, 0, 0].tolist() == pytest.approx([0.8, 0.8, 0.0, 0.0])
+    assert float(hard_outline(torch.ones(1, 3, 1, 1), torch.full((1, 1, 1, 1), 0.6)).max()) == 1.0
+
+
 def test_rectangle():
     where = torch.zeros(1, 6, 7, dtype=torch.bool)
     assert rectangle(where) is None
@@ -61,9 +72,10 @@ def test_rectangle():
 
 
 def test_the_crop_is_square_centred_on_the_background():
-    """A mask of 2 x 4 pixels and a margin of 1: 4 x 6 pixels in a square of 6."""
+    """A mask of 3 x 5 pixels and a margin of 1: 4 x 6 pixels, one less than it might be below and
+    to the right, in a square of 6."""
     picture, mask = torch.full((3, 20, 20), 0.25), torch.zeros(1, 20, 20)
-    mask[0, 5:7, 8:12] = 0.5
+    mask[0, 5:8, 8:13] = 0.5
     square = mask_crop(picture, mask, 1.0, margin=1, size=6)
     expected = torch.full((3, 6, 6), 0.25)
     expected[:, [0, 5]] = 1.0
@@ -79,7 +91,17 @@ def test_the_crops_margin_ends_at_the_pictures_border():
         torch.arange(400.0).view(1, 20, 20).expand(3, 20, 20) / 400,
         torch.zeros(1, 20, 20),
     )
-    mask[0, 0:4, 18:20] = 1
+    mask[0, 0:5, 18:20] = 1
     square = mask_crop(picture, mask, 1.0, margin=2, size=6)
     assert torch.equal(square[:, :, 1:5], picture[:, 0:6, 16:20])
     assert bool((square[:, :, [0, 5]] == 1).all())
+
+
+def test_the_crop_shrinks_as_opencv_interpolates():
+    """No low-pass before it: what a published score's script does."""
+    picture, mask = torch.rand(3, 40, 44), torch.zeros(1, 40, 44)
+    mask[0, 10:31, 12:33] = 1
+    square = mask_crop(picture, mask, 1.0, margin=4, size=16)
+    part = picture[:, 6:34, 8:36].permute(1, 2, 0).numpy()
+    expected = cv2.resize(np.ascontiguousarray(part), (16, 16), interpolation=cv2.INTER_LINEAR)
+    assert np.abs(square.permute(1, 2, 0).numpy() - expected).max() < 1e-5

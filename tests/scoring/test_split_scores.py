@@ -10,7 +10,7 @@ from torchmetrics.classification import MulticlassJaccardIndex
 
 from gsgan.data.measures import Measures
 from gsgan.errors import GsganError
-from gsgan.metrics.image import psnr, ssim
+from gsgan.metrics.image import psnr, ssim, ssim_uniform
 from gsgan.scene import Camera, Frame
 from gsgan.scoring.prepare import Prediction, Stage
 from gsgan.scoring.scores import Mean, PictureScores, SegmentationScores
@@ -84,6 +84,16 @@ def test_only_the_inside_of_the_box_counts_where_a_protocol_says_so():
     scores.update(image, target, box=torch.zeros_like(box))  # not seen: counted, not averaged
     assert scores.compute()["psnr_left_out"] == scores.compute()["ssim_left_out"] == 1
     assert scores.compute()["psnr"] == result["psnr"]
+
+
+def test_the_window_of_ssim_is_the_protocols():
+    generator = torch.Generator().manual_seed(0)
+    image, target = (torch.rand(1, 3, 24, 24, generator=generator) for _ in range(2))
+    scores = PictureScores(None, "", Measures(ssim_window="uniform", ssim_range=2))
+    scores.update(image, target)
+    expected = float(ssim_uniform(image, target, value_range=2))
+    assert scores.compute()["ssim"] == pytest.approx(expected, abs=1e-9)
+    assert abs(expected - float(ssim(image, target, value_range=2))) > 1e-4
 
 
 def test_the_floor_of_a_split_is_the_background_and_its_psnr_is_known():

@@ -62,6 +62,17 @@ def test_boxes_that_nothing_asks_for_are_not_made(data):
     assert Stage(Measures(), None).box(frame) is None
 
 
+def test_the_truth_is_outlined_as_the_protocol_says(data):
+    frame = data.dataset("train")[0]
+    edge = (frame.mask > 0.05) & (frame.mask < 0.95)
+    assert bool(edge.any())  # the outline of this data is soft
+    hard = Stage(Measures(truth_outline="hard", background="white"), None).truth(frame)
+    outside = (frame.mask < 0.5).expand_as(hard)
+    assert bool((hard[outside] == 1).all())
+    taken = (frame.image / frame.mask.clamp_min(1e-6)).clamp(0, 1)
+    assert torch.allclose(hard[~outside], taken[~outside], atol=1e-6)
+
+
 def test_values_are_clamped_before_8_bits(data):
     frame = data.dataset("train")[0]
     stage = Stage(Measures(eight_bits="cut"), None)

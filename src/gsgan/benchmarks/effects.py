@@ -21,14 +21,22 @@ from gsgan.benchmarks.effects_case import (
     scores_of,
     train,
 )
-from gsgan.benchmarks.effects_cost import load, measure, price_of_off, spread
+from gsgan.benchmarks.effects_cost import (
+    load,
+    measure,
+    measure_untrained,
+    price_of_off,
+    spread,
+)
 from gsgan.benchmarks.environment import environment
 from gsgan.benchmarks.tables import check_block
 from gsgan.console import make_console
+from gsgan.effects.settings import CHOICES
 from gsgan.errors import ConfigError, GsganError
 
 DEFAULT, REAL = "default person", "real capture"
 STATES = ("off", "on")
+UNTRAINED_SPLIT = "novel_view"
 
 
 @dataclass(frozen=True)
@@ -39,7 +47,8 @@ class EffectsBench:
         base: overrides of `gsgan.train` that all runs share; the effects in question are off.
         budget: factor on the iterations, which ``base`` passes on.
         cases: by effect, the scene that calls for it.
-        only: effects to look at; None: all.
+        only: effects to look at; None: all, and those ``timed``.
+        timed: effects that have no case: timed in the default scene, on and off, untrained.
         train: train at all; without, only what `auto` decides is found out.
         default: train with each effect on the default person too, where it should gain nothing.
         real: folder of a real capture for ``real_effect``; None leaves it out.
@@ -61,6 +70,7 @@ class EffectsBench:
     budget: float
     cases: dict[str, Case]
     only: list[str] | None
+    timed: list[str]
     train: bool
     default: bool
     real: str | None
@@ -87,6 +97,9 @@ class EffectsBench:
         if unknown or isinstance(self.only, str) or self.only == []:
             given = self.only if isinstance(self.only, str) else ", ".join(unknown)
             raise ConfigError(f"only must list some of {', '.join(self.cases)}; got {given!r}")
+        if isinstance(self.timed, str) or not set(self.timed) <= set(CHOICES) - set(self.cases):
+            left = ", ".join(name for name in CHOICES if name not in self.cases)
+            raise ConfigError(f"timed must list some of {left}; got {self.timed!r}")
         if self.real_effect not in self.cases:
             raise ConfigError(
                 f"real_effect must be one of {', '.join(self.cases)}, got {self.real_effect!r}"
@@ -100,6 +113,7 @@ class EffectsBench:
             "base",
             "budget",
             "only",
+            "timed",
             "train",
             "default",
             "real_base",
@@ -173,10 +187,12 @@ def run(config: DictConfig, folder: Path) -> None:
     todo = list(cells(bench))
     try:
         ratio = work(bench, todo, folder / "runs", console)
+        untrained = timed(bench, console)
     except KeyboardInterrupt:
         console.print(f"the same command goes on with {folder}", soft_wrap=True, markup=False)
         raise
-    report = effects_report.Report([cell.row for cell in todo], ratio, bench.off_ratio, where)
+    rows = [cell.row for cell in todo] + untrained
+    report = effects_report.Report(rows, ratio, bench.off_ratio, where)
     effects_report.write(report, folder, bench.settings())
     effects_report.show(report, console)
     if bench.docs is not None:
@@ -215,6 +231,19 @@ def work(bench: EffectsBench, todo: list[Cell], runs: Path, console: Console) ->
             progress.advance(task)
         progress.update(task, description="the price of effects that are off")
         return _price_of_off(bench, todo, runs) if trainings else None
+
+
+def timed(bench: EffectsBench, console: Console) -> list[Row]:
+    """A row for each effect that has no case: what it costs, and what `auto` says of it."""
+    if not bench.train or bench.only is not None or not bench.timed:
+        return []
+    rows = []
+    with console.status("timing effects that have no scene of their own"):
+        for name, (auto, why) in decide(bench.base, bench.timed).items():
+            row = Row(name, DEFAULT, auto, auto, why, UNTRAINED_SPLIT)
+            measure_untrained(row, bench.base, frames=bench.frames, repeats=bench.repeats)
+            rows.append(row)
+    return rows
 
 
 def _price_of_off(bench: EffectsBench, todo: list[Cell], runs: Path) -> float:

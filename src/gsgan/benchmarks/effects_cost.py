@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsgan.benchmarks.effects_case import Row, Training
+from gsgan.benchmarks.effects_case import Row, Training, compose
 from gsgan.data.capture import CaptureDataset
 from gsgan.data.datamodule import GsganData
 from gsgan.errors import GsganError
@@ -58,6 +58,32 @@ def measure(
     for action, found in ((paint, row.paint_ms), (read, row.read_ms)):
         for state, samples in interleaved(action, repeats).items():
             found[state] = (median(samples) or 0.0) / count
+
+
+def measure_untrained(row: Row, base: Sequence[str], *, frames: int, repeats: int) -> None:
+    """Times painting with the effect off and on, in turn, by models that have learned nothing.
+
+    Args:
+        row: gets the figures; names the effect and the split.
+        base: overrides of `gsgan.train`.
+        frames: held-out pictures gone through in each round.
+        repeats: rounds.
+    """
+    from gsgan.runs import build_avatar, build_data
+
+    paint: dict[str, Callable[[], object]] = {}
+    count = 1
+    for state in ("off", "on"):
+        config = compose([*base, f"effects.{row.effect}={state}"])
+        data = build_data(config)
+        avatar = build_avatar(config, data).eval()
+        dataset = data.dataset(row.split)
+        chosen = spread(len(dataset), frames)
+        count = len(chosen)
+        paint[state] = painting(avatar, [dataset[i] for i in chosen])
+        row.parameters[state] = sum(p.numel() for p in avatar.parameters())
+    for state, samples in interleaved(paint, repeats).items():
+        row.paint_ms[state] = (median(samples) or 0.0) / count
 
 
 def spread(length: int, count: int) -> list[int]:

@@ -109,6 +109,8 @@ def text(report: Report) -> str:
         "painting and for reading from disk, off and on in turn, medians.",
         table(report),
     ]
+    if any(row.paint_ms and not row.scores for row in report.rows):
+        parts.append("Rows with times but no gain are of models before training.")
     if report.off is not None:
         parts.append(
             f"A forward pass with all effects off takes {report.off:.3f} times what the same "

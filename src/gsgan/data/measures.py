@@ -17,7 +17,6 @@ CHOICES: dict[str, tuple[Any, ...]] = {
     "ssim_range": (1.0, 2.0),
     "psnr_pooling": ("picture", "channels"),
     "eight_bits": ("none", "rounded", "cut"),
-    "truth_eight_bits": ("none", "rounded", "cut"),
     "truth_outline": ("soft", "hard"),
 }
 
@@ -41,7 +40,6 @@ class Measures:
             -1 to 1, which comes out higher.
         psnr_pooling: "picture", one error for all channels; "channels", the mean of their PSNRs.
         eight_bits: whether predictions are "rounded" or "cut" to 8 bits first.
-        truth_eight_bits: the same of the truth, where it was made smaller or put together.
         truth_outline: "soft", put on the background by its mask as alpha; "hard", as it was taken
             where the mask is at least one half, and the background elsewhere.
 
@@ -60,7 +58,6 @@ class Measures:
     ssim_range: float = 1.0
     psnr_pooling: Literal["picture", "channels"] = "picture"
     eight_bits: Literal["none", "rounded", "cut"] = "none"
-    truth_eight_bits: Literal["none", "rounded", "cut"] = "none"
     truth_outline: Literal["soft", "hard"] = "soft"
 
     def __post_init__(self) -> None:

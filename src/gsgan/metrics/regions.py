@@ -97,7 +97,5 @@ def mask_crop(
     border = (left, side - width - left, top, side - height - top)
     square = functional.pad(part, border, value=background)[None]
     if side != size:
-        square = functional.interpolate(
-            square, (size, size), mode="bilinear", align_corners=False
-        )
+        square = functional.interpolate(square, (size, size), mode="bilinear", align_corners=False)
     return square[0]

@@ -115,8 +115,7 @@ class Stage:
         image, mask = frame.image, frame.mask
         if self.measures.truth_outline == "hard":
             image, mask = hard_outline(image, mask), (mask >= 0.5).to(mask)
-        image = on_background(image, mask, self.background)
-        return eight_bits(image, self.measures.truth_eight_bits)
+        return on_background(image, mask, self.background)
 
     def picture(
         self, prediction: Prediction, variant: str, frame: Frame, box: Tensor | None
