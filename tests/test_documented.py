@@ -130,6 +130,7 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
         "/path/to/sweep": lambda: run,
         "runs=runs/ablation": lambda: f"runs={run.parent}",
         "/path/to/page.md": report_page,
+        "fill=docs/ablations.md": lambda: f"fill={report_page()}",
     }
 
     def fill(line: str) -> str:
@@ -150,6 +151,14 @@ def tiny_training(arguments: list[str], capture: Path) -> list[str]:
     if not any(a.startswith("data.root=") for a in given):
         given.append(f"data.root={capture}")
     return given
+
+
+def shorter_study(arguments: list[str], folder: Path) -> list[str]:
+    """The ablation study: the first two of what it varies, a few iterations each."""
+    given = [",".join(a.split(",")[: 1 if a.startswith("seed=") else 2]) for a in arguments]
+    few = {"segmentation": 2, "step_one": 2, "step_two": 4, "discriminator_start": 1, "epoch": 4}
+    given += [f"training.schedule.{name}={value}" for name, value in few.items()]
+    return [*given, f"hydra.sweep.dir={folder / 'sweep'}", "hydra.sweep.subdir=${hydra.job.num}"]
 
 
 def fixed(given: list[str], option: str) -> bool:
@@ -178,6 +187,8 @@ def test_every_documented_command_runs(line, place, capture, inside, tmp_path):
     if not name:
         return  # the bare list of commands: test_the_list_of_commands
     if name == "train":
+        if "experiment=ablation" in arguments:
+            arguments = shorter_study(arguments, tmp_path)
         arguments = tiny_training(arguments, capture)
     if name == "bench":
         arguments = tiny_bench(arguments, tmp_path, capture)

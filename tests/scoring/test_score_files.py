@@ -22,10 +22,13 @@ def variant(protocol: str | None = None) -> dict:
     }
 
 
-def scored(split: str, seed: int = 0, protocol: str | None = None) -> Scored:
+def scored(
+    split: str, seed: int = 0, protocol: str | None = None, commit: str | None = None
+) -> Scored:
     facts = {
         "method": "m", "model": None, "protocol": protocol, "seed": seed, "iterations": 5,
-        "data": {"name": "d", "root": "r", "fingerprint": "f"}, "commit": None, "dirty": None,
+        "data": {"name": "d", "root": "r", "fingerprint": "f"}, "commit": commit, "dirty": None,
+        "version": "1",
     }  # fmt: skip
     row = Row("cam", 3, {"psnr": 1 / 3, "ssim": math.inf, "miou": math.nan})
     return Scored({split: {"full": variant(protocol)}}, {split: {"full": [row]}}, facts)
@@ -51,7 +54,7 @@ def test_scoring_one_split_keeps_the_others(tmp_path):
     assert dropped == []
 
 
-@pytest.mark.parametrize("other", [{"seed": 1}, {"protocol": "zju"}])
+@pytest.mark.parametrize("other", [{"seed": 1}, {"protocol": "zju"}, {"commit": "abc"}])
 def test_scores_of_another_way_are_not_mixed_in(tmp_path, other):
     write_scored(scored("novel_pose", **other), tmp_path, "t")
     whole, dropped = joined(scored("novel_view"), tmp_path, ("novel_view", "novel_pose"))

@@ -63,7 +63,7 @@ def test_boxes_that_nothing_asks_for_are_not_made(data):
 
 
 def test_the_truth_is_outlined_as_the_protocol_says(data):
-    frame = data.dataset("train")[0]
+    frame = GsganData(str(data.layout.root), size=20).dataset("train")[0]
     edge = (frame.mask > 0.05) & (frame.mask < 0.95)
     assert bool(edge.any())  # the outline of this data is soft
     hard = Stage(Measures(truth_outline="hard", background="white"), None).truth(frame)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
 FINGERPRINT = 12  # hexadecimal digits
-SAME = ("method", "model", "protocol", "seed", "iterations")
+SAME = ("method", "model", "protocol", "seed", "iterations", "version", "commit", "dirty")
 
 
 @dataclass(frozen=True)
@@ -128,20 +128,23 @@ def choices(folder: Path) -> dict[str, Any]:
 
 def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
     """Whether two scorings may stand in one table: of one method and training on the same data,
-    wherever that lies."""
+    wherever that lies, by the same code."""
     prints = (a["data"]["fingerprint"], b["data"]["fingerprint"])
     return prints[0] == prints[1] and all(a[key] == b[key] for key in SAME)
 
 
-def caption(held: dict[str, Any]) -> str:
-    """One line for people under a table: what its rows are of."""
+def provenance(held: dict[str, Any]) -> dict[str, str]:
+    """What every row of a table carries: protocol, data, number of seeds, commit."""
     data = held["data"]
-    seed = "seeds: none said" if held["seed"] is None else f"1 seed ({held['seed']})"
-    commit = held["commit"] or "unknown"
-    changed = ", changed since" if held["dirty"] else ""
-    return (
-        f"{held['method']}{'' if held['model'] is None else ' ' + held['model']} · "
-        f"protocol {held['protocol'] or 'none'} · "
-        f"data {data['name'] or 'unknown'} ({data['root']}, {data['fingerprint']}) · {seed} · "
-        f"commit {commit}{changed}"
-    )
+    return {
+        "protocol": held["protocol"] or "none",
+        "data": f"{data['name'] or 'unknown'} ({data['root']}, {data['fingerprint']})",
+        "seeds": "none said" if held["seed"] is None else f"1 ({held['seed']})",
+        "commit": (held["commit"] or "unknown") + (", changed since" if held["dirty"] else ""),
+    }
+
+
+def caption(held: dict[str, Any]) -> str:
+    """One line for people at a table: what its rows are of."""
+    method = held["method"] if held["model"] is None else f"{held['method']} {held['model']}"
+    return " · ".join([method, *(f"{what} {said}" for what, said in provenance(held).items())])

@@ -9,7 +9,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from gsgan.scoring.facts import caption
+from gsgan.scoring.facts import caption, provenance
 from gsgan.scoring.scores import METRICS
 
 Results = dict[str, dict[str, dict[str, Any]]]
@@ -111,14 +111,18 @@ def print_table(
 
 
 def markdown(results: Results, held: dict[str, Any], title: str) -> str:
-    """The same table in Markdown, with every metric, and once more by camera."""
-    lines = [f"# {title}", "", caption(held), "", *_table(results, "split")]
+    """The same table in Markdown, with every metric, and once more by camera; every row carries
+    what it is of."""
+    lines = [f"# {title}", "", caption(held), "", *_table(results, held, "split")]
     lines += ["", *(f"- {note}" for note in notes(results))]
-    lines += ["", "## By camera", "", *_table(results, "camera")]
+    lines += ["", "## By camera", "", *_table(results, held, "camera")]
     return "\n".join([*lines, ""])
 
 
-def _table(results: Results, per: str) -> list[str]:
-    header = ["split", "picture", "images", *(HEADINGS[m] for m in METRICS)]
+def _table(results: Results, held: dict[str, Any], per: str) -> list[str]:
+    said = provenance(held)
+    header = ["split", "picture", "images", *(HEADINGS[m] for m in METRICS), *said]
     table = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
-    return table + ["| " + " | ".join(row) + " |" for row in rows(results, per=per)]
+    return table + [
+        "| " + " | ".join([*row, *said.values()]) + " |" for row in rows(results, per=per)
+    ]
