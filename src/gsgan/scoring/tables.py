@@ -70,7 +70,8 @@ def notes(results: Results) -> list[str]:
         for mark in scored["marks"]:
             found[f"marked: {mark}"] = None
         if protocol := scored.get("protocol"):
-            found[f"protocol: {protocol['name']} ({protocol['source']})"] = None
+            note = f"; {protocol['note']}" if protocol.get("note") else ""
+            found[f"protocol: {protocol['name']} ({protocol['source']}){note}"] = None
             for departure in protocol["departures"]:
                 found[f"departs from {protocol['name']}: {departure}"] = None
         if not scored["images"]:
