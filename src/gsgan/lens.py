@@ -1,30 +1,70 @@
-"""Lens distortion of whole pictures: painted straight, then bent as the lens does.
+"""Lens distortion: where a lens shows points, and what it does to small shapes about them.
 
-Convention: OpenCV's model (k1 k2 p1 p2 k3) on x/z and y/z of the camera's axes. Means and shapes
-of Gaussians are not bent one by one: the UNet paints pixels as a pinhole sees them, and every map
-(colour, alpha, S) has to follow the same lens, so the finished maps are resampled. That is exact in
-geometry for all of them, and costs what one cubic interpolation blurs.
+Convention: OpenCV's model (k1 k2 p1 p2 k3) on x/z and y/z of the camera's axes. `Camera.project`
+and the rasteriser follow the camera's lens by what is here; a camera without one costs nothing.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
-from gsgan.precision import full_precision
-from gsgan.scene import Camera
+if TYPE_CHECKING:
+    from gsgan.scene import Camera
 
 ITERATIONS = 20  # of Newton: a usable lens takes 4, places near its fold more
 FOUND = 1e-9  # of x/z, in float64: what the lens must bring a found point back to
-REACH = 1.0  # picture sides beyond the border that are painted at most: only a fold lies further
+RIM = 0.999  # share of the radius at which a lens folds: what lies beyond it is shown there
 
 
 def distort(points: Tensor, dist: Tensor) -> Tensor:
     """``[B, M, 2]`` where lenses ``[B, 5]`` show points ``[B, M, 2]`` of the z = 1 plane."""
     return _bent(points, dist)[0]
+
+
+def distort_within(points: Tensor, dist: Tensor) -> Tensor:
+    """`distort`, with points beyond the lens's fold brought back to its rim.
+
+    A lens model mirrors what lies beyond its fold into the picture, which no lens does: so such
+    points stay where the last ones before it are shown, far from the middle.
+    """
+    radius = points.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(points.dtype).tiny)
+    rim = RIM * fold_radius(dist).to(points.dtype)[:, None, None]
+    return distort(points * (rim / radius).clamp_max(1), dist)
+
+
+def bend(x_cam: Tensor, dist: Tensor, near: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Moves points so that a pinhole shows them where the lens does, at the same depth.
+
+    Convention: differentiable; values and gradients are finite for every finite point. Points
+    nearer than ``near``, beyond the lens's fold or not finite stay where they are.
+
+    Args:
+        x_cam: ``[B, M, 3]`` metres, camera axes.
+        dist: ``[B, 5]``.
+        near: metres.
+
+    Returns:
+        The points ``[B, M, 3]``, the derivative of the move ``[B, M, 3, 3]`` (how small shapes
+        about them change: with it a pinhole's first-order projection is the lens's), and which of
+        them lie beyond the fold, where a lens shows nothing ``[B, M]``.
+    """
+    z = x_cam[..., 2:]
+    ahead = (z > near) & torch.isfinite(x_cam).all(dim=-1, keepdim=True)
+    n = torch.where(ahead, x_cam[..., :2], 0.0) / torch.where(ahead, z, 1.0)
+    beyond = n.norm(dim=-1, keepdim=True) >= RIM * fold_radius(dist).to(n.dtype)[:, None, None]
+    moves = ahead & ~beyond
+    n = torch.where(moves, n, 0.0)
+    shown, slope = _bent(n, dist)
+    moved = torch.cat([shown * torch.where(moves, z, 1.0), z], dim=-1)
+    by_depth = shown - (slope @ n.unsqueeze(-1)).squeeze(-1)
+    top = torch.cat([slope, by_depth.unsqueeze(-1)], dim=-1)
+    bottom = top.new_tensor([0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 3)
+    eye = torch.eye(3, dtype=top.dtype, device=top.device)
+    jacobian = torch.where(moves.unsqueeze(-1), torch.cat([top, bottom], dim=-2), eye)
+    return torch.where(moves, moved, x_cam), jacobian, (ahead & beyond).squeeze(-1)
 
 
 def undistort(points: Tensor, dist: Tensor, iterations: int = ITERATIONS) -> tuple[Tensor, Tensor]:
@@ -96,52 +136,6 @@ def _bent(points: Tensor, dist: Tensor) -> tuple[Tensor, Tensor]:
         torch.stack([across, radial + slope * y * y + 6 * p1 * y + 2 * p2 * x], dim=-1),
     ]
     return bent, torch.stack(rows, dim=-2)
-
-
-@dataclass(frozen=True)
-class Bend:
-    """How pinhole pictures become those of lenses.
-
-    Args:
-        straight: pinhole cameras of the same K, wide enough for all that the lenses show.
-        grid: ``[B, H, W, 2]`` where each pixel of the lens's picture lies in the straight one, as
-            `torch.nn.functional.grid_sample` counts; far outside where the lens shows nothing.
-    """
-
-    straight: Camera
-    grid: Tensor
-
-    @classmethod
-    def of(cls, camera: Camera) -> Bend:
-        """The bend of cameras with a lens.
-
-        Raises:
-            ValueError: when they have none.
-        """
-        if camera.dist is None:
-            raise ValueError("Bend: expected cameras with dist, got pinholes")
-        height, width = camera.size
-        with full_precision(camera.K):
-            pixels, found = (x.flatten(1, 2) for x in straight_pixels(camera))
-        reach = REACH * pixels.new_tensor([width, height])
-        side = pixels.new_tensor([width, height])
-        ahead = ((pixels >= -reach) & (pixels <= side + reach)).all(-1) & found
-        kept = pixels[ahead] if bool(ahead.any()) else pixels.new_tensor([[0.0, 0.0]])
-        low = kept.amin(0).floor().clamp_max(0)
-        high = torch.maximum(kept.amax(0).ceil(), pixels.new_tensor([width, height]))
-        size = (high - low).clamp_min(1)
-        (left, top), (w, h) = low.long().tolist(), size.long().tolist()
-        grid = 2 * (pixels - low) / size - 1
-        grid = torch.where(ahead.unsqueeze(-1), grid, torch.full_like(grid, 4.0))
-        straight = replace(camera, dist=None).crop(top, left, (h, w))
-        return cls(straight, grid.unflatten(1, (height, width)).to(camera.K.dtype))
-
-    def __call__(self, picture: Tensor) -> Tensor:
-        """``[B, C, H, W]`` as the lenses show pictures ``[B, C, h, w]`` of the straight cameras."""
-        with full_precision(picture):
-            return functional.grid_sample(
-                picture.float(), self.grid.float(), mode="bicubic", align_corners=False
-            ).to(picture.dtype)
 
 
 def straight_pixels(camera: Camera) -> tuple[Tensor, Tensor]:

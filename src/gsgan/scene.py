@@ -14,6 +14,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from gsgan.lens import distort_within
+
 S = TypeVar("S", bound="_TensorRecord")
 
 
@@ -94,7 +96,7 @@ def _check(owner: str, name: str, value: Tensor, *shape: int | None) -> None:
 
 @dataclass(frozen=True)
 class Camera(_TensorRecord):
-    """A batch of pinhole cameras of one picture size.
+    """A batch of cameras of one picture size, pinholes or with a lens.
 
     Args:
         K: ``[B, 3, 3]`` intrinsics in pixels of the picture, skew allowed.
@@ -148,13 +150,14 @@ class Camera(_TensorRecord):
         """Pixel positions ``[B, M, 2]`` and depths ``[B, M]`` of world points ``[B, M, 3]``.
 
         Points nearer than ``near`` metres are divided by ``near`` instead of their depth: their
-        pixels are finite but meaningless, so mask them by the returned depth. Lens distortion is
-        not applied.
+        pixels are finite but meaningless, so mask them by the returned depth. A lens (``dist``) is
+        followed; what lies beyond its fold is shown at the fold's rim.
         """
         x_cam = self.to_camera(points)
         depth = x_cam[..., 2]
         xy1 = x_cam / depth.clamp_min(near).unsqueeze(-1)
-        xy1 = torch.cat([xy1[..., :2], torch.ones_like(xy1[..., :1])], dim=-1)
+        xy = xy1[..., :2] if self.dist is None else distort_within(xy1[..., :2], self.dist)
+        xy1 = torch.cat([xy, torch.ones_like(xy[..., :1])], dim=-1)
         return (xy1 @ self.K.mT)[..., :2], depth
 
     def crop(self, top: int, left: int, size: tuple[int, int]) -> Camera:

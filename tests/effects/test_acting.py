@@ -259,7 +259,8 @@ def test_pictures_are_taken_as_the_word_says(build, bent):
     assert views[2].camera.dist is None
     assert torch.equal(views[0].image, views[2].image)  # the file's own pixels
     assert not torch.equal(views[0].image, views[1].image)
-    assert torch.equal(raw.dataset("train")[0].image, straight.dataset("train")[0].image)
+    assert torch.equal(raw.dataset("train")[0].image, ignored.dataset("train")[0].image)
+    assert raw.dataset("train")[0].camera.dist is not None
     entry = ring_camera(4 * torch.pi / 3, (64, 64)) | {"dist": LENS}
     wrist = distorted_pixels(entry, skeletons(5)[0][15:16])[0]
     assert float(views[0].mask[0, 0, int(wrist[1]), int(wrist[0])]) == 1
@@ -291,7 +292,7 @@ def test_a_raw_crop_follows_the_lens(build, bent):
     assert not border.any()
 
 
-def test_paintings_are_bent_with_every_map(build, bent):
+def test_paintings_follow_the_lens_with_every_map(build, bent):
     data, avatar, _ = build(
         f"data.root={bent}", "data.size=64", "effects.distortion=project", "effects.depth=on"
     )

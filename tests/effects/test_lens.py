@@ -1,14 +1,17 @@
-"""The lens: OpenCV's numbers, its inverse, and pictures bent as a lens shows them."""
+"""The lens: OpenCV's numbers, its inverse, and splats as a lens shows them."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from gsgan.lens import Bend, distort, fold_radius, straight_pixels, undistort
-from gsgan.scene import Camera
+from gsgan.lens import bend, distort, fold_radius, straight_pixels, undistort
+from gsgan.scene import Camera, Gaussians
+from gsgan.splat import accuracy, rasterise
 
 BARREL = [-0.28, 0.09, 0.001, -0.0008, -0.01]
 PINCUSHION = [0.2, 0.05, -0.002, 0.001, 0.0]
@@ -70,38 +73,108 @@ def camera(dist, size=(40, 48)) -> Camera:
     return Camera(K, torch.eye(3)[None], torch.zeros(1, 3), size, lens)
 
 
+def shows(dist, points: torch.Tensor) -> np.ndarray:
+    """Pixels at which OpenCV shows points ``[N, 3]`` in the test camera."""
+    K = camera(None).K[0].double().numpy()
+    zero = np.zeros(3)
+    return cv2.projectPoints(points.double().numpy(), zero, zero, K, np.array(dist))[0][:, 0]
+
+
+def splats(means: torch.Tensor, covariances: torch.Tensor, features: torch.Tensor) -> Gaussians:
+    half = torch.full(means.shape[:2], 0.5)
+    return Gaussians(means, None, None, half, features, covariances=covariances)
+
+
+POINTS = torch.tensor([[0.3, -0.22, 1.0], [-0.5, 0.4, 1.7], [0.0, 0.0, 2.0], [0.9, 0.6, 2.1]])
+
+
+@pytest.mark.parametrize("dist", [BARREL, PINCUSHION, [0.0] * 5])
+def test_points_are_projected_as_opencv_does(dist):
+    seen, depth = camera(dist).project(POINTS[None])
+    assert np.abs(seen[0].numpy() - shows(dist, POINTS)).max() < 1e-4
+    assert torch.equal(depth[0], POINTS[:, 2])
+
+
+def test_points_beyond_the_fold_are_shown_at_its_rim():
+    lens = [-0.5, 0.0, 0.0, 0.0, 0.0]  # shown at most at 0.544
+    far = torch.tensor([[[0.9, 0.0, 1.0], [50.0, 0.0, 1.0], [3.0, -4.0, 1.0]]], requires_grad=True)
+    seen, _ = camera(lens).project(far)
+    radius = ((seen - torch.tensor([24.0, 20.0])) / 50).norm(dim=-1)
+    torch.testing.assert_close(radius, torch.full((1, 3), 0.5443), atol=1e-3, rtol=0)
+    seen.sum().backward()
+    assert torch.isfinite(far.grad).all()
+
+
+@pytest.mark.parametrize("backend", ["reference", "torch", "native"])
 @pytest.mark.parametrize("dist", [BARREL, PINCUSHION])
-def test_a_painted_point_lands_where_the_lens_shows_it(dist):
-    """A smooth bump painted about a point of the pinhole picture moves to the distorted point."""
-    bend = Bend.of(camera(dist))
-    straight = bend.straight
-    height, width = straight.size
-    point = torch.tensor([[[0.3, -0.22, 1.0]]])
-    at = straight.project(point)[0][0, 0]
-    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    bump = torch.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / 8)[None, None]
-    shown = bend(bump)[0, 0]
+def test_a_splat_lands_where_the_lens_shows_it_in_the_shape_it_shows(dist, backend):
+    """Against many points drawn from the Gaussian, each projected by OpenCV."""
+    means = torch.tensor([[[0.3, -0.22, 1.0]]])
+    axes = torch.tensor([[0.05, 0.01, 0.0], [0.0, 0.03, 0.01], [0.0, 0.0, 0.04]])
+    splat = splats(means, (axes @ axes.T)[None, None], torch.ones(1, 1, 1))
+    high = accuracy("high")
+    alpha = rasterise(splat, camera(dist), settings=high, backend=backend).alpha[0, 0].double()
     rows, columns = torch.meshgrid(torch.arange(40) + 0.5, torch.arange(48) + 0.5, indexing="ij")
-    found = torch.stack([(shown * columns).sum(), (shown * rows).sum()]) / shown.sum()
-    wanted = distort(point[..., :2], torch.tensor([dist]))[0, 0] * 50 + torch.tensor([24.0, 20.0])
-    assert float((found - wanted).abs().max()) < 0.25  # the bump itself is bent a little
-    assert float((at - wanted).abs().max()) > 0.4  # it did move
+    at = torch.stack([columns.double(), rows.double()], dim=-1)
+    weight = alpha / alpha.sum()
+    centre = (weight[..., None] * at).sum((0, 1))
+    spread = (at - centre).flatten(0, 1)
+    shape = (spread * weight.flatten()[:, None]).T @ spread
+    generator = torch.Generator().manual_seed(0)
+    drawn = means[0, 0] + torch.randn(20_000, 3, generator=generator) @ (0.2 * axes).T
+    theirs = torch.from_numpy(shows(dist, drawn))
+    wanted = torch.cov(theirs.T) / 0.2**2  # small shapes: what the first order is about
+    assert float((centre - torch.from_numpy(shows(dist, means[0]))[0]).abs().max()) < 0.05
+    wanted += high.low_pass * torch.eye(2)
+    torch.testing.assert_close(shape, wanted, rtol=0.03, atol=0.05)
+    pinhole = rasterise(splat, camera(None), settings=high, backend=backend).alpha[0, 0]
+    assert float((pinhole - alpha).abs().max()) > 0.05  # the lens did something
 
 
-def test_without_distortion_nothing_moves():
-    bend = Bend.of(camera([0.0] * 5))
-    assert bend.straight.size == (40, 48)
-    picture = torch.rand(1, 3, 40, 48)
-    torch.testing.assert_close(bend(picture), picture, atol=1e-5, rtol=0)
+def test_gradients_through_the_lens_are_right():
+    lens = torch.tensor([BARREL], dtype=torch.float64)
+    x = torch.cat([POINTS, torch.tensor([[0.1, 0.1, -1.0], [0.2, 0.1, 0.0]])]).double()[None]
+    x = x.clone().requires_grad_()
+
+    def moved(p, d):
+        return bend(p, d, near=0.01)[:2]
+
+    assert torch.autograd.gradcheck(moved, (x, lens.clone().requires_grad_()))
+    points, jacobian, _ = bend(x, lens, near=0.01)
+    for m in range(points.shape[1]):
+        derivative = torch.autograd.functional.jacobian(lambda p: bend(p, lens, 0.01)[0][0, m], x)  # noqa: B023
+        torch.testing.assert_close(jacobian[0, m], derivative[:, 0, m])
+    assert torch.equal(points[0, 4:], x[0, 4:])  # behind the camera nothing moves
 
 
-def test_strong_lenses_stay_within_bounds():
-    bend = Bend.of(camera([-0.8, 0.0, 0.0, 0.0, 0.0]))  # folds inside the picture
-    assert max(bend.straight.size) <= 3 * 48
-    assert torch.isfinite(bend(torch.rand(1, 2, *bend.straight.size))).all()
+def test_hard_points_stay_finite_and_out_of_the_picture():
+    """Behind, in the lens's centre, beyond the fold, at infinity, not a number."""
+    lens = torch.tensor([[-0.5, 0.0, 0.0, 0.0, 0.0]])
+    hard = torch.tensor(
+        [[0, 0, 1], [0.1, 0, 0], [0.1, 0, -1], [0.9, 0, 1], [1e20, 0, 1], [float("nan"), 0, 1.0]]
+    )[None].requires_grad_()
+    points, jacobian, beyond = bend(hard, lens, near=0.01)
+    assert beyond[0].tolist() == [False, False, False, True, True, False]
+    assert torch.isfinite(jacobian).all()
+    torch.testing.assert_close(points, hard, equal_nan=True)  # on the axis, or not moved
+    (points[0, :5].sum() + jacobian.sum()).backward()
+    assert torch.isfinite(hard.grad).all()
 
 
-def test_a_pinhole_has_no_bend():
-    for function in (Bend.of, straight_pixels):
-        with pytest.raises(ValueError, match="expected cameras with dist"):
-            function(camera(None))
+def test_what_lies_beyond_the_fold_is_not_painted():
+    means = torch.tensor([[[0.95, 0.0, 1.0]]])
+    splat = splats(means, 1e-4 * torch.eye(3)[None, None], torch.ones(1, 1, 1))
+    wide = replace(camera([-0.5, 0, 0, 0, 0]), K=camera(None).K * torch.tensor([[0.4], [0.4], [1]]))
+    assert float(rasterise(splat, wide).alpha.max()) == 0
+
+
+def test_without_coefficients_the_lens_changes_nothing():
+    colours = torch.rand(1, 4, 3, generator=torch.Generator().manual_seed(1))
+    splat = splats(POINTS[None], 1e-3 * torch.eye(3).expand(1, 4, 3, 3), colours)
+    plain, through = (rasterise(splat, camera(d)).features for d in (None, [0.0] * 5))
+    torch.testing.assert_close(plain, through, atol=1e-5, rtol=0)
+
+
+def test_straight_pixels_need_a_lens():
+    with pytest.raises(ValueError, match="expected cameras with dist"):
+        straight_pixels(camera(None))

@@ -69,7 +69,7 @@ class GsganData(LightningDataModule):
         info_samples: pictures a camera from which the mean foreground colour is taken.
         min_joints: a frame with fewer usable joints is dropped.
         distortion: ``auto`` and ``undistort`` undistort pictures on reading; ``off`` takes them as
-            a pinhole's; ``project`` undistorts those that train and leaves the others as taken.
+            a pinhole's; ``project`` leaves them as taken, with the lens in ``camera.dist``.
         wanted: what the root should be, for the message when it is not set.
 
     Raises:
@@ -128,7 +128,7 @@ class GsganData(LightningDataModule):
         self.cache_mb = _at_least("cache_mb", cache_mb, 0)
         self.info_samples = _at_least("info_samples", info_samples, 1)
         self.checks = replace(Checks(), min_joints=_at_least("min_joints", min_joints, 1))
-        self.lenses = _lenses(distortion)
+        self.lens = _lens(distortion)
         self._datasets: dict[str, CaptureDataset] | None = None
         self._layout: Layout | None = None
         self._splits: Splits | None = None
@@ -154,9 +154,7 @@ class GsganData(LightningDataModule):
         limit = int(self.cache_mb * 2**20) // (2 * self.workers + 1)
         cache = PictureCache(limit)
         self._datasets = {
-            name: CaptureDataset(
-                layout, splits.items[name], self.size, self.crop, cache, self.lenses[name]
-            )
+            name: CaptureDataset(layout, splits.items[name], self.size, self.crop, cache, self.lens)
             for name in SPLITS
         }
         self._check_one_size()
@@ -320,18 +318,17 @@ def _at_least(name: str, value: Any, least: int) -> Any:
     return value
 
 
-def _lenses(distortion: str) -> dict[str, Lens]:
-    """What is done about the lens, by split."""
-    held_out: dict[str, Lens] = {
+def _lens(distortion: str) -> Lens:
+    """What is done about the lens on reading."""
+    words: dict[str, Lens] = {
         "auto": "undistort",
         "on": "undistort",
         "undistort": "undistort",
         "off": "ignore",
         "project": "raw",
     }
-    if distortion not in held_out:
+    if distortion not in words:
         raise ConfigError(
-            f"effects.distortion must be one of {', '.join(held_out)}; got {distortion!r}"
+            f"effects.distortion must be one of {', '.join(words)}; got {distortion!r}"
         )
-    lens = held_out[distortion]
-    return {"train": "undistort" if lens == "raw" else lens} | dict.fromkeys(SPLITS[1:], lens)
+    return words[distortion]

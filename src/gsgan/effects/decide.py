@@ -101,7 +101,9 @@ def _distortion(info: SceneInfo, settings: EffectSettings, wish: str | int) -> E
                 "a lens has coefficients beyond the fifth (k4, k5, k6), which painting does not "
                 "know; choose effects.distortion=undistort"
             )
-        return Effect("project", "held-out pictures are judged as taken", forced=True)
+        return Effect(
+            "project", "pictures stay as taken: what is painted follows the lens", forced=True
+        )
     why = "a lens coefficient is not zero: pictures are undistorted on reading"
     return Effect("undistort", why if wish == AUTO else FORCED, forced=wish != AUTO)
 

@@ -40,7 +40,7 @@ class Effects:
 
     Args:
         view_dependence: degree of the spherical harmonics, 0 to 3.
-        distortion: ``undistort`` or ``project`` (held-out pictures are judged as taken).
+        distortion: ``undistort``, or ``project``: pictures stay as taken, Gaussians follow.
         antialias: opacities make up for the rasteriser's low-pass.
         colour_correction: an affine map of colours a training camera.
         segmentation: ``body`` or ``hands``.

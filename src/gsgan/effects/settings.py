@@ -30,8 +30,8 @@ class EffectSettings:
     Args:
         view_dependence: ``auto``, ``off``, ``on`` (the degree that the cameras can tell), 0 to 3.
         distortion: ``auto``, ``off`` (pictures are taken as a pinhole's), ``undistort`` (or ``on``:
-            pictures are undistorted on reading), or ``project`` (those that are held out are not:
-            what is painted is bent as their lens does).
+            pictures are undistorted on reading), or ``project`` (pictures stay as taken: Gaussians
+            and joints follow the lens).
         antialias, colour_correction, random_background, depth: ``auto``, ``on``, ``off``.
         segmentation: ``auto``, ``off``, ``body`` (or ``on``: all parts), ``hands`` (those alone).
         only: names of effects: these are on, all others off, whatever else is said; None: no list.

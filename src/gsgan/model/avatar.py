@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from gsgan.body import open_body
 from gsgan.effects import Effects, EffectSettings, decide
 from gsgan.errors import DataError
-from gsgan.lens import Bend
 from gsgan.model.class_vote import ClassVote, Pictures
 from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import Deformation
@@ -310,19 +309,7 @@ class Avatar(nn.Module):
             )
 
     def paint(self, frame: Frame) -> Painting:
-        """The whole picture of a frame of a dataset: its window painted, background around it.
-
-        Where the frame's camera has a lens (``camera.dist``) the picture is painted as a pinhole
-        sees it and then bent, see `gsgan.lens`.
-        """
-        if frame.camera.dist is None:
-            return self._paint(frame, frame.camera.size[0])
-        bend = Bend.of(frame.camera)
-        straight = replace(frame, camera=bend.straight)
-        return self._paint(straight, frame.camera.size[0]).bent(bend)
-
-    def _paint(self, frame: Frame, height: int) -> Painting:
-        """The whole picture of a frame's camera, p₂D's lines as wide as in one ``height`` high."""
+        """The whole picture of a frame of a dataset: its window painted, background around it."""
         window = self.window(frame)
         if window is None:
             return self(
@@ -330,7 +317,6 @@ class Avatar(nn.Module):
                 frame.visibility,
                 frame.camera,
                 frame.body,
-                picture_height=height,
                 camera_index=frame.camera_index,
             )
         painting = self(
@@ -338,7 +324,7 @@ class Avatar(nn.Module):
             frame.visibility,
             window.camera(frame.camera),
             frame.body,
-            picture_height=height,
+            picture_height=window.picture[0],
             camera_index=frame.camera_index,
         )
         with self.stage("paste"):

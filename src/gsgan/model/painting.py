@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsgan.lens import Bend
 from gsgan.scene import Gaussians
 from gsgan.window import Window
 
@@ -61,25 +60,4 @@ class Painting:
             segmentation=parts,
             corrected=paste(self.corrected),
             depth=paste(self.depth),
-        )
-
-    def bent(self, bend: Bend) -> Painting:
-        """The same as lenses show it, all background where they show nothing."""
-
-        def through(x: Tensor | None) -> Tensor | None:
-            return None if x is None else bend(x)
-
-        parts = through(self.segmentation)
-        if parts is not None:
-            inside = bend(torch.ones_like(self.segmentation[:, :1]))  # type: ignore[index]
-            parts = torch.cat([parts[:, :1] + (1 - inside), parts[:, 1:]], dim=1).clamp_min(0)
-        alpha = through(self.alpha)
-        return replace(
-            self,
-            image=through(self.image),
-            features=through(self.features),
-            alpha=None if alpha is None else alpha.clamp(0, 1),  # cubic weights overshoot
-            segmentation=parts,
-            corrected=through(self.corrected),
-            depth=through(self.depth),
         )

@@ -35,7 +35,8 @@ def draw_skeleton(
     Convention: a channel is the largest ``exp(-d² / 2 sigma²)`` over its group's segments, d the
     distance of the pixel's centre in pixels; 1 on the bone. ``sigma = sigma_px H / 512``, at least
     ``min_sigma_px`` pixels of the grid it is computed on. Left out: segments with an end unseen or
-    nearer than ``near``. Lens distortion is not applied. Differentiable in p and the camera.
+    nearer than ``near``. Joints follow the camera's lens, bones stay straight. Differentiable in p
+    and the camera.
 
     Args:
         p: ``[B, J, 3]`` finite joints, metres, world frame.

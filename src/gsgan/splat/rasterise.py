@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.splat import checks, gsplat_backend, reference, tiles
+from gsgan.splat.lens import as_pinhole_sees
 from gsgan.splat.project import Projected, project
 from gsgan.splat.settings import Accuracy, accuracy
 
@@ -33,8 +34,8 @@ def rasterise(
     """Draws Gaussians as a camera sees them.
 
     Convention: features come back premultiplied and the background is the caller's to add.
-    Differentiable in every tensor of ``gaussians`` and in the camera's K, R and t. Lens distortion
-    (``camera.dist``) is not applied. Autocast has no effect in here.
+    Differentiable in every tensor of ``gaussians`` and in the camera's K, R and t. A lens
+    (``camera.dist``) is followed, see `gsgan.splat.lens`. Autocast has no effect in here.
 
     Args:
         gaussians: N >= 0 Gaussians per batch item.
@@ -58,6 +59,8 @@ def rasterise(
     """
     settings = accuracy(settings) if isinstance(settings, str) else settings
     keep = checks.check(gaussians, camera, settings, on_invalid, rotation_tolerance)
+    if camera.dist is not None:
+        gaussians, camera = as_pinhole_sees(gaussians, camera, settings.near)
     name, reason = resolve_backend(backend, gaussians.means.device, settings)
     if name == "gsplat" and (why_not := gsplat_backend.unsuited(gaussians, camera)):
         name, reason = _torch_instead_of_gsplat(why_not)
