@@ -71,6 +71,11 @@ def test_pictures_of_a_run_score_as_the_run_does(run, painted, given, inside):
     assert (runs["method"], runs["model"], runs["seed"]) == ("gsgan", "full", 0)
     assert runs["iterations"] == 16
     assert 0 < runs["train_seconds"] < 600
+    stored = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)["gsgan"]["code"]
+    assert runs["trained_by"] == stored
+    assert facts["trained_by"] is None
+    if runs["commit"] is not None:  # a checkout: the run was trained and scored by the same code
+        assert [code.removesuffix("+changes") for code in stored] == [runs["commit"]]
     assert "other" in result.stdout
     assert {p.name for p in (out / "pictures").iterdir()} == {"novel_view.png", "novel_pose.png"}
 

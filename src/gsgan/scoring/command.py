@@ -76,6 +76,7 @@ def evaluate_folder(config: DictConfig) -> Results:
             seed=stored.seed,
             iterations=state["step"],
             train_seconds=state.get("train_seconds"),
+            trained_by=tuple(state["code"]) if "code" in state else None,
         ),
         wanted=wanted,
     )

@@ -32,6 +32,7 @@ class Method:
         seed: of the training, or None.
         iterations: of the training, or None.
         train_seconds: of wall clock, all parts of a resumed run together, or None.
+        trained_by: commits that trained it, those of a resumed run's parts; None: not known.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Method:
     seed: int | None = None
     iterations: int | None = None
     train_seconds: float | None = None
+    trained_by: tuple[str, ...] | None = None
 
 
 def facts(method: Method, data: GsganData, device: torch.device) -> dict[str, Any]:
@@ -54,7 +56,7 @@ def facts(method: Method, data: GsganData, device: torch.device) -> dict[str, An
         version = importlib.metadata.version("gsgan")
     except importlib.metadata.PackageNotFoundError:
         version = None
-    commit, dirty = commit_of(Path(__file__).resolve().parent)
+    commit, dirty = commit_of()
     return {
         "version": version,
         "commit": commit,
@@ -71,16 +73,27 @@ def facts(method: Method, data: GsganData, device: torch.device) -> dict[str, An
         "seed": method.seed,
         "iterations": method.iterations,
         "train_seconds": method.train_seconds,
+        "trained_by": None if method.trained_by is None else list(method.trained_by),
         "device": str(device),
         "torch": torch.__version__,
     }
 
 
-def commit_of(folder: Path) -> tuple[str | None, bool | None]:
+def training_code() -> list[str]:
+    """What a checkpoint says of the code that trained it; empty where that is not known."""
+    commit, dirty = commit_of()
+    return [] if commit is None else [commit + ("+changes" if dirty else "")]
+
+
+def commit_of(folder: Path | None = None) -> tuple[str | None, bool | None]:
     """``git describe`` of the checkout that holds the code, and whether it was changed since.
 
     (None, None) where the code is installed, or git is not at hand.
+
+    Args:
+        folder: of the code; None: of this very package.
     """
+    folder = folder or Path(__file__).resolve().parent
     root = next((f for f in folder.parents if (f / ".git").exists()), None)
     if root is None or not (root / "src" / "gsgan").is_dir():
         return None, None

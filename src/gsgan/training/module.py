@@ -156,6 +156,7 @@ class AvatarTraining(LightningModule):
         self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1) if wanted else None
         self.step = 0  # iterations done: Lightning's global_step counts every optimiser's steps
         self.skipped = 0
+        self.code: list[str] = []  # commits that trained, more than one where a run was resumed
         self.start_psnr: float | None = None
         self.last_psnr: float | None = None
         self.seconds_before: float | None = 0.0  # None: an earlier part did not count them
@@ -474,6 +475,7 @@ class AvatarTraining(LightningModule):
             "averaged": self.average is not None and self.average.started,
             "start_psnr": self.start_psnr,
             "train_seconds": self.train_seconds,
+            "code": self.code,
             "marks": self.marks,
             "record": self.record,
             "effects": self.avatar.effects.plain(),
@@ -486,6 +488,7 @@ class AvatarTraining(LightningModule):
         self.rollback.done = state["rollbacks"]
         self.start_psnr = state["start_psnr"]
         self.seconds_before = state.get("train_seconds")
+        self.code = list(dict.fromkeys([*state.get("code", []), *self.code]))
 
 
 def _fit_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:

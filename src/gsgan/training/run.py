@@ -26,7 +26,7 @@ from gsgan.files import write_atomically
 from gsgan.metrics.lpips import check_lpips
 from gsgan.model.avatar import Avatar
 from gsgan.runs import CHECKPOINT, build_training, checkpoint_to_resume, read_checkpoint
-from gsgan.scoring.facts import Method
+from gsgan.scoring.facts import Method, training_code
 from gsgan.scoring.files import NAMES
 from gsgan.scoring.run import evaluate_run
 from gsgan.training.callbacks import Narrator, PictureGrid
@@ -62,6 +62,7 @@ def run_training(config: DictConfig) -> None:
         )
         return
 
+    module.code = training_code()
     describe(console, folder, data, module)
     where = training_device(config.trainer.accelerator)
     costs = effect_costs(config, data, module.avatar, config.effects.measure, where)
@@ -89,6 +90,7 @@ def run_training(config: DictConfig) -> None:
             seed=config.seed,
             iterations=module.step,
             train_seconds=module.train_seconds,
+            trained_by=tuple(module.code),
         )
         evaluate_run(
             folder, config, console, data=data, avatar=avatar, marks=module.marks, method=method
