@@ -93,6 +93,15 @@ def build(tiny):
     return run
 
 
+@pytest.fixture(autouse=True)
+def denormals():
+    """Training in this process flushes denormals; other tests reckon with them."""
+    import torch
+
+    yield
+    torch.set_flush_denormal(False)
+
+
 @pytest.fixture
 def inside(tmp_path, monkeypatch, capfd):
     """The same in this process, for the many ways to go wrong: seconds less each."""

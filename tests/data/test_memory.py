@@ -61,8 +61,9 @@ def test_the_measurement_sees_pictures_that_are_kept(layout: Layout) -> None:
     before = resident()
     kept = [dataset[i] for i in range(WARM)]
     images = [frame.image.clone() for frame in kept for _ in range(3)]
-    assert sum(image.nbytes for image in images) > 40 * MIB
-    assert resident() - before > 40 * MIB
+    held = sum(image.nbytes for image in images)
+    assert held > 40 * MIB
+    assert resident() - before > held / 2  # memory that was freed before may be taken up again
 
 
 def index_bytes(root: Path) -> int:

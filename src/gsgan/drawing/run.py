@@ -23,6 +23,7 @@ from gsgan.drawing.shots import Shot, choose_items, make_shots
 from gsgan.drawing.subjects import Subject, check_same_truth, open_subjects
 from gsgan.errors import ConfigError
 from gsgan.files import write_atomically
+from gsgan.runs import load_config
 
 FORMATS = ("png", "pdf")
 RECORD = "figures.json"
@@ -46,6 +47,8 @@ def make_figures(config: DictConfig) -> Record:
         raise ConfigError("settings and shots are tables of values; leave them out, or set a key")
     settings: Settings = instantiate(config.settings)
     out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
+    for folder in folders:
+        load_config(folder)  # a run folder at all? else nothing is to be made beside it
     _prepare(out)
     console = make_console()
     logging.getLogger("fontTools").setLevel(logging.WARNING)  # tells every glyph of a PDF
