@@ -18,6 +18,7 @@ SMALL_BENCH = {
         *("reference.size=32", "judge_at=[300]", "windows=1", "window=16", "dense=false"),
         "memory=false",
     ],
+    "rays": ["rays=[1]", "reference=4", "picture=16", "frames=1"],
     "loader": ["data.size=32", "batches=2", "workers=[0,1]"],
     "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
     "trade-off": [

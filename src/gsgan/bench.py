@@ -17,6 +17,7 @@ from gsgan.config import FAILED, entry
 SUBJECTS = {
     "raster": "time against error of every backend and accuracy setting of the rasteriser",
     "stability": "the float32 error of every hard case",
+    "rays": "what anti-aliasing of the default person costs, and the noise without it",
     "loader": "training pictures a second from disk",
     "speed": "milliseconds from skeleton to picture, by stage",
     "trade-off": "quality against time and memory, over settings and small trainings",

@@ -47,7 +47,7 @@ class Settings:
         test_cameras: in the gaps between them.
         frames: moments of the choreography.
         test_frames: of these, held out (see :func:`gsgan.data.synthetic.motion.held_out`).
-        rays_per_pixel: anti-aliasing.
+        rays_per_pixel: anti-aliasing, a square number.
         seed: of the motion.
         identity: of the clothes and colours.
         radius: metres from the middle of the scene to the cameras.
@@ -62,7 +62,7 @@ class Settings:
     test_cameras: int = 2
     frames: int = 60
     test_frames: int = 15
-    rays_per_pixel: int = 4
+    rays_per_pixel: int = 16
     seed: int = 0
     identity: int = 0
     radius: float = 2.8
