@@ -381,7 +381,7 @@ def test_the_impossible_ends_a_command_in_one_sentence(capture, inside, tmp_path
 def test_all_means_all_that_this_model_can_have(build):
     _, avatar, frame = build("effects=all", "model=splat_only")
     every = {"view_dependence", "antialias", "colour_correction", "random_background", "depth"}
-    every |= {"face"}
+    every |= {"face", "body_points"}
     assert {name for name, effect in avatar.effects if effect.on} == every
     assert torch.isfinite(avatar.paint(frame).image).all()
     _, avatar, frame = build("effects=all", "model=image_to_image")

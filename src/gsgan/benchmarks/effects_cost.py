@@ -121,11 +121,10 @@ def without_hooks(avatar: Avatar, frame: Frame, height: int) -> Tensor:
     camera = frame.camera
     p, valid = sanitise(frame.skeleton, frame.visibility, avatar.template, avatar.limb_sum)
     frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
-    assert avatar.densify is not None
     assert avatar.deformation is not None
     assert avatar.generator is not None
     assert avatar.pose_encoder is not None
-    points = avatar.densify(p, valid, frames)
+    points = avatar.place(p, valid, frames, frame.body)
     gaussians = avatar.deformation(p, points, camera.centre, frames.hubs[:, 0], None)
     F = rasterise(gaussians, camera, settings=avatar.accuracy).features
     S = avatar.segmentation(frame.body, camera) if avatar.segmentation else None

@@ -97,7 +97,7 @@ def _pictures(rays: int, config: DictConfig) -> tuple[np.ndarray, float]:
         )
         seconds = time.perf_counter() - start
         files = sorted((root / "images").glob("*/*"))
-        pictures = [cv2.imread(str(file)) for file in files]
+        pictures = [np.asarray(cv2.imread(str(file)), np.float64) for file in files]
     return np.stack(pictures) / 255.0, seconds
 
 

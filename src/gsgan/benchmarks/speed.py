@@ -97,8 +97,9 @@ def _settings(config: DictConfig, subject: Subject, device: torch.device) -> dic
         found |= {"accuracy": avatar.accuracy.name, "backend": drawing}
         found["channels of F"] = avatar.splat_channels
         found["SH degree"] = avatar.splats.sh_degree
-    if avatar.densify is not None:
-        found["Gaussians"] = avatar.densify.n_points
+    placed = avatar.body_points or avatar.densify
+    if placed is not None:
+        found["Gaussians"] = placed.n_points
     return found
 
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -16,8 +17,11 @@ from gsgan.data.capture import CaptureDataset
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
 from gsgan.data.splits import Item, Splits
-from gsgan.data.surface_colours import SurfaceColours, surface_colours
+from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
 from gsgan.errors import DataError
+
+if TYPE_CHECKING:
+    from gsgan.body import SkinnedBody
 
 SOLID = 0.9  # of the mask: pixels at the outline are darkened by the black behind them
 
@@ -55,6 +59,8 @@ class SceneInfo:
         surface: how colours differ between training cameras on the same surface, or None where
             they share too little.
         darkest: brightness in [0, 1] of the person's darkest percent.
+        body_inside: share of the posed body that masks of training pictures hold; None where there
+            is no body pose or no mesh.
     """
 
     camera_names: tuple[str, ...]
@@ -83,6 +89,7 @@ class SceneInfo:
     scale_test: tuple[float, float] | None = None
     surface: SurfaceColours | None = None
     darkest: float = 0.0
+    body_inside: float | None = None
 
 
 def scene_info(
@@ -112,6 +119,7 @@ def scene_info(
     foreground, darkest = foreground_colours(dataset, samples)
     entries = {name: entry for name, entry in layout.cameras.items() if name in cameras}
     scales = [_scales(data, samples) for data in held_out if data.items]
+    mesh = _mesh(layout)
     return SceneInfo(
         camera_names=layout.camera_names,
         n_train_cameras=len(cameras),
@@ -137,8 +145,9 @@ def scene_info(
         spread=_spread(list(entries.values()), np.array(centre)),
         scale_train=_scales(dataset, samples),
         scale_test=(min(s[0] for s in scales), max(s[1] for s in scales)) if scales else None,
-        surface=_shared_surface(layout, dataset, tuple(entries), samples),
+        surface=_shared_surface(layout, dataset, tuple(entries), samples, mesh),
         darkest=darkest,
+        body_inside=_body_inside(dataset, samples, mesh),
     )
 
 
@@ -229,19 +238,40 @@ def _scales(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
     return min(medians), max(medians)
 
 
-def _shared_surface(
-    layout: Layout, dataset: CaptureDataset, cameras: tuple[str, ...], samples: int
-) -> SurfaceColours | None:
-    """Colours compared in moments that every training camera saw; None with a single camera."""
+def _mesh(layout: Layout) -> SkinnedBody | None:
+    """The body that the capture's poses move; None where they or its model file are missing."""
     from gsgan.body import open_body
 
+    body = layout.meta.body
+    if body is None or layout.poses is None:
+        return None
+    with suppress(DataError):
+        return open_body(body.kind, body.file, body.betas)
+    return None
+
+
+def _body_inside(dataset: CaptureDataset, samples: int, mesh: SkinnedBody | None) -> float | None:
+    if mesh is None or not dataset.items:
+        return None
+    chosen = _evenly(range(len(dataset.items)), 2 * samples)
+    shares = [body_inside(dataset[i], mesh) for i in chosen]
+    return float(np.mean([share for share in shares if share is not None] or [0.0]))
+
+
+def _shared_surface(
+    layout: Layout,
+    dataset: CaptureDataset,
+    cameras: tuple[str, ...],
+    samples: int,
+    mesh: SkinnedBody | None,
+) -> SurfaceColours | None:
+    """Colours compared in moments that every training camera saw; None with a single camera.
+
+    Without a mesh the visual hull has to do.
+    """
     index = {item: i for i, item in enumerate(dataset.items)}
     shared = sorted({f for _, f in dataset.items if all((c, f) in index for c in cameras)})
     if len(cameras) < 2 or not shared:
         return None
     moments = [[dataset[index[c, f]] for c in cameras] for f in _evenly(shared, samples)]
-    body, mesh = layout.meta.body, None
-    if body is not None and layout.poses is not None:
-        with suppress(DataError):  # without the model file the visual hull has to do
-            mesh = open_body(body.kind, body.file, body.betas)
     return surface_colours(moments, mesh)

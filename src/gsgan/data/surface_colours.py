@@ -34,6 +34,7 @@ WHOLE = 0.95  # of the blur must lie in the mask: outlines mix with what lies be
 LEAST_POINTS = 30  # shared by two cameras in a moment: fewer lie at outlines, seen at a slant
 LEAST_MOMENTS = 3
 COARSEST = 0.03  # metres a pixel may cover: in coarser pictures every colour is a mixture
+SLACK = 0.03  # metres by which a body may leave the mask: bare feet and hair are cut so far off
 RESIDUAL = 0.95  # the quantile: highlights cover little of a person
 
 
@@ -93,6 +94,22 @@ def surface_colours(
         points=len(brightness),
         source="hull" if body is None else "body",
     )
+
+
+def body_inside(frame: Frame, body: SkinnedBody) -> float | None:
+    """Share of the posed body's vertices in the picture that the mask holds, give or take 3 cm.
+
+    Returns:
+        None where the picture shows none of them.
+    """
+    with torch.no_grad():
+        pixels, inside, _ = _place(frame, _skin(body, frame))
+    if not inside.any():
+        return None
+    reach = int(np.ceil(SLACK / _pixel(frame)))
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
+    mask = cv2.dilate((frame.mask[0, 0].numpy() > 0.5).astype(np.uint8), kernel)
+    return float(mask[pixels[inside, 1], pixels[inside, 0]].mean())
 
 
 def _pixel(frame: Frame) -> float:

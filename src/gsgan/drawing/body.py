@@ -7,14 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_rgba_array
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.drawing.layout import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, Grid
 from gsgan.drawing.shots import Shot
 from gsgan.drawing.subjects import Subject
+from gsgan.model.body_points import BodyPoints
 from gsgan.scene import Gaussians
 from gsgan.skeleton import MEDIAPIPE33, BoneFrames, Densify, bone_frames, sanitise
 from gsgan.splat import Accuracy, project
@@ -75,23 +78,37 @@ def draw_bones(axes: Axes, pose: Pose, shot: Shot, width: float = 1.4) -> None:
     axes.plot(joints[:, 0], joints[:, 1], ".", color="#222222", ms=width * 1.6, mew=0)
 
 
-def draw_points(axes: Axes, densify: Densify, pose: Pose, shot: Shot) -> int:
+def draw_points(axes: Axes, placed: Densify | BodyPoints, pose: Pose, shot: Shot) -> int:
     """The points of Algorithm 1 in their parts' colours, far ones first; returns how many.
 
-    Those on the side of their part that the camera cannot see are pale.
+    Those on the side of their part that the camera cannot see are pale. Points on a body take the
+    colour of the bone that moves them most.
     """
-    densify = deepcopy(densify).cpu()  # a copy: the avatar's own stays where it paints
-    points = densify(pose.p, pose.valid, pose.frames)
+    placed = deepcopy(placed).cpu()  # a copy: the avatar's own stays where it paints
+    if isinstance(placed, BodyPoints):
+        assert shot.frame.body is not None
+        points = placed(shot.frame.body)
+        colours = placed_colours(placed)
+        away = np.zeros(len(colours), dtype=bool)
+    else:
+        points = placed(pose.p, pose.valid, pose.frames)
+        colours = to_rgba_array(np.array(part_colours(placed))[points.part_id.numpy()])
+        outward = (points.frames[0] @ placed.normals.to(points.means).unsqueeze(-1)).squeeze(-1)
+        away = (outward * (points.means[0] - shot.camera.centre)).sum(-1).numpy() > 0
     pixels, depth = (x[0].numpy() for x in shot.camera.project(points.means))
     keep = np.flatnonzero(points.valid[0].numpy() & (depth > NEAR))
     order = keep[np.argsort(-depth[keep])]
-    outward = (points.frames[0] @ densify.normals.to(points.means).unsqueeze(-1)).squeeze(-1)
-    away = (outward * (points.means[0] - shot.camera.centre)).sum(-1).numpy() > 0
-    colours = to_rgba_array(np.array(part_colours(densify))[points.part_id.numpy()])
     colours[away, 3] = PALE
     x, y = pixels[order].T
     axes.scatter(x, y, s=1.1, c=colours[order], linewidths=0, rasterized=True)
     return len(order)
+
+
+def placed_colours(placed: BodyPoints) -> NDArray[np.float64]:
+    """``[N, 4]``: neighbouring bones differ."""
+    weights, bones = placed.points.bone_weight, placed.points.bone_index
+    most = bones.gather(1, weights.argmax(dim=1, keepdim=True))[:, 0].numpy()
+    return np.asarray(colormaps["tab20"](7 * most % 20))
 
 
 def part_colours(densify: Densify) -> list[str]:

@@ -23,9 +23,9 @@ def draw(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings)
     Source: the paper's densify figure (skeleton, points), with what Ψ makes of them.
     """
     subject = subjects[0]
-    if subject.avatar.densify is None:
+    placed = subject.avatar.body_points or subject.avatar.densify
+    if placed is None:
         raise Unavailable(f"{subject.name} has no densify: its model makes no points of a skeleton")
-    densify = subject.avatar.densify
     aspect = aspect_of([shot.truth for shot in shots])
     grid = Grid(len(shots), len(TITLES), aspect, settings, width=settings.page, titles=TITLES)
     numbers = {}
@@ -35,8 +35,8 @@ def draw(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings)
         found = measure(image, shot.truth, settings)
         seen = int(pose.valid.sum())
         draw_bones(open_panel(grid, row, 0, shot, f"{seen} joints"), pose, shot)
-        axes = open_panel(grid, row, 1, shot, f"N = {densify.n_points}")
-        points = draw_points(axes, densify, pose, shot)
+        axes = open_panel(grid, row, 1, shot, f"N = {placed.n_points}")
+        points = draw_points(axes, placed, pose, shot)
         axes = open_panel(grid, row, 2, shot, f"{settings.sigmas:g} σ")
         assert painting.gaussians is not None
         accuracy = subject.avatar.accuracy

@@ -151,6 +151,22 @@ def _segmentation(info: SceneInfo, settings: EffectSettings, wish: str | int) ->
     return Effect(mode, "the data has a body pose", forced=wish != AUTO)
 
 
+def _body_points(info: SceneInfo, settings: EffectSettings, wish: str | int) -> Effect:
+    if not info.has_body_pose:
+        if wish != AUTO:
+            raise Impossible("the data has no body pose")
+        return Effect(OFF, "the data has no body pose")
+    if wish != AUTO:
+        return Effect("on", FORCED, forced=True)
+    if info.body_inside is None:
+        return Effect(OFF, "the body's mesh is not at hand")
+    said = f"{100 * info.body_inside:.0f} % of the posed body lies inside the masks"
+    limit = f"limit {100 * settings.body_inside:g} %"
+    if info.body_inside < settings.body_inside:
+        return Effect(OFF, f"{said} ({limit}): the skeleton is trusted more")
+    return Effect("on", f"{said} ({limit})")
+
+
 def _random_background(info: SceneInfo, settings: EffectSettings, wish: str | int) -> Effect:
     if wish != AUTO:
         return Effect("on", FORCED, forced=True)
@@ -172,6 +188,7 @@ _RULES: dict[str, Callable[[SceneInfo, EffectSettings, str | int], Effect]] = {
     "antialias": _antialias,
     "colour_correction": _colour_correction,
     "segmentation": _segmentation,
+    "body_points": _body_points,
     "random_background": _random_background,
     "depth": _depth,
 }

@@ -44,6 +44,7 @@ class Effects:
         antialias: opacities make up for the rasteriser's low-pass.
         colour_correction: an affine map of colours a training camera.
         segmentation: ``body`` or ``hands``.
+        body_points: G sits on the surface of the posed body, not on the skeleton's shapes.
         random_background: Step I compares pictures over a random colour.
         depth: the rasteriser returns depth.
         hands, face: points on fingers and face, as the skeleton has them; nothing to choose.
@@ -55,6 +56,7 @@ class Effects:
     antialias: Effect = _DEFAULT
     colour_correction: Effect = _DEFAULT
     segmentation: Effect = _DEFAULT
+    body_points: Effect = _DEFAULT
     random_background: Effect = _DEFAULT
     depth: Effect = _DEFAULT
     hands: Effect = _DEFAULT

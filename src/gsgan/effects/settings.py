@@ -15,6 +15,7 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "antialias": ON_OFF,
     "colour_correction": ON_OFF,
     "segmentation": (*ON_OFF, "body", "hands"),
+    "body_points": ON_OFF,
     "random_background": ON_OFF,
     "depth": ON_OFF,
 }
@@ -32,7 +33,8 @@ class EffectSettings:
         distortion: ``auto``, ``off`` (pictures are taken as a pinhole's), ``undistort`` (or ``on``:
             pictures are undistorted on reading), or ``project`` (pictures stay as taken: Gaussians
             and joints follow the lens).
-        antialias, colour_correction, random_background, depth: ``auto``, ``on``, ``off``.
+        antialias, colour_correction, body_points, random_background, depth: ``auto``, ``on``,
+            ``off``.
         segmentation: ``auto``, ``off``, ``body`` (or ``on``: all parts), ``hands`` (those alone).
         only: names of effects: these are on, all others off, whatever else is said; None: no list.
         impossible: what becomes of a forced effect that this scene cannot have: ``error``, ``off``.
@@ -44,6 +46,7 @@ class EffectSettings:
         colour_errors: standard errors.
         scale_ratio: of pixels a metre.
         dark: brightness in [0, 1].
+        body_inside: share in [0, 1].
         measure: rounds in which a run times each effect that is on before it begins; 0: none.
 
     Raises:
@@ -55,6 +58,7 @@ class EffectSettings:
     antialias: str | bool = AUTO
     colour_correction: str | bool = AUTO
     segmentation: str | bool = AUTO
+    body_points: str | bool = AUTO
     random_background: str | bool = AUTO
     depth: str | bool = AUTO
     only: Sequence[str] | None = None
@@ -67,6 +71,7 @@ class EffectSettings:
     colour_errors: float = 3.0
     scale_ratio: float = 1.3
     dark: float = 0.25
+    body_inside: float = 0.95
     measure: int = 5
 
     def __post_init__(self) -> None:
@@ -78,7 +83,7 @@ class EffectSettings:
             raise ConfigError(f"effects.impossible must be error or off, got {self.impossible!r}")
         for name in (
             *("view_residual", "view_spread", "colour_difference", "colour_share"),
-            *("colour_errors", "dark"),
+            *("colour_errors", "dark", "body_inside"),
         ):
             _at_least(name, getattr(self, name), 0)
         _at_least("scale_ratio", self.scale_ratio, 1)

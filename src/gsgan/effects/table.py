@@ -16,6 +16,7 @@ NAMED = {
     "antialias": "anti-aliasing",
     "colour_correction": "colour correction",
     "segmentation": "segmentation S",
+    "body_points": "points on the body",
     "random_background": "random background",
     "depth": "depth",
     "hands": "finger points",

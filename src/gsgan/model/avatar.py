@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from gsgan.body import open_body
 from gsgan.effects import Effects, EffectSettings, decide
 from gsgan.errors import DataError
+from gsgan.model.body_points import BodyPoints
 from gsgan.model.class_vote import ClassVote, Pictures
 from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import Deformation
@@ -27,6 +28,7 @@ from gsgan.skeleton import (
     MEDIAPIPE33,
     BoneFrames,
     Densify,
+    Points,
     bone_frames,
     draw_skeleton,
     omega,
@@ -94,6 +96,7 @@ class Avatar(nn.Module):
         generator: Callable[..., Generator] | None,
         accuracy: Accuracy,
         surface: Callable[..., SurfaceGaussians] | None = None,
+        body_points: Callable[..., BodyPoints] | None = None,
         twist: Literal["none", "hinge"] = "none",
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
@@ -117,15 +120,19 @@ class Avatar(nn.Module):
         # Each part draws from a seed of its own: leaving one out does not change the others' start.
         seed = torch.initial_seed()
         torch.manual_seed(seed + 1)
-        self.densify = densify
         self.deformation: Deformation | None = None
+        self.densify: Densify | None = None
+        self.body_points: BodyPoints | None = None
         if (deformation is None) != (densify is None):
             raise ValueError("Avatar: densify and deformation go together; got only one of them")
         if densify is not None and deformation is not None:
             if surface is not None:
                 raise ValueError("Avatar: give a deformation or a surface, got both")
+            self.body_points = self._build_body_points(scene, body_points)
+            if self.body_points is None:
+                self.densify = densify
             self.deformation = deformation(
-                rest_points=densify.rest_points,
+                rest_points=(self.body_points or densify).rest_points,
                 body_height=self.body_height,
                 joints=len(self.template.names),
                 sh_degree=self.effects.degree,
@@ -177,6 +184,19 @@ class Avatar(nn.Module):
             )
         degree = self.effects.degree
         return build(body=body, body_height=self.body_height, sh_degree=degree)
+
+    def _build_body_points(
+        self, scene: SceneInfo, build: Callable[..., BodyPoints] | None
+    ) -> BodyPoints | None:
+        if build is None:
+            self.effects = self.effects.without("body_points", "the model leaves them out")
+        if build is None or not self.effects.body_points.on:
+            return None
+        body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
+        if body is None:
+            self.effects = self.effects.without("body_points", "the body has no mesh here")
+            return None
+        return build(body=body, body_height=self.body_height)
 
     def _build_segmentation(
         self,
@@ -299,14 +319,23 @@ class Avatar(nn.Module):
                 raise ValueError("Avatar: this model's Gaussians sit on the body; give its pose")
             with self.stage("surface"):
                 return self.surface(body, camera.centre)
-        if self.densify is None or self.deformation is None:
+        if self.deformation is None:
             return None
         with self.stage("densify"):
-            points = self.densify(p, valid, frames)  # Alg. 1: G
+            points = self.place(p, valid, frames, body)
         with self.stage("Ψ"):
             return self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
                 p, points, camera.centre, frames.hubs[:, 0], pose_noise
             )
+
+    def place(self, p: Tensor, valid: Tensor, frames: BoneFrames, body: BodyPose | None) -> Points:
+        """G: on the body's surface where this scene has one that fits, else by Alg. 1."""
+        if self.body_points is not None:
+            if body is None:
+                raise ValueError("Avatar: this model's points sit on the body; give its pose")
+            return self.body_points(body)
+        assert self.densify is not None
+        return self.densify(p, valid, frames)
 
     def paint(self, frame: Frame) -> Painting:
         """The whole picture of a frame of a dataset: its window painted, background around it."""
@@ -373,7 +402,7 @@ class Avatar(nn.Module):
 def _possible(effects: Effects, densifies: bool, on_surface: bool) -> Effects:
     """Without the effects on points and Gaussians that this model does not have."""
     if not densifies:
-        for name in ("hands", "face"):
+        for name in ("body_points", "hands", "face"):
             effects = effects.without(name, "this model puts no points on the skeleton")
     if densifies or on_surface:
         return effects

@@ -176,6 +176,7 @@ class Deformation(nn.Module):
         if residuals.sh.shape[-2] > 1:
             view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
             view = (frames.mT @ view.unsqueeze(-1)).squeeze(-1)
+            view = functional.normalize(view, dim=-1, eps=1e-6)  # frames of a skinned body shear
         colour = functional.relu(sh_to_colour(residuals.sh, view))
         return Gaussians(
             means=means,

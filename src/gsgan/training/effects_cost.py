@@ -17,7 +17,14 @@ from gsgan.runs import build_avatar
 from gsgan.scene import Frame
 from gsgan.timing import interleaved, median
 
-IN_THE_MODEL = ("view_dependence", "antialias", "colour_correction", "segmentation", "depth")
+IN_THE_MODEL = (
+    "view_dependence",
+    "antialias",
+    "colour_correction",
+    "segmentation",
+    "body_points",
+    "depth",
+)
 
 
 def training_device(accelerator: str) -> torch.device:

@@ -1,0 +1,66 @@
+"""G on a skinned body: fixed points of its surface, where the data has a pose that fits."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from gsgan.body import SkinnedBody
+from gsgan.model.skinned_points import SkinnedPoints
+from gsgan.scene import BodyPose
+from gsgan.skeleton import Points
+
+
+class BodyPoints(nn.Module):
+    """Takes the place of densify: each point rides on its vertex by linear blend skinning.
+
+    A body pose says what 33 landmarks cannot: how the trunk bends and forearms turn. Ψ then has to
+    learn shape, colour and what changes with the pose, not where the surface is.
+
+    Args:
+        body: vertices, weights and joints.
+        body_height: metres, the length scale of Ψ's input.
+        points: vertices used, spread evenly over the surface; None for all.
+        sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
+
+    Source: ours; the paper's G is Alg. 1's (`gsgan.skeleton.Densify`).
+    """
+
+    rest_points: Tensor
+    part_id: Tensor
+
+    def __init__(
+        self,
+        body: SkinnedBody,
+        body_height: float,
+        *,
+        points: int | None = None,
+        sigma: float = 0.7,
+    ) -> None:
+        super().__init__()
+        self.points, self.sigma = SkinnedPoints(body, points), sigma
+        rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
+        self.register_buffer("rest_points", rest, persistent=False)
+        self.register_buffer("part_id", torch.arange(len(self.points)), persistent=False)
+
+    @property
+    def n_points(self) -> int:
+        """N."""
+        return len(self.points)
+
+    def forward(self, pose: BodyPose) -> Points:
+        """G in pose; each point is a part of its own, its frame the linear part of its skinning.
+
+        Args:
+            pose: B poses of the body.
+        """
+        A, t = self.points.blend(pose)
+        scales = (self.sigma * self.points.spacing).expand(len(A), -1)
+        return Points(
+            means=(A @ self.points.means.unsqueeze(-1)).squeeze(-1) + t,
+            rotations=A,
+            origins=t,
+            scales=scales,
+            valid=torch.ones_like(scales, dtype=torch.bool),
+            part_id=self.part_id,
+        )

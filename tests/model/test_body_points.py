@@ -1,0 +1,135 @@
+"""G on a skinned body: where the points are, that nothing else is built, and that Ψ learns there."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gsgan.body import open_body
+from gsgan.data.surface_colours import body_inside
+from gsgan.effects import EffectSettings, decide
+from gsgan.errors import ConfigError
+from gsgan.model.body_points import BodyPoints
+from gsgan.scene import BodyPose
+
+ON = "effects.body_points=on"
+
+
+@pytest.fixture(scope="module")
+def body():
+    return open_body("free", None, ())
+
+
+def rest(body, batch: int = 1) -> BodyPose:
+    return BodyPose(torch.zeros(batch, len(body.joints), 3), torch.zeros(batch, 3))
+
+
+def test_at_rest_the_points_are_vertices_and_their_frames_the_worlds(body):
+    placed = BodyPoints(body, 1.7, points=200)
+    points = placed(rest(body, 2))
+    chosen = placed.points.chosen
+    assert points.means.shape == (2, 200, 3)
+    assert placed.n_points == len(chosen.unique()) == 200
+    torch.testing.assert_close(points.means[1], body.vertices[chosen].float())
+    torch.testing.assert_close(points.frames, torch.eye(3).expand(2, 200, 3, 3))
+
+
+def test_a_turned_body_turns_points_and_frames(body):
+    placed = BodyPoints(body, 1.7, points=200)
+    pose = rest(body)
+    theta = pose.theta.clone()
+    theta[0, 0, 2] = torch.pi / 2  # the root, about the world's z
+    before, after = placed(pose), placed(replace(pose, theta=theta))
+    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    torch.testing.assert_close(after.frames[0, 7], quarter, atol=1e-6, rtol=0)
+    between = before.means[0] - before.means[0, :1]
+    torch.testing.assert_close(
+        after.means[0] - after.means[0, :1], between @ quarter.mT, atol=1e-5, rtol=0
+    )
+
+
+def test_on_the_body_nothing_is_densified_and_off_it_no_body_is_built(build):
+    _, avatar, frame = build(ON)
+    assert avatar.densify is None
+    painting = avatar.paint(frame)
+    assert painting.gaussians.means.shape[1] == avatar.body_points.n_points == 500
+    _, plain, frame = build("effects.body_points=off")
+    assert plain.body_points is None
+    assert plain.paint(frame).gaussians.means.shape[1] == plain.densify.n_points
+
+
+def test_untrained_gaussians_sit_on_the_surface(build):
+    _, avatar, frame = build(ON)
+    means = avatar.paint(frame).gaussians.means
+    torch.testing.assert_close(means, avatar.body_points(frame.body).means)
+
+
+def test_psi_gets_finite_gradients_through_sheared_frames(build):
+    _, avatar, frame = build(ON, "effects.view_dependence=2")
+    avatar.paint(frame).features[:, :3].square().mean().backward()
+    grads = [p.grad for p in avatar.deformation.parameters() if p.grad is not None]
+    assert grads
+    assert all(torch.isfinite(g).all() for g in grads)
+    assert float(avatar.deformation.table.grad.abs().max()) > 0
+
+
+def test_without_the_frames_body_pose_it_says_what_is_missing(build):
+    _, avatar, frame = build(ON)
+    with pytest.raises(ValueError, match="sit on the body; give its pose"):
+        avatar.paint(replace(frame, body=None))
+
+
+@pytest.mark.parametrize("model", ["image_to_image", "lbs_splat"])
+def test_models_without_psi_refuse_it_in_one_sentence(build, model):
+    with pytest.raises(ConfigError, match=r"effects\.body_points=on is not possible"):
+        build(ON, f"model={model}")
+
+
+@pytest.mark.parametrize(
+    ("inside", "value", "why"),
+    [
+        (1.0, "on", "100 % of the posed body"),
+        (0.95, "on", "95 %"),
+        (0.9, "off", "the skeleton is trusted more"),
+        (None, "off", "mesh is not at hand"),
+    ],
+)
+def test_auto_trusts_a_pose_that_fits_the_masks(build, inside, value, why):
+    data, _, _ = build()
+    effect = decide(replace(data.info, body_inside=inside), EffectSettings()).body_points
+    assert effect.value == value
+    assert why in effect.why
+
+
+def test_without_a_body_pose_it_is_off_and_forcing_it_an_error(build):
+    data, _, _ = build()
+    bare = replace(data.info, has_body_pose=False)
+    assert not decide(bare, EffectSettings()).body_points.on
+    with pytest.raises(ConfigError, match="the data has no body pose"):
+        decide(bare, EffectSettings(body_points="on"))
+
+
+def test_a_fitting_body_lies_in_its_mask_and_a_shifted_one_leaves_it(body):
+    from gsgan.data.synthetic.scenes import ensure_scene
+
+    frame = synthetic_frame(ensure_scene)
+    exact = body_inside(frame, body)
+    pose = frame.body
+    away = replace(frame, body=replace(pose, transl=pose.transl + torch.tensor([0.3, 0.3, 0])))
+    gone = replace(frame, body=replace(pose, transl=pose.transl + torch.tensor([0, 0, 50.0])))
+    assert exact > 0.99
+    assert body_inside(away, body) < 0.8
+    assert body_inside(gone, body) is None
+
+
+def synthetic_frame(ensure_scene):
+    from gsgan.data.datamodule import GsganData
+
+    root = ensure_scene(
+        size=64, train_cameras=2, test_cameras=0, frames=2, test_frames=0, rays_per_pixel=1,
+        workers=1, progress=False,
+    )  # fmt: skip
+    data = GsganData(root=root, size=64)
+    return data.dataset("train")[0]
