@@ -1,4 +1,4 @@
-"""G on a skinned body: where the points are, that nothing else is built, and that Ψ learns there."""
+"""G on a skinned body: where the points are, that nothing else is built, that Ψ learns there."""
 
 from __future__ import annotations
 
@@ -133,3 +133,11 @@ def synthetic_frame(ensure_scene):
     )  # fmt: skip
     data = GsganData(root=root, size=64)
     return data.dataset("train")[0]
+
+
+def test_low_pass_is_the_models_for_F_and_S_whatever_the_accuracy(build):
+    _, avatar, _ = build("accuracy=draft")
+    assert avatar.accuracy.low_pass == avatar.segmentation.accuracy.low_pass == 0.0833
+    assert avatar.accuracy.name == "draft"
+    _, usual, _ = build("model.low_pass=null")
+    assert usual.accuracy.low_pass == usual.segmentation.accuracy.low_pass == 0.3

@@ -68,6 +68,7 @@ class Avatar(nn.Module):
         pose_encoder: Ω (or the flat skeleton) to g; None in ``splat_only``.
         generator: the UNet, given its channel counts; None makes Step I's colour the picture.
         accuracy: the rasteriser's settings for F.
+        low_pass: square pixels that F and S add to every ellipse; None keeps their accuracy's.
         twist: how bone frames turn about their bones, ``none`` or ``hinge``.
         window_margin: metres round the joints that are painted; None paints whole pictures.
         window_multiple: the window's sides are multiples of so many pixels.
@@ -97,6 +98,7 @@ class Avatar(nn.Module):
         accuracy: Accuracy,
         surface: Callable[..., SurfaceGaussians] | None = None,
         body_points: Callable[..., BodyPoints] | None = None,
+        low_pass: float | None = None,
         twist: Literal["none", "hinge"] = "none",
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
@@ -109,9 +111,9 @@ class Avatar(nn.Module):
         super().__init__()
         self.effects = decide(scene, EffectSettings()) if effects is None else effects
         self.effects = _possible(self.effects, densify is not None, surface is not None)
-        if self.effects.antialias.on:
-            accuracy = replace(accuracy, antialias=True)
-        self.template, self.accuracy, self.twist = MEDIAPIPE33, accuracy, twist
+        self.low_pass = low_pass
+        self.accuracy = self._image_formation(accuracy)
+        self.template, self.twist = MEDIAPIPE33, twist
         self.window_margin = window_margin
         self.window_multiple, self.window_least = window_multiple, window_least
         self.limb_sum = float(scene.body_height)
@@ -220,9 +222,14 @@ class Avatar(nn.Module):
         said = replace(wanted, value=mode, why=f"{wanted.why}; {why}")
         self.effects = replace(self.effects, segmentation=said)
         built = build(body=body, mode=mode)
-        if self.effects.antialias.on:
-            built.accuracy = replace(built.accuracy, antialias=True)
+        built.accuracy = self._image_formation(built.accuracy)
         return built
+
+    def _image_formation(self, accuracy: Accuracy) -> Accuracy:
+        """How pixels are formed is the model's and the scene's, whatever may be left out."""
+        low_pass = accuracy.low_pass if self.low_pass is None else self.low_pass
+        antialias = accuracy.antialias or self.effects.antialias.on
+        return replace(accuracy, low_pass=low_pass, antialias=antialias)
 
     def forward(
         self,
