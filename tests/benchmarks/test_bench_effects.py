@@ -111,10 +111,10 @@ def bench(compose):
 
 def test_the_default_person_without_effects_is_trained_once(bench):
     todo = list(effects.cells(bench()))
-    assert len(todo) == 8
+    assert len(todo) == 9
     names = [t.name for cell in todo for t in cell.runs.values()]
     assert names.count("default-off") == 3
-    assert len(set(names)) == 12
+    assert len(set(names)) == 14
     assert [c.row.effect for c in todo if not c.runs] == ["distortion"]
     for cell in todo:
         if cell.runs:
@@ -134,7 +134,7 @@ def test_only_some_and_not_on_the_default_person(bench):
 
 def test_without_training_only_auto_is_asked(bench, capture):
     todo = list(effects.cells(bench("train=false", f"real={capture}")))
-    assert len(todo) == 9
+    assert len(todo) == 10
     assert not any(c.runs for c in todo)
 
 

@@ -146,6 +146,8 @@ def cells(bench: EffectsBench) -> Iterator[Cell]:
         case = bench.cases[effect]
         on = f"effects.{effect}={case.word}"
         yield _cell(bench, Row(effect, effect, True, None, "", case.split), case.scene, on)
+        if not case.scene:
+            continue  # the default person calls for it
         row = Row(effect, DEFAULT, False, None, "", case.split)
         runs = {"off": plain, "on": Training(f"default-{effect}", (*bench.base, on))}
         yield Cell(row, [], runs if bench.train and bench.default and case.elsewhere else {})
