@@ -23,8 +23,13 @@ SMALL_BENCH = {
     "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
     "trade-off": [
         "base=[" + ",".join(f"'{w}'" for w in [*TINY, "data.root=/path/to/capture"]) + "]",
-        *(f"factors.{f}=null" for f in ("points_per_limb", "channels_of_F", "generator_width")),
-        *("factors.model=null", "settings.accuracies=[draft]", "settings.scales=[0.5]"),
+        *(f"factors.{f}=null" for f in ("points_on_body", "points_per_limb", "channels_of_F")),
+        *(
+            "factors.generator_width=null",
+            "factors.model=null",
+            "settings.accuracies=[draft]",
+            "settings.scales=[0.5]",
+        ),
         *("settings.backends=[]", "repeats=1", "pictures=1"),
     ],
     "effects": [

@@ -28,7 +28,10 @@ HEAD = "epoch,step,val/psnr,val/psnr_splat,val/seconds\n"
 SMALL = ["repeats=1", "pictures=2", "settings.accuracies=[draft]", "settings.scales=[0.5]"]
 NO_FACTORS = [
     f"factors.{name}=null"
-    for name in ("points_per_limb", "channels_of_F", "generator_width", "model")
+    for name in (
+        *("points_on_body", "points_per_limb"),
+        *("channels_of_F", "generator_width", "model"),
+    )
 ]
 
 
@@ -94,6 +97,8 @@ def test_a_sweep_changes_one_thing_at_a_time(tmp_path):
     assert [p.name for p in points] == ["base", "size of it 1", "size of it x/y"]
     assert points[2].words == ("p=q", "a.b=x/y")
     assert points[2].folder == tmp_path / "size_of_it-x_y"
+    beside = {"n": {"key": "a", "values": [1], "also": ["b=2"]}}
+    assert sweep(["p=q"], beside, tmp_path)[1].words == ("p=q", "b=2", "a=1")
 
 
 @pytest.mark.parametrize(

@@ -65,17 +65,17 @@ def sweep(base: Sequence[str], factors: Mapping[str, Any], folder: Path) -> list
     """The base point, and each factor's values one at a time; a factor that is None is left out.
 
     Raises:
-        ConfigError: when a factor has no ``key`` and ``values``, or two points would share a
+        ConfigError: when a factor has more than ``key``, ``values`` and ``also``, or two points would share a
             folder.
     """
     found = [Trained(BASE, BASE, tuple(base), folder / BASE)]
     for name, choice in factors.items():
         if choice is None:
             continue
-        if not isinstance(choice, Mapping) or set(choice) != {"key", "values"}:
+        if not isinstance(choice, Mapping) or set(choice) - {"also"} != {"key", "values"}:
             raise ConfigError(f"factors.{name} must have a key and values, got {choice!r}")
         for value in choice["values"]:
-            words = (*base, f"{choice['key']}={value}")
+            words = (*base, *choice.get("also", ()), f"{choice['key']}={value}")
             place = re.sub(r"[^\w.-]+", "_", f"{name}-{value}")
             found.append(Trained(name.replace("_", " "), str(value), words, folder / place))
     folders = [point.folder for point in found]
