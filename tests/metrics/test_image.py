@@ -13,6 +13,7 @@ from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMe
 from gsgan.metrics.image import (
     edge_f1,
     edge_ratio,
+    edge_scores,
     high_frequencies,
     person_box,
     psnr,
@@ -194,3 +195,33 @@ def test_edge_ratio_counts_opencvs_edge_pixels():
     ]
     counts = [int(np.count_nonzero(cv2.Canny(g, 100, 200))) for g in grey]
     assert float(edge_ratio(image, target)) == pytest.approx(counts[0] / counts[1], abs=1e-9)
+
+
+def test_edges_in_the_persons_box_leave_out_those_elsewhere():
+    image, target = square(6), square(6)
+    image[..., 26:34, 26:34] = 1.0  # an edge that the truth lacks, outside the box
+    where = torch.zeros(1, 1, 40, 40, dtype=torch.bool)
+    where[..., 4:20, 4:20] = True
+    f1, ratio = edge_scores(image, target, where)
+    assert float(f1) == float(ratio) == 1.0
+    assert float(edge_f1(image, target)) < 0.9
+    assert float(edge_ratio(image, target)) > 1.3
+    f1, ratio = edge_scores(image, target, torch.zeros_like(where))
+    assert math.isnan(float(f1))
+    assert math.isnan(float(ratio))
+
+
+def test_edges_counted_everywhere_are_the_whole_pictures():
+    image, target = pair()
+    everywhere = torch.ones(len(image), 1, *image.shape[-2:], dtype=torch.bool)
+    for whole, inside in zip(
+        edge_scores(image, target), edge_scores(image, target, everywhere), strict=True
+    ):
+        assert torch.equal(whole, inside)
+
+
+def test_an_edge_at_the_boxs_border_may_match_one_just_outside():
+    image, target = square(6), square(7)  # one pixel off, within the tolerance
+    where = torch.zeros(1, 1, 40, 40, dtype=torch.bool)
+    where[..., 7:19, 7:19] = True
+    assert float(edge_scores(image, target, where)[0]) == 1.0

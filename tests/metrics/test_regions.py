@@ -105,3 +105,18 @@ def test_the_crop_shrinks_as_opencv_interpolates():
     part = picture[:, 6:34, 8:36].permute(1, 2, 0).numpy()
     expected = cv2.resize(np.ascontiguousarray(part), (16, 16), interpolation=cv2.INTER_LINEAR)
     assert np.abs(square.permute(1, 2, 0).numpy() - expected).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("box", "least", "expected"),
+    [
+        ((10, 14, 20, 30), 1, (slice(10, 14), slice(20, 30))),
+        ((10, 14, 20, 30), 16, (slice(4, 20), slice(17, 33))),
+        ((0, 4, 36, 40), 16, (slice(0, 16), slice(24, 40))),  # pushed in at the border
+        ((10, 14, 20, 30), 64, (slice(0, 40), slice(0, 40))),  # as far as the picture reaches
+    ],
+)
+def test_a_rectangle_is_widened_as_asked(box, least, expected):
+    where = torch.zeros(1, 40, 40, dtype=torch.bool)
+    where[:, box[0] : box[1], box[2] : box[3]] = True
+    assert rectangle(where, least) == expected

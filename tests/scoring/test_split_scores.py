@@ -153,7 +153,9 @@ def test_every_split_has_every_metric_or_a_reason():
             "psnr",
             "ssim_person",
             "lpips",
+            "lpips_person",
             "edge_ratio",
+            "edge_f1_person",
             "miou",
             "miou_with_background",
         ):
@@ -199,3 +201,23 @@ def test_miou_of_a_split_without_parts_is_none():
     )
     assert scores.compute()["miou"] is None
     assert scores.compute()["miou_reason"]
+
+
+def test_lpips_in_the_persons_box_sees_that_box_alone():
+    seen = []
+
+    def spy(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        seen.append(tuple(image.shape))
+        return (image - target).abs().flatten(1).mean(dim=1)
+
+    scores = PictureScores(spy, "")
+    target, mask = torch.zeros(2, 3, 100, 120), torch.zeros(2, 1, 100, 120)
+    mask[0, :, 10:90, 20:50] = 1  # the second picture shows nobody
+    image = target.clone()
+    image[:, :, :, 90:] = 1.0  # wrong, but far from the person
+    scores.update(image, target, mask)
+    assert seen == [(2, 3, 100, 120), (1, 3, 80, 64)]  # 30 columns, widened to 64
+    result = scores.compute()
+    assert result["lpips"] == pytest.approx(0.25)
+    assert result["lpips_person"] == 0.0
+    assert result["lpips_person_left_out"] == 1

@@ -65,8 +65,8 @@ def sweep(base: Sequence[str], factors: Mapping[str, Any], folder: Path) -> list
     """The base point, and each factor's values one at a time; a factor that is None is left out.
 
     Raises:
-        ConfigError: when a factor has more than ``key``, ``values`` and ``also``, or two points would share a
-            folder.
+        ConfigError: when a factor is not made of ``key``, ``values`` and perhaps ``also``, or two
+            points would share a folder.
     """
     found = [Trained(BASE, BASE, tuple(base), folder / BASE)]
     for name, choice in factors.items():

@@ -164,13 +164,28 @@ def edge_ratio(image: Tensor, target: Tensor, *, low: float = 100.0, high: float
 
 
 def edge_scores(
-    image: Tensor, target: Tensor, *, low: float = 100.0, high: float = 200.0, tolerance: int = 1
+    image: Tensor,
+    target: Tensor,
+    where: Tensor | None = None,
+    *,
+    low: float = 100.0,
+    high: float = 200.0,
+    tolerance: int = 1,
 ) -> tuple[Tensor, Tensor]:
-    """`edge_f1` and `edge_ratio` with the edges found once."""
+    """`edge_f1` and `edge_ratio` with the edges found once.
+
+    Args:
+        image, target: pictures.
+        where: ``[B, 1, H, W]`` bool: edges of the whole pictures, those in here counted.
+        low, high, tolerance: see `edge_f1`.
+    """
     f1, ratio = [], []
-    for a, b in zip(image, target, strict=True):
+    for i, (a, b) in enumerate(zip(image, target, strict=True)):
         edges, truth = canny(a, low, high), canny(b, low, high)
-        f1.append(_edge_f1(edges, truth, tolerance))
+        inside = None if where is None else where[i, 0].cpu().numpy()
+        f1.append(_edge_f1(edges, truth, tolerance, inside))
+        if inside is not None:
+            edges, truth = edges & inside, truth & inside
         ratio.append(float(edges.sum() / truth.sum()) if truth.any() else float("nan"))
     return torch.tensor(f1, dtype=torch.float64), torch.tensor(ratio, dtype=torch.float64)
 
@@ -181,14 +196,18 @@ def canny(picture: Tensor, low: float = 100.0, high: float = 200.0) -> np.ndarra
     return cv2.Canny(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), low, high) > 0
 
 
-def _edge_f1(edges: np.ndarray, truth: np.ndarray, tolerance: int) -> float:
+def _edge_f1(
+    edges: np.ndarray, truth: np.ndarray, tolerance: int, inside: np.ndarray | None = None
+) -> float:
+    kernel = np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
+    near_truth = cv2.dilate(truth.astype(np.uint8), kernel) > 0
+    near_edges = cv2.dilate(edges.astype(np.uint8), kernel) > 0
+    if inside is not None:
+        edges, truth = edges & inside, truth & inside
     if not truth.any():
         return float("nan")
     if not edges.any():
         return 0.0
-    kernel = np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
-    near_truth = cv2.dilate(truth.astype(np.uint8), kernel) > 0
-    near_edges = cv2.dilate(edges.astype(np.uint8), kernel) > 0
     precision = (edges & near_truth).sum() / edges.sum()
     recall = (truth & near_edges).sum() / truth.sum()
     total = precision + recall

@@ -53,12 +53,26 @@ def cleared(image: Tensor, keep: Tensor, background: float) -> Tensor:
     return torch.where(keep, image, image.new_tensor(background))
 
 
-def rectangle(where: Tensor) -> tuple[slice, slice] | None:
-    """Rows and columns of the smallest rectangle that holds ``where [1, H, W]``; None if empty."""
+def rectangle(where: Tensor, least: int = 1) -> tuple[slice, slice] | None:
+    """Rows and columns of the smallest rectangle that holds ``where [1, H, W]``; None if empty.
+
+    Args:
+        where: bool.
+        least: pixels, its least side, as far as the picture reaches.
+    """
     rows, columns = (where[0].any(dim=d).nonzero().flatten().tolist() for d in (1, 0))
     if not rows:
         return None
-    return slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+    height, width = where.shape[-2:]
+    return _widened(rows[0], rows[-1] + 1, height, least), _widened(
+        columns[0], columns[-1] + 1, width, least
+    )
+
+
+def _widened(start: int, stop: int, size: int, least: int) -> slice:
+    side = min(max(stop - start, least), size)
+    start = min(max(start - (side - (stop - start)) // 2, 0), size - side)
+    return slice(start, start + side)
 
 
 def mask_crop(

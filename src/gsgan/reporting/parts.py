@@ -114,7 +114,11 @@ def _origin(runs: Sequence[Run]) -> str:
 
 
 def _heading(metric: str, runs: Sequence[Run], split: str) -> str:
-    named = common(lpips_name(run, split) or "" for run in runs) if metric == "lpips" else ""
+    if not metric.startswith("lpips"):
+        return heading(metric)
+    named = common(lpips_name(run, split) or "" for run in runs)
+    if metric == "lpips_person" and named:  # of the box, whatever region the protocol's LPIPS has
+        named = f"{named.split(' mask crop')[0]} in box"
     return f"{named} {METRICS[metric].better}" if named else heading(metric)
 
 

@@ -16,6 +16,7 @@ from gsgan.metrics.image import (
     Score,
     edge_scores,
     high_frequencies,
+    person_box,
     psnr,
     psnr_person,
     psnr_where,
@@ -27,11 +28,12 @@ from gsgan.metrics.regions import BACKGROUNDS, cleared, mask_crop, rectangle
 from gsgan.model.segmentation import IGNORE
 
 PICTURE_METRICS = (
-    *("psnr", "psnr_person", "ssim", "ssim_person", "lpips"),
-    *("edge_f1", "edge_ratio", "high_frequencies"),
+    *("psnr", "psnr_person", "ssim", "ssim_person", "lpips", "lpips_person"),
+    *("edge_f1", "edge_f1_person", "edge_ratio", "edge_ratio_person", "high_frequencies"),
 )
 PART_METRICS = ("miou", "miou_with_background")
 METRICS = (*PICTURE_METRICS, *PART_METRICS)
+LPIPS_LEAST = 64  # pixels: AlexNet's last map is empty below
 Place = tuple[str, int]  # camera name, frame number
 
 
@@ -103,8 +105,12 @@ class PictureScores:
         if mask is not None:
             scores["psnr_person"] = psnr_person(image, target, mask)
             scores["ssim_person"] = ssim_person(image, target, mask)
+            inside = edge_scores(image, target, person_box(mask))
+            scores["edge_f1_person"], scores["edge_ratio_person"] = inside
         if self.lpips is not None:
             scores["lpips"] = self._lpips(image, target, mask)
+            if mask is not None:
+                scores["lpips_person"] = self._lpips_person(image, target, mask)
         values = {name: score.double().tolist() for name, score in scores.items()}
         for i, (camera, frame) in enumerate(places or [("", 0)] * len(image)):
             row = {name: values[name][i] for name in PICTURE_METRICS if name in values}
@@ -151,6 +157,21 @@ class PictureScores:
                 scores.append(self.lpips(crops[0][None], crops[1][None])[0])
         return torch.stack(scores)
 
+    def _lpips_person(self, image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+        """LPIPS of the person's box, made as large as the backbone needs; NaN without one."""
+        assert self.lpips is not None
+        if self.measures.lpips_channels == "bgr":
+            image, target = image.flip(1), target.flip(1)
+        scores = []
+        for i, box in enumerate(person_box(mask)):
+            part = rectangle(box, LPIPS_LEAST)
+            if part is None:
+                scores.append(image.new_tensor(torch.nan))
+                continue
+            a, b = (x[i : i + 1, :, part[0], part[1]] for x in (image, target))
+            scores.append(self.lpips(a, b)[0])
+        return torch.stack(scores)
+
     def compute(self) -> dict[str, Any]:
         """``{metric: value or None, metric_reason: …}``; scores left out are counted."""
         result: dict[str, Any] = {}
@@ -161,7 +182,7 @@ class PictureScores:
                 result[f"{name}_left_out"] = mean.left_out
             if mean.value is None:
                 no_score = "no picture had a finite score" if mean.left_out else "no picture"
-                missing = self.lpips_reason if name == "lpips" else ""
+                missing = self.lpips_reason if name.startswith("lpips") else ""
                 result[f"{name}_reason"] = missing or no_score
         return result
 

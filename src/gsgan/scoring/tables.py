@@ -19,16 +19,23 @@ HEADINGS = {
     "ssim": "SSIM ↑",
     "ssim_person": "SSIM in box ↑",
     "lpips": "LPIPS ↓",
+    "lpips_person": "LPIPS in box ↓",
     "edge_f1": "edge F1 ↑",
+    "edge_f1_person": "edge F1 in box ↑",
     "edge_ratio": "edges →1",
+    "edge_ratio_person": "edges in box →1",
     "high_frequencies": "detail →1",
     "miou": "mIoU ↑",
     "miou_with_background": "with background ↑",
 }
-IN_TERMINAL = tuple(m for m in METRICS if m not in ("ssim_person", "miou_with_background"))
+NOT_IN_TERMINAL = (  # a narrow one; metrics.md has them all
+    *("ssim_person", "lpips_person", "edge_f1_person", "edge_ratio_person"),
+    "miou_with_background",
+)
+IN_TERMINAL = tuple(m for m in METRICS if m not in NOT_IN_TERMINAL)
 _DIGITS = {
-    "psnr": 2, "psnr_person": 2, "ssim": 4, "ssim_person": 4, "lpips": 4, "edge_f1": 3,
-    "edge_ratio": 2, "high_frequencies": 2, "miou": 3, "miou_with_background": 3,
+    "psnr": 2, "psnr_person": 2, "ssim": 4, "ssim_person": 4, "lpips": 4, "lpips_person": 4,
+    "edge_f1": 3, "edge_f1_person": 3, "edge_ratio": 2, "edge_ratio_person": 2, "high_frequencies": 2, "miou": 3, "miou_with_background": 3,
 }  # fmt: skip
 _VARIANTS = {
     "full": "picture",
@@ -78,7 +85,8 @@ def notes(results: Results) -> list[str]:
             found[f"{split}: {scored['psnr_reason']}"] = None
             continue
         for metric in METRICS:
-            if metric != "miou_with_background" and scored[metric] is None:
+            said = metric in ("miou_with_background", "lpips_person")  # beside the whole's
+            if not said and scored[metric] is None:
                 found[f"{metric} n/a: {scored[f'{metric}_reason']}"] = None
     return list(found)
 
