@@ -35,7 +35,8 @@ NOT_IN_TERMINAL = (  # a narrow one; metrics.md has them all
 IN_TERMINAL = tuple(m for m in METRICS if m not in NOT_IN_TERMINAL)
 _DIGITS = {
     "psnr": 2, "psnr_person": 2, "ssim": 4, "ssim_person": 4, "lpips": 4, "lpips_person": 4,
-    "edge_f1": 3, "edge_f1_person": 3, "edge_ratio": 2, "edge_ratio_person": 2, "high_frequencies": 2, "miou": 3, "miou_with_background": 3,
+    "edge_f1": 3, "edge_f1_person": 3, "edge_ratio": 2, "edge_ratio_person": 2,
+    "high_frequencies": 2, "miou": 3, "miou_with_background": 3,
 }  # fmt: skip
 _VARIANTS = {
     "full": "picture",
