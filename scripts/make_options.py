@@ -26,6 +26,7 @@ ORDER = (
     "figures",
     "bench_raster",
     "bench_stability",
+    "bench_rays",
     "bench_loader",
     "bench_speed",
     "bench_trade_off",

@@ -18,6 +18,12 @@ def test_options_page_is_up_to_date():
     assert done.returncode == 0, "run .venv/bin/python scripts/make_options.py"
 
 
+def test_options_page_shows_every_config():
+    page, conf = (ROOT / "docs" / "options.md").read_text(), ROOT / "conf"
+    for path in conf.rglob("*.yaml"):
+        assert f"\n## {path.relative_to(conf).with_suffix('')}\n" in page
+
+
 @pytest.mark.parametrize(
     "page", ["README.md", *(f"docs/{p.name}" for p in sorted((ROOT / "docs").glob("*.md")))]
 )

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 DISCRIMINATOR_SALT = 1000
 CHECKPOINT = Path("checkpoints") / "last.ckpt"
+ON_THE_BODY = ("segmentation", "body_points")  # effects that need the body's mesh
 # What may differ between a run and its continuation: where and how it runs, not what it learns.
 FREE_KEYS = (
     *("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips"),
@@ -208,7 +209,8 @@ def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avat
     """The trained avatar of a run folder, in eval mode, and the marks its tables must carry.
 
     Raises:
-        DataError: when the checkpoint is missing, damaged, or of another model.
+        DataError: when the checkpoint is missing, damaged, or of another model, or when the data
+            lacks what the model was built with.
     """
     path = folder / CHECKPOINT
     checkpoint = read_checkpoint(path)
@@ -221,6 +223,8 @@ def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avat
     decided = checkpoint["gsgan"].get("effects")
     effects = None if decided is None else Effects.from_plain(decided)
     avatar = build_avatar(config, data, state.get("segmentation.vertex_labels"), effects)
+    if effects is not None:
+        _check_body(folder, effects, avatar.effects)
     try:
         avatar.load_state_dict(state)
     except RuntimeError as error:
@@ -228,3 +232,14 @@ def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avat
             f"{path}: its weights do not fit the config beside it ({folder / '.hydra'})"
         ) from error
     return avatar.eval(), list(checkpoint["gsgan"]["marks"])
+
+
+def _check_body(folder: Path, trained: Effects, built: Effects) -> None:
+    """Refuses to load what was trained on a body whose model file is no longer given."""
+    for name in ON_THE_BODY:
+        if getattr(trained, name).on and not getattr(built, name).on:
+            raise DataError(
+                f"{folder}: trained with effects.{name}={getattr(trained, name).value}, which "
+                f"cannot be built now: {getattr(built, name).why}; set data.smpl in "
+                f"{folder / '.hydra' / 'config.yaml'} to the model file"
+            )

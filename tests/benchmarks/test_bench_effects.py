@@ -113,8 +113,8 @@ def test_the_default_person_without_effects_is_trained_once(bench):
     todo = list(effects.cells(bench()))
     assert len(todo) == 9
     names = [t.name for cell in todo for t in cell.runs.values()]
-    assert names.count("default-off") == 3
-    assert len(set(names)) == 14
+    assert names.count("default-off") == 4
+    assert len(set(names)) == 13
     assert [c.row.effect for c in todo if not c.runs] == ["distortion"]
     for cell in todo:
         if cell.runs:

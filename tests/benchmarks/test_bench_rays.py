@@ -22,7 +22,9 @@ def test_more_rays_come_nearer_to_the_truth(compose, tmp_path):
     assert f"| 16 | {many['psnr']:.1f} |" in page.read_text()
 
 
-@pytest.mark.parametrize("wrong", ["rays=[]", "rays=[36]", "docs=/not/there.md"])
+@pytest.mark.parametrize(
+    "wrong", ["rays=[]", "rays=[36]", "rays=4", "rays=[1.5]", "docs=/not/there.md"]
+)
 def test_what_makes_no_sense_is_refused_before_tracing(compose, tmp_path, wrong):
     with pytest.raises(ConfigError, match=wrong.split("=")[0]):
         run(compose("bench_rays", *SMALL, wrong), tmp_path)

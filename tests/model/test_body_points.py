@@ -10,9 +10,10 @@ import torch
 from gsgan.body import open_body
 from gsgan.data.surface_colours import body_inside
 from gsgan.effects import EffectSettings, decide
-from gsgan.errors import ConfigError
+from gsgan.errors import ConfigError, DataError
 from gsgan.model.body_points import BodyPoints
-from gsgan.scene import BodyPose
+from gsgan.runs import CHECKPOINT, build_training, load_avatar
+from gsgan.scene import BodyPose, cat
 
 ON = "effects.body_points=on"
 
@@ -75,6 +76,89 @@ def test_psi_gets_finite_gradients_through_sheared_frames(build):
     assert float(avatar.deformation.table.grad.abs().max()) > 0
 
 
+def test_poses_of_a_batch_do_not_mix(build):
+    data, avatar, frame = build(ON, "effects.view_dependence=1")
+    other = data.dataset("train")[5]
+    with torch.no_grad():
+        for parameter in avatar.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter))
+        avatar.window_margin = None
+        both = avatar.paint(cat([frame, other])).features
+        assert (both[0] - both[1]).abs().max() > 0.1
+        torch.testing.assert_close(both[1:], avatar.paint(other).features, atol=2e-4, rtol=1e-4)
+
+
+def test_points_go_where_the_avatar_goes(build):
+    _, avatar, frame = build(ON)
+    painting = avatar.double().paint(frame.to(torch.float64))
+    assert painting.gaussians.means.dtype == painting.image.dtype == torch.float64
+    assert not [name for name in avatar.state_dict() if name.startswith("body_points")]
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("size.body_points=0", "points must be at least 1, or null, got 0"),
+        ("model.body_points.sigma=-1", "sigma must be positive, got -1"),
+    ],
+)
+def test_numbers_out_of_range_are_refused_in_one_sentence(build, word, said):
+    with pytest.raises(ConfigError, match=said):
+        build(ON, word)
+
+
+def stored(module, folder):
+    """The run folder of a training that has just begun."""
+    checkpoint = {"state_dict": module.state_dict()}
+    module.on_save_checkpoint(checkpoint)
+    (folder / CHECKPOINT).parent.mkdir()
+    torch.save(checkpoint, folder / CHECKPOINT)
+    return checkpoint
+
+
+@pytest.mark.parametrize(("effect", "model"), [("body_points", "wo_seg"), ("segmentation", "full")])
+def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
+    tiny, tmp_path, monkeypatch, effect, model
+):
+    config = tiny(f"effects.{effect}=on", "effects.impossible=off", f"model={model}")
+    data, module = build_training(config)
+    stored(module, tmp_path)
+    avatar, _ = load_avatar(tmp_path, config, data)
+    assert getattr(avatar, effect) is not None
+    for place in ("avatar", "parts"):
+        monkeypatch.setattr(f"gsgan.model.{place}.open_body", lambda *_: None)
+    with pytest.raises(DataError, match=rf"effects\.{effect}=.* no model file; set data\.smpl"):
+        load_avatar(tmp_path, config, data)
+
+
+def test_a_run_from_before_body_points_and_low_pass_loads_as_it_was_trained(tiny, tmp_path):
+    config = tiny("~model.low_pass", "~model.body_points", "~effects.body_points")
+    data, module = build_training(config)
+    checkpoint = stored(module, tmp_path)
+    del checkpoint["gsgan"]["effects"]["body_points"]
+    torch.save(checkpoint, tmp_path / CHECKPOINT)
+    data._info = replace(data.info, body_inside=1.0)  # what would call for points on the body now
+    avatar, _ = load_avatar(tmp_path, config, data)
+    assert avatar.body_points is None
+    assert avatar.accuracy.low_pass == avatar.segmentation.accuracy.low_pass == 0.3
+
+
+def test_the_figure_of_densify_says_where_the_points_are(build, tmp_path):
+    from gsgan.drawing.densify import draw
+    from gsgan.drawing.settings import Settings
+    from gsgan.drawing.shots import make_shots
+    from gsgan.drawing.subjects import Subject
+
+    for word, said in (("on", "the bone that moves them most"), ("off", "Algorithm 1 puts on")):
+        data, avatar, _ = build(f"effects.body_points={word}")
+        shots = make_shots(data, "train", data.dataset("train").items[:1], 9.0)
+        subject = Subject("one", "full", tmp_path, 0, data, avatar, [])
+        drawing = draw([subject], shots, Settings())
+        assert said in drawing.caption
+        placed = avatar.body_points or avatar.densify
+        assert drawing.numbers[shots[0].name]["one"]["points"] == placed.n_points
+
+
 def test_without_the_frames_body_pose_it_says_what_is_missing(build):
     _, avatar, frame = build(ON)
     with pytest.raises(ValueError, match="sit on the body; give its pose"):
@@ -122,6 +206,10 @@ def test_a_fitting_body_lies_in_its_mask_and_a_shifted_one_leaves_it(body):
     assert exact > 0.99
     assert body_inside(away, body) < 0.8
     assert body_inside(gone, body) is None
+    nobody = replace(frame, mask=torch.zeros_like(frame.mask))
+    assert body_inside(nobody, body) is None  # a mask that failed tells nothing of the pose
+    behind = replace(frame, skeleton=2 * frame.camera.centre[:, None] - frame.skeleton)
+    assert body_inside(behind, body) == exact  # whatever the joints say
 
 
 def synthetic_frame(ensure_scene):

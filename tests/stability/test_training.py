@@ -145,6 +145,24 @@ def test_a_few_steps_from_all_hard_skeletons_stay_finite(make):
     assert not all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
 
 
+@pytest.mark.parametrize("turn", [2.6, torch.pi])
+def test_a_few_steps_from_points_on_a_folded_body_stay_finite(make, turn):
+    """Every joint turned so far that skinning flattens what lies between two bones."""
+    words = ("effects.body_points=on", "effects.view_dependence=1")
+    module, frame, fit = make((1, 2, 2), "training.rollback.collapse=0", *words)
+    theta = torch.zeros_like(frame.body.theta)
+    theta[:, 1:, 0] = turn
+    folded = replace(frame, body=replace(frame.body, theta=theta))
+    A, _ = module.avatar.body_points.points.blend(folded.body)
+    assert torch.linalg.svdvals(A)[..., -1].min() < 0.3
+    before = [p.detach().clone() for p in module.avatar.deformation.parameters()]
+    fit([folded] * 5)
+    assert module.step == 5
+    assert_finite(module)
+    after = module.avatar.deformation.parameters()
+    assert not all(torch.equal(a, b) for a, b in zip(before, after, strict=True))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DEGENERATE)
 def test_a_hundred_steps_from_each_hard_skeleton_stay_finite(make, name):

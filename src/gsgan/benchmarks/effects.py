@@ -145,12 +145,13 @@ def cells(bench: EffectsBench) -> Iterator[Cell]:
     for effect in bench.only or list(bench.cases):
         case = bench.cases[effect]
         on = f"effects.{effect}={case.word}"
-        yield _cell(bench, Row(effect, effect, True, None, "", case.split), case.scene, on)
-        if not case.scene:
-            continue  # the default person calls for it
-        row = Row(effect, DEFAULT, False, None, "", case.split)
+        called = not case.scene  # by the default person
+        if not called:
+            yield _cell(bench, Row(effect, effect, True, None, "", case.split), case.scene, on)
+        row = Row(effect, DEFAULT, called, None, "", case.split)
         runs = {"off": plain, "on": Training(f"default-{effect}", (*bench.base, on))}
-        yield Cell(row, [], runs if bench.train and bench.default and case.elsewhere else {})
+        wanted = called or (bench.default and case.elsewhere)
+        yield Cell(row, [], runs if bench.train and wanted else {})
     if bench.real is not None:
         effect = bench.real_effect
         root = Path(bench.real).expanduser().resolve()

@@ -26,7 +26,8 @@ class Case:
     """An effect and the scene that calls for it; each key of a case in conf/bench_effects.yaml.
 
     Args:
-        scene: overrides of `gsgan.train` that make the scene.
+        scene: overrides of `gsgan.train` that make the scene; none: the default person calls
+            for it.
         word: what turns the effect on.
         split: held-out pictures that tell what it is worth, ``novel_view`` or ``novel_pose``.
         elsewhere: whether it can be turned on in the default scene as well.

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import cv2
 import numpy as np
@@ -52,9 +54,12 @@ def run(config: DictConfig, folder: Path) -> None:
     Raises:
         ConfigError: on a number that makes no sense, or a page without the block.
     """
-    rays, reference = list(config.rays), config.reference
-    if not rays or max(rays) >= reference:
-        raise ConfigError(f"rays must list numbers below reference={reference}, got {rays}")
+    rays, reference = config.rays, config.reference
+    if not _counts(rays) or not _counts([reference]) or max(rays) >= reference:
+        raise ConfigError(
+            "rays must list whole numbers of at least 1, all below reference, got "
+            f"rays={rays} and reference={reference}"
+        )
     if config.docs is not None:
         check_block(Path(config.docs), "rays")
     console, where = make_console(), environment(torch.device("cpu"))
@@ -80,6 +85,12 @@ def run(config: DictConfig, folder: Path) -> None:
         fill_block(Path(config.docs), "rays", text)
     console.print(text, markup=False, highlight=False)
     console.print(f"tables and raw numbers: {folder}", markup=False, highlight=False)
+
+
+def _counts(values: Any) -> bool:
+    """Whether it is a list of whole numbers above 0, and not empty."""
+    listed = isinstance(values, Sequence) and not isinstance(values, str) and len(values) > 0
+    return listed and all(type(n) is int and n > 0 for n in values)
 
 
 def _pictures(rays: int, config: DictConfig) -> tuple[np.ndarray, float]:

@@ -80,7 +80,7 @@ def untrained(config: DictConfig, poses: int, device: torch.device, *, last: boo
         replace(frame, camera=frame.camera.resize((side, side))).to(device)
         for frame in spread(data, poses)
     ]
-    mark = "untrained weights: Gaussians are as densify makes them, which sets what F costs"
+    mark = "untrained weights: Gaussians are where they start, which sets what F costs"
     return Subject(place(avatar, device, last=last), frames, "untrained avatar", (mark,))
 
 

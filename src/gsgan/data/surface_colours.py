@@ -100,16 +100,17 @@ def body_inside(frame: Frame, body: SkinnedBody) -> float | None:
     """Share of the posed body's vertices in the picture that the mask holds, give or take 3 cm.
 
     Returns:
-        None where the picture shows none of them.
+        None where the picture shows none of them, or its mask holds nobody.
     """
     with torch.no_grad():
-        pixels, inside, _ = _place(frame, _skin(body, frame))
-    if not inside.any():
+        pixels, inside, depth = _place(frame, _skin(body, frame))
+    empty = (frame.mask[0, 0].numpy() <= 0.5).astype(np.uint8)
+    if not inside.any() or empty.all():
         return None
-    reach = int(np.ceil(SLACK / _pixel(frame)))
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
-    mask = cv2.dilate((frame.mask[0, 0].numpy() > 0.5).astype(np.uint8), kernel)
-    return float(mask[pixels[inside, 1], pixels[inside, 0]].mean())
+    # of the body, not of the joints: where the two disagree, those may lie behind the camera
+    reach = np.ceil(SLACK * float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside])))
+    distance = cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return float((distance[pixels[inside, 1], pixels[inside, 0]] <= reach).mean())
 
 
 def _pixel(frame: Frame) -> float:

@@ -79,16 +79,16 @@ def draw_bones(axes: Axes, pose: Pose, shot: Shot, width: float = 1.4) -> None:
 
 
 def draw_points(axes: Axes, placed: Densify | BodyPoints, pose: Pose, shot: Shot) -> int:
-    """The points of Algorithm 1 in their parts' colours, far ones first; returns how many.
+    """G, far points first; returns how many.
 
-    Those on the side of their part that the camera cannot see are pale. Points on a body take the
-    colour of the bone that moves them most.
+    Algorithm 1's points have their parts' colours, pale on the side of their part that the camera
+    cannot see; points on a body have the colour of the bone that moves them most.
     """
     placed = deepcopy(placed).cpu()  # a copy: the avatar's own stays where it paints
     if isinstance(placed, BodyPoints):
         assert shot.frame.body is not None
         points = placed(shot.frame.body)
-        colours = placed_colours(placed)
+        colours = bone_colours(placed)
         away = np.zeros(len(colours), dtype=bool)
     else:
         points = placed(pose.p, pose.valid, pose.frames)
@@ -104,8 +104,8 @@ def draw_points(axes: Axes, placed: Densify | BodyPoints, pose: Pose, shot: Shot
     return len(order)
 
 
-def placed_colours(placed: BodyPoints) -> NDArray[np.float64]:
-    """``[N, 4]``: neighbouring bones differ."""
+def bone_colours(placed: BodyPoints) -> NDArray[np.float64]:
+    """``[N, 4]`` RGBA of the bone that moves each point most; neighbouring bones differ."""
     weights, bones = placed.points.bone_weight, placed.points.bone_index
     most = bones.gather(1, weights.argmax(dim=1, keepdim=True))[:, 0].numpy()
     return np.asarray(colormaps["tab20"](7 * most % 20))

@@ -10,7 +10,14 @@ from gsgan.drawing.measures import decibels, measure, where_from
 from gsgan.drawing.settings import Settings
 from gsgan.drawing.shots import Shot
 from gsgan.drawing.subjects import Subject
+from gsgan.model.body_points import BodyPoints
+from gsgan.skeleton import Densify
 
+POINTS = {
+    Densify: "the points that Algorithm 1 puts on cylinders, sphere and box, coloured by part, "
+    "pale on the side of the part that faces away",
+    BodyPoints: "points of the posed body's surface, coloured by the bone that moves them most",
+}
 TITLES = ("(a) skeleton", "(b) points", "(c) Gaussians", "(d) picture", "(e) truth")
 
 
@@ -46,9 +53,8 @@ def draw(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings)
         counts = {"joints": seen, "points": points, "gaussians": drawn}
         numbers[shot.name] = {subject.name: found | counts}
     caption = (
-        "From skeleton to picture through one camera: (a) the joints; (b) the points that "
-        "Algorithm 1 puts on cylinders, sphere and box, coloured by part, pale on the side of the "
-        "part that faces away; (c) the Gaussians after Ψ, filled to "
+        f"From skeleton to picture through one camera: (a) the joints; (b) {POINTS[type(placed)]}; "
+        "(c) the Gaussians after Ψ, filled to "
         f"{settings.sigmas:g} σ with their own colour and opacity; (d) the picture; (e) the truth. "
         + where_from(shots, settings.margin)
     )

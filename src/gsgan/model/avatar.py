@@ -64,6 +64,7 @@ class Avatar(nn.Module):
         surface: in place of Ψ, Gaussians on the body's surface, given the body (``lbs_splat``).
             Without either nothing is splatted, and the UNet paints the drawn skeleton alone
             (``image_to_image``).
+        body_points: in densify's place where that effect is on, given the body and its height.
         segmentation: S, given a body; None leaves it out (``wo_seg``).
         pose_encoder: Ω (or the flat skeleton) to g; None in ``splat_only``.
         generator: the UNet, given its channel counts; None makes Step I's colour the picture.
@@ -194,9 +195,12 @@ class Avatar(nn.Module):
             self.effects = self.effects.without("body_points", "the model leaves them out")
         if build is None or not self.effects.body_points.on:
             return None
-        body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
+        body = open_body(scene.body, scene.body_file, scene.betas)
         if body is None:
-            self.effects = self.effects.without("body_points", "the body has no mesh here")
+            why = (
+                f"the data's poses are of the body {scene.body!r}, of which there is no model file"
+            )
+            self.effects = self.effects.without("body_points", why)
             return None
         return build(body=body, body_height=self.body_height)
 

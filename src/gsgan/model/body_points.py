@@ -23,6 +23,9 @@ class BodyPoints(nn.Module):
         points: vertices used, spread evenly over the surface; None for all.
         sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
 
+    Raises:
+        ValueError: on a number out of range.
+
     Source: ours; the paper's G is Alg. 1's (`gsgan.skeleton.Densify`).
     """
 
@@ -38,6 +41,8 @@ class BodyPoints(nn.Module):
         sigma: float = 0.7,
     ) -> None:
         super().__init__()
+        if sigma <= 0:
+            raise ValueError(f"BodyPoints: sigma must be positive, got {sigma}")
         self.points, self.sigma = SkinnedPoints(body, points), sigma
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
         self.register_buffer("rest_points", rest, persistent=False)

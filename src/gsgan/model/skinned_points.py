@@ -18,6 +18,9 @@ class SkinnedPoints(nn.Module):
         body: vertices, weights and joints.
         count: vertices used, spread evenly over the surface; None for all.
 
+    Raises:
+        ValueError: on a count below 1.
+
     Source: paper Sec. 3.4; method.md § 3.
     """
 
@@ -30,8 +33,11 @@ class SkinnedPoints(nn.Module):
 
     def __init__(self, body: SkinnedBody, count: int | None = None) -> None:
         super().__init__()
+        if count is not None and count < 1:
+            raise ValueError(f"SkinnedPoints: points must be at least 1, or null, got {count}")
         vertices = body.vertices.float()
-        chosen = farthest_points(vertices, min(count or len(vertices), len(vertices)))
+        every = len(vertices)
+        chosen = farthest_points(vertices, every if count is None else min(count, every))
         self.parents = body.parents
         means = vertices[chosen]
         for name, value in {

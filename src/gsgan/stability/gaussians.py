@@ -135,6 +135,48 @@ def _needles() -> Iterator[RasterCase]:
         )
 
 
+def _low_passes() -> Iterator[RasterCase]:
+    """What is thinner than a pixel, at the low-pass of conf/model: a quarter of the usual one."""
+    camera, settings = pinhole(focal=600.0), replace(HIGH, name="of the model", low_pass=0.0833)
+    name = "low-pass of 1/12, {}"
+    for degrees, antialias in ((0.0, False), (45.0, False), (37.3, False), (45.0, True)):
+        half = math.radians(degrees) / 2
+        yield raster_case(
+            name.format(f"needle at {degrees:g} degrees{', anti-aliased' if antialias else ''}"),
+            _sparse(
+                [(0.01, 0.004, 2.0)],
+                (1.0, 1e-4, 1e-4),
+                (math.cos(half), 0.0, 0.0, math.sin(half)),
+                camera,
+            ),
+            settings=replace(settings, antialias=antialias),
+        )
+    yield raster_case(
+        name.format("pancake seen edge on"),
+        _sparse(
+            [(0.01, 0.004, 2.0)],
+            (1.0, 1.0, 1e-4),
+            (math.cos(math.pi / 4), 0.0, math.sin(math.pi / 4), 0.0),
+            camera,
+        ),
+        settings=settings,
+    )
+    for shape, diagonal in (("of rank 1", (0.04, 0.0, 0.0)), ("zero", (0.0, 0.0, 0.0))):
+        yield raster_case(
+            name.format(f"covariance {shape}"),
+            partial(_with_covariance, diagonal),
+            settings=settings,
+        )
+    yield raster_case(
+        name.format("200 far below a pixel"),
+        lambda: {**cloud(200, scale=1e-4), **pinhole()},
+        settings=settings,
+        tolerance=Tolerance(4e-5, 4e-4),
+        note="A spot a third of a pixel wide: rounding its mean counts four times as much as at "
+        "the usual low-pass.",
+    )
+
+
 def _sparse(
     means: list[Numbers], scales: Numbers, quat: Numbers, camera: Inputs
 ) -> Callable[[], Inputs]:
@@ -205,6 +247,7 @@ GAUSSIANS: tuple[RasterCase, ...] = (
     *_sizes(),
     *_needles(),
     *_covariances(),
+    *_low_passes(),
     *_quaternions(),
     *_places(),
     *CROWDS,

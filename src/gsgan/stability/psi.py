@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
-from dataclasses import fields
-from functools import lru_cache
+from dataclasses import fields, replace
+from functools import lru_cache, partial
 from typing import Any
 
 import torch
@@ -16,7 +17,7 @@ from gsgan.skeleton import MEDIAPIPE33, Densify
 from gsgan.splat import Accuracy, rasterise
 from gsgan.stability.case import FINITE_ONLY, Case, Inputs, Tolerance
 from gsgan.stability.poses import noisy, rest, rounded
-from gsgan.stability.raster import pinhole, raster_case
+from gsgan.stability.raster import Numbers, pinhole, raster_case
 
 SUBJECT = "Ψ"
 SH_DEGREE, FEATURES = 1, 2
@@ -59,10 +60,14 @@ def ordinary_residuals(seed: int = 0, sigma: float = 0.3) -> Inputs:
     return {**made, "p": noisy(1), "eye": torch.tensor([[0.1, 1.0, 4.0]], dtype=torch.float64)}
 
 
-def composed(inputs: Inputs) -> dict[str, Tensor]:
-    """Ĝ of given residuals."""
+def composed(inputs: Inputs, frame: Numbers | None = None) -> dict[str, Tensor]:
+    """Ĝ of given residuals; ``frame``, the nine numbers of a matrix, is every point's in place of
+    its part's."""
     p = inputs["p"]
     points = some_points(p.dtype, p.device)(p)
+    if frame is not None:
+        frames = p.new_tensor(frame).view(1, 1, 3, 3).expand_as(points.rotations)
+        points = replace(points, rotations=frames)
     residuals = Residuals(**{field.name: inputs[field.name] for field in fields(Residuals)})
     made = small_psi(p.dtype, p.device).compose(points, residuals, inputs["eye"])
     assert made.covariances is not None
@@ -90,9 +95,8 @@ def _case(
         name=name,
         subject=SUBJECT,
         build=rounded(make),
-        run=composed,
         note=note,
-        **(options or {}),
+        **{"run": composed, **(options or {})},
     )
 
 
@@ -166,6 +170,26 @@ def _views() -> Iterator[Case]:
     )
 
 
+def _skinned_frames() -> Iterator[Case]:
+    """Frames of a skinned body's points: means of rotations, which shear, flatten and vanish."""
+    cos, sin = math.cos(2.6), math.sin(2.6)
+    folded = ((1 + cos) / 2, -sin / 2, 0.0, sin / 2, (1 + cos) / 2, 0.0, 0.0, 0.0, 1.0)
+    for name, frame, note in (
+        ("an elbow folded by 150 degrees", folded, "Half and half: a quarter as wide there."),
+        (
+            "two bones half a turn apart",
+            (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+            "Of rank 1: means move, and colours are seen, along one line only.",
+        ),
+        (
+            "four bones that cancel",
+            (0.0,) * 9,
+            "Gaussians shrink to points that no residual moves; no direction to be seen from.",
+        ),
+    ):
+        yield _case(f"frames of {name}", note, {"run": partial(composed, frame=frame)})
+
+
 def _step_zero(
     inputs: Inputs, backend: str, *, size: tuple[int, int], settings: Accuracy
 ) -> dict[str, Tensor]:
@@ -196,4 +220,7 @@ def _first_step() -> Iterator[Case]:
         )
 
 
-PSI: tuple[Case, ...] = (*_saturated(), *_quaternions(), *_views(), *_first_step())
+PSI: tuple[Case, ...] = (
+    *(*_saturated(), *_quaternions(), *_views()),
+    *(*_skinned_frames(), *_first_step()),
+)
