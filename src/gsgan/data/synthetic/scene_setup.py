@@ -47,7 +47,7 @@ class Settings:
         test_cameras: in the gaps between them.
         frames: moments of the choreography.
         test_frames: of these, held out (see :func:`gsgan.data.synthetic.motion.held_out`).
-        rays_per_pixel: anti-aliasing, a square number.
+        rays_per_pixel: anti-aliasing; docs/data.md tells what few of them cost.
         seed: of the motion.
         identity: of the clothes and colours.
         radius: metres from the middle of the scene to the cameras.
