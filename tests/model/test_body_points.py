@@ -196,9 +196,7 @@ def test_without_a_body_pose_it_is_off_and_forcing_it_an_error(build):
 
 
 def test_a_fitting_body_lies_in_its_mask_and_a_shifted_one_leaves_it(body):
-    from gsgan.data.synthetic.scenes import ensure_scene
-
-    frame = synthetic_frame(ensure_scene)
+    frame = synthetic_frame()
     exact = body_inside(frame, body)
     pose = frame.body
     away = replace(frame, body=replace(pose, transl=pose.transl + torch.tensor([0.3, 0.3, 0])))
@@ -212,8 +210,9 @@ def test_a_fitting_body_lies_in_its_mask_and_a_shifted_one_leaves_it(body):
     assert body_inside(behind, body) == exact  # whatever the joints say
 
 
-def synthetic_frame(ensure_scene):
+def synthetic_frame():
     from gsgan.data.datamodule import GsganData
+    from gsgan.data.synthetic.scenes import ensure_scene
 
     root = ensure_scene(
         size=64, train_cameras=2, test_cameras=0, frames=2, test_frames=0, rays_per_pixel=1,

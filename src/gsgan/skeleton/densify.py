@@ -34,7 +34,8 @@ class Points:
 
     Args:
         means: ``[B, N, 3]`` metres, world frame.
-        rotations: ``[B, P, 3, 3]`` frames of the parts: limbs, then face, then torso.
+        rotations: ``[B, P, 3, 3]`` frames of the parts: limbs, then face, then torso. On a skinned
+            body (`gsgan.model.body_points`) each point is a part, and its frame may shear.
         origins: ``[B, P, 3]`` metres, world frame: where each part's frame sits.
         scales: ``[B, N]`` metres, initial standard deviation, the same in all directions.
         valid: ``[B, N]`` bool, False on parts whose joints were not seen.
@@ -54,7 +55,10 @@ class Points:
         return self.rotations.index_select(1, self.part_id)
 
     def local(self) -> Tensor:
-        """``[B, N, 3]`` metres: the points in their parts' frames, free of any rigid motion."""
+        """``[B, N, 3]`` metres: the points in their parts' frames, free of any rigid motion.
+
+        Convention: frames are rotations, as densify's are.
+        """
         offset = self.means - self.origins.index_select(1, self.part_id)
         return (offset.unsqueeze(-2) @ self.frames).squeeze(-2)
 
