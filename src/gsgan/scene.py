@@ -226,11 +226,14 @@ class Raster(_TensorRecord):
         features: ``[B, C, H, W]`` premultiplied by alpha; the background is the caller's to add.
         alpha: ``[B, 1, H, W]`` in [0, 1].
         depth: ``[B, 1, H, W]`` metres times alpha, or None when it was not asked for.
+        fine: ``[B, C, kH, kW]`` features before k² of them were averaged to a pixel, or None where
+            the settings supersample nothing.
     """
 
     features: Tensor
     alpha: Tensor
     depth: Tensor | None = None
+    fine: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,11 @@ import pytest
 import torch
 
 from gsgan.body import open_body
+from gsgan.body.normals import vertex_normals
 from gsgan.data.surface_colours import body_inside
 from gsgan.effects import EffectSettings, decide
 from gsgan.errors import ConfigError, DataError
-from gsgan.model.body_points import BodyPoints
+from gsgan.model.body_points import BodyPoints, moved_normals
 from gsgan.runs import CHECKPOINT, build_training, load_avatar
 from gsgan.scene import BodyPose, cat
 
@@ -49,6 +50,62 @@ def test_a_turned_body_turns_points_and_frames(body):
     torch.testing.assert_close(
         after.means[0] - after.means[0, :1], between @ quarter.mT, atol=1e-5, rtol=0
     )
+
+
+def test_normals_are_the_surfaces_and_turn_with_it(body):
+    placed = BodyPoints(body, 1.7, points=200)
+    pose = rest(body)
+    before = placed(pose).normals[0]
+    torch.testing.assert_close(before.norm(dim=-1), torch.ones(200))
+    height = body.vertices[:, 2]
+    top = (placed.points.means[:, 2] - height.max()).abs().argmin()
+    assert before[top, 2] > 0.7  # the crown of the head looks up
+    theta = pose.theta.clone()
+    theta[0, 0, 2] = torch.pi / 2
+    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    after = placed(replace(pose, theta=theta)).normals[0]
+    torch.testing.assert_close(after, before @ quarter.mT, atol=1e-6, rtol=0)
+
+
+def test_normals_point_out_of_the_posed_body(body):
+    """Against trimesh, which knows the whole mesh: no formula shared."""
+    import trimesh
+
+    torch.manual_seed(1)
+    pose = replace(rest(body), theta=0.15 * torch.randn(1, len(body.joints), 3))
+    placed = BodyPoints(body, 1.7)
+    points = placed(pose)
+    mesh = trimesh.Trimesh(points.means[0].numpy(), body.faces.numpy(), process=False)
+    face = torch.tensor(mesh.face_normals, dtype=torch.float32)
+    agree = (points.normals[0][body.faces[:, 0]] * face).sum(-1)
+    assert agree.median() > 0.97
+    assert (agree > 0.5).float().mean() > 0.97
+
+
+@pytest.mark.parametrize(
+    ("name", "A", "expected"),
+    [
+        ("sheared", [[1.0, 0, 0.7], [0, 1, 0], [0, 0, 1]], [0.0, 0, 1]),
+        ("flattened onto its tangent plane", [[1.0, 0, 0], [0, 1, 0], [0, 0, 0]], [0.0, 0, 1]),
+        ("flattened to a line", [[1.0, 0, 0], [0, 0, 0], [0, 0, 0]], [0.0, 0, 0]),
+        ("shrunk to nothing", [[0.0, 0, 0], [0, 0, 0], [0, 0, 0]], [0.0, 0, 0]),
+        ("shrunk a thousand times", [[1e-3, 0, 0], [0, 1e-3, 0], [0, 0, 1e-3]], [0.0, 0, 1]),
+    ],
+)
+def test_stability_normals_of_a_skin_that_is(name, A, expected):
+    A = torch.tensor([[A]], requires_grad=True)
+    normal = moved_normals(A, torch.tensor([[0.0, 0.0, 1.0]]))
+    torch.testing.assert_close(normal[0, 0].detach(), torch.tensor(expected), atol=1e-5, rtol=0)
+    normal.sum().backward()
+    assert torch.isfinite(A.grad).all()
+
+
+def test_a_vertex_without_a_face_has_no_normal():
+    corners = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [5, 5, 5], [2, 0, 0]])
+    faces = torch.tensor([[0, 1, 2], [0, 1, 4]])  # the second has no area
+    found = vertex_normals(corners, faces)
+    up, none = [0.0, 0, 1], [0.0, 0, 0]
+    torch.testing.assert_close(found, torch.tensor([up, up, up, none, none]))
 
 
 def test_on_the_body_nothing_is_densified_and_off_it_no_body_is_built(build):
@@ -220,6 +277,18 @@ def synthetic_frame():
     )  # fmt: skip
     data = GsganData(root=root, size=64)
     return data.dataset("train")[0]
+
+
+def test_supersampling_is_the_models_and_of_F_alone(build):
+    _, avatar, frame = build("model.supersample=3")
+    assert avatar.accuracy.supersample == 3
+    assert avatar.segmentation.accuracy.supersample == 1
+    painting = avatar.paint(frame)
+    assert painting.features.shape[-2:] == painting.image.shape[-2:] == frame.image.shape[-2:]
+    _, baseline, _ = build("model=lbs_splat", "model.supersample=3")
+    assert baseline.accuracy.supersample == 3
+    _, usual, _ = build("model.supersample=null", "accuracy.supersample=2")
+    assert (usual.accuracy.supersample, usual.segmentation.accuracy.supersample) == (2, 1)
 
 
 def test_low_pass_is_the_models_for_F_and_S_whatever_the_accuracy(build):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -117,6 +119,23 @@ def test_pelvis_code_does_not_know_the_heading(densify):
         frames = bone_frames(q, torch.ones(1, 33, dtype=torch.bool))
         codes.append(psi.pose_code(q, q[:, 23:25].mean(1), frames.hubs[:, 0], None))
     torch.testing.assert_close(codes[0], codes[1], atol=1e-9, rtol=0)
+
+
+def test_psi_is_told_where_the_surface_looks_unless_it_shall_not_be(densify):
+    torch.manual_seed(0)
+    psi = small(densify)
+    with torch.no_grad():
+        psi.head.weight.normal_(0, 0.3)
+    points = densify(rest())
+    turned = replace(points, normals=-points.normals)
+    pose, root = torch.zeros(1, 99), torch.zeros(1, 3)
+    told, other = (psi.residuals(given, pose, root).sh for given in (points, turned))
+    assert (told - other).abs().max() > 1e-3
+    blind = small(densify, normals=False)
+    assert "from_normal.weight" not in blind.state_dict()
+    blind.head.weight.data.copy_(psi.head.weight.data)
+    one, two = (blind.residuals(given, pose, root).sh for given in (points, turned))
+    torch.testing.assert_close(one, two)
 
 
 def test_noise_reaches_only_the_pose_code(densify):

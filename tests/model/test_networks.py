@@ -30,6 +30,26 @@ def test_generator_takes_any_size(size):
     assert torch.isfinite(image).all()
 
 
+def test_generator_sees_what_supersampling_averages():
+    F, S, p2d, g = inputs(17, 12)
+    net = Generator(5, 4, 8, 35, 2, base=4)
+    assert net.content.stem.in_channels == generator().content.stem.in_channels + 4 * 5
+    fine = torch.rand(2, 5, 34, 24, requires_grad=True)
+    image = net(F, S, p2d, g, fine)
+    assert image.shape == (2, 3, 17, 12)
+    assert not torch.equal(image, net(F, S, p2d, g, 1 - fine))
+    image.square().mean().backward()
+    assert torch.isfinite(fine.grad).all()
+    assert (fine.grad != 0).any()
+
+
+def test_stability_overflowing_fine_features_are_bounded_like_F():
+    F, S, p2d, g = inputs(16, 16)
+    net = Generator(5, 4, 8, 35, 2, base=4, feature_bound=10.0)
+    fine = 20 * torch.randn(2, 5, 32, 32)
+    torch.testing.assert_close(net(F, S, p2d, g, fine * 1e30), net(F, S, p2d, g, 1e3 * fine.sign()))
+
+
 def test_generator_with_rgb_skip_starts_at_step_one_colour():
     F, S, p2d, g = inputs(16, 16)
     torch.testing.assert_close(generator(rgb_skip=True)(F, S, p2d, g), F[:, :3], rtol=0, atol=0)

@@ -210,5 +210,6 @@ def test_hands_mode_from_the_config_paints(build):
     painting = avatar.paint(frame)
     assert painting.segmentation.shape[1] == 4
     assert avatar.segmentation.map.names[-1] == "face_neck"
-    assert avatar.generator.content.stem.in_channels == 5 + 4 + 8
+    F = 5 * (1 + avatar.accuracy.supersample**2)  # averaged and as drawn
+    assert avatar.generator.content.stem.in_channels == F + 4 + 8
     assert torch.isfinite(painting.image).all()

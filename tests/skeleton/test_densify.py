@@ -112,7 +112,7 @@ def test_torso_edges_are_kept_within_range() -> None:
 def test_normals_point_out() -> None:
     d = densify()
     points = d(rest())
-    world = (points.frames @ d.normals.unsqueeze(-1)).squeeze(-1)[0]
+    world = points.normals[0]
     torch.testing.assert_close(world.norm(dim=-1), torch.ones(5400, dtype=F64))
     centre = torch.stack(
         [
@@ -151,6 +151,7 @@ def test_a_rigid_motion_moves_every_point_with_it(seed: int) -> None:
     a, b = d(p), d(p @ R.mT + shift)
     torch.testing.assert_close(b.means, a.means @ R.mT + shift, atol=1e-9, rtol=0)
     torch.testing.assert_close(b.frames, R @ a.frames, atol=1e-9, rtol=0)
+    torch.testing.assert_close(b.normals, a.normals @ R.mT, atol=1e-9, rtol=0)
     torch.testing.assert_close(b.scales, a.scales, atol=1e-9, rtol=0)
     torch.testing.assert_close(b.local(), a.local(), atol=1e-6, rtol=0)
 

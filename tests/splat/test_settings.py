@@ -56,6 +56,8 @@ def test_presets_are_the_table():
         ("alpha_max", 1.01),
         ("low_pass", 0.0),
         ("fov_clamp", 0.9),
+        ("supersample", 0),
+        ("supersample", 1.5),
     ],
 )
 def test_values_out_of_range_are_refused(field, value):

@@ -263,6 +263,32 @@ def test_the_average_follows_its_formula():
     assert values == pytest.approx(expected)
 
 
+def test_an_average_of_every_fourth_iteration_forgets_as_fast():
+    layer = torch.nn.Linear(1, 1)
+    torch.nn.init.constant_(layer.weight, 1.0)
+    often, seldom = MovingAverage(layer, 0.99), MovingAverage(layer, 0.99, every=4)
+    for average, updates in ((often, 4000), (seldom, 1000)):  # past the quick start
+        for _ in range(updates):
+            average.update(layer)
+    torch.nn.init.constant_(layer.weight, 2.0)
+    for step in range(40):
+        often.update(layer)
+        if step % 4 == 0:
+            seldom.update(layer)
+    expected = 2 - 0.99**40
+    for average in (often, seldom):
+        assert float(average.module.weight.detach()) == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_average_is_updated_when_the_config_says(make):
+    module, trainer, data = make("training.average_every=5", "training.schedule.step_one=0")
+    trainer.fit(module, data)
+    steps = range(module.schedule.total - module.schedule.step_two, module.schedule.total)
+    assert int(module.average.copy.n_averaged) == sum(step % 5 == 0 for step in steps)
+    with pytest.raises(ConfigError, match=r"training\.average_every must be at least 1, got 0"):
+        make("training.average_every=0")
+
+
 @pytest.mark.parametrize("model", ["lbs_splat", "image_to_image", "splat_only"])
 def test_baselines_train_with_the_same_schedule(make, model):
     module, trainer, data = make(f"model={model}", "training.schedule.stretch=1")

@@ -126,11 +126,12 @@ def without_hooks(avatar: Avatar, frame: Frame, height: int) -> Tensor:
     assert avatar.pose_encoder is not None
     points = avatar.place(p, valid, frames, frame.body)
     gaussians = avatar.deformation(p, points, camera.centre, frames.hubs[:, 0], None)
-    F = rasterise(gaussians, camera, settings=avatar.accuracy).features
+    raster = rasterise(gaussians, camera, settings=avatar.accuracy)
+    F = raster.features
     S = avatar.segmentation(frame.body, camera) if avatar.segmentation else None
     p2d = avatar.draw(p, valid, camera, height)
     g = avatar.pose_encoder(*avatar.pose_inputs(p, valid, frames, camera))
-    return avatar.generator(F, S, p2d, g).to(F.dtype)
+    return avatar.generator(F, S, p2d, g, raster.fine).to(F.dtype)
 
 
 def price_of_off(avatar: Avatar, frames: Sequence[Frame], repeats: int) -> float:

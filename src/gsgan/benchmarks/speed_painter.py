@@ -104,7 +104,10 @@ def changed(avatar: Avatar, way: Way) -> Iterator[None]:
     """The avatar paints that way in here, and as before afterwards."""
     before = avatar.accuracy, avatar.window_margin
     if way.accuracy is not None:  # how pixels are formed is the model's, not the setting's
-        formed = {name: getattr(avatar.accuracy, name) for name in ("low_pass", "antialias")}
+        formed = {
+            name: getattr(avatar.accuracy, name)
+            for name in ("low_pass", "supersample", "antialias")
+        }
         avatar.accuracy = replace(way.accuracy, **formed)
     avatar.window_margin = None if way.whole else avatar.window_margin
     _draw_with(avatar, way.backend)

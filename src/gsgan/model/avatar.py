@@ -70,6 +70,7 @@ class Avatar(nn.Module):
         generator: the UNet, given its channel counts; None makes Step I's colour the picture.
         accuracy: the rasteriser's settings for F.
         low_pass: square pixels that F and S add to every ellipse; None keeps their accuracy's.
+        supersample: F is drawn so many times larger each way and averaged; None keeps its accuracy's.
         twist: how bone frames turn about their bones, ``none`` or ``hinge``.
         window_margin: metres round the joints that are painted; None paints whole pictures.
         window_multiple: the window's sides are multiples of so many pixels.
@@ -100,6 +101,7 @@ class Avatar(nn.Module):
         surface: Callable[..., SurfaceGaussians] | None = None,
         body_points: Callable[..., BodyPoints] | None = None,
         low_pass: float | None = None,
+        supersample: int | None = None,
         twist: Literal["none", "hinge"] = "none",
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
@@ -114,6 +116,8 @@ class Avatar(nn.Module):
         self.effects = _possible(self.effects, densify is not None, surface is not None)
         self.low_pass = low_pass
         self.accuracy = self._image_formation(accuracy)
+        if supersample is not None:
+            self.accuracy = replace(self.accuracy, supersample=supersample)
         self.template, self.twist = MEDIAPIPE33, twist
         self.window_margin = window_margin
         self.window_multiple, self.window_least = window_multiple, window_least
@@ -157,6 +161,7 @@ class Avatar(nn.Module):
                 segmentation_channels=self.segmentation.classes if self.segmentation else 0,
                 skeleton_channels=SKELETON_CHANNELS if self.splats else 0,
                 pose_channels=pose_encoder.channels,
+                supersample=self.accuracy.supersample if self.splat_channels else 1,
             )
         self.colour: ColourCorrection | None = None
         if self.effects.colour_correction.on:
@@ -231,9 +236,11 @@ class Avatar(nn.Module):
 
     def _image_formation(self, accuracy: Accuracy) -> Accuracy:
         """How pixels are formed is the model's and the scene's, whatever may be left out."""
-        low_pass = accuracy.low_pass if self.low_pass is None else self.low_pass
-        antialias = accuracy.antialias or self.effects.antialias.on
-        return replace(accuracy, low_pass=low_pass, antialias=antialias)
+        return replace(
+            accuracy,
+            low_pass=accuracy.low_pass if self.low_pass is None else self.low_pass,
+            antialias=accuracy.antialias or self.effects.antialias.on,
+        )
 
     def forward(
         self,
@@ -295,8 +302,10 @@ class Avatar(nn.Module):
                 if F is None:  # image_to_image: the drawing stands in F's place
                     image = self.generator(p2d, S, None, g).to(skeleton.dtype)  # type: ignore[misc]
                 else:
-                    seen = F.detach() if detach_features else F
-                    image = self.generator(seen, S, p2d, g).to(F.dtype)  # type: ignore[misc]
+                    seen, fine = F, raster.fine  # type: ignore[union-attr]
+                    if detach_features:
+                        seen, fine = F.detach(), None if fine is None else fine.detach()
+                    image = self.generator(seen, S, p2d, g, fine).to(F.dtype)  # type: ignore[misc]
         if raster is None:
             return Painting(image, F, None, S, gaussians)
         painting = Painting(image, F, raster.alpha, S, gaussians, depth=raster.depth)

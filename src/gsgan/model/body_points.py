@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from gsgan.body import SkinnedBody
+from gsgan.body.normals import vertex_normals
 from gsgan.model.skinned_points import SkinnedPoints
 from gsgan.scene import BodyPose
 from gsgan.skeleton import Points
@@ -30,6 +32,7 @@ class BodyPoints(nn.Module):
     """
 
     rest_points: Tensor
+    rest_normals: Tensor
     part_id: Tensor
 
     def __init__(
@@ -46,6 +49,8 @@ class BodyPoints(nn.Module):
         self.points, self.sigma = SkinnedPoints(body, points), sigma
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
         self.register_buffer("rest_points", rest, persistent=False)
+        normals = vertex_normals(body.vertices.float(), body.faces)[self.points.chosen]
+        self.register_buffer("rest_normals", normals, persistent=False)
         self.register_buffer("part_id", torch.arange(len(self.points)), persistent=False)
 
     @property
@@ -68,4 +73,17 @@ class BodyPoints(nn.Module):
             scales=scales,
             valid=torch.ones_like(scales, dtype=torch.bool),
             part_id=self.part_id,
+            normals=moved_normals(A, self.rest_normals),
         )
+
+
+def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
+    """``[B, N, 3]`` normals of a surface that linear maps ``A`` ``[B, N, 3, 3]`` move.
+
+    By the cofactors, which are det(A) A⁻ᵀ without the division: where skinning flattens a point's
+    neighbourhood the normal stays finite; where it has none left the normal is zero.
+    """
+    x, y, z = A.unbind(-1)
+    cofactors = [torch.linalg.cross(a, b) for a, b in ((y, z), (z, x), (x, y))]
+    moved = (torch.stack(cofactors, dim=-1) @ normals.unsqueeze(-1)).squeeze(-1)
+    return functional.normalize(moved, dim=-1, eps=1e-6)

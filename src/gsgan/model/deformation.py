@@ -50,6 +50,7 @@ class Deformation(nn.Module):
         features: channels beside the three of colour.
         sh_degree: 0 (no view dependence) to 3.
         rest_octaves, position_octaves: positional encodings of the rest and the posed point.
+        normals: Ψ is told where each point's surface looks, which is what light depends on.
         free_table: also learn one residual a point that does not depend on the pose.
         pose_frame: ``world``, or ``pelvis``: the pose code turned with the pelvis, so that it
             says nothing of the subject's heading.
@@ -76,6 +77,7 @@ class Deformation(nn.Module):
         sh_degree: int = 1,
         rest_octaves: int = 6,
         position_octaves: int = 2,
+        normals: bool = True,
         free_table: bool = True,
         pose_frame: str = "world",
         opacity: float = 0.5,
@@ -103,6 +105,7 @@ class Deformation(nn.Module):
         self.from_point = nn.Linear(point_size, width)
         self.from_position = nn.Linear(encoded_size(3, position_octaves), width, bias=False)
         self.from_pose = nn.Linear(3 * joints, width, bias=False)
+        self.from_normal = nn.Linear(3, width, bias=False) if normals else None
         self.trunk = nn.ModuleList(nn.Linear(width, width) for _ in range(layers - 1))
         self.parts = (3, 4, 3, 1, 3 * (sh_degree + 1) ** 2, features)
         self.head = nn.Linear(width, sum(self.parts))
@@ -125,6 +128,8 @@ class Deformation(nn.Module):
         position = (points.means - root[:, None]) / self.body_height
         x = self.from_point(torch.cat([self.rest_code, self.embedding], dim=-1))
         x = x + self.from_position(positional_encoding(position, self.position_octaves))
+        if self.from_normal is not None:
+            x = x + self.from_normal(points.normals)
         x = functional.relu(x + self.from_pose(pose)[:, None])
         for layer in self.trunk:
             x = functional.relu(layer(x))

@@ -88,6 +88,8 @@ class Generator(nn.Module):
         segmentation_channels: channels of S; 0 leaves S out (``wo_seg``).
         skeleton_channels: channels of p₂D.
         pose_channels: length of g.
+        supersample: F is drawn so many times larger each way; that picture's pixels then enter
+            E_c as channels beside their average, 1 for none.
         base: channels at full resolution.
         multipliers: channels of each level in units of ``base``; one level a halving.
         style: what scales and shifts the decoder: ``film``, at every pixel by E_s(F) and g, or
@@ -108,6 +110,7 @@ class Generator(nn.Module):
         segmentation_channels: int,
         skeleton_channels: int,
         pose_channels: int,
+        supersample: int = 1,
         *,
         base: int = 32,
         multipliers: Sequence[int] = (1, 2, 4, 8, 8),
@@ -128,6 +131,9 @@ class Generator(nn.Module):
         mapped = style == "film"
         widths = [max(1, round(style_share * c)) if mapped else 0 for c in channels]
         inputs = feature_channels + segmentation_channels + skeleton_channels
+        self.supersample = supersample
+        if supersample > 1:
+            inputs += feature_channels * supersample**2
         self.stride = 2 ** (len(channels) - 1)
         self.rgb_skip, self.output, self.feature_bound = rgb_skip, output, feature_bound
         self.content = Encoder(inputs, channels)
@@ -142,7 +148,14 @@ class Generator(nn.Module):
         if rgb_skip:
             start_at_zero(self.paint)
 
-    def forward(self, F: Tensor, S: Tensor | None, p2d: Tensor | None, g: Tensor) -> Tensor:
+    def forward(
+        self,
+        F: Tensor,
+        S: Tensor | None,
+        p2d: Tensor | None,
+        g: Tensor,
+        fine: Tensor | None = None,
+    ) -> Tensor:
         """I_pred ``[B, 3, H, W]``, not clamped.
 
         Args:
@@ -150,10 +163,14 @@ class Generator(nn.Module):
             S: ``[B, classes, H, W]`` part probabilities, or None when built without.
             p2d: ``[B, 8, H, W]`` the drawn skeleton; None when it is F already (image_to_image).
             g: ``[B, 35]`` the pose code.
+            fine: ``[B, C, kH, kW]``, F before it was averaged; given where built to supersample.
         """
         height, width = F.shape[-2:]
         features = F.clamp(-self.feature_bound, self.feature_bound)
-        content = torch.cat([x for x in (features, S, p2d) if x is not None], dim=1)
+        if fine is not None:
+            fine = functional.pixel_unshuffle(fine, self.supersample)
+            fine = fine.clamp(-self.feature_bound, self.feature_bound)
+        content = torch.cat([x for x in (features, S, p2d, fine) if x is not None], dim=1)
         skips = self.content(self._padded(content))
         styles = self.style(self._padded(features)) if self.style else [None] * len(skips)
         h = skips[-1]

@@ -40,6 +40,7 @@ class Points:
         scales: ``[B, N]`` metres, initial standard deviation, the same in all directions.
         valid: ``[B, N]`` bool, False on parts whose joints were not seen.
         part_id: ``[N]`` int64 into the parts.
+        normals: ``[B, N, 3]`` outward, of length one, world frame.
     """
 
     means: Tensor
@@ -48,6 +49,7 @@ class Points:
     scales: Tensor
     valid: Tensor
     part_id: Tensor
+    normals: Tensor
 
     @property
     def frames(self) -> Tensor:
@@ -222,13 +224,17 @@ class Densify(nn.Module):
         head = self._face_points @ (head_R * radius[:, None, None]).mT + origins[:, -2:-1]
         trunk = self._torso_points @ (trunk_R * edges.unsqueeze(1)).mT + origins[:, -1:]
         spread = torch.cat([frames.lengths * self._limb_sigma(), self._hub_sigma(radius, edges)], 1)
+        rotations = torch.cat([frames.limbs, head_R.unsqueeze(1), trunk_R.unsqueeze(1)], dim=1)
+        # Stretching a cylinder or a box along its axes leaves its normals as they are.
+        turned = rotations.index_select(1, self.part_id) @ self.normals.unsqueeze(-1)
         return Points(
             means=torch.cat([limbs, head, trunk], dim=1) + root,
-            rotations=torch.cat([frames.limbs, head_R.unsqueeze(1), trunk_R.unsqueeze(1)], dim=1),
+            rotations=rotations,
             origins=origins + root,
             scales=spread.index_select(1, self.part_id),
             valid=self._seen(valid).index_select(1, self.part_id),
             part_id=self.part_id,
+            normals=turned.squeeze(-1),
         )
 
     def _seen(self, valid: Tensor) -> Tensor:

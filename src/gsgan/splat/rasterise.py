@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.splat import checks, gsplat_backend, reference, tiles
@@ -50,7 +51,8 @@ def rasterise(
         rotation_tolerance: how far an entry of ``R Rᵀ`` may be from the identity's.
 
     Returns:
-        features ``[B, C, H, W]``, alpha ``[B, 1, H, W]`` and depth, in the Gaussians' dtype.
+        features ``[B, C, H, W]``, alpha ``[B, 1, H, W]`` and depth, in the Gaussians' dtype; where
+        the settings supersample also what was averaged.
 
     Raises:
         ValueError: naming the argument, what was expected and what came.
@@ -67,9 +69,15 @@ def rasterise(
     if reason:
         _say_once(reason)
     out = gaussians.means.dtype
+    times, fine = settings.supersample, None
+    drawn = camera.resize((camera.size[0] * times, camera.size[1] * times))
     with tiles.full_precision(gaussians.means.device):
-        features, alpha, z = _draw(name, gaussians, camera, settings, keep, depth)
-    return Raster(features.to(out), alpha.to(out), None if z is None else z.to(out))
+        features, alpha, z = _draw(name, gaussians, drawn, settings, keep, depth)
+        if times > 1:
+            fine = features.to(out)
+            features, alpha = avg_pool2d(features, times), avg_pool2d(alpha, times)
+            z = None if z is None else avg_pool2d(z, times)
+    return Raster(features.to(out), alpha.to(out), None if z is None else z.to(out), fine)
 
 
 def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tuple[str, str]:

@@ -36,6 +36,8 @@ class Accuracy:
         fov_clamp: x/z and y/z are clamped to this many half fields of view (from the middle of
             the picture) where the Jacobian of the projection is formed, >= 1.
         antialias: multiply opacities by sqrt(det before / det after) of the low-pass.
+        supersample: >= 1: draw so many times larger each way, then average. The low-pass counts in
+            the larger picture's pixels.
 
     Raises:
         ValueError: on a value outside its range, naming it.
@@ -55,6 +57,7 @@ class Accuracy:
     low_pass: float = 0.3
     fov_clamp: float = 1.3
     antialias: bool = False
+    supersample: int = 1
 
     def __post_init__(self) -> None:
         self._require("alpha_min", 0 <= self.alpha_min < 1, "in [0, 1)")
@@ -66,6 +69,8 @@ class Accuracy:
         self._require("alpha_max", self.alpha_min < self.alpha_max <= 1, "in (alpha_min, 1]")
         self._require("low_pass", self.low_pass > 0, "> 0 square pixels")
         self._require("fov_clamp", self.fov_clamp >= 1, ">= 1")
+        whole = int(self.supersample) == self.supersample
+        self._require("supersample", whole and self.supersample >= 1, "a whole number >= 1")
 
     def _require(self, field: str, holds: bool, expected: str) -> None:
         if not holds:

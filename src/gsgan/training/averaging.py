@@ -15,11 +15,12 @@ class MovingAverage(nn.Module):
     """An exponential moving average of a module's parameters.
 
     Convention: the average starts as a copy at the first update and forgets that start quickly:
-    the decay at update n is ``min(decay, (1 + n) / (10 + n))``. Buffers are copied, not averaged.
+    the decay at update n is ``min(decay ** every, (1 + n) / (10 + n))``. Buffers are copied, not averaged.
 
     Args:
         module: what is averaged.
-        decay: in [0, 1); how much of the average each update keeps.
+        decay: in [0, 1); how much of the average each iteration keeps.
+        every: iterations from one update to the next.
 
     Raises:
         ConfigError: on a decay out of range.
@@ -27,11 +28,11 @@ class MovingAverage(nn.Module):
     Source: method.md § 7 (EMA 0.999 of the generator).
     """
 
-    def __init__(self, module: nn.Module, decay: float) -> None:
+    def __init__(self, module: nn.Module, decay: float, every: int = 1) -> None:
         super().__init__()
         if not 0 <= decay < 1:
             raise ConfigError(f"training.average must be null or in [0, 1), got {decay!r}")
-        self.decay = decay
+        self.decay = decay**every
         self.copy = AveragedModel(module, multi_avg_fn=self._blend)
         self.copy.requires_grad_(False)
 

@@ -112,6 +112,7 @@ class AvatarTraining(LightningModule):
         log_every: iterations between logged values.
         average: decay of the moving average of the last step's weights, which is what gets
             scored; None scores the weights as they are.
+        average_every: iterations from one of its updates to the next, which counts for as many.
         rollback: what is done when the rendered person vanishes.
         record: plain config values stored with every checkpoint.
 
@@ -133,6 +134,7 @@ class AvatarTraining(LightningModule):
         max_skipped: int = 20,
         log_every: int = 20,
         average: float | None = None,
+        average_every: int = 1,
         rollback: Rollback | None = None,
         record: dict[str, Any] | None = None,
     ) -> None:
@@ -145,11 +147,14 @@ class AvatarTraining(LightningModule):
         self.schedule = _fit_schedule(schedule, avatar)
         self.recipes, self.step_one, self.step_two = recipes, step_one, step_two
         self.pose_noise, self.seed, self.log_every = pose_noise, seed, log_every
-        if log_every < 1:
-            raise ConfigError(f"training.log_every must be at least 1, got {log_every}")
+        for name, every in {"log_every": log_every, "average_every": average_every}.items():
+            if every < 1:
+                raise ConfigError(f"training.{name} must be at least 1, got {every}")
         self.max_skipped, self.record = max_skipped, record or {}
         self.rollback = rollback or Rollback()
-        self.average = MovingAverage(avatar, average) if average is not None else None
+        self.average, self.average_every = None, average_every
+        if average is not None:
+            self.average = MovingAverage(avatar, average, average_every)
         # Step I over a random colour, so that black clothes do not become transparent.
         self.random_background = avatar.effects.random_background.on
         wanted = step_one.feature_head and avatar.splat_channels > 3
@@ -301,8 +306,8 @@ class AvatarTraining(LightningModule):
         painting = self._paint(frame, height, paint=False)
         loss = self.step_one_loss(painting, frame)
         self._descend(loss, *self._splatting())
-        if self.average is not None and self.avatar.generator is None:  # this is its last step
-            self.average.update(self.avatar)
+        if self.avatar.generator is None:  # this is its last step
+            self._update_average()
         self._log("step_one/loss", loss)
 
     def _train_step_two(self, frame: Frame, height: int) -> None:
@@ -312,12 +317,15 @@ class AvatarTraining(LightningModule):
             self.discriminator.requires_grad_(False)
         terms = self.step_two_terms(painting, frame, play)
         self._descend(torch.stack(list(terms.values())).sum(), *self._splatting(), "generator")
-        if self.average is not None:
-            self.average.update(self.avatar)
+        self._update_average()
         for name, term in terms.items():
             self._log(f"step_two/{name}", term)
         if play:
             self._train_discriminator(painting, frame)
+
+    def _update_average(self) -> None:
+        if self.average is not None and self.step % self.average_every == 0:
+            self.average.update(self.avatar)
 
     def _splatting(self) -> tuple[str, ...]:
         """The optimisers of what makes Step I's picture."""
