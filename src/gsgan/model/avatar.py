@@ -70,7 +70,8 @@ class Avatar(nn.Module):
         generator: the UNet, given its channel counts; None makes Step I's colour the picture.
         accuracy: the rasteriser's settings for F.
         low_pass: square pixels that F and S add to every ellipse; None keeps their accuracy's.
-        supersample: F is drawn so many times larger each way and averaged; None keeps its accuracy's.
+        supersample: F is drawn so many times larger each way and averaged; None keeps what its
+            accuracy says.
         twist: how bone frames turn about their bones, ``none`` or ``hinge``.
         window_margin: metres round the joints that are painted; None paints whole pictures.
         window_multiple: the window's sides are multiples of so many pixels.

@@ -15,7 +15,8 @@ class MovingAverage(nn.Module):
     """An exponential moving average of a module's parameters.
 
     Convention: the average starts as a copy at the first update and forgets that start quickly:
-    the decay at update n is ``min(decay ** every, (1 + n) / (10 + n))``. Buffers are copied, not averaged.
+    the decay at update n is ``min(decay ** every, (1 + n) / (10 + n))``. Buffers are copied, not
+    averaged.
 
     Args:
         module: what is averaged.
