@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from gsgan.body import SkinnedBody
 from gsgan.body.normals import vertex_normals
 from gsgan.model.skinned_points import SkinnedPoints
 from gsgan.scene import BodyPose
 from gsgan.skeleton import Points
+
+NORMAL_FLOOR = 1e-2  # less lets rounding decide where a skin is flat
 
 
 class BodyPoints(nn.Module):
@@ -80,10 +81,10 @@ class BodyPoints(nn.Module):
 def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
     """``[B, N, 3]`` normals of a surface that linear maps ``A`` ``[B, N, 3, 3]`` move.
 
-    By the cofactors, which are det(A) A⁻ᵀ without the division: where skinning flattens a point's
-    neighbourhood the normal stays finite; where it has none left the normal is zero.
+    By the cofactors, which are det(A) A⁻ᵀ without the division. Where skinning flattens a point's
+    neighbourhood there is no normal: it fades to zero, from about NORMAL_FLOOR of the area at rest.
     """
     x, y, z = A.unbind(-1)
     cofactors = [torch.linalg.cross(a, b) for a, b in ((y, z), (z, x), (x, y))]
     moved = (torch.stack(cofactors, dim=-1) @ normals.unsqueeze(-1)).squeeze(-1)
-    return functional.normalize(moved, dim=-1, eps=1e-6)
+    return moved * torch.rsqrt(moved.square().sum(-1, keepdim=True) + NORMAL_FLOOR**2)

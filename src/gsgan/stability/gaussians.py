@@ -161,6 +161,12 @@ def _low_passes() -> Iterator[RasterCase]:
         ),
         settings=settings,
     )
+    for times in (2, 3):
+        yield raster_case(
+            name.format(f"needle drawn {times} times as large and averaged"),
+            _sparse([(0.01, 0.004, 2.0)], (1.0, 1e-4, 1e-4), (0.9, 0.0, 0.0, 0.3), camera),
+            settings=replace(settings, supersample=times),
+        )
     for shape, diagonal in (("of rank 1", (0.04, 0.0, 0.0)), ("zero", (0.0, 0.0, 0.0))):
         yield raster_case(
             name.format(f"covariance {shape}"),

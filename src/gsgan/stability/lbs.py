@@ -16,6 +16,7 @@ from gsgan.body import (
     forward_kinematics,
     skin,
 )
+from gsgan.model.body_points import moved_normals
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat import Accuracy, rasterise
 from gsgan.stability.case import REFUSED, Case, Inputs, Tolerance
@@ -41,7 +42,7 @@ def _arm(**changes: Any) -> Inputs:
 
 
 def _skinned(inputs: Inputs) -> dict[str, Tensor]:
-    """Points and covariances ``[1, 4, ...]`` of the posed arm; bones scaled where asked."""
+    """Points, covariances and normals ``[1, 4, ...]`` of the posed arm; bones scaled if asked."""
     check_weights(inputs["weights"].detach())  # as every body does when it is made
     R = axis_angle_to_matrix(inputs["theta"])
     bones = forward_kinematics(inputs["joints"], PARENTS, R, torch.zeros_like(R[:, 0, 0]))
@@ -51,7 +52,9 @@ def _skinned(inputs: Inputs) -> dict[str, Tensor]:
         bones = torch.cat([bones[:, :, :3] * size, last], dim=2)
     A, t = blend_transforms(bones, BONES.to(R.device), inputs["weights"])
     axes = A * inputs["scales"][:, None]
-    return {"means": skin(inputs["points"], A, t), "covariances": axes @ axes.mT}
+    up = torch.tensor([0.48, 0.6, 0.64], device=A.device, dtype=A.dtype).expand(4, 3)
+    posed = {"means": skin(inputs["points"], A, t), "covariances": axes @ axes.mT}
+    return {**posed, "normals": moved_normals(A, up)}
 
 
 def _painted(
@@ -60,7 +63,8 @@ def _painted(
     """The skinned Gaussians, and their picture."""
     posed = _skinned(inputs)
     gaussians = Gaussians(
-        **posed,
+        means=posed["means"],
+        covariances=posed["covariances"],
         quats=None,
         scales=None,
         opacities=torch.full_like(posed["means"][..., 0], 0.7),
