@@ -16,7 +16,7 @@ from gsgan.reporting.mixing import (
 from gsgan.reporting.origin import UNKNOWN, commit, names_of, runs_grid
 from gsgan.reporting.paper import MEAN, PaperTable
 from gsgan.reporting.parts import Part, grids, groups, parts
-from gsgan.reporting.scored import Run
+from gsgan.reporting.scored import Run, by_settings
 from gsgan.reporting.spec import TableSpec, subject_of
 
 
@@ -87,7 +87,7 @@ def _select(spec: TableSpec, runs: Sequence[Run]) -> tuple[list[Run], list[LeftO
         elif rows is not None and run.name not in rows:
             out.append(LeftOut(run.folder, f"table {spec.name} has no row for {run.name}"))
         else:
-            taken.append(run)
+            taken.append(by_settings(run, spec.by or ()))
     return taken, out
 
 

@@ -17,6 +17,7 @@ from gsgan.reporting.grid import Report
 from gsgan.reporting.paper import read_paper
 from gsgan.reporting.spec import TableSpec
 from gsgan.reporting.writers import html, latex, markdown, numbers
+from gsgan.reporting.writers.curves import picture
 from gsgan.reporting.writers.terminal import print_report
 
 WRITERS = {
@@ -25,6 +26,7 @@ WRITERS = {
     "report.html": html.page,
     "report.json": numbers.text,
 }
+CURVES = "report.png"
 BLOCK_END = "<!-- /report -->"
 
 
@@ -51,6 +53,8 @@ def run_report(config: DictConfig) -> Report:
     try:
         for name, text in WRITERS.items():
             write_atomically(folder / name, text(report))
+        if spec.by:
+            write_atomically(folder / CURVES, picture(report))
         if page is not None:
             fill_block(page, _start(spec), BLOCK_END, markdown.block(report), key="fill")
     except OSError as error:
@@ -58,7 +62,8 @@ def run_report(config: DictConfig) -> Report:
         raise ConfigError(f"{where} cannot be written: {error.strerror}") from None
     console = make_console()
     print_report(report, console)
-    console.print(f"tables: {folder}/{{{','.join(WRITERS)}}}", markup=False, soft_wrap=True)
+    files = [*WRITERS, *([CURVES] if spec.by else [])]
+    console.print(f"tables: {folder}/{{{','.join(files)}}}", markup=False, soft_wrap=True)
     if page is not None:
         console.print(f"filled: {page}", markup=False, soft_wrap=True)
     return report

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsgan.errors import DataError
+from gsgan.errors import ConfigError, DataError
 from gsgan.reporting.spec import METRICS
 
 METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"
@@ -74,6 +74,25 @@ class Run:
             return None
         chosen = {k: v for k, v in self.settings.items() if k.split(".")[0] == "data"}
         return {k: v for k, v in chosen.items() if k not in IDLE_DATA_KEYS}
+
+
+def by_settings(run: Run, keys: Sequence[str]) -> Run:
+    """The run under a name that tells those settings, which then may differ from others'.
+
+    Raises:
+        ConfigError: when the run does not have such a setting.
+    """
+    told = [run.name]
+    for key in keys:
+        if run.settings is None or key not in run.settings:
+            raise ConfigError(f"table.by: {run.said} has no setting {key}")
+        value = run.settings[key]
+        shown = f"{value:g}" if _is_number(value) else str(value)
+        told.append(f"{key.rpartition('.')[2].replace('_', ' ')} {shown}")
+    if not keys:
+        return run
+    settings = {key: value for key, value in (run.settings or {}).items() if key not in keys}
+    return replace(run, name=", ".join(told), settings=settings)
 
 
 def is_run(folder: Path) -> bool:

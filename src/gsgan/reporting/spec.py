@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -88,6 +89,8 @@ class TableSpec:
         metrics: columns, or one grid each where subjects are the columns.
         splits: one grid each.
         rows: in this order, each even where it has no run yet; None takes whatever there is.
+        by: dotted keys of the runs' configs whose values make rows of their own, so that a sweep
+            over settings can be shown.
         variants: pictures that make rows, where ``rows`` is None.
         subjects: columns, where each subject has its own; None for metrics as columns.
         data: the data set that it is about; None takes any one.
@@ -104,6 +107,7 @@ class TableSpec:
     metrics: Sequence[str]
     splits: Sequence[str]
     rows: Sequence[RowSpec | Mapping[str, Any]] | None = None
+    by: Sequence[str] | None = None
     variants: Sequence[str] = (PAINTED,)
     subjects: Sequence[str] | None = None
     data: str | None = None
@@ -118,7 +122,7 @@ class TableSpec:
                 raise ConfigError(f"table.{name} must be a text, got {held!r}")
         if not isinstance(self.apart, bool):
             raise ConfigError(f"table.apart must be true or false, got {self.apart!r}")
-        for name in ("metrics", "splits", "variants", "subjects", "rows"):
+        for name in ("metrics", "splits", "variants", "subjects", "rows", "by"):
             self._check_list(name, getattr(self, name))
         unknown = [metric for metric in self.metrics if metric not in METRICS]
         if unknown:
@@ -132,11 +136,13 @@ class TableSpec:
         if self.rows is not None:
             rows = [r if isinstance(r, RowSpec) else _row(r) for r in self.rows]
             object.__setattr__(self, "rows", rows)
+        if self.by is not None and self.rows is not None:
+            raise ConfigError("table.by makes rows of its own, so table.rows must be null")
         if self.subjects is not None:
             object.__setattr__(self, "subjects", [str(s) for s in self.subjects])
 
     def _check_list(self, name: str, held: Any) -> None:
-        if held is None and name in ("subjects", "rows"):
+        if held is None and name in ("subjects", "rows", "by"):
             return
         if isinstance(held, str) or not isinstance(held, Sequence) or not held:
             raise ConfigError(f"table.{name} must be a list of at least one, got {held!r}")
@@ -153,12 +159,18 @@ class TableSpec:
         """
         if self.rows is not None:
             return [row for row in self.rows if isinstance(row, RowSpec)]
-        ordered = sorted(names, key=lambda name: (name != self.reference, name))
+        ordered = sorted(names, key=lambda name: (name != self.reference, _natural(name)))
         return [
             RowSpec(name, f"{name}: Step I's colour" if variant == SPLAT else None, variant)
             for name in ordered
             for variant in self.variants
         ]
+
+
+def _natural(name: str) -> list[str | float]:
+    """Numbers in a name by their size, words between them by letters."""
+    parts = re.split(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)", name)
+    return [float(part) if i % 2 else part for i, part in enumerate(parts)]
 
 
 def _row(given: Mapping[str, Any]) -> RowSpec:
