@@ -189,7 +189,13 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
 
 
 def test_a_run_from_before_body_points_and_low_pass_loads_as_it_was_trained(tiny, tmp_path):
-    config = tiny("~model.low_pass", "~model.body_points", "~effects.body_points")
+    newer = (
+        "model.low_pass",
+        "model.supersample",
+        "model.body_points",
+        "model.deformation.normals",
+    )
+    config = tiny(*(f"~{key}" for key in newer), "~effects.body_points")
     data, module = build_training(config)
     checkpoint = stored(module, tmp_path)
     del checkpoint["gsgan"]["effects"]["body_points"]
@@ -198,6 +204,8 @@ def test_a_run_from_before_body_points_and_low_pass_loads_as_it_was_trained(tiny
     avatar, _ = load_avatar(tmp_path, config, data)
     assert avatar.body_points is None
     assert avatar.accuracy.low_pass == avatar.segmentation.accuracy.low_pass == 0.3
+    assert avatar.accuracy.supersample == 1
+    assert avatar.deformation.from_normal is None
 
 
 def test_the_figure_of_densify_says_where_the_points_are(build, tmp_path):

@@ -123,7 +123,7 @@ def test_pelvis_code_does_not_know_the_heading(densify):
 
 def test_psi_is_told_where_the_surface_looks_unless_it_shall_not_be(densify):
     torch.manual_seed(0)
-    psi = small(densify)
+    psi = small(densify, normals=True)
     with torch.no_grad():
         psi.head.weight.normal_(0, 0.3)
     points = densify(rest())
@@ -131,7 +131,7 @@ def test_psi_is_told_where_the_surface_looks_unless_it_shall_not_be(densify):
     pose, root = torch.zeros(1, 99), torch.zeros(1, 3)
     told, other = (psi.residuals(given, pose, root).sh for given in (points, turned))
     assert (told - other).abs().max() > 1e-3
-    blind = small(densify, normals=False)
+    blind = small(densify)
     assert "from_normal.weight" not in blind.state_dict()
     blind.head.weight.data.copy_(psi.head.weight.data)
     one, two = (blind.residuals(given, pose, root).sh for given in (points, turned))

@@ -77,7 +77,7 @@ class Deformation(nn.Module):
         sh_degree: int = 1,
         rest_octaves: int = 6,
         position_octaves: int = 2,
-        normals: bool = True,
+        normals: bool = False,
         free_table: bool = True,
         pose_frame: str = "world",
         opacity: float = 0.5,
