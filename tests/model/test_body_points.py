@@ -195,7 +195,7 @@ def test_a_run_from_before_body_points_and_low_pass_loads_as_it_was_trained(tiny
         "model.body_points",
         "model.deformation.normals",
     )
-    config = tiny(*(f"~{key}" for key in newer), "~effects.body_points")
+    config = tiny(*(f"~model.{key}" for key in newer), "~effects.body_points")
     data, module = build_training(config)
     checkpoint = stored(module, tmp_path)
     del checkpoint["gsgan"]["effects"]["body_points"]
