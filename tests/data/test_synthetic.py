@@ -325,7 +325,7 @@ def test_knees_bend_forwards():
 
 
 def test_motion_is_smooth():
-    theta, transl, _ = motion(1200, 0)  # 48 frames a second
+    theta, transl, _ = motion(1680, 0)  # 48 frames a second
     step = (theta[1:] - theta[:-1]).norm(dim=-1).max()
     assert step < 0.3
     assert (transl[1:] - transl[:-1]).norm(dim=-1).max() < 0.05
@@ -346,13 +346,13 @@ def test_fingers_move_while_signing():
 
 
 def test_held_out_frames_are_blocks_and_one_whole_passage():
-    test, names = held_out(60, 15), passage_names(60)
-    assert len(test) == len(set(test)) == 15
+    test, names = held_out(84, 21), passage_names(84)
+    assert len(test) == len(set(test)) == 21
     combination = [i for i, n in enumerate(names) if n == COMBINATION]
     assert set(combination) <= set(test)
     rest = [i for i in test if i not in combination]
     assert all(i - 1 in rest or i + 1 in rest for i in rest)  # blocks, not single frames
-    assert {names[i] for i in range(60) if i not in test} == set(names) - {COMBINATION}
+    assert {names[i] for i in range(84) if i not in test} == set(names) - {COMBINATION}
 
 
 @pytest.mark.parametrize("frames", [1, 2, 7, 30])

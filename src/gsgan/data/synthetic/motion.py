@@ -245,6 +245,44 @@ def squat_and_wave(c: Controls, s: Tensor, style: Style) -> None:
     c.spine[:, 2] += 0.4 * torch.sin(TAU * s)
 
 
+def freestyle(c: Controls, s: Tensor, style: Style) -> None:
+    """Arms, trunk, legs and heading wander, each on its own clock: poses that no other passage has.
+
+    A person who trains on named movements alone is painted worst where two of them meet.
+    """
+    for i, shift in enumerate((0.0, 2.6)):
+        a = style.phase + shift
+        rise = 1.25 + 1.1 * style.amplitude * _wander(s, 4.0, a)  # 0 hangs, half a turn is up
+        around = 0.75 + 0.7 * _wander(s, 5.3, a + 1)  # 0 before the body, a quarter sideways
+        reach = 0.42 + 0.09 * _wander(s, 6.1, a + 2)
+        c.wrist[:, i, 0] = 0.06 + reach * torch.sin(rise) * torch.sin(around)
+        c.wrist[:, i, 1] = -0.04 - reach * torch.sin(rise).clamp_min(0.1) * torch.cos(around)
+        c.wrist[:, i, 2] = -reach * torch.cos(rise)
+        c.elbow[:, i] = c.elbow.new_tensor([1.0, 0.6, -0.5])
+        c.palm[:, i] = 0.3 + 0.6 * _wander(s, 4.7, a + 3)
+        c.flex[:, i] = 0.25 * _wander(s, 5.9, a + 4)
+        for finger in range(5):
+            c.curl[:, i, finger] = 0.45 + 0.4 * _wander(s, 6.5, a + 5 + 0.9 * finger)
+        forth = _wander(s, 3.7, a + 2.2)
+        c.ankle[:, i, 0] += 0.03 + 0.04 * _wander(s, 3.1, a + 0.7)
+        c.ankle[:, i, 1] += 0.14 * forth
+        c.ankle[:, i, 2] += 0.10 * forth.clamp_min(0) ** 2
+    _squat_legs(c, 0.6 * (0.5 + 0.5 * _wander(s, 3.3, style.phase + 6)) ** 2, style.amplitude)
+    c.spine[:, 2] += 0.6 * _wander(s, 3.5, style.phase + 1.5)
+    c.spine[:, 1] += 0.3 * _wander(s, 4.3, style.phase + 2.5)
+    c.spine[:, 0] += 0.2 * _wander(s, 3.9, style.phase + 3.5)
+    c.head[:, 2] += -0.3 * _wander(s, 4.9, style.phase + 4.5)
+    c.head[:, 0] += 0.15 * _wander(s, 5.7, style.phase + 5.5)
+    c.root[:, 2] += 0.9 * _wander(s, 2.3, style.phase + 0.5)
+
+
+def _wander(s: Tensor, cycles: float, phase: float) -> Tensor:
+    """Smooth, in [-1, 1], never the same twice within a passage."""
+    golden = (1 + math.sqrt(5)) / 2
+    slow, fast = TAU * cycles * s + phase, TAU * cycles * golden * s + 2.4 * phase + 1
+    return 0.5 * (torch.sin(slow) + torch.sin(fast))
+
+
 COMBINATION = "squat_and_wave"
 # name, what happens, seconds
 PASSAGES: tuple[tuple[str, Passage, float], ...] = (
@@ -256,6 +294,7 @@ PASSAGES: tuple[tuple[str, Passage, float], ...] = (
     ("twist", twist, 3.0),
     ("signing", signing, 5.0),
     (COMBINATION, squat_and_wave, 3.0),
+    ("freestyle", freestyle, 10.0),
 )
 DURATION = sum(seconds for _, _, seconds in PASSAGES)
 

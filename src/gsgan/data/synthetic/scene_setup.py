@@ -60,8 +60,8 @@ class Settings:
     size: int = 128
     train_cameras: int = 6
     test_cameras: int = 2
-    frames: int = 60
-    test_frames: int = 15
+    frames: int = 84
+    test_frames: int = 21
     rays_per_pixel: int = 16
     seed: int = 0
     identity: int = 0
