@@ -12,6 +12,7 @@ from commands import ROOT, TINY
 
 # A GPU's settings: one kind of machine runs the tests.
 ELSEWHERE = ("trainer=gpu", "trainer=ddp")
+REPORTS = ("ablation", "ablation_skeleton", "gan")  # blocks of docs/ablations.md
 SMALL_BENCH = {
     "raster": [
         *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "reference.gaussians=300"),
@@ -113,7 +114,8 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
 
     def report_page() -> Path:
         page = folder() / "page.md"
-        page.write_text("# Page\n\n<!-- report:ablation -->\n<!-- /report -->\n")
+        blocks = (f"<!-- report:{name} -->\n<!-- /report -->" for name in REPORTS)
+        page.write_text("# Page\n\n" + "\n\n".join(blocks) + "\n")
         return page
 
     def another_run(name: str) -> Path:
@@ -134,6 +136,8 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
         "/path/to/videos": videos,
         "/path/to/predictions": predictions,
         "/path/to/sweep": lambda: run,
+        "runs=runs/ablation_skeleton": lambda: f"runs={run.parent}",
+        "runs=runs/ablation_gan": lambda: f"runs={run.parent}",
         "runs=runs/ablation": lambda: f"runs={run.parent}",
         "/path/to/page.md": report_page,
         "fill=docs/ablations.md": lambda: f"fill={report_page()}",
@@ -193,7 +197,7 @@ def test_every_documented_command_runs(line, place, capture, inside, tmp_path):
     if not name:
         return  # the bare list of commands: test_the_list_of_commands
     if name == "train":
-        if "experiment=ablation" in arguments:
+        if any(a.startswith("experiment=ablation") for a in arguments):
             arguments = shorter_study(arguments, tmp_path)
         arguments = tiny_training(arguments, capture)
     if name == "bench":
