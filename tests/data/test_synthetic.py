@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from gsgan.body.free import free_body
+from gsgan.body.lbs import axis_angle_to_matrix
 from gsgan.data.synthetic import cache_root, ensure_synthetic, make, make_synthetic
 from gsgan.data.synthetic.identity import SHIRT_PATTERNS, albedo, make_identity, marks_of
 from gsgan.data.synthetic.motion import (
@@ -345,6 +346,28 @@ def test_fingers_move_while_signing():
         assert theta[now, finger].norm(dim=-1).std() > 0.1
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_every_camera_sees_the_whole_motion(seed):
+    """Cameras are placed by fewer moments than this: what lies between them must fit as well."""
+    stage = build_stage(Settings(size=128, frames=350, test_frames=60, seed=seed))
+    for frame in range(0, 350, 5):
+        vertices = stage.vertices(frame)[::23]
+        for view in stage.views.values():
+            pixels = view.project(vertices)
+            assert pixels.min() > 1
+            assert pixels.max() < 127
+
+
+def test_the_free_movement_has_poses_that_no_named_one_has():
+    theta, _, names = motion(350, 0)
+    turned = axis_angle_to_matrix(theta[:, 1:]).flatten(1)  # without the root
+    free = torch.tensor([name == "freestyle" for name in names])
+    named = turned[~free]
+    nearest = torch.cdist(turned[free], named).amin(dim=1)
+    within = torch.cdist(named, named).fill_diagonal_(torch.inf).amin(dim=1)
+    assert nearest.median() > 3 * within.median()
+
+
 def test_held_out_frames_are_blocks_and_one_whole_passage():
     test, names = held_out(84, 21), passage_names(84)
     assert len(test) == len(set(test)) == 21
@@ -376,7 +399,6 @@ def test_two_bone_reaches_its_target_with_the_right_lengths():
 
 
 def test_swing_and_twist_multiply_to_the_rotation():
-    from gsgan.body.lbs import axis_angle_to_matrix
 
     axis = torch.tensor([0.0, 0.6, -0.8], dtype=torch.float64)
     R = axis_angle_to_matrix(torch.tensor([[0.7, -0.2, 0.4]], dtype=torch.float64))

@@ -10,9 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 
 from gsgan.drawing import ablation, canny, errors, segmentation
-from gsgan.drawing.body import ellipses, part_colours
+from gsgan.drawing.body import draw_gaussians, ellipses, part_colours
 from gsgan.drawing.layout import LEAST_FONT, Grid, Unavailable, style
 from gsgan.drawing.measures import measure, written
 from gsgan.drawing.registry import KINDS
@@ -124,6 +125,29 @@ def test_ellipses_are_the_projected_covariances():
     assert major == pytest.approx(math.sqrt((100 * 0.2 / 2) ** 2 + low), rel=1e-4)
     assert minor == pytest.approx(math.sqrt((100 * 0.05 / 2) ** 2 + low), rel=1e-4)
     assert math.remainder(lengths[major] - turn, math.pi) == pytest.approx(0, abs=1e-4)
+
+
+def test_ellipses_are_as_wide_as_the_supersampled_picture_has_them():
+    camera = Camera(
+        torch.tensor([[[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]]),
+        torch.eye(3)[None],
+        torch.zeros(1, 3),
+        (64, 64),
+    )
+    gaussians = Gaussians(
+        means=torch.tensor([[[0.0, 0, 2]]]),
+        quats=torch.tensor([[[1.0, 0, 0, 0]]]),
+        scales=torch.tensor([[[0.002, 0.002, 0.002]]]),  # a tenth of a pixel: low-pass matters
+        opacities=torch.ones(1, 1),
+        features=torch.ones(1, 1, 3),
+    )
+    accuracy = replace(ACCURACY["high"], supersample=2)
+    larger = project(gaussians, camera.resize((128, 128)), accuracy)
+    wanted, _, _ = ellipses(larger.factors[0].double())
+    axes = Figure().add_subplot()
+    draw_gaussians(axes, gaussians, SimpleNamespace(camera=camera), accuracy, sigmas=1.0)
+    (drawn,) = axes.collections
+    assert 2 * float(drawn.get_widths()[0]) == pytest.approx(2 * float(wanted[0]), rel=1e-4)
 
 
 @pytest.mark.parametrize("limbs", ["paper22", "all26"])

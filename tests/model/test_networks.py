@@ -43,6 +43,17 @@ def test_generator_sees_what_supersampling_averages():
     assert (fine.grad != 0).any()
 
 
+def test_generator_refuses_a_fine_F_it_was_not_built_for():
+    F, S, p2d, g = inputs(16, 12)
+    net = Generator(5, 4, 8, 35, 2, base=4)
+    with pytest.raises(ValueError, match=r"fine must be \(32, 24\) pixels, got None"):
+        net(F, S, p2d, g)
+    with pytest.raises(ValueError, match=r"fine must be \(32, 24\) pixels, got \(48, 36\)"):
+        net(F, S, p2d, g, torch.zeros(2, 5, 48, 36))
+    with pytest.raises(ValueError, match=r"fine must be None pixels, got \(32, 24\)"):
+        generator()(F, S, p2d, g, torch.zeros(2, 5, 32, 24))
+
+
 def test_stability_overflowing_fine_features_are_bounded_like_F():
     F, S, p2d, g = inputs(16, 16)
     net = Generator(5, 4, 8, 35, 2, base=4, feature_bound=10.0)

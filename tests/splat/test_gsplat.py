@@ -139,6 +139,9 @@ def drawn(gaussians, cam, backend, settings=STANDARD, depth=True):
 def assert_same(got, want, tolerance=2e-5):
     (raster, grads), (want_raster, want_grads) = got, want
     for name, value in vars(want_raster).items():
+        assert (getattr(raster, name) is None) == (value is None), name
+        if value is None:
+            continue
         assert error(getattr(raster, name), value) < tolerance, name
     for name, grad in want_grads.items():
         if name != "K":
@@ -166,6 +169,16 @@ def test_the_settings_that_gsplat_takes_are_passed_on(stand_in, changes):
     want = drawn(gaussians, cam, "reference", settings)
     assert error(want[0].features, plain.features) > 1e-2
     assert_same(drawn(gaussians, cam, "gsplat", settings), want)
+
+
+def test_supersampled_it_draws_the_larger_picture(stand_in):
+    gaussians, cam = scene()
+    settings = replace(STANDARD, supersample=2)
+    got = drawn(gaussians, cam, "gsplat", settings)
+    call, (height, width) = stand_in.calls[-1], cam.size
+    assert (call.width, call.height) == (2 * width, 2 * height)
+    torch.testing.assert_close(call.Ks[:, 0, :2], 2 * cam.K[:, :2])
+    assert_same(got, drawn(gaussians, cam, "reference", settings))
 
 
 def test_without_depth_none_is_drawn(stand_in):

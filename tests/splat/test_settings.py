@@ -57,7 +57,10 @@ def test_presets_are_the_table():
         ("low_pass", 0.0),
         ("fov_clamp", 0.9),
         ("supersample", 0),
-        ("supersample", 1.5),
+        ("supersample", 2.0),
+        ("supersample", True),
+        ("supersample", float("nan")),
+        ("supersample", "x"),
     ],
 )
 def test_values_out_of_range_are_refused(field, value):

@@ -96,6 +96,8 @@ def _settings(config: DictConfig, subject: Subject, device: torch.device) -> dic
         drawing, _ = resolve_backend(config.backend, device, avatar.accuracy)
         found |= {"accuracy": avatar.accuracy.name, "backend": drawing}
         found["channels of F"] = avatar.splat_channels
+        if avatar.accuracy.supersample > 1:
+            found["F drawn"] = f"{avatar.accuracy.supersample} times as large, then averaged"
         found["SH degree"] = avatar.splats.sh_degree
     placed = avatar.body_points or avatar.densify
     if placed is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -93,8 +93,7 @@ def draw_points(axes: Axes, placed: Densify | BodyPoints, pose: Pose, shot: Shot
     else:
         points = placed(pose.p, pose.valid, pose.frames)
         colours = to_rgba_array(np.array(part_colours(placed))[points.part_id.numpy()])
-        outward = (points.frames[0] @ placed.normals.to(points.means).unsqueeze(-1)).squeeze(-1)
-        away = (outward * (points.means[0] - shot.camera.centre)).sum(-1).numpy() > 0
+        away = (points.normals[0] * (points.means[0] - shot.camera.centre)).sum(-1).numpy() > 0
     pixels, depth = (x[0].numpy() for x in shot.camera.project(points.means))
     keep = np.flatnonzero(points.valid[0].numpy() & (depth > NEAR))
     order = keep[np.argsort(-depth[keep])]
@@ -127,6 +126,8 @@ def draw_gaussians(
 
     Their opacity is that of the ellipse; the lens's low-pass filter is in their size.
     """
+    # Supersampled, the low-pass counts in smaller pixels than the panel's.
+    accuracy = replace(accuracy, low_pass=accuracy.low_pass / accuracy.supersample**2)
     seen = project(gaussians, shot.camera, accuracy)
     keep = torch.nonzero(seen.visible[0]).flatten()
     keep = keep[seen.depths[0, keep].argsort(descending=True)]

@@ -69,7 +69,8 @@ class Avatar(nn.Module):
         pose_encoder: Ω (or the flat skeleton) to g; None in ``splat_only``.
         generator: the UNet, given its channel counts; None makes Step I's colour the picture.
         accuracy: the rasteriser's settings for F.
-        low_pass: square pixels that F and S add to every ellipse; None keeps their accuracy's.
+        low_pass: square pixels, of the picture as drawn, that F and S add to every ellipse; None
+            keeps their accuracy's.
         supersample: F is drawn so many times larger each way and averaged; None keeps what its
             accuracy says.
         twist: how bone frames turn about their bones, ``none`` or ``hinge``.

@@ -164,8 +164,12 @@ class Generator(nn.Module):
             p2d: ``[B, 8, H, W]`` the drawn skeleton; None when it is F already (image_to_image).
             g: ``[B, 35]`` the pose code.
             fine: ``[B, C, kH, kW]``, F before it was averaged; given where built to supersample.
+
+        Raises:
+            ValueError: when ``fine`` is missing, not expected, or of another size.
         """
         height, width = F.shape[-2:]
+        self._check_fine(height, width, fine)
         features = F.clamp(-self.feature_bound, self.feature_bound)
         if fine is not None:
             fine = functional.pixel_unshuffle(fine, self.supersample)
@@ -182,6 +186,16 @@ class Generator(nn.Module):
         if self.rgb_skip:
             return F[:, :3] + painted
         return torch.sigmoid(painted) if self.output == "sigmoid" else painted
+
+    def _check_fine(self, height: int, width: int, fine: Tensor | None) -> None:
+        k = self.supersample
+        wanted = None if k == 1 else (k * height, k * width)
+        given = None if fine is None else tuple(fine.shape[-2:])
+        if wanted != given:
+            raise ValueError(
+                f"Generator: built with supersample={k}, so fine must be {wanted} pixels, "
+                f"got {given}"
+            )
 
     def _padded(self, x: Tensor) -> Tensor:
         """Zeros on the right and below, up to a multiple of the stride; channels last."""

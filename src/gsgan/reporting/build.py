@@ -62,7 +62,7 @@ def build(
         spec.title,
         _grids(shown, paper),
         runs_grid(taken, names),
-        _remarks(taken),
+        [*_remarks(taken), *_uncompared(spec, taken)],
         [(names[held.folder], held.reason) for held in left_out],
     )
 
@@ -115,6 +115,15 @@ def _grids(shown: Sequence[Part], paper: PaperTable | None) -> list[Grid]:
         nearest = [i for i, part in enumerate(shown) if part.split == paper.split] or [0]
         found.append(paper.grid(str(why[nearest[0]])))
     return found
+
+
+def _uncompared(spec: TableSpec, runs: Sequence[Run]) -> list[str]:
+    """Why a table by settings has no differences: its rows have longer names than usual."""
+    names = sorted({run.name for run in runs})
+    if not spec.by or spec.reference is None or spec.reference in names:
+        return []
+    example = f"table.reference='{names[0]}'"
+    return [f"No differences: no row is called {spec.reference}; {example} compares with that row."]
 
 
 def _remarks(runs: Sequence[Run]) -> list[str]:

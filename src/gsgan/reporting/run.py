@@ -17,7 +17,6 @@ from gsgan.reporting.grid import Report
 from gsgan.reporting.paper import read_paper
 from gsgan.reporting.spec import TableSpec
 from gsgan.reporting.writers import html, latex, markdown, numbers
-from gsgan.reporting.writers.curves import picture
 from gsgan.reporting.writers.terminal import print_report
 
 WRITERS = {
@@ -53,8 +52,9 @@ def run_report(config: DictConfig) -> Report:
     try:
         for name, text in WRITERS.items():
             write_atomically(folder / name, text(report))
-        if spec.by:
-            write_atomically(folder / CURVES, picture(report))
+        curves = _curves(report) if spec.by else None
+        if curves is not None:
+            write_atomically(folder / CURVES, curves)
         if page is not None:
             fill_block(page, _start(spec), BLOCK_END, markdown.block(report), key="fill")
     except OSError as error:
@@ -62,7 +62,7 @@ def run_report(config: DictConfig) -> Report:
         raise ConfigError(f"{where} cannot be written: {error.strerror}") from None
     console = make_console()
     print_report(report, console)
-    files = [*WRITERS, *([CURVES] if spec.by else [])]
+    files = [*WRITERS, *([] if curves is None else [CURVES])]
     console.print(f"tables: {folder}/{{{','.join(files)}}}", markup=False, soft_wrap=True)
     if page is not None:
         console.print(f"filled: {page}", markup=False, soft_wrap=True)
@@ -80,6 +80,12 @@ def _given(runs: object) -> list[str]:
     if not isinstance(runs, ListConfig):
         raise ConfigError(f"runs must be a list of folders, got {runs!r}")
     return [str(run) for run in runs]
+
+
+def _curves(report: Report) -> bytes | None:
+    from gsgan.reporting.writers.curves import picture  # here: it brings matplotlib
+
+    return picture(report)
 
 
 def _start(spec: TableSpec) -> str:

@@ -77,22 +77,27 @@ class Run:
 
 
 def by_settings(run: Run, keys: Sequence[str]) -> Run:
-    """The run under a name that tells those settings, which then may differ from others'.
+    """The run under a name that tells those settings, so that each of their values has a row.
 
     Raises:
         ConfigError: when the run does not have such a setting.
     """
-    told = [run.name]
-    for key in keys:
-        if run.settings is None or key not in run.settings:
-            raise ConfigError(f"table.by: {run.said} has no setting {key}")
-        value = run.settings[key]
-        shown = f"{value:g}" if _is_number(value) else str(value)
-        told.append(f"{key.rpartition('.')[2].replace('_', ' ')} {shown}")
     if not keys:
         return run
-    settings = {key: value for key, value in (run.settings or {}).items() if key not in keys}
-    return replace(run, name=", ".join(told), settings=settings)
+    told = [run.name]
+    for key in keys:
+        if key == "seed":
+            raise ConfigError("table.by cannot be the seed: the seeds of a row are its spread")
+        if run.settings is None or key not in run.settings:
+            raise ConfigError(f"table.by: {run.said} has no setting {key}")
+        told.append(f"{key.rpartition('.')[2].replace('_', ' ')} {_exact(run.settings[key])}")
+    return replace(run, name=", ".join(told))
+
+
+def _exact(value: Any) -> str:
+    """A value in the fewest characters that tell it from any other."""
+    short = f"{value:g}" if _is_number(value) else str(value)
+    return short if not _is_number(value) or float(short) == value else repr(value)
 
 
 def is_run(folder: Path) -> bool:

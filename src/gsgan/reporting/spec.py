@@ -169,7 +169,7 @@ class TableSpec:
 
 def _natural(name: str) -> list[str | float]:
     """Numbers in a name by their size, words between them by letters."""
-    parts = re.split(r"(\d+(?:\.\d+)?(?:e[+-]?\d+)?)", name)
+    parts = re.split(r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d+)?)", name)
     return [float(part) if i % 2 else part for i, part in enumerate(parts)]
 
 

@@ -40,7 +40,8 @@ class Points:
         scales: ``[B, N]`` metres, initial standard deviation, the same in all directions.
         valid: ``[B, N]`` bool, False on parts whose joints were not seen.
         part_id: ``[N]`` int64 into the parts.
-        normals: ``[B, N, 3]`` outward, of length one, world frame.
+        normals: ``[B, N, 3]`` outward, world frame, of length one; on a skinned body shorter, down
+            to zero, where the skin is flat.
     """
 
     means: Tensor

@@ -70,7 +70,9 @@ def rasterise(
         _say_once(reason)
     out = gaussians.means.dtype
     times, fine = settings.supersample, None
-    drawn = camera.resize((camera.size[0] * times, camera.size[1] * times))
+    drawn = camera
+    if times > 1:
+        drawn = camera.resize((camera.size[0] * times, camera.size[1] * times))
     with tiles.full_precision(gaussians.means.device):
         features, alpha, z = _draw(name, gaussians, drawn, settings, keep, depth)
         if times > 1:

@@ -69,7 +69,7 @@ class Accuracy:
         self._require("alpha_max", self.alpha_min < self.alpha_max <= 1, "in (alpha_min, 1]")
         self._require("low_pass", self.low_pass > 0, "> 0 square pixels")
         self._require("fov_clamp", self.fov_clamp >= 1, ">= 1")
-        whole = int(self.supersample) == self.supersample
+        whole = isinstance(self.supersample, int) and not isinstance(self.supersample, bool)
         self._require("supersample", whole and self.supersample >= 1, "a whole number >= 1")
 
     def _require(self, field: str, holds: bool, expected: str) -> None:

@@ -18,6 +18,8 @@ SIDE = 16
 """Pixels."""
 CHANNELS = {"F": 5, "S": 4, "p2d": 8}
 POSE = 35
+TIMES = 2
+"""F is drawn so many times larger each way, and averaged."""
 
 
 @lru_cache(maxsize=8)
@@ -26,7 +28,7 @@ def _generator(dtype: torch.dtype, device: torch.device, biased: bool) -> Genera
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         F, S, p2d = CHANNELS.values()
-        made = Generator(F, S, p2d, POSE, base=4)
+        made = Generator(F, S, p2d, POSE, TIMES, base=4)
         for module in made.modules():
             if isinstance(module, Style) and module.from_map is not None:
                 nn.init.normal_(module.from_map.weight, std=0.1)
@@ -46,15 +48,17 @@ def _inputs(scale: float = 1.0, shift: float = 0.0, person: float = 1.0) -> Inpu
         return torch.rand(1, *shape, generator=generator, dtype=torch.float64)
 
     made = {name: rand(channels, SIDE, SIDE) for name, channels in CHANNELS.items()}
-    made["F"] = scale * (made["F"] - shift)
+    made["fine"] = rand(CHANNELS["F"], TIMES * SIDE, TIMES * SIDE)
+    for name in ("F", "fine"):
+        made[name] = scale * (made[name] - shift)
     for value in made.values():
-        value[..., round(person * SIDE) :] = 0
+        value[..., round(person * value.shape[-1]) :] = 0
     return {**made, "g": 2 * rand(POSE) - 1}
 
 
 def _painted(inputs: Inputs, biased: bool = True) -> Outputs:
-    F, S, p2d, g = (inputs[name] for name in ("F", "S", "p2d", "g"))
-    return {"image": _generator(F.dtype, F.device, biased)(F, S, p2d, g)}
+    F, S, p2d, g, fine = (inputs[name] for name in ("F", "S", "p2d", "g", "fine"))
+    return {"image": _generator(F.dtype, F.device, biased)(F, S, p2d, g, fine)}
 
 
 def _in_half_precision(inputs: Inputs, half: torch.dtype) -> Outputs:

@@ -43,6 +43,7 @@ def small_psi(dtype: torch.dtype, device: torch.device) -> Deformation:
             embedding=4,
             features=FEATURES,
             sh_degree=SH_DEGREE,
+            normals=True,
         )
     return psi.to(device, dtype)
 

@@ -39,6 +39,7 @@ def frames_and_points(inputs: Inputs) -> dict[str, Tensor]:
         "torso": frames.torso,
         "points": points.means,
         "sigmas": points.scales,
+        "normals": points.normals,
         "pose code": omega(p, valid, None, frame="world", frames=frames),
     }
 

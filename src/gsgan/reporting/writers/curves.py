@@ -1,4 +1,4 @@
-"""A sweep over settings as curves: a panel a score, the table's rows along it."""
+"""A sweep over settings as curves: a panel a score, a line a model, the settings along it."""
 
 from __future__ import annotations
 
@@ -6,56 +6,90 @@ import io
 import math
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure, SubFigure
 
 from gsgan.reporting.grid import Grid, Report, Row
 
 COLUMNS = 3
-PANEL = (3.1, 2.5)  # inches
-COLOUR = "#0072b2"
+PANEL = (3.1, 2.4)  # inches
+# Distinguishable without colour vision, too (Okabe and Ito).
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
-def picture(report: Report) -> bytes:
-    """PNG of the last split's scores: means, spreads as bars; differences are not shown.
+def picture(report: Report) -> bytes | None:
+    """PNG of every grid of scores: means, spreads as bars. None where no run has a score to show.
 
-    A score that no run has gets no panel.
+    Differences have no panel, nor has a score that no run has.
     """
-    scored = [grid for grid in report.grids if any(row.kind == "floor" for row in grid.rows)]
-    grid = scored[-1]
-    rows = [row for row in grid.rows if row.kind == "run"]
-    shown = [i for i in range(len(grid.columns)) if any(_mean(row, i) is not None for row in rows)]
-    down = math.ceil(len(shown) / COLUMNS)
-    across = min(len(shown), COLUMNS)
-    size = (PANEL[0] * across, PANEL[1] * down + 0.4)
+    grids = [grid for grid in report.grids if any(row.kind == "floor" for row in grid.rows)]
+    shown = {id(grid): _columns(grid) for grid in grids}
+    grids = [grid for grid in grids if shown[id(grid)]]
+    if not grids:
+        return None
+    down = [math.ceil(len(shown[id(grid)]) / COLUMNS) for grid in grids]
+    across = max(min(len(shown[id(grid)]), COLUMNS) for grid in grids)
+    size = (PANEL[0] * across, sum(PANEL[1] * n + 0.5 for n in down))
     figure = Figure(figsize=size, dpi=120, layout="constrained")
-    for place, i in enumerate(shown):
-        _panel(figure.add_subplot(down, across, place + 1), grid, rows, i)
-    figure.suptitle(grid.title, fontsize=9)
+    parts = figure.subfigures(len(grids), 1, height_ratios=down, squeeze=False)[:, 0]
+    for part, grid, rows in zip(parts, grids, down, strict=True):
+        _draw(part, grid, shown[id(grid)], rows, across)
     stream = io.BytesIO()
     figure.savefig(stream, format="png", metadata={"Software": ""})
     return stream.getvalue()
 
 
-def _panel(axes: Axes, grid: Grid, rows: list[Row], i: int) -> None:
-    there = [(x, row) for x, row in enumerate(rows) if _mean(row, i) is not None]
-    spreads = [row.cells[i].numbers.get("spread") or 0.0 for _, row in there]
-    axes.errorbar(
-        [x for x, _ in there],
-        [_mean(row, i) for _, row in there],  # type: ignore[arg-type]
-        yerr=spreads,
-        color=COLOUR,
-        marker="o",
-        markersize=4,
-        lw=1.2,
-        capsize=3,
-    )
-    labels = [row.label.replace(", ", "\n") for row in rows]
-    axes.set_xticks(range(len(rows)), labels, fontsize=6.5)
-    axes.set_xlim(-0.4, len(rows) - 0.6)
+def _columns(grid: Grid) -> list[int]:
+    """Those that some run has a value for."""
+    rows = _runs(grid)
+    return [i for i in range(len(grid.columns)) if any(_mean(row, i) is not None for row in rows)]
+
+
+def _draw(part: SubFigure, grid: Grid, columns: list[int], down: int, across: int) -> None:
+    axes = [part.add_subplot(down, across, place + 1) for place in range(len(columns))]
+    for panel, i in zip(axes, columns, strict=True):
+        _panel(panel, grid, i)
+    lines, labels = axes[0].get_legend_handles_labels()
+    if len(labels) > 1:
+        part.legend(lines, labels, loc="outside lower center", ncols=3, fontsize=7, frameon=False)
+    part.suptitle(grid.title, fontsize=9)
+
+
+def _panel(axes: Axes, grid: Grid, i: int) -> None:
+    rows = _runs(grid)
+    settings = list(dict.fromkeys(_split(row)[1] for row in rows))
+    for k, line in enumerate(dict.fromkeys(_split(row)[0] for row in rows)):
+        there = [row for row in rows if _split(row)[0] == line and _mean(row, i) is not None]
+        if not there:
+            continue
+        axes.errorbar(
+            [settings.index(_split(row)[1]) for row in there],
+            [_mean(row, i) for row in there],  # type: ignore[arg-type]
+            yerr=[row.cells[i].numbers.get("spread") or 0.0 for row in there],
+            color=COLOURS[k % len(COLOURS)],
+            marker=MARKERS[k % len(MARKERS)],
+            markersize=4,
+            lw=1.2,
+            capsize=3,
+            label=line,
+        )
+    axes.set_xticks(range(len(settings)), [s.replace(", ", "\n") for s in settings], fontsize=6.5)
+    axes.set_xlim(-0.4, len(settings) - 0.6)
     axes.set_title(grid.columns[i], fontsize=8.5)
     axes.tick_params(axis="y", labelsize=7)
     axes.grid(visible=True, alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _runs(grid: Grid) -> list[Row]:
+    return [row for row in grid.rows if row.kind == "run"]
+
+
+def _split(row: Row) -> tuple[str, str]:
+    """The line a row belongs to, and its place on it: ``by_settings`` names rows so."""
+    named, colon, variant = row.label.partition(": ")
+    model, _, setting = named.partition(", ")
+    return f"{model}{colon}{variant}", setting
 
 
 def _mean(row: Row, i: int) -> float | None:
