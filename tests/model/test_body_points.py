@@ -189,12 +189,7 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
 
 
 def test_a_run_from_before_body_points_and_low_pass_loads_as_it_was_trained(tiny, tmp_path):
-    newer = (
-        "model.low_pass",
-        "model.supersample",
-        "model.body_points",
-        "model.deformation.normals",
-    )
+    newer = ("low_pass", "supersample", "body_points", "deformation.normals")
     config = tiny(*(f"~model.{key}" for key in newer), "~effects.body_points")
     data, module = build_training(config)
     checkpoint = stored(module, tmp_path)
