@@ -30,7 +30,7 @@ NO_FACTORS = [
     f"factors.{name}=null"
     for name in (
         *("points_on_body", "points_per_limb"),
-        *("channels_of_F", "generator_width", "model"),
+        *("channels_of_F", "supersampling", "generator_width", "model"),
     )
 ]
 
