@@ -26,6 +26,7 @@ SMALL_BENCH = {
         "base=[" + ",".join(f"'{w}'" for w in [*TINY, "data.root=/path/to/capture"]) + "]",
         *(f"factors.{f}=null" for f in ("points_on_body", "points_per_limb", "channels_of_F")),
         *(
+            "factors.supersampling=null",
             "factors.generator_width=null",
             "factors.model=null",
             "settings.accuracies=[draft]",
