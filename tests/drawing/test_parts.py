@@ -37,6 +37,12 @@ def rendered(figure) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
+def pinhole() -> Camera:
+    """At the origin, looking along +z; 100 pixels of focal length, 64 x 64 pixels."""
+    K = torch.tensor([[[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]])
+    return Camera(K, torch.eye(3)[None], torch.zeros(1, 3), (64, 64))
+
+
 def test_numbers_of_a_picture_in_closed_form():
     truth = torch.zeros(1, 3, 16, 16)
     truth[..., 4:12, 4:12] = 0.8
@@ -103,12 +109,7 @@ def test_agreement_of_parts_in_closed_form():
 
 
 def test_ellipses_are_the_projected_covariances():
-    camera = Camera(
-        torch.tensor([[[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]]),
-        torch.eye(3)[None],
-        torch.zeros(1, 3),
-        (64, 64),
-    )
+    camera = pinhole()
     turn = math.radians(30)
     gaussians = Gaussians(
         means=torch.tensor([[[0.0, 0, 2]]]),
@@ -128,12 +129,7 @@ def test_ellipses_are_the_projected_covariances():
 
 
 def test_ellipses_are_as_wide_as_the_supersampled_picture_has_them():
-    camera = Camera(
-        torch.tensor([[[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]]),
-        torch.eye(3)[None],
-        torch.zeros(1, 3),
-        (64, 64),
-    )
+    camera = pinhole()
     gaussians = Gaussians(
         means=torch.tensor([[[0.0, 0, 2]]]),
         quats=torch.tensor([[[1.0, 0, 0, 0]]]),
