@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ import gsgan.compat  # noqa: F401  (before anything imports torchvision)
 for folder in ("data", "capture"):  # what tests of other folders share with them
     sys.path.insert(0, str(Path(__file__).parent / folder))
 torch.set_num_threads(1)  # tensors here are tiny: more threads only wait for each other
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # nor do those of the commands that tests start
 
 
 @pytest.fixture(autouse=True)

@@ -92,7 +92,7 @@ def test_variants_build_only_what_they_use(make):
     assert splat.perceptual is None
     assert splat.schedule.step_two == 0
     both = full.schedule.step_one + full.schedule.step_two
-    assert splat.schedule.step_one == pytest.approx(3.0 * both, abs=1)  # in the same time
+    assert splat.schedule.step_one == pytest.approx(1.75 * both, abs=1)  # in the same time
     wo_feat, _, _ = make("model=wo_feat")
     assert wo_feat.step_two.feature_matching == 0
     assert wo_feat.discriminator is not None
@@ -205,7 +205,8 @@ def test_a_run_driven_into_the_collapse_is_caught_and_brought_back(make, capsys)
     module.rollback.restore = watched
     trainer.fit(module, data)
     assert module.rollback.done == 1
-    assert seen[0] < 0.05 < 0.5 < seen[1]
+    # What is kept had 0.5 of the mask before its own step, on its own picture; each step here takes a lot.
+    assert seen[0] < 0.05 < 0.3 < seen[1]
     assert module.rollback.rate == 0.5
     assert "back to the last good state" in capsys.readouterr().out
     assert module.step == module.schedule.total
