@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from gsgan.config import config_folder, one_sentence, spelled_out
+from gsgan.config import LONGEST_NAME, config_folder, folder_name, one_sentence, spelled_out
 from gsgan.errors import ConfigError, DataError
 
 SRC = Path(__file__).parents[1] / "src" / "gsgan"
@@ -149,3 +149,18 @@ def test_unknown_values_become_one_sentence(tiny, override, named):
 )
 def test_a_list_of_effects_is_a_value_and_no_list_of_files(said, meant):
     assert spelled_out(said) == meant
+
+
+def test_a_sweep_folder_has_a_name_that_file_systems_take(tmp_path):
+    short = "model-full_seed-1"
+    assert folder_name(short) == short
+    many = "_".join(f"training.recipes.psi.rate.key{i}-0.{i}" for i in range(12))
+    other = many.replace("key11-0.11", "key11-0.12")
+    names = {folder_name(many), folder_name(other)}
+    assert len(names) == 2
+    for name in names:
+        assert len(name.encode()) <= LONGEST_NAME
+        (tmp_path / f"99_{name}").mkdir()
+    accents = folder_name("é" * LONGEST_NAME)
+    assert len(accents.encode()) <= LONGEST_NAME
+    assert "/" not in folder_name("data.smpl-/path/SMPL.pkl_seed-1")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import re
 import shutil
 import sys
@@ -11,13 +12,14 @@ from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, InstantiationException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from rich.console import Console
 
 from gsgan.errors import GsganError
 
 FAILED = 1
+LONGEST_NAME = 200  # bytes of a sweep's folder; file systems take 255, files beside it need some
 EFFECTS_LIST = re.compile(r"effects=(\[[^\[\]]*\])")
 
 
@@ -32,6 +34,21 @@ def config_folder() -> Path:
         if (folder / "train.yaml").is_file():
             return folder
     raise GsganError(f"{package / 'conf'}: the config folder is missing; install gsgan again")
+
+
+def folder_name(overrides: str) -> str:
+    """One folder's name for a sweep's overrides, however many, whatever paths are in them.
+
+    What is too long is cut, and ends in a digest of the whole: two sweeps never share a folder.
+    """
+    name = overrides.replace("/", "_").encode()
+    if len(name) <= LONGEST_NAME:
+        return name.decode()
+    end = "_" + hashlib.sha256(overrides.encode()).hexdigest()[:12]
+    return name[: LONGEST_NAME - len(end)].decode(errors="ignore") + end
+
+
+OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
 
 
 def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
