@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -59,6 +60,20 @@ def test_evaluate_finds_a_dataset_that_moved(run, capture, tmp_path, inside):
     assert result.returncode == 0, result.stderr
     scores = json.loads((run / "metrics.json").read_text())
     assert scores == json.loads(kept)  # the other split's scores stay
+
+
+def test_evaluate_finds_a_body_model_that_moved(run, tmp_path, inside):
+    from gsgan.runs import Moved, load_config
+
+    model = tmp_path / "SMPL_NEUTRAL.pkl"
+    assert load_config(run, Moved(smpl=str(model))).data.smpl == str(model)
+    assert load_config(run).data.smpl is None
+    gone = inside("evaluate", f"run={run}", f"data_root={tmp_path / 'away'}")
+    refused(gone, str(tmp_path / "away"))
+    copy = shutil.copytree(run, tmp_path / "copy")
+    config = copy / ".hydra" / "config.yaml"
+    config.write_text(re.sub(r"(?m)^  smpl: null\n", "", config.read_text()))
+    refused(inside("evaluate", f"run={copy}", f"data_smpl={model}"), "data_smpl", "no model file")
 
 
 def test_evaluate_refuses_what_is_no_run(run, tmp_path, inside):

@@ -200,6 +200,7 @@ def test_what_does_not_fit_together_is_said(run, copy, given, inside):
         ([f"run={run}", *given], ("a run has its own data", "data_root=")),
         ([f"run={run}", "method=x"], ("a run has its own method",)),
         ([here, *given, "data_root=/x"], ("data_root is for run=",)),
+        ([here, *given, "data_smpl=/x"], ("data_smpl is for run=", "data.smpl")),
         ([here, *given, "per=frame"], ("per must be split or camera",)),
         ([here, *given, "splits=[]"], ("splits must be among",)),
         ([here, *given, "predictions_pattern=x.png"], ("{frame} once",)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,10 +109,24 @@ def _differences(before: Any, now: Any, at: str = "") -> list[str]:
     return [] if before == now else [at]
 
 
-def load_config(folder: Path) -> DictConfig:
-    """The config a run was started with.
+@dataclass(frozen=True)
+class Moved:
+    """Where a run's dataset and body model file lie now; None: where they lay."""
+
+    root: str | None = None
+    smpl: str | None = None
+
+    @classmethod
+    def said(cls, config: DictConfig) -> Moved:
+        """As ``data_root`` and ``data_smpl`` of a command's config say it."""
+        return cls(config.data_root, config.data_smpl)
+
+
+def load_config(folder: Path, moved: Moved | None = None) -> DictConfig:
+    """The config a run was started with, its paths absolute, or where they have moved.
 
     Raises:
+        ConfigError: when a model file is given for data that reads none.
         DataError: when the folder is not a run folder.
     """
     path = folder / ".hydra" / "config.yaml"
@@ -127,6 +142,12 @@ def load_config(folder: Path) -> DictConfig:
         if path is not None and not Path(path).expanduser().is_absolute():
             started = OmegaConf.load(folder / ".hydra" / "hydra.yaml").hydra.runtime.cwd
             OmegaConf.update(config, key, str(Path(started) / path))
+    moved = moved or Moved()
+    if moved.smpl is not None and "smpl" not in config.data:
+        raise ConfigError(f"data_smpl: {folder} was trained on data that reads no model file")
+    for key, now in (("data.root", moved.root), ("data.smpl", moved.smpl)):
+        if now is not None:
+            OmegaConf.update(config, key, now)
     return config
 
 
@@ -240,6 +261,6 @@ def _check_body(folder: Path, trained: Effects, built: Effects) -> None:
         if getattr(trained, name).on and not getattr(built, name).on:
             raise DataError(
                 f"{folder}: trained with effects.{name}={getattr(trained, name).value}, which "
-                f"cannot be built now: {getattr(built, name).why}; set data.smpl in "
-                f"{folder / '.hydra' / 'config.yaml'} to the model file"
+                f"cannot be built now: {getattr(built, name).why}; give data_smpl=<the model "
+                "file>"
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import re
 import shutil
@@ -785,3 +786,28 @@ def test_the_config_trains_with_segmentation_on_cihp_labels(
     assert set(avatar.segmentation.map.names) < set(CIHP)
     assert painting.image is not None
     assert torch.isfinite(painting.image).all()
+
+
+def test_a_run_is_scored_with_its_model_file_elsewhere(
+    written: Path, smpl_file: Path, tmp_path: Path, inside
+) -> None:
+    first, now, run = (
+        tmp_path / smpl_file.name,
+        tmp_path / "moved" / smpl_file.name,
+        tmp_path / "run",
+    )
+    shutil.copy(smpl_file, first)
+    trained = inside(
+        "train", "size=tiny", "training=smoke", "data=zju_mocap", f"data.root={written}",
+        f"data.smpl={first}", "data.size=32", "data.reader.drop_frames=3", f"hydra.run.dir={run}",
+    )  # fmt: skip
+    assert trained.returncode == 0, trained.stderr
+    before = (run / "metrics.json").read_text()
+    now.parent.mkdir()
+    first.rename(now)
+    gone = inside("evaluate", f"run={run}")
+    assert gone.returncode != 0
+    assert f"{first} is no file" in " ".join(gone.stderr.split())
+    found = inside("evaluate", f"run={run}", f"data_smpl={now}")
+    assert found.returncode == 0, found.stderr
+    assert json.loads((run / "metrics.json").read_text()) == json.loads(before)

@@ -19,6 +19,7 @@ from gsgan.benchmarks.tables import check_block, fill_block
 from gsgan.console import make_console
 from gsgan.devices import pick_device
 from gsgan.errors import ConfigError
+from gsgan.runs import Moved
 from gsgan.splat import resolve_backend
 
 
@@ -75,7 +76,7 @@ def _subject(config: DictConfig, device: torch.device) -> Subject:
     if config.run is None:
         return untrained(config, config.poses, device, last=last)
     folder = Path(config.run).expanduser()
-    return trained(folder, config.data_root, config.poses, device, last=last)
+    return trained(folder, Moved.said(config), config.poses, device, last=last)
 
 
 def _settings(config: DictConfig, subject: Subject, device: torch.device) -> dict[str, Any]:

@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from gsgan.data.datamodule import GsganData
 from gsgan.errors import ConfigError
 from gsgan.model.avatar import Avatar
-from gsgan.runs import build_avatar, build_data, load_avatar, load_config
+from gsgan.runs import Moved, build_avatar, build_data, load_avatar, load_config
 from gsgan.scene import Frame
 
 SPLITS = ("novel_pose", "novel_view", "train")  # poses are taken from the first that has any
@@ -35,14 +35,12 @@ class Subject:
     marks: tuple[str, ...] = ()
 
 
-def trained(
-    folder: Path, data_root: str | None, poses: int, device: torch.device, *, last: bool
-) -> Subject:
+def trained(folder: Path, moved: Moved, poses: int, device: torch.device, *, last: bool) -> Subject:
     """The avatar of a run folder, and held-out frames spread over its data.
 
     Args:
         folder: the run folder.
-        data_root: where its dataset lies now; None: where it lay.
+        moved: where its dataset and model file lie now.
         poses: how many frames at most.
         device: where to.
         last: channels last in memory.
@@ -50,9 +48,7 @@ def trained(
     Raises:
         DataError: when the folder, its checkpoint or its data is not what it should be.
     """
-    config = load_config(folder)
-    if data_root is not None:
-        OmegaConf.update(config, "data.root", data_root)
+    config = load_config(folder, moved)
     data = build_data(config)
     avatar, marks = load_avatar(folder, config, data)
     frames = spread(data, poses)

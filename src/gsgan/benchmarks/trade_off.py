@@ -42,7 +42,7 @@ from gsgan.console import make_console
 from gsgan.devices import pick_device
 from gsgan.errors import ConfigError, DataError
 from gsgan.metrics.lpips import lpips
-from gsgan.runs import CHECKPOINT
+from gsgan.runs import CHECKPOINT, Moved
 
 MEASUREMENTS = "measurements.jsonl"
 # What figures depend on: another version of it measures anew.
@@ -80,7 +80,7 @@ def run(config: DictConfig, folder: Path) -> None:
     console.print(where.sentence(), highlight=False)
     stage = set_stage(
         list(dict.fromkeys(point.folder for point in points)),
-        data_root=config.data_root,
+        moved=Moved.said(config),
         split=config.split,
         pictures=config.pictures,
         device=device,
@@ -146,7 +146,7 @@ def _conditions(
         "machine": asdict(replace(where, date="", load=None)),
         "code": source_digest([*code, *own]),
         "weights": {str(at): digest(at) for at in {point.folder for point in points}},
-        "frames": [config.split, len(stage.frames), config.data_root],
+        "frames": [config.split, len(stage.frames), config.data_root, config.data_smpl],
         "lpips": [config.lpips.net, config.lpips.path],
         "channels_last": config.channels_last,
     }

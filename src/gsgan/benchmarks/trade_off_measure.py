@@ -20,7 +20,7 @@ from gsgan.benchmarks.trade_off_points import Point
 from gsgan.errors import ConfigError
 from gsgan.metrics.image import edge_f1, psnr, ssim
 from gsgan.model.avatar import Avatar
-from gsgan.runs import build_data, load_avatar, load_config
+from gsgan.runs import Moved, build_data, load_avatar, load_config
 from gsgan.scene import Frame
 from gsgan.timing import interleaved
 
@@ -51,7 +51,7 @@ class Stage:
 def set_stage(
     folders: Sequence[Path],
     *,
-    data_root: str | None,
+    moved: Moved,
     split: str,
     pictures: int,
     device: torch.device,
@@ -61,7 +61,7 @@ def set_stage(
 
     Args:
         folders: of the runs.
-        data_root: where their dataset lies now; None: where it lay.
+        moved: where their dataset and model file lie now.
         split: whose frames.
         pictures: how many at most.
         device: where to.
@@ -71,10 +71,7 @@ def set_stage(
         ConfigError: when the runs do not share their data, or the split has no frame.
         DataError: when a run, its checkpoint or its data is not what it should be.
     """
-    configs = {folder: load_config(folder) for folder in folders}
-    if data_root is not None:
-        for config in configs.values():
-            OmegaConf.update(config, "data.root", data_root)
+    configs = {folder: load_config(folder, moved) for folder in folders}
     first = next(iter(configs))
     for folder, config in configs.items():
         if _content(config) != _content(configs[first]):

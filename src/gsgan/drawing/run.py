@@ -23,7 +23,7 @@ from gsgan.drawing.shots import Shot, choose_items, make_shots
 from gsgan.drawing.subjects import Subject, check_same_truth, open_subjects
 from gsgan.errors import ConfigError
 from gsgan.files import write_atomically
-from gsgan.runs import load_config
+from gsgan.runs import Moved, load_config
 
 FORMATS = ("png", "pdf")
 RECORD = "figures.json"
@@ -47,12 +47,13 @@ def make_figures(config: DictConfig) -> Record:
         raise ConfigError("settings and shots are tables of values; leave them out, or set a key")
     settings: Settings = instantiate(config.settings)
     out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
+    moved = Moved.said(config)
     for folder in folders:
-        load_config(folder)  # a run folder at all? else nothing is to be made beside it
+        load_config(folder, moved)  # a run folder at all? else nothing is to be made beside it
     _prepare(out)
     console = make_console()
     logging.getLogger("fontTools").setLevel(logging.WARNING)  # tells every glyph of a PDF
-    subjects = open_subjects(folders, names, config.data_root, pick_device(config.device))
+    subjects = open_subjects(folders, names, moved, pick_device(config.device))
     made: Record = {}
     left_out: dict[str, str] = {}
     with _progress(console) as progress, style(settings):

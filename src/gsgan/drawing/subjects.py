@@ -16,7 +16,7 @@ from gsgan.data.splits import Item
 from gsgan.drawing.shots import Shot
 from gsgan.errors import ConfigError, DataError
 from gsgan.model.avatar import Avatar, Painting
-from gsgan.runs import CHECKPOINT, build_data, load_avatar, load_config, read_checkpoint
+from gsgan.runs import CHECKPOINT, Moved, build_data, load_avatar, load_config, read_checkpoint
 from gsgan.training.schedule import Schedule
 
 # A model's name in print.
@@ -119,7 +119,7 @@ def _finite(painting: Painting, folder: Path, shot: Shot) -> Painting:
 def open_subjects(
     folders: Sequence[Path],
     names: Sequence[str] | None,
-    data_root: str | None,
+    moved: Moved,
     device: torch.device | str,
 ) -> list[Subject]:
     """The avatars of run folders, the first one's data leading.
@@ -127,7 +127,7 @@ def open_subjects(
     Args:
         folders: of runs, each once.
         names: in print, one a folder; None takes the model's.
-        data_root: where the dataset lies now, or None.
+        moved: where their dataset and model file lie now.
         device: that paints.
 
     Raises:
@@ -150,7 +150,7 @@ def open_subjects(
         raise ConfigError(f"{twice[0]} is given twice; every run in run and compare must differ")
     subjects: list[Subject] = []
     for folder in folders:
-        subject = _open(folder, data_root, device)
+        subject = _open(folder, moved, device)
         if subjects:
             _check_same_data(subjects[0], subject)
         subjects.append(subject)
@@ -158,10 +158,8 @@ def open_subjects(
     return [replace(s, name=str(title)) for s, title in zip(subjects, titles, strict=True)]
 
 
-def _open(folder: Path, data_root: str | None, device: torch.device | str) -> Subject:
-    config = load_config(folder)
-    if data_root is not None:
-        OmegaConf.update(config, "data.root", data_root)
+def _open(folder: Path, moved: Moved, device: torch.device | str) -> Subject:
+    config = load_config(folder, moved)
     data = build_data(config)
     avatar, marks = load_avatar(folder, config, data)
     model = _model(folder)

@@ -6,14 +6,14 @@ import json
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.progress import track
 
 from gsgan.console import make_console
 from gsgan.data.datamodule import GsganData
 from gsgan.devices import pick_device
 from gsgan.errors import ConfigError
-from gsgan.runs import CHECKPOINT, build_data, load_avatar, load_config, read_checkpoint
+from gsgan.runs import CHECKPOINT, Moved, build_data, load_avatar, load_config, read_checkpoint
 from gsgan.scoring.facts import Method
 from gsgan.scoring.files import FACTS_FILE, METRICS_FILE
 from gsgan.scoring.folder import SHOWN, Folder, Pattern, check_headers, read_folder
@@ -58,9 +58,7 @@ def evaluate_folder(config: DictConfig) -> Results:
     wanted = Wanted(config.splits, config.per, config.pictures)
     device = pick_device(config.device)
     folder = Path(config.run).expanduser()
-    stored = load_config(folder)
-    if config.data_root is not None:
-        OmegaConf.update(stored, "data.root", config.data_root)
+    stored = load_config(folder, Moved.said(config))
     data = build_data(stored)
     avatar, marks = load_avatar(folder, stored, data)
     state = read_checkpoint(folder / CHECKPOINT)["gsgan"]
@@ -94,8 +92,9 @@ def evaluate_predictions(config: DictConfig) -> Results:
             "data is not set: give the data that the predictions are of, as for training, e.g. "
             "data=zju_mocap data.root=… protocol=zju_gauhuman"
         )
-    if config.data_root is not None:
-        raise ConfigError("data_root is for run=; give data.root beside predictions=")
+    for key in ("root", "smpl"):
+        if config[f"data_{key}"] is not None:
+            raise ConfigError(f"data_{key} is for run=; give data.{key} beside predictions=")
     wanted = Wanted(config.splits, config.per, config.pictures)
     pattern = Pattern(config.predictions_pattern)
     root = Path(config.predictions).expanduser()
