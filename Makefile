@@ -24,7 +24,7 @@ $(STAMP): pyproject.toml constraints.txt
 train: $(STAMP) ## train an avatar of the default person, then score it (minutes on 2 cores)
 	$(BIN)/python -m gsgan.train experiment=demo $(ARGS)
 
-test: $(STAMP) ## run the tests with coverage, a process a core (without both when ARGS choose some)
+test: $(STAMP) ## run the tests with coverage, a process a core (ARGS: one process, no coverage)
 	$(BIN)/python -m pytest $(if $(ARGS),$(ARGS),-n auto --dist worksteal --cov --cov-report=term:skip-covered --cov-fail-under=85)
 
 test-slow: $(STAMP) ## run the tests that take minutes

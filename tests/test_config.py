@@ -151,16 +151,36 @@ def test_a_list_of_effects_is_a_value_and_no_list_of_files(said, meant):
     assert spelled_out(said) == meant
 
 
-def test_a_sweep_folder_has_a_name_that_file_systems_take(tmp_path):
-    short = "model-full_seed-1"
-    assert folder_name(short) == short
-    many = "_".join(f"training.recipes.psi.rate.key{i}-0.{i}" for i in range(12))
-    other = many.replace("key11-0.11", "key11-0.12")
-    names = {folder_name(many), folder_name(other)}
-    assert len(names) == 2
-    for name in names:
-        assert len(name.encode()) <= LONGEST_NAME
-        (tmp_path / f"99_{name}").mkdir()
-    accents = folder_name("é" * LONGEST_NAME)
-    assert len(accents.encode()) <= LONGEST_NAME
-    assert "/" not in folder_name("data.smpl-/path/SMPL.pkl_seed-1")
+MANY = [f"training.recipes.psi.rate.{key}=0.{i}" for i, key in enumerate(("hold", "final"))] + [
+    f"training.step_two.{key}=0.25" for key in ("l1", "l2", "ssim", "perceptual", "anchor")
+]
+
+
+@pytest.mark.parametrize("experiment", [[], ["experiment=ablation"]])
+def test_a_sweep_folder_has_a_name_that_file_systems_take(experiment, tmp_path):
+    from hydra import compose, initialize_config_dir
+    from omegaconf import open_dict
+
+    given = [*experiment, *MANY, "data.val_pictures=3", "effects.only=[depth,mask]", "logger=csv"]
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("train", overrides=given, return_hydra_config=True)
+    with open_dict(config):
+        config.hydra.job.num = 7
+    name = config.hydra.sweep.subdir
+    assert len(name.encode()) <= LONGEST_NAME + 2
+    assert not set(name) & set("[],=/ ")
+    assert "psi.rate.hold-0.0" in name
+    (tmp_path / name).mkdir()
+
+
+def test_two_runs_of_a_sweep_never_share_a_folder():
+    assert folder_name("model-full_seed-1") == "model-full_seed-1"
+    many = "_".join(MANY)
+    pairs = [
+        (many + "_a-1", many + "_a-2"),
+        ("data.smpl-/a/b_c", "data.smpl-/a_b/c"),
+        ("names-é", "names-è"),
+    ]
+    for one, other in pairs:
+        assert folder_name(one) != folder_name(other)
+        assert max(map(len, map(folder_name, (one, other)))) <= LONGEST_NAME

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 import subprocess
 import sys
@@ -62,18 +61,21 @@ def test_evaluate_finds_a_dataset_that_moved(run, capture, tmp_path, inside):
     assert scores == json.loads(kept)  # the other split's scores stay
 
 
-def test_evaluate_finds_a_body_model_that_moved(run, tmp_path, inside):
-    from gsgan.runs import Moved, load_config
+@pytest.mark.parametrize("command", ["evaluate", "figures", "bench speed"])
+def test_a_model_file_is_refused_for_a_run_that_read_none(command, run, inside):
+    command, *first = command.split()
+    result = inside(command, *first, f"run={run}", "data_smpl=/SMPL_NEUTRAL.pkl")
+    refused(result, "data_smpl", "was trained without a body model file")
 
-    model = tmp_path / "SMPL_NEUTRAL.pkl"
-    assert load_config(run, Moved(smpl=str(model))).data.smpl == str(model)
-    assert load_config(run).data.smpl is None
-    gone = inside("evaluate", f"run={run}", f"data_root={tmp_path / 'away'}")
-    refused(gone, str(tmp_path / "away"))
-    copy = shutil.copytree(run, tmp_path / "copy")
-    config = copy / ".hydra" / "config.yaml"
-    config.write_text(re.sub(r"(?m)^  smpl: null\n", "", config.read_text()))
-    refused(inside("evaluate", f"run={copy}", f"data_smpl={model}"), "data_smpl", "no model file")
+
+def test_a_dataset_that_is_gone_is_asked_for(run, tmp_path, inside):
+    result = inside("evaluate", f"run={run}", f"data_root={tmp_path / 'away'}")
+    refused(result, str(tmp_path / "away"), "does not exist", "data_root=<where it is now>")
+
+
+def test_nothing_has_moved_where_there_is_no_run(inside):
+    refused(inside("bench", "speed", "data_root=/x"), "data_root", "give run= too")
+    refused(inside("bench", "trade-off", "data_smpl=/x"), "data_smpl", "give run= too")
 
 
 def test_evaluate_refuses_what_is_no_run(run, tmp_path, inside):

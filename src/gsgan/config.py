@@ -37,15 +37,16 @@ def config_folder() -> Path:
 
 
 def folder_name(overrides: str) -> str:
-    """One folder's name for a sweep's overrides, however many, whatever paths are in them.
+    """The folder of a sweep's run: its overrides, as far as a name may be long and have signs.
 
-    What is too long is cut, and ends in a digest of the whole: two sweeps never share a folder.
+    A name that had to be changed ends in a digest of the overrides: no two runs share a folder. No
+    sign in it means anything to a shell or in ``run=<folder>``.
     """
-    name = overrides.replace("/", "_").encode()
-    if len(name) <= LONGEST_NAME:
-        return name.decode()
+    name = re.sub(r"[^A-Za-z0-9_.+-]", "_", overrides)
+    if name == overrides and len(name) <= LONGEST_NAME:
+        return name
     end = "_" + hashlib.sha256(overrides.encode()).hexdigest()[:12]
-    return name[: LONGEST_NAME - len(end)].decode(errors="ignore") + end
+    return name[: LONGEST_NAME - len(end)] + end
 
 
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)

@@ -121,13 +121,22 @@ class Moved:
         """As ``data_root`` and ``data_smpl`` of a command's config say it."""
         return cls(config.data_root, config.data_smpl)
 
+    def none(self) -> None:
+        """For a command that was given no run.
+
+        Raises:
+            ConfigError: when something is said to have moved.
+        """
+        if self != Moved():
+            raise ConfigError("data_root and data_smpl are of a trained run; give run= too")
+
 
 def load_config(folder: Path, moved: Moved | None = None) -> DictConfig:
     """The config a run was started with, its paths absolute, or where they have moved.
 
     Raises:
-        ConfigError: when a model file is given for data that reads none.
-        DataError: when the folder is not a run folder.
+        ConfigError: when a model file is given for a run that read none.
+        DataError: when the folder is not a run folder, or its data is no longer there.
     """
     path = folder / ".hydra" / "config.yaml"
     if not path.is_file():
@@ -137,17 +146,26 @@ def load_config(folder: Path, moved: Moved | None = None) -> DictConfig:
         )
     config = OmegaConf.load(path)
     assert isinstance(config, DictConfig)
-    for key in ("data.root", "data.smpl"):
-        path = OmegaConf.select(config, key)
-        if path is not None and not Path(path).expanduser().is_absolute():
-            started = OmegaConf.load(folder / ".hydra" / "hydra.yaml").hydra.runtime.cwd
-            OmegaConf.update(config, key, str(Path(started) / path))
     moved = moved or Moved()
-    if moved.smpl is not None and "smpl" not in config.data:
-        raise ConfigError(f"data_smpl: {folder} was trained on data that reads no model file")
-    for key, now in (("data.root", moved.root), ("data.smpl", moved.smpl)):
-        if now is not None:
-            OmegaConf.update(config, key, now)
+    if moved.smpl is not None and OmegaConf.select(config, "data.smpl") is None:
+        # A skeleton from fits is another one: the scores would be of another model.
+        raise ConfigError(f"data_smpl: {folder} was trained without a body model file")
+    for key, what, now in (
+        ("root", "dataset", moved.root),
+        ("smpl", "body model file", moved.smpl),
+    ):
+        stored = OmegaConf.select(config, f"data.{key}")
+        place = stored if now is None else now
+        if place is None:
+            continue
+        if now is None and not Path(place).expanduser().is_absolute():
+            started = OmegaConf.load(folder / ".hydra" / "hydra.yaml").hydra.runtime.cwd
+            place = str(Path(started) / place)
+        if not Path(place).expanduser().exists():
+            raise DataError(
+                f"{place} does not exist, the {what} of {folder}; give data_{key}=<where it is now>"
+            )
+        OmegaConf.update(config, f"data.{key}", place)
     return config
 
 
@@ -261,6 +279,6 @@ def _check_body(folder: Path, trained: Effects, built: Effects) -> None:
         if getattr(trained, name).on and not getattr(built, name).on:
             raise DataError(
                 f"{folder}: trained with effects.{name}={getattr(trained, name).value}, which "
-                f"cannot be built now: {getattr(built, name).why}; give data_smpl=<the model "
-                "file>"
+                f"cannot be built now: {getattr(built, name).why}; set data.smpl in "
+                f"{folder / '.hydra' / 'config.yaml'} to the model file"
             )

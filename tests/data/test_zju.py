@@ -807,7 +807,9 @@ def test_a_run_is_scored_with_its_model_file_elsewhere(
     first.rename(now)
     gone = inside("evaluate", f"run={run}")
     assert gone.returncode != 0
-    assert f"{first} is no file" in " ".join(gone.stderr.split())
+    assert f"{first} does not exist, the body model file of" in " ".join(gone.stderr.split())
+    assert "data_smpl=<where it is now>" in " ".join(gone.stderr.split())
+    (run / "metrics.json").unlink()
     found = inside("evaluate", f"run={run}", f"data_smpl={now}")
     assert found.returncode == 0, found.stderr
     assert json.loads((run / "metrics.json").read_text()) == json.loads(before)

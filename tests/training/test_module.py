@@ -205,7 +205,7 @@ def test_a_run_driven_into_the_collapse_is_caught_and_brought_back(make, capsys)
     module.rollback.restore = watched
     trainer.fit(module, data)
     assert module.rollback.done == 1
-    # Kept is what had 0.5 on its own picture, before that iteration's step took from it.
+    # The guard wants 0.5 of its own picture; this is another picture, one step later.
     assert seen[0] < 0.05 < 0.3 < seen[1]
     assert module.rollback.rate == 0.5
     assert "back to the last good state" in capsys.readouterr().out

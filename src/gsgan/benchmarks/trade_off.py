@@ -214,6 +214,8 @@ def _check(config: DictConfig) -> None:
     """Before anything takes time."""
     if config.run is not None and config.runs is not None:
         raise ConfigError("give run=<one run> or runs=<a multirun's folder>, not both")
+    if config.run is None and config.runs is None:
+        Moved.said(config).none()
     least = {"repeats": 1, "pictures": 1} | ({} if config.threads is None else {"threads": 1})
     for name, low in least.items():
         value = config[name]

@@ -48,7 +48,7 @@ def evaluate_folder(config: DictConfig) -> Results:
         DataError: when the folder, its checkpoint or its data is not what it should be.
     """
     for key, instead in (
-        ("data", "data_root= where it has moved"),
+        ("data", "data_root= and data_smpl= where it has moved"),
         ("protocol", "the run's own is used"),
         ("out", "its scores go into the run folder"),
         ("method", "it is gsgan"),
