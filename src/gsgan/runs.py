@@ -121,8 +121,8 @@ class Moved:
         """As ``data_root`` and ``data_smpl`` of a command's config say it."""
         return cls(config.data_root, config.data_smpl)
 
-    def none(self) -> None:
-        """For a command that was given no run.
+    def refuse_without_run(self) -> None:
+        """What a command calls that was given no run: nothing can have moved.
 
         Raises:
             ConfigError: when something is said to have moved.

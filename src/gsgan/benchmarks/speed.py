@@ -74,7 +74,7 @@ def _measure(config: DictConfig, painter: Painter, subject: Subject, console: Co
 def _subject(config: DictConfig, device: torch.device) -> Subject:
     last = bool(config.channels_last)
     if config.run is None:
-        Moved.said(config).none()
+        Moved.said(config).refuse_without_run()
         return untrained(config, config.poses, device, last=last)
     folder = Path(config.run).expanduser()
     return trained(folder, Moved.said(config), config.poses, device, last=last)

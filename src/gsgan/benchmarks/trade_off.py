@@ -215,7 +215,7 @@ def _check(config: DictConfig) -> None:
     if config.run is not None and config.runs is not None:
         raise ConfigError("give run=<one run> or runs=<a multirun's folder>, not both")
     if config.run is None and config.runs is None:
-        Moved.said(config).none()
+        Moved.said(config).refuse_without_run()
     least = {"repeats": 1, "pictures": 1} | ({} if config.threads is None else {"threads": 1})
     for name, low in least.items():
         value = config[name]
