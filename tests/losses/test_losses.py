@@ -57,25 +57,38 @@ def maps(value: float) -> list[list[torch.Tensor]]:
         ("logistic", math.log1p(math.exp(-2)), math.log1p(math.exp(2)), math.log1p(math.exp(-2))),
         ("hinge", 0.0, 3.0, -2.0),
         ("lsgan", 1.0, 4.0, 1.0),
+        ("relativistic", math.log(2), 0.0, math.log(2)),
     ],
 )
 def test_gan_closed_forms(form, at_real, at_fake, for_generator):
     """All logits at 2, two scales summed."""
     total = float(discriminator_loss(maps(2.0), maps(2.0), form))
     assert math.isclose(total, 2 * (at_real + at_fake), rel_tol=1e-5)
-    assert math.isclose(float(generator_loss(maps(2.0), form)), 2 * for_generator, rel_tol=1e-5)
+    assert math.isclose(
+        float(generator_loss(maps(2.0), maps(2.0), form)), 2 * for_generator, rel_tol=1e-5
+    )
 
 
 @pytest.mark.parametrize("logit", [1e4, -1e4])
 def test_gan_extreme_logits_have_finite_gradients(logit):
     fake = [[torch.full((1, 1, 2, 2), logit, requires_grad=True)]]
-    (generator_loss(fake) + discriminator_loss(fake, fake)).backward()
+    (generator_loss(fake, fake) + discriminator_loss(fake, fake)).backward()
     assert torch.isfinite(fake[0][0].grad).all()
 
 
 def test_unknown_gan_is_refused():
-    with pytest.raises(ConfigError, match="logistic, hinge, lsgan"):
-        generator_loss(maps(0.0), "wgan")
+    with pytest.raises(ConfigError, match="logistic, hinge, lsgan, relativistic"):
+        generator_loss(maps(0.0), maps(0.0), "wgan")
+
+
+def test_a_relativistic_judge_sees_only_how_the_pair_differs():
+    for shift in (0.0, 7.0):
+        real, fake = maps(shift + 3.0), maps(shift + 1.0)
+        judged, painted = (
+            float(loss(real, fake, "relativistic")) for loss in (discriminator_loss, generator_loss)
+        )
+        assert math.isclose(judged, 2 * math.log1p(math.exp(-2)), rel_tol=1e-5)
+        assert math.isclose(painted, 2 * math.log1p(math.exp(2)), rel_tol=1e-5)
 
 
 def test_feature_matching_leaves_logits_and_real_side_out():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from gsgan.errors import ConfigError
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.encoding import encoded_size, positional_encoding
 from gsgan.model.generator import Generator, Style
@@ -144,6 +145,18 @@ def test_discriminator_judges_every_scale():
 def test_discriminator_refuses_pictures_that_normalisation_would_erase():
     with pytest.raises(ValueError, match="too small"):
         Discriminator(scales=2, base=4, layers=4)(torch.rand(1, 3, 16, 16))
+
+
+def test_a_judge_without_normalisation_sees_contrast():
+    """Instance normalisation hides it: what a judge of nearly right pictures needs."""
+    torch.manual_seed(0)
+    image = 100 * torch.randn(1, 3, 32, 32)  # so that normalisation's own epsilon does not show
+    for norm, sees in (("none", True), ("instance", False)):
+        judge = Discriminator(scales=1, base=4, layers=3, norm=norm)
+        sharp, soft = judge(image)[0][-1], judge(0.5 * image)[0][-1]
+        assert (float((sharp - soft).abs().max()) > 0.01 * float(sharp.std())) is sees
+    with pytest.raises(ConfigError, match="norm must be one of instance, none"):
+        Discriminator(norm="batch")
 
 
 def test_pose_graph_spreads_along_edges_only():

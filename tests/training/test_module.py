@@ -347,5 +347,5 @@ def test_float16_is_refused_before_anything_trains(make, monkeypatch):
 
 
 def test_wrong_gan_name_is_one_sentence(make):
-    with pytest.raises(Exception, match="logistic, hinge, lsgan"):
+    with pytest.raises(Exception, match="logistic, hinge, lsgan, relativistic"):
         make("training.step_two.gan=wasserstein")

@@ -13,29 +13,30 @@ from gsgan.errors import ConfigError
 Maps = Sequence[Sequence[Tensor]]  # per scale: feature maps, the logits last
 
 
-def _mean_over_scales(term: Callable[[Tensor], Tensor], maps: Maps) -> Tensor:
-    return torch.stack([term(scale[-1].float()).mean() for scale in maps]).sum()
+Term = Callable[[Tensor, Tensor], Tensor]
+softplus, relu = functional.softplus, functional.relu
 
-
-# name: (on real logits, on fake logits, generator's on fake logits)
-_FORMS: dict[str, tuple[Callable[[Tensor], Tensor], ...]] = {
-    "logistic": (
-        lambda x: functional.softplus(-x),
-        functional.softplus,
-        lambda x: functional.softplus(-x),
-    ),
-    "hinge": (lambda x: functional.relu(1 - x), lambda x: functional.relu(1 + x), lambda x: -x),
-    "lsgan": (lambda x: (x - 1).square(), lambda x: x.square(), lambda x: (x - 1).square()),
+# name: what the discriminator, and what the generator, minimises of (real, fake) logits
+_FORMS: dict[str, tuple[Term, Term]] = {
+    "logistic": (lambda r, f: softplus(-r) + softplus(f), lambda _, f: softplus(-f)),
+    "hinge": (lambda r, f: relu(1 - r) + relu(1 + f), lambda _, f: -f),
+    "lsgan": (lambda r, f: (r - 1).square() + f.square(), lambda _, f: (f - 1).square()),
+    "relativistic": (lambda r, f: softplus(f - r), lambda r, f: softplus(r - f)),
 }
-
-
 FORMS = tuple(_FORMS)
+COMPARING = ("relativistic",)
+"""Forms whose generator is judged beside the real picture."""
 
 
-def _form(name: str) -> tuple[Callable[[Tensor], Tensor], ...]:
+def _form(name: str) -> tuple[Term, Term]:
     if name not in _FORMS:
         raise ConfigError(f"training.step_two.gan must be one of {', '.join(_FORMS)}; got {name!r}")
     return _FORMS[name]
+
+
+def _mean_over_scales(term: Term, real: Maps, fake: Maps) -> Tensor:
+    scales = zip(real, fake, strict=True)
+    return torch.stack([term(r[-1].float(), f[-1].float()).mean() for r, f in scales]).sum()
 
 
 def discriminator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor:
@@ -43,15 +44,22 @@ def discriminator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor
 
     Args:
         real, fake: the discriminator's maps of a real and a painted picture.
-        form: ``logistic`` (non-saturating), ``hinge`` or ``lsgan``.
+        form: ``logistic`` (non-saturating), ``hinge``, ``lsgan`` or ``relativistic``: how much
+            more real the real one looks than the painted one of the same frame, place by place
+            (Jolicoeur-Martineau 2019). That is the one to take where painted pictures are near
+            their truth: each pair then differs in nothing but what is to be learnt, while two
+            unpaired pictures differ in pose and camera by far more.
+
+    Raises:
+        ConfigError: on an unknown form.
     """
-    on_real, on_fake, _ = _form(form)
-    return _mean_over_scales(on_real, real) + _mean_over_scales(on_fake, fake)
+    return _mean_over_scales(_form(form)[0], real, fake)
 
 
-def generator_loss(fake: Maps, form: str = "logistic") -> Tensor:
-    """What the generator minimises, same conventions."""
-    return _mean_over_scales(_form(form)[2], fake)
+def generator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor:
+    """What the generator minimises, same conventions; ``real`` matters to a `COMPARING` form only,
+    any other may be given ``fake`` twice."""
+    return _mean_over_scales(_form(form)[1], real, fake)
 
 
 def feature_matching(real: Maps, fake: Maps) -> Tensor:

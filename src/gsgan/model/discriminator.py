@@ -5,7 +5,10 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional
 
+from gsgan.errors import ConfigError
+
 SLOPE = 0.2
+NORMS = ("instance", "none")
 
 
 class PatchDiscriminator(nn.Module):
@@ -13,26 +16,38 @@ class PatchDiscriminator(nn.Module):
 
     Args:
         base: channels of the first layer.
-        layers: feature layers; all but the last two halve the picture.
+        layers: feature layers; all but the last halve the picture.
+        norm: ``instance``, or ``none``. Instance normalisation makes every picture's contrast the
+            same, and with it goes how sharp it is: with it a judge of nearly right pictures
+            learnt nothing.
+
+    Raises:
+        ConfigError: on an unknown norm.
 
     Source: method.md § 7 (the pix2pixHD family).
     """
 
-    def __init__(self, base: int = 64, layers: int = 4) -> None:
+    def __init__(self, base: int = 64, layers: int = 4, norm: str = "instance") -> None:
         super().__init__()
         if layers < 2:
             raise ValueError(f"PatchDiscriminator: layers must be at least 2, got {layers}")
+        if norm not in NORMS:
+            raise ConfigError(
+                f"training.discriminator.norm must be one of {', '.join(NORMS)}; got {norm!r}"
+            )
+        normal = norm == "instance"
         widths = [base * min(2**i, 8) for i in range(layers)]
         blocks: list[nn.Module] = []
         previous = 3
         for i, channels in enumerate(widths):
             stride = 2 if i < layers - 1 else 1
             conv = nn.Conv2d(previous, channels, 4, stride=stride, padding=2 if stride == 1 else 1)
-            norm: list[nn.Module] = [nn.InstanceNorm2d(channels)] if i > 0 else []
-            blocks.append(nn.Sequential(conv, *norm, nn.LeakyReLU(SLOPE)))
+            between: list[nn.Module] = [nn.InstanceNorm2d(channels)] if normal and i > 0 else []
+            blocks.append(nn.Sequential(conv, *between, nn.LeakyReLU(SLOPE)))
             previous = channels
         self.blocks = nn.ModuleList(blocks)
         self.logits = nn.Conv2d(previous, 1, 4, padding=2)
+        self.apply(_initialise if normal else _initialise_without_norm)
 
     def forward(self, image: Tensor) -> list[Tensor]:
         """Feature maps, then the logits, of a picture ``[B, 3, H, W]``."""
@@ -47,16 +62,17 @@ class Discriminator(nn.Module):
 
     Args:
         scales: judges; each sees the picture halved once more.
-        base, layers: as `PatchDiscriminator`.
+        base, layers, norm: as `PatchDiscriminator`.
 
     Source: paper Sec. 3.6; method.md § 7.
     """
 
-    def __init__(self, *, scales: int = 2, base: int = 64, layers: int = 4) -> None:
+    def __init__(
+        self, *, scales: int = 2, base: int = 64, layers: int = 4, norm: str = "instance"
+    ) -> None:
         super().__init__()
-        self.judges = nn.ModuleList(PatchDiscriminator(base, layers) for _ in range(scales))
+        self.judges = nn.ModuleList(PatchDiscriminator(base, layers, norm) for _ in range(scales))
         self.stride = 2 ** (layers - 1 + scales - 1)
-        self.apply(_initialise)
 
     def forward(self, image: Tensor) -> list[list[Tensor]]:
         """For each scale its feature maps with the logits last.
@@ -81,5 +97,13 @@ class Discriminator(nn.Module):
 def _initialise(module: nn.Module) -> None:
     if isinstance(module, nn.Conv2d):
         nn.init.normal_(module.weight, 0.0, 0.02)
+        if module.bias is not None:
+            nn.init.zeros_(module.bias)
+
+
+def _initialise_without_norm(module: nn.Module) -> None:
+    """He et al. 2015: unscaled, the signal would die out under weights of 0.02."""
+    if isinstance(module, nn.Conv2d):
+        nn.init.kaiming_normal_(module.weight, a=SLOPE, nonlinearity="leaky_relu")
         if module.bias is not None:
             nn.init.zeros_(module.bias)

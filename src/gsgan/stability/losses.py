@@ -122,7 +122,7 @@ def _features(inputs: Inputs) -> Outputs:
     fake, real = judge(image), judge(target)
     return {
         "L_feat": feature_matching(real, fake),
-        "L_GAN": generator_loss(fake),
+        "L_GAN": generator_loss(real, fake),
         "judge's": discriminator_loss(real, fake),
     }
 
@@ -143,7 +143,7 @@ def _gan(inputs: Inputs, form: str) -> Outputs:
     real, fake = [[inputs["real"]]], [[inputs["fake"]]]
     return {
         "judge's": discriminator_loss(real, fake, form),
-        "generator's": generator_loss(fake, form),
+        "generator's": generator_loss(real, fake, form),
     }
 
 

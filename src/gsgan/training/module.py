@@ -12,7 +12,13 @@ from torch import Tensor, nn
 
 from gsgan.effects import Effect, Effects
 from gsgan.errors import ConfigError, GsganError
-from gsgan.losses.adversarial import FORMS, discriminator_loss, feature_matching, generator_loss
+from gsgan.losses.adversarial import (
+    COMPARING,
+    FORMS,
+    discriminator_loss,
+    feature_matching,
+    generator_loss,
+)
 from gsgan.losses.perceptual import Perceptual
 from gsgan.losses.photometric import photometric, without_unsure
 from gsgan.metrics.image import psnr
@@ -59,7 +65,7 @@ class StepTwoLoss:
             by as much); VGG is the costliest term on a CPU.
         adversarial: L_GAN.
         feature_matching: L_feat, between the discriminator's features.
-        gan: ``logistic``, ``hinge`` or ``lsgan``.
+        gan: ``logistic``, ``hinge``, ``lsgan`` or ``relativistic``.
         anchor: weight of L_Ψ, which keeps C a picture while Ψ learns from the generator.
         detach_features: keep the generator's gradient out of Ψ (ablation).
 
@@ -255,6 +261,8 @@ class AvatarTraining(LightningModule):
         start, end = self.schedule.bounds(SEGMENTATION if name == "segmentation" else STEP_TWO)
         if name in SPLATTING:  # one span over both steps: restarting the rate costs quality
             start = self.schedule.bounds(STEP_ONE)[0]
+        elif name == "discriminator":
+            start, end = self.schedule.game
         rate = self.recipes[name].rate.at(self.step, start, end)
         return rate * self.rollback.rate if name == "psi" else rate
 
@@ -416,12 +424,13 @@ class AvatarTraining(LightningModule):
             terms["perceptual"] = scale * self.perceptual(image, target)
         if play:
             assert self.discriminator is not None
-            fake = self.discriminator(image)
-            if w.adversarial:
-                terms["adversarial"] = w.adversarial * generator_loss(fake, w.gan)
-            if w.feature_matching:
+            real = fake = self.discriminator(image)
+            if w.feature_matching or w.gan in COMPARING:
                 with torch.no_grad():
                     real = self.discriminator(target)
+            if w.adversarial:
+                terms["adversarial"] = w.adversarial * generator_loss(real, fake, w.gan)
+            if w.feature_matching:
                 terms["feature_matching"] = w.feature_matching * feature_matching(real, fake)
         return terms
 

@@ -81,10 +81,16 @@ class Schedule:
         }
         return ends[phase]
 
+    @property
+    def game(self) -> tuple[int, int]:
+        """First iteration the discriminator plays, and the first after its last."""
+        start, end = self.bounds(STEP_TWO)
+        return min(start + self.discriminator_start, end), end
+
     def adversarial(self, step: int) -> bool:
         """Whether the discriminator plays at this iteration."""
-        start = self.segmentation + self.step_one + self.discriminator_start
-        return self.phase(step) == STEP_TWO and step >= start
+        start, end = self.game
+        return start <= step < end
 
 
 _SHAPES = {
