@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -12,22 +12,15 @@ from torch import Tensor, nn
 
 from gsgan.effects import Effect, Effects
 from gsgan.errors import ConfigError, GsganError
-from gsgan.losses.adversarial import (
-    COMPARING,
-    FORMS,
-    discriminator_loss,
-    feature_matching,
-    generator_loss,
-)
+from gsgan.losses.adversarial import discriminator_loss
 from gsgan.losses.perceptual import Perceptual
-from gsgan.losses.photometric import photometric, without_unsure
 from gsgan.metrics.image import psnr
 from gsgan.model.avatar import Avatar, Painting
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.segmentation import segmentation_loss
-from gsgan.precision import full_precision
 from gsgan.scene import Frame
 from gsgan.training.averaging import MovingAverage
+from gsgan.training.losses import StepOneLoss, StepTwoLoss
 from gsgan.training.optimisers import Recipe, clip, set_rate
 from gsgan.training.rollback import Rollback
 from gsgan.training.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
@@ -35,69 +28,6 @@ from gsgan.training.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
 PSNR_CAP = 100.0  # dB: one picture equal to the truth would make a watched mean infinite
 SPLATTING = ("psi", "colour")  # optimisers of what makes Step I's picture
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
-
-
-@dataclass(frozen=True)
-class StepOneLoss:
-    """L_Ψ = l1 · L1(C, I) + ssim · (1 - SSIM(C, I)), over a background.
-
-    Args:
-        l1, ssim: weights (paper: 0.8, 0.2).
-        feature_head: weight of the same loss on a linear readout of F; without it F's further
-            channels get no gradient in Step I. 0 builds no readout.
-
-    Source: paper Sec. 3.6; method.md § 2.
-    """
-
-    l1: float = 0.8
-    ssim: float = 0.2
-    feature_head: float = 0.5
-
-
-@dataclass(frozen=True)
-class StepTwoLoss:
-    """Weights of the generator's loss; a term of weight 0 is not computed.
-
-    Args:
-        l1, l2, ssim: photometric terms on I_pred (the paper's footnote: l2 reconstruction).
-        perceptual: L_perc.
-        perceptual_every: compute L_perc only every so many iterations (its weight is multiplied
-            by as much); VGG is the costliest term on a CPU.
-        adversarial: L_GAN.
-        feature_matching: L_feat, between the discriminator's features.
-        gan: ``logistic``, ``hinge``, ``lsgan`` or ``relativistic``.
-        anchor: weight of L_Ψ, which keeps C a picture while Ψ learns from the generator.
-        detach_features: keep the generator's gradient out of Ψ (ablation).
-
-    Source: paper Sec. 3.6; method.md § 7, § 13.
-    """
-
-    l1: float = 1.0
-    l2: float = 0.0
-    ssim: float = 0.2
-    perceptual: float = 1.0
-    perceptual_every: int = 1
-    adversarial: float = 1.0
-    feature_matching: float = 10.0
-    gan: str = "logistic"
-    anchor: float = 1.0
-    detach_features: bool = False
-
-    def __post_init__(self) -> None:
-        if self.gan not in FORMS:
-            raise ConfigError(
-                f"training.step_two.gan must be one of {', '.join(FORMS)}; got {self.gan!r}"
-            )
-        if self.perceptual_every < 1:
-            raise ConfigError(
-                "training.step_two.perceptual_every must be at least 1, "
-                f"got {self.perceptual_every}"
-            )
-
-    @property
-    def plays(self) -> bool:
-        """Whether a discriminator is needed at all."""
-        return bool(self.adversarial or self.feature_matching)
 
 
 class AvatarTraining(LightningModule):
@@ -390,49 +320,20 @@ class AvatarTraining(LightningModule):
 
     def step_one_loss(self, painting: Painting, frame: Frame) -> Tensor:
         """L_Ψ of Step I's colour, and of the linear readout of F."""
-        with full_precision(frame.image):
-            return self._step_one_loss(painting, frame)
-
-    def _step_one_loss(self, painting: Painting, frame: Frame) -> Tensor:
-        weights = self.step_one
-        background = self._background(frame)
-        target = frame.image + (1 - frame.mask) * background
-        assert painting.features is not None and painting.alpha is not None  # noqa: PT018
-        assert painting.colour is not None
-        behind = (1 - painting.alpha) * background
-        pixels = {"l1": weights.l1, "ssim": weights.ssim}
-        loss = photometric(painting.colour + behind, target, unsure=frame.unsure, **pixels)
-        if self.feature_head is not None:
-            # No bias where nothing is: the readout commutes with alpha blending.
-            read = nn.functional.conv2d(painting.features, self.feature_head.weight)
-            read = read + painting.alpha * self.feature_head.bias.view(1, 3, 1, 1)  # type: ignore[union-attr]
-            loss = loss + weights.feature_head * photometric(
-                read + behind, target, unsure=frame.unsure, **pixels
-            )
-        return loss
+        return self.step_one(painting, frame, self._background(frame), self.feature_head)
 
     def step_two_terms(self, painting: Painting, frame: Frame, play: bool) -> dict[str, Tensor]:
         """The generator's losses, weighted, by name."""
-        w, image = self.step_two, painting.image
-        assert image is not None
-        target = without_unsure(frame.image, image, frame.unsure)
-        terms = {"photometric": photometric(image, target, l1=w.l1, l2=w.l2, ssim=w.ssim)}
-        if w.anchor and painting.features is not None:
-            terms["anchor"] = w.anchor * self.step_one_loss(painting, frame)
-        if self.perceptual is not None and self.step % w.perceptual_every == 0:
-            scale = w.perceptual * w.perceptual_every
-            terms["perceptual"] = scale * self.perceptual(image, target)
-        if play:
-            assert self.discriminator is not None
-            real = fake = self.discriminator(image)
-            if w.feature_matching or w.gan in COMPARING:
-                with torch.no_grad():
-                    real = self.discriminator(target)
-            if w.adversarial:
-                terms["adversarial"] = w.adversarial * generator_loss(real, fake, w.gan)
-            if w.feature_matching:
-                terms["feature_matching"] = w.feature_matching * feature_matching(real, fake)
-        return terms
+        assert painting.image is not None
+        held = self.step_two.anchor and painting.features is not None
+        return self.step_two.terms(
+            painting.image,
+            frame,
+            anchor=self.step_one_loss(painting, frame) if held else None,
+            perceptual=self.perceptual,
+            judge=self.discriminator if play else None,
+            step=self.step,
+        )
 
     # -- randomness: from (seed, iteration, rank), so that resuming changes nothing
 
