@@ -150,6 +150,30 @@ def test_a_run_that_is_half_trained_is_said_to_be(twin, tmp_path, inside):
     assert said in (tmp_path / "out" / "captions.md").read_text()
 
 
+def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside):
+    for log in twin.glob("logs*"):
+        shutil.rmtree(log)
+    head = "epoch,step,val/psnr,val/psnr_splat,val/seconds\n"
+    parts = {
+        "logs": "0,0,8.0,8.0,0\n1,99,20.0,19.0,60\n1,120,,,\n2,199,1.0,1.0,99\n",
+        "logs_000150": "2,199,22.0,20.0,120\n3,299,23",  # killed within the line
+    }
+    for name, text in parts.items():
+        (twin / name).mkdir()
+        (twin / name / "metrics.csv").write_text(head + text)
+    given = (f"run={twin}", f"out={tmp_path / 'out'}", "figures=training", "formats=png")
+    result = inside("figures", *given)
+    assert result.returncode == 0, result.stdout + result.stderr
+    entry = json.loads((tmp_path / "out" / "figures.json").read_text())["training"]
+    assert entry["numbers"]["training"]["GaussianGAN"] == {
+        "minutes": [0, 1, 2], "psnr": [8, 20, 22], "psnr_colour": [8, 19, 20]
+    }  # fmt: skip
+    assert "Split" not in entry["caption"]
+    shutil.rmtree(twin / "logs_000150")
+    (twin / "logs" / "metrics.csv").write_text(head)
+    refused(inside("figures", *given), str(twin), "no log of its training", "logger=csv")
+
+
 def test_a_figure_that_fails_leaves_the_others_numbers(run, tmp_path, inside, monkeypatch):
     """As a stopped command does: pictures, captions and numbers are of one making."""
 

@@ -14,6 +14,7 @@ from gsgan.drawing import (
     segmentation,
     strip,
     teaser,
+    training,
 )
 from gsgan.drawing.layout import Drawing
 from gsgan.drawing.settings import Settings
@@ -31,11 +32,13 @@ class Kind:
         draw: subjects, the first one leading, and shots to a drawing.
         one_camera: all its shots come from one camera.
         compares: it needs a second run.
+        pictures: it shows pictures of a split; else it gets no shots.
     """
 
     draw: Draw
     one_camera: bool = False
     compares: bool = False
+    pictures: bool = True
 
 
 KINDS = {
@@ -47,4 +50,5 @@ KINDS = {
     "strip": Kind(strip.draw, one_camera=True),
     "comparison": Kind(comparison.draw, compares=True),
     "ablation": Kind(ablation.draw, compares=True),
+    "training": Kind(training.draw, pictures=False),
 }

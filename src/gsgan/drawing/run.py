@@ -62,7 +62,9 @@ def make_figures(config: DictConfig) -> Record:
             progress.update(task, description=f"drawing {name}")
             try:
                 drawing = _draw(name, subjects, config, settings)
-                entry = _entry(drawing, subjects, config.split)
+                entry = _entry(drawing, subjects)
+                if KINDS[name].pictures:
+                    entry["caption"] += f" Split {config.split}."
                 entry["files"] = _save(drawing, out / name, formats)
                 made[name] = entry
                 _write_record(out, made)  # now: a command that is stopped leaves no stale numbers
@@ -101,6 +103,8 @@ def _draw(
     name: str, subjects: Sequence[Subject], config: DictConfig, settings: Settings
 ) -> Drawing:
     kind, data = KINDS[name], subjects[0].data
+    if not kind.pictures:
+        return kind.draw(subjects, (), settings)
     items = choose_items(
         data,
         config.split,
@@ -173,11 +177,11 @@ def _progress(console: Console) -> Progress:
     return Progress(*columns, console=console, transient=True)
 
 
-def _entry(drawing: Drawing, subjects: Sequence[Subject], split: str) -> dict[str, Any]:
+def _entry(drawing: Drawing, subjects: Sequence[Subject]) -> dict[str, Any]:
     shown = [s for s in subjects if any(s.name in panels for panels in drawing.numbers.values())]
     marks = sorted({note for subject in shown for note in subject.notes})
     return {
-        "caption": f"{drawing.caption} Split {split}.",
+        "caption": drawing.caption,
         "numbers": drawing.numbers,
         "runs": {subject.name: str(subject.folder) for subject in shown},
         "marks": marks,
