@@ -14,7 +14,6 @@ from commands import TINY, refused
 from gsgan.benchmarks import trade_off_train
 from gsgan.benchmarks.environment import environment
 from gsgan.benchmarks.speed_painter import Way
-from gsgan.benchmarks.trade_off_curves import Curve, curve
 from gsgan.benchmarks.trade_off_files import drawn
 from gsgan.benchmarks.trade_off_front import front, steps
 from gsgan.benchmarks.trade_off_measure import score
@@ -23,6 +22,7 @@ from gsgan.benchmarks.trade_off_points import Point, Trained, asked, found_runs,
 from gsgan.benchmarks.trade_off_report import Report, Row, make_rows
 from gsgan.errors import ConfigError, DataError, GsganError
 from gsgan.splat import ACCURACY
+from gsgan.training.curve import Curve, curve
 
 HEAD = "epoch,step,val/psnr,val/psnr_splat,val/seconds\n"
 SMALL = ["repeats=1", "pictures=2", "settings.accuracies=[draft]", "settings.scales=[0.5]"]

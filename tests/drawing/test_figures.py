@@ -156,7 +156,7 @@ def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside)
     head = "epoch,step,val/psnr,val/psnr_splat,val/seconds\n"
     parts = {
         "logs": "0,0,8.0,8.0,0\n1,99,20.0,19.0,60\n1,120,,,\n2,199,1.0,1.0,99\n",
-        "logs_000150": "2,199,22.0,20.0,120\n3,299,23",  # killed within the line
+        "logs_000150": "2,199,22.0,20.0,120\n3,299,23.0,21.0,18",  # killed within the line
     }
     for name, text in parts.items():
         (twin / name).mkdir()
@@ -166,12 +166,24 @@ def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside)
     assert result.returncode == 0, result.stdout + result.stderr
     entry = json.loads((tmp_path / "out" / "figures.json").read_text())["training"]
     assert entry["numbers"]["training"]["GaussianGAN"] == {
-        "minutes": [0, 1, 2], "psnr": [8, 20, 22], "psnr_colour": [8, 19, 20]
+        "seconds": [0, 60, 120], "psnr": [8, 20, 22], "psnr_colour": [8, 19, 20]
     }  # fmt: skip
-    assert "Split" not in entry["caption"]
+    assert "watched while training" in entry["caption"]
+    (twin / "logs_000150" / "metrics.csv").write_bytes(b"\xff\xfe\x00")
+    refused(inside("figures", *given), "logs_000150", "not a readable log", "UnicodeDecodeError")
     shutil.rmtree(twin / "logs_000150")
     (twin / "logs" / "metrics.csv").write_text(head)
-    refused(inside("figures", *given), str(twin), "no log of its training", "logger=csv")
+    refused(inside("figures", *given), str(twin), "no log that tells", "logger=csv")
+
+
+def test_training_curves_are_of_the_same_watched_pictures(run, twin, tmp_path, inside):
+    given = (f"run={run}", f"compare={twin}", f"out={tmp_path / 'out'}", "figures=training")
+    assert inside("figures", *given, "names=[ours,'_x $1 {']").returncode == 0
+    edit(twin, data__val_pictures=1)
+    refused(inside("figures", *given), "watched different pictures", "data.val_pictures")
+    edit(twin, data__val_pictures=OmegaConf.load(run / ".hydra/config.yaml").data.val_pictures)
+    edit(twin, data__size=24)
+    refused(inside("figures", *given), "cannot be compared", "32x32 and 24x24 pixels")
 
 
 def test_a_figure_that_fails_leaves_the_others_numbers(run, tmp_path, inside, monkeypatch):

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 import torch
 from lightning import Trainer
 
 from gsgan.errors import ConfigError, GsganError
+from gsgan.losses.adversarial import FORMS, generator_loss
+from gsgan.model.discriminator import Discriminator
 from gsgan.runs import build_training, load_avatar
 from gsgan.training.averaging import MovingAverage
+from gsgan.training.losses import StepTwoLoss, judged
 from gsgan.training.module import AvatarTraining
 
 
@@ -344,6 +348,38 @@ def test_float16_is_refused_before_anything_trains(make, monkeypatch):
             module.on_fit_start()
     monkeypatch.setattr(Trainer, "precision", "bf16-mixed")
     module.on_fit_start()
+
+
+def test_the_discriminators_rate_spans_the_game_alone(make):
+    module, _, _ = make("training.schedule.step_two=40", "training.schedule.discriminator_start=20")
+    start, end = module.schedule.game
+    recipe = module.recipes["discriminator"].rate
+    rates = []
+    for module.step in (start, end - 1):
+        rates.append(module._rate("discriminator"))
+    assert rates[0] == recipe.peak
+    assert rates[1] < 0.2 * recipe.peak  # it fell within the game, not before
+
+
+def test_a_comparing_gan_without_feature_matching_still_sees_the_real_picture():
+    torch.manual_seed(0)
+    judge = Discriminator(scales=1, base=4, layers=2, norm="none")
+    image = torch.rand(1, 3, 16, 16, requires_grad=True)
+    frame = SimpleNamespace(image=torch.rand(1, 3, 16, 16), unsure=None)
+    weights = StepTwoLoss(adversarial=2.0, feature_matching=0.0, gan="relativistic")
+    terms = weights.terms(image, frame, anchor=None, perceptual=None, judge=judge, step=0)
+    expected = 2 * generator_loss(judge(frame.image), judge(image), "relativistic")
+    assert float(terms["adversarial"]) == pytest.approx(float(expected), rel=1e-6)
+    terms["adversarial"].backward()
+    assert float(image.grad.abs().max()) > 0
+
+
+def test_a_comparing_gan_judges_in_full_precision():
+    judge, image = Discriminator(scales=1, base=4, layers=2, norm="none"), torch.rand(1, 3, 16, 16)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        kinds = {gan: judged(judge, image, gan)[0][-1].dtype for gan in FORMS}
+    assert kinds.pop("relativistic") == torch.float32
+    assert set(kinds.values()) == {torch.bfloat16}
 
 
 def test_wrong_gan_name_is_one_sentence(make):

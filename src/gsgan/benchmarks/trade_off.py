@@ -17,7 +17,6 @@ from gsgan.benchmarks.environment import Environment, environment
 from gsgan.benchmarks.speed_painter import without_denormals
 from gsgan.benchmarks.store import Store, source_digest
 from gsgan.benchmarks.tables import check_block
-from gsgan.benchmarks.trade_off_curves import curve
 from gsgan.benchmarks.trade_off_files import write, write_docs
 from gsgan.benchmarks.trade_off_measure import (
     Stage,
@@ -43,6 +42,7 @@ from gsgan.devices import pick_device
 from gsgan.errors import ConfigError, DataError
 from gsgan.metrics.lpips import lpips
 from gsgan.runs import CHECKPOINT, Moved
+from gsgan.training.curve import curve
 
 MEASUREMENTS = "measurements.jsonl"
 # What figures depend on: another version of it measures anew.

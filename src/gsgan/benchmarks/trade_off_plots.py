@@ -12,11 +12,11 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from gsgan.benchmarks.tables import number
-from gsgan.benchmarks.trade_off_curves import Curve
 from gsgan.benchmarks.trade_off_front import steps
 from gsgan.benchmarks.trade_off_labels import put_labels
 from gsgan.benchmarks.trade_off_points import BASE
 from gsgan.benchmarks.trade_off_report import QUALITIES, Report, Row
+from gsgan.training.curve import Curve
 
 # Distinguishable without colour vision, too (Okabe and Ito); shapes tell the same again.
 COLOURS = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#777777")

@@ -11,9 +11,9 @@ from typing import Any
 from gsgan.benchmarks.environment import Environment
 from gsgan.benchmarks.speed_stages import Spread
 from gsgan.benchmarks.tables import NOTHING, markdown, number
-from gsgan.benchmarks.trade_off_curves import Curve
 from gsgan.benchmarks.trade_off_front import front
 from gsgan.benchmarks.trade_off_points import Point, by_label
+from gsgan.training.curve import Curve
 
 # Metric: heading, digits, and 1 where more is better, -1 where less is.
 QUALITIES = {

@@ -259,16 +259,22 @@ class GsganData(LightningDataModule):
         sampler.set_epoch(epoch)
         return self._loader(dataset, sampler)
 
-    def val_dataloader(self) -> DataLoader[Frame]:
-        """Pictures watched while training: evenly spaced over held-out poses.
+    @property
+    def watched(self) -> tuple[str, list[int]]:
+        """Pictures watched while training, a split and places in it: evenly spaced over held-out
+        poses.
 
         Without held-out poses they come from held-out cameras; without those, from training.
         """
         name = next((n for n in ("novel_pose", "novel_view") if self.splits.items[n]), "train")
-        dataset = self.dataset(name)
-        count = min(self.val_pictures, len(dataset))
-        chosen = [(2 * i + 1) * len(dataset) // (2 * count) for i in range(count)]
-        return self._loader(Subset(dataset, chosen))
+        most = len(self.dataset(name))
+        count = min(self.val_pictures, most)
+        return name, [(2 * i + 1) * most // (2 * count) for i in range(count)]
+
+    def val_dataloader(self) -> DataLoader[Frame]:
+        """The pictures of `watched`."""
+        name, places = self.watched
+        return self._loader(Subset(self.dataset(name), places))
 
     def test_dataloader(self) -> list[DataLoader[Frame]]:
         """One loader a held-out split that is not empty, as in `eval_names`."""

@@ -32,13 +32,13 @@ class Kind:
         draw: subjects, the first one leading, and shots to a drawing.
         one_camera: all its shots come from one camera.
         compares: it needs a second run.
-        pictures: it shows pictures of a split; else it gets no shots.
+        watched: it is of the pictures that were watched while training, not of a split's.
     """
 
     draw: Draw
     one_camera: bool = False
     compares: bool = False
-    pictures: bool = True
+    watched: bool = False
 
 
 KINDS = {
@@ -50,5 +50,5 @@ KINDS = {
     "strip": Kind(strip.draw, one_camera=True),
     "comparison": Kind(comparison.draw, compares=True),
     "ablation": Kind(ablation.draw, compares=True),
-    "training": Kind(training.draw, pictures=False),
+    "training": Kind(training.draw, watched=True),
 }

@@ -6,6 +6,7 @@ import io
 import json
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from gsgan.drawing.layout import Drawing, Unavailable, style
 from gsgan.drawing.registry import KINDS
 from gsgan.drawing.settings import Settings
 from gsgan.drawing.shots import Shot, choose_items, make_shots
-from gsgan.drawing.subjects import Subject, check_same_truth, open_subjects
+from gsgan.drawing.subjects import Subject, check_same_truth, open_subjects, watched_items
 from gsgan.errors import ConfigError
 from gsgan.files import write_atomically
 from gsgan.runs import Moved, load_config
@@ -63,8 +64,6 @@ def make_figures(config: DictConfig) -> Record:
             try:
                 drawing = _draw(name, subjects, config, settings)
                 entry = _entry(drawing, subjects)
-                if KINDS[name].pictures:
-                    entry["caption"] += f" Split {config.split}."
                 entry["files"] = _save(drawing, out / name, formats)
                 made[name] = entry
                 _write_record(out, made)  # now: a command that is stopped leaves no stale numbers
@@ -103,19 +102,22 @@ def _draw(
     name: str, subjects: Sequence[Subject], config: DictConfig, settings: Settings
 ) -> Drawing:
     kind, data = KINDS[name], subjects[0].data
-    if not kind.pictures:
-        return kind.draw(subjects, (), settings)
-    items = choose_items(
-        data,
-        config.split,
-        frames=_frames(config.frames),
-        camera=None if config.camera is None else str(config.camera),
-        count=_count(config.shots, name),
-        one_camera=kind.one_camera,
-    )
-    shots: list[Shot] = make_shots(data, config.split, items, settings.margin)
-    check_same_truth(subjects, shots, config.split)
-    return kind.draw(subjects, shots, settings)
+    if kind.watched:
+        split, items = watched_items(subjects)
+    else:
+        split = config.split
+        items = choose_items(
+            data,
+            split,
+            frames=_frames(config.frames),
+            camera=None if config.camera is None else str(config.camera),
+            count=_count(config.shots, name),
+            one_camera=kind.one_camera,
+        )
+    shots: list[Shot] = make_shots(data, split, items, settings.margin)
+    check_same_truth(subjects, shots, split)
+    drawing = kind.draw(subjects, shots, settings)
+    return replace(drawing, caption=f"{drawing.caption} Split {split}.")
 
 
 def _folders(config: DictConfig) -> list[Path]:

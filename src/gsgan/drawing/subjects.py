@@ -218,6 +218,23 @@ def _check_same_data(first: Subject, other: Subject) -> None:
             )
 
 
+def watched_items(subjects: Sequence[Subject]) -> tuple[str, list[Item]]:
+    """The split and the pictures that all of them watched while training.
+
+    Raises:
+        DataError: when they watched different ones.
+    """
+    split, places = subjects[0].data.watched
+    for other in subjects[1:]:
+        if other.data.watched != (split, places):
+            raise DataError(
+                f"{subjects[0].folder} and {other.folder} cannot be compared: they watched "
+                "different pictures while training; give both the same data.val_pictures"
+            )
+    dataset = subjects[0].data.dataset(split)
+    return split, [dataset.items[i] for i in places]
+
+
 def check_same_truth(subjects: Sequence[Subject], shots: Sequence[Shot], split: str) -> None:
     """The pictures shown must be the very same in every run's data.
 

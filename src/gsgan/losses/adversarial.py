@@ -45,10 +45,10 @@ def discriminator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor
     Args:
         real, fake: the discriminator's maps of a real and a painted picture.
         form: ``logistic`` (non-saturating), ``hinge``, ``lsgan`` or ``relativistic``: how much
-            more real the real one looks than the painted one of the same frame, place by place
-            (Jolicoeur-Martineau 2019). That is the one to take where painted pictures are near
-            their truth: each pair then differs in nothing but what is to be learnt, while two
-            unpaired pictures differ in pose and camera by far more.
+            more real the real picture looks than the painted one, place by place (the paired
+            form, RpGAN, of Jolicoeur-Martineau 2019; that the pair shows one frame is ours).
+            What both share then cancels, so it is the one to take where painted pictures are
+            near their truth.
 
     Raises:
         ConfigError: on an unknown form.

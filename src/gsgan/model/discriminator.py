@@ -17,9 +17,9 @@ class PatchDiscriminator(nn.Module):
     Args:
         base: channels of the first layer.
         layers: feature layers; all but the last halve the picture.
-        norm: ``instance``, or ``none``. Instance normalisation makes every picture's contrast the
-            same, and with it goes how sharp it is: with it a judge of nearly right pictures
-            learnt nothing.
+        norm: ``instance``, or ``none``. Instance normalisation makes the contrast of every
+            channel the same, and with it goes how sharp the picture is (docs/ablations.md has
+            what each learnt of nearly right pictures).
 
     Raises:
         ConfigError: on an unknown norm.
@@ -78,8 +78,8 @@ class Discriminator(nn.Module):
         """For each scale its feature maps with the logits last.
 
         Raises:
-            ValueError: when the picture is so small that the coarsest map has a single pixel,
-                where instance normalisation would erase it.
+            ValueError: when the picture is so small that the coarsest map has a single pixel:
+                nothing is left to judge by place, and instance normalisation would erase it.
         """
         if min(image.shape[-2:]) < 2 * self.stride:
             raise ValueError(

@@ -104,10 +104,10 @@ def _stand_in(dtype: torch.dtype, device: torch.device) -> Perceptual:
 
 
 @lru_cache(maxsize=8)
-def _judge(dtype: torch.dtype, device: torch.device) -> Discriminator:
+def _judge(dtype: torch.dtype, device: torch.device, norm: str) -> Discriminator:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        judge = Discriminator(scales=2, base=4, layers=3)
+        judge = Discriminator(scales=2, base=4, layers=3, norm=norm)
     return judge.to(device, dtype)
 
 
@@ -116,20 +116,24 @@ def _perceptual(inputs: Inputs) -> Outputs:
     return {"L_perc": _stand_in(image.dtype, image.device)(image, target)}
 
 
-def _features(inputs: Inputs) -> Outputs:
+def _features(inputs: Inputs, norm: str, form: str) -> Outputs:
     image, target = inputs["image"], inputs["target"]
-    judge = _judge(image.dtype, image.device)
+    judge = _judge(image.dtype, image.device, norm)
     fake, real = judge(image), judge(target)
     return {
         "L_feat": feature_matching(real, fake),
-        "L_GAN": generator_loss(real, fake),
-        "judge's": discriminator_loss(real, fake),
+        "L_GAN": generator_loss(real, fake, form),
+        "judge's": discriminator_loss(real, fake, form),
     }
 
 
 def _networks() -> Iterator[Case]:
     for name in ("ordinary pictures", "equal pictures", "all background", "two greys"):
-        for what, run in (("perceptual loss", _perceptual), ("discriminator's losses", _features)):
+        for what, run in (
+            ("perceptual loss", _perceptual),
+            ("discriminator's losses", partial(_features, norm="instance", form="logistic")),
+            ("comparing discriminator's", partial(_features, norm="none", form="relativistic")),
+        ):
             yield Case(
                 name=f"{what} of {name}",
                 subject=SUBJECT,

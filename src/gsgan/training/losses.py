@@ -61,6 +61,15 @@ class StepOneLoss:
         return loss
 
 
+def judged(judge: Discriminator, image: Tensor, gan: str) -> list[list[Tensor]]:
+    """The discriminator's maps of a picture; in full precision where the GAN's form compares two,
+    since bf16 rounds away what nearly equal pictures differ in."""
+    if gan not in COMPARING:
+        return judge(image)  # type: ignore[no-any-return]
+    with full_precision(image):
+        return judge(image.to(next(judge.parameters()).dtype))  # type: ignore[no-any-return]
+
+
 @dataclass(frozen=True)
 class StepTwoLoss:
     """Weights of the generator's loss; a term of weight 0 is not computed.
@@ -140,10 +149,10 @@ class StepTwoLoss:
 
     def _game(self, judge: Discriminator, image: Tensor, target: Tensor) -> dict[str, Tensor]:
         terms = {}
-        real = fake = judge(image)
+        real = fake = judged(judge, image, self.gan)
         if self.feature_matching or self.gan in COMPARING:
             with torch.no_grad():
-                real = judge(target)
+                real = judged(judge, target, self.gan)
         if self.adversarial:
             terms["adversarial"] = self.adversarial * generator_loss(real, fake, self.gan)
         if self.feature_matching:

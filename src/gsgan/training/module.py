@@ -14,13 +14,14 @@ from gsgan.effects import Effect, Effects
 from gsgan.errors import ConfigError, GsganError
 from gsgan.losses.adversarial import discriminator_loss
 from gsgan.losses.perceptual import Perceptual
+from gsgan.losses.photometric import without_unsure
 from gsgan.metrics.image import psnr
 from gsgan.model.avatar import Avatar, Painting
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.segmentation import segmentation_loss
 from gsgan.scene import Frame
 from gsgan.training.averaging import MovingAverage
-from gsgan.training.losses import StepOneLoss, StepTwoLoss
+from gsgan.training.losses import StepOneLoss, StepTwoLoss, judged
 from gsgan.training.optimisers import Recipe, clip, set_rate
 from gsgan.training.rollback import Rollback
 from gsgan.training.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
@@ -273,9 +274,10 @@ class AvatarTraining(LightningModule):
         assert self.discriminator is not None
         assert painting.image is not None
         self.discriminator.requires_grad_(True)
-        real = self.discriminator(frame.image)
-        fake = self.discriminator(painting.image.detach())
-        loss = discriminator_loss(real, fake, self.step_two.gan)
+        painted, gan = painting.image.detach(), self.step_two.gan
+        target = without_unsure(frame.image, painted, frame.unsure)
+        real, fake = (judged(self.discriminator, image, gan) for image in (target, painted))
+        loss = discriminator_loss(real, fake, gan)
         self._descend(loss, "discriminator")
         self._log("step_two/discriminator", loss)
 

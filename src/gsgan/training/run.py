@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 import warnings
 from pathlib import Path
 from typing import Any
@@ -112,6 +113,8 @@ def remove_old_results(folder: Path) -> None:
     """Removes what an earlier run left in a folder that starts over."""
     for name in (*NAMES, PROGRESS, CHECKPOINT):
         (folder / name).unlink(missing_ok=True)
+    for log in folder.glob("logs*"):  # else its curve would be drawn as the new run's
+        shutil.rmtree(log, ignore_errors=True)
 
 
 def report_progress(console: Console, folder: Path, module: AvatarTraining) -> None:
