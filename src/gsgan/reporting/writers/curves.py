@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
@@ -12,6 +13,8 @@ from gsgan.reporting.grid import Grid, Report, Row
 
 COLUMNS = 3
 PANEL = (3.1, 2.4)  # inches
+LETTERS = 45  # of all labels along a panel, side by side: more are written aslant
+SLANT = 0.7  # inches that takes
 # Distinguishable without colour vision, too (Okabe and Ito).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
@@ -29,9 +32,11 @@ def picture(report: Report) -> bytes | None:
         return None
     down = [math.ceil(len(shown[id(grid)]) / COLUMNS) for grid in grids]
     across = max(min(len(shown[id(grid)]), COLUMNS) for grid in grids)
-    size = (PANEL[0] * across, sum(PANEL[1] * n + 0.5 for n in down))
+    high = [PANEL[1] + SLANT * _aslant(_settings(_runs(grid))) for grid in grids]
+    size = (PANEL[0] * across, sum(h * n + 0.5 for h, n in zip(high, down, strict=True)))
     figure = Figure(figsize=size, dpi=120, layout="constrained")
-    parts = figure.subfigures(len(grids), 1, height_ratios=down, squeeze=False)[:, 0]
+    ratios = [h * n for h, n in zip(high, down, strict=True)]
+    parts = figure.subfigures(len(grids), 1, height_ratios=ratios, squeeze=False)[:, 0]
     for part, grid, rows in zip(parts, grids, down, strict=True):
         _draw(part, grid, shown[id(grid)], rows, across)
     stream = io.BytesIO()
@@ -57,7 +62,7 @@ def _draw(part: SubFigure, grid: Grid, columns: list[int], down: int, across: in
 
 def _panel(axes: Axes, grid: Grid, i: int) -> None:
     rows = _runs(grid)
-    settings = list(dict.fromkeys(_split(row)[1] for row in rows))
+    settings = _settings(rows)
     for k, line in enumerate(dict.fromkeys(_split(row)[0] for row in rows)):
         there = [row for row in rows if _split(row)[0] == line and _mean(row, i) is not None]
         if not there:
@@ -73,12 +78,27 @@ def _panel(axes: Axes, grid: Grid, i: int) -> None:
             capsize=3,
             label=line,
         )
-    axes.set_xticks(range(len(settings)), [s.replace(", ", "\n") for s in settings], fontsize=6.5)
+    aslant: dict[str, Any] = {"rotation": 40, "ha": "right", "rotation_mode": "anchor"}
+    axes.set_xticks(
+        range(len(settings)),
+        [s.replace(", ", "\n") for s in settings],
+        fontsize=6.5,
+        **(aslant if _aslant(settings) else {}),
+    )
     axes.set_xlim(-0.4, len(settings) - 0.6)
     axes.set_title(grid.columns[i], fontsize=8.5)
     axes.tick_params(axis="y", labelsize=7)
     axes.grid(visible=True, alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _settings(rows: list[Row]) -> list[str]:
+    return list(dict.fromkeys(_split(row)[1] for row in rows))
+
+
+def _aslant(settings: list[str]) -> bool:
+    """Whether labels side by side would run into each other."""
+    return sum(max(len(part) for part in s.split(", ")) for s in settings) > LETTERS
 
 
 def _runs(grid: Grid) -> list[Row]:
