@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import yaml
 from report_folders import report_of, row, table, texts, variant, write_run
@@ -60,9 +62,6 @@ def test_what_is_no_list_of_settings_is_refused(by):
 
 
 def test_the_picture_shows_a_panel_a_score_that_there_is(tmp_path):
-    import cv2
-    import numpy as np
-
     runs = [swept(tmp_path, w, s, 30 + s + w) for w in (0, 0.5) for s in (0, 1)]
     one = picture(report_of(table(by=[KEY]), *runs))  # LPIPS is not there
     pixels = cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR)
@@ -97,6 +96,20 @@ def test_models_and_variants_are_lines_of_their_own(tmp_path, monkeypatch):
         ("full: Step I's colour", [0, 1], [20.0, 20.0]),
         ("wo_seg", [1], [25.0]),
     ]
+
+
+def test_labels_that_would_run_into_each_other_are_written_aslant(tmp_path):
+    """Which takes height; a few short ones stay upright."""
+    perceptual = "training.step_two.perceptual"
+    heights = {}
+    for count in (2, 5):
+        runs = [
+            swept(tmp_path / str(count), 0.001 * i, 0, 30.0 + i, perceptual=0.1)
+            for i in range(count)
+        ]
+        shown = picture(report_of(table(by=[KEY, perceptual]), *runs))
+        heights[count] = cv2.imdecode(np.frombuffer(shown, np.uint8), 0).shape[0]
+    assert heights[5] > 1.2 * heights[2]
 
 
 def test_without_a_score_to_show_there_is_no_picture(tmp_path, inside):
