@@ -63,7 +63,7 @@ def _curve(subject: Subject) -> Curve:
         found = curve(subject.name, subject.folder)
     except DataError as error:
         raise Unavailable(str(error)) from error
-    if found is None:
+    if found is None or found.seconds[-1] <= 0:
         raise Unavailable(
             f"{subject.folder} has no log that tells of two validations and their time "
             "(logger=csv writes one)"

@@ -6,11 +6,20 @@ import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from gsgan.errors import DataError
 
 SECONDS, QUALITY, COLOUR = "val/seconds", "val/psnr", "val/psnr_splat"
-Point = tuple[float, float, float | None, float]  # seconds, dB, dB, iteration
+
+
+class Point(NamedTuple):
+    """One validation: seconds of training, dB of the picture and of Step I's colour, iteration."""
+
+    seconds: float
+    psnr: float
+    colour: float | None
+    step: float
 
 
 @dataclass(frozen=True)
@@ -43,13 +52,17 @@ def curve(label: str, run: Path) -> Curve | None:
     for log in sorted(run.glob("logs*/metrics.csv"), key=lambda path: path.parent.name):
         part = _validations(log)
         if part:
-            start = _start(log)
-            points = [p for p in points if p[0] < part[0][0] and p[3] < start] + part
+            start, began = _start(log), part[0].seconds
+            points = [p for p in points if p.seconds < began and p.step < start] + part
     if len(points) < 2:
         return None
-    seconds, psnr = (tuple(p[i] for p in points) for i in range(2))
-    colour = tuple(p[2] for p in points if p[2] is not None)
-    return Curve(label, seconds, psnr, colour if len(colour) == len(points) else ())  # type: ignore[arg-type]
+    colour = tuple(p.colour for p in points if p.colour is not None)
+    return Curve(
+        label,
+        tuple(p.seconds for p in points),
+        tuple(p.psnr for p in points),
+        colour if len(colour) == len(points) else (),
+    )
 
 
 def _validations(log: Path) -> list[Point]:
@@ -66,7 +79,8 @@ def _validations(log: Path) -> list[Point]:
     for row in rows:
         seconds, psnr = _number(row, SECONDS), _number(row, QUALITY)
         if seconds is not None and psnr is not None:
-            found.append((seconds, psnr, _number(row, COLOUR), _number(row, "step") or 0.0))
+            colour, step = _number(row, COLOUR), _number(row, "step")
+            found.append(Point(seconds, psnr, colour, step or 0.0))
     return found
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import logging
-import shutil
+import re
 import warnings
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from gsgan.training.effects_cost import effect_costs, training_device
 from gsgan.training.module import AvatarTraining
 
 PROGRESS = "progress.json"
+LOGS = re.compile(r"logs(_\d+)?")  # of a run, and of its resumed parts
 
 
 def run_training(config: DictConfig) -> None:
@@ -113,8 +115,11 @@ def remove_old_results(folder: Path) -> None:
     """Removes what an earlier run left in a folder that starts over."""
     for name in (*NAMES, PROGRESS, CHECKPOINT):
         (folder / name).unlink(missing_ok=True)
-    for log in folder.glob("logs*"):  # else its curve would be drawn as the new run's
-        shutil.rmtree(log, ignore_errors=True)
+    for log in folder.glob("logs*/metrics.csv"):  # else its curve would be drawn as the new run's
+        if LOGS.fullmatch(log.parent.name):
+            log.unlink(missing_ok=True)
+            with suppress(OSError):  # it holds more: not all of it is ours
+                log.parent.rmdir()
 
 
 def report_progress(console: Console, folder: Path, module: AvatarTraining) -> None:
