@@ -20,6 +20,7 @@ same for the config as composed.
 ORDER = (
     "prepare",
     "check",
+    "fit",
     "train",
     "evaluate",
     "report",
@@ -27,6 +28,7 @@ ORDER = (
     "bench_raster",
     "bench_stability",
     "bench_rays",
+    "bench_fit",
     "bench_loader",
     "bench_speed",
     "bench_trade_off",

@@ -20,6 +20,10 @@ SMALL_BENCH = {
         "memory=false",
     ],
     "rays": ["rays=[1]", "reference=4", "picture=16", "frames=1"],
+    "fit": [
+        *("size.picture=32", "data.source.frames=2", "data.source.rays_per_pixel=1"),
+        *("fit.shape_steps=2", "fit.sweeps=1", 'settings=["fit.sweeps=2"]'),
+    ],
     "loader": ["data.size=32", "batches=2", "workers=[0,1]"],
     "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
     "trade-off": [
@@ -125,6 +129,10 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
     makers: dict[str, Callable[[], Path | str]] = {
         "/path/to/run_wo_gcn": lambda: another_run("run_wo_gcn"),
         "/path/to/run_wo_seg": lambda: another_run("run_wo_seg"),
+        "out=/path/to/capture/landmarks3d_fit.npz": lambda: f"out={folder() / 'fit.npz'}",
+        "data.reader.landmarks=landmarks3d_fit.npz": lambda: (
+            f"data.reader.landmarks={capture / 'landmarks3d.npz'}"
+        ),
         "out=/path/to/capture": lambda: f"out={folder() / 'capture'}",
         "/path/to/capture": lambda: capture,
         "<run folder>": lambda: run,
@@ -203,6 +211,8 @@ def test_every_documented_command_runs(line, place, capture, inside, tmp_path):
         arguments = tiny_training(arguments, capture)
     if name == "bench":
         arguments = tiny_bench(arguments, tmp_path, capture)
+    if name == "fit":
+        arguments += ["size.picture=32", "fit.shape_steps=2", "fit.sweeps=1", "shown=1"]
     if name == "prepare":  # MediaPipe is not at hand: its output is given
         source = next(a for a in arguments if a.startswith("source=")).removeprefix("source=")
         arguments = [a for a in arguments if a != "setup=true"]

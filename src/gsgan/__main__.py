@@ -3,6 +3,7 @@
 COMMANDS = {
     "gsgan.prepare": "make a dataset of your own videos: source=<folder> out=<folder>",
     "gsgan.check": "look a dataset over before training: data=capture data.root=<folder>",
+    "gsgan.fit": "landmarks that fit the masks: data.root=<folder> out=<file.npz>",
     "gsgan.train": "train an avatar, then score it on what was held out",
     "gsgan.evaluate": "score a run, run=<folder>, or any method's pictures, predictions=<folder>",
     "gsgan.report": "tables of scored runs: runs=[<folder>,…] table=ablation",

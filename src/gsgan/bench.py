@@ -18,6 +18,7 @@ SUBJECTS = {
     "raster": "time against error of every backend and accuracy setting of the rasteriser",
     "stability": "the float32 error of every hard case",
     "rays": "what anti-aliasing of the default person costs, and the noise without it",
+    "fit": "how much noise in the landmarks their fit to the masks takes away",
     "loader": "training pictures a second from disk",
     "speed": "milliseconds from skeleton to picture, by stage",
     "trade-off": "quality against time and memory, over settings and small trainings",

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from omegaconf import OmegaConf
 
+from gsgan.data.formats.capture import LANDMARKS
+
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
@@ -119,13 +121,17 @@ def fingerprint(data: GsganData) -> str:
     Contents of pictures are not in it, nor where they lie.
     """
     layout, splits = data.layout, data.splits
-    said = {
+    said: dict[str, Any] = {
         "cameras": {name: list(camera.size) for name, camera in layout.cameras.items()},
         "frames": list(layout.frames),
         "splits": {name: [list(item) for item in items] for name, items in splits.items.items()},
         "size": data.size,
         "crop": None if data.crop is None else asdict(data.crop),
     }
+    chosen = getattr(data.reader, "landmarks", LANDMARKS)
+    if chosen != LANDMARKS:  # other skeletons are other inputs, and cut other windows
+        p = b"".join(layout.landmarks.p[frame].tobytes() for frame in layout.frames)
+        said["landmarks"] = hashlib.sha256(p).hexdigest()
     plain = json.dumps(said, sort_keys=True).encode()
     return hashlib.sha256(plain).hexdigest()[:FINGERPRINT]
 

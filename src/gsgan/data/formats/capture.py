@@ -38,6 +38,7 @@ from gsgan.data.skeletons import (
 )
 from gsgan.errors import DataError
 
+LANDMARKS = "landmarks3d.npz"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 MASK_SUFFIXES = (".png",)
 LOOKED_AT = Trust(min_box_iou=0.0)
@@ -49,16 +50,18 @@ class CaptureReader:
     """Reads a capture in the bring-your-own layout; what is looked at is a setting.
 
     Args:
+        landmarks: the skeletons' file, in the capture's folder unless its path is absolute.
         drop_frames: frames to leave out, e.g. "360-370", or None.
         trust: which pictures are looked at.
     """
 
+    landmarks: str = LANDMARKS
     drop_frames: Any = None
     trust: Trust = LOOKED_AT
 
     def __call__(self, root: str | Path, checks: Checks, smpl: str | None = None) -> Layout:
         """See `read_capture`."""
-        return read_capture(root, checks, smpl, self.trust, self.drop_frames)
+        return read_capture(root, checks, smpl, self.trust, self.drop_frames, self.landmarks)
 
 
 def read_capture(
@@ -67,6 +70,7 @@ def read_capture(
     smpl: str | None = None,
     trust: Trust = LOOKED_AT,
     drop_frames: Any = None,
+    landmarks: str = LANDMARKS,
 ) -> Layout:
     """Reads and checks everything but most pictures' pixels.
 
@@ -76,6 +80,7 @@ def read_capture(
         smpl: the user's model file, for poses of an SMPL or SMPL-X body.
         trust: which pictures are looked at.
         drop_frames: frames to leave out, e.g. "360-370", or None.
+        landmarks: the skeletons' file, in the folder unless its path is absolute.
 
     Raises:
         DataError: for whatever is missing, damaged or contradictory, naming the file.
@@ -89,7 +94,10 @@ def read_capture(
         notes.append(f"lengths converted from {meta.unit} to metres")
     cameras = read_cameras(root / "cameras.json", cameras_json, conventions, checks)
     images = _index_images(root, cameras)
-    landmarks = read_landmarks(root / "landmarks3d.npz", meta, conventions, checks, notes)
+    joints_file = landmarks_path(root, landmarks)
+    if landmarks != LANDMARKS:
+        notes.append(f"skeletons come from {landmarks}, not from {LANDMARKS}")
+    skeletons = read_landmarks(joints_file, meta, conventions, checks, notes)
     poses = None
     if (root / "body_pose.npz").exists():
         poses = read_poses(root / "body_pose.npz", meta, conventions)
@@ -106,7 +114,7 @@ def read_capture(
         },
         mask_folders={name: root / "masks" / name for name in cameras},
         labels={name: _files_of(root, "labels", name) for name in cameras},
-        landmarks=landmarks,
+        landmarks=skeletons,
         poses=poses,
         pixels=PixelRules(composed=conventions.composed),
         calibration=root / "cameras.json",
@@ -123,6 +131,22 @@ def read_capture(
         "check that cameras, landmarks and masks belong together",
     )
     return replace(layout, notes=(*layout.notes, *doubts, *watch_masks(layout, trust)))
+
+
+def landmarks_path(root: Path, name: str) -> Path:
+    """The skeletons' file: in the capture's folder unless its path is absolute.
+
+    Raises:
+        DataError: when it is not there, or no npz.
+    """
+    if not isinstance(name, str) or not name.endswith(".npz"):
+        raise DataError(f"data.reader.landmarks must name an .npz file, got {name!r}")
+    path = root / Path(name).expanduser()
+    if name != LANDMARKS and not path.is_file():
+        raise DataError(
+            f"data.reader.landmarks={name}: {path} does not exist; gsgan.fit makes such files"
+        )
+    return path
 
 
 def read_cameras(

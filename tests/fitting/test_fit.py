@@ -1,0 +1,246 @@
+"""`gsgan.fit`: noise goes, what was not seen stays missing, a stopped fit goes on."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from commands import refused
+from hydra.utils import instantiate
+from make import write_tiny_capture
+
+import gsgan.compat  # noqa: F401
+from gsgan.data.datamodule import GsganData
+from gsgan.data.formats.capture import CaptureReader
+from gsgan.errors import ConfigError, DataError
+from gsgan.fitting import run as running
+from gsgan.fitting.fitter import Fitter
+from gsgan.fitting.moments import Moments, make_fitter
+from gsgan.fitting.run import run_fit
+from gsgan.scoring.facts import fingerprint
+
+BODY = slice(11, 33)
+QUICK = [
+    "size.picture=48",
+    "fit.shape_steps=20",
+    "fit.sweeps=3",
+    "fit.densify.points_per_limb=10",
+    "fit.densify.face_points=20",
+    "fit.densify.torso_points=40",
+    "device=cpu",
+    "shown=1",
+]
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory) -> Path:
+    """Four cameras round a person, one held out, landmarks in centimetres."""
+    splits = {"train_cameras": ["cam00", "cam01", "cam02"], "test_cameras": ["cam03"]}
+    root = tmp_path_factory.mktemp("people")
+    return write_tiny_capture(root, cameras=4, frames=4, size=(96, 96), unit="cm", splits=splits)
+
+
+@pytest.fixture
+def fit(compose, people, tmp_path):
+    """Fits and returns the written arrays: ``fit("fit.sweeps=1", root=…)``."""
+
+    def run(*overrides: str, root: Path = people, name: str = "fit.npz"):
+        out = tmp_path / name
+        run_fit(compose("fit", f"data.root={root}", f"out={out}", *QUICK, *overrides))
+        return dict(np.load(out))
+
+    return run
+
+
+def with_landmarks(people: Path, to: Path, change) -> Path:
+    """A copy of the capture whose landmarks ``change`` alters in place."""
+    shutil.copytree(people, to)
+    arrays = dict(np.load(to / "landmarks3d.npz"))
+    change(arrays)
+    np.savez(to / "landmarks3d.npz", **arrays)
+    return to
+
+
+def test_noise_in_the_landmarks_goes(fit, people, tmp_path):
+    truth = np.load(people / "landmarks3d.npz")["p"]
+    noise = 3 * np.random.default_rng(0).standard_normal(truth.shape)
+
+    def add(arrays):
+        arrays["p"] = truth + noise
+
+    noisy = with_landmarks(people, tmp_path / "noisy", add)
+    fitted = fit("fit.shape_steps=60", "fit.sweeps=15", root=noisy)
+
+    def off(p):
+        return np.linalg.norm(p - truth, axis=-1)[:, BODY].mean()
+
+    assert off(fitted["p"]) < 0.8 * off(truth + noise)
+    moved = 0.01 * np.linalg.norm(fitted["p"] - truth - noise, axis=-1)
+    np.testing.assert_allclose(fitted["moved_m"], moved, atol=1e-5)
+
+
+def test_the_masks_are_filled_better(people, compose):
+    config = compose("fit", f"data.root={people}", *QUICK, "fit.sweeps=10")
+    data = instantiate(config.data, _convert_="all")
+    moments = Moments(data, torch.device("cpu"))
+    chance = torch.Generator().manual_seed(0)
+    noisy = moments.skeletons + 0.03 * torch.randn(moments.skeletons.shape, generator=chance)
+    fitter = make_fitter(instantiate(config.fit), moments, 0, noisy)
+    for _ in range(40):
+        fitter.shape_step()
+    while not fitter.done:
+        fitter.sweep()
+    before, after = fitter.agreement(noisy), fitter.agreement(fitter.joints())
+    assert after.iou > before.iou + 0.02
+    assert after.share < before.share
+
+
+def test_a_joint_that_was_not_seen_stays_missing_and_spoils_nothing(fit, people, tmp_path):
+    def hide(arrays):
+        arrays["p"][:, 15] = np.nan  # a wrist, in no frame
+        arrays["conf"] = np.ones(arrays["p"].shape[:2])
+        arrays["conf"][1, 25] = 0  # a knee, in one
+
+    fitted = fit(root=with_landmarks(people, tmp_path / "hidden", hide))
+    assert np.isnan(fitted["p"][:, 15]).all()
+    assert np.isnan(fitted["moved_m"][:, 15]).all()
+    assert np.isnan(fitted["moved_m"][1, 25])
+    others = np.delete(np.arange(33), [15])
+    assert np.isfinite(fitted["p"][:, others]).all()
+    assert fitted["conf"][1, 25] == 0
+
+
+def test_joints_in_one_place_keep_gradients_finite(people, compose):
+    config = compose("fit", f"data.root={people}", *QUICK)
+    moments = Moments(instantiate(config.data, _convert_="all"), torch.device("cpu"))
+    start = moments.skeletons.clone()
+    start[0, 13] = start[0, 11]  # an upper arm of no length
+    start[1] = start[1, :1]  # a person of one point
+    fitter = make_fitter(instantiate(config.fit), moments, 0, start)
+    fitter.shape_step()
+    fitter.sweep()
+    assert fitter.joints().isfinite().all()
+    assert all(p.isfinite().all() for p in fitter.shape.parameters())
+
+
+def test_held_out_cameras_are_not_looked_at(fit, people, tmp_path):
+    plain = fit()
+    other = shutil.copytree(people, tmp_path / "other")
+    for file in (other / "masks/cam03").iterdir():
+        cv2.imwrite(str(file), np.full((96, 96), 255, np.uint8))
+    trust = "data.reader.trust.frames=0"
+    changed = fit(trust, root=other, name="other.npz")
+    np.testing.assert_array_equal(plain["p"], changed["p"])
+    assert str(plain["fitted_to"]) == "cam00, cam01, cam02"
+
+
+def test_frames_without_pictures_keep_their_landmarks(fit, people, tmp_path):
+    def lengthen(arrays):
+        for key in arrays:
+            if key != "names":
+                arrays[key] = np.concatenate([arrays[key], arrays[key][-1:]])
+        arrays["frame_id"][-1] = 99
+
+    longer = with_landmarks(people, tmp_path / "longer", lengthen)
+    fitted = fit(root=longer)
+    np.testing.assert_array_equal(fitted["p"][-1], np.load(longer / "landmarks3d.npz")["p"][-1])
+    assert np.isnan(fitted["moved_m"][-1]).all()
+
+
+def test_a_stopped_fit_goes_on_to_the_same_end(fit, monkeypatch, tmp_path, capsys):
+    whole = fit()
+    sweep, done = Fitter.sweep, []
+
+    def stopping(self, advance=lambda: None):
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(self.swept)
+        return sweep(self, advance)
+
+    monkeypatch.setattr(Fitter, "sweep", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        fit(name="again.npz")
+    assert not (tmp_path / "again.npz").exists()
+    monkeypatch.setattr(Fitter, "sweep", sweep)
+    capsys.readouterr()
+    again = fit(name="again.npz")
+    assert "going on after 2 of 3 sweeps" in capsys.readouterr().out
+    np.testing.assert_array_equal(whole["p"], again["p"])
+    assert not list(tmp_path.glob(".*fitting"))
+
+
+@pytest.mark.parametrize("left", ["other settings", "damage"])
+def test_what_does_not_fit_is_not_gone_on_from(fit, monkeypatch, tmp_path, capsys, left):
+    whole = fit()
+    if left == "damage":
+        (tmp_path / ".again.npz.fitting").write_bytes(b"PK no")
+    else:
+        monkeypatch.setattr(running, "fit_picture", lambda *_: 1 / 0)
+        with pytest.raises(ZeroDivisionError):
+            fit("fit.prior=0.5", name="again.npz")
+        monkeypatch.undo()
+    again = fit(name="again.npz")
+    assert "starting anew" in capsys.readouterr().out
+    np.testing.assert_array_equal(whole["p"], again["p"])
+
+
+def test_the_picture_shows_every_camera(fit, tmp_path):
+    fit("shown=2")
+    picture = cv2.imread(str(tmp_path / "fit.png"))
+    assert picture.shape[1] == 3 * 300
+    assert picture.shape[0] > 2 * 300
+
+
+def test_fitted_landmarks_are_read_and_are_other_data(fit, people, tmp_path):
+    fitted = fit()
+    plain = GsganData(str(people), size=48)
+    other = GsganData(
+        str(people), reader=CaptureReader(landmarks=str(tmp_path / "fit.npz")), size=48
+    )
+    frame = other.dataset("train")[0]
+    np.testing.assert_allclose(frame.skeleton[0], 0.01 * fitted["p"][0], atol=1e-6)
+    assert any("skeletons come from" in note for note in other.layout.notes)
+    assert fingerprint(plain) != fingerprint(other)
+    assert fingerprint(plain) == fingerprint(GsganData(str(people), size=48))
+
+
+@pytest.mark.parametrize("name", ["not_there.npz", "landmarks.json"])
+def test_a_landmarks_file_that_is_none_is_refused(people, name):
+    with pytest.raises(DataError, match=r"data\.reader\.landmarks"):
+        GsganData(str(people), reader=CaptureReader(landmarks=name)).setup()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (["out=null"], "out is not set"),
+        (["out=fit.txt"], "must end in .npz"),
+        (["shown=0"], "shown must be"),
+        (["fit.sweeps=0"], "fit.sweeps"),
+        (["fit.sweeps=2.5"], "fit.sweeps"),
+        (["fit.noise=0"], "fit.noise"),
+        (["fit.prior=-1"], "fit.prior"),
+        (["fit.hold=2"], "fit.hold"),
+    ],
+)
+def test_wrong_settings_are_one_sentence(inside, people, overrides, words):
+    refused(inside("fit", f"data.root={people}", "out=a.npz", *QUICK, *overrides), words)
+
+
+def test_a_file_that_is_there_is_not_replaced_unasked(compose, people, tmp_path):
+    out = tmp_path / "fit.npz"
+    out.write_bytes(b"mine")
+    with pytest.raises(ConfigError, match="overwrite=true"):
+        run_fit(compose("fit", f"data.root={people}", f"out={out}", *QUICK))
+    assert out.read_bytes() == b"mine"
+
+
+def test_other_formats_are_refused(compose, people, tmp_path):
+    with pytest.raises(ConfigError, match="data=capture"):
+        run_fit(
+            compose("fit", "data=zju_mocap", f"data.root={people}", f"out={tmp_path / 'a.npz'}")
+        )
