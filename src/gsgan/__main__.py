@@ -8,7 +8,7 @@ COMMANDS = {
     "gsgan.evaluate": "score a run, run=<folder>, or any method's pictures, predictions=<folder>",
     "gsgan.report": "tables of scored runs: runs=[<folder>,…] table=ablation",
     "gsgan.figures": "the paper's figures of a run: run=<folder> compare=[<folder>,…]",
-    "gsgan.bench": "measure what things cost: raster, stability, loader, effects, speed, trade-off",
+    "gsgan.bench": "measure what things cost: raster, stability, fit, effects, speed, trade-off …",
 }
 
 

@@ -18,10 +18,11 @@ from gsgan.data.datamodule import GsganData
 from gsgan.data.formats.capture import CaptureReader
 from gsgan.errors import ConfigError, DataError
 from gsgan.fitting import run as running
-from gsgan.fitting.fitter import Fitter
+from gsgan.fitting.fitter import Fitter, _wrong
 from gsgan.fitting.moments import Moments, make_fitter
 from gsgan.fitting.run import run_fit
 from gsgan.scoring.facts import fingerprint
+from gsgan.scoring.run import make_scorer
 
 BODY = slice(11, 33)
 QUICK = [
@@ -135,7 +136,65 @@ def test_held_out_cameras_are_not_looked_at(fit, people, tmp_path):
     trust = "data.reader.trust.frames=0"
     changed = fit(trust, root=other, name="other.npz")
     np.testing.assert_array_equal(plain["p"], changed["p"])
-    assert str(plain["fitted_to"]) == "cam00, cam01, cam02"
+    assert list(plain["fitted_to"]) == ["cam00", "cam01", "cam02"]
+
+
+def test_pictures_are_looked_at_for_their_masks_alone(fit, people, tmp_path):
+    other = shutil.copytree(people, tmp_path / "other")
+    for file in other.glob("images/*/*"):
+        cv2.imwrite(str(file), np.full((96, 96, 3), 10, np.uint8))
+    np.testing.assert_array_equal(fit()["p"], fit(root=other, name="other.npz")["p"])
+
+
+@pytest.mark.parametrize("hole", ["no mask of a moment", "a crumb in one mask"])
+def test_an_empty_mask_spoils_no_other_frame(fit, people, tmp_path, capsys, hole):
+    holed = shutil.copytree(people, tmp_path / "holed")
+    for camera in ("cam00", "cam01", "cam02")[: 3 if hole.startswith("no") else 1]:
+        mask = np.zeros((96, 96), np.uint8)
+        mask[50:52, 50:52] = 255 if hole.startswith("a") else 0
+        cv2.imwrite(str(holed / f"masks/{camera}/000001.png"), mask)
+    capsys.readouterr()
+    trust = "data.reader.trust.frames=0"
+    fitted, plain = fit(trust, root=holed), fit(name="plain.npz")
+    assert "left out" in capsys.readouterr().out
+    there = np.load(people / "landmarks3d.npz")["p"]
+    others = [0, 2, 3]
+    moved = np.linalg.norm(plain["p"] - there, axis=-1)[others].mean()
+    apart = np.linalg.norm(plain["p"] - fitted["p"], axis=-1)[others].mean()
+    assert apart < moved
+    if hole.startswith("no"):
+        np.testing.assert_array_equal(fitted["p"][1], there[1])
+    else:
+        assert np.nanmax(fitted["moved_m"][1]) < 0.1
+
+
+def test_masks_without_anyone_are_refused(compose, people, tmp_path):
+    empty = shutil.copytree(people, tmp_path / "empty")
+    for file in empty.glob("masks/*/*"):
+        cv2.imwrite(str(file), np.zeros((96, 96), np.uint8))
+    with pytest.raises(DataError):
+        run_fit(
+            compose(
+                *("fit", f"data.root={empty}", f"out={tmp_path / 'a.npz'}", *QUICK),
+                *("data.reader.trust.frames=0", "data.reader.trust.watched_masks=0"),
+            )
+        )
+
+
+def test_beyond_the_border_nothing_is_charged(people, tmp_path):
+    """A window that reaches beyond what the camera took says so, and the fit passes it by."""
+    oblong = write_tiny_capture(tmp_path / "oblong", cameras=2, frames=2, size=(96, 64))
+    data = GsganData(str(oblong), size=48)
+    moments = Moments(data, torch.device("cpu"))
+    frame = moments.pictures(0)[0]
+    assert frame.unsure is not None
+    beyond = frame.unsure > 0.5
+    assert beyond.float().mean() == pytest.approx(1 / 3)
+    assert float(frame.mask[beyond].max()) == 0
+    everything = torch.ones_like(frame.mask)
+    assert float(_wrong(everything, frame)[beyond].max()) == 0
+    inside = GsganData(str(people), size=48)
+    assert Moments(inside, torch.device("cpu")).pictures(0)[0].unsure is None
 
 
 def test_frames_without_pictures_keep_their_landmarks(fit, people, tmp_path):
@@ -173,6 +232,19 @@ def test_a_stopped_fit_goes_on_to_the_same_end(fit, monkeypatch, tmp_path, capsy
     assert not list(tmp_path.glob(".*fitting"))
 
 
+def test_a_stopped_fit_does_not_go_on_with_other_masks(fit, people, monkeypatch, tmp_path, capsys):
+    other = shutil.copytree(people, tmp_path / "other")
+    monkeypatch.setattr(running, "fit_picture", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        fit(root=other)
+    monkeypatch.undo()
+    file = next(other.glob("masks/cam00/*"))
+    cv2.imwrite(str(file), cv2.dilate(cv2.imread(str(file), 0), np.ones((3, 3), np.uint8)))
+    capsys.readouterr()
+    fit("overwrite=true", root=other)
+    assert "starting anew" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("left", ["other settings", "damage"])
 def test_what_does_not_fit_is_not_gone_on_from(fit, monkeypatch, tmp_path, capsys, left):
     whole = fit()
@@ -183,7 +255,7 @@ def test_what_does_not_fit_is_not_gone_on_from(fit, monkeypatch, tmp_path, capsy
         with pytest.raises(ZeroDivisionError):
             fit("fit.prior=0.5", name="again.npz")
         monkeypatch.undo()
-    again = fit(name="again.npz")
+    again = fit("overwrite=true", name="again.npz")
     assert "starting anew" in capsys.readouterr().out
     np.testing.assert_array_equal(whole["p"], again["p"])
 
@@ -208,6 +280,45 @@ def test_fitted_landmarks_are_read_and_are_other_data(fit, people, tmp_path):
     assert fingerprint(plain) == fingerprint(GsganData(str(people), size=48))
 
 
+def test_a_camera_that_was_fitted_to_is_not_held_out(fit, people, tmp_path):
+    fit()
+    reader = CaptureReader(landmarks=str(tmp_path / "fit.npz"))
+    leaking = GsganData(str(people), reader=reader, size=48, test_cameras=["cam01"])
+    with pytest.raises(ConfigError, match="fitted to the masks of cam01"):
+        leaking.setup()
+
+
+def test_scores_say_that_skeletons_were_fitted(fit, people, tmp_path, compose):
+    fit()
+    config = compose("train", "data=capture", f"data.root={people}")
+    reader = CaptureReader(landmarks=str(tmp_path / "fit.npz"))
+    for data, said in (
+        (GsganData(str(people), reader=reader), True),
+        (GsganData(str(people)), False),
+    ):
+        marks = make_scorer(config, data, []).marks
+        assert any("fitted to the masks of cam00" in mark for mark in marks) == said
+
+
+def test_a_file_in_the_folder_is_named_from_there(compose, people, tmp_path, capsys):
+    root = shutil.copytree(people, tmp_path / "root")
+    run_fit(compose("fit", f"data.root={root}", f"out={root / 'fit.npz'}", *QUICK))
+    said = capsys.readouterr().out
+    assert "data.reader.landmarks=fit.npz" in said
+    assert GsganData(
+        str(root), reader=CaptureReader(landmarks="fit.npz")
+    ).layout.landmarks.fitted_to
+
+
+def test_a_body_pose_that_stays_is_told(compose, capture, tmp_path, capsys):
+    run_fit(compose("fit", f"data.root={capture}", f"out={tmp_path / 'a.npz'}", *QUICK))
+    assert "body pose stays" in capsys.readouterr().out
+
+
+def test_a_protocol_says_who_is_looked_at(compose):
+    assert compose("fit", "protocol=zju_gauhuman", "data=capture").protocol.name == "zju_gauhuman"
+
+
 @pytest.mark.parametrize("name", ["not_there.npz", "landmarks.json"])
 def test_a_landmarks_file_that_is_none_is_refused(people, name):
     with pytest.raises(DataError, match=r"data\.reader\.landmarks"):
@@ -219,6 +330,9 @@ def test_a_landmarks_file_that_is_none_is_refused(people, name):
     [
         (["out=null"], "out is not set"),
         (["out=fit.txt"], "must end in .npz"),
+        (["out=5"], "must end in .npz"),
+        (["out=/proc/no/fit.npz"], "cannot be written"),
+        (["fit.densify=null"], "fit.densify"),
         (["shown=0"], "shown must be"),
         (["fit.sweeps=0"], "fit.sweeps"),
         (["fit.sweeps=2.5"], "fit.sweeps"),
@@ -237,6 +351,14 @@ def test_a_file_that_is_there_is_not_replaced_unasked(compose, people, tmp_path)
     with pytest.raises(ConfigError, match="overwrite=true"):
         run_fit(compose("fit", f"data.root={people}", f"out={out}", *QUICK))
     assert out.read_bytes() == b"mine"
+
+
+def test_the_landmarks_themselves_are_never_replaced(compose, people):
+    there = (people / "landmarks3d.npz").read_bytes()
+    out = people / "landmarks3d.npz"
+    with pytest.raises(ConfigError, match="give another name"):
+        run_fit(compose("fit", f"data.root={people}", f"out={out}", "overwrite=true", *QUICK))
+    assert out.read_bytes() == there
 
 
 def test_other_formats_are_refused(compose, people, tmp_path):

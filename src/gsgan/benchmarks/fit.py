@@ -6,7 +6,6 @@ import json
 import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import gsgan.compat  # noqa: F401  (must come before lightning)
 
@@ -63,9 +62,10 @@ def run(config: DictConfig, folder: Path) -> None:
         check_block(Path(config.docs), "fit")
     console, where = make_console(), environment(torch.device("cpu"))
     console.print(where.sentence(), highlight=False)
+    changed = {one: _changed(config, one) for one in ("", *settings)}  # all, before hours of work
     start, rows = float("nan"), []
-    for one in track(["", *settings], "fitting", console=console, transient=True):
-        start, fitted = _fitted(config, one)
+    for one, its in track(changed.items(), "fitting", console=console, transient=True):
+        start, fitted = _fitted(its, one)
         rows.append(fitted)
     text = (
         f"{where.sentence()}; {config.data.source.frames} frames, noise of "
@@ -95,17 +95,27 @@ def _cells(rows: list[Fitted]) -> list[list[str]]:
     ]
 
 
-def _fitted(config: DictConfig, override: str) -> tuple[float, Fitted]:
+def _changed(config: DictConfig, override: str) -> DictConfig:
+    """The config with one override, whose fit can be built.
+
+    Raises:
+        ConfigError: when it cannot.
+    """
+    changed = OmegaConf.merge(config, OmegaConf.from_dotlist([override] if override else []))
+    assert isinstance(changed, DictConfig)
+    instantiate(changed.fit)
+    return changed
+
+
+def _fitted(changed: DictConfig, override: str) -> tuple[float, Fitted]:
     """Metres that joints are off at the start, and the fit with one override."""
-    changed: Any = OmegaConf.merge(config, OmegaConf.from_dotlist([override] if override else []))
     data: GsganData = instantiate(changed.data, _convert_="all")
     moments = Moments(data, torch.device("cpu"))
     truth = moments.skeletons
     chance = torch.Generator().manual_seed(changed.seed)
     noisy = truth + changed.noise * torch.randn(truth.shape, generator=chance)
     fitter = make_fitter(instantiate(changed.fit), moments, changed.seed, noisy)
-    for i in range(len(moments.frames)):
-        moments.pictures(i)  # decoded before the clock starts
+    make_fitter(instantiate(changed.fit), moments, changed.seed, noisy).shape_step()  # warm
     began = time.perf_counter()
     while fitter.shaped < fitter.settings.shape_steps:
         fitter.shape_step()

@@ -59,7 +59,7 @@ def read_reprojection(subject: Subject) -> Reprojection | None:
         medians = {name: _median(pixels) for name, pixels in found.items()}
         return Reprojection(_nanmean(stack), _median(stack), medians, "landmarks2d/", focal)
     path = subject.layout.root / "landmarks3d.npz"
-    if not path.is_file():
+    if subject.layout.landmarks.fitted_to or not path.is_file():  # its errors are of its own joints
         return None
     arrays = read_arrays(path, ("reproj_px", "frame_id"))
     if "reproj_px" not in arrays:

@@ -152,6 +152,17 @@ class CaptureDataset(Dataset[Frame]):
             unsure=None if picture.unsure is None else _unit(picture.unsure)[None, None],
         )
 
+    def inside(self, index: int) -> Tensor | None:
+        """``[1, 1, H, W]`` 1 where a pixel of the item lies in what the camera took; None where
+        all do. Windows reach beyond borders, and undistorted pictures have empty rims."""
+        item = self.items[index]
+        camera, window = self.layout.cameras[item[0]], self.window(item)
+        mapping = self._mapping(camera, window)
+        taken = cropping.take(np.full(camera.size, 255, np.uint8), window, mapping, exact=True)
+        size = window.size if self.size is None else (self.size, self.size)
+        taken = cropping.resize(taken, size, exact=True)
+        return None if taken.all() else _unit(taken)[None, None]
+
     def window(self, item: Item) -> Window:
         """Which part of the (undistorted) picture an item shows."""
         camera = self.layout.cameras[item[0]]
@@ -179,12 +190,16 @@ class CaptureDataset(Dataset[Frame]):
         """Whether the camera's pictures keep their distortion, and say so."""
         return self.lens == "raw" and camera.distorted and not camera.dist[5:].any()
 
+    def _mapping(self, camera: CameraEntry, window: Window) -> NDArray[np.float32] | None:
+        """Where the window's pixels lie in the picture as taken; None for a pinhole."""
+        if not camera.distorted or self.lens == "ignore" or self._raw(camera):
+            return None
+        return cropping.undistort_map(camera.K, camera.dist, window)
+
     def _load(self, item: Item) -> Picture:
         camera, window = self.layout.cameras[item[0]], self.window(item)
         rules = self.layout.pixels
-        mapping = None
-        if camera.distorted and self.lens != "ignore" and not self._raw(camera):
-            mapping = cropping.undistort_map(camera.K, camera.dist, window)
+        mapping = self._mapping(camera, window)
         size = window.size if self.size is None else (self.size, self.size)
 
         def fit(picture: Bytes, exact: bool) -> Bytes:

@@ -148,6 +148,7 @@ class GsganData(LightningDataModule):
             return
         self._layout = layout = self.reader(self._folder(), self.checks, self.smpl)
         self._splits = splits = self._split(layout)
+        _refuse_leak(layout, splits)
         for note in (*layout.notes, *splits.notes):
             log.warning("%s: %s", layout.root, note)
         # every process has its own, and training and validation start their own workers
@@ -308,6 +309,15 @@ class GsganData(LightningDataModule):
 
 def _root_not_set(wanted: str) -> str:
     return f"data.root is not set: give the folder of {wanted}, e.g. data.root=/path/to/capture"
+
+
+def _refuse_leak(layout: Layout, splits: Splits) -> None:
+    seen = [camera for camera in splits.test_cameras if camera in layout.landmarks.fitted_to]
+    if seen and splits.items["novel_view"]:
+        raise ConfigError(
+            f"{layout.landmarks.source} was fitted to the masks of {seen[0]}, which is held out "
+            "here; run gsgan.fit with the same data.train_cameras, data.test_cameras or protocol"
+        )
 
 
 def _crop(crop: PersonCrop | str | None) -> PersonCrop | None:

@@ -24,12 +24,14 @@ class Landmarks:
     """Skeletons by frame: ``p [J, 3]`` metres, finite, ``visibility [J]`` in [0, 1].
 
     A joint of visibility 0 is a stand-in for one that was not seen. ``source`` names the file or
-    folder they come from, for messages.
+    folder they come from, for messages; ``fitted_to`` the cameras whose masks `gsgan.fit` moved
+    them to fit, none for landmarks as they were found.
     """
 
     p: Mapping[int, Float]
     visibility: Mapping[int, Float]
     source: str = "landmarks3d.npz"
+    fitted_to: tuple[str, ...] = ()
 
     def seen(self, frame: int) -> Float:
         """``[N, 3]`` the joints of a frame that are no stand-ins."""

@@ -45,7 +45,8 @@ class Fitter:
         shape: of the person.
         skeletons: ``[F, J, 3]`` metres, finite.
         visibility: ``[F, J]`` in [0, 1].
-        pictures: gives the pictures of frame number i, one a camera.
+        pictures: gives the pictures of frame number i, at least one, one a camera, with a person
+            in each mask; ``unsure`` where they say nothing.
         settings: see `Fit`.
         seed: of the order of frames and cameras.
 
@@ -130,11 +131,12 @@ class Fitter:
             wrong = area = 0.0
             for frame in self._windows(i):
                 alpha = self._alpha(i, skeleton, frame)
-                person, mask = alpha > 0.5, frame.mask > 0.5
+                judged = True if frame.unsure is None else frame.unsure < 0.5
+                person, mask = (alpha > 0.5) & judged, (frame.mask > 0.5) & judged
                 either = (person | mask).sum().item()
                 if either:
                     ious.append((person & mask).sum().item() / either)
-                wrong += (alpha - frame.mask).abs().sum().item()
+                wrong += _wrong(alpha, frame).sum().item()
                 area += frame.mask.sum().item()
             if area:
                 shares.append(wrong / area)
@@ -172,9 +174,9 @@ class Fitter:
         if len(frames) > self.settings.cameras:
             frames = chance.sample(frames, self.settings.cameras)
         skeleton = self.start[i] + move
-        wrong = [(self._alpha(i, skeleton, frame) - frame.mask).abs().sum() for frame in frames]
-        area = sum(frame.mask.sum() for frame in frames)
-        return torch.stack(wrong).sum() / torch.as_tensor(area).clamp_min(1.0)
+        wrong = [_wrong(self._alpha(i, skeleton, frame), frame).sum() for frame in frames]
+        area = torch.stack([frame.mask.sum() for frame in frames]).sum()
+        return torch.stack(wrong).sum() / area
 
     def _alpha(self, i: int, skeleton: Tensor, frame: Frame) -> Tensor:
         return self.shape(skeleton[None], self.visibility[i][None], frame.camera)
@@ -202,6 +204,12 @@ class Fitter:
         factor = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * fallen))
         self.of_shape.param_groups[0]["lr"] = self.settings.shape_rate * factor
         self.of_joints.param_groups[0]["lr"] = self.settings.joint_rate * factor
+
+
+def _wrong(alpha: Tensor, frame: Frame) -> Tensor:
+    """How far alpha is from the mask; 0 where the picture says nothing."""
+    off = (alpha - frame.mask).abs()
+    return off if frame.unsure is None else off * (1 - frame.unsure)
 
 
 def _mean(values: Sequence[float]) -> float:

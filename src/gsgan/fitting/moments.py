@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.capture import CaptureDataset, PictureCache
 from gsgan.data.datamodule import GsganData
+from gsgan.errors import DataError
 from gsgan.fitting.fitter import Fitter
 from gsgan.fitting.settings import Fit
 from gsgan.fitting.shape import RigidShape
@@ -20,14 +22,26 @@ from gsgan.skeleton import limb_length_sum
 class Moments:
     """The frames of a capture and their pictures by the cameras that train.
 
-    Held-out cameras are not looked at: what they saw is for scoring only.
+    Held-out cameras are not looked at: what they saw is for scoring only. Pictures without a
+    person, or nearly so, are left out, and frames that have none left.
 
     Args:
         data: the capture.
         device: the pictures go there.
+        least_mask: see `Fit`.
+        advance: called after each picture is looked at.
+
+    Raises:
+        DataError: when no picture is left.
     """
 
-    def __init__(self, data: GsganData, device: torch.device) -> None:
+    def __init__(
+        self,
+        data: GsganData,
+        device: torch.device,
+        least_mask: float = 0.1,
+        advance: Callable[[], None] = lambda: None,
+    ) -> None:
         layout, cameras = data.layout, data.splits.train_cameras
         items = [
             (camera, frame)
@@ -37,19 +51,51 @@ class Moments:
         ]
         cache = PictureCache(int(data.cache_mb * 2**20))
         self.dataset = CaptureDataset(layout, items, data.size, data.crop, cache, data.lens)
-        self.frames = tuple(sorted({frame for _, frame in items}))
         self.cameras, self.device = cameras, device
+        self._unseen: dict[int, torch.Tensor] = {}
+        places = self._usable(least_mask, advance)
+        if not places:
+            raise DataError(f"{layout.root}: the masks of {', '.join(cameras)} hold no person")
+        self.left_out = len(items) - len(places)
+        self.frames = tuple(sorted({items[place][1] for place in places}))
         self._places: dict[int, list[int]] = {frame: [] for frame in self.frames}
-        for place, (_, frame) in enumerate(items):
-            self._places[frame].append(place)
+        for place in places:
+            self._places[items[place][1]].append(place)
         marks = layout.landmarks
         self.skeletons = self._stacked(marks.p)
         self.visibility = self._stacked(marks.visibility)
 
     def pictures(self, i: int) -> list[Frame]:
-        """The pictures of the i-th frame, one a camera."""
-        places = self._places[self.frames[i]]
-        return [self.dataset[place].to(self.device) for place in places]
+        """The pictures of the i-th frame, one a camera; ``unsure`` beyond the camera's border."""
+        return [self._picture(place) for place in self._places[self.frames[i]]]
+
+    def _picture(self, place: int) -> Frame:
+        frame, unseen = self.dataset[place], self._unseen.get(place)
+        if unseen is not None:
+            unsure = unseen if frame.unsure is None else torch.maximum(unseen, frame.unsure)
+            frame = replace(frame, unsure=unsure)
+        return frame.to(self.device)
+
+    def _usable(self, least: float, advance: Callable[[], None]) -> list[int]:
+        """Places of the pictures whose masks hold enough of the person; finds borders by the way.
+
+        Areas are compared in square metres at the person: a mask shrinks with the distance.
+        """
+        areas: dict[str, dict[int, float]] = {}
+        for place, (camera, _) in enumerate(self.dataset.items):
+            frame, inside = self.dataset[place], self.dataset.inside(place)
+            if inside is not None:
+                self._unseen[place] = 1 - inside
+            depth = frame.camera.to_camera(frame.skeleton)[0, :, 2].median()
+            pixel = (depth / frame.camera.K[0, 0, 0]).square()
+            areas.setdefault(camera, {})[place] = float(frame.mask.sum() * pixel)
+            advance()
+        usable = []
+        for found in areas.values():
+            known = [area for area in found.values() if area > 0]
+            usual = float(np.median(known)) if known else np.inf
+            usable += [place for place, area in found.items() if area >= least * usual]
+        return sorted(usable)
 
     def _stacked(self, by_frame: Mapping[int, NDArray[np.float64]]) -> torch.Tensor:
         values = np.stack([by_frame[frame] for frame in self.frames])
@@ -68,10 +114,5 @@ def make_fitter(
     limb_sum = float(limb_length_sum(start, moments.visibility > 0).nanmedian())
     shape = RigidShape(settings.densify, limb_sum, settings.accuracy)
     return Fitter(
-        shape.to(moments.device),
-        start,
-        moments.visibility,
-        moments.pictures,
-        settings,
-        seed,
+        shape.to(moments.device), start, moments.visibility, moments.pictures, settings, seed
     )

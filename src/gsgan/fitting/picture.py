@@ -36,16 +36,22 @@ def fit_picture(
     """
     count = len(frames)
     chosen = sorted({int((k + 0.5) * count / shown) for k in range(shown)})
-    rows: list[Bytes] = []
-    for i in chosen:
-        tiles = {int(f.camera_index): _tile(fitter, i, f, joints[i]) for f in fitter.pictures(i)}
-        row = [
-            caption(tile, f"{names[place]}  frame {frames[i]}", BAR)
-            for place, tile in sorted(tiles.items())
-        ]
-        rows.append(np.concatenate(row, axis=1))
-    width = max(row.shape[1] for row in rows)
-    padded = [np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0))) for row in rows]
+    tiles = [
+        {
+            int(frame.camera_index): _tile(fitter, i, frame, joints[i])
+            for frame in fitter.pictures(i)
+        }
+        for i in chosen
+    ]
+    columns = sorted(set().union(*tiles))
+    empty = np.zeros((TILE, TILE, 3), np.uint8)
+    padded = [
+        np.concatenate(
+            [caption(row.get(c, empty), f"{names[c]}  frame {frames[i]}", BAR) for c in columns],
+            axis=1,
+        )
+        for i, row in zip(chosen, tiles, strict=True)
+    ]
     sheet = caption(np.concatenate(padded), LEGEND, BAR)
     ok, data = cv2.imencode(".png", sheet[..., ::-1])
     if not ok:
@@ -62,11 +68,13 @@ def _tile(fitter: Fitter, i: int, frame: Frame, after: Tensor) -> Bytes:
         inside = (_large(alpha[0, 0]) > 0.5).astype(np.uint8)
         lines = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
         cv2.drawContours(picture, lines, -1, colour, 1, cv2.LINE_AA)
-    return picture
+    height, width = picture.shape[:2]
+    return np.pad(picture, ((0, TILE - height), (0, TILE - width), (0, 0)))
 
 
 def _large(values: Tensor) -> NDArray[np.float32]:
     array = values.detach().to("cpu", torch.float32).numpy()
     scale = TILE / max(array.shape[:2])
-    large = cv2.resize(array, None, fx=scale, fy=scale, interpolation=cv2.INTER_LINEAR)
+    size = [max(1, min(TILE, round(scale * side))) for side in array.shape[1::-1]]
+    large = cv2.resize(array, size, interpolation=cv2.INTER_LINEAR)
     return large.astype(np.float32, copy=False)

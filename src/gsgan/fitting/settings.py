@@ -19,6 +19,7 @@ class Fit:
     Args:
         densify: skeleton to points.
         accuracy: the rasteriser's settings.
+        least_mask: a picture with less of the camera's usual mask area is left out.
         shape_steps: steps on the shape alone, before joints move.
         sweeps: passes over all frames; each moves every frame's joints once, and the shape.
         cameras: a step looks at so many cameras at most, drawn by chance.
@@ -35,6 +36,7 @@ class Fit:
 
     densify: Densify
     accuracy: Accuracy
+    least_mask: float = 0.1
     shape_steps: int = 150
     sweeps: int = 20
     cameras: int = 8
@@ -46,7 +48,10 @@ class Fit:
     hold: float = 0.4
 
     def __post_init__(self) -> None:
-        above = {"sweeps", "cameras", "noise", "joint_rate", "shape_rate"}
+        for name in ("densify", "accuracy"):
+            if getattr(self, name) is None:
+                raise ConfigError(f"fit.{name} cannot be null; conf/fit/standard.yaml has it")
+        above = {"least_mask", "sweeps", "cameras", "noise", "joint_rate", "shape_rate"}
         for field in fields(self)[2:]:
             value = getattr(self, field.name)
             whole = isinstance(field.default, int)

@@ -115,9 +115,8 @@ def protocols_differ(a: Run, b: Run, split: str, *, subjects: bool = False) -> s
 
 
 def differing(a: dict[str, Any], b: dict[str, Any]) -> list[str]:
-    """Keys whose values differ, or that one of them lacks."""
-    missing = object()
-    return sorted(key for key in a.keys() | b.keys() if a.get(key, missing) != b.get(key, missing))
+    """Keys whose values differ; one that a run of an older config lacks is null there."""
+    return sorted(key for key in a.keys() | b.keys() if a.get(key) != b.get(key))
 
 
 def _refuse_other_data(first: Run, run: Run, split: str, where: str) -> None:
@@ -129,7 +128,8 @@ def _refuse_other_data(first: Run, run: Run, split: str, where: str) -> None:
         names = [data_name(r) for r in (first, run)]
         told = f"{names[0]} and {names[1]}"
         if names[0] == names[1]:
-            told = f"two sets of {names[0]} (cameras, frames, split, picture size or crop)"
+            what = "cameras, frames, split, picture size, crop or fitted landmarks"
+            told = f"two sets of {names[0]} ({what})"
         raise _mixture(where, first, run, f"are of different data: {told}")
     counts = [_images(r, split) for r in (first, run)]
     if counts[0] != counts[1]:

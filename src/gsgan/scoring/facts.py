@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 from omegaconf import OmegaConf
 
-from gsgan.data.formats.capture import LANDMARKS
-
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
@@ -118,7 +116,7 @@ def commit_of(folder: Path | None = None) -> tuple[str | None, bool | None]:
 def fingerprint(data: GsganData) -> str:
     """A short hash of what is trained on and scored: cameras, frames, splits, picture size.
 
-    Contents of pictures are not in it, nor where they lie.
+    Contents of pictures are not in it, nor where they lie; of landmarks only fitted ones are.
     """
     layout, splits = data.layout, data.splits
     said: dict[str, Any] = {
@@ -128,10 +126,10 @@ def fingerprint(data: GsganData) -> str:
         "size": data.size,
         "crop": None if data.crop is None else asdict(data.crop),
     }
-    chosen = getattr(data.reader, "landmarks", LANDMARKS)
-    if chosen != LANDMARKS:  # other skeletons are other inputs, and cut other windows
-        p = b"".join(layout.landmarks.p[frame].tobytes() for frame in layout.frames)
-        said["landmarks"] = hashlib.sha256(p).hexdigest()
+    if layout.landmarks.fitted_to:  # other skeletons are other inputs, and cut other windows
+        marks = layout.landmarks
+        held = [m[f].tobytes() for m in (marks.p, marks.visibility) for f in layout.frames]
+        said["landmarks"] = hashlib.sha256(b"".join(held)).hexdigest()
     plain = json.dumps(said, sort_keys=True).encode()
     return hashlib.sha256(plain).hexdigest()[:FINGERPRINT]
 

@@ -116,6 +116,9 @@ def make_scorer(config: DictConfig, data: GsganData, marks: list[str]) -> Scorer
     score, reason = lpips(config.lpips.net, config.lpips.path, measures.lpips_range)
     boxes = BodyBoxes(data) if measures.needs_body_box else None
     name = lpips_name(config.lpips.net, measures)
+    if fitted := data.layout.landmarks.fitted_to:
+        told = f"skeletons fitted to the masks of {', '.join(fitted)}, held-out frames' too"
+        marks = [*marks, told]
     return Scorer(Stage(measures, boxes), score, reason, name, marks)
 
 

@@ -50,12 +50,13 @@ class CaptureReader:
     """Reads a capture in the bring-your-own layout; what is looked at is a setting.
 
     Args:
-        landmarks: the skeletons' file, in the capture's folder unless its path is absolute.
+        landmarks: the skeletons' file, in the capture's folder unless its path is absolute; None
+            is landmarks3d.npz.
         drop_frames: frames to leave out, e.g. "360-370", or None.
         trust: which pictures are looked at.
     """
 
-    landmarks: str = LANDMARKS
+    landmarks: str | None = None
     drop_frames: Any = None
     trust: Trust = LOOKED_AT
 
@@ -70,7 +71,7 @@ def read_capture(
     smpl: str | None = None,
     trust: Trust = LOOKED_AT,
     drop_frames: Any = None,
-    landmarks: str = LANDMARKS,
+    landmarks: str | None = None,
 ) -> Layout:
     """Reads and checks everything but most pictures' pixels.
 
@@ -80,7 +81,8 @@ def read_capture(
         smpl: the user's model file, for poses of an SMPL or SMPL-X body.
         trust: which pictures are looked at.
         drop_frames: frames to leave out, e.g. "360-370", or None.
-        landmarks: the skeletons' file, in the folder unless its path is absolute.
+        landmarks: the skeletons' file, in the folder unless its path is absolute; None is
+            landmarks3d.npz.
 
     Raises:
         DataError: for whatever is missing, damaged or contradictory, naming the file.
@@ -95,7 +97,7 @@ def read_capture(
     cameras = read_cameras(root / "cameras.json", cameras_json, conventions, checks)
     images = _index_images(root, cameras)
     joints_file = landmarks_path(root, landmarks)
-    if landmarks != LANDMARKS:
+    if joints_file.name != LANDMARKS:
         notes.append(f"skeletons come from {landmarks}, not from {LANDMARKS}")
     skeletons = read_landmarks(joints_file, meta, conventions, checks, notes)
     poses = None
@@ -133,16 +135,18 @@ def read_capture(
     return replace(layout, notes=(*layout.notes, *doubts, *watch_masks(layout, trust)))
 
 
-def landmarks_path(root: Path, name: str) -> Path:
+def landmarks_path(root: Path, name: str | None) -> Path:
     """The skeletons' file: in the capture's folder unless its path is absolute.
 
     Raises:
         DataError: when it is not there, or no npz.
     """
+    if name is None:
+        return root / LANDMARKS
     if not isinstance(name, str) or not name.endswith(".npz"):
         raise DataError(f"data.reader.landmarks must name an .npz file, got {name!r}")
     path = root / Path(name).expanduser()
-    if name != LANDMARKS and not path.is_file():
+    if not path.is_file():
         raise DataError(
             f"data.reader.landmarks={name}: {path} does not exist; gsgan.fit makes such files"
         )
@@ -237,13 +241,17 @@ def read_landmarks(
         DataError: on wrong arrays.
     """
     joints = SKELETONS[meta.skeleton]
-    arrays = read_arrays(path, ("p", "conf", "frame_id"))
+    arrays = read_arrays(path, ("p", "conf", "frame_id", "fitted_to"))
     p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64) * conventions.scale
     ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(p),), path), str(path))
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:
         conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
-    return make_landmarks(ids, p, conf, checks.max_reach, notes)
+    found = make_landmarks(ids, p, conf, checks.max_reach, notes, path.name)
+    cameras = arrays.get("fitted_to", np.array([], str))
+    if cameras.ndim != 1 or cameras.dtype.kind != "U":
+        raise DataError(f"{path}: 'fitted_to' must list camera names, found {cameras.dtype}")
+    return replace(found, fitted_to=tuple(cameras.tolist()))
 
 
 def read_poses(path: Path, meta: Meta, conventions: Conventions) -> Poses:
