@@ -79,6 +79,12 @@ def test_reprojection_of_stored_distances(subject):
     assert judge_reprojection(found, Limits()) == []
 
 
+def test_stored_distances_are_not_those_of_fitted_landmarks(subject):
+    fitted = replace(subject.layout.landmarks, fitted_to=("cam00",))
+    moved = replace(subject, layout=replace(subject.layout, landmarks=fitted))
+    assert read_reprojection(moved) is None
+
+
 def test_reprojection_of_detections_is_measured_by_camera(subject, tmp_path):
     root = tmp_path / "capture"
     (root / "landmarks2d").mkdir(parents=True)

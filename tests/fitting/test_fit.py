@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import random
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,11 +16,11 @@ from hydra.utils import instantiate
 from make import write_tiny_capture
 
 import gsgan.compat  # noqa: F401
-from gsgan.data.datamodule import GsganData
+from gsgan.data.datamodule import GsganData, _refuse_leak
 from gsgan.data.formats.capture import CaptureReader
 from gsgan.errors import ConfigError, DataError
 from gsgan.fitting import run as running
-from gsgan.fitting.fitter import Fitter, _wrong
+from gsgan.fitting.fitter import Fitter, _wrong, around
 from gsgan.fitting.moments import Moments, make_fitter
 from gsgan.fitting.run import run_fit
 from gsgan.scoring.facts import fingerprint
@@ -146,23 +148,30 @@ def test_pictures_are_looked_at_for_their_masks_alone(fit, people, tmp_path):
     np.testing.assert_array_equal(fit()["p"], fit(root=other, name="other.npz")["p"])
 
 
-@pytest.mark.parametrize("hole", ["no mask of a moment", "a crumb in one mask"])
+@pytest.mark.parametrize(
+    "hole", ["no mask of a moment", "a bystander in a moment", "a crumb in one mask"]
+)
 def test_an_empty_mask_spoils_no_other_frame(fit, people, tmp_path, capsys, hole):
     holed = shutil.copytree(people, tmp_path / "holed")
-    for camera in ("cam00", "cam01", "cam02")[: 3 if hole.startswith("no") else 1]:
+    whole = "moment" in hole
+    for camera in ("cam00", "cam01", "cam02")[: 3 if whole else 1]:
         mask = np.zeros((96, 96), np.uint8)
-        mask[50:52, 50:52] = 255 if hole.startswith("a") else 0
+        if "bystander" in hole:
+            mask[:, :8] = 255
+        if "crumb" in hole:
+            mask[50:52, 50:52] = 255
         cv2.imwrite(str(holed / f"masks/{camera}/000001.png"), mask)
     capsys.readouterr()
-    trust = "data.reader.trust.frames=0"
-    fitted, plain = fit(trust, root=holed), fit(name="plain.npz")
+    whole_pictures = ("data.crop=null", "data.reader.trust.frames=0")
+    fitted = fit(*whole_pictures, root=holed)
+    plain = fit(*whole_pictures, name="plain.npz")
     assert "left out" in capsys.readouterr().out
     there = np.load(people / "landmarks3d.npz")["p"]
     others = [0, 2, 3]
     moved = np.linalg.norm(plain["p"] - there, axis=-1)[others].mean()
     apart = np.linalg.norm(plain["p"] - fitted["p"], axis=-1)[others].mean()
     assert apart < moved
-    if hole.startswith("no"):
+    if whole:
         np.testing.assert_array_equal(fitted["p"][1], there[1])
     else:
         assert np.nanmax(fitted["moved_m"][1]) < 0.1
@@ -181,7 +190,7 @@ def test_masks_without_anyone_are_refused(compose, people, tmp_path):
         )
 
 
-def test_beyond_the_border_nothing_is_charged(people, tmp_path):
+def test_beyond_the_border_nothing_is_charged(people, tmp_path, compose):
     """A window that reaches beyond what the camera took says so, and the fit passes it by."""
     oblong = write_tiny_capture(tmp_path / "oblong", cameras=2, frames=2, size=(96, 64))
     data = GsganData(str(oblong), size=48)
@@ -193,8 +202,28 @@ def test_beyond_the_border_nothing_is_charged(people, tmp_path):
     assert float(frame.mask[beyond].max()) == 0
     everything = torch.ones_like(frame.mask)
     assert float(_wrong(everything, frame)[beyond].max()) == 0
+    whole = instantiate(compose("fit", *QUICK).fit)
+    fitter = make_fitter(whole, moments)
+    fitter.shape.forward = lambda *_: everything  # alpha of 1 wherever the window is
+    seen = [around(moments.skeletons[0], one) for one in moments.pictures(0)]
+    everything = torch.ones(1, 1, *seen[0].mask.shape[-2:])
+    area = sum(float(one.mask.sum()) for one in seen)
+    counted = sum(float((1 - one.mask)[one.unsure < 0.5].sum()) for one in seen)
+    share = fitter._share(0, torch.zeros(33, 3), random.Random(0))
+    assert float(share) == pytest.approx(counted / area, rel=1e-5)
+    assert counted < sum(float((1 - one.mask).sum()) for one in seen)
     inside = GsganData(str(people), size=48)
     assert Moments(inside, torch.device("cpu")).pictures(0)[0].unsure is None
+
+
+def test_an_undistorted_picture_has_rims_that_say_nothing(tmp_path):
+    bent = write_tiny_capture(
+        tmp_path / "bent", cameras=2, frames=2, size=(96, 96), dist=(0.3, 0, 0, 0, 0)
+    )
+    frame = Moments(GsganData(str(bent), size=48), torch.device("cpu")).pictures(0)[0]
+    assert frame.unsure is not None
+    assert float(frame.unsure[0, 0, 0, 0]) == 1
+    assert float(frame.unsure[0, 0, 24, 24]) == 0
 
 
 def test_frames_without_pictures_keep_their_landmarks(fit, people, tmp_path):
@@ -288,6 +317,23 @@ def test_a_camera_that_was_fitted_to_is_not_held_out(fit, people, tmp_path):
         leaking.setup()
 
 
+def test_nor_where_all_its_pictures_are_of_held_out_poses(fit, people, tmp_path):
+    fit()
+    reader = CaptureReader(landmarks=str(tmp_path / "fit.npz"))
+    layout = GsganData(str(people), reader=reader, size=48).layout
+    splits = GsganData(str(people), size=48, test_cameras=["cam01"]).splits
+    splits = replace(splits, items={**splits.items, "novel_view": ()})
+    with pytest.raises(ConfigError, match="cam01"):
+        _refuse_leak(layout, splits)
+
+
+def test_a_second_fit_keeps_the_cameras_of_the_first(fit, tmp_path):
+    fit()
+    first = f"data.reader.landmarks={tmp_path / 'fit.npz'}"
+    again = fit(first, "data.train_cameras=[cam03]", "data.test_cameras=[]", name="again.npz")
+    assert list(again["fitted_to"]) == ["cam00", "cam01", "cam02", "cam03"]
+
+
 def test_scores_say_that_skeletons_were_fitted(fit, people, tmp_path, compose):
     fit()
     config = compose("train", "data=capture", f"data.root={people}")
@@ -315,8 +361,10 @@ def test_a_body_pose_that_stays_is_told(compose, capture, tmp_path, capsys):
     assert "body pose stays" in capsys.readouterr().out
 
 
-def test_a_protocol_says_who_is_looked_at(compose):
-    assert compose("fit", "protocol=zju_gauhuman", "data=capture").protocol.name == "zju_gauhuman"
+def test_a_protocol_says_who_is_looked_at_but_not_how_large(compose):
+    config = compose("fit", "protocol=zju_gauhuman", "data=capture")
+    assert config.protocol.name == "zju_gauhuman"
+    assert config.data.size == 128
 
 
 @pytest.mark.parametrize("name", ["not_there.npz", "landmarks.json"])
@@ -359,6 +407,23 @@ def test_the_landmarks_themselves_are_never_replaced(compose, people):
     with pytest.raises(ConfigError, match="give another name"):
         run_fit(compose("fit", f"data.root={people}", f"out={out}", "overwrite=true", *QUICK))
     assert out.read_bytes() == there
+
+
+def test_nor_is_the_file_that_is_read(fit, tmp_path):
+    fit()
+    read = f"data.reader.landmarks={tmp_path / 'fit.npz'}"
+    with pytest.raises(ConfigError, match="give another name"):
+        fit(read, "overwrite=true")
+
+
+def test_a_fit_stopped_between_its_files_goes_on(fit, monkeypatch, tmp_path):
+    monkeypatch.setattr(running, "fit_picture", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        fit()
+    assert (tmp_path / "fit.npz").exists()
+    monkeypatch.undo()
+    fit()
+    assert (tmp_path / "fit.png").exists()
 
 
 def test_other_formats_are_refused(compose, people, tmp_path):

@@ -13,7 +13,7 @@ from report_folders import report_of, row, table, texts, write_run
 
 from gsgan.errors import ConfigError, DataError
 from gsgan.reporting.folders import find_runs, read_runs
-from gsgan.reporting.mixing import same_data
+from gsgan.reporting.mixing import differing, same_data
 from gsgan.reporting.scored import read_run
 
 
@@ -122,6 +122,9 @@ def test_an_old_folder_and_a_new_one_are_matched_by_their_configs(tmp_path, tiny
     assert same_data(old, replace(new, data=new.data | {"root": "elsewhere"})) is False
     assert same_data(old, replace(new, data=new.data | {"name": "zju_mocap"})) is False
     assert same_data(old, replace(new, settings=None)) is None  # predictions: no config
+    before = {k: v for k, v in old.settings.items() if k != "data.reader.landmarks"}
+    assert same_data(replace(old, settings=before), new)  # of a config that had no such key yet
+    assert differing(before, old.settings) == []
     other = read_run(old_run(tmp_path / "other", tiny("data.train_frames=[0,1]")))
     assert same_data(old, other) is False
 

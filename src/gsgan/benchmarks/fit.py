@@ -110,11 +110,12 @@ def _changed(config: DictConfig, override: str) -> DictConfig:
 def _fitted(changed: DictConfig, override: str) -> tuple[float, Fitted]:
     """Metres that joints are off at the start, and the fit with one override."""
     data: GsganData = instantiate(changed.data, _convert_="all")
-    moments = Moments(data, torch.device("cpu"))
+    settings = instantiate(changed.fit)
+    moments = Moments(data, torch.device("cpu"), settings.least_mask)
     truth = moments.skeletons
     chance = torch.Generator().manual_seed(changed.seed)
     noisy = truth + changed.noise * torch.randn(truth.shape, generator=chance)
-    fitter = make_fitter(instantiate(changed.fit), moments, changed.seed, noisy)
+    fitter = make_fitter(settings, moments, changed.seed, noisy)
     make_fitter(instantiate(changed.fit), moments, changed.seed, noisy).shape_step()  # warm
     began = time.perf_counter()
     while fitter.shaped < fitter.settings.shape_steps:

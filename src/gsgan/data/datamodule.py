@@ -312,8 +312,9 @@ def _root_not_set(wanted: str) -> str:
 
 
 def _refuse_leak(layout: Layout, splits: Splits) -> None:
-    seen = [camera for camera in splits.test_cameras if camera in layout.landmarks.fitted_to]
-    if seen and splits.items["novel_view"]:
+    held_out = [c for c in splits.test_cameras if c not in splits.train_cameras]
+    seen = [camera for camera in held_out if camera in layout.landmarks.fitted_to]
+    if seen:
         raise ConfigError(
             f"{layout.landmarks.source} was fitted to the masks of {seen[0]}, which is held out "
             "here; run gsgan.fit with the same data.train_cameras, data.test_cameras or protocol"

@@ -19,6 +19,7 @@ from gsgan.window import body_window
 BETAS = (0.9, 0.99)
 LENGTH_FLOOR = 1e-12  # square metres
 FINAL_RATE = 0.02  # of the rates, at the last sweep
+NEAR = 0.01  # metres, nearer than which a joint has no place in the picture
 MARGIN = 0.25  # metres round the joints, as the avatar's windows: wider only costs time
 
 
@@ -176,20 +177,13 @@ class Fitter:
         skeleton = self.start[i] + move
         wrong = [_wrong(self._alpha(i, skeleton, frame), frame).sum() for frame in frames]
         area = torch.stack([frame.mask.sum() for frame in frames]).sum()
-        return torch.stack(wrong).sum() / area
+        return torch.stack(wrong).sum() / area.clamp_min(1.0)
 
     def _alpha(self, i: int, skeleton: Tensor, frame: Frame) -> Tensor:
         return self.shape(skeleton[None], self.visibility[i][None], frame.camera)
 
     def _windows(self, i: int) -> list[Frame]:
-        near = self.shape.accuracy.near
-        found = []
-        for frame in self.pictures(i):
-            window = body_window(
-                self.start[i][None], frame.camera, margin=MARGIN, multiple=16, least=32, near=near
-            )
-            found.append(window.frame(frame))
-        return found
+        return [around(self.start[i], frame) for frame in self.pictures(i)]
 
     def _lengths(self, skeletons: Tensor) -> Tensor:
         """``[..., L]`` metres; the floor keeps the gradient of a limb of no length finite."""
@@ -204,6 +198,12 @@ class Fitter:
         factor = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * fallen))
         self.of_shape.param_groups[0]["lr"] = self.settings.shape_rate * factor
         self.of_joints.param_groups[0]["lr"] = self.settings.joint_rate * factor
+
+
+def around(skeleton: Tensor, frame: Frame) -> Frame:
+    """The part of a picture round ``skeleton`` ``[J, 3]``: all that is compared."""
+    settings = {"margin": MARGIN, "near": NEAR}
+    return body_window(skeleton[None], frame.camera, multiple=16, least=32, **settings).frame(frame)
 
 
 def _wrong(alpha: Tensor, frame: Frame) -> Tensor:

@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from gsgan.data.capture import CaptureDataset, PictureCache
 from gsgan.data.datamodule import GsganData
 from gsgan.errors import DataError
-from gsgan.fitting.fitter import Fitter
+from gsgan.fitting.fitter import Fitter, around
 from gsgan.fitting.settings import Fit
 from gsgan.fitting.shape import RigidShape
 from gsgan.scene import Frame
 from gsgan.skeleton import limb_length_sum
+
+USUAL = 0.75  # quantile of the masks' areas that counts as usual: crumbs may be the most
 
 
 class Moments:
@@ -72,30 +74,33 @@ class Moments:
     def _picture(self, place: int) -> Frame:
         frame, unseen = self.dataset[place], self._unseen.get(place)
         if unseen is not None:
-            unsure = unseen if frame.unsure is None else torch.maximum(unseen, frame.unsure)
+            unsure = unseen.to(frame.mask.dtype)
+            if frame.unsure is not None:
+                unsure = torch.maximum(unsure, frame.unsure)
             frame = replace(frame, unsure=unsure)
         return frame.to(self.device)
 
     def _usable(self, least: float, advance: Callable[[], None]) -> list[int]:
         """Places of the pictures whose masks hold enough of the person; finds borders by the way.
 
-        Areas are compared in square metres at the person: a mask shrinks with the distance.
+        Counted is what the fit compares, in square metres at the person: a mask shrinks with the
+        distance, and another person's lies elsewhere.
         """
-        areas: dict[str, dict[int, float]] = {}
-        for place, (camera, _) in enumerate(self.dataset.items):
-            frame, inside = self.dataset[place], self.dataset.inside(place)
+        areas = []
+        for place in range(len(self.dataset)):
+            inside = self.dataset.inside(place)
             if inside is not None:
-                self._unseen[place] = 1 - inside
-            depth = frame.camera.to_camera(frame.skeleton)[0, :, 2].median()
-            pixel = (depth / frame.camera.K[0, 0, 0]).square()
-            areas.setdefault(camera, {})[place] = float(frame.mask.sum() * pixel)
+                self._unseen[place] = inside < 0.5
+            picture = self._picture(place)
+            seen = around(picture.skeleton[0], picture)
+            mask = seen.mask if seen.unsure is None else seen.mask * (1 - seen.unsure)
+            depth = seen.camera.to_camera(seen.skeleton)[0, :, 2].median()
+            pixel = (depth / seen.camera.K[0, 0, 0]).square()
+            areas.append(float(mask.sum() * pixel))
             advance()
-        usable = []
-        for found in areas.values():
-            known = [area for area in found.values() if area > 0]
-            usual = float(np.median(known)) if known else np.inf
-            usable += [place for place, area in found.items() if area >= least * usual]
-        return sorted(usable)
+        known = [area for area in areas if area > 0]
+        usual = float(np.quantile(known, USUAL)) if known else np.inf
+        return [place for place, area in enumerate(areas) if area >= least * usual]
 
     def _stacked(self, by_frame: Mapping[int, NDArray[np.float64]]) -> torch.Tensor:
         values = np.stack([by_frame[frame] for frame in self.frames])

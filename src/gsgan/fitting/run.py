@@ -65,9 +65,9 @@ def run_fit(config: DictConfig, console: Console | None = None) -> Path:
     source = landmarks_path(layout.root, data.reader.landmarks)
     if out.resolve() in {source.resolve(), (layout.root / LANDMARKS).resolve()}:
         raise ConfigError(f"out={config.out} holds the landmarks themselves; give another name")
-    kept = read_arrays(source, ("p", "conf", "frame_id"))
+    kept = read_arrays(source, ("p", "conf", "frame_id", "fitted_to"))
     moments = _moments(data, settings, pick_device(config.device), console)
-    partial = out.with_name(f".{out.name}.fitting")
+    partial = partial_file(out)
     key = _key(config, source, moments)
     fitter = _begun(settings, moments, config.seed, partial, key, console)
     _work(fitter, partial, key, console)
@@ -98,9 +98,15 @@ def _out(config: DictConfig) -> Path:
         there = [file for file in (out, out.with_suffix(".png")) if file.exists()]
         write_atomically(out.with_name(f".{out.name}.try"), b"")  # before an hour's work, not after
         out.with_name(f".{out.name}.try").unlink()
-    if there and not config.overwrite:
+    begun = partial_file(out).exists()  # a fit of this name was stopped, perhaps between its files
+    if there and not config.overwrite and not begun:
         raise ConfigError(f"{there[0]} is there already; overwrite=true replaces it")
     return out
+
+
+def partial_file(out: Path) -> Path:
+    """Where a stopped fit waits."""
+    return out.with_name(f".{out.name}.fitting")
 
 
 def _moments(data: GsganData, settings: Fit, device: torch.device, console: Console) -> Moments:
@@ -189,7 +195,10 @@ def _fields(
         p[row, seen[i]] = new[i, seen[i]]
         moves[row, seen[i]] = moved[i].cpu().numpy()[seen[i]]
     names = np.array(MEDIAPIPE33.names)
-    told = {"moved_m": moves, "fitted_to": np.array(moments.cameras)}
+    before = kept.get(
+        "fitted_to", np.array([], str)
+    ).tolist()  # of a fit that this one goes on from
+    told = {"moved_m": moves, "fitted_to": np.array(sorted({*before, *moments.cameras}))}
     return {**kept, "p": p, "names": names, **told}
 
 

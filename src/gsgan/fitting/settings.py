@@ -19,7 +19,7 @@ class Fit:
     Args:
         densify: skeleton to points.
         accuracy: the rasteriser's settings.
-        least_mask: a picture with less of the camera's usual mask area is left out.
+        least_mask: a picture with a smaller share of the usual mask area is left out.
         shape_steps: steps on the shape alone, before joints move.
         sweeps: passes over all frames; each moves every frame's joints once, and the shape.
         cameras: a step looks at so many cameras at most, drawn by chance.

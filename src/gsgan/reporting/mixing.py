@@ -99,7 +99,9 @@ def same_data(a: Run, b: Run) -> bool | None:
     if None not in roots and roots[0] != roots[1]:
         return False
     settings = [run.data_settings() for run in (a, b)]
-    return None if None in settings else settings[0] == settings[1]
+    if settings[0] is None or settings[1] is None:
+        return None
+    return not differing(settings[0], settings[1])
 
 
 def protocols_differ(a: Run, b: Run, split: str, *, subjects: bool = False) -> str:

@@ -97,7 +97,7 @@ def read_capture(
     cameras = read_cameras(root / "cameras.json", cameras_json, conventions, checks)
     images = _index_images(root, cameras)
     joints_file = landmarks_path(root, landmarks)
-    if joints_file.name != LANDMARKS:
+    if joints_file != root / LANDMARKS:
         notes.append(f"skeletons come from {landmarks}, not from {LANDMARKS}")
     skeletons = read_landmarks(joints_file, meta, conventions, checks, notes)
     poses = None
@@ -250,7 +250,7 @@ def read_landmarks(
     found = make_landmarks(ids, p, conf, checks.max_reach, notes, path.name)
     cameras = arrays.get("fitted_to", np.array([], str))
     if cameras.ndim != 1 or cameras.dtype.kind != "U":
-        raise DataError(f"{path}: 'fitted_to' must list camera names, found {cameras.dtype}")
+        raise DataError(f"{path}: 'fitted_to' must list camera names; run gsgan.fit again")
     return replace(found, fitted_to=tuple(cameras.tolist()))
 
 
