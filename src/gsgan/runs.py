@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -71,8 +71,13 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return checkpoint
 
 
-def checkpoint_to_resume(folder: Path, config: DictConfig, marks: list[str]) -> Path | None:
+def checkpoint_to_resume(folder: Path, now: Mapping[str, Any], marks: list[str]) -> Path | None:
     """The checkpoint of an earlier part of this very run, or None.
+
+    Args:
+        folder: the run's.
+        now: what the run's checkpoints will hold, of `training_record`.
+        marks: the run's stand-ins.
 
     Raises:
         ConfigError: when the folder holds a run with other settings.
@@ -88,8 +93,7 @@ def checkpoint_to_resume(folder: Path, config: DictConfig, marks: list[str]) -> 
             f"({'; '.join(state['marks']) or 'none'}; now {'; '.join(marks) or 'none'}); set "
             "training.perceptual.weights as it was, or resume=false to start over there"
         )
-    before, now = state["record"], record(config)
-    changed = sorted(set(_differences(before, now)))
+    changed = sorted(set(_differences(state["record"], now)))
     if changed:
         shown = ", ".join(changed[:5]) + (" …" if len(changed) > 5 else "")
         raise ConfigError(
@@ -232,7 +236,16 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     avatar = build_avatar(config, data)
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
     with _naming("training"):
-        return data, instantiate(config.training)(avatar, record=record(config))
+        return data, instantiate(config.training)(avatar, record=training_record(config, data))
+
+
+def training_record(config: DictConfig, data: GsganData) -> dict[str, Any]:
+    """What two parts of one run must have in common: its settings, and the skeletons where
+    `gsgan.fit` made them, whose file may be made again under the same name."""
+    held = record(config)
+    if data.layout.landmarks.fitted_to:
+        held["fitted landmarks"] = data.layout.landmarks.digest(data.layout.frames)
+    return held
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from gsgan.fitting import run as running
 from gsgan.fitting.fitter import Fitter, _wrong, around
 from gsgan.fitting.moments import Moments, make_fitter
 from gsgan.fitting.run import run_fit
+from gsgan.runs import CHECKPOINT, checkpoint_to_resume, training_record
 from gsgan.scoring.facts import fingerprint
 from gsgan.scoring.run import make_scorer
 
@@ -431,3 +432,21 @@ def test_other_formats_are_refused(compose, people, tmp_path):
         run_fit(
             compose("fit", "data=zju_mocap", f"data.root={people}", f"out={tmp_path / 'a.npz'}")
         )
+
+
+def test_training_does_not_go_on_with_other_fitted_landmarks(fit, people, compose, tmp_path):
+    """The file of a stopped run may be made again under the same name."""
+    config = compose("train", "data=capture", f"data.root={people}", "size=tiny")
+    records = []
+    for sweeps in (1, 2):
+        fit(f"fit.sweeps={sweeps}", "overwrite=true")
+        reader = CaptureReader(landmarks=str(tmp_path / "fit.npz"))
+        records.append(training_record(config, GsganData(str(people), reader=reader, size=48)))
+    folder = tmp_path / "run"
+    (folder / "checkpoints").mkdir(parents=True)
+    torch.save({"gsgan": {"record": records[0], "marks": []}}, folder / CHECKPOINT)
+    assert checkpoint_to_resume(folder, records[0], []) == folder / CHECKPOINT
+    with pytest.raises(ConfigError, match="fitted landmarks"):
+        checkpoint_to_resume(folder, records[1], [])
+    plain = training_record(config, GsganData(str(people), size=48))
+    assert "fitted landmarks" not in plain

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +33,11 @@ class Landmarks:
     visibility: Mapping[int, Float]
     source: str = "landmarks3d.npz"
     fitted_to: tuple[str, ...] = ()
+
+    def digest(self, frames: Iterable[int]) -> str:
+        """A hash of the skeletons of those frames."""
+        held = [part[f].tobytes() for f in frames for part in (self.p, self.visibility)]
+        return hashlib.sha256(b"".join(held)).hexdigest()
 
     def seen(self, frame: int) -> Float:
         """``[N, 3]`` the joints of a frame that are no stand-ins."""

@@ -127,9 +127,7 @@ def fingerprint(data: GsganData) -> str:
         "crop": None if data.crop is None else asdict(data.crop),
     }
     if layout.landmarks.fitted_to:  # other skeletons are other inputs, and cut other windows
-        marks = layout.landmarks
-        held = [m[f].tobytes() for m in (marks.p, marks.visibility) for f in layout.frames]
-        said["landmarks"] = hashlib.sha256(b"".join(held)).hexdigest()
+        said["landmarks"] = layout.landmarks.digest(layout.frames)
     plain = json.dumps(said, sort_keys=True).encode()
     return hashlib.sha256(plain).hexdigest()[:FINGERPRINT]
 

@@ -55,7 +55,7 @@ def run_training(config: DictConfig) -> None:
 
     data, module = build_training(config)
     seed_everything(config.seed, workers=True, verbose=False)
-    resume = checkpoint_to_resume(folder, config, module.marks) if config.resume else None
+    resume = checkpoint_to_resume(folder, module.record, module.marks) if config.resume else None
     if resume is None:
         remove_old_results(folder)
     elif finished(folder, module, config):
