@@ -202,8 +202,10 @@ class Fitter:
 
 def around(skeleton: Tensor, frame: Frame) -> Frame:
     """The part of a picture round ``skeleton`` ``[J, 3]``: all that is compared."""
-    settings = {"margin": MARGIN, "near": NEAR}
-    return body_window(skeleton[None], frame.camera, multiple=16, least=32, **settings).frame(frame)
+    window = body_window(
+        skeleton[None], frame.camera, margin=MARGIN, multiple=16, least=32, near=NEAR
+    )
+    return window.frame(frame)
 
 
 def _wrong(alpha: Tensor, frame: Frame) -> Tensor:

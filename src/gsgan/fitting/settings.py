@@ -11,10 +11,12 @@ if TYPE_CHECKING:  # they load torch
     from gsgan.skeleton import Densify
     from gsgan.splat import Accuracy
 
+PARTS = ("densify", "accuracy")  # not numbers
+
 
 @dataclass(frozen=True)
 class Fit:
-    """Settings of the fit; what each gives and costs is measured in docs/data.md.
+    """Settings of the fit; what most of them give and cost is measured in docs/data.md.
 
     Args:
         densify: skeleton to points.
@@ -48,11 +50,13 @@ class Fit:
     hold: float = 0.4
 
     def __post_init__(self) -> None:
-        for name in ("densify", "accuracy"):
+        for name in PARTS:
             if getattr(self, name) is None:
                 raise ConfigError(f"fit.{name} cannot be null; conf/fit/standard.yaml has it")
         above = {"least_mask", "sweeps", "cameras", "noise", "joint_rate", "shape_rate"}
-        for field in fields(self)[2:]:
+        for field in fields(self):
+            if field.name in PARTS:
+                continue
             value = getattr(self, field.name)
             whole = isinstance(field.default, int)
             kind = int if whole else (int, float)
