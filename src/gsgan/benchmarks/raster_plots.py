@@ -14,11 +14,10 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from gsgan.benchmarks.raster_cell import Row
 from gsgan.benchmarks.raster_marks import TIMES, growth
+from gsgan.palette import BLUE, DASHES, GREEN, GREY, MARKERS, PURPLE, VERMILLION
 
-# One colour a backend in every picture; distinguishable without colour vision, too.
-COLOURS = {"native": "#0072b2", "torch": "#d55e00", "gsplat": "#009e73", "dense": "#555555"}
-LINES = ("-", "--", ":", "-.")  # by channels, in rising order
-MARKERS = ("s", "o", "^", "v", "D", "P", "X")  # by setting, in the config's order
+# One colour a backend in every picture.
+COLOURS = {"native": BLUE, "torch": VERMILLION, "gsplat": GREEN, "dense": GREY}
 
 
 def error_picture(rows: Sequence[Row]) -> bytes:
@@ -83,8 +82,8 @@ def _by_backend(
 def _style(rows: Sequence[Row], backend: str, channels: int) -> dict[str, Any]:
     order = sorted({row.channels for row in rows})
     return {
-        "color": COLOURS.get(backend, "#cc79a7"),
-        "linestyle": LINES[order.index(channels) % len(LINES)],
+        "color": COLOURS.get(backend, PURPLE),
+        "linestyle": DASHES[order.index(channels) % len(DASHES)],
         "label": f"{backend}, C={channels}",
     }
 

@@ -16,14 +16,12 @@ from gsgan.benchmarks.trade_off_front import steps
 from gsgan.benchmarks.trade_off_labels import put_labels
 from gsgan.benchmarks.trade_off_points import BASE
 from gsgan.benchmarks.trade_off_report import QUALITIES, Report, Row
+from gsgan.palette import BLACK, COLOURS, DASHES, GREY, MARKERS
 from gsgan.training.curve import Curve
 
-# Distinguishable without colour vision, too (Okabe and Ito); shapes tell the same again.
-COLOURS = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#777777")
+ORDER = (BLACK, *COLOURS[:-1], GREY)  # the base point's first
 STAR = "*"  # the base point's
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
 FAR = 8.0  # times the median time, beyond which a point would squeeze the others together
-LINES = ("-", "--", ":", "-.")
 KNOWN = {
     "base": "Step I and II (full)",
     "full": "Step I and II (full)",
@@ -76,7 +74,7 @@ def within(rows: Sequence[Row]) -> list[Row]:
 def _styles(rows: Sequence[Row]) -> dict[str, tuple[str, str]]:
     factors = list(dict.fromkeys(row.factor for row in rows))
     return {
-        factor: (COLOURS[i % len(COLOURS)], STAR if factor == BASE else MARKERS[i % len(MARKERS)])
+        factor: (ORDER[i % len(ORDER)], STAR if factor == BASE else MARKERS[i % len(MARKERS)])
         for i, factor in enumerate(factors)
     }
 
@@ -119,8 +117,8 @@ def training_picture(curves: Sequence[Curve]) -> bytes:
         axes.plot(
             [second / 60 for second in curve.seconds],
             curve.psnr,
-            color=COLOURS[i % len(COLOURS)],
-            linestyle=LINES[i % len(LINES)],
+            color=ORDER[i % len(ORDER)],
+            linestyle=DASHES[i % len(DASHES)],
             lw=1.5,
             label=None if curve.label in named else KNOWN.get(curve.label, curve.label),
         )

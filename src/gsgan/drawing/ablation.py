@@ -9,12 +9,13 @@ from matplotlib.patches import Rectangle
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.drawing.layout import VERMILLION, Drawing, Grid, Unavailable, aspect_of
+from gsgan.drawing.layout import Drawing, Grid, Unavailable, aspect_of
 from gsgan.drawing.measures import decibels, finite, measure, where_from
 from gsgan.drawing.settings import Settings
 from gsgan.drawing.shots import Shot
 from gsgan.drawing.subjects import Subject
 from gsgan.metrics.image import psnr
+from gsgan.palette import VERMILLION
 
 Box = tuple[slice, slice]  # rows, columns
 

@@ -14,10 +14,11 @@ from matplotlib.colors import to_rgba_array
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsgan.drawing.layout import BLACK, BLUE, GREEN, ORANGE, PURPLE, SKY, VERMILLION, Grid
+from gsgan.drawing.layout import Grid
 from gsgan.drawing.shots import Shot
 from gsgan.drawing.subjects import Subject
 from gsgan.model.body_points import BodyPoints
+from gsgan.palette import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
 from gsgan.scene import Gaussians
 from gsgan.skeleton import MEDIAPIPE33, BoneFrames, Densify, bone_frames, sanitise
 from gsgan.splat import Accuracy, project
@@ -26,7 +27,7 @@ from gsgan.splat import Accuracy, project
 GROUP_COLOURS = dict(
     zip(
         (name for name, _ in MEDIAPIPE33.draw_groups),
-        (PURPLE, "#777777", BLUE, VERMILLION, SKY, ORANGE, GREEN, BLACK),
+        (PURPLE, GREY, BLUE, VERMILLION, SKY, ORANGE, GREEN, BLACK),
         strict=True,
     )
 )

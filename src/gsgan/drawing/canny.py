@@ -9,21 +9,13 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from torch import Tensor
 
-from gsgan.drawing.layout import (
-    BLACK,
-    SKY,
-    VERMILLION,
-    Drawing,
-    Grid,
-    aspect_of,
-    extent,
-    foot_lines,
-)
+from gsgan.drawing.layout import Drawing, Grid, aspect_of, extent, foot_lines
 from gsgan.drawing.measures import measure, rivals, where_from, written
 from gsgan.drawing.settings import Settings
 from gsgan.drawing.shots import Shot
 from gsgan.drawing.subjects import Subject
 from gsgan.metrics.image import canny
+from gsgan.palette import BLACK, SKY, VERMILLION
 
 FOUND, MISSED, INVENTED = BLACK, SKY, VERMILLION
 

@@ -19,9 +19,6 @@ from torch import Tensor
 
 from gsgan.drawing.settings import Settings
 
-# Okabe and Ito's colours: told apart with every kind of colour vision.
-BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
-YELLOW, BLUE, VERMILLION, PURPLE = "#f0e442", "#0072b2", "#d55e00", "#cc79a7"
 GAP = 0.05  # inches between panels
 EDGE = 0.02  # inches round the whole, so that no frame is cut
 LEAST_FONT = 5.0  # points: smaller is not readable in print

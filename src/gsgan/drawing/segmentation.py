@@ -8,19 +8,13 @@ import torch
 from matplotlib.colors import to_hex, to_rgb
 from torch import Tensor
 
-from gsgan.drawing.layout import (
-    VERMILLION,
-    Drawing,
-    Grid,
-    Unavailable,
-    aspect_of,
-    foot_lines,
-)
+from gsgan.drawing.layout import Drawing, Grid, Unavailable, aspect_of, foot_lines
 from gsgan.drawing.measures import Numbers, where_from, written
 from gsgan.drawing.settings import Settings
 from gsgan.drawing.shots import Shot
 from gsgan.drawing.subjects import Subject
 from gsgan.model.segmentation import IGNORE, Segmentation
+from gsgan.palette import VERMILLION
 from gsgan.pictures import colour_labels
 from gsgan.scoring.scores import SegmentationScores
 

@@ -8,25 +8,14 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gsgan.drawing.layout import (
-    BLACK,
-    BLUE,
-    GREEN,
-    ORANGE,
-    PURPLE,
-    SKY,
-    VERMILLION,
-    Drawing,
-    Unavailable,
-)
+from gsgan.drawing.layout import Drawing, Unavailable
 from gsgan.drawing.settings import Settings
 from gsgan.drawing.shots import Shot
 from gsgan.drawing.subjects import Subject
 from gsgan.errors import DataError
+from gsgan.palette import COLOURS, MARKERS
 from gsgan.training.curve import Curve, curve
 
-COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK)
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")  # one more: the pairs repeat late
 HEIGHT = 0.75  # of the figure, as a share of its width
 
 

@@ -9,15 +9,13 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
+from gsgan.palette import COLOURS, MARKERS
 from gsgan.reporting.grid import Grid, Report, Row
 
 COLUMNS = 3
 PANEL = (3.1, 2.4)  # inches
 LETTERS = 45  # of all labels along a panel, side by side: more are written aslant
 SLANT = 0.7  # inches that takes
-# Distinguishable without colour vision, too (Okabe and Ito).
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 
 
 def picture(report: Report) -> bytes | None:
