@@ -3,8 +3,6 @@
 A pickle is a program. Here it may build dicts, lists, numbers, text and numpy arrays, and name the
 few classes in `ALLOWED`, each replaced by a stand-in of ours; anything else is refused by name
 before it is called. Whatever is wrong with a file becomes one `DataError`.
-
-Source: formats.md § 4 (the classes that occur in such files).
 """
 
 from __future__ import annotations

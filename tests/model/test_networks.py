@@ -174,7 +174,7 @@ def test_pose_graph_spreads_along_edges_only():
 
 
 def test_a_linear_readout_takes_every_joint_and_has_the_same_length():
-    """method.md § 5: 33 x 32 numbers a joint's channels, 1056 -> 35."""
+    """33 x 32 numbers a joint's channels, 1056 -> 35."""
     torch.manual_seed(0)
     graph = PoseGraph(readout="linear")
     assert graph.readout.numel() + graph.readout_bias.numel() == 1056 * 35 + 35

@@ -194,7 +194,7 @@ def alpha_share(module, frame) -> float:
 
 
 def test_a_run_driven_into_the_collapse_is_caught_and_brought_back(make, capsys):
-    """The collapse of method.md § 13: every opacity falls to nothing, and no NaN says so."""
+    """The collapse: every opacity falls to nothing, and no NaN says so."""
     module, trainer, data = make(*LONGER)
     frame, seen = data.dataset("train")[0], []
     push_opacities_down(module, until=1)

@@ -263,7 +263,7 @@ def from_zju(Rh: ArrayLike, Th: ArrayLike, J0: ArrayLike) -> tuple[Floats, Float
     Returns:
         ``global_orient [..., 3]`` and ``transl [..., 3]``.
 
-    Source: formats.md § 1.1.
+    Source: the release's loaders.
     """
     orient, turned, root = _turned_root(Rh, J0)
     return orient, np.asarray(Th, np.float64) + turned - root

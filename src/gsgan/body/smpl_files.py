@@ -1,6 +1,6 @@
 """A model file of the SMPL family as checked arrays, whatever pickled it.
 
-Source: formats.md § 4 (keys and shapes that public loaders rely on).
+Source: keys and shapes that public loaders rely on.
 """
 
 from __future__ import annotations

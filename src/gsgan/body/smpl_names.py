@@ -1,6 +1,6 @@
 """SMPL's and SMPL-X's joints and parts by name. Constants only.
 
-Source: formats.md § 1.1, § 4 and § 5 (facts that public loaders state).
+Source: facts that public loaders state.
 """
 
 from __future__ import annotations

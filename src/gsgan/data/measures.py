@@ -46,7 +46,7 @@ class Measures:
     Raises:
         ConfigError: on a value that is none of these.
 
-    Source: method.md § 9.
+    Source: the publications' scoring scripts, which differ in these.
     """
 
     region: Literal["full", "body_box_cleared", "body_box"] = "full"

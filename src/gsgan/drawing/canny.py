@@ -25,7 +25,7 @@ def draw(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings)
 
     Edges of the truth that a picture lacks and edges that it invents have colours of their own.
 
-    Source: the paper's Canny figure; method.md § 9 asks for edge ratio and F1 beside it.
+    Source: the paper's Canny figure; edge ratio and F1 are ours.
     """
     pictures = [rivals(subjects, shot) for shot in shots]
     titles = ["truth", *pictures[0]]

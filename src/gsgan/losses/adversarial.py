@@ -67,7 +67,7 @@ def feature_matching(real: Maps, fake: Maps) -> Tensor:
 
     Weighted as pix2pixHD: 4 / (number of maps) for each map, mean over scales.
 
-    Source: paper Sec. 3.6; method.md § 7.
+    Source: paper Sec. 3.6.
     """
     loss = real[0][0].new_zeros(())
     for real_scale, fake_scale in zip(real, fake, strict=True):

@@ -98,7 +98,7 @@ def mask_crop(
     Returns:
         ``[3, size, size]``, or None where the mask is empty.
 
-    Source: method.md § 9 (the scoring script of THuman4.0's protocol).
+    Source: the scoring script of THuman4.0's protocol.
     """
     box = rectangle(person_box(mask[None])[0])
     if box is None:

@@ -40,7 +40,7 @@ from gsgan.window import Window, body_window
 if TYPE_CHECKING:
     from gsgan.data.datamodule import SceneInfo  # loads Lightning
 
-LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in a picture 512 high (method.md § 4)
+LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in a picture 512 high
 SKELETON_CHANNELS = len(MEDIAPIPE33.draw_groups)
 UNWATCHED: AbstractContextManager[None] = nullcontext()  # entering it costs next to nothing
 
@@ -84,7 +84,7 @@ class Avatar(nn.Module):
         effects: what the scene calls for; None decides it here, with the settings' defaults. Those
             that this model cannot have are taken out.
 
-    Source: paper Fig. 2 and Sec. 3; architecture.md § 4.
+    Source: paper Fig. 2 and Sec. 3.
     """
 
     # Exchanged by benches: what each stage runs in, by its name, and who rasterises F.
@@ -397,7 +397,7 @@ class Avatar(nn.Module):
             )
 
     def segment(self, body: BodyPose | None, camera: Camera) -> Tensor | None:
-        """S, without gradient: it is trained on its own (method.md § 3) and then frozen."""
+        """S, without gradient: it is trained on its own and then frozen."""
         if self.segmentation is None:
             return None
         if body is None:

@@ -59,7 +59,7 @@ class Deformation(nn.Module):
         scale_min, scale_max: body heights, the range of every scale.
         logit_bound: opacity logits are kept within ± this, where the sigmoid still has a gradient.
 
-    Source: paper Sec. 3.3; method.md § 2 and § 13 (the table beside the MLP).
+    Source: paper Sec. 3.3; the table beside the MLP is ours.
     """
 
     rest_code: Tensor

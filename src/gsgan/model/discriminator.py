@@ -24,7 +24,7 @@ class PatchDiscriminator(nn.Module):
     Raises:
         ConfigError: on an unknown norm.
 
-    Source: method.md § 7 (the pix2pixHD family).
+    Source: paper Sec. 3.6 (the pix2pixHD family).
     """
 
     def __init__(self, base: int = 64, layers: int = 4, norm: str = "instance") -> None:
@@ -64,7 +64,7 @@ class Discriminator(nn.Module):
         scales: judges; each sees the picture halved once more.
         base, layers, norm: as `PatchDiscriminator`.
 
-    Source: paper Sec. 3.6; method.md § 7.
+    Source: paper Sec. 3.6.
     """
 
     def __init__(

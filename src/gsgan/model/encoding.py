@@ -18,7 +18,7 @@ def positional_encoding(x: Tensor, octaves: int) -> Tensor:
     Returns:
         ``[..., D * (1 + 2 * octaves)]``: x, then all sines, then all cosines.
 
-    Source: method.md § 2 (PE_6, PE_2), § 5.
+    Source: paper Sec. 3.3.
     """
     if octaves == 0:
         return x

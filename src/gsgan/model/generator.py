@@ -101,7 +101,7 @@ class Generator(nn.Module):
             ``sigmoid``.
         feature_bound: F is clamped to ± this before it enters (half precision overflows).
 
-    Source: paper Sec. 3.5; method.md § 4 (sizes, style), § 13 (linear output).
+    Source: paper Sec. 3.5; sizes, style and the linear output are ours where it is silent.
     """
 
     def __init__(

@@ -24,7 +24,7 @@ class GraphLayer(nn.Module):
         inputs, outputs: channels.
         neighbour: initial weight of an edge; the diagonal starts at 1.
 
-    Source: method.md § 5 (DANBO's layers, restated).
+    Source: ours, after the graph layers of DANBO (Su et al., 2022).
     """
 
     mask: Tensor
@@ -60,7 +60,7 @@ class PoseGraph(nn.Module):
     Raises:
         ValueError: on another readout.
 
-    Source: paper Sec. 3.5; method.md § 5: the paper does not say how joints become g.
+    Source: paper Sec. 3.5, which does not say how joints become g.
     """
 
     edges: Tensor

@@ -39,7 +39,7 @@ class Segmentation(nn.Module):
         scale: initial standard deviation, as a share of the distance to the nearest neighbour.
         accuracy: the rasteriser's settings.
 
-    Source: paper Sec. 3.4; method.md § 3.
+    Source: paper Sec. 3.4.
     """
 
     one_hot: Tensor
@@ -146,7 +146,7 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor, floor: float = 1e-6)
         labels: ``[B, H, W]`` int64, see `Segmentation.truth`.
         floor: added inside the logarithm, so that a class never hit still has a gradient.
 
-    Source: method.md § 3, § 10.
+    Source: paper Sec. 3.4.
     """
     labels = torch.where(labels < segmentation.shape[1], labels, IGNORE)
     log = (segmentation + floor).log()

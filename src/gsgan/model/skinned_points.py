@@ -21,7 +21,7 @@ class SkinnedPoints(nn.Module):
     Raises:
         ValueError: on a count below 1.
 
-    Source: paper Sec. 3.4; method.md § 3.
+    Source: paper Sec. 3.4.
     """
 
     joints: Tensor

@@ -32,7 +32,7 @@ class SurfaceGaussians(nn.Module):
         scale_min, scale_max: body heights, the range of every scale.
         logit_bound: opacity logits are kept within ± this.
 
-    Source: the baselines of the paper's Sec. 4; method.md § 13 (lbs_splat).
+    Source: the baselines of the paper's Sec. 4.
     """
 
     def __init__(

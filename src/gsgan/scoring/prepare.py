@@ -25,7 +25,7 @@ from gsgan.scene import Frame
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-VERTEX_MARGIN = 0.05  # metres round the body's vertices: method.md § 9's sources take as much
+VERTEX_MARGIN = 0.05  # metres round the body's vertices: published scoring scripts take as much
 JOINT_MARGIN = 0.2  # metres round joints, which lie inside the flesh: as `PersonCrop` takes
 HIDDEN_OUTLINE = (
     "pictures without alpha are put on the protocol's background by the truth's mask, which hides "

@@ -3,7 +3,7 @@
 Convention: metres, any frame; what the body model does not know is NaN with confidence 0, never
 zero. Confidence 1 is a point that means the same in both; 0.5 one that lies near it.
 
-Source: formats.md § 5; vertex numbers as public loaders state them.
+Source: vertex numbers as public loaders state them.
 """
 
 from __future__ import annotations

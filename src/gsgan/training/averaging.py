@@ -26,7 +26,7 @@ class MovingAverage(nn.Module):
     Raises:
         ConfigError: on a decay out of range.
 
-    Source: method.md § 7 (EMA 0.999 of the generator).
+    Source: ours; the usual average of a generator's weights.
     """
 
     def __init__(self, module: nn.Module, decay: float, every: int = 1) -> None:

@@ -27,7 +27,7 @@ class StepOneLoss:
         feature_head: weight of the same loss on a linear readout of F; without it F's further
             channels get no gradient in Step I. 0 builds no readout.
 
-    Source: paper Sec. 3.6; method.md § 2.
+    Source: paper Sec. 3.6.
     """
 
     l1: float = 0.8
@@ -85,7 +85,7 @@ class StepTwoLoss:
         anchor: weight of L_Ψ, which keeps C a picture while Ψ learns from the generator.
         detach_features: keep the generator's gradient out of Ψ (ablation).
 
-    Source: paper Sec. 3.6; method.md § 7, § 13.
+    Source: paper Sec. 3.6.
     """
 
     l1: float = 1.0

@@ -53,7 +53,7 @@ class AvatarTraining(LightningModule):
         rollback: what is done when the rendered person vanishes.
         record: plain config values stored with every checkpoint.
 
-    Source: paper Alg. 2; method.md § 7.
+    Source: paper Alg. 2.
     """
 
     def __init__(
@@ -150,7 +150,7 @@ class AvatarTraining(LightningModule):
         avatar, groups = self.avatar, {}
         if avatar.segmentation is not None:
             s = avatar.segmentation
-            # method.md § 3: quats 1e-3, log scales 5e-3, opacity logits 5e-2
+            # ours: quats 1e-3, log scales 5e-3, opacity logits 5e-2
             groups["segmentation"] = [
                 ([s.quats], 1.0), ([s.log_scales], 5.0), ([s.logit_opacities], 50.0),
             ]  # fmt: skip

@@ -17,7 +17,7 @@ class Recipe:
 
     Args:
         rate: learning rate over the phases in which the optimiser works.
-        betas: Adam's. A second beta of 0.99 keeps Ψ from the collapse of method.md § 13.
+        betas: Adam's. A second beta of 0.99 keeps Ψ from a collapse (`Rollback`).
         eps: Adam's.
         clip: largest gradient norm; None leaves gradients alone.
     """

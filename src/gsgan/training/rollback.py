@@ -32,7 +32,7 @@ class Rollback:
     Raises:
         ConfigError: on values out of range.
 
-    Source: method.md § 13.
+    Source: ours.
     """
 
     collapse: float = 0.05

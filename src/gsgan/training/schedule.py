@@ -25,7 +25,7 @@ class Schedule:
         degree_every: iterations of Steps I and II after which the degree of the spherical harmonics
             rises by one, from 0; 0 takes them all at once.
 
-    Source: paper Alg. 2; method.md § 7 and § 13 (why Ψ goes on learning in Step II).
+    Source: paper Alg. 2.
     """
 
     segmentation: int
