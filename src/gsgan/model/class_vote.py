@@ -60,7 +60,7 @@ class ClassVote:
         depth_tolerance: metres behind the nearest surface that still count as seen: more than
             neighbours differ on a slanted surface, less than a limb is thick.
 
-    Source: paper Sec. 3.4.
+    Source: paper Sec. 3.4 (one class a vertex); the vote is ours.
     """
 
     vote_frames: int = 100

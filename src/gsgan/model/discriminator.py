@@ -24,7 +24,7 @@ class PatchDiscriminator(nn.Module):
     Raises:
         ConfigError: on an unknown norm.
 
-    Source: paper Sec. 3.6 (the pix2pixHD family).
+    Source: ours, after pix2pixHD (Wang et al., 2018).
     """
 
     def __init__(self, base: int = 64, layers: int = 4, norm: str = "instance") -> None:

@@ -18,7 +18,7 @@ def positional_encoding(x: Tensor, octaves: int) -> Tensor:
     Returns:
         ``[..., D * (1 + 2 * octaves)]``: x, then all sines, then all cosines.
 
-    Source: paper Sec. 3.3.
+    Source: ours, as NeRF has it (Mildenhall et al., 2020).
     """
     if octaves == 0:
         return x

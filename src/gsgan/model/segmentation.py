@@ -146,7 +146,7 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor, floor: float = 1e-6)
         labels: ``[B, H, W]`` int64, see `Segmentation.truth`.
         floor: added inside the logarithm, so that a class never hit still has a gradient.
 
-    Source: paper Sec. 3.4.
+    Source: ours; the maps are those of paper Sec. 3.4.
     """
     labels = torch.where(labels < segmentation.shape[1], labels, IGNORE)
     log = (segmentation + floor).log()
