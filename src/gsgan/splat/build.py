@@ -3,7 +3,7 @@
 The shared library is compiled by the system's compiler into a user cache (``GSGAN_CACHE``, else
 ``$XDG_CACHE_HOME/gsgan``, else ``~/.cache/gsgan``; subfolder ``native``) and loaded from there
 later. A file's name says what it was made from and what it holds, so that nothing stale or damaged
-is ever loaded.
+is ever loaded. ``GSGAN_MARCH`` (say ``x86-64``) compiles for that processor, not for this one.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ BASE_FLAGS = (
     *("-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"),
 )
 # Tried in this order: some compilers lack OpenMP (Apple's clang), some the flag for the own CPU.
-_FLAGS = (
+_NATIVE_FLAGS = (
     ("-march=native", "-mprefer-vector-width=512", "-fopenmp"),
     ("-march=native", "-fopenmp"),
     ("-mcpu=native", "-fopenmp"),
@@ -129,9 +129,15 @@ def _cache_folder() -> Path:
     return folder
 
 
+def _flags() -> tuple[tuple[str, ...], ...]:
+    """Sets of flags to try, the best first."""
+    march = os.environ.get("GSGAN_MARCH")
+    return ((f"-march={march}", "-fopenmp"), (f"-march={march}",)) if march else _NATIVE_FLAGS
+
+
 def cache_key(command: list[str]) -> str:
     """Names what a compiled kernel depends on: source, flags, compiler, CPU."""
-    parts = (_source(), repr(BASE_FLAGS), repr(_FLAGS), repr(command), _version(command), _cpu())
+    parts = (_source(), repr(BASE_FLAGS), repr(_flags()), repr(command), _version(command), _cpu())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
 
@@ -187,7 +193,7 @@ def _build(command: list[str], folder: Path, key: str) -> Path:
     message = ""
     with tempfile.TemporaryDirectory(dir=folder, prefix="build-") as work:
         target = Path(work) / "native.so"
-        for flags in _FLAGS:
+        for flags in _flags():
             done = _run([*command, *BASE_FLAGS, *flags, str(SOURCE), "-o", str(target)])
             if done.returncode == 0 and target.is_file():
                 final = folder / f"{key}-{_digest(target)}.so"

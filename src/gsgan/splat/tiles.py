@@ -156,9 +156,10 @@ class _Walk:
         axis = torch.arange(tiling.tile, dtype=dtype, device=device) - (tiling.tile - 1) / 2
         y, x = (axis_.flatten() for axis_ in torch.meshgrid(axis, axis, indexing="ij"))
         self.xy = torch.stack([x, y])
-        # q is a polynomial of the pixel's place in the tile: one small matrix product gives it.
-        self.basis = torch.stack([torch.ones_like(x), x, y, x * x, x * y, y * y])
-        self.parts_of_q = x.new_tensor([-0.5, -1, -1, -0.5, -1, -0.5])
+        # u and v are linear in the pixel's place in the tile: a small matrix product gives each.
+        # Written out as one polynomial in x and y, q would cancel: a narrow ellipse far from the
+        # middle of its tile loses the square of the digits that u and v lose.
+        self.basis = torch.stack([torch.ones_like(x), x, y])
         tile = lists.tiles % (lists.grid[0] * lists.grid[1])
         corner = torch.stack([tile % lists.grid[1], tile // lists.grid[1]], dim=-1)
         self.centres = (corner * tiling.tile + tiling.tile / 2).to(geometry.dtype)
@@ -202,7 +203,7 @@ class _Walk:
                 blocks.append((rows, before))
             ids = self._ids(starts[rows], counts[rows], offset)
             place = self._place(ids, rows, chunk)
-            alpha = self._alpha(self._exponential(ids, place, rows, chunk), ids)[0]
+            alpha = self._alpha(self._exponential(ids, place, rows, chunk)[0], ids)[0]
             weights, before = self._weights(alpha, before)
             sums.index_add_(0, rows, self.values[ids].mT @ weights)
         return sums, blocks
@@ -215,7 +216,7 @@ class _Walk:
         for number, (rows, before) in reversed(list(enumerate(blocks))):
             ids = self._ids(starts[rows], counts[rows], number * self.tiling.layers)
             place = self._place(ids, rows, chunk)
-            exponential = self._exponential(ids, place, rows, chunk)
+            exponential, u, v = self._exponential(ids, place, rows, chunk)
             alpha, passes = self._alpha(exponential, ids, want_mask=True)
             assert passes is not None
             values, grad_here = self.values[ids], grad[rows]
@@ -229,8 +230,7 @@ class _Walk:
             # d picture / d alpha = T (what is here - what is behind).
             d_alpha = seen.sub_(hidden).mul_(transmittance).mul_(passes)
             self._add(self.values_grad, ids, alpha.mul_(transmittance) @ grad_here.mT)
-            moments = d_alpha.mul_(exponential).flatten(0, 1) @ self.basis.mT
-            self._add(self.sums, ids, _whitened_sums(place, moments))
+            self._add(self.sums, ids, self._whitened_sums(place, d_alpha.mul_(exponential), u, v))
 
     def _ids(self, starts: Tensor, counts: Tensor, offset: int) -> Tensor:
         """``[T, K]`` rows of the ellipses of one block; the empty row past the end of a list."""
@@ -246,20 +246,21 @@ class _Walk:
         u, v = (p * (dx + k * dy)).clamp_(-U_MAX, U_MAX), (r * dy).clamp_(-U_MAX, U_MAX)
         return _Place(*(i.to(self.values.dtype) for i in (u, v, p, p * k, r)))
 
-    def _exponential(self, ids: Tensor, place: _Place, rows: Tensor, chunk: slice) -> Tensor:
-        """``exp(-q / 2)``, ``[T, K, P]``."""
-        u, v, p, w, r = vars(place).values()
-        halves = [u * u + v * v, u * p, u * w + v * r, p * p, p * w, w * w + r * r]
-        coefficients = torch.stack(halves, dim=-1).mul_(self.parts_of_q).flatten(0, 1)
-        q = coefficients @ self.basis
-        exponential = q.clamp_(self.least_exponent, 0.0).exp_().unflatten(0, ids.shape)
+    def _exponential(
+        self, ids: Tensor, place: _Place, rows: Tensor, chunk: slice
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """``exp(-q / 2)``, and u and v, whose squares q is the sum of; each ``[T, K, P]``."""
+        u = torch.stack([place.u, place.p, place.w], dim=-1) @ self.basis
+        v = torch.stack([place.v, torch.zeros_like(place.v), place.r], dim=-1) @ self.basis
+        q = (u * u).addcmul_(v, v)
+        exponential = q.mul_(-0.5).clamp_(min=self.least_exponent).exp_()
         if self.lists.box is not None:
             box, means = self.lists.box[ids], self.geometry[ids][..., :2]
             place_of_mean = (means - self.centres[chunk][rows].unsqueeze(1)).to(box)
             for axis in range(2):
                 distance = self.xy[axis] - place_of_mean[..., axis, None]
                 exponential.mul_(_indicator(-distance.abs(), -box[..., axis, None]))
-        return exponential
+        return exponential, u, v
 
     def _alpha(
         self, exponential: Tensor, ids: Tensor, want_mask: bool = False
@@ -290,6 +291,16 @@ class _Walk:
             torch.mul(layers[:, k - 1], through[:, k - 1], out=layers[:, k])
         return layers, layers[:, -1] * through[:, -1]
 
+    def _whitened_sums(self, place: _Place, g: Tensor, u: Tensor, v: Tensor) -> Tensor:
+        """``[T, K, 6]`` sums over pixels of ``g`` times 1, u, v, u², u v, v²; u and v are spent."""
+        one = g.sum(-1)
+        sum_u, ux, uy = (u.mul_(g) @ self.basis.mT).unbind(-1)
+        sum_v, _, vy = (v.mul_(g) @ self.basis.mT).unbind(-1)
+        uu = place.u * sum_u + place.p * ux + place.w * uy
+        uv = place.v * sum_u + place.r * uy
+        vv = place.v * sum_v + place.r * vy
+        return torch.stack([one, sum_u, sum_v, uu, uv, vv], dim=-1)
+
     def _add(self, total: Tensor, ids: Tensor, part: Tensor) -> None:
         total.index_add_(0, ids.flatten(), part.reshape(-1, part.shape[-1]))
 
@@ -301,21 +312,6 @@ def _behind(alpha: Tensor, seen: Tensor, behind: Tensor) -> tuple[Tensor, Tensor
     for k in range(alpha.shape[1] - 1, 0, -1):
         torch.lerp(layers[:, k], seen[:, k], alpha[:, k], out=layers[:, k - 1])
     return layers, torch.lerp(layers[:, 0], seen[:, 0], alpha[:, 0])
-
-
-def _whitened_sums(place: _Place, moments: Tensor) -> Tensor:
-    """``[T * K, 6]`` sums over pixels of ``g = dL/dalpha exp(-q/2)`` times 1, u, v, u², u v, v².
-
-    ``moments [T * K, 6]`` are those of g times 1, x, y, x², x y, y², about the middle of the tile.
-    """
-    u, v, p, w, r = (i.flatten() for i in vars(place).values())
-    one, x, y, xx, xy, yy = moments.unbind(-1)
-    along_u, along_v = p * x + w * y, r * y  # g times what u and v add to their value at the middle
-    sum_u, sum_v = u * one + along_u, v * one + along_v
-    uu = u * (sum_u + along_u) + p * (p * xx + 2 * w * xy) + w * w * yy
-    uv = u * sum_v + v * along_u + r * (p * xy + w * yy)
-    vv = v * (sum_v + along_v) + r * r * yy
-    return torch.stack([one, sum_u, sum_v, uu, uv, vv], dim=-1)
 
 
 def _geometry_gradient(geometry: Tensor, opacities: Tensor, sums: Tensor) -> Tensor:
