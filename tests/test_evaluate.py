@@ -150,6 +150,64 @@ def test_a_perfect_picture_and_its_white_background(capture, given, inside, tmp_
         assert not any("alpha" in said for said in record["departures"])
 
 
+def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
+    """By the alpha that each of its pictures has; the table is marked."""
+    from gsgan.metrics.image import psnr
+    from gsgan.metrics.regions import on_background
+    from gsgan.runs import build_data, load_avatar, load_config
+
+    copy = shutil.copytree(run, tmp_path / "copy")
+    result = inside("evaluate", f"run={copy}", "background=white", "pictures=1")
+    assert result.returncode == 0, result.stderr
+    assert "scored on white" in result.stdout
+    assert "scored on white" in (copy / "metrics.md").read_text()
+    black, white = scores(run), scores(copy)
+    data = build_data(load_config(run))
+    avatar, _ = load_avatar(run, load_config(run), data)
+    for split, variants in white.items():
+        found: dict[str, list[float]] = {name: [] for name in variants}
+        for i in range(len(data.dataset(split))):
+            frame = data.dataset(split)[i]
+            with torch.no_grad():
+                painting = avatar.paint(frame)
+            truth = on_background(frame.image, frame.mask, 1.0)
+            for name, picture in (
+                ("full", (painting.image.clamp(0, 1), painting.alpha.clamp(0, 1))),
+                ("splat", (painting.colour.clamp(0, 1), painting.splat_alpha)),
+                ("floor", (torch.zeros_like(truth), torch.zeros_like(frame.mask))),
+            ):
+                found[name].append(float(psnr(on_background(*picture, 1.0).clamp(0, 1), truth)))
+        for name, values in variants.items():
+            assert values["psnr"] == pytest.approx(sum(found[name]) / len(found[name]), abs=1e-3)
+            assert abs(values["psnr"] - black[split][name]["psnr"]) > 0.1
+            assert "scored on white" in values["marks"]
+            assert "scored on white" not in black[split][name]["marks"]
+
+
+def test_another_background_departs_from_the_protocol(copy, given, inside):
+    protocol = [
+        *("protocol=paper_thuman4", "protocol.train_cameras=[cam00,cam01]"),
+        *("protocol.test_cameras=[cam02]", "protocol.train_frames=0-3"),
+        *("protocol.test_frames=0-3", "data.size=32", "predictions_background=black"),
+    ]
+    arguments = [f"predictions={copy}", "splits=[novel_view]", *given, *protocol]
+    full = []
+    for word in ("null", "white", "black"):
+        result = inside("evaluate", *arguments, f"background={word}")
+        assert result.returncode == 0, result.stderr
+        full.append(scores(copy.with_name("other_scores"))["novel_view"]["full"])
+    plain, same, other = full
+    assert plain["psnr"] == same["psnr"] != other["psnr"]
+    assert plain["marks"] == same["marks"] == []
+    assert other["marks"] == ["scored on black"]
+    said = [values["protocol"]["departures"] for values in full]
+    departure = "background is black, asked for: white"
+    assert [departure in departures for departures in said] == [False, False, True]
+    assert "departs from paper_thuman4: " + departure in (
+        (copy.with_name("other_scores") / "metrics.md").read_text()
+    )
+
+
 def test_pictures_under_wrong_names(capture, given, inside, tmp_path):
     """The truth itself, one camera's frames exchanged: an error that names the frame."""
     from gsgan.data.datamodule import GsganData
@@ -205,6 +263,8 @@ def test_what_does_not_fit_together_is_said(run, copy, given, inside):
         ([here, *given, "splits=[]"], ("splits must be among",)),
         ([here, *given, "predictions_pattern=x.png"], ("{frame} once",)),
         ([here, *given, "predictions_background=grey"], ("black, white or null",)),
+        ([here, *given, "background=grey"], ("background must be black, white or null",)),
+        ([f"run={run}", "background=grey"], ("background must be black, white or null", "'grey'")),
         ([here, *given, "predictions_margin=1"], ("above 1, or null",)),
         ([here, *given, f"out={copy}/scores"], ("inside the predictions",)),
         ([here, *given, f"out={run}"], ("is a run folder",)),

@@ -49,7 +49,15 @@ def folder_name(overrides: str) -> str:
     return name[: LONGEST_NAME - len(end)] + end
 
 
+def if_gpu(then: object, otherwise: object) -> object:
+    """One of two values: whether CUDA can be used here."""
+    import torch  # here, so that importing an entry point stays light
+
+    return then if torch.cuda.is_available() else otherwise
+
+
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+OmegaConf.register_new_resolver("if_gpu", if_gpu, replace=True)
 
 
 def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from gsgan.constants import constant
+
 if TYPE_CHECKING:
     from gsgan.scene import Camera
 
@@ -61,7 +63,7 @@ def bend(x_cam: Tensor, dist: Tensor, near: float) -> tuple[Tensor, Tensor, Tens
     moved = torch.cat([shown * torch.where(moves, z, 1.0), z], dim=-1)
     by_depth = shown - (slope @ n.unsqueeze(-1)).squeeze(-1)
     top = torch.cat([slope, by_depth.unsqueeze(-1)], dim=-1)
-    bottom = top.new_tensor([0.0, 0.0, 1.0]).expand(*top.shape[:-2], 1, 3)
+    bottom = constant((0.0, 0.0, 1.0), top).expand(*top.shape[:-2], 1, 3)
     eye = torch.eye(3, dtype=top.dtype, device=top.device)
     jacobian = torch.where(moves.unsqueeze(-1), torch.cat([top, bottom], dim=-2), eye)
     return torch.where(moves, moved, x_cam), jacobian, (ahead & beyond).squeeze(-1)

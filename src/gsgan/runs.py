@@ -23,12 +23,11 @@ if TYPE_CHECKING:
 
 DISCRIMINATOR_SALT = 1000
 CHECKPOINT = Path("checkpoints") / "last.ckpt"
-ON_THE_BODY = ("segmentation", "body_points")  # effects that need the body's mesh
 # What may differ between a run and its continuation: where and how it runs, not what it learns.
 FREE_KEYS = (
-    *("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips"),
+    *("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips", "cpu_hours"),
     *("data.root", "data.smpl", "data.workers", "data.cache_mb", "data.val_pictures"),
-    "data.source.workers",
+    *("data.source.workers", "training.max_skipped", "training.skip_window", "model.backend"),
 )
 
 
@@ -150,6 +149,11 @@ def load_config(folder: Path, moved: Moved | None = None) -> DictConfig:
         )
     config = OmegaConf.load(path)
     assert isinstance(config, DictConfig)
+    if OmegaConf.select(config, "effects.segmentation") is not None:  # until 2026-11-22
+        raise DataError(
+            f"{folder}: trained by an older gsgan, whose pictures had no alpha of their own; train "
+            "again, or use the commit that its facts.json names"
+        )
     moved = moved or Moved()
     if moved.smpl is not None and OmegaConf.select(config, "data.smpl") is None:
         # A skeleton from fits is another one: the scores would be of another model.
@@ -275,8 +279,8 @@ def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avat
     decided = checkpoint["gsgan"].get("effects")
     effects = None if decided is None else Effects.from_plain(decided)
     avatar = build_avatar(config, data, state.get("segmentation.vertex_labels"), effects)
-    if effects is not None:
-        _check_body(folder, effects, avatar.effects)
+    points = effects is not None and effects.body_points.on
+    _check_body(folder, avatar, points, segments="segmentation.quats" in state)
     try:
         avatar.load_state_dict(state)
     except RuntimeError as error:
@@ -286,12 +290,13 @@ def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avat
     return avatar.eval(), list(checkpoint["gsgan"]["marks"])
 
 
-def _check_body(folder: Path, trained: Effects, built: Effects) -> None:
+def _check_body(folder: Path, avatar: Avatar, points: bool, segments: bool) -> None:
     """Refuses to load what was trained on a body whose model file is no longer given."""
-    for name in ON_THE_BODY:
-        if getattr(trained, name).on and not getattr(built, name).on:
-            raise DataError(
-                f"{folder}: trained with effects.{name}={getattr(trained, name).value}, which "
-                f"cannot be built now: {getattr(built, name).why}; set data.smpl in "
-                f"{folder / '.hydra' / 'config.yaml'} to the model file"
-            )
+    now = avatar.effects.body_points
+    lost = [("S", avatar.segmentation_why)] * (segments and avatar.segmentation is None)
+    lost += [("effects.body_points=on", now.why)] * (points and not now.on)
+    for what, why in lost:
+        raise DataError(
+            f"{folder}: trained with {what}, which cannot be built now: {why}; set data.smpl in "
+            f"{folder / '.hydra' / 'config.yaml'} to the model file"
+        )

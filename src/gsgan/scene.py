@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from gsgan.constants import constant
 from gsgan.lens import distort_within
 
 S = TypeVar("S", bound="_TensorRecord")
@@ -168,7 +169,7 @@ class Camera(_TensorRecord):
 
     def resize(self, size: tuple[int, int]) -> Camera:
         """The camera of the whole picture resampled to ``size = (H, W)``."""
-        scale = self.K.new_tensor([size[1] / self.size[1], size[0] / self.size[0], 1.0])
+        scale = constant((size[1] / self.size[1], size[0] / self.size[0], 1.0), self.K)
         return replace(self, K=self.K * scale[:, None], size=size)
 
 

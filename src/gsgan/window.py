@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsgan.constants import constant
 from gsgan.scene import Camera, Frame, cat
 
 
@@ -91,7 +92,7 @@ def body_window(
     reach = margin * focal[:, None] / depth.clamp_min(near).unsqueeze(-1)
     low = (pixels - reach).amin(dim=1).floor()
     high = (pixels + reach).amax(dim=1).ceil()
-    everywhere = low.new_tensor([width, height])
+    everywhere = constant((width, height), low)
     behind = (depth < near).any(dim=1, keepdim=True)
     low = torch.where(behind, torch.zeros_like(low), low).clamp_min(0).minimum(everywhere - 1)
     high = torch.where(behind, everywhere.expand_as(high), high).clamp_min(1).minimum(everywhere)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import contextlib
 import json
 import sys
-from dataclasses import replace
 
 import pytest
-import torch
 from hydra.utils import instantiate
 
 from gsgan.benchmarks import effects, effects_case, effects_cost
@@ -45,20 +43,19 @@ def row(effect="antialias", called=True, auto=None, off=20.0, on=21.0, **more) -
 
 
 def test_the_table_shows_gain_cost_and_decision():
-    page = text(Report([row(marks=["a stand-in"])], 1.004, 1.02, WHERE))
+    page = text(Report([row(marks=["a stand-in"])], WHERE))
     line = next(x for x in page.splitlines() if x.startswith("| antialias"))
     assert "on: scales differ" in line
     assert "+1.00 (20.00 → 21.00)" in line
     assert "+0.50 (19.00 → 19.50)" in line
     assert "30.00 → 31.50" in line
     assert "+72" in line
-    assert "1.004 times" in page
     assert "Stand-in in use: a stand-in." in page
 
 
 def test_what_was_not_trained_is_a_dash_and_no_failure(tmp_path):
     bare = Row("distortion", "default person", False, False, "no lens", "novel_view")
-    report = Report([bare], None, 1.02, WHERE)
+    report = Report([bare], WHERE)
     assert report.failures == []
     assert "| distortion | default person | off: no lens | – | – | novel_view | – | – | – |" in (
         text(report)
@@ -66,33 +63,31 @@ def test_what_was_not_trained_is_a_dash_and_no_failure(tmp_path):
     write(report, tmp_path, {"repeats": 1})
     record = json.loads((tmp_path / "effects.json").read_text())
     assert record["rows"][0]["gain_db"] == {"full": None, "splat": None}
-    assert record["all_off_ratio"] is None
 
 
 @pytest.mark.parametrize(
-    ("rows", "off", "complaint"),
+    ("rows", "complaint"),
     [
-        ([row(auto=False)], 1.0, "auto leaves antialias in the scene antialias off"),
-        ([row(called=False, auto=True)], 1.0, "scene default person on"),
-        ([row(on=19.9)], 1.0, "gains -0.10 dB although it is called for"),
-        ([row()], 1.03, "takes 1.030 times"),
+        ([row(auto=False)], "auto leaves antialias in the scene antialias off"),
+        ([row(called=False, auto=True)], "scene default person on"),
+        ([row(on=19.9)], "gains -0.10 dB although it is called for"),
     ],
 )
-def test_what_is_not_as_it_must_be_is_said(rows, off, complaint):
-    failures = Report(rows, off, 1.02, WHERE).failures
+def test_what_is_not_as_it_must_be_is_said(rows, complaint):
+    failures = Report(rows, WHERE).failures
     assert len(failures) == 1
     assert complaint in failures[0]
-    assert "(wrong)" in text(Report(rows, off, 1.02, WHERE)) or "auto" not in complaint
+    assert "(wrong)" in text(Report(rows, WHERE)) or "auto" not in complaint
 
 
 def test_an_effect_need_not_gain_where_it_is_not_called_for():
-    assert Report([row(called=False, on=19.0)], 1.0, 1.02, WHERE).failures == []
+    assert Report([row(called=False, on=19.0)], WHERE).failures == []
 
 
 def test_the_block_of_a_page_is_rewritten(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- bench:effects -->old<!-- end -->\nafter")
-    write_docs(Report([row()], 1.0, 1.02, WHERE), page)
+    write_docs(Report([row()], WHERE), page)
     assert "old" not in page.read_text()
     assert "| antialias |" in page.read_text()
     assert page.read_text().endswith("after")
@@ -152,11 +147,8 @@ def test_the_real_capture_has_its_own_runs(bench, capture):
         ("only=[gloss]", "only must list some of"),
         ("only=antialias", "only must list some of"),
         ("only=[]", "only must list some of"),
-        ("timed=[antialias]", "timed must list some of segmentation"),
-        ("timed=depth", "timed must list some of"),
         ("repeats=0", "repeats must be"),
         ("frames=1.5", "frames must be"),
-        ("off_ratio=0.5", "off_ratio must be"),
         ("real=nosuch/folder", "no such folder"),
         ("real_effect=depth", "real_effect must be one of"),
         ("cases.antialias.split=train", "split must be one of"),
@@ -222,53 +214,9 @@ def test_compose_leaves_the_outer_command_its_hydra():
         assert GlobalHydra.instance().hydra is before
 
 
-def test_off_paints_the_same_as_a_build_without_the_feature(build):
-    _, avatar, frame = build(*OFF)
-    ratio = effects_cost.price_of_off(avatar.eval(), [frame], repeats=3)
-    assert 0.2 < ratio < 5  # a real measurement, of a run too short to say more
-    window = avatar.window(frame)
-    cut, height = window.frame(frame), frame.camera.size[0]
-    with torch.no_grad():
-        plain = effects_cost.without_hooks(avatar, cut, height)
-    assert plain.shape[-2:] == window.size
-
-
-def test_an_effect_that_acts_when_off_is_found(build, monkeypatch):
-    _, avatar, frame = build(*OFF)
-    plain = effects_cost.without_hooks
-    monkeypatch.setattr(effects_cost, "without_hooks", lambda *a: 1.01 * plain(*a))
-    with pytest.raises(GsganError, match="another picture"):
-        effects_cost.price_of_off(avatar.eval(), [frame], repeats=1)
-
-
 def test_frames_for_timing_are_spread():
     assert effects_cost.spread(10, 2) == [2, 7]
     assert effects_cost.spread(3, 8) == [0, 1, 2]
-
-
-def test_effects_without_a_scene_are_timed_on_and_off(compose, capture):
-    from gsgan.console import make_console
-
-    data = ("data=capture", f"data.root={capture}", "data.size=32")
-    base = ["size=tiny", "training=smoke", *data, *OFF]
-    quoted = ",".join(f"'{x}'" for x in base)
-    overrides = (f"base=[{quoted}]", "frames=1", "repeats=1", "timed=[segmentation,depth]")
-    bench = instantiate(compose("bench_effects", *overrides))
-    rows = {found.effect: found for found in effects.timed(bench, make_console())}
-    assert set(rows) == {"segmentation", "depth"}
-    for found in rows.values():
-        assert found.called == found.auto
-        assert found.paint_ms["off"] > 0
-        assert found.paint_ms["on"] > 0
-    assert rows["segmentation"].auto
-    assert rows["segmentation"].parameters["on"] > rows["segmentation"].parameters["off"]
-    assert rows["depth"].parameters["on"] == rows["depth"].parameters["off"]
-    report = Report(list(rows.values()), 1.0, 1.02, WHERE)
-    assert report.failures == []
-    assert "of models before training" in text(report)
-    assert "before training" not in text(Report([row()], 1.0, 1.02, WHERE))
-    assert effects.timed(replace(bench, only=["antialias"]), make_console()) == []
-    assert effects.timed(replace(bench, train=False), make_console()) == []
 
 
 def test_the_whole_bench_in_miniature(launched, compose, tmp_path, monkeypatch):
@@ -279,7 +227,7 @@ def test_the_whole_bench_in_miniature(launched, compose, tmp_path, monkeypatch):
     page.write_text("<!-- bench:effects --><!-- end -->")
     overrides = (
         *(f"base=[{base}]", "only=[colour_correction]", "frames=1", "repeats=2"),
-        *("off_ratio=100", f"docs={page}", "threads=1", "default=false"),
+        *(f"docs={page}", "threads=1", "default=false"),
     )
     config = compose("bench_effects", *overrides)
 
@@ -297,7 +245,6 @@ def test_the_whole_bench_in_miniature(launched, compose, tmp_path, monkeypatch):
     assert all(ms > 0 for ms in (*one["paint_ms"].values(), *one["read_ms"].values()))
     assert one["parameters"]["on"] > one["parameters"]["off"]
     assert one["marks"]
-    assert record["all_off_ratio"] > 0
     assert "| colour_correction |" in page.read_text()
     assert found["default person"]["scores"] == {}
     assert len(launched) == 2

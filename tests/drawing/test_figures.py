@@ -57,7 +57,7 @@ def test_every_figure_is_made_with_numbers_of_the_pictures_shown(run, twin, tmp_
     assert found == expected(run, found)
     assert list(record["densify"]["runs"].values()) == [str(run)]  # the other run is not in it
     twins = list(found["cam00/000004"])
-    assert twins == ["GaussianGAN, one", "GaussianGAN, twin"]
+    assert twins == ["gsgan, one", "gsgan, twin"]
 
 
 def expected(run: Path, found: dict) -> dict:
@@ -145,7 +145,7 @@ def test_a_run_that_is_half_trained_is_said_to_be(twin, tmp_path, inside):
     torch.save(checkpoint, path)
     given = (f"run={twin}", f"out={tmp_path / 'out'}", "figures=strip", "formats=png", *FEW)
     result = inside("figures", *given)
-    said = f"GaussianGAN is unfinished: 3 of {total} iterations"
+    said = f"gsgan is unfinished: 3 of {total} iterations"
     assert said in result.stdout
     assert said in (tmp_path / "out" / "captions.md").read_text()
 
@@ -165,7 +165,7 @@ def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside)
     result = inside("figures", *given)
     assert result.returncode == 0, result.stdout + result.stderr
     entry = json.loads((tmp_path / "out" / "figures.json").read_text())["training"]
-    assert entry["numbers"]["training"]["GaussianGAN"] == {
+    assert entry["numbers"]["training"]["gsgan"] == {
         "seconds": [0, 60, 120], "psnr": [8, 20, 22], "psnr_colour": [8, 19, 20]
     }  # fmt: skip
     assert "watched while training" in entry["caption"]

@@ -295,13 +295,15 @@ def test_what_is_kept_of_a_painting_is_on_the_cpu(build):
     def painted(frame):
         found = paint(frame)
         tinted = None if found.colour is None else found.colour * 0.5
-        return replace(found, corrected=tinted, depth=found.alpha)
+        return replace(found, corrected=tinted)
 
     subject.avatar.paint = painted
     kept = subject.paint(shot)
-    assert kept.corrected is None
-    assert kept.depth is None
-    assert kept.alpha is None
+    for name in ("corrected", "alpha", "splat_alpha"):
+        assert getattr(kept, name) is None, name
+    assert kept.features.shape[1] == 3
+    assert kept.segmentation is not None
+    assert kept.gaussians is not None
     want = painted(shot.frame).corrected
     assert torch.equal(subject.colour(shot), shot.window.cut(want).clamp(0, 1))
 

@@ -46,8 +46,6 @@ def parameters(avatar) -> int:
         ("view_dependence", "1", True),
         ("antialias", "on", False),
         ("colour_correction", "on", True),
-        ("segmentation", "body", True),
-        ("depth", "on", False),
     ],
 )
 def test_off_builds_no_parameter_and_calls_no_operator(build, effect, word, adds):
@@ -55,40 +53,41 @@ def test_off_builds_no_parameter_and_calls_no_operator(build, effect, word, adds
     _, on, _ = build(NONE, f"effects.{effect}={word}")
     assert (parameters(on) > parameters(off)) == adds
     plain, more = calls(off, frame), calls(on, frame)
-    # the native rasteriser is one call whatever it does: anti-aliasing and depth show elsewhere
+    # the native rasteriser is one call whatever it does: anti-aliasing shows elsewhere
     if adds:
         assert sum(more.values()) > sum(plain.values())
     if effect == "antialias":
         assert on.accuracy.antialias
         assert not off.accuracy.antialias
-    assert (on.paint(frame).depth is not None) == (effect == "depth")
 
 
 def test_all_off_is_the_plain_chain_operator_by_operator(build):
     """The forward pass with effects off against its parts called one after the other."""
-    from gsgan.skeleton import bone_frames, sanitise
+    from gsgan.skeleton import bone_frames
     from gsgan.splat import rasterise
 
     _, avatar, frame = build(NONE)
     camera = frame.camera
 
     def chain():
-        p, valid = sanitise(frame.skeleton, frame.visibility, avatar.template, avatar.limb_sum)
+        p, valid = frame.skeleton, frame.visibility > 0
         frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
         points = avatar.densify(p, valid, frames)
         gaussians = avatar.deformation(p, points, camera.centre, frames.hubs[:, 0], None)
         raster = rasterise(gaussians, camera, settings=avatar.accuracy)
-        F = raster.features
+        S = avatar.segmentation(frame.body, camera)
         p2d = avatar.draw(p, valid, camera, None)
         g = avatar.pose_encoder(*avatar.pose_inputs(p, valid, frames, camera))
-        return avatar.generator(F, None, p2d, g, raster.fine).to(F.dtype)
+        painted = avatar.generator(raster.features, S, p2d, g, raster.fine, raster.alpha)
+        return painted[:, :3], painted[:, 3:]
 
     def whole():
-        return avatar(frame.skeleton, frame.visibility, camera, frame.body).image
+        painting = avatar(frame.skeleton, frame.visibility, camera, frame.body)
+        return painting.image, painting.alpha
 
     counts = []
     with torch.no_grad():
-        assert torch.equal(chain(), whole())
+        assert all(torch.equal(a, b) for a, b in zip(chain(), whole(), strict=True))
         for paint in (chain, whole):
             with Calls() as seen:
                 paint()
@@ -267,6 +266,44 @@ def test_pictures_are_taken_as_the_word_says(build, bent):
     assert float(views[0].mask[0, 0, int(wrist[1]), int(wrist[0])]) == 1
 
 
+@pytest.mark.parametrize("word", [NONE, "effects.only=[antialias]", "effects.only=[]"])
+def test_with_all_effects_off_a_lens_is_followed_still(build, bent, word):
+    """It is the camera's own, and no choice; taken as a pinhole's only where a word says so."""
+    at = (f"data.root={bent}", "data.size=64")
+    data, avatar, _ = build(*at, word)
+    assert avatar.effects.distortion.value == "undistort"
+    assert data.dataset("novel_view")[0].camera.dist is None
+    wanted = build(*at)[0].dataset("novel_view")[0].image
+    assert torch.equal(data.dataset("novel_view")[0].image, wanted)
+    ignored, avatar, _ = build(*at, word, "effects.distortion=off")
+    assert not avatar.effects.distortion.on
+    assert not torch.equal(ignored.dataset("novel_view")[0].image, wanted)
+
+
+@pytest.mark.parametrize("word", [NONE, "effects.only=[]"])
+def test_with_all_effects_off_the_model_keeps_its_segmentation(build, word):
+    _, avatar, frame = build(word)
+    assert {name for name, effect in avatar.effects if effect.on} == set()
+    assert avatar.segmentation is not None
+    assert avatar.paint(frame).segmentation.shape[1] == avatar.segmentation.classes
+
+
+@pytest.mark.parametrize("effect", ["segmentation", "depth", "hands", "face"])
+def test_what_is_no_effect_is_refused(tiny, effect):
+    from hydra.errors import ConfigCompositionException
+
+    with pytest.raises(ConfigCompositionException, match=rf"effects\.{effect}"):
+        tiny(f"effects.{effect}=off")
+
+
+def test_effects_that_a_checkpoint_had_and_that_are_no_more_are_passed_over():
+    from gsgan.effects import NAMES, Effects
+
+    before = Effects().plain() | {"depth": {"value": "on", "why": "it said so", "forced": True}}
+    assert set(NAMES) | {"depth", "cameras"} == set(before)
+    assert Effects.from_plain(before) == Effects()
+
+
 def test_a_lens_with_more_coefficients_is_undistorted_where_others_stay(tmp_path):
     """What ``effects.impossible=off`` makes of ``project``: never a lens that is half known."""
     from make import write_tiny_capture
@@ -295,7 +332,7 @@ def test_a_raw_crop_follows_the_lens(build, bent):
 
 def test_paintings_follow_the_lens_with_every_map(build, bent):
     data, avatar, _ = build(
-        *(f"data.root={bent}", "data.size=64", "effects.distortion=project", "effects.depth=on"),
+        *(f"data.root={bent}", "data.size=64", "effects.distortion=project"),
         "model.low_pass=0.3",  # untrained points are sparse: with less there are gaps
         "model.supersample=1",
     )
@@ -303,16 +340,16 @@ def test_paintings_follow_the_lens_with_every_map(build, bent):
     with torch.no_grad():
         painting = avatar.paint(frame)
         pinhole = avatar.paint(replace(frame, camera=replace(frame.camera, dist=None)))
-    for name in ("image", "features", "alpha", "depth"):
+    for name in ("image", "features", "alpha", "splat_alpha"):
         assert getattr(painting, name).shape[-2:] == frame.image.shape[-2:]
         assert torch.isfinite(getattr(painting, name)).all()
-    assert 0 <= float(painting.alpha.min()) <= float(painting.alpha.max()) <= 1
+    assert 0 <= float(painting.splat_alpha.min()) <= float(painting.splat_alpha.max()) <= 1
 
     def overlap(alpha: torch.Tensor) -> float:
         person, truth = alpha > 0.3, frame.mask > 0.5
         return float((person & truth).sum() / (person | truth).sum())
 
-    assert overlap(painting.alpha) > overlap(pinhole.alpha) + 0.01
+    assert overlap(painting.splat_alpha) > overlap(pinhole.splat_alpha) + 0.01
 
 
 # --- runs
@@ -345,14 +382,15 @@ def test_a_trained_avatar_has_what_its_checkpoint_says_not_what_the_scene_says_n
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
     config = load_config(copy)
-    OmegaConf.update(config, "effects.segmentation", "off")
+    OmegaConf.update(config, "effects.antialias", "on")
     avatar, _ = load_avatar(copy, config, build_data(config))
-    assert avatar.segmentation is not None
+    assert not avatar.effects.antialias.on
+    assert not avatar.accuracy.antialias
     checkpoint = read_checkpoint(copy / CHECKPOINT)
     del checkpoint["gsgan"]["effects"]  # of an older version: decided anew
     torch.save(checkpoint, copy / CHECKPOINT)
-    avatar, _ = load_avatar(copy, load_config(copy), build_data(load_config(copy)))
-    assert avatar.effects.segmentation.on
+    avatar, _ = load_avatar(copy, config, build_data(config))
+    assert avatar.effects.antialias.on
 
 
 def test_a_run_whose_data_now_calls_for_other_effects_is_not_gone_on_with(tiny):
@@ -369,9 +407,9 @@ def test_a_run_whose_data_now_calls_for_other_effects_is_not_gone_on_with(tiny):
     ("words", "said"),
     [
         (("effects.distortion=undistort",), "no camera of this data has a lens coefficient"),
-        (("effects.segmentation=body", "model=wo_seg"), "the model leaves it out"),
-        (("effects.depth=on", "model=image_to_image"), "this model splats nothing"),
-        (("effects=[depth,distortion]",), "no camera of this data has a lens coefficient"),
+        (("effects.body_points=on", "model.body_points=null"), "the model leaves them out"),
+        (("effects.antialias=on", "model=image_to_image"), "this model splats nothing"),
+        (("effects=[antialias,distortion]",), "no camera of this data has a lens coefficient"),
         (("effects.colour_correction=on", "data.train_cameras=[cam00]"), "one training camera"),
     ],
 )
@@ -383,8 +421,8 @@ def test_the_impossible_ends_a_command_in_one_sentence(capture, inside, tmp_path
 
 def test_all_means_all_that_this_model_can_have(build):
     _, avatar, frame = build("effects=all", "model=splat_only")
-    every = {"view_dependence", "antialias", "colour_correction", "random_background", "depth"}
-    every |= {"face", "body_points"}
+    every = {"view_dependence", "antialias", "colour_correction", "random_background"}
+    every |= {"body_points"}
     assert {name for name, effect in avatar.effects if effect.on} == every
     assert torch.isfinite(avatar.paint(frame).image).all()
     _, avatar, frame = build("effects=all", "model=image_to_image")

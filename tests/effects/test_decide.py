@@ -52,11 +52,11 @@ def scene(**changes) -> SceneInfo:
 
 
 def on(effects: Effects) -> set[str]:
-    return {name for name, effect in effects if effect.on} - {"face"}
+    return {name for name, effect in effects if effect.on}
 
 
 def test_a_plain_scene_calls_for_what_it_always_had():
-    assert on(decide(scene(), EffectSettings())) == {"segmentation", "random_background"}
+    assert on(decide(scene(), EffectSettings())) == {"random_background"}
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_a_plain_scene_calls_for_what_it_always_had():
         ({"held_out_distortion": True}, "distortion", "undistort"),
         ({"scale_test": (25.0, 60.0)}, "antialias", "on"),  # half the scale
         ({"scale_test": (50.0, 120.0)}, "antialias", "on"),  # double
-        ({"has_body_pose": False}, "segmentation", "off"),
+        ({"body_inside": 1.0}, "body_points", "on"),
         ({"darkest": 0.4}, "random_background", "off"),
     ],
 )
@@ -124,8 +124,7 @@ def test_every_threshold_is_read(name, at, setting):
     [
         ({"distortion": "undistort"}, {}, "no camera of this data has a lens coefficient"),
         ({"colour_correction": "on"}, {"n_train_cameras": 1}, "one training camera"),
-        ({"segmentation": "body"}, {"has_body_pose": False}, "no body pose"),
-        ({"segmentation": "hands"}, {"label_names": ("background", "hat")}, "no part .* is a hand"),
+        ({"body_points": "on"}, {"has_body_pose": False}, "no body pose"),
         ({"only": ["distortion"]}, {}, "effects.distortion=on is not possible"),
     ],
 )
@@ -150,30 +149,42 @@ def test_forced_words_win_over_the_scene():
     settings = EffectSettings(view_dependence=3, antialias="on", random_background="off")
     found = decide(scene(), settings)
     assert found.degree == 3
-    assert on(found) == {"view_dependence", "antialias", "segmentation"}
+    assert on(found) == {"view_dependence", "antialias"}
     assert decide(scene(), EffectSettings(view_dependence="on")).degree == 2
 
 
 def test_yamls_on_and_off_are_understood():
-    settings = EffectSettings(antialias=True, segmentation=False, impossible=False)
-    assert (settings.antialias, settings.segmentation, settings.impossible) == ("on", "off", "off")
+    settings = EffectSettings(antialias=True, body_points=False, impossible=False)
+    assert (settings.antialias, settings.body_points, settings.impossible) == ("on", "off", "off")
 
 
 def test_a_list_turns_on_these_and_no_other():
-    found = decide(scene(), EffectSettings(only=["antialias", "depth"]))
-    assert on(found) == {"antialias", "depth"}
+    found = decide(scene(), EffectSettings(only=["antialias", "body_points"]))
+    assert on(found) == {"antialias", "body_points"}
     none = decide(scene(), EffectSettings(only=[]))
     assert on(none) == set()
 
 
+@pytest.mark.parametrize("word", ["auto", "off", "undistort", "project"])
+def test_a_list_leaves_lenses_to_their_own_word(word):
+    bent = scene(has_distortion=True)
+    found = decide(bent, EffectSettings(distortion=word, only=["antialias"]))
+    assert found.distortion == decide(bent, EffectSettings(distortion=word)).distortion
+    assert found.distortion.on == (word != "off")
+    named = decide(bent, EffectSettings(distortion=word, only=["distortion"]))
+    assert named.distortion.on
+
+
 def test_without_a_forced_effect_is_refused_and_a_wanted_one_goes():
-    auto = decide(scene(), EffectSettings())
-    assert not auto.without("segmentation", "no room").segmentation.on
-    forced = decide(scene(), EffectSettings(segmentation="body"))
-    with pytest.raises(ConfigError, match=r"effects\.segmentation=body is not possible: no room"):
-        forced.without("segmentation", "no room")
-    lenient = decide(scene(), EffectSettings(segmentation="body", impossible="off"))
-    assert not lenient.without("segmentation", "no room").segmentation.on
+    auto = decide(scene(body_inside=1.0), EffectSettings())
+    assert auto.body_points.on
+    assert not auto.without("body_points", "no room").body_points.on
+    forced = decide(scene(), EffectSettings(body_points="on"))
+    with pytest.raises(ConfigError, match=r"effects\.body_points=on is not possible: no room"):
+        forced.without("body_points", "no room")
+    lenient = decide(scene(), EffectSettings(body_points="on", impossible="off"))
+    assert lenient.body_points.on
+    assert not lenient.without("body_points", "no room").body_points.on
 
 
 def test_decisions_survive_a_checkpoint(tmp_path):
@@ -194,6 +205,7 @@ def test_decisions_survive_a_checkpoint(tmp_path):
         ({"view_residual": float("nan")}, "effects.view_residual must be a number"),
         ({"degree_cameras": [4, 2, 8]}, "three rising numbers"),
         ({"only": ["colours"]}, "effects.only must list some of"),
+        ({"only": ["segmentation"]}, "effects.only must list some of"),
         ({"only": "antialias"}, "effects.only must list some of"),
         ({"impossible": "maybe"}, "effects.impossible must be error or off"),
     ],
@@ -213,11 +225,12 @@ def test_configs_say_what_their_names_say(compose):
         degree_cameras=auto.degree_cameras
     )  # same values in code and yaml
     assert on(decide(scene(), none)) == set()
+    assert on(decide(scene(has_distortion=True), none)) == {"distortion"}  # the camera's own
     found = on(decide(scene(has_distortion=True), every))
     assert found == set(CHOICES)
     assert on(decide(scene(), every)) == set(CHOICES) - {"distortion"}
-    listed = instantiate(compose("train", "effects.only=[depth]").effects)
-    assert on(decide(scene(), listed)) == {"depth"}
+    listed = instantiate(compose("train", "effects.only=[antialias]").effects)
+    assert on(decide(scene(), listed)) == {"antialias"}
 
 
 def test_the_table_has_a_row_an_effect():
@@ -225,7 +238,8 @@ def test_the_table_has_a_row_an_effect():
     plain = rows(effects)
     assert len(plain) == len(NAMES)
     assert all(row[2] for row in plain)
-    costed = {row[0]: row for row in rows(effects, {"segmentation": Cost(4000, 1.234)})}
-    assert costed["segmentation S"][3:] == ("4,000", "1.23")
+    listed = decide(scene(), EffectSettings(only=["antialias", "random_background"]))
+    costed = {row[0]: row for row in rows(listed, {"antialias": Cost(4000, 1.234)})}
+    assert costed["anti-aliasing"][3:] == ("4,000", "1.23")
     assert costed["random background"][3:] == ("–", "–")
-    assert costed["depth"][3:] == ("", "")
+    assert costed["points on the body"][3:] == ("", "")

@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from gsgan.effects import Effect
+from gsgan.skeleton import sanitise
 
 
 def test_paints_every_part(build):
@@ -22,7 +22,10 @@ def test_paints_every_part(build):
         atol=1e-4,
         rtol=0,
     )
-    assert torch.equal(painting.image, painting.colour)  # rgb_skip starts at Step I's picture
+    # rgb_skip starts at Step I's picture
+    assert torch.equal(painting.image, painting.colour)
+    assert torch.equal(painting.alpha, painting.splat_alpha)
+    assert painting.alpha.shape[1] == 1
 
 
 def test_the_window_changes_nothing_about_step_one(build):
@@ -53,6 +56,7 @@ def test_a_missing_joint_still_paints(build):
     _, avatar, frame = build()
     skeleton, visibility = frame.skeleton.clone(), frame.visibility.clone()
     skeleton[0, 15], visibility[0, 15] = float("nan"), 0
+    skeleton, _ = sanitise(skeleton, visibility)
     painting = avatar.paint(dataclasses.replace(frame, skeleton=skeleton, visibility=visibility))
     assert torch.isfinite(painting.image).all()
 
@@ -78,16 +82,17 @@ def test_what_is_off_builds_no_parameter(build, model, absent):
     painting = avatar.paint(frame)
     assert painting.segmentation is None
     assert painting.image is not None
-    assert avatar.effects.segmentation == Effect("off", "the model leaves it out")
+    assert avatar.segmentation is None
+    assert avatar.segmentation_why == "the model leaves it out"
 
 
-def test_data_without_body_pose_turns_segmentation_off(build, tmp_path):
+def test_data_without_body_pose_builds_no_segmentation(build, tmp_path):
     from make import write_tiny_capture
 
     root = write_tiny_capture(tmp_path / "bare", cameras=2, frames=4, size=(48, 48))
     _, avatar, frame = build(f"data.root={root}")
     assert avatar.segmentation is None
-    assert avatar.effects.segmentation == Effect("off", "the data has no body pose")
+    assert avatar.segmentation_why == "the data has no body pose"
     assert torch.isfinite(avatar.paint(frame).image).all()
 
 
@@ -100,15 +105,15 @@ def test_segmentation_of_a_model_file(build, tiny, tmp_path):
     bare = {"body": "smpl", "label_names": (), "n_labels": 0, "has_labels": False}
     scene = dataclasses.replace(data.info, **bare, body_file=str(tmp_path / "smpl.pkl"))
     avatar = instantiate(tiny().model)(scene=scene)
-    assert avatar.effects.segmentation.on
-    assert "parts by the body's joints" in avatar.effects.segmentation.why
+    assert avatar.segmentation_why == "parts by the body's joints"
+    assert avatar.segmentation.common is not None  # this data has no labels to learn from
     pose = dataclasses.replace(frame.body, theta=torch.zeros(1, 24, 3))
     painting = avatar.paint(dataclasses.replace(frame, body=pose))
     assert painting.segmentation.shape[1] == 12  # no joint has hair
     assert avatar.segmentation.map.absent == ("hair",)
     without = instantiate(tiny().model)(scene=dataclasses.replace(data.info, **bare))
     assert without.segmentation is None
-    assert "no model file" in without.effects.segmentation.why
+    assert "no model file" in without.segmentation_why
 
 
 def test_batches_are_independent(build):

@@ -173,18 +173,24 @@ def stored(module, folder):
     return checkpoint
 
 
-@pytest.mark.parametrize(("effect", "model"), [("body_points", "wo_seg"), ("segmentation", "full")])
+@pytest.mark.parametrize(
+    ("part", "words", "said"),
+    [
+        ("body_points", (ON, "effects.impossible=off", "model=wo_seg"), r"effects\.body_points=on"),
+        ("segmentation", ("effects.body_points=off",), "S"),
+    ],
+)
 def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
-    tiny, tmp_path, monkeypatch, effect, model
+    tiny, tmp_path, monkeypatch, part, words, said
 ):
-    config = tiny(f"effects.{effect}=on", "effects.impossible=off", f"model={model}")
+    config = tiny(*words)
     data, module = build_training(config)
     stored(module, tmp_path)
     avatar, _ = load_avatar(tmp_path, config, data)
-    assert getattr(avatar, effect) is not None
+    assert getattr(avatar, part) is not None
     for place in ("avatar", "parts"):
         monkeypatch.setattr(f"gsgan.model.{place}.open_body", lambda *_: None)
-    with pytest.raises(DataError, match=rf"effects\.{effect}=.* no model file; set data\.smpl"):
+    with pytest.raises(DataError, match=rf"with {said}, .* no model file; set data\.smpl"):
         load_avatar(tmp_path, config, data)
 
 
@@ -290,13 +296,21 @@ def test_supersampling_is_the_models_and_of_F_alone(build):
     assert painting.features.shape[-2:] == painting.image.shape[-2:] == frame.image.shape[-2:]
     _, baseline, _ = build("model=lbs_splat", "model.supersample=3")
     assert baseline.accuracy.supersample == 3
-    _, usual, _ = build("model.supersample=null", "accuracy.supersample=2")
-    assert (usual.accuracy.supersample, usual.segmentation.accuracy.supersample) == (2, 1)
 
 
 def test_low_pass_is_the_models_for_F_and_S_whatever_the_accuracy(build):
     _, avatar, _ = build("accuracy=draft")
     assert avatar.accuracy.low_pass == avatar.segmentation.accuracy.low_pass == 0.0833
     assert avatar.accuracy.name == "draft"
-    _, usual, _ = build("model.low_pass=null")
+    _, usual, _ = build("model.low_pass=0.3")
     assert usual.accuracy.low_pass == usual.segmentation.accuracy.low_pass == 0.3
+
+
+@pytest.mark.parametrize("key", ["low_pass", "supersample"])
+def test_what_is_the_models_is_not_the_accuracys_too(tiny, key):
+    """A word that would change nothing is an error."""
+    from hydra.errors import ConfigCompositionException
+
+    tiny(f"model.{key}=1")
+    with pytest.raises(ConfigCompositionException, match=rf"accuracy\.{key}"):
+        tiny(f"accuracy.{key}=1")

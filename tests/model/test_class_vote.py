@@ -239,8 +239,8 @@ def no_vote(*_):
 def test_labels_that_are_the_bodys_own_are_not_voted_on(build, monkeypatch):
     monkeypatch.setattr(ClassVote, "__call__", no_vote)
     _, avatar, _ = build()
-    assert avatar.effects.segmentation.on
-    assert "no class vote" in avatar.effects.segmentation.why
+    assert avatar.segmentation is not None
+    assert "no class vote" in avatar.segmentation_why
     assert "segmentation.vertex_labels" not in avatar.state_dict()
 
 
@@ -250,7 +250,7 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_
     config = tiny(f"data.root={foreign}", FEW)
     data, module = build_training(config)
     avatar = module.avatar
-    assert "class vote over 2 pictures" in avatar.effects.segmentation.why
+    assert "class vote over 2 pictures" in avatar.segmentation_why
     assert avatar.segmentation.map.names[0] == "cloth 0"
     assert avatar.segmentation.classes > 2
     path = tmp_path / "run" / CHECKPOINT

@@ -27,7 +27,7 @@ def inputs(height: int, width: int, batch: int = 2):
 @pytest.mark.parametrize("size", [(32, 32), (17, 33), (16, 1)])
 def test_generator_takes_any_size(size):
     image = generator()(*inputs(*size))
-    assert image.shape == (2, 3, *size)
+    assert image.shape == (2, 4, *size)
     assert torch.isfinite(image).all()
 
 
@@ -37,7 +37,7 @@ def test_generator_sees_what_supersampling_averages():
     assert net.content.stem.in_channels == generator().content.stem.in_channels + 4 * 5
     fine = torch.rand(2, 5, 34, 24, requires_grad=True)
     image = net(F, S, p2d, g, fine)
-    assert image.shape == (2, 3, 17, 12)
+    assert image.shape == (2, 4, 17, 12)
     assert not torch.equal(image, net(F, S, p2d, g, 1 - fine))
     image.square().mean().backward()
     assert torch.isfinite(fine.grad).all()
@@ -62,15 +62,19 @@ def test_stability_overflowing_fine_features_are_bounded_like_F():
     torch.testing.assert_close(net(F, S, p2d, g, fine * 1e30), net(F, S, p2d, g, 1e3 * fine.sign()))
 
 
-def test_generator_with_rgb_skip_starts_at_step_one_colour():
+def test_generator_with_rgb_skip_starts_at_step_one_colour_and_alpha():
     F, S, p2d, g = inputs(16, 16)
-    torch.testing.assert_close(generator(rgb_skip=True)(F, S, p2d, g), F[:, :3], rtol=0, atol=0)
+    alpha = torch.rand(2, 1, 16, 16)
+    painted = generator(rgb_skip=True)(F, S, p2d, g, alpha=alpha)
+    torch.testing.assert_close(painted, torch.cat([F[:, :3], alpha], 1), rtol=0, atol=0)
+    with pytest.raises(ValueError, match="rgb_skip=True, so alpha must be given"):
+        generator(rgb_skip=True)(F, S, p2d, g)
 
 
 def test_generator_without_segmentation_has_fewer_inputs():
     F, _, p2d, g = inputs(16, 16)
     without = Generator(5, 0, 8, 35, base=4)
-    assert without(F, None, p2d, g).shape == (2, 3, 16, 16)
+    assert without(F, None, p2d, g).shape == (2, 4, 16, 16)
     assert without.content.stem.in_channels == generator().content.stem.in_channels - 4
 
 
@@ -96,7 +100,7 @@ def test_style_by_pose_alone_builds_no_style_encoder_and_still_follows_the_pose(
         torch.nn.init.normal_(style.from_pose.weight, std=0.1)
     F, S, p2d, g = inputs(17, 16)
     image = net(F, S, p2d, g)
-    assert image.shape == (2, 3, 17, 16)
+    assert image.shape == (2, 4, 17, 16)
     assert float((image - net(F, S, p2d, -g)).abs().max().detach()) > 1e-3
     with pytest.raises(ValueError, match="style must be film or pose"):
         generator(style="spade")

@@ -11,7 +11,7 @@ from gsgan.body import free_body
 from gsgan.body.smpl_names import CIHP, CLOTHES, SMPLX_JOINTS
 from gsgan.errors import ConfigError
 from gsgan.model.classes import IGNORE, class_map
-from gsgan.model.segmentation import Segmentation, segmentation_loss
+from gsgan.model.segmentation import Segmentation, segmentation_loss, silhouette_loss
 from gsgan.scene import BodyPose, Camera
 
 SIZE = 32
@@ -89,6 +89,109 @@ def test_loss_is_finite_where_a_class_was_never_hit_and_ignores_255():
     assert torch.isfinite(S.grad).all()
     assert float(S.grad[0, 1, 0, 0]) < 0  # there is a way out of zero
     assert (S.grad[..., 1] == 0).all()
+
+
+# --- masks in the place of labels -----------------------------------------------------------------
+
+
+def without_labels(**options) -> Segmentation:
+    return Segmentation(free_body(), points=1000, labelled=False, **options)
+
+
+def body_mask() -> torch.Tensor:
+    with torch.no_grad():
+        return (Segmentation(free_body()).raster(rest_pose(), facing_camera()).alpha > 0.5).float()
+
+
+def fit_to(segmentation: Segmentation, mask: torch.Tensor, steps: int = 15) -> list[float]:
+    """The loss of each step of its own optimiser groups."""
+    groups = [
+        {"params": parameters, "lr": 1e-2 * factor}
+        for parameters, factor in segmentation.parameter_groups()
+    ]
+    optimiser, losses = torch.optim.Adam(groups), []
+    for _ in range(steps):
+        alpha = segmentation.raster(rest_pose(), facing_camera()).alpha
+        loss = silhouette_loss(alpha, mask)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    return losses
+
+
+def test_without_labels_two_numbers_learn_from_masks_and_nothing_else_moves():
+    segmentation = without_labels(scale=0.3)
+    assert [p.shape for p in segmentation.parameters() if p.requires_grad] == [(2,)]
+    before = {name: value.clone() for name, value in segmentation.state_dict().items()}
+    losses = fit_to(segmentation, body_mask())
+    assert losses[-1] < 0.8 * losses[0]
+    moved = {k for k, v in segmentation.state_dict().items() if not torch.equal(v, before[k])}
+    assert moved == {"common"}
+    assert bool((segmentation.common != 0).all())
+    assert segmentation.common[0] > 0  # too small shapes grew
+
+
+def test_common_is_added_to_all_log_scales_and_all_logits():
+    one, other = without_labels(), without_labels()
+    with torch.no_grad():
+        one.common.copy_(torch.tensor([0.4, -1.5]))
+        other.log_scales += 0.4
+        other.logit_opacities -= 1.5
+        a, b = one.gaussians(rest_pose()), other.gaussians(rest_pose())
+    torch.testing.assert_close(a.covariances, b.covariances)
+    torch.testing.assert_close(a.opacities, b.opacities)
+    assert not torch.allclose(a.opacities, without_labels().gaussians(rest_pose()).opacities)
+
+
+def test_with_labels_there_is_no_common_number_and_all_is_trained():
+    segmentation = Segmentation(free_body(), points=100)
+    assert segmentation.common is None
+    assert "common" not in segmentation.state_dict()
+    trained = [p for parameters, _ in segmentation.parameter_groups() for p in parameters]
+    assert {id(p) for p in trained} == {id(p) for p in segmentation.parameters()}
+    assert all(p.requires_grad for p in trained)
+
+
+def test_silhouette_loss_is_binary_cross_entropy_of_the_sure_pixels():
+    generator = torch.Generator().manual_seed(0)
+    alpha, mask = (torch.rand(2, 1, 5, 7, generator=generator) for _ in range(2))
+    alpha.requires_grad_()
+    unsure = torch.zeros(2, 1, 5, 7)
+    unsure[..., 2] = 0.3
+    loss = silhouette_loss(alpha, mask, unsure)
+    sure = unsure == 0
+    expected = torch.nn.functional.binary_cross_entropy(alpha[sure], mask[sure])
+    torch.testing.assert_close(loss, expected, atol=1e-4, rtol=0)
+    loss.backward()
+    assert bool((alpha.grad[~sure] == 0).all())
+    assert bool((alpha.grad[sure] != 0).all())
+    assert float(silhouette_loss(alpha, mask, torch.ones_like(mask)).detach()) == 0  # none is sure
+
+
+@pytest.mark.parametrize("truth", [0.0, 1.0])
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_stability_silhouette_loss_where_alpha_is_0_or_1(value, truth):
+    alpha = torch.full((1, 1, 2, 2), value, requires_grad=True)
+    loss = silhouette_loss(alpha, torch.full_like(alpha, truth).detach())
+    loss.backward()
+    expected = 0 if value == truth else -math.log(1e-6)
+    assert math.isclose(float(loss.detach()), expected, rel_tol=1e-5, abs_tol=1e-5)
+    assert torch.isfinite(alpha.grad).all()
+    if value != truth:  # there is a way back
+        assert bool((alpha.grad.sign() == (1 if value > truth else -1)).all())
+
+
+@pytest.mark.parametrize("common", [(0.0, -60.0), (0.0, 60.0), (-9.0, 0.0), (2.0, 60.0)])
+def test_stability_common_numbers_of_an_empty_or_opaque_body_get_finite_gradients(common):
+    segmentation = without_labels()
+    with torch.no_grad():
+        segmentation.common.copy_(torch.tensor(common))
+    alpha = segmentation.raster(rest_pose(), facing_camera()).alpha
+    loss = silhouette_loss(alpha, body_mask())
+    loss.backward()
+    assert torch.isfinite(loss)
+    assert torch.isfinite(segmentation.common.grad).all()
 
 
 # --- classes -------------------------------------------------------------------------------------
@@ -171,7 +274,8 @@ def test_finger_joints_belong_to_their_hand():
     ("mode", "names", "words"),
     [
         ("hands", CIHP, "no left_hand and no right_hand"),
-        ("hand", CLOTHES, "mode must be body, hands, none; got 'hand'"),
+        ("hand", CLOTHES, "mode must be body or hands; got 'hand'"),
+        ("none", CLOTHES, "mode must be body or hands; got 'none'"),
     ],
 )
 def test_modes_that_cannot_be_are_one_sentence(mode, names, words):
@@ -199,10 +303,13 @@ def test_a_class_without_a_vertex_is_not_learned_and_scored_as_missed():
     assert not (scored.argmax(1) == to_find)[:, 1:].any()
 
 
-def test_no_part_is_built_with_mode_none(build):
-    _, avatar, _ = build("model.segmentation.mode=none")
+def test_null_leaves_it_out_whatever_the_effects(build):
+    _, avatar, _ = build("model.segmentation=null")
     assert avatar.segmentation is None
-    assert not avatar.effects.segmentation.on
+    assert avatar.segmentation_why == "the model leaves it out"
+    _, avatar, _ = build("effects=none")
+    assert avatar.segmentation.common is None  # this data has labels
+    assert "own" in avatar.segmentation_why
 
 
 def test_hands_mode_from_the_config_paints(build):

@@ -20,12 +20,12 @@ def paper_run(folder, **held):
 def test_beside_the_same_data_subject_protocol_and_split(tmp_path):
     (grid,) = report_of(table(**ABLATION, **VIEW), paper_run(tmp_path / "a")).grids
     labels = [r.label for r in grid.rows]
-    assert labels[:2] == ["full", "full (paper)"]
-    printed = row(grid, "full (paper)")
+    assert labels[:2] == ["full", "full (as printed)"]
+    printed = row(grid, "full (as printed)")
     assert (texts(printed), printed.kind) == (["34.16"], "paper")
     assert "mean" not in printed.cells[0].numbers  # in no mean of ours
     assert texts(row(grid, "full")) == ["30.00"]
-    assert texts(row(grid, "w/o S (paper)")) == ["29.08"]
+    assert texts(row(grid, "w/o S (as printed)")) == ["29.08"]
     assert labels[-1] == "all background (floor)"
 
 
@@ -42,7 +42,7 @@ APART = {
 def test_elsewhere_they_stand_by_themselves_and_say_why(tmp_path, held, said):
     ours, paper = report_of(table(**ABLATION, **VIEW), paper_run(tmp_path / "a", **held)).grids
     assert all(r.kind != "paper" for r in ours.rows)
-    assert all(r.kind == "paper" and "(paper)" in r.label for r in paper.rows)
+    assert all(r.kind == "paper" and "(as printed)" in r.label for r in paper.rows)
     assert said in paper.remarks[0]
     told = ("n/a", "zju_mocap", "the paper's, read as paper_zju", "n/a")
     assert all(r.provenance == told for r in paper.rows)
@@ -59,7 +59,7 @@ def test_the_six_subjects_beside_ours(tmp_path):
     runs = [paper_run(tmp_path / s, data=zju(int(s))) for s in subjects]
     spec = table(**VIEW, subjects=subjects, data="zju_mocap", paper="zju")
     (grid,) = report_of(spec, *runs).grids
-    assert texts(row(grid, "GaussianGAN (paper)")) == [
+    assert texts(row(grid, "GaussianGAN (as printed)")) == [
         "34.16", "36.45", "29.99", "33.23", "31.50", "32.26", "32.94",
     ]  # fmt: skip
     assert texts(row(grid, "full")) == ["30.00"] * 7

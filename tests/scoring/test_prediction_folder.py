@@ -140,11 +140,11 @@ def person(value: int = 128, behind: int = 0) -> np.ndarray:
 
 def test_pictures_are_rgb_and_their_alpha_is_taken(tmp_path):
     found = one(tmp_path, person()).predict(frame(), ("cam", 3))
-    assert found.alpha is None
+    assert not found.alphas
     assert (found.pictures["full"][0, :, 2, 2] * 255).tolist() == pytest.approx([128, 20, 10])
     alpha = np.full((*SIZE, 1), 51, np.uint8)
     found = one(tmp_path, np.concatenate([person(), alpha], -1)).predict(frame(), ("cam", 3))
-    assert float(found.alpha.min()) == float(found.alpha.max()) == pytest.approx(0.2)
+    assert found.alphas["full"].aminmax() == pytest.approx((0.2, 0.2))
     assert float(found.pictures["full"][0, 0, 2, 2]) == pytest.approx(0.2 * 128 / 255)
 
 

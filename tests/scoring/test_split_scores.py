@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,10 +12,11 @@ from torchmetrics.classification import MulticlassJaccardIndex
 from gsgan.data.measures import Measures
 from gsgan.errors import GsganError
 from gsgan.metrics.image import psnr, ssim, ssim_uniform
+from gsgan.model.painting import Painting
 from gsgan.scene import Camera, Frame
 from gsgan.scoring.prepare import Prediction, Stage
 from gsgan.scoring.scores import Mean, PictureScores, SegmentationScores
-from gsgan.scoring.split import FLOOR, FULL, Scorer, empty_split, score_split
+from gsgan.scoring.split import FLOOR, FULL, SPLAT, Scorer, empty_split, painter, score_split
 
 
 def frame(image: torch.Tensor, mask: torch.Tensor, labels: torch.Tensor | None = None) -> Frame:
@@ -105,7 +107,7 @@ def test_the_floor_of_a_split_is_the_background_and_its_psnr_is_known():
     ):
         found = score_split(
             [(("a", 0), f)],
-            lambda f, _: Prediction({FULL: f.image}, f.mask),
+            lambda f, _: Prediction({FULL: f.image}, {FULL: f.mask}),
             scorer(Measures(background=background)),
         )
         assert found.variants[FLOOR]["psnr"] == pytest.approx(
@@ -122,7 +124,7 @@ def test_an_opaque_picture_on_black_hides_its_outline_on_white_and_says_so():
     fat[..., 0:4, 0:4] = 0.9  # painted outside the truth's mask
 
     def predict(f: Frame, _: object) -> Prediction:
-        return Prediction({FULL: fat}, None, "black")
+        return Prediction({FULL: fat}, {}, "black")
 
     white = score_split([(("a", 0), f)], predict, scorer(Measures(background="white")))
     assert white.hidden_outline
@@ -134,17 +136,44 @@ def test_an_opaque_picture_on_black_hides_its_outline_on_white_and_says_so():
     )
 
 
+def test_each_picture_of_an_avatar_is_put_on_white_by_its_own_alpha():
+    """I_pred is the truth; Step I's colour is it at half the alpha: 0.3 off, 0.15 at the edge."""
+    f = person()
+    painting = Painting(f.image, f.mask, features=0.5 * f.image, splat_alpha=0.5 * f.mask)
+    avatar = SimpleNamespace(paint=lambda _: painting, segmentation=None)
+    white = scorer(Measures(background="white"))
+    found = score_split([(("a", 0), f)], painter(avatar), white)
+    assert found.rows[FULL][0].scores["psnr"] == math.inf
+    assert found.variants[SPLAT]["psnr"] == pytest.approx(
+        -10 * math.log10((56 * 0.3**2 + 8 * 0.15**2) / 576), abs=1e-4
+    )
+    assert not found.hidden_outline
+
+
+def test_one_variant_without_alpha_takes_the_truths_mask_and_says_so():
+    f = person()
+
+    def predict(f: Frame, _: object) -> Prediction:
+        return Prediction({FULL: 0.5 * f.image, SPLAT: f.image}, {FULL: 0.5 * f.mask})
+
+    found = score_split([(("a", 0), f)], predict, scorer(Measures(background="white")))
+    assert found.hidden_outline
+    assert found.rows[SPLAT][0].scores["psnr"] > 100
+    assert found.rows[FULL][0].scores["psnr"] < 30
+    assert not score_split([(("a", 0), f)], predict, scorer()).hidden_outline
+
+
 def test_a_picture_that_is_not_finite_is_an_error_that_names_it():
     f = person()
     broken = f.image.clone()
     broken[0, 0, 3, 3] = torch.nan
     with pytest.raises(GsganError, match=r"camera a, frame 0: 1 values .* not finite"):
-        score_split([(("a", 0), f)], lambda f, _: Prediction({FULL: broken}, None), scorer())
+        score_split([(("a", 0), f)], lambda f, _: Prediction({FULL: broken}, {}), scorer())
 
 
 def test_every_split_has_every_metric_or_a_reason():
     f = person()
-    found = score_split([(("a", 0), f)], lambda f, _: Prediction({FULL: f.image}, None), scorer())
+    found = score_split([(("a", 0), f)], lambda f, _: Prediction({FULL: f.image}, {}), scorer())
     for values in (
         *found.variants.values(),
         *empty_split("none held out", scorer()).variants.values(),

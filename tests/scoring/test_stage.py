@@ -49,7 +49,7 @@ def test_what_is_painted_outside_the_box_is_cleared_and_only_there(data, backgro
     stage = Stage(Measures(region="body_box_cleared", background=background), BodyBoxes(data))
     frame = data.dataset("train")[0]
     box = stage.box(frame)
-    picture = stage.picture(Prediction({FULL: torch.full_like(frame.image, 0.3)}, None, background),
+    picture = stage.picture(Prediction({FULL: torch.full_like(frame.image, 0.3)}, {}, background),
                             FULL, frame, box)  # fmt: skip
     inside = box.expand_as(picture)
     assert bool((picture[inside] == 0.3).all())
@@ -79,5 +79,5 @@ def test_values_are_clamped_before_8_bits(data):
     wild = torch.full_like(frame.image, 1.7)
     wild[..., 0] = -3.0
     wild[..., 1] = 0.5
-    picture = stage.picture(Prediction({FULL: wild}, None), FULL, frame, None)
+    picture = stage.picture(Prediction({FULL: wild}, {}), FULL, frame, None)
     assert torch.equal(picture[0, 0, 0, :3] * 255, torch.tensor([0.0, 127.0, 255.0]))

@@ -25,8 +25,9 @@ def test_every_preset_is_a_config_and_every_config_a_preset():
 def test_config_equals_preset(name):
     config = yaml.safe_load((CONF / f"{name}.yaml").read_text())
     assert config.pop("_target_") == "gsgan.splat.settings.Accuracy"
-    # anti-aliasing is no cut-off but an effect: conf/effects says
-    assert set(config) == {field.name for field in fields(Accuracy)} - {"antialias"}
+    # how pixels are formed is no cut-off: conf/effects and conf/model have it
+    formed = {"antialias", "low_pass", "supersample"}
+    assert set(config) == {field.name for field in fields(Accuracy)} - formed
     assert Accuracy(**config) == accuracy(name)
 
 

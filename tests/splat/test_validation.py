@@ -199,7 +199,7 @@ def test_bad_cameras_are_refused(cam, message):
 
 def test_choices_are_checked():
     gaussians = cloud(5)
-    with pytest.raises(ValueError, match="on_invalid must be error or drop, got 'skip'"):
+    with pytest.raises(ValueError, match="on_invalid must be error, drop or unchecked, got 'skip'"):
         rasterise(gaussians, camera(), on_invalid="skip")
     with pytest.raises(ValueError, match="settings must be Accuracy, got dict"):
         rasterise(gaussians, camera(), settings={"alpha_min": 0.1})

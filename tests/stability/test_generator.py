@@ -36,7 +36,7 @@ def test_geometry_and_rasteriser_stay_in_float32_under_autocast(build, half):
         plain = avatar.paint(frame)
         with torch.autocast("cpu", dtype=half):
             mixed = avatar.paint(frame)
-    for name in ("features", "alpha", "segmentation"):
+    for name in ("features", "splat_alpha", "segmentation"):
         assert torch.equal(getattr(mixed, name), getattr(plain, name)), name
     assert torch.equal(mixed.gaussians.means, plain.gaussians.means)
     assert torch.equal(mixed.gaussians.covariances, plain.gaussians.covariances)

@@ -21,22 +21,14 @@ from gsgan.benchmarks.effects_case import (
     scores_of,
     train,
 )
-from gsgan.benchmarks.effects_cost import (
-    load,
-    measure,
-    measure_untrained,
-    price_of_off,
-    spread,
-)
+from gsgan.benchmarks.effects_cost import measure
 from gsgan.benchmarks.environment import environment
 from gsgan.benchmarks.tables import check_block
 from gsgan.console import make_console
-from gsgan.effects.settings import CHOICES
 from gsgan.errors import ConfigError, GsganError
 
 DEFAULT, REAL = "default person", "real capture"
 STATES = ("off", "on")
-UNTRAINED_SPLIT = "novel_view"
 
 
 @dataclass(frozen=True)
@@ -47,8 +39,7 @@ class EffectsBench:
         base: overrides of `gsgan.train` that all runs share; the effects in question are off.
         budget: factor on the iterations, which ``base`` passes on.
         cases: by effect, the scene that calls for it.
-        only: effects to look at; None: all, and those ``timed``.
-        timed: effects that have no case: timed in the default scene, on and off, untrained.
+        only: effects to look at; None: all.
         train: train at all; without, only what `auto` decides is found out.
         default: train with each effect on the default person too, where it should gain nothing.
         real: folder of a real capture for ``real_effect``; None leaves it out.
@@ -57,7 +48,6 @@ class EffectsBench:
         real_split: held-out pictures of it that are scored.
         frames: held-out pictures painted in each round of timing.
         repeats: rounds of timing, off and on in turn.
-        off_ratio: what a forward pass with all effects off may take, in units of one without them.
         threads: of torch while timing; None: torch's choice.
         fresh: train again what the output folder holds.
         docs: a Markdown page whose ``bench:effects`` block is rewritten; None: none.
@@ -70,7 +60,6 @@ class EffectsBench:
     budget: float
     cases: dict[str, Case]
     only: list[str] | None
-    timed: list[str]
     train: bool
     default: bool
     real: str | None
@@ -79,7 +68,6 @@ class EffectsBench:
     real_split: str
     frames: int
     repeats: int
-    off_ratio: float
     threads: int | None = None
     fresh: bool = False
     docs: str | None = None
@@ -91,15 +79,10 @@ class EffectsBench:
                 continue
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ConfigError(f"{name} must be a whole number of at least 1, got {value!r}")
-        if isinstance(self.off_ratio, bool) or not self.off_ratio >= 1:
-            raise ConfigError(f"off_ratio must be a number of at least 1, got {self.off_ratio!r}")
         unknown = sorted(set(self.only or ()) - set(self.cases))
         if unknown or isinstance(self.only, str) or self.only == []:
             given = self.only if isinstance(self.only, str) else ", ".join(unknown)
             raise ConfigError(f"only must list some of {', '.join(self.cases)}; got {given!r}")
-        if isinstance(self.timed, str) or not set(self.timed) <= set(CHOICES) - set(self.cases):
-            left = ", ".join(name for name in CHOICES if name not in self.cases)
-            raise ConfigError(f"timed must list some of {left}; got {self.timed!r}")
         if self.real_effect not in self.cases:
             raise ConfigError(
                 f"real_effect must be one of {', '.join(self.cases)}, got {self.real_effect!r}"
@@ -113,13 +96,11 @@ class EffectsBench:
             "base",
             "budget",
             "only",
-            "timed",
             "train",
             "default",
             "real_base",
             "frames",
             "repeats",
-            "off_ratio",
         )
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name in told}
 
@@ -175,8 +156,8 @@ def run(config: DictConfig, folder: Path) -> None:
         folder: where everything goes; runs lie under ``runs/``.
 
     Raises:
-        GsganError: when a run fails; after all is written, when `auto` decided wrongly, an effect
-            that was called for gained nothing, or effects that are off cost too much.
+        GsganError: when a run fails; after all is written, when `auto` decided wrongly or an
+            effect that was called for gained nothing.
     """
     from hydra.utils import instantiate
 
@@ -189,13 +170,11 @@ def run(config: DictConfig, folder: Path) -> None:
     console.print(where.sentence(), highlight=False)
     todo = list(cells(bench))
     try:
-        ratio = work(bench, todo, folder / "runs", console)
-        untrained = timed(bench, console)
+        work(bench, todo, folder / "runs", console)
     except KeyboardInterrupt:
         console.print(f"the same command goes on with {folder}", soft_wrap=True, markup=False)
         raise
-    rows = [cell.row for cell in todo] + untrained
-    report = effects_report.Report(rows, ratio, bench.off_ratio, where)
+    report = effects_report.Report([cell.row for cell in todo], where)
     effects_report.write(report, folder, bench.settings())
     effects_report.show(report, console)
     if bench.docs is not None:
@@ -205,14 +184,14 @@ def run(config: DictConfig, folder: Path) -> None:
         raise GsganError("; ".join(report.failures))
 
 
-def work(bench: EffectsBench, todo: list[Cell], runs: Path, console: Console) -> float | None:
-    """Fills the rows; returns the price of all effects off, None where nothing was trained."""
+def work(bench: EffectsBench, todo: list[Cell], runs: Path, console: Console) -> None:
+    """Fills the rows."""
     trainings = list({t.name: t for cell in todo for t in cell.runs.values()}.values())
     scenes = list(dict.fromkeys(tuple(cell.scene) for cell in todo))
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
     metrics = {}
     with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
-        task = progress.add_task("", total=len(scenes) + len(trainings) + len(todo) + 1)
+        task = progress.add_task("", total=len(scenes) + len(trainings) + len(todo))
         for scene in scenes:
             here = [cell.row for cell in todo if tuple(cell.scene) == scene]
             progress.update(task, description=f"deciding in {here[0].scene}")
@@ -232,28 +211,3 @@ def work(bench: EffectsBench, todo: list[Cell], runs: Path, console: Console) ->
                 cell.row.marks = sorted({m for run in scored.values() for m in marks_of(run)})
                 measure(cell.row, cell.runs, runs, frames=bench.frames, repeats=bench.repeats)
             progress.advance(task)
-        progress.update(task, description="the price of effects that are off")
-        return _price_of_off(bench, todo, runs) if trainings else None
-
-
-def timed(bench: EffectsBench, console: Console) -> list[Row]:
-    """A row for each effect that has no case: what it costs, and what `auto` says of it."""
-    if not bench.train or bench.only is not None or not bench.timed:
-        return []
-    rows = []
-    with console.status("timing effects that have no scene of their own"):
-        for name, (auto, why) in decide(bench.base, bench.timed).items():
-            row = Row(name, DEFAULT, auto, auto, why, UNTRAINED_SPLIT)
-            measure_untrained(row, bench.base, frames=bench.frames, repeats=bench.repeats)
-            rows.append(row)
-    return rows
-
-
-def _price_of_off(bench: EffectsBench, todo: list[Cell], runs: Path) -> float:
-    """With a model that has nothing on but what the default scene had before there were effects."""
-    default = next((c for c in todo if c.row.scene == DEFAULT and c.runs), None)
-    cell = default or next(c for c in todo if c.runs)
-    avatar, data = load(cell.runs["off"], runs)
-    dataset = data.dataset(cell.row.split)
-    frames = [dataset[i] for i in spread(len(dataset), bench.frames)]
-    return price_of_off(avatar, frames, bench.repeats)

@@ -26,15 +26,10 @@ class Report:
 
     Args:
         rows: one an effect and scene.
-        off: time of a forward pass with all effects off, in units of one without the feature;
-            None where nothing was trained.
-        off_limit: what that may be.
         where: it was measured.
     """
 
     rows: list[Row]
-    off: float | None
-    off_limit: float
     where: Environment
 
     @property
@@ -49,11 +44,6 @@ class Report:
             gain = row.gain("full")
             if row.called and gain is not None and gain <= 0:
                 found.append(f"{name} gains {gain:+.2f} dB although it is called for")
-        if self.off is not None and self.off > self.off_limit:
-            found.append(
-                f"a forward pass with all effects off takes {self.off:.3f} times what one without "
-                f"the feature does (limit {self.off_limit:g})"
-            )
         return found
 
     @property
@@ -109,13 +99,6 @@ def text(report: Report) -> str:
         "painting and for reading from disk, off and on in turn, medians.",
         table(report),
     ]
-    if any(row.paint_ms and not row.scores for row in report.rows):
-        parts.append("Rows with times but no gain are of models before training.")
-    if report.off is not None:
-        parts.append(
-            f"A forward pass with all effects off takes {report.off:.3f} times what the same "
-            f"computation without the feature takes (limit {report.off_limit:g})."
-        )
     parts += [f"Stand-in in use: {mark}." for mark in report.marks]
     return "\n\n".join(parts)
 
@@ -130,7 +113,6 @@ def write(report: Report, folder: Path, settings: dict[str, Any]) -> None:
         "where": report.where.as_dict(),
         "settings": settings,
         "rows": rows,
-        "all_off_ratio": report.off,
         "failures": report.failures,
     }
     write_atomically(folder / "effects.json", json.dumps(record, indent=1))

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from gsgan.constants import constant
+
 
 def axis_angle_to_matrix(axis_angle: Tensor, small: float = 1e-6) -> Tensor:
     """Rotation matrices ``[..., 3, 3]`` of axis-angle vectors ``[..., 3]`` in radians.
@@ -99,7 +101,7 @@ def forward_kinematics(
     R, position = _accumulate(joints, parents, rotations, transl)
     shift = position - (R @ joints.unsqueeze(-1)).squeeze(-1)
     top = torch.cat([R, shift.unsqueeze(-1)], dim=-1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(*top.shape[:2], 1, 4)
+    bottom = constant((0.0, 0.0, 0.0, 1.0), top).expand(*top.shape[:2], 1, 4)
     return torch.cat([top, bottom], dim=-2)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -98,6 +98,8 @@ class CaptureDataset(Dataset[Frame]):
         crop: None for the full picture, padded to a square when a size is given.
         cache: shared between datasets of one layout, size and crop, without an item in two of them;
             None decodes every time.
+        skeletons: ``[33, 3]`` by frame, without gaps, see `complete_skeletons`; None takes the
+            capture's own, with NaN where a joint was not seen.
         lens: ``undistort``; ``ignore`` takes pictures as a pinhole's; ``raw`` leaves them as taken
             and says so in ``camera.dist`` (five coefficients; lenses with more are undistorted).
 
@@ -113,6 +115,7 @@ class CaptureDataset(Dataset[Frame]):
         crop: PersonCrop | None = None,
         cache: PictureCache | None = None,
         lens: Lens = "undistort",
+        skeletons: Mapping[int, NDArray[np.float64]] | None = None,
     ) -> None:
         if size is not None and (not isinstance(size, int) or size < 1):
             raise ConfigError(f"data.size must be a whole number of pixels above 0, got {size!r}")
@@ -122,6 +125,7 @@ class CaptureDataset(Dataset[Frame]):
         self.crop = crop
         self.lens = lens
         self.cache = cache or PictureCache(0)
+        self.skeletons = layout.landmarks.p if skeletons is None else skeletons
         self._indices = {name: i for i, name in enumerate(layout.camera_names)}
 
     def __len__(self) -> int:
@@ -138,13 +142,12 @@ class CaptureDataset(Dataset[Frame]):
         if picture is None:
             picture = self._load(item)
             self.cache.put(item, picture)
-        landmarks = self.layout.landmarks
         return Frame(
             image=_unit(picture.image)[None],
             mask=_unit(picture.mask)[None, None],
             camera=self.camera(item),
-            skeleton=_float(landmarks.p[frame]),
-            visibility=_float(landmarks.visibility[frame]),
+            skeleton=_float(self.skeletons[frame]),
+            visibility=_float(self.layout.landmarks.visibility[frame]),
             frame_id=torch.tensor([frame]),
             camera_index=torch.tensor([self._indices[name]]),
             body=self._body(frame),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from gsgan.data.layout import Checks, Layout
 from gsgan.data.protocol import Protocol
 from gsgan.data.sampler import StepSampler, pass_order
 from gsgan.data.scene_info import SceneInfo, count_labels, scene_info
+from gsgan.data.skeletons import complete_skeletons
 from gsgan.data.splits import SPLITS, Splits, make_splits, protocol_splits
 from gsgan.errors import ConfigError
 from gsgan.scene import Frame, cat
@@ -38,6 +40,8 @@ __all__ = [
 ]
 
 log = logging.getLogger(__name__)
+
+MOST_WORKERS = 8
 
 Reader = Callable[[str | Path, Checks, str | None], Layout]
 """A dataset's folder, what it must satisfy, the user's body model file: the layout."""
@@ -63,7 +67,8 @@ class GsganData(LightningDataModule):
         train_cameras, test_cameras, train_frames, test_frames, test_share: see `make_splits`.
         val_pictures: pictures watched while training.
         steps_per_epoch: batches an epoch; None is one pass over the training items.
-        workers: loading processes; 0 loads in this one.
+        workers: loading processes; 0 loads in this one; None: 0 without a GPU, else up to
+            `MOST_WORKERS`, as many as there are processors for each GPU.
         seed: of the order of training items.
         cache_mb: bound on decoded pictures kept in memory, all loading processes together.
         info_samples: pictures a camera from which the mean foreground colour is taken.
@@ -93,7 +98,7 @@ class GsganData(LightningDataModule):
         test_share: float = 0.2,
         val_pictures: int = 24,
         steps_per_epoch: int | None = None,
-        workers: int = 0,
+        workers: int | None = None,
         seed: int = 0,
         cache_mb: float = 1024,
         info_samples: int = 8,
@@ -123,7 +128,7 @@ class GsganData(LightningDataModule):
             _at_least("steps_per_epoch", steps_per_epoch, 1)
         self.steps_per_epoch = steps_per_epoch
         self.val_pictures = _at_least("val_pictures", val_pictures, 1)
-        self.workers = _at_least("workers", workers, 0)
+        self.workers = default_workers() if workers is None else _at_least("workers", workers, 0)
         self.seed = _at_least("seed", seed, 0)
         self.cache_mb = _at_least("cache_mb", cache_mb, 0)
         self.info_samples = _at_least("info_samples", info_samples, 1)
@@ -154,8 +159,12 @@ class GsganData(LightningDataModule):
         # every process has its own, and training and validation start their own workers
         limit = int(self.cache_mb * 2**20) // (2 * self.workers + 1)
         cache = PictureCache(limit)
+        trained = sorted({frame for _, frame in splits.items["train"]})
+        skeletons = complete_skeletons(layout, trained)
         self._datasets = {
-            name: CaptureDataset(layout, splits.items[name], self.size, self.crop, cache, self.lens)
+            name: CaptureDataset(
+                layout, splits.items[name], self.size, self.crop, cache, self.lens, skeletons
+            )
             for name in SPLITS
         }
         self._check_one_size()
@@ -305,6 +314,15 @@ class GsganData(LightningDataModule):
             worker_init_fn=_quiet_worker,
             persistent_workers=self.workers > 0 and sampler is not None,
         )
+
+
+def default_workers() -> int:
+    """Loading processes that keep a GPU busy and leave a processor to each training process."""
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if not gpus:
+        return 0
+    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    return max(0, min(MOST_WORKERS, processors // gpus - 1))
 
 
 def _root_not_set(wanted: str) -> str:

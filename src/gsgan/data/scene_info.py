@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -16,9 +16,11 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.capture import CaptureDataset
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
+from gsgan.data.skeletons import body_height, joints_of
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
 from gsgan.errors import DataError
+from gsgan.scene import Frame
 
 if TYPE_CHECKING:
     from gsgan.body import SkinnedBody
@@ -109,8 +111,7 @@ def scene_info(
         held_out: datasets of the held-out items; none of their pictures is looked at.
     """
     frames = sorted({frame for _, frame in splits.items["train"]})
-    p = torch.from_numpy(np.stack([layout.landmarks.p[f] for f in frames]))
-    valid = torch.from_numpy(np.stack([layout.landmarks.visibility[f] for f in frames])) > 0
+    p, valid = joints_of(layout, frames)
     middles = torch.stack([q[v].mean(0) for q, v in zip(p, valid, strict=True)])
     cameras = {camera for camera, _ in splits.items["train"]}
     tested = {camera for data in held_out for camera, _ in data.items} - cameras
@@ -131,7 +132,7 @@ def scene_info(
         n_labels=count_labels(layout, splits.items["train"]),
         label_names=layout.meta.label_names or (),
         foreground=foreground,
-        body_height=_body_height(p, valid),
+        body_height=body_height(p, valid),
         centre=centre,
         up_axis=layout.meta.up_axis,
         fps=layout.meta.fps,
@@ -149,12 +150,6 @@ def scene_info(
         darkest=darkest,
         body_inside=_body_inside(dataset, samples, mesh),
     )
-
-
-def _body_height(p: torch.Tensor, valid: torch.Tensor) -> float:
-    from gsgan.skeleton import limb_length_sum
-
-    return float(limb_length_sum(p, valid).nanmedian())
 
 
 def _triple(values: torch.Tensor) -> tuple[float, float, float]:
@@ -193,11 +188,13 @@ def foreground_colours(
     """
     colours, brightness = {}, []
     for camera, indices in _by_camera(dataset).items():
-        frames = [dataset[i] for i in _evenly(indices, samples)]
-        total = sum(f.image.double().sum((0, 2, 3)) for f in frames)
-        weight = sum(float(f.mask.double().sum()) for f in frames)
-        colours[camera] = _triple(torch.as_tensor(total) / max(weight, 1.0))
-        brightness += [f.image.amax(1, keepdim=True)[f.mask > SOLID] for f in frames]
+        total, weight = torch.zeros(3, dtype=torch.float64), 0.0
+        for index in _evenly(indices, samples):
+            frame = dataset[index]
+            total += frame.image.double().sum((0, 2, 3))
+            weight += float(frame.mask.double().sum())
+            brightness.append(frame.image.amax(1, keepdim=True)[frame.mask > SOLID])
+        colours[camera] = _triple(total / max(weight, 1.0))
     solid = torch.cat(brightness).numpy()
     return colours, float(np.percentile(solid, 1)) if solid.size else 0.0
 
@@ -273,5 +270,18 @@ def _shared_surface(
     shared = sorted({f for _, f in dataset.items if all((c, f) in index for c in cameras)})
     if len(cameras) < 2 or not shared:
         return None
-    moments = [[dataset[index[c, f]] for c in cameras] for f in _evenly(shared, samples)]
+    moments = [_Moment(dataset, [index[c, f] for c in cameras]) for f in _evenly(shared, samples)]
     return surface_colours(moments, mesh)
+
+
+class _Moment(Sequence[Frame]):
+    """Frames of one moment, each read when it is asked for: all of them at full size are GBs."""
+
+    def __init__(self, dataset: CaptureDataset, indices: Sequence[int]) -> None:
+        self.dataset, self.indices = dataset, indices
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    def __getitem__(self, place: Any) -> Any:
+        return self.dataset[self.indices[place]]

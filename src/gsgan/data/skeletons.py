@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from gsgan.data.files import LARGEST_FRAME
 from gsgan.errors import DataError
+from gsgan.skeleton import limb_length_sum, sanitise
+
+if TYPE_CHECKING:
+    from gsgan.data.layout import Layout
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -149,3 +155,30 @@ def fill_missing(p: Float, valid: Bool, ids: NDArray[np.int64]) -> Float:
         ahead = np.abs(ids[known[after]] - ids[holes])
         filled[holes, joint] = p[known[np.where(back <= ahead, before, after)], joint]
     return filled
+
+
+def joints_of(layout: Layout, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Joints ``[F, J, 3]`` metres and which of them were seen ``[F, J]`` bool, of some frames."""
+    marks = layout.landmarks
+    p, visibility = (np.stack([part[f] for f in frames]) for part in (marks.p, marks.visibility))
+    return torch.from_numpy(p), torch.from_numpy(visibility) > 0
+
+
+def body_height(p: Tensor, valid: Tensor) -> float:
+    """Metres: the summed limb lengths, median over frames, see `limb_length_sum`."""
+    return float(limb_length_sum(p, valid).nanmedian())
+
+
+def complete_skeletons(layout: Layout, trained: Sequence[int]) -> dict[int, Float]:
+    """Every frame's joints ``[J, 3]`` metres, stand-ins in place of those that were not seen.
+
+    Done once for a capture, so that no frame is repaired while it is painted: some templates'
+    joints no body model has (the mouth), so with SMPL every frame would be.
+
+    Args:
+        layout: the capture.
+        trained: frames that set the body's height, which says how long the missing bones are.
+    """
+    height = body_height(*joints_of(layout, trained))
+    p, _ = sanitise(*joints_of(layout, layout.frames), body_height=height)
+    return dict(zip(layout.frames, p.numpy(), strict=True))

@@ -64,13 +64,14 @@ def surface_colours(
 
     Args:
         moments: of each, one frame a camera, the same cameras in the same order, pictures of any
-            size.
+            size. No two frames are held at once, so sequences that read them from disk take little
+            memory.
         body: the mesh that the frames' poses move; None takes the visual hull.
 
     Returns:
         None where no two cameras share enough, or pictures are too coarse.
     """
-    if not moments or max(map(_pixel, moments[0])) > COARSEST:
+    if not moments or max(_pixel(frame) for frame in moments[0]) > COARSEST:
         return None
     found: dict[tuple[int, int], list[Float]] = {}
     with torch.no_grad():

@@ -33,7 +33,7 @@ def draw(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings)
         raise Unavailable("the data has no part labels")
     able = [subject for subject in subjects if subject.parts(shots[0]) is not None]
     if not able:
-        why = subjects[0].avatar.effects.segmentation.why
+        why = subjects[0].avatar.segmentation_why
         raise Unavailable(f"{subjects[0].name} has no segmentation S: {why}")
     maps = [_segmentation(subject).map for subject in able]
     for subject, other in zip(able, maps, strict=True):

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 from hydra.utils import instantiate
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from torch import Tensor
 
 from gsgan.data.datamodule import GsganData
@@ -16,12 +17,22 @@ from gsgan.data.splits import Item
 from gsgan.drawing.shots import Shot
 from gsgan.errors import ConfigError, DataError
 from gsgan.model.avatar import Avatar, Painting
-from gsgan.runs import CHECKPOINT, Moved, build_data, load_avatar, load_config, read_checkpoint
+from gsgan.paper import NAME, departures, flat
+from gsgan.runs import (
+    CHECKPOINT,
+    Moved,
+    build_data,
+    load_avatar,
+    load_config,
+    read_checkpoint,
+    record,
+)
+from gsgan.scoring.facts import choices
 from gsgan.training.schedule import Schedule
 
 # A model's name in print.
 TITLES = {
-    "full": "GaussianGAN",
+    "full": "gsgan",
     "wo_seg": "w/o S",
     "wo_gcn": "w/o GCN",
     "wo_feat": "w/o L_feat",
@@ -68,8 +79,12 @@ class Subject:
             with torch.no_grad():
                 painting = self.avatar.paint(shot.frame.to(device))
             # of F only the colour is shown: thirty channels of every shot would fill the memory
-            kept = replace(
-                painting, features=painting.colour, alpha=None, corrected=None, depth=None
+            colour = painting.colour
+            kept = Painting(
+                painting.image,
+                features=colour,
+                segmentation=painting.segmentation,
+                gaussians=painting.gaussians,
             )
             self._painted[shot.item] = _finite(_on_cpu(kept), self.folder, shot)
         return self._painted[shot.item]
@@ -162,8 +177,11 @@ def _open(folder: Path, moved: Moved, device: torch.device | str) -> Subject:
     config = load_config(folder, moved)
     data = build_data(config)
     avatar, marks = load_avatar(folder, config, data)
-    model = _model(folder)
+    chosen = choices(folder)
+    model = str(chosen.get("model") or folder.resolve().name)
     name = TITLES.get(model, model)
+    if model == "full" and not departures(_settings(config), model, str(chosen.get("data"))):
+        name = NAME
     step = int(read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"])
     total = _iterations(config, avatar)
     return Subject(name, model, folder, config.seed, data, avatar.to(device), marks, step, total)
@@ -176,11 +194,10 @@ def _iterations(config: DictConfig, avatar: Avatar) -> int:
     return stretched + (0 if avatar.segmentation is None else schedule.segmentation)
 
 
-def _model(folder: Path) -> str:
-    """Which choice of the model group a run was started with."""
-    path = folder / ".hydra" / "hydra.yaml"
-    stored = OmegaConf.load(path) if path.is_file() else DictConfig({})
-    return str(OmegaConf.select(stored, "hydra.runtime.choices.model") or folder.resolve().name)
+def _settings(config: DictConfig) -> dict[str, Any]:
+    config = config.copy()
+    config.seed = 0
+    return dict(flat(record(config)))
 
 
 def _distinct(subjects: Sequence[Subject]) -> list[str]:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from gsgan.data.scene_info import SceneInfo
 
 FORCED = "the config says so"
-HAND = "hand"
 TOO_LITTLE = "too little surface is shared by two cameras, or pictures are too coarse, to tell"
 
 
@@ -39,12 +38,8 @@ def decide(info: SceneInfo, settings: EffectSettings) -> Effects:
         ConfigError: when an effect is forced that the scene cannot have.
     """
     found = {name: _one(name, info, settings) for name in CHOICES}
-    return Effects(
-        **found,
-        hands=Effect(OFF, f"the skeleton ({info.skeleton}) has no finger joints"),
-        face=Effect("on", f"the skeleton ({info.skeleton}) has a face"),
-        cameras=info.train_cameras if found["colour_correction"].on else (),
-    )
+    cameras = info.train_cameras if found["colour_correction"].on else ()
+    return Effects(**found, cameras=cameras)
 
 
 def _one(name: str, info: SceneInfo, settings: EffectSettings) -> Effect:
@@ -140,17 +135,6 @@ def _colour_correction(info: SceneInfo, settings: EffectSettings, wish: str | in
     return Effect("on", f"{said} (limit {max(noise, settings.colour_difference):.3f})")
 
 
-def _segmentation(info: SceneInfo, settings: EffectSettings, wish: str | int) -> Effect:
-    if not info.has_body_pose:
-        if wish != AUTO:
-            raise Impossible("the data has no body pose")
-        return Effect(OFF, "the data has no body pose")
-    mode = "hands" if wish == "hands" else "body"
-    if mode == "hands" and info.label_names and not any(HAND in n for n in info.label_names):
-        raise Impossible(f"no part of the data is a hand ({', '.join(info.label_names)})")
-    return Effect(mode, "the data has a body pose", forced=wish != AUTO)
-
-
 def _body_points(info: SceneInfo, settings: EffectSettings, wish: str | int) -> Effect:
     if not info.has_body_pose:
         if wish != AUTO:
@@ -176,19 +160,11 @@ def _random_background(info: SceneInfo, settings: EffectSettings, wish: str | in
     return Effect(OFF, f"{said} (limit {settings.dark:g})")
 
 
-def _depth(info: SceneInfo, settings: EffectSettings, wish: str | int) -> Effect:
-    if wish != AUTO:
-        return Effect("on", FORCED, forced=True)
-    return Effect(OFF, "nothing in training reads it")
-
-
 _RULES: dict[str, Callable[[SceneInfo, EffectSettings, str | int], Effect]] = {
     "view_dependence": _view_dependence,
     "distortion": _distortion,
     "antialias": _antialias,
     "colour_correction": _colour_correction,
-    "segmentation": _segmentation,
     "body_points": _body_points,
     "random_background": _random_background,
-    "depth": _depth,
 }

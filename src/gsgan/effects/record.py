@@ -43,11 +43,8 @@ class Effects:
         distortion: ``undistort``, or ``project``: pictures stay as taken, Gaussians follow.
         antialias: opacities make up for the rasteriser's low-pass.
         colour_correction: an affine map of colours a training camera.
-        segmentation: ``body`` or ``hands``.
         body_points: G sits on the surface of the posed body, not on the skeleton's shapes.
         random_background: Step I compares pictures over a random colour.
-        depth: the rasteriser returns depth.
-        hands, face: points on fingers and face, as the skeleton has them; nothing to choose.
         cameras: training cameras in the order of the colour corrections.
     """
 
@@ -55,12 +52,8 @@ class Effects:
     distortion: Effect = _DEFAULT
     antialias: Effect = _DEFAULT
     colour_correction: Effect = _DEFAULT
-    segmentation: Effect = _DEFAULT
     body_points: Effect = _DEFAULT
     random_background: Effect = _DEFAULT
-    depth: Effect = _DEFAULT
-    hands: Effect = _DEFAULT
-    face: Effect = _DEFAULT
     cameras: tuple[str, ...] = ()
 
     def __iter__(self) -> Iterator[tuple[str, Effect]]:

@@ -14,10 +14,8 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "distortion": (*ON_OFF, "undistort", "project"),
     "antialias": ON_OFF,
     "colour_correction": ON_OFF,
-    "segmentation": (*ON_OFF, "body", "hands"),
     "body_points": ON_OFF,
     "random_background": ON_OFF,
-    "depth": ON_OFF,
 }
 
 
@@ -33,10 +31,9 @@ class EffectSettings:
         distortion: ``auto``, ``off`` (pictures are taken as a pinhole's), ``undistort`` (or ``on``:
             pictures are undistorted on reading), or ``project`` (pictures stay as taken: Gaussians
             and joints follow the lens).
-        antialias, colour_correction, body_points, random_background, depth: ``auto``, ``on``,
-            ``off``.
-        segmentation: ``auto``, ``off``, ``body`` (or ``on``: all parts), ``hands`` (those alone).
-        only: names of effects: these are on, all others off, whatever else is said; None: no list.
+        antialias, colour_correction, body_points, random_background: ``auto``, ``on``, ``off``.
+        only: names of effects: these are on, all others off, whatever else is said, except that
+            lenses are followed as ``distortion`` says; None: no list.
         impossible: what becomes of a forced effect that this scene cannot have: ``error``, ``off``.
         view_residual: see ``auto``; likewise the others.
         view_spread: degrees.
@@ -57,10 +54,8 @@ class EffectSettings:
     distortion: str | bool = AUTO
     antialias: str | bool = AUTO
     colour_correction: str | bool = AUTO
-    segmentation: str | bool = AUTO
     body_points: str | bool = AUTO
     random_background: str | bool = AUTO
-    depth: str | bool = AUTO
     only: Sequence[str] | None = None
     impossible: str | bool = "error"
     view_residual: float = 0.09
@@ -105,8 +100,8 @@ class EffectSettings:
         said: str | int = getattr(self, name)
         if self.only is None:
             return said
-        if name not in self.only:
-            return "off"
+        if name not in self.only:  # a lens is the camera's, not a choice
+            return said if name == "distortion" else "off"
         return "on" if said in (AUTO, "off", 0) else said
 
 

@@ -15,12 +15,8 @@ NAMED = {
     "distortion": "lens distortion",
     "antialias": "anti-aliasing",
     "colour_correction": "colour correction",
-    "segmentation": "segmentation S",
     "body_points": "points on the body",
     "random_background": "random background",
-    "depth": "depth",
-    "hands": "finger points",
-    "face": "face points",
 }
 UNKNOWN = "–"
 

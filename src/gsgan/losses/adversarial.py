@@ -1,4 +1,4 @@
-"""The GAN game and feature matching (paper Sec. 3.6)."""
+"""The GAN game and feature matching (paper Sec. 3.5)."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def feature_matching(real: Maps, fake: Maps) -> Tensor:
 
     Weighted as pix2pixHD: 4 / (number of maps) for each map, mean over scales.
 
-    Source: paper Sec. 3.6.
+    Source: paper Sec. 3.5.
     """
     loss = real[0][0].new_zeros(())
     for real_scale, fake_scale in zip(real, fake, strict=True):

@@ -35,7 +35,7 @@ class Perceptual(nn.Module):
         ConfigError: on an unknown ``weights``.
         DataError: when ``vgg16`` was asked for and its file is not there.
 
-    Source: paper Sec. 3.6.
+    Source: paper Sec. 3.5.
     """
 
     mean: Tensor

@@ -20,7 +20,7 @@ from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
 from gsgan.model.painting import Painting
 from gsgan.model.parts import labelled_body
-from gsgan.model.segmentation import Segmentation, mode_of
+from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
 from gsgan.precision import full_precision
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians
@@ -32,9 +32,10 @@ from gsgan.skeleton import (
     bone_frames,
     draw_skeleton,
     omega,
-    sanitise,
+    root_of,
 )
-from gsgan.splat import Accuracy, rasterise
+from gsgan.splat import BACKENDS, Accuracy, rasterise
+from gsgan.splat.checks import checks_for
 from gsgan.window import Window, body_window
 
 if TYPE_CHECKING:
@@ -69,10 +70,9 @@ class Avatar(nn.Module):
         pose_encoder: Ω (or the flat skeleton) to g; None in ``splat_only``.
         generator: the UNet, given its channel counts; None makes Step I's colour the picture.
         accuracy: the rasteriser's settings for F.
-        low_pass: square pixels, of the picture as drawn, that F and S add to every ellipse; None
-            keeps their accuracy's.
-        supersample: F is drawn so many times larger each way and averaged; None keeps what its
-            accuracy says.
+        low_pass: square pixels, of the picture as drawn, that F and S add to every ellipse.
+        supersample: F is drawn so many times larger each way and averaged.
+        backend: who rasterises F and S, see `gsgan.splat.rasterise`.
         twist: how bone frames turn about their bones, ``none`` or ``hinge``.
         window_margin: metres round the joints that are painted; None paints whole pictures.
         window_multiple: the window's sides are multiples of so many pixels.
@@ -84,12 +84,11 @@ class Avatar(nn.Module):
         effects: what the scene calls for; None decides it here, with the settings' defaults. Those
             that this model cannot have are taken out.
 
-    Source: paper Fig. 2 and Sec. 3.
+    Source: paper Fig. 3 and Sec. 3.
     """
 
-    # Exchanged by benches: what each stage runs in, by its name, and who rasterises F.
+    # Exchanged by benches: what each stage runs in, by its name.
     stage: Callable[[str], AbstractContextManager[None]] = staticmethod(unwatched)
-    backend = "auto"
 
     def __init__(
         self,
@@ -102,8 +101,9 @@ class Avatar(nn.Module):
         accuracy: Accuracy,
         surface: Callable[..., SurfaceGaussians] | None = None,
         body_points: Callable[..., BodyPoints] | None = None,
-        low_pass: float | None = None,
-        supersample: int | None = None,
+        low_pass: float = 0.3,
+        supersample: int = 1,
+        backend: str = "auto",
         twist: Literal["none", "hinge"] = "none",
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
@@ -116,10 +116,10 @@ class Avatar(nn.Module):
         super().__init__()
         self.effects = decide(scene, EffectSettings()) if effects is None else effects
         self.effects = _possible(self.effects, densify is not None, surface is not None)
-        self.low_pass = low_pass
-        self.accuracy = self._image_formation(accuracy)
-        if supersample is not None:
-            self.accuracy = replace(self.accuracy, supersample=supersample)
+        if backend not in BACKENDS:
+            raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+        self.low_pass, self.backend = low_pass, backend
+        self.accuracy = replace(self._image_formation(accuracy), supersample=supersample)
         self.template, self.twist = MEDIAPIPE33, twist
         self.window_margin = window_margin
         self.window_multiple, self.window_least = window_multiple, window_least
@@ -219,28 +219,21 @@ class Avatar(nn.Module):
         pictures: Pictures | None,
         vertex_labels: Tensor | None,
     ) -> Segmentation | None:
-        if build is None or mode_of(build) == "none":
-            self.effects = self.effects.without("segmentation", "the model leaves it out")
-        wanted = self.effects.segmentation
-        if build is None or not wanted.on:
+        self.segmentation_why = "the model leaves it out"
+        if build is None:
             return None
-        body, why = labelled_body(scene, vote, pictures, vertex_labels)
+        body, self.segmentation_why = labelled_body(scene, vote, pictures, vertex_labels)
         if body is None:
-            self.effects = self.effects.without("segmentation", why)
             return None
-        said_so = wanted.forced or wanted.value == "hands"
-        mode = str(wanted.value) if said_so else mode_of(build)
-        said = replace(wanted, value=mode, why=f"{wanted.why}; {why}")
-        self.effects = replace(self.effects, segmentation=said)
-        built = build(body=body, mode=mode)
-        built.accuracy = self._image_formation(built.accuracy)
+        built = build(body=body, labelled=scene.has_labels)
+        built.accuracy, built.backend = self._image_formation(built.accuracy), self.backend
         return built
 
     def _image_formation(self, accuracy: Accuracy) -> Accuracy:
         """How pixels are formed is the model's and the scene's, whatever may be left out."""
         return replace(
             accuracy,
-            low_pass=accuracy.low_pass if self.low_pass is None else self.low_pass,
+            low_pass=self.low_pass,
             antialias=accuracy.antialias or self.effects.antialias.on,
         )
 
@@ -260,8 +253,9 @@ class Avatar(nn.Module):
         """Paints the pose.
 
         Args:
-            skeleton: ``[B, J, 3]`` metres, world.
-            visibility: ``[B, J]`` in [0, 1]; 0 marks a joint that was not seen.
+            skeleton: ``[B, J, 3]`` metres, world, finite: see `gsgan.skeleton.sanitise` for joints
+                that were not seen, which the data module stands in for when it opens a capture.
+            visibility: ``[B, J]`` in [0, 1]; 0 marks a stand-in.
             camera: B cameras.
             body: pose of the skinned body; needed when S was built.
             pose_noise: ``[B, J, 3]`` body heights, added to Ψ's pose code (training only).
@@ -277,7 +271,7 @@ class Avatar(nn.Module):
         paints = paint and self.generator is not None
         with full_precision(skeleton):
             with self.stage("skeleton"):
-                p, valid = sanitise(skeleton, visibility, self.template, self.limb_sum)
+                p, valid = skeleton, visibility > 0
                 frames = bone_frames(p, valid, self.template, twist=self.twist)
 
             gaussians = self.splat(p, valid, frames, camera, body, pose_noise)
@@ -289,40 +283,44 @@ class Avatar(nn.Module):
                         camera,
                         settings=self.accuracy,
                         backend=self.backend,
-                        depth=self.effects.depth.on,
+                        on_invalid=checks_for(skeleton.device),
                     )
             S = self.segment(body, camera) if paints else None  # Sec. 3.4
             p2d = self.draw(p, valid, camera, picture_height) if paints else None
             pose = self.pose_inputs(p, valid, frames, camera) if paints else None
 
         F = None if raster is None else raster.features
-        image = F[:, :3] if self.generator is None and F is not None else None
+        image = alpha = None
+        if self.generator is None and raster is not None:
+            image, alpha = raster.features[:, :3], raster.alpha
         if paints:  # Sec. 3.5
             with self.stage("pose encoder"):
                 g = self.pose_encoder(*pose)  # type: ignore[misc]
             with self.stage("UNet"):
-                if F is None:  # image_to_image: the drawing stands in F's place
-                    image = self.generator(p2d, S, None, g).to(skeleton.dtype)  # type: ignore[misc]
+                if raster is None:  # image_to_image: the drawing stands in F's place
+                    inputs = (p2d, S, None, g)
                 else:
-                    seen, fine = F, raster.fine  # type: ignore[union-attr]
+                    seen = (raster.features, raster.fine, raster.alpha)
                     if detach_features:
-                        seen, fine = F.detach(), None if fine is None else fine.detach()
-                    image = self.generator(seen, S, p2d, g, fine).to(F.dtype)  # type: ignore[misc]
+                        seen = tuple(None if x is None else x.detach() for x in seen)  # type: ignore[assignment]
+                    inputs = (seen[0], S, p2d, g, *seen[1:])  # type: ignore[assignment]
+                painted = self.generator(*inputs).to(skeleton.dtype)  # type: ignore[misc]
+            image, alpha = painted[:, :3], painted[:, 3:]
         if raster is None:
-            return Painting(image, F, None, S, gaussians)
-        painting = Painting(image, F, raster.alpha, S, gaussians, depth=raster.depth)
+            return Painting(image, alpha, segmentation=S)
+        painting = Painting(image, alpha, F, raster.alpha, S, gaussians)
         return self.as_taken(painting, camera_index)
 
     def as_taken(self, painting: Painting, camera_index: Tensor | None) -> Painting:
         """The painting in the colours of its cameras: the one place where they are corrected."""
         if self.colour is None or camera_index is None or painting.features is None:
             return painting
-        assert painting.alpha is not None
-        colour = self.colour(painting.features[:, :3], painting.alpha, camera_index)
+        assert painting.splat_alpha is not None
+        colour = self.colour(painting.features[:, :3], painting.splat_alpha, camera_index)
         image = painting.image
         if self.generator is None:
             image = colour
-        elif image is not None:
+        elif image is not None and painting.alpha is not None:
             image = self.colour(image, painting.alpha, camera_index)
         return replace(painting, image=image, corrected=colour)
 
@@ -386,9 +384,8 @@ class Avatar(nn.Module):
         if self.window_margin is None:
             return None
         with self.stage("window"), full_precision(frame.skeleton):
-            p, _ = sanitise(frame.skeleton, frame.visibility, self.template, self.limb_sum)
             return body_window(
-                p,
+                frame.skeleton,
                 frame.camera,
                 margin=self.window_margin,
                 multiple=self.window_multiple,
@@ -416,7 +413,7 @@ class Avatar(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Ω ``[B, J, 6]``, and the joints about the root in camera axes and body heights."""
         with self.stage("Ω"):
-            root = p[:, 23:25].mean(dim=1, keepdim=True)
+            root = root_of(p, self.template).unsqueeze(1)
             in_camera = (p - root) @ camera.R.mT / self.body_height
             return omega(p, valid, camera.R, self.template, frames=frames), in_camera
 
@@ -424,10 +421,9 @@ class Avatar(nn.Module):
 def _possible(effects: Effects, densifies: bool, on_surface: bool) -> Effects:
     """Without the effects on points and Gaussians that this model does not have."""
     if not densifies:
-        for name in ("body_points", "hands", "face"):
-            effects = effects.without(name, "this model puts no points on the skeleton")
+        effects = effects.without("body_points", "this model puts no points on the skeleton")
     if densifies or on_surface:
         return effects
-    for name in ("view_dependence", "antialias", "colour_correction", "random_background", "depth"):
+    for name in ("view_dependence", "antialias", "colour_correction", "random_background"):
         effects = effects.without(name, "this model splats nothing")
     return effects

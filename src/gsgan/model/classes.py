@@ -12,7 +12,7 @@ from gsgan.body.smpl_names import group_of_part
 from gsgan.errors import ConfigError
 
 IGNORE = 255
-MODES = ("body", "hands", "none")
+MODES = ("body", "hands")
 HANDS = ("left_hand", "right_hand")
 FACE = "face_neck"
 
@@ -64,8 +64,8 @@ def class_map(
     Raises:
         ConfigError: on another mode, or when a hand or face is wanted that no label names.
     """
-    if mode not in MODES[:2]:
-        raise ConfigError(f"model.segmentation.mode must be {', '.join(MODES)}; got {mode!r}")
+    if mode not in MODES:
+        raise ConfigError(f"model.segmentation.mode must be {' or '.join(MODES)}; got {mode!r}")
     if mode == "hands":
         return _hands(label_names, face)
     present = set(vertex_labels.unique().tolist()) - {0}

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from gsgan.precision import full_precision
+
 
 class ColourCorrection(nn.Module):
     """An affine map of colours a training camera; cameras that never trained keep the picture.
@@ -46,13 +48,14 @@ class ColourCorrection(nn.Module):
         return torch.cat([affine, identity[None]])[self.rows[camera_index]]
 
     def forward(self, picture: Tensor, alpha: Tensor, camera_index: Tensor) -> Tensor:
-        """The picture as these cameras take it: ``A c + b alpha``.
+        """The picture as these cameras take it: ``A c + b alpha``. Autocast has no effect.
 
         Args:
             picture: ``[B, 3, H, W]`` RGB on black.
             alpha: ``[B, 1, H, W]``.
             camera_index: ``[B]`` int64.
         """
-        affine = self.of_cameras(camera_index).to(picture.dtype)
-        mixed = torch.einsum("bij,bjhw->bihw", affine[..., :3], picture)
-        return mixed + affine[..., 3, None, None] * alpha
+        with full_precision(picture):
+            affine = self.of_cameras(camera_index).to(picture.dtype)
+            mixed = torch.einsum("bij,bjhw->bihw", affine[..., :3], picture)
+            return mixed + affine[..., 3, None, None] * alpha

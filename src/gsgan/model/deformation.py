@@ -10,9 +10,11 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor, nn
 from torch.nn import functional
 
+from gsgan.constants import constant
+from gsgan.model.bounded import bounded
 from gsgan.model.encoding import encoded_size, positional_encoding
 from gsgan.scene import Gaussians
-from gsgan.skeleton import Points
+from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
 
 QUAT_FLOOR = 1e-12  # added under the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
@@ -56,8 +58,9 @@ class Deformation(nn.Module):
             says nothing of the subject's heading.
         opacity: initial opacity of every point.
         mean_bound: body heights a mean may leave its point by; None lifts the bound.
-        scale_min, scale_max: body heights, the range of every scale.
-        logit_bound: opacity logits are kept within ± this, where the sigmoid still has a gradient.
+        scale_min, scale_max: body heights, the range of every scale (`bounded`).
+        logit_bound: opacity logits are kept within ± this, where the sigmoid still has a gradient
+            (`bounded`).
 
     Source: paper Sec. 3.3; the table beside the MLP is ours.
     """
@@ -170,13 +173,12 @@ class Deformation(nn.Module):
         offset = offset * self.body_height
         means = points.means + (frames @ offset.unsqueeze(-1)).squeeze(-1)
         low, high = (math.log(bound * self.body_height) for bound in self.scale_range)
-        scales = (points.scales.log().unsqueeze(-1) + residuals.scales).clamp(low, high).exp()
+        scales = bounded(points.scales.log().unsqueeze(-1) + residuals.scales, low, high).exp()
         axes = frames @ quaternion_to_rotation_matrix(_unit_quat(residuals.quats))
         axes = axes * scales.unsqueeze(-2)
         logit = math.log(self.opacity / (1 - self.opacity))
-        opacities = torch.sigmoid(
-            (logit + residuals.opacities).clamp(-self.logit_bound, self.logit_bound)
-        )
+        logits = bounded(logit + residuals.opacities, -self.logit_bound, self.logit_bound)
+        opacities = torch.sigmoid(logits)
         view = means  # at degree 0 a colour has no direction
         if residuals.sh.shape[-2] > 1:
             view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
@@ -217,12 +219,12 @@ class Deformation(nn.Module):
         noise: Tensor | None = None,
     ) -> Gaussians:
         """Ĝ for joints ``p`` ``[B, J, 3]``, seen from ``eye`` ``[B, 3]`` (both world, metres)."""
-        root = p[:, 23:25].mean(dim=1)
+        root = root_of(p)
         residuals = self.residuals(points, self.pose_code(p, root, pelvis, noise), root)
         return self.compose(points, residuals, eye)
 
 
 def _unit_quat(residual: Tensor) -> Tensor:
     """(1, 0, 0, 0) + δq, w x y z, of length one; finite where the sum vanishes."""
-    quat = residual + residual.new_tensor([1.0, 0.0, 0.0, 0.0])
+    quat = residual + constant((1.0, 0.0, 0.0, 0.0), residual)
     return quat * torch.rsqrt(quat.square().sum(-1, keepdim=True) + QUAT_FLOOR)

@@ -1,4 +1,4 @@
-"""The multi-scale patch discriminator, whose features also serve L_feat (paper Sec. 3.6)."""
+"""The multi-scale patch discriminator, whose features also serve L_feat (paper Sec. 3.5)."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Discriminator(nn.Module):
         scales: judges; each sees the picture halved once more.
         base, layers, norm: as `PatchDiscriminator`.
 
-    Source: paper Sec. 3.6.
+    Source: paper Sec. 3.5; scales, widths and normalisation are pix2pixHD's.
     """
 
     def __init__(

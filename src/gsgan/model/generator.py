@@ -81,7 +81,7 @@ class DecoderLevel(nn.Module):
 
 
 class Generator(nn.Module):
-    """F ⊕ S ⊕ p₂D and g to the picture.
+    """F ⊕ S ⊕ p₂D and g to the picture and its alpha.
 
     Args:
         feature_channels: channels of F, colour included.
@@ -95,13 +95,13 @@ class Generator(nn.Module):
         style: what scales and shifts the decoder: ``film``, at every pixel by E_s(F) and g, or
             ``pose``, by g alone: E_s is then not built.
         style_share: E_s's width as a share of E_c's.
-        rgb_skip: paint a correction of Step I's colour instead of the whole picture; the last
-            layer then starts at zero, and training from Step I's picture.
+        rgb_skip: paint a correction of Step I's colour and alpha instead of the whole picture;
+            the last layer then starts at zero, and training from Step I's picture.
         output: ``linear`` (clamped only when shown: an all-black start can recover) or
             ``sigmoid``.
         feature_bound: F is clamped to ± this before it enters (half precision overflows).
 
-    Source: paper Sec. 3.5; sizes, style and the linear output are ours where it is silent.
+    Source: paper Sec. 3.5; sizes, style, the linear output and alpha are ours where it is silent.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class Generator(nn.Module):
             DecoderLevel(channels[i + 1], channels[i], widths[i], pose_channels)
             for i in reversed(range(len(channels) - 1))
         )
-        self.paint = nn.Conv2d(channels[0], 3, 3, padding=1)
+        self.paint = nn.Conv2d(channels[0], 4, 3, padding=1)
         if rgb_skip:
             start_at_zero(self.paint)
 
@@ -155,8 +155,9 @@ class Generator(nn.Module):
         p2d: Tensor | None,
         g: Tensor,
         fine: Tensor | None = None,
+        alpha: Tensor | None = None,
     ) -> Tensor:
-        """I_pred ``[B, 3, H, W]``, not clamped.
+        """I_pred on black and its alpha, ``[B, 4, H, W]``, not clamped.
 
         Args:
             F: ``[B, C, H, W]`` rendered features, the first three channels Step I's colour.
@@ -164,9 +165,11 @@ class Generator(nn.Module):
             p2d: ``[B, 8, H, W]`` the drawn skeleton; None when it is F already (image_to_image).
             g: ``[B, 35]`` the pose code.
             fine: ``[B, C, kH, kW]``, F before it was averaged; given where built to supersample.
+            alpha: ``[B, 1, H, W]`` of F; given where built with ``rgb_skip``.
 
         Raises:
-            ValueError: when ``fine`` is missing, not expected, or of another size.
+            ValueError: when ``fine`` is missing, not expected, or of another size, or alpha is
+                missing.
         """
         height, width = F.shape[-2:]
         self._check_fine(height, width, fine)
@@ -184,7 +187,9 @@ class Generator(nn.Module):
             h = level(h, skips[-2 - i], styles[-2 - i], g)
         painted = self.paint(h)[..., :height, :width]
         if self.rgb_skip:
-            return F[:, :3] + painted
+            if alpha is None:
+                raise ValueError("Generator: built with rgb_skip=True, so alpha must be given")
+            return torch.cat([F[:, :3], alpha], dim=1) + painted
         return torch.sigmoid(painted) if self.output == "sigmoid" else painted
 
     def _check_fine(self, height: int, width: int, fine: Tensor | None) -> None:

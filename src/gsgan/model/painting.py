@@ -16,24 +16,25 @@ class Painting:
     """What an avatar makes of one pose seen by one camera.
 
     Args:
-        image: ``[B, 3, H, W]`` I_pred on black, not clamped; None when only Step I was asked for.
+        image: ``[B, 3, H, W]`` I_pred on black, not clamped; None when only Step I was requested.
+        alpha: ``[B, 1, H, W]`` of ``image``, not clamped: the generator's fourth channel, or the
+            splats' alpha where their colour is the image.
         features: ``[B, C, H, W]`` F on black; the first three channels are Step I's colour. None,
-            like alpha and gaussians, where nothing is splatted (``image_to_image``).
-        alpha: ``[B, 1, H, W]``.
+            like splat_alpha and gaussians, where nothing is splatted (``image_to_image``).
+        splat_alpha: ``[B, 1, H, W]`` of F.
         segmentation: ``[B, classes, H, W]`` S, or None where it was not built.
         gaussians: Ĝ.
         corrected: ``[B, 3, H, W]`` Step I's colour as the camera takes it, where colours are
             corrected; F stays as it was.
-        depth: ``[B, 1, H, W]`` metres times alpha, where the effect is on.
     """
 
     image: Tensor | None
-    features: Tensor | None
-    alpha: Tensor | None
-    segmentation: Tensor | None
-    gaussians: Gaussians | None
+    alpha: Tensor | None = None
+    features: Tensor | None = None
+    splat_alpha: Tensor | None = None
+    segmentation: Tensor | None = None
+    gaussians: Gaussians | None = None
     corrected: Tensor | None = None
-    depth: Tensor | None = None
 
     @property
     def colour(self) -> Tensor | None:
@@ -55,9 +56,9 @@ class Painting:
         return replace(
             self,
             image=paste(self.image),
-            features=paste(self.features),
             alpha=paste(self.alpha),
+            features=paste(self.features),
+            splat_alpha=paste(self.splat_alpha),
             segmentation=parts,
             corrected=paste(self.corrected),
-            depth=paste(self.depth),
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -15,11 +14,12 @@ from gsgan.body import SkinnedBody
 from gsgan.model.classes import IGNORE, class_map
 from gsgan.model.skinned_points import SkinnedPoints
 from gsgan.precision import full_precision
-from gsgan.scene import BodyPose, Camera, Gaussians
+from gsgan.scene import BodyPose, Camera, Gaussians, Raster
 from gsgan.splat import accuracy as named_accuracy
 from gsgan.splat import rasterise
+from gsgan.splat.checks import checks_for
 
-__all__ = ["IGNORE", "Segmentation", "mode_of", "segmentation_loss"]
+__all__ = ["IGNORE", "Segmentation", "segmentation_loss", "silhouette_loss"]
 
 
 class Segmentation(nn.Module):
@@ -38,8 +38,12 @@ class Segmentation(nn.Module):
         opacity: initial opacity.
         scale: initial standard deviation, as a share of the distance to the nearest neighbour.
         accuracy: the rasteriser's settings.
+        labelled: whether the data has part labels, from which every shape and opacity learns.
+            Without them one factor on all scales and one on all opacities learn from the masks:
+            free shapes would fit the silhouette by growing over each other's parts (default person,
+            held-out poses, 800 iterations: mIoU 0.54 for 0.75; untrained 0.62, from labels 0.90).
 
-    Source: paper Sec. 3.4.
+    Source: paper Sec. 3.4; learning from masks is ours.
     """
 
     one_hot: Tensor
@@ -57,6 +61,7 @@ class Segmentation(nn.Module):
         opacity: float = 0.9,
         scale: float = 0.7,
         accuracy: str = "standard",
+        labelled: bool = True,
     ) -> None:
         super().__init__()
         self.accuracy = named_accuracy(accuracy)
@@ -76,6 +81,16 @@ class Segmentation(nn.Module):
         self.log_scales = nn.Parameter((scale * spacing).log().unsqueeze(-1).repeat(1, 3))
         logit = math.log(opacity / (1 - opacity))
         self.logit_opacities = nn.Parameter(torch.full((count,), logit))
+        self.common: nn.Parameter | None = None
+        if not labelled:
+            self.requires_grad_(False)
+            self.common = nn.Parameter(torch.zeros(2))  # added to all log scales, and all logits
+
+    def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
+        """(parameters, multiplier of the learning rate); the multipliers are ours."""
+        if self.common is not None:
+            return [([self.common], 10.0)]
+        return [([self.quats], 1.0), ([self.log_scales], 5.0), ([self.logit_opacities], 50.0)]
 
     @property
     def classes(self) -> int:
@@ -104,22 +119,34 @@ class Segmentation(nn.Module):
         A, t = self.points.blend(pose)
         batch = A.shape[0]
         rotation = quaternion_to_rotation_matrix(functional.normalize(self.quats, dim=-1, eps=1e-6))
-        axes = A @ (rotation * self.log_scales.exp().unsqueeze(-2))
+        log_scales: Tensor = self.log_scales
+        logits: Tensor = self.logit_opacities
+        if self.common is not None:
+            log_scales, logits = log_scales + self.common[0], logits + self.common[1]
+        axes = A @ (rotation * log_scales.exp().unsqueeze(-2))
         return Gaussians(
             means=(A @ self.points.means.unsqueeze(-1)).squeeze(-1) + t,
             quats=None,
             scales=None,
             covariances=axes @ axes.mT,
-            opacities=torch.sigmoid(self.logit_opacities).expand(batch, -1),
+            opacities=torch.sigmoid(logits).expand(batch, -1),
             features=self.one_hot.expand(batch, -1, -1),
         )
 
+    def raster(self, pose: BodyPose, camera: Camera) -> Raster:
+        """The splatted body: features are its classes, alpha its silhouette."""
+        with full_precision(pose.theta):
+            return rasterise(
+                self.gaussians(pose),
+                camera,
+                settings=self.accuracy,
+                backend=self.backend,
+                on_invalid=checks_for(camera.K.device),
+            )
+
     def forward(self, pose: BodyPose, camera: Camera) -> Tensor:
         """S ``[B, classes, H, W]``: probabilities; channel 0 is what no class covers."""
-        with full_precision(pose.theta):
-            raster = rasterise(
-                self.gaussians(pose), camera, settings=self.accuracy, backend=self.backend
-            )
+        raster = self.raster(pose, camera)
         covered = raster.alpha if self.all_classed else raster.features.sum(dim=1, keepdim=True)
         return torch.cat([(1 - covered).clamp_min(0), raster.features], dim=1)
 
@@ -128,11 +155,6 @@ def _classes_as_loaded(segmentation: nn.Module, _: Any) -> None:
     """A checkpoint's votes take effect where they differ from those just held."""
     assert isinstance(segmentation, Segmentation)
     segmentation.one_hot.copy_(segmentation._classes_of_points())
-
-
-def mode_of(build: Callable[..., Segmentation]) -> str:
-    """The mode that a config's segmentation (a partial) asks for; ``none`` builds nothing."""
-    return str(getattr(build, "keywords", {}).get("mode", "body"))
 
 
 def segmentation_loss(segmentation: Tensor, labels: Tensor, floor: float = 1e-6) -> Tensor:
@@ -152,3 +174,24 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor, floor: float = 1e-6)
     log = (segmentation + floor).log()
     total = functional.nll_loss(log, labels, ignore_index=IGNORE, reduction="sum")
     return total / (labels != IGNORE).sum().clamp_min(1)
+
+
+def silhouette_loss(
+    alpha: Tensor, mask: Tensor, unsure: Tensor | None = None, floor: float = 1e-6
+) -> Tensor:
+    """Binary cross-entropy of the splatted body's silhouette, for data without part labels.
+
+    Args:
+        alpha: ``[B, 1, H, W]`` of `Segmentation.raster`.
+        mask: ``[B, 1, H, W]`` in [0, 1].
+        unsure: ``[B, 1, H, W]`` above 0 where pixels are left out, or None.
+        floor: added inside the logarithms.
+
+    Returns:
+        The mean over the other pixels; 0 where there are none.
+
+    Source: ours.
+    """
+    loss = -(mask * (alpha + floor).log() + (1 - mask) * (1 - alpha + floor).log())
+    sure = torch.ones_like(loss) if unsure is None else (unsure <= 0).to(loss)
+    return (loss * sure).sum() / sure.sum().clamp_min(1)

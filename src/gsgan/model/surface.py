@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsgan.body import SkinnedBody
+from gsgan.model.bounded import bounded
 from gsgan.model.skinned_points import SkinnedPoints
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.splat.sh import sh_to_colour
@@ -85,14 +86,14 @@ class SurfaceGaussians(nn.Module):
         means = (A @ canonical.unsqueeze(-1)).squeeze(-1) + t
         low, high = (math.log(bound * self.body_height) for bound in self.scale_range)
         rotation = quaternion_to_rotation_matrix(functional.normalize(self.quats, dim=-1, eps=1e-6))
-        axes = A @ (rotation * self.log_scales.clamp(low, high).exp().unsqueeze(-2))
+        axes = A @ (rotation * bounded(self.log_scales, low, high).exp().unsqueeze(-2))
         sh = self.sh[:, : (self.active_degree + 1) ** 2].expand(batch, -1, -1, -1)
         view = means  # at degree 0 a colour has no direction
         if sh.shape[-2] > 1:
             # Seen from the canonical body, as in 3DGS-Avatar: a turned arm keeps its highlights.
             view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
             view = functional.normalize((A.mT @ view.unsqueeze(-1)).squeeze(-1), dim=-1, eps=1e-6)
-        logits = self.logit_opacities.clamp(-self.logit_bound, self.logit_bound)
+        logits = bounded(self.logit_opacities, -self.logit_bound, self.logit_bound)
         return Gaussians(
             means=means,
             quats=None,

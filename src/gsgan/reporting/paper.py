@@ -16,7 +16,7 @@ from gsgan.reporting.scored import Run
 from gsgan.reporting.spec import METRICS, heading, subject_of
 
 FILE = Path(__file__).with_name("paper.yaml")
-MARK = "paper"  # in the label of every row that is the paper's
+MARK = "as printed"  # in the label of every row that is the paper's
 MEAN = "mean"
 
 
@@ -84,7 +84,7 @@ class PaperTable:
             columns: (subject, metric) of each.
         """
         cells = [_printed(held.values.get(s, {}).get(metric)) for s, metric in columns]
-        notes = (f"{MARK}: as printed in {self.title}" + (f"; {self.note}" if self.note else ""),)
+        notes = (f"{MARK} in {self.title}" + (f"; {self.note}" if self.note else ""),)
         return Row(f"{held.label} ({MARK})", cells, self._origin, "paper", notes)
 
     @property

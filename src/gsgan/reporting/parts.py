@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from gsgan.paper import NAME, named
 from gsgan.reporting.cells import Column, Source
 from gsgan.reporting.grid import NO_RUN, NOT_HAD, Cell, Grid, Row, common
 from gsgan.reporting.mixing import data_name, lpips_name, protocols_differ, same_data
@@ -131,7 +132,8 @@ def grids(part: Part, paper: PaperTable | None) -> list[Grid]:
     """
     rows, printed = [], _paper_rows(part, paper)
     for spec in part.rows:
-        rows.append(_row(part, spec))
+        row = _row(part, spec)
+        rows.append(row if paper is None else beside_the_paper(row, part.source(spec).runs))
         if spec.variant == PAINTED:
             rows += printed.pop(spec.run, [])
     rows += [row for left in printed.values() for row in left]
@@ -180,6 +182,19 @@ def _row(part: Part, spec: RowSpec) -> Row:
         return Row(spec.title, blank, origin, notes=("no scored run",))
     cells = [source.cell(column) for column in part.columns]
     return Row(spec.title, cells, origin, notes=notes)
+
+
+def beside_the_paper(row: Row, runs: Sequence[Run]) -> Row:
+    """A row that stands beside the paper's figures: named as the paper's method where all of its
+    runs are, else with a note that says in what they are not."""
+    told = [run.departures() for run in runs]
+    if not told:
+        return row
+    if None in told:
+        return replace(row, notes=(*row.notes, "no config tells whether it is experiment=paper"))
+    if found := next((keys for keys in told if keys), None):
+        return replace(row, notes=(*row.notes, named(found)))
+    return replace(row, label=NAME if runs[0].name == "full" else f"{NAME}, {row.label}")
 
 
 def _floor(part: Part) -> Row:

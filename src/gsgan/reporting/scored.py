@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsgan.errors import ConfigError, DataError
+from gsgan.paper import departures, flat
 from gsgan.reporting.spec import METRICS
 
 METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"
@@ -67,6 +68,13 @@ class Run:
         """The protocol as it stands beside a split's scores."""
         variants = self.scores.get(split, {}).values()
         return next((v["protocol"] for v in variants if v.get("protocol")), None)
+
+    def departures(self) -> list[str] | None:
+        """Settings in which it is not ``experiment=paper``; None where no config tells."""
+        model, data = self.facts.get("model"), self.data.get("name")
+        if self.settings is None or model is None or data is None:
+            return None
+        return departures(self.settings, model, data)
 
     def data_settings(self) -> dict[str, Any] | None:
         """What its config says of the data, where it has a config."""
@@ -248,17 +256,9 @@ def _settings(config: DictConfig) -> dict[str, Any]:
     seedless = config.copy()
     seedless.seed = 0  # data and training refer to it
     try:
-        return dict(_flat(record(seedless)))
+        return dict(flat(record(seedless)))
     except OmegaConfBaseException as error:
         raise DataError(f"{CONFIG}: {str(error).splitlines()[0]}") from None
-
-
-def _flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
-    if isinstance(value, dict) and value:
-        for key, held in value.items():
-            yield from _flat(held, f"{at}.{key}" if at else str(key))
-    else:
-        yield at, value
 
 
 def _whole(seed: Any, folder: Path) -> int | None:

@@ -62,10 +62,17 @@ def evaluate_folder(config: DictConfig) -> Results:
     data = build_data(stored)
     avatar, marks = load_avatar(folder, stored, data)
     state = read_checkpoint(folder / CHECKPOINT)["gsgan"]
+    usual = "black" if data.protocol is None else data.protocol.measures.background
+    elsewhere = config.background not in (None, usual)  # a run's own scores stay
+    out = folder / f"on_{config.background}" if elsewhere else None
+    console = make_console()
+    if out is not None:
+        console.print(f"scores on {config.background} go into {out}", soft_wrap=True)
     return evaluate_run(
         folder,
         config,
-        make_console(),
+        console,
+        out=out,
         data=data,
         avatar=avatar.to(device),
         marks=marks,

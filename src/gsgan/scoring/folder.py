@@ -115,9 +115,9 @@ class Folder:
         image = _unit(rgb).permute(2, 0, 1)[None].to(frame.image)
         if alpha is not None:
             cover = _unit(alpha)[None, None].to(frame.image)
-            return Prediction({FULL: image * cover}, cover)
+            return Prediction({FULL: image * cover}, {FULL: cover})
         self._check_background(path, image, frame.mask)
-        return Prediction({FULL: image}, None, self.background)
+        return Prediction({FULL: image}, {}, self.background)
 
     def _check_background(self, path: Path, image: Tensor, mask: Tensor) -> None:
         behind = image.permute(0, 2, 3, 1)[mask[:, 0] == 0]

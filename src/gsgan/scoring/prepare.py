@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -39,8 +40,8 @@ class Prediction:
 
     Args:
         pictures: by variant, ``[B, 3, H, W]``; None for a variant that it does not have.
-        alpha: ``[B, 1, H, W]`` of the pictures, which are then on black and premultiplied; None
-            for opaque ones.
+        alphas: by variant, ``[B, 1, H, W]`` of the pictures, which are then on black and
+            premultiplied; None or absent for opaque ones.
         background: on which opaque pictures are painted, "black" or "white".
         segmentation: ``[B, classes, H, W]``, or None.
         labels: ``[B, H, W]`` the truth in the segmentation's classes; None where those are the
@@ -48,7 +49,7 @@ class Prediction:
     """
 
     pictures: dict[str, Tensor]
-    alpha: Tensor | None
+    alphas: Mapping[str, Tensor | None]
     background: str = "black"
     segmentation: Tensor | None = None
     labels: Tensor | None = None
@@ -134,9 +135,10 @@ class Stage:
                 "not finite; it cannot be scored"
             )
         image = image.clamp(0, 1)
-        if prediction.alpha is not None:
-            image = on_background(image, prediction.alpha.clamp(0, 1), self.background).clamp(0, 1)
-        elif self.needs_mask(prediction):
+        alpha = prediction.alphas.get(variant)
+        if alpha is not None:
+            image = on_background(image, alpha.clamp(0, 1), self.background).clamp(0, 1)
+        elif prediction.background != self.measures.background:
             old = BACKGROUNDS[prediction.background]
             image = moved_background(image, frame.mask, old, self.background)
         image = eight_bits(image, self.measures.eight_bits)
@@ -145,8 +147,9 @@ class Stage:
         return image
 
     def needs_mask(self, prediction: Prediction) -> bool:
-        """Whether only the truth's mask can put it on this background."""
-        return prediction.alpha is None and prediction.background != self.measures.background
+        """Whether only the truth's mask can put one of its pictures on this background."""
+        opaque = any(prediction.alphas.get(name) is None for name in prediction.pictures)
+        return opaque and prediction.background != self.measures.background
 
     def floor(self, frame: Frame) -> Tensor:
         """``[B, 3, H, W]`` the all-background picture."""

@@ -17,6 +17,7 @@ from gsgan.data.measures import Measures
 from gsgan.data.splits import Item
 from gsgan.errors import ConfigError
 from gsgan.metrics.lpips import lpips, lpips_name
+from gsgan.metrics.regions import BACKGROUNDS
 from gsgan.model.avatar import Avatar, Painting
 from gsgan.pictures import grid_rows, write_grid
 from gsgan.scene import Frame
@@ -78,11 +79,12 @@ def evaluate_run(
     marks: list[str],
     method: Method | None = None,
     wanted: Wanted | None = None,
+    out: Path | None = None,
 ) -> Results:
     """Scores an avatar on held-out cameras and poses and writes it all into the run folder.
 
     Args:
-        folder: the run folder, see `evaluate_method`.
+        folder: the run folder.
         config: for ``lpips.net`` and ``lpips.path``.
         console: prints the table.
         data: of the run.
@@ -90,6 +92,7 @@ def evaluate_run(
         marks: notes that the tables must carry.
         method: what is known of the training; the model's and the data's name come from the folder.
         wanted: splits, rows, pictures.
+        out: another folder to write to, see `evaluate_method`.
 
     Returns:
         ``{split: {variant: {metric: value}}}``, as in metrics.json.
@@ -100,19 +103,26 @@ def evaluate_run(
     device = next(avatar.parameters()).device
     scorer = make_scorer(config, data, marks)
     return evaluate_method(
-        folder, console, data, painter(avatar), scorer, config.lpips.net,
+        out or folder, console, data, painter(avatar), scorer, config.lpips.net,
         method=method, device=device, variants=variants, wanted=wanted or Wanted(), avatar=avatar,
     )  # fmt: skip
 
 
 def make_scorer(config: DictConfig, data: GsganData, marks: list[str]) -> Scorer:
-    """How the pictures of a dataset are scored: as its protocol says, or plainly.
+    """How the pictures of a dataset are scored: as its protocol says, or plainly, on another
+    background where the config has one.
 
     Raises:
-        ConfigError: on an unknown LPIPS backbone.
+        ConfigError: on an unknown LPIPS backbone or background.
         DataError: when a given weight file or body model cannot be read.
     """
     measures = Measures() if data.protocol is None else data.protocol.measures
+    background = config.get("background")
+    if background not in (None, *BACKGROUNDS):
+        raise ConfigError(f"background must be black, white or null; got {background!r}")
+    if background not in (None, measures.background):
+        measures = replace(measures, background=background)
+        marks = [*marks, f"scored on {background}"]
     score, reason = lpips(config.lpips.net, config.lpips.path, measures.lpips_range)
     boxes = BodyBoxes(data) if measures.needs_body_box else None
     name = lpips_name(config.lpips.net, measures)
@@ -202,6 +212,9 @@ def _with_protocol(
     """The results with the protocol and every departure from it beside each variant."""
     record = data.protocol_record(lpips_net)
     if record is not None:
+        asked, used = record["measures"]["background"], scorer.stage.measures.background
+        if asked != used:
+            record["departures"].append(f"background is {used}, asked for: {asked}")
         if scorer.stage.boxes is not None:
             record["departures"] += scorer.stage.boxes.departures
         if any(found.hidden_outline for found in scores.values()):
@@ -235,7 +248,7 @@ def write_pictures(
                 painting = avatar.paint(frame)
         else:
             picture = stage.picture(predict(frame, item), FULL, frame, stage.box(frame))
-            painting = Painting(picture, None, None, None, None)
+            painting = Painting(picture)
             frame = replace(frame, image=stage.truth(frame))
         grid += grid_rows(frame, painting)
     if grid:

@@ -60,20 +60,20 @@ class SplitScores:
 def painter(avatar: Avatar) -> Predict:
     """The predictions of an avatar in eval mode: I_pred as ``full``, Step I's colour as ``splat``.
 
-    A picture of the UNet has no alpha of its own: its splats' is taken for it.
+    Each is put on the background by its own alpha.
     """
 
     def predict(frame: Frame, item: Item) -> Prediction:
         with torch.no_grad():
             painting = avatar.paint(frame)
         assert painting.image is not None
-        pictures = {FULL: painting.image}
+        pictures, alphas = {FULL: painting.image}, {FULL: painting.alpha}
         if painting.colour is not None:
-            pictures[SPLAT] = painting.colour
+            pictures[SPLAT], alphas[SPLAT] = painting.colour, painting.splat_alpha
         parts, labels = painting.segmentation, frame.labels
         if avatar.segmentation is not None and parts is not None and labels is not None:
             parts, labels = avatar.segmentation.to_score(parts, labels)
-        return Prediction(pictures, painting.alpha, segmentation=parts, labels=labels)
+        return Prediction(pictures, alphas, segmentation=parts, labels=labels)
 
     return predict
 

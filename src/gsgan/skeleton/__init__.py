@@ -2,7 +2,7 @@
 
 from gsgan.skeleton.densify import Densify, Points
 from gsgan.skeleton.draw import draw_skeleton
-from gsgan.skeleton.frames import BoneFrames, bone_frames, omega
+from gsgan.skeleton.frames import BoneFrames, bone_frames, omega, root_of
 from gsgan.skeleton.rotation6d import rotation_from_6d, rotation_to_6d
 from gsgan.skeleton.sanitise import limb_length_sum, recentre, sanitise
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
@@ -18,6 +18,7 @@ __all__ = [
     "limb_length_sum",
     "omega",
     "recentre",
+    "root_of",
     "rotation_from_6d",
     "rotation_to_6d",
     "sanitise",

@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from gsgan.constants import constant
 from gsgan.scene import Camera
 from gsgan.skeleton.frames import check_skeleton
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
@@ -54,7 +55,7 @@ def draw_skeleton(
     Raises:
         ValueError: on a wrong shape, batch size or ``downscale``.
 
-    Source: Sec. 3.4 (p₂D is not specified there); method notes, section 4.
+    Source: paper Sec. 3.5 (p₂D is not specified there); method notes, section 4.
     """
     valid = check_skeleton("draw_skeleton", p, valid, template)
     if len(camera) != len(p):
@@ -104,7 +105,7 @@ def _distance2(
     length2 = d.square().sum(-1, keepdim=True)
     short = length2 < MIN_SEGMENT_PX**2
     length2 = torch.where(short, MIN_SEGMENT_PX**2, length2)
-    d = torch.where(short, d.new_tensor([MIN_SEGMENT_PX, 0.0]), d)
+    d = torch.where(short, constant((MIN_SEGMENT_PX, 0.0), d), d)
     # an unseen segment is put so far off its line that its value is an exact zero
     away = torch.where(shown, 0.0, 1e4 * float(max(h, w)))
 

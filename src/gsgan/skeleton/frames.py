@@ -17,6 +17,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
+from gsgan.constants import constant
 from gsgan.skeleton.rotation6d import orthogonal_to, rotation_from_6d, rotation_to_6d
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, N_HUBS, PELVIS, SkeletonTemplate
 
@@ -232,6 +233,12 @@ def check_skeleton(
     return valid
 
 
+def root_of(p: Tensor, template: SkeletonTemplate = MEDIAPIPE33) -> Tensor:
+    """``[B, 3]`` metres: the middle of the hips of joints ``[B, J, 3]``."""
+    left, right = template.hips
+    return (p[:, left] + p[:, right]) / 2
+
+
 def bone_frames(
     p: Tensor,
     valid: Tensor | None = None,
@@ -269,7 +276,7 @@ def bone_frames(
     Raises:
         ValueError: on a shape that does not fit the template, or an unknown ``twist``.
 
-    Source: method notes, section 6 (6D bone rotations of Sec. 3.4; the paper leaves the frames
+    Source: method notes, section 6 (6D bone rotations of paper Sec. 3.5, which leaves the frames
     open).
     """
     if twist not in ("none", "hinge"):
@@ -395,7 +402,7 @@ def _towards_hinge(R: Tensor, upper: Tensor, lower: Tensor, level: _Level) -> Te
     turn = torch.stack([1.0 - weight.squeeze(-1) + parts[..., 0], parts[..., 1]], dim=-1)
     norm2 = turn.square().sum(-1, keepdim=True)
     lost = norm2 < FOLDED  # half a turn at half weight: either way is as good
-    turn = torch.where(lost, turn.new_tensor([1.0, 0.0]), turn)
+    turn = torch.where(lost, constant((1.0, 0.0), turn), turn)
     cos, sin = _unit(turn)[..., None, None].unbind(-3)
     cross, along = level.about
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
@@ -435,7 +442,7 @@ def omega(
     Raises:
         ValueError: on a wrong shape, an unknown ``frame``, or a missing ``R_cam``.
 
-    Source: method notes, section 6; pose code of Sec. 3.4 (DANBO's input).
+    Source: method notes, section 6; pose code of paper Sec. 3.5 (DANBO's input).
     """
     valid = check_skeleton("omega", p, valid, template)
     if frame not in ("camera", "world"):

@@ -15,7 +15,7 @@ def rotation_to_6d(R: Tensor) -> Tensor:
     Returns:
         ``[..., 6]``: column 0, then column 1.
 
-    Source: Zhou et al. 2019, used for the pose code of Sec. 3.4; column order is ours.
+    Source: Zhou et al. 2019, used for the pose code of paper Sec. 3.5; column order is ours.
     """
     return R[..., :2].transpose(-1, -2).flatten(-2)
 

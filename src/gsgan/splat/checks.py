@@ -35,11 +35,21 @@ def check(
             raise ValueError(
                 f"rasterise: {name} must be {kind.__name__}, got {type(value).__name__}"
             )
-    if on_invalid not in ("error", "drop"):
-        raise ValueError(f"rasterise: on_invalid must be error or drop, got {on_invalid!r}")
+    if on_invalid not in ("error", "drop", "unchecked"):
+        raise ValueError(
+            f"rasterise: on_invalid must be error, drop or unchecked, got {on_invalid!r}"
+        )
     _check_types(gaussians, camera)
+    if on_invalid == "unchecked":
+        return None
     _check_camera(camera, rotation_tolerance)
     return _check_gaussians(gaussians, on_invalid)
+
+
+def checks_for(device: torch.device) -> str:
+    """``on_invalid`` of what a model made: ``error`` on a CPU, ``unchecked`` where the host would
+    have to wait for the numbers."""
+    return "error" if device.type == "cpu" else "unchecked"
 
 
 def _tensors(record: Gaussians | Camera) -> dict[str, Tensor]:

@@ -1,11 +1,12 @@
-"""Drawing with gsplat's CUDA kernels, where the package is installed and draws what is asked for.
+"""Drawing with gsplat's CUDA kernels, where the package is installed.
 
 gsplat has its cut-offs compiled in. What is known of them here was read in the sources of gsplat
 1.5.3; the cap on alphas, which differs between versions (0.999 in 1.5.3, 0.99 after it), is
 measured. This module was tested against a stand-in for the package and has never been run on a GPU.
 
-Where gsplat differs from ``Accuracy`` all the same:
+Where gsplat differs from ``Accuracy``, which `given_up` puts into a sentence:
 
+- Its cut-offs are those of `COMPILED_IN`, whatever the settings say.
 - It stops a pixel one layer earlier, before the layer that would leave ``transmittance_min`` or
   less. That layer may weigh up to ``transmittance_min / (1 - alpha_max)``, see ``stop_loss``.
 - It computes in float32 throughout (the camera's place in the world is taken off in float64 before)
@@ -23,6 +24,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat.project import QUAT_MIN, without
@@ -40,11 +42,6 @@ COMPILED_IN: dict[str, float | str] = {
 TOLERANCE = 1e-5  # relative, between a setting and what is compiled in
 
 
-def expected(settings: Accuracy, device: torch.device) -> bool:
-    """Whether this is a case for gsplat, were it installed."""
-    return device.type == DEVICE and not _mismatch(settings)
-
-
 def why_not(settings: Accuracy, device: torch.device) -> str:
     """Why gsplat cannot draw with these settings here; the first call may compile it (minutes).
 
@@ -53,13 +50,29 @@ def why_not(settings: Accuracy, device: torch.device) -> str:
     """
     if device.type != DEVICE:
         return f"gsplat runs on CUDA only, the Gaussians are on {device}."
-    found = _mismatch(settings)
-    if found:
-        return found
-    cap, problem = _measured_cap(device)
-    if cap is None:
-        return problem
-    return "" if _equal(settings.alpha_max, cap) else _differs(settings, "alpha_max", cap)
+    if settings.dtype != "float32":
+        return f"gsplat computes in float32, the settings {settings.name!r} in {settings.dtype}."
+    return _measured_cap(device)[1]
+
+
+def differences(settings: Accuracy, device: torch.device) -> list[str]:
+    """Where gsplat's cut-offs are others than the settings', a clause each; `why_not` is empty."""
+    have = {**COMPILED_IN, "alpha_max": _measured_cap(device)[0] or 0.0}
+    return [
+        f"{name} is {value if isinstance(value, str) else f'{value:.6g}'}, not {want}"
+        for name, value in have.items()
+        if not _equal(want := getattr(settings, name), value)
+    ]
+
+
+def given_up(settings: Accuracy, device: torch.device) -> str:
+    """What gsplat draws otherwise than the settings say, in one sentence; `why_not` is empty."""
+    lost = _stop_loss(_measured_cap(device)[0] or 0.0)
+    found = [f"a stopped pixel may lack {lost:.2g} of its light", *differences(settings, device)]
+    return (
+        f"Drawing with gsplat, the fastest here; against the settings {settings.name!r}: "
+        f"{'; '.join(found)}; backend=torch keeps to them."
+    )
 
 
 def unsuited(gaussians: Gaussians, camera: Camera) -> str:
@@ -74,20 +87,17 @@ def unsuited(gaussians: Gaussians, camera: Camera) -> str:
         return "there are no Gaussians, which gsplat is not made for."
     if torch.is_grad_enabled() and camera.K.requires_grad:
         return "gsplat has no gradient for Camera.K, which requires one."
-    if camera.K[:, 0, 1].any():
-        return "gsplat knows no skew, and Camera.K has some."
     return ""
 
 
-def stop_loss(settings: Accuracy) -> float:
+def _stop_loss(cap: float) -> float:
     """The most light that a stopped pixel may lack: the layer at which it stops, and what is left.
 
     A layer of alpha ``a`` stops the pixel where ``T (1 - a) <= transmittance_min``, and takes all
-    of ``T`` along: with alphas up to ``alpha_max`` that is the returned part of the light.
+    of ``T`` along: with alphas up to ``cap`` that is the returned part of the light.
     """
-    if settings.alpha_max == 1:
-        return 1.0
-    return min(1.0, settings.transmittance_min / (1 - settings.alpha_max))
+    stop = float(COMPILED_IN["transmittance_min"])
+    return 1.0 if cap >= 1 else min(1.0, stop / (1 - cap))
 
 
 def draw(
@@ -104,7 +114,7 @@ def draw(
 
     Args:
         gaussians: N >= 1 Gaussians per batch item, of at most float32.
-        camera: one camera without skew per batch item.
+        camera: one camera per batch item.
         settings: near, low_pass and antialias are passed on; the rest is compiled in.
         keep: ``[B, N]`` bool; the others are not drawn, whatever they hold.
         want_depth: whether to blend depths too.
@@ -143,14 +153,6 @@ def draw(
     return picture[:, :C], alphas.squeeze(1).movedim(-1, 1), depth
 
 
-def _mismatch(settings: Accuracy) -> str:
-    """Names the first setting that no version of gsplat draws with; empty where there is none."""
-    for name, have in COMPILED_IN.items():
-        if not _equal(getattr(settings, name), have):
-            return _differs(settings, name, have)
-    return ""
-
-
 def _rasterization() -> Any:
     return importlib.import_module("gsplat").rasterization
 
@@ -170,7 +172,7 @@ def _usable(quats: Tensor) -> Tensor:
     """Quaternions whose squares neither underflow nor overflow; the identity for zero ones."""
     largest = quats.detach().abs().amax(-1, keepdim=True)
     usable = largest > QUAT_MIN
-    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    identity = functional.pad(torch.ones_like(quats[..., :1]), (0, 3))
     return torch.where(usable, quats / torch.where(usable, largest, 1.0), identity)
 
 
@@ -178,13 +180,18 @@ def _seen_from_the_camera(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor
     """Means ``[B, N, 3]`` about the camera's place, and the ``[B, 4, 4]`` transform from there.
 
     In float64, so that a camera far from the origin costs no digits. The place is a constant that
-    cancels: gradients are those of the means, R and t themselves.
+    cancels: gradients are those of the means, R and t themselves. gsplat knows no skew, so the
+    transform holds it: ``fx x + s y`` is ``fx (x + y s / fx)``, and what is multiplied onto means
+    and shapes need not be a rotation.
     """
     camera = camera.to(torch.float64)
     place = camera.centre.detach()
+    K = camera.K.detach()
+    shear = torch.eye(3, dtype=K.dtype, device=K.device).repeat(len(camera), 1, 1)
+    shear[:, 0, 1] = K[:, 0, 1] / K[:, 0, 0]
     left = camera.t.unsqueeze(-1) + camera.R @ place.unsqueeze(-1)
-    top = torch.cat([camera.R, left], dim=-1)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(camera), 1, 4)
+    top = shear @ torch.cat([camera.R, left], dim=-1)
+    bottom = functional.pad(torch.ones_like(top[:, :1, :1]), (3, 0))
     viewmats = torch.cat([top, bottom], dim=1)
     return (means.double() - place.unsqueeze(1)).float(), viewmats.float()
 
@@ -223,9 +230,3 @@ def _equal(a: float | str, b: float | str) -> bool:
     if isinstance(a, str) or isinstance(b, str):
         return a == b
     return math.isclose(a, b, rel_tol=TOLERANCE)
-
-
-def _differs(settings: Accuracy, name: str, have: float | str) -> str:
-    want = getattr(settings, name)
-    have = have if isinstance(have, str) else f"{have:.6g}"
-    return f"gsplat draws with {name}={have}, the settings {settings.name!r} have {want}."

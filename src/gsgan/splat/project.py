@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from gsgan.constants import constant
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat.settings import Accuracy
 
@@ -85,7 +86,7 @@ def project(
     in_front = x_cam.detach()[:, 2] > settings.near
     if keep is not None:
         in_front = in_front & keep
-    x_cam = torch.where(in_front.unsqueeze(1), x_cam, x_cam.new_tensor([[0.0], [0.0], [1.0]]))
+    x_cam = torch.where(in_front.unsqueeze(1), x_cam, constant(((0.0,), (0.0,), (1.0,)), x_cam))
     depths = x_cam[:, 2]
     ratios = x_cam[:, :2] / depths.unsqueeze(1)
     means = K[:, :2, :2] @ ratios + K[:, :2, 2:]
@@ -201,7 +202,7 @@ def field_of_view(K: Tensor, size: tuple[int, int], widen: float) -> tuple[Tenso
     The corners of the picture bound them, which holds with skew and an off-centre principal point.
     """
     H, W = size
-    corners = K.new_tensor([[0, W, 0, W], [0, 0, H, H]]) - K[:, :2, 2:]
+    corners = constant(((0, W, 0, W), (0, 0, H, H)), K) - K[:, :2, 2:]
     ratios = _inverse(K[:, :2, :2]) @ corners
     low, high = ratios.amin(-1, keepdim=True), ratios.amax(-1, keepdim=True)
     middle, half = (low + high) / 2, (high - low) / 2
@@ -239,7 +240,7 @@ def _footprint(
         reach = reach * (1 + EXTENT_MARGIN) + EXTENT_MARGIN
     extents = reach.unsqueeze(1) * torch.stack([a, c], dim=1).sqrt()
     # The outermost pixel centres are half a pixel inside the picture.
-    last = means.new_tensor([[W - 0.5], [H - 0.5]])
+    last = constant(((W - 0.5,), (H - 0.5,)), means)
     inside = ((means + extents >= 0.5) & (means - extents <= last)).all(1)
     visible = in_front & inside & (opacities >= settings.alpha_min)
     return torch.where(visible.unsqueeze(-1), extents.mT, 0.0), visible

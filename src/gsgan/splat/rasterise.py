@@ -42,12 +42,13 @@ def rasterise(
         gaussians: N >= 0 Gaussians per batch item.
         camera: one camera per batch item, of the Gaussians' dtype and device.
         settings: an ``Accuracy``, or the name of a preset.
-        backend: ``auto`` (the fastest there is for the device and settings), ``reference``,
-            ``torch``, ``native`` or ``gsplat``. One that cannot draw this gives way to ``torch``,
-            and says why once.
+        backend: ``auto`` (the fastest there is on the device; what it leaves out against the
+            settings is logged once), ``reference``, ``torch``, ``native`` or ``gsplat``. One that
+            cannot draw this gives way to ``torch``, and says why once.
         depth: whether to return the depth (metres times alpha).
         on_invalid: ``error`` refuses Gaussians that are not finite or have a scale <= 0; ``drop``
-            leaves them out and warns with their number.
+            leaves them out and warns with their number; ``unchecked`` takes Gaussians and camera as
+            they are: the checks read numbers back to the host, for which a GPU waits.
         rotation_tolerance: how far an entry of ``R Rᵀ`` may be from the identity's.
 
     Returns:
@@ -102,8 +103,11 @@ def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tupl
         return name, ""
     if name == "auto" and settings.is_dense:
         return "reference", ""
-    if name == "gsplat" or (name == "auto" and gsplat_backend.expected(settings, device)):
-        return _gsplat_or_torch(name, device, settings)
+    if name == "gsplat" or (name == "auto" and device.type == gsplat_backend.DEVICE):
+        why_not = gsplat_backend.why_not(settings, device)
+        if why_not:
+            return _torch_instead_of_gsplat(why_not)
+        return "gsplat", gsplat_backend.given_up(settings, device)
     if device.type != "cpu":
         asked = name == "native"
         return (
@@ -114,19 +118,6 @@ def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tupl
     if why_not:
         return "torch", f"Drawing with the torch backend, which is slower: {why_not}"
     return "native", ""
-
-
-def _gsplat_or_torch(name: str, device: torch.device, settings: Accuracy) -> tuple[str, str]:
-    """Where ``auto`` takes gsplat it says what that costs: its stop is not that of ``Accuracy``."""
-    why_not = gsplat_backend.why_not(settings, device)
-    if why_not:
-        return _torch_instead_of_gsplat(why_not)
-    lost, meant = gsplat_backend.stop_loss(settings), settings.transmittance_min
-    price = (
-        f"Drawing with gsplat, where a stopped pixel may lack {lost:.2g} of its light, not "
-        f"{meant:.2g}; backend=torch keeps to the settings."
-    )
-    return "gsplat", price * (name == "auto")
 
 
 def _torch_instead_of_gsplat(why_not: str) -> tuple[str, str]:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from gsgan.constants import constant
 from gsgan.splat.project import Projected
 from gsgan.splat.settings import Accuracy
 
@@ -41,6 +42,8 @@ class TileLists:
 
     ``ids[starts[i] : starts[i] + counts[i]]`` are the rows (batch item x N + index) of the i-th
     listed tile, ``tiles[i]`` its place among all (item, row, column); most layers first.
+    ``depths`` holds the counts again, on the host: all that it needs to know of the lists, read
+    back at once.
     """
 
     size: tuple[int, int]
@@ -49,13 +52,15 @@ class TileLists:
     tiles: Tensor
     starts: Tensor
     counts: Tensor
+    depths: list[int]
     box: Tensor | None  # [B * N + 1, 2] half-sizes outside of which nothing is drawn
 
 
 def tile_lists(
     projected: Projected, size: tuple[int, int], settings: Accuracy, tiling: Tiling
 ) -> TileLists:
-    """Lists the ellipses of each tile.
+    """Lists the ellipses of each tile. The host waits twice: for the number of pairs of ellipse and
+    tile, and for the lists' lengths.
 
     Args:
         projected: the ellipses.
@@ -68,24 +73,32 @@ def tile_lists(
     B, N = projected.depths.shape
     order = projected.depths.argsort(dim=1, stable=True)
     order = (order + N * torch.arange(B, device=order.device).unsqueeze(1)).flatten()
-    order = order[projected.visible.flatten()[order]]
     first, last = _pixel_box(projected, size, order)
     first, last = first // side, last // side
-    spans = (last - first + 1).clamp_min(0)
+    spans = (last - first + 1).clamp_min(0) * projected.visible.flatten()[order].unsqueeze(-1)
     rows, tile_xy = _pairs(order, first, spans)
-    if settings.alpha_min > 0:
-        reached = _reaches(projected, rows, tile_xy, settings, tiling)
-        rows, tile_xy = rows[reached], tile_xy[reached]
+    tiles = B * grid[0] * grid[1]
     tile = (rows // max(N, 1) * grid[0] + tile_xy[:, 1]) * grid[1] + tile_xy[:, 0]
+    if settings.alpha_min > 0:  # pairs that do not meet are sorted behind the last tile
+        tile = torch.where(_reaches(projected, rows, tile_xy, settings, tiling), tile, tiles)
     tile, by_tile = tile.to(torch.int32).sort(stable=True)
-    tiles, counts = tile.unique_consecutive(return_counts=True)
-    starts = counts.cumsum(0) - counts
-    deepest = counts.argsort(descending=True, stable=True)
+    ends = torch.searchsorted(tile, torch.arange(tiles + 1, device=tile.device, dtype=tile.dtype))
+    starts, counts = ends[:-1], ends.diff()
+    counts, deepest = counts.sort(descending=True, stable=True)
+    depths = counts.tolist()
+    listed = len(depths) - depths.count(0)
     box = None
     if settings.extent == "sigma":
         box = with_empty_row(projected.extents)
     return TileLists(
-        *(size, grid, rows[by_tile], tiles.long()[deepest], starts[deepest], counts[deepest], box)
+        size=size,
+        grid=grid,
+        ids=rows[by_tile],
+        tiles=deepest[:listed],
+        starts=starts[deepest[:listed]],
+        counts=counts[:listed],
+        depths=depths[:listed],
+        box=box,
     )
 
 
@@ -93,7 +106,7 @@ def _pixel_box(projected: Projected, size: tuple[int, int], rows: Tensor) -> tup
     """First and last pixel (x, y) whose centre is in the footprint, each ``[M, 2]`` int64."""
     means = projected.means.flatten(0, 1)[rows]
     extents = projected.extents.flatten(0, 1)[rows].to(means)
-    edge = means.new_tensor([size[1], size[0]])
+    edge = constant((size[1], size[0]), means)
     # Clamped as floats: footprints reach far beyond what integers hold. Extents are rounded: the
     # box is rounded outwards, not to the nearest.
     first = torch.minimum((means - extents - 0.5).floor().clamp_min(0), edge)
@@ -104,8 +117,11 @@ def _pixel_box(projected: Projected, size: tuple[int, int], rows: Tensor) -> tup
 def _pairs(rows: Tensor, first: Tensor, spans: Tensor) -> tuple[Tensor, Tensor]:
     """Every (ellipse, tile) pair: rows ``[M]`` in the given order, tiles (x, y) ``[M, 2]``."""
     counts = spans[:, 0] * spans[:, 1]
-    which = torch.arange(len(rows), device=rows.device).repeat_interleave(counts)
-    step = torch.arange(len(which), device=rows.device) - (counts.cumsum(0) - counts)[which]
+    ends = counts.cumsum(0)
+    total = int(ends[-1]) if len(ends) else 0
+    which = torch.arange(len(rows), device=rows.device)
+    which = which.repeat_interleave(counts, output_size=total)
+    step = torch.arange(total, device=rows.device) - (ends - counts)[which]
     width = spans[:, 0][which]
     return rows[which], first[which] + torch.stack([step % width, step // width], dim=-1)
 

@@ -11,9 +11,12 @@ the way back. Neither takes a logarithm nor divides by ``1 - alpha``, so an opaq
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
+from operator import neg
 from typing import Any
 
 import torch
@@ -166,8 +169,10 @@ class _Walk:
         # exp of less is 0 or subnormal: slow, and below every alpha_min. Above 0 is rounding.
         self.least_exponent = math.log(torch.finfo(dtype).tiny)
         # threshold() keeps what is greater; alphas equal to alpha_min are to be kept.
-        alpha_min = torch.tensor(settings.alpha_min, dtype=dtype)
-        self.below_alpha_min = torch.nextafter(alpha_min, alpha_min - 1).item()
+        self.below_alpha_min = _next_below(settings.alpha_min, dtype)
+        # Tiles that let no more light through are left out: that a GPU finds out costs more than
+        # it saves, as the host has to wait. Their layers weigh nothing either way.
+        self.stops = settings.transmittance_min > 0 and device.type == "cpu"
         self.sums = self.values.new_zeros(len(self.values), 6)
         self.values_grad = torch.zeros_like(self.values)
 
@@ -187,18 +192,21 @@ class _Walk:
     def forward(self, chunk: slice, save: bool) -> tuple[Tensor, list[tuple[Tensor, Tensor]]]:
         """Blended values ``[T, V, P]``, and for each block its tiles and incoming transmittance."""
         starts, counts = self.lists.starts[chunk], self.lists.counts[chunk]
+        depths = self.lists.depths[chunk]
         sums = self.values.new_zeros(len(starts), self.values.shape[-1], self.pixels)
         before = self.values.new_ones(len(starts), self.pixels)
         rows = torch.arange(len(starts), device=starts.device)
         blocks: list[tuple[Tensor, Tensor]] = []
-        # Most layers first: the tiles that still have some are the first ones.
-        for offset in range(0, int(counts[0]), self.tiling.layers):
-            going = counts[rows] > offset
-            if self.settings.transmittance_min > 0:
+        for offset in range(0, depths[0], self.tiling.layers):
+            if self.stops:
+                going = counts[rows] > offset
                 going &= before.amax(-1) >= self.settings.transmittance_min
-            rows, before = rows[going], before[going]
-            if not len(rows):
-                break
+                rows, before = rows[going], before[going]
+                if not len(rows):
+                    break
+            else:  # most layers first: the tiles that still have some are the first ones
+                left = bisect_left(depths, -offset, key=neg)
+                rows, before = rows[:left], before[:left]
             if save:
                 blocks.append((rows, before))
             ids = self._ids(starts[rows], counts[rows], offset)
@@ -319,6 +327,13 @@ def _geometry_gradient(geometry: Tensor, opacities: Tensor, sums: Tensor) -> Ten
     _, _, p, k, r = geometry.unbind(-1)
     _, u, v, uu, uv, vv = (sums * opacities.unsqueeze(-1)).unbind(-1)
     return torch.stack([p * u, p * k * u + r * v, -uu / p, -uv * p / r, -vv / r], dim=-1)
+
+
+@lru_cache(maxsize=16)
+def _next_below(value: float, dtype: torch.dtype) -> float:
+    """The number of that type just below a value."""
+    rounded = torch.tensor(value, dtype=dtype)
+    return torch.nextafter(rounded, rounded - 1).item()
 
 
 def _indicator(x: Tensor, least: float | Tensor) -> Tensor:

@@ -17,7 +17,14 @@ import torch
 from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians
-from gsgan.splat import ACCURACY, BACKENDS, Accuracy, rasterise, resolve_backend
+from gsgan.splat import (
+    ACCURACY,
+    BACKENDS,
+    Accuracy,
+    gsplat_backend,
+    rasterise,
+    resolve_backend,
+)
 from gsgan.stability.case import Case, Inputs, Outputs
 
 SIZE = (24, 32)
@@ -135,10 +142,13 @@ def _joined(inputs: Inputs, name: str) -> Tensor | None:
 def drawing_backends(
     device: torch.device | str = "cpu", settings: Accuracy = ACCURACY["high"]
 ) -> tuple[str, ...]:
-    """The backends that take these settings on this device without passing them on to another."""
+    """The backends that keep to these settings on this device."""
     device = torch.device(device)
     names = (name for name in BACKENDS if name != "auto")
-    return tuple(name for name in names if resolve_backend(name, device, settings)[0] == name)
+    found = [name for name in names if resolve_backend(name, device, settings)[0] == name]
+    if "gsplat" in found and gsplat_backend.differences(settings, device):
+        found.remove("gsplat")
+    return tuple(found)
 
 
 def pinhole(

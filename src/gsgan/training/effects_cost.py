@@ -17,14 +17,7 @@ from gsgan.runs import build_avatar
 from gsgan.scene import Frame
 from gsgan.timing import interleaved, median
 
-IN_THE_MODEL = (
-    "view_dependence",
-    "antialias",
-    "colour_correction",
-    "segmentation",
-    "body_points",
-    "depth",
-)
+IN_THE_MODEL = ("view_dependence", "antialias", "colour_correction", "body_points")
 
 
 def training_device(accelerator: str) -> torch.device:
@@ -64,7 +57,7 @@ def effect_costs(
 
 def _costs(config: DictConfig, data: GsganData, avatar: Avatar, rounds: int) -> dict[str, Cost]:
     frame = data.dataset("train")[0].to(next(avatar.parameters()).device)
-    costs = {"random_background": Cost(), "face": Cost(), "hands": Cost()}
+    costs = {"random_background": Cost()}
     with torch.random.fork_rng():
         for name in IN_THE_MODEL:
             if getattr(avatar.effects, name).on:

@@ -1,8 +1,9 @@
-"""What Step I and Step II minimise: weights, and the sums they weigh (paper Sec. 3.6, Alg. 2)."""
+"""What Step I and Step II minimise: weights, and the sums they weigh (paper Sec. 3.5, Alg. 2)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -20,44 +21,54 @@ from gsgan.scene import Frame
 
 @dataclass(frozen=True)
 class StepOneLoss:
-    """L_Ψ = l1 · L1(C, I) + ssim · (1 - SSIM(C, I)), over a background.
+    """L_Ψ = l1 · L1(C, I) + ssim · (1 - SSIM(C, I)), over a random colour or black.
 
     Args:
         l1, ssim: weights (paper: 0.8, 0.2).
         feature_head: weight of the same loss on a linear readout of F; without it F's further
             channels get no gradient in Step I. 0 builds no readout.
+        alpha: weight of L1 between the splats' alpha and the mask, where pictures are compared on
+            black only: a random colour behind them teaches alpha by itself.
 
-    Source: paper Sec. 3.6.
+    Source: paper Sec. 3.5 (λ = 0.2); readout and alpha are ours.
     """
 
     l1: float = 0.8
     ssim: float = 0.2
     feature_head: float = 0.5
+    alpha: float = 0.1
 
     def __call__(
-        self, painting: Painting, frame: Frame, background: Tensor, head: nn.Conv2d | None
+        self, painting: Painting, frame: Frame, background: Tensor | None, head: nn.Conv2d | None
     ) -> Tensor:
-        """The loss of a painting of ``frame`` over ``background [B, 3, 1, 1]``; ``head`` is the
-        linear readout of F. In full precision, autocast or not."""
+        """The loss of a painting of ``frame`` over ``background [B, 3, 1, 1]``, None for black;
+        ``head`` is the linear readout of F. In full precision, autocast or not."""
         with full_precision(frame.image):
             return self._loss(painting, frame, background, head)
 
     def _loss(
-        self, painting: Painting, frame: Frame, background: Tensor, head: nn.Conv2d | None
+        self, painting: Painting, frame: Frame, background: Tensor | None, head: nn.Conv2d | None
     ) -> Tensor:
-        target = frame.image + (1 - frame.mask) * background
-        assert painting.features is not None and painting.alpha is not None  # noqa: PT018
+        assert painting.features is not None and painting.splat_alpha is not None  # noqa: PT018
         assert painting.colour is not None
-        behind = (1 - painting.alpha) * background
+        target, behind = frame.image, frame.image.new_zeros(())
+        if background is not None:
+            target = frame.image + (1 - frame.mask) * background
+            behind = (1 - painting.splat_alpha) * background
         pixels = {"l1": self.l1, "ssim": self.ssim}
         loss = photometric(painting.colour + behind, target, unsure=frame.unsure, **pixels)
         if head is not None:
             # No bias where nothing is: the readout commutes with alpha blending.
             read = functional.conv2d(painting.features, head.weight)
-            read = read + painting.alpha * head.bias.view(1, 3, 1, 1)  # type: ignore[union-attr]
+            read = read + painting.splat_alpha * head.bias.view(1, 3, 1, 1)  # type: ignore[union-attr]
             loss = loss + self.feature_head * photometric(
                 read + behind, target, unsure=frame.unsure, **pixels
             )
+        if background is None and self.alpha:
+            matte = photometric(
+                painting.splat_alpha, frame.mask, l1=1.0, ssim=0.0, unsure=frame.unsure
+            )
+            loss = loss + self.alpha * matte
         return loss
 
 
@@ -76,6 +87,7 @@ class StepTwoLoss:
 
     Args:
         l1, l2, ssim: photometric terms on I_pred (the paper's footnote: l2 reconstruction).
+        alpha: weight of the same terms between I_pred's alpha and the mask.
         perceptual: L_perc.
         perceptual_every: compute L_perc only every so many iterations (its weight is multiplied
             by as much); VGG is the costliest term on a CPU.
@@ -85,12 +97,14 @@ class StepTwoLoss:
         anchor: weight of L_Ψ, which keeps C a picture while Ψ learns from the generator.
         detach_features: keep the generator's gradient out of Ψ (ablation).
 
-    Source: paper Sec. 3.6.
+    Source: paper Sec. 3.5 and Alg. 2, an unweighted sum of L_GAN, L_perc and L_feat; weights, the
+        other terms and the anchor are ours.
     """
 
     l1: float = 1.0
     l2: float = 0.0
     ssim: float = 0.2
+    alpha: float = 1.0
     perceptual: float = 1.0
     perceptual_every: int = 1
     adversarial: float = 1.0
@@ -117,7 +131,7 @@ class StepTwoLoss:
 
     def terms(
         self,
-        image: Tensor,
+        painting: Painting,
         frame: Frame,
         *,
         anchor: Tensor | None,
@@ -128,16 +142,20 @@ class StepTwoLoss:
         """The generator's losses, weighted, by name.
 
         Args:
-            image: ``[B, 3, H, W]`` I_pred.
+            painting: with I_pred and its alpha.
             frame: what it should be.
             anchor: L_Ψ of the same painting; None leaves it out.
             perceptual: L_perc; None leaves it out.
             judge: the discriminator; None while it does not play.
             step: the iteration, for ``perceptual_every``.
         """
+        image, alpha = painting.image, painting.alpha
+        assert image is not None and alpha is not None  # noqa: PT018
         target = without_unsure(frame.image, image, frame.unsure)
-        pixels = photometric(image, target, l1=self.l1, l2=self.l2, ssim=self.ssim)
-        terms = {"photometric": pixels}
+        by_pixel = partial(photometric, l1=self.l1, l2=self.l2, ssim=self.ssim)
+        terms = {"photometric": by_pixel(image, target)}
+        if self.alpha:
+            terms["alpha"] = self.alpha * by_pixel(alpha, frame.mask, unsure=frame.unsure)
         if anchor is not None:
             terms["anchor"] = self.anchor * anchor
         if perceptual is not None and step % self.perceptual_every == 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from dataclasses import replace
 from typing import Any
 
@@ -18,7 +19,7 @@ from gsgan.losses.photometric import without_unsure
 from gsgan.metrics.image import psnr
 from gsgan.model.avatar import Avatar, Painting
 from gsgan.model.discriminator import Discriminator
-from gsgan.model.segmentation import segmentation_loss
+from gsgan.model.segmentation import segmentation_loss, silhouette_loss
 from gsgan.scene import Frame
 from gsgan.training.averaging import MovingAverage
 from gsgan.training.losses import StepOneLoss, StepTwoLoss, judged
@@ -45,7 +46,9 @@ class AvatarTraining(LightningModule):
         pose_noise: standard deviation, body heights, of the noise on Ψ's pose code.
         seed: with the iteration it determines every random number drawn here, so a resumed run
             draws the same ones.
-        max_skipped: non-finite gradients that are skipped before the run is stopped.
+        max_skipped: non-finite gradients within ``skip_window`` at which the run is stopped; those
+            before are skipped.
+        skip_window: iterations.
         log_every: iterations between logged values.
         average: decay of the moving average of the last step's weights, which is what gets
             scored; None scores the weights as they are.
@@ -69,6 +72,7 @@ class AvatarTraining(LightningModule):
         pose_noise: float = 0.01,
         seed: int = 0,
         max_skipped: int = 20,
+        skip_window: int = 1000,
         log_every: int = 20,
         average: float | None = None,
         average_every: int = 1,
@@ -87,7 +91,8 @@ class AvatarTraining(LightningModule):
         for name, every in {"log_every": log_every, "average_every": average_every}.items():
             if every < 1:
                 raise ConfigError(f"training.{name} must be at least 1, got {every}")
-        self.max_skipped, self.record = max_skipped, record or {}
+        self.max_skipped, self.skip_window = max_skipped, skip_window
+        self.record = record or {}
         self.rollback = rollback or Rollback()
         self.average, self.average_every = None, average_every
         if average is not None:
@@ -97,7 +102,7 @@ class AvatarTraining(LightningModule):
         wanted = step_one.feature_head and avatar.splat_channels > 3
         self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1) if wanted else None
         self.step = 0  # iterations done: Lightning's global_step counts every optimiser's steps
-        self.skipped = 0
+        self.skipped: deque[int] = deque()  # iterations, within the window
         self.code: list[str] = []  # commits that trained, more than one where a run was resumed
         self.start_psnr: float | None = None
         self.last_psnr: float | None = None
@@ -149,11 +154,7 @@ class AvatarTraining(LightningModule):
     def _parameter_groups(self) -> dict[str, list[tuple[list[nn.Parameter], float]]]:
         avatar, groups = self.avatar, {}
         if avatar.segmentation is not None:
-            s = avatar.segmentation
-            # ours: quats 1e-3, log scales 5e-3, opacity logits 5e-2
-            groups["segmentation"] = [
-                ([s.quats], 1.0), ([s.log_scales], 5.0), ([s.logit_opacities], 50.0),
-            ]  # fmt: skip
+            groups["segmentation"] = avatar.segmentation.parameter_groups()
         head = list(self.feature_head.parameters()) if self.feature_head else []
         if avatar.splats is not None:
             groups["psi"] = [*avatar.splats.parameter_groups(), (head, 1.0)]
@@ -191,23 +192,28 @@ class AvatarTraining(LightningModule):
     def _rate(self, name: str) -> float:
         start, end = self.schedule.bounds(SEGMENTATION if name == "segmentation" else STEP_TWO)
         if name in SPLATTING:  # one span over both steps: restarting the rate costs quality
-            start = self.schedule.bounds(STEP_ONE)[0]
+            start, end_one = self.schedule.bounds(STEP_ONE)
+            end = end_one if self.recipes[name].span == "step_one" else end
         elif name == "discriminator":
             start, end = self.schedule.game
         rate = self.recipes[name].rate.at(self.step, start, end)
         return rate * self.rollback.rate if name == "psi" else rate
 
     def _skip(self, names: tuple[str, ...]) -> None:
-        self.skipped += 1
+        if self.step not in self.skipped:  # the discriminator's may follow the generator's
+            self.skipped.append(self.step)
+        while self.skipped[0] <= self.step - self.skip_window:
+            self.skipped.popleft()
+        count = f"{len(self.skipped)} of the last {self.skip_window} iterations"
         self.print(
             f"iteration {self.step}: a gradient of {', '.join(names)} was not finite; skipped "
-            f"({self.skipped} of at most {self.max_skipped})"
+            f"({count}, at most {self.max_skipped})"
         )
-        if self.skipped >= self.max_skipped:
+        if len(self.skipped) >= self.max_skipped:
             raise GsganError(
-                f"training stopped at iteration {self.step}: {self.skipped} iterations had "
-                "gradients that were not finite; check the data, or lower the learning rates "
-                "(training.recipes.*.rate.peak)"
+                f"training stopped at iteration {self.step}: {count} had gradients that were not "
+                "finite; check the data, lower the learning rates (training.recipes.*.rate.peak), "
+                "or go on with a larger training.max_skipped"
             )
 
     # -- one iteration
@@ -232,12 +238,17 @@ class AvatarTraining(LightningModule):
         self.step += 1
 
     def _train_segmentation(self, frame: Frame) -> None:
-        if frame.labels is None or frame.body is None:
-            return  # nothing to learn from: S keeps its initial Gaussians
         segmentation = self.avatar.segmentation
         assert segmentation is not None
-        labels = segmentation.truth(frame.labels)
-        loss = segmentation_loss(segmentation(frame.body, frame.camera), labels)
+        assert frame.body is not None
+        if segmentation.common is not None:
+            alpha = segmentation.raster(frame.body, frame.camera).alpha
+            loss = silhouette_loss(alpha, frame.mask, frame.unsure)
+        elif frame.labels is None:
+            return  # one of the pictures that nobody labelled
+        else:
+            labels = segmentation.truth(frame.labels)
+            loss = segmentation_loss(segmentation(frame.body, frame.camera), labels)
         self._descend(loss, "segmentation")
         self._log("segmentation/nll", loss)
 
@@ -293,18 +304,18 @@ class AvatarTraining(LightningModule):
             picture_height=height,
             camera_index=frame.camera_index,
         )
-        if painting.alpha is not None:
-            self.rollback.watch(painting.alpha, frame.mask)
+        if painting.splat_alpha is not None:
+            self.rollback.watch(painting.splat_alpha, frame.mask)
         return painting
 
     def on_train_epoch_end(self) -> None:
         """Goes back to the last good state when the person has vanished, before it is saved."""
-        if self.rollback.share >= self.rollback.collapse:
-            self.rollback.keep(self)
+        share = self.rollback.share(self._mean_of_ranks)
+        if share >= self.rollback.collapse:
+            self.rollback.keep(self, share)
             return
         found = self.optimizers()
         optimisers = [o.optimizer for o in (found if isinstance(found, list) else [found])]
-        share = float(self.rollback.share)
         what = f"the rendered person has vanished (alpha is {share:.1%} of the masks')"
         if not self.rollback.restore(self, optimisers):
             raise GsganError(
@@ -318,6 +329,11 @@ class AvatarTraining(LightningModule):
             f"{self.rollback.most})"
         )
 
+    def _mean_of_ranks(self, value: Tensor) -> Tensor:
+        """Over all processes, so that they decide alike."""
+        mean: Tensor = self.trainer.strategy.reduce(value, reduce_op="mean")
+        return mean
+
     # -- losses
 
     def step_one_loss(self, painting: Painting, frame: Frame) -> Tensor:
@@ -329,7 +345,7 @@ class AvatarTraining(LightningModule):
         assert painting.image is not None
         held = self.step_two.anchor and painting.features is not None
         return self.step_two.terms(
-            painting.image,
+            painting,
             frame,
             anchor=self.step_one_loss(painting, frame) if held else None,
             perceptual=self.perceptual,
@@ -344,10 +360,10 @@ class AvatarTraining(LightningModule):
         state = (self.seed * SEED_STRIDE + self.step) * 64 + 2 * (rank % 32) + salt
         return torch.Generator().manual_seed(state % (2**63))
 
-    def _background(self, frame: Frame) -> Tensor:
+    def _background(self, frame: Frame) -> Tensor | None:
         shape = (len(frame), 3, 1, 1)
         if not self.random_background:
-            return frame.image.new_zeros(shape)
+            return None
         return torch.rand(shape, generator=self._random(0)).to(frame.image)
 
     def _pose_noise(self, skeleton: Tensor) -> Tensor | None:
@@ -390,7 +406,6 @@ class AvatarTraining(LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint["gsgan"] = {
             "step": self.step,
-            "skipped": self.skipped,
             "rollbacks": self.rollback.done,
             "averaged": self.average is not None and self.average.started,
             "start_psnr": self.start_psnr,
@@ -404,7 +419,7 @@ class AvatarTraining(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         state = checkpoint["gsgan"]
         _same_effects(state.get("effects"), self.avatar.effects)
-        self.step, self.skipped = state["step"], state["skipped"]
+        self.step = state["step"]
         self.rollback.done = state["rollbacks"]
         self.start_psnr = state["start_psnr"]
         self.seconds_before = state.get("train_seconds")

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
+from gsgan.errors import ConfigError
 from gsgan.training.schedule import Rate
 
 
@@ -17,6 +19,8 @@ class Recipe:
 
     Args:
         rate: learning rate over the phases in which the optimiser works.
+        span: of an optimiser that works in Steps I and II, what the rate's shares are of: ``both``
+            steps, or ``step_one``, after which the rate stays as it ended.
         betas: Adam's. A second beta of 0.99 keeps Ψ from a collapse (`Rollback`).
         eps: Adam's.
         clip: largest gradient norm; None leaves gradients alone.
@@ -26,6 +30,11 @@ class Recipe:
     betas: tuple[float, float] = (0.9, 0.99)
     eps: float = 1e-8
     clip: float | None = None
+    span: Literal["both", "step_one"] = "both"
+
+    def __post_init__(self) -> None:
+        if self.span not in ("both", "step_one"):
+            raise ConfigError(f"training.recipes: span must be both or step_one, got {self.span!r}")
 
     def build(self, groups: Iterable[tuple[list[nn.Parameter], float]]) -> torch.optim.Adam:
         """Adam over (parameters, rate multiplier) groups; parameters that take no gradient wait."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,8 +41,8 @@ class Rollback:
     most: int = 3
     slower: float = 0.5
     done: int = 0
-    alpha: float = 0.0
-    mask: float = 0.0
+    alpha: Tensor | None = None
+    mask: Tensor | None = None
     _state: dict[str, Any] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -62,20 +62,26 @@ class Rollback:
         """Factor on Ψ's learning rate."""
         return self.slower**self.done
 
-    @property
-    def share(self) -> float:
-        """Rendered alpha as a share of the masks'; infinite before anything was seen."""
-        return self.alpha / self.mask if self.mask else float("inf")
+    def share(self, over_ranks: Callable[[Tensor], Tensor] = lambda value: value) -> float:
+        """Rendered alpha as a share of the masks'; infinite before anything was seen.
+
+        Args:
+            over_ranks: means of a tensor over all processes. All of them must call this together.
+        """
+        if self.alpha is None or self.mask is None:
+            return float("inf")
+        alpha, mask = over_ranks(torch.stack([self.alpha, self.mask])).tolist()
+        return alpha / mask if mask else float("inf")
 
     def watch(self, alpha: Tensor, mask: Tensor) -> None:
         """Takes in one iteration's alpha and mask."""
         for name, value in (("alpha", alpha), ("mask", mask)):
-            kept = self.memory * getattr(self, name)
+            kept = 0.0 if getattr(self, name) is None else self.memory * getattr(self, name)
             setattr(self, name, kept + (1 - self.memory) * value.detach().mean())
 
-    def keep(self, module: nn.Module) -> None:
+    def keep(self, module: nn.Module, share: float) -> None:
         """Keeps a copy of the state when it is a good one."""
-        if self.share >= self.healthy:
+        if share >= self.healthy:
             self._state = {k: v.detach().clone() for k, v in module.state_dict().items()}
 
     def restore(self, module: nn.Module, optimisers: Sequence[torch.optim.Optimizer]) -> bool:
@@ -83,7 +89,7 @@ class Rollback:
         if self._state is None or self.done >= self.most:
             return False
         self.done += 1
-        self.alpha = self.mask = 0.0
+        self.alpha = self.mask = None
         module.load_state_dict(self._state)
         for optimiser in optimisers:
             optimiser.state.clear()

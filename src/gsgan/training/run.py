@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
+import time
 import warnings
 from contextlib import suppress
 from pathlib import Path
@@ -16,7 +17,7 @@ from hydra.utils import instantiate
 from lightning import Trainer, seed_everything
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.utilities import rank_zero_only
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 from torch.utils.flop_counter import FlopCounterMode
@@ -24,6 +25,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from gsgan.console import make_console
 from gsgan.data.datamodule import GsganData
 from gsgan.effects.table import effects_table
+from gsgan.errors import ConfigError
 from gsgan.files import write_atomically
 from gsgan.metrics.lpips import check_lpips
 from gsgan.model.avatar import Avatar
@@ -31,12 +33,14 @@ from gsgan.runs import CHECKPOINT, build_training, checkpoint_to_resume, read_ch
 from gsgan.scoring.facts import Method, training_code
 from gsgan.scoring.files import NAMES
 from gsgan.scoring.run import evaluate_run
+from gsgan.splat import resolve_backend
 from gsgan.training.callbacks import Narrator, PictureGrid
 from gsgan.training.checkpoints import AtomicCheckpoints
 from gsgan.training.effects_cost import effect_costs, training_device
 from gsgan.training.module import AvatarTraining
 
 PROGRESS = "progress.json"
+STEP_PER_PAINTING = 4  # a training iteration takes about so many times as long as painting
 LOGS = re.compile(r"logs(_\d+)?")  # of a run, and of its resumed parts
 
 
@@ -65,8 +69,9 @@ def run_training(config: DictConfig) -> None:
         )
         return
 
+    refuse_long_cpu_run(config, data, module)
     module.code = training_code()
-    describe(console, folder, data, module)
+    describe(console, folder, data, module, config.trainer.accelerator)
     where = training_device(config.trainer.accelerator)
     costs = effect_costs(config, data, module.avatar, config.effects.measure, where)
     console.print(effects_table(module.avatar.effects, costs))
@@ -99,6 +104,31 @@ def run_training(config: DictConfig) -> None:
             folder, config, console, data=data, avatar=avatar, marks=module.marks, method=method
         )
     console.print(f"run folder: {folder}", soft_wrap=True)
+
+
+def refuse_long_cpu_run(config: DictConfig, data: GsganData, module: AvatarTraining) -> None:
+    """Stops a run that would take very long because ``trainer=auto`` found no GPU.
+
+    Raises:
+        ConfigError: with the price, and what makes it smaller.
+    """
+    chosen = not OmegaConf.is_interpolation(config.trainer, "accelerator")
+    if chosen or config.trainer.accelerator != "cpu":
+        return
+    frame = data.dataset("train")[0]
+    with torch.no_grad():
+        module.avatar.paint(frame)  # what is built once is built
+        began = time.perf_counter()
+        module.avatar.paint(frame)
+        seconds = time.perf_counter() - began
+    hours = STEP_PER_PAINTING * seconds * module.schedule.total / 3600
+    if hours > config.cpu_hours:
+        long = f"{hours / 24:.0f} days" if hours > 48 else f"{hours:.0f} hours"
+        raise ConfigError(
+            f"no GPU is found, and on this CPU {module.schedule.total:,} iterations at "
+            f"{seconds:.2g} s an image would take about {long}: size=small training=demo trains "
+            "for minutes at 128², trainer=cpu goes on all the same"
+        )
 
 
 def finished(folder: Path, module: AvatarTraining, config: DictConfig) -> bool:
@@ -176,7 +206,15 @@ def build_trainer(
     )
 
 
-def describe(console: Console, folder: Path, data: GsganData, module: AvatarTraining) -> None:
+def rasteriser(avatar: Avatar, device: torch.device) -> str:
+    """The backend that will draw, and what there is to say of it."""
+    name, told = resolve_backend(avatar.backend, device, avatar.accuracy)
+    return f"{name}: {told}" if told else name
+
+
+def describe(
+    console: Console, folder: Path, data: GsganData, module: AvatarTraining, accelerator: str
+) -> None:
     """What is trained on what, and which stand-ins are in use."""
     info, avatar = data.info, module.avatar
     held_out = ", ".join(f"{len(data.dataset(name))} {name}" for name in data.eval_names)
@@ -188,7 +226,14 @@ def describe(console: Console, folder: Path, data: GsganData, module: AvatarTrai
     )
     for name, part in parts(avatar, module).items():
         table.add_row(name, f"{sum(p.numel() for p in part.parameters()):,} parameters")
-    table.add_row("a picture costs", cost(avatar, data))
+    if avatar.segmentation is None:
+        table.add_row("segmentation S", f"not built: {avatar.segmentation_why}")
+    else:
+        source = "part labels" if info.has_labels else "masks: the data has no part labels"
+        table.add_row("", f"{avatar.segmentation_why}; S learns from {source}")
+    if avatar.splats is not None:
+        table.add_row("rasteriser", rasteriser(avatar, training_device(accelerator)))
+    table.add_row("an image costs", cost(avatar, data))
     s = module.schedule
     table.add_row(
         "schedule", f"segmentation {s.segmentation}, Step I {s.step_one}, Step II {s.step_two}"
@@ -203,11 +248,11 @@ def parts(avatar: Avatar, module: AvatarTraining) -> dict[str, torch.nn.Module]:
     found = {
         "Ψ": avatar.deformation,
         "surface": avatar.surface,
-        "segmentation": avatar.segmentation,
         "colour correction": avatar.colour,
         "pose encoder": avatar.pose_encoder,
         "generator": avatar.generator,
         "discriminator": module.discriminator,
+        "segmentation S": avatar.segmentation,
     }
     return {name: part for name, part in found.items() if part is not None}
 

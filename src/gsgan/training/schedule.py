@@ -25,7 +25,7 @@ class Schedule:
         degree_every: iterations of Steps I and II after which the degree of the spherical harmonics
             rises by one, from 0; 0 takes them all at once.
 
-    Source: paper Alg. 2.
+    Source: paper Alg. 2; of the numbers in conf/training only Step I's 10,000 are the paper's.
     """
 
     segmentation: int

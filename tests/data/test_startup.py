@@ -1,0 +1,95 @@
+"""What opening a capture does once, so that nothing does it for every image."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+from make import write_tiny_capture
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from gsgan.data.capture import CaptureDataset
+from gsgan.data.datamodule import GsganData, default_workers
+from gsgan.skeleton import MEDIAPIPE33
+
+MOUTH = [MEDIAPIPE33.names.index(name) for name in ("mouth_left", "mouth_right")]
+
+
+class Calls(TorchDispatchMode):
+    def __init__(self) -> None:
+        super().__init__()
+        self.count: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count[str(func)] += 1
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.fixture
+def without_mouth(capture, tmp_path):
+    """The capture as SMPL gives it: no mouth in any frame."""
+    import shutil
+
+    root = shutil.copytree(capture, tmp_path / "smpl")
+    with np.load(root / "landmarks3d.npz") as held:
+        arrays = dict(held)
+    arrays["p"][:, MOUTH] = np.nan
+    arrays["conf"][:, MOUTH] = 0
+    np.savez(root / "landmarks3d.npz", **arrays)
+    return root
+
+
+def test_a_mouth_that_no_frame_has_is_put_in_place_once(build, without_mouth):
+    data, _, frame = build(f"data.root={without_mouth}")
+    whole = data.dataset("train").skeletons
+    assert set(whole) == set(data.layout.frames)
+    assert all(np.isfinite(p).all() for p in whole.values())
+    assert float(frame.visibility[0, MOUTH].max()) == 0
+    head = frame.skeleton[0, MEDIAPIPE33.nose]
+    assert float((frame.skeleton[0, MOUTH] - head).norm(dim=-1).max()) < 0.2  # metres
+
+
+def test_painting_takes_as_many_operators_without_a_mouth_as_with_one(build, without_mouth):
+    counts = []
+    for overrides in ((), (f"data.root={without_mouth}",)):
+        _, avatar, frame = build("effects=none", *overrides)
+        avatar.paint(frame)
+        with Calls() as seen, torch.no_grad():
+            avatar.paint(frame)
+        counts.append(seen.count)
+    assert counts[0] == counts[1]
+
+
+def test_looking_a_scene_over_holds_few_images_at_once(tmp_path, monkeypatch):
+    """8 moments of 4 cameras are compared; all of them at 1330 × 1150 would be gigabytes."""
+    root = write_tiny_capture(tmp_path / "c", cameras=4, frames=12, size=(48, 48))
+    alive: weakref.WeakSet = weakref.WeakSet()
+    most, reads = 0, 0
+    plain = CaptureDataset.__getitem__
+
+    def watched(self, index):
+        nonlocal most, reads
+        frame = plain(self, index)
+        gc.collect()
+        alive.add(frame.image)
+        most, reads = max(most, len(alive)), reads + 1
+        return frame
+
+    monkeypatch.setattr(CaptureDataset, "__getitem__", watched)
+    assert GsganData(str(root), info_samples=8).info.n_train_cameras == 4
+    assert reads > 30
+    assert most <= 3
+
+
+@pytest.mark.parametrize(
+    ("gpus", "processors", "expected"), [(0, 16, 0), (1, 16, 8), (1, 4, 3), (4, 16, 3), (2, 2, 0)]
+)
+def test_loading_processes_by_default(monkeypatch, gpus, processors, expected):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: gpus > 0)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: gpus)
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(processors)), raising=False)
+    assert default_workers() == expected

@@ -1,0 +1,65 @@
+"""A bound that a parameter can come back from."""
+
+from __future__ import annotations
+
+import torch
+
+from gsgan.model.bounded import bounded
+from gsgan.model.colour import ColourCorrection
+from gsgan.model.deformation import Deformation
+from gsgan.skeleton import Points
+
+X = torch.tensor([-3.0, -1.0, 0.0, 1.0, 3.0])
+
+
+def slopes(grad: float) -> list[float]:
+    x = X.clone().requires_grad_()
+    bounded(x, -2.0, 2.0).backward(torch.full_like(x, grad))
+    return x.grad.tolist()
+
+
+def test_values_are_a_clamps():
+    assert torch.equal(bounded(X, -2.0, 2.0), X.clamp(-2, 2))
+
+
+def test_beyond_a_bound_the_gradient_leads_back_and_never_further_out():
+    assert slopes(1.0) == [0, 1, 1, 1, 1]  # a step against it lowers x: from above, back in
+    assert slopes(-1.0) == [-1, -1, -1, -1, 0]
+
+
+def test_stability_an_opacity_and_a_scale_beyond_their_bounds_come_back():
+    """Of Ψ: raw residuals far outside, a loss that wants them inside."""
+    torch.manual_seed(0)
+    net = Deformation(torch.zeros(4, 3), 1.7, free_table=True, embedding=0, width=8, layers=2)
+    points = Points(
+        means=torch.zeros(1, 4, 3),
+        rotations=torch.eye(3).expand(1, 1, 3, 3),
+        origins=torch.zeros(1, 1, 3),
+        scales=torch.full((1, 4), 0.02),
+        valid=torch.ones(1, 4, dtype=torch.bool),
+        part_id=torch.zeros(4, dtype=torch.long),
+        normals=torch.zeros(1, 4, 3),
+    )
+    sizes = net.parts
+    at = sum(sizes[:3])
+    with torch.no_grad():
+        net.table[:, 7:10] = 20.0  # log scales: far above the largest
+        net.table[:, at] = 40.0  # logits: saturated
+    pose, root = torch.zeros(1, 99), torch.zeros(1, 3)
+    gaussians = net.compose(points, net.residuals(points, pose, root), torch.ones(1, 3))
+    (gaussians.opacities.sum() + gaussians.covariances.diagonal(dim1=-2, dim2=-1).sum()).backward()
+    assert torch.isfinite(net.table.grad).all()
+    assert (net.table.grad[:, 7:10] > 0).all()
+    assert (net.table.grad[:, at] > 0).all()
+
+
+def test_colour_correction_keeps_float32_under_bf16():
+    torch.manual_seed(0)
+    colour = ColourCorrection(["a", "b"], ["a", "b"])
+    torch.nn.init.normal_(colour.offsets, std=0.3)
+    given = (torch.rand(1, 3, 8, 8), torch.rand(1, 1, 8, 8), torch.tensor([0]))
+    plain = colour(*given)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        mixed = colour(*given)
+    assert mixed.dtype == torch.float32
+    assert torch.equal(mixed, plain)

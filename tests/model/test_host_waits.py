@@ -1,0 +1,146 @@
+"""Painting never makes the host wait for a GPU, so that it can be captured as a graph.
+
+On the meta device every operation that reads a number back fails. What would be copied over from
+the host (a tensor made of numbers) is counted beside it. The rasteriser itself is stood in for:
+gsplat's is not ours, and the portable one waits twice, see `gsgan.splat.tile_lists`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from contextlib import nullcontext
+from dataclasses import replace
+
+import pytest
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from gsgan.splat import gsplat_backend, rasterise
+
+META = torch.device("meta")
+READS = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "is_nonzero", "equal")
+
+
+class Reads(TorchDispatchMode):
+    """Counts operators for which the host waits."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        name = func.overloadpacket.__name__
+        if any(name.startswith(read) for read in READS):
+            self.seen[name] += 1
+        if name == "repeat_interleave" and (kwargs or {}).get("output_size") is None:
+            self.seen[name] += 1
+        if name.startswith("index") and any(
+            isinstance(i, torch.Tensor) and i.dtype == torch.bool
+            for i in (args[1] if isinstance(args[1], list | tuple) else ())
+        ):
+            self.seen["index by a mask"] += 1
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.fixture
+def copies(monkeypatch):
+    """Counts tensors that are made of numbers on a device."""
+    seen: Counter[str] = Counter()
+
+    def counted(module, name, device_of):
+        plain = getattr(module, name)
+
+        def make(*args, **kwargs):
+            if device_of(args, kwargs) == META:
+                seen[name] += 1
+            return plain(*args, **kwargs)
+
+        monkeypatch.setattr(module, name, make)
+
+    def asked(args, kwargs):
+        return torch.device(kwargs.get("device") or "cpu")
+
+    counted(torch, "tensor", asked)
+    counted(torch, "as_tensor", asked)
+    counted(torch.Tensor, "new_tensor", lambda args, kwargs: args[0].device)
+    return seen
+
+
+def drawn(gaussians, camera, settings, keep, want_depth):
+    """What gsplat would return, empty."""
+    batch, (height, width) = len(camera), camera.size
+    features = gaussians.features.new_zeros(batch, gaussians.features.shape[-1], height, width)
+    return features, features[:, :1], None
+
+
+@pytest.mark.parametrize("model", ["full", "wo_gcn", "splat_only", "lbs_splat"])
+@pytest.mark.parametrize("scene", ["auto", "none", "all", "lens"])
+def test_painting_reads_nothing_back_and_copies_nothing_over(
+    build, monkeypatch, copies, model, scene
+):
+    effects = "auto" if scene == "lens" else scene
+    _, avatar, frame = build(f"model={model}", f"effects={effects}")
+    if scene == "lens":
+        dist = torch.tensor([[-0.2, 0.05, 0.001, 0.0, 0.0]])
+        frame = replace(frame, camera=replace(frame.camera, dist=dist))
+    window = avatar.window(frame)
+    assert window is not None
+    frame = window.frame(frame).to(META)
+    monkeypatch.setattr(gsplat_backend, "why_not", lambda settings, device: "")
+    monkeypatch.setattr(gsplat_backend, "draw", drawn)
+    monkeypatch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # knows no meta device
+    avatar = avatar.to(META).eval()
+    avatar.backend = "gsplat"
+    if avatar.segmentation is not None:
+        avatar.segmentation.backend = "gsplat"
+
+    def paint():
+        with torch.no_grad():
+            return avatar(
+                *(frame.skeleton, frame.visibility, frame.camera, frame.body),
+                picture_height=48,
+                camera_index=frame.camera_index,
+            ).pasted(window)
+
+    paint()  # constants are made once for a device
+    copies.clear()
+    with Reads() as reads:
+        painting = paint()
+    assert painting.image.device == META
+    assert painting.image.shape[-2:] == window.picture
+    assert not reads.seen
+    assert not copies
+
+
+def test_the_window_is_read_back_once(build):
+    _, avatar, frame = build()
+    with Reads() as reads:
+        avatar.window(frame)
+    assert not reads.seen  # a list of numbers leaves by one copy, which is no operator of these
+
+
+def test_the_portable_rasteriser_waits_twice(build, monkeypatch):
+    """As on CUDA: the stop that only a CPU makes is left out."""
+    from gsgan.splat import tiles
+
+    _, avatar, frame = build("effects=none")
+    with torch.no_grad():
+        painting = avatar.paint(frame)
+    plain = rasterise(painting.gaussians, frame.camera, settings=avatar.accuracy, backend="torch")
+    stopping = tiles._Walk.__init__
+
+    def without_stop(self, *args):
+        stopping(self, *args)
+        self.stops = False
+
+    monkeypatch.setattr(tiles._Walk, "__init__", without_stop)
+    with Reads() as reads, torch.no_grad():
+        raster = rasterise(
+            painting.gaussians,
+            replace(frame.camera),
+            settings=avatar.accuracy,
+            backend="torch",
+            on_invalid="unchecked",
+        )
+    assert reads.seen == {"_local_scalar_dense": 1}  # and one list of numbers
+    torch.testing.assert_close(raster.features, plain.features, atol=1e-5, rtol=0)

@@ -1,0 +1,156 @@
+"""`experiment=paper` is one line for every data set, and only its runs bear the paper's name."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from omegaconf import OmegaConf
+
+from gsgan.config import config_folder
+from gsgan.paper import departures, flat, named
+from gsgan.runs import record
+
+DATA = sorted(path.stem for path in (config_folder() / "data").glob("*.yaml"))
+OURS = {  # what gsgan adds to the paper's method, and the value that leaves it out
+    "effects.body_points": "off",
+    "effects.colour_correction": "off",
+    "effects.antialias": "off",
+    "effects.random_background": "off",
+    "model.deformation.normals": False,
+    "model.deformation.free_table": False,
+    "model.deformation.embedding": 0,
+    "model.generator.rgb_skip": False,
+    "model.low_pass": 0.3,
+    "model.supersample": 1,
+    "model.window_margin": None,
+    "training.average": None,
+    "training.pose_noise": 0.0,
+    "training.recipes.psi.clip": None,
+    "training.step_one.feature_head": 0.0,
+    "training.step_two.anchor": 0.0,
+    "training.step_two.adversarial": 1.0,
+    "training.step_two.perceptual": 1.0,
+    "training.step_two.feature_matching": 1.0,
+    "training.step_two.gan": "logistic",
+    "training.schedule.step_one": 10000,
+    "training.recipes.generator.rate.peak": 2e-5,
+}
+
+
+@pytest.fixture
+def settings(compose):
+    def run(*overrides: str):
+        return dict(flat(record(compose("train", *overrides))))
+
+    return run
+
+
+@pytest.mark.parametrize("data", DATA)
+def test_the_preset_leaves_out_what_is_ours_on_every_data(settings, data):
+    found = settings("experiment=paper", f"data={data}")
+    assert {key: found[key] for key in OURS} == OURS
+    assert departures(found, "full", data) == []
+
+
+@pytest.mark.parametrize(("data", "protocol"), [("thuman4", "thuman4"), ("zju_mocap", "zju")])
+def test_it_brings_the_papers_protocol(compose, data, protocol):
+    config = compose("train", "experiment=paper", f"data={data}")
+    assert config.protocol.name == f"paper_{protocol}"
+    assert config.data.protocol.name == f"paper_{protocol}"
+    assert config.data.crop is None
+
+
+def test_an_ablation_of_it_is_the_papers_ablation(settings):
+    found = settings("experiment=paper", "data=zju_mocap", "model=wo_gcn")
+    assert departures(found, "wo_gcn", "zju_mocap") == []
+    assert departures(found, "full", "zju_mocap") != []
+
+
+def test_what_changes_no_number_is_no_departure(settings):
+    idle = ("training.log_every=5", "training.max_skipped=3", "model.backend=torch", "seed=0")
+    assert departures(settings("experiment=paper", *idle), "full", "synthetic") == []
+
+
+def test_every_other_run_says_in_what_it_differs(settings):
+    told = departures(settings("data=thuman4"), "full", "thuman4")
+    assert {"effects.body_points", "model.deformation.normals", "training.average"} <= set(told)
+    assert departures(
+        settings("experiment=paper", "training.step_two.perceptual=2"), "full", "synthetic"
+    ) == ["training.step_two.perceptual"]
+    assert named(["a", "b"]) == "differs from experiment=paper in a, b"
+    assert named([str(i) for i in range(9)]).endswith("5 and 3 more")
+
+
+def test_the_page_lists_keys_that_exist_and_values_of_the_preset(compose):
+    """Every key of docs/paper.md, by its last word where several share a cell."""
+    page = (config_folder().parent / "docs" / "paper.md").read_text()
+    config = compose("train", "experiment=paper")
+    groups = ("model", "training", "effects", "size")
+    known = dict(flat({g: OmegaConf.to_container(config[g], resolve=True) for g in groups}))
+    groups = {key.rpartition(".")[0] for key in known} | set(known)
+    parents = {".".join(key.split(".")[:n]) for key in known for n in range(1, 6)}
+    for row in (line for line in page.splitlines() if line.startswith("|")):
+        cell = row.split("|")[3]
+        keys = re.findall(r"`([a-z0-9_.]+)`", cell)
+        for key in keys:
+            if "." in key:
+                assert key in parents | groups, key
+                first = key
+            else:
+                assert f"{first.rpartition('.')[0]}.{key}" in parents | groups, key
+    for key in OURS:
+        group, _, name = key.rpartition(".")
+        assert name in page, key
+        assert group.split(".")[0] in page
+
+
+# --- what data asks for by itself
+
+
+@pytest.mark.parametrize("data", DATA)
+def test_large_captures_train_at_full_size_by_themselves(compose, data):
+    config = compose("train", f"data={data}")
+    large = data in ("thuman4", "zju_mocap", "avatarrex")
+    assert config.size.picture == (512 if large else 128)
+    assert config.training.schedule.step_two == (250_000 if large else 2600)
+    small = compose("train", f"data={data}", "size=small", "training=demo")
+    assert (small.size.picture, small.training.schedule.step_two) == (128, 2600)
+
+
+@pytest.mark.parametrize(
+    ("there", "told"), [(True, ("gpu", "bf16-mixed")), (False, ("cpu", "32-true"))]
+)
+def test_the_accelerator_is_the_one_that_is_there(compose, monkeypatch, there, told):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: there)
+    trainer = compose("train").trainer
+    assert (trainer.accelerator, trainer.precision) == told
+    assert compose("train", "trainer=cpu").trainer.accelerator == "cpu"
+
+
+def test_a_long_run_without_a_gpu_is_refused_with_its_price_until_it_is_asked_for(
+    inside, capture, tmp_path
+):
+    """Tiny, with a budget to match."""
+    few = [
+        *("data=capture", f"data.root={capture}", "size=tiny", "training=smoke", "data.crop=null"),
+        *("evaluate=false", f"hydra.run.dir={tmp_path / 'run'}"),
+    ]
+    refused = inside("train", *few, "cpu_hours=1e-9")
+    assert refused.returncode == 1
+    assert "no GPU is found, and on this CPU 16 iterations" in refused.stderr
+    assert "size=small training=demo" in refused.stderr
+    assert refused.stderr.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+    assert inside("train", *few, "cpu_hours=1e-9", "trainer=cpu").returncode == 0
+
+
+# --- factors that make baselines train equally long
+
+
+@pytest.mark.parametrize("model", ["splat_only", "lbs_splat", "image_to_image"])
+def test_a_baseline_is_stretched_by_an_experiment_only(compose, model):
+    assert compose("train", f"model={model}", "training=paper").training.schedule.stretch == 1
+    study = compose("train", "experiment=ablation", f"model={model}")
+    assert study.training.schedule.stretch == study.equal_time[model] > 1
+    assert compose("train", "experiment=ablation").training.schedule.stretch == 1
