@@ -160,8 +160,10 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
     result = inside("evaluate", f"run={copy}", "background=white", "pictures=1")
     assert result.returncode == 0, result.stderr
     assert "scored on white" in result.stdout
-    assert "scored on white" in (copy / "metrics.md").read_text()
-    black, white = scores(run), scores(copy)
+    on_white = copy / "on_white"
+    assert "scored on white" in (on_white / "metrics.md").read_text()
+    assert scores(copy) == scores(run)  # its own stay
+    black, white = scores(run), scores(on_white)
     data = build_data(load_config(run))
     avatar, _ = load_avatar(run, load_config(run), data)
     for split, variants in white.items():
