@@ -163,6 +163,9 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
     on_white = copy / "on_white"
     assert "scored on white" in (on_white / "metrics.md").read_text()
     assert scores(copy) == scores(run)  # its own stay
+    shown = cv2.imread(str(on_white / "pictures" / "novel_pose.png"))
+    assert (shown[-1, 0] == 255).all()  # the truth's corner
+    assert (shown[-1, 3 * shown.shape[1] // 5 + 1] > 128).all()  # and the painted one, fourth
     black, white = scores(run), scores(on_white)
     data = build_data(load_config(run))
     avatar, _ = load_avatar(run, load_config(run), data)

@@ -67,6 +67,30 @@ def test_an_ablation_of_it_is_the_papers_ablation(settings):
     assert departures(found, "full", "zju_mocap") != []
 
 
+@pytest.mark.parametrize("model", ["lbs_splat", "image_to_image"])
+def test_baselines_that_are_not_the_papers_are_refused_in_one_sentence(inside, capture, model):
+    given = ("experiment=paper", f"model={model}", "data=capture", f"data.root={capture}")
+    result = inside("train", *given, "size=tiny", "training=smoke")
+    assert result.returncode == 1
+    assert "it goes with model=full, wo_feat, wo_seg, wo_gcn or splat_only" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("model", ["full", "wo_feat", "wo_seg", "wo_gcn", "splat_only"])
+def test_it_builds_with_the_papers_models(build, model):
+    small = ("size=tiny", "training=smoke")
+    _, avatar, frame = build("experiment=paper", f"model={model}", *small)
+    assert avatar.effects.degree == 3
+    assert avatar.body_points is None
+    assert avatar.window(frame) is None
+    assert avatar.paint(frame).image.shape == frame.image.shape
+
+
+def test_unknown_models_and_data_are_no_departure_that_could_be_named(settings):
+    assert departures(settings(), "mine", "synthetic") is None
+    assert departures(settings(), "full", "mine") is None
+
+
 def test_what_changes_no_number_is_no_departure(settings):
     idle = ("training.log_every=5", "training.max_skipped=3", "model.backend=torch", "seed=0")
     assert departures(settings("experiment=paper", *idle), "full", "synthetic") == []

@@ -19,3 +19,11 @@ def constant(values: Any, like: Tensor) -> Tensor:
 def _constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
     with torch.inference_mode(False):  # born in it, it could not be used for training later
         return torch.tensor(values, dtype=dtype, device=device)
+
+
+def filled(values: Any, like: Tensor) -> Tensor:
+    """`constant` for values that change from call to call: written on the device, number by
+    number."""
+    if isinstance(values, tuple):
+        return torch.stack([filled(value, like) for value in values])
+    return like.new_full((), values)

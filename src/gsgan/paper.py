@@ -29,21 +29,47 @@ def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
         yield at, value
 
 
-def departures(settings: Mapping[str, Any], model: str, data: str) -> list[str]:
+def settings_of(config: DictConfig) -> dict[str, Any]:
+    """A run's config by dotted key, less what differs between seeds, machines and continuations.
+
+    Raises:
+        OmegaConfBaseException: when it cannot be resolved.
+    """
+    from gsgan.runs import record  # here: it brings torch
+
+    seedless = config.copy()
+    seedless.seed = 0  # data and training refer to it
+    return dict(flat(record(seedless)))
+
+
+def departures(settings: Mapping[str, Any], model: str, data: str) -> list[str] | None:
     """Keys in which a run is not what ``experiment=paper`` makes of its model and data.
 
     Args:
         settings: of the run, resolved, by dotted key.
         model: choice of the model group; an ablation is compared with the same ablation.
         data: choice of the data group.
+
+    Returns:
+        None where such a model or data set is not in conf/.
     """
-    paper = _paper(model, data)
+    from hydra.errors import HydraException
+
+    try:
+        paper = _paper(model, data)
+    except HydraException:
+        return None
     mine = {k: v for k, v in settings.items() if k.partition(".")[0] in METHOD}
     return sorted(
         key
         for key in paper.keys() | mine.keys()
-        if paper.get(key) != mine.get(key) and not _idle(key)
+        if _word(paper.get(key)) != _word(mine.get(key)) and not _idle(key)
     )
+
+
+def _word(value: Any) -> Any:
+    """YAML reads a bare on or off as true or false."""
+    return {"on": True, "off": False}.get(value, value) if isinstance(value, str) else value
 
 
 def named(told: list[str], most: int = 6) -> str:

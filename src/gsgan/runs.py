@@ -203,6 +203,7 @@ def build_avatar(
     data: GsganData,
     vertex_labels: Tensor | None = None,
     effects: Effects | None = None,
+    labelled: bool | None = None,
 ) -> Avatar:
     """The untrained avatar of a config, sized to the data, its weights from ``config.seed``.
 
@@ -212,18 +213,25 @@ def build_avatar(
         vertex_labels: ``[V]`` the outcome of an earlier class vote; None holds it where it is
             called for.
         effects: decided earlier; None decides them from the training split.
+        labelled: whether S was trained on part labels; None: whether the data has some.
 
     Raises:
         ConfigError: when a value under ``model`` is not one the parts can take.
     """
     if effects is None:
         effects = decide(data.info, effect_settings(config))
+    if config.model.get("densify") is not None and "_target_" not in config.model.densify:
+        raise ConfigError(
+            "experiment=paper changes parts that this model does not have; it goes with "
+            "model=full, wo_feat, wo_seg, wo_gcn or splat_only"
+        )
     torch.manual_seed(config.seed)
     with _naming("model"):
         return instantiate(config.model)(
             scene=data.info,
             pictures=data.labelled("train"),
             vertex_labels=vertex_labels,
+            labelled=labelled,
             effects=effects,
         )
 
@@ -278,7 +286,9 @@ def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avat
     }
     decided = checkpoint["gsgan"].get("effects")
     effects = None if decided is None else Effects.from_plain(decided)
-    avatar = build_avatar(config, data, state.get("segmentation.vertex_labels"), effects)
+    labelled = "segmentation.common" not in state if "segmentation.quats" in state else None
+    votes = state.get("segmentation.vertex_labels")
+    avatar = build_avatar(config, data, votes, effects, labelled)
     points = effects is not None and effects.body_points.on
     _check_body(folder, avatar, points, segments="segmentation.quats" in state)
     try:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 
 import pytest
 import torch
@@ -12,6 +13,7 @@ from gsgan.body.smpl_names import CIHP, CLOTHES, SMPLX_JOINTS
 from gsgan.errors import ConfigError
 from gsgan.model.classes import IGNORE, class_map
 from gsgan.model.segmentation import Segmentation, segmentation_loss, silhouette_loss
+from gsgan.runs import Moved, build_data, load_avatar, load_config
 from gsgan.scene import BodyPose, Camera
 
 SIZE = 32
@@ -320,3 +322,35 @@ def test_hands_mode_from_the_config_paints(build):
     F = 5 * (1 + avatar.accuracy.supersample**2)  # averaged and as drawn
     assert avatar.generator.content.stem.in_channels == F + 4 + 8
     assert torch.isfinite(painting.image).all()
+
+
+# --- labels that come and go
+
+
+def capture_without_labels(capture, folder, frames=None):
+    """The capture without label images, of all frames or of some."""
+    root = shutil.copytree(capture, folder)
+    if frames is None:
+        shutil.rmtree(root / "labels")
+    else:
+        for path in (root / "labels").rglob("*.png"):
+            if int(path.stem) in frames:
+                path.unlink()
+    return root
+
+
+def test_a_trained_S_is_loaded_whether_or_not_labels_are_at_hand(run, capture, tmp_path):
+    bare = capture_without_labels(capture, tmp_path / "bare")
+    config = load_config(run, Moved(str(bare)))
+    data = build_data(config)
+    assert not data.info.has_labels
+    avatar, _ = load_avatar(run, config, data)
+    assert avatar.segmentation.common is None
+
+
+def test_labels_of_held_out_images_alone_teach_nothing(build, capture, tmp_path):
+    some = capture_without_labels(capture, tmp_path / "some", frames=range(4))  # those that train
+    data, avatar, _ = build(f"data.root={some}")
+    assert data.layout.labels
+    assert not data.info.has_labels
+    assert avatar.segmentation.common is not None

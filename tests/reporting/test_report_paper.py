@@ -6,7 +6,9 @@ import pytest
 from report_folders import protocol, report_of, row, table, texts, write_run, zju
 
 from gsgan.errors import ConfigError
+from gsgan.paper import NAME
 from gsgan.reporting.paper import read_paper
+from gsgan.reporting.scored import Run
 
 ABLATION = {"rows": [{"run": "full"}, {"run": "wo_seg"}], "paper": "ablation"}
 VIEW = {"splits": ["novel_view"], "metrics": ["psnr"]}
@@ -46,6 +48,26 @@ def test_elsewhere_they_stand_by_themselves_and_say_why(tmp_path, held, said):
     assert said in paper.remarks[0]
     told = ("n/a", "zju_mocap", "the paper's, read as paper_zju", "n/a")
     assert all(r.provenance == told for r in paper.rows)
+
+
+def test_only_runs_of_the_preset_bear_the_papers_name(tmp_path, monkeypatch):
+    rows = [{"run": "full"}, {"run": "full", "label": "C", "variant": "splat"}]
+    rows.append({"run": "wo_seg", "label": "w/o S"})
+    spec = table(**(ABLATION | VIEW | {"rows": rows}))
+    runs = [paper_run(tmp_path / name, model=name) for name in ("full", "wo_seg")]
+    for told, labels in (
+        ([], [NAME, f"{NAME}, w/o S"]),
+        (["model.low_pass"], ["full", "w/o S"]),
+        (None, ["full", "w/o S"]),
+    ):
+        monkeypatch.setattr(Run, "departures", lambda run, told=told: told)
+        (grid,) = report_of(spec, *runs).grids
+        ours = [r.label for r in grid.rows if r.kind != "paper"]
+        assert [label for label in ours if label in labels] == labels
+        assert ours.count(NAME) == (told == [])
+        notes = " ".join(note for r in grid.rows for note in r.notes)
+        assert ("differs from experiment=paper in model.low_pass" in notes) == bool(told)
+        assert ("no config tells whether" in notes) == (told is None)
 
 
 def test_another_split_is_not_the_papers(tmp_path):

@@ -91,6 +91,14 @@ def test_training_asks_all_ranks(make, monkeypatch):
     assert asked.count("mean") == module.schedule.epochs - 1  # the first one trains S alone
 
 
+def test_an_alpha_that_is_not_finite_is_no_collapse():
+    rollback = Rollback()
+    mask = torch.full((1, 1, 4, 4), 0.3)
+    for alpha in (0.3, float("nan"), 0.3):
+        rollback.watch(torch.full((1, 1, 4, 4), alpha), mask)
+    assert 0.5 < rollback.share() < 1
+
+
 # --- rates
 
 
@@ -107,6 +115,12 @@ def test_psis_rate_ends_with_step_one_however_long_step_two_is(make):
     assert rates[6][0] == pytest.approx(1e-3)
     assert rates[6][1] == pytest.approx(1e-4)  # half-way, exponentially
     assert rates[6][2] == rates[6][3] == pytest.approx(1e-5)
+
+
+def test_a_span_that_is_not_read_is_refused(make):
+    module, _, _ = make("+training.recipes.generator.span=step_one")
+    with pytest.raises(ConfigError, match="only psi and colour have one"):
+        module.configure_optimizers()
 
 
 def test_a_span_is_both_steps_or_the_first():

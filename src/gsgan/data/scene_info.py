@@ -36,7 +36,7 @@ class SceneInfo:
         camera_names: all cameras; `Frame.camera_index` counts in this order.
         n_train_cameras: cameras that train.
         has_distortion: a lens coefficient of a training camera is not zero.
-        has_labels: there are part labels.
+        has_labels: there are part labels of training images.
         has_body_pose: there is a body pose for every frame.
         body: kind of the skinned body ("free", "smpl", "smplx"), or None.
         skeleton: name of the landmark set.
@@ -125,7 +125,7 @@ def scene_info(
         camera_names=layout.camera_names,
         n_train_cameras=len(cameras),
         has_distortion=any(entry.distorted for entry in entries.values()),
-        has_labels=bool(layout.labels),
+        has_labels=any(layout.label_path(*item) for item in splits.items["train"]),
         has_body_pose=layout.poses is not None,
         body=None if body is None else body.kind,
         skeleton=layout.meta.skeleton,

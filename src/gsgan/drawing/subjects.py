@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import torch
 from hydra.utils import instantiate
@@ -17,7 +16,7 @@ from gsgan.data.splits import Item
 from gsgan.drawing.shots import Shot
 from gsgan.errors import ConfigError, DataError
 from gsgan.model.avatar import Avatar, Painting
-from gsgan.paper import NAME, departures, flat
+from gsgan.paper import NAME, departures, settings_of
 from gsgan.runs import (
     CHECKPOINT,
     Moved,
@@ -25,7 +24,6 @@ from gsgan.runs import (
     load_avatar,
     load_config,
     read_checkpoint,
-    record,
 )
 from gsgan.scoring.facts import choices
 from gsgan.training.schedule import Schedule
@@ -180,7 +178,7 @@ def _open(folder: Path, moved: Moved, device: torch.device | str) -> Subject:
     chosen = choices(folder)
     model = str(chosen.get("model") or folder.resolve().name)
     name = TITLES.get(model, model)
-    if model == "full" and not departures(_settings(config), model, str(chosen.get("data"))):
+    if model == "full" and departures(settings_of(config), model, str(chosen.get("data"))) == []:
         name = NAME
     step = int(read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"])
     total = _iterations(config, avatar)
@@ -192,12 +190,6 @@ def _iterations(config: DictConfig, avatar: Avatar) -> int:
     schedule: Schedule = instantiate(config.training.schedule)
     stretched = sum(round(n * schedule.stretch) for n in (schedule.step_one, schedule.step_two))
     return stretched + (0 if avatar.segmentation is None else schedule.segmentation)
-
-
-def _settings(config: DictConfig) -> dict[str, Any]:
-    config = config.copy()
-    config.seed = 0
-    return dict(flat(record(config)))
 
 
 def _distinct(subjects: Sequence[Subject]) -> list[str]:

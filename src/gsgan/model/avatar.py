@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from gsgan.body import open_body
 from gsgan.effects import Effects, EffectSettings, decide
-from gsgan.errors import DataError
+from gsgan.errors import ConfigError, DataError
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.class_vote import ClassVote, Pictures
 from gsgan.model.colour import ColourCorrection
@@ -81,6 +81,7 @@ class Avatar(nn.Module):
             None votes with its own settings.
         pictures: training frames with labels, for that vote.
         vertex_labels: ``[V]`` int64, the outcome of an earlier vote, which then is not held again.
+        labelled: whether S was trained on part labels; None: whether the data has some.
         effects: what the scene calls for; None decides it here, with the settings' defaults. Those
             that this model cannot have are taken out.
 
@@ -111,9 +112,13 @@ class Avatar(nn.Module):
         class_vote: ClassVote | None = None,
         pictures: Pictures | None = None,
         vertex_labels: Tensor | None = None,
+        labelled: bool | None = None,
         effects: Effects | None = None,
     ) -> None:
         super().__init__()
+        _refuse_formation(accuracy)
+        if densify is not None and densify.template is not MEDIAPIPE33 and twist != "none":
+            raise ValueError("twist=hinge goes with densify.limbs=paper22 only")
         self.effects = decide(scene, EffectSettings()) if effects is None else effects
         self.effects = _possible(self.effects, densify is not None, surface is not None)
         if backend not in BACKENDS:
@@ -150,7 +155,7 @@ class Avatar(nn.Module):
         if self.splats is None and generator is None:
             raise ValueError("Avatar: nothing paints; give a deformation, a surface or a generator")
         self.segmentation = self._build_segmentation(
-            scene, segmentation, class_vote or ClassVote(), pictures, vertex_labels
+            scene, segmentation, class_vote or ClassVote(), pictures, vertex_labels, labelled
         )
         self.pose_encoder = pose_encoder
         self.generator: Generator | None = None
@@ -218,6 +223,7 @@ class Avatar(nn.Module):
         vote: ClassVote,
         pictures: Pictures | None,
         vertex_labels: Tensor | None,
+        labelled: bool | None,
     ) -> Segmentation | None:
         self.segmentation_why = "the model leaves it out"
         if build is None:
@@ -225,7 +231,7 @@ class Avatar(nn.Module):
         body, self.segmentation_why = labelled_body(scene, vote, pictures, vertex_labels)
         if body is None:
             return None
-        built = build(body=body, labelled=scene.has_labels)
+        built = build(body=body, labelled=scene.has_labels if labelled is None else labelled)
         built.accuracy, built.backend = self._image_formation(built.accuracy), self.backend
         return built
 
@@ -234,7 +240,7 @@ class Avatar(nn.Module):
         return replace(
             accuracy,
             low_pass=self.low_pass,
-            antialias=accuracy.antialias or self.effects.antialias.on,
+            antialias=self.effects.antialias.on,
         )
 
     def forward(
@@ -321,7 +327,8 @@ class Avatar(nn.Module):
         if self.generator is None:
             image = colour
         elif image is not None and painting.alpha is not None:
-            image = self.colour(image, painting.alpha, camera_index)
+            # alpha learns from the mask alone
+            image = self.colour(image, painting.alpha.detach(), camera_index)
         return replace(painting, image=image, corrected=colour)
 
     def splat(
@@ -416,6 +423,17 @@ class Avatar(nn.Module):
             root = root_of(p, self.template).unsqueeze(1)
             in_camera = (p - root) @ camera.R.mT / self.body_height
             return omega(p, valid, camera.R, self.template, frames=frames), in_camera
+
+
+def _refuse_formation(accuracy: Accuracy) -> None:
+    """How pixels are formed has one place: a value given to the accuracy would be overridden."""
+    for name, place in (
+        ("low_pass", "model.low_pass"),
+        ("supersample", "model.supersample"),
+        ("antialias", "effects.antialias"),
+    ):
+        if getattr(accuracy, name) != getattr(Accuracy, name):
+            raise ConfigError(f"accuracy.{name} is not read; set {place}")
 
 
 def _possible(effects: Effects, densifies: bool, on_surface: bool) -> Effects:

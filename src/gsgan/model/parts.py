@@ -41,13 +41,15 @@ def labelled_body(
         return None, (
             f"the data's poses are of the body {scene.body!r}, of which there is no model file"
         )
-    if not scene.has_labels:
+    if not scene.has_labels and vertex_labels is None:
         guess = body.label_source == "guess"
         return body, "parts by the body's joints" if guess else "parts are the body's own"
-    if body.shares_labels(scene.label_names):
+    if scene.has_labels and body.shares_labels(scene.label_names):
         _check_number(scene, body)
         return body, "the labels are the body's own, so there is no class vote"
     names = label_names(scene)
+    if vertex_labels is not None and not scene.has_labels:  # a voted S, painted without labels
+        names = names or tuple(f"part {i}" for i in range(int(vertex_labels.max()) + 1))
     if vertex_labels is not None:
         if len(vertex_labels) != len(body.vertices) or int(vertex_labels.max()) >= len(names):
             raise DataError(

@@ -133,7 +133,7 @@ def grids(part: Part, paper: PaperTable | None) -> list[Grid]:
     rows, printed = [], _paper_rows(part, paper)
     for spec in part.rows:
         row = _row(part, spec)
-        rows.append(row if paper is None else beside_the_paper(row, part.source(spec).runs))
+        rows.append(row if paper is None else beside_the_paper(row, spec, part.source(spec).runs))
         if spec.variant == PAINTED:
             rows += printed.pop(spec.run, [])
     rows += [row for left in printed.values() for row in left]
@@ -184,7 +184,7 @@ def _row(part: Part, spec: RowSpec) -> Row:
     return Row(spec.title, cells, origin, notes=notes)
 
 
-def beside_the_paper(row: Row, runs: Sequence[Run]) -> Row:
+def beside_the_paper(row: Row, spec: RowSpec, runs: Sequence[Run]) -> Row:
     """A row that stands beside the paper's figures: named as the paper's method where all of its
     runs are, else with a note that says in what they are not."""
     told = [run.departures() for run in runs]
@@ -194,7 +194,8 @@ def beside_the_paper(row: Row, runs: Sequence[Run]) -> Row:
         return replace(row, notes=(*row.notes, "no config tells whether it is experiment=paper"))
     if found := next((keys for keys in told if keys), None):
         return replace(row, notes=(*row.notes, named(found)))
-    return replace(row, label=NAME if runs[0].name == "full" else f"{NAME}, {row.label}")
+    whole = (spec.run, spec.variant) == ("full", PAINTED)
+    return replace(row, label=NAME if whole else f"{NAME}, {row.label}")
 
 
 def _floor(part: Part) -> Row:

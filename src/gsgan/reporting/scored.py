@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsgan.errors import ConfigError, DataError
-from gsgan.paper import departures, flat
+from gsgan.paper import departures, settings_of
 from gsgan.reporting.spec import METRICS
 
 METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"
@@ -250,13 +250,8 @@ def _config(folder: Path) -> tuple[DictConfig | None, dict[str, Any]]:
 
 
 def _settings(config: DictConfig) -> dict[str, Any]:
-    """The config by dotted key, less what differs between seeds, machines and continuations."""
-    from gsgan.runs import record  # here: it brings torch
-
-    seedless = config.copy()
-    seedless.seed = 0  # data and training refer to it
     try:
-        return dict(flat(record(seedless)))
+        return settings_of(config)
     except OmegaConfBaseException as error:
         raise DataError(f"{CONFIG}: {str(error).splitlines()[0]}") from None
 

@@ -17,7 +17,7 @@ from gsgan.runs import CHECKPOINT, Moved, build_data, load_avatar, load_config, 
 from gsgan.scoring.facts import Method
 from gsgan.scoring.files import FACTS_FILE, METRICS_FILE
 from gsgan.scoring.folder import SHOWN, Folder, Pattern, check_headers, read_folder
-from gsgan.scoring.run import Wanted, evaluate_method, evaluate_run, make_scorer
+from gsgan.scoring.run import Wanted, check_background, evaluate_method, evaluate_run, make_scorer
 from gsgan.scoring.shuffled import Exchanged
 from gsgan.scoring.split import FLOOR, FULL
 from gsgan.scoring.tables import Results
@@ -62,6 +62,7 @@ def evaluate_folder(config: DictConfig) -> Results:
     data = build_data(stored)
     avatar, marks = load_avatar(folder, stored, data)
     state = read_checkpoint(folder / CHECKPOINT)["gsgan"]
+    check_background(config.background)
     usual = "black" if data.protocol is None else data.protocol.measures.background
     elsewhere = config.background not in (None, usual)  # a run's own scores stay
     out = folder / f"on_{config.background}" if elsewhere else None

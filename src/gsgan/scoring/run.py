@@ -104,8 +104,19 @@ def evaluate_run(
     scorer = make_scorer(config, data, marks)
     return evaluate_method(
         out or folder, console, data, painter(avatar), scorer, config.lpips.net,
-        method=method, device=device, variants=variants, wanted=wanted or Wanted(), avatar=avatar,
+        method=method, device=device, variants=variants, wanted=wanted or Wanted(),
+        name=folder.name,
     )  # fmt: skip
+
+
+def check_background(background: object) -> None:
+    """Refuses what is no background.
+
+    Raises:
+        ConfigError: on another word than black or white.
+    """
+    if background not in (None, *BACKGROUNDS):
+        raise ConfigError(f"background must be black, white or null; got {background!r}")
 
 
 def make_scorer(config: DictConfig, data: GsganData, marks: list[str]) -> Scorer:
@@ -118,8 +129,7 @@ def make_scorer(config: DictConfig, data: GsganData, marks: list[str]) -> Scorer
     """
     measures = Measures() if data.protocol is None else data.protocol.measures
     background = config.get("background")
-    if background not in (None, *BACKGROUNDS):
-        raise ConfigError(f"background must be black, white or null; got {background!r}")
+    check_background(background)
     if background not in (None, measures.background):
         measures = replace(measures, background=background)
         marks = [*marks, f"scored on {background}"]
@@ -147,7 +157,7 @@ def evaluate_method(
     no_parts: str = "the model has no segmentation",
     watch: Watch | None = None,
     check: Callable[[], None] | None = None,
-    avatar: Avatar | None = None,
+    name: str | None = None,
 ) -> Results:
     """Scores a method's predictions and writes metrics.json, scores.csv, facts.json, metrics.md and
     ``pictures/`` into a folder, nothing of it before all is scored.
@@ -166,7 +176,7 @@ def evaluate_method(
         no_parts: why there is no segmentation.
         watch: sees every prediction as scored.
         check: called when all is scored, before anything is written; may refuse.
-        avatar: for pictures of its steps.
+        name: in the title of the table; None takes the method's.
 
     Raises:
         GsganError: on a prediction that cannot be scored.
@@ -185,7 +195,7 @@ def evaluate_method(
         check()
     for split in wanted.splits:
         path = folder / "pictures" / f"{split}.png"
-        write_pictures(data, split, path, wanted.pictures, predict, scorer.stage, device, avatar)
+        write_pictures(data, split, path, wanted.pictures, predict, scorer.stage, device)
     results = _with_protocol(scores, data, scorer, lpips_net)
     rows = {split: found.rows for split, found in scores.items()}
     now = Scored(results, rows, facts(method, data, device))
@@ -193,8 +203,7 @@ def evaluate_method(
     if dropped:
         said = f"earlier scores of {', '.join(dropped)} were made otherwise and are left out"
         console.print(said, highlight=False)
-    what = folder.name if avatar is not None else method.name
-    title = f"{what}: held-out cameras (novel_view) and poses (novel_pose)"
+    title = f"{name or method.name}: held-out cameras (novel_view) and poses (novel_pose)"
     write_scored(whole, folder, title)
     print_table(whole.results, whole.facts, console, title, wanted.per)
     return whole.results
@@ -233,24 +242,21 @@ def write_pictures(
     predict: Predict,
     stage: Stage,
     device: torch.device,
-    avatar: Avatar | None,
 ) -> None:
-    """A grid of ``rows`` frames spread over a split: an avatar's steps, or prediction and truth as
-    scored."""
+    """A grid of ``rows`` frames spread over a split: prediction and truth as scored."""
     dataset = data.dataset(split)
     rows = min(rows, len(dataset))
     grid: list[dict[str, torch.Tensor]] = []
     for i in range(rows):
         index = round((i + 0.5) * len(dataset) / rows - 0.5)
         frame, item = dataset[index].to(device), dataset.items[index]
-        if avatar is not None:
-            with torch.no_grad():
-                painting = avatar.paint(frame)
-        else:
-            picture = stage.picture(predict(frame, item), FULL, frame, stage.box(frame))
-            painting = Painting(picture)
-            frame = replace(frame, image=stage.truth(frame))
-        grid += grid_rows(frame, painting)
+        prediction = predict(frame, item)
+        box = stage.box(frame)
+        shown = {name: stage.picture(prediction, name, frame, box) for name in prediction.pictures}
+        painting = Painting(
+            shown[FULL], corrected=shown.get(SPLAT), segmentation=prediction.segmentation
+        )
+        grid += grid_rows(replace(frame, image=stage.truth(frame)), painting)
     if grid:
         write_grid(_one_size(grid), path)
 

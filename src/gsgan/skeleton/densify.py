@@ -16,7 +16,6 @@ from gsgan.skeleton.frames import (
     MIN_LENGTH,
     BoneFrames,
     Swing,
-    Twist,
     bone_frames,
     check_skeleton,
     constants,
@@ -87,7 +86,6 @@ class Densify(nn.Module):
         limbs: ``paper22``, or ``all26`` with the trunk's four edges.
         sigma: initial standard deviation over the mean spacing ``sqrt(area / points)``.
         torso_range: the box's edges stay within these multiples of the rest pose's (``fit``).
-        twist: see :func:`gsgan.skeleton.bone_frames`.
         min_length: metres, see :func:`gsgan.skeleton.bone_frames`.
         dtype: of the buffers; None: torch's default.
 
@@ -124,12 +122,11 @@ class Densify(nn.Module):
         *,
         sigma: float = 0.6,
         torso_range: tuple[float, float] = (0.25, 4.0),
-        twist: Twist = "none",
         min_length: float = MIN_LENGTH,
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        _check_options(torso=torso, sampler=sampler, limbs=limbs, twist=twist)
+        _check_options(torso=torso, sampler=sampler, limbs=limbs)
         counts = (points_per_limb, face_points, torso_points)
         if min(counts) < 1:
             raise ConfigError(f"Densify: every part needs at least one point, got {counts}")
@@ -141,7 +138,7 @@ class Densify(nn.Module):
         self.template = template if limbs == "paper22" else template.with_torso_limbs()
         self.counts = counts
         self.radius_ratio, self.face_radius_scale = radius_ratio, face_radius_scale
-        self.torso, self.twist = torso, twist
+        self.torso = torso
         self.sigma, self.torso_range, self.min_length = sigma, tuple(torso_range), min_length
         self._make_buffers(sampler, dtype or torch.get_default_dtype())
 
@@ -208,9 +205,7 @@ class Densify(nn.Module):
         valid = check_skeleton("Densify", p, valid, self.template)
         c = constants(self.template, p.device, p.dtype)
         if frames is None or frames.limbs.shape[1] != len(self.template.limbs):
-            frames = bone_frames(
-                p, valid, self.template, twist=self.twist, min_length=self.min_length
-            )
+            frames = bone_frames(p, valid, self.template, min_length=self.min_length)
         root = p[:, self.template.hips[0], None].detach()
         q = p - root
         face, torso = q.index_select(1, self._face), q.index_select(1, c.torso)
@@ -275,7 +270,7 @@ class Densify(nn.Module):
 
 
 def _check_options(**options: str) -> None:
-    known = {"torso": Torso, "sampler": Sampler, "limbs": Limbs, "twist": Twist}
+    known = {"torso": Torso, "sampler": Sampler, "limbs": Limbs}
     for name, value in options.items():
         if value not in get_args(known[name]):
             raise ConfigError(

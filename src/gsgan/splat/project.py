@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsgan.constants import constant
+from gsgan.constants import constant, filled
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat.settings import Accuracy
 
@@ -202,7 +202,7 @@ def field_of_view(K: Tensor, size: tuple[int, int], widen: float) -> tuple[Tenso
     The corners of the picture bound them, which holds with skew and an off-centre principal point.
     """
     H, W = size
-    corners = constant(((0, W, 0, W), (0, 0, H, H)), K) - K[:, :2, 2:]
+    corners = filled(((0, W, 0, W), (0, 0, H, H)), K) - K[:, :2, 2:]
     ratios = _inverse(K[:, :2, :2]) @ corners
     low, high = ratios.amin(-1, keepdim=True), ratios.amax(-1, keepdim=True)
     middle, half = (low + high) / 2, (high - low) / 2
@@ -240,7 +240,7 @@ def _footprint(
         reach = reach * (1 + EXTENT_MARGIN) + EXTENT_MARGIN
     extents = reach.unsqueeze(1) * torch.stack([a, c], dim=1).sqrt()
     # The outermost pixel centres are half a pixel inside the picture.
-    last = constant(((W - 0.5,), (H - 0.5,)), means)
+    last = filled(((W - 0.5,), (H - 0.5,)), means)
     inside = ((means + extents >= 0.5) & (means - extents <= last)).all(1)
     visible = in_front & inside & (opacities >= settings.alpha_min)
     return torch.where(visible.unsqueeze(-1), extents.mT, 0.0), visible

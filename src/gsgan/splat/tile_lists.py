@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.constants import constant
+from gsgan.constants import filled
 from gsgan.splat.project import Projected
 from gsgan.splat.settings import Accuracy
 
@@ -106,7 +106,7 @@ def _pixel_box(projected: Projected, size: tuple[int, int], rows: Tensor) -> tup
     """First and last pixel (x, y) whose centre is in the footprint, each ``[M, 2]`` int64."""
     means = projected.means.flatten(0, 1)[rows]
     extents = projected.extents.flatten(0, 1)[rows].to(means)
-    edge = constant((size[1], size[0]), means)
+    edge = filled((size[1], size[0]), means)
     # Clamped as floats: footprints reach far beyond what integers hold. Extents are rounded: the
     # box is rounded outwards, not to the nearest.
     first = torch.minimum((means - extents - 0.5).floor().clamp_min(0), edge)

@@ -170,8 +170,8 @@ class _Walk:
         self.least_exponent = math.log(torch.finfo(dtype).tiny)
         # threshold() keeps what is greater; alphas equal to alpha_min are to be kept.
         self.below_alpha_min = _next_below(settings.alpha_min, dtype)
-        # Tiles that let no more light through are left out: that a GPU finds out costs more than
-        # it saves, as the host has to wait. Their layers weigh nothing either way.
+        # On a CPU, tiles that let no more light through are left out. On a GPU the host would have
+        # to wait for the answer; their layers weigh nothing either way.
         self.stops = settings.transmittance_min > 0 and device.type == "cpu"
         self.sums = self.values.new_zeros(len(self.values), 6)
         self.values_grad = torch.zeros_like(self.values)

@@ -27,8 +27,8 @@ class StepOneLoss:
         l1, ssim: weights (paper: 0.8, 0.2).
         feature_head: weight of the same loss on a linear readout of F; without it F's further
             channels get no gradient in Step I. 0 builds no readout.
-        alpha: weight of L1 between the splats' alpha and the mask, where pictures are compared on
-            black only: a random colour behind them teaches alpha by itself.
+        alpha: weight of L1 between the splats' alpha and the mask, where images are compared on
+            black only; over a random colour the other terms supervise alpha already.
 
     Source: paper Sec. 3.5 (λ = 0.2); readout and alpha are ours.
     """

@@ -19,7 +19,7 @@ from gsgan.losses.photometric import without_unsure
 from gsgan.metrics.image import psnr
 from gsgan.model.avatar import Avatar, Painting
 from gsgan.model.discriminator import Discriminator
-from gsgan.model.segmentation import segmentation_loss, silhouette_loss
+from gsgan.model.segmentation import IGNORE, segmentation_loss, silhouette_loss
 from gsgan.scene import Frame
 from gsgan.training.averaging import MovingAverage
 from gsgan.training.losses import StepOneLoss, StepTwoLoss, judged
@@ -29,6 +29,7 @@ from gsgan.training.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
 
 PSNR_CAP = 100.0  # dB: one picture equal to the truth would make a watched mean infinite
 SPLATTING = ("psi", "colour")  # optimisers of what makes Step I's picture
+FROM_MASKS = 800  # iterations of S, at most, where two numbers learn from masks (docs/effects.md)
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
 
 
@@ -148,6 +149,9 @@ class AvatarTraining(LightningModule):
         missing = sorted(set(groups) - set(self.recipes))
         if missing:
             raise ConfigError(f"training.recipes lacks {', '.join(missing)}")
+        for name in set(groups) - set(SPLATTING):
+            if self.recipes[name].span != "both":
+                raise ConfigError(f"training.recipes.{name}.span: only psi and colour have one")
         self._names = list(groups)
         return [self.recipes[name].build(groups[name]) for name in self._names]
 
@@ -244,10 +248,10 @@ class AvatarTraining(LightningModule):
         if segmentation.common is not None:
             alpha = segmentation.raster(frame.body, frame.camera).alpha
             loss = silhouette_loss(alpha, frame.mask, frame.unsure)
-        elif frame.labels is None:
-            return  # one of the pictures that nobody labelled
         else:
-            labels = segmentation.truth(frame.labels)
+            labels = torch.full_like(frame.mask[:, 0], IGNORE, dtype=torch.long)
+            if frame.labels is not None:  # else nobody labelled this image: nothing is learned
+                labels = segmentation.truth(frame.labels)
             loss = segmentation_loss(segmentation(frame.body, frame.camera), labels)
         self._descend(loss, "segmentation")
         self._log("segmentation/nll", loss)
@@ -429,6 +433,8 @@ class AvatarTraining(LightningModule):
 def _fit_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
     if avatar.segmentation is None:
         schedule = replace(schedule, segmentation=0)
+    elif avatar.segmentation.common is not None:
+        schedule = replace(schedule, segmentation=min(schedule.segmentation, FROM_MASKS))
     one, two, start = (
         round(n * schedule.stretch)
         for n in (schedule.step_one, schedule.step_two, schedule.discriminator_start)

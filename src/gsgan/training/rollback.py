@@ -76,8 +76,11 @@ class Rollback:
     def watch(self, alpha: Tensor, mask: Tensor) -> None:
         """Takes in one iteration's alpha and mask."""
         for name, value in (("alpha", alpha), ("mask", mask)):
-            kept = 0.0 if getattr(self, name) is None else self.memory * getattr(self, name)
-            setattr(self, name, kept + (1 - self.memory) * value.detach().mean())
+            now, before = value.detach().mean(), getattr(self, name)
+            before = torch.zeros_like(now) if before is None else before
+            mixed = self.memory * before + (1 - self.memory) * now
+            # a value that is not finite is a gradient's matter, not a collapse
+            setattr(self, name, torch.where(torch.isfinite(now), mixed, before))
 
     def keep(self, module: nn.Module, share: float) -> None:
         """Keeps a copy of the state when it is a good one."""
