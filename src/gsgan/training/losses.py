@@ -87,7 +87,9 @@ class StepTwoLoss:
 
     Args:
         l1, l2, ssim: photometric terms on I_pred (the paper's footnote: l2 reconstruction).
-        alpha: weight of the same terms between I_pred's alpha and the mask.
+        alpha: weight of the same terms with both images on white, I_pred by its alpha, the truth
+            by its mask: what supervises that alpha. (Between alpha and mask directly, the default
+            person scored 0.2 dB less on white and 0.15 dB less on black.)
         perceptual: L_perc.
         perceptual_every: compute L_perc only every so many iterations (its weight is multiplied
             by as much); VGG is the costliest term on a CPU.
@@ -155,7 +157,8 @@ class StepTwoLoss:
         by_pixel = partial(photometric, l1=self.l1, l2=self.l2, ssim=self.ssim)
         terms = {"photometric": by_pixel(image, target)}
         if self.alpha:
-            terms["alpha"] = self.alpha * by_pixel(alpha, frame.mask, unsure=frame.unsure)
+            white, truth = image + 1 - alpha, frame.image + 1 - frame.mask
+            terms["alpha"] = self.alpha * by_pixel(white, truth, unsure=frame.unsure)
         if anchor is not None:
             terms["anchor"] = self.anchor * anchor
         if perceptual is not None and step % self.perceptual_every == 0:
