@@ -4,29 +4,18 @@ from __future__ import annotations
 
 import gc
 import weakref
-from collections import Counter
 
 import numpy as np
 import pytest
 import torch
 from make import write_tiny_capture
-from torch.utils._python_dispatch import TorchDispatchMode
+from operators import Calls
 
 from gsgan.data.capture import CaptureDataset
 from gsgan.data.datamodule import GsganData, default_workers
 from gsgan.skeleton import MEDIAPIPE33
 
 MOUTH = [MEDIAPIPE33.names.index(name) for name in ("mouth_left", "mouth_right")]
-
-
-class Calls(TorchDispatchMode):
-    def __init__(self) -> None:
-        super().__init__()
-        self.count: Counter[str] = Counter()
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count[str(func)] += 1
-        return func(*args, **(kwargs or {}))
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
+from operators import Calls
 
 from gsgan.errors import ConfigError
 from gsgan.model.colour import ColourCorrection
@@ -15,18 +15,6 @@ from gsgan.runs import build_training, load_avatar, read_checkpoint
 
 NONE = "effects=none"
 LENS = (-0.6, 0.2, 0.001, 0, 0)
-
-
-class Calls(TorchDispatchMode):
-    """Counts every operator."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.count: Counter[str] = Counter()
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count[str(func)] += 1
-        return func(*args, **(kwargs or {}))
 
 
 def calls(avatar, frame) -> Counter[str]:
