@@ -81,8 +81,10 @@ def test_exact_goes_to_the_reference_unless_a_backend_is_forced():
     assert resolve_backend("torch", CPU, ACCURACY["exact"]) == ("torch", "")
 
 
-def test_cuda_takes_torch():
-    assert resolve_backend("auto", torch.device("cuda"), ACCURACY["high"]) == ("torch", "")
+def test_cuda_takes_torch_without_gsplat():
+    name, reason = resolve_backend("auto", torch.device("cuda"), ACCURACY["high"])
+    assert name == "torch"
+    assert "gsplat is not installed" in reason
     name, reason = resolve_backend("native", torch.device("cuda"), ACCURACY["high"])
     assert name == "torch"
     assert "CPU only" in reason

@@ -48,9 +48,9 @@ def labelled_body(
         _check_number(scene, body)
         return body, "the labels are the body's own, so there is no class vote"
     names = label_names(scene)
-    if vertex_labels is not None and not scene.has_labels:  # a voted S, painted without labels
-        names = names or tuple(f"part {i}" for i in range(int(vertex_labels.max()) + 1))
     if vertex_labels is not None:
+        if not scene.has_labels:  # voted on where there were some
+            names = tuple(f"part {i}" for i in range(int(vertex_labels.max()) + 1))
         if len(vertex_labels) != len(body.vertices) or int(vertex_labels.max()) >= len(names):
             raise DataError(
                 f"the checkpoint holds labels of {len(vertex_labels)} vertices, which do not fit "

@@ -68,9 +68,8 @@ class Segmentation(nn.Module):
         self.points = SkinnedPoints(body, points)
         self.map = class_map(body.label_names, body.vertex_labels, mode, hands_face)
         # What was voted is kept, so that no vote is held again; the body's own needs no keeping.
-        self.register_buffer(
-            "vertex_labels", body.vertex_labels, persistent=body.label_source == "vote"
-        )
+        self.voted = body.label_source == "vote"
+        self.register_buffer("vertex_labels", body.vertex_labels, persistent=self.voted)
         self.register_buffer("truth_table", self.map.as_table(), persistent=False)
         self.register_buffer("one_hot", self._classes_of_points(), persistent=False)
         self.register_load_state_dict_post_hook(_classes_as_loaded)

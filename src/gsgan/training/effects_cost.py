@@ -77,7 +77,7 @@ def _in_the_model(
     without = build_avatar(
         config,
         data,
-        vertex_labels=None if S is None else S.vertex_labels,
+        vertex_labels=S.vertex_labels if S is not None and S.voted else None,
         effects=avatar.effects.switched_off(name, "to see what it costs"),
     ).to(frame.image.device)
     added = _parameters(avatar) - _parameters(without)
