@@ -99,7 +99,7 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
 
 
 def spelled_out(argument: str) -> str:
-    """``effects=[depth]`` as ``effects.only=[depth]``: Hydra would look for such files."""
+    """``effects=[antialias]`` as ``effects.only=[antialias]``: Hydra would look for such files."""
     found = EFFECTS_LIST.fullmatch(argument)
     return argument if found is None else f"effects.only={found[1]}"
 

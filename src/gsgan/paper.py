@@ -72,11 +72,10 @@ def _word(value: Any) -> Any:
     return {"on": True, "off": False}.get(value, value) if isinstance(value, str) else value
 
 
-def named(told: list[str], most: int = 6) -> str:
+def clause(keys: list[str], most: int = 6) -> str:
     """The departures in one clause."""
-    return f"differs from experiment=paper in {', '.join(told[:most])}" + (
-        f" and {len(told) - most} more" if len(told) > most else ""
-    )
+    more = f" and {len(keys) - most} more" if len(keys) > most else ""
+    return f"differs from experiment=paper in {', '.join(keys[:most])}{more}"
 
 
 def _idle(key: str) -> bool:

@@ -317,11 +317,12 @@ class GsganData(LightningDataModule):
 
 
 def default_workers() -> int:
-    """Loading processes that keep a GPU busy and leave a processor to each training process."""
+    """Loading processes per training process: one processor is left for that itself."""
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if not gpus:
         return 0
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    mine = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
+    processors = mine or os.cpu_count() or 1
     return max(0, min(MOST_WORKERS, processors // gpus - 1))
 
 

@@ -20,7 +20,7 @@ from gsgan.drawing.subjects import Subject
 from gsgan.model.body_points import BodyPoints
 from gsgan.palette import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILLION
 from gsgan.scene import Gaussians
-from gsgan.skeleton import MEDIAPIPE33, BoneFrames, Densify, bone_frames, sanitise
+from gsgan.skeleton import MEDIAPIPE33, BoneFrames, Densify, bone_frames
 from gsgan.splat import Accuracy, project
 
 # By group of the drawn skeleton; hands are darker and lighter than the arms they end.
@@ -45,9 +45,9 @@ class Pose:
 
 
 def pose_of(subject: Subject, shot: Shot) -> Pose:
-    """The skeleton, joints never seen replaced as the avatar does."""
+    """The skeleton, with the dataset's stand-ins for joints that were not seen."""
     frame, avatar = shot.frame, subject.avatar
-    p, valid = sanitise(frame.skeleton, frame.visibility, avatar.template, avatar.limb_sum)
+    p, valid = frame.skeleton, frame.visibility > 0
     return Pose(p, valid, bone_frames(p, valid, avatar.template, twist=avatar.twist))
 
 

@@ -116,7 +116,7 @@ class Avatar(nn.Module):
         effects: Effects | None = None,
     ) -> None:
         super().__init__()
-        _refuse_formation(accuracy)
+        _check_accuracy(accuracy)
         if densify is not None and densify.template is not MEDIAPIPE33 and twist != "none":
             raise ValueError("twist=hinge goes with densify.limbs=paper22 only")
         self.effects = decide(scene, EffectSettings()) if effects is None else effects
@@ -327,7 +327,7 @@ class Avatar(nn.Module):
         if self.generator is None:
             image = colour
         elif image is not None and painting.alpha is not None:
-            # alpha learns from the mask alone
+            # detached: losses of the corrected colours are not to move alpha
             image = self.colour(image, painting.alpha.detach(), camera_index)
         return replace(painting, image=image, corrected=colour)
 
@@ -425,8 +425,8 @@ class Avatar(nn.Module):
             return omega(p, valid, camera.R, self.template, frames=frames), in_camera
 
 
-def _refuse_formation(accuracy: Accuracy) -> None:
-    """How pixels are formed has one place: a value given to the accuracy would be overridden."""
+def _check_accuracy(accuracy: Accuracy) -> None:
+    """Refuses values of the accuracy that the model and the effects set: they would be lost."""
     for name, place in (
         ("low_pass", "model.low_pass"),
         ("supersample", "model.supersample"),

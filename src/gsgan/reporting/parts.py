@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from gsgan.paper import NAME, named
+from gsgan.paper import NAME, clause
 from gsgan.reporting.cells import Column, Source
 from gsgan.reporting.grid import NO_RUN, NOT_HAD, Cell, Grid, Row, common
 from gsgan.reporting.mixing import data_name, lpips_name, protocols_differ, same_data
@@ -187,13 +187,13 @@ def _row(part: Part, spec: RowSpec) -> Row:
 def beside_the_paper(row: Row, spec: RowSpec, runs: Sequence[Run]) -> Row:
     """A row that stands beside the paper's figures: named as the paper's method where all of its
     runs are, else with a note that says in what they are not."""
-    told = [run.departures() for run in runs]
-    if not told:
+    departures = [run.departures() for run in runs]
+    if not departures:
         return row
-    if None in told:
+    if None in departures:
         return replace(row, notes=(*row.notes, "no config tells whether it is experiment=paper"))
-    if found := next((keys for keys in told if keys), None):
-        return replace(row, notes=(*row.notes, named(found)))
+    if found := next((keys for keys in departures if keys), None):
+        return replace(row, notes=(*row.notes, clause(found)))
     whole = (spec.run, spec.variant) == ("full", PAINTED)
     return replace(row, label=NAME if whole else f"{NAME}, {row.label}")
 

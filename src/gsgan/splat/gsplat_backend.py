@@ -56,7 +56,7 @@ def why_not(settings: Accuracy, device: torch.device) -> str:
 
 
 def differences(settings: Accuracy, device: torch.device) -> list[str]:
-    """Where gsplat's cut-offs are others than the settings', a clause each; `why_not` is empty."""
+    """Where gsplat's cut-offs differ from the settings, a clause each; `why_not` is empty."""
     have = {**COMPILED_IN, "alpha_max": _measured_cap(device)[0] or 0.0}
     return [
         f"{name} is {value if isinstance(value, str) else f'{value:.6g}'}, not {want}"
@@ -66,7 +66,7 @@ def differences(settings: Accuracy, device: torch.device) -> list[str]:
 
 
 def given_up(settings: Accuracy, device: torch.device) -> str:
-    """What gsplat draws otherwise than the settings say, in one sentence; `why_not` is empty."""
+    """How gsplat's result differs from the settings, in one sentence; `why_not` is empty."""
     lost = _stop_loss(_measured_cap(device)[0] or 0.0)
     found = [f"a stopped pixel may lack {lost:.2g} of its light", *differences(settings, device)]
     return (

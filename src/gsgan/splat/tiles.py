@@ -300,7 +300,7 @@ class _Walk:
         return layers, layers[:, -1] * through[:, -1]
 
     def _whitened_sums(self, place: _Place, g: Tensor, u: Tensor, v: Tensor) -> Tensor:
-        """``[T, K, 6]`` sums over pixels of ``g`` times 1, u, v, u², u v, v²; u and v are spent."""
+        """``[T, K, 6]`` sums over pixels of ``g`` times 1, u, v, u², u v, v²; overwrites u, v."""
         one = g.sum(-1)
         sum_u, ux, uy = (u.mul_(g) @ self.basis.mT).unbind(-1)
         sum_v, _, vy = (v.mul_(g) @ self.basis.mT).unbind(-1)

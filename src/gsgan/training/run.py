@@ -217,12 +217,6 @@ def build_trainer(
     )
 
 
-def rasteriser(avatar: Avatar, device: torch.device) -> str:
-    """The backend that will draw, and what there is to say of it."""
-    name, told = resolve_backend(avatar.backend, device, avatar.accuracy)
-    return f"{name}: {told}" if told else name
-
-
 def describe(
     console: Console, folder: Path, data: GsganData, module: AvatarTraining, accelerator: str
 ) -> None:
@@ -243,7 +237,9 @@ def describe(
         source = "part labels" if info.has_labels else "masks: the data has no part labels"
         table.add_row("", f"{avatar.segmentation_why}; S learns from {source}")
     if avatar.splats is not None:
-        table.add_row("rasteriser", rasteriser(avatar, training_device(accelerator)))
+        # why it is this one is logged when it first draws
+        device = training_device(accelerator)
+        table.add_row("rasteriser", resolve_backend(avatar.backend, device, avatar.accuracy)[0])
     table.add_row("an image costs", cost(avatar, data))
     s = module.schedule
     table.add_row(

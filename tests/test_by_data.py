@@ -1,0 +1,57 @@
+"""What data and machine decide by themselves, and the factors that belong to a study."""
+
+from __future__ import annotations
+
+import pytest
+
+from gsgan.config import config_folder
+
+DATA = sorted(path.stem for path in (config_folder() / "data").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("data", DATA)
+def test_large_captures_train_at_full_size_by_themselves(compose, data):
+    config = compose("train", f"data={data}")
+    large = data in ("thuman4", "zju_mocap", "avatarrex")
+    assert config.size.picture == (512 if large else 128)
+    assert config.training.schedule.step_two == (250_000 if large else 2600)
+    small = compose("train", f"data={data}", "size=small", "training=demo")
+    assert (small.size.picture, small.training.schedule.step_two) == (128, 2600)
+
+
+@pytest.mark.parametrize(
+    ("there", "told"), [(True, ("gpu", "bf16-mixed")), (False, ("cpu", "32-true"))]
+)
+def test_the_accelerator_is_the_one_that_is_there(compose, monkeypatch, there, told):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: there)
+    trainer = compose("train").trainer
+    assert (trainer.accelerator, trainer.precision) == told
+    assert compose("train", "trainer=cpu").trainer.accelerator == "cpu"
+
+
+def test_a_long_run_without_a_gpu_is_refused_with_its_price_until_it_is_asked_for(
+    inside, capture, tmp_path
+):
+    """Tiny, with a budget to match."""
+    few = [
+        *("data=capture", f"data.root={capture}", "size=tiny", "training=smoke", "data.crop=null"),
+        *("evaluate=false", f"hydra.run.dir={tmp_path / 'run'}"),
+    ]
+    refused = inside("train", *few, "cpu_hours=1e-9")
+    assert refused.returncode == 1
+    assert "no GPU is found, and on this CPU 16 iterations" in refused.stderr
+    assert "size=small training=demo" in refused.stderr
+    assert refused.stderr.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+    assert inside("train", *few, "cpu_hours=1e-9", "trainer=cpu").returncode == 0
+
+
+# --- factors that make baselines train equally long
+
+
+@pytest.mark.parametrize("model", ["splat_only", "lbs_splat", "image_to_image"])
+def test_a_baseline_is_stretched_by_an_experiment_only(compose, model):
+    assert compose("train", f"model={model}", "training=paper").training.schedule.stretch == 1
+    study = compose("train", "experiment=ablation", f"model={model}")
+    assert study.training.schedule.stretch == study.equal_time[model] > 1
+    assert compose("train", "experiment=ablation").training.schedule.stretch == 1
