@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import logging
 import os
 import sys
@@ -13,9 +13,9 @@ import pytest
 import torch
 from omegaconf import DictConfig
 
-import gsgan.compat  # noqa: F401  (before anything imports torchvision)
+import gsgan.utils.compat  # noqa: F401  (before anything imports torchvision)
 
-for folder in ("data", "capture"):  # what tests of other folders share with them
+for folder in ("data", "prepare"):  # what tests of other folders share with them
     sys.path.insert(0, str(Path(__file__).parent / folder))
 torch.set_num_threads(1)  # tensors here are tiny: more threads only wait for each other
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # nor do those of the commands that tests start
@@ -60,13 +60,20 @@ def compose():
     from hydra import compose as hydra_compose
     from hydra import initialize_config_dir
 
-    from gsgan.config import config_folder
+    from gsgan.utils.config import config_folder
 
     def run(name: str, *overrides: str) -> DictConfig:
         with initialize_config_dir(str(config_folder()), version_base="1.3"):
             return hydra_compose(name, overrides=list(overrides))
 
     return run
+
+
+def entry_module(command: str) -> str:
+    """The module that ``python -m gsgan.<command>`` runs."""
+    name = f"gsgan.{command}"
+    spec = importlib.util.find_spec(name)
+    return name if spec is None or spec.submodule_search_locations is None else f"{name}.__main__"
 
 
 TINY = ("size=tiny", "training=smoke", "data=capture", "data.size=32", "data.crop=null")
@@ -85,7 +92,7 @@ def tiny(compose, capture):
 @pytest.fixture
 def build(tiny):
     """(data, avatar, frame) of a tiny config: everything real, everything small."""
-    from gsgan.runs import build_avatar, build_data
+    from gsgan.train.runs import build_avatar, build_data
 
     def run(*overrides: str):
         config = tiny(*overrides)
@@ -116,7 +123,7 @@ def inside(tmp_path, monkeypatch, capfd):
         capfd.readouterr()
         code = 0
         try:
-            importlib.import_module(f"gsgan.{command}").main()
+            importlib.import_module(entry_module(command)).main()
         except SystemExit as end:
             code = 0 if end.code is None else end.code
         out, err = capfd.readouterr()

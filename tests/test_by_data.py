@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gsgan.config import config_folder
+from gsgan.utils.config import config_folder
 
 DATA = sorted(path.stem for path in (config_folder() / "data").glob("*.yaml"))
 

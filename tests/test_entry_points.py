@@ -124,8 +124,8 @@ def test_same_seed_same_numbers_other_seed_others(run, capture, tmp_path):
 
 KILL = """
 import os, signal, sys
-from gsgan.training.module import AvatarTraining
-from gsgan.train import main
+from gsgan.train.module import AvatarTraining
+from gsgan.train.__main__ import main
 step = AvatarTraining.training_step
 def dying(self, *args):
     if self.step == 10:  # in the middle of the third of four epochs

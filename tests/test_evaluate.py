@@ -25,7 +25,7 @@ def given(capture: Path) -> list[str]:
 @pytest.fixture(scope="session")
 def painted(run: Path, capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What the tiny run paints, as a method of someone else would leave it: 8-bit PNGs."""
-    from gsgan.runs import build_data, load_avatar, load_config
+    from gsgan.train.runs import build_data, load_avatar, load_config
 
     root = tmp_path_factory.mktemp("others") / "other"
     data = build_data(load_config(run))
@@ -154,7 +154,7 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
     """By the alpha that each of its pictures has; the table is marked."""
     from gsgan.metrics.image import psnr
     from gsgan.metrics.regions import on_background
-    from gsgan.runs import build_data, load_avatar, load_config
+    from gsgan.train.runs import build_data, load_avatar, load_config
 
     copy = shutil.copytree(run, tmp_path / "copy")
     result = inside("evaluate", f"run={copy}", "background=white", "pictures=1")
@@ -293,8 +293,8 @@ def test_seconds_of_a_resumed_training_add_up(tiny, monkeypatch):
     """Parts before an interruption count; an old checkpoint without them leaves it unknown."""
     from types import SimpleNamespace
 
-    from gsgan.runs import build_training
-    from gsgan.training import module as training
+    from gsgan.train import module as training
+    from gsgan.train.runs import build_training
 
     clock = SimpleNamespace(now=100.0)
     monkeypatch.setattr(training.time, "monotonic", lambda: clock.now)
@@ -320,7 +320,7 @@ def test_seconds_of_a_resumed_training_add_up(tiny, monkeypatch):
 
 
 def test_cameras_of_several_sizes_share_one_grid():
-    from gsgan.scoring.run import _one_size
+    from gsgan.evaluate.run import _one_size
 
     small, large = torch.ones(3, 2, 5), torch.ones(3, 4, 3)
     a, b = _one_size([{"x": small}, {"x": large}])

@@ -7,9 +7,9 @@ import re
 import pytest
 from omegaconf import OmegaConf
 
-from gsgan.config import config_folder
-from gsgan.paper import IDLE, clause, departures, flat
-from gsgan.runs import record
+from gsgan.train.paper import IDLE, clause, departures, flat
+from gsgan.train.runs import record
+from gsgan.utils.config import config_folder
 
 DATA = sorted(path.stem for path in (config_folder() / "data").glob("*.yaml"))
 OURS = {  # what gsgan adds to the paper's method, and the value that leaves it out

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from omegaconf import DictConfig
 
-from gsgan.config import entry
+from gsgan.utils.config import entry
 
 
 def figures(config: DictConfig) -> None:
@@ -13,7 +13,7 @@ def figures(config: DictConfig) -> None:
     Raises:
         GsganError: on anything the user can put right.
     """
-    from gsgan.drawing.run import make_figures  # loads matplotlib
+    from gsgan.report.figures.run import make_figures  # loads matplotlib
 
     make_figures(config)
 

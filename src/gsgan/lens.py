@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from gsgan.constants import constant
+from gsgan.utils.constants import constant
 
 if TYPE_CHECKING:
     from gsgan.scene import Camera

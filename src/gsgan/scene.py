@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from gsgan.constants import constant
 from gsgan.lens import distort_within
+from gsgan.utils.constants import constant
 
 S = TypeVar("S", bound="_TensorRecord")
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.constants import constant
 from gsgan.scene import Camera, Frame, cat
+from gsgan.utils.constants import constant
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from gsgan.body.free import free_body, free_body_path, majority_vertex_labels, read_body
-from gsgan.errors import DataError
 from gsgan.scene import BodyPose
+from gsgan.utils.errors import DataError
 
 torch.set_num_threads(1)
 

@@ -14,9 +14,9 @@ from writers.smpl import PARENTS, joint_positions, smpl_arrays, write_smpl
 from gsgan.body import free_body, open_body, skin
 from gsgan.body.smpl import SkinnedModel, from_zju, read_smpl, to_zju
 from gsgan.body.smpl_names import CIHP, CLOTHES, SMPL_JOINTS, SMPLX_JOINTS
-from gsgan.errors import DataError
 from gsgan.model.segmentation import Segmentation
 from gsgan.scene import BodyPose, Camera
+from gsgan.utils.errors import DataError
 
 D = torch.float64
 SMALL = 120

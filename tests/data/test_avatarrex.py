@@ -16,8 +16,8 @@ from gsgan.data.checks import Checks
 from gsgan.data.formats.avatarrex import AvatarrexReader
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_image, read_mask
-from gsgan.errors import DataError
 from gsgan.skeleton.smpl import to_mediapipe33
+from gsgan.utils.errors import DataError
 
 pytestmark = pytest.mark.usefixtures("model_once")
 

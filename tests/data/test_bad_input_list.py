@@ -23,7 +23,7 @@ from writers.easymocap import write_calibration, write_easymocap
 
 from gsgan.data.checks import Checks
 from gsgan.data.formats.easymocap import EasymocapReader
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 TESTS = Path(__file__).parents[1]
 ROWS: dict[str, tuple[str, ...]] = {
@@ -83,24 +83,24 @@ ROWS: dict[str, tuple[str, ...]] = {
         "data/test_easymocap.py: test_joints_without_confidence_are_unknown",
     ),
     "Pose2Sim: units, axes, filled gaps, fewer markers, order of cameras": (
-        "capture/test_prepare_points3d.py: test_trc_units_axes_and_names_are_undone",
-        "capture/test_prepare_points3d.py: test_zeros_of_gap_filling_are_missing",
-        "capture/test_prepare_points3d.py: test_last_values_of_gap_filling_are_taken_out",
-        "capture/test_prepare_run.py: test_joints_of_another_tool_take_the_place_of_detections",
-        "capture/test_prepare_pairing.py: test_same_names_whatever_their_order",
+        "prepare/test_prepare_points3d.py: test_trc_units_axes_and_names_are_undone",
+        "prepare/test_prepare_points3d.py: test_zeros_of_gap_filling_are_missing",
+        "prepare/test_prepare_points3d.py: test_last_values_of_gap_filling_are_taken_out",
+        "prepare/test_prepare_run.py: test_joints_of_another_tool_take_the_place_of_detections",
+        "prepare/test_prepare_pairing.py: test_same_names_whatever_their_order",
     ),
     "own: frame counts, frame rates, rotation, clocks": (
         "data/test_capture.py: test_frames_pair_by_number_not_by_position",
-        "capture/test_prepare_doubts.py: test_sources_that_differ",
-        "capture/test_prepare_solve.py: test_a_late_clock_is_measured",
-        "checking/test_corruptions.py: test_a_camera_out_of_step_is_named",
+        "prepare/test_prepare_doubts.py: test_sources_that_differ",
+        "prepare/test_prepare_solve.py: test_a_late_clock_is_measured",
+        "check/test_corruptions.py: test_a_camera_out_of_step_is_named",
     ),
     "own: swapped sides, several people, NaN, far joints, wrong bones": (
-        "capture/test_prepare_solve.py: test_planted_flips_are_found_and_put_right",
-        "capture/test_prepare_doubts.py: test_empty_frames_crowds_and_frozen_joints",
-        "capture/test_prepare_solve.py: test_cleansing_takes_out_what_no_body_has",
+        "prepare/test_prepare_solve.py: test_planted_flips_are_found_and_put_right",
+        "prepare/test_prepare_doubts.py: test_empty_frames_crowds_and_frozen_joints",
+        "prepare/test_prepare_solve.py: test_cleansing_takes_out_what_no_body_has",
         "data/test_capture.py: test_missing_joints_stand_in_from_the_nearest_frame",
-        "checking/test_corruptions.py: test_left_and_right_exchanged_in_some_frames_are_named",
+        "check/test_corruptions.py: test_left_and_right_exchanged_in_some_frames_are_named",
     ),
     "own: file names of dates and time stamps": (
         "data/test_capture.py: BAD_INDEX[frame of a date]",
@@ -120,7 +120,7 @@ ROWS: dict[str, tuple[str, ...]] = {
     "any: skewed K, which is kept": (
         "data/test_capture.py: test_a_skewed_K_is_kept_and_undistorted_with_its_skew",
         "data/test_meeting.py: test_boxes_follow_skew_and_lens",
-        "capture/test_prepare_solve.py: test_undistortion_inverts_the_lens",
+        "prepare/test_prepare_solve.py: test_undistortion_inverts_the_lens",
     ),
     "any: joints behind a camera, camera to world": (
         "data/test_capture.py: BAD_INDEX[camera turned round]",

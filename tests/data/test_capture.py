@@ -21,8 +21,8 @@ from gsgan.data.files import cut_off, last_number, read_header
 from gsgan.data.formats.capture import LOOKED_AT, read_capture
 from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Checks, Layout, fill_missing, spans
-from gsgan.errors import ConfigError, DataError
 from gsgan.scene import Frame, cat
+from gsgan.utils.errors import ConfigError, DataError
 
 LENS = (-0.25, 0.08, 0.002, -0.001, 0.01)
 RATIONAL = (0.1, 0.02, 0.001, 0.002, 0.01, 0.3, 0.05, 0.01)
@@ -753,7 +753,7 @@ def test_arrays_that_would_unpack_to_too_much_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = write_tiny_capture(tmp_path)
-    monkeypatch.setattr("gsgan.pickles.LARGEST_MEMBER", 1000)
+    monkeypatch.setattr("gsgan.utils.pickles.LARGEST_MEMBER", 1000)
     with pytest.raises(DataError, match=r"landmarks3d.npz is not a whole npz file .p would"):
         Layout.read(root)
 

@@ -16,12 +16,12 @@ import pytest
 import torch
 from make import skeletons, write_landmarks, write_tiny_capture
 
-from gsgan.config import one_sentence
 from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order
 from gsgan.data.layout import Layout
 from gsgan.data.splits import make_splits, parse_frames, parse_names
-from gsgan.errors import ConfigError, DataError, GsganError
 from gsgan.scene import Frame
+from gsgan.utils.config import one_sentence
+from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 # isort: split
 import lightning

@@ -29,8 +29,8 @@ from gsgan.data.formats.smpl_motion import Motion, posed
 from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_image, read_mask
-from gsgan.errors import ConfigError, DataError
 from gsgan.skeleton.smpl import to_mediapipe33
+from gsgan.utils.errors import ConfigError, DataError
 
 pytestmark = pytest.mark.usefixtures("model_once")
 

@@ -16,7 +16,7 @@ from formats_list import FORMATS, Format
 from writers.common import Subject
 
 from gsgan.data.capture import CaptureDataset
-from gsgan.errors import GsganError
+from gsgan.utils.errors import GsganError
 
 pytestmark = [
     pytest.mark.usefixtures("model_once"),

@@ -18,7 +18,7 @@ from gsgan.data.formats.capture import LOOKED_AT, CaptureReader
 from gsgan.data.formats.meeting import box_of, inside_share, mask_beyond
 from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Layout
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 
 @pytest.fixture

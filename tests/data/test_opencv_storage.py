@@ -10,7 +10,7 @@ import pytest
 
 from gsgan.data.calibration import opencv_storage
 from gsgan.data.calibration.opencv_storage import read_storage
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 NAMES = ["01", "cam a", "Camera (1)", "1e3", "- x", 'the "left" one', "cam's", "ü"]
 HEAD = "%YAML:1.0\n---\n"

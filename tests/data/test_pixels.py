@@ -17,7 +17,7 @@ from gsgan.data.pixels import (
     read_mask,
     with_ignored_border,
 )
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 VALUES = np.array([[0, 1, 127], [128, 200, 255]], np.uint8)
 RULES = PixelRules()

@@ -10,13 +10,13 @@ from typing import Any
 import pytest
 from make import write_tiny_capture
 
-from gsgan.config import config_folder
 from gsgan.data.datamodule import GsganData
 from gsgan.data.layout import Layout
 from gsgan.data.measures import CHOICES, Measures
 from gsgan.data.protocol import Protocol
 from gsgan.data.splits import camera_name, make_splits, parse_frames, protocol_splits
-from gsgan.errors import ConfigError, DataError
+from gsgan.utils.config import config_folder
+from gsgan.utils.errors import ConfigError, DataError
 
 NAMES = sorted(path.stem for path in (config_folder() / "protocol").glob("*.yaml"))
 ONE = Protocol("one", train_cameras=[0], test_cameras=None, train_frames="0-5", test_frames="0-9:4")
@@ -234,8 +234,8 @@ def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> Non
 
     from rich.console import Console
 
-    from gsgan.runs import build_avatar, build_data
-    from gsgan.scoring.run import Wanted, evaluate_run
+    from gsgan.evaluate.run import Wanted, evaluate_run
+    from gsgan.train.runs import build_avatar, build_data
 
     config = compose(
         "train",

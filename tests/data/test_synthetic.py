@@ -40,8 +40,8 @@ from gsgan.data.synthetic.trace import (
     pixel_offsets,
     pixel_rays,
 )
-from gsgan.errors import ConfigError, DataError
 from gsgan.scene import BodyPose
+from gsgan.utils.errors import ConfigError, DataError
 
 torch.set_num_threads(1)
 TINY = {

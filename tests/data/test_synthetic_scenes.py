@@ -19,7 +19,7 @@ from gsgan.data.synthetic.scenes.make import build_scene, options_key
 from gsgan.data.synthetic.scenes.photograph import Gloss, PhotographedPerson
 from gsgan.data.synthetic.scenes.tint import Tint, make_tints
 from gsgan.data.synthetic.trace import Light, PosedPerson
-from gsgan.errors import ConfigError, DataError
+from gsgan.utils.errors import ConfigError, DataError
 
 LENS = (-0.28, 0.09, 0.001, -0.0008, -0.01)
 # Three cameras: tints that average to none need more than two to differ from each other's mirror.

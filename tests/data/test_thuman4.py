@@ -27,8 +27,8 @@ from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_image, read_mask, read_unsure
 from gsgan.data.splits import make_splits
-from gsgan.errors import ConfigError, DataError
 from gsgan.skeleton.smpl import to_mediapipe33
+from gsgan.utils.errors import ConfigError, DataError
 
 pytestmark = pytest.mark.usefixtures("model_once")
 

@@ -30,9 +30,9 @@ from gsgan.data.formats.zju import ZjuReader, layout_of
 from gsgan.data.formats.zju_annots import camera_folders, frame_number, read_annots
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_labels, read_mask
-from gsgan.errors import ConfigError, DataError
 from gsgan.scene import Frame
 from gsgan.skeleton.smpl import to_mediapipe33
+from gsgan.utils.errors import ConfigError, DataError
 
 pytestmark = pytest.mark.usefixtures("model_once")
 
@@ -761,7 +761,7 @@ def test_files_are_found_by_number(tmp_path: Path) -> None:
 def test_the_config_trains_with_segmentation_on_cihp_labels(
     compose, written: Path, smpl_file: Path
 ) -> None:
-    from gsgan.runs import build_avatar, build_data
+    from gsgan.train.runs import build_avatar, build_data
 
     config = compose(
         "train",

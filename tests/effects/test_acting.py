@@ -9,9 +9,9 @@ import pytest
 import torch
 from operators import Calls
 
-from gsgan.errors import ConfigError
 from gsgan.model.colour import ColourCorrection
-from gsgan.runs import build_training, load_avatar, read_checkpoint
+from gsgan.train.runs import build_training, load_avatar, read_checkpoint
+from gsgan.utils.errors import ConfigError
 
 NONE = "effects=none"
 LENS = (-0.6, 0.2, 0.001, 0, 0)
@@ -211,7 +211,7 @@ def test_degrees_above_the_active_one_are_neither_computed_nor_moved(build):
 
 
 def test_the_degree_is_raised_by_the_schedule():
-    from gsgan.training.schedule import Schedule
+    from gsgan.train.schedule import Schedule
 
     schedule = Schedule(10, 30, 30, degree_every=20)
     assert [schedule.degree(s, 3) for s in (0, 9, 29, 30, 49, 50, 69)] == [0, 0, 0, 1, 1, 2, 2]
@@ -365,7 +365,7 @@ def test_a_trained_avatar_has_what_its_checkpoint_says_not_what_the_scene_says_n
 
     from omegaconf import OmegaConf
 
-    from gsgan.runs import CHECKPOINT, build_data, load_config
+    from gsgan.train.runs import CHECKPOINT, build_data, load_config
 
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)

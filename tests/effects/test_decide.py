@@ -11,7 +11,7 @@ from gsgan.data.surface_colours import SurfaceColours
 from gsgan.effects import NAMES, Effects, EffectSettings, decide
 from gsgan.effects.settings import CHOICES
 from gsgan.effects.table import Cost, rows
-from gsgan.errors import ConfigError
+from gsgan.utils.errors import ConfigError
 
 ALIKE = SurfaceColours(difference=0.01, error=0.001, residual=0.05, points=1000, source="body")
 GLOSSY = replace(ALIKE, residual=0.12)

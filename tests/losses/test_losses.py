@@ -7,11 +7,11 @@ import math
 import pytest
 import torch
 
-from gsgan.errors import ConfigError, DataError
 from gsgan.losses.adversarial import discriminator_loss, feature_matching, generator_loss
 from gsgan.losses.perceptual import Perceptual
 from gsgan.losses.photometric import d_ssim, photometric
 from gsgan.losses.weights import FILES, find_weights, load_weights
+from gsgan.utils.errors import ConfigError, DataError
 
 
 def picture(seed: int = 0) -> torch.Tensor:

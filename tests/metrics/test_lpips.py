@@ -9,11 +9,11 @@ import torch
 from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
 from gsgan.data.measures import Measures
-from gsgan.errors import ConfigError
+from gsgan.evaluate.scores import PictureScores
 from gsgan.losses.weights import FILES
 from gsgan.metrics.lpips import lpips, lpips_name
 from gsgan.metrics.regions import mask_crop
-from gsgan.scoring.scores import PictureScores
+from gsgan.utils.errors import ConfigError
 
 RANGES = [(-1.0, 1.0), (0.0, 1.0)]
 

@@ -11,10 +11,10 @@ from gsgan.body import open_body
 from gsgan.body.normals import vertex_normals
 from gsgan.data.surface_colours import body_inside
 from gsgan.effects import EffectSettings, decide
-from gsgan.errors import ConfigError, DataError
 from gsgan.model.body_points import BodyPoints, moved_normals
-from gsgan.runs import CHECKPOINT, build_training, load_avatar
 from gsgan.scene import BodyPose, cat
+from gsgan.train.runs import CHECKPOINT, build_training, load_avatar
+from gsgan.utils.errors import ConfigError, DataError
 
 ON = "effects.body_points=on"
 
@@ -210,10 +210,10 @@ def test_a_run_from_before_body_points_and_low_pass_loads_as_it_was_trained(tiny
 
 
 def test_the_figure_of_densify_says_where_the_points_are(build, tmp_path):
-    from gsgan.drawing.densify import draw
-    from gsgan.drawing.settings import Settings
-    from gsgan.drawing.shots import make_shots
-    from gsgan.drawing.subjects import Subject
+    from gsgan.report.figures.densify import draw
+    from gsgan.report.figures.settings import Settings
+    from gsgan.report.figures.shots import make_shots
+    from gsgan.report.figures.subjects import Subject
 
     for word, said in (("on", "the bone that moves them most"), ("off", "Algorithm 1 puts on")):
         data, avatar, _ = build(f"effects.body_points={word}")

@@ -13,9 +13,9 @@ import torch
 
 from gsgan.body import SkinnedBody, free_body, open_body
 from gsgan.body.smpl_names import CIHP
-from gsgan.errors import ConfigError, DataError
 from gsgan.model.class_vote import ClassVote, neighbour_distance, seen
 from gsgan.scene import BodyPose, Camera, Frame
+from gsgan.utils.errors import ConfigError, DataError
 
 FOCAL, SIZE = 40.0, 32
 
@@ -245,7 +245,7 @@ def test_labels_that_are_the_bodys_own_are_not_voted_on(build, monkeypatch):
 
 
 def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_path, monkeypatch):
-    from gsgan.runs import CHECKPOINT, build_training, load_avatar
+    from gsgan.train.runs import CHECKPOINT, build_training, load_avatar
 
     config = tiny(f"data.root={foreign}", FEW)
     data, module = build_training(config)
@@ -267,7 +267,7 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_
 
 
 def test_a_resumed_run_goes_by_the_votes_it_began_with(foreign, tiny):
-    from gsgan.runs import build_avatar, build_data
+    from gsgan.train.runs import build_avatar, build_data
 
     config = tiny(f"data.root={foreign}", FEW)
     avatar = build_avatar(config, build_data(config))
@@ -282,7 +282,7 @@ def test_a_resumed_run_goes_by_the_votes_it_began_with(foreign, tiny):
 
 
 def test_votes_of_another_body_are_refused(foreign, tiny):
-    from gsgan.runs import build_avatar, build_data
+    from gsgan.train.runs import build_avatar, build_data
 
     config = tiny(f"data.root={foreign}")
     with pytest.raises(DataError, match="labels of 7 vertices, which do not fit the free body"):
@@ -292,7 +292,7 @@ def test_votes_of_another_body_are_refused(foreign, tiny):
 def test_without_pictures_foreign_labels_are_refused(foreign, tiny):
     from hydra.utils import instantiate
 
-    from gsgan.runs import build_data
+    from gsgan.train.runs import build_data
 
     config = tiny(f"data.root={foreign}")
     with pytest.raises(DataError, match="no training picture with labels"):

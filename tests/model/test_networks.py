@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsgan.errors import ConfigError
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.encoding import encoded_size, positional_encoding
 from gsgan.model.generator import Generator, Style
 from gsgan.model.pose_graph import PoseGraph, PoseLinear
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.utils.errors import ConfigError
 
 
 def generator(**options) -> Generator:

@@ -10,11 +10,11 @@ import torch
 
 from gsgan.body import free_body
 from gsgan.body.smpl_names import CIHP, CLOTHES, SMPLX_JOINTS
-from gsgan.errors import ConfigError
 from gsgan.model.classes import IGNORE, class_map
 from gsgan.model.segmentation import Segmentation, segmentation_loss, silhouette_loss
-from gsgan.runs import Moved, build_data, load_avatar, load_config
 from gsgan.scene import BodyPose, Camera
+from gsgan.train.runs import Moved, build_data, load_avatar, load_config
+from gsgan.utils.errors import ConfigError
 
 SIZE = 32
 FOCAL = 1.1 * SIZE

@@ -5,9 +5,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from gsgan.bench.cases.poses import DEGENERATE, REST, noisy, rest
 from gsgan.scene import Camera
 from gsgan.skeleton import MEDIAPIPE33
-from gsgan.stability.poses import DEGENERATE, REST, noisy, rest
 
 __all__ = [
     "DEGENERATE",

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from skeleton_poses import DEGENERATE, REST, assert_rotation, camera, noisy, rest, rotation
 from torch import Tensor
 
-from gsgan.errors import ConfigError
 from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames, recentre, sampling
 from gsgan.skeleton.template import HEAD
+from gsgan.utils.errors import ConfigError
 
 F64 = torch.float64
 SAMPLERS: tuple[Any, ...] = ("even", "trimesh")

@@ -17,9 +17,9 @@ import pytest
 import torch
 from splat_scenes import camera, cloud, error, gradients, join, leaves, loss, one, with_covariances
 
+from gsgan.bench.cases.raster import drawing_backends
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat import ACCURACY, gsplat_backend, rasterise, resolve_backend
-from gsgan.stability.raster import drawing_backends
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 STANDARD = ACCURACY["standard"]

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import pytest
 import torch
 
-from gsgan.stability import Case, judge
-from gsgan.stability.case import FINITE_ONLY
+from gsgan.bench.cases import Case, judge
+from gsgan.bench.cases.case import FINITE_ONLY
 
 torch.set_num_threads(1)
 

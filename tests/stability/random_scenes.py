@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from hypothesis import strategies as st
 
-from gsgan.stability.case import Inputs
-from gsgan.stability.raster import pinhole
+from gsgan.bench.cases.case import Inputs
+from gsgan.bench.cases.raster import pinhole
 
 Size = tuple[int, int]
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsgan.stability import VERDICTS, Case, Tolerance, all_cases, judge, registry, table
+from gsgan.bench.cases import VERDICTS, Case, Tolerance, all_cases, judge, registry, table
 
 
 class Spoiled(torch.autograd.Function):

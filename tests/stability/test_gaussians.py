@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsgan.stability.gaussians import GAUSSIANS
+from gsgan.bench.cases.gaussians import GAUSSIANS
 from stability.judged import assert_as_expected, each
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from gsgan.bench.cases.generator import GENERATOR
 from gsgan.model.generator import Style
-from gsgan.stability.generator import GENERATOR
 from stability.judged import assert_as_expected, each
 
 HALVES = (torch.bfloat16, torch.float16)

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from gsgan.bench.cases.lbs import BONES, LBS, PARENTS
+from gsgan.bench.cases.raster import rotation
 from gsgan.body import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
-from gsgan.stability.lbs import BONES, LBS, PARENTS
-from gsgan.stability.raster import rotation
 from stability.judged import assert_as_expected, each
 from stability.motions import ANGLES, METRES, assert_rotation
 

@@ -9,10 +9,10 @@ import torch
 from kornia.losses import ssim_loss
 from torchmetrics.functional.image import structural_similarity_index_measure
 
+from gsgan.bench.cases.losses import LOSSES, PAIRS
+from gsgan.evaluate.scores import PictureScores
 from gsgan.losses.photometric import d_ssim
 from gsgan.metrics.image import psnr, ssim
-from gsgan.scoring.scores import PictureScores
-from gsgan.stability.losses import LOSSES, PAIRS
 from stability.judged import assert_as_expected, each
 
 

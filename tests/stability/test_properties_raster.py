@@ -9,11 +9,8 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gsgan.splat import ACCURACY, Accuracy, project, rasterise
-from gsgan.splat.project import rotations
-from gsgan.splat.reference import error_bound
-from gsgan.stability.case import Inputs, Tolerance
-from gsgan.stability.raster import (
+from gsgan.bench.cases.case import Inputs, Tolerance
+from gsgan.bench.cases.raster import (
     drawing_backends,
     picture,
     raster_case,
@@ -21,6 +18,9 @@ from gsgan.stability.raster import (
     rotation,
     uncut,
 )
+from gsgan.splat import ACCURACY, Accuracy, project, rasterise
+from gsgan.splat.project import rotations
+from gsgan.splat.reference import error_bound
 from stability.judged import assert_as_expected
 from stability.random_scenes import scenes
 

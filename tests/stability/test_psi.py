@@ -7,11 +7,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gsgan.bench.cases.poses import DEGENERATE, noisy, rest
+from gsgan.bench.cases.psi import PSI, composed, ordinary_residuals, small_psi, some_points
+from gsgan.bench.cases.raster import SIZE, pinhole
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat import rasterise
-from gsgan.stability.poses import DEGENERATE, noisy, rest
-from gsgan.stability.psi import PSI, composed, ordinary_residuals, small_psi, some_points
-from gsgan.stability.raster import SIZE, pinhole
 from stability.judged import assert_as_expected, each
 from stability.motions import ANGLES, METRES, rigid
 

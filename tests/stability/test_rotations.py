@@ -6,8 +6,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from gsgan.bench.cases.rotations import ROTATIONS
 from gsgan.skeleton import rotation_from_6d
-from gsgan.stability.rotations import ROTATIONS
 from stability.judged import assert_as_expected, each
 from stability.motions import assert_rotation
 

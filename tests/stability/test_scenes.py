@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsgan.stability.case import REFUSED
-from gsgan.stability.scenes import SCENES
+from gsgan.bench.cases.case import REFUSED
+from gsgan.bench.cases.scenes import SCENES
 from stability.judged import assert_as_expected, each
 
 

@@ -7,10 +7,10 @@ import torch
 from hypothesis import given, settings
 from torch import Tensor
 
+from gsgan.bench.cases.crossings import CROSSINGS, Crossing
+from gsgan.bench.cases.skeleton import SKELETON, few_points
 from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames, omega
 from gsgan.skeleton.frames import BoneFrames
-from gsgan.stability.crossings import CROSSINGS, Crossing
-from gsgan.stability.skeleton import SKELETON, few_points
 from stability.judged import assert_as_expected, each
 from stability.motions import ANGLES, METRES, assert_rotation, rigid, skeletons
 

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from gsgan.body.skinned import SkinnedBody, carry
-from gsgan.errors import DataError
 from gsgan.scene import BodyPose
+from gsgan.utils.errors import DataError
 
 
 @dataclass(frozen=True, kw_only=True)

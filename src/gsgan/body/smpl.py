@@ -226,7 +226,7 @@ def read_smpl(path: Path | str) -> SkinnedModel:
     """A body model from the user's file: SMPL's .pkl, chumpy or cleaned, or an .npz.
 
     Args:
-        path: the model file; nothing in it is run (see gsgan.pickles).
+        path: the model file; nothing in it is run (see gsgan.utils.pickles).
 
     Raises:
         DataError: when the file is missing, damaged, refused, or not such a model.

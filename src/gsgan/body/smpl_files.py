@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.arrays import expect_array
-from gsgan.errors import DataError
-from gsgan.pickles import read_npz, read_pickle
+from gsgan.utils.arrays import expect_array
+from gsgan.utils.errors import DataError
+from gsgan.utils.pickles import read_npz, read_pickle
 
 KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 SMPLX_JOINT_COUNT = 55

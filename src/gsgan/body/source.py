@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from gsgan.body.free import free_body
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 if TYPE_CHECKING:
     from gsgan.body.skinned import SkinnedBody

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 Float = NDArray[np.float64]
 

@@ -21,8 +21,8 @@ from gsgan.data.crop import PersonCrop, Window
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL
 from gsgan.data.splits import Item
-from gsgan.errors import ConfigError, DataError
 from gsgan.scene import BodyPose, Camera, Frame
+from gsgan.utils.errors import ConfigError, DataError
 
 Bytes = NDArray[np.uint8]
 Lens = Literal["undistort", "ignore", "raw"]

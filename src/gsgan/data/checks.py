@@ -13,7 +13,7 @@ from gsgan.data.crop import NEAR, inside, project
 from gsgan.data.files import check_picture
 from gsgan.data.pixels import MaskFile
 from gsgan.data.skeletons import HUBS, Landmarks, Poses
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 Index = Mapping[str, Mapping[int, str]]
 """Paths relative to the root, by camera name and frame number."""

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.errors import ConfigError
+from gsgan.utils.errors import ConfigError
 
 Float = NDArray[np.float64]
 Bytes = NDArray[np.uint8]

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import gsgan.compat  # noqa: F401  (must come before lightning)
+import gsgan.utils.compat  # noqa: F401  (must come before lightning)
 
 # isort: split
 import cv2
@@ -27,8 +27,8 @@ from gsgan.data.sampler import StepSampler, pass_order
 from gsgan.data.scene_info import SceneInfo, count_labels, scene_info
 from gsgan.data.skeletons import complete_skeletons
 from gsgan.data.splits import SPLITS, Splits, make_splits, protocol_splits
-from gsgan.errors import ConfigError
 from gsgan.scene import Frame, cat
+from gsgan.utils.errors import ConfigError
 
 __all__ = [
     "GsganData",

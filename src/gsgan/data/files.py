@@ -20,8 +20,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.errors import DataError
-from gsgan.pickles import read_npz
+from gsgan.utils.errors import DataError
+from gsgan.utils.pickles import read_npz
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}

@@ -25,7 +25,7 @@ from gsgan.data.checks import (
 )
 from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules
 from gsgan.data.skeletons import Landmarks, Poses, fill_missing
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 __all__ = [
     "IGNORE_LABEL",

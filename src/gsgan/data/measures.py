@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from gsgan.errors import ConfigError
+from gsgan.utils.errors import ConfigError
 
 CHOICES: dict[str, tuple[Any, ...]] = {
     "region": ("full", "body_box_cleared", "body_box"),

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.files import read_colour, read_grey, read_stored
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 Bytes = NDArray[np.uint8]
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from gsgan.data.measures import Measures
-from gsgan.errors import ConfigError
+from gsgan.utils.errors import ConfigError
 
 
 @dataclass(frozen=True)

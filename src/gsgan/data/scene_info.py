@@ -19,8 +19,8 @@ from gsgan.data.pixels import IGNORE_LABEL, read_labels
 from gsgan.data.skeletons import body_height, joints_of
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
-from gsgan.errors import DataError
 from gsgan.scene import Frame
+from gsgan.utils.errors import DataError
 
 if TYPE_CHECKING:
     from gsgan.body import SkinnedBody

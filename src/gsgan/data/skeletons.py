@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.data.files import LARGEST_FRAME
-from gsgan.errors import DataError
 from gsgan.skeleton import limb_length_sum, sanitise
+from gsgan.utils.errors import DataError
 
 if TYPE_CHECKING:
     from gsgan.data.layout import Layout

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 from gsgan.data.files import LARGEST_FRAME
 from gsgan.data.layout import Layout, spans
 from gsgan.data.protocol import Protocol
-from gsgan.errors import ConfigError, DataError
+from gsgan.utils.errors import ConfigError, DataError
 
 T = TypeVar("T", int, str)
 

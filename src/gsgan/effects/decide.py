@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from gsgan.effects.record import OFF, Effect, Effects
 from gsgan.effects.settings import AUTO, CHOICES, EffectSettings
-from gsgan.errors import ConfigError
+from gsgan.utils.errors import ConfigError
 
 if TYPE_CHECKING:
     from gsgan.data.scene_info import SceneInfo

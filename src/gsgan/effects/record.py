@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from gsgan.errors import ConfigError
+from gsgan.utils.errors import ConfigError
 
 OFF = "off"
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gsgan.errors import ConfigError
+from gsgan.utils.errors import ConfigError
 
 AUTO = "auto"
 ON_OFF = (AUTO, "on", "off")

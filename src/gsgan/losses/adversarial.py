@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.errors import ConfigError
+from gsgan.utils.errors import ConfigError
 
 Maps = Sequence[Sequence[Tensor]]  # per scale: feature maps, the logits last
 

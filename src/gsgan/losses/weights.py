@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 FILES = {
     "vgg16": "vgg16-397923af.pth",

@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from gsgan.data.measures import Measures
-from gsgan.errors import ConfigError
 from gsgan.losses.weights import FILES, find_weights, how_to_get, load_weights
 from gsgan.metrics.image import Score
+from gsgan.utils.errors import ConfigError
 
 _BACKBONES = {"vgg": "vgg16", "alex": "alexnet"}
 

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 
 from gsgan.body import open_body
 from gsgan.effects import Effects, EffectSettings, decide
-from gsgan.errors import ConfigError, DataError
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.class_vote import ClassVote, Pictures
 from gsgan.model.colour import ColourCorrection
@@ -22,7 +21,6 @@ from gsgan.model.painting import Painting
 from gsgan.model.parts import labelled_body
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
-from gsgan.precision import full_precision
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians
 from gsgan.skeleton import (
     MEDIAPIPE33,
@@ -36,6 +34,8 @@ from gsgan.skeleton import (
 )
 from gsgan.splat import BACKENDS, Accuracy, rasterise
 from gsgan.splat.checks import checks_for
+from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.precision import full_precision
 from gsgan.window import Window, body_window
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ from rich.progress import track
 from torch import Tensor
 
 from gsgan.body import SkinnedBody
-from gsgan.console import make_console
-from gsgan.errors import ConfigError, DataError
 from gsgan.model.classes import IGNORE
 from gsgan.scene import Camera, Frame
+from gsgan.utils.console import make_console
+from gsgan.utils.errors import ConfigError, DataError
 
 NEIGHBOUR = 4  # the neighbour whose distance says how wide the gaps between vertices are
 CELLS = 2.0  # cells of the depth map across the median occluder's radius

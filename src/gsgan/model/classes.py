@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from gsgan.body.smpl_names import group_of_part
-from gsgan.errors import ConfigError
+from gsgan.utils.errors import ConfigError
 
 IGNORE = 255
 MODES = ("body", "hands")

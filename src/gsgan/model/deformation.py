@@ -10,12 +10,12 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.constants import constant
 from gsgan.model.bounded import bounded
 from gsgan.model.encoding import encoded_size, positional_encoding
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
+from gsgan.utils.constants import constant
 
 QUAT_FLOOR = 1e-12  # added under the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.errors import ConfigError
+from gsgan.utils.errors import ConfigError
 
 SLOPE = 0.2
 NORMS = ("instance", "none")

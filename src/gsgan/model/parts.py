@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 from torch import Tensor
 
 from gsgan.body import SkinnedBody, open_body
-from gsgan.errors import DataError
 from gsgan.model.class_vote import ClassVote, Pictures
+from gsgan.utils.errors import DataError
 
 if TYPE_CHECKING:
     from gsgan.data.scene_info import SceneInfo  # loads the data package

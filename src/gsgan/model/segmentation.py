@@ -13,11 +13,11 @@ from torch.nn import functional
 from gsgan.body import SkinnedBody
 from gsgan.model.classes import IGNORE, class_map
 from gsgan.model.skinned_points import SkinnedPoints
-from gsgan.precision import full_precision
 from gsgan.scene import BodyPose, Camera, Gaussians, Raster
 from gsgan.splat import accuracy as named_accuracy
 from gsgan.splat import rasterise
 from gsgan.splat.checks import checks_for
+from gsgan.utils.precision import full_precision
 
 __all__ = ["IGNORE", "Segmentation", "segmentation_loss", "silhouette_loss"]
 

@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsgan.errors import ConfigError
 from gsgan.skeleton import sampling
 from gsgan.skeleton.frames import (
     MIN_LENGTH,
@@ -21,6 +20,7 @@ from gsgan.skeleton.frames import (
     constants,
 )
 from gsgan.skeleton.template import HEAD, MEDIAPIPE33, SkeletonTemplate
+from gsgan.utils.errors import ConfigError
 
 Torso = Literal["fit", "cube"]
 Sampler = Literal["even", "trimesh"]

@@ -9,10 +9,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from gsgan.constants import constant
 from gsgan.scene import Camera
 from gsgan.skeleton.frames import check_skeleton
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
+from gsgan.utils.constants import constant
 
 MIN_SEGMENT_PX = 1e-2
 """Pixels: a shorter segment is drawn as a point, with a finite slope."""

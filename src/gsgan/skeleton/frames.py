@@ -17,9 +17,9 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from gsgan.constants import constant
 from gsgan.skeleton.rotation6d import orthogonal_to, rotation_from_6d, rotation_to_6d
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, N_HUBS, PELVIS, SkeletonTemplate
+from gsgan.utils.constants import constant
 
 Twist = Literal["none", "hinge"]
 

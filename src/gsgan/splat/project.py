@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsgan.constants import constant, filled
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat.settings import Accuracy
+from gsgan.utils.constants import constant, filled
 
 # exp(-745.2) is the smallest double above zero: beyond this a Gaussian is exactly 0.
 EXP_UNDERFLOW = 746.0

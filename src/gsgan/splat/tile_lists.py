@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.constants import filled
 from gsgan.splat.project import Projected
 from gsgan.splat.settings import Accuracy
+from gsgan.utils.constants import filled
 
 # Rounding errors, in units of the last place, that q may have gathered where tiles are listed.
 ROUNDING = 64

@@ -16,8 +16,8 @@ from writers import python2
 
 from gsgan.body import free_body
 from gsgan.body.smpl_names import JOINT_NAMES
-from gsgan.files import write_atomically
 from gsgan.skeleton.smpl import TABLES
+from gsgan.utils.files import write_atomically
 
 Kind = Literal["smpl", "smplx"]
 BODY_PARENTS = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19)

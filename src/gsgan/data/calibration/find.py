@@ -12,7 +12,7 @@ from gsgan.data.calibration.own_json import read_own_json
 from gsgan.data.calibration.qualisys import read_qualisys
 from gsgan.data.calibration.toml_tables import read_toml
 from gsgan.data.cameras import CameraEntry
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 HEAD = 65536  # bytes enough to tell the formats apart
 PATTERNS = ("cameras.json", "intri.yml", "intri.yaml", "*.qca.txt", "*.qca", "*.toml")

@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 MAX_BYTES = 2**20  # of a file: some 1000 cameras
 MAX_ENTRIES = 10_000  # of a matrix; calibrations have at most 14

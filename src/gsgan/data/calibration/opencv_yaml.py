@@ -9,7 +9,7 @@ import numpy as np
 
 from gsgan.data.calibration.opencv_storage import Storage, read_storage
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 MAX_LENS = 8  # coefficients that are understood
 SAME_ROTATION = 1e-3  # largest entry in which Rot_ and R_ of one camera may differ

@@ -10,7 +10,7 @@ import numpy as np
 
 from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.data.files import natural_order
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 SUBPIXELS = 64  # parts of a pixel in which focal lengths and centres are written
 MILLIMETRE = 1e-3

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 NO_CAMERAS = ("metadata", "capture_volume", "charuco", "checkerboard")
 KEYS = ("size", "matrix", "distortions", "rotation", "translation")

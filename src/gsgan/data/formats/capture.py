@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 
-from gsgan.arrays import expect_array
 from gsgan.data.cameras import EXPECTED, CameraEntry, make_camera, numbers
 from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, read_arrays, read_json
@@ -36,7 +35,8 @@ from gsgan.data.skeletons import (
     make_landmarks,
     whole_frame_ids,
 )
-from gsgan.errors import DataError
+from gsgan.utils.arrays import expect_array
+from gsgan.utils.errors import DataError
 
 LANDMARKS = "landmarks3d.npz"
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")

@@ -9,7 +9,7 @@ from typing import Any
 from gsgan.data.files import read_json
 from gsgan.data.layout import BodyModel, Meta
 from gsgan.data.skeletons import SKELETONS
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}

@@ -15,7 +15,7 @@ from gsgan.data.files import read_header
 from gsgan.data.formats.smpl_motion import require_kind
 from gsgan.data.layout import Found
 from gsgan.data.splits import parse_frames
-from gsgan.errors import ConfigError, DataError
+from gsgan.utils.errors import ConfigError, DataError
 
 AXES = ("x", "y", "z")
 

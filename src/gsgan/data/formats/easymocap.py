@@ -34,7 +34,7 @@ from gsgan.data.formats.trust import Trust, watch_masks
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, assemble, dataset_folder
 from gsgan.data.pixels import MASK_RULES, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
-from gsgan.errors import ConfigError, DataError
+from gsgan.utils.errors import ConfigError, DataError
 
 CONTENTS = "intri.yml, extri.yml, images/, mask/, and keypoints3d/ or smpl/"
 SKELETONS = {"smpl": "smpl24 -> mediapipe33", "keypoints3d": "body25 -> mediapipe33"}

@@ -15,7 +15,7 @@ from gsgan.data.files import frame_files, read_json_value
 from gsgan.data.formats.smpl_motion import Motion
 from gsgan.data.formats.zju_params import fit_parameters, to_motion
 from gsgan.data.joints import BODY, FROM_HANDS, HAND, SETS
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 Float = NDArray[np.float64]
 

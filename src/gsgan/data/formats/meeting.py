@@ -15,7 +15,7 @@ from gsgan.data.crop import NEAR, project
 from gsgan.data.formats.trust import Trust, spread
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 Bytes = NDArray[np.uint8]
 Float = NDArray[np.float64]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gsgan.data.files import frame_files, last_number, read_header, read_stored
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 Files = dict[str, dict[int, str]]
 """Paths relative to the root, by camera and frame."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from gsgan.body.smpl import SkinnedModel
 from gsgan.data.skeletons import Poses
-from gsgan.errors import DataError
 from gsgan.skeleton.smpl import TABLES, to_mediapipe33
+from gsgan.utils.errors import DataError
 
 Float = NDArray[np.float64]
 MODEL_NAMES = {"smpl": "SMPL", "smplx": "SMPL-X"}

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from gsgan.body.smpl import SkinnedModel
 from gsgan.data.checks import spans
 from gsgan.data.formats.smpl_motion import Motion
-from gsgan.errors import DataError
-from gsgan.pickles import read_npz
+from gsgan.utils.errors import DataError
+from gsgan.utils.pickles import read_npz
 
 Float = NDArray[np.float64]
 

@@ -31,7 +31,7 @@ from gsgan.data.formats.trust import Trust, watch_masks
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile, PixelRules
 from gsgan.data.skeletons import make_landmarks
-from gsgan.errors import ConfigError, DataError
+from gsgan.utils.errors import ConfigError, DataError
 
 PARAMETERS = "smpl_params.npz"
 MISSING = "missing_img_files.txt"

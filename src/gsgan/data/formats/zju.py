@@ -40,7 +40,7 @@ from gsgan.data.layout import (
 )
 from gsgan.data.pixels import MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
-from gsgan.errors import ConfigError, DataError
+from gsgan.utils.errors import ConfigError, DataError
 
 Float = NDArray[np.float64]
 

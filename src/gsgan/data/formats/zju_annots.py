@@ -13,8 +13,8 @@ import numpy as np
 from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.data.files import frame_files, frame_of, last_number, natural_order
 from gsgan.data.formats.common import picture_size
-from gsgan.errors import DataError
-from gsgan.pickles import read_npy
+from gsgan.utils.errors import DataError
+from gsgan.utils.pickles import read_npy
 
 ANNOTS = ("annots.npy", "annots_new.npy")
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")

@@ -22,9 +22,9 @@ from gsgan.data.formats.zju_params import still_root
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import Landmarks, make_landmarks
-from gsgan.errors import DataError
-from gsgan.pickles import read_npz, read_pickle
 from gsgan.skeleton.smpl import to_mediapipe33
+from gsgan.utils.errors import DataError
+from gsgan.utils.pickles import read_npz, read_pickle
 
 Float = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from gsgan.body.smpl import SkinnedModel, from_zju
 from gsgan.data.files import frame_files
 from gsgan.data.formats.smpl_motion import Motion, one_shape, parameter, posed
-from gsgan.errors import ConfigError, DataError
-from gsgan.pickles import read_npy
+from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.pickles import read_npy
 
 Float = NDArray[np.float64]
 

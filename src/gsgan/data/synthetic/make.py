@@ -26,8 +26,8 @@ import gsgan
 from gsgan.body.free import free_body
 from gsgan.data.synthetic.scene_setup import Settings, Stage, build_stage, dataset_key
 from gsgan.data.synthetic.worker import trace_frames
-from gsgan.errors import DataError
 from gsgan.scene import BodyPose
+from gsgan.utils.errors import DataError
 
 
 def cache_root() -> Path:

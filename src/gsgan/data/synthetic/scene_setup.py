@@ -20,8 +20,8 @@ from gsgan.body.free import Body, free_body, free_body_path
 from gsgan.data.synthetic.identity import make_identity, marks_of
 from gsgan.data.synthetic.motion import held_out, motion
 from gsgan.data.synthetic.trace import Person, View
-from gsgan.errors import ConfigError
 from gsgan.scene import BodyPose
+from gsgan.utils.errors import ConfigError
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.synthetic.scene_setup import Settings, Stage, build_stage
 from gsgan.data.synthetic.trace import Light, PosedPerson
-from gsgan.errors import DataError
+from gsgan.utils.errors import DataError
 
 
 def trace_frames(root: Path, stage: Stage, rays: int, frames: Iterable[int]) -> Iterator[int]:

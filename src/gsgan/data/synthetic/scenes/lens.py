@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.synthetic.trace import View
-from gsgan.errors import ConfigError
+from gsgan.utils.errors import ConfigError
 
 Array = NDArray[np.float64]
 

@@ -27,7 +27,7 @@ from gsgan.data.synthetic.scenes.photograph import Gloss, PhotographedPerson
 from gsgan.data.synthetic.scenes.tint import Tint, make_tints
 from gsgan.data.synthetic.trace import Array, Light, View
 from gsgan.data.synthetic.worker import _bytes, write_png
-from gsgan.errors import ConfigError, DataError
+from gsgan.utils.errors import ConfigError, DataError
 
 KEPT = ("landmarks3d.npz", "hands3d.npz", "body_pose.npz")
 

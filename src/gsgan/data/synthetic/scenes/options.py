@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from gsgan.data.cameras import DISTORTION_LENGTHS
-from gsgan.errors import ConfigError
+from gsgan.utils.errors import ConfigError
 
 MOST_TINT = 0.3
 SCALES = (0.25, 4.0)

@@ -1,0 +1,127 @@
+"""Hard inputs of the generator: empty pixels, unbounded features, half precision."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from gsgan.bench.cases.case import Case, Inputs, Outputs, Tolerance
+from gsgan.bench.cases.poses import rounded
+from gsgan.model.generator import Generator, Style
+
+SUBJECT = "generator"
+SIDE = 16
+"""Pixels."""
+CHANNELS = {"F": 5, "S": 4, "p2d": 8}
+POSE = 35
+TIMES = 2
+"""F is drawn so many times larger each way, and averaged."""
+
+
+@lru_cache(maxsize=8)
+def _generator(dtype: torch.dtype, device: torch.device, biased: bool) -> Generator:
+    """A small one whose style is not at its start, with or without biases."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        F, S, p2d = CHANNELS.values()
+        made = Generator(F, S, p2d, POSE, TIMES, base=4)
+        for module in made.modules():
+            if isinstance(module, Style) and module.from_map is not None:
+                nn.init.normal_(module.from_map.weight, std=0.1)
+                nn.init.normal_(module.from_pose.weight, std=0.1)
+    if not biased:
+        for name, parameter in made.named_parameters():
+            if name.endswith("bias"):
+                nn.init.zeros_(parameter)
+    return made.to(device, dtype)
+
+
+def _inputs(scale: float = 1.0, shift: float = 0.0, person: float = 1.0) -> Inputs:
+    """Random maps; beyond ``person`` of the width every channel is zero."""
+    generator = torch.Generator().manual_seed(0)
+
+    def rand(*shape: int) -> Tensor:
+        return torch.rand(1, *shape, generator=generator, dtype=torch.float64)
+
+    made = {name: rand(channels, SIDE, SIDE) for name, channels in CHANNELS.items()}
+    made["fine"] = rand(CHANNELS["F"], TIMES * SIDE, TIMES * SIDE)
+    for name in ("F", "fine"):
+        made[name] = scale * (made[name] - shift)
+    for value in made.values():
+        value[..., round(person * value.shape[-1]) :] = 0
+    return {**made, "g": 2 * rand(POSE) - 1}
+
+
+def _painted(inputs: Inputs, biased: bool = True) -> Outputs:
+    F, S, p2d, g, fine = (inputs[name] for name in ("F", "S", "p2d", "g", "fine"))
+    return {"image": _generator(F.dtype, F.device, biased)(F, S, p2d, g, fine)}
+
+
+def _in_half_precision(inputs: Inputs, half: torch.dtype) -> Outputs:
+    """Under autocast, which float64 (the judge) is not subject to.
+
+    The picture only. Rounding flips activations that are near 0, so the gradient is right for a
+    slightly different network: off by 0.1 of its largest entry and more, whatever the code does.
+    """
+    with torch.no_grad(), torch.autocast(inputs["F"].device.type, dtype=half):
+        return {"image": _painted(inputs)["image"].to(inputs["F"].dtype)}
+
+
+def _case(name: str, make: Callable[[], Inputs], note: str = "", **options: Any) -> Case:
+    fixed: dict[str, Any] = {"run": _painted, "tolerance": Tolerance(1e-5, 1e-4)}
+    return Case(name=name, subject=SUBJECT, build=rounded(make), note=note, **{**fixed, **options})
+
+
+def _pixels() -> Iterator[Case]:
+    yield _case("an ordinary picture", _inputs)
+    yield _case("half of the pixels all zero", partial(_inputs, person=0.5))
+    yield _case("every pixel zero", partial(_inputs, person=0.0))
+    yield _case(
+        "half of the pixels all zero, no biases",
+        partial(_inputs, person=0.5),
+        run=partial(_painted, biased=False),
+        note="Normalising a pixel that is zero in every channel: it stays zero.",
+    )
+    yield _case(
+        "every pixel zero, no biases",
+        partial(_inputs, person=0.0),
+        run=partial(_painted, biased=False),
+        note="The slope is 1e3 a normalisation, so 1e15 in all: right, and what biases are for.",
+    )
+
+
+def _features() -> Iterator[Case]:
+    note = "F is clamped to ± 1e3 before it enters; beyond, its slope is 0."
+    yield _case("features of 1e9", partial(_inputs, scale=1e9), note)
+    yield _case("features of ± 1e6", partial(_inputs, scale=1e6, shift=0.5), note)
+    yield _case("features of 1e-6", partial(_inputs, scale=1e-6))
+
+
+def _halves() -> Iterator[Case]:
+    """The picture with autocast is the picture without, to a few of the type's own roundings."""
+    scenes: tuple[tuple[str, Callable[[], Inputs]], ...] = (
+        ("an ordinary picture", _inputs),
+        ("half of the pixels all zero", partial(_inputs, person=0.5)),
+        ("features of 1e9", partial(_inputs, scale=1e9)),
+        ("features of ± 1e6", partial(_inputs, scale=1e6, shift=0.5)),
+    )
+    for name, half, tolerance in (
+        ("bf16", torch.bfloat16, 0.05),
+        ("fp16", torch.float16, 0.02),
+    ):
+        for what, make in scenes:
+            yield _case(
+                f"{name} autocast, {what}",
+                make,
+                run=partial(_in_half_precision, half=half),
+                tolerance=Tolerance(tolerance),
+                note="The picture only: half precision's gradients belong to a network whose "
+                "activations near 0 have the other sign.",
+            )
+
+
+GENERATOR: tuple[Case, ...] = (*_pixels(), *_features(), *_halves())

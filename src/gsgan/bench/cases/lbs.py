@@ -1,0 +1,145 @@
+"""Hard skinning: weights that do not sum to one, blends that are no rotation, bones of size 0."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gsgan.bench.cases.case import REFUSED, Case, Inputs, Tolerance
+from gsgan.bench.cases.poses import rounded
+from gsgan.bench.cases.raster import pinhole, raster_case
+from gsgan.body import (
+    axis_angle_to_matrix,
+    blend_transforms,
+    check_weights,
+    forward_kinematics,
+    skin,
+)
+from gsgan.model.body_points import moved_normals
+from gsgan.scene import Camera, Gaussians
+from gsgan.splat import Accuracy, rasterise
+
+SUBJECT = "LBS"
+PARENTS = (-1, 0, 1)
+"""Shoulder, elbow, wrist: an arm along x, 0.3 m each."""
+BONES = torch.tensor([[0, 1], [1, 2], [0, 1], [2, 2]])
+"""Of four points: two that bones share half and half, one nearly rigid, one rigid."""
+
+
+def _arm(**changes: Any) -> Inputs:
+    points = [[0.3, 0.04, 0.0], [0.6, 0.0, 0.04], [0.15, 0.03, 0.02], [0.7, 0.01, 0.02]]
+    weights = [[0.5, 0.5], [0.5, 0.5], [0.99, 0.01], [1.0, 0.0]]
+    theta = [[0.1, -0.2, 0.3], [0.0, 0.4, 0.2], [-0.3, 0.1, 0.2]]
+    joints = [[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]]
+    made = {"theta": theta, "weights": weights, "points": points, "joints": joints} | changes
+    inputs = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in made.items()}
+    scales = torch.tensor([0.03, 0.05, 0.02], dtype=torch.float64).expand(4, 3)
+    return {**inputs, "theta": inputs["theta"].unsqueeze(0), "scales": scales.clone()}
+
+
+def _skinned(inputs: Inputs) -> dict[str, Tensor]:
+    """Points, covariances and normals ``[1, 4, ...]`` of the posed arm; bones scaled if asked."""
+    check_weights(inputs["weights"].detach())  # as every body does when it is made
+    R = axis_angle_to_matrix(inputs["theta"])
+    bones = forward_kinematics(inputs["joints"], PARENTS, R, torch.zeros_like(R[:, 0, 0]))
+    if "bone scale" in inputs:
+        size = inputs["bone scale"][:, None, None]
+        last = bones.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(1, 3, 1, 4)
+        bones = torch.cat([bones[:, :, :3] * size, last], dim=2)
+    A, t = blend_transforms(bones, BONES.to(R.device), inputs["weights"])
+    axes = A * inputs["scales"][:, None]
+    up = torch.tensor([0.48, 0.6, 0.64], device=A.device, dtype=A.dtype).expand(4, 3)
+    posed = {"means": skin(inputs["points"], A, t), "covariances": axes @ axes.mT}
+    return {**posed, "normals": moved_normals(A, up)}
+
+
+def _painted(
+    inputs: Inputs, backend: str, *, size: tuple[int, int], settings: Accuracy
+) -> dict[str, Tensor]:
+    """The skinned Gaussians, and their picture."""
+    posed = _skinned(inputs)
+    gaussians = Gaussians(
+        means=posed["means"],
+        covariances=posed["covariances"],
+        quats=None,
+        scales=None,
+        opacities=torch.full_like(posed["means"][..., 0], 0.7),
+        features=inputs["points"].unsqueeze(0),
+    )
+    camera = Camera(inputs["K"], inputs["R"], inputs["t"], size)
+    raster = rasterise(gaussians, camera, settings=settings, backend=backend)
+    return {**posed, "features": raster.features, "alpha": raster.alpha}
+
+
+def _case(name: str, options: dict[str, Any] | None = None, **changes: Any) -> Case:
+    return Case(
+        name=name,
+        subject=SUBJECT,
+        build=rounded(lambda: _arm(**changes)),
+        run=_skinned,
+        **(options or {}),
+    )
+
+
+def _weights() -> Iterator[Case]:
+    summed: dict[str, Any] = {"note": "They are divided by their sum."}
+    refused: dict[str, Any] = {"expect": REFUSED}
+    for name, factor in (("two", 2.0), ("a half", 0.5), ("a millionth", 1e-6)):
+        weights = (_arm()["weights"] * factor).tolist()
+        yield _case(f"weights that sum to {name}", summed, weights=weights)
+    rows = _arm()["weights"].tolist()
+    yield _case("a vertex without weight", refused, weights=[[0.0, 0.0], *rows[1:]])
+    yield _case("a negative weight", refused, weights=[[1.5, -0.5], *rows[1:]])
+
+
+def _turns() -> Iterator[Case]:
+    axis = torch.tensor([[0.6, 0.0, 0.8]] * 3, dtype=torch.float64)
+    alike: dict[str, Any] = {
+        "tolerance": Tolerance(1e-5, 1e-3),
+        "gradient_floor": {"weights": 1e-6, "joints": 1e-6},
+        "note": "Bones move nearly alike: the gradients of weights and joints are differences of "
+        "equal numbers, and count as 0 below 1e-6.",
+    }
+    for name, angle in (("zero", 0.0), ("1e-9", 1e-9), ("a turn but for 0.003", 6.28)):
+        yield _case(f"joints turned by {name}", alike, theta=(angle * axis).tolist())
+    yield _case("joints turned by half a turn", theta=(math.pi * axis).tolist())
+    yield _case(
+        "joints turned by a thousandth, where the series ends",
+        alike,
+        theta=[[1.0001e-3, 0, 0], [0, 0.9999e-3, 0], [0, 0, 1e-3]],
+    )
+
+
+def _pictures() -> Iterator[Case]:
+    """What cannot be inverted must still be drawn: each on every backend of the rasteriser."""
+    twisted = [[0.0, 0, 0], [math.pi, 0, 0], [0.0, 0, 0]]
+    folded = [[0.0, 0, 0], [0, 0, math.pi], [0.0, 0, 0]]
+    note = "Half and half of two opposite bones is flat: the covariance has rank 1 or 2."
+    scenes: tuple[tuple[str, dict[str, Any], dict[str, Any], str], ...] = (
+        ("elbow collapsed by twisting half a turn", {"theta": twisted}, {}, note),
+        ("elbow collapsed by folding half a turn", {"theta": folded}, {}, note),
+        ("bone scale 0", {}, {"bone scale": [1.0, 0.0, 1.0]}, "Gaussians shrink to a point."),
+        ("all bones of scale 0", {}, {"bone scale": [0.0, 0.0, 0.0]}, "All Gaussians are points."),
+    )
+    for name, changes, more, why in scenes:
+        extra = {k: torch.tensor(v, dtype=torch.float64) for k, v in more.items()}
+        camera = pinhole(focal=40.0, t=(-0.35, 0.02, 1.0))
+        yield raster_case(
+            name,
+            lambda changes=changes, extra=extra, camera=camera: {  # type: ignore[misc]
+                **_arm(**changes),
+                **extra,
+                **camera,
+            },
+            subject=SUBJECT,
+            draw=_painted,
+            tolerance=Tolerance(1e-5, 1e-4),
+            note=why,
+        )
+
+
+LBS: tuple[Case, ...] = (_case("an ordinary pose"), *_weights(), *_turns(), *_pictures())

@@ -1,0 +1,33 @@
+"""``python -m gsgan.check data=…``: look a dataset over before any training."""
+
+from __future__ import annotations
+
+import sys
+
+from omegaconf import DictConfig
+
+from gsgan.utils.config import FAILED, entry
+from gsgan.utils.errors import ConfigError
+
+
+def check(config: DictConfig) -> None:
+    """Checks the dataset, prints and writes a report; ends with 1 when something is wrong.
+
+    With ``strict`` a warning is enough for that.
+
+    Raises:
+        GsganError: on a config value that does not fit.
+    """
+    from gsgan.check.run import run_check
+
+    if not isinstance(config.strict, bool):
+        raise ConfigError(f"strict must be true or false, got {config.strict!r}")
+    report = run_check(config)
+    if report.errors or (config.strict and report.warnings):
+        sys.exit(FAILED)
+
+
+main = entry("check")(check)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""Pictures for people: the grid of a validation, with captions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsgan.model.avatar import Painting
+from gsgan.scene import Frame
+from gsgan.utils.files import write_atomically
+
+CAPTION_HEIGHT = 22
+ERROR_GAIN = 4.0  # errors are small: shown this many times brighter, and said so in the caption
+# Background, then twelve body parts; classes beyond go round again.
+PALETTE = torch.tensor(
+    [
+        [0, 0, 0], [110, 70, 40], [240, 200, 170], [60, 120, 220], [50, 60, 110],
+        [230, 120, 60], [250, 190, 60], [200, 50, 80], [250, 110, 150], [60, 160, 90],
+        [140, 210, 110], [120, 80, 170], [190, 150, 230],
+    ]
+)  # fmt: skip
+
+
+def colour_labels(labels: Tensor) -> Tensor:
+    """``[B, H, W]`` part labels as pictures ``[B, 3, H, W]``; 255 (ignore) is white."""
+    index = torch.where(labels == 0, 0, 1 + (labels - 1) % (len(PALETTE) - 1))
+    picture = PALETTE.to(labels.device)[index].float() / 255
+    picture = torch.where((labels == 255).unsqueeze(-1), 1.0, picture)
+    return picture.permute(0, 3, 1, 2)
+
+
+def error_heat(image: Tensor, target: Tensor) -> Tensor:
+    """Mean absolute error of each pixel as a heat map ``[B, 3, H, W]``, black = none."""
+    error = ((image - target).abs().mean(dim=1) * ERROR_GAIN).clamp(0, 1)
+    heat = [
+        cv2.applyColorMap((e * 255).byte().cpu().numpy(), cv2.COLORMAP_INFERNO)[..., ::-1].copy()
+        for e in error
+    ]
+    return torch.from_numpy(np.stack(heat)).permute(0, 3, 1, 2).to(image) / 255
+
+
+def grid_rows(frame: Frame, painting: Painting) -> list[dict[str, Tensor]]:
+    """One row a batch item: pictures ``[3, H, W]`` by caption; what was not painted is absent."""
+    assert painting.image is not None
+    image, colour, parts = painting.image.clamp(0, 1), painting.colour, painting.segmentation
+    columns = {
+        "truth": frame.image,
+        "Step I colour": None if colour is None else colour.clamp(0, 1),
+        "S": None if parts is None else colour_labels(parts.argmax(dim=1)),
+        "I_pred": image,
+        f"error x{ERROR_GAIN:g}": error_heat(image, frame.image),
+    }
+    shown = {name: column.detach().cpu() for name, column in columns.items() if column is not None}
+    return [{name: column[i] for name, column in shown.items()} for i in range(len(frame))]
+
+
+def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) -> Path:
+    """Writes rows of pictures ``[3, H, W]`` as one PNG with a caption over each column.
+
+    Args:
+        rows: at least one row, each with the same captions; all pictures of one size.
+        path: the PNG.
+        least: pixels; smaller pictures are enlarged by a whole factor to at least this width.
+    """
+    captions = list(rows[0])
+    scale = max(1, -(-least // rows[0][captions[0]].shape[-1]))
+    body = torch.cat([torch.cat(list(row.values()), dim=-1) for row in rows], dim=-2)
+    body = body.clamp(0, 1).repeat_interleave(scale, -1).repeat_interleave(scale, -2)
+    pixels = (body * 255).round().byte().permute(1, 2, 0).numpy()
+    header = np.full((CAPTION_HEIGHT, pixels.shape[1], 3), 255, np.uint8)
+    step = pixels.shape[1] // len(captions)
+    for i, caption in enumerate(captions):
+        at = (i * step + 4, CAPTION_HEIGHT - 7)
+        cv2.putText(header, caption, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    ok, data = cv2.imencode(".png", np.concatenate([header, pixels])[..., ::-1])
+    if not ok:
+        raise OSError(f"{path}: the picture could not be encoded as PNG")
+    write_atomically(path, data.tobytes())
+    return path

@@ -1,0 +1,24 @@
+"""``python -m gsgan.fit data.root=<folder> out=<file>``: landmarks that fit the masks."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from gsgan.utils.config import entry
+
+
+def fit(config: DictConfig) -> None:
+    """Moves the landmarks of ``config.data`` until the person fits its masks.
+
+    Raises:
+        GsganError: on anything the user can put right.
+    """
+    from gsgan.fit.run import run_fit
+
+    run_fit(config)
+
+
+main = entry("fit")(fit)
+
+if __name__ == "__main__":
+    main()

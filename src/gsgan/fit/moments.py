@@ -1,0 +1,123 @@
+"""The frames of a capture as the fit sees them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsgan.data.capture import CaptureDataset, PictureCache
+from gsgan.data.datamodule import GsganData
+from gsgan.fit.fitter import Fitter, around
+from gsgan.fit.settings import Fit
+from gsgan.fit.shape import RigidShape
+from gsgan.scene import Frame
+from gsgan.skeleton import limb_length_sum
+from gsgan.utils.errors import DataError
+
+USUAL = 0.75  # quantile of the masks' areas that counts as usual: crumbs may be the most
+
+
+class Moments:
+    """The frames of a capture and their pictures by the cameras that train.
+
+    Held-out cameras are not looked at: what they saw is for scoring only. Pictures without a
+    person, or nearly so, are left out, and frames that have none left.
+
+    Args:
+        data: the capture.
+        device: the pictures go there.
+        least_mask: see `Fit`.
+        advance: called after each picture is looked at.
+
+    Raises:
+        DataError: when no picture is left.
+    """
+
+    def __init__(
+        self,
+        data: GsganData,
+        device: torch.device,
+        least_mask: float = 0.1,
+        advance: Callable[[], None] = lambda: None,
+    ) -> None:
+        layout, cameras = data.layout, data.splits.train_cameras
+        items = [
+            (camera, frame)
+            for frame in layout.frames
+            for camera in cameras
+            if frame in layout.images[camera]
+        ]
+        cache = PictureCache(int(data.cache_mb * 2**20))
+        self.dataset = CaptureDataset(layout, items, data.size, data.crop, cache, data.lens)
+        self.cameras, self.device = cameras, device
+        self._unseen: dict[int, torch.Tensor] = {}
+        places = self._usable(least_mask, advance)
+        if not places:
+            raise DataError(f"{layout.root}: the masks of {', '.join(cameras)} hold no person")
+        self.left_out = len(items) - len(places)
+        self.frames = tuple(sorted({items[place][1] for place in places}))
+        self._places: dict[int, list[int]] = {frame: [] for frame in self.frames}
+        for place in places:
+            self._places[items[place][1]].append(place)
+        marks = layout.landmarks
+        self.skeletons = self._stacked(marks.p)
+        self.visibility = self._stacked(marks.visibility)
+
+    def pictures(self, i: int) -> list[Frame]:
+        """The pictures of the i-th frame, one a camera; ``unsure`` beyond the camera's border."""
+        return [self._picture(place) for place in self._places[self.frames[i]]]
+
+    def _picture(self, place: int) -> Frame:
+        frame, unseen = self.dataset[place], self._unseen.get(place)
+        if unseen is not None:
+            unsure = unseen.to(frame.mask.dtype)
+            if frame.unsure is not None:
+                unsure = torch.maximum(unsure, frame.unsure)
+            frame = replace(frame, unsure=unsure)
+        return frame.to(self.device)
+
+    def _usable(self, least: float, advance: Callable[[], None]) -> list[int]:
+        """Places of the pictures whose masks hold enough of the person; finds borders by the way.
+
+        Counted is what the fit compares, in square metres at the person: a mask shrinks with the
+        distance, and another person's lies elsewhere.
+        """
+        areas = []
+        for place in range(len(self.dataset)):
+            inside = self.dataset.inside(place)
+            if inside is not None:
+                self._unseen[place] = inside < 0.5
+            picture = self._picture(place)
+            seen = around(picture.skeleton[0], picture)
+            mask = seen.mask if seen.unsure is None else seen.mask * (1 - seen.unsure)
+            depth = seen.camera.to_camera(seen.skeleton)[0, :, 2].median()
+            pixel = (depth / seen.camera.K[0, 0, 0]).square()
+            areas.append(float(mask.sum() * pixel))
+            advance()
+        known = [area for area in areas if area > 0]
+        usual = float(np.quantile(known, USUAL)) if known else np.inf
+        return [place for place, area in enumerate(areas) if area >= least * usual]
+
+    def _stacked(self, by_frame: Mapping[int, NDArray[np.float64]]) -> torch.Tensor:
+        values = np.stack([by_frame[frame] for frame in self.frames])
+        return torch.from_numpy(values).to(self.device, torch.float32)
+
+
+def make_fitter(
+    settings: Fit, moments: Moments, seed: int = 0, start: torch.Tensor | None = None
+) -> Fitter:
+    """The fit before its first step.
+
+    Args:
+        start: ``[F, J, 3]`` metres, skeletons in place of the capture's own.
+    """
+    start = moments.skeletons if start is None else start
+    limb_sum = float(limb_length_sum(start, moments.visibility > 0).nanmedian())
+    shape = RigidShape(settings.densify, limb_sum, settings.accuracy)
+    return Fitter(
+        shape.to(moments.device), start, moments.visibility, moments.pictures, settings, seed
+    )

@@ -1,0 +1,202 @@
+"""What a user should look at before training: each doubt is one sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gsgan.data.cameras import CameraEntry
+from gsgan.data.joints import BODY, joint_names
+from gsgan.prepare.cleanse import BODY_BONES, bone_lengths
+from gsgan.prepare.landmarks import Detections
+from gsgan.prepare.pictures import Written
+from gsgan.prepare.rig import FOCAL, Float, known
+from gsgan.prepare.solve import Solution, median
+from gsgan.prepare.sources import Source
+from gsgan.utils.errors import DataError
+
+
+@dataclass(frozen=True)
+class Doubts:
+    """From which values on something is reported.
+
+    Args:
+        reprojection: median error of one camera, in thousandths of the focal length.
+        camera_turn: degrees by which refinement turned a camera.
+        camera_move: metres by which refinement moved a camera.
+        flips: share of frames in which a camera's sides were swapped.
+        frozen_frames: frames in a row in which a detection stays the same to the last digit.
+        missing: share of frames in which a camera has no person or an empty mask, or a body joint
+            is missing.
+        undecoded: share of a video's frames that cannot be decoded; headers may be a few off.
+        people: share of frames with more than one person.
+        bone: share by which a limb's length may scatter (median deviation from its median).
+        lag: frames tried either way when the clocks are compared; 0 skips it.
+        delay: frames by which a clock may be off.
+        delay_gain: share by which the error must fall for a delay to be believed.
+        fps: share by which frame rates may differ.
+        distance: metres, least and greatest median distance of a camera to the person; beyond them
+            units are wrong and nothing is written.
+    """
+
+    reprojection: float = 6.0
+    camera_turn: float = 3.0
+    camera_move: float = 0.1
+    flips: float = 0.1
+    frozen_frames: int = 8
+    missing: float = 0.2
+    undecoded: float = 0.02
+    people: float = 0.02
+    bone: float = 0.1
+    lag: int = 6
+    delay: float = 0.5
+    delay_gain: float = 0.05
+    fps: float = 0.01
+    distance: tuple[float, float] = (0.3, 30.0)
+
+
+def doubts_about_sources(sources: Mapping[str, Source], limits: Doubts) -> list[str]:
+    """Frame rates that differ, lengths that differ, rotation metadata."""
+    found = []
+    rates = {name: s.fps for name, s in sources.items() if s.fps}
+    if rates and max(rates.values()) > (1 + limits.fps) * min(rates.values()):
+        said = ", ".join(f"{name} {fps:g}" for name, fps in rates.items())
+        found.append(f"frame rates differ ({said}): frames are paired by number all the same")
+    counts = {name: s.count for name, s in sources.items()}
+    if len(set(counts.values())) > 1:
+        said = ", ".join(f"{name} {count}" for name, count in counts.items())
+        found.append(f"cameras have different numbers of frames ({said}): was one cut or dropped?")
+    for name, source in sources.items():
+        if source.turned and not source.rotate:
+            found.append(
+                f"{name}: its metadata ask for a turn by {source.turned} degrees, which is not "
+                "obeyed; set apply_rotation=true if it was calibrated turned"
+            )
+    return found
+
+
+def doubts_about_pictures(
+    sources: Mapping[str, Source], written: Mapping[str, Written], limits: Doubts
+) -> list[str]:
+    """Videos that end before their time, masks that show nobody."""
+    found = []
+    for name, one in written.items():
+        count, decoded = sources[name].count, one.decoded
+        if decoded is not None and decoded < (1 - limits.undecoded) * count:
+            found.append(f"{name}: only {decoded} of {count} frames can be decoded: is it damaged?")
+        empty = one.empty / max(1, len(one.frames))
+        if empty > limits.missing:
+            found.append(f"{name}: {empty:.0%} of the written masks are empty")
+    return found
+
+
+def doubts_about_detections(detections: Mapping[str, Detections], limits: Doubts) -> list[str]:
+    """Cameras without a person, with more than one, or with frozen joints or pictures."""
+    found = []
+    for name, seen in detections.items():
+        empty = float(np.mean(seen.people == 0))
+        if empty > limits.missing:
+            found.append(f"{name}: no person in {empty:.0%} of the frames")
+        crowd = float(np.mean(seen.people > 1))
+        if crowd > limits.people:
+            found.append(
+                f"{name}: more than one person in {crowd:.0%} of the frames; the one seen best was "
+                "taken, which need not be the same one"
+            )
+        found += _frozen(name, seen.px[:, :BODY], limits.frozen_frames)
+    return found
+
+
+def _frozen(name: str, values: Float, limit: int) -> list[str]:
+    runs = longest_runs(values)
+    stuck = [joint_names()[j] for j in np.flatnonzero(runs >= limit)]
+    if len(stuck) > BODY // 2:
+        return [
+            f"{name}: {int(np.median(runs))} frames in a row are identical: did it stand still?"
+        ]
+    if stuck:
+        return [f"{name}: frozen for {limit} frames or more: {', '.join(stuck)}"]
+    return []
+
+
+def longest_runs(values: Float) -> np.ndarray:
+    """``[J]`` the longest run of frames in which ``values [F, J, D]`` stay exactly alike."""
+    same = (np.diff(values, axis=0) == 0).all(-1)  # NaN is never the same
+    longest = np.zeros(values.shape[1], int)
+    current = np.zeros(values.shape[1], int)
+    for row in same:
+        current = np.where(row, current + 1, 0)
+        longest = np.maximum(longest, current)
+    return np.where(longest > 0, longest + 1, 0)
+
+
+def doubts_about_solution(
+    solution: Solution,
+    names: Sequence[str],
+    turned: Float,
+    moved_mm: Float,
+    delay: Float,
+    gain: Float,
+    limits: Doubts,
+) -> list[str]:
+    """Cameras that do not fit, swapped sides, clocks, bones, joints that are missing."""
+    found = []
+    for c, name in enumerate(names):
+        error = median(solution.stages["smoothed"][c])
+        if error > limits.reprojection * solution.rig.focal[c] / FOCAL:
+            found.append(f"{name}: joints land {error:.1f} px off; is its calibration its own?")
+        if turned[c] > limits.camera_turn or moved_mm[c] > 1000 * limits.camera_move:
+            found.append(
+                f"{name}: refinement turned it by {turned[c]:.1f} degrees and moved it by "
+                f"{moved_mm[c]:.0f} mm: it was bumped, or the calibration is another one's"
+            )
+        swapped = float(solution.flips[c].any(-1).mean())
+        if swapped > limits.flips:
+            found.append(f"{name}: left and right were swapped in {swapped:.0%} of the frames")
+        if abs(delay[c]) > limits.delay and gain[c] > limits.delay_gain:
+            found.append(
+                f"{name}: its clock seems {delay[c]:+.1f} frames late; if so, set "
+                f"offsets={{{name}: {round(delay[c])}}}"
+            )
+    return found + _doubts_about_joints(solution, limits)
+
+
+def _doubts_about_joints(solution: Solution, limits: Doubts) -> list[str]:
+    found = []
+    lost = 1 - np.isfinite(solution.p[:, :BODY]).all(-1).mean(0)
+    if rare := [joint_names()[j] for j in np.flatnonzero(lost > limits.missing)]:
+        found.append(f"missing in more than {limits.missing:.0%} of the frames: {', '.join(rare)}")
+    for (a, b), length in zip(BODY_BONES, bone_lengths(solution.p, BODY_BONES).T, strict=True):
+        usual = median(length)
+        scatter = median(np.abs(length - usual)) / usual
+        if scatter > limits.bone:
+            bone = f"{joint_names()[a]} to {joint_names()[b]}"
+            found.append(f"the length from {bone} scatters by {scatter:.0%} round {usual:.2f} m")
+    if removed := {why: count for why, count in solution.removed.items() if count}:
+        said = ", ".join(f"{count} {why}" for why, count in removed.items())
+        found.append(f"joints taken out as impossible: {said}")
+    return found
+
+
+def check_distance(cameras: Sequence[CameraEntry], p: Float, limits: Doubts, where: object) -> None:
+    """Refuses a capture whose cameras stand impossibly near or far: its unit is another one.
+
+    Raises:
+        DataError: saying the distance found.
+    """
+    seen = p[known(p)]
+    if not len(seen):
+        raise DataError(
+            f"{where}: no joint was seen by two cameras in any frame; do the cameras' frame "
+            "numbers belong together?"
+        )
+    person = np.median(seen, axis=0)
+    distance = float(np.median([np.linalg.norm(c.centre - person) for c in cameras]))
+    low, high = limits.distance
+    if not low <= distance <= high:
+        raise DataError(
+            f"{where}: cameras stand {distance:.3g} m from the person, expected {low:g} to "
+            f"{high:g}; is the calibration in another unit? Set unit=mm, cm or m"
+        )

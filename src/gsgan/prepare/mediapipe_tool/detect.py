@@ -1,0 +1,178 @@
+"""Finds body and hand landmarks, and the person's mask, in one video or folder of pictures.
+
+Runs in its own environment (requirements.txt beside it); `gsgan.prepare.mediapipe` starts it.
+Prints ``<pictures done> <pictures in all>`` a line. Writes an npz:
+
+    px (F,33,2), conf (F,33)     pixels of the picture as stored, first pixel's centre at (0.5, 0.5)
+    left, right (F,21,2)         the person's hands; NaN = not found
+    frame_id (F,), size (2,) [w, h]
+
+and masks/%06d.png, 0..255. Depth estimates are not written: they are relative, not metric.
+"""
+
+import argparse
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("GLOG_minloglevel", "2")
+
+import cv2
+import mediapipe as mp
+import numpy as np
+
+PICTURES = (".jpg", ".jpeg", ".png")
+JOINTS, HAND = 33, 21
+
+
+def main() -> None:
+    options = parse()
+    if options.threads and hasattr(os, "sched_setaffinity"):
+        # MediaPipe offers no thread count; the processors it may use bound it.
+        allowed = sorted(os.sched_getaffinity(0))
+        first = options.slot * options.threads
+        chosen = {allowed[(first + i) % len(allowed)] for i in range(options.threads)}
+        os.sched_setaffinity(0, chosen)
+    cv2.setNumThreads(options.threads or -1)
+    count, pictures = open_source(Path(options.source), options.rotate)
+    if options.masks:
+        Path(options.masks).mkdir(parents=True, exist_ok=True)
+    found: dict[str, list[Any]] = {}
+    size = (0, 0)
+    with Detector(options) as detector:
+        for done, (frame, picture) in enumerate(pictures, start=1):
+            size = picture.shape[1], picture.shape[0]
+            landmarks = detector.landmarks(picture)
+            for name, value in (*landmarks.items(), ("frame_id", frame)):
+                found.setdefault(name, []).append(value)
+            if options.masks:
+                write_mask(Path(options.masks), frame, detector.mask(picture, landmarks["px"]))
+            print(done, max(done, count), flush=True)
+    if not found:
+        raise SystemExit(f"{options.source} holds no picture that can be decoded")
+    out = Path(options.out)
+    part = out.with_name(f".{out.name}")
+    with part.open("wb") as stream:
+        arrays: dict[str, Any] = {name: np.array(values) for name, values in found.items()}
+        np.savez(stream, size=np.array(size), **arrays)
+    part.replace(out)
+
+
+def parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--source", required=True, help="a video, or a folder of pictures")
+    parser.add_argument("--out", required=True, help="npz to write")
+    parser.add_argument("--masks", default="", help="folder for masks; none are made without it")
+    parser.add_argument("--hands", type=int, default=1, help="1: find the hands too")
+    parser.add_argument("--rotate", type=int, default=0, help="1: obey rotation metadata")
+    parser.add_argument("--threads", type=int, default=0, help="processors to use; 0: all")
+    parser.add_argument("--slot", type=int, default=0, help="which of several that run at once")
+    parser.add_argument("--confidence", type=float, default=0.5, help="least, to find a person")
+    parser.add_argument("--tracking", type=float, default=0.5, help="least, to keep following")
+    parser.add_argument("--margin", type=float, default=0.15, help="of the mask's crop, share")
+    return parser.parse_args()
+
+
+def open_source(path: Path, rotate: int) -> tuple[int, Iterator[tuple[int, Any]]]:
+    """How many pictures (0: unknown), and an iterator of (frame number, BGR picture)."""
+    if path.is_dir():
+        files = {
+            int(re.findall(r"[0-9]+", p.stem)[-1]): p
+            for p in path.iterdir()
+            if p.suffix.lower() in PICTURES and not p.name.startswith(".")
+        }
+        return len(files), ((frame, read_picture(files[frame])) for frame in sorted(files))
+    video = cv2.VideoCapture(str(path))
+    video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(rotate))
+    return int(video.get(cv2.CAP_PROP_FRAME_COUNT)), read_video(video)
+
+
+def read_picture(path: Path) -> Any:
+    """As stored: gsgan's calibration knows no EXIF rotation."""
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None:
+        raise SystemExit(f"{path} is damaged")
+    return picture
+
+
+def read_video(video: cv2.VideoCapture) -> Iterator[tuple[int, Any]]:
+    for frame in range(10**9):
+        ok, picture = video.read()
+        if not ok:
+            return
+        yield frame, picture
+
+
+class Detector:
+    """One video's detectors: they follow the person from picture to picture, so one a video."""
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        solutions = mp.solutions
+        common = {
+            "model_complexity": 1,  # the one whose weights the package brings along
+            "min_detection_confidence": options.confidence,
+            "min_tracking_confidence": options.tracking,
+        }
+        self.margin = options.margin
+        # Smoothing here would lag; gsgan smooths in 3D.
+        kind = solutions.holistic.Holistic if options.hands else solutions.pose.Pose
+        self.body = kind(smooth_landmarks=False, **common)
+        self.segmenter = solutions.pose.Pose(
+            static_image_mode=True, enable_segmentation=True, **common
+        )
+
+    def __enter__(self) -> "Detector":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.body.close()
+        self.segmenter.close()
+
+    def landmarks(self, picture: Any) -> dict[str, Any]:
+        found = self.body.process(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
+        size = picture.shape[1], picture.shape[0]
+        pose = found.pose_landmarks
+        visibility = [p.visibility for p in pose.landmark] if pose else [0.0] * JOINTS
+        return {
+            "px": pixels(pose, size, JOINTS),
+            "conf": np.array(visibility, np.float32),
+            "left": pixels(getattr(found, "left_hand_landmarks", None), size, HAND),
+            "right": pixels(getattr(found, "right_hand_landmarks", None), size, HAND),
+        }
+
+    def mask(self, picture: Any, px: Any) -> Any:
+        """0..255 of the whole picture, found in a crop round the person; None: nobody there."""
+        if not np.isfinite(px).all():
+            return None
+        height, width = picture.shape[:2]
+        low, high = px.min(0), px.max(0)
+        reach = self.margin * (high - low).max()
+        left, top = np.clip(low - reach, 0, [width - 1, height - 1]).astype(int)
+        right, bottom = np.clip(high + reach, 1, [width, height]).astype(int)
+        if right - left < 2 or bottom - top < 2:
+            return None
+        crop = cv2.cvtColor(picture[top:bottom, left:right], cv2.COLOR_BGR2RGB)
+        alpha = self.segmenter.process(crop).segmentation_mask
+        if alpha is None:
+            return None
+        mask = np.zeros((height, width), np.uint8)
+        mask[top:bottom, left:right] = np.round(255 * np.clip(alpha, 0, 1))
+        return mask
+
+
+def pixels(landmarks: Any, size: tuple[int, int], count: int) -> Any:
+    """``[count, 2]``; MediaPipe's numbers are shares of the picture's width and height."""
+    if landmarks is None:
+        return np.full((count, 2), np.nan, np.float32)
+    return np.array([(p.x * size[0], p.y * size[1]) for p in landmarks.landmark], np.float32)
+
+
+def write_mask(folder: Path, frame: int, mask: Any) -> None:
+    if mask is not None:
+        cv2.imwrite(str(folder / f"{frame:06d}.png"), mask)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The training scheme: one LightningModule, schedules, callbacks."""

@@ -1,0 +1,24 @@
+"""``python -m gsgan.train``: train an avatar, then score it on what was held out."""
+
+from __future__ import annotations
+
+from omegaconf import DictConfig
+
+from gsgan.utils.config import entry
+
+
+def train(config: DictConfig) -> None:
+    """Builds data, avatar and training from the config, fits, evaluates.
+
+    Raises:
+        GsganError: on anything the user can put right.
+    """
+    from gsgan.train.run import run_training
+
+    run_training(config)
+
+
+main = entry("train")(train)
+
+if __name__ == "__main__":
+    main()

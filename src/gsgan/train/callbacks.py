@@ -1,0 +1,92 @@
+"""What a run shows while it works: picture grids and a line per validation."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from lightning import Callback, LightningModule, Trainer
+from rich.console import Console
+from torch import Tensor
+
+from gsgan.evaluate.pictures import grid_rows, write_grid
+from gsgan.model.avatar import Painting
+from gsgan.scene import Frame
+
+if TYPE_CHECKING:
+    from gsgan.train.module import AvatarTraining
+
+
+def _training(module: LightningModule) -> AvatarTraining:
+    return cast("AvatarTraining", module)
+
+
+class PictureGrid(Callback):
+    """Writes truth, Step-I colour, S, I_pred and error at each validation.
+
+    Args:
+        folder: where ``step_000000.png`` goes.
+        rows: pictures a grid, spread over the validation frames.
+    """
+
+    def __init__(self, folder: Path, rows: int = 4) -> None:
+        self.folder, self.rows = folder, rows
+        self._collected: list[dict[str, Tensor]] = []
+
+    def on_validation_epoch_start(self, trainer: Trainer, module: LightningModule) -> None:
+        self._collected = []
+
+    def on_validation_batch_end(
+        self,
+        trainer: Trainer,
+        module: LightningModule,
+        outputs: Any,
+        batch: Frame,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        if (
+            trainer.is_global_zero
+            and isinstance(outputs, Painting)
+            and self._wants(trainer, batch_idx)
+        ):
+            self._collected += grid_rows(batch, outputs)[:1]
+
+    def _wants(self, trainer: Trainer, batch_idx: int) -> bool:
+        total = int(sum(trainer.num_val_batches))
+        stride = max(1, total // max(1, self.rows))
+        return batch_idx % stride == 0 and len(self._collected) < self.rows
+
+    def on_validation_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
+        if self._collected:
+            write_grid(self._collected, self.folder / f"step_{_training(module).step:06d}.png")
+
+
+class Narrator(Callback):
+    """One line a validation: iteration, phase, scores, time left."""
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self._clock = time.monotonic()
+        self._first = 0
+
+    def on_train_start(self, trainer: Trainer, module: LightningModule) -> None:
+        self._clock, self._first = time.monotonic(), _training(module).step
+
+    def on_validation_end(self, trainer: Trainer, module: LightningModule) -> None:
+        if not trainer.is_global_zero:
+            return
+        module = _training(module)
+        step, total = module.step, module.schedule.total
+        scores = trainer.callback_metrics
+        line = f"{step:>6}/{total} {module.schedule.phase(max(0, step - 1)):<12}"
+        line += f" held-out PSNR {float(scores['val/psnr']):5.2f} dB"
+        if module.avatar.generator is not None and "val/psnr_splat" in scores:
+            line += f" (Step I's colour {float(scores['val/psnr_splat']):5.2f})"
+        done = step - self._first
+        if done:
+            spent = time.monotonic() - self._clock
+            left = spent / done * (total - step)
+            line += f"  {done / spent:5.1f} it/s, {left / 60:4.1f} min left"
+        self.console.print(line, highlight=False, soft_wrap=True)

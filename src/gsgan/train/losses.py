@@ -1,0 +1,181 @@
+"""What Step I and Step II minimise: weights, and the sums they weigh (paper Sec. 3.5, Alg. 2)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gsgan.losses.adversarial import COMPARING, FORMS, feature_matching, generator_loss
+from gsgan.losses.perceptual import Perceptual
+from gsgan.losses.photometric import photometric, without_unsure
+from gsgan.model.avatar import Painting
+from gsgan.model.discriminator import Discriminator
+from gsgan.scene import Frame
+from gsgan.utils.errors import ConfigError
+from gsgan.utils.precision import full_precision
+
+
+@dataclass(frozen=True)
+class StepOneLoss:
+    """L_Ψ = l1 · L1(C, I) + ssim · (1 - SSIM(C, I)), over a random colour or black.
+
+    Args:
+        l1, ssim: weights (paper: 0.8, 0.2).
+        feature_head: weight of the same loss on a linear readout of F; without it F's further
+            channels get no gradient in Step I. 0 builds no readout.
+        alpha: weight of L1 between the splats' alpha and the mask, where images are compared on
+            black only; over a random colour the other terms supervise alpha already.
+
+    Source: paper Sec. 3.5 (λ = 0.2); readout and alpha are ours.
+    """
+
+    l1: float = 0.8
+    ssim: float = 0.2
+    feature_head: float = 0.5
+    alpha: float = 0.1
+
+    def __call__(
+        self, painting: Painting, frame: Frame, background: Tensor | None, head: nn.Conv2d | None
+    ) -> Tensor:
+        """The loss of a painting of ``frame`` over ``background [B, 3, 1, 1]``, None for black;
+        ``head`` is the linear readout of F. In full precision, autocast or not."""
+        with full_precision(frame.image):
+            return self._loss(painting, frame, background, head)
+
+    def _loss(
+        self, painting: Painting, frame: Frame, background: Tensor | None, head: nn.Conv2d | None
+    ) -> Tensor:
+        assert painting.features is not None and painting.splat_alpha is not None  # noqa: PT018
+        assert painting.colour is not None
+        target, behind = frame.image, frame.image.new_zeros(())
+        if background is not None:
+            target = frame.image + (1 - frame.mask) * background
+            behind = (1 - painting.splat_alpha) * background
+        pixels = {"l1": self.l1, "ssim": self.ssim}
+        loss = photometric(painting.colour + behind, target, unsure=frame.unsure, **pixels)
+        if head is not None:
+            # No bias where nothing is: the readout commutes with alpha blending.
+            read = functional.conv2d(painting.features, head.weight)
+            read = read + painting.splat_alpha * head.bias.view(1, 3, 1, 1)  # type: ignore[union-attr]
+            loss = loss + self.feature_head * photometric(
+                read + behind, target, unsure=frame.unsure, **pixels
+            )
+        if background is None and self.alpha:
+            matte = photometric(
+                painting.splat_alpha, frame.mask, l1=1.0, ssim=0.0, unsure=frame.unsure
+            )
+            loss = loss + self.alpha * matte
+        return loss
+
+
+def judged(judge: Discriminator, image: Tensor, gan: str) -> list[list[Tensor]]:
+    """The discriminator's maps of a picture; in full precision where the GAN's form compares two,
+    since bf16 rounds away what nearly equal pictures differ in."""
+    if gan not in COMPARING:
+        return judge(image)  # type: ignore[no-any-return]
+    with full_precision(image):
+        return judge(image.to(next(judge.parameters()).dtype))  # type: ignore[no-any-return]
+
+
+@dataclass(frozen=True)
+class StepTwoLoss:
+    """Weights of the generator's loss; a term of weight 0 is not computed.
+
+    Args:
+        l1, l2, ssim: photometric terms on I_pred (the paper's footnote: l2 reconstruction).
+        alpha: weight of the same terms with both images on white, I_pred by its alpha, the truth
+            by its mask: what supervises that alpha. (Between alpha and mask directly, the default
+            person scored 0.2 dB less on white and 0.15 dB less on black.)
+        perceptual: L_perc.
+        perceptual_every: compute L_perc only every so many iterations (its weight is multiplied
+            by as much); VGG is the costliest term on a CPU.
+        adversarial: L_GAN.
+        feature_matching: L_feat, between the discriminator's features.
+        gan: ``logistic``, ``hinge``, ``lsgan`` or ``relativistic``.
+        anchor: weight of L_Ψ, which keeps C a picture while Ψ learns from the generator.
+        detach_features: keep the generator's gradient out of Ψ (ablation).
+
+    Source: paper Sec. 3.5 and Alg. 2, an unweighted sum of L_GAN, L_perc and L_feat; weights, the
+        other terms and the anchor are ours.
+    """
+
+    l1: float = 1.0
+    l2: float = 0.0
+    ssim: float = 0.2
+    alpha: float = 1.0
+    perceptual: float = 1.0
+    perceptual_every: int = 1
+    adversarial: float = 1.0
+    feature_matching: float = 10.0
+    gan: str = "logistic"
+    anchor: float = 1.0
+    detach_features: bool = False
+
+    def __post_init__(self) -> None:
+        if self.gan not in FORMS:
+            raise ConfigError(
+                f"training.step_two.gan must be one of {', '.join(FORMS)}; got {self.gan!r}"
+            )
+        if self.perceptual_every < 1:
+            raise ConfigError(
+                "training.step_two.perceptual_every must be at least 1, "
+                f"got {self.perceptual_every}"
+            )
+
+    @property
+    def plays(self) -> bool:
+        """Whether a discriminator is needed at all."""
+        return bool(self.adversarial or self.feature_matching)
+
+    def terms(
+        self,
+        painting: Painting,
+        frame: Frame,
+        *,
+        anchor: Tensor | None,
+        perceptual: Perceptual | None,
+        judge: Discriminator | None,
+        step: int,
+    ) -> dict[str, Tensor]:
+        """The generator's losses, weighted, by name.
+
+        Args:
+            painting: with I_pred and its alpha.
+            frame: what it should be.
+            anchor: L_Ψ of the same painting; None leaves it out.
+            perceptual: L_perc; None leaves it out.
+            judge: the discriminator; None while it does not play.
+            step: the iteration, for ``perceptual_every``.
+        """
+        image, alpha = painting.image, painting.alpha
+        assert image is not None and alpha is not None  # noqa: PT018
+        target = without_unsure(frame.image, image, frame.unsure)
+        by_pixel = partial(photometric, l1=self.l1, l2=self.l2, ssim=self.ssim)
+        terms = {"photometric": by_pixel(image, target)}
+        if self.alpha:
+            white, truth = image + 1 - alpha, frame.image + 1 - frame.mask
+            terms["alpha"] = self.alpha * by_pixel(white, truth, unsure=frame.unsure)
+        if anchor is not None:
+            terms["anchor"] = self.anchor * anchor
+        if perceptual is not None and step % self.perceptual_every == 0:
+            scale = self.perceptual * self.perceptual_every
+            terms["perceptual"] = scale * perceptual(image, target)
+        if judge is not None:
+            terms |= self._game(judge, image, target)
+        return terms
+
+    def _game(self, judge: Discriminator, image: Tensor, target: Tensor) -> dict[str, Tensor]:
+        terms = {}
+        real = fake = judged(judge, image, self.gan)
+        if self.feature_matching or self.gan in COMPARING:
+            with torch.no_grad():
+                real = judged(judge, target, self.gan)
+        if self.adversarial:
+            terms["adversarial"] = self.adversarial * generator_loss(real, fake, self.gan)
+        if self.feature_matching:
+            terms["feature_matching"] = self.feature_matching * feature_matching(real, fake)
+        return terms

@@ -1,0 +1,467 @@
+"""The training scheme of the paper as one LightningModule (Alg. 2), manually optimised."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from dataclasses import replace
+from typing import Any
+
+import gsgan.utils.compat  # noqa: F401  (must come before lightning)
+
+# isort: split
+import torch
+from lightning import LightningModule
+from torch import Tensor, nn
+
+from gsgan.effects import Effect, Effects
+from gsgan.losses.adversarial import discriminator_loss
+from gsgan.losses.perceptual import Perceptual
+from gsgan.losses.photometric import without_unsure
+from gsgan.metrics.image import psnr
+from gsgan.model.avatar import Avatar, Painting
+from gsgan.model.discriminator import Discriminator
+from gsgan.model.segmentation import IGNORE, segmentation_loss, silhouette_loss
+from gsgan.scene import Frame
+from gsgan.train.averaging import MovingAverage
+from gsgan.train.losses import StepOneLoss, StepTwoLoss, judged
+from gsgan.train.optimisers import Recipe, clip, set_rate
+from gsgan.train.rollback import Rollback
+from gsgan.train.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
+from gsgan.utils.errors import ConfigError, GsganError
+
+PSNR_CAP = 100.0  # dB: one picture equal to the truth would make a watched mean infinite
+SPLATTING = ("psi", "colour")  # optimisers of what makes Step I's picture
+FROM_MASKS = 800  # iterations of S, at most, where two numbers learn from masks (docs/effects.md)
+SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
+
+
+class AvatarTraining(LightningModule):
+    """Trains S, then Ψ (Step I), then generator and discriminator with Ψ (Step II).
+
+    Args:
+        avatar: what is trained.
+        discriminator: the judge; None, or no adversarial weight, leaves the GAN out.
+        perceptual: L_perc; None leaves it out.
+        schedule: iterations of each phase. Without S its phase is left out; without a generator
+            Step I gets Step II's iterations, so that Ψ trains equally long in every variant.
+        recipes: optimisers by name: segmentation, psi, colour, generator, discriminator.
+        step_one, step_two: loss weights.
+        pose_noise: standard deviation, body heights, of the noise on Ψ's pose code.
+        seed: with the iteration it determines every random number drawn here, so a resumed run
+            draws the same ones.
+        max_skipped: non-finite gradients within ``skip_window`` at which the run is stopped; those
+            before are skipped.
+        skip_window: iterations.
+        log_every: iterations between logged values.
+        average: decay of the moving average of the last step's weights, which is what gets
+            scored; None scores the weights as they are.
+        average_every: iterations from one of its updates to the next, which counts for as many.
+        rollback: what is done when the rendered person vanishes.
+        record: plain config values stored with every checkpoint.
+
+    Source: paper Alg. 2.
+    """
+
+    def __init__(
+        self,
+        avatar: Avatar,
+        discriminator: Discriminator | None,
+        perceptual: Perceptual | None,
+        schedule: Schedule,
+        recipes: dict[str, Recipe],
+        step_one: StepOneLoss,
+        step_two: StepTwoLoss,
+        *,
+        pose_noise: float = 0.01,
+        seed: int = 0,
+        max_skipped: int = 20,
+        skip_window: int = 1000,
+        log_every: int = 20,
+        average: float | None = None,
+        average_every: int = 1,
+        rollback: Rollback | None = None,
+        record: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.automatic_optimization = False
+        self.avatar = avatar
+        paints = avatar.generator is not None
+        self.discriminator = discriminator if paints and step_two.plays else None
+        self.perceptual = perceptual if paints and step_two.perceptual else None
+        self.schedule = _fit_schedule(schedule, avatar)
+        self.recipes, self.step_one, self.step_two = recipes, step_one, step_two
+        self.pose_noise, self.seed, self.log_every = pose_noise, seed, log_every
+        for name, every in {"log_every": log_every, "average_every": average_every}.items():
+            if every < 1:
+                raise ConfigError(f"training.{name} must be at least 1, got {every}")
+        self.max_skipped, self.skip_window = max_skipped, skip_window
+        self.record = record or {}
+        self.rollback = rollback or Rollback()
+        self.average, self.average_every = None, average_every
+        if average is not None:
+            self.average = MovingAverage(avatar, average, average_every)
+        # Step I over a random colour, so that black clothes do not become transparent.
+        self.random_background = avatar.effects.random_background.on
+        wanted = step_one.feature_head and avatar.splat_channels > 3
+        self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1) if wanted else None
+        self.step = 0  # iterations done: Lightning's global_step counts every optimiser's steps
+        self.skipped: deque[int] = deque()  # iterations, within the window
+        self.code: list[str] = []  # commits that trained, more than one where a run was resumed
+        self.start_psnr: float | None = None
+        self.last_psnr: float | None = None
+        self.seconds_before: float | None = 0.0  # None: an earlier part did not count them
+        self._began: float | None = None
+
+    @property
+    def train_seconds(self) -> float | None:
+        """Wall clock of the training so far, parts before an interruption included; None when one
+        of them did not say."""
+        if self.seconds_before is None or self._began is None:
+            return self.seconds_before
+        return self.seconds_before + time.monotonic() - self._began
+
+    def on_fit_start(self) -> None:
+        """Refuses float16: its scaled gradients would be clipped and guarded before unscaling.
+
+        Raises:
+            ConfigError: when ``trainer.precision`` is one of float16's.
+        """
+        if self.trainer.precision in ("16-true", "16-mixed"):
+            raise ConfigError(
+                f"trainer.precision={self.trainer.precision}: float16 loses this training's small "
+                "gradients, and scaled ones cannot be clipped; choose bf16-mixed or 32-true"
+            )
+
+    def on_train_start(self) -> None:
+        self._began = time.monotonic()
+
+    def on_train_end(self) -> None:
+        self.seconds_before, self._began = self.train_seconds, None
+
+    @property
+    def marks(self) -> list[str]:
+        """Notes that every table of this run must carry."""
+        mark = self.perceptual.mark if self.perceptual is not None else None
+        return [mark] if mark else []
+
+    # -- optimisers
+
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        groups = self._parameter_groups()
+        missing = sorted(set(groups) - set(self.recipes))
+        if missing:
+            raise ConfigError(f"training.recipes lacks {', '.join(missing)}")
+        for name in set(groups) - set(SPLATTING):
+            if self.recipes[name].span != "both":
+                raise ConfigError(f"training.recipes.{name}.span: only psi and colour have one")
+        self._names = list(groups)
+        return [self.recipes[name].build(groups[name]) for name in self._names]
+
+    def _parameter_groups(self) -> dict[str, list[tuple[list[nn.Parameter], float]]]:
+        avatar, groups = self.avatar, {}
+        if avatar.segmentation is not None:
+            groups["segmentation"] = avatar.segmentation.parameter_groups()
+        head = list(self.feature_head.parameters()) if self.feature_head else []
+        if avatar.splats is not None:
+            groups["psi"] = [*avatar.splats.parameter_groups(), (head, 1.0)]
+        if avatar.colour is not None:
+            groups["colour"] = [(list(avatar.colour.parameters()), 1.0)]
+        if avatar.generator is not None and avatar.pose_encoder is not None:
+            pose = list(avatar.pose_encoder.parameters())
+            groups["generator"] = [([*avatar.generator.parameters(), *pose], 1.0)]
+        if self.discriminator is not None:
+            groups["discriminator"] = [(list(self.discriminator.parameters()), 1.0)]
+        return groups
+
+    def _optimiser(self, name: str) -> Any:
+        found = self.optimizers()
+        return (found if isinstance(found, list) else [found])[self._names.index(name)]
+
+    def _descend(self, loss: Tensor, *names: str) -> None:
+        """One backward pass, then one step of each named optimiser, unless a gradient is not
+        finite: then no parameter moves and the iteration is counted as skipped."""
+        optimisers = [self._optimiser(name) for name in names]
+        for optimiser in optimisers:
+            optimiser.zero_grad(set_to_none=True)
+        self.manual_backward(loss)
+        norms = [
+            clip(optimiser.optimizer, self.recipes[name].clip).to(loss.device)
+            for name, optimiser in zip(names, optimisers, strict=True)
+        ]
+        if not bool(torch.isfinite(torch.stack(norms)).all()):
+            self._skip(names)
+            return
+        for name, optimiser in zip(names, optimisers, strict=True):
+            set_rate(optimiser, self._rate(name))
+            optimiser.step()
+
+    def _rate(self, name: str) -> float:
+        start, end = self.schedule.bounds(SEGMENTATION if name == "segmentation" else STEP_TWO)
+        if name in SPLATTING:  # one span over both steps: restarting the rate costs quality
+            start, end_one = self.schedule.bounds(STEP_ONE)
+            end = end_one if self.recipes[name].span == "step_one" else end
+        elif name == "discriminator":
+            start, end = self.schedule.game
+        rate = self.recipes[name].rate.at(self.step, start, end)
+        return rate * self.rollback.rate if name == "psi" else rate
+
+    def _skip(self, names: tuple[str, ...]) -> None:
+        if self.step not in self.skipped:  # the discriminator's may follow the generator's
+            self.skipped.append(self.step)
+        while self.skipped[0] <= self.step - self.skip_window:
+            self.skipped.popleft()
+        count = f"{len(self.skipped)} of the last {self.skip_window} iterations"
+        self.print(
+            f"iteration {self.step}: a gradient of {', '.join(names)} was not finite; skipped "
+            f"({count}, at most {self.max_skipped})"
+        )
+        if len(self.skipped) >= self.max_skipped:
+            raise GsganError(
+                f"training stopped at iteration {self.step}: {count} had gradients that were not "
+                "finite; check the data, lower the learning rates (training.recipes.*.rate.peak), "
+                "or go on with a larger training.max_skipped"
+            )
+
+    # -- one iteration
+
+    def training_step(self, frame: Frame, batch_idx: int) -> None:
+        if self.step >= self.schedule.total:
+            return
+        if self.avatar.splats is not None:
+            self.avatar.splats.active_degree = self.schedule.degree(
+                self.step, self.avatar.splats.sh_degree
+            )
+        window = self.avatar.window(frame)
+        height = frame.camera.size[0]
+        frame = frame if window is None else window.frame(frame)
+        phase = self.schedule.phase(self.step)
+        if phase == SEGMENTATION:
+            self._train_segmentation(frame)
+        elif phase == STEP_ONE:
+            self._train_step_one(frame, height)
+        else:
+            self._train_step_two(frame, height)
+        self.step += 1
+
+    def _train_segmentation(self, frame: Frame) -> None:
+        segmentation = self.avatar.segmentation
+        assert segmentation is not None
+        assert frame.body is not None
+        if segmentation.common is not None:
+            alpha = segmentation.raster(frame.body, frame.camera).alpha
+            loss = silhouette_loss(alpha, frame.mask, frame.unsure)
+        else:
+            labels = torch.full_like(frame.mask[:, 0], IGNORE, dtype=torch.long)
+            if frame.labels is not None:  # else nobody labelled this image: nothing is learned
+                labels = segmentation.truth(frame.labels)
+            loss = segmentation_loss(segmentation(frame.body, frame.camera), labels)
+        self._descend(loss, "segmentation")
+        self._log("segmentation/nll", loss)
+
+    def _train_step_one(self, frame: Frame, height: int) -> None:
+        painting = self._paint(frame, height, paint=False)
+        loss = self.step_one_loss(painting, frame)
+        self._descend(loss, *self._splatting())
+        if self.avatar.generator is None:  # this is its last step
+            self._update_average()
+        self._log("step_one/loss", loss)
+
+    def _train_step_two(self, frame: Frame, height: int) -> None:
+        painting = self._paint(frame, height, paint=True)
+        play = self.discriminator is not None and self.schedule.adversarial(self.step)
+        if self.discriminator is not None:
+            self.discriminator.requires_grad_(False)
+        terms = self.step_two_terms(painting, frame, play)
+        self._descend(torch.stack(list(terms.values())).sum(), *self._splatting(), "generator")
+        self._update_average()
+        for name, term in terms.items():
+            self._log(f"step_two/{name}", term)
+        if play:
+            self._train_discriminator(painting, frame)
+
+    def _update_average(self) -> None:
+        if self.average is not None and self.step % self.average_every == 0:
+            self.average.update(self.avatar)
+
+    def _splatting(self) -> tuple[str, ...]:
+        """The optimisers of what makes Step I's picture."""
+        return tuple(name for name in SPLATTING if name in self._names)
+
+    def _train_discriminator(self, painting: Painting, frame: Frame) -> None:
+        assert self.discriminator is not None
+        assert painting.image is not None
+        self.discriminator.requires_grad_(True)
+        painted, gan = painting.image.detach(), self.step_two.gan
+        target = without_unsure(frame.image, painted, frame.unsure)
+        real, fake = (judged(self.discriminator, image, gan) for image in (target, painted))
+        loss = discriminator_loss(real, fake, gan)
+        self._descend(loss, "discriminator")
+        self._log("step_two/discriminator", loss)
+
+    def _paint(self, frame: Frame, height: int, *, paint: bool) -> Painting:
+        painting: Painting = self.avatar(
+            frame.skeleton,
+            frame.visibility,
+            frame.camera,
+            frame.body,
+            pose_noise=self._pose_noise(frame.skeleton),
+            paint=paint,
+            detach_features=self.step_two.detach_features,
+            picture_height=height,
+            camera_index=frame.camera_index,
+        )
+        if painting.splat_alpha is not None:
+            self.rollback.watch(painting.splat_alpha, frame.mask)
+        return painting
+
+    def on_train_epoch_end(self) -> None:
+        """Goes back to the last good state when the person has vanished, before it is saved."""
+        share = self.rollback.share(self._mean_of_ranks)
+        if share >= self.rollback.collapse:
+            self.rollback.keep(self, share)
+            return
+        found = self.optimizers()
+        optimisers = [o.optimizer for o in (found if isinstance(found, list) else [found])]
+        what = f"the rendered person has vanished (alpha is {share:.1%} of the masks')"
+        if not self.rollback.restore(self, optimisers):
+            raise GsganError(
+                f"training stopped at iteration {self.step}: {what}, also after "
+                f"{self.rollback.done} returns to a good state; the last good checkpoint is kept; "
+                "start again with a lower training.recipes.psi.rate.peak"
+            )
+        self.print(
+            f"iteration {self.step}: {what}; back to the last good state, Ψ's learning rate times "
+            f"{self.rollback.rate:g} from here ({self.rollback.done} of at most "
+            f"{self.rollback.most})"
+        )
+
+    def _mean_of_ranks(self, value: Tensor) -> Tensor:
+        """Over all processes, so that they decide alike."""
+        mean: Tensor = self.trainer.strategy.reduce(value, reduce_op="mean")
+        return mean
+
+    # -- losses
+
+    def step_one_loss(self, painting: Painting, frame: Frame) -> Tensor:
+        """L_Ψ of Step I's colour, and of the linear readout of F."""
+        return self.step_one(painting, frame, self._background(frame), self.feature_head)
+
+    def step_two_terms(self, painting: Painting, frame: Frame, play: bool) -> dict[str, Tensor]:
+        """The generator's losses, weighted, by name."""
+        assert painting.image is not None
+        held = self.step_two.anchor and painting.features is not None
+        return self.step_two.terms(
+            painting,
+            frame,
+            anchor=self.step_one_loss(painting, frame) if held else None,
+            perceptual=self.perceptual,
+            judge=self.discriminator if play else None,
+            step=self.step,
+        )
+
+    # -- randomness: from (seed, iteration, rank), so that resuming changes nothing
+
+    def _random(self, salt: int) -> torch.Generator:
+        rank = self.trainer.global_rank if self._trainer is not None else 0
+        state = (self.seed * SEED_STRIDE + self.step) * 64 + 2 * (rank % 32) + salt
+        return torch.Generator().manual_seed(state % (2**63))
+
+    def _background(self, frame: Frame) -> Tensor | None:
+        shape = (len(frame), 3, 1, 1)
+        if not self.random_background:
+            return None
+        return torch.rand(shape, generator=self._random(0)).to(frame.image)
+
+    def _pose_noise(self, skeleton: Tensor) -> Tensor | None:
+        if not self.pose_noise:
+            return None
+        noise = torch.randn(skeleton.shape, generator=self._random(1))
+        return self.pose_noise * noise.to(skeleton)
+
+    # -- validation and checkpoints
+
+    def validation_step(  # type: ignore[override]
+        self, frame: Frame, batch_idx: int
+    ) -> Painting:
+        painting: Painting = self.shown.paint(frame)
+        for name, picture in (("psnr", painting.image), ("psnr_splat", painting.colour)):
+            if picture is None:
+                continue
+            score = psnr(picture.clamp(0, 1), frame.image).clamp_max(PSNR_CAP).mean()
+            self.log(f"val/{name}", score, batch_size=len(frame), sync_dist=True)
+        return painting
+
+    @property
+    def shown(self) -> Avatar:
+        """The avatar that is watched and scored: the average, once there is one."""
+        if self.average is None or not self.average.started:
+            return self.avatar
+        return self.average.module.eval()  # type: ignore[return-value]
+
+    def on_validation_epoch_end(self) -> None:
+        if self.train_seconds is not None:  # the time axis of every curve
+            self.log("val/seconds", self.train_seconds, sync_dist=True)
+        self.last_psnr = float(self.trainer.callback_metrics["val/psnr"])
+        if self.start_psnr is None:
+            self.start_psnr = self.last_psnr
+
+    def _log(self, name: str, value: Tensor) -> None:
+        if self.step % self.log_every == 0 and self._trainer is not None:
+            self.log(name, value.detach())
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["gsgan"] = {
+            "step": self.step,
+            "rollbacks": self.rollback.done,
+            "averaged": self.average is not None and self.average.started,
+            "start_psnr": self.start_psnr,
+            "train_seconds": self.train_seconds,
+            "code": self.code,
+            "marks": self.marks,
+            "record": self.record,
+            "effects": self.avatar.effects.plain(),
+        }
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        state = checkpoint["gsgan"]
+        _same_effects(state.get("effects"), self.avatar.effects)
+        self.step = state["step"]
+        self.rollback.done = state["rollbacks"]
+        self.start_psnr = state["start_psnr"]
+        self.seconds_before = state.get("train_seconds")
+        self.code = list(dict.fromkeys([*state.get("code", []), *self.code]))
+
+
+def _fit_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
+    if avatar.segmentation is None:
+        schedule = replace(schedule, segmentation=0)
+    elif avatar.segmentation.common is not None:
+        schedule = replace(schedule, segmentation=min(schedule.segmentation, FROM_MASKS))
+    one, two, start = (
+        round(n * schedule.stretch)
+        for n in (schedule.step_one, schedule.step_two, schedule.discriminator_start)
+    )
+    every = round(schedule.degree_every * schedule.stretch)
+    if avatar.generator is None:
+        one, two = one + two, 0
+    if avatar.splats is None:
+        one, two = 0, one + two
+    return replace(
+        schedule, step_one=one, step_two=two, discriminator_start=start, degree_every=every
+    )
+
+
+def _same_effects(stored: dict[str, Any] | None, now: Effects) -> None:
+    """Refuses to go on with a run whose data called for other effects when it began."""
+    if stored is None:
+        return
+    before = Effects.from_plain(stored)
+    for name, effect in now:
+        was: Effect = getattr(before, name)
+        if was.value != effect.value:
+            raise ConfigError(
+                f"effects.{name}: the run began with {was.value} ({was.why}), its data now calls "
+                f"for {effect.value} ({effect.why}); set effects.{name}={was.value}, or "
+                "resume=false to start over"
+            )

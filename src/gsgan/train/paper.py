@@ -1,0 +1,107 @@
+"""Whether a run is the paper's method: its settings against those of ``experiment=paper``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from functools import lru_cache
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+NAME = "GaussianGAN (paper)"
+METHOD = ("model", "training", "effects", "accuracy")  # groups that say what the method is
+# Of these, what changes neither what is computed nor what is learned.
+IDLE = (
+    *("model.backend", "model.window_multiple", "model.window_least", "model.class_vote"),
+    *("training.seed", "training.log_every", "training.max_skipped", "training.skip_window"),
+    *("training.rollback", "training.average_every", "training.perceptual.path"),
+    *("training.schedule.epoch", "effects.measure", "effects.impossible"),
+)
+
+
+def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
+    """A nested config by dotted key."""
+    if isinstance(value, Mapping) and value:
+        for key, held in value.items():
+            yield from flat(held, f"{at}.{key}" if at else str(key))
+    else:
+        yield at, value
+
+
+def settings_of(config: DictConfig) -> dict[str, Any]:
+    """A run's config by dotted key, less what differs between seeds, machines and continuations.
+
+    Raises:
+        OmegaConfBaseException: when it cannot be resolved.
+    """
+    from gsgan.train.runs import record  # here: it brings torch
+
+    seedless = config.copy()
+    seedless.seed = 0  # data and training refer to it
+    return dict(flat(record(seedless)))
+
+
+def departures(settings: Mapping[str, Any], model: str, data: str) -> list[str] | None:
+    """Keys in which a run is not what ``experiment=paper`` makes of its model and data.
+
+    Args:
+        settings: of the run, resolved, by dotted key.
+        model: choice of the model group; an ablation is compared with the same ablation.
+        data: choice of the data group.
+
+    Returns:
+        None where such a model or data set is not in conf/.
+    """
+    from hydra.errors import HydraException
+
+    try:
+        paper = _paper(model, data)
+    except HydraException:
+        return None
+    mine = {k: v for k, v in settings.items() if k.partition(".")[0] in METHOD}
+    return sorted(
+        key
+        for key in paper.keys() | mine.keys()
+        if _word(paper.get(key)) != _word(mine.get(key)) and not _idle(key)
+    )
+
+
+def _word(value: Any) -> Any:
+    """YAML reads a bare on or off as true or false."""
+    return {"on": True, "off": False}.get(value, value) if isinstance(value, str) else value
+
+
+def clause(keys: list[str], most: int = 6) -> str:
+    """The departures in one clause."""
+    more = f" and {len(keys) - most} more" if len(keys) > most else ""
+    return f"differs from experiment=paper in {', '.join(keys[:most])}{more}"
+
+
+def _idle(key: str) -> bool:
+    return any(key == idle or key.startswith(f"{idle}.") for idle in IDLE)
+
+
+@lru_cache(maxsize=64)
+def _paper(model: str, data: str) -> dict[str, Any]:
+    from hydra import compose
+
+    with _hydra():
+        config: DictConfig = compose(
+            "train", ["experiment=paper", f"model={model}", f"data={data}"]
+        )
+        config.seed = 0
+        method = {group: OmegaConf.to_container(config[group], resolve=True) for group in METHOD}
+    return dict(flat(method))
+
+
+def _hydra() -> AbstractContextManager[Any]:
+    """Hydra as the running command has it, or for this call."""
+    from hydra import initialize_config_dir
+    from hydra.core.global_hydra import GlobalHydra
+
+    from gsgan.utils.config import config_folder
+
+    if GlobalHydra.instance().is_initialized():
+        return nullcontext()
+    return initialize_config_dir(str(config_folder()), version_base="1.3")

@@ -1,0 +1,99 @@
+"""Catching a collapse: the person vanishes without a NaN, and the last good state comes back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from gsgan.utils.errors import ConfigError
+
+
+@dataclass
+class Rollback:
+    """Compares rendered alpha with the masks, keeps the last good state and restores it.
+
+    Convention: the two are averaged over recent iterations, so that a fall within an epoch shows.
+    Optimisers start afresh after a return: their momenta point into the collapse.
+
+    Every opacity can fall to 0 for good without a gradient that is not finite: then the rendered
+    alpha falls far below the masks'.
+
+    Args:
+        collapse: alpha below this share of the masks' is a collapse.
+        healthy: alpha of at least this share of the masks' is a state worth keeping.
+        memory: share of the average that each iteration keeps.
+        most: restorations before the run is stopped.
+        slower: factor on Ψ's learning rate after each restoration.
+
+    Raises:
+        ConfigError: on values out of range.
+
+    Source: ours.
+    """
+
+    collapse: float = 0.05
+    healthy: float = 0.5
+    memory: float = 0.9
+    most: int = 3
+    slower: float = 0.5
+    done: int = 0
+    alpha: Tensor | None = None
+    mask: Tensor | None = None
+    _state: dict[str, Any] | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.collapse < self.healthy <= 1:
+            raise ConfigError(
+                "training.rollback: 0 <= collapse < healthy <= 1 must hold, got "
+                f"{self.collapse!r} and {self.healthy!r}"
+            )
+        if self.most < 0 or not 0 < self.slower <= 1 or not 0 <= self.memory < 1:
+            raise ConfigError(
+                "training.rollback: most must be at least 0, slower in (0, 1] and memory in "
+                f"[0, 1), got {self.most!r}, {self.slower!r} and {self.memory!r}"
+            )
+
+    @property
+    def rate(self) -> float:
+        """Factor on Ψ's learning rate."""
+        return self.slower**self.done
+
+    def share(self, over_ranks: Callable[[Tensor], Tensor] = lambda value: value) -> float:
+        """Rendered alpha as a share of the masks'; infinite before anything was seen.
+
+        Args:
+            over_ranks: means of a tensor over all processes. All of them must call this together.
+        """
+        if self.alpha is None or self.mask is None:
+            return float("inf")
+        alpha, mask = over_ranks(torch.stack([self.alpha, self.mask])).tolist()
+        return alpha / mask if mask else float("inf")
+
+    def watch(self, alpha: Tensor, mask: Tensor) -> None:
+        """Takes in one iteration's alpha and mask."""
+        for name, value in (("alpha", alpha), ("mask", mask)):
+            now, before = value.detach().mean(), getattr(self, name)
+            before = torch.zeros_like(now) if before is None else before
+            mixed = self.memory * before + (1 - self.memory) * now
+            # a value that is not finite is a gradient's matter, not a collapse
+            setattr(self, name, torch.where(torch.isfinite(now), mixed, before))
+
+    def keep(self, module: nn.Module, share: float) -> None:
+        """Keeps a copy of the state when it is a good one."""
+        if share >= self.healthy:
+            self._state = {k: v.detach().clone() for k, v in module.state_dict().items()}
+
+    def restore(self, module: nn.Module, optimisers: Sequence[torch.optim.Optimizer]) -> bool:
+        """Puts the last good state back; False where there is none or it was put back too often."""
+        if self._state is None or self.done >= self.most:
+            return False
+        self.done += 1
+        self.alpha = self.mask = None
+        module.load_state_dict(self._state)
+        for optimiser in optimisers:
+            optimiser.state.clear()
+        return True

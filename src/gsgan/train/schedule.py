@@ -1,0 +1,141 @@
+"""When what is trained, and at which rate: pure maps from the iteration to a value."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from gsgan.utils.errors import ConfigError
+
+SEGMENTATION, STEP_ONE, STEP_TWO = "segmentation", "step I", "step II"
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Iterations of each phase, in the order segmentation, Step I, Step II.
+
+    Args:
+        segmentation: iterations of S alone (0 where S is not built).
+        step_one: iterations of Ψ alone.
+        step_two: iterations in which generator, discriminator and Ψ learn together.
+        discriminator_start: iterations into Step II before the GAN starts.
+        epoch: iterations between checkpoints; Lightning's epoch is this many sampled batches.
+        stretch: factor on Steps I and II, for a variant whose iterations are cheaper: the same
+            time for every variant, where the same iterations would starve the simpler ones.
+        degree_every: iterations of Steps I and II after which the degree of the spherical harmonics
+            rises by one, from 0; 0 takes them all at once.
+
+    Source: paper Alg. 2; of the numbers in conf/training only Step I's 10,000 are the paper's.
+    """
+
+    segmentation: int
+    step_one: int
+    step_two: int
+    discriminator_start: int = 0
+    epoch: int = 250
+    stretch: float = 1.0
+    degree_every: int = 0
+
+    def __post_init__(self) -> None:
+        if self.stretch <= 0:
+            raise ConfigError(f"schedule.stretch must be above 0, got {self.stretch}")
+        for name in (
+            *("segmentation", "step_one", "step_two", "discriminator_start"),
+            "degree_every",
+        ):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"schedule.{name} must be 0 or more, got {getattr(self, name)}")
+        if self.epoch < 1:
+            raise ConfigError(f"schedule.epoch must be 1 or more, got {self.epoch}")
+        if self.total == 0:
+            raise ConfigError("schedule: every phase has 0 iterations, so there is nothing to do")
+
+    @property
+    def epochs(self) -> int:
+        """Epochs the whole run takes, the last one perhaps cut short."""
+        return math.ceil(self.total / self.epoch)
+
+    @property
+    def total(self) -> int:
+        """Iterations of the whole run."""
+        return self.segmentation + self.step_one + self.step_two
+
+    def phase(self, step: int) -> str:
+        """The phase that iteration ``step`` (from 0) belongs to."""
+        if step < self.segmentation:
+            return SEGMENTATION
+        return STEP_ONE if step < self.segmentation + self.step_one else STEP_TWO
+
+    def degree(self, step: int, most: int) -> int:
+        """The degree of the spherical harmonics at an iteration, up to ``most``."""
+        if self.degree_every == 0:
+            return most
+        return min(most, max(0, step - self.segmentation) // self.degree_every)
+
+    def bounds(self, phase: str) -> tuple[int, int]:
+        """First iteration of a phase, and the first after it."""
+        ends = {
+            SEGMENTATION: (0, self.segmentation),
+            STEP_ONE: (self.segmentation, self.segmentation + self.step_one),
+            STEP_TWO: (self.segmentation + self.step_one, self.total),
+        }
+        return ends[phase]
+
+    @property
+    def game(self) -> tuple[int, int]:
+        """First iteration the discriminator plays, and the first after its last."""
+        start, end = self.bounds(STEP_TWO)
+        return min(start + self.discriminator_start, end), end
+
+    def adversarial(self, step: int) -> bool:
+        """Whether the discriminator plays at this iteration."""
+        start, end = self.game
+        return start <= step < end
+
+
+_SHAPES = {
+    "cosine": lambda x, final: final + (1 - final) * 0.5 * (1 + math.cos(math.pi * x)),
+    "linear": lambda x, final: 1 + (final - 1) * x,
+    "exponential": lambda x, final: final**x,
+}
+
+
+@dataclass(frozen=True)
+class Rate:
+    """A learning rate over one span: warm-up, constant, descent, constant.
+
+    Args:
+        peak: the rate.
+        hold: share of the span before the descent begins.
+        until: share of the span at which it ends.
+        final: rate at the end, as a share of the peak.
+        warmup: iterations of linear warm-up.
+        shape: of the descent, ``cosine``, ``linear`` or ``exponential``.
+
+    Raises:
+        ConfigError: on an unknown shape, or shares out of order.
+    """
+
+    peak: float
+    hold: float = 0.5
+    until: float = 1.0
+    final: float = 0.0
+    warmup: int = 0
+    shape: str = "cosine"
+
+    def __post_init__(self) -> None:
+        if self.shape not in _SHAPES:
+            raise ConfigError(f"rate.shape must be one of {', '.join(_SHAPES)}; got {self.shape!r}")
+        if not 0 <= self.hold <= self.until <= 1:
+            raise ConfigError(
+                f"rate: 0 <= hold <= until <= 1 must hold, got hold={self.hold}, until={self.until}"
+            )
+
+    def at(self, step: int, start: int, end: int) -> float:
+        """The rate at iteration ``step`` of the span [start, end)."""
+        done = (step - start) / max(1, end - start)
+        scale = min(1.0, (step - start + 1) / (self.warmup + 1))
+        if done > self.hold:
+            fallen = min(1.0, (done - self.hold) / max(1e-9, self.until - self.hold))
+            scale *= _SHAPES[self.shape](fallen, self.final)
+        return self.peak * scale

@@ -1,0 +1,1 @@
+"""Files, console, errors, config, pickles: knows nothing of the method."""

@@ -1,0 +1,147 @@
+"""Where the config lies, and how an entry point starts, fails and says so."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, InstantiationException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from rich.console import Console
+
+from gsgan.utils.errors import GsganError
+
+FAILED = 1
+LONGEST_NAME = 200  # bytes of a sweep's folder; file systems take 255, files beside it need some
+EFFECTS_LIST = re.compile(r"effects=(\[[^\[\]]*\])")
+
+
+def config_folder() -> Path:
+    """conf/: inside the package when installed, beside src/ in a checkout.
+
+    Raises:
+        GsganError: when neither is there.
+    """
+    package = Path(__file__).resolve().parents[1]
+    for folder in (package / "conf", package.parents[1] / "conf"):
+        if (folder / "train.yaml").is_file():
+            return folder
+    raise GsganError(f"{package / 'conf'}: the config folder is missing; install gsgan again")
+
+
+def folder_name(overrides: str) -> str:
+    """The folder of a sweep's run: its overrides, as far as a name may be long and have signs.
+
+    A name that had to be changed ends in a digest of the overrides: no two runs share a folder. No
+    sign in it means anything to a shell or in ``run=<folder>``.
+    """
+    name = re.sub(r"[^A-Za-z0-9_.+-]", "_", overrides)
+    if name == overrides and len(name) <= LONGEST_NAME:
+        return name
+    end = "_" + hashlib.sha256(overrides.encode()).hexdigest()[:12]
+    return name[: LONGEST_NAME - len(end)] + end
+
+
+def if_gpu(then: object, otherwise: object) -> object:
+    """One of two values: whether CUDA can be used here."""
+    import torch  # here, so that importing an entry point stays light
+
+    return then if torch.cuda.is_available() else otherwise
+
+
+OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
+OmegaConf.register_new_resolver("if_gpu", if_gpu, replace=True)
+
+
+def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
+    """Makes a function of a config into a command: Hydra's grammar, errors as one sentence.
+
+    Args:
+        name: the config file, without ``.yaml``, and the command's name.
+    """
+
+    def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
+        @functools.wraps(task)
+        def run(config: DictConfig) -> None:
+            import gsgan.utils.compat  # noqa: F401  (before lightning and torchmetrics)
+
+            try:
+                task(config)
+            except KeyboardInterrupt:
+                _say("interrupted")
+                sys.exit(130)
+            except Exception as error:
+                sentence = one_sentence(error)
+                if sentence is None:
+                    raise
+                _say(sentence)
+                _remove_unused_folder()
+                sys.exit(FAILED)
+
+        @functools.wraps(task)
+        def main() -> None:
+            import hydra  # here, so that importing an entry point stays light
+
+            sys.argv[1:] = [f"hydra.job.name={name}", *map(spelled_out, sys.argv[1:])]
+            command = hydra.main(
+                version_base="1.3", config_path=str(config_folder()), config_name=name
+            )(run)
+            command()
+
+        return main
+
+    return decorate
+
+
+def spelled_out(argument: str) -> str:
+    """``effects=[antialias]`` as ``effects.only=[antialias]``: Hydra would look for such files."""
+    found = EFFECTS_LIST.fullmatch(argument)
+    return argument if found is None else f"effects.only={found[1]}"
+
+
+def one_sentence(error: BaseException) -> str | None:
+    """What to tell the user, or None for a bug, whose traceback is worth more."""
+    if isinstance(error, GsganError):
+        return _without_worker(error)
+    if isinstance(error, InstantiationException):
+        cause = error.__cause__
+        if isinstance(cause, GsganError):
+            return str(cause)
+        where = str(error).rpartition("full_key: ")[2] or "the config"
+        if isinstance(cause, (ValueError, TypeError)):
+            return f"{where}: {cause}"
+        return f"{where}: {str(error).splitlines()[0]}"
+    if isinstance(error, (HydraException, OmegaConfBaseException)):
+        return str(error).splitlines()[0]
+    return None
+
+
+def _without_worker(error: GsganError) -> str:
+    """The sentence alone, when a DataLoader's worker process put its traceback before it."""
+    text = str(error)
+    if not text.startswith("Caught "):
+        return text
+    return text.rpartition(f"{type(error).__name__}: ")[2].strip().rpartition("\n")[2]
+
+
+def _remove_unused_folder() -> None:
+    """Takes back the run folder that Hydra made, when nothing of a run is in it."""
+    settings = HydraConfig.get()
+    subfolder = settings.output_subdir
+    if subfolder is None:  # this command has no folder of its own
+        return
+    folder = Path(settings.runtime.output_dir)
+    if {path.name for path in folder.iterdir()} <= {subfolder, f"{settings.job.name}.log"}:
+        shutil.rmtree(folder)
+
+
+def _say(sentence: str) -> None:
+    console = Console(stderr=True, soft_wrap=True)
+    console.print(f"gsgan: {sentence}", style="bold red", markup=False, highlight=False)

@@ -1,0 +1,213 @@
+"""`gsgan.bench speed`: stages, spreads and ways of painting on a tiny avatar, and refusals."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+from commands import refused
+
+from gsgan.bench.speed_painter import Painter, Way, painting_memory
+from gsgan.bench.speed_report import Report, picture
+from gsgan.bench.speed_stages import Spread, StageClock, Times, measure
+from gsgan.bench.speed_subject import spread
+from gsgan.model.avatar import UNWATCHED, unwatched
+from gsgan.splat import accuracy
+from gsgan.utils.errors import ConfigError
+
+ALL = [
+    *("window", "skeleton", "densify", "Ψ", "F", "S", "p₂D", "Ω", "pose encoder", "UNet", "paste"),
+]
+
+
+@pytest.fixture
+def small(build):
+    data, avatar, frame = build()
+    with torch.no_grad():  # a trained one: where the UNet paints and Gaussians differ
+        for parameter in avatar.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=torch.manual_seed(1))
+    return data, avatar.eval(), frame
+
+
+def test_spread_is_median_and_deciles():
+    assert Spread.of([float(i) for i in range(11)]) == Spread(5.0, 1.0, 9.0)
+    assert Spread.of([7.0]) == Spread(7.0, 7.0, 7.0)
+
+
+def test_every_stage_is_timed_and_the_avatar_is_left_unwatched(small):
+    _, avatar, frame = small
+    ticks = []
+    painter = Painter(avatar, Way())
+    times = measure(painter, [frame], count=3, warmup=2, tick=lambda: ticks.append(1))
+    assert list(times.stages) == ALL
+    assert len(ticks) == 5
+    assert all(0 < s.p10 <= s.median <= s.p90 for s in times.stages.values())
+    assert avatar.stage is unwatched
+    assert avatar.stage("F") is UNWATCHED
+
+
+def test_a_stage_that_fails_leaves_the_avatar_unwatched(small):
+    _, avatar, frame = small
+
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError
+
+    avatar.draw = fail
+    with pytest.raises(ZeroDivisionError):
+        measure(Painter(avatar, Way()), [frame], count=1, warmup=0)
+    assert avatar.stage is unwatched
+
+
+@pytest.mark.parametrize(
+    ("model", "absent", "there"),
+    [
+        ("wo_seg", {"S"}, {"F", "UNet"}),
+        ("splat_only", {"S", "UNet", "p₂D", "Ω", "pose encoder"}, {"Ψ", "F"}),
+        ("image_to_image", {"densify", "Ψ", "F"}, {"p₂D", "UNet"}),
+        ("lbs_splat", {"densify", "Ψ", "UNet"}, {"surface", "F"}),
+    ],
+)
+def test_what_a_model_lacks_has_no_stage(build, model, absent, there):
+    few = ["model.surface.points=100"] if model == "lbs_splat" else []
+    _, avatar, frame = build(f"model={model}", *few)
+    stages = set(measure(Painter(avatar.eval(), Way()), [frame], count=1, warmup=0).stages)
+    assert there <= stages
+    assert not absent & stages
+
+
+def test_the_clock_adds_up_what_one_stage_takes_twice():
+    clock = StageClock(torch.device("cpu"))
+    for _ in range(2):
+        with clock("F"):
+            pass
+    once = clock.frame["F"]
+    with clock("F"):
+        sum(range(100_000))
+    assert clock.frame["F"] > once > 0
+
+
+def test_ways_of_painting_do_not_reach_each_other(small):
+    _, avatar, frame = small
+    plain, exact = Painter(avatar, Way()), Painter(avatar, Way(accuracy=accuracy("exact")))
+    draft = Painter(avatar, Way(accuracy=accuracy("draft"), backend="torch", whole=True))
+    before = (avatar.accuracy, avatar.window_margin, avatar.backend, avatar.segmentation.backend)
+    first = plain(frame)
+    other, exactly = draft(frame), exact(frame)
+    assert torch.equal(plain(frame), first)
+    assert not torch.equal(other, first)
+    assert (other - exactly).abs().max() > (first - exactly).abs().max()
+    after = (avatar.accuracy, avatar.window_margin, avatar.backend, avatar.segmentation.backend)
+    assert after == before
+
+
+def test_precision_reaches_the_networks_and_not_the_picture_type(small):
+    _, avatar, frame = small
+    full, half = Painter(avatar, Way())(frame), Painter(avatar, Way(precision="bf16-mixed"))(frame)
+    assert half.dtype == full.dtype == torch.float32
+    assert 0 < (half - full).abs().max() < 0.1
+
+
+def test_a_picture_of_another_size_comes_back_in_its_own(small):
+    _, avatar, frame = small
+    full = Painter(avatar, Way())(frame)
+    for scale in (0.5, 2.0):
+        picture = Painter(avatar, Way(scale=scale))(frame)
+        assert picture.shape == full.shape
+        assert picture.isfinite().all()
+        assert (picture - full).abs().mean() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [
+        ({"precision": "8-bit"}, "bf16-mixed"),
+        ({"backend": "vulkan"}, "native"),
+        ({"scale": 0}, "0"),
+    ],
+)
+def test_a_way_that_makes_no_sense_is_refused(wrong, word):
+    with pytest.raises(ConfigError, match=word):
+        Way(**wrong)
+
+
+def test_memory_of_painting_is_of_the_right_size(small):
+    """Dense float64 blending holds Gaussians times pixels: more than tiles do."""
+    _, avatar, frame = small
+    tiles = painting_memory(Painter(avatar, Way()), [frame])
+    dense = painting_memory(Painter(avatar, Way(accuracy=accuracy("exact"))), [frame])
+    if tiles is None or dense is None:
+        pytest.skip("this system does not tell the peak of memory")
+    gaussians = avatar.densify.n_points
+    assert dense > 4e-6 * 8 * gaussians
+    assert dense > tiles
+
+
+def test_the_frames_are_spread_over_a_split(small):
+    data, _, _ = small
+    assert [int(f.frame_id) for f in spread(data, 2, "novel_pose")] != []
+    assert len(spread(data, 99)) == len(data.dataset("novel_pose"))
+    data.dataset("novel_view").items = ()
+    with pytest.raises(ConfigError, match="novel_view"):
+        spread(data, 2, "novel_view")
+
+
+def test_the_report_adds_up_and_draws(tmp_path):
+    from gsgan.bench.environment import environment
+
+    times = Times(
+        Spread(10, 9, 12), {"F": Spread(6, 5, 7), "UNet": Spread(3, 2, 4)}, Spread(1, 1, 1)
+    )
+    settings = {"avatar": "untrained avatar", "picture": "512 x 512"}
+    report = Report(times, None, environment(torch.device("cpu")), settings, ("untrained weights",))
+    text = report.text()
+    assert "| F | 6.00 | 5.00 | 7.00 | 60% |" in text
+    assert "| **end to end** | 10.0 | 9.00 | 12.0 | 100.0 frames/s |" in text
+    assert "- untrained weights" in text
+    assert picture(report).startswith(b"\x89PNG")
+
+
+def test_the_command_times_a_run_and_fills_the_page(run, tmp_path, inside):
+    page = tmp_path / "page.md"
+    page.write_text("# Speed\n\n<!-- bench:mine -->\nold\n<!-- end -->\n")
+    out = tmp_path / "out"
+    given = [f"run={run}", "frames=2", "warmup=1", "poses=2", f"hydra.run.dir={out}"]
+    done = inside("bench", "speed", *given, f"docs={page}", "block=mine")
+    assert done.returncode == 0, done.stderr
+    found = json.loads((out / "speed.json").read_text())
+    assert list(found["times_ms"]["stages"]) == ALL
+    assert found["settings"]["avatar"] == f"trained run {run.name}"
+    assert found["settings"]["precision"] == "32-true"
+    assert found["where"]["threads"] >= 1
+    assert "old" not in page.read_text()
+    assert "| UNet |" in page.read_text()
+    assert (out / "speed.png").is_file()
+    assert torch.tensor([1e-310], dtype=torch.float64) * 1 > 0  # denormals are there again
+
+
+def test_the_command_times_an_untrained_avatar_at_its_size(capture, tmp_path, inside):
+    out = tmp_path / "out"
+    given = ["size=tiny", "size.picture=64", f"data.root={capture}", "frames=1", "warmup=0"]
+    done = inside("bench", "speed", *given, "model=splat_only", f"hydra.run.dir={out}")
+    assert done.returncode == 0, done.stderr
+    found = json.loads((out / "speed.json").read_text())
+    assert found["settings"]["picture"] == "64 x 64"
+    assert "untrained weights" in found["marks"][0]
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ("frames=0", ["frames"]),
+        ("warmup=-1", ["warmup"]),
+        ("threads=0", ["threads"]),
+        ("channels_last=maybe", ["channels_last"]),
+        ("precision=8-bit", ["precision", "32-true"]),
+        ("backend=vulkan", ["backend", "native"]),
+        ("run=/nowhere", ["/nowhere", "not a run folder"]),
+        ("docs=/nowhere.md", ["/nowhere.md"]),
+        ("device=cuda:99", ["device=cuda:99"]),
+    ],
+)
+def test_what_makes_no_sense_ends_in_one_sentence(inside, given, words):
+    refused(inside("bench", "speed", given), *words)

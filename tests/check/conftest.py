@@ -1,0 +1,59 @@
+"""A small good capture, and copies of it to be damaged."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsgan.check.findings import Report
+from gsgan.check.settings import Limits, Sampling
+
+
+@pytest.fixture(scope="session")
+def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four cameras, twelve frames, 2D detections included."""
+    from make import write_landmarks, write_tiny_capture
+
+    root = write_tiny_capture(
+        tmp_path_factory.mktemp("good"), cameras=4, frames=12, size=(64, 96), labels=True
+    )
+    with np.load(root / "landmarks3d.npz") as held:
+        p, ids = held["p"], held["frame_id"]
+    # measured joints are never still and never exact: a millimetre of noise
+    p = p + np.random.default_rng(0).normal(0, 0.001, p.shape)
+    write_landmarks(root, p=p, frame_id=ids, reproj_px=np.full(p.shape[:2], 0.2))
+    return root
+
+
+@pytest.fixture
+def copy(good: Path, tmp_path: Path) -> Path:
+    """A copy of the good capture."""
+    return Path(shutil.copytree(good, tmp_path / "capture"))
+
+
+@pytest.fixture
+def check():
+    """Checks a folder: ``check(root, pictures=48, joint_jump=0.1)``."""
+    from gsgan.check.run import check_data
+    from gsgan.data.datamodule import GsganData
+
+    def run(root: Path, pictures: int = 48, **limits: float) -> Report:
+        sampling = Sampling(
+            pictures=pictures, hull_frames=1, trial_frames=3, shown=2, tile=60, size_ratio=1.4
+        )
+        # the little man's raised arm grows: his forearm is no fault of the capture
+        return check_data(GsganData(root=str(root)), sampling, Limits(limb_share=2.0, **limits))
+
+    return run
+
+
+@pytest.fixture
+def subject(good: Path):
+    """The good capture as the checks see it."""
+    from gsgan.check.subject import subject_of
+    from gsgan.data.datamodule import GsganData
+
+    return subject_of(GsganData(root=str(good)))

@@ -1,0 +1,154 @@
+"""The command: report, JSON, exit code; and the real capture's findings."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from make import edit_json
+
+FEW = ("sampling.pictures=16", "sampling.hull_frames=1", "sampling.shown=2", "sampling.tile=60")
+REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real_capture"
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch, capfd):
+    """Runs ``python -m gsgan.check`` in this process: (exit code, output, report's text)."""
+
+    def run(*args: str, report: str = "check.html") -> tuple[int, str, str]:
+        from gsgan.check.__main__ import main
+
+        work = tmp_path / "work"
+        work.mkdir(exist_ok=True)
+        monkeypatch.chdir(work)
+        monkeypatch.setenv("COLUMNS", "160")
+        arguments = [f"report={report}", *args]
+        monkeypatch.setattr(sys, "argv", ["gsgan.check", *arguments])
+        code = 0
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+        output = "".join(capfd.readouterr())
+        written = work / report
+        return code, output, written.read_text() if written.is_file() else ""
+
+    return run
+
+
+def test_a_good_capture_passes_and_leaves_a_report(good, command, tmp_path):
+    code, output, page = command(f"data.root={good}", "limits.limb_share=2", *FEW)
+    assert code == 0
+    assert "nothing wrong was found" in output
+    assert sorted(path.name for path in (tmp_path / "work").iterdir()) == [
+        "check.html",
+        "check.json",
+    ]
+    assert "nothing wrong was found" in page
+    assert "<script" not in page
+    assert "http" not in page.replace("http://www.w3.org/2000/svg", "")
+    pictures = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', page)
+    assert len(pictures) == 4  # a strip a camera
+    strip = cv2.imdecode(np.frombuffer(base64.b64decode(pictures[0]), np.uint8), 1)
+    assert strip.shape == (60 + 18, 45 + 4 + 45, 3)
+    assert page.count("<svg") == 6  # the rig and five series
+    for camera in ("cam00", "cam01", "cam02", "cam03"):
+        assert f"camera {camera}" in page
+    numbers = json.loads((tmp_path / "work" / "check.json").read_text())
+    assert numbers["errors"] == 0
+    assert numbers["cameras"]["cam00"]["inside"] == 1
+
+
+def test_something_wrong_ends_with_1(copy, command, tmp_path):
+    def exchange(cameras):
+        for key in "Rt":
+            one, other = cameras["cam00"][key], cameras["cam01"][key]
+            cameras["cam00"][key], cameras["cam01"][key] = other, one
+
+    edit_json(copy / "cameras.json", exchange)
+    code, output, page = command(f"data.root={copy}", *FEW)
+    assert code == 1
+    assert "cameras cam00 and cam01 look exchanged" in " ".join(output.split())
+    assert "cameras cam00 and cam01 look exchanged" in page
+    assert json.loads((tmp_path / "work" / "check.json").read_text())["errors"] == 1
+
+
+@pytest.mark.parametrize(("strict", "ends"), [("false", 0), ("true", 1)])
+def test_warnings_end_with_1_where_that_is_asked_for(good, command, tmp_path, strict, ends):
+    # at the usual limit the little man's forearm is a warning
+    code, *_ = command(f"data.root={good}", f"strict={strict}", *FEW)
+    numbers = json.loads((tmp_path / "work" / "check.json").read_text())
+    assert numbers["errors"] == 0
+    assert numbers["warnings"] > 0
+    assert code == ends
+
+
+def test_data_that_cannot_be_read_leave_a_report_too(copy, command):
+    (copy / "meta.json").write_text("{")
+    code, output, page = command(f"data.root={copy}", *FEW)
+    assert code == 1
+    assert "Traceback" not in output
+    assert "meta.json is not valid JSON" in page
+    assert "images/cam00" in page
+
+
+def test_names_from_the_data_are_escaped(copy, command):
+    (copy / "images" / "cam00").rename(copy / "images" / "<b>&")
+    code, _, page = command(f"data.root={copy}", *FEW)
+    assert code == 1
+    assert "&lt;b&gt;&amp;" in page
+    assert "<b>" not in page
+
+
+def test_a_root_that_is_not_set_is_one_sentence(command):
+    code, output, page = command()
+    assert code == 1
+    assert output.count("\n") == 1
+    assert "data.root is not set" in output
+    assert page == ""
+
+
+def test_settings_that_make_no_sense_are_one_sentence(good, command):
+    code, output, _ = command(f"data.root={good}", "limits.flesh=-1")
+    assert code == 1
+    assert "limits.flesh must be a number above 0" in output
+    assert "Traceback" not in output
+
+
+def test_strict_must_be_true_or_false(good, command):
+    code, output, page = command(f"data.root={good}", "strict=maybe")
+    assert code == 1
+    assert "strict must be true or false, got 'maybe'" in output
+    assert page == ""
+
+
+def test_a_report_that_cannot_be_written_is_said(good, command, tmp_path):
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work" / "taken").write_text("")
+    code, output, _ = command(f"data.root={good}", *FEW, report="taken/check.html")
+    assert code == 1
+    assert "report=taken/check.html cannot be written" in " ".join(output.split())
+
+
+@pytest.mark.skipif(not (REAL / "cameras.json").is_file(), reason=f"no real capture at {REAL}")
+def test_the_real_capture_has_what_is_known_of_it(command, tmp_path):
+    code, output, _ = command(f"data.root={REAL}", "sampling.pictures=40", "sampling.shown=1")
+    assert code == 0
+    assert "0 errors, 2 warnings" in output
+    numbers = json.loads((tmp_path / "work" / "check.json").read_text())
+    told = {finding["topic"]: finding["sentence"] for finding in numbers["findings"]}
+    assert "exposure or white balance" in told["colour"]  # cam02 is dark, cam04 bright
+    assert "cam02" in told["colour"]
+    assert "cam04" in told["colour"]
+    assert set(numbers["doubtful_frames"]) == {"64", "65"}  # the right foot, found flipped
+    for camera in numbers["cameras"].values():
+        assert camera["inside"] > 0.98
+        assert camera["overlap"] > camera["rivals"][0]["overlap"] + 0.2
+    assert all(share > 0.95 for share in numbers["hull"].values())
+    assert 3 < numbers["camera_distance"] < 3.5

@@ -1,0 +1,350 @@
+"""Good data passes; every damage is found, named, and an error where training would be wasted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from make import edit_json, write_landmarks
+
+from gsgan.skeleton.template import MEDIAPIPE33
+
+MIRROR = list(MEDIAPIPE33.mirror)
+
+
+def edit_landmarks(root: Path, change) -> None:
+    with np.load(root / "landmarks3d.npz") as held:
+        arrays = {key: held[key].copy() for key in held.files}
+    change(arrays["p"])
+    write_landmarks(root, **arrays)
+
+
+def move_masks(root: Path, camera: str, dx: int, dy: int = 0) -> None:
+    for path in (root / "masks" / camera).iterdir():
+        mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(path), np.roll(mask, (dy, dx), (0, 1)))
+
+
+def only(report, level: str) -> str:
+    """The one finding of a level."""
+    sentences = [f.sentence for f in report.findings if f.level == level]
+    assert len(sentences) == 1, sentences
+    return sentences[0]
+
+
+def test_a_good_capture_has_nothing_wrong(good, check):
+    report = check(good)
+    assert report.findings == ()
+    cameras = report.numbers["cameras"]
+    assert all(score["inside"] == 1 and score["lag"] == 0 for score in cameras.values())
+    assert all(score["overlap"] > score["rivals"][0]["overlap"] for score in cameras.values())
+    assert report.numbers["camera_distance"] == pytest.approx(3.0, abs=0.1)
+    assert all(share > 0.95 for share in report.numbers["hull"].values())
+
+
+@pytest.mark.parametrize(("keys", "named"), [("Rt", "R and t"), ("RtK", "R and t")])
+def test_exchanged_cameras_are_named(copy, check, keys, named):
+    def exchange(cameras):
+        for key in keys:
+            one, other = cameras["cam00"][key], cameras["cam01"][key]
+            cameras["cam00"][key], cameras["cam01"][key] = other, one
+
+    edit_json(copy / "cameras.json", exchange)
+    sentence = only(check(copy), "error")
+    assert sentence.startswith("cameras cam00 and cam01 look exchanged")
+    assert named in sentence
+
+
+def test_opposite_cameras_exchanged_are_named(copy, check):
+    def exchange(cameras):
+        for key in "Rt":
+            one, other = cameras["cam01"][key], cameras["cam03"][key]
+            cameras["cam01"][key], cameras["cam03"][key] = other, one
+
+    edit_json(copy / "cameras.json", exchange)
+    assert "cam01 and cam03 look exchanged" in only(check(copy), "error")
+
+
+def test_one_camera_in_millimetres_is_named(copy, check):
+    def scale(cameras):
+        cameras["cam02"]["t"] = [1000 * x for x in cameras["cam02"]["t"]]
+
+    edit_json(copy / "cameras.json", scale)
+    sentence = only(check(copy), "error")
+    assert sentence.startswith("camera cam02 stands")
+    assert "another unit" in sentence
+
+
+def test_all_cameras_in_millimetres_stop_the_reader_and_the_report_says_so(copy, check):
+    def scale(cameras):
+        for camera in cameras.values():
+            camera["t"] = [1000 * x for x in camera["t"]]
+
+    edit_json(copy / "cameras.json", scale)
+    report = check(copy)
+    assert "check 'unit'" in only(report, "error")
+    assert report.numbers == {"readable": False}
+    listed = dict(report.sections[0].tables[0].rows)
+    assert listed["images/cam00"] == "12 × .png"
+
+
+def test_moved_masks_are_named_with_their_shift(copy, check):
+    move_masks(copy, "cam01", 12)
+    sentence = only(check(copy), "error")
+    assert sentence.startswith("camera cam01: its masks lie +12, +0 pixels")
+    assert "100% in the other cameras" in sentence
+
+
+def test_masks_moved_in_every_camera_are_told_once(copy, check):
+    for i in range(4):
+        move_masks(copy, f"cam{i:02d}", 0, -14)
+    sentence = only(check(copy), "error")
+    assert sentence.startswith("in every camera the masks lie beside the skeleton")
+    assert "cam02 +0, -14" in sentence
+
+
+def test_mirrored_pictures_are_named(copy, check):
+    for kind in ("images", "masks"):
+        for path in (copy / kind / "cam01").iterdir():
+            cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:, ::-1])
+    sentence = only(check(copy), "error")
+    assert sentence.startswith("camera cam01: ")
+    assert "mirrored pictures" in sentence.split(" would fit its masks better")[0]
+
+
+def test_a_camera_out_of_step_is_named(copy, check):
+    def run_sideways(p):  # quickly, and in no rhythm that another lag would fit
+        p[..., 0] += 0.15 * np.array([0, 2, 3, 1, 0, 3, 0, 1, 3, 2, 0, 1])[:, None]
+
+    edit_landmarks(copy, run_sideways)
+    redraw(copy)
+    for kind in ("images", "masks", "labels"):
+        for frame in range(11):
+            folder = copy / kind / "cam00"
+            (folder / f"{frame + 1:06d}.png").replace(folder / f"{frame:06d}.png")
+    report = check(copy, pixel_tolerance=0.5, joint_tolerance=0.02, joint_jump=1.0)
+    (found,) = (f for f in report.findings if f.topic == "synchronisation")
+    assert found.level == "error"
+    assert found.sentence.startswith("camera cam00: its pictures fit the skeleton 1 frame(s) later")
+
+
+def redraw(root: Path) -> None:
+    """Pictures and masks anew for changed landmarks."""
+    import json
+
+    from make import draw_person
+
+    with np.load(root / "landmarks3d.npz") as held:
+        p = held["p"]
+    for name, camera in json.loads((root / "cameras.json").read_text()).items():
+        for frame, joints in enumerate(p):
+            image, mask = draw_person(camera, joints)
+            cv2.imwrite(str(root / f"images/{name}/{frame:06d}.png"), image[..., ::-1])
+            cv2.imwrite(str(root / f"masks/{name}/{frame:06d}.png"), mask)
+
+
+def test_missing_pictures_are_listed_and_are_no_error(copy, check):
+    for frame in (3, 4):
+        (copy / "images" / "cam02" / f"{frame:06d}.png").unlink()
+    sentence = only(check(copy), "warning")
+    assert sentence == "camera cam02 lacks 2 of the 12 frames: 3-4"
+
+
+def test_a_missing_mask_is_an_error(copy, check):
+    (copy / "masks" / "cam02" / "000003.png").unlink()
+    sentence = only(check(copy), "error")
+    assert str(copy / "masks" / "cam02" / "000003.png") in sentence
+
+
+def test_a_picture_cut_off_is_found_though_few_are_looked_at(copy, check):
+    path = copy / "images" / "cam01" / "000005.png"
+    path.write_bytes(path.read_bytes()[:-30])
+    report = check(copy, pictures=4)
+    assert str(path) in only(report, "error")
+
+
+def test_an_empty_mask_is_found_though_few_are_looked_at(copy, check):
+    path = copy / "masks" / "cam03" / "000007.png"
+    cv2.imwrite(str(path), np.zeros((96, 64), np.uint8))
+    report = check(copy, pictures=4)
+    assert "frame 7: cam03: the mask is empty" in only(report, "warning")
+    assert report.numbers["doubtful_frames"] == {"7": ["cam03: the mask is empty"]}
+
+
+def test_a_camera_with_empty_masks_is_an_error(copy, check):
+    for path in (copy / "masks" / "cam03").iterdir():
+        cv2.imwrite(str(path), np.zeros((96, 64), np.uint8))
+    assert only(check(copy), "error").startswith("camera cam03: its masks are empty")
+
+
+def test_frozen_joints_are_named(copy, check):
+    def freeze(p):
+        p[4:10, 15:23] = p[4, 15:23]
+
+    edit_landmarks(copy, freeze)
+    sentence = only(check(copy), "warning")
+    assert sentence.startswith("joints stand exactly still")
+    assert "in 6 of 12 frames: 4-9" in sentence
+    assert "left_wrist" in sentence
+
+
+def test_left_and_right_exchanged_in_some_frames_are_named(copy, check):
+    def exchange(p):
+        p[5:7] = p[5:7][:, MIRROR]
+
+    edit_landmarks(copy, exchange)
+    report = check(copy)
+    assert report.errors == 0
+    found = {f.sentence.split(" in ")[0]: f.sentence for f in report.findings}
+    assert "2 of 12 frames: 5-6" in found["left and right are exchanged"]
+    assert "2 of 12 frames: 5-6" in found["nose or toes point backwards"]
+
+
+def test_left_and_right_exchanged_throughout_is_an_error(copy, check):
+    def exchange(p):
+        p[:] = p[:, MIRROR]
+
+    edit_landmarks(copy, exchange)
+    assert "left and right are exchanged" in only(check(copy), "error")
+
+
+def test_a_jump_is_named(copy, check):
+    def jump(p):
+        p[6, 15] += [0.5, 0, 0]
+
+    edit_landmarks(copy, jump)
+    report = check(copy)
+    assert report.errors == 0
+    jumps = [f.sentence for f in report.findings if "joints jump" in f.sentence]
+    assert len(jumps) == 1
+    assert "1 of 12 frames: 6 (frame 6: jumps: left_wrist 0.50 m)" in jumps[0]
+
+
+def test_joints_not_seen_are_named(copy, check):
+    def lose(p):
+        p[8, :11] = np.nan
+
+    edit_landmarks(copy, lose)
+    assert "few joints were seen in 1 of 12 frames: 8" in only(check(copy), "warning")
+
+
+def test_joints_that_the_source_never_knows_are_no_fault(copy, check):
+    """OpenPose's 25 points leave a third of the 33 open."""
+
+    def lose(p):
+        p[:, [1, 3, 4, 6, 9, 10, *range(17, 23)]] = np.nan
+
+    edit_landmarks(copy, lose)
+    assert not any("joints were seen" in f.sentence for f in check(copy).findings)
+
+
+def test_a_darker_camera_is_named(copy, check):
+    for path in (copy / "images" / "cam01").iterdir():
+        image = cv2.imread(str(path))
+        cv2.imwrite(str(path), (image * 0.6).astype(np.uint8))
+    sentence = only(check(copy), "warning")
+    assert "exposure or white balance" in sentence
+    assert "cam01 red 0.60" in sentence
+    assert "cam00" not in sentence
+
+
+def test_a_person_of_another_size_is_told(copy, check):
+    def shrink(p):
+        p[:] = p * 0.5
+
+    edit_landmarks(copy, shrink)
+    report = check(copy)
+    told = " ".join(f.sentence for f in report.findings)
+    assert "the limb lengths speak for a person of 0.79" in told
+    assert "in every camera the masks lie beside the skeleton" in only(report, "error")
+
+
+def test_the_wrong_up_axis_is_told(copy, check):
+    edit_json(copy / "meta.json", lambda meta: meta.update(up_axis="y"))
+    sentence = only(check(copy), "warning")
+    assert "points along z, 90 degrees from the up axis y" in sentence
+
+
+@pytest.mark.parametrize(("cameras", "frames"), [(1, 1), (2, 3)])
+def test_the_smallest_captures_can_be_checked(tmp_path, check, cameras, frames):
+    import json
+
+    from make import write_tiny_capture
+
+    from gsgan.check.run import plain
+
+    root = write_tiny_capture(tmp_path / "tiny", cameras=cameras, frames=frames, size=(48, 64))
+    report = check(root)
+    assert report.errors == 0
+    assert report.numbers["hull"] is None
+    assert report.numbers["cameras"]["cam00"]["outside"] == 0
+    json.dumps(plain(report), allow_nan=False)
+
+
+def test_lens_distortion_is_undone_before_anything_is_judged(tmp_path, check):
+    from make import write_tiny_capture
+
+    lens = {"dist": (-0.3, 0.1, 0, 0, 0), "size": (96, 96)}
+    root = write_tiny_capture(tmp_path / "lens", cameras=3, frames=4, **lens)
+    assert min(c["inside"] for c in check(root).numbers["cameras"].values()) > 0.99
+
+
+def turn(root: Path, axis: tuple[float, float, float], degrees: float) -> None:
+    def change(cameras):
+        r = cv2.Rodrigues(np.radians(degrees) * np.array(axis))[0]
+        camera = cameras["cam01"]
+        camera["R"], camera["t"] = (r @ camera["R"]).tolist(), (r @ camera["t"]).tolist()
+
+    edit_json(root / "cameras.json", change)
+
+
+def scale_focal(root: Path, factor: float, *names: str, centre: bool = False) -> None:
+    def change(cameras):
+        for name in names:
+            K = np.array(cameras[name]["K"])
+            K[[0, 1], [0, 1]] *= factor
+            K[:2, 2] *= factor if centre else 1
+            cameras[name]["K"] = K.tolist()
+
+    edit_json(root / "cameras.json", change)
+
+
+def test_a_camera_that_is_nearly_right_is_named(copy, check):
+    turn(copy, (0, 0, 1), 12)
+    sentences = [f.sentence for f in check(copy, inside_warning=0.71).findings]
+    assert any(s.startswith("camera cam01: joints lie") for s in sentences)
+    assert not any("camera cam00" in s or "camera cam02" in s for s in sentences)
+
+
+@pytest.mark.parametrize("names", [("cam01",), ("cam01", "cam03")])
+def test_focal_lengths_of_half_are_named_for_what_they_are(copy, check, names):
+    scale_focal(copy, 0.5, *names)
+    # the tiny person is of thin discs, so all is smaller than in a capture
+    limits = {"fullness": 1.2, "inside_warning": 0.3, "inside_error": 0.2}
+    errors = [f.sentence for f in check(copy, **limits).findings if f.level == "error"]
+    (told,) = (s for s in errors if "far larger than the body" in s)
+    assert all(f"{name} " in told for name in names)
+    assert not any("clock" in s or "would fit" in s for s in errors)
+
+
+def test_joints_just_outside_every_mask_are_told_once(copy, check):
+    scale_focal(copy, 1.12, *(f"cam{i:02d}" for i in range(4)))
+    told = [f.sentence for f in check(copy, inside_warning=0.71, outside_all=0.002).findings]
+    assert sum("in most cameras joints lie" in s for s in told) == 1
+
+
+def test_a_camera_that_training_refuses_is_explained_by_the_check(copy, check):
+    scale_focal(copy, 0.5, "cam01", centre=True)
+    report = check(copy)
+    assert report.numbers["readable"]
+    assert report.errors == 1
+    assert only(report, "error").startswith("camera cam01: ")
+
+
+def test_without_suspects_there_is_nothing_small_to_judge():
+    from gsgan.check.blame import judge_small
+    from gsgan.check.settings import Limits
+
+    assert judge_small([], Limits()) == []

@@ -1,0 +1,125 @@
+"""Jumps, limbs, frozen joints and exchanged sides on skeletons made for the purpose."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from make import skeletons
+
+from gsgan.check.motion import (
+    body_parts,
+    facing,
+    frozen,
+    jump_distance,
+    jumped,
+    limb_lengths,
+    measured_joints,
+    odd_limbs,
+    runs,
+    swapped,
+)
+from gsgan.skeleton.template import MEDIAPIPE33
+
+MIRROR = list(MEDIAPIPE33.mirror)
+
+
+@pytest.fixture
+def p():
+    return skeletons(20) + np.random.default_rng(1).normal(0, 0.002, (20, 33, 3))
+
+
+@pytest.fixture
+def seen():
+    return np.ones((20, 33), bool)
+
+
+def test_a_steady_motion_is_no_jump(seen):
+    line = np.zeros((20, 33, 3))
+    line[..., 0] = 3.0 * np.arange(20)[:, None]
+    distance = jump_distance(line, seen)
+    assert np.nanmax(distance) == 0
+    assert np.isnan(distance[[0, -1]]).all()
+
+
+def test_a_stray_frame_is_named_and_its_neighbours_are_not(p, seen):
+    p[7, 3, 2] += 0.6
+    distance = jump_distance(p, seen)
+    assert distance[7, 3] == pytest.approx(0.6, abs=0.02)
+    assert distance[6, 3] == pytest.approx(0.3, abs=0.02)
+    assert np.argwhere(jumped(distance, 0.2)).tolist() == [[7, 3]]
+
+
+def test_unseen_joints_do_not_jump(p, seen):
+    p[7, 3], seen[7, 3] = 100, False
+    assert not jumped(jump_distance(p, seen), 0.2).any()
+
+
+def test_odd_limbs_need_both_limits(p, seen):
+    lengths = limb_lengths(p, seen, MEDIAPIPE33)
+    thigh = MEDIAPIPE33.limbs.index((23, 25))
+    lengths[4, thigh] *= 1.5
+    odd, share = odd_limbs(lengths, share=0.3, metres=0.06)
+    assert odd[4, thigh]
+    assert share[4, thigh] == pytest.approx(0.5, abs=0.02)
+    assert not odd_limbs(lengths, share=0.3, metres=0.3)[0][4, thigh]
+    assert not odd_limbs(lengths, share=0.6, metres=0.06)[0][4, thigh]
+
+
+def test_limbs_without_both_ends_are_not_judged(p, seen):
+    seen[:, 25] = False
+    lengths = limb_lengths(p, seen, MEDIAPIPE33)
+    assert np.isnan(lengths[:, MEDIAPIPE33.limbs.index((23, 25))]).all()
+    assert not odd_limbs(lengths, 0.3, 0.06)[0][:, MEDIAPIPE33.limbs.index((23, 25))].any()
+
+
+def test_frozen_joints_are_found_from_their_first_frame_to_their_last(p, seen):
+    p[5:10, 15] = p[5, 15]
+    p[12:14, 16] = p[12, 16]
+    held = frozen(p, seen, least=5)
+    assert np.flatnonzero(held[:, 15]).tolist() == [5, 6, 7, 8, 9]
+    assert held.sum() == 5
+    assert not frozen(p, seen, least=6).any()
+
+
+def test_only_joints_with_bones_that_change_are_measured(seen):
+    p = skeletons(20)  # of a computed skeleton only the raised forearm changes
+    measured = measured_joints(limb_lengths(p, seen, MEDIAPIPE33), MEDIAPIPE33, share=0.05)
+    assert measured[[13, 15]].all()
+    assert not measured[23:].any()
+
+
+def test_runs():
+    assert runs(np.array([1, 1, 0, 1, 0, 0, 1], bool)) == [(0, 1), (3, 3), (6, 6)]
+    assert runs(np.zeros(3, bool)) == []
+
+
+@pytest.mark.parametrize("part", ["face", "arms", "legs"])
+def test_an_exchange_of_one_part_is_found_in_that_part_only(p, seen, part):
+    p[..., 0] += np.linspace(0, 0.3, 20)[:, None]
+    parts = body_parts(MEDIAPIPE33)
+    for left, right in parts[part]:
+        p[8:11, [left, right]] = p[8:11, [right, left]]
+    for name, pairs in parts.items():
+        found = np.flatnonzero(swapped(p, seen, pairs, ratio=2.0, metres=0.03))
+        assert found.tolist() == ([8, 9, 10] if name == part else [])
+
+
+def test_every_joint_with_a_side_belongs_to_one_part():
+    pairs = [pair for part in body_parts(MEDIAPIPE33).values() for pair in part]
+    assert sorted(j for pair in pairs for j in pair) == list(range(1, 33))
+
+
+def test_an_exchange_is_found_across_unseen_frames(p, seen):
+    legs = body_parts(MEDIAPIPE33)["legs"]
+    seen[8, 23:] = False
+    p[9:12] = p[9:12][:, MIRROR]
+    assert np.flatnonzero(swapped(p, seen, legs, 2.0, 0.06)).tolist() == [9, 10, 11]
+
+
+def test_facing_turns_with_exchanged_sides_and_not_with_the_person(p, seen):
+    assert (facing(p, seen, MEDIAPIPE33) > 0).all()
+    turned = p * [-1, -1, 1]
+    assert (facing(turned, seen, MEDIAPIPE33) > 0).all()
+    assert (facing(p[:, MIRROR], seen, MEDIAPIPE33) < 0).all()
+    seen[0, 11] = False
+    assert np.isnan(facing(p, seen, MEDIAPIPE33)[0])

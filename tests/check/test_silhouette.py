@@ -1,0 +1,90 @@
+"""Distances, boxes, overlaps and shifts against values known in advance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gsgan.check.silhouette import (
+    best_shift,
+    body_silhouette,
+    box,
+    moved,
+    overlap,
+    placement,
+)
+from gsgan.skeleton.template import MEDIAPIPE33
+
+
+def square(size=(40, 60), rows=slice(10, 20), columns=slice(20, 40)):
+    mask = np.zeros(size, bool)
+    mask[rows, columns] = True
+    return mask
+
+
+def test_overlap_and_box():
+    a, b = square(), square(columns=slice(30, 50))
+    assert overlap(a, b) == pytest.approx(1 / 3)
+    assert overlap(a & ~a, b & ~b) == 0
+    assert box(a, tail=0).tolist() == [20, 10, 40, 20]
+    assert np.isnan(box(a & ~a)).all()
+
+
+def test_box_leaves_specks_out():
+    mask = square(size=(100, 100), rows=slice(20, 80), columns=slice(30, 60))
+    mask[2, 97] = True
+    assert box(mask) == pytest.approx([30, 20, 60, 80], abs=1)
+
+
+@pytest.mark.parametrize("shift", [(0, 0), (7, 0), (-6, 4), (15, -9)])
+def test_best_shift_finds_the_shift(shift):
+    body = square()
+    mask = moved(body, *shift)
+    assert best_shift(mask, body) == shift
+
+
+def test_moving_leaves_nothing_behind():
+    assert moved(square(), 20, 0)[:, 40:].sum() == 200
+    assert not moved(square(), 60, 0).any()
+    assert not moved(square(), 0, -40).any()
+
+
+def test_placement_follows_a_crop_and_resize():
+    K = np.array([[100.0, 0, 30], [0, 110, 20], [0, 0, 1]])
+    cropped = K.copy()
+    cropped[:2, 2] -= (5, 3)
+    scaled = np.diag([0.5, 0.25, 1]) @ cropped
+    place = placement(K, scaled, (8, 12))
+    assert place(np.array([25.0, 43.0])) == pytest.approx([10, 10])
+    assert place.resized((16, 24))(np.array([25.0, 43.0])) == pytest.approx([20, 20])
+
+
+def silhouette(pixels, depth=None, visible=None, size=(200, 120), focal=200.0):
+    depth = np.full(33, 2.0) if depth is None else depth
+    visible = np.ones(33, bool) if visible is None else visible
+    return body_silhouette(pixels, depth, visible, focal, size, MEDIAPIPE33, flesh=0.07)
+
+
+def standing() -> np.ndarray:
+    rest = np.array(MEDIAPIPE33.rest_positions)
+    return np.stack([60 + 100 * rest[:, 0], 190 - 100 * rest[:, 1]], 1)
+
+
+def test_the_foretold_body_covers_its_joints_and_no_more_than_a_body():
+    pixels = standing()
+    body = silhouette(pixels)
+    assert body[np.floor(pixels[:, 1]).astype(int), np.floor(pixels[:, 0]).astype(int)].all()
+    area = body.sum() / 100**2  # square metres
+    assert 0.35 < area < 0.75
+    assert body[80, 60]  # the trunk is filled
+
+
+def test_unseen_joints_and_those_behind_the_camera_draw_nothing():
+    pixels = standing()
+    assert not silhouette(pixels, visible=np.zeros(33, bool)).any()
+    assert not silhouette(pixels, depth=np.full(33, -2.0)).any()
+
+
+def test_bodies_far_out_of_the_picture_are_harmless():
+    assert silhouette(standing() + 1e9).shape == (200, 120)
+    assert silhouette(np.full((33, 2), np.nan)).shape == (200, 120)

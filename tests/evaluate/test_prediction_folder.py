@@ -1,0 +1,188 @@
+"""A folder of predictions: names, what is missing, twice or too much, and files that are broken."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gsgan.evaluate.folder import Folder, Pattern, check_headers, read_folder
+from gsgan.scene import Camera, Frame
+from gsgan.utils.errors import ConfigError, DataError
+
+CAMERAS = ("cam1", "cam10", "B (2)")
+EXPECTED = {
+    "novel_view": [("cam1", 0), ("cam10", 5)],
+    "novel_pose": [("cam1", 7), ("B (2)", 12)],
+}
+DEFAULT = Pattern("{split}/{camera}/{frame}.png")
+
+
+def touch(root: Path, *names: str) -> Path:
+    for name in names:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(b"")
+    return root
+
+
+def read(root: Path, pattern: Pattern = DEFAULT) -> Folder:
+    return read_folder(root, pattern, EXPECTED, CAMERAS, "black")
+
+
+ALL = (
+    "novel_view/cam1/000000.png",
+    "novel_view/cam10/5.png",
+    "novel_pose/cam1/0007.png",
+    "novel_pose/B (2)/00012.png",
+)
+
+
+def test_every_padding_of_a_number_is_read(tmp_path):
+    folder = read(touch(tmp_path, *ALL))
+    assert folder.files["B (2)", 12] == ALL[3]
+    assert set(folder.files) == {item for items in EXPECTED.values() for item in items}
+    assert folder.extra == ()
+
+
+@pytest.mark.parametrize(
+    ("pattern", "names"),
+    [
+        ("{camera}_{frame}.jpg", ("cam1_0.jpg", "cam10_05.jpg", "cam1_7.jpg", "B (2)_12.jpg")),
+        ("{frame}_view{camera_index}.png",
+         ("0_view0.png", "5_view1.png", "000007_view00.png", "12_view2.png")),
+    ],
+)  # fmt: skip
+def test_patterns_without_a_split(tmp_path, pattern, names):
+    folder = read(touch(tmp_path, *names), Pattern(pattern))
+    assert list(folder.files.values()) == sorted(names)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "message"),
+    [
+        ("{camera}.png", "must have {frame} once"),
+        ("{frame}.png", "{camera} or {camera_index} once"),
+        ("{camera}/{camera_index}/{frame}.png", "once"),
+        ("{camera}/{view}/{frame}.png", "has the field {view}"),
+    ],
+)
+def test_patterns_that_cannot_be(pattern, message):
+    with pytest.raises(ConfigError, match=message):
+        Pattern(pattern)
+
+
+def test_a_missing_picture_is_named(tmp_path):
+    touch(tmp_path, *ALL[:3])
+    with pytest.raises(DataError, match=r"lacks 1 of 4 .* camera B \(2\), frame 12, expected as "
+                                        r"novel_pose/B \(2\)/000012.png"):  # fmt: skip
+        read(tmp_path)
+
+
+def test_a_folder_of_other_names_shows_what_is_there(tmp_path):
+    touch(tmp_path, "view/0.png", ".DS_Store")
+    with pytest.raises(DataError, match=r"lacks 4 of 4 .* in the folder there is view/0.png$"):
+        read(tmp_path)
+    with pytest.raises(DataError, match="does not exist"):
+        read(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="is a file"):
+        read(tmp_path / "view" / "0.png")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    with pytest.raises(DataError, match=r"there is nothing$"):
+        read(empty)
+
+
+def test_a_picture_there_twice_is_named(tmp_path):
+    touch(tmp_path, *ALL, "novel_view/cam10/005.png")
+    with pytest.raises(DataError, match=r"camera cam10, frame 5 twice, as novel_view/cam10/005.png "
+                                        r"and novel_view/cam10/5.png"):  # fmt: skip
+        read(tmp_path)
+
+
+def test_files_that_nothing_asks_for_are_told(tmp_path):
+    extra = ("notes.txt", "novel_pose/cam1/000008.png", "novel_pose/cam1/0.png", "train/cam1/0.png")
+    assert read(touch(tmp_path, *ALL, *extra)).extra == tuple(sorted(extra))
+
+
+SIZE = (6, 8)  # H, W
+
+
+def frame() -> Frame:
+    mask = torch.zeros(1, 1, *SIZE)
+    mask[..., 2:4, 2:5] = 1
+    eye = torch.eye(3)[None]
+    return Frame(
+        image=0.5 * mask.expand(1, 3, -1, -1),
+        mask=mask,
+        camera=Camera(eye, eye, torch.zeros(1, 3), SIZE),
+        skeleton=torch.zeros(1, 33, 3),
+        visibility=torch.ones(1, 33),
+        frame_id=torch.tensor([3]),
+        camera_index=torch.tensor([0]),
+    )
+
+
+def one(
+    tmp_path: Path, pixels: np.ndarray, name: str = "3.png", background: str = "black"
+) -> Folder:
+    assert cv2.imwrite(str(tmp_path / name), pixels)
+    return Folder(tmp_path, {("cam", 3): name}, (), background)
+
+
+def person(value: int = 128, behind: int = 0) -> np.ndarray:
+    pixels = np.full((*SIZE, 3), behind, np.uint8)
+    pixels[2:4, 2:5] = (10, 20, value)  # BGR
+    return pixels
+
+
+def test_pictures_are_rgb_and_their_alpha_is_taken(tmp_path):
+    found = one(tmp_path, person()).predict(frame(), ("cam", 3))
+    assert not found.alphas
+    assert (found.pictures["full"][0, :, 2, 2] * 255).tolist() == pytest.approx([128, 20, 10])
+    alpha = np.full((*SIZE, 1), 51, np.uint8)
+    found = one(tmp_path, np.concatenate([person(), alpha], -1)).predict(frame(), ("cam", 3))
+    assert found.alphas["full"].aminmax() == pytest.approx((0.2, 0.2))
+    assert float(found.pictures["full"][0, 0, 2, 2]) == pytest.approx(0.2 * 128 / 255)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "message"),
+    [
+        (person().astype(np.uint16) * 257, "16 bits|uint16"),
+        (person()[..., 0], "grey"),
+        (person()[:5], r"camera cam, frame 3\) is 8x5 pixels .* truth as scored is 8x6"),
+    ],
+)
+def test_pictures_of_another_kind_are_refused(tmp_path, pixels, message):
+    folder = one(tmp_path, pixels)
+    if pixels.ndim == 3:  # a grey one may be a palette: told when it is read
+        with pytest.raises(DataError, match=message):
+            check_headers(folder, ("cam", 3), SIZE)
+    with pytest.raises(DataError, match=message):
+        folder.predict(frame(), ("cam", 3))
+
+
+@pytest.mark.parametrize("kept", [0, 20, 60, -20])
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+def test_truncated_files_are_refused(tmp_path, kept, suffix):
+    name = f"3.{suffix}"
+    folder = one(tmp_path, np.random.default_rng(0).integers(0, 255, (*SIZE, 3), np.uint8), name)
+    path = tmp_path / name
+    path.write_bytes(path.read_bytes()[:kept])
+    with pytest.raises(DataError, match=name):
+        folder.predict(frame(), ("cam", 3))
+    path.unlink()
+    with pytest.raises(DataError, match=name):
+        folder.predict(frame(), ("cam", 3))
+
+
+def test_a_background_that_was_not_said_is_noticed(tmp_path):
+    with pytest.raises(DataError, match=r"painted on white, expected: black; .*=white"):
+        one(tmp_path, person(behind=255)).predict(frame(), ("cam", 3))
+    with pytest.raises(DataError, match=r"painted on black, expected: white"):
+        one(tmp_path, person(), background="white").predict(frame(), ("cam", 3))
+    one(tmp_path, person(behind=255), background="white").predict(frame(), ("cam", 3))
+    one(tmp_path, person(behind=90)).predict(frame(), ("cam", 3))  # bad, but not the other one

@@ -1,0 +1,81 @@
+"""What is written: every digit, and never scores of different ways in one table."""
+
+from __future__ import annotations
+
+import csv
+import math
+
+import pytest
+
+from gsgan.evaluate.files import HEADER, Scored, csv_text, joined, read_rows, write_scored
+from gsgan.evaluate.scores import METRICS, Row
+from gsgan.evaluate.split import no_scores
+
+
+def variant(protocol: str | None = None) -> dict:
+    return no_scores(METRICS, "none") | {
+        "images": 1,
+        "marks": [],
+        "lpips_name": None,
+        "cameras": {},
+        "protocol": protocol and {"name": protocol, "source": "", "departures": []},
+    }
+
+
+def scored(
+    split: str, seed: int = 0, protocol: str | None = None, commit: str | None = None
+) -> Scored:
+    facts = {
+        "method": "m", "model": None, "protocol": protocol, "seed": seed, "iterations": 5,
+        "data": {"name": "d", "root": "r", "fingerprint": "f"}, "commit": commit, "dirty": None,
+        "version": "1",
+    }  # fmt: skip
+    row = Row("cam", 3, {"psnr": 1 / 3, "ssim": math.inf, "miou": math.nan})
+    return Scored({split: {"full": variant(protocol)}}, {split: {"full": [row]}}, facts)
+
+
+def test_the_csv_keeps_every_digit(tmp_path):
+    path = tmp_path / "scores.csv"
+    path.write_text(csv_text(scored("novel_pose").rows))
+    with path.open() as stream:
+        (line,) = csv.DictReader(stream)
+    assert tuple(line) == HEADER
+    assert float(line["psnr"]) == 1 / 3
+    assert (line["ssim"], line["miou"], line["lpips"]) == ("inf", "", "")
+    assert (line["split"], line["camera"], line["frame"]) == ("novel_pose", "cam", "3")
+    row = read_rows(path)["novel_pose"]["full"][0]
+    assert row == Row("cam", 3, {"psnr": 1 / 3, "ssim": math.inf})
+
+
+def test_scoring_one_split_keeps_the_others(tmp_path):
+    write_scored(scored("novel_pose"), tmp_path, "t")
+    whole, dropped = joined(scored("novel_view"), tmp_path, ("novel_view", "novel_pose"))
+    assert list(whole.results) == list(whole.rows) == ["novel_view", "novel_pose"]
+    assert dropped == []
+
+
+@pytest.mark.parametrize("other", [{"seed": 1}, {"protocol": "zju"}, {"commit": "abc"}])
+def test_scores_of_another_way_are_not_mixed_in(tmp_path, other):
+    write_scored(scored("novel_pose", **other), tmp_path, "t")
+    whole, dropped = joined(scored("novel_view"), tmp_path, ("novel_view", "novel_pose"))
+    assert list(whole.results) == ["novel_view"]
+    assert dropped == ["novel_pose"]
+
+
+def test_damaged_earlier_scores_are_left_out(tmp_path):
+    write_scored(scored("novel_pose"), tmp_path, "t")
+    (tmp_path / "scores.csv").write_text("split,psnr\n")
+    whole, dropped = joined(scored("novel_view"), tmp_path, ("novel_view", "novel_pose"))
+    assert list(whole.results) == ["novel_view"]
+    assert dropped == ["novel_pose"]
+    (tmp_path / "metrics.json").write_text("{")
+    assert joined(scored("novel_view"), tmp_path, ("novel_view",))[1] == []
+    assert not list(tmp_path.glob(".*.part"))
+
+
+def test_nothing_that_json_does_not_have_is_written(tmp_path):
+    broken = scored("novel_pose")
+    broken.results["novel_pose"]["full"]["psnr"] = math.nan
+    with pytest.raises(ValueError, match="JSON"):
+        write_scored(broken, tmp_path, "t")
+    assert not (tmp_path / "metrics.json").exists()

@@ -1,0 +1,106 @@
+"""Tables: the floor, the marks and what was scored always show, None is n/a, JSON is strict."""
+
+from __future__ import annotations
+
+import json
+
+from rich.console import Console
+
+from gsgan.data.measures import Measures
+from gsgan.evaluate.files import Scored, write_scored
+from gsgan.evaluate.prepare import Stage
+from gsgan.evaluate.scores import METRICS
+from gsgan.evaluate.split import Scorer, empty_split
+from gsgan.evaluate.tables import IN_TERMINAL, markdown, notes, print_table, rows
+
+FACTS = {
+    "method": "gsgan", "model": "wo_seg", "protocol": "zju_gauhuman", "seed": 3,
+    "data": {"name": "zju_mocap", "root": "my_377", "fingerprint": "0123456789ab"},
+    "commit": "abc", "dirty": True,
+}  # fmt: skip
+
+
+def results(marks=("perceptual loss: stand-in",)):
+    scores = {
+        "psnr": 30.123, "psnr_person": 28.0, "high_frequencies": 0.9, "ssim": 0.98,
+        "ssim_person": 0.9, "lpips": None, "lpips_reason": "no weights", "lpips_name": None,
+        "lpips_person": None, "lpips_person_reason": "no weights", "edge_f1_person": 0.5,
+        "edge_ratio_person": 1.2, "edge_f1": 0.5, "edge_ratio": 1.25, "miou": 0.9,
+        "miou_with_background": 0.95,
+        "images": 3, "marks": list(marks),
+    }  # fmt: skip
+    scores["cameras"] = {"cam07": dict.fromkeys(METRICS) | {"psnr": 29.5}}
+    split = {"full": dict(scores), "splat": dict(scores), "floor": dict(scores)}
+    scorer = Scorer(Stage(Measures(), None), None, "no weights", "LPIPS", list(marks))
+    return {
+        "novel_view": empty_split("no camera is held out", scorer).variants,
+        "novel_pose": split,
+    }
+
+
+def test_every_table_shows_floor_mark_reason_and_what_was_scored():
+    console = Console(record=True, width=140)
+    print_table(results(), FACTS, console, "run")
+    for text in (console.export_text(), markdown(results(), FACTS, "run")):
+        assert "floor" in text
+        assert "marked: perceptual loss: stand-in" in text
+        assert "lpips n/a: no weights" in text
+        assert "novel_view: no camera is held out" in text
+        assert "30.12" in text
+        for said in ("protocol zju_gauhuman", "my_377, 0123456789ab", "seeds 1 (3)", "commit abc"):
+            assert said in text
+        assert "changed since" in text
+
+
+def test_every_row_of_the_written_table_carries_what_it_is_of():
+    lines = [x for x in markdown(results(), FACTS, "run").splitlines() if x.startswith("| novel_")]
+    assert len(lines) == 6 + 9  # by split, and with the cameras
+    for line in lines:
+        assert line.endswith(
+            "| zju_gauhuman | zju_mocap (my_377, 0123456789ab) | 1 (3) | abc, changed since |"
+        )
+
+
+def test_the_table_fits_a_hundred_columns():
+    console = Console(record=True, width=100)
+    print_table(results(), FACTS, console, "run", "camera")
+    text = console.export_text()
+    assert "…" not in text
+    assert text.count("mIoU") == 1
+
+
+def test_cameras_have_rows_where_asked_for():
+    split = list(rows(results(), IN_TERMINAL))
+    cameras = list(rows(results(), IN_TERMINAL, "camera"))
+    assert len(cameras) == len(split) + 3  # one camera in three variants
+    assert cameras[4][1:4] == ["  cam07", "", "29.50"]
+
+
+def test_metrics_json_has_the_promised_shape(tmp_path):
+    write_scored(Scored(results(), {}, FACTS), tmp_path, "run")
+    stored = json.loads((tmp_path / "metrics.json").read_text())
+    assert set(stored) == {"novel_view", "novel_pose"}
+    for split in stored.values():
+        assert {"full", "splat", "floor"} <= set(split)
+        for scores in split.values():
+            for metric in METRICS:
+                assert scores[metric] is not None or scores[f"{metric}_reason"]
+            for means in scores["cameras"].values():
+                assert set(means) == set(METRICS)
+    assert json.loads((tmp_path / "facts.json").read_text()) == FACTS
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_notes_say_each_thing_once():
+    said = notes(results())
+    assert len(said) == len(set(said)) == 3
+
+
+def test_a_caption_names_what_is_not_known():
+    from gsgan.evaluate.facts import caption
+
+    unknown = FACTS | {"model": None, "protocol": None, "seed": None, "commit": None, "dirty": None}
+    said = caption(unknown)
+    assert "protocol none" in said
+    assert "commit unknown" in said
+    assert said.startswith("gsgan · ")

@@ -1,0 +1,252 @@
+"""Means, reasons, cameras; regions of a protocol; mIoU against torchmetrics."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torchmetrics.classification import MulticlassJaccardIndex
+
+from gsgan.data.measures import Measures
+from gsgan.evaluate.prepare import Prediction, Stage
+from gsgan.evaluate.scores import Mean, PictureScores, SegmentationScores
+from gsgan.evaluate.split import FLOOR, FULL, SPLAT, Scorer, empty_split, painter, score_split
+from gsgan.metrics.image import psnr, ssim, ssim_uniform
+from gsgan.model.painting import Painting
+from gsgan.scene import Camera, Frame
+from gsgan.utils.errors import GsganError
+
+
+def frame(image: torch.Tensor, mask: torch.Tensor, labels: torch.Tensor | None = None) -> Frame:
+    size = tuple(image.shape[-2:])
+    eye = torch.eye(3)[None]
+    return Frame(
+        image=image,
+        mask=mask,
+        camera=Camera(eye, eye, torch.zeros(1, 3), size),
+        skeleton=torch.zeros(1, 33, 3),
+        visibility=torch.ones(1, 33),
+        frame_id=torch.tensor([0]),
+        camera_index=torch.tensor([0]),
+        labels=labels,
+    )
+
+
+def person(size: int = 24) -> Frame:
+    """A grey person of 8 x 8 pixels on black, her last column half covered."""
+    mask = torch.zeros(1, 1, size, size)
+    mask[..., 8:16, 8:15], mask[..., 8:16, 15] = 1.0, 0.5
+    return frame(0.4 * mask.expand(1, 3, -1, -1), mask)
+
+
+def scorer(measures: Measures | None = None) -> Scorer:
+    return Scorer(Stage(measures or Measures(), None), None, "no weights", "LPIPS-VGG [-1,1]")
+
+
+def test_equal_pictures_are_kept_out_of_the_mean():
+    mean = Mean()
+    mean.update([math.inf, 30.0, 20.0, math.nan])
+    assert (mean.value, mean.count, mean.left_out) == (25.0, 2, 2)
+    assert Mean().value is None
+
+
+def test_picture_scores_name_a_reason_for_every_none():
+    scores = PictureScores(None, "no weights")
+    image = torch.zeros(1, 3, 16, 16)
+    scores.update(image, image)  # PSNR infinite, no edges
+    result = scores.compute()
+    assert result["psnr"] is None
+    assert result["psnr_left_out"] == 1
+    assert "finite" in result["psnr_reason"]
+    assert result["lpips_reason"] == "no weights"
+    assert result["ssim"] == pytest.approx(1.0)
+
+
+def test_means_by_camera_and_over_all():
+    scores, target = PictureScores(None, ""), torch.zeros(1, 3, 16, 16)
+    for error, place in ((0.1, ("a", 0)), (0.01, ("a", 1)), (0.001, ("b", 0))):
+        scores.update(target + error, target, places=[place])
+    assert scores.compute()["psnr"] == pytest.approx(40.0, abs=1e-3)
+    cameras = scores.by_camera()
+    assert [cameras[c]["psnr"] for c in "ab"] == pytest.approx([30.0, 60.0], abs=1e-3)
+
+
+def test_only_the_inside_of_the_box_counts_where_a_protocol_says_so():
+    generator = torch.Generator().manual_seed(0)
+    image, target = (torch.rand(1, 3, 24, 24, generator=generator) for _ in range(2))
+    box = torch.zeros(1, 1, 24, 24, dtype=torch.bool)
+    box[..., 4:14, 6:20] = True
+    scores = PictureScores(None, "", Measures(region="body_box"))
+    scores.update(image, target, box=box)
+    result, part = scores.compute(), (..., slice(4, 14), slice(6, 20))
+    assert result["psnr"] == pytest.approx(float(psnr(image[part], target[part])), abs=1e-5)
+    assert result["ssim"] == pytest.approx(float(ssim(image[part], target[part])), abs=1e-6)
+    scores.update(image, target, box=torch.zeros_like(box))  # not seen: counted, not averaged
+    assert scores.compute()["psnr_left_out"] == scores.compute()["ssim_left_out"] == 1
+    assert scores.compute()["psnr"] == result["psnr"]
+
+
+def test_the_window_of_ssim_is_the_protocols():
+    generator = torch.Generator().manual_seed(0)
+    image, target = (torch.rand(1, 3, 24, 24, generator=generator) for _ in range(2))
+    scores = PictureScores(None, "", Measures(ssim_window="uniform", ssim_range=2))
+    scores.update(image, target)
+    expected = float(ssim_uniform(image, target, value_range=2))
+    assert scores.compute()["ssim"] == pytest.approx(expected, abs=1e-9)
+    assert abs(expected - float(ssim(image, target, value_range=2))) > 1e-4
+
+
+def test_the_floor_of_a_split_is_the_background_and_its_psnr_is_known():
+    """Black: 8 * 7.25 pixels' worth of 0.4² of 576. White: 0.6² inside, 0.3² where half covered."""
+    f = person()
+    for background, power in (
+        ("black", 56 * 0.4**2 + 8 * 0.2**2),
+        ("white", 56 * 0.6**2 + 8 * 0.3**2),
+    ):
+        found = score_split(
+            [(("a", 0), f)],
+            lambda f, _: Prediction({FULL: f.image}, {FULL: f.mask}),
+            scorer(Measures(background=background)),
+        )
+        assert found.variants[FLOOR]["psnr"] == pytest.approx(
+            -10 * math.log10(power / 576), abs=1e-4
+        )
+        assert found.variants[FULL]["psnr"] is None  # equal: its own alpha puts it on white too
+        assert found.rows[FULL][0].scores["psnr"] == math.inf
+        assert not found.hidden_outline
+
+
+def test_an_opaque_picture_on_black_hides_its_outline_on_white_and_says_so():
+    f = person()
+    fat = f.image.clone()
+    fat[..., 0:4, 0:4] = 0.9  # painted outside the truth's mask
+
+    def predict(f: Frame, _: object) -> Prediction:
+        return Prediction({FULL: fat}, {}, "black")
+
+    white = score_split([(("a", 0), f)], predict, scorer(Measures(background="white")))
+    assert white.hidden_outline
+    assert white.rows[FULL][0].scores["psnr"] > 100
+    black = score_split([(("a", 0), f)], predict, scorer())
+    assert not black.hidden_outline
+    assert black.variants[FULL]["psnr"] == pytest.approx(
+        -10 * math.log10(16 * 0.81 / 576), abs=1e-4
+    )
+
+
+def test_each_picture_of_an_avatar_is_put_on_white_by_its_own_alpha():
+    """I_pred is the truth; Step I's colour is it at half the alpha: 0.3 off, 0.15 at the edge."""
+    f = person()
+    painting = Painting(f.image, f.mask, features=0.5 * f.image, splat_alpha=0.5 * f.mask)
+    avatar = SimpleNamespace(paint=lambda _: painting, segmentation=None)
+    white = scorer(Measures(background="white"))
+    found = score_split([(("a", 0), f)], painter(avatar), white)
+    assert found.rows[FULL][0].scores["psnr"] == math.inf
+    assert found.variants[SPLAT]["psnr"] == pytest.approx(
+        -10 * math.log10((56 * 0.3**2 + 8 * 0.15**2) / 576), abs=1e-4
+    )
+    assert not found.hidden_outline
+
+
+def test_one_variant_without_alpha_takes_the_truths_mask_and_says_so():
+    f = person()
+
+    def predict(f: Frame, _: object) -> Prediction:
+        return Prediction({FULL: 0.5 * f.image, SPLAT: f.image}, {FULL: 0.5 * f.mask})
+
+    found = score_split([(("a", 0), f)], predict, scorer(Measures(background="white")))
+    assert found.hidden_outline
+    assert found.rows[SPLAT][0].scores["psnr"] > 100
+    assert found.rows[FULL][0].scores["psnr"] < 30
+    assert not score_split([(("a", 0), f)], predict, scorer()).hidden_outline
+
+
+def test_a_picture_that_is_not_finite_is_an_error_that_names_it():
+    f = person()
+    broken = f.image.clone()
+    broken[0, 0, 3, 3] = torch.nan
+    with pytest.raises(GsganError, match=r"camera a, frame 0: 1 values .* not finite"):
+        score_split([(("a", 0), f)], lambda f, _: Prediction({FULL: broken}, {}), scorer())
+
+
+def test_every_split_has_every_metric_or_a_reason():
+    f = person()
+    found = score_split([(("a", 0), f)], lambda f, _: Prediction({FULL: f.image}, {}), scorer())
+    for values in (
+        *found.variants.values(),
+        *empty_split("none held out", scorer()).variants.values(),
+    ):
+        for metric in (
+            "psnr",
+            "ssim_person",
+            "lpips",
+            "lpips_person",
+            "edge_ratio",
+            "edge_f1_person",
+            "miou",
+            "miou_with_background",
+        ):
+            assert values[metric] is not None or values[f"{metric}_reason"]
+        assert values["lpips_name"] is None
+
+
+def segmentation(predicted: torch.Tensor, classes: int) -> torch.Tensor:
+    return torch.nn.functional.one_hot(predicted, classes).float().permute(0, 3, 1, 2)
+
+
+def test_miou_counts_classes_of_the_truth_only():
+    """Class 1 half right, class 2 absent from the truth but predicted once, 255 ignored."""
+    labels = torch.tensor([[[0, 0, 1, 1, 255]]])
+    scores = SegmentationScores(3)
+    scores.update(segmentation(torch.tensor([[[0, 2, 1, 0, 1]]]), 3), labels)
+    result = scores.compute()
+    assert result["miou"] == pytest.approx(1 / 2)  # class 1: 1 of {2 true, 1 predicted}
+    assert result["miou_with_background"] == pytest.approx((1 / 3 + 1 / 2) / 2)
+
+
+def test_miou_is_torchmetrics_jaccard_index_over_the_split():
+    generator = torch.Generator().manual_seed(0)
+    predicted, labels = (torch.randint(0, 4, (3, 9, 9), generator=generator) for _ in range(2))
+    labels[:, 0] = 255
+    scores = SegmentationScores(4)
+    own = scores.update(segmentation(predicted, 4), labels, [("a", 0), ("b", 0), ("b", 1)])
+    each = MulticlassJaccardIndex(4, average=None, ignore_index=255)
+    expected = each(predicted, labels)
+    assert scores.compute()["miou"] == pytest.approx(float(expected[1:].mean()), abs=1e-6)
+    assert scores.compute()["miou_with_background"] == pytest.approx(
+        float(expected.mean()), abs=1e-6
+    )
+    first = MulticlassJaccardIndex(4, average=None, ignore_index=255)(predicted[:1], labels[:1])
+    assert own[0]["miou"] == scores.by_camera()["a"]["miou"]
+    assert own[0]["miou"] == pytest.approx(float(first[1:].mean()), abs=1e-6)
+
+
+def test_miou_of_a_split_without_parts_is_none():
+    scores = SegmentationScores(3)
+    scores.update(
+        segmentation(torch.zeros(1, 1, 2, dtype=torch.long), 3), torch.zeros(1, 1, 2).long()
+    )
+    assert scores.compute()["miou"] is None
+    assert scores.compute()["miou_reason"]
+
+
+def test_lpips_in_the_persons_box_sees_that_box_alone():
+    seen = []
+
+    def spy(image: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
+        seen.append(tuple(image.shape))
+        return (image - target).abs().flatten(1).mean(dim=1)
+
+    scores = PictureScores(spy, "")
+    target, mask = torch.zeros(2, 3, 100, 120), torch.zeros(2, 1, 100, 120)
+    mask[0, :, 10:90, 20:50] = 1  # the second picture shows nobody
+    image = target.clone()
+    image[:, :, :, 90:] = 1.0  # wrong, but far from the person
+    scores.update(image, target, mask)
+    assert seen == [(2, 3, 100, 120), (1, 3, 80, 64)]  # 30 columns, widened to 64
+    result = scores.compute()
+    assert result["lpips"] == pytest.approx(0.25)
+    assert result["lpips_person"] == 0.0
+    assert result["lpips_person_left_out"] == 1

@@ -1,0 +1,83 @@
+"""What a protocol does to pictures, on real frames: the body's box, clearing, 8 bits."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+from gsgan.data.datamodule import GsganData
+from gsgan.data.measures import Measures
+from gsgan.evaluate.prepare import JOINT_MARGIN, VERTEX_MARGIN, BodyBoxes, Prediction, Stage
+from gsgan.evaluate.split import FULL
+from gsgan.metrics.body_box import box_corners, box_mask
+
+
+@pytest.fixture(scope="module")
+def data(capture) -> GsganData:
+    return GsganData(str(capture))
+
+
+def test_the_box_is_round_the_posed_vertices_where_there_is_a_mesh(data):
+    from gsgan.body import free_body
+
+    boxes, frame = BodyBoxes(data), data.dataset("train")[1]
+    assert boxes.departures == []
+    vertices = free_body().posed_vertices(frame.body)[0]
+    assert torch.equal(boxes.corners(frame, 0), box_corners(vertices, VERTEX_MARGIN))
+    assert torch.equal(boxes.masks(frame)[0], box_mask(boxes.corners(frame, 0), frame.camera))
+
+
+def test_else_it_is_round_the_seen_joints_with_a_larger_margin_and_says_so(data):
+    boxes, frame = BodyBoxes(data), data.dataset("train")[1]
+    boxes.body = None
+    assert "20 cm round the joints, asked for: 5 cm round the vertices" in boxes.departures[0]
+    seen = torch.ones_like(frame.visibility)
+    seen[0, 0] = 0
+    away = frame.skeleton.clone()
+    away[0, 0] = 100.0  # a stand-in of a joint that was not seen
+    frame = dataclasses.replace(frame, skeleton=away, visibility=seen)
+    assert torch.equal(boxes.corners(frame, 0), box_corners(away[0, 1:], JOINT_MARGIN))
+    mask = boxes.masks(frame)
+    assert 0.01 < float(mask.float().mean()) < 0.9
+    assert bool(mask[frame.mask > 0.5].float().mean() > 0.99)
+
+
+@pytest.mark.parametrize("background", ["black", "white"])
+def test_what_is_painted_outside_the_box_is_cleared_and_only_there(data, background):
+    stage = Stage(Measures(region="body_box_cleared", background=background), BodyBoxes(data))
+    frame = data.dataset("train")[0]
+    box = stage.box(frame)
+    picture = stage.picture(Prediction({FULL: torch.full_like(frame.image, 0.3)}, {}, background),
+                            FULL, frame, box)  # fmt: skip
+    inside = box.expand_as(picture)
+    assert bool((picture[inside] == 0.3).all())
+    assert bool((picture[~inside] == stage.background).all())
+    assert float(stage.truth(frame)[0, 0, 0, 0]) == stage.background
+
+
+def test_boxes_that_nothing_asks_for_are_not_made(data):
+    frame = data.dataset("train")[0]
+    assert Stage(Measures(), None).box(frame) is None
+
+
+def test_the_truth_is_outlined_as_the_protocol_says(data):
+    frame = GsganData(str(data.layout.root), size=20).dataset("train")[0]
+    edge = (frame.mask > 0.05) & (frame.mask < 0.95)
+    assert bool(edge.any())  # the outline of this data is soft
+    hard = Stage(Measures(truth_outline="hard", background="white"), None).truth(frame)
+    outside = (frame.mask < 0.5).expand_as(hard)
+    assert bool((hard[outside] == 1).all())
+    taken = (frame.image / frame.mask.clamp_min(1e-6)).clamp(0, 1)
+    assert torch.allclose(hard[~outside], taken[~outside], atol=1e-6)
+
+
+def test_values_are_clamped_before_8_bits(data):
+    frame = data.dataset("train")[0]
+    stage = Stage(Measures(eight_bits="cut"), None)
+    wild = torch.full_like(frame.image, 1.7)
+    wild[..., 0] = -3.0
+    wild[..., 1] = 0.5
+    picture = stage.picture(Prediction({FULL: wild}, {}), FULL, frame, None)
+    assert torch.equal(picture[0, 0, 0, :3] * 255, torch.tensor([0.0, 127.0, 255.0]))

@@ -1,0 +1,164 @@
+"""Rigs, motions and files for the tests of `gsgan.prepare`: everything about them is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+from make import distorted_pixels, ring_camera, skeletons, write_tiny_capture
+
+from gsgan.data.cameras import CameraEntry, make_camera
+from gsgan.prepare.rig import Rig
+
+ANGLES = (0.0, 1.3, 2.7, 4.2)
+LENS = (-0.05, 0.14, 0.0006, -0.0007, 0.01)
+
+
+def ring(angles: Sequence[float] = ANGLES, size=(1080, 1920), dist=(0,) * 5) -> list[CameraEntry]:
+    """Cameras round the person, metres, pixel centres at +0.5; ``size`` is (w, h)."""
+    cameras = []
+    for i, angle in enumerate(angles):
+        raw = ring_camera(angle, size)
+        values = {key: raw[key] for key in ("K", "R", "t")}
+        entry = make_camera("ring", f"cam{i}", **values, dist=dist, size=size[::-1])
+        cameras.append(entry)
+    return cameras
+
+
+def seen(
+    cameras: Sequence[CameraEntry], frames: int = 12, noise: float = 0.0, seed: int = 0
+) -> tuple[Rig, np.ndarray, np.ndarray, np.ndarray]:
+    """A rig, the true ``p [F, 33, 3]``, what it sees ``uv [C, F, 33, 2]``, and confidence 1."""
+    rig, p = Rig.of(cameras), skeletons(frames)
+    uv = rig.project(p.reshape(-1, 3))[0].reshape(len(rig), frames, 33, 2)
+    uv = uv + noise * np.random.default_rng(seed).standard_normal(uv.shape)
+    return rig, p, uv, np.ones(uv.shape[:3])
+
+
+def turned(rig: Rig, camera: int, degrees: float, metres: float) -> Rig:
+    """The rig with one camera turned about its vertical axis and moved sideways."""
+    turn = cv2.Rodrigues(np.radians([0.0, degrees, 0.0]))[0]
+    R, t = rig.R.copy(), rig.t.copy()
+    R[camera], t[camera] = turn @ R[camera], turn @ t[camera] + [metres, 0, 0]
+    return Rig(rig.K, R, t)
+
+
+# ------------------------------------------------ calibration files, as other tools write them
+
+
+def _matrix(name: str, value: np.ndarray) -> str:
+    value = np.atleast_2d(value)
+    data = ", ".join(repr(float(v)) for v in value.ravel())
+    return (
+        f"{name}: !!opencv-matrix\n   rows: {value.shape[0]}\n   cols: {value.shape[1]}\n"
+        f"   dt: d\n   data: [ {data} ]\n"
+    )
+
+
+def centred_at_zero(camera: CameraEntry) -> np.ndarray:
+    """K as OpenCV counts: from the centre of the first pixel."""
+    K = camera.K.copy()
+    K[:2, 2] -= 0.5
+    return K
+
+
+def write_easymocap(folder: Path, cameras: Sequence[CameraEntry], sizes: bool = True) -> Path:
+    """intri.yml and extri.yml, the second in another order and with a "none" among the names."""
+    head = "%YAML:1.0\n---\nnames:\n"
+    intri = head + "".join(f'   - "{c.name}"\n' for c in cameras) + '   - "none"\n'
+    for c in cameras:
+        intri += _matrix(f"K_{c.name}", centred_at_zero(c))
+        intri += _matrix(f"dist_{c.name}", c.dist[None, :5])
+        intri += f"H_{c.name}: {c.size[0]}\nW_{c.name}: {c.size[1]}\n" if sizes else ""
+    extri = head + "".join(f'   - "{c.name}"\n' for c in reversed(cameras))
+    for c in reversed(cameras):
+        extri += _matrix(f"R_{c.name}", cv2.Rodrigues(c.R)[0]) + _matrix(f"Rot_{c.name}", c.R)
+        extri += _matrix(f"T_{c.name}", c.t[:, None])
+    (folder / "intri.yml").write_text(intri)
+    (folder / "extri.yml").write_text(extri)
+    return folder / "intri.yml"
+
+
+def write_toml(
+    path: Path, cameras: Sequence[CameraEntry], unit: float = 1.0, lens: int = 4
+) -> Path:
+    """Pose2Sim's TOML (``lens`` 4) or aniposelib's (5, and no ``fisheye``); ``unit`` per metre."""
+    text = ""
+    for i, c in enumerate(cameras):
+        K = centred_at_zero(c).tolist()
+        text += f"[cam_{i:02d}]\nname = {json.dumps(c.name)}\n"
+        text += f"size = [{float(c.size[1])}, {float(c.size[0])}]\nmatrix = {K}\n"
+        text += f"distortions = {c.dist[:lens].tolist()}\n"
+        text += f"rotation = {cv2.Rodrigues(c.R)[0].ravel().tolist()}\n"
+        text += f"translation = {(c.t * unit).tolist()}\n" + ("fisheye = false\n" * (lens == 4))
+    path.write_text(text + "[metadata]\nadjusted = false\nerror = 0.0\n")
+    return path
+
+
+def write_qca(path: Path, cameras: Sequence[CameraEntry], left: int = 0) -> Path:
+    """Qualisys XML: 1/64 pixel, millimetres, camera axes up and backwards."""
+    text = "<?xml version='1.0' encoding='ASCII'?>\n<calibration><cameras>\n"
+    for c in cameras:
+        r, C = np.diag([1, -1, -1]) @ c.R, 1000 * c.centre
+        rows = " ".join(f'r{i + 1}{j + 1}="{float(r[i, j])!r}"' for i in range(3) for j in range(3))
+        h, w = c.size
+        K = centred_at_zero(c)
+        f_u, f_v = (64 * float(K[i, i]) for i in (0, 1))
+        c_u, c_v = 64 * (float(K[0, 2]) + left), 64 * float(K[1, 2])
+        k1, k2, p1, p2, k3 = (float(v) for v in c.dist[:5])
+        text += (
+            f'<camera active="1" serial="{c.name}" model="Miqus Video" viewrotation="0">'
+            f'<fov_video left="{left}" top="0" right="{left + w - 1}" bottom="{h - 1}"/>'
+            f'<transform {rows} x="{float(C[0])!r}" y="{float(C[1])!r}" z="{float(C[2])!r}"/>'
+            f'<intrinsic focalLengthU="{f_u}" focalLengthV="{f_v}" '
+            f'centerPointU="{c_u}" centerPointV="{c_v}" '
+            f'skew="0" radialDistortion1="{k1}" radialDistortion2="{k2}" '
+            f'radialDistortion3="{k3}" tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/>'
+            "</camera>\n"
+        )
+    marker = '<camera active="1" serial="77" model="Miqus M3" viewrotation="0"/>'
+    path.write_text(text + marker + "</cameras></calibration>\n")
+    return path
+
+
+def write_own(path: Path, cameras: Sequence[CameraEntry]) -> Path:
+    """cameras.json of the bring-your-own layout."""
+    content = {
+        c.name: {
+            "K": c.K.tolist(),
+            "R": c.R.tolist(),
+            "t": c.t.tolist(),
+            "dist": c.dist[:5].tolist(),
+            "size": [c.size[1], c.size[0]],
+        }
+        for c in cameras
+    }
+    path.write_text(json.dumps(content))
+    return path
+
+
+def write_project(
+    root: Path, cameras: int = 3, frames: int = 6, size: tuple[int, int] = (96, 80)
+) -> Path:
+    """A folder with videos, calibration, 2D landmarks (pose/) and masks of a known person."""
+    write_tiny_capture(
+        root, cameras=cameras, frames=frames, size=size, dist=[-0.1, 0.05, 0.001, -0.001, 0.0]
+    )
+    truth, rig = skeletons(frames), json.loads((root / "cameras.json").read_text())
+    (root / "videos").mkdir()
+    (root / "pose").mkdir()
+    for name, camera in rig.items():
+        video = cv2.VideoWriter(
+            str(root / "videos" / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30, size
+        )
+        for path in sorted((root / "images" / name).iterdir()):
+            video.write(cv2.imread(str(path)))
+        video.release()
+        px = np.stack([distorted_pixels(camera, p) for p in truth])
+        conf, ids = np.ones(px.shape[:2]), np.arange(frames)
+        np.savez(root / "pose" / f"{name}.npz", px=px, conf=conf, frame_id=ids)
+    (root / "landmarks3d.npz").unlink()
+    return root

@@ -1,0 +1,129 @@
+"""Calibration files: what one tool wrote is read back as the cameras it meant."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from capture_scenes import (
+    LENS,
+    ring,
+    write_easymocap,
+    write_own,
+    write_qca,
+    write_toml,
+)
+
+from gsgan.data.calibration import find_calibration, read_calibration
+from gsgan.utils.errors import DataError
+
+
+def equal(found, wanted, lens: int = 5) -> None:
+    assert list(found) == [c.name for c in wanted]
+    for camera in wanted:
+        read = found[camera.name]
+        assert read.size == camera.size
+        np.testing.assert_allclose(read.K, camera.K, atol=1e-9)
+        np.testing.assert_allclose(read.R, camera.R, atol=1e-9)
+        np.testing.assert_allclose(read.t, camera.t, atol=1e-9)
+        np.testing.assert_allclose(read.dist[:lens], camera.dist[:lens], atol=1e-12)
+
+
+def test_easymocap_pairs_by_name_though_the_orders_differ(tmp_path: Path):
+    cameras = ring(dist=LENS)
+    calibration = read_calibration(write_easymocap(tmp_path, cameras))
+    assert calibration.format == "OpenCV YAML"
+    equal(calibration.cameras, cameras)
+
+
+def test_easymocap_starts_from_either_file_and_takes_the_size_from_pictures(tmp_path: Path):
+    write_easymocap(tmp_path, ring(), sizes=False)
+    found = read_calibration(tmp_path / "extri.yml").cameras
+    assert [c.size for c in found.values()] == [(0, 0)] * 4
+
+
+def test_easymocap_refuses_two_rotations_for_one_camera(tmp_path: Path):
+    write_easymocap(tmp_path, ring())
+    text = (tmp_path / "extri.yml").read_text()
+    other = re.sub(r"(Rot_cam2:.*?data: \[ )[^,]+", r"\g<1>0.125", text, flags=re.S)
+    (tmp_path / "extri.yml").write_text(other)
+    with pytest.raises(DataError, match=r"cam2.*different rotations"):
+        read_calibration(tmp_path / "intri.yml")
+
+
+def test_easymocap_camera_without_its_other_half(tmp_path: Path):
+    write_easymocap(tmp_path, ring())
+    text = (tmp_path / "extri.yml").read_text().replace("T_cam1", "T_camX")
+    (tmp_path / "extri.yml").write_text(text)
+    with pytest.raises(DataError, match=r"extri\.yml lacks .*cam1"):
+        read_calibration(tmp_path / "intri.yml")
+    (tmp_path / "extri.yml").unlink()
+    with pytest.raises(DataError, match=r"extri\.yml does not exist"):
+        read_calibration(tmp_path / "intri.yml")
+
+
+def test_pose2sim_toml(tmp_path: Path):
+    cameras = ring(dist=(*LENS[:4], 0))
+    equal(read_calibration(write_toml(tmp_path / "Calib.toml", cameras)).cameras, cameras)
+
+
+def test_aniposelib_toml_in_millimetres(tmp_path: Path):
+    cameras = ring(dist=LENS)
+    path = write_toml(tmp_path / "calibration.toml", cameras, unit=1000, lens=5)
+    equal(read_calibration(path, unit_scale=1e-3).cameras, cameras)
+
+
+def test_fisheye_is_refused(tmp_path: Path):
+    path = write_toml(tmp_path / "Calib.toml", ring())
+    path.write_text(path.read_text().replace("fisheye = false", "fisheye = true", 1))
+    with pytest.raises(DataError, match=r"cam_00.*fisheye"):
+        read_calibration(path)
+
+
+@pytest.mark.parametrize("left", [0, 16])
+def test_qualisys_units_axes_and_window(tmp_path: Path, left: int):
+    cameras = ring(dist=LENS)
+    calibration = read_calibration(write_qca(tmp_path / "rig.qca.txt", cameras, left))
+    equal(calibration.cameras, cameras)
+    assert any("77" in note for note in calibration.notes)  # the marker camera is left out
+
+
+def test_own_json_says_its_unit_itself(tmp_path: Path):
+    cameras = ring(dist=LENS)
+    equal(read_calibration(write_own(tmp_path / "cameras.json", cameras)).cameras, cameras)
+    (tmp_path / "meta.json").write_text('{"unit": "mm"}')
+    found = read_calibration(tmp_path / "cameras.json").cameras
+    np.testing.assert_allclose(found["cam1"].t, cameras[1].t / 1000)
+
+
+def test_pixel_centre_is_a_setting(tmp_path: Path):
+    path = write_toml(tmp_path / "Calib.toml", ring())
+    half, zero = read_calibration(path, pixel_centre=0.5), read_calibration(path)
+    shift = zero.cameras["cam0"].K - half.cameras["cam0"].K
+    np.testing.assert_allclose(shift, [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    "content", ["", "hello", "%YAML:1.0\n---\nx: [", "<calibration><camera", "[a]\nmatrix = ["]
+)
+def test_damaged_files_are_told_in_one_sentence(tmp_path: Path, content: str):
+    path = tmp_path / "intri.yml"
+    path.write_text(content)
+    (tmp_path / "extri.yml").write_text(content)
+    with pytest.raises(DataError, match=r"intri\.yml") as failure:
+        read_calibration(path)
+    assert "\n" not in str(failure.value)
+
+
+def test_finds_the_one_calibration_of_a_project(tmp_path: Path):
+    with pytest.raises(DataError, match="holds no calibration"):
+        find_calibration(tmp_path)
+    (tmp_path / "Config.toml").write_text("[project]\nframe_rate = 60\n")
+    (tmp_path / "calibration").mkdir()
+    path = write_toml(tmp_path / "calibration" / "Calib.toml", ring())
+    assert find_calibration(tmp_path) == path
+    write_easymocap(tmp_path, ring())
+    with pytest.raises(DataError, match=r"more than one.*Calib\.toml"):
+        find_calibration(tmp_path)

@@ -1,0 +1,134 @@
+"""A process that is really killed (SIGKILL), at any stage: the next run makes the same dataset."""
+
+from __future__ import annotations
+
+import io
+import os
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import pytest
+from capture_scenes import write_project
+from rich.console import Console
+
+from gsgan.data.layout import Layout
+from gsgan.prepare.inputs import in_parallel
+from gsgan.prepare.options import Options
+from gsgan.prepare.progress import Bars
+from gsgan.prepare.run import prepare
+
+LIMIT = 120  # seconds after which the child is taken to hang
+pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork, no child to kill")
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_project(tmp_path_factory.mktemp("killed") / "project", 3, 4, (64, 48))
+
+
+def options(project: Path, out: Path, **more) -> Options:
+    given = {"landmarks": str(project / "pose"), "masks": str(project / "masks"), "workers": 1}
+    return Options(source=str(project), out=str(out), **(given | more))
+
+
+def quiet() -> Console:
+    return Console(file=io.StringIO())
+
+
+def killed(run: Callable[[], object], stop: Callable[[Path, int], bool]) -> bool:
+    """Whether a child that runs this was killed, at the first file for which ``stop`` says so.
+
+    It dies as the file, written under another name, is to take its place; ``stop`` gets that place
+    and how many files came before.
+    """
+    child = os.fork()
+    if child == 0:
+        signal.alarm(LIMIT)
+        cv2.setNumThreads(0)
+        replace, before = os.replace, list[Path]()
+
+        def dying(source, target) -> None:
+            if stop(Path(target), len(before)):
+                os.kill(os.getpid(), signal.SIGKILL)
+            before.append(Path(target))
+            replace(source, target)
+
+        os.replace = dying
+        try:
+            run()
+        finally:
+            os._exit(3)  # it came to its end, or broke
+    _, status = os.waitpid(child, 0)
+    return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
+
+
+def pictures(out: Path) -> dict[str, bytes]:
+    paths = sorted((out / "images").rglob("*")) + sorted((out / "masks").rglob("*"))
+    return {str(p.relative_to(out)): p.read_bytes() for p in paths if p.is_file()}
+
+
+STAGES: dict[str, Callable[[Path, int], bool]] = {
+    "solving": lambda place, _: place.name.startswith("solution-"),
+    "the first picture": lambda place, _: "images" in place.parts,
+    "a mask, its picture written": lambda place, n: "masks" in place.parts and n > 8,
+    "the landmarks": lambda place, _: place.name == "landmarks3d.npz",
+    "the report": lambda place, _: place.name == "report.html",
+    "the whole dataset": lambda place, _: place.name == "out",
+}
+
+
+@pytest.fixture(scope="module")
+def whole(project: Path) -> dict[str, bytes]:
+    """The pictures of a run that nothing disturbed."""
+    return pictures(prepare(options(project, project.parent / "undisturbed"), quiet()))
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_killed_process_leaves_nothing_half_and_is_taken_up(
+    project: Path, whole: dict[str, bytes], tmp_path: Path, stage: str
+) -> None:
+    out = tmp_path / "out"
+    given = options(project, out)
+    assert killed(lambda: prepare(given, quiet()), STAGES[stage])
+    assert not out.exists()
+    assert prepare(given, quiet()) == out
+    assert pictures(out) == whole
+    assert [p for p in out.rglob("*") if p.name.endswith(".part")] == []
+    assert len(Layout.read(out).frames) == 4
+
+
+def test_an_earlier_dataset_outlives_a_kill(
+    project: Path, whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    prepare(options(project, out, frames="0-2"), quiet())
+    again = options(project, out, overwrite=True)
+    assert killed(lambda: prepare(again, quiet()), STAGES["the report"])
+    assert len(Layout.read(out).frames) == 3  # the earlier one is still there
+    assert killed(lambda: prepare(again, quiet()), lambda place, _: place == out)
+    assert len(Layout.read(tmp_path / ".out.old").frames) == 3  # moved aside, not lost
+    prepare(again, quiet())
+    assert pictures(out) == whole
+    assert not (tmp_path / ".out.old").exists()
+
+
+def test_one_failure_or_an_interrupt_stops_the_other_cameras_at_their_next_picture() -> None:
+    steps: list[int] = []
+    with Bars("working", ["a", "b", "c"]) as bars:
+
+        def work(index: int) -> None:
+            if index == 0:
+                while not steps:
+                    time.sleep(0.001)
+                raise KeyboardInterrupt
+            for step in range(10**6):
+                bars.advance("b")
+                steps.append(step)
+                time.sleep(0.001)
+
+        with pytest.raises(KeyboardInterrupt):
+            in_parallel(work, range(3), 2, bars.stop)
+    assert 0 < len(steps) < 10**4

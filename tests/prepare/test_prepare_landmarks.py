@@ -1,0 +1,125 @@
+"""2D landmarks from files of several detectors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsgan.data.joints import BODY, HAND, LEFT, RIGHT, SETS, hand_names
+from gsgan.prepare.landmarks import find_landmarks, gather, read_detections
+from gsgan.skeleton.template import MEDIAPIPE33
+from gsgan.utils.errors import DataError
+
+
+def triples(count: int, first: float = 0.0) -> list[float]:
+    return [v for j in range(count) for v in (first + 10 * j, first + 10 * j + 1, 0.9)]
+
+
+def write_people(folder: Path, frame: int, *people: dict) -> None:
+    folder.mkdir(exist_ok=True)
+    (folder / f"cam_{frame:012d}_keypoints.json").write_text(json.dumps({"people": people}))
+
+
+def test_openpose_body_25_keeps_the_persons_sides(tmp_path: Path):
+    write_people(tmp_path / "a_json", 7, {"pose_keypoints_2d": triples(25)})
+    found = read_detections(tmp_path / "a_json")
+    assert found.frame_id.tolist() == [7]
+    left_wrist, right_heel = 15, 30
+    np.testing.assert_allclose(found.px[0, left_wrist], [70.5, 71.5])  # OpenPose's 7, + 0.5
+    np.testing.assert_allclose(found.px[0, right_heel], [240.5, 241.5])
+    assert found.conf[0, 1] == 0  # the inner eye: OpenPose does not know it
+    assert np.isnan(found.px[0, 1]).all()
+
+
+@pytest.mark.parametrize("count", SETS)
+def test_every_set_maps_left_to_left(count: int):
+    mapping = SETS[count][1]
+    assert len(set(mapping.values())) == len(mapping)
+    for j, twin in enumerate(MEDIAPIPE33.mirror):
+        assert (j in mapping) == (twin in mapping)
+    assert {11, 12, 23, 24} <= set(mapping)
+
+
+def test_hands_of_openpose_stand_in_for_the_bodys_hand_joints(tmp_path: Path):
+    person = {"pose_keypoints_2d": triples(25), "hand_left_keypoints_2d": triples(21, 1000)}
+    write_people(tmp_path / "a", 0, person)
+    found = read_detections(tmp_path / "a")
+    np.testing.assert_allclose(found.px[0, LEFT][5], [1050.5, 1051.5])
+    np.testing.assert_allclose(found.px[0, 19], [1050.5, 1051.5])  # left index
+    assert (found.conf[0, RIGHT] == 0).all()
+
+
+def test_zero_confidence_is_missing_and_the_best_seen_person_is_taken(tmp_path: Path):
+    faint = {"pose_keypoints_2d": [5.0, 5.0, 0.1] * 17}
+    clear = {"pose_keypoints_2d": [8.0, 8.0, 0.9] * 16 + [0, 0, 0]}
+    write_people(tmp_path / "a", 0, faint, clear)
+    write_people(tmp_path / "a", 1)
+    found = read_detections(tmp_path / "a")
+    assert found.people.tolist() == [2, 0]
+    np.testing.assert_allclose(found.px[0, 11], [8.5, 8.5])
+    assert np.isnan(found.px[0, 28]).all()  # the right ankle, written as zeros
+    assert (found.conf[1] == 0).all()
+
+
+def test_easymocap_rows(tmp_path: Path):
+    (tmp_path / "a").mkdir()
+    person = {"keypoints": np.reshape(triples(25), (25, 3)).tolist(), "personID": 0}
+    (tmp_path / "a" / "000003.json").write_text(json.dumps({"height": 1, "annots": [person]}))
+    found = read_detections(tmp_path / "a")
+    np.testing.assert_allclose(found.px[0, 0], [0.5, 1.5])
+
+
+def test_npz_of_the_tool(tmp_path: Path):
+    px = np.full((2, BODY, 2), 4.0)
+    px[0, 3] = np.nan
+    hand = np.full((2, HAND, 2), np.nan)
+    hand[1] = 9
+    conf, ids = np.full((2, BODY), 0.7), np.array([5, 2])
+    np.savez(tmp_path / "a.npz", px=px, conf=conf, right=hand, frame_id=ids)
+    found = read_detections(tmp_path / "a.npz")
+    assert found.frame_id.tolist() == [2, 5]  # sorted
+    assert found.conf[1, 3] == 0
+    assert (found.conf[0, RIGHT] == 1).all()
+    assert (found.conf[1, RIGHT] == 0).all()
+    assert len(hand_names()) == 2 * HAND
+
+
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        ("[]", "JSON object"),
+        ('{"x": 1}', "neither 'people'"),
+        ('{"people": [3]}', "must be an object"),
+        ('{"people": [{"pose_keypoints_2d": [1, 2]}]}', "x, y, confidence"),
+        ('{"people": [{"pose_keypoints_2d": ["a", 1, 1]}]}', "x, y, confidence"),
+        ('{"people": [{"pose_keypoints_2d": [1, 2, 0.5]}]}', "1 joints; known are 17"),
+    ],
+)
+def test_damaged_json_names_the_file(tmp_path: Path, content: str, what: str):
+    (tmp_path / "f_000001.json").write_text(content)
+    with pytest.raises(DataError, match=what) as failure:
+        read_detections(tmp_path)
+    assert "f_000001.json" in str(failure.value)
+
+
+def test_a_camera_without_landmarks_is_named(tmp_path: Path):
+    (tmp_path / "a.npz").touch()
+    (tmp_path / "b_json").mkdir()
+    assert list(find_landmarks(tmp_path, ["a", "b"])) == ["a", "b"]
+    with pytest.raises(DataError, match=r"camera c.*found a\.npz, b_json"):
+        find_landmarks(tmp_path, ["a", "c"])
+
+
+def test_cameras_meet_by_number_and_offset(tmp_path: Path):
+    for name, ids in (("a", [0, 1, 2]), ("b", [3, 4])):
+        px = np.zeros((len(ids), BODY, 2)) + np.array(ids)[:, None, None]
+        np.savez(tmp_path / f"{name}.npz", px=px, conf=np.ones(px.shape[:2]), frame_id=ids)
+    cameras = {n: read_detections(tmp_path / f"{n}.npz") for n in "ab"}
+    frames, px, conf = gather(cameras, {"b": -2})
+    assert frames.tolist() == [0, 1, 2]
+    assert conf[1, :, 0].tolist() == [0, 1, 1]
+    assert px[1, 1, 0].tolist() == [3, 3]
+    assert gather(cameras, {"a": -1})[0].tolist() == [0, 1, 3, 4]  # nothing before frame 0

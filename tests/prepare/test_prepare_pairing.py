@@ -1,0 +1,51 @@
+"""Videos find their calibrated cameras by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from capture_scenes import ring
+
+from gsgan.prepare.pairing import fit_size, pair_cameras
+from gsgan.utils.errors import DataError
+
+
+def test_same_names_whatever_their_order():
+    assert pair_cameras(["b", "A"], ["a", "b"], {}) == {"b": "b", "A": "a"}
+
+
+def test_a_serial_number_inside_the_name():
+    assert pair_cameras(["Miqus_5_21474"], ["21474", "2147"], {}) == {"Miqus_5_21474": "21474"}
+
+
+def test_given_names_win_and_may_be_numbers():
+    assert pair_cameras(["cam01"], ["21474", "cam01"], {"cam01": 21474}) == {"cam01": "21474"}
+
+
+@pytest.mark.parametrize(
+    ("sources", "cameras", "given", "what"),
+    [
+        (["x"], ["a", "b"], {}, r"no one camera.*videos: x; calibration: a, b"),
+        (["a_b"], ["a", "b"], {}, r"no one camera"),
+        (["a", "A"], ["a"], {}, r"more than one video"),
+        (["a"], ["a"], {"z": "a"}, r"names what is not there"),
+    ],
+)
+def test_what_does_not_pair_lists_both_sides(sources, cameras, given, what):
+    with pytest.raises(DataError, match=what):
+        pair_cameras(sources, cameras, given)
+
+
+def test_a_few_pixels_less_keep_k_and_are_noted():
+    camera = ring(size=(1088, 1920))[0]
+    fitted, note = fit_size(camera, "left", (1920, 1080), 16, Path("rig"))
+    assert (fitted.name, fitted.size) == ("left", (1920, 1080))
+    assert fitted.K is camera.K
+    assert note is not None
+    assert "1088x1920" in note
+
+
+def test_another_resolution_is_refused():
+    with pytest.raises(DataError, match="calibrated for 1080x1920"):
+        fit_size(ring()[0], "left", (960, 540), 16, Path("rig"))

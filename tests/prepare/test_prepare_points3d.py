@@ -1,0 +1,119 @@
+"""3D joints that another tool wrote: units, axes, names, filled gaps."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from make import skeletons
+
+from gsgan.data.joints import SETS
+from gsgan.prepare.points3d import read_points3d, without_frozen
+from gsgan.utils.errors import DataError
+
+MARKERS = {
+    "Nose": 0,
+    **{f"L{part}": 2 * i + 11 for i, part in enumerate(("Shoulder", "Elbow", "Wrist"))},
+    **{f"R{part}": 2 * i + 12 for i, part in enumerate(("Shoulder", "Elbow", "Wrist"))},
+    "LHip": 23,
+    "RHip": 24,
+    "Lknee": 25,
+    "right_knee": 26,
+    "LBigToe": 31,
+    "RBigToe": 32,
+    "LHeel": 29,
+    "RHeel": 30,
+}
+
+
+def write_trc(path: Path, p: np.ndarray, unit: str = "m") -> Path:
+    """As Pose2Sim writes: (y, z, x) of the world, so that y is up; an unknown marker beside."""
+    scale = {"m": 1, "mm": 1000}[unit]
+    names = [*MARKERS, "Neck"]
+    header = ["DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units"]
+    values = ["60", "60", str(len(p)), str(len(names)), unit]
+    lines = [
+        f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
+        "\t".join(header),
+        "\t".join(values),
+        "Frame#\tTime\t" + "\t\t\t".join(names) + "\t\t",
+        "\t\t" + "\t".join(f"X{i}\tY{i}\tZ{i}" for i in range(len(names))),
+    ]
+    for f, frame in enumerate(p):
+        row = np.vstack([frame[list(MARKERS.values())], [[9, 9, 9]]])[:, [1, 2, 0]] * scale
+        cells = [
+            "" if np.isnan(v) else repr(float(v)) for v in np.where(row == 0, 0.0, row).ravel()
+        ]
+        lines.append("\t".join([str(f), str(f / 60), *cells]))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("unit", ["m", "mm"])
+def test_trc_units_axes_and_names_are_undone(tmp_path: Path, unit: str):
+    p = skeletons(4)
+    p[2, 15] = np.nan
+    found = read_points3d(write_trc(tmp_path / "a.trc", p, unit))
+    joints = list(MARKERS.values())
+    np.testing.assert_allclose(found.p[:, joints], p[:, joints], atol=1e-9)
+    unknown = sorted(set(range(33)) - set(joints))
+    assert np.isnan(found.p[:, unknown]).all()
+    assert (found.conf[:, unknown] == 0).all()
+    assert found.conf[2, 15] == 0
+
+
+def test_zeros_of_gap_filling_are_missing(tmp_path: Path):
+    p = skeletons(4)
+    p[1, 16] = 0
+    found = read_points3d(write_trc(tmp_path / "a.trc", p))
+    assert np.isnan(found.p[1, 16]).all()
+    assert found.conf[1, 16] == 0
+
+
+def test_last_values_of_gap_filling_are_taken_out():
+    p = np.random.default_rng(0).standard_normal((20, 2, 3))
+    p[5:13, 1], p[15:18, 0] = p[5, 1], p[15, 0]
+    found, count = without_frozen(p, frames=8)
+    assert count == 7
+    assert np.isnan(found[6:13, 1]).all()
+    assert np.isfinite(found).sum() == p.size - 3 * 7
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda text: "hello", "no .trc file"),
+        (lambda text: text.replace("\tm\n", "\tfeet\n"), "Units is 'feet'"),
+        (lambda text: text.replace("1.58", "x.yz"), "holds no numbers"),
+        (lambda text: text.replace("Shoulder", "Sh").replace("Hip", "H"), "no shoulders and hips"),
+    ],
+)
+def test_damaged_trc(tmp_path: Path, change, what: str):
+    path = write_trc(tmp_path / "a.trc", skeletons(2))
+    path.write_text(change(path.read_text()))
+    with pytest.raises(DataError, match=what):
+        read_points3d(path)
+
+
+def test_easymocap_zero_confidence_is_missing(tmp_path: Path):
+    truth, numbers = skeletons(2), SETS[25][1]
+    for f, p in enumerate(truth):
+        joints = np.zeros((67, 4))
+        joints[list(numbers.values())] = np.c_[p[list(numbers)], np.full(len(numbers), 0.8)]
+        joints[numbers[16]] = 0
+        people = [{"id": 0, "keypoints3d": joints.tolist()}]
+        (tmp_path / f"{f:06d}.json").write_text(json.dumps(people))
+    found = read_points3d(tmp_path)
+    seen = sorted(set(numbers) - {16})
+    np.testing.assert_allclose(found.p[:, seen], truth[:, seen])
+    assert (found.conf[:, seen] == 0.8).all()
+    assert np.isnan(found.p[:, 16]).all()
+
+
+@pytest.mark.parametrize("text", ["{", "{}", "[3]", '[{"keypoints3d": [1, 2]}]', "[]"])
+def test_damaged_easymocap(tmp_path: Path, text: str):
+    (tmp_path / "000000.json").write_text(text)
+    with pytest.raises(DataError, match=str(tmp_path.name)):
+        read_points3d(tmp_path)

@@ -1,0 +1,309 @@
+"""`gsgan.prepare` from videos on disk to a dataset that training reads."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from capture_scenes import write_project
+from make import skeletons
+from rich.console import Console
+from test_prepare_points3d import write_trc
+
+import gsgan.prepare.mediapipe as tool
+from gsgan.data.layout import Layout
+from gsgan.prepare import pictures
+from gsgan.prepare.__main__ import prepare as command
+from gsgan.prepare.options import Options
+from gsgan.prepare.run import prepare
+from gsgan.utils.errors import ConfigError, DataError, GsganError
+
+CAMERAS, FRAMES, SIZE = 3, 6, (96, 80)
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """A project folder: videos, calibration, 2D landmarks and masks of a person that is known."""
+    return write_project(tmp_path / "project", CAMERAS, FRAMES, SIZE)
+
+
+def options(project: Path, **more) -> Options:
+    given = {
+        "source": str(project),
+        "out": str(project.parent / "out"),
+        "landmarks": str(project / "pose"),
+        "masks": str(project / "masks"),
+    }
+    return Options(**(given | more))
+
+
+def quiet() -> Console:
+    return Console(file=io.StringIO())
+
+
+def test_videos_become_a_capture_that_training_reads(project: Path):
+    out = prepare(options(project), quiet())
+    layout = Layout.read(out)
+    assert layout.camera_names == ("cam00", "cam01", "cam02")
+    assert layout.frames == tuple(range(FRAMES))
+    assert (layout.meta.fps, layout.meta.up_axis) == (30.0, "z")
+    found = np.load(out / "landmarks3d.npz")
+    known = np.isfinite(found["p"]).all(-1)
+    assert known.mean() > 0.9
+    np.testing.assert_allclose(found["p"][known], skeletons(FRAMES)[known], atol=0.02)
+    assert np.nanmedian(found["reproj_px"]) < 0.2
+    assert not layout.cameras["cam01"].distorted
+    given = json.loads((project / "cameras.json").read_text())["cam01"]
+    np.testing.assert_allclose(layout.cameras["cam01"].K, given["K"])
+    hands = np.load(out / "hands3d.npz")  # no hands were given: there, and missing
+    assert np.isnan(hands["p"]).all()
+    assert (hands["conf"] == 0).all()
+
+
+def test_the_report_tells_every_stage_and_shows_overlays(project: Path):
+    out = prepare(options(project), quiet())
+    numbers = json.loads((out / "report.json").read_text())
+    assert list(numbers["error_px"]) == ["plain", "robust", "flips", "refined", "smoothed"]
+    assert numbers["cameras"]["cam02"]["frames_written"] == FRAMES
+    assert numbers["settings"]["solve"]["smoothing"]["seconds"] == 0.02
+    html = (out / "report.html").read_text()
+    assert html.count("data:image/jpeg;base64,") == CAMERAS
+    assert "http" not in html
+
+
+def test_pictures_are_undistorted_and_scaled(project: Path):
+    small = pictures.PictureFiles(scale=0.5, format="png")
+    out = prepare(options(project, pictures=small), quiet())
+    camera = Layout.read(out).cameras["cam00"]
+    assert camera.size == (SIZE[1] // 2, SIZE[0] // 2)
+    given = json.loads((project / "cameras.json").read_text())["cam00"]
+    np.testing.assert_allclose(camera.K[:2], np.array(given["K"])[:2] / 2)
+    mask = cv2.imread(str(out / "masks" / "cam00" / "000002.png"), cv2.IMREAD_GRAYSCALE)
+    p = np.load(out / "landmarks3d.npz")["p"][2]
+    x = p @ camera.R.T + camera.t
+    uv = (x / x[:, 2:]) @ camera.K.T
+    inside = mask[uv[:, 1].astype(int), uv[:, 0].astype(int)] > 127
+    assert inside.mean() > 0.9
+
+
+def test_the_same_again_is_left_alone_and_another_refused(project: Path):
+    out = prepare(options(project), quiet())
+    before = (out / "meta.json").stat().st_mtime_ns
+    prepare(options(project), quiet())
+    assert (out / "meta.json").stat().st_mtime_ns == before
+    small = pictures.PictureFiles(scale=0.5)
+    with pytest.raises(DataError, match="overwrite=true"):
+        prepare(options(project, pictures=small), quiet())
+    prepare(options(project, pictures=small, overwrite=True, keep_work=False), quiet())
+    assert Layout.read(out).cameras["cam00"].size == (40, 48)
+    assert [p.name for p in out.parent.iterdir() if p.name.startswith(".")] == []
+
+
+def test_what_is_not_ours_is_never_overwritten(project: Path):
+    out = project.parent / "out"
+    out.mkdir()
+    (out / "thesis.txt").write_text("do not lose")
+    with pytest.raises(DataError, match="something else"):
+        prepare(options(project, overwrite=True), quiet())
+    assert (out / "thesis.txt").read_text() == "do not lose"
+
+
+def test_a_killed_run_leaves_no_dataset_and_goes_on_where_it_was(project: Path, monkeypatch):
+    write, written = pictures._write, []
+
+    def dying(path, pixels, files):
+        if len(written) == 10:
+            raise KeyboardInterrupt
+        written.append(path)
+        write(path, pixels, files)
+
+    monkeypatch.setattr(pictures, "_write", dying)
+    with pytest.raises(KeyboardInterrupt):
+        prepare(options(project, workers=1), quiet())
+    assert not (project.parent / "out").exists()
+    monkeypatch.setattr(pictures, "_write", lambda *a: (written.append(a[0]), write(*a)))
+    monkeypatch.setattr("gsgan.prepare.solving.solve", None)  # found again, not solved again
+    out = prepare(options(project, workers=1), quiet())
+    assert len(written) == len(set(written)) == 2 * CAMERAS * FRAMES
+    assert len(Layout.read(out).frames) == FRAMES
+
+
+def test_a_camera_that_missed_pictures_and_masks_keeps_the_rest(project: Path):
+    (project / "masks" / "cam01" / "000003.png").unlink()
+    out = prepare(options(project, frames="1-5"), quiet())
+    layout = Layout.read(out)
+    assert sorted(layout.images["cam01"]) == [1, 2, 4, 5]
+    assert sorted(layout.images["cam00"]) == [1, 2, 3, 4, 5]
+
+
+def test_offsets_move_a_cameras_numbers(project: Path):
+    late = options(project, offsets={"cam02": 1})
+    out = prepare(late, quiet())
+    assert sorted(Layout.read(out).images["cam02"]) == list(
+        range(1, FRAMES)
+    )  # frame 6 is its own alone
+    with pytest.raises(ConfigError, match="offsets name cam09"):
+        prepare(options(project, offsets={"cam09": 1}, out=str(project / "x")), quiet())
+
+
+def test_folders_of_pictures_need_a_frame_rate(project: Path):
+    for video in (project / "videos").iterdir():
+        video.unlink()
+    (project / "videos").rmdir()
+    with pytest.raises(ConfigError, match="give fps"):
+        prepare(options(project), quiet())
+    out = prepare(options(project, fps=25), quiet())
+    assert Layout.read(out).meta.fps == 25
+
+
+def in_centimetres(project: Path) -> None:
+    rig = json.loads((project / "cameras.json").read_text())
+    for camera in rig.values():
+        camera["t"] = [100 * x for x in camera["t"]]
+    (project / "cameras.json").write_text(json.dumps(rig))
+
+
+def no_detections(project: Path) -> None:
+    for path in (project / "pose").iterdir():
+        with np.load(path) as held:
+            arrays = dict(held)
+        hand = arrays["px"][:, :21]  # hands alone do not make a person
+        np.savez(path, **arrays | {"px": np.full_like(arrays["px"], np.nan), "left": hand})
+
+
+@pytest.mark.parametrize(
+    ("break_it", "more", "what"),
+    [
+        (lambda p: None, {"unit": "mm"}, r"cameras\.json: cameras stand 0\.003 m .* unit=mm"),
+        (in_centimetres, {}, r"cameras\.json: cameras stand 3\d\d m .* unit=mm, cm or m"),
+        (lambda p: None, {"source": "nowhere"}, r"nowhere is no folder"),
+        (lambda p: (p / "cameras.json").unlink(), {}, "holds no calibration"),
+        (lambda p: (p / "pose" / "cam01.npz").unlink(), {}, "no landmarks of the camera cam01"),
+        (lambda p: (p / "pose" / "cam01.npz").write_bytes(b"PK"), {}, r"cam01\.npz"),
+        (lambda p: (p / "videos" / "cam01.avi").write_bytes(b"RIFF"), {}, r"cam01\.avi"),
+        (lambda p: (p / "masks" / "cam00" / "000001.png").write_bytes(b"x"), {}, r"000001\.png"),
+        (no_detections, {}, "no body joint of any frame came out in 3D"),
+        (lambda p: None, {"frames": "90-99"}, "no frame is left"),
+        (lambda p: None, {"cameras": {"cam00": "cam01"}}, "more than one video"),
+        (lambda p: None, {"unit": "inch"}, "unit must be one of"),
+        (lambda p: None, {"source": None}, "give source="),
+    ],
+)
+def test_what_is_wrong_is_said_in_one_sentence(project: Path, break_it, more, what):
+    break_it(project)
+    with pytest.raises(GsganError, match=what) as failure:
+        prepare(options(project, **more), quiet())
+    assert "\n" not in str(failure.value)
+    assert not (project.parent / "out").exists()
+
+
+def test_joints_of_another_tool_take_the_place_of_detections(project: Path):
+    given = write_trc(project / "person.trc", skeletons(FRAMES))
+    out = prepare(options(project, landmarks="nowhere", landmarks3d=str(given)), quiet())
+    assert Layout.read(out).frames == tuple(range(FRAMES))
+    found = np.load(out / "landmarks3d.npz")
+    assert (found["conf"][:, 1] == 0).all()  # an eye that the file does not know
+    np.testing.assert_allclose(found["p"][:, 11], skeletons(FRAMES)[:, 11], atol=1e-3)
+    assert json.loads((out / "report.json").read_text())["error_px"] == {"smoothed": None}
+    assert not (out / "landmarks2d").exists()
+
+
+def test_one_camera_is_not_enough(project: Path):
+    for name in ("cam01", "cam02"):
+        (project / "videos" / f"{name}.avi").unlink()
+    with pytest.raises(DataError, match="only the camera cam00"):
+        prepare(options(project), quiet())
+
+
+def test_every_key_of_the_config_is_understood(project: Path, compose, capsys):
+    config = compose(
+        "prepare",
+        f"source={project}",
+        f"out={project.parent / 'out'}",
+        f"landmarks={project / 'pose'}",
+        f"masks={project / 'masks'}",
+        "cameras={cam00: cam00}",
+    )
+    command(config)
+    assert "is ready" in capsys.readouterr().out
+    assert plain(Options(**_defaults(compose))) == plain(Options("a", "b"))
+
+
+def plain(given: Options) -> dict:
+    """The settings without the difference between tuples and lists."""
+    return json.loads(json.dumps(given.record()))
+
+
+def _defaults(compose) -> dict:
+    from hydra.utils import instantiate
+
+    return instantiate(compose("prepare", "source=a", "out=b"), _convert_="all")
+
+
+# ------------------------------------------------ the MediaPipe tool, without MediaPipe
+
+STUB = """
+import argparse, pathlib, numpy as np, shutil
+parser = argparse.ArgumentParser()
+for name in "source out masks hands rotate threads slot confidence tracking margin".split():
+    parser.add_argument("--" + name, default="")
+given = parser.parse_args()
+name, root = pathlib.Path(given.source).stem, pathlib.Path({root!r})
+if name == {bad!r}:
+    raise SystemExit("the stub refuses " + name)
+shutil.copytree(root / "masks" / name, given.masks)
+for i in range(6):
+    print(i + 1, 6)
+shutil.copy(root / "pose" / (name + ".npz"), given.out)
+"""
+
+
+def with_stub(project: Path, monkeypatch, bad: str = "") -> Options:
+    import sys
+
+    environment = project.parent / "environment"
+    (environment / "bin").mkdir(parents=True, exist_ok=True)
+    (environment / tool.READY).touch()
+    python = environment / "bin" / "python"
+    if not python.exists():
+        python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+        python.chmod(0o755)
+    script = project.parent / f"stub{bad}.py"
+    script.write_text(STUB.format(root=str(project), bad=bad))
+    monkeypatch.setattr(tool, "SCRIPT", script)
+    mediapipe = tool.MediaPipe(folder=str(environment))
+    return options(project, landmarks="mediapipe", masks="mediapipe", mediapipe=mediapipe)
+
+
+def test_the_tool_is_run_once_a_camera(project: Path, monkeypatch):
+    given = with_stub(project, monkeypatch)
+    out = prepare(given, quiet())
+    assert len(Layout.read(out).frames) == FRAMES
+    calls = []
+    monkeypatch.setattr("gsgan.prepare.inputs.detect", lambda *a, **k: calls.append(a))
+    smoother = {"pictures": pictures.PictureFiles(scale=0.5), "overwrite": True}
+    prepare(Options(**(vars(given) | smoother)), quiet())
+    assert calls == []
+
+
+def test_a_failing_tool_says_its_last_line(project: Path, monkeypatch):
+    with pytest.raises(DataError, match=r"cam01\.avi: the MediaPipe tool failed: the stub refuses"):
+        prepare(with_stub(project, monkeypatch, bad="cam01"), quiet())
+    assert not (project.parent / "out").exists()
+
+
+def test_the_environment_is_only_made_when_asked(project: Path):
+    missing = tool.MediaPipe(folder=str(project / "nothing"))
+    with pytest.raises(ConfigError, match="add setup=true"):
+        prepare(options(project, landmarks="mediapipe", mediapipe=missing), quiet())
+    assert not (project / "nothing").exists()
+
+
+def test_a_python_that_is_not_there_is_named(tmp_path: Path):
+    missing = tool.MediaPipe(folder=str(tmp_path / "env"), python=str(tmp_path / "python9"))
+    with pytest.raises(DataError, match="python9 cannot be started"):
+        tool.ensure_environment(missing, True, print)

@@ -1,0 +1,285 @@
+"""Triangulation, flips, refinement, smoothing on motions whose truth is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from capture_scenes import LENS, ring, seen, turned
+from make import distorted_pixels, skeletons
+
+from gsgan.data.joints import flip_groups
+from gsgan.prepare.cleanse import Cleansing, cleanse
+from gsgan.prepare.desync import clock_errors
+from gsgan.prepare.flips import FlipSearch, apply_flips, find_flips
+from gsgan.prepare.refine import Refinement, camera_moves, refine_rig
+from gsgan.prepare.rig import Rig, undistort_points
+from gsgan.prepare.smooth import smooth
+from gsgan.prepare.solve import Settings, Solution, solve, stage_medians
+from gsgan.prepare.triangulate import Triangulation, linear_points
+from gsgan.utils.errors import ConfigError
+
+GROUPS = flip_groups(hands=False)
+
+
+def flat(values: np.ndarray) -> np.ndarray:
+    return values.reshape(len(values), -1, *values.shape[3:])
+
+
+def test_undistortion_inverts_the_lens():
+    camera = ring(dist=LENS)[1]
+    rig, p = Rig.of([camera]), skeletons(1)[0]
+    raw = {key: getattr(camera, key) for key in ("R", "t", "K", "dist")}
+    stored = np.r_[distorted_pixels(raw, p), [[np.nan, 3.0]]]
+    straight = undistort_points(camera, stored)
+    np.testing.assert_allclose(straight[:-1], rig.project(p)[0][0], atol=1e-4)
+    assert np.abs(straight[:-1] - stored[:-1]).max() > 1  # the lens does something
+    assert np.isnan(straight[-1]).all()
+
+
+def test_exact_detections_give_exact_points():
+    rig, p, uv, conf = seen(ring())
+    truth = p.reshape(-1, 3)
+    np.testing.assert_allclose(linear_points(rig, flat(uv), flat(conf)), truth, atol=1e-9)
+    points = Triangulation().points(rig, flat(uv), flat(conf))
+    np.testing.assert_allclose(points.p, truth, atol=1e-9)
+    assert points.error.max() < 1e-6
+
+
+def test_one_wild_detection_is_outvoted():
+    rig, p, uv, conf = seen(ring(), noise=1.0)
+    uv[2, :, 15] += [300, -200]  # one camera takes another thing for the left wrist
+    plain = linear_points(rig, flat(uv), flat(conf)).reshape(p.shape)
+    robust = Triangulation().points(rig, flat(uv), flat(conf)).p.reshape(p.shape)
+    off = [np.linalg.norm(found - p, axis=-1)[:, 15].max() for found in (plain, robust)]
+    assert off[0] > 0.1
+    assert off[1] < 0.01
+
+
+def test_too_few_views_and_zero_weight_are_missing_not_zero():
+    rig, _, uv, conf = seen(ring(), frames=2)
+    conf[1:, 0, 4] = 0  # one camera left
+    conf[:, 0, 5] = 0
+    uv[:, 0, 5] = np.nan
+    conf[0, 0, 6], uv[0, 0, 6] = 0, np.nan  # three left: enough
+    points = Triangulation().points(rig, flat(uv), flat(conf))
+    assert np.isnan(points.p[[4, 5]]).all()
+    assert (points.weight[:, [4, 5]] == 0).all()
+    assert np.isfinite(points.p[6]).all()
+    assert np.isnan(linear_points(rig, flat(uv), flat(conf))[[4, 5]]).all()
+
+
+def test_rays_that_are_nearly_parallel_are_not_believed():
+    rig, _, uv, conf = seen(ring(angles=(0.0, 0.003)))
+    assert np.isnan(Triangulation().points(rig, flat(uv), flat(conf)).p).all()
+    loose = Triangulation(max_elongation=1e4)
+    assert np.isfinite(loose.points(rig, flat(uv), flat(conf)).p).all()
+
+
+def test_detections_that_contradict_each_other_are_missing():
+    rig, _, uv, conf = seen(ring(angles=(0.0, 1.3)), frames=2)
+    uv[0, 0, 3, 1] += 400
+    points = Triangulation().points(rig, flat(uv), flat(conf))
+    assert np.isnan(points.p[3]).all()
+    assert np.isfinite(np.delete(points.p, 3, axis=0)).all()
+
+
+def test_a_point_behind_the_cameras_costs_but_breaks_nothing():
+    rig, _, uv, conf = seen(ring(), frames=1)
+    behind = -1000 * np.ones((33, 3))
+    assert np.isinf(rig.errors(behind, flat(uv))).any()
+    assert np.isnan(rig.errors(np.full((33, 3), np.nan), flat(uv))).all()
+    assert conf.all()
+
+
+def test_chunks_and_spread_out_pairs_change_nothing_that_matters():
+    rig, p, uv, conf = seen(ring(angles=np.linspace(0, 6, 9)), noise=0.5)
+    whole = Triangulation().points(rig, flat(uv), flat(conf)).p
+    chunked = Triangulation(chunk=50).points(rig, flat(uv), flat(conf)).p
+    np.testing.assert_array_equal(whole, chunked)
+    few = Triangulation(max_pairs=5).points(rig, flat(uv), flat(conf)).p
+    np.testing.assert_allclose(few, p.reshape(-1, 3), atol=0.01)
+
+
+def planted(shape: tuple[int, int, int]) -> np.ndarray:
+    flips = np.zeros(shape, bool)
+    flips[1, :5] = True  # one camera, everything, at the start
+    flips[2, 7:9, 2] = True  # the legs of another
+    flips[:3, 10, 1] = True  # three of four cameras swap the arms for one frame
+    return flips
+
+
+def test_planted_flips_are_found_and_put_right():
+    rig, p, uv, conf = seen(ring(), noise=1.0)
+    flips = planted((4, 12, 3))
+    swapped = apply_flips(uv, flips, GROUPS)
+    assert np.abs(swapped - uv).max() > 50
+    found = find_flips(rig, swapped, conf, GROUPS, FlipSearch(), Triangulation())
+    # Small pairs (the eyes) seen edge-on cannot be told, and need not.
+    np.testing.assert_array_equal(found[..., 1:], flips[..., 1:])
+    put_right = apply_flips(swapped, found, GROUPS)
+    np.testing.assert_allclose(put_right[:, :, 11:], uv[:, :, 11:])
+    assert p.shape[0] == 12
+
+
+def test_no_flips_where_there_are_none():
+    rig, _, uv, conf = seen(ring(), noise=3.0)
+    found = find_flips(rig, uv, conf, GROUPS, FlipSearch(), Triangulation())
+    assert found[..., 1:].sum() == 0
+
+
+def test_all_cameras_swapped_for_a_moment_is_told_from_the_motion():
+    rig, _, uv, conf = seen(ring(), frames=20)
+    flips = np.zeros((4, 20, 3), bool)
+    flips[:, 8:11] = True
+    swapped = apply_flips(uv, flips, GROUPS)
+    found = find_flips(rig, swapped, conf, GROUPS, FlipSearch(), Triangulation())
+    np.testing.assert_array_equal(found, flips)
+
+
+def test_refinement_recovers_a_camera_that_was_bumped():
+    rig, p, uv, conf = seen(ring(), frames=20, noise=0.3)
+    given = turned(rig, 2, degrees=1.5, metres=0.03)
+    triangulation = Triangulation()
+    start = triangulation.points(given, flat(uv), flat(conf))
+    assert np.median(start.error[2]) > 20
+    found = refine_rig(given, given, start.p, flat(uv), flat(conf), Refinement())
+    after = triangulation.points(found, flat(uv), flat(conf))
+    assert np.median(after.error) < 0.5
+    # The world may move a little as a whole, the cameras not against each other.
+    angles, _ = camera_moves(relative(rig), relative(found))
+    assert angles.max() < 0.1
+    distances = np.linalg.norm(after.p[11] - after.p[24]) / np.linalg.norm(p[0, 11] - p[0, 24])
+    assert distances == pytest.approx(1, abs=0.02)
+
+
+def relative(rig: Rig) -> Rig:
+    """All cameras as seen from the first."""
+    R = rig.R @ rig.R[0].T
+    return Rig(rig.K, R, rig.t - np.einsum("cij,j->ci", R, rig.t[0]))
+
+
+def test_refinement_leaves_a_right_calibration_alone():
+    rig, p, uv, conf = seen(ring())
+    found = refine_rig(rig, rig, p.reshape(-1, 3), flat(uv), flat(conf), Refinement())
+    turned_by, moved_by = camera_moves(rig, found)
+    assert turned_by.max() < 1e-6
+    assert moved_by.max() < 1e-4
+
+
+def test_refinement_of_two_cameras_and_of_nothing_stays_finite():
+    rig, p, uv, conf = seen(ring(angles=(0.0, 1.3)), noise=1.0)
+    found = refine_rig(rig, rig, p.reshape(-1, 3), flat(uv), flat(conf), Refinement())
+    assert np.isfinite(found.R).all()
+    np.testing.assert_allclose(np.linalg.det(found.R), 1)
+    nothing = refine_rig(
+        rig, rig, np.full((5, 3), np.nan), flat(uv)[:, :5], np.zeros((2, 5)), Refinement()
+    )
+    np.testing.assert_allclose(nothing.R, rig.R)
+
+
+def test_moves_are_degrees_and_millimetres():
+    rig = Rig.of(ring())
+    angles, distances = camera_moves(rig, turned(rig, 1, degrees=2.0, metres=0.05))
+    np.testing.assert_allclose(angles, [0, 2, 0, 0], atol=1e-9)
+    np.testing.assert_allclose(distances, [0, 50, 0, 0], atol=1e-9)
+
+
+def test_smoothing_keeps_a_parabola_and_its_gaps():
+    time = np.arange(40) / 60
+    p = np.stack([time, 3 * time**2, 1 - time], axis=-1)[:, None].repeat(2, axis=1)
+    p[10:14, 0] = np.nan
+    weight = np.ones(p.shape[:2])
+    weight[20, 1] = 0
+    found = smooth(p, weight, time, seconds=0.05)
+    assert np.isnan(found[10:14, 0]).all()
+    assert np.isnan(found[20, 1]).all()
+    known = np.isfinite(found)
+    np.testing.assert_allclose(found[known], p[known], atol=1e-9)
+    assert known.sum() == p.size - 3 * 5
+
+
+def test_smoothing_halves_noise_and_trusts_by_weight():
+    rng = np.random.default_rng(0)
+    time = np.arange(200) / 60
+    truth = np.zeros((200, 1, 3))
+    noisy = truth + 0.01 * rng.standard_normal(truth.shape)
+    noisy[100] += 5.0
+    weight = np.ones((200, 1))
+    weight[100] = 1e-9
+    found = smooth(noisy, weight, time, seconds=0.05)
+    assert np.abs(found - truth).max() < 0.02
+    assert found[:90].std() < 0.6 * noisy[:90].std()
+
+
+def test_no_smoothing_and_lonely_points_stay_as_they_are():
+    p = np.random.default_rng(1).standard_normal((5, 2, 3))
+    np.testing.assert_array_equal(smooth(p, np.ones((5, 2)), np.arange(5.0), 0.0), p)
+    np.testing.assert_array_equal(smooth(p, np.ones((5, 2)), np.arange(5.0), 0.1), p)
+
+
+def test_cleansing_takes_out_what_no_body_has():
+    p = skeletons(1).repeat(10, axis=0)
+    p[3, 15] += [5, 0, 0]  # a wrist five metres away
+    p[6, 27] += [0, 0, 0.3]  # a shin a good deal too short
+    p[:, 31] = np.nan
+    found, removed = cleanse(p, Cleansing())
+    assert np.isnan(found[3, 15]).all()
+    assert np.isnan(found[6, 27]).all()
+    assert removed == {"too far away": 1, "bone length": 1}
+    assert np.isfinite(found).sum() == np.isfinite(p).sum() - 6
+
+
+def test_a_late_clock_is_measured():
+    cameras = ring()
+    rig, _, uv, conf = seen(cameras, frames=40)
+    late = uv.copy()
+    late[1, 2:] = uv[1, :-2]  # shows at frame f what the others show at f - 2
+    delay, gain = clock_errors(rig, late, conf, Triangulation(), lag=6)
+    assert delay[1] == pytest.approx(-2, abs=0.2)
+    assert gain[1] > 0.5
+    delay, gain = clock_errors(rig, uv, conf, Triangulation(), lag=6)
+    np.testing.assert_allclose(delay, 0, atol=0.05)
+    assert np.isnan(
+        clock_errors(rig.without(0).without(0), uv[2:], conf[2:], Triangulation(), 3)[0]
+    ).all()
+
+
+def test_all_stages_together_end_near_the_truth():
+    rig, p, uv, conf = seen(ring(), frames=30, noise=2.0)
+    flips = np.zeros((4, 30, 3), bool)
+    flips[1, :9] = True
+    swapped = apply_flips(uv, flips, GROUPS)
+    given = turned(rig, 3, degrees=1.0, metres=0.02)
+    found = solve(given, np.arange(30) / 60, swapped, conf, Settings())
+    medians = {name: values[0] for name, values in stage_medians(found.stages).items()}
+    assert list(medians) == ["plain", "robust", "flips", "refined", "smoothed"]
+    assert medians["plain"] > 5
+    assert medians["refined"] < 2.5
+    assert found.flips[1, :9, 1:].all()
+    error = np.linalg.norm(found.p - p, axis=-1)
+    assert np.nanmedian(error) < 0.02
+    again = Solution.from_arrays(found.to_arrays(), given.K)
+    np.testing.assert_array_equal(again.p, found.p)
+    assert again.removed == found.removed
+
+
+def test_nobody_seen_ends_without_joints_or_warnings():
+    rig, _, uv, conf = seen(ring(), frames=3)
+    found = solve(rig, np.arange(3.0), np.full_like(uv, np.nan), 0 * conf, Settings())
+    assert np.isnan(found.p).all()
+    assert (found.conf == 0).all()
+    np.testing.assert_allclose(found.rig.R, rig.R)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: Triangulation(scale=0),
+        lambda: FlipSearch(gain=-1),
+        lambda: Refinement(frames=0),
+        lambda: Cleansing(bone=0),
+    ],
+)
+def test_settings_out_of_range_are_named(make):
+    with pytest.raises(ConfigError, match=r"(scale|gain|frames|bone)"):
+        make()

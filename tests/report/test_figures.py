@@ -1,0 +1,246 @@
+"""``gsgan.figures`` as a user types it: every figure made, and every way to go wrong."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import pytest
+import torch
+from commands import refused
+from omegaconf import OmegaConf
+
+from gsgan.metrics.image import edge_f1, psnr
+from gsgan.report.figures.registry import KINDS
+from gsgan.train.runs import build_data, load_avatar, load_config
+from gsgan.utils.errors import DataError
+
+FEW = ("shots.teaser=2", "shots.strip=2", "shots.errors=1", "shots.canny=1", "settings.dpi=60")
+
+
+@pytest.fixture
+def twin(run, tmp_path) -> Path:
+    """Another run on the same data."""
+    return Path(shutil.copytree(run, tmp_path / "twin"))
+
+
+def edit(run: Path, **values) -> None:
+    path = run / ".hydra" / "config.yaml"
+    config = OmegaConf.load(path)
+    for key, value in values.items():
+        OmegaConf.update(config, key.replace("__", "."), value)
+    OmegaConf.save(config, path)
+
+
+def test_every_figure_is_made_with_numbers_of_the_pictures_shown(run, twin, tmp_path, inside):
+    out = tmp_path / "out"
+    whole = "settings.margin=9"  # metres: the window is the picture
+    result = inside("figures", f"run={run}", f"compare=[{twin}]", f"out={out}", whole, *FEW)
+    assert result.returncode == 0, result.stdout + result.stderr
+    record = json.loads((out / "figures.json").read_text())
+    assert list(record) == list(KINDS)
+    for name in KINDS:
+        picture = cv2.imread(str(out / f"{name}.png"))
+        assert picture is not None
+        assert picture.std() > 5  # not blank
+        pdf = (out / f"{name}.pdf").read_bytes()
+        assert pdf.startswith(b"%PDF")
+        assert pdf.rstrip().endswith(b"%%EOF")
+    captions = (out / "captions.md").read_text()
+    assert "Marked: perceptual loss" in captions
+    assert "split novel_pose" in captions.lower()
+    assert not list(out.glob(".*"))
+    found = record["comparison"]["numbers"]
+    assert found == expected(run, found)
+    assert list(record["densify"]["runs"].values()) == [str(run)]  # the other run is not in it
+    twins = list(found["cam00/000004"])
+    assert twins == ["gsgan, one", "gsgan, twin"]
+
+
+def expected(run: Path, found: dict) -> dict:
+    """PSNR and edge F1 of whole pictures, painted here without the figures' code."""
+    config = load_config(run)
+    data = build_data(config)
+    avatar, _ = load_avatar(run, config, data)
+    dataset = data.dataset("novel_pose")
+    numbers: dict = {}
+    for name, panels in found.items():
+        camera, frame_id = name.split("/")
+        frame = dataset[dataset.items.index((camera, int(frame_id)))]
+        with torch.no_grad():
+            image = avatar.paint(frame).image.clamp(0, 1)
+        score = {
+            "psnr": pytest.approx(float(psnr(image, frame.image)), abs=1e-4),
+            "edge_f1": pytest.approx(float(edge_f1(image, frame.image)), abs=1e-9),
+        }
+        numbers[name] = {run: score | {"edge_ratio": panels[run]["edge_ratio"]} for run in panels}
+    return numbers
+
+
+def test_the_same_figure_has_the_same_bytes_and_earlier_ones_are_kept(run, tmp_path, inside):
+    given = (f"run={run}", f"out={tmp_path / 'out'}", "formats=[png,pdf]", *FEW)
+    assert inside("figures", *given, "figures=canny").returncode == 0
+    before = {p.name: p.read_bytes() for p in (tmp_path / "out").glob("canny.*")}
+    assert not json.loads((tmp_path / "out" / "figures.json").read_text())["canny"]["marks"][1:]
+    (tmp_path / "out" / "figures.json").write_text('{"canny": ')  # cut off
+    assert inside("figures", *given, "figures=[canny]", "frames=null").returncode == 0
+    assert {p.name: p.read_bytes() for p in (tmp_path / "out").glob("canny.*")} == before
+    assert inside("figures", *given, "figures=strip", "frames=[5]").returncode == 0
+    record = json.loads((tmp_path / "out" / "figures.json").read_text())
+    assert list(record) == ["canny", "strip"]
+    assert list(record["strip"]["numbers"]) == ["cam00/000005"]
+    assert "## canny" in (tmp_path / "out" / "captions.md").read_text()
+
+
+def test_what_cannot_be_made_is_said_and_the_rest_is_made(run, tmp_path, inside):
+    given = (f"run={run}", f"out={tmp_path / 'out'}", "formats=png", *FEW)
+    result = inside("figures", *given, "figures=[ablation,canny]")
+    assert result.returncode == 0, result.stderr
+    assert "ablation: left out, there is one run" in result.stdout
+    assert {p.name for p in (tmp_path / "out").glob("*.png")} == {"canny.png"}
+    refused(inside("figures", *given, "figures=ablation"), "no figure could be made", "one run")
+
+
+def test_names_in_print(run, twin, tmp_path, inside):
+    given = (f"run={run}", f"compare={twin}", f"out={tmp_path / 'out'}", "formats=png", *FEW)
+    result = inside("figures", *given, "figures=strip", "names=[ours,'cost $5 {x_1}']")
+    assert result.returncode == 0, result.stdout + result.stderr
+    record = json.loads((tmp_path / "out" / "figures.json").read_text())
+    assert list(record["strip"]["runs"]) == ["ours", "cost $5 {x_1}"]
+    refused(inside("figures", *given, "names=[ours]"), "names", "2 in all", "got 1")
+    refused(inside("figures", *given, "names=[ours,ours]"), "names", "ours", "differ")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"data__size": 24}, ("cannot be compared", "32x32 and 24x24 pixels")),
+        ({"data__train_frames": "0-2"}, ("cannot be compared", "split train", "other pictures")),
+    ],
+)
+def test_runs_on_other_data_are_refused(run, twin, tmp_path, inside, change, words):
+    edit(twin, **change)
+    result = inside("figures", f"run={run}", f"compare=[{twin}]", f"out={tmp_path / 'out'}", *FEW)
+    refused(result, str(run), str(twin), *words)
+    assert not list((tmp_path / "out").glob("*.p*"))
+
+
+def test_a_run_on_other_pixels_is_refused(run, twin, capture, tmp_path, inside):
+    other = Path(shutil.copytree(capture, tmp_path / "other"))
+    for path in (other / "images").rglob("*.*"):
+        cv2.imwrite(str(path), 255 - cv2.imread(str(path)))
+    edit(twin, data__root=str(other))
+    given = (f"run={run}", f"compare=[{twin}]", f"out={tmp_path / 'out'}", "figures=strip", *FEW)
+    refused(inside("figures", *given), "cannot be compared", "its pixels differ")
+
+
+def test_a_run_that_is_half_trained_is_said_to_be(twin, tmp_path, inside):
+    path = twin / "checkpoints" / "last.ckpt"
+    checkpoint = torch.load(path, weights_only=True)
+    total = checkpoint["gsgan"]["step"]
+    checkpoint["gsgan"]["step"] = 3
+    torch.save(checkpoint, path)
+    given = (f"run={twin}", f"out={tmp_path / 'out'}", "figures=strip", "formats=png", *FEW)
+    result = inside("figures", *given)
+    said = f"gsgan is unfinished: 3 of {total} iterations"
+    assert said in result.stdout
+    assert said in (tmp_path / "out" / "captions.md").read_text()
+
+
+def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside):
+    for log in twin.glob("logs*"):
+        shutil.rmtree(log)
+    head = "epoch,step,val/psnr,val/psnr_splat,val/seconds\n"
+    parts = {
+        "logs": "0,0,8.0,8.0,0\n1,99,20.0,19.0,60\n1,120,,,\n2,199,1.0,1.0,99\n",
+        "logs_000150": "2,199,22.0,20.0,120\n3,299,23.0,21.0,18",  # killed within the line
+    }
+    for name, text in parts.items():
+        (twin / name).mkdir()
+        (twin / name / "metrics.csv").write_text(head + text)
+    given = (f"run={twin}", f"out={tmp_path / 'out'}", "figures=training", "formats=png")
+    result = inside("figures", *given)
+    assert result.returncode == 0, result.stdout + result.stderr
+    entry = json.loads((tmp_path / "out" / "figures.json").read_text())["training"]
+    assert entry["numbers"]["training"]["gsgan"] == {
+        "seconds": [0, 60, 120], "psnr": [8, 20, 22], "psnr_colour": [8, 19, 20]
+    }  # fmt: skip
+    assert "watched while training" in entry["caption"]
+    (twin / "logs_000150" / "metrics.csv").write_bytes(b"\xff\xfe\x00")
+    refused(inside("figures", *given), "logs_000150", "not a readable log", "UnicodeDecodeError")
+    shutil.rmtree(twin / "logs_000150")
+    (twin / "logs" / "metrics.csv").write_text(head)
+    refused(inside("figures", *given), str(twin), "no log that tells", "logger=csv")
+
+
+def test_training_curves_are_of_the_same_watched_pictures(run, twin, tmp_path, inside):
+    given = (f"run={run}", f"compare={twin}", f"out={tmp_path / 'out'}", "figures=training")
+    assert inside("figures", *given, "names=[ours,'_x $1 {']").returncode == 0
+    edit(twin, data__val_pictures=1)
+    refused(inside("figures", *given), "watched different pictures", "data.val_pictures")
+    edit(twin, data__val_pictures=OmegaConf.load(run / ".hydra/config.yaml").data.val_pictures)
+    edit(twin, data__size=24)
+    refused(inside("figures", *given), "cannot be compared", "32x32 and 24x24 pixels")
+
+
+def test_a_figure_that_fails_leaves_the_others_numbers(run, tmp_path, inside, monkeypatch):
+    """As a stopped command does: pictures, captions and numbers are of one making."""
+
+    def fail(*_: object) -> None:
+        raise DataError("the last picture is damaged")
+
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "figures.json").write_text('{"strip": 3, "errors": {"caption": "old"}}')
+    monkeypatch.setitem(KINDS, "strip", replace(KINDS["strip"], draw=fail))
+    given = (f"run={run}", f"out={out}", "figures=[canny,strip]", "formats=png", *FEW)
+    refused(inside("figures", *given), "the last picture is damaged")
+    assert list(json.loads((out / "figures.json").read_text())) == ["canny"]
+    assert "## canny" in (out / "captions.md").read_text()
+    assert not (out / "strip.png").exists()
+
+
+def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
+    path = twin / "checkpoints" / "last.ckpt"
+    checkpoint = torch.load(path, weights_only=True)
+    for key, value in checkpoint["state_dict"].items():
+        if "generator" in key and value.is_floating_point():
+            value.fill_(float("nan"))
+    torch.save(checkpoint, path)
+    result = inside("figures", f"run={twin}", f"out={tmp_path / 'out'}", "figures=strip", *FEW)
+    refused(result, str(twin), "not finite")
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("run=null",), ("run is not set",)),
+        (("run=/nowhere",), ("/nowhere", "not a run folder")),
+        (("compare=[{run}]",), ("is given twice",)),
+        (("compare=[/nowhere]",), ("/nowhere", "not a run folder")),
+        (("figures=[canny,cany]",), ("figures must be among teaser", "cany")),
+        (("figures=[]",), ("figures must be among", "none")),
+        (("formats=gif",), ("formats must be among png, pdf", "gif")),
+        (("split=test",), ("split must be one of", "test")),
+        (("frames=[99]",), ("lacks 99", "4-5")),
+        (("frames=[a]",), ("frames must be a list of frame numbers",)),
+        (("camera=cam07",), ("cam07", "which has cam00")),
+        (("shots.canny=0", "figures=canny"), ("shots.canny", "at least 1")),
+        (("settings.dpi=-1",), ("settings.dpi",)),
+        (("settings=null",), ("settings and shots are tables",)),
+        (("shots=null",), ("settings and shots are tables",)),
+        (("names=[null]",), ("names must be texts",)),
+        (("out={run}/metrics.json",), ("metrics.json", "cannot be written to")),
+        (("data_root=/nowhere",), ("/nowhere",)),
+    ],
+)
+def test_a_wrong_value_ends_in_one_sentence(run, inside, given, words):
+    given = [argument.replace("{run}", str(run)) for argument in given]
+    if not any(argument.startswith("run=") for argument in given):
+        given.append(f"run={run}")
+    result = inside("figures", *given)
+    refused(result, *words)
+    assert len(result.stderr.strip().splitlines()) == 1

@@ -1,0 +1,85 @@
+"""``python -m gsgan.report`` as a user types it, and its config."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from commands import refused
+from hydra.utils import instantiate
+from report_folders import write_run
+
+from gsgan.utils.config import config_folder
+
+SRC = Path(__file__).parents[2] / "src" / "gsgan"
+FILES = {"report.md", "report.tex", "report.html", "report.json"}
+
+
+@pytest.fixture
+def sweep(tmp_path):
+    folder = tmp_path / "sweep"
+    for model, values in (("full", (30.0, 31.0)), ("wo_seg", (29.5, 31.25))):
+        for seed, psnr in enumerate(values):
+            write_run(folder / f"{model}_{seed}", model, seed, psnr=psnr)
+    (folder / "unfinished" / ".hydra").mkdir(parents=True)
+    (folder / "unfinished" / ".hydra" / "config.yaml").write_text("seed: 0\n")
+    return folder
+
+
+def test_it_writes_all_four_and_names_what_it_left_out(sweep, tmp_path, inside):
+    result = inside("report", f"runs=[{sweep}]", "table=ablation", "out=tables")
+    assert result.returncode == 0, result.stderr
+    assert "30.50 ± 0.71" in result.stdout
+    assert "left out: unfinished" in result.stdout
+    out = tmp_path / "tables"
+    assert {path.name for path in out.iterdir()} == FILES
+    for path in out.iterdir():
+        assert "unfinished" in path.read_text(), path.name
+    held = json.loads((out / "report.json").read_text())
+    without = next(r for r in held["grids"][1]["rows"] if r["label"] == "w/o S")
+    assert without["cells"]["PSNR dB ↑"]["mean"] == pytest.approx(-0.125)
+    assert without["cells"]["PSNR dB ↑"]["agreeing"] == 1
+    assert not (tmp_path / "outputs").exists()  # Hydra left nothing
+
+
+def test_it_fills_a_block_of_a_page_again_and_again(sweep, tmp_path, inside):
+    page = tmp_path / "page.md"
+    page.write_text("# P\n<!-- report:ablation -->old<!-- /report -->\nafter\n")
+    for _ in range(2):
+        given = [f"runs=[{sweep}]", "table=ablation", "out=t", f"fill={page}"]
+        assert inside("report", *given).returncode == 0
+    text = page.read_text()
+    assert text.startswith("# P\n<!-- report:ablation -->\n\n**novel_pose")
+    assert text.endswith("<!-- /report -->\nafter\n")
+    assert "old" not in text
+    assert str(tmp_path) not in text  # no path of this machine
+
+
+def test_what_is_wrong_is_said_in_one_sentence_before_anything_is_written(sweep, tmp_path, inside):
+    runs = f"runs=[{sweep}]"
+    refused(inside("report"), "runs is not set")
+    refused(inside("report", "runs=[]"), "runs is not set")
+    refused(inside("report", "runs={a: 1}"), "runs must be a list")
+    refused(inside("report", f"runs=[{tmp_path}/gone]"), "gone does not exist")
+    refused(inside("report", runs, "out=null"), "out is not set")
+    refused(inside("report", runs, "out=a", "allow_dirty=maybe"), "allow_dirty must be")
+    refused(inside("report", runs, "out=a", "table=zju"), "is of zju_mocap", "table=plain")
+    refused(inside("report", runs, "out=a", "table.metrics=[fid]"), "fid", "psnr")
+    refused(inside("report", runs, "out=a", "table.rows=[{model: full}]"), "table.rows", "model")
+    page = tmp_path / "page.md"
+    page.write_text("no block")
+    refused(inside("report", runs, "out=a", f"fill={page}"), "expected a block", "report:plain")
+    refused(inside("report", runs, "out=a", "fill=gone.md"), "gone.md: no such page")
+    assert not (tmp_path / "a").exists()
+    refused(inside("report", runs, f"out={page}/x"), "cannot be written")
+
+
+@pytest.mark.parametrize("name", sorted(p.stem for p in (config_folder() / "table").glob("*")))
+def test_every_table_composes_and_its_keys_are_read(compose, name):
+    config = compose("report", f"table={name}")
+    assert instantiate(config.table).name == name
+    code = "\n".join(path.read_text() for path in SRC.rglob("*.py"))
+    for key in config:
+        assert re.search(rf"config\.{key}\b", code), key

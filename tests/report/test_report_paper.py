@@ -1,0 +1,115 @@
+"""The paper's figures: as printed, marked, beside nothing but the same data and protocol."""
+
+from __future__ import annotations
+
+import pytest
+from report_folders import protocol, report_of, row, table, texts, write_run, zju
+
+from gsgan.report.paper import read_paper
+from gsgan.report.scored import Run
+from gsgan.train.paper import NAME
+from gsgan.utils.errors import ConfigError
+
+ABLATION = {"rows": [{"run": "full"}, {"run": "wo_seg"}], "paper": "ablation"}
+VIEW = {"splits": ["novel_view"], "metrics": ["psnr"]}
+
+
+def paper_run(folder, **held):
+    given = {"data": zju(377), "record": protocol("paper_zju"), "splits": ("novel_view",)}
+    return write_run(folder, psnr=30.0, **(given | held))
+
+
+def test_beside_the_same_data_subject_protocol_and_split(tmp_path):
+    (grid,) = report_of(table(**ABLATION, **VIEW), paper_run(tmp_path / "a")).grids
+    labels = [r.label for r in grid.rows]
+    assert labels[:2] == ["full", "full (as printed)"]
+    printed = row(grid, "full (as printed)")
+    assert (texts(printed), printed.kind) == (["34.16"], "paper")
+    assert "mean" not in printed.cells[0].numbers  # in no mean of ours
+    assert texts(row(grid, "full")) == ["30.00"]
+    assert texts(row(grid, "w/o S (as printed)")) == ["29.08"]
+    assert labels[-1] == "all background (floor)"
+
+
+APART = {
+    "synthetic": ({"data": None, "record": None}, "of synthetic, person, the paper's of zju"),
+    "another subject": ({"data": zju(386)}, "CoreView_386, the paper's of subject 377"),
+    "no protocol": ({"record": None}, "no published protocol"),
+    "another protocol": ({"record": protocol("zju_gauhuman")}, "follow zju_gauhuman"),
+    "a departure": ({"record": protocol("paper_zju", departures=["at scale 1"])}, "at scale 1"),
+}
+
+
+@pytest.mark.parametrize(("held", "said"), APART.values(), ids=APART)
+def test_elsewhere_they_stand_by_themselves_and_say_why(tmp_path, held, said):
+    ours, paper = report_of(table(**ABLATION, **VIEW), paper_run(tmp_path / "a", **held)).grids
+    assert all(r.kind != "paper" for r in ours.rows)
+    assert all(r.kind == "paper" and "(as printed)" in r.label for r in paper.rows)
+    assert said in paper.remarks[0]
+    told = ("n/a", "zju_mocap", "the paper's, read as paper_zju", "n/a")
+    assert all(r.provenance == told for r in paper.rows)
+
+
+def test_only_runs_of_the_preset_bear_the_papers_name(tmp_path, monkeypatch):
+    rows = [{"run": "full"}, {"run": "full", "label": "C", "variant": "splat"}]
+    rows.append({"run": "wo_seg", "label": "w/o S"})
+    spec = table(**(ABLATION | VIEW | {"rows": rows}))
+    runs = [paper_run(tmp_path / name, model=name) for name in ("full", "wo_seg")]
+    for told, labels in (
+        ([], [NAME, f"{NAME}, w/o S"]),
+        (["model.low_pass"], ["full", "w/o S"]),
+        (None, ["full", "w/o S"]),
+    ):
+        monkeypatch.setattr(Run, "departures", lambda run, told=told: told)
+        (grid,) = report_of(spec, *runs).grids
+        ours = [r.label for r in grid.rows if r.kind != "paper"]
+        assert [label for label in ours if label in labels] == labels
+        assert ours.count(NAME) == (told == [])
+        notes = " ".join(note for r in grid.rows for note in r.notes)
+        assert ("differs from experiment=paper in model.low_pass" in notes) == bool(told)
+        assert ("no config tells whether" in notes) == (told is None)
+
+
+def test_another_split_is_not_the_papers(tmp_path):
+    run = paper_run(tmp_path / "a", splits=("novel_pose",))
+    spec = table(**(ABLATION | VIEW | {"splits": ["novel_pose"]}))
+    assert "novel_pose scores, the paper's novel_view" in report_of(spec, run).grids[-1].remarks[0]
+
+
+def test_the_six_subjects_beside_ours(tmp_path):
+    subjects = ["377", "386", "387", "392", "393", "394"]
+    runs = [paper_run(tmp_path / s, data=zju(int(s))) for s in subjects]
+    spec = table(**VIEW, subjects=subjects, data="zju_mocap", paper="zju")
+    (grid,) = report_of(spec, *runs).grids
+    assert texts(row(grid, "GaussianGAN (as printed)")) == [
+        "34.16", "36.45", "29.99", "33.23", "31.50", "32.26", "32.94",
+    ]  # fmt: skip
+    assert texts(row(grid, "full")) == ["30.00"] * 7
+
+
+@pytest.mark.parametrize("name", ["zju", "thuman4", "ablation", "miou", "slp"])
+def test_every_printed_figure_is_a_number_and_has_its_own_table(name):
+    paper = read_paper(name)
+    grid = paper.grid("why")
+    printed = [c for r in grid.rows for c in r.cells if c.text != "n/a"]
+    assert printed
+    assert all(float(c.text) == c.numbers["paper"] for c in printed)
+    assert paper.title in grid.title
+
+
+def test_the_mean_that_method_md_quotes_follows_from_the_table():
+    (held,) = read_paper("zju").rows
+    values = [float(v["psnr"]) for s, v in held.values.items() if s != "mean"]
+    assert sum(values) / len(values) == pytest.approx(32.93, abs=0.005)
+
+
+def test_private_or_pooled_figures_never_stand_beside(tmp_path):
+    for name in ("slp", "miou"):
+        run = paper_run(tmp_path / name, record=None)
+        spec = table(metrics=["psnr"], splits=["novel_view"], paper=name)
+        assert "Not beside" in report_of(spec, run).grids[-1].remarks[0]
+
+
+def test_an_unknown_entry_is_refused():
+    with pytest.raises(ConfigError, match=r"table\.paper=tables: paper\.yaml has zju"):
+        read_paper("tables")

@@ -1,0 +1,317 @@
+"""Tables of handmade runs: every number in closed form, every mixture refused by name."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import pytest
+from report_folders import protocol, report_of, row, table, texts, variant, write_run, zju
+
+from gsgan.report.build import build
+from gsgan.report.scored import read_run
+from gsgan.utils.errors import ConfigError
+
+SPLITS = ("novel_view", "novel_pose")
+
+
+def seeds(tmp_path, model="full", values=(30.0, 32.0, 31.0), **held):
+    return [
+        write_run(tmp_path / f"{model}{seed}", model, seed, psnr=value, **held)
+        for seed, value in enumerate(values)
+    ]
+
+
+def test_mean_spread_seeds_and_floor(tmp_path):
+    report = report_of(table(), *seeds(tmp_path))
+    (grid,) = report.grids
+    full = row(grid, "full")
+    assert texts(full) == ["31.00 ± 1.00"]
+    assert full.cells[0].numbers["seeds"] == {"0": 30.0, "1": 32.0, "2": 31.0}
+    assert full.provenance == ("3", "synthetic, person", "none", "abc123")
+    floor = row(grid, "all background (floor)")
+    assert (texts(floor), floor.kind) == (["15.50"], "floor")
+    assert any("LPIPS ↓ (weights are not at hand)" in remark for remark in grid.remarks)
+
+
+def test_one_seed_has_no_spread(tmp_path):
+    report = report_of(table(), write_run(tmp_path / "a", psnr=30.0))
+    assert texts(row(report.grids[0], "full")) == ["30.00"]
+    assert "one seed has no spread" in report.grids[0].remarks[0]
+
+
+def test_differences_are_taken_seed_by_seed(tmp_path):
+    runs = [*seeds(tmp_path), *seeds(tmp_path, "wo_seg", (29.0, 30.0, 32.0))]
+    rows = [{"run": "full"}, {"run": "wo_seg", "label": "w/o S"}, {"run": "wo_gcn"}]
+    scores, differences = report_of(table(rows=rows, reference="full"), *runs).grids
+    assert texts(row(differences, "w/o S")) == ["−0.67 ± 1.53 (2/3)"]  # −1, −2, +1
+    assert texts(row(scores, "wo_gcn")) == ["–"]
+    assert row(scores, "wo_gcn").notes == ("no scored run",)
+    assert [r.label for r in differences.rows] == ["w/o S"]
+
+
+def test_a_difference_says_how_many_seeds_it_is_of_and_names_both_commits(tmp_path):
+    runs = seeds(tmp_path)
+    for seed, psnr in ((1, 31.0), (2, 30.5), (7, 90.0)):
+        held = {"facts": {"commit": "def456"}, "psnr": psnr}
+        runs.append(write_run(tmp_path / f"b{seed}", "wo_seg", seed, **held))
+    scores, differences = report_of(table(reference="full"), *runs).grids
+    assert row(scores, "wo_seg").provenance[0] == "3"
+    found = row(differences, "wo_seg")
+    assert texts(found) == ["−0.75 ± 0.35 (2/2)"]  # −1, −0.5
+    assert found.cells[0].numbers["seeds"] == {"1": -1.0, "2": -0.5}
+    assert found.provenance == ("2", "synthetic, person", "none", "def456, abc123")
+
+
+def test_the_floor_has_no_seed_and_one_value(tmp_path):
+    report = report_of(table(), *seeds(tmp_path))
+    numbers = row(report.grids[0], "all background (floor)").cells[0].numbers
+    assert (numbers["n"], numbers["spread"]) == (1, None)
+
+
+def test_a_value_that_some_seeds_lack_is_counted_and_explained(tmp_path):
+    runs = [*seeds(tmp_path, values=(30.0, 31.0), lpips=0.1)]
+    runs.append(write_run(tmp_path / "x", "full", 2, psnr=32.0))
+    full = row(report_of(table(), *runs).grids[0], "full")
+    assert texts(full) == ["31.00 ± 1.00", "0.1000 ± 0.0000"]
+    assert full.cells[1].notes == ("seed 2: weights are not at hand",)
+    assert full.cells[1].numbers["n"] == 2
+
+
+def test_marks_departures_and_left_out_pictures_are_noted(tmp_path):
+    record = protocol("zju_humannerf", departures=["background is black, asked for: white"])
+    report = report_of(
+        table(),
+        write_run(tmp_path / "a", psnr=30.0, psnr_left_out=2, marks=["stand-in"], record=record),
+    )
+    full = row(report.grids[0], "full")
+    assert full.notes == (
+        "marked: stand-in",
+        "departs from zju_humannerf: background is black, asked for: white",
+    )
+    assert full.cells[0].notes == ("2 pictures without a finite score are not in the mean",)
+
+
+def test_step_ones_colour_is_a_row_of_its_own(tmp_path):
+    run = write_run(tmp_path / "a", psnr=30.0, splat={"psnr": 29.0})
+    grid = report_of(table(variants=["full", "splat"]), run).grids[0]
+    assert [r.label for r in grid.rows] == [
+        "full", "full: Step I's colour", "all background (floor)",
+    ]  # fmt: skip
+    assert texts(row(grid, "full: Step I's colour")) == ["29.00"]
+
+
+MIXTURES = {
+    "other data": ({"data": {"name": "capture", "root": "me"}}, "are of different data"),
+    "other fingerprint": (
+        {"data": {"name": "synthetic", "root": "person", "fingerprint": "beef"}},
+        "two sets of synthetic, person",
+    ),
+    "a protocol": ({"record": protocol("paper_zju")}, "other protocols: none and paper_zju"),
+    "other pictures": ({"floor": {"psnr": 15.6}}, "against different pictures"),
+    "fewer pictures": ({"images": 2}, "scored on 3 and 2 pictures"),
+    "changed code": ({"facts": {"dirty": True}}, "uncommitted changes"),
+    "another LPIPS": ({"lpips": 0.1, "lpips_name": "LPIPS-Alex"}, "LPIPS-VGG and LPIPS-Alex"),
+}
+
+
+@pytest.mark.parametrize(("held", "said"), MIXTURES.values(), ids=MIXTURES)
+def test_what_does_not_belong_in_one_column_is_refused_by_name(tmp_path, held, said):
+    first = write_run(tmp_path / "first", psnr=30.0, lpips=0.2, lpips_name="LPIPS-VGG")
+    other = write_run(tmp_path / "other", "wo_seg", psnr=29.0, **held)
+    with pytest.raises(ConfigError, match=said) as caught:
+        report_of(table(), first, other)
+    assert str(first) in str(caught.value)
+    assert str(other) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("held", "said"),
+    [
+        ({"marks": ["stand-in"]}, "carry other marks: unmarked and stand-in"),
+        ({"facts": {"iterations": 10}}, "trained 7000 and 10 iterations"),
+    ],
+)
+def test_seeds_of_one_row_are_of_one_thing(tmp_path, held, said):
+    runs = [write_run(tmp_path / "a", psnr=30.0), write_run(tmp_path / "b", seed=1, **held)]
+    with pytest.raises(ConfigError, match=said):
+        report_of(table(), *runs)
+
+
+def test_every_pair_of_seeds_is_compared(tmp_path):
+    """One that does not tell its iterations must not hide that two others differ."""
+    runs = [
+        write_run(tmp_path / str(seed), seed=seed, psnr=30.0, facts={"iterations": done})
+        for seed, done in enumerate((7000, None, 10))
+    ]
+    with pytest.raises(ConfigError, match="trained 7000 and 10 iterations"):
+        report_of(table(), *runs)
+
+
+def test_a_method_of_a_models_name_is_not_pooled_with_it(tmp_path):
+    model = write_run(tmp_path / "a", psnr=30.0)
+    facts = {"method": "full", "iterations": None}
+    method = write_run(tmp_path / "b", None, None, psnr=20.0, facts=facts)
+    with pytest.raises(ConfigError, match="a model trained here and a method's predictions"):
+        report_of(table(), model, method)
+
+
+def trained(tmp_path, name, model, seed, **settings):
+    run = read_run(write_run(tmp_path / name, model, seed, psnr=30.0))
+    return replace(run, settings={"training.step_two.l2": 5.0, **settings})
+
+
+def test_seeds_of_one_row_have_one_config(tmp_path):
+    runs = [
+        trained(tmp_path, "a", "full", 0),
+        trained(tmp_path, "b", "full", 1, **{"training.step_two.l2": 1.0}),
+    ]
+    with pytest.raises(ConfigError, match=r"more than the seed: training\.step_two\.l2"):
+        build(table(), runs, [], None)
+
+
+def test_a_row_says_in_which_settings_it_differs_from_the_reference(tmp_path):
+    settings = {"model.generator.base": 12, "model.generator.width": 1}
+    runs = [
+        trained(tmp_path, "a", "full", 0, **settings),
+        trained(tmp_path, "b", "mine", 0, **{"training.step_two.l2": 1.0}),
+        trained(tmp_path, "c", "twin", 0, **settings),
+    ]
+    scores, _ = build(table(reference="full"), runs, [], None).grids
+    told = "mine differs from full in model.generator, training.step_two.l2"
+    assert row(scores, "mine").notes == (told,)
+    assert row(scores, "twin").notes == ("twin differs from full in no setting",)
+    assert row(scores, "full").notes == ()
+
+
+def test_one_seed_twice_is_refused(tmp_path):
+    runs = [write_run(tmp_path / name, psnr=30.0) for name in ("a", "again")]
+    with pytest.raises(ConfigError, match=r"a \(full, seed 0\) and .*again are one row's same"):
+        report_of(table(), *runs)
+
+
+def test_data_that_cannot_be_compared_is_refused(tmp_path):
+    told = write_run(tmp_path / "a", psnr=30.0)
+    untold = write_run(tmp_path / "b", seed=1, psnr=30.0, data={"name": "synthetic"})
+    with pytest.raises(ConfigError, match="cannot be shown to be of the same data"):
+        report_of(table(), told, untold)
+
+
+def test_protocols_of_one_name_and_other_values_are_refused(tmp_path):
+    a = write_run(tmp_path / "a", psnr=30.0, record=protocol("p"))
+    b = write_run(tmp_path / "b", seed=1, psnr=30.0, record=protocol("p", scale=1.0))
+    with pytest.raises(ConfigError, match="p, with other scale"):
+        report_of(table(), a, b)
+
+
+def test_several_commits_stand_together_and_are_listed(tmp_path):
+    runs = [
+        write_run(tmp_path / "a", psnr=30.0),
+        write_run(tmp_path / "b", seed=1, psnr=30.0, facts={"commit": "def456"}),
+    ]
+    report = report_of(table(), *runs)
+    assert row(report.grids[0], "full").provenance[3] == "abc123, def456"
+    assert "Runs are of several commits: abc123, def456." in report.remarks
+
+
+def test_changed_code_passes_when_it_is_allowed(tmp_path):
+    runs = [
+        write_run(tmp_path / "a", psnr=30.0),
+        write_run(tmp_path / "b", seed=1, psnr=30.0, facts={"dirty": True}),
+    ]
+    report = report_of(table(), *runs, allow_dirty=True)
+    assert row(report.grids[0], "full").provenance[3] == "abc123, abc123 + changes"
+    assert any("uncommitted" in remark for remark in report.remarks)
+
+
+def test_apart_gives_other_data_a_grid_of_its_own(tmp_path):
+    a = write_run(tmp_path / "a", psnr=30.0)
+    b = write_run(tmp_path / "b", psnr=20.0, data={"name": "capture", "root": "me"})
+    c = write_run(tmp_path / "c", psnr=25.0, record=protocol("p"))
+    grids = report_of(table(apart=True), a, b, c).grids
+    assert [texts(row(grid, "full")) for grid in grids] == [["30.00"], ["20.00"], ["25.00"]]
+    assert "capture, me" in grids[1].title
+    assert "protocol p" in grids[2].title
+
+
+def test_one_grid_takes_runs_that_scored_other_splits(tmp_path):
+    both = write_run(tmp_path / "a", psnr=30.0, record=protocol("p"), splits=SPLITS)
+    one = write_run(tmp_path / "b", "wo_seg", psnr=29.0, record=protocol("p"), splits=SPLITS[:1])
+    grids = report_of(table(apart=True, splits=SPLITS), both, one).grids
+    assert len(grids) == 2
+    assert [r.label for r in grids[0].rows] == ["full", "wo_seg", "all background (floor)"]
+    assert [r.label for r in grids[1].rows] == ["full", "all background (floor)"]
+
+
+def test_runs_of_other_rows_are_named_and_left_out(tmp_path):
+    runs = [write_run(tmp_path / "a", psnr=30.0), write_run(tmp_path / "b", "mine", psnr=30.0)]
+    report = report_of(table(rows=[{"run": "full"}]), *runs)
+    assert report.left_out == [("b", "table t has no row for mine")]
+    with pytest.raises(ConfigError, match=r"no scored run is left.*no row for mine"):
+        report_of(table(rows=[{"run": "full"}]), runs[1])
+
+
+def test_a_split_that_no_run_scored_is_refused(tmp_path):
+    run = write_run(tmp_path / "a", psnr=30.0)
+    with pytest.raises(ConfigError, match="no run has scored a picture of novel_view"):
+        report_of(table(splits=["novel_view"]), run)
+    held = {"novel_view": {"full": variant(0, psnr_reason="none is held out")}}
+    (run / "metrics.json").write_text(json.dumps(held))
+    with pytest.raises(ConfigError, match="no run has scored"):
+        report_of(table(splits=["novel_view"]), run)
+
+
+SUBJECTS = {"subjects": ["377", "386"], "metrics": ["psnr"], "data": "zju_mocap"}
+
+
+def test_subjects_are_columns_with_a_mean_over_them_by_seed(tmp_path):
+    runs = [
+        write_run(tmp_path / f"{s}_{seed}", "full", seed, data=zju(s), psnr=30.0 + k + 2 * seed)
+        for k, s in enumerate((377, 386))
+        for seed in (0, 1)
+    ]
+    (grid,) = report_of(table(**SUBJECTS), *runs).grids
+    assert grid.columns == ["377", "386", "mean"]
+    full = row(grid, "full")
+    assert texts(full) == ["31.00 ± 1.41", "32.00 ± 1.41", "31.50 ± 1.41"]
+    assert full.provenance[:2] == ("2", "zju_mocap, 2 subjects")
+    assert texts(row(grid, "all background (floor)")) == ["15.50"] * 3
+
+
+def test_a_mean_over_subjects_needs_all_of_them(tmp_path):
+    one = write_run(tmp_path / "a", data=zju(377), psnr=30.0)
+    two = write_run(tmp_path / "b", "wo_seg", data=zju(386), psnr=29.0)
+    grid = report_of(table(**SUBJECTS), one, two).grids[0]
+    assert texts(row(grid, "full"))[:2] == ["30.00", "n/a"]
+    assert "mean" not in grid.columns  # no row has it
+    assert any("no mean over subjects: 386 missing" in remark for remark in grid.remarks)
+
+
+def test_a_mean_over_subjects_of_other_seeds_has_no_spread(tmp_path):
+    for subject, seeds in ((377, (0, 1)), (386, (0,))):
+        for seed in seeds:
+            write_run(
+                tmp_path / f"{subject}_{seed}", seed=seed, data=zju(subject), psnr=30.0 + 2 * seed
+            )
+    full = row(report_of(table(**SUBJECTS), tmp_path).grids[0], "full")
+    assert texts(full) == ["31.00 ± 1.41", "30.00", "30.50"]
+    assert "their seeds differ" in full.cells[2].notes[0]
+    assert full.provenance[0] == "1 to 2"
+
+
+def test_other_subjects_are_left_out_and_other_data_refused(tmp_path):
+    one = write_run(tmp_path / "a", data=zju(377), psnr=30.0)
+    other = write_run(tmp_path / "b", data=zju(313), psnr=30.0)
+    assert report_of(table(**SUBJECTS), one, other).left_out[0][0] == "b"
+    synthetic = write_run(tmp_path / "c", psnr=30.0)
+    with pytest.raises(ConfigError, match=r"of zju_mocap, but .*c \(full, seed 0\) is of synth"):
+        report_of(table(**SUBJECTS), one, synthetic)
+
+
+def test_a_mean_over_subjects_refuses_other_protocols(tmp_path):
+    one = write_run(tmp_path / "a", data=zju(377), psnr=30.0, record=protocol("p", subject=377))
+    two = write_run(tmp_path / "b", data=zju(386), psnr=30.0, record=protocol("p", subject=386))
+    report_of(table(**SUBJECTS), one, two)  # the subject is theirs to differ in
+    three = write_run(tmp_path / "c", data=zju(386), seed=1, psnr=30.0, record=protocol("q"))
+    with pytest.raises(ConfigError, match="p and q"):
+        report_of(table(**SUBJECTS), one, three)

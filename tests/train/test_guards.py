@@ -1,0 +1,128 @@
+"""What stops a run, what does not, and rates that follow the schedule."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import pytest
+import torch
+
+from gsgan.train.optimisers import Recipe
+from gsgan.train.rollback import Rollback
+from gsgan.train.schedule import Rate
+from gsgan.utils.errors import ConfigError, GsganError
+
+
+def skipping(make, *overrides):
+    module, _, _ = make(*overrides)
+    module.print = lambda *_: None
+    return module
+
+
+def test_non_finite_gradients_far_apart_never_stop_a_run(make):
+    module = skipping(make, "training.max_skipped=3", "training.skip_window=100")
+    for step in range(0, 2000, 60):  # two in every window
+        module.step = step
+        module._skip(("psi",))
+    assert len(module.skipped) == 2
+
+
+def test_too_many_within_the_window_do(make):
+    module = skipping(make, "training.max_skipped=3", "training.skip_window=100")
+    for module.step in (5, 6):
+        module._skip(("psi",))
+    module.step = 7
+    with pytest.raises(GsganError, match=r"3 of the last 100 iterations .* larger training.max_sk"):
+        module._skip(("psi",))
+
+
+def test_two_optimisers_of_one_iteration_count_once(make):
+    module = skipping(make, "training.max_skipped=2")
+    module._skip(("generator",))
+    module._skip(("discriminator",))
+    assert module.skipped == deque([0])
+
+
+def test_a_resumed_run_starts_counting_anew_and_may_change_the_limit(make, tiny):
+    from gsgan.train.runs import record
+
+    module = skipping(make, "training.max_skipped=20")
+    for step in range(19):
+        module.step = step
+        module._skip(("psi",))
+    checkpoint: dict = {}
+    module.on_save_checkpoint(checkpoint)
+    again = skipping(make, "training.max_skipped=20")
+    again.on_load_checkpoint(checkpoint)
+    again._skip(("psi",))  # no twentieth
+    assert record(tiny("training.max_skipped=3")) == record(tiny("training.max_skipped=300"))
+
+
+# --- the way back from a collapse, by all ranks together
+
+
+def test_ranks_decide_together_whether_the_person_has_vanished():
+    """Two ranks: one sees the person, one does not; alone they would decide differently."""
+    ranks = [Rollback(memory=0.0), Rollback(memory=0.0)]
+    for rank, alpha in zip(ranks, (0.3, 0.0), strict=True):
+        rank.watch(torch.full((1, 1, 4, 4), alpha), torch.full((1, 1, 4, 4), 0.3))
+    alone = [rank.share() for rank in ranks]
+    assert alone[0] > 0.9
+    assert alone[1] == 0
+    held = [torch.stack([rank.alpha, rank.mask]) for rank in ranks]
+
+    def over_ranks(value):
+        return torch.stack(held).mean(0)
+
+    shares = [rank.share(over_ranks) for rank in ranks]
+    assert shares == [pytest.approx(0.5)] * 2
+
+
+def test_training_asks_all_ranks(make, monkeypatch):
+    module, trainer, data = make()
+    asked = []
+
+    def reduce(value, *, reduce_op):
+        asked.append(reduce_op)
+        return value
+
+    monkeypatch.setattr(trainer.strategy, "reduce", reduce)
+    trainer.fit(module, data)
+    assert asked.count("mean") == module.schedule.epochs - 1  # the first one trains S alone
+
+
+def test_an_alpha_that_is_not_finite_is_no_collapse():
+    rollback = Rollback()
+    mask = torch.full((1, 1, 4, 4), 0.3)
+    for alpha in (0.3, float("nan"), 0.3):
+        rollback.watch(torch.full((1, 1, 4, 4), alpha), mask)
+    assert 0.5 < rollback.share() < 1
+
+
+# --- rates
+
+
+def test_psis_rate_ends_with_step_one_however_long_step_two_is(make):
+    rates = {}
+    for two in (6, 60):
+        module, _, _ = make("training=paper", "training.schedule.segmentation=0",
+                            "training.schedule.step_one=10", f"training.schedule.step_two={two}",
+                            "training.perceptual.weights=random")  # fmt: skip
+        rates[two] = []
+        for module.step in (0, 5, 10, 15):
+            rates[two].append(module._rate("psi"))
+    assert rates[6] == rates[60]
+    assert rates[6][0] == pytest.approx(1e-3)
+    assert rates[6][1] == pytest.approx(1e-4)  # half-way, exponentially
+    assert rates[6][2] == rates[6][3] == pytest.approx(1e-5)
+
+
+def test_a_span_that_is_not_read_is_refused(make):
+    module, _, _ = make("+training.recipes.generator.span=step_one")
+    with pytest.raises(ConfigError, match="only psi and colour have one"):
+        module.configure_optimizers()
+
+
+def test_a_span_is_both_steps_or_the_first():
+    with pytest.raises(ConfigError, match="span must be both or step_one, got 'all'"):
+        Recipe(Rate(1e-3), span="all")

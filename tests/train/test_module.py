@@ -1,0 +1,512 @@
+"""The training scheme: every phase learns what it should, guards hold, randomness is derived."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+from lightning import Trainer
+from torch.utils.data import DataLoader
+
+from gsgan.losses.adversarial import FORMS, generator_loss
+from gsgan.model.discriminator import Discriminator
+from gsgan.model.painting import Painting
+from gsgan.model.segmentation import silhouette_loss
+from gsgan.train.averaging import MovingAverage
+from gsgan.train.losses import StepOneLoss, StepTwoLoss, judged
+from gsgan.train.runs import load_avatar
+from gsgan.utils.errors import ConfigError, GsganError
+
+
+def snapshot(module: torch.nn.Module) -> dict[str, torch.Tensor]:
+    return {name: value.clone() for name, value in module.state_dict().items()}
+
+
+def moved(before: dict[str, torch.Tensor], module: torch.nn.Module, part: str) -> bool:
+    after = module.state_dict()
+    return any(
+        not torch.equal(before[name], after[name]) for name in before if name.startswith(part)
+    )
+
+
+PARTS = {
+    "segmentation": "avatar.segmentation",
+    "psi": "avatar.deformation",
+    "generator": "avatar.generator",
+    "pose": "avatar.pose_encoder",
+    "discriminator": "discriminator",
+}
+
+
+@pytest.mark.parametrize(
+    ("schedule", "learning"),
+    [
+        ((3, 0, 0), {"segmentation"}),
+        ((0, 3, 0), {"psi"}),
+        ((0, 0, 3), {"psi", "generator", "pose", "discriminator"}),
+    ],
+)
+def test_each_phase_moves_its_own_parts_only(make, schedule, learning):
+    s, one, two = schedule
+    module, trainer, data = make(
+        f"training.schedule.segmentation={s}", f"training.schedule.step_one={one}",
+        f"training.schedule.step_two={two}", "training.schedule.discriminator_start=0",
+        "size.rgb_skip=false",  # with it, only the last layer moves in the first steps
+    )  # fmt: skip
+    before = snapshot(module)
+    trainer.fit(module, data)
+    assert {name for name, part in PARTS.items() if moved(before, module, part)} == learning
+    assert module.step == sum(schedule)
+
+
+def test_a_short_run_improves_step_one(make):
+    module, trainer, data = make(
+        "training.schedule.segmentation=0", "training.schedule.step_one=40",
+        "training.schedule.step_two=0", "training.recipes.psi.rate.peak=0.01",
+    )  # fmt: skip
+    frame = data.dataset("train")[0]
+    with torch.no_grad():
+        before = float((module.avatar.paint(frame).colour - frame.image).abs().mean())
+    trainer.fit(module, data)
+    with torch.no_grad():
+        after = float((module.avatar.paint(frame).colour - frame.image).abs().mean())
+    assert after < 0.7 * before
+
+
+def test_variants_build_only_what_they_use(make):
+    full, _, _ = make()
+    splat, _, _ = make("model=splat_only")
+    assert splat.discriminator is None
+    assert splat.perceptual is None
+    assert splat.schedule.step_two == 0
+    both = full.schedule.step_one + full.schedule.step_two
+    assert splat.schedule.step_one == both
+    wo_feat, _, _ = make("model=wo_feat")
+    assert wo_feat.step_two.feature_matching == 0
+    assert wo_feat.discriminator is not None
+    wo_seg, _, _ = make("model=wo_seg")
+    assert wo_seg.avatar.segmentation is None
+    assert wo_seg.schedule.segmentation == 0
+    no_gan, _, _ = make("training.step_two.adversarial=0", "model=wo_feat")
+    assert no_gan.discriminator is None
+
+
+def test_detached_features_keep_the_generator_out_of_psi(make):
+    module, trainer, data = make(
+        "training.step_two.detach_features=true", "training.step_two.anchor=0",
+        "training.schedule.segmentation=0", "training.schedule.step_one=0",
+    )  # fmt: skip
+    before = snapshot(module)
+    trainer.fit(module, data)
+    assert not moved(before, module, "avatar.deformation")
+    assert moved(before, module, "avatar.generator")
+
+
+def test_a_nan_gradient_skips_its_step_and_a_second_one_stops_the_run(make, capsys):
+    module, trainer, data = make("training.schedule.segmentation=0", "training.max_skipped=2")
+    poisoned = {1, 3}
+
+    def loss(painting, frame):
+        value = painting.features.sum()
+        return value * float("nan") if module.step in poisoned else value * 0
+
+    module.step_one_loss = loss
+    before = snapshot(module.avatar.deformation)
+    with pytest.raises(GsganError, match="2 of the last 1000 iterations had gradients"):
+        trainer.fit(module, data)
+    assert module.step == 3
+    assert "skipped (1 of the last 1000 iterations, at most 2)" in capsys.readouterr().out
+    assert not moved(before, module.avatar.deformation, "")
+
+
+def test_randomness_follows_from_seed_and_step(make):
+    module, _, data = make("effects.random_background=on")
+    frame = data.dataset("train")[0]
+    first = module._background(frame), module._pose_noise(frame.skeleton)
+    again = module._background(frame), module._pose_noise(frame.skeleton)
+    assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
+    module.step = 1
+    assert not torch.equal(module._background(frame), first[0])
+    module.step, module.seed = 0, 1
+    assert not torch.equal(module._pose_noise(frame.skeleton), first[1])
+    module.random_background = False
+    assert module._background(frame) is None
+
+
+# --- alpha
+
+
+def leaves(*channels: int, size: int = 16) -> list[torch.Tensor]:
+    """Random pictures that take a gradient."""
+    generator = torch.Generator().manual_seed(0)
+    return [torch.rand(1, n, size, size, generator=generator).requires_grad_() for n in channels]
+
+
+def seen_person(size: int = 16) -> SimpleNamespace:
+    """A person in the middle, unsure at the right side."""
+    mask, unsure = torch.zeros(1, 1, size, size), torch.zeros(1, 1, size, size)
+    mask[..., 4:12, 4:12], unsure[..., 13:] = 1.0, 1.0
+    return SimpleNamespace(image=0.4 * mask.expand(1, 3, -1, -1), mask=mask, unsure=unsure)
+
+
+def test_step_two_compares_on_white_by_alpha_and_mask():
+    image, alpha = leaves(3, 1)
+    frame = seen_person()
+    weights = StepTwoLoss(l1=0.5, l2=3.0, ssim=0.0, alpha=2.0)
+
+    def terms(loss: StepTwoLoss) -> dict[str, torch.Tensor]:
+        painting = Painting(image, alpha)
+        return loss.terms(painting, frame, anchor=None, perceptual=None, judge=None, step=0)
+
+    found = terms(weights)
+    off = ((image + 1 - alpha) - (frame.image + 1 - frame.mask)).detach() * (frame.unsure == 0)
+    assert float(found["alpha"].detach()) == pytest.approx(
+        2 * float(0.5 * off.abs().mean() + 3 * off.square().mean()), rel=1e-5
+    )
+    (slope,) = torch.autograd.grad(found["alpha"], alpha)
+    expected = -2 * (0.5 * off.sign() + 6 * off).sum(1, keepdim=True) / off.numel()
+    torch.testing.assert_close(slope, expected)
+    assert torch.autograd.grad(found["photometric"], alpha, allow_unused=True) == (None,)
+    assert set(terms(replace(weights, alpha=0.0))) == {"photometric"}
+
+
+def test_the_generators_fourth_channel_learns_from_alpha_alone(make):
+    module, _, data = make("size.rgb_skip=false", "training.step_two.perceptual_every=1")
+    frame = data.dataset("train")[0]
+    last = module.avatar.generator.paint.weight
+    terms = module.step_two_terms(module.avatar.paint(frame), frame, play=True)
+    assert {"alpha", "photometric", "anchor", "adversarial"} <= set(terms)
+    slopes = {
+        name: torch.autograd.grad(term, last, retain_graph=True, allow_unused=True)[0]
+        for name, term in terms.items()
+    }
+    assert bool(slopes["alpha"][3].any())
+    assert bool(slopes["alpha"][:3].any())  # the image on white is its colours, too
+    for name in terms.keys() - {"alpha", "anchor"}:
+        assert bool(slopes[name][:3].any()), name
+        assert not slopes[name][3].any(), name
+    assert slopes["anchor"] is None  # of what is splatted
+
+
+def test_on_black_step_one_compares_the_splats_alpha_with_the_mask():
+    features, alpha = leaves(5, 1)
+    frame, colour = seen_person(), torch.tensor([0.2, 0.9, 0.5]).view(1, 3, 1, 1)
+    painting = Painting(None, features=features, splat_alpha=alpha)
+    with_alpha, without = StepOneLoss(alpha=0.3), StepOneLoss(alpha=0.0)
+    on_black = with_alpha(painting, frame, None, None)
+    (slope,) = torch.autograd.grad(on_black, alpha)
+    off = (alpha - frame.mask).detach() * (frame.unsure == 0)
+    torch.testing.assert_close(slope, 0.3 * off.sign() / off.numel())
+    black = without(painting, frame, None, None)
+    assert torch.autograd.grad(black, alpha, allow_unused=True) == (None,)
+    assert float((on_black - black).detach()) == pytest.approx(0.3 * float(off.abs().mean()))
+    # a colour behind her teaches alpha by itself
+    over = with_alpha(painting, frame, colour, None)
+    assert torch.equal(over, without(painting, frame, colour, None))
+    assert bool(torch.autograd.grad(over, alpha)[0].any())
+
+
+@pytest.mark.parametrize("word", ["on", "off"])
+def test_step_one_teaches_the_splats_alpha_with_and_without_a_random_background(make, word):
+    """On black and without a weight, a black person could as well be transparent."""
+    module, _, data = make(f"effects.random_background={word}", "training.step_one.feature_head=0")
+    frame = data.dataset("train")[0]
+    painting = module.avatar.paint(frame)
+    alpha = painting.splat_alpha.detach().requires_grad_()
+    seen = replace(painting, splat_alpha=alpha)
+    (slope,) = torch.autograd.grad(module.step_one_loss(seen, frame), alpha)
+    missing = (alpha < 0.9) & (frame.mask == 1)
+    assert bool(missing.any())
+    if word == "off":
+        assert bool((slope[missing] < 0).all())
+        module.step_one = replace(module.step_one, alpha=0.0)
+        loss = module.step_one_loss(seen, frame)
+        assert torch.autograd.grad(loss, alpha, allow_unused=True) == (None,)
+    else:
+        assert bool(slope.any())
+
+
+# --- S without labels
+
+
+@pytest.fixture
+def unlabelled(tmp_path):
+    """A small capture with body poses and no labels."""
+    from make import write_tiny_capture
+
+    return write_tiny_capture(
+        tmp_path / "unlabelled", frames=3, size=(48, 48), body_pose=True, meta={"body": "free"}
+    )
+
+
+def test_without_labels_s_learns_two_numbers_from_the_masks(make, unlabelled):
+    module, trainer, data = make(
+        f"data.root={unlabelled}", "training.schedule.segmentation=20",
+        "training.schedule.step_one=0", "training.schedule.step_two=0",
+    )  # fmt: skip
+    segmentation, frame = module.avatar.segmentation, data.dataset("train")[0]
+
+    def loss() -> float:
+        with torch.no_grad():
+            alpha = segmentation.raster(frame.body, frame.camera).alpha
+            return float(silhouette_loss(alpha, frame.mask))
+
+    before, first = snapshot(module), loss()
+    trainer.fit(module, data)
+    after = module.state_dict()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert changed == {"avatar.segmentation.common"}
+    assert loss() < first
+
+
+def test_unsure_pixels_teach_s_nothing(make, unlabelled):
+    module, trainer, data = make(
+        f"data.root={unlabelled}", "training.schedule.segmentation=2",
+        "training.schedule.step_one=0", "training.schedule.step_two=0",
+    )  # fmt: skip
+    frame = data.dataset("train")[0]
+    doubtful = replace(frame, unsure=torch.ones_like(frame.mask))
+    trainer.fit(module, DataLoader([doubtful] * 2, batch_size=None))
+    assert module.step == 2
+    assert not module.avatar.segmentation.common.any()
+
+
+def test_feature_head_commutes_with_blending(make):
+    """The readout of F on a background is the background where nothing is."""
+    module, _, data = make()
+    frame = data.dataset("train")[0]
+    torch.nn.init.ones_(module.feature_head.bias)
+    painting = module.avatar.paint(frame)
+    empty = replace(painting, features=painting.features * 0, splat_alpha=painting.splat_alpha * 0)
+    blank = replace(frame, image=frame.image * 0, mask=frame.mask * 0)
+    assert float(module.step_one_loss(empty, blank).detach()) == pytest.approx(0, abs=1e-5)
+
+
+def test_pose_noise_can_be_off(make):
+    module, _, data = make("training.pose_noise=0")
+    assert module._pose_noise(data.dataset("train")[0].skeleton) is None
+
+
+def push_opacities_down(module, until: int) -> None:
+    """Ψ's rate is wild and its gradient makes every opacity fall, until the run came back so often;
+    all else in Ψ stands still."""
+    deformation = module.avatar.deformation.requires_grad_(False)
+    deformation.logit_bound = 40.0
+    deformation.table.requires_grad_(True)
+
+    def push(gradient: torch.Tensor) -> torch.Tensor:
+        pushed = torch.zeros_like(gradient)
+        pushed[:, 10] = float(module.rollback.done < until)  # after means 3, quats 4, scales 3
+        return pushed
+
+    deformation.table.register_hook(push)
+
+
+LONGER = (
+    "training.schedule.segmentation=0", "training.schedule.step_one=16",
+    "training.schedule.step_two=8", "training.recipes.psi.rate.peak=0.7",
+    "training.recipes.psi.rate.hold=1.0", "training.recipes.psi.clip=null",
+    "training.rollback.memory=0",
+)  # fmt: skip
+
+
+def alpha_share(module, frame) -> float:
+    with torch.no_grad():
+        return float(module.avatar.paint(frame).splat_alpha.mean() / frame.mask.mean())
+
+
+def test_a_run_driven_into_the_collapse_is_caught_and_brought_back(make, capsys):
+    """The collapse: every opacity falls to nothing, and no NaN says so."""
+    module, trainer, data = make(*LONGER)
+    frame, seen = data.dataset("train")[0], []
+    push_opacities_down(module, until=1)
+    restore = module.rollback.restore
+
+    def watched(*args):
+        seen.append(alpha_share(module, frame))
+        back = restore(*args)
+        seen.append(alpha_share(module, frame))
+        return back
+
+    module.rollback.restore = watched
+    trainer.fit(module, data)
+    assert module.rollback.done == 1
+    assert seen[0] < 0.05 < 0.5 < seen[1]
+    assert module.rollback.rate == 0.5
+    assert "back to the last good state" in capsys.readouterr().out
+    assert module.step == module.schedule.total
+
+
+def test_a_person_that_keeps_vanishing_stops_the_run_before_its_checkpoint(make, tmp_path):
+    from lightning.pytorch.callbacks import ModelCheckpoint
+
+    keep = ModelCheckpoint(tmp_path / "kept", save_on_train_epoch_end=True)
+    module, trainer, data = make(*LONGER, enable_checkpointing=True, callbacks=[keep])
+    module.rollback.most = 1
+    push_opacities_down(module, until=9)
+    with pytest.raises(GsganError, match="has vanished"):
+        trainer.fit(module, data)
+    assert module.rollback.done == 1
+    kept = torch.load(keep.best_model_path, weights_only=True)["state_dict"]
+    assert float(kept["avatar.deformation.table"][:, 10].min()) > -20
+
+
+def test_the_average_is_scored_and_comes_back_from_a_checkpoint(make, tmp_path, tiny):
+    module, trainer, data = make("training.average=0.9", "training.schedule.step_one=0")
+    frame = data.dataset("train")[0]
+    assert module.shown is module.avatar
+    trainer.fit(module, data)
+    assert module.shown is not module.avatar
+    averaged = dict(module.shown.named_parameters())
+    moving = {
+        name: value
+        for name, value in module.avatar.named_parameters()
+        if not torch.equal(value, averaged[name])
+    }
+    assert any(name.startswith("generator") for name in moving)
+    assert all(not p.requires_grad for p in averaged.values())
+    trainer.save_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=False)
+    config = tiny("training.average=0.9", "training.schedule.step_one=0")
+    loaded, _ = load_avatar(tmp_path / "run", config, data)
+    with torch.no_grad():
+        expected, found = module.shown.paint(frame).image, loaded.paint(frame).image
+    torch.testing.assert_close(found, expected)
+
+
+def test_the_average_follows_its_formula():
+    layer = torch.nn.Linear(1, 1)
+    average = MovingAverage(layer, 0.5)
+    values = []
+    for step in range(4):
+        torch.nn.init.constant_(layer.weight, float(step))
+        average.update(layer)
+        values.append(float(average.module.weight.detach()))
+    # a copy first; then decay min(0.5, (1 + n) / (10 + n)) with n = 1, 2, 3
+    expected = [0.0]
+    for n in (1, 2, 3):
+        decay = min(0.5, (1 + n) / (10 + n))
+        expected.append(decay * expected[-1] + (1 - decay) * n)
+    assert values == pytest.approx(expected)
+
+
+def test_an_average_of_every_fourth_iteration_forgets_as_fast():
+    layer = torch.nn.Linear(1, 1)
+    torch.nn.init.constant_(layer.weight, 1.0)
+    often, seldom = MovingAverage(layer, 0.99), MovingAverage(layer, 0.99, every=4)
+    for average, updates in ((often, 4000), (seldom, 1000)):  # past the quick start
+        for _ in range(updates):
+            average.update(layer)
+    torch.nn.init.constant_(layer.weight, 2.0)
+    for step in range(40):
+        often.update(layer)
+        if step % 4 == 0:
+            seldom.update(layer)
+    expected = 2 - 0.99**40
+    for average in (often, seldom):
+        assert float(average.module.weight.detach()) == pytest.approx(expected, abs=1e-5)
+
+
+def test_the_average_is_updated_when_the_config_says(make):
+    module, trainer, data = make("training.average_every=5", "training.schedule.step_one=0")
+    trainer.fit(module, data)
+    steps = range(module.schedule.total - module.schedule.step_two, module.schedule.total)
+    assert int(module.average.copy.n_averaged) == sum(step % 5 == 0 for step in steps)
+    with pytest.raises(ConfigError, match=r"training\.average_every must be at least 1, got 0"):
+        make("training.average_every=0")
+
+
+@pytest.mark.parametrize("model", ["lbs_splat", "image_to_image", "splat_only"])
+def test_baselines_train_with_the_same_schedule(make, model):
+    module, trainer, data = make(f"model={model}", "training.schedule.stretch=1")
+    before = snapshot(module)
+    trainer.fit(module, data)
+    both = module.schedule.step_one + module.schedule.step_two
+    assert both == 12
+    assert module.step == both
+    part = {"lbs_splat": "avatar.surface", "image_to_image": "avatar.generator"}
+    assert moved(before, module, part.get(model, "avatar.deformation"))
+
+
+def test_a_stretched_schedule_starts_the_gan_at_the_same_share(make):
+    plain, _, _ = make()
+    module, _, _ = make("training.schedule.stretch=2.5")
+    for name in ("step_one", "step_two", "discriminator_start"):
+        assert getattr(module.schedule, name) == round(2.5 * getattr(plain.schedule, name))
+    assert module.schedule.segmentation == plain.schedule.segmentation
+
+
+def test_every_variant_is_scored_by_its_moving_average(make):
+    module, trainer, data = make("model=splat_only", "training.schedule.stretch=1")
+    trainer.fit(module, data)
+    assert module.average.started
+    assert module.shown is module.average.module
+    live = dict(module.avatar.named_parameters())
+    averaged = dict(module.shown.named_parameters())
+    assert any(not torch.equal(live[name], averaged[name]) for name in live)
+
+
+def test_every_phase_runs_under_bf16_autocast(make):
+    """Geometry, rasteriser and SSIM stay in float32: F is the same with and without autocast."""
+    module, _, data = make()
+    frame = data.dataset("train")[0]
+    plain = module.avatar.paint(frame)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert module.avatar.window(frame) is not None
+        mixed = module.avatar.paint(frame)
+        terms = module.step_two_terms(mixed, frame, play=True)
+        torch.stack(list(terms.values())).sum().backward()
+    assert torch.equal(plain.features, mixed.features)
+    assert mixed.image.dtype == torch.float32
+    assert float((plain.image - mixed.image).abs().max().detach()) < 0.05
+
+
+def test_float16_is_refused_before_anything_trains(make, monkeypatch):
+    """Said to a trainer as a GPU's would have it: on a CPU Lightning takes bf16 in its place."""
+    module, _, _ = make()
+    for precision in ("16-mixed", "16-true"):
+        module.trainer = Trainer(accelerator="cpu", logger=False)
+        monkeypatch.setattr(Trainer, "precision", precision)
+        with pytest.raises(ConfigError, match=f"precision={precision}: .* choose bf16-mixed"):
+            module.on_fit_start()
+    monkeypatch.setattr(Trainer, "precision", "bf16-mixed")
+    module.on_fit_start()
+
+
+def test_the_discriminators_rate_spans_the_game_alone(make):
+    module, _, _ = make("training.schedule.step_two=40", "training.schedule.discriminator_start=20")
+    start, end = module.schedule.game
+    recipe = module.recipes["discriminator"].rate
+    rates = []
+    for module.step in (start, end - 1):
+        rates.append(module._rate("discriminator"))
+    assert rates[0] == recipe.peak
+    assert rates[1] < 0.2 * recipe.peak  # it fell within the game, not before
+
+
+def test_a_comparing_gan_without_feature_matching_still_sees_the_real_picture():
+    torch.manual_seed(0)
+    judge = Discriminator(scales=1, base=4, layers=2, norm="none")
+    image = torch.rand(1, 3, 16, 16, requires_grad=True)
+    frame = SimpleNamespace(image=torch.rand(1, 3, 16, 16), unsure=None)
+    weights = StepTwoLoss(adversarial=2.0, feature_matching=0.0, gan="relativistic", alpha=0.0)
+    painting = Painting(image, image[:, :1])
+    terms = weights.terms(painting, frame, anchor=None, perceptual=None, judge=judge, step=0)
+    expected = 2 * generator_loss(judge(frame.image), judge(image), "relativistic")
+    assert float(terms["adversarial"]) == pytest.approx(float(expected), rel=1e-6)
+    terms["adversarial"].backward()
+    assert float(image.grad.abs().max()) > 0
+
+
+def test_a_comparing_gan_judges_in_full_precision():
+    judge, image = Discriminator(scales=1, base=4, layers=2, norm="none"), torch.rand(1, 3, 16, 16)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        kinds = {gan: judged(judge, image, gan)[0][-1].dtype for gan in FORMS}
+    assert kinds.pop("relativistic") == torch.float32
+    assert set(kinds.values()) == {torch.bfloat16}
+
+
+def test_wrong_gan_name_is_one_sentence(make):
+    with pytest.raises(Exception, match="logistic, hinge, lsgan, relativistic"):
+        make("training.step_two.gan=wasserstein")

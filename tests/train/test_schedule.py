@@ -1,0 +1,58 @@
+"""Schedules are pure maps from the iteration to a value."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from gsgan.train.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Rate, Schedule
+from gsgan.utils.errors import ConfigError
+
+
+def test_phases_follow_each_other():
+    s = Schedule(segmentation=2, step_one=3, step_two=4, discriminator_start=1, epoch=4)
+    assert [s.phase(i) for i in range(9)] == [SEGMENTATION] * 2 + [STEP_ONE] * 3 + [STEP_TWO] * 4
+    assert (s.total, s.epochs) == (9, 3)
+    assert [s.adversarial(i) for i in range(9)] == [False] * 6 + [True] * 3
+    assert s.bounds(STEP_TWO) == (5, 9)
+    assert s.game == (6, 9)
+    late = Schedule(segmentation=2, step_one=3, step_two=4, discriminator_start=9)
+    assert late.game == (9, 9)
+    assert not any(late.adversarial(i) for i in range(9))
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"segmentation": -1}, {"epoch": 0}, {"segmentation": 0, "step_one": 0, "step_two": 0}]
+)
+def test_impossible_schedules_are_refused(wrong):
+    with pytest.raises(ConfigError, match="schedule"):
+        Schedule(**({"segmentation": 1, "step_one": 1, "step_two": 1} | wrong))
+
+
+def test_rate_holds_then_descends_to_its_end():
+    rate = Rate(peak=2.0, hold=0.5, final=0.1)
+    assert rate.at(0, 0, 100) == rate.at(50, 0, 100) == 2.0
+    assert math.isclose(rate.at(75, 0, 100), 2.0 * (0.1 + 0.9 * 0.5), rel_tol=1e-9)
+    assert math.isclose(rate.at(100, 0, 100), 0.2, rel_tol=1e-9)
+    values = [rate.at(i, 0, 100) for i in range(101)]
+    assert values == sorted(values, reverse=True)
+
+
+@pytest.mark.parametrize(("shape", "half"), [("linear", 0.505), ("exponential", 0.1)])
+def test_rate_shapes(shape, half):
+    rate = Rate(peak=1.0, hold=0.0, until=0.5, final=0.01, shape=shape)
+    assert math.isclose(rate.at(25, 0, 100), half, rel_tol=1e-9)
+    assert math.isclose(rate.at(50, 0, 100), 0.01, rel_tol=1e-9)
+    assert math.isclose(rate.at(99, 0, 100), 0.01, rel_tol=1e-9)
+
+
+@pytest.mark.parametrize("wrong", [{"shape": "step"}, {"hold": 0.9, "until": 0.5}])
+def test_impossible_rates_are_refused(wrong):
+    with pytest.raises(ConfigError, match="rate"):
+        Rate(**({"peak": 1.0} | wrong))
+
+
+def test_rate_warms_up():
+    rate = Rate(peak=1.0, hold=1.0, warmup=3)
+    assert [rate.at(i, 10, 20) for i in range(10, 15)] == [0.25, 0.5, 0.75, 1.0, 1.0]

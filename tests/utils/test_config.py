@@ -1,0 +1,187 @@
+"""Configs compose, match their constructors key for key, and ablations differ by a line or two."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from gsgan.utils.config import LONGEST_NAME, config_folder, folder_name, one_sentence, spelled_out
+from gsgan.utils.errors import ConfigError, DataError
+
+SRC = Path(__file__).parents[2] / "src" / "gsgan"
+
+
+def options(group: str) -> list[str]:
+    return sorted(path.stem for path in (config_folder() / group).glob("*.yaml"))
+
+
+@pytest.mark.parametrize("model", options("model"))
+@pytest.mark.parametrize("data", options("data"))
+def test_every_model_composes_with_every_data(compose, model, data):
+    config = compose("train", f"model={model}", f"data={data}")
+    assert OmegaConf.to_container(config.model, resolve=True)["_target_"].startswith("gsgan.")
+
+
+@pytest.mark.parametrize(
+    "group", ["effects", "trainer", "logger", "size", "training", "accuracy", "experiment"]
+)
+def test_every_option_composes(compose, group):
+    assert options(group)
+    for option in options(group):
+        OmegaConf.to_container(compose("train", f"{group}={option}").training, resolve=True)
+
+
+def test_the_names_that_the_readme_promises_exist():
+    assert {"full", "wo_seg", "wo_gcn", "wo_feat", "splat_only"} <= set(options("model"))
+    assert {"synthetic", "capture", "zju_mocap", "thuman4"} <= set(options("data"))
+    assert {"cpu", "gpu", "ddp"} <= set(options("trainer"))
+    assert "demo" in options("experiment")
+
+
+def differences(a, b, at: str = "") -> set[str]:
+    if isinstance(a, dict) and isinstance(b, dict):
+        keys = set(a) | set(b)
+        return {x for k in keys for x in differences(a.get(k), b.get(k), f"{at}.{k}".strip("."))}
+    return set() if a == b else {at}
+
+
+@pytest.mark.parametrize("experiment", [None, "demo", "smoke"])
+@pytest.mark.parametrize(
+    ("model", "changed"),
+    [
+        ("wo_seg", {"model.segmentation"}),
+        ("wo_feat", {"training.step_two.feature_matching"}),
+        ("wo_gcn", {"model.pose_encoder"}),
+        (
+            "splat_only",
+            {
+                *("model.segmentation", "model.pose_encoder", "model.generator"),
+                "training.schedule.stretch",
+            },
+        ),
+    ],
+)
+def test_an_ablation_changes_what_it_says_and_nothing_else(compose, model, changed, experiment):
+    chosen = [] if experiment is None else [f"experiment={experiment}"]
+    full = OmegaConf.to_container(compose("train", *chosen))
+    other = OmegaConf.to_container(compose("train", *chosen, f"model={model}"))
+    found = {".".join(key.split(".")[:3]) for key in differences(full, other)}
+    assert {next(c for c in changed if key.startswith(c)) for key in found} == changed
+
+
+def test_demo_is_what_train_does_by_default(compose):
+    assert compose("train") == compose("train", "experiment=demo")
+
+
+def test_every_top_level_key_is_read_by_code(compose):
+    code = "\n".join(path.read_text() for path in SRC.rglob("*.py"))
+    yaml = "\n".join(path.read_text() for path in config_folder().rglob("*.yaml"))
+    for name in ("train", "evaluate"):
+        for key in compose(name):
+            named = rf'(config|stored)\.({key}\b|get\("{key}"\))'
+            read = re.search(named, code) or f"${{{key}" in yaml
+            assert read, f"conf/{name}.yaml: {key} is read by nothing"
+
+
+def test_every_size_key_is_used(compose):
+    yaml = "\n".join(path.read_text() for path in config_folder().rglob("*.yaml"))
+    for size in options("size"):
+        keys = compose("train", f"size={size}").size
+        assert set(keys) == set(compose("train").size), size
+        for key in keys:
+            assert re.search(rf"\$\{{.*\bsize\.{key}\b", yaml), f"size.{key} is read by nothing"
+
+
+def test_unknown_keys_do_not_pass_silently(tiny):
+    from hydra.utils import instantiate
+
+    config = tiny("+data.sizes=3")
+    with pytest.raises(Exception, match="sizes"):
+        instantiate(config.data)
+
+
+def test_missing_config_folder_is_said(monkeypatch, tmp_path):
+    import gsgan.utils.config as module
+
+    monkeypatch.setattr(module, "__file__", str(tmp_path / "a" / "b" / "config.py"))
+    with pytest.raises(Exception, match="config folder is missing"):
+        config_folder()
+
+
+def test_bugs_keep_their_traceback_and_mistakes_get_a_sentence():
+    assert one_sentence(DataError("x.png: missing")) == "x.png: missing"
+    assert one_sentence(ConfigError("run is not set")) == "run is not set"
+    assert one_sentence(ZeroDivisionError("a bug")) is None
+
+
+@pytest.mark.parametrize(
+    ("override", "named"),
+    [
+        ("effects.view_dependence=7", "effects.view_dependence must be one of"),
+        ("model.generator.output=tanh", "output must be linear or sigmoid"),
+        ("training.schedule.step_two=-1", "schedule.step_two must be 0 or more"),
+        ("+model.densify.colour=1", "unexpected keyword argument 'colour'"),
+        ("+model.generator.colour=1", "unexpected keyword argument 'colour'"),
+        ("training.perceptual.weights=resnet", "vgg16, auto or random"),
+        ("data.crop=car", "data.crop must be null or person"),
+    ],
+)
+def test_unknown_values_become_one_sentence(tiny, override, named):
+    from gsgan.train.runs import build_training
+
+    config = tiny(override)
+    with pytest.raises(Exception) as caught:  # noqa: PT011 (the sentence is what is checked)
+        build_training(config)
+    assert named in (one_sentence(caught.value) or "")
+
+
+@pytest.mark.parametrize(
+    ("said", "meant"),
+    [
+        ("effects=[body_points,antialias]", "effects.only=[body_points,antialias]"),
+        ("effects=[]", "effects.only=[]"),
+        ("effects=none", "effects=none"),
+        ("effects=[body_points],[antialias]", "effects=[body_points],[antialias]"),  # Hydra's sweep
+        ("data.train_cameras=[cam00]", "data.train_cameras=[cam00]"),
+    ],
+)
+def test_a_list_of_effects_is_a_value_and_no_list_of_files(said, meant):
+    assert spelled_out(said) == meant
+
+
+MANY = [f"training.recipes.psi.rate.{key}=0.{i}" for i, key in enumerate(("hold", "final"))] + [
+    f"training.step_two.{key}=0.25" for key in ("l1", "l2", "ssim", "perceptual", "anchor")
+]
+
+
+@pytest.mark.parametrize("experiment", [[], ["experiment=ablation"]])
+def test_a_sweep_folder_has_a_name_that_file_systems_take(experiment, tmp_path):
+    from hydra import compose, initialize_config_dir
+    from omegaconf import open_dict
+
+    given = [*experiment, *MANY, "data.val_pictures=3", "effects.only=[a,b]", "logger=csv"]
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("train", overrides=given, return_hydra_config=True)
+    with open_dict(config):
+        config.hydra.job.num = 7
+    name = config.hydra.sweep.subdir
+    assert len(name.encode()) <= LONGEST_NAME + 2
+    assert not set(name) & set("[],=/ ")
+    assert "psi.rate.hold-0.0" in name
+    (tmp_path / name).mkdir()
+
+
+def test_two_runs_of_a_sweep_never_share_a_folder():
+    assert folder_name("model-full_seed-1") == "model-full_seed-1"
+    many = "_".join(MANY)
+    pairs = [
+        (many + "_a-1", many + "_a-2"),
+        ("data.smpl-/a/b_c", "data.smpl-/a_b/c"),
+        ("names-é", "names-è"),
+    ]
+    for one, other in pairs:
+        assert folder_name(one) != folder_name(other)
+        assert max(map(len, map(folder_name, (one, other)))) <= LONGEST_NAME

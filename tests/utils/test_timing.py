@@ -1,0 +1,69 @@
+"""Interleaving, patience, exponents."""
+
+from __future__ import annotations
+
+import pytest
+
+from gsgan.utils import timing
+from gsgan.utils.timing import interleaved, median, slope
+
+
+class Clock:
+    """A clock that only the actions move."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+        self.calls: list[str] = []
+
+    def action(self, name: str, *seconds: float):
+        times = list(seconds)
+
+        def run() -> None:
+            self.calls.append(name)
+            self.now += times.pop(0) if len(times) > 1 else times[0]
+
+        return run
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock.now)
+    return clock
+
+
+def test_round_robin_after_one_warm_up_each(clock):
+    actions = {"a": clock.action("a", 9.0, 1.0, 2.0), "b": clock.action("b", 3.0)}
+    samples = interleaved(actions, 2)
+    assert clock.calls == ["a", "b", "a", "b", "a", "b"]
+    assert samples == {"a": [1000.0, 2000.0], "b": [3000.0, 3000.0]}
+
+
+def test_what_takes_longer_than_the_patience_is_called_twice_and_the_shorter_counts(clock):
+    actions = {"slow": clock.action("slow", 9.0), "fast": clock.action("fast", 1.0)}
+    samples = interleaved(actions, 3, patience=5.0)
+    assert samples == {"slow": [9000.0], "fast": [1000.0] * 3}
+    assert clock.calls.count("slow") == 2
+
+
+def test_every_call_is_told(clock):
+    told = []
+    interleaved({"a": clock.action("a", 1.0)}, 2, tick=lambda: told.append(clock.now))
+    assert told == [1.0, 2.0, 3.0]
+
+
+def test_no_rounds_are_refused():
+    with pytest.raises(ValueError, match="repeats must be at least 1, got 0"):
+        interleaved({}, 0)
+
+
+def test_the_median_shrugs_off_one_disturbance():
+    assert median([1.0, 2.0, 900.0]) == 2.0
+    assert median([]) is None
+
+
+@pytest.mark.parametrize("p", [0.5, 1.0, 2.0])
+def test_the_slope_is_the_exponent(p):
+    x = [1000.0, 3000.0, 50000.0]
+    assert slope(x, [7 * v**p for v in x]) == pytest.approx(p)
+    assert slope([5.0, 5.0], [1.0, 2.0]) is None
