@@ -1,0 +1,70 @@
+"""The layout of src/gsgan: few entries, short files, imports that point one way."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "src" / "gsgan"
+# Parts of the method, in reading order: each imports only from earlier ones.
+PARTS = (
+    *("utils", "scene", "skeleton", "splat", "body", "data"),
+    *("effects", "losses", "metrics", "model"),
+)
+ENTRIES = 20
+LINES = 400
+FILES = sorted(PACKAGE.rglob("*.py"))
+
+
+def module_name(path: Path) -> str:
+    """``gsgan.data.layout`` of src/gsgan/data/layout.py."""
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(path) for path in FILES}
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Modules of gsgan that a file imports when it runs, not those for type checking only."""
+    pending: list[ast.AST] = [ast.parse(path.read_text())]
+    while pending:
+        node = pending.pop()
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            continue
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in MODULES)
+        elif isinstance(node, ast.ImportFrom) and node.module in MODULES:
+            names = {f"{node.module}.{alias.name}" for alias in node.names}
+            yield from (names & MODULES) or {node.module}
+        pending.extend(ast.iter_child_nodes(node))
+
+
+def test_few_entries():
+    entries = [p.name for p in PACKAGE.iterdir() if p.name not in ("__pycache__", "conf")]
+    assert len(entries) <= ENTRIES, sorted(entries)
+
+
+def test_short_files():
+    long = {module_name(p): n for p in FILES if (n := len(p.read_text().splitlines())) > LINES}
+    assert not long
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_a_part_imports_only_earlier_parts(part):
+    allowed = PARTS[: PARTS.index(part) + 1]
+    for path in FILES:
+        name = module_name(path).split(".")
+        if name[1:2] != [part]:
+            continue
+        for other in imported(path):
+            package = (other.split(".") + [""])[1]
+            assert package in ("", *allowed), f"{'.'.join(name)} imports {other}"
+
+
+def test_no_circles():
+    TopologicalSorter({module_name(path): set(imported(path)) for path in FILES}).prepare()
