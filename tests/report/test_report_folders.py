@@ -184,4 +184,4 @@ def test_predictions_that_were_scored_stand_beside_a_run(run, capture, tmp_path,
     (grid,) = report.grids
     assert [r.label for r in grid.rows] == ["black", "full", "all background (floor)"]
     assert texts(row(grid, "black")) == texts(row(grid, "all background (floor)"))
-    assert row(grid, "black").provenance[0] == "1"
+    assert row(grid, "black").origin[0] == "1"

@@ -6,7 +6,7 @@ import pytest
 from report_folders import protocol, report_of, row, table, texts, write_run, zju
 
 from gsgan.report.paper import read_paper
-from gsgan.report.scored import Run
+from gsgan.report.runs import Run
 from gsgan.train.paper import NAME
 from gsgan.utils.errors import ConfigError
 
@@ -47,7 +47,7 @@ def test_elsewhere_they_stand_by_themselves_and_say_why(tmp_path, held, said):
     assert all(r.kind == "paper" and "(as printed)" in r.label for r in paper.rows)
     assert said in paper.remarks[0]
     told = ("n/a", "zju_mocap", "the paper's, read as paper_zju", "n/a")
-    assert all(r.provenance == told for r in paper.rows)
+    assert all(r.origin == told for r in paper.rows)
 
 
 def test_only_runs_of_the_preset_bear_the_papers_name(tmp_path, monkeypatch):
@@ -67,7 +67,7 @@ def test_only_runs_of_the_preset_bear_the_papers_name(tmp_path, monkeypatch):
         assert ours.count(NAME) == (told == [])
         notes = " ".join(note for r in grid.rows for note in r.notes)
         assert ("differs from experiment=paper in model.low_pass" in notes) == bool(told)
-        assert ("no config tells whether" in notes) == (told is None)
+        assert ("no config says whether" in notes) == (told is None)
 
 
 def test_another_split_is_not_the_papers(tmp_path):
@@ -99,7 +99,7 @@ def test_every_printed_figure_is_a_number_and_has_its_own_table(name):
 
 def test_the_mean_that_method_md_quotes_follows_from_the_table():
     (held,) = read_paper("zju").rows
-    values = [float(v["psnr"]) for s, v in held.values.items() if s != "mean"]
+    values = [float(v["psnr"]) for s, v in held["values"].items() if s != "mean"]
     assert sum(values) / len(values) == pytest.approx(32.93, abs=0.005)
 
 
