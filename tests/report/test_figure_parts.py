@@ -10,17 +10,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from gsgan.report.figures import ablation, canny, errors, segmentation
+from gsgan.report.figures import images
 from gsgan.report.figures.body import draw_gaussians, ellipses, part_colours
-from gsgan.report.figures.layout import LEAST_FONT, Grid, Unavailable, style
-from gsgan.report.figures.measures import measure, written
-from gsgan.report.figures.registry import KINDS
-from gsgan.report.figures.run import wanted_figures
-from gsgan.report.figures.settings import Settings
-from gsgan.report.figures.shots import NARROWEST, choose_items, make_shots, spread
-from gsgan.report.figures.subjects import Subject
+from gsgan.report.figures.layout import LEAST_FONT, Panels, Settings, Unavailable, style, written
+from gsgan.report.figures.run import KINDS
+from gsgan.report.figures.segmentation import agreement, disagreement
+from gsgan.report.figures.shots import NARROWEST, choose_items, make_shots
+from gsgan.report.figures.subjects import Subject, measure
+from gsgan.report.runs import Run
 from gsgan.scene import Camera, Gaussians
 from gsgan.skeleton import Densify
 from gsgan.splat import ACCURACY, project
@@ -35,6 +35,10 @@ def rendered(figure) -> np.ndarray:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3]
+
+
+def rgb(colour: str) -> list[int]:
+    return [round(255 * value) for value in to_rgb(colour)]
 
 
 def pinhole() -> Camera:
@@ -62,33 +66,33 @@ def test_edges_found_missing_and_invented_have_their_colours():
     truth, edges = np.zeros((8, 8), bool), np.zeros((8, 8), bool)
     truth[1, 1] = truth[6, 6] = True
     edges[1, 2] = edges[6, 1] = True  # one pixel off, and far from any
-    painted = canny.paint_edges(edges, truth, tolerance=1)
-    colours = {canny.FOUND: (1, 2), canny.MISSED: (6, 6), canny.INVENTED: (6, 1)}
+    painted = images.paint_edges(edges, truth, tolerance=1)
+    colours = {images.FOUND: (1, 2), images.MISSED: (6, 6), images.INVENTED: (6, 1)}
     for colour, (row, column) in colours.items():
-        assert painted[row, column].tolist() == canny._rgb(colour)
+        assert painted[row, column].tolist() == rgb(colour)
     assert (painted != 255).any(-1).sum() == 3
-    strict = canny.paint_edges(edges, truth, tolerance=0)
-    assert strict[1, 2].tolist() == canny._rgb(canny.INVENTED)
+    strict = images.paint_edges(edges, truth, tolerance=0)
+    assert strict[1, 2].tolist() == rgb(images.INVENTED)
 
 
 def test_errors_are_levels_of_255_and_share_one_scale():
     truth = torch.zeros(1, 3, 2, 2)
     picture = truth.clone()
     picture[0, :, 0, 0] = torch.tensor([0.3, -0.3, 0.6])
-    assert errors.error_levels(picture, truth)[0, 0] == pytest.approx(0.4 * 255)
-    assert errors._scale([torch.zeros(4, 4), torch.full((4, 4), 12.0)]) == 15
-    assert errors._scale([torch.zeros(4, 4)]) == 5
+    assert images.error_levels(picture, truth)[0, 0] == pytest.approx(0.4 * 255)
+    assert images.scale_end(torch.tensor([0.0, 12.0])) == 15
+    assert images.scale_end(torch.zeros(4)) == 5
 
 
 def test_the_box_lies_where_the_runs_differ():
     runs = torch.zeros(3, 3, 20, 10)
     runs[1, :, 12:16, 6:9] = 1.0
-    rows, columns = ablation.most_disputed(runs, 0.3)
+    rows, columns = images.most_disputed(runs, 0.3)
     assert (rows.stop - rows.start, columns.stop - columns.start) == (6, 3)
     assert rows.start <= 12
     assert rows.stop >= 16
     assert (columns.start, columns.stop) == (6, 9)
-    whole = ablation.most_disputed(torch.zeros(2, 3, 5, 5), 1.0)
+    whole = images.most_disputed(torch.zeros(2, 3, 5, 5), 1.0)
     assert whole == (slice(0, 5), slice(0, 5))
 
 
@@ -96,16 +100,16 @@ def test_agreement_of_parts_in_closed_form():
     labels = torch.tensor([[[0, 1, 1, 2], [255, 2, 2, 0]]])
     ours = torch.tensor([[[0, 1, 2, 2], [1, 2, 2, 0]]])
     parts = torch.nn.functional.one_hot(ours, 3).permute(0, 3, 1, 2).float()
-    found = segmentation.agreement(parts, labels)
+    found = agreement(parts, labels)
     assert found["miou"] == pytest.approx((1 / 2 + 3 / 4) / 2)
     assert found["wrong_share"] == pytest.approx(1 / 5)  # 255 is left out
-    wrong = segmentation.disagreement(ours, labels)[0]
+    wrong = disagreement(ours, labels)[0]
     assert wrong[:, 0, 0].tolist() == [1, 1, 1]
     assert wrong[:, 0, 2].tolist() == pytest.approx([0xD5 / 255, 0x5E / 255, 0])
     assert wrong[:, 1, 0].tolist() == [1, 1, 1]
     nobody = torch.zeros(1, 2, 2, dtype=torch.int64)
     blank = torch.nn.functional.one_hot(nobody, 3).permute(0, 3, 1, 2).float()
-    assert segmentation.agreement(blank, nobody) == {"miou": None, "wrong_share": None}
+    assert agreement(blank, nobody) == {"miou": None, "wrong_share": None}
 
 
 def test_ellipses_are_the_projected_covariances():
@@ -157,22 +161,23 @@ def test_a_panel_holds_its_picture_and_text_its_width():
     picture[0, 0, 3, 1] = 1.0  # the lower right pixel is red
     with style(SETTINGS):
         titles = ["a title far wider than any panel " * 8, "$x^$"]  # and no formula
-        grid = Grid(1, 2, 2.0, SETTINGS, width=2.0, titles=titles, names=["row"], notes=1, foot=0.3)
-        grid.picture(0, 0, picture, "note")
-        axes = grid.picture(0, 1, picture)
+        grid = Panels(1, 2, SETTINGS, aspect=2.0, width=2.0, titles=titles, names=["row"], foot=0.3)
+        grid.show(0, 0, picture, "note")
+        axes = grid.show(0, 1, picture)
         drawn = rendered(grid.figure)
     box = axes.get_window_extent()
     height = drawn.shape[0]
     corner = drawn[round(height - box.y0) - 3, round(box.x1) - 3]
     assert corner.tolist() == [255, 0, 0]
     assert drawn[round(height - box.y1) + 3, round(box.x0) + 3].tolist() == [0, 0, 0]
-    long = next(text for text in grid.figure.texts if text.get_text().endswith("…"))
+    heads = [axes.title for axes in grid.axes[0]]
+    long = heads[0]
+    assert long.get_text().endswith("…")
     assert long.get_fontsize() >= LEAST_FONT
     assert long.get_window_extent().width <= box.width * 1.01
-    heads = [text.get_fontsize() for text in grid.figure.texts if text.get_text() in ("$x^$",)]
-    assert heads == [long.get_fontsize()]  # titles of one size
+    assert heads[1].get_fontsize() == long.get_fontsize()
     assert grid.width <= 2.0 + 1e-9
-    assert grid.panel_height <= SETTINGS.tallest
+    assert 2.0 * grid.panel_width <= SETTINGS.tallest
 
 
 @pytest.mark.parametrize(
@@ -184,11 +189,6 @@ def test_a_panel_holds_its_picture_and_text_its_width():
 def test_settings_that_cannot_be_are_refused(key, value):
     with pytest.raises(ConfigError, match=key):
         Settings(**{key: value})
-
-
-def test_spread_takes_each_at_most_once():
-    assert spread(list(range(10)), 2) == [2, 7]
-    assert spread([1, 2, 3], 9) == [1, 2, 3]
 
 
 @pytest.fixture
@@ -216,7 +216,7 @@ def test_shots_are_spread_over_frames_and_cameras(data):
 def test_an_empty_split_says_which_are_not(build):
     data = build("data.test_cameras=[]", "data.train_cameras=[cam00,cam01,cam02]")[0]
     with pytest.raises(
-        DataError, match=r"no camera is held out.*give split=train, split=novel_pose"
+        DataError, match=r"no camera is held out.*use split=train, split=novel_pose"
     ):
         choose_items(data, "novel_view", frames=None, camera=None, count=1)
 
@@ -240,17 +240,15 @@ def test_windows_hold_the_joints_and_have_one_size(data):
 def subject_of(build, *overrides: str) -> Subject:
     data, avatar, _ = build(*overrides)
     model = overrides[0].removeprefix("model=") if overrides else "full"
-    return Subject(model, model, Path("run"), 0, data, avatar.eval(), [])
+    return Subject(model, Run(Path("run"), model, {}, 0, {}), data, avatar.eval(), [])
 
 
 @pytest.mark.parametrize(
     ("model", "figure", "words"),
     [
         ("splat_only", "segmentation", "has no segmentation S: the model leaves it out"),
-        ("splat_only", "errors", "no second picture"),
+        ("splat_only", "errors", "no second image"),
         ("image_to_image", "densify", "makes no points"),
-        ("full", "comparison", "there is one run"),
-        ("full", "ablation", "there is one run"),
     ],
 )
 def test_what_a_model_cannot_have_is_said(build, model, figure, words):
@@ -265,7 +263,7 @@ def test_data_without_labels_has_no_segmentation_figure(build):
     shot = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)[0]
     bare = replace(shot, frame=replace(shot.frame, labels=None))
     with pytest.raises(Unavailable, match="no part labels"):
-        segmentation.draw([subject], [bare], SETTINGS)
+        KINDS["segmentation"].draw([subject], [bare], SETTINGS)
 
 
 def test_drawing_leaves_the_avatar_where_it_paints(build, monkeypatch):
@@ -310,8 +308,11 @@ def test_what_is_kept_of_a_painting_is_on_the_cpu(build):
 
 def test_an_unfinished_run_is_marked(build):
     subject = subject_of(build)
-    assert replace(subject, step=12, total=12).notes == []
-    half = replace(subject, step=3, total=12, marks=["stand-in"])
+    schedule = {"step_one": 4, "step_two": 6, "segmentation": 2}
+    settings = {f"training.schedule.{name}": count for name, count in schedule.items()}
+    subject = replace(subject, run=replace(subject.run, settings=settings))
+    assert replace(subject, step=12).notes == []
+    half = replace(subject, step=3, marks=["stand-in"])
     assert half.notes == ["stand-in", "full is unfinished: 3 of 12 iterations"]
 
 
@@ -320,13 +321,7 @@ def test_a_splat_only_run_stands_for_splatting_alone(build):
     full, splat = subject_of(build), subject_of(build, "model=splat_only")
     shots = make_shots(full.data, "novel_pose", [("cam00", 4)], 0.2)
     with style(SETTINGS):
-        alone = canny.draw([full], shots, SETTINGS).numbers["cam00/000004"]
-        both = canny.draw([full, splat], shots, SETTINGS).numbers["cam00/000004"]
+        alone = images.canny([full], shots, SETTINGS).numbers["cam00/000004"]
+        both = images.canny([full, splat], shots, SETTINGS).numbers["cam00/000004"]
     assert list(alone) == ["full", "Step I's colour"]
     assert list(both) == ["full", "splat_only"]
-
-
-def test_null_asks_for_what_so_many_runs_can_have():
-    config = SimpleNamespace(figures=None)
-    assert "ablation" not in wanted_figures(config, several=False)
-    assert "ablation" in wanted_figures(config, several=True)

@@ -56,7 +56,9 @@ class PaperTable:
                 return f"runs here follow {name}, the paper's is read as {self.protocol}"
             if record.get("departures"):
                 return f"runs here depart from {self.protocol}: {'; '.join(record['departures'])}"
-        return None if split == self.split else f"these are {split} scores, the paper's {self.split}"
+        return (
+            None if split == self.split else f"these are {split} scores, the paper's {self.split}"
+        )
 
     def beside(self, columns: Sequence[tuple[str | None, str]]) -> dict[str, list[Row]]:
         """Its rows by the model that they belong to.

@@ -261,7 +261,9 @@ def _row(part: Part, spec: RowSpec, cells: list[Cell], *, beside_paper: bool) ->
         else:
             whole = (spec.run, spec.variant) == ("full", PAINTED)
             label = NAME if whole else f"{NAME}, {label}"
-    counts = [len([run for run in part.runs_of(c) if run in runs]) for c in part.columns if c != MEAN]
+    counts = [
+        len([run for run in part.runs_of(c) if run in runs]) for c in part.columns if c != MEAN
+    ]
     return Row(label, cells, _origin(runs, counts), notes=tuple(notes))
 
 

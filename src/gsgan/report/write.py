@@ -161,9 +161,7 @@ def _escape_latex(text: str) -> str:
 MARKDOWN = Markup(_escape_markdown, "*{}*", "**{}**", "<sup>{}</sup>")
 HTML = Markup(html.escape, "<em>{}</em>", "<strong>{}</strong>", "<sup>{}</sup>")
 LATEX = Markup(_escape_latex, r"\textit{{{}}}", r"\textbf{{{}}}", r"\textsuperscript{{{}}}")
-TERMINAL = Markup(
-    rich_markup.escape, "[italic]{}[/italic]", "[bold]{}[/bold]", " [cyan]{}[/cyan]"
-)
+TERMINAL = Markup(rich_markup.escape, "[italic]{}[/italic]", "[bold]{}[/bold]", " [cyan]{}[/cyan]")
 
 
 def markdown_block(report: Report) -> str:
@@ -279,7 +277,9 @@ def print_report(report: Report, console: Console) -> None:
         console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
     for grid in report.grids:
-        drawn = Table(title=rich_markup.escape(grid.title), title_justify="left", box=box.SIMPLE_HEAD)
+        drawn = Table(
+            title=rich_markup.escape(grid.title), title_justify="left", box=box.SIMPLE_HEAD
+        )
         text = TERMINAL.table(grid, notes).iloc[:, : 1 + len(grid.columns)]
         for i, name in enumerate(text.columns):
             drawn.add_column(name, justify="right" if i else "left", no_wrap=not i, overflow="fold")
@@ -287,7 +287,9 @@ def print_report(report: Report, console: Console) -> None:
             drawn.add_row(*row)
         console.print(drawn)
         rows = [row for row in grid.rows if row.kind != "floor" and NO_RUN not in row.origin]
-        origin = [f"{name}: {common(row.origin[i] for row in rows)}" for i, name in enumerate(ORIGIN)]
+        origin = [
+            f"{name}: {common(row.origin[i] for row in rows)}" for i, name in enumerate(ORIGIN)
+        ]
         for remark in (*grid.remarks, "; ".join(origin)):
             say(f"  {remark}", "dim")
     for note, letter in notes.items():
