@@ -34,8 +34,8 @@ def test_beside_the_same_data_subject_protocol_and_split(tmp_path):
 APART = {
     "synthetic": ({"data": None, "record": None}, "of synthetic, person, the paper's of zju"),
     "another subject": ({"data": zju(386)}, "CoreView_386, the paper's of subject 377"),
-    "no protocol": ({"record": None}, "no published protocol"),
-    "another protocol": ({"record": protocol("zju_gauhuman")}, "follow zju_gauhuman"),
+    "no protocol": ({"record": None}, "follow protocol none"),
+    "another protocol": ({"record": protocol("zju_gauhuman")}, "follow protocol zju_gauhuman"),
     "a departure": ({"record": protocol("paper_zju", departures=["at scale 1"])}, "at scale 1"),
 }
 

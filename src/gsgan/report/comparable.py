@@ -34,17 +34,15 @@ def check_row(runs: Sequence[Run], split: str, where: str) -> None:
             raise _refusal(where, a, b, "have the same row and seed")
         if (a.seed is None) != (b.seed is None):
             raise _refusal(where, a, b, "are a model trained here and a method's predictions")
-        if a.settings is not None and b.settings is not None:
-            changed = differing(a.settings, b.settings)
-            if changed:
-                shown = ", ".join(changed[:3]) + (" …" if len(changed) > 3 else "")
-                raise _refusal(where, a, b, f"differ in more than the seed: {shown}")
+        changed = differing(a.settings, b.settings) if a.settings and b.settings else []
+        if changed:
+            raise _refusal(where, a, b, f"differ in more than the seed: {', '.join(changed[:3])}")
         done = [run.facts.get("iterations") for run in (a, b)]
         if None not in done and done[0] != done[1]:
             raise _refusal(where, a, b, f"trained {done[0]} and {done[1]} iterations")
-        marks = [(run.of(split, PAINTED) or {}).get("marks") for run in (a, b)]
-        if None not in marks and marks[0] != marks[1]:
-            text = " and ".join("; ".join(m or ["unmarked"]) for m in marks)
+        marks = ["; ".join(run.of(split, PAINTED).get("marks", [])) for run in (a, b)]
+        if marks[0] != marks[1]:
+            text = " and ".join(mark or "unmarked" for mark in marks)
             raise _refusal(where, a, b, f"have different marks: {text}")
 
 
@@ -67,27 +65,31 @@ def check_column(
     for run in scored[1:]:
         if not subjects:
             _check_images(scored[0], run, split, where)
-        if text := protocols_differ(scored[0], run, split, subjects=subjects):
+        names = [r.protocol(split)["name"] for r in (scored[0], run)]
+        keys = differing(*(r.protocol(split) for r in (scored[0], run)))
+        if names[0] != names[1]:
+            text = f"{names[0]} and {names[1]}"
+            raise _refusal(where, scored[0], run, f"were scored by different protocols: {text}")
+        if keys := [key for key in keys if not subjects or key not in PER_SUBJECT]:
+            text = f"{names[0]} with different {', '.join(keys)}"
             raise _refusal(where, scored[0], run, f"were scored by different protocols: {text}")
     lpips = {name: run for run in scored if (name := lpips_name(run, split))}
     if len(lpips) > 1:
         raise _refusal(where, *list(lpips.values())[:2], f"have {' and '.join(lpips)}")
-    code = {dirty: run for run in scored if (dirty := run.facts.get("dirty")) is not None}
+    code = {bool(run.facts.get("dirty")): run for run in scored}
     if len(code) > 1 and not allow_dirty:
-        raise _refusal(
-            where, code[False], code[True],
-            "are of a commit and of uncommitted changes (allow_dirty=true allows both)",
-        )  # fmt: skip
+        what = "are of a commit and of uncommitted changes (allow_dirty=true allows both)"
+        raise _refusal(where, code[False], code[True], what)
 
 
 def check_data(a: Run, b: Run, where: str) -> None:
-    """Two runs must be of the same data.
+    """Two runs must be of the same data and splits.
 
     Raises:
         ConfigError: naming both.
     """
     if a.data.get("fingerprint") != b.data.get("fingerprint"):
-        names = [run.data_name or "unknown" for run in (a, b)]
+        names = [run.data_name for run in (a, b)]
         text = " and ".join(names) if names[0] != names[1] else f"two sets of {names[0]} ({DATA})"
         raise _refusal(where, a, b, f"are of different data: {text}")
 
@@ -98,20 +100,18 @@ def check_frame(a: Run, b: Run, name: str, frames: tuple[Frame, Frame]) -> None:
     Args:
         a, b: the runs.
         name: of the image.
-        frames: the ground truth of each run's own data.
+        frames: the ground truth in each run's own data.
 
     Raises:
         ConfigError: naming both runs and the image.
     """
-    first, second = frames
-    pairs = {
-        "pixels": (first.image, second.image),
-        "camera": (first.camera.K, second.camera.K),
-        "skeleton": (first.skeleton, second.skeleton),
-    }
-    different = [k for k, (x, y) in pairs.items() if x.shape != y.shape or not torch.equal(x, y)]
-    if different:
-        raise _refusal("figures", a, b, f"have a different {name}: {', '.join(different)}")
+    for what, x, y in (
+        ("image", *(frame.image for frame in frames)),
+        ("camera", *(frame.camera.K for frame in frames)),
+        ("skeleton", *(frame.skeleton for frame in frames)),
+    ):
+        if not torch.equal(x, y):
+            raise _refusal("figures", a, b, f"have a different {what} {name}")
 
 
 def _check_images(a: Run, b: Run, split: str, where: str) -> None:
@@ -119,22 +119,10 @@ def _check_images(a: Run, b: Run, split: str, where: str) -> None:
     counts = [run.images(split) for run in (a, b)]
     if counts[0] != counts[1]:
         raise _refusal(where, a, b, f"were scored on {counts[0]} and {counts[1]} images")
-    low, high = ((run.of(split, FLOOR) or {}).get("psnr") for run in (a, b))
-    if low is not None and high is not None and abs(low - high) > FLOOR_TOLERANCE:
-        raise _refusal(
-            where, a, b, "were scored against different images: an all-background image has "
-            f"{low:.3f} and {high:.3f} dB",
-        )  # fmt: skip
-
-
-def protocols_differ(a: Run, b: Run, split: str, *, subjects: bool = False) -> str:
-    """How the protocols of two runs differ, or an empty text."""
-    records = [run.protocol(split) or {"name": None} for run in (a, b)]
-    names = [record["name"] for record in records]
-    if names[0] != names[1]:
-        return f"{names[0] or 'none'} and {names[1] or 'none'}"
-    keys = [k for k in differing(*records) if not subjects or k not in PER_SUBJECT]
-    return f"{names[0]}, with different {', '.join(keys)}" if keys else ""
+    low, high = (run.of(split, FLOOR).get("psnr") for run in (a, b))
+    if None not in (low, high) and abs(low - high) > FLOOR_TOLERANCE:
+        text = f"an all-background image has {low:.3f} and {high:.3f} dB"
+        raise _refusal(where, a, b, f"were scored against different images: {text}")
 
 
 def differing(a: dict[str, Any], b: dict[str, Any]) -> list[str]:

@@ -50,15 +50,14 @@ class PaperTable:
                 return f"runs here are of {run.data_name}, the paper's of {self.data}"
             if self.subject and subject_of(run.data.get("root"), [self.subject]) is None:
                 return f"runs here are of {run.data_name}, the paper's of subject {self.subject}"
-            record = run.protocol(split) or {"name": None}
+            record = run.protocol(split)
             if record["name"] != self.protocol:
-                name = record["name"] or "no published protocol"
-                return f"runs here follow {name}, the paper's is read as {self.protocol}"
+                return f"runs here follow protocol {record['name']}, the paper's {self.protocol}"
             if record.get("departures"):
                 return f"runs here depart from {self.protocol}: {'; '.join(record['departures'])}"
-        return (
-            None if split == self.split else f"these are {split} scores, the paper's {self.split}"
-        )
+        if split != self.split:
+            return f"these are {split} scores, the paper's {self.split}"
+        return None
 
     def beside(self, columns: Sequence[tuple[str | None, str]]) -> dict[str, list[Row]]:
         """Its rows by the model that they belong to.

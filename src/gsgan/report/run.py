@@ -12,7 +12,7 @@ from gsgan.report.paper import read_paper
 from gsgan.report.runs import find_runs, read_runs
 from gsgan.report.spec import TableSpec
 from gsgan.report.table import build
-from gsgan.report.write import WRITERS, Report, markdown_block, print_report
+from gsgan.report.write import MARKDOWN, WRITERS, Report, print_report
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
@@ -74,7 +74,7 @@ def make_tables(config: DictConfig) -> Report:
         for name, content in files.items():
             write_atomically(folder / name, content)
         if page is not None:
-            fill_block(page, start, BLOCK_END, markdown_block(report), key="fill")
+            fill_block(page, start, BLOCK_END, MARKDOWN.body(report), key="fill")
     except OSError as error:
         where = error.filename or folder
         raise ConfigError(f"{where} cannot be written: {error.strerror}") from None

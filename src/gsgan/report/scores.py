@@ -42,9 +42,9 @@ def scores(runs: Sequence[Run], split: str, columns: Mapping[str, str]) -> Value
         for metric in dict.fromkeys(columns.values())
     ]
     frame = pd.DataFrame(rows, columns=[*KEYS, "seed", "value", "note"])
-    runs_own = frame.name != FLOOR  # one floor for all runs: they are of the same data
-    floor = frame[~runs_own].sort_values("value").drop_duplicates("column")
-    frame = pd.concat([frame[runs_own], floor])
+    own = frame.name != FLOOR  # one floor for all runs: they are of the same data
+    floor = frame[~own].sort_values("value").drop_duplicates("column")
+    frame = pd.concat([frame[own], floor])
     if subjects:
         means = [
             _over_subjects(found, subjects).assign(name=name, variant=variant, column=MEAN)
@@ -56,15 +56,10 @@ def scores(runs: Sequence[Run], split: str, columns: Mapping[str, str]) -> Value
 
 def _value(run: Run, split: str, variant: str, metric: str) -> tuple[float, str | None]:
     """A score, and why it is missing or incomplete."""
-    nothing, held = float("nan"), run.of(split, variant)
-    if split not in run.scores:
-        return nothing, f"{split} was not scored"
-    if held is None:
-        return nothing, "the method has no such image"
-    if metric not in held:
-        return nothing, f"{metric} is not in metrics.json: score the run again"
-    if held[metric] is None:
-        return nothing, str(held.get(f"{metric}_reason", "not scored"))
+    held = run.of(split, variant)
+    if held.get(metric) is None:
+        why = "not scored" if held else f"no {variant} image of {split} was scored"
+        return float("nan"), str(held.get(f"{metric}_reason", why))
     left_out = held.get(f"{metric}_left_out")
     note = f"{left_out} images without a finite score are not in the mean" if left_out else None
     return float(held[metric]), note
@@ -84,21 +79,21 @@ def _over_subjects(found: pd.DataFrame, subjects: Sequence[str]) -> pd.DataFrame
 
 
 def mean_cell(metric: str, found: pd.DataFrame | None) -> Cell:
-    """Mean ± standard deviation over seeds."""
+    """Mean ± sample standard deviation (n − 1) over seeds; one seed has no spread."""
     if found is None:
         return Cell(NOT_HAD, {"n": 0}, (f"{NOT_HAD}: no scored run",))
-    notes = [
+    notes = tuple(
         str(note) if len(seeds) == len(found) else f"seed {', '.join(seeds)}: {note}"
         for note, seeds in found.groupby("note", sort=False)["seed"]
-    ]
+    )
     values = found.set_index("seed")["value"].dropna()
     if values.empty:
         return Cell(NOT_HAD, {"n": 0}, tuple(f"{NOT_HAD}: {note}" for note in notes))
-    return _statistics(metric, values, notes=tuple(notes))
+    return replace(_statistics(metric, values), notes=notes)
 
 
 def difference(metric: str, mine: pd.DataFrame | None, reference: pd.DataFrame | None) -> Cell:
-    """Mean ± standard deviation of a row less the reference, over the seeds of both."""
+    """A row less the reference, seed by seed, and how many seeds have the mean's sign."""
     if mine is None or reference is None:
         return Cell(NOT_HAD, {"n": 0})
     ours, theirs = (f[f.seed != NO_SEED].set_index("seed")["value"] for f in (mine, reference))
@@ -111,12 +106,9 @@ def difference(metric: str, mine: pd.DataFrame | None, reference: pd.DataFrame |
     return replace(cell, text=text, numbers={**cell.numbers, "agreeing": agreeing})
 
 
-def _statistics(
-    metric: str, values: pd.Series, *, signed: bool = False, notes: tuple[str, ...] = ()
-) -> Cell:
-    """Mean and sample standard deviation (n − 1), which one value does not have."""
+def _statistics(metric: str, values: pd.Series, *, signed: bool = False) -> Cell:
     mean, spread = float(values.mean()), float(values.std()) if len(values) > 1 else None
     text = written(metric, mean, signed=signed)
     text += "" if spread is None else f" ± {written(metric, spread)}"
     numbers = {"mean": mean, "spread": spread, "n": len(values), "seeds": values.to_dict()}
-    return Cell(text, numbers, notes)
+    return Cell(text, numbers)

@@ -111,9 +111,7 @@ class TableSpec:
             held = getattr(self, key)
             if held is None and key in ("subjects", "rows", "by"):
                 continue
-            entries = (Mapping, RowSpec) if key == "rows" else (str, int)
-            right = isinstance(held, Sequence) and not isinstance(held, str) and len(held) > 0
-            if not right or not all(isinstance(entry, entries) for entry in held):
+            if isinstance(held, str) or not isinstance(held, Sequence) or not held:
                 raise ConfigError(f"table.{key} must be a list of at least one, got {held!r}")
         if self.rows is not None:
             object.__setattr__(self, "rows", [_row(row) for row in self.rows])

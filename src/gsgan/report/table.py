@@ -1,4 +1,4 @@
-"""A table of runs: one tidy frame of scores, statistics over its seeds, rows and grids."""
+"""A table of runs: its rows and columns, and what belongs below it."""
 
 from __future__ import annotations
 
@@ -8,12 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from gsgan.report.comparable import (
-    check_column,
-    check_row,
-    differing,
-    lpips_name,
-)
+from gsgan.report.comparable import check_column, check_row, differing, lpips_name
 from gsgan.report.paper import PaperTable
 from gsgan.report.runs import Run, by_settings
 from gsgan.report.scores import Values, difference, mean_cell, scores
@@ -32,8 +27,6 @@ from gsgan.report.write import NO_RUN, NOT_HAD, Cell, Grid, Report, Row, common
 from gsgan.train.paper import NAME, clause
 from gsgan.utils.errors import ConfigError
 
-UNKNOWN = "unknown"
-MOST_SETTINGS = 6  # named in a note
 FLOOR_LABEL = "all background (floor)"
 SPREAD = (
     "Mean ± sample standard deviation over seeds, as many as the column seeds says; one seed has "
@@ -41,6 +34,7 @@ SPREAD = (
 )
 PAIRS = "Row − {} of the same seed; in brackets, how many of the seeds have the mean's sign."
 SPLITS = {"novel_view": "held-out cameras", "novel_pose": "held-out poses"}
+FACTS = ("version", "iterations", "train_seconds", "device", "torch", "date")
 
 
 @dataclass(frozen=True)
@@ -61,10 +55,10 @@ class Part:
 
     @property
     def columns(self) -> dict[str, str]:
-        """Headings of the columns: metrics, or subjects and their mean."""
+        """The metric of each column: metrics themselves, or subjects and their mean."""
         if self.metric is None:
-            return {metric: self._heading(metric) for metric in self.spec.metrics}
-        return {column: column for column in (*(self.spec.subjects or ()), MEAN)}
+            return {metric: metric for metric in self.spec.metrics}
+        return dict.fromkeys([*(self.spec.subjects or ()), MEAN], self.metric)
 
     @property
     def title(self) -> str:
@@ -73,11 +67,11 @@ class Part:
         if self.spec.apart:
             run = self.runs[0]
             data = f"{run.data_name} [{run.data.get('fingerprint')}]"
-            text = f"{data}, protocol {run.protocol_name}: {text}"
-        return text if self.metric is None else f"{self._heading(self.metric)}, {text}"
+            text = f"{data}, protocol {run.protocol()['name']}: {text}"
+        return text if self.metric is None else f"{self.heading(self.metric)}, {text}"
 
-    def _heading(self, metric: str) -> str:
-        """With LPIPS' backbone and region, as far as runs have it."""
+    def heading(self, metric: str) -> str:
+        """Of a metric, with LPIPS' backbone and region as far as runs have it."""
         named = common(lpips_name(run, self.split) or "" for run in self.runs)
         if not metric.startswith("lpips") or not named:
             return heading(metric)
@@ -85,7 +79,7 @@ class Part:
             named = f"{named.split(' mask crop')[0]} in box"
         return f"{named} {METRICS[metric].better}"
 
-    def of(self, name: str) -> list[Run]:
+    def of(self, name: str | None) -> list[Run]:
         """The runs of a model or method."""
         return [run for run in self.runs if run.name == name]
 
@@ -133,22 +127,26 @@ def build(
     Raises:
         ConfigError: when runs in one column or row differ in more than they may, or no run is left.
     """
-    taken, unfit = _select(spec, runs)
+    unfit = {run.folder: why for run in runs if (why := _no_place(spec, run))}
+    taken = [by_settings(run, spec.by or ()) for run in runs if run.folder not in unfit]
     left_out = {**left_out, **unfit}
-    if not taken:
-        reasons = "; ".join(f"{folder}: {reason}" for folder, reason in left_out.items())
-        raise ConfigError(f"table {spec.name}: no scored run is left for it ({reasons})")
-    metrics = [None] if spec.subjects is None else spec.metrics
+    groups: dict[Any, list[Run]] = {}
+    for run in taken:  # with apart, other data and protocols have grids of their own
+        key = (str(run.data), run.protocol()["name"]) if spec.apart else None
+        groups.setdefault(key, []).append(run)
     parts = [
         Part(spec, group, split, metric)
-        for group in _groups(spec, taken)
+        for group in groups.values()
         for split in spec.splits
-        for metric in metrics
+        for metric in ([None] if spec.subjects is None else spec.metrics)
         if any(run.images(split) for run in group)
     ]
     if not parts:
-        names = " or ".join(spec.splits)
-        raise ConfigError(f"table {spec.name}: no run has scored an image of {names}")
+        reasons = "; ".join(f"{folder}: {reason}" for folder, reason in left_out.items())
+        raise ConfigError(
+            f"table {spec.name}: no run is left that has scored an image of "
+            f"{' or '.join(spec.splits)} ({reasons or 'none left out'})"
+        )
     for part in parts:
         part.check(allow_dirty)
     folders = [*(run.folder for run in taken), *left_out]
@@ -164,52 +162,37 @@ def build(
     )
 
 
-def _select(spec: TableSpec, runs: Sequence[Run]) -> tuple[list[Run], dict[Path, str]]:
-    """The runs that the table has a place for, and why the others have none.
+def _no_place(spec: TableSpec, run: Run) -> str | None:
+    """Why the table has no place for a run.
 
     Raises:
         ConfigError: on a run of another data set than the table's.
     """
-    taken, unfit = [], {}
-    rows = None if spec.rows is None else {row.run for row in spec.rows}
-    for run in runs:
-        if spec.data is not None and run.data.get("name") != spec.data:
-            raise ConfigError(
-                f"table {spec.name} is of {spec.data}, but {run} is of {run.data_name}; leave it "
-                "out of runs, or use table=plain"
-            )
-        if spec.subjects and subject_of(run.data.get("root"), spec.subjects) is None:
-            names = ", ".join(spec.subjects)
-            unfit[run.folder] = f"its subject is none of {names} ({run.data_name})"
-        elif rows is not None and run.name not in rows:
-            unfit[run.folder] = f"table {spec.name} has no row for {run.name}"
-        else:
-            taken.append(by_settings(run, spec.by or ()))
-    return taken, unfit
-
-
-def _groups(spec: TableSpec, runs: Sequence[Run]) -> list[list[Run]]:
-    """All runs in one group, or with ``apart`` those of each data set and protocol."""
-    found: dict[Any, list[Run]] = {}
-    for run in runs:
-        key = (*map(str, run.data.values()), run.protocol_name) if spec.apart else None
-        found.setdefault(key, []).append(run)
-    return list(found.values())
+    if spec.data not in (None, run.data.get("name")):
+        raise ConfigError(
+            f"table {spec.name} is of {spec.data}, but {run} is of {run.data_name}; leave it out "
+            "of runs, or use table=plain"
+        )
+    if spec.subjects and subject_of(run.data.get("root"), spec.subjects) is None:
+        return f"its subject is none of {', '.join(spec.subjects)} ({run.data_name})"
+    if spec.rows is not None and run.name not in {row.run for row in spec.rows}:
+        return f"table {spec.name} has no row for {run.name}"
+    return None
 
 
 def _grids(parts: Sequence[Part], paper: PaperTable | None) -> list[Grid]:
     """Those of every part, with the paper's numbers beside them where they may, else last."""
-    if paper is None:
-        return [grid for part in parts for grid in _part_grids(part, None)]
-    why = [paper.why_apart(part.runs, part.split) for part in parts]
-    found = [
-        grid
-        for part, reason in zip(parts, why, strict=True)
-        for grid in _part_grids(part, None if reason else paper)
-    ]
-    if None not in why:
-        nearest = [i for i, part in enumerate(parts) if part.split == paper.split] or [0]
-        found.append(paper.grid(str(why[nearest[0]])))
+    found: list[Grid] = []
+    reasons: dict[str, str] = {}
+    beside = False
+    for part in parts:
+        why = None if paper is None else paper.why_apart(part.runs, part.split)
+        found += _part_grids(part, None if why else paper)
+        beside = beside or why is None
+        reasons.setdefault(part.split, why or "")
+    if paper is not None and not beside:
+        why = reasons.get(str(paper.split)) or next(iter(reasons.values()))
+        found.append(paper.grid(why))
     return found
 
 
@@ -220,39 +203,35 @@ def _part_grids(part: Part, paper: PaperTable | None) -> Iterator[Grid]:
         part: what is shown.
         paper: numbers that may stand beside it, or None.
     """
-    metrics = {column: part.metric or column for column in part.columns}
-    values = scores(part.runs, part.split, metrics)
-    printed = {} if paper is None else paper.beside(
-        [(None if part.metric is None else c, m) for c, m in metrics.items()]
-    )  # fmt: skip
+    columns = part.columns
+    values = scores(part.runs, part.split, columns)
+    subjects = [(None if part.metric is None else c, m) for c, m in columns.items()]
+    printed = {} if paper is None else paper.beside(subjects)
     rows: list[Row] = []
     for spec in part.rows:
-        cells = [mean_cell(m, values.get((spec.run, spec.variant, c))) for c, m in metrics.items()]
+        cells = [mean_cell(m, values.get((spec.run, spec.variant, c))) for c, m in columns.items()]
         rows.append(_row(part, spec, cells, beside_paper=paper is not None))
         if spec.variant == PAINTED:
             rows += printed.pop(spec.run, [])
-    rows = _with_best([*rows, *(row for left in printed.values() for row in left)], metrics)
-    floor = [mean_cell(m, values.get((FLOOR, FLOOR, c))) for c, m in metrics.items()]
-    _, *origin = _origin(part.runs, [])
-    rows.append(Row(FLOOR_LABEL, floor, (NOT_HAD, *origin), "floor"))
-    headings = list(part.columns.values())
-    yield _without_empty(Grid(part.title, headings, rows, (SPREAD,)), explain=True)
-    if differences := list(_differences(part, values, metrics)):
+    rows = _with_best([*rows, *(row for left in printed.values() for row in left)], part)
+    floor = [mean_cell(m, values.get((FLOOR, FLOOR, c))) for c, m in columns.items()]
+    origin = (NOT_HAD, *_origin(part.runs, [])[1:])
+    rows.append(Row(FLOOR_LABEL, floor, origin, "floor"))
+    yield _without_empty(part, part.title, rows, SPREAD)
+    if differences := list(_differences(part, values)):
         title = f"{part.title}: difference from {part.spec.reference}"
-        remarks = (PAIRS.format(part.spec.reference),)
-        yield _without_empty(Grid(title, headings, differences, remarks), explain=False)
+        yield _without_empty(part, title, differences, PAIRS.format(part.spec.reference))
 
 
 def _row(part: Part, spec: RowSpec, cells: list[Cell], *, beside_paper: bool) -> Row:
-    runs = part.of(spec.run)
+    runs, reference = part.of(spec.run), part.of(part.spec.reference)
     if not runs:
         cells = [Cell(NO_RUN, {"n": 0}) for _ in cells]
         return Row(spec.title, cells, ("0", NO_RUN, NO_RUN, NO_RUN), notes=("no scored run",))
     label, notes = spec.title, list(_marks(runs, part.split))
-    reference = part.of(part.spec.reference or "")
     if reference and spec.variant == PAINTED and spec.run != part.spec.reference:
         notes += _changes(runs[0], reference[0])
-    if beside_paper:
+    if beside_paper:  # named as the paper's method where all runs are
         departures = [run.departures() for run in runs]
         if None in departures:
             notes.append("no config says whether it is experiment=paper")
@@ -261,65 +240,56 @@ def _row(part: Part, spec: RowSpec, cells: list[Cell], *, beside_paper: bool) ->
         else:
             whole = (spec.run, spec.variant) == ("full", PAINTED)
             label = NAME if whole else f"{NAME}, {label}"
-    counts = [
-        len([run for run in part.runs_of(c) if run in runs]) for c in part.columns if c != MEAN
-    ]
+    counts = [sum(run in runs for run in part.runs_of(c)) for c in part.columns if c != MEAN]
     return Row(label, cells, _origin(runs, counts), notes=tuple(notes))
 
 
-def _differences(part: Part, values: Values, metrics: Mapping[str, str]) -> Iterator[Row]:
+def _differences(part: Part, values: Values) -> Iterator[Row]:
     """A row for every row that has a seed in common with the reference."""
-    name = str(part.spec.reference)
+    reference = (str(part.spec.reference), PAINTED)
     for spec in part.rows:
-        if (spec.run, spec.variant) == (name, PAINTED):
-            continue
-        pairs = [[values.get((*row, c)) for row in ((spec.run, spec.variant), (name, PAINTED))]
-                 for c in metrics]  # fmt: skip
-        cells = [difference(m, *pair) for m, pair in zip(metrics.values(), pairs, strict=True)]
-        if counts := [cell.numbers["n"] for cell in cells if cell.numbers["n"]]:
-            runs = [*part.of(spec.run), *part.of(name)]
+        row = (spec.run, spec.variant)
+        cells = [
+            difference(metric, values.get((*row, c)), values.get((*reference, c)))
+            for c, metric in part.columns.items()
+        ]
+        counts = [cell.numbers["n"] for cell in cells if cell.numbers["n"]]
+        if counts and row != reference:
+            runs = [*part.of(spec.run), *part.of(part.spec.reference)]
             yield Row(spec.title, cells, _origin(runs, counts))
 
 
-def _with_best(rows: Sequence[Row], metrics: Mapping[str, str]) -> list[Row]:
+def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
     """Marks the best of our rows in each column that several of them have."""
-    rows = [replace(row, cells=list(row.cells)) for row in rows]
-    for i, metric in enumerate(metrics.values()):
-        better = METRICS[metric].better
-        means = {
-            place: row.cells[i].numbers["mean"]
-            for place, row in enumerate(rows)
-            if "mean" in row.cells[i].numbers
-        }
+    found = [list(row.cells) for row in rows]
+    for i, metric in enumerate(part.columns.values()):
+        sign = {"↑": -1, "↓": 1}.get(METRICS[metric].better)
+        means = [cells[i].numbers["mean"] for cells in found if "mean" in cells[i].numbers]
         if len(means) < 2:
             continue
-        losses = {k: {"↑": -v, "↓": v}.get(better, abs(v - 1)) for k, v in means.items()}
-        best = written(metric, means[min(losses, key=lambda place: losses[place])])
-        for place, mean in means.items():
-            if written(metric, mean) == best:
-                cells: Any = rows[place].cells
-                cells[i] = replace(cells[i], best=True)
-    return rows
+        best = min(means, key=lambda mean: abs(mean - 1) if sign is None else sign * mean)
+        for cells in found:
+            mean = cells[i].numbers.get("mean")
+            equal = mean is not None and written(metric, mean) == written(metric, best)
+            cells[i] = replace(cells[i], best=equal)
+    return [replace(row, cells=cells) for row, cells in zip(rows, found, strict=True)]
 
 
-def _without_empty(grid: Grid, *, explain: bool) -> Grid:
-    """Without columns that only the floor has; ``explain``: with a remark that says why."""
-    rows = [row for row in grid.rows if row.kind != "floor"]
-    kept, remarks = [], list(grid.remarks)
-    for i, name in enumerate(grid.columns):
-        if any(row.cells[i].numbers.keys() & {"mean", "paper"} for row in rows):
+def _without_empty(part: Part, title: str, rows: Sequence[Row], remark: str) -> Grid:
+    """A grid without the columns that only the floor has, which a remark names with the reason."""
+    subjects = part.metric is not None
+    headings = [c if subjects else part.heading(c) for c in part.columns]
+    shown = [row for row in rows if row.kind != "floor"]
+    kept, remarks = [], [remark]
+    for i, name in enumerate(headings):
+        if any(row.cells[i].numbers.keys() & {"mean", "paper"} for row in shown):
             kept.append(i)
-        elif explain:
-            why = common(n.removeprefix("n/a: ") for row in rows for n in row.cells[i].notes)
+        elif len(shown) < len(rows):  # not below differences: it is below the scores
+            why = common(n.removeprefix("n/a: ") for row in shown for n in row.cells[i].notes)
             remarks.append(f"Not shown: {name} ({why}).")
-    if not kept:
-        return grid
-    return replace(
-        grid,
-        columns=[grid.columns[i] for i in kept],
-        rows=[replace(row, cells=[row.cells[i] for i in kept]) for row in grid.rows],
-        remarks=tuple(remarks),
-    )
+    kept = kept or list(range(len(headings)))
+    rows = [replace(row, cells=[row.cells[i] for i in kept]) for row in rows]
+    return Grid(title, [headings[i] for i in kept], rows, tuple(remarks))
 
 
 def _origin(runs: Sequence[Run], counts: Sequence[int]) -> tuple[str, ...]:
@@ -328,7 +298,7 @@ def _origin(runs: Sequence[Run], counts: Sequence[int]) -> tuple[str, ...]:
     data = common(run.data_name for run in runs)
     if len(roots := {run.data.get("root") for run in runs}) > 1:
         data = f"{runs[0].data['name']}, {len(roots)} subjects"
-    protocol = common(run.protocol_name for run in runs)
+    protocol = common(run.protocol()["name"] for run in runs)
     return seeds, data, protocol, common(run.commit for run in runs)
 
 
@@ -338,7 +308,7 @@ def _marks(runs: Sequence[Run], split: str) -> list[str]:
     for run in runs:
         for held in run.scores.get(split, {}).values():
             found += [f"marked: {mark}" for mark in held.get("marks", [])]
-        record = run.protocol(split) or {}
+        record = run.protocol(split)
         found += [f"departs from {record['name']}: {d}" for d in record.get("departures", [])]
     return list(dict.fromkeys(found))
 
@@ -347,12 +317,11 @@ def _changes(run: Run, reference: Run) -> list[str]:
     """In which settings a run differs from the reference; parts of the model as a whole."""
     if run.settings is None or reference.settings is None:
         return []
-    keys = [
-        ".".join(key.split(".")[:2]) if key.startswith("model.") else key
-        for key in differing(reference.settings, run.settings)
-    ]
-    found = list(dict.fromkeys(keys))
-    text = ", ".join(found[:MOST_SETTINGS]) + (" …" if len(found) > MOST_SETTINGS else "")
+    keys = differing(reference.settings, run.settings)
+    found = dict.fromkeys(
+        ".".join(key.split(".")[:2]) if key.startswith("model.") else key for key in keys
+    )
+    text = ", ".join(list(found)[:6]) + (" …" if len(found) > 6 else "")
     return [f"{run.name} differs from {reference.name} in {text or 'no setting'}"]
 
 
@@ -361,20 +330,17 @@ def _remarks(spec: TableSpec, runs: Sequence[Run]) -> Iterator[str]:
     if len(commits) > 1:
         yield f"Runs are of several commits: {', '.join(commits)}."
     if spec.by and spec.reference is not None and spec.reference not in names:
-        yield (
-            f"No differences: no row is called {spec.reference}; table.reference='{names[0]}' "
-            "compares with that row."
-        )
+        example = f"table.reference='{names[0]}'"
+        yield f"No differences: no row is called {spec.reference}; set for example {example}."
 
 
 def _runs_grid(runs: Sequence[Run], names: Mapping[Path, str]) -> Grid:
     """One row per run: where it came from."""
-    header = ("version", "iterations", "train_seconds", "device", "torch", "date")
     rows = []
     for run in runs:
-        held = [run.name, run.seed, run.data_name, run.data.get("fingerprint"), run.protocol_name]
-        held += [run.commit, *(run.facts.get(key) for key in header)]
-        cells = [Cell(UNKNOWN if text is None else str(text)) for text in held]
+        held = [run.name, run.seed, run.data_name, run.data.get("fingerprint")]
+        held += [run.protocol()["name"], run.commit, *(run.facts.get(key) for key in FACTS)]
+        cells = [Cell("unknown" if text is None else str(text)) for text in held]
         rows.append(Row(names[run.folder], cells))
-    columns = ("row", "seed", "data", "fingerprint", "protocol", "commit", *header)
-    return Grid("Runs", columns, rows, first="folder")
+    columns = ("row", "seed", "data", "fingerprint", "protocol", "commit", *FACTS)
+    return Grid("Runs", columns, rows)
