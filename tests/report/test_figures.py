@@ -134,7 +134,7 @@ def test_a_run_on_other_pixels_is_refused(run, twin, capture, tmp_path, inside):
         cv2.imwrite(str(path), 255 - cv2.imread(str(path)))
     edit(twin, data__root=str(other))
     given = (f"run={run}", f"compare=[{twin}]", f"out={tmp_path / 'out'}", "figures=strip", *FEW)
-    refused(inside("report", *given), "different cam00/000004: pixels")
+    refused(inside("report", *given), "different image cam00/000004")
 
 
 def test_a_run_that_is_half_trained_is_said_to_be(twin, tmp_path, inside):
@@ -226,7 +226,7 @@ def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
         (("formats=gif",), ("formats must be among png, pdf", "gif")),
         (("split=test",), ("split must be one of", "test")),
         (("frames=[99]",), ("lacks 99", "4-5")),
-        (("frames=[a]",), ("frames must be a list of frame numbers",)),
+        (("frames=[a]",), ("frames must be a whole number",)),
         (("camera=cam07",), ("cam07", "which has cam00")),
         (("shots.canny=0", "figures=canny"), ("shots.canny", "at least 1")),
         (("settings.dpi=-1",), ("settings.dpi",)),

@@ -75,7 +75,8 @@ def check_column(
             raise _refusal(where, scored[0], run, f"were scored by different protocols: {text}")
     lpips = {name: run for run in scored if (name := lpips_name(run, split))}
     if len(lpips) > 1:
-        raise _refusal(where, *list(lpips.values())[:2], f"have {' and '.join(lpips)}")
+        first, second, *_ = lpips.values()
+        raise _refusal(where, first, second, f"have {' and '.join(lpips)}")
     code = {bool(run.facts.get("dirty")): run for run in scored}
     if len(code) > 1 and not allow_dirty:
         what = "are of a commit and of uncommitted changes (allow_dirty=true allows both)"
@@ -105,12 +106,13 @@ def check_frame(a: Run, b: Run, name: str, frames: tuple[Frame, Frame]) -> None:
     Raises:
         ConfigError: naming both runs and the image.
     """
-    for what, x, y in (
-        ("image", *(frame.image for frame in frames)),
-        ("camera", *(frame.camera.K for frame in frames)),
-        ("skeleton", *(frame.skeleton for frame in frames)),
+    x, y = frames
+    for what, same in (
+        ("image", torch.equal(x.image, y.image)),
+        ("camera", torch.equal(x.camera.K, y.camera.K)),
+        ("skeleton", torch.equal(x.skeleton, y.skeleton)),
     ):
-        if not torch.equal(x, y):
+        if not same:
             raise _refusal("figures", a, b, f"have a different {what} {name}")
 
 
@@ -120,7 +122,7 @@ def _check_images(a: Run, b: Run, split: str, where: str) -> None:
     if counts[0] != counts[1]:
         raise _refusal(where, a, b, f"were scored on {counts[0]} and {counts[1]} images")
     low, high = (run.of(split, FLOOR).get("psnr") for run in (a, b))
-    if None not in (low, high) and abs(low - high) > FLOOR_TOLERANCE:
+    if low is not None and high is not None and abs(low - high) > FLOOR_TOLERANCE:
         text = f"an all-background image has {low:.3f} and {high:.3f} dB"
         raise _refusal(where, a, b, f"were scored against different images: {text}")
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsgan.evaluate.facts import choices
@@ -203,8 +203,10 @@ def _read_config(folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:
         text = (folder / CONFIG).read_text()
         # `_target_` of runs from before gsgan.training was called gsgan.train
         config = OmegaConf.create(text.replace("gsgan.training.", "gsgan.train."))
+        if not isinstance(config, DictConfig):
+            raise ValueError("not a config")
         return settings_of(config), choices(folder)
-    except (AttributeError, OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
+    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
         raise DataError(f"{folder / '.hydra'}: damaged ({str(error).splitlines()[0]})") from None
 
 

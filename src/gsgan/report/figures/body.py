@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.model.body_points import BodyPoints
-from gsgan.report.figures.layout import Drawing, Panels, Settings, Unavailable, written
-from gsgan.report.figures.shots import Shot, aspect_of
-from gsgan.report.figures.subjects import Subject, measure
+from gsgan.report.figures.layout import Drawing, Panel, Settings, Sheet, Unavailable, written
+from gsgan.report.figures.shots import Shot
+from gsgan.report.figures.subjects import Numbers, Subject, measure
 from gsgan.scene import Gaussians
 from gsgan.skeleton import MEDIAPIPE33, BoneFrames, Densify, bone_frames
 from gsgan.splat import Accuracy, project
@@ -52,32 +52,32 @@ def densify(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settin
     placed = subject.avatar.body_points or subject.avatar.densify
     if placed is None:
         raise Unavailable(f"{subject.name} has no densify: its model makes no points of a skeleton")
-    panels = Panels(
-        len(shots), len(TITLES), settings, aspect=aspect_of(shots), width=settings.page,
-        titles=TITLES,
-    )  # fmt: skip
-    numbers = {}
-    for row, shot in enumerate(shots):
-        pose, gaussians = pose_of(subject, shot), subject.paint(shot).gaussians
-        assert gaussians is not None
-        image = subject.image(shot)
+    panels, poses = [], []
+    numbers: dict[str, dict[str, Numbers]] = {}
+    for shot in shots:
+        pose, image = pose_of(subject, shot), subject.image(shot)
         found = measure(image, shot.truth, settings)
-        seen = int(pose.valid.sum())
-        draw_bones(open_panel(panels, row, 0, shot, f"{seen} joints"), pose, shot)
-        axes = open_panel(panels, row, 1, shot, f"N = {placed.n_points}")
-        points = draw_points(axes, placed, pose, shot)
-        axes = open_panel(panels, row, 2, shot, f"{settings.sigmas:g} σ")
-        drawn = draw_gaussians(axes, gaussians, shot, subject.avatar.accuracy, settings.sigmas)
-        panels.show(row, 3, image, written(found["psnr"], 2, " dB"))
-        panels.show(row, 4, shot.truth)
-        counts = {"joints": seen, "points": points, "gaussians": drawn}
-        numbers[shot.name] = {subject.name: found | counts}
+        notes = (f"{int(pose.valid.sum())} joints", f"N = {placed.n_points}")
+        empty = [Panel(None, note, framed=True) for note in (*notes, f"{settings.sigmas:g} σ")]
+        drawn = Panel(image, written(found["psnr"], 2, " dB"))
+        panels.append([*empty, drawn, Panel(shot.truth)])
+        poses.append(pose)
+        numbers[shot.name] = {subject.name: found | {"joints": int(pose.valid.sum())}}
+    sheet = Sheet(panels, settings, width=settings.page, titles=TITLES)
+    for row, shot, pose in zip(sheet.axes, shots, poses, strict=True):
+        gaussians, accuracy = subject.paint(shot).gaussians, subject.avatar.accuracy
+        assert gaussians is not None
+        draw_bones(row[0], pose, shot)
+        found = numbers[shot.name][subject.name]
+        found["points"] = draw_points(row[1], placed, pose, shot)
+        fit_to(row[2], shot)
+        found["gaussians"] = draw_gaussians(row[2], gaussians, shot, accuracy, settings.sigmas)
     caption = (
         f"From skeleton to image through one camera: (a) the joints; (b) {POINTS[type(placed)]}; "
         f"(c) the Gaussians after Ψ, filled to {settings.sigmas:g} σ with their own colour and "
         "opacity; (d) the image; (e) the ground truth."
     )
-    return Drawing(panels.figure, caption, numbers)
+    return Drawing(sheet.figure, caption, numbers)
 
 
 @dataclass(frozen=True)
@@ -96,17 +96,16 @@ def pose_of(subject: Subject, shot: Shot) -> Pose:
     return Pose(p, valid, bone_frames(p, valid, avatar.template, twist=avatar.twist))
 
 
-def open_panel(panels: Panels, row: int, column: int, shot: Shot, note: str = "") -> Axes:
-    """An empty, framed panel in the pixels of the shot's window."""
-    axes = panels.panel(row, column, note, framed=True)
+def fit_to(axes: Axes, shot: Shot) -> None:
+    """Gives an empty panel the pixels of the shot's window."""
     height, width = shot.window.size
     axes.set(xlim=(0, width), ylim=(height, 0))
     axes.set_aspect("equal", adjustable="box")
-    return axes
 
 
 def draw_bones(axes: Axes, pose: Pose, shot: Shot, width: float = 1.4) -> None:
     """The skeleton in its groups' colours, far bones first, joints as dots."""
+    fit_to(axes, shot)
     pixels, depth = (x[0].numpy() for x in shot.camera.project(pose.p))
     shown = pose.valid[0].numpy() & (depth > NEAR)
     bones = [edge for edge in BONE_COLOURS if shown[list(edge)].all()]
@@ -123,6 +122,7 @@ def draw_points(axes: Axes, placed: Densify | BodyPoints, pose: Pose, shot: Shot
     Algorithm 1's points have their parts' colours, pale on the side of their part that faces away
     from the camera; points on a body have the colour of the bone that moves them most.
     """
+    fit_to(axes, shot)
     placed = deepcopy(placed).cpu()  # a copy: the avatar's own stays on the device that renders
     if isinstance(placed, BodyPoints):
         assert shot.frame.body is not None

@@ -17,17 +17,18 @@ from torch.nn import functional
 
 from gsgan.metrics.image import canny as canny_edges
 from gsgan.metrics.image import psnr
-from gsgan.report.figures.body import draw_bones, open_panel, pose_of
+from gsgan.report.figures.body import draw_bones, pose_of
 from gsgan.report.figures.layout import (
     BAR_FOOT,
     Drawing,
-    Panels,
+    Panel,
     Settings,
+    Sheet,
     Unavailable,
     legend_foot,
     written,
 )
-from gsgan.report.figures.shots import Shot, aspect_of
+from gsgan.report.figures.shots import Shot
 from gsgan.report.figures.subjects import Numbers, Subject, finite, measure, rivals
 from gsgan.utils.palette import BLACK, SKY, VERMILLION
 
@@ -35,7 +36,6 @@ FOUND, MISSED, INVENTED = BLACK, SKY, VERMILLION  # edges
 ERROR_COLOURS = "magma_r"  # pale is no error; even steps of lightness, in grey print too
 LEVELS = 255.0
 Images = list[dict[str, Tensor]]  # per shot, by name
-Box = tuple[slice, slice]  # rows, columns
 
 
 def teaser(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
@@ -44,21 +44,19 @@ def teaser(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setting
     Source: the paper's teaser.
     """
     subject = subjects[0]
-    images = [{subject.name: subject.image(shot)} for shot in shots]
+    images = _images([subject], shots)
     numbers = _measured(images, shots, settings)
-    panels = Panels(
-        2, len(shots), settings, aspect=aspect_of(shots), width=settings.page,
-        names=["skeleton", "image"], notes=0,
-    )  # fmt: skip
-    for column, shot in enumerate(shots):
-        draw_bones(open_panel(panels, 0, column, shot), pose_of(subject, shot), shot)
-        panels.show(1, column, images[column][subject.name])
+    below = [Panel(image) for held in images for image in held.values()]
+    panels = [[Panel(None, framed=True)] * len(shots), below]
+    sheet = Sheet(panels, settings, width=settings.page, names=["skeleton", "image"])
+    for axes, shot in zip(sheet.axes[0], shots, strict=True):
+        draw_bones(axes, pose_of(subject, shot), shot)
     each = ", ".join(_decibels(numbers[shot.name][subject.name]) for shot in shots)
     caption = (
         f"Skeletons and cameras (above) and the images that {subject.name} makes of them (below); "
         f"PSNR from left to right {each}."
     )
-    return Drawing(panels.figure, caption, numbers)
+    return Drawing(sheet.figure, caption, numbers)
 
 
 def strip(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
@@ -66,19 +64,16 @@ def strip(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings
 
     Source: the paper's strip of the sign language sequence.
     """
-    images = [{s.name: s.image(shot) for s in subjects} for shot in shots]
+    images = _images(subjects, shots)
     numbers = _measured(images, shots, settings)
-    panels = Panels(
-        1 + len(subjects), len(shots), settings, aspect=aspect_of(shots), width=settings.page,
-        titles=[f"frame {shot.item[1]}" for shot in shots],
-        names=["truth", *images[0]],
-    )  # fmt: skip
-    for column, shot in enumerate(shots):
-        panels.show(0, column, shot.truth)
-        for row, (name, image) in enumerate(images[column].items(), start=1):
-            panels.show(row, column, image, _decibels(numbers[shot.name][name]))
+    panels = [[Panel(shot.truth) for shot in shots]]
+    for name in images[0]:
+        notes = [_decibels(numbers[shot.name][name]) for shot in shots]
+        panels.append([Panel(x[name], note) for x, note in zip(images, notes, strict=True)])
+    titles, names = [f"frame {shot.item[1]}" for shot in shots], ["truth", *images[0]]
+    sheet = Sheet(panels, settings, width=settings.page, titles=titles, names=names)
     caption = "One camera over time: the ground truth and each run's images, with PSNR."
-    return Drawing(panels.figure, caption, numbers)
+    return Drawing(sheet.figure, caption, numbers)
 
 
 def comparison(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
@@ -86,17 +81,18 @@ def comparison(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Set
 
     Source: the paper's comparison figure.
     """
-    images = [{s.name: s.image(shot) for s in subjects} for shot in shots]
+    images = _images(subjects, shots)
     numbers = _measured(images, shots, settings)
-    panels = _row_per_shot(images, shots, settings, notes=2)
-    for row, shot in enumerate(shots):
-        panels.show(row, 0, shot.truth)
-        for column, (name, image) in enumerate(images[row].items(), start=1):
+    panels = []
+    for shot, held in zip(shots, images, strict=True):
+        panels.append([Panel(shot.truth)])
+        for name, image in held.items():
             found = numbers[shot.name][name]
             note = f"{_decibels(found)}\nF1 {written(found['edge_f1'], 3)}"
-            panels.show(row, column, image, note)
+            panels[-1].append(Panel(image, note))
+    sheet = Sheet(panels, settings, width=settings.page, titles=["truth", *images[0]])
     caption = "The ground truth and each run's image, with PSNR and the F1 of Canny edges."
-    return Drawing(panels.figure, caption, numbers)
+    return Drawing(sheet.figure, caption, numbers)
 
 
 def ablation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
@@ -107,32 +103,36 @@ def ablation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setti
 
     Source: the paper's ablation triplet (full, w/o GCN, w/o S).
     """
-    images = [{s.name: s.image(shot) for s in subjects} for shot in shots]
+    images = _images(subjects, shots)
     numbers = _measured(images, shots, settings)
-    panels = _row_per_shot(images, shots, settings, rows=2)
-    for i, shot in enumerate(shots):
-        box = most_disputed(torch.cat(list(images[i].values())), settings.detail)
-        rows, columns = box
-        size = (columns.stop - columns.start, rows.stop - rows.start)
-        for column, (name, image) in enumerate([("", shot.truth), *images[i].items()]):
-            notes = ["", ""]
-            if name:
-                found = numbers[shot.name][name]
-                found["psnr_detail"] = finite(psnr(image[..., *box], shot.truth[..., *box]))
-                notes = [written(found[key], 2, " dB") for key in ("psnr", "psnr_detail")]
-            frame: dict[str, Any] = {"fill": False, "edgecolor": VERMILLION}
-            axes = panels.show(2 * i, column, image, notes[0])
-            axes.add_patch(Rectangle((columns.start, rows.start), *size, lw=0.8, **frame))
-            axes = panels.show(2 * i + 1, column, image[..., *box], notes[1])
-            axes.add_patch(Rectangle((0, 0), *size, lw=1.6, **frame))
+    panels: list[list[Panel]] = []
+    boxes: list[tuple[slice, slice] | None] = []
+    for shot, held in zip(shots, images, strict=True):
+        box = most_disputed(torch.cat(list(held.values())), settings.detail)
+        above, below = [Panel(shot.truth)], [Panel(shot.truth[..., *box])]
+        for name, image in held.items():
+            found = numbers[shot.name][name]
+            found["psnr_detail"] = finite(psnr(image[..., *box], shot.truth[..., *box]))
+            above.append(Panel(image, _decibels(found)))
+            below.append(Panel(image[..., *box], written(found["psnr_detail"], 2, " dB")))
+        panels += [above, below]
+        boxes += [box, None]
+    sheet = Sheet(panels, settings, width=settings.page, titles=["truth", *images[0]])
+    for row, shown in zip(sheet.axes, boxes, strict=True):
+        for axes in row:
+            if shown is None:  # the magnified
+                axes.spines[:].set(visible=True, color=VERMILLION, linewidth=1.6)
+                continue
+            (top, height), (left, width) = ((side.start, side.stop - side.start) for side in shown)
+            axes.add_patch(Rectangle((left, top), width, height, fill=False, ec=VERMILLION, lw=0.8))
     caption = (
         "The ground truth and each run's image, with PSNR; below, magnified, the box in which the "
         "runs' images differ most from each other, with PSNR in the box."
     )
-    return Drawing(panels.figure, caption, numbers)
+    return Drawing(sheet.figure, caption, numbers)
 
 
-def most_disputed(images: Tensor, share: float) -> Box:
+def most_disputed(images: Tensor, share: float) -> tuple[slice, slice]:
     """The box with the largest variance between images of one thing.
 
     Args:
@@ -158,24 +158,27 @@ def canny(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings
     """
     images = [rivals(subjects, shot) for shot in shots]
     numbers = _measured(images, shots, settings)
-    panels = _row_per_shot(images, shots, settings, notes=2, foot=legend_foot(1, settings))
-    for row, shot in enumerate(shots):
-        truth = canny_edges(shot.truth[0], settings.canny_low, settings.canny_high)
-        for column, (name, image) in enumerate([("", shot.truth), *images[row].items()]):
-            edges = canny_edges(image[0], settings.canny_low, settings.canny_high)
-            note = f"{truth.sum()} px"
-            if name:
-                found = numbers[shot.name][name]
-                note = f"ratio {written(found['edge_ratio'], 2)}\nF1 {written(found['edge_f1'], 3)}"
-            painted = paint_edges(edges, truth, settings.canny_tolerance)
-            panels.show(row, column, painted, note, framed=True)
-    panels.legend({"edge": FOUND, "missing": MISSED, "not in the truth": INVENTED}, columns=3)
+    low, high, tolerance = settings.canny_low, settings.canny_high, settings.canny_tolerance
+    panels = []
+    for shot, held in zip(shots, images, strict=True):
+        truth = canny_edges(shot.truth[0], low, high)
+        painted = paint_edges(truth, truth, tolerance)
+        panels.append([Panel(painted, f"{truth.sum()} px", framed=True)])
+        for name, image in held.items():
+            found = numbers[shot.name][name]
+            note = f"ratio {written(found['edge_ratio'], 2)}\nF1 {written(found['edge_f1'], 3)}"
+            painted = paint_edges(canny_edges(image[0], low, high), truth, tolerance)
+            panels[-1].append(Panel(painted, note, framed=True))
+    titles, foot = ["truth", *images[0]], legend_foot(1, settings)
+    width = settings.column if len(titles) <= 3 else settings.page
+    sheet = Sheet(panels, settings, width=width, titles=titles, foot=foot)
+    sheet.legend({"edge": FOUND, "missing": MISSED, "not in the truth": INVENTED}, columns=3)
     caption = (
-        f"Canny edges (thresholds {settings.canny_low:g} and {settings.canny_high:g} on 8-bit "
-        "grey); below the ground truth, their number of pixels. Ratio: edge pixels over the ground "
-        f"truth's. F1: of edges, {settings.canny_tolerance} px off allowed."
+        f"Canny edges (thresholds {low:g} and {high:g} on 8-bit grey); below the ground truth, "
+        "their number of pixels. Ratio: edge pixels over the ground truth's. F1: of edges, "
+        f"{tolerance} px off allowed."
     )
-    return Drawing(panels.figure, caption, numbers)
+    return Drawing(sheet.figure, caption, numbers)
 
 
 def paint_edges(edges: np.ndarray, truth: np.ndarray, tolerance: int) -> np.ndarray:
@@ -214,29 +217,26 @@ def errors(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setting
     ]
     every = torch.cat([error.flatten() for held in maps for error in held.values()])
     top = settings.error_max or scale_end(every)
-    scale = Normalize(0, top)
-    panels = Panels(
-        len(shots), 1 + 2 * len(names), settings, aspect=aspect_of(shots), width=settings.page,
-        titles=["truth", *(f"{name}\n{what}" for what in ("image", "error") for name in names)],
-        foot=BAR_FOOT,
-    )  # fmt: skip
-    for row, shot in enumerate(shots):
-        panels.show(row, 0, shot.truth)
-        for column, (name, image) in enumerate(images[row].items(), start=1):
-            error, found = maps[row][name], numbers[shot.name][name]
-            found["error_mean"] = float(error.mean())
-            panels.show(row, column, image, _decibels(found))
-            panels.show(
-                row, column + len(names), error.numpy(), f"mean {error.mean():.2f}", framed=True,
-                cmap=ERROR_COLOURS, norm=scale,
-            )  # fmt: skip
+    how: dict[str, Any] = {"cmap": ERROR_COLOURS, "norm": Normalize(0, top)}
+    panels = []
+    for shot, held, found in zip(shots, images, maps, strict=True):
+        panels.append([Panel(shot.truth)])
+        for name, image in held.items():
+            numbers[shot.name][name]["error_mean"] = float(found[name].mean())
+            panels[-1].append(Panel(image, _decibels(numbers[shot.name][name])))
+        panels[-1] += [
+            Panel(error.numpy(), f"mean {error.mean():.2f}", framed=True, how=how)
+            for error in found.values()
+        ]
+    titles = ["truth", *(f"{name}\n{what}" for what in ("image", "error") for name in names)]
+    sheet = Sheet(panels, settings, width=settings.page, titles=titles, foot=BAR_FOOT)
     label = "absolute error, mean of R, G and B (levels of 255)"
-    panels.bar(ScalarMappable(scale, ERROR_COLOURS), label, over=bool((every > top).any()))
+    sheet.bar(ScalarMappable(how["norm"], ERROR_COLOURS), label, over=bool((every > top).any()))
     caption = (
         "Absolute error of each pixel, mean over the three channels, in levels of 255; one scale "
         f"for all maps, which ends at {top:g}. The mean over the window is below each map."
     )
-    return Drawing(panels.figure, caption, numbers)
+    return Drawing(sheet.figure, caption, numbers)
 
 
 def error_levels(image: Tensor, truth: Tensor) -> Tensor:
@@ -250,6 +250,10 @@ def scale_end(values: Tensor) -> float:
     return max(5.0, 5.0 * math.ceil(high / 5.0))
 
 
+def _images(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Images:
+    return [{subject.name: subject.image(shot) for subject in subjects} for shot in shots]
+
+
 def _measured(
     images: Images, shots: Sequence[Shot], settings: Settings
 ) -> dict[str, dict[str, Numbers]]:
@@ -258,18 +262,6 @@ def _measured(
         shot.name: {name: measure(image, shot.truth, settings) for name, image in held.items()}
         for shot, held in zip(shots, images, strict=True)
     }
-
-
-def _row_per_shot(
-    images: Images, shots: Sequence[Shot], settings: Settings, rows: int = 1, **how: Any
-) -> Panels:
-    """Panels with a column for the ground truth and one per image."""
-    titles = ["truth", *images[0]]
-    width = settings.column if len(titles) <= 3 else settings.page
-    aspect = aspect_of(shots)
-    return Panels(
-        rows * len(shots), len(titles), settings, aspect=aspect, width=width, titles=titles, **how
-    )
 
 
 def _decibels(found: Numbers) -> str:

@@ -1,11 +1,10 @@
-"""Sizes in print, and panels in rows and columns: what every figure of images is laid out with."""
+"""Sizes in print, and images in rows and columns: what most figures are laid out with."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import matplotlib
@@ -22,31 +21,18 @@ from gsgan.utils.errors import ConfigError
 
 GAP = 0.05  # inches between panels
 EDGE = 0.02  # inches around the whole, so that no frame is cut off
-LEAST_FONT = 5.0  # points: smaller is not readable in print
+LEAST_FONT = 3.0  # points
 LINE = 1.4 / 72  # inches per line and point of font size
 BAR_FOOT = 0.46  # inches that a colour bar needs in the foot
-LIMITS = {  # of every setting but error_max
+LIMITS = {  # of settings: what is readable and fits into memory
     "column": (1, 50), "page": (2, 50), "tallest": (0.3, 50), "font": (1, 20), "dpi": (1, 2400),
-    "margin": (1e-3, 1e3), "canny_low": (1e-3, 1e5), "canny_high": (1e-3, 1e5),
-    "canny_tolerance": (0, 100), "sigmas": (1e-3, 100), "detail": (1e-3, 1),
+    "canny_tolerance": (0, 100), "detail": (0.01, 1),
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How figures look and how the images in them are measured.
-
-    Args:
-        column, page: inches, width of a figure in one column and across the page.
-        tallest: inches, maximum height of one image.
-        font: points, of titles; numbers below images are one point smaller.
-        dpi: of the PNG, and of raster parts of the PDF.
-        margin: metres around the joints that are shown.
-        canny_low, canny_high: Canny's hysteresis thresholds on 8-bit grey.
-        canny_tolerance: pixels an edge may be off and still count as found.
-        error_max: levels of 255 at the end of the error scale; None takes the 99.5th percentile.
-        sigmas: standard deviations at which projected Gaussians are outlined.
-        detail: sides of the ablation's magnified box, as a share of the image's.
+    """How figures look and how the images in them are measured; `conf/report.yaml` has units.
 
     Raises:
         ConfigError: on a value outside `LIMITS`.
@@ -66,17 +52,16 @@ class Settings:
     detail: float = 0.35
 
     def __post_init__(self) -> None:
-        scale = {} if self.error_max is None else {"error_max": (1e-3, 255)}
-        for name, (low, high) in (LIMITS | scale).items():
-            value, kind = getattr(self, name), int if name in ("dpi", "canny_tolerance") else float
-            right = isinstance(value, int | kind) and not isinstance(value, bool)
-            if not right or not low <= value <= high:
-                whole = "a whole number" if kind is int else "a number"
+        for name, value in vars(self).items():
+            if name == "error_max" and value is None:
+                continue
+            kind = int if name in ("dpi", "canny_tolerance") else int | float
+            low, high = LIMITS.get(name, (1e-6, 1e6))
+            if not isinstance(value, kind) or not low <= value <= high:
+                what = "a whole number" if kind is int else "a number"
                 raise ConfigError(
-                    f"settings.{name} must be {whole} from {low:g} to {high:g}, got {value!r}"
+                    f"settings.{name} must be {what} from {low:g} to {high:g}, got {value!r}"
                 )
-        if self.canny_low > self.canny_high:
-            raise ConfigError("settings.canny_low must be at most settings.canny_high")
 
 
 @dataclass(frozen=True)
@@ -112,64 +97,91 @@ def style(settings: Settings) -> Iterator[None]:
         yield
 
 
-class Panels:
-    """A figure of equal panels, a title above each column and a note below each panel.
-
-    The widest figure that fits ``width`` with no panel higher than ``settings.tallest``. Text that
-    is wider than its panel is made smaller, and then cut off with an ellipsis.
+@dataclass(frozen=True)
+class Panel:
+    """One image of a sheet.
 
     Args:
-        rows, columns: of panels.
+        image: ``[1, 3, h, w]`` in [0, 1], or ``[h, w, …]`` as matplotlib takes it; None leaves the
+            panel empty.
+        note: below it, of one line or more.
+        framed: whether it has a frame.
+        how: further options of ``imshow``.
+    """
+
+    image: Tensor | np.ndarray | None
+    note: str = ""
+    framed: bool = False
+    how: dict[str, Any] = field(default_factory=dict)
+
+
+class Sheet:
+    """A figure of equal panels, the widest that fits; text that does not fit is made smaller.
+
+    Args:
+        panels: by row.
         settings: sizes.
-        aspect: a panel's height over its width.
         width: inches, at most.
         titles: above the columns, of one line or more.
         names: at the left of the rows.
-        notes: lines of text below each panel.
         foot: inches kept at the bottom for a legend or colour bar.
+
+    Attributes:
+        axes: ``[rows, columns]``, in pixels of the images, pixel centres at +0.5.
     """
 
     def __init__(
         self,
-        rows: int,
-        columns: int,
+        panels: Sequence[Sequence[Panel]],
         settings: Settings,
         *,
-        aspect: float,
         width: float,
         titles: Sequence[str] = (),
         names: Sequence[str] = (),
-        notes: int = 1,
         foot: float = 0.0,
     ) -> None:
         self.small, self.foot = settings.font - 1, foot
-        line = settings.font * LINE
+        shown = [[pixels(panel.image) for panel in row] for row in panels]
+        sizes = [image.shape for row in shown for image in row if image is not None]
+        aspect = max(shape[0] / shape[1] for shape in sizes)
+        rows, columns, line = len(panels), len(panels[0]), settings.font * LINE
         left = EDGE + (line if names else 0.0)
         top = EDGE + line * max((1 + title.count("\n") for title in titles), default=0)
-        below = notes * self.small * LINE + GAP
+        notes = [panel.note for row in panels for panel in row if panel.note]
+        below = max((1 + n.count("\n") for n in notes), default=0) * self.small * LINE + GAP
         gaps = left + EDGE + GAP * (columns - 1)
-        self.panel_width = min((width - gaps) / columns, settings.tallest / aspect)
-        panel_height = self.panel_width * aspect
-        self.width = gaps + columns * self.panel_width
+        panel_width = min((width - gaps) / columns, settings.tallest / aspect)
+        panel_height = panel_width * aspect
+        self.width = gaps + columns * panel_width
         self.height = top + rows * (panel_height + below) + foot
         self.figure = Figure(figsize=(self.width, self.height))
         self._renderer = FigureCanvasAgg(self.figure).get_renderer()
-        self.axes = self.figure.subplots(
-            rows, columns, squeeze=False,
-            gridspec_kw={
-                "left": left / self.width, "right": 1 - EDGE / self.width,
-                "top": 1 - top / self.height, "bottom": (below + foot) / self.height,
-                "wspace": GAP / self.panel_width, "hspace": below / panel_height,
-            },
-        )  # fmt: skip
-        for axes in self.axes.flat:
-            axes.set(xticks=[], yticks=[])
-            axes.spines[:].set_visible(False)
+        places = {
+            "left": left / self.width,
+            "right": 1 - EDGE / self.width,
+            "top": 1 - top / self.height,
+            "bottom": (below + foot) / self.height,
+            "wspace": GAP / panel_width,
+            "hspace": below / panel_height,
+        }
+        self.axes = self.figure.subplots(rows, columns, squeeze=False, gridspec_kw=places)
+        for i, row in enumerate(panels):
+            for axes, panel, image in zip(self.axes[i], row, shown[i], strict=True):
+                self._fill(axes, panel, image)
+                self._fit([axes.set_xlabel(panel.note, size=self.small, labelpad=2)], panel_width)
         plain: dict[str, Any] = {"parse_math": False, "size": settings.font}  # "$x" is no formula
         heads = [a.set_title(t, pad=2, **plain) for a, t in zip(self.axes[0], titles, strict=False)]
-        self._fit(heads, self.panel_width)
+        self._fit(heads, panel_width)
         for axes, name in zip(self.axes[:, 0], names, strict=False):
             self._fit([axes.set_ylabel(name, labelpad=2, **plain)], panel_height)
+
+    def _fill(self, axes: Axes, panel: Panel, image: np.ndarray | None) -> None:
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_visible(panel.framed)
+        if image is not None:
+            height, width = image.shape[:2]
+            extent = (0, width, height, 0)
+            axes.imshow(image, interpolation="nearest", extent=extent, **panel.how)
 
     def _fit(self, texts: Sequence[Text], room: float) -> None:
         """Gives texts the largest common size at which none is longer than ``room`` inches."""
@@ -180,38 +192,7 @@ class Panels:
 
         while any(map(long, texts)) and (size := float(texts[0].get_fontsize())) > LEAST_FONT:
             for text in texts:
-                text.set_fontsize(max(LEAST_FONT, size - 0.25))
-        for text in texts:
-            lines = text.get_text().split("\n")
-            most = max(map(len, lines))
-            while long(text) and most > 1:
-                most -= 1
-                text.set_text("\n".join(s if len(s) <= most else f"{s[:most]}…" for s in lines))
-
-    def panel(self, row: int, column: int, note: str = "", *, framed: bool = False) -> Axes:
-        """A panel, with the note below it."""
-        axes: Axes = self.axes[row, column]
-        axes.spines[:].set_visible(framed)
-        self._fit([axes.set_xlabel(note, size=self.small, labelpad=2)], self.panel_width)
-        return axes
-
-    def show(
-        self,
-        row: int,
-        column: int,
-        image: Tensor | np.ndarray,
-        note: str = "",
-        *,
-        framed: bool = False,
-        **how: Any,
-    ) -> Axes:
-        """A panel with an image: ``[1, 3, h, w]`` in [0, 1], or an array as matplotlib takes it."""
-        axes = self.panel(row, column, note, framed=framed)
-        shown = pixels(image) if isinstance(image, Tensor) else image
-        height, width = shown.shape[:2]
-        # pixel centres at +0.5, as in the cameras
-        axes.imshow(shown, interpolation="nearest", extent=(0, width, height, 0), **how)
-        return axes
+                text.set_fontsize(size - 0.25)
 
     def bar(self, mappable: ScalarMappable, label: str, *, over: bool) -> None:
         """A colour bar in the foot; ``over``: there are values beyond its end."""
@@ -226,12 +207,11 @@ class Panels:
 
     def legend(self, colours: dict[str, str], columns: int) -> None:
         """Named colours in the foot."""
-        patches = [Patch(facecolor=c, edgecolor="#555555", label=name, lw=0.4)
-                   for name, c in colours.items()]  # fmt: skip
+        patches = [Patch(facecolor=colour, label=name) for name, colour in colours.items()]
         self.figure.legend(
             handles=patches, loc="lower center", ncols=columns, frameon=False,
-            fontsize=self.small, handlelength=1.0, handleheight=0.8, columnspacing=1.0,
-            handletextpad=0.4, borderaxespad=0.0, borderpad=0.0, labelspacing=0.35,
+            fontsize=self.small, handlelength=1.0, columnspacing=1.0, borderpad=0.0,
+            borderaxespad=0.0, labelspacing=0.35,
         )  # fmt: skip
 
 
@@ -240,12 +220,14 @@ def legend_foot(lines: int, settings: Settings) -> float:
     return lines * (settings.font - 1) * LINE + 0.05
 
 
-def pixels(image: Tensor) -> np.ndarray:
-    """``[h, w, 3]`` bytes of an image ``[1, 3, h, w]``."""
+def pixels(image: Tensor | np.ndarray | None) -> np.ndarray | None:
+    """``[h, w, 3]`` bytes of an image ``[1, 3, h, w]``; arrays as they are."""
+    if not isinstance(image, Tensor):
+        return image
     shown = (image[0].detach().cpu().clamp(0, 1) * 255).round().byte()
     return shown.permute(1, 2, 0).numpy()
 
 
 def written(value: float | None, digits: int, unit: str = "") -> str:
     """A number with its unit, or n/a."""
-    return "n/a" if value is None or not math.isfinite(value) else f"{value:.{digits}f}{unit}"
+    return "n/a" if value is None else f"{value:.{digits}f}{unit}"

@@ -126,13 +126,13 @@ def _draw(
             )
         items = [data.dataset(split).items[i] for i in places]
     else:
-        split = config.split
+        split, frames = config.split, _list(config.frames)
         items = choose_items(
             data,
             split,
-            frames=_frames(config.frames),
+            frames=frames and [_whole("frames", frame) for frame in dict.fromkeys(frames)],
             camera=None if config.camera is None else str(config.camera),
-            count=_count(config.shots, name),
+            count=_whole(f"shots.{name}", config.shots.get(name)),
             one_camera=kind.one_camera,
         )
     shots = make_shots(data, split, items, settings.margin)
@@ -173,20 +173,10 @@ def _chosen(key: str, value: Any, known: list[str]) -> list[str]:
     return names
 
 
-def _frames(value: Any) -> list[int] | None:
-    frames = _list(value)
-    if frames is None:
-        return None
-    if not frames or any(isinstance(f, bool) or not isinstance(f, int) for f in frames):
-        raise ConfigError(f"frames must be a list of frame numbers, e.g. [12,40]; got {value!r}")
-    return list(dict.fromkeys(frames))
-
-
-def _count(shots: DictConfig, name: str) -> int:
-    count = shots.get(name)
-    if isinstance(count, bool) or not isinstance(count, int) or count < 1:
-        raise ConfigError(f"shots.{name} must be a whole number of at least 1, got {count!r}")
-    return count
+def _whole(key: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or value < (key != "frames"):
+        raise ConfigError(f"{key} must be a whole number, shots of at least 1; got {value!r}")
+    return value
 
 
 def _entry(drawing: Drawing, subjects: Sequence[Subject]) -> dict[str, Any]:

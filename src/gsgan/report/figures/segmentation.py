@@ -13,13 +13,14 @@ from gsgan.evaluate.scores import SegmentationScores
 from gsgan.model.segmentation import IGNORE, Segmentation
 from gsgan.report.figures.layout import (
     Drawing,
-    Panels,
+    Panel,
     Settings,
+    Sheet,
     Unavailable,
     legend_foot,
     written,
 )
-from gsgan.report.figures.shots import Shot, aspect_of
+from gsgan.report.figures.shots import Shot
 from gsgan.report.figures.subjects import Numbers, Subject
 from gsgan.utils.palette import VERMILLION
 
@@ -51,29 +52,30 @@ def segmentation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: S
     names = _legend(scored, (*maps[0].names, *maps[0].absent))
     width = settings.page if several else settings.column
     columns = max(1, int(width / LEGEND_WIDTH))
-    panels = Panels(
-        len(shots), len(titles), settings, aspect=aspect_of(shots), width=width, titles=titles,
-        foot=legend_foot(-(-len(names) // columns), settings),
-    )  # fmt: skip
+    panels = []
     numbers: dict[str, dict[str, Numbers]] = {}
-    for row, shot in enumerate(shots):
-        panels.show(row, 0, shot.truth)
+    for shot, held in zip(shots, scored, strict=True):
+        _, truth = held[able[0].name]
+        panels.append([Panel(shot.truth), Panel(colour_labels(truth))])
         numbers[shot.name] = {}
-        for place, (name, (parts, labels)) in enumerate(scored[row].items()):
-            panels.show(row, 1, colour_labels(labels))
+        for name, (parts, labels) in held.items():
             ours, found = parts.argmax(dim=1), agreement(parts, labels)
-            column, wrong = 2 + 2 * place, found["wrong_share"]
-            panels.show(row, column, colour_labels(ours), f"mIoU {written(found['miou'], 3)}")
+            wrong = found["wrong_share"]
             share = "n/a" if wrong is None else f"{100 * wrong:.1f} % wrong"
-            panels.show(row, column + 1, disagreement(ours, labels), share, framed=True)
+            panels[-1] += [
+                Panel(colour_labels(ours), f"mIoU {written(found['miou'], 3)}"),
+                Panel(disagreement(ours, labels), share, framed=True),
+            ]
             numbers[shot.name][name] = found
-    panels.legend(names, columns=columns)
+    foot = legend_foot(-(-len(names) // columns), settings)
+    sheet = Sheet(panels, settings, width=width, titles=titles, foot=foot)
+    sheet.legend(names, columns=columns)
     caption = (
         "The true parts, the segmentation S (most probable part), and where they disagree "
         "(vermillion, on the person in grey). mIoU: mean over the parts present, without the "
         "background. Wrong: share of the pixels that are the person's in either."
     )
-    return Drawing(panels.figure, caption, numbers)
+    return Drawing(sheet.figure, caption, numbers)
 
 
 def agreement(parts: Tensor, labels: Tensor) -> Numbers:
@@ -121,8 +123,8 @@ def _legend(
     labels = torch.cat([x.flatten() for s, truth in pairs for x in (s.argmax(dim=1), truth)])
     legend = {}
     for part in labels.unique().tolist():
-        rgb = colour_labels(torch.full((1, 1, 1), part)).flatten().tolist()
+        red, green, blue = colour_labels(torch.full((1, 1, 1), part)).flatten().tolist()
         name = names[part].replace("_", " ") if part < len(names) else f"part {part}"
         if part:
-            legend["not scored" if part == IGNORE else name] = to_hex(rgb)
+            legend["not scored" if part == IGNORE else name] = to_hex((red, green, blue))
     return legend

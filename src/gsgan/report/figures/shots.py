@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 from gsgan.data.checks import spans
 from gsgan.data.datamodule import GsganData
 from gsgan.data.splits import SPLITS, Item
-from gsgan.scene import Camera, Frame
+from gsgan.scene import Camera, Frame, cat
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.window import Window, body_window
 
 NEAR = 0.01  # metres: with a joint nearer the camera than this, the whole image is shown
-NARROWEST = 0.6  # width over height of a window: narrower ones leave no room for a title
+LEAST = 16  # pixels, the shortest side
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,11 +47,6 @@ class Shot:
     def camera(self) -> Camera:
         """Of the part shown."""
         return self.window.camera(self.frame.camera)
-
-
-def aspect_of(shots: Sequence[Shot]) -> float:
-    """The largest height over width of the parts shown."""
-    return max(shot.window.size[0] / shot.window.size[1] for shot in shots)
 
 
 def choose_items(
@@ -115,21 +111,12 @@ def make_shots(data: GsganData, split: str, items: Sequence[Item], margin: float
     """
     dataset = data.dataset(split)
     frames = [dataset[dataset.items.index(item)] for item in items]
-    windows = [
-        body_window(f.skeleton, f.camera, margin=margin, multiple=1, least=16, near=NEAR)
-        for f in frames
-    ]
-    sizes = [(h, max(w, round(NARROWEST * h))) for h, w in (window.size for window in windows)]
-    if len({frame.camera.size for frame in frames}) == 1:
-        sizes = [(max(h for h, _ in sizes), max(w for _, w in sizes))] * len(sizes)
-    windows = [_grown(window, size) for window, size in zip(windows, sizes, strict=True)]
-    return [Shot(*shot) for shot in zip(items, frames, windows, strict=True)]
-
-
-def _grown(window: Window, size: tuple[int, int]) -> Window:
-    """The window enlarged about its centre, inside the image."""
-    height, width = (min(side, whole) for side, whole in zip(size, window.picture, strict=True))
-    (top, left), (old_height, old_width) = window.corners[0], window.size
-    top = min(max(0, top + (old_height - height) // 2), window.picture[0] - height)
-    left = min(max(0, left + (old_width - width) // 2), window.picture[1] - width)
-    return Window(((top, left),), (height, width), window.picture)
+    one_size = len({frame.camera.size for frame in frames}) == 1
+    shots: list[Shot] = []
+    for batch in [frames] if one_size else [[frame] for frame in frames]:
+        p, camera = torch.cat([f.skeleton for f in batch]), cat([f.camera for f in batch])
+        boxes = body_window(p, camera, margin=margin, multiple=1, least=LEAST, near=NEAR)
+        for corner, frame in zip(boxes.corners, batch, strict=True):
+            window = Window((corner,), boxes.size, boxes.picture)
+            shots.append(Shot(items[len(shots)], frame, window))
+    return shots
