@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from gsgan.report.figures import images
 from gsgan.report.figures.body import draw_gaussians, ellipses, part_colours
 from gsgan.report.figures.layout import Panel, Settings, Sheet, Unavailable, style, written
-from gsgan.report.figures.run import KINDS
+from gsgan.report.figures.run import FIGURES
 from gsgan.report.figures.segmentation import agreement, disagreement
 from gsgan.report.figures.shots import choose_items, make_shots
 from gsgan.report.figures.subjects import Subject, measure
@@ -250,7 +250,7 @@ def test_what_a_model_cannot_have_is_said(build, model, figure, words):
     subject = subject_of(build, f"model={model}")
     shots = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)
     with style(SETTINGS), pytest.raises(Unavailable, match=words):
-        KINDS[figure].draw([subject], shots, SETTINGS)
+        FIGURES[figure]([subject], shots, SETTINGS)
 
 
 def test_data_without_labels_has_no_segmentation_figure(build):
@@ -258,7 +258,7 @@ def test_data_without_labels_has_no_segmentation_figure(build):
     shot = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)[0]
     bare = replace(shot, frame=replace(shot.frame, labels=None))
     with pytest.raises(Unavailable, match="no part labels"):
-        KINDS["segmentation"].draw([subject], [bare], SETTINGS)
+        FIGURES["segmentation"]([subject], [bare], SETTINGS)
 
 
 def test_drawing_leaves_the_avatar_where_it_paints(build, monkeypatch):
@@ -274,7 +274,7 @@ def test_drawing_leaves_the_avatar_where_it_paints(build, monkeypatch):
     monkeypatch.setattr(torch.nn.Module, "_apply", watched)
     shots = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)
     with style(SETTINGS):
-        KINDS["densify"].draw([subject], shots, SETTINGS)
+        FIGURES["densify"]([subject], shots, SETTINGS)
     assert moved  # the copy was
     assert not moved & {id(module) for module in subject.avatar.modules()}
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,7 @@ from commands import refused
 from omegaconf import OmegaConf
 
 from gsgan.metrics.image import edge_f1, psnr
-from gsgan.report.figures.run import KINDS
+from gsgan.report.figures.run import FIGURES
 from gsgan.train.runs import build_data, load_avatar, load_config
 from gsgan.utils.errors import DataError
 
@@ -41,8 +40,8 @@ def test_every_figure_is_made_with_numbers_of_the_pictures_shown(run, twin, tmp_
     result = inside("report", f"run={run}", f"compare=[{twin}]", f"out={out}", whole, *FEW)
     assert result.returncode == 0, result.stdout + result.stderr
     record = json.loads((out / "figures.json").read_text())
-    assert list(record) == list(KINDS)
-    for name in KINDS:
+    assert list(record) == list(FIGURES)
+    for name in FIGURES:
         picture = cv2.imread(str(out / f"{name}.png"))
         assert picture is not None
         assert picture.std() > 5  # not blank
@@ -195,7 +194,7 @@ def test_a_figure_that_fails_leaves_the_others_numbers(run, tmp_path, inside, mo
     out = tmp_path / "out"
     out.mkdir()
     (out / "figures.json").write_text('{"strip": 3, "errors": {"caption": "old"}}')
-    monkeypatch.setitem(KINDS, "strip", replace(KINDS["strip"], draw=fail))
+    monkeypatch.setitem(FIGURES, "strip", fail)
     given = (f"run={run}", f"out={out}", "figures=[canny,strip]", "formats=png", *FEW)
     refused(inside("report", *given), "the last picture is damaged")
     assert list(json.loads((out / "figures.json").read_text())) == ["canny"]

@@ -108,10 +108,9 @@ class TableSpec:
 
     def __post_init__(self) -> None:
         for key in ("metrics", "splits", "variants", "subjects", "rows", "by"):
-            held = getattr(self, key)
-            if held is None and key in ("subjects", "rows", "by"):
-                continue
-            if isinstance(held, str) or not isinstance(held, Sequence) or not held:
+            held, optional = getattr(self, key), key in ("subjects", "rows", "by")
+            right = isinstance(held, Sequence) and not isinstance(held, str) and len(held) > 0
+            if not right and not (optional and held is None):
                 raise ConfigError(f"table.{key} must be a list of at least one, got {held!r}")
         if self.rows is not None:
             object.__setattr__(self, "rows", [_row(row) for row in self.rows])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -37,6 +37,7 @@ POINTS = {
     "pale on the side of the part that faces away",
     BodyPoints: "points of the posed body's surface, coloured by the bone that moves them most",
 }
+Pose = tuple[Tensor, Tensor, BoneFrames]
 TITLES = ("(a) skeleton", "(b) points", "(c) Gaussians", "(d) image", "(e) truth")
 
 
@@ -56,13 +57,13 @@ def densify(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settin
     numbers: dict[str, dict[str, Numbers]] = {}
     for shot in shots:
         pose, image = pose_of(subject, shot), subject.image(shot)
-        found = measure(image, shot.truth, settings)
-        notes = (f"{int(pose.valid.sum())} joints", f"N = {placed.n_points}")
+        found, joints = measure(image, shot.truth, settings), int(pose[1].sum())
+        notes = (f"{joints} joints", f"N = {placed.n_points}")
         empty = [Panel(None, note, framed=True) for note in (*notes, f"{settings.sigmas:g} σ")]
         drawn = Panel(image, written(found["psnr"], 2, " dB"))
         panels.append([*empty, drawn, Panel(shot.truth)])
         poses.append(pose)
-        numbers[shot.name] = {subject.name: found | {"joints": int(pose.valid.sum())}}
+        numbers[shot.name] = {subject.name: found | {"joints": joints}}
     sheet = Sheet(panels, settings, width=settings.page, titles=TITLES)
     for row, shot, pose in zip(sheet.axes, shots, poses, strict=True):
         gaussians, accuracy = subject.paint(shot).gaussians, subject.avatar.accuracy
@@ -80,20 +81,15 @@ def densify(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settin
     return Drawing(sheet.figure, caption, numbers)
 
 
-@dataclass(frozen=True)
-class Pose:
-    """A shot's skeleton as the model gets it: ``p [1, J, 3]`` metres, ``valid [1, J]`` bool."""
-
-    p: Tensor
-    valid: Tensor
-    frames: BoneFrames
-
-
 def pose_of(subject: Subject, shot: Shot) -> Pose:
-    """The skeleton, with the dataset's substitutes for joints that were not seen."""
+    """The skeleton as the model gets it, with substitutes for joints that were not seen.
+
+    Returns:
+        p ``[1, J, 3]`` metres, valid ``[1, J]`` bool, bone frames.
+    """
     frame, avatar = shot.frame, subject.avatar
     p, valid = frame.skeleton, frame.visibility > 0
-    return Pose(p, valid, bone_frames(p, valid, avatar.template, twist=avatar.twist))
+    return p, valid, bone_frames(p, valid, avatar.template, twist=avatar.twist)
 
 
 def fit_to(axes: Axes, shot: Shot) -> None:
@@ -106,8 +102,9 @@ def fit_to(axes: Axes, shot: Shot) -> None:
 def draw_bones(axes: Axes, pose: Pose, shot: Shot, width: float = 1.4) -> None:
     """The skeleton in its groups' colours, far bones first, joints as dots."""
     fit_to(axes, shot)
-    pixels, depth = (x[0].numpy() for x in shot.camera.project(pose.p))
-    shown = pose.valid[0].numpy() & (depth > NEAR)
+    p, valid, _ = pose
+    pixels, depth = (x[0].numpy() for x in shot.camera.project(p))
+    shown = valid[0].numpy() & (depth > NEAR)
     bones = [edge for edge in BONE_COLOURS if shown[list(edge)].all()]
     bones.sort(key=lambda edge: -depth[list(edge)].mean())
     lines, colours = [pixels[list(edge)] for edge in bones], [BONE_COLOURS[e] for e in bones]
@@ -130,7 +127,7 @@ def draw_points(axes: Axes, placed: Densify | BodyPoints, pose: Pose, shot: Shot
         colours = bone_colours(placed)
         away = np.zeros(len(colours), dtype=bool)
     else:
-        points = placed(pose.p, pose.valid, pose.frames)
+        points = placed(*pose)
         colours = to_rgba_array(np.array(part_colours(placed))[points.part_id.numpy()])
         away = (points.normals[0] * (points.means[0] - shot.camera.centre)).sum(-1).numpy() > 0
     pixels, depth = (x[0].numpy() for x in shot.camera.project(points.means))

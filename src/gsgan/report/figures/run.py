@@ -6,7 +6,7 @@ import io
 import json
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,34 +35,19 @@ METADATA: dict[str, dict[str, Any]] = {  # no dates: the same figure gives the s
 }
 
 
-@dataclass(frozen=True)
-class Kind:
-    """How a figure is made.
-
-    Args:
-        draw: subjects, the first one leading, and shots to a drawing.
-        one_camera: all its shots come from one camera.
-        compares: it needs a second run.
-        watched: it is of the images that were watched while training, not of a split's.
-    """
-
-    draw: Callable[[Sequence[Subject], Sequence[Shot], Settings], Drawing]
-    one_camera: bool = False
-    compares: bool = False
-    watched: bool = False
-
-
-KINDS = {
-    "teaser": Kind(images.teaser),
-    "densify": Kind(densify),
-    "segmentation": Kind(segmentation),
-    "canny": Kind(images.canny),
-    "errors": Kind(images.errors),
-    "strip": Kind(images.strip, one_camera=True),
-    "comparison": Kind(images.comparison, compares=True),
-    "ablation": Kind(images.ablation, compares=True),
-    "training": Kind(training, watched=True),
+# Each draws shots of subjects, the first one leading.
+FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot], Settings], Drawing]] = {
+    "teaser": images.teaser,
+    "densify": densify,
+    "segmentation": segmentation,
+    "canny": images.canny,
+    "errors": images.errors,
+    "strip": images.strip,
+    "comparison": images.comparison,
+    "ablation": images.ablation,
+    "training": training,
 }
+COMPARE = ("comparison", "ablation")  # need a second run
 
 
 def make_figures(config: DictConfig) -> None:
@@ -73,9 +58,9 @@ def make_figures(config: DictConfig) -> None:
         DataError: when a run or its data cannot be read.
     """
     folders = [Path(str(f)).expanduser() for f in (config.run, *(_list(config.compare) or []))]
-    names = _chosen("figures", config.figures, list(KINDS))
+    names = _chosen("figures", config.figures, list(FIGURES))
     if config.figures is None and len(folders) == 1:
-        names = [name for name in names if not KINDS[name].compares]
+        names = [name for name in names if name not in COMPARE]
     formats = _chosen("formats", config.formats, list(METADATA))
     if config.settings is None or config.shots is None:
         raise ConfigError("settings and shots are tables of values; leave them out, or set a key")
@@ -114,10 +99,10 @@ def make_figures(config: DictConfig) -> None:
 def _draw(
     name: str, subjects: Sequence[Subject], config: DictConfig, settings: Settings
 ) -> Drawing:
-    kind, data = KINDS[name], subjects[0].data
-    if kind.compares and len(subjects) < 2:
+    data = subjects[0].data
+    if name in COMPARE and len(subjects) < 2:
         raise Unavailable("there is one run; add others as compare=[<folder>,…]")
-    if kind.watched:
+    if name == "training":
         split, places = data.watched
         if any(subject.data.watched != (split, places) for subject in subjects):
             raise DataError(
@@ -133,7 +118,7 @@ def _draw(
             frames=frames and [_whole("frames", frame) for frame in dict.fromkeys(frames)],
             camera=None if config.camera is None else str(config.camera),
             count=_whole(f"shots.{name}", config.shots.get(name)),
-            one_camera=kind.one_camera,
+            one_camera=name == "strip",
         )
     shots = make_shots(data, split, items, settings.margin)
     for subject in subjects[1:]:
@@ -141,19 +126,15 @@ def _draw(
         for shot in shots:
             theirs = dataset[dataset.items.index(shot.item)]
             check_frame(subjects[0].run, subject.run, shot.name, (shot.frame, theirs))
-    drawing = kind.draw(subjects, shots, settings)
-    caption = drawing.caption
-    if not kind.watched:
-        cameras = {camera: [i for c, i in items if c == camera] for camera, _ in items}
-        listed = "; ".join(
-            f"camera {camera} frame {', '.join(map(str, frames))}"
-            for camera, frames in cameras.items()
+    drawing = FIGURES[name](subjects, shots, settings)
+    about = f"Split {split}."
+    if name != "training":
+        about = (
+            f"Images: {', '.join(shot.name for shot in shots)}. Numbers are of the windows shown, "
+            f"which reach at least {settings.margin:g} m beyond the joints, not of whole images. "
+            + about
         )
-        caption += (
-            f" Images: {listed}. Numbers are of the windows shown, which reach at least "
-            f"{settings.margin:g} m beyond the joints, not of whole images."
-        )
-    return Drawing(drawing.figure, f"{caption} Split {split}.", drawing.numbers)
+    return replace(drawing, caption=f"{drawing.caption} {about}")
 
 
 def _list(value: Any) -> list[Any] | None:
@@ -205,7 +186,9 @@ def _write_record(out: Path, made: dict[str, dict[str, Any]]) -> None:
         kept = {k: v for k, v in before.items() if {"caption", "runs", "marks"} <= v.keys()}
     except (OSError, ValueError, AttributeError):
         kept = {}
-    record = {name: made.get(name) or kept[name] for name in KINDS if name in made or name in kept}
+    record = {
+        name: made.get(name) or kept[name] for name in FIGURES if name in made or name in kept
+    }
     write_atomically(out / RECORD, json.dumps(record, indent=1, allow_nan=False) + "\n")
     parts = ["# Captions"]
     for name, entry in record.items():
