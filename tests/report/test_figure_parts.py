@@ -1,4 +1,4 @@
-"""The parts of the figures, on pictures whose numbers are known."""
+"""The parts of the figures, on images whose numbers are known."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def pinhole() -> Camera:
     return Camera(K, torch.eye(3)[None], torch.zeros(1, 3), (64, 64))
 
 
-def test_numbers_of_a_picture_in_closed_form():
+def test_measures_in_closed_form():
     truth = torch.zeros(1, 3, 16, 16)
     truth[..., 4:12, 4:12] = 0.8
     found = measure(truth + 0.1, truth, SETTINGS)
@@ -77,9 +77,9 @@ def test_edges_found_missing_and_invented_have_their_colours():
 
 def test_errors_are_levels_of_255_and_share_one_scale():
     truth = torch.zeros(1, 3, 2, 2)
-    picture = truth.clone()
-    picture[0, :, 0, 0] = torch.tensor([0.3, -0.3, 0.6])
-    assert images.error_levels(picture, truth)[0, 0] == pytest.approx(0.4 * 255)
+    image = truth.clone()
+    image[0, :, 0, 0] = torch.tensor([0.3, -0.3, 0.6])
+    assert images.error_levels(image, truth)[0, 0] == pytest.approx(0.4 * 255)
     assert images.scale_end(torch.tensor([0.0, 12.0])) == 15
     assert images.scale_end(torch.zeros(4)) == 5
 
@@ -132,7 +132,7 @@ def test_ellipses_are_the_projected_covariances():
     assert math.remainder(lengths[major] - turn, math.pi) == pytest.approx(0, abs=1e-4)
 
 
-def test_ellipses_are_as_wide_as_the_supersampled_picture_has_them():
+def test_ellipses_are_as_wide_as_the_supersampled_image_has_them():
     camera = pinhole()
     gaussians = Gaussians(
         means=torch.tensor([[[0.0, 0, 2]]]),
@@ -209,7 +209,7 @@ def test_shots_are_spread_over_frames_and_cameras(data):
         choose_items(data, "test", frames=None, camera=None, count=1)
 
 
-def test_an_empty_split_says_which_are_not(build):
+def test_an_empty_split_names_those_with_images(build):
     data = build("data.test_cameras=[]", "data.train_cameras=[cam00,cam01,cam02]")[0]
     with pytest.raises(
         DataError, match=r"no camera is held out.*use split=train, split=novel_pose"
@@ -246,7 +246,7 @@ def subject_of(build, *overrides: str) -> Subject:
         ("image_to_image", "densify", "makes no points"),
     ],
 )
-def test_what_a_model_cannot_have_is_said(build, model, figure, words):
+def test_a_figure_that_a_model_cannot_have_says_why(build, model, figure, words):
     subject = subject_of(build, f"model={model}")
     shots = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)
     with style(SETTINGS), pytest.raises(Unavailable, match=words):
@@ -261,8 +261,8 @@ def test_data_without_labels_has_no_segmentation_figure(build):
         FIGURES["segmentation"]([subject], [bare], SETTINGS)
 
 
-def test_drawing_leaves_the_avatar_where_it_paints(build, monkeypatch):
-    """On a GPU, points moved to the CPU for a figure would be missing for the next picture."""
+def test_drawing_leaves_the_avatar_on_its_device(build, monkeypatch):
+    """On a GPU, points moved to the CPU for a figure would be missing for the next image."""
     subject = subject_of(build)
     moved: set[int] = set()
     apply = torch.nn.Module._apply

@@ -1,4 +1,4 @@
-"""``gsgan.figures`` as a user types it: every figure made, and every way to go wrong."""
+"""``gsgan.report run=…`` as a user types it: every figure, and every error."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ def edit(run: Path, **values) -> None:
     OmegaConf.save(config, path)
 
 
-def test_every_figure_is_made_with_numbers_of_the_pictures_shown(run, twin, tmp_path, inside):
+def test_every_figure_is_made_with_numbers_of_the_images_shown(run, twin, tmp_path, inside):
     out = tmp_path / "out"
-    whole = "settings.margin=9"  # metres: the window is the picture
+    whole = "settings.margin=9"  # metres: the window is the image
     result = inside("report", f"run={run}", f"compare=[{twin}]", f"out={out}", whole, *FEW)
     assert result.returncode == 0, result.stdout + result.stderr
     record = json.loads((out / "figures.json").read_text())
     assert list(record) == list(FIGURES)
     for name in FIGURES:
-        picture = cv2.imread(str(out / f"{name}.png"))
-        assert picture is not None
-        assert picture.std() > 5  # not blank
+        image = cv2.imread(str(out / f"{name}.png"))
+        assert image is not None
+        assert image.std() > 5  # not blank
         pdf = (out / f"{name}.pdf").read_bytes()
         assert pdf.startswith(b"%PDF")
         assert pdf.rstrip().endswith(b"%%EOF")
@@ -60,7 +60,7 @@ def test_every_figure_is_made_with_numbers_of_the_pictures_shown(run, twin, tmp_
 
 
 def expected(run: Path, found: dict) -> dict:
-    """PSNR and edge F1 of whole pictures, painted here without the figures' code."""
+    """PSNR and edge F1 of whole images, rendered here without the figures' code."""
     config = load_config(run)
     data = build_data(config)
     avatar, _ = load_avatar(run, config, data)
@@ -94,7 +94,7 @@ def test_the_same_figure_has_the_same_bytes_and_earlier_ones_are_kept(run, tmp_p
     assert "## canny" in (tmp_path / "out" / "captions.md").read_text()
 
 
-def test_what_cannot_be_made_is_said_and_the_rest_is_made(run, tmp_path, inside):
+def test_a_figure_that_cannot_be_made_is_named_and_the_rest_is_made(run, tmp_path, inside):
     given = (f"run={run}", f"out={tmp_path / 'out'}", "formats=png", *FEW)
     result = inside("report", *given, "figures=[ablation,canny]")
     assert result.returncode == 0, result.stderr
@@ -136,7 +136,7 @@ def test_a_run_on_other_pixels_is_refused(run, twin, capture, tmp_path, inside):
     refused(inside("report", *given), "different image cam00/000004")
 
 
-def test_a_run_that_is_half_trained_is_said_to_be(twin, tmp_path, inside):
+def test_an_unfinished_run_is_marked_in_captions(twin, tmp_path, inside):
     path = twin / "checkpoints" / "last.ckpt"
     checkpoint = torch.load(path, weights_only=True)
     total = checkpoint["gsgan"]["step"]
@@ -144,9 +144,9 @@ def test_a_run_that_is_half_trained_is_said_to_be(twin, tmp_path, inside):
     torch.save(checkpoint, path)
     given = (f"run={twin}", f"out={tmp_path / 'out'}", "figures=strip", "formats=png", *FEW)
     result = inside("report", *given)
-    said = f"gsgan is unfinished: 3 of {total} iterations"
-    assert said in result.stdout
-    assert said in (tmp_path / "out" / "captions.md").read_text()
+    message = f"gsgan is unfinished: 3 of {total} iterations"
+    assert message in result.stdout
+    assert message in (tmp_path / "out" / "captions.md").read_text()
 
 
 def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside):
@@ -175,7 +175,7 @@ def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside)
     refused(inside("report", *given), str(twin), "has no log of two validations", "logger=csv")
 
 
-def test_training_curves_are_of_the_same_watched_pictures(run, twin, tmp_path, inside):
+def test_training_curves_are_of_the_same_watched_images(run, twin, tmp_path, inside):
     given = (f"run={run}", f"compare={twin}", f"out={tmp_path / 'out'}", "figures=training")
     assert inside("report", *given, "names=[ours,'_x $1 {']").returncode == 0
     edit(twin, data__val_pictures=1)
@@ -186,17 +186,17 @@ def test_training_curves_are_of_the_same_watched_pictures(run, twin, tmp_path, i
 
 
 def test_a_figure_that_fails_leaves_the_others_numbers(run, tmp_path, inside, monkeypatch):
-    """As a stopped command does: pictures, captions and numbers are of one making."""
+    """As a stopped command does: images, captions and numbers match."""
 
     def fail(*_: object) -> None:
-        raise DataError("the last picture is damaged")
+        raise DataError("the last image is damaged")
 
     out = tmp_path / "out"
     out.mkdir()
     (out / "figures.json").write_text('{"strip": 3, "errors": {"caption": "old"}}')
     monkeypatch.setitem(FIGURES, "strip", fail)
     given = (f"run={run}", f"out={out}", "figures=[canny,strip]", "formats=png", *FEW)
-    refused(inside("report", *given), "the last picture is damaged")
+    refused(inside("report", *given), "the last image is damaged")
     assert list(json.loads((out / "figures.json").read_text())) == ["canny"]
     assert "## canny" in (out / "captions.md").read_text()
     assert not (out / "strip.png").exists()
@@ -236,7 +236,7 @@ def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
         (("data_root=/nowhere",), ("/nowhere",)),
     ],
 )
-def test_a_wrong_value_ends_in_one_sentence(run, inside, given, words):
+def test_a_wrong_value_ends_in_one_message(run, inside, given, words):
     given = [argument.replace("{run}", str(run)) for argument in given]
     if not any(argument.startswith("run=") for argument in given):
         given.append(f"run={run}")

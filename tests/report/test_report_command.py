@@ -57,7 +57,7 @@ def test_it_fills_a_block_of_a_page_again_and_again(sweep, tmp_path, inside):
     assert str(tmp_path) not in text  # no path of this machine
 
 
-def test_what_is_wrong_is_said_in_one_sentence_before_anything_is_written(sweep, tmp_path, inside):
+def test_a_wrong_value_ends_in_one_message_before_anything_is_written(sweep, tmp_path, inside):
     runs = f"runs=[{sweep}]"
     refused(inside("report"), "runs and run are not set")
     refused(inside("report", "runs=[]"), "runs and run are not set")

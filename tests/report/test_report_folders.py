@@ -1,4 +1,4 @@
-"""Which folders are runs, what they tell, and how damaged ones are told apart."""
+"""Which folders are runs, what is read from them, and which are left out."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_a_sweep_is_searched_and_each_run_taken_once(tmp_path):
 
 
 @pytest.mark.parametrize("entry", ["absent", "x*", "a/metrics.json", "empty", ""])
-def test_what_is_no_run_is_refused(tmp_path, monkeypatch, entry):
+def test_an_entry_without_a_run_is_refused(tmp_path, monkeypatch, entry):
     write_run(tmp_path / "a")
     (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path)
@@ -34,7 +34,7 @@ def test_what_is_no_run_is_refused(tmp_path, monkeypatch, entry):
         find_runs([entry])
 
 
-def test_facts_say_what_a_run_is(tmp_path):
+def test_name_and_seed_come_from_the_facts(tmp_path):
     run = read_run(write_run(tmp_path / "a", "wo_gcn", 3, psnr=30.0))
     assert (run.name, run.seed, run.data["name"]) == ("wo_gcn", 3, "synthetic")
     predicted = write_run(tmp_path / "b", None, None, facts={"method": "gauhuman"})
@@ -60,7 +60,7 @@ def test_settings_are_without_the_seed_and_know_older_names(tmp_path, tiny):
 
 
 @pytest.mark.parametrize(
-    ("file", "text", "said"),
+    ("file", "text", "message"),
     [
         ("metrics.json", '{"novel_pose": {"full": {"psnr": 30', "damaged"),
         ("metrics.json", "3", "damaged"),
@@ -75,11 +75,11 @@ def test_settings_are_without_the_seed_and_know_older_names(tmp_path, tiny):
         ("facts.json", "{", "damaged"),
     ],
 )
-def test_a_damaged_file_is_named_and_its_run_left_out(tmp_path, file, text, said):
+def test_a_damaged_file_is_named_and_its_run_left_out(tmp_path, file, text, message):
     whole = write_run(tmp_path / "whole", psnr=30.0)
     broken = write_run(tmp_path / "broken", psnr=30.0)
     (broken / file).write_text(text)
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=message):
         read_run(broken)
     runs, out = read_runs([whole, broken])
     assert [run.folder for run in runs] == [whole]
@@ -117,7 +117,7 @@ def test_every_score_of_the_evaluation_has_a_column():
     assert set(SHOWN) >= set(SCORED)
 
 
-def test_the_format_is_the_evaluations_own(run):
+def test_it_reads_what_evaluate_writes(run):
     read = read_run(run)
     facts = json.loads((run / "facts.json").read_text())
     assert (read.name, read.seed) == ("full", 0)
@@ -125,8 +125,8 @@ def test_the_format_is_the_evaluations_own(run):
     assert read.settings["training.schedule.epoch"] == 4
 
 
-def test_predictions_that_were_scored_stand_beside_a_run(run, capture, tmp_path, inside):
-    """Black pictures of a method of someone else: its row has the floor's very scores."""
+def test_scored_predictions_stand_beside_a_run(run, capture, tmp_path, inside):
+    """A method's black images have exactly the floor's scores."""
     from gsgan.train.runs import build_data, load_config
 
     for camera, frame in build_data(load_config(run)).dataset("novel_pose").items:

@@ -54,14 +54,14 @@ def test_a_setting_that_a_run_does_not_have_is_named(tmp_path):
 
 
 @pytest.mark.parametrize("by", [[], "training"])
-def test_what_is_no_list_of_settings_is_refused(by):
+def test_by_must_be_a_list_of_settings(by):
     with pytest.raises(ConfigError, match=r"table\.by"):
         table(by=by)
     with pytest.raises(ConfigError, match=r"table\.rows must be null"):
         table(by=[KEY], rows=[{"run": "full"}])
 
 
-def test_the_picture_shows_a_panel_a_score_that_there_is(tmp_path):
+def test_the_curves_have_a_panel_per_metric_that_runs_have(tmp_path):
     runs = [swept(tmp_path, w, s, 30 + s + w) for w in (0, 0.5) for s in (0, 1)]
     one = curves(report_of(table(by=[KEY]), *runs))  # LPIPS is not there
     pixels = cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR)

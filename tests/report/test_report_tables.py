@@ -78,7 +78,7 @@ def test_a_value_that_some_seeds_lack_is_counted_and_explained(tmp_path):
     assert full.cells[1].numbers["n"] == 2
 
 
-def test_marks_departures_and_left_out_pictures_are_noted(tmp_path):
+def test_marks_departures_and_left_out_images_are_noted(tmp_path):
     record = protocol("zju_humannerf", departures=["background is black, asked for: white"])
     report = report_of(
         table(),
@@ -123,33 +123,33 @@ MIXTURES = {
         "two sets of synthetic, person",
     ),
     "a protocol": ({"record": protocol("paper_zju")}, "different protocols: none and paper_zju"),
-    "other pictures": ({"floor": {"psnr": 15.6}}, "against different images"),
-    "fewer pictures": ({"images": 2}, "scored on 3 and 2 images"),
+    "other images": ({"floor": {"psnr": 15.6}}, "against different images"),
+    "fewer images": ({"images": 2}, "scored on 3 and 2 images"),
     "changed code": ({"facts": {"dirty": True}}, "uncommitted changes"),
     "another LPIPS": ({"lpips": 0.1, "lpips_name": "LPIPS-Alex"}, "LPIPS-VGG and LPIPS-Alex"),
 }
 
 
-@pytest.mark.parametrize(("held", "said"), MIXTURES.values(), ids=MIXTURES)
-def test_what_does_not_belong_in_one_column_is_refused_by_name(tmp_path, held, said):
+@pytest.mark.parametrize(("held", "message"), MIXTURES.values(), ids=MIXTURES)
+def test_runs_that_do_not_belong_in_one_column_are_refused_by_name(tmp_path, held, message):
     first = write_run(tmp_path / "first", psnr=30.0, lpips=0.2, lpips_name="LPIPS-VGG")
     other = write_run(tmp_path / "other", "wo_seg", psnr=29.0, **held)
-    with pytest.raises(ConfigError, match=said) as caught:
+    with pytest.raises(ConfigError, match=message) as caught:
         report_of(table(), first, other)
     assert str(first) in str(caught.value)
     assert str(other) in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("held", "said"),
+    ("held", "message"),
     [
         ({"marks": ["stand-in"]}, "have different marks: unmarked and stand-in"),
         ({"facts": {"iterations": 10}}, "trained 7000 and 10 iterations"),
     ],
 )
-def test_seeds_of_one_row_are_of_one_thing(tmp_path, held, said):
+def test_seeds_of_one_row_must_match(tmp_path, held, message):
     runs = [write_run(tmp_path / "a", psnr=30.0), write_run(tmp_path / "b", seed=1, **held)]
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         report_of(table(), *runs)
 
 
@@ -185,7 +185,7 @@ def test_seeds_of_one_row_have_one_config(tmp_path):
         build(table(), runs, {}, None)
 
 
-def test_a_row_says_in_which_settings_it_differs_from_the_reference(tmp_path):
+def test_a_row_names_the_settings_in_which_it_differs_from_the_reference(tmp_path):
     settings = {"model.generator.base": 12, "model.generator.width": 1}
     runs = [
         trained(tmp_path, "a", "full", 0, **settings),
@@ -193,8 +193,8 @@ def test_a_row_says_in_which_settings_it_differs_from_the_reference(tmp_path):
         trained(tmp_path, "c", "twin", 0, **settings),
     ]
     scores, _ = build(table(reference="full"), runs, {}, None).grids
-    told = "mine differs from full in model.generator, training.step_two.l2"
-    assert row(scores, "mine").notes == (told,)
+    note = "mine differs from full in model.generator, training.step_two.l2"
+    assert row(scores, "mine").notes == (note,)
     assert row(scores, "twin").notes == ("twin differs from full in no setting",)
     assert row(scores, "full").notes == ()
 
