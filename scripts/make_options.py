@@ -24,7 +24,6 @@ ORDER = (
     "train",
     "evaluate",
     "report",
-    "figures",
     "bench_raster",
     "bench_stability",
     "bench_rays",

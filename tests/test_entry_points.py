@@ -61,7 +61,7 @@ def test_evaluate_finds_a_dataset_that_moved(run, capture, tmp_path, inside):
     assert scores == json.loads(kept)  # the other split's scores stay
 
 
-@pytest.mark.parametrize("command", ["evaluate", "figures", "bench speed"])
+@pytest.mark.parametrize("command", ["evaluate", "report", "bench speed"])
 def test_a_model_file_is_refused_for_a_run_that_read_none(command, run, inside):
     command, *first = command.split()
     result = inside(command, *first, f"run={run}", "data_smpl=/SMPL_NEUTRAL.pkl")

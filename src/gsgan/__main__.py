@@ -6,8 +6,7 @@ COMMANDS = {
     "gsgan.fit": "landmarks that fit the masks: data.root=<folder> out=<file.npz>",
     "gsgan.train": "train an avatar, then score it on what was held out",
     "gsgan.evaluate": "score a run, run=<folder>, or any method's pictures, predictions=<folder>",
-    "gsgan.report": "tables of scored runs: runs=[<folder>,…] table=ablation",
-    "gsgan.figures": "the paper's figures of a run: run=<folder> compare=[<folder>,…]",
+    "gsgan.report": "tables of scored runs, runs=[<folder>,…], and figures of a run, run=<folder>",
     "gsgan.bench": "measure what things cost: raster, stability, fit, effects, speed, trade-off …",
 }
 

@@ -1,24 +1,17 @@
-"""``python -m gsgan.figures run=<folder>``: the paper's figures from any run."""
+"""``python -m gsgan.figures``: the old name of ``python -m gsgan.report run=<folder>``."""
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
+import sys
 
-from gsgan.utils.config import entry
-
-
-def figures(config: DictConfig) -> None:
-    """Draws the figures of ``config.run``, beside the runs of ``config.compare``.
-
-    Raises:
-        GsganError: on anything the user can put right.
-    """
-    from gsgan.report.figures.run import make_figures  # loads matplotlib
-
-    make_figures(config)
+from gsgan.report.__main__ import main as report
 
 
-main = entry("figures")(figures)
+def main() -> None:
+    """Names the new command, and does the work."""
+    print("gsgan.figures is now python -m gsgan.report run=<folder>, same keys", file=sys.stderr)
+    report()
+
 
 if __name__ == "__main__":
     main()

@@ -210,16 +210,17 @@ def test_a_run_from_before_body_points_and_low_pass_loads_as_it_was_trained(tiny
 
 
 def test_the_figure_of_densify_says_where_the_points_are(build, tmp_path):
-    from gsgan.report.figures.densify import draw
-    from gsgan.report.figures.settings import Settings
+    from gsgan.report.figures.body import densify
+    from gsgan.report.figures.layout import Settings
     from gsgan.report.figures.shots import make_shots
     from gsgan.report.figures.subjects import Subject
+    from gsgan.report.runs import Run
 
     for word, said in (("on", "the bone that moves them most"), ("off", "Algorithm 1 puts on")):
         data, avatar, _ = build(f"effects.body_points={word}")
         shots = make_shots(data, "train", data.dataset("train").items[:1], 9.0)
-        subject = Subject("one", "full", tmp_path, 0, data, avatar, [])
-        drawing = draw([subject], shots, Settings())
+        subject = Subject("one", Run(tmp_path, "full", {}, 0, {}), data, avatar, [])
+        drawing = densify([subject], shots, Settings())
         assert said in drawing.caption
         placed = avatar.body_points or avatar.densify
         assert drawing.numbers[shots[0].name]["one"]["points"] == placed.n_points

@@ -6,14 +6,14 @@ import json
 from pathlib import Path
 from typing import Any
 
-from gsgan.report.build import build
-from gsgan.report.folders import find_runs, read_runs
-from gsgan.report.grid import Grid, Report, Row
 from gsgan.report.paper import read_paper
+from gsgan.report.runs import find_runs, read_runs
 from gsgan.report.spec import METRICS, TableSpec
+from gsgan.report.table import build
+from gsgan.report.write import Grid, Report, Row
 
-FLOOR = {"psnr": 15.5, "ssim": 0.8, "miou_reason": "an all-background picture has no parts"}
-NO_LPIPS = "weights are not at hand"
+FLOOR = {"psnr": 15.5, "ssim": 0.8, "miou_reason": "an all-background image has no parts"}
+NO_LPIPS = "weights are not available"
 
 
 def variant(images: int = 3, **held: Any) -> dict[str, Any]:

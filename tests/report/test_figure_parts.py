@@ -1,4 +1,4 @@
-"""The parts of the figures, on pictures whose numbers are known."""
+"""The parts of the figures, on images whose numbers are known."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from gsgan.report.figures import ablation, canny, errors, segmentation
+from gsgan.report.figures import images
 from gsgan.report.figures.body import draw_gaussians, ellipses, part_colours
-from gsgan.report.figures.layout import LEAST_FONT, Grid, Unavailable, style
-from gsgan.report.figures.measures import measure, written
-from gsgan.report.figures.registry import KINDS
-from gsgan.report.figures.run import wanted_figures
-from gsgan.report.figures.settings import Settings
-from gsgan.report.figures.shots import NARROWEST, choose_items, make_shots, spread
-from gsgan.report.figures.subjects import Subject
+from gsgan.report.figures.layout import Panel, Settings, Sheet, Unavailable, style, written
+from gsgan.report.figures.run import FIGURES
+from gsgan.report.figures.segmentation import agreement, disagreement
+from gsgan.report.figures.shots import choose_items, make_shots
+from gsgan.report.figures.subjects import Subject, measure
+from gsgan.report.runs import Run
 from gsgan.scene import Camera, Gaussians
 from gsgan.skeleton import Densify
 from gsgan.splat import ACCURACY, project
@@ -37,13 +37,17 @@ def rendered(figure) -> np.ndarray:
     return np.asarray(canvas.buffer_rgba())[..., :3]
 
 
+def rgb(colour: str) -> list[int]:
+    return [round(255 * value) for value in to_rgb(colour)]
+
+
 def pinhole() -> Camera:
     """At the origin, looking along +z; 100 pixels of focal length, 64 x 64 pixels."""
     K = torch.tensor([[[100.0, 0, 32], [0, 100, 32], [0, 0, 1]]])
     return Camera(K, torch.eye(3)[None], torch.zeros(1, 3), (64, 64))
 
 
-def test_numbers_of_a_picture_in_closed_form():
+def test_measures_in_closed_form():
     truth = torch.zeros(1, 3, 16, 16)
     truth[..., 4:12, 4:12] = 0.8
     found = measure(truth + 0.1, truth, SETTINGS)
@@ -62,33 +66,33 @@ def test_edges_found_missing_and_invented_have_their_colours():
     truth, edges = np.zeros((8, 8), bool), np.zeros((8, 8), bool)
     truth[1, 1] = truth[6, 6] = True
     edges[1, 2] = edges[6, 1] = True  # one pixel off, and far from any
-    painted = canny.paint_edges(edges, truth, tolerance=1)
-    colours = {canny.FOUND: (1, 2), canny.MISSED: (6, 6), canny.INVENTED: (6, 1)}
+    painted = images.paint_edges(edges, truth, tolerance=1)
+    colours = {images.FOUND: (1, 2), images.MISSED: (6, 6), images.INVENTED: (6, 1)}
     for colour, (row, column) in colours.items():
-        assert painted[row, column].tolist() == canny._rgb(colour)
+        assert painted[row, column].tolist() == rgb(colour)
     assert (painted != 255).any(-1).sum() == 3
-    strict = canny.paint_edges(edges, truth, tolerance=0)
-    assert strict[1, 2].tolist() == canny._rgb(canny.INVENTED)
+    strict = images.paint_edges(edges, truth, tolerance=0)
+    assert strict[1, 2].tolist() == rgb(images.INVENTED)
 
 
 def test_errors_are_levels_of_255_and_share_one_scale():
     truth = torch.zeros(1, 3, 2, 2)
-    picture = truth.clone()
-    picture[0, :, 0, 0] = torch.tensor([0.3, -0.3, 0.6])
-    assert errors.error_levels(picture, truth)[0, 0] == pytest.approx(0.4 * 255)
-    assert errors._scale([torch.zeros(4, 4), torch.full((4, 4), 12.0)]) == 15
-    assert errors._scale([torch.zeros(4, 4)]) == 5
+    image = truth.clone()
+    image[0, :, 0, 0] = torch.tensor([0.3, -0.3, 0.6])
+    assert images.error_levels(image, truth)[0, 0] == pytest.approx(0.4 * 255)
+    assert images.scale_end(torch.tensor([0.0, 12.0])) == 15
+    assert images.scale_end(torch.zeros(4)) == 5
 
 
 def test_the_box_lies_where_the_runs_differ():
     runs = torch.zeros(3, 3, 20, 10)
     runs[1, :, 12:16, 6:9] = 1.0
-    rows, columns = ablation.most_disputed(runs, 0.3)
+    rows, columns = images.most_disputed(runs, 0.3)
     assert (rows.stop - rows.start, columns.stop - columns.start) == (6, 3)
     assert rows.start <= 12
     assert rows.stop >= 16
     assert (columns.start, columns.stop) == (6, 9)
-    whole = ablation.most_disputed(torch.zeros(2, 3, 5, 5), 1.0)
+    whole = images.most_disputed(torch.zeros(2, 3, 5, 5), 1.0)
     assert whole == (slice(0, 5), slice(0, 5))
 
 
@@ -96,16 +100,16 @@ def test_agreement_of_parts_in_closed_form():
     labels = torch.tensor([[[0, 1, 1, 2], [255, 2, 2, 0]]])
     ours = torch.tensor([[[0, 1, 2, 2], [1, 2, 2, 0]]])
     parts = torch.nn.functional.one_hot(ours, 3).permute(0, 3, 1, 2).float()
-    found = segmentation.agreement(parts, labels)
+    found = agreement(parts, labels)
     assert found["miou"] == pytest.approx((1 / 2 + 3 / 4) / 2)
     assert found["wrong_share"] == pytest.approx(1 / 5)  # 255 is left out
-    wrong = segmentation.disagreement(ours, labels)[0]
+    wrong = disagreement(ours, labels)[0]
     assert wrong[:, 0, 0].tolist() == [1, 1, 1]
     assert wrong[:, 0, 2].tolist() == pytest.approx([0xD5 / 255, 0x5E / 255, 0])
     assert wrong[:, 1, 0].tolist() == [1, 1, 1]
     nobody = torch.zeros(1, 2, 2, dtype=torch.int64)
     blank = torch.nn.functional.one_hot(nobody, 3).permute(0, 3, 1, 2).float()
-    assert segmentation.agreement(blank, nobody) == {"miou": None, "wrong_share": None}
+    assert agreement(blank, nobody) == {"miou": None, "wrong_share": None}
 
 
 def test_ellipses_are_the_projected_covariances():
@@ -128,7 +132,7 @@ def test_ellipses_are_the_projected_covariances():
     assert math.remainder(lengths[major] - turn, math.pi) == pytest.approx(0, abs=1e-4)
 
 
-def test_ellipses_are_as_wide_as_the_supersampled_picture_has_them():
+def test_ellipses_are_as_wide_as_the_supersampled_image_has_them():
     camera = pinhole()
     gaussians = Gaussians(
         means=torch.tensor([[[0.0, 0, 2]]]),
@@ -152,43 +156,35 @@ def test_every_part_has_the_colour_of_its_bone(limbs):
     assert len(part_colours(densify)) == int(densify.part_id.max()) + 1
 
 
-def test_a_panel_holds_its_picture_and_text_its_width():
-    picture = torch.zeros(1, 3, 4, 2)
-    picture[0, 0, 3, 1] = 1.0  # the lower right pixel is red
+def test_a_panel_holds_its_image_and_text_fits_its_width():
+    image = torch.zeros(1, 3, 4, 2)
+    image[0, 0, 3, 1] = 1.0  # the lower right pixel is red
     with style(SETTINGS):
-        titles = ["a title far wider than any panel " * 8, "$x^$"]  # and no formula
-        grid = Grid(1, 2, 2.0, SETTINGS, width=2.0, titles=titles, names=["row"], notes=1, foot=0.3)
-        grid.picture(0, 0, picture, "note")
-        axes = grid.picture(0, 1, picture)
-        drawn = rendered(grid.figure)
-    box = axes.get_window_extent()
+        titles = ["a title wider than its panel", "$x^$"]  # and no formula
+        panels = [[Panel(image, "note"), Panel(image)]]
+        sheet = Sheet(panels, SETTINGS, width=1.5, titles=titles, names=["row"], foot=0.3)
+        drawn = rendered(sheet.figure)
+    box = sheet.axes[0, 1].get_window_extent()
     height = drawn.shape[0]
     corner = drawn[round(height - box.y0) - 3, round(box.x1) - 3]
     assert corner.tolist() == [255, 0, 0]
     assert drawn[round(height - box.y1) + 3, round(box.x0) + 3].tolist() == [0, 0, 0]
-    long = next(text for text in grid.figure.texts if text.get_text().endswith("…"))
-    assert long.get_fontsize() >= LEAST_FONT
+    long, short = (axes.title for axes in sheet.axes[0])
     assert long.get_window_extent().width <= box.width * 1.01
-    heads = [text.get_fontsize() for text in grid.figure.texts if text.get_text() in ("$x^$",)]
-    assert heads == [long.get_fontsize()]  # titles of one size
-    assert grid.width <= 2.0 + 1e-9
-    assert grid.panel_height <= SETTINGS.tallest
+    assert short.get_fontsize() == long.get_fontsize() < SETTINGS.font
+    assert sheet.width <= 1.5 + 1e-9
+    assert box.height / sheet.figure.dpi <= SETTINGS.tallest
 
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("font", 0), ("dpi", 1.5), ("canny_low", 300.0), ("detail", 2.0), ("page", "wide"),
+    [("font", 0), ("dpi", 1.5), ("detail", 2.0), ("page", "wide"),
      ("canny_tolerance", -1), ("column", 0.1), ("page", math.inf), ("dpi", 10**8),
      ("margin", math.nan)],
 )  # fmt: skip
 def test_settings_that_cannot_be_are_refused(key, value):
     with pytest.raises(ConfigError, match=key):
         Settings(**{key: value})
-
-
-def test_spread_takes_each_at_most_once():
-    assert spread(list(range(10)), 2) == [2, 7]
-    assert spread([1, 2, 3], 9) == [1, 2, 3]
 
 
 @pytest.fixture
@@ -213,10 +209,10 @@ def test_shots_are_spread_over_frames_and_cameras(data):
         choose_items(data, "test", frames=None, camera=None, count=1)
 
 
-def test_an_empty_split_says_which_are_not(build):
+def test_an_empty_split_names_those_with_images(build):
     data = build("data.test_cameras=[]", "data.train_cameras=[cam00,cam01,cam02]")[0]
     with pytest.raises(
-        DataError, match=r"no camera is held out.*give split=train, split=novel_pose"
+        DataError, match=r"no camera is held out.*use split=train, split=novel_pose"
     ):
         choose_items(data, "novel_view", frames=None, camera=None, count=1)
 
@@ -228,7 +224,6 @@ def test_windows_hold_the_joints_and_have_one_size(data):
     assert len({shot.truth.shape for shot in shots}) == 1
     for shot in shots:
         height, width = shot.window.size
-        assert width >= min(round(NARROWEST * height), 32) - 1
         pixels, _ = shot.camera.project(shot.frame.skeleton)
         inside = (pixels >= 0) & (pixels <= torch.tensor([width, height]))
         reach, _ = shot.frame.camera.project(shot.frame.skeleton)
@@ -240,24 +235,22 @@ def test_windows_hold_the_joints_and_have_one_size(data):
 def subject_of(build, *overrides: str) -> Subject:
     data, avatar, _ = build(*overrides)
     model = overrides[0].removeprefix("model=") if overrides else "full"
-    return Subject(model, model, Path("run"), 0, data, avatar.eval(), [])
+    return Subject(model, Run(Path("run"), model, {}, 0, {}), data, avatar.eval(), [])
 
 
 @pytest.mark.parametrize(
     ("model", "figure", "words"),
     [
         ("splat_only", "segmentation", "has no segmentation S: the model leaves it out"),
-        ("splat_only", "errors", "no second picture"),
+        ("splat_only", "errors", "no second image"),
         ("image_to_image", "densify", "makes no points"),
-        ("full", "comparison", "there is one run"),
-        ("full", "ablation", "there is one run"),
     ],
 )
-def test_what_a_model_cannot_have_is_said(build, model, figure, words):
+def test_a_figure_that_a_model_cannot_have_says_why(build, model, figure, words):
     subject = subject_of(build, f"model={model}")
     shots = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)
     with style(SETTINGS), pytest.raises(Unavailable, match=words):
-        KINDS[figure].draw([subject], shots, SETTINGS)
+        FIGURES[figure]([subject], shots, SETTINGS)
 
 
 def test_data_without_labels_has_no_segmentation_figure(build):
@@ -265,11 +258,11 @@ def test_data_without_labels_has_no_segmentation_figure(build):
     shot = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)[0]
     bare = replace(shot, frame=replace(shot.frame, labels=None))
     with pytest.raises(Unavailable, match="no part labels"):
-        segmentation.draw([subject], [bare], SETTINGS)
+        FIGURES["segmentation"]([subject], [bare], SETTINGS)
 
 
-def test_drawing_leaves_the_avatar_where_it_paints(build, monkeypatch):
-    """On a GPU, points moved to the CPU for a figure would be missing for the next picture."""
+def test_drawing_leaves_the_avatar_on_its_device(build, monkeypatch):
+    """On a GPU, points moved to the CPU for a figure would be missing for the next image."""
     subject = subject_of(build)
     moved: set[int] = set()
     apply = torch.nn.Module._apply
@@ -281,7 +274,7 @@ def test_drawing_leaves_the_avatar_where_it_paints(build, monkeypatch):
     monkeypatch.setattr(torch.nn.Module, "_apply", watched)
     shots = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)
     with style(SETTINGS):
-        KINDS["densify"].draw([subject], shots, SETTINGS)
+        FIGURES["densify"]([subject], shots, SETTINGS)
     assert moved  # the copy was
     assert not moved & {id(module) for module in subject.avatar.modules()}
 
@@ -310,8 +303,11 @@ def test_what_is_kept_of_a_painting_is_on_the_cpu(build):
 
 def test_an_unfinished_run_is_marked(build):
     subject = subject_of(build)
-    assert replace(subject, step=12, total=12).notes == []
-    half = replace(subject, step=3, total=12, marks=["stand-in"])
+    schedule = {"step_one": 4, "step_two": 6, "segmentation": 2}
+    settings = {f"training.schedule.{name}": count for name, count in schedule.items()}
+    subject = replace(subject, run=replace(subject.run, settings=settings))
+    assert replace(subject, step=12).notes == []
+    half = replace(subject, step=3, marks=["stand-in"])
     assert half.notes == ["stand-in", "full is unfinished: 3 of 12 iterations"]
 
 
@@ -320,13 +316,7 @@ def test_a_splat_only_run_stands_for_splatting_alone(build):
     full, splat = subject_of(build), subject_of(build, "model=splat_only")
     shots = make_shots(full.data, "novel_pose", [("cam00", 4)], 0.2)
     with style(SETTINGS):
-        alone = canny.draw([full], shots, SETTINGS).numbers["cam00/000004"]
-        both = canny.draw([full, splat], shots, SETTINGS).numbers["cam00/000004"]
+        alone = images.canny([full], shots, SETTINGS).numbers["cam00/000004"]
+        both = images.canny([full, splat], shots, SETTINGS).numbers["cam00/000004"]
     assert list(alone) == ["full", "Step I's colour"]
     assert list(both) == ["full", "splat_only"]
-
-
-def test_null_asks_for_what_so_many_runs_can_have():
-    config = SimpleNamespace(figures=None)
-    assert "ablation" not in wanted_figures(config, several=False)
-    assert "ablation" in wanted_figures(config, several=True)

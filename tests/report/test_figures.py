@@ -1,10 +1,9 @@
-"""``gsgan.figures`` as a user types it: every figure made, and every way to go wrong."""
+"""``gsgan.report run=…`` as a user types it: every figure, and every error."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +13,7 @@ from commands import refused
 from omegaconf import OmegaConf
 
 from gsgan.metrics.image import edge_f1, psnr
-from gsgan.report.figures.registry import KINDS
+from gsgan.report.figures.run import FIGURES
 from gsgan.train.runs import build_data, load_avatar, load_config
 from gsgan.utils.errors import DataError
 
@@ -35,17 +34,17 @@ def edit(run: Path, **values) -> None:
     OmegaConf.save(config, path)
 
 
-def test_every_figure_is_made_with_numbers_of_the_pictures_shown(run, twin, tmp_path, inside):
+def test_every_figure_is_made_with_numbers_of_the_images_shown(run, twin, tmp_path, inside):
     out = tmp_path / "out"
-    whole = "settings.margin=9"  # metres: the window is the picture
-    result = inside("figures", f"run={run}", f"compare=[{twin}]", f"out={out}", whole, *FEW)
+    whole = "settings.margin=9"  # metres: the window is the image
+    result = inside("report", f"run={run}", f"compare=[{twin}]", f"out={out}", whole, *FEW)
     assert result.returncode == 0, result.stdout + result.stderr
     record = json.loads((out / "figures.json").read_text())
-    assert list(record) == list(KINDS)
-    for name in KINDS:
-        picture = cv2.imread(str(out / f"{name}.png"))
-        assert picture is not None
-        assert picture.std() > 5  # not blank
+    assert list(record) == list(FIGURES)
+    for name in FIGURES:
+        image = cv2.imread(str(out / f"{name}.png"))
+        assert image is not None
+        assert image.std() > 5  # not blank
         pdf = (out / f"{name}.pdf").read_bytes()
         assert pdf.startswith(b"%PDF")
         assert pdf.rstrip().endswith(b"%%EOF")
@@ -61,7 +60,7 @@ def test_every_figure_is_made_with_numbers_of_the_pictures_shown(run, twin, tmp_
 
 
 def expected(run: Path, found: dict) -> dict:
-    """PSNR and edge F1 of whole pictures, painted here without the figures' code."""
+    """PSNR and edge F1 of whole images, rendered here without the figures' code."""
     config = load_config(run)
     data = build_data(config)
     avatar, _ = load_avatar(run, config, data)
@@ -82,48 +81,48 @@ def expected(run: Path, found: dict) -> dict:
 
 def test_the_same_figure_has_the_same_bytes_and_earlier_ones_are_kept(run, tmp_path, inside):
     given = (f"run={run}", f"out={tmp_path / 'out'}", "formats=[png,pdf]", *FEW)
-    assert inside("figures", *given, "figures=canny").returncode == 0
+    assert inside("report", *given, "figures=canny").returncode == 0
     before = {p.name: p.read_bytes() for p in (tmp_path / "out").glob("canny.*")}
     assert not json.loads((tmp_path / "out" / "figures.json").read_text())["canny"]["marks"][1:]
     (tmp_path / "out" / "figures.json").write_text('{"canny": ')  # cut off
-    assert inside("figures", *given, "figures=[canny]", "frames=null").returncode == 0
+    assert inside("report", *given, "figures=[canny]", "frames=null").returncode == 0
     assert {p.name: p.read_bytes() for p in (tmp_path / "out").glob("canny.*")} == before
-    assert inside("figures", *given, "figures=strip", "frames=[5]").returncode == 0
+    assert inside("report", *given, "figures=strip", "frames=[5]").returncode == 0
     record = json.loads((tmp_path / "out" / "figures.json").read_text())
     assert list(record) == ["canny", "strip"]
     assert list(record["strip"]["numbers"]) == ["cam00/000005"]
     assert "## canny" in (tmp_path / "out" / "captions.md").read_text()
 
 
-def test_what_cannot_be_made_is_said_and_the_rest_is_made(run, tmp_path, inside):
+def test_a_figure_that_cannot_be_made_is_named_and_the_rest_is_made(run, tmp_path, inside):
     given = (f"run={run}", f"out={tmp_path / 'out'}", "formats=png", *FEW)
-    result = inside("figures", *given, "figures=[ablation,canny]")
+    result = inside("report", *given, "figures=[ablation,canny]")
     assert result.returncode == 0, result.stderr
     assert "ablation: left out, there is one run" in result.stdout
     assert {p.name for p in (tmp_path / "out").glob("*.png")} == {"canny.png"}
-    refused(inside("figures", *given, "figures=ablation"), "no figure could be made", "one run")
+    refused(inside("report", *given, "figures=ablation"), "no figure could be made", "one run")
 
 
 def test_names_in_print(run, twin, tmp_path, inside):
     given = (f"run={run}", f"compare={twin}", f"out={tmp_path / 'out'}", "formats=png", *FEW)
-    result = inside("figures", *given, "figures=strip", "names=[ours,'cost $5 {x_1}']")
+    result = inside("report", *given, "figures=strip", "names=[ours,'cost $5 {x_1}']")
     assert result.returncode == 0, result.stdout + result.stderr
     record = json.loads((tmp_path / "out" / "figures.json").read_text())
     assert list(record["strip"]["runs"]) == ["ours", "cost $5 {x_1}"]
-    refused(inside("figures", *given, "names=[ours]"), "names", "2 in all", "got 1")
-    refused(inside("figures", *given, "names=[ours,ours]"), "names", "ours", "differ")
+    refused(inside("report", *given, "names=[ours]"), "names must be 2 different texts")
+    refused(inside("report", *given, "names=[ours,ours]"), "names must be 2 different texts")
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"data__size": 24}, ("cannot be compared", "32x32 and 24x24 pixels")),
-        ({"data__train_frames": "0-2"}, ("cannot be compared", "split train", "other pictures")),
+        ({"data__size": 24}, ("two sets of capture", "image size")),
+        ({"data__train_frames": "0-2"}, ("two sets of capture", "frames, split")),
     ],
 )
 def test_runs_on_other_data_are_refused(run, twin, tmp_path, inside, change, words):
     edit(twin, **change)
-    result = inside("figures", f"run={run}", f"compare=[{twin}]", f"out={tmp_path / 'out'}", *FEW)
+    result = inside("report", f"run={run}", f"compare=[{twin}]", f"out={tmp_path / 'out'}", *FEW)
     refused(result, str(run), str(twin), *words)
     assert not list((tmp_path / "out").glob("*.p*"))
 
@@ -134,20 +133,20 @@ def test_a_run_on_other_pixels_is_refused(run, twin, capture, tmp_path, inside):
         cv2.imwrite(str(path), 255 - cv2.imread(str(path)))
     edit(twin, data__root=str(other))
     given = (f"run={run}", f"compare=[{twin}]", f"out={tmp_path / 'out'}", "figures=strip", *FEW)
-    refused(inside("figures", *given), "cannot be compared", "its pixels differ")
+    refused(inside("report", *given), "different image cam00/000004")
 
 
-def test_a_run_that_is_half_trained_is_said_to_be(twin, tmp_path, inside):
+def test_an_unfinished_run_is_marked_in_captions(twin, tmp_path, inside):
     path = twin / "checkpoints" / "last.ckpt"
     checkpoint = torch.load(path, weights_only=True)
     total = checkpoint["gsgan"]["step"]
     checkpoint["gsgan"]["step"] = 3
     torch.save(checkpoint, path)
     given = (f"run={twin}", f"out={tmp_path / 'out'}", "figures=strip", "formats=png", *FEW)
-    result = inside("figures", *given)
-    said = f"gsgan is unfinished: 3 of {total} iterations"
-    assert said in result.stdout
-    assert said in (tmp_path / "out" / "captions.md").read_text()
+    result = inside("report", *given)
+    message = f"gsgan is unfinished: 3 of {total} iterations"
+    assert message in result.stdout
+    assert message in (tmp_path / "out" / "captions.md").read_text()
 
 
 def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside):
@@ -162,7 +161,7 @@ def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside)
         (twin / name).mkdir()
         (twin / name / "metrics.csv").write_text(head + text)
     given = (f"run={twin}", f"out={tmp_path / 'out'}", "figures=training", "formats=png")
-    result = inside("figures", *given)
+    result = inside("report", *given)
     assert result.returncode == 0, result.stdout + result.stderr
     entry = json.loads((tmp_path / "out" / "figures.json").read_text())["training"]
     assert entry["numbers"]["training"]["gsgan"] == {
@@ -170,34 +169,34 @@ def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside)
     }  # fmt: skip
     assert "watched while training" in entry["caption"]
     (twin / "logs_000150" / "metrics.csv").write_bytes(b"\xff\xfe\x00")
-    refused(inside("figures", *given), "logs_000150", "not a readable log", "UnicodeDecodeError")
+    refused(inside("report", *given), "logs_000150", "not a readable log", "UnicodeDecodeError")
     shutil.rmtree(twin / "logs_000150")
     (twin / "logs" / "metrics.csv").write_text(head)
-    refused(inside("figures", *given), str(twin), "no log that tells", "logger=csv")
+    refused(inside("report", *given), str(twin), "has no log of two validations", "logger=csv")
 
 
-def test_training_curves_are_of_the_same_watched_pictures(run, twin, tmp_path, inside):
+def test_training_curves_are_of_the_same_watched_images(run, twin, tmp_path, inside):
     given = (f"run={run}", f"compare={twin}", f"out={tmp_path / 'out'}", "figures=training")
-    assert inside("figures", *given, "names=[ours,'_x $1 {']").returncode == 0
+    assert inside("report", *given, "names=[ours,'_x $1 {']").returncode == 0
     edit(twin, data__val_pictures=1)
-    refused(inside("figures", *given), "watched different pictures", "data.val_pictures")
+    refused(inside("report", *given), "watched different images", "data.val_pictures")
     edit(twin, data__val_pictures=OmegaConf.load(run / ".hydra/config.yaml").data.val_pictures)
     edit(twin, data__size=24)
-    refused(inside("figures", *given), "cannot be compared", "32x32 and 24x24 pixels")
+    refused(inside("report", *given), "two sets of capture", "image size")
 
 
 def test_a_figure_that_fails_leaves_the_others_numbers(run, tmp_path, inside, monkeypatch):
-    """As a stopped command does: pictures, captions and numbers are of one making."""
+    """As a stopped command does: images, captions and numbers match."""
 
     def fail(*_: object) -> None:
-        raise DataError("the last picture is damaged")
+        raise DataError("the last image is damaged")
 
     out = tmp_path / "out"
     out.mkdir()
     (out / "figures.json").write_text('{"strip": 3, "errors": {"caption": "old"}}')
-    monkeypatch.setitem(KINDS, "strip", replace(KINDS["strip"], draw=fail))
+    monkeypatch.setitem(FIGURES, "strip", fail)
     given = (f"run={run}", f"out={out}", "figures=[canny,strip]", "formats=png", *FEW)
-    refused(inside("figures", *given), "the last picture is damaged")
+    refused(inside("report", *given), "the last image is damaged")
     assert list(json.loads((out / "figures.json").read_text())) == ["canny"]
     assert "## canny" in (out / "captions.md").read_text()
     assert not (out / "strip.png").exists()
@@ -210,14 +209,14 @@ def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
         if "generator" in key and value.is_floating_point():
             value.fill_(float("nan"))
     torch.save(checkpoint, path)
-    result = inside("figures", f"run={twin}", f"out={tmp_path / 'out'}", "figures=strip", *FEW)
+    result = inside("report", f"run={twin}", f"out={tmp_path / 'out'}", "figures=strip", *FEW)
     refused(result, str(twin), "not finite")
 
 
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (("run=null",), ("run is not set",)),
+        (("run=null",), ("runs and run are not set",)),
         (("run=/nowhere",), ("/nowhere", "not a run folder")),
         (("compare=[{run}]",), ("is given twice",)),
         (("compare=[/nowhere]",), ("/nowhere", "not a run folder")),
@@ -226,21 +225,31 @@ def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
         (("formats=gif",), ("formats must be among png, pdf", "gif")),
         (("split=test",), ("split must be one of", "test")),
         (("frames=[99]",), ("lacks 99", "4-5")),
-        (("frames=[a]",), ("frames must be a list of frame numbers",)),
+        (("frames=[a]",), ("frames must be a whole number",)),
         (("camera=cam07",), ("cam07", "which has cam00")),
         (("shots.canny=0", "figures=canny"), ("shots.canny", "at least 1")),
         (("settings.dpi=-1",), ("settings.dpi",)),
         (("settings=null",), ("settings and shots are tables",)),
         (("shots=null",), ("settings and shots are tables",)),
-        (("names=[null]",), ("names must be texts",)),
+        (("names=[null]",), ("names must be 1 different texts",)),
         (("out={run}/metrics.json",), ("metrics.json", "cannot be written to")),
         (("data_root=/nowhere",), ("/nowhere",)),
     ],
 )
-def test_a_wrong_value_ends_in_one_sentence(run, inside, given, words):
+def test_a_wrong_value_ends_in_one_message(run, inside, given, words):
     given = [argument.replace("{run}", str(run)) for argument in given]
     if not any(argument.startswith("run=") for argument in given):
         given.append(f"run={run}")
-    result = inside("figures", *given)
+    result = inside("report", *given)
     refused(result, *words)
     assert len(result.stderr.strip().splitlines()) == 1
+
+
+def test_the_old_command_names_the_new_one_and_does_the_work(run, tmp_path, inside):
+    given = (f"run={run}", f"out={tmp_path / 'out'}", "figures=strip", "formats=png", *FEW)
+    result = inside("figures", *given)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr.strip() == (
+        "gsgan.figures is now python -m gsgan.report run=<folder>, same keys"
+    )
+    assert (tmp_path / "out" / "strip.png").exists()

@@ -32,7 +32,7 @@ def test_it_writes_all_four_and_names_what_it_left_out(sweep, tmp_path, inside):
     result = inside("report", f"runs=[{sweep}]", "table=ablation", "out=tables")
     assert result.returncode == 0, result.stderr
     assert "30.50 ± 0.71" in result.stdout
-    assert "left out: unfinished" in result.stdout
+    assert "Left out: unfinished" in result.stdout
     out = tmp_path / "tables"
     assert {path.name for path in out.iterdir()} == FILES
     for path in out.iterdir():
@@ -57,13 +57,12 @@ def test_it_fills_a_block_of_a_page_again_and_again(sweep, tmp_path, inside):
     assert str(tmp_path) not in text  # no path of this machine
 
 
-def test_what_is_wrong_is_said_in_one_sentence_before_anything_is_written(sweep, tmp_path, inside):
+def test_a_wrong_value_ends_in_one_message_before_anything_is_written(sweep, tmp_path, inside):
     runs = f"runs=[{sweep}]"
-    refused(inside("report"), "runs is not set")
-    refused(inside("report", "runs=[]"), "runs is not set")
+    refused(inside("report"), "runs and run are not set")
+    refused(inside("report", "runs=[]"), "runs and run are not set")
     refused(inside("report", "runs={a: 1}"), "runs must be a list")
-    refused(inside("report", f"runs=[{tmp_path}/gone]"), "gone does not exist")
-    refused(inside("report", runs, "out=null"), "out is not set")
+    refused(inside("report", f"runs=[{tmp_path}/gone]"), "gone' contains no run folder")
     refused(inside("report", runs, "out=a", "allow_dirty=maybe"), "allow_dirty must be")
     refused(inside("report", runs, "out=a", "table=zju"), "is of zju_mocap", "table=plain")
     refused(inside("report", runs, "out=a", "table.metrics=[fid]"), "fid", "psnr")
@@ -81,5 +80,5 @@ def test_every_table_composes_and_its_keys_are_read(compose, name):
     config = compose("report", f"table={name}")
     assert instantiate(config.table).name == name
     code = "\n".join(path.read_text() for path in SRC.rglob("*.py"))
-    for key in config:
+    for key in config:  # of tables and figures
         assert re.search(rf"config\.{key}\b", code), key

@@ -1,9 +1,9 @@
-"""Which folders are runs, what they tell, and how damaged ones are told apart."""
+"""Which folders are runs, what is read from them, and which are left out."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+import re
 
 import cv2
 import numpy as np
@@ -11,9 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 from report_folders import report_of, row, table, texts, write_run
 
-from gsgan.report.folders import find_runs, read_runs
-from gsgan.report.mixing import differing, same_data
-from gsgan.report.scored import read_run
+from gsgan.report.runs import find_runs, read_run, read_runs
 from gsgan.utils.errors import ConfigError, DataError
 
 
@@ -22,135 +20,94 @@ def test_a_sweep_is_searched_and_each_run_taken_once(tmp_path):
     flat = write_run(tmp_path / "sweep" / "b")
     (flat / "checkpoints").mkdir()
     (tmp_path / "sweep" / "multirun.yaml").write_text("")
-    assert find_runs([str(tmp_path / "sweep")]) == [flat, deep]
+    assert find_runs([str(tmp_path / "sweep")]) == [deep, flat]
     given = [f"{tmp_path}/sweep/b*", f"{tmp_path}/sweep", str(deep)]
     assert find_runs(given) == [flat, deep]
 
 
-@pytest.mark.parametrize(
-    ("entry", "said"),
-    [("absent", "does not exist"), ("x*", "matches no folder"), ("a/metrics.json", "is a file"),
-     ("empty", "holds no run folder")],
-)  # fmt: skip
-def test_what_is_no_run_is_refused(tmp_path, entry, said):
+@pytest.mark.parametrize("entry", ["absent", "x*", "a/metrics.json", "empty", ""])
+def test_an_entry_without_a_run_is_refused(tmp_path, monkeypatch, entry):
     write_run(tmp_path / "a")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ConfigError, match=said):
-        find_runs([f"{tmp_path}/{entry}"])
-
-
-def test_an_empty_entry_is_not_the_folder_one_stands_in(tmp_path, monkeypatch):
-    write_run(tmp_path / "a")
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match="an entry is empty"):
-        find_runs([""])
+    with pytest.raises(ConfigError, match=f"runs: '{re.escape(entry)}' contains no run folder"):
+        find_runs([entry])
 
 
-def test_facts_say_what_a_run_is(tmp_path):
+def test_name_and_seed_come_from_the_facts(tmp_path):
     run = read_run(write_run(tmp_path / "a", "wo_gcn", 3, psnr=30.0))
     assert (run.name, run.seed, run.data["name"]) == ("wo_gcn", 3, "synthetic")
     predicted = write_run(tmp_path / "b", None, None, facts={"method": "gauhuman"})
     assert (read_run(predicted).name, read_run(predicted).seed) == ("gauhuman", None)
 
 
-def old_run(folder, config, **choices):
-    """A run folder from before facts.json."""
-    write_run(folder, psnr=30.0)
-    (folder / "facts.json").unlink()
+def trained(folder, config, **facts):
+    """A scored run folder with a config."""
+    write_run(folder, psnr=30.0, facts=facts)
     (folder / ".hydra").mkdir()
     OmegaConf.save(config, folder / ".hydra" / "config.yaml")
-    held = {"hydra": {"runtime": {"choices": {"model": "full", "data": "capture", **choices}}}}
-    (folder / ".hydra" / "hydra.yaml").write_text(OmegaConf.to_yaml(held))
     return folder
 
 
-def test_an_old_folder_is_read_from_its_config(tmp_path, tiny):
-    runs = [
-        read_run(old_run(tmp_path / str(seed), tiny(f"seed={seed}"), model="wo_seg"))
-        for seed in (4, 5)
-    ]
-    assert [(r.name, r.seed, r.data["name"]) for r in runs] == [
-        ("wo_seg", 4, "capture"), ("wo_seg", 5, "capture"),
-    ]  # fmt: skip
-    assert runs[0].settings == runs[1].settings  # they differ in the seed alone
-    assert runs[0].facts == {}
-    other = read_run(old_run(tmp_path / "other", tiny("training.pose_noise=0.5")))
+def test_settings_are_without_the_seed_and_know_older_names(tmp_path, tiny):
+    runs = [read_run(trained(tmp_path / str(seed), tiny(f"seed={seed}"))) for seed in (4, 5)]
+    assert runs[0].settings == runs[1].settings
+    path = tmp_path / "5" / ".hydra" / "config.yaml"
+    path.write_text(path.read_text().replace("gsgan.train.", "gsgan.training."))
+    assert read_run(tmp_path / "5").settings == runs[0].settings
+    other = read_run(trained(tmp_path / "other", tiny("training.pose_noise=0.5")))
     assert other.settings != runs[0].settings
-    assert other.data_settings() == runs[0].data_settings()
 
 
 @pytest.mark.parametrize(
-    ("file", "text", "said"),
+    ("file", "text", "message"),
     [
         ("metrics.json", '{"novel_pose": {"full": {"psnr": 30', "damaged"),
-        ("metrics.json", '{"novel_pose": {"full": {"psnr": NaN, "images": 1}}}', "damaged"),
-        ("metrics.json", "[]", "expected a table"),
-        ("metrics.json", "{}", "no scores"),
-        ("metrics.json", '{"novel_pose": 3}', "novel_pose is not a table"),
-        ("metrics.json", '{"novel_pose": {"full": {"psnr": "30", "images": 1}}}', "psnr must be"),
-        ("metrics.json", '{"novel_pose": {"full": {"psnr": 30}}}', "count of images"),
+        ("metrics.json", "3", "damaged"),
         ("metrics.json", "\x00\x01", "damaged"),
-        ("metrics.json", '{"a": {"full": {"psnr": 1%s, "images": 1}}}' % ("0" * 400), "psnr must"),
-        ("metrics.json", '{"a": {"full": {"images": 1, "marks": [3]}}}', "marks must be"),
-        ("metrics.json", '{"a": {"full": {"images": 1, "protocol": {}}}}', "protocol is not"),
-        ("facts.json", '{"model": "full", "data": {"root": 3}}', "root cannot be 3"),
+        ("metrics.json", '{"novel_pose": {"full": {"psnr": NaN, "images": 1}}}', "not finite"),
+        ("metrics.json", '{"novel_pose": 3}', "not as gsgan.evaluate"),
+        ("metrics.json", '{"novel_pose": {"full": {"psnr": "30", "images": 1}}}', "must be real"),
+        ("metrics.json", '{"novel_pose": {"full": {"psnr": 30}}}', "images"),
         ("facts.json", '{"model": "full", "data": {}, "commit": 5}', "commit cannot be 5"),
-        ("facts.json", '{"model": "full", "data": {}, "train_seconds": "a"}', "train_seconds"),
-        ("facts.json", '{"data": {}}', "neither a model nor a method"),
-        ("facts.json", '{"model": "full", "data": 3}', "data must be a table"),
+        ("facts.json", '{"model": "full", "data": 3}', "data cannot be 3"),
+        ("facts.json", '{"model": "full", "data": {}, "seed": "a"}', "seed cannot be"),
         ("facts.json", "{", "damaged"),
-        ("facts.json", '{"model": "full", "data": {}, "seed": "a"}', "seed must be"),
-        ("facts.json", '{"model": "full", "data": {}, "protocol": "p"}', "says protocol p"),
     ],
 )
-def test_a_damaged_file_is_named_and_its_run_left_out(tmp_path, file, text, said):
+def test_a_damaged_file_is_named_and_its_run_left_out(tmp_path, file, text, message):
     whole = write_run(tmp_path / "whole", psnr=30.0)
     broken = write_run(tmp_path / "broken", psnr=30.0)
     (broken / file).write_text(text)
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=message):
         read_run(broken)
     runs, out = read_runs([whole, broken])
     assert [run.folder for run in runs] == [whole]
-    assert [held.folder for held in out] == [broken]
-    assert str(tmp_path) not in out[0].reason  # it ends in pages that others read
-
-
-def test_an_old_folder_and_a_new_one_are_matched_by_their_configs(tmp_path, tiny):
-    old, new = (read_run(old_run(tmp_path / str(s), tiny(f"seed={s}"))) for s in (0, 1))
-    new = replace(new, data=new.data | {"fingerprint": "f00d"})
-    assert same_data(old, new)
-    assert same_data(old, replace(new, data=new.data | {"root": "elsewhere"})) is False
-    assert same_data(old, replace(new, data=new.data | {"name": "zju_mocap"})) is False
-    assert same_data(old, replace(new, settings=None)) is None  # predictions: no config
-    before = {k: v for k, v in old.settings.items() if k != "data.reader.landmarks"}
-    assert same_data(replace(old, settings=before), new)  # of a config that had no such key yet
-    assert differing(before, old.settings) == []
-    other = read_run(old_run(tmp_path / "other", tiny("data.train_frames=[0,1]")))
-    assert same_data(old, other) is False
+    assert list(out) == [broken]
+    assert str(tmp_path) not in out[broken]  # it ends in pages that others read
 
 
 def test_a_run_that_was_scored_half_way_is_left_out(tmp_path, tiny):
-    run = old_run(tmp_path / "a", tiny())
-    for done in (15, 3):
-        facts = {"model": "full", "data": {}, "iterations": done}
-        (run / "facts.json").write_text(json.dumps(facts))
-        told = [held.reason for held in read_runs([run])[1]]
-        assert told == ([] if done == 15 else ["scored after 3 of at least 12 iterations"])
+    run = trained(tmp_path / "a", tiny(), iterations=15)
+    assert read_runs([run])[1] == {}
+    facts = json.loads((run / "facts.json").read_text())
+    (run / "facts.json").write_text(json.dumps(facts | {"iterations": 3}))
+    assert read_runs([run])[1] == {run: "scored after 3 of at least 12 iterations"}
 
 
 def test_an_unfinished_run_and_a_broken_config_are_left_out(tmp_path, tiny):
-    unfinished = old_run(tmp_path / "a", tiny())
+    unfinished = trained(tmp_path / "a", tiny())
     (unfinished / "metrics.json").unlink()
-    broken = old_run(tmp_path / "b", tiny())
+    broken = trained(tmp_path / "b", tiny())
     (broken / ".hydra" / "config.yaml").write_text("seed: [0")
     unknown = write_run(tmp_path / "c")
     (unknown / "facts.json").unlink()
     runs, out = read_runs(find_runs([str(tmp_path)]))
     assert not runs
-    told = {held.folder.name: held.reason for held in out}
-    assert "not finished" in told["a"]
-    assert "damaged" in told["b"]
-    assert "neither facts.json nor .hydra" in told["c"]
+    reasons = {folder.name: reason for folder, reason in out.items()}
+    assert "not finished" in reasons["a"]
+    assert "damaged" in reasons["b"]
+    assert "no facts.json" in reasons["c"]
 
 
 def test_every_score_of_the_evaluation_has_a_column():
@@ -160,7 +117,7 @@ def test_every_score_of_the_evaluation_has_a_column():
     assert set(SHOWN) >= set(SCORED)
 
 
-def test_the_format_is_the_evaluations_own(run):
+def test_it_reads_what_evaluate_writes(run):
     read = read_run(run)
     facts = json.loads((run / "facts.json").read_text())
     assert (read.name, read.seed) == ("full", 0)
@@ -168,8 +125,8 @@ def test_the_format_is_the_evaluations_own(run):
     assert read.settings["training.schedule.epoch"] == 4
 
 
-def test_predictions_that_were_scored_stand_beside_a_run(run, capture, tmp_path, inside):
-    """Black pictures of a method of someone else: its row has the floor's very scores."""
+def test_scored_predictions_stand_beside_a_run(run, capture, tmp_path, inside):
+    """A method's black images have exactly the floor's scores."""
     from gsgan.train.runs import build_data, load_config
 
     for camera, frame in build_data(load_config(run)).dataset("novel_pose").items:
@@ -184,4 +141,4 @@ def test_predictions_that_were_scored_stand_beside_a_run(run, capture, tmp_path,
     (grid,) = report.grids
     assert [r.label for r in grid.rows] == ["black", "full", "all background (floor)"]
     assert texts(row(grid, "black")) == texts(row(grid, "all background (floor)"))
-    assert row(grid, "black").provenance[0] == "1"
+    assert row(grid, "black").origin[0] == "1"

@@ -1,4 +1,4 @@
-"""The paper's figures: as printed, marked, beside nothing but the same data and protocol."""
+"""The paper's numbers: as printed, marked, beside the same data and protocol only."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pytest
 from report_folders import protocol, report_of, row, table, texts, write_run, zju
 
 from gsgan.report.paper import read_paper
-from gsgan.report.scored import Run
+from gsgan.report.runs import Run
 from gsgan.train.paper import NAME
 from gsgan.utils.errors import ConfigError
 
@@ -34,40 +34,40 @@ def test_beside_the_same_data_subject_protocol_and_split(tmp_path):
 APART = {
     "synthetic": ({"data": None, "record": None}, "of synthetic, person, the paper's of zju"),
     "another subject": ({"data": zju(386)}, "CoreView_386, the paper's of subject 377"),
-    "no protocol": ({"record": None}, "no published protocol"),
-    "another protocol": ({"record": protocol("zju_gauhuman")}, "follow zju_gauhuman"),
+    "no protocol": ({"record": None}, "follow protocol none"),
+    "another protocol": ({"record": protocol("zju_gauhuman")}, "follow protocol zju_gauhuman"),
     "a departure": ({"record": protocol("paper_zju", departures=["at scale 1"])}, "at scale 1"),
 }
 
 
-@pytest.mark.parametrize(("held", "said"), APART.values(), ids=APART)
-def test_elsewhere_they_stand_by_themselves_and_say_why(tmp_path, held, said):
+@pytest.mark.parametrize(("held", "message"), APART.values(), ids=APART)
+def test_otherwise_they_have_a_table_of_their_own_with_the_reason(tmp_path, held, message):
     ours, paper = report_of(table(**ABLATION, **VIEW), paper_run(tmp_path / "a", **held)).grids
     assert all(r.kind != "paper" for r in ours.rows)
     assert all(r.kind == "paper" and "(as printed)" in r.label for r in paper.rows)
-    assert said in paper.remarks[0]
-    told = ("n/a", "zju_mocap", "the paper's, read as paper_zju", "n/a")
-    assert all(r.provenance == told for r in paper.rows)
+    assert message in paper.remarks[0]
+    departed = ("n/a", "zju_mocap", "the paper's, read as paper_zju", "n/a")
+    assert all(r.origin == departed for r in paper.rows)
 
 
-def test_only_runs_of_the_preset_bear_the_papers_name(tmp_path, monkeypatch):
+def test_only_runs_of_experiment_paper_have_the_papers_name(tmp_path, monkeypatch):
     rows = [{"run": "full"}, {"run": "full", "label": "C", "variant": "splat"}]
     rows.append({"run": "wo_seg", "label": "w/o S"})
     spec = table(**(ABLATION | VIEW | {"rows": rows}))
     runs = [paper_run(tmp_path / name, model=name) for name in ("full", "wo_seg")]
-    for told, labels in (
+    for departed, labels in (
         ([], [NAME, f"{NAME}, w/o S"]),
         (["model.low_pass"], ["full", "w/o S"]),
         (None, ["full", "w/o S"]),
     ):
-        monkeypatch.setattr(Run, "departures", lambda run, told=told: told)
+        monkeypatch.setattr(Run, "departures", lambda run, departed=departed: departed)
         (grid,) = report_of(spec, *runs).grids
         ours = [r.label for r in grid.rows if r.kind != "paper"]
         assert [label for label in ours if label in labels] == labels
-        assert ours.count(NAME) == (told == [])
+        assert ours.count(NAME) == (departed == [])
         notes = " ".join(note for r in grid.rows for note in r.notes)
-        assert ("differs from experiment=paper in model.low_pass" in notes) == bool(told)
-        assert ("no config tells whether" in notes) == (told is None)
+        assert ("differs from experiment=paper in model.low_pass" in notes) == bool(departed)
+        assert ("no config says whether" in notes) == (departed is None)
 
 
 def test_another_split_is_not_the_papers(tmp_path):
@@ -88,7 +88,7 @@ def test_the_six_subjects_beside_ours(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["zju", "thuman4", "ablation", "miou", "slp"])
-def test_every_printed_figure_is_a_number_and_has_its_own_table(name):
+def test_every_printed_value_is_a_number(name):
     paper = read_paper(name)
     grid = paper.grid("why")
     printed = [c for r in grid.rows for c in r.cells if c.text != "n/a"]
@@ -99,11 +99,11 @@ def test_every_printed_figure_is_a_number_and_has_its_own_table(name):
 
 def test_the_mean_that_method_md_quotes_follows_from_the_table():
     (held,) = read_paper("zju").rows
-    values = [float(v["psnr"]) for s, v in held.values.items() if s != "mean"]
+    values = [float(v["psnr"]) for s, v in held["values"].items() if s != "mean"]
     assert sum(values) / len(values) == pytest.approx(32.93, abs=0.005)
 
 
-def test_private_or_pooled_figures_never_stand_beside(tmp_path):
+def test_private_or_pooled_numbers_never_stand_beside(tmp_path):
     for name in ("slp", "miou"):
         run = paper_run(tmp_path / name, record=None)
         spec = table(metrics=["psnr"], splits=["novel_view"], paper=name)

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from report_folders import report_of, row, table, texts, variant, write_run
 
-from gsgan.report.writers.curves import picture
+from gsgan.report.curves import curves
 from gsgan.utils.errors import ConfigError
 
 KEY = "training.step_two.adversarial"
@@ -39,7 +39,7 @@ def test_values_of_a_setting_are_rows_in_their_order(tmp_path):
 
 def test_without_it_they_are_refused_and_so_is_any_other_difference(tmp_path):
     runs = [swept(tmp_path, weight, 0, 30.0) for weight in (0.0, 0.5)]
-    with pytest.raises(ConfigError, match="one row's same seed"):
+    with pytest.raises(ConfigError, match="the same row and seed"):
         report_of(table(), *runs)
     other = swept(tmp_path, 0.5, 1, 30.0, perceptual=3.0)
     with pytest.raises(ConfigError, match=r"more than the seed: training\.step_two\.perceptual"):
@@ -53,19 +53,19 @@ def test_a_setting_that_a_run_does_not_have_is_named(tmp_path):
         report_of(table(by=[KEY]), write_run(tmp_path / "bare", psnr=30.0))
 
 
-@pytest.mark.parametrize("by", [[], "training", [["a"]], [KEY, KEY]])
-def test_what_is_no_list_of_settings_is_refused(by):
+@pytest.mark.parametrize("by", [[], "training"])
+def test_by_must_be_a_list_of_settings(by):
     with pytest.raises(ConfigError, match=r"table\.by"):
         table(by=by)
     with pytest.raises(ConfigError, match=r"table\.rows must be null"):
         table(by=[KEY], rows=[{"run": "full"}])
 
 
-def test_the_picture_shows_a_panel_a_score_that_there_is(tmp_path):
+def test_the_curves_have_a_panel_per_metric_that_runs_have(tmp_path):
     runs = [swept(tmp_path, w, s, 30 + s + w) for w in (0, 0.5) for s in (0, 1)]
-    one = picture(report_of(table(by=[KEY]), *runs))  # LPIPS is not there
+    one = curves(report_of(table(by=[KEY]), *runs))  # LPIPS is not there
     pixels = cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR)
-    assert pixels.shape[0] / pixels.shape[1] == pytest.approx((2.4 + 0.5) / 3.1, rel=0.05)
+    assert pixels.shape[0] / pixels.shape[1] == pytest.approx((3.0 + 0.5) / 3.1, rel=0.05)
     assert pixels.std() > 5
 
 
@@ -90,7 +90,7 @@ def test_models_and_variants_are_lines_of_their_own(tmp_path, monkeypatch):
     facts = json.loads((runs[-1] / "facts.json").read_text())
     (runs[-1] / "facts.json").write_text(json.dumps(facts | {"model": "wo_seg"}))
     spec = table(by=[KEY], metrics=["psnr"], variants=["full", "splat"])
-    assert picture(report_of(spec, *runs))
+    assert curves(report_of(spec, *runs))
     assert lines == [
         ("full", [0, 1], [30.0, 32.0]),
         ("full: Step I's colour", [0, 1], [20.0, 20.0]),
@@ -98,21 +98,7 @@ def test_models_and_variants_are_lines_of_their_own(tmp_path, monkeypatch):
     ]
 
 
-def test_labels_that_would_run_into_each_other_are_written_aslant(tmp_path):
-    """Which takes height; a few short ones stay upright."""
-    perceptual = "training.step_two.perceptual"
-    heights = {}
-    for count in (2, 5):
-        runs = [
-            swept(tmp_path / str(count), 0.001 * i, 0, 30.0 + i, perceptual=0.1)
-            for i in range(count)
-        ]
-        shown = picture(report_of(table(by=[KEY, perceptual]), *runs))
-        heights[count] = cv2.imdecode(np.frombuffer(shown, np.uint8), 0).shape[0]
-    assert heights[5] > 1.2 * heights[2]
-
-
-def test_without_a_score_to_show_there_is_no_picture(tmp_path, inside):
+def test_without_a_score_to_show_there_are_no_curves(tmp_path, inside):
     swept(tmp_path / "s", 0.5, 0, 30.0)
     given = [f"runs=[{tmp_path / 's'}]", f"table.by=[{KEY}]", "table.metrics=[lpips]", "out=t"]
     result = inside("report", *given)
@@ -130,11 +116,11 @@ def test_values_that_differ_late_keep_rows_of_their_own(tmp_path):
 def test_a_reference_that_is_no_row_is_remarked_and_one_that_is_compares(tmp_path):
     runs = [swept(tmp_path, weight, 0, 30.0 + weight) for weight in (0, 0.5)]
     report = report_of(table(by=[KEY], reference="full"), *runs)
-    assert any("no row is called full; table.reference='full, adversarial 0'" in r
+    assert any("no row is called full; set for example table.reference='full, adversarial 0'" in r
                for r in report.remarks)  # fmt: skip
     report = report_of(table(by=[KEY], reference="full, adversarial 0"), *runs)
     assert texts(row(report.grids[1], "full, adversarial 0.5"))[0].startswith("+0.50")
-    with pytest.raises(ConfigError, match=r"table\.by cannot be the seed"):
+    with pytest.raises(ConfigError, match=r"has no setting seed"):
         report_of(table(by=["seed"]), *runs)
 
 

@@ -1,4 +1,4 @@
-"""``python -m gsgan.report runs=[…] table=…``: tables of scored runs, the paper's beside them."""
+"""``python -m gsgan.report``: tables of scored runs (runs=[…]) and figures of one run (run=…)."""
 
 from __future__ import annotations
 
@@ -8,11 +8,7 @@ from gsgan.utils.config import entry
 
 
 def report(config: DictConfig) -> None:
-    """Gathers the runs ``config.runs`` into the table ``config.table``.
-
-    Raises:
-        GsganError: on anything the user can put right.
-    """
+    """Makes the tables of ``config.runs`` and the figures of ``config.run``."""
     from gsgan.report.run import run_report
 
     run_report(config)

@@ -1,92 +1,86 @@
-"""The command: finds runs, builds the table, writes and prints it."""
+"""The command: tables of ``runs``, figures of ``run``, or both."""
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig, ListConfig
 
-from gsgan.report.build import build
-from gsgan.report.folders import find_runs, read_runs
-from gsgan.report.grid import Report
 from gsgan.report.paper import read_paper
+from gsgan.report.runs import find_runs, read_runs
 from gsgan.report.spec import TableSpec
-from gsgan.report.writers import html, latex, markdown, numbers
-from gsgan.report.writers.terminal import print_report
+from gsgan.report.table import build
+from gsgan.report.write import MARKDOWN, WRITERS, Report, print_report
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
 from gsgan.utils.pages import check_block, fill_block
 
-WRITERS = {
-    "report.md": markdown.page,
-    "report.tex": latex.page,
-    "report.html": html.page,
-    "report.json": numbers.text,
-}
 CURVES = "report.png"
 BLOCK_END = "<!-- /report -->"
 
 
-def run_report(config: DictConfig) -> Report:
-    """``gsgan.report``: the table ``config.table`` of ``config.runs``, into ``config.out``.
+def run_report(config: DictConfig) -> None:
+    """``gsgan.report``.
 
     Raises:
-        ConfigError: on runs that are not there or do not belong into one table, or on a page or
+        ConfigError: when neither ``runs`` nor ``run`` is set, and as the two parts do.
+        DataError: when a run or its data cannot be read.
+    """
+    tables, figures = config.runs not in (None, "", []), config.run is not None
+    if not tables and not figures:
+        raise ConfigError(
+            "runs and run are not set: give runs=[<run folder>,<sweep folder>,…] for tables, or "
+            "run=<run folder> for figures"
+        )
+    if tables:
+        make_tables(config)
+    if figures:
+        from gsgan.report.figures.run import make_figures  # here: it imports matplotlib
+
+        make_figures(config)
+
+
+def make_tables(config: DictConfig) -> Report:
+    """Writes the table ``config.table`` of ``config.runs`` into ``config.out``.
+
+    Raises:
+        ConfigError: on runs that do not exist or do not belong into one table, or on a page or
             folder that cannot be written.
     """
-    given = _given(config.runs)
-    if not config.out:
-        raise ConfigError("out is not set: give the folder that the tables are written into")
+    given = [config.runs] if isinstance(config.runs, str) else config.runs
+    if not isinstance(given, list | ListConfig):
+        raise ConfigError(f"runs must be a list of folders, got {given!r}")
     if not isinstance(config.allow_dirty, bool):
         raise ConfigError(f"allow_dirty must be true or false, got {config.allow_dirty!r}")
     spec: TableSpec = instantiate(config.table)
     paper = None if spec.paper is None else read_paper(spec.paper)
     page = None if config.fill is None else Path(str(config.fill)).expanduser()
+    start = f"<!-- report:{spec.name} -->"
     if page is not None:
-        check_block(page, _start(spec), BLOCK_END, key="fill")
-    runs, left_out = read_runs(find_runs(given))
+        check_block(page, start, BLOCK_END, key="fill")
+    runs, left_out = read_runs(find_runs([str(entry) for entry in given]))
     report = build(spec, runs, left_out, paper, allow_dirty=config.allow_dirty)
-    folder = Path(str(config.out)).expanduser()
+    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    folder = Path(str(config.out or f"runs/report/{now}")).expanduser()
+    files: dict[str, str | bytes] = {name: text(report) for name, text in WRITERS.items()}
+    if spec.by:
+        from gsgan.report.curves import curves  # here: it imports matplotlib
+
+        files |= {CURVES: image} if (image := curves(report)) else {}
     try:
-        for name, text in WRITERS.items():
-            write_atomically(folder / name, text(report))
-        curves = _curves(report) if spec.by else None
-        if curves is not None:
-            write_atomically(folder / CURVES, curves)
+        for name, content in files.items():
+            write_atomically(folder / name, content)
         if page is not None:
-            fill_block(page, _start(spec), BLOCK_END, markdown.block(report), key="fill")
+            fill_block(page, start, BLOCK_END, MARKDOWN.body(report), key="fill")
     except OSError as error:
         where = error.filename or folder
         raise ConfigError(f"{where} cannot be written: {error.strerror}") from None
     console = make_console()
     print_report(report, console)
-    files = [*WRITERS, *([] if curves is None else [CURVES])]
     console.print(f"tables: {folder}/{{{','.join(files)}}}", markup=False, soft_wrap=True)
     if page is not None:
         console.print(f"filled: {page}", markup=False, soft_wrap=True)
     return report
-
-
-def _given(runs: object) -> list[str]:
-    if runs is None or runs == "" or (isinstance(runs, ListConfig) and not runs):
-        raise ConfigError(
-            "runs is not set: give runs=[<run folder>,<sweep folder>,…] of gsgan.train or "
-            "gsgan.evaluate"
-        )
-    if isinstance(runs, str):
-        return [runs]
-    if not isinstance(runs, ListConfig):
-        raise ConfigError(f"runs must be a list of folders, got {runs!r}")
-    return [str(run) for run in runs]
-
-
-def _curves(report: Report) -> bytes | None:
-    from gsgan.report.writers.curves import picture  # here: it brings matplotlib
-
-    return picture(report)
-
-
-def _start(spec: TableSpec) -> str:
-    return f"<!-- report:{spec.name} -->"

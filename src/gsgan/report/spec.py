@@ -1,28 +1,20 @@
-"""What a table shows: scores, rows, splits, as ``conf/table`` says it."""
+"""What a table shows, as set in ``conf/table``, and how each metric is written."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from gsgan.utils.errors import ConfigError
 
 PAINTED, SPLAT, FLOOR = "full", "splat", "floor"  # variants in metrics.json
-NEEDED = ("name", "title")
-MINUS = "−"
+MEAN = "mean"  # the column over subjects
 
 
-@dataclass(frozen=True)
-class Metric:
-    """How one score is shown.
-
-    Args:
-        heading: of its column.
-        digits: after the point.
-        better: ``↑`` the higher, ``↓`` the lower, ``→1`` the nearer to one.
-    """
+class Metric(NamedTuple):
+    """A metric's heading, digits after the point, and better: ``↑``, ``↓`` or ``→1`` (near 1)."""
 
     heading: str
     digits: int
@@ -51,22 +43,22 @@ def heading(metric: str) -> str:
     return f"{METRICS[metric].heading} {METRICS[metric].better}"
 
 
-def shown(metric: str, value: float, *, signed: bool = False) -> str:
-    """A value with the metric's digits, and a real minus; never a minus before zero."""
+def written(metric: str, value: float, *, signed: bool = False) -> str:
+    """A value with the metric's digits and a typographic minus; zero has no sign."""
     text = f"{value:{'+' if signed else ''}.{METRICS[metric].digits}f}"
     if float(text) == 0:
         text = text.lstrip("+-")
-    return text.replace("-", MINUS)
+    return text.replace("-", "−")
 
 
 @dataclass(frozen=True)
 class RowSpec:
-    """One row: a model's (or method's) runs, one of their pictures.
+    """One row: the runs of a model or method, and which of their images are scored.
 
     Args:
-        label: what the row is called; None takes the name.
         run: name of the model or method.
-        variant: ``full`` for the final picture, ``splat`` for Step I's colour.
+        label: the row's first column; None takes the name.
+        variant: ``full`` for the final image, ``splat`` for Step I's colour.
     """
 
     run: str
@@ -75,7 +67,7 @@ class RowSpec:
 
     @property
     def title(self) -> str:
-        """What stands in the row's first column."""
+        """The row's first column."""
         return self.run if self.label is None else self.label
 
 
@@ -84,29 +76,28 @@ class TableSpec:
     """One table.
 
     Args:
-        name: of the table, its files' titles and its block in a page.
+        name: of the table, and of its block in a page.
         title: its heading.
-        metrics: columns, or one grid each where subjects are the columns.
-        splits: one grid each.
-        rows: in this order, each even where it has no run yet; None takes whatever there is.
-        by: dotted keys of the runs' configs whose values make rows of their own, so that a sweep
-            over settings can be shown.
-        variants: pictures that make rows, where ``rows`` is None.
-        subjects: columns, where each subject has its own; None for metrics as columns.
-        data: the data set that it is about; None takes any one.
-        apart: one set of grids for each data set and protocol, in place of a refusal.
+        metrics: columns; one grid per metric where subjects are the columns.
+        splits: one grid per split.
+        rows: in this order, shown even where there is no run yet; None takes all runs.
+        by: dotted config keys whose values make rows of their own, to show a sweep over settings.
+        variants: images that make rows, where ``rows`` is None.
+        subjects: columns, one per subject; None for metrics as columns.
+        data: the only data set allowed; None allows any one.
+        apart: give each data set and protocol its own grids instead of refusing to mix them.
         reference: the row that others are compared with, seed by seed; None compares nothing.
-        paper: the entry in paper.yaml that goes with it, or None.
+        paper: entry in paper.yaml whose printed numbers go with it, or None.
 
     Raises:
-        ConfigError: on a metric that there is not, or a value that does not fit.
+        ConfigError: on an unknown metric or a value of the wrong kind.
     """
 
     name: str
     title: str
     metrics: Sequence[str]
     splits: Sequence[str]
-    rows: Sequence[RowSpec | Mapping[str, Any]] | None = None
+    rows: Sequence[RowSpec] | None = None
     by: Sequence[str] | None = None
     variants: Sequence[str] = (PAINTED,)
     subjects: Sequence[str] | None = None
@@ -116,49 +107,36 @@ class TableSpec:
     paper: str | None = None
 
     def __post_init__(self) -> None:
-        for name in ("name", "title", "data", "reference", "paper"):
-            held = getattr(self, name)
-            if not (isinstance(held, str) and held) and (held is not None or name in NEEDED):
-                raise ConfigError(f"table.{name} must be a text, got {held!r}")
-        if not isinstance(self.apart, bool):
-            raise ConfigError(f"table.apart must be true or false, got {self.apart!r}")
-        for name in ("metrics", "splits", "variants", "subjects", "rows", "by"):
-            self._check_list(name, getattr(self, name))
-        unknown = [metric for metric in self.metrics if metric not in METRICS]
-        if unknown:
-            raise ConfigError(
-                f"table.metrics has {', '.join(map(str, unknown))}; known: {', '.join(METRICS)}"
-            )
-        if wrong := set(self.variants) - {PAINTED, SPLAT}:
-            raise ConfigError(
-                f"table.variants must be among full and splat, got {', '.join(map(str, wrong))}"
-            )
+        for key in ("metrics", "splits", "variants", "subjects", "rows", "by"):
+            held, optional = getattr(self, key), key in ("subjects", "rows", "by")
+            right = isinstance(held, Sequence) and not isinstance(held, str) and len(held) > 0
+            if not right and not (optional and held is None):
+                raise ConfigError(f"table.{key} must be a list of at least one, got {held!r}")
         if self.rows is not None:
-            rows = [r if isinstance(r, RowSpec) else _row(r) for r in self.rows]
-            object.__setattr__(self, "rows", rows)
+            object.__setattr__(self, "rows", [_row(row) for row in self.rows])
+        if self.subjects is not None:
+            object.__setattr__(self, "subjects", [str(subject) for subject in self.subjects])
+        variants = [*self.variants, *(row.variant for row in self.rows or ())]
+        for key, known, values in (
+            ("metrics", list(METRICS), self.metrics),
+            ("variants", [PAINTED, SPLAT], variants),
+            ("apart", [False, True], [self.apart]),
+        ):
+            if unknown := [str(value) for value in values if value not in known]:
+                raise ConfigError(
+                    f"table.{key} has {', '.join(unknown)}; known: {', '.join(map(str, known))}"
+                )
         if self.by is not None and self.rows is not None:
             raise ConfigError("table.by makes rows of its own, so table.rows must be null")
-        if self.subjects is not None:
-            object.__setattr__(self, "subjects", [str(s) for s in self.subjects])
-
-    def _check_list(self, name: str, held: Any) -> None:
-        if held is None and name in ("subjects", "rows", "by"):
-            return
-        if isinstance(held, str) or not isinstance(held, Sequence) or not held:
-            raise ConfigError(f"table.{name} must be a list of at least one, got {held!r}")
-        if name != "rows" and not all(isinstance(entry, str | int) for entry in held):
-            raise ConfigError(f"table.{name} must be a list of names, got {list(held)}")
-        if twice := [entry for i, entry in enumerate(held) if entry in held[:i]]:
-            raise ConfigError(f"table.{name} has {twice[0]} twice")
 
     def row_specs(self, names: Sequence[str]) -> list[RowSpec]:
         """The table's rows.
 
         Args:
-            names: of the runs there are, for a table that takes whatever there is.
+            names: of all runs, for a table without fixed rows.
         """
         if self.rows is not None:
-            return [row for row in self.rows if isinstance(row, RowSpec)]
+            return list(self.rows)
         ordered = sorted(names, key=lambda name: (name != self.reference, _natural(name)))
         return [
             RowSpec(name, f"{name}: Step I's colour" if variant == SPLAT else None, variant)
@@ -167,28 +145,22 @@ class TableSpec:
         ]
 
 
-def _natural(name: str) -> list[str | float]:
-    """Numbers in a name by their size, words between them by letters."""
-    parts = re.split(r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d+)?)", name)
-    return [float(part) if i % 2 else part for i, part in enumerate(parts)]
-
-
-def _row(given: Mapping[str, Any]) -> RowSpec:
+def _row(given: RowSpec | Mapping[str, Any]) -> RowSpec:
     try:
-        row = RowSpec(**given)
+        return given if isinstance(given, RowSpec) else RowSpec(**given)
     except TypeError:
         raise ConfigError(
             f"table.rows must be like {{run: wo_seg, label: w/o S, variant: full}}, got {given!r}"
         ) from None
-    if not isinstance(row.run, str) or not isinstance(row.label, str | None):
-        raise ConfigError(f"table.rows: run and label must be texts, got {given!r}")
-    if row.variant not in (PAINTED, SPLAT):
-        raise ConfigError(f"table.rows: variant must be full or splat, got {row.variant!r}")
-    return row
+
+
+def _natural(name: str) -> list[str | float]:
+    """A sort key: numbers by value, the words between them by letters."""
+    parts = re.split(r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d+)?)", name)
+    return [float(part) if i % 2 else part for i, part in enumerate(parts)]
 
 
 def subject_of(root: str | None, subjects: Sequence[str]) -> str | None:
-    """The subject whose folder this is: ``CoreView_377`` and ``my_377`` are both 377's."""
-    if root is None:
-        return None
-    return next((s for s in subjects if root == s or root.endswith(f"_{s}")), None)
+    """The subject of a data folder: ``CoreView_377`` and ``my_377`` are both 377's."""
+    name = root or ""
+    return next((s for s in subjects if name == s or name.endswith(f"_{s}")), None)

@@ -1,4 +1,4 @@
-"""Markdown tables, and the marked blocks of a page that a command fills."""
+"""Markdown tables, and marked blocks of a page that a command fills."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def fill_block(page: Path, start: str, end: str, text: str, *, key: str) -> None:
-    """Puts text between the marker ``start`` and the ``end`` that follows it.
+    """Replaces the text between the marker ``start`` and the next ``end``.
 
     Args:
         page: a Markdown file.
         start, end: the markers, HTML comments.
-        text: what shall stand between them.
-        key: the config key that gave the page, for the error's sentence.
+        text: to write between them.
+        key: the config key of the page, for the message.
 
     Raises:
         ConfigError: when the page is missing or has no such block.
@@ -32,7 +32,7 @@ def fill_block(page: Path, start: str, end: str, text: str, *, key: str) -> None
 
 
 def check_block(page: Path, start: str, end: str, *, key: str) -> None:
-    """Whether ``fill_block`` will find its block, before anything long begins.
+    """Checks that ``fill_block`` will find its block, before anything long begins.
 
     Raises:
         ConfigError: as ``fill_block`` does.

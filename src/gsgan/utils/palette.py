@@ -1,4 +1,4 @@
-"""Colours and markers of every plot, told apart with any colour vision (Okabe and Ito)."""
+"""Colours and markers of all plots, distinct with any colour vision (Okabe and Ito)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ BLACK, ORANGE, SKY, GREEN = "#000000", "#e69f00", "#56b4e9", "#009e73"
 BLUE, VERMILLION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
 GREY = "#777777"
 
-COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK)  # in the order plots take them
-# Shapes tell the same again; ten of them, seven colours: pairs repeat late.
+COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK)  # in the order of use
+# Ten markers and seven colours: pairs repeat late.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
 DASHES = ("-", "--", ":", "-.")

@@ -1,1 +1,1 @@
-"""The paper's figures from any run: one small module a figure, one table of them."""
+"""Figures of the paper, of any run."""

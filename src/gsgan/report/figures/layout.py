@@ -1,10 +1,10 @@
-"""Panels in rows and columns, laid out in inches: what every figure of pictures stands on."""
+"""Sizes in print, and images in rows and columns: what most figures are laid out with."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import matplotlib
@@ -17,24 +17,61 @@ from matplotlib.patches import Patch
 from matplotlib.text import Text
 from torch import Tensor
 
-from gsgan.report.figures.settings import Settings
+from gsgan.utils.errors import ConfigError
 
 GAP = 0.05  # inches between panels
-EDGE = 0.02  # inches round the whole, so that no frame is cut
-LEAST_FONT = 5.0  # points: smaller is not readable in print
-POINT = 1 / 72  # inches
-LINE = 1.35  # height of a line of text over its font size
+EDGE = 0.02  # inches around the whole, so that no frame is cut off
+LEAST_FONT = 3.0  # points
+LINE = 1.4 / 72  # inches per line and point of font size
+BAR_FOOT = 0.46  # inches that a colour bar needs in the foot
+LIMITS = {  # of settings: what is readable and fits into memory
+    "column": (1, 50), "page": (2, 50), "tallest": (0.3, 50), "font": (1, 20), "dpi": (1, 2400),
+    "canny_tolerance": (0, 100), "detail": (0.01, 1),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How figures look and how the images in them are measured; `conf/report.yaml` has units.
+
+    Raises:
+        ConfigError: on a value outside `LIMITS`.
+    """
+
+    column: float = 3.5
+    page: float = 7.16
+    tallest: float = 1.9
+    font: float = 8.0
+    dpi: int = 300
+    margin: float = 0.2
+    canny_low: float = 100.0
+    canny_high: float = 200.0
+    canny_tolerance: int = 1
+    error_max: float | None = None
+    sigmas: float = 1.0
+    detail: float = 0.35
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if name == "error_max" and value is None:
+                continue
+            kind = int if name in ("dpi", "canny_tolerance") else int | float
+            low, high = LIMITS.get(name, (1e-6, 1e6))
+            if not isinstance(value, kind) or not low <= value <= high:
+                what = "a whole number" if kind is int else "a number"
+                raise ConfigError(
+                    f"settings.{name} must be {what} from {low:g} to {high:g}, got {value!r}"
+                )
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure with what is to be said about it.
+    """A figure with its caption and numbers.
 
     Args:
         figure: of matplotlib.
         caption: whole sentences, Markdown: what is shown and how its numbers were measured.
-        numbers: ``{picture: {panel: {measure: value}}}``, as they stand in the figure; None where
-            a measure is not defined.
+        numbers: ``{image: {panel: {measure: value}}}``, None where a measure is not defined.
     """
 
     figure: Figure
@@ -43,7 +80,7 @@ class Drawing:
 
 
 class Unavailable(Exception):
-    """What the runs given lack for a figure, as a sentence; the other figures are still made."""
+    """What the runs lack for a figure; the other figures are still made."""
 
 
 @contextmanager
@@ -60,162 +97,137 @@ def style(settings: Settings) -> Iterator[None]:
         yield
 
 
-class Grid:
-    """A figure of equal panels, a title over each column and a note under each panel.
-
-    The widest figure that fits ``width`` with no panel higher than ``settings.tallest``. Text that
-    is wider than its panel is made smaller, and cut off with an ellipsis where that is not enough.
+@dataclass(frozen=True)
+class Panel:
+    """One image of a sheet.
 
     Args:
-        rows, columns: of panels.
-        aspect: a panel's height over its width.
+        image: ``[1, 3, h, w]`` in [0, 1], or ``[h, w, …]`` as matplotlib takes it; None leaves the
+            panel empty.
+        note: below it, of one line or more.
+        framed: whether it has a frame.
+        how: further options of ``imshow``.
+    """
+
+    image: Tensor | np.ndarray | None
+    note: str = ""
+    framed: bool = False
+    how: dict[str, Any] = field(default_factory=dict)
+
+
+class Sheet:
+    """A figure of equal panels, the widest that fits; text that does not fit is made smaller.
+
+    Args:
+        panels: by row.
         settings: sizes.
         width: inches, at most.
-        titles: over the columns, of one line or more; none leaves no room for them.
-        names: at the left of the rows; none leaves no room for them.
-        notes: lines of text under the panels of each row, or of all.
+        titles: above the columns, of one line or more.
+        names: at the left of the rows.
         foot: inches kept at the bottom for a legend or colour bar.
+
+    Attributes:
+        axes: ``[rows, columns]``, in pixels of the images, pixel centres at +0.5.
     """
 
     def __init__(
         self,
-        rows: int,
-        columns: int,
-        aspect: float,
+        panels: Sequence[Sequence[Panel]],
         settings: Settings,
         *,
         width: float,
         titles: Sequence[str] = (),
         names: Sequence[str] = (),
-        notes: int | Sequence[int] = 1,
         foot: float = 0.0,
     ) -> None:
-        self.settings = settings
-        self.small = settings.font - 1
-        self.foot = foot
-        line = settings.font * LINE * POINT
-        self.left = EDGE + (line if names else 0.0)
+        self.small, self.foot = settings.font - 1, foot
+        shown = [[pixels(panel.image) for panel in row] for row in panels]
+        sizes = [image.shape for row in shown for image in row if image is not None]
+        aspect = max(shape[0] / shape[1] for shape in sizes)
+        rows, columns, line = len(panels), len(panels[0]), settings.font * LINE
+        left = EDGE + (line if names else 0.0)
         top = EDGE + line * max((1 + title.count("\n") for title in titles), default=0)
-        gaps = GAP * (columns - 1)
-        self.panel_width = (width - self.left - EDGE - gaps) / columns
-        self.panel_width = min(self.panel_width, settings.tallest / aspect)
-        self.panel_height = self.panel_width * aspect
-        self.width = self.left + columns * self.panel_width + gaps + EDGE
-        lines = [notes] * rows if isinstance(notes, int) else list(notes)
-        steps = [self.panel_height + n * self.small * LINE * POINT + GAP for n in lines]
-        self.tops = [top + sum(steps[:row]) for row in range(rows)]
-        self.height = top + sum(steps) + foot
+        notes = [panel.note for row in panels for panel in row if panel.note]
+        below = max((1 + n.count("\n") for n in notes), default=0) * self.small * LINE + GAP
+        gaps = left + EDGE + GAP * (columns - 1)
+        panel_width = min((width - gaps) / columns, settings.tallest / aspect)
+        panel_height = panel_width * aspect
+        self.width = gaps + columns * panel_width
+        self.height = top + rows * (panel_height + below) + foot
         self.figure = Figure(figsize=(self.width, self.height))
         self._renderer = FigureCanvasAgg(self.figure).get_renderer()
-        lowest = max((title.count("\n") for title in titles), default=0)
-        heads = []
-        for column, title in enumerate(titles):  # those of fewer lines stand lower
-            padded = "\n" * (lowest - title.count("\n")) + title
-            heads += self._lines(column, EDGE, padded, settings.font)
-        for head in heads:
-            head.set_fontsize(min(float(other.get_fontsize()) for other in heads))
-        for row, name in enumerate(names):
-            middle = self.tops[row] + self.panel_height / 2
-            x = EDGE + line * 0.4
-            self._text(
-                x, middle, name, self.panel_height, size=settings.font, va="center", rotation=90
-            )
+        places = {
+            "left": left / self.width,
+            "right": 1 - EDGE / self.width,
+            "top": 1 - top / self.height,
+            "bottom": (below + foot) / self.height,
+            "wspace": GAP / panel_width,
+            "hspace": below / panel_height,
+        }
+        self.axes = self.figure.subplots(rows, columns, squeeze=False, gridspec_kw=places)
+        for i, row in enumerate(panels):
+            for axes, panel, image in zip(self.axes[i], row, shown[i], strict=True):
+                self._fill(axes, panel, image)
+                self._fit([axes.set_xlabel(panel.note, size=self.small, labelpad=2)], panel_width)
+        plain: dict[str, Any] = {"parse_math": False, "size": settings.font}  # "$x" is no formula
+        heads = [a.set_title(t, pad=2, **plain) for a, t in zip(self.axes[0], titles, strict=False)]
+        self._fit(heads, panel_width)
+        for axes, name in zip(self.axes[:, 0], names, strict=False):
+            self._fit([axes.set_ylabel(name, labelpad=2, **plain)], panel_height)
 
-    def _lines(self, column: int, top: float, text: str, size: float) -> list[Text]:
-        """Lines over or under a column's panels, beginning ``top`` inches from the top edge."""
-        x = self.left + column * (self.panel_width + GAP) + self.panel_width / 2
-        made = []
-        for number, line in enumerate(text.split("\n")):
-            baseline = top + (number * LINE + 1) * size * POINT
-            made.append(self._text(x, baseline, line, self.panel_width, va="baseline", size=size))
-        return made
+    def _fill(self, axes: Axes, panel: Panel, image: np.ndarray | None) -> None:
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set_visible(panel.framed)
+        if image is not None:
+            height, width = image.shape[:2]
+            extent = (0, width, height, 0)
+            axes.imshow(image, interpolation="nearest", extent=extent, **panel.how)
 
-    def _text(self, x: float, y: float, text: str, room: float, *, size: float, **how: Any) -> Text:
-        """Text at inches from the left and top edges, centred, in ``room`` inches of length."""
-        place = (x / self.width, 1 - y / self.height)
-        # a name with a dollar sign is no formula
-        shown = self.figure.text(*place, text, ha="center", size=size, parse_math=False, **how)
+    def _fit(self, texts: Sequence[Text], room: float) -> None:
+        """Gives texts the largest common size at which none is longer than ``room`` inches."""
 
-        def length() -> float:
-            box = shown.get_window_extent(self._renderer)
-            return max(box.width, box.height) / self.figure.dpi
+        def long(text: Text) -> bool:
+            box = text.get_window_extent(self._renderer)
+            return max(box.width, box.height) / self.figure.dpi > room
 
-        while length() > room and size > LEAST_FONT:
-            size = max(LEAST_FONT, size - 0.25)
-            shown.set_fontsize(size)
-        while len(text) > 2 and length() > room:
-            text = text[:-1]
-            shown.set_text(f"{text}…")
-        return shown
-
-    def panel(self, row: int, column: int, note: str = "", *, framed: bool = False) -> Axes:
-        """The axes of a panel, without ticks, and the note under it."""
-        x, y = self.left + column * (self.panel_width + GAP), self.tops[row]
-        size = (self.panel_width / self.width, self.panel_height / self.height)
-        place = (x / self.width, (self.height - y - self.panel_height) / self.height)
-        axes = self.figure.add_axes((*place, *size))
-        axes.set_xticks([])
-        axes.set_yticks([])
-        if not framed:
-            axes.set_axis_off()
-        self._lines(column, y + self.panel_height + 0.02, note, self.small)
-        return axes
-
-    def picture(
-        self, row: int, column: int, picture: Tensor, note: str = "", *, framed: bool = False
-    ) -> Axes:
-        """A panel with a picture ``[1, 3, h, w]`` in [0, 1]."""
-        axes = self.panel(row, column, note, framed=framed)
-        axes.imshow(pixels(picture), interpolation="nearest", extent=extent(picture))
-        return axes
+        while any(map(long, texts)) and (size := float(texts[0].get_fontsize())) > LEAST_FONT:
+            for text in texts:
+                text.set_fontsize(size - 0.25)
 
     def bar(self, mappable: ScalarMappable, label: str, *, over: bool) -> None:
-        """A colour bar across the middle of the foot; ``over`` points it where values go beyond."""
-        wide = min(0.6 * self.width, 3.0)
-        at = ((self.width - wide) / 2, self.foot - 0.12, wide, 0.08)
+        """A colour bar in the foot; ``over``: there are values beyond its end."""
+        wide = min(0.6, 3.0 / self.width)
         axes = self.figure.add_axes(
-            (at[0] / self.width, at[1] / self.height, at[2] / self.width, at[3] / self.height)
+            ((1 - wide) / 2, (self.foot - 0.12) / self.height, wide, 0.08 / self.height)
         )
-        bar = self.figure.colorbar(
-            mappable, cax=axes, orientation="horizontal", extend="max" if over else "neither"
-        )
-        bar.outline.set_linewidth(0.4)  # type: ignore[operator]
+        end = "max" if over else "neither"
+        self.figure.colorbar(mappable, cax=axes, orientation="horizontal", extend=end)
         axes.tick_params(labelsize=self.small, width=0.4, length=2, pad=1.5)
-        bar.set_label(label, fontsize=self.small, labelpad=2)
+        axes.set_xlabel(label, fontsize=self.small, labelpad=2)
 
     def legend(self, colours: dict[str, str], columns: int) -> None:
-        """Named colours across the foot."""
-        patches = [
-            Patch(facecolor=c, edgecolor="#555555", linewidth=0.4, label=name)
-            for name, c in colours.items()
-        ]
+        """Named colours in the foot."""
+        patches = [Patch(facecolor=colour, label=name) for name, colour in colours.items()]
         self.figure.legend(
             handles=patches, loc="lower center", ncols=columns, frameon=False,
-            fontsize=self.small, handlelength=1.0, handleheight=0.8, columnspacing=1.0,
-            handletextpad=0.4, borderaxespad=0.0, borderpad=0.0, labelspacing=0.35,
+            fontsize=self.small, handlelength=1.0, columnspacing=1.0, borderpad=0.0,
+            borderaxespad=0.0, labelspacing=0.35,
         )  # fmt: skip
 
 
-def foot_lines(lines: int, settings: Settings) -> float:
-    """Inches that so many lines of small text need in the foot."""
-    return lines * (settings.font - 1) * 1.45 * POINT + 0.05
+def legend_foot(lines: int, settings: Settings) -> float:
+    """Inches that a legend of so many lines needs in the foot."""
+    return lines * (settings.font - 1) * LINE + 0.05
 
 
-BAR_FOOT = 0.46  # inches that a colour bar needs in the foot
-
-
-def pixels(picture: Tensor) -> np.ndarray:
-    """``[h, w, 3]`` bytes of a picture ``[1, 3, h, w]``."""
-    shown = (picture[0].detach().cpu().clamp(0, 1) * 255).round().byte()
+def pixels(image: Tensor | np.ndarray | None) -> np.ndarray | None:
+    """``[h, w, 3]`` bytes of an image ``[1, 3, h, w]``; arrays as they are."""
+    if not isinstance(image, Tensor):
+        return image
+    shown = (image[0].detach().cpu().clamp(0, 1) * 255).round().byte()
     return shown.permute(1, 2, 0).numpy()
 
 
-def extent(picture: Tensor) -> tuple[float, float, float, float]:
-    """Places pixel centres at +0.5, as cameras have them: left, right, bottom, top."""
-    height, width = picture.shape[-2:]
-    return 0.0, float(width), float(height), 0.0
-
-
-def aspect_of(pictures: Sequence[Tensor]) -> float:
-    """The highest of the pictures' heights over their widths."""
-    return max(picture.shape[-2] / picture.shape[-1] for picture in pictures)
+def written(value: float | None, digits: int, unit: str = "") -> str:
+    """A number with its unit, or n/a."""
+    return "n/a" if value is None else f"{value:.{digits}f}{unit}"

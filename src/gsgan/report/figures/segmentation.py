@@ -1,4 +1,4 @@
-"""Segmentation: the true parts against S, and the pixels on which they disagree."""
+"""The segmentation figure: the true parts, S, and the pixels on which they disagree."""
 
 from __future__ import annotations
 
@@ -11,18 +11,24 @@ from torch import Tensor
 from gsgan.evaluate.pictures import colour_labels
 from gsgan.evaluate.scores import SegmentationScores
 from gsgan.model.segmentation import IGNORE, Segmentation
-from gsgan.report.figures.layout import Drawing, Grid, Unavailable, aspect_of, foot_lines
-from gsgan.report.figures.measures import Numbers, where_from, written
-from gsgan.report.figures.settings import Settings
+from gsgan.report.figures.layout import (
+    Drawing,
+    Panel,
+    Settings,
+    Sheet,
+    Unavailable,
+    legend_foot,
+    written,
+)
 from gsgan.report.figures.shots import Shot
-from gsgan.report.figures.subjects import Subject
+from gsgan.report.figures.subjects import Numbers, Subject
 from gsgan.utils.palette import VERMILLION
 
 LEGEND_WIDTH = 1.15  # inches of a part's name with its colour
 
 
-def draw(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
-    """Columns are the picture, the true parts, and of each run S and where it is wrong.
+def segmentation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
+    """Columns are the image, the true parts, and of each run S and where it is wrong.
 
     Raises:
         Unavailable: without part labels, or where no run has S.
@@ -35,53 +41,45 @@ def draw(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings)
     if not able:
         why = subjects[0].avatar.segmentation_why
         raise Unavailable(f"{subjects[0].name} has no segmentation S: {why}")
-    maps = [_segmentation(subject).map for subject in able]
-    for subject, other in zip(able, maps, strict=True):
-        if other != maps[0]:
-            raise Unavailable(f"{able[0].name} and {subject.name} tell different parts apart")
+    maps = [_module(subject).map for subject in able]
+    if any(other != maps[0] for other in maps):
+        raise Unavailable("the runs do not have the same parts")
     several = len(able) > 1
-    titles = ["picture", "true parts"]
+    titles = ["image", "true parts"]
     for subject in able:
         titles += [f"{subject.name}\nS" if several else "S (ours)", "disagreement"]
-    names = _legend(_present(able, shots), (*maps[0].names, *maps[0].absent))
+    scored = [{s.name: _scored(s, shot) for s in able} for shot in shots]
+    names = _legend(scored, (*maps[0].names, *maps[0].absent))
     width = settings.page if several else settings.column
-    in_line = max(1, int(width / LEGEND_WIDTH))
-    grid = Grid(
-        len(shots),
-        len(titles),
-        aspect_of([shot.truth for shot in shots]),
-        settings,
-        width=width,
-        titles=titles,
-        foot=foot_lines(-(-len(names) // in_line), settings),
-    )
+    columns = max(1, int(width / LEGEND_WIDTH))
+    panels = []
     numbers: dict[str, dict[str, Numbers]] = {}
-    for row, shot in enumerate(shots):
-        grid.picture(row, 0, shot.truth)
-        grid.picture(row, 1, colour_labels(_scored(able[0], shot)[1]))
+    for shot, held in zip(shots, scored, strict=True):
+        _, truth = held[able[0].name]
+        panels.append([Panel(shot.truth), Panel(colour_labels(truth))])
         numbers[shot.name] = {}
-        for place, subject in enumerate(able):
-            parts, labels = _scored(subject, shot)
-            ours = parts.argmax(dim=1)
-            found = agreement(parts, labels)
-            column = 2 + 2 * place
-            grid.picture(row, column, colour_labels(ours), f"mIoU {written(found['miou'], 3)}")
+        for name, (parts, labels) in held.items():
+            ours, found = parts.argmax(dim=1), agreement(parts, labels)
             wrong = found["wrong_share"]
             share = "n/a" if wrong is None else f"{100 * wrong:.1f} % wrong"
-            grid.picture(row, column + 1, disagreement(ours, labels), share, framed=True)
-            numbers[shot.name][subject.name] = found
-    grid.legend(names, columns=in_line)
+            panels[-1] += [
+                Panel(colour_labels(ours), f"mIoU {written(found['miou'], 3)}"),
+                Panel(disagreement(ours, labels), share, framed=True),
+            ]
+            numbers[shot.name][name] = found
+    foot = legend_foot(-(-len(names) // columns), settings)
+    sheet = Sheet(panels, settings, width=width, titles=titles, foot=foot)
+    sheet.legend(names, columns=columns)
     caption = (
         "The true parts, the segmentation S (most probable part), and where they disagree "
-        "(vermillion, on the person in grey). mIoU: mean over the parts present, background left "
-        "out. Wrong: share of the pixels that either calls the person. "
-        + where_from(shots, settings.margin)
+        "(vermillion, on the person in grey). mIoU: mean over the parts present, without the "
+        "background. Wrong: share of the pixels that are the person's in either."
     )
-    return Drawing(grid.figure, caption, numbers)
+    return Drawing(sheet.figure, caption, numbers)
 
 
 def agreement(parts: Tensor, labels: Tensor) -> Numbers:
-    """mIoU of one picture, and the share of the person's pixels whose part is wrong.
+    """mIoU of one image, and the share of the person's pixels whose part is wrong.
 
     Args:
         parts: ``[1, classes, h, w]`` S.
@@ -91,49 +89,42 @@ def agreement(parts: Tensor, labels: Tensor) -> Numbers:
     scores.update(parts, labels)
     ours, seen = parts.argmax(dim=1), labels != IGNORE
     person = seen & ((ours > 0) | (labels > 0))
-    wrong = person & (ours != labels)
-    share = float(wrong.sum() / person.sum()) if person.any() else None
+    share = float((ours != labels)[person].double().mean()) if person.any() else None
     return {"miou": scores.compute()["miou"], "wrong_share": share}
 
 
 def disagreement(ours: Tensor, labels: Tensor) -> Tensor:
     """``[1, 3, h, w]``: wrong pixels in vermillion, the rest of the person grey, white around."""
     grey = torch.where((labels > 0) & (labels != IGNORE), 0.8, 1.0)
-    picture = grey.unsqueeze(1).repeat(1, 3, 1, 1)
     wrong = ((ours != labels) & (labels != IGNORE)).unsqueeze(1)
     rgb = torch.tensor(to_rgb(VERMILLION))
-    return torch.where(wrong, rgb[None, :, None, None], picture)
+    return torch.where(wrong, rgb[None, :, None, None], grey.unsqueeze(1))
 
 
-def _segmentation(subject: Subject) -> Segmentation:
+def _module(subject: Subject) -> Segmentation:
     assert subject.avatar.segmentation is not None
     return subject.avatar.segmentation
 
 
 def _scored(subject: Subject, shot: Shot) -> tuple[Tensor, Tensor]:
-    """S and the true parts of a shot, both in the classes that the run tells apart."""
-    parts = subject.parts(shot)
-    assert parts is not None and shot.frame.labels is not None  # noqa: PT018
-    padded, truth = _segmentation(subject).to_score(parts, shot.window.cut(shot.frame.labels))
+    """S and the true parts of a shot, both in the run's classes."""
+    parts, labels = subject.parts(shot), shot.frame.labels
+    assert parts is not None
+    assert labels is not None
+    padded, truth = _module(subject).to_score(parts, shot.window.cut(labels))
     return padded, truth.to(parts.device)
 
 
-def _present(able: Sequence[Subject], shots: Sequence[Shot]) -> list[int]:
-    """The parts in any of the pictures, background left out."""
-    present: set[int] = set()
-    for shot in shots:
-        for subject in able:
-            parts, labels = _scored(subject, shot)
-            present |= set(labels.unique().tolist())
-            present |= set(parts.argmax(dim=1).unique().tolist())
-    return sorted(present - {0})
-
-
-def _legend(present: Sequence[int], names: Sequence[str]) -> dict[str, str]:
-    """Colours by the name of each part shown."""
+def _legend(
+    scored: Sequence[dict[str, tuple[Tensor, Tensor]]], names: Sequence[str]
+) -> dict[str, str]:
+    """Colours by the name of each part in any of the images, background left out."""
+    pairs = [pair for held in scored for pair in held.values()]
+    labels = torch.cat([x.flatten() for s, truth in pairs for x in (s.argmax(dim=1), truth)])
     legend = {}
-    for part in present:
+    for part in labels.unique().tolist():
         red, green, blue = colour_labels(torch.full((1, 1, 1), part)).flatten().tolist()
         name = names[part].replace("_", " ") if part < len(names) else f"part {part}"
-        legend["not judged" if part == IGNORE else name] = to_hex((red, green, blue))
+        if part:
+            legend["not scored" if part == IGNORE else name] = to_hex((red, green, blue))
     return legend

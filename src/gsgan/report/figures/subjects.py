@@ -1,22 +1,25 @@
-"""The runs that a figure shows, side by side on the same data."""
+"""The avatars that a figure shows side by side: rendering, measuring, naming."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
-from hydra.utils import instantiate
-from omegaconf import DictConfig
 from torch import Tensor
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.splits import Item
-from gsgan.evaluate.facts import choices
+from gsgan.evaluate.facts import fingerprint
+from gsgan.metrics.image import edge_scores, psnr
 from gsgan.model.avatar import Avatar, Painting
+from gsgan.report.comparable import check_data
+from gsgan.report.figures.layout import Settings
 from gsgan.report.figures.shots import Shot
-from gsgan.train.paper import NAME, departures, settings_of
+from gsgan.report.runs import Run, read_run
+from gsgan.train.paper import NAME
 from gsgan.train.runs import (
     CHECKPOINT,
     Moved,
@@ -25,11 +28,9 @@ from gsgan.train.runs import (
     load_config,
     read_checkpoint,
 )
-from gsgan.train.schedule import Schedule
 from gsgan.utils.errors import ConfigError, DataError
 
-# A model's name in print.
-TITLES = {
+TITLES = {  # of models, in print
     "full": "gsgan",
     "wo_seg": "w/o S",
     "wo_gcn": "w/o GCN",
@@ -38,61 +39,64 @@ TITLES = {
     "lbs_splat": "LBS splat",
     "image_to_image": "image to image",
 }
+STEP_ONE = "Step I's colour"
+Numbers = dict[str, float | None]
 
 
 @dataclass
 class Subject:
-    """A trained avatar with its run folder and data.
+    """A trained avatar with its run and data.
 
     Args:
-        name: as it stands over its pictures.
-        model: the choice of the model group, or the folder's name where that is not known.
-        folder: of the run.
-        seed: of the run.
+        name: above its images.
+        run: its folder and settings, with the fingerprint of ``data``.
         data: of the run.
-        avatar: in eval mode, on the device that paints.
-        marks: notes that whatever shows this run must carry.
-        step, total: iterations that it was trained, and that its config asks for.
+        avatar: in eval mode, on the device that renders.
+        marks: that every figure of it must carry.
+        step: iterations trained.
     """
 
     name: str
-    model: str
-    folder: Path
-    seed: int
+    run: Run
     data: GsganData
     avatar: Avatar
     marks: list[str]
     step: int = 0
-    total: int = 0
     _painted: dict[Item, Painting] = field(default_factory=dict, repr=False)
 
     def paint(self, shot: Shot) -> Painting:
-        """What the avatar makes of a shot's whole picture, painted once, kept on the CPU.
+        """What the avatar makes of a shot's whole image, rendered once, kept on the CPU.
 
         Raises:
-            DataError: when the picture is not finite.
+            DataError: when the image is not finite.
         """
         if shot.item not in self._painted:
             device = next(self.avatar.parameters()).device
             with torch.no_grad():
                 painting = self.avatar.paint(shot.frame.to(device))
-            # of F only the colour is shown: thirty channels of every shot would fill the memory
-            colour = painting.colour
-            kept = Painting(
-                painting.image,
-                features=colour,
-                segmentation=painting.segmentation,
-                gaussians=painting.gaussians,
-            )
-            self._painted[shot.item] = _finite(_on_cpu(kept), self.folder, shot)
+            kept = {  # of F only the colour: all channels of every shot would fill the memory
+                name: None if part is None else part.cpu()
+                for name, part in (
+                    ("image", painting.image),
+                    ("features", painting.colour),
+                    ("segmentation", painting.segmentation),
+                )
+            }
+            if any(part is not None and not bool(part.isfinite().all()) for part in kept.values()):
+                raise DataError(
+                    f"{self.run.folder}: its image of {shot.name} is not finite; train it again"
+                )
+            gaussians = None if painting.gaussians is None else painting.gaussians.to("cpu")
+            self._painted[shot.item] = Painting(**kept, gaussians=gaussians)
         return self._painted[shot.item]
 
     @property
     def notes(self) -> list[str]:
-        """Its marks, and that it is unfinished where it is."""
-        if self.step >= self.total:
+        """Its marks, and that its training is unfinished where it is."""
+        total = self.run.planned(segmentation=self.avatar.segmentation is not None)
+        if total is None or self.step >= total:
             return self.marks
-        return [*self.marks, f"{self.name} is unfinished: {self.step} of {self.total} iterations"]
+        return [*self.marks, f"{self.name} is unfinished: {self.step} of {total} iterations"]
 
     def image(self, shot: Shot) -> Tensor:
         """``[1, 3, h, w]`` I_pred in [0, 1], as shown."""
@@ -101,7 +105,7 @@ class Subject:
         return shot.window.cut(image).clamp(0, 1)
 
     def colour(self, shot: Shot) -> Tensor | None:
-        """``[1, 3, h, w]`` Step I's colour in [0, 1]; None where it is the picture, or not made."""
+        """``[1, 3, h, w]`` Step I's colour in [0, 1]; None where it is the image, or not made."""
         colour = self.paint(shot).colour
         if colour is None or self.avatar.generator is None:
             return None
@@ -113,160 +117,103 @@ class Subject:
         return None if parts is None else shot.window.cut(parts)
 
 
-def _on_cpu(painting: Painting) -> Painting:
-    """The painting's pictures and Gaussians on the CPU."""
-    parts = {name: getattr(painting, name) for name in ("image", "features", "segmentation")}
-    moved = {name: None if part is None else part.cpu() for name, part in parts.items()}
-    gaussians = painting.gaussians
-    return replace(painting, **moved, gaussians=None if gaussians is None else gaussians.to("cpu"))
-
-
-def _finite(painting: Painting, folder: Path, shot: Shot) -> Painting:
-    """The painting, if all that is shown of it is finite."""
-    shown = (painting.image, painting.colour, painting.segmentation)
-    if any(part is not None and not bool(torch.isfinite(part).all()) for part in shown):
-        raise DataError(f"{folder}: what it paints of {shot.name} is not finite; train it again")
-    return painting
-
-
 def open_subjects(
     folders: Sequence[Path],
     names: Sequence[str] | None,
     moved: Moved,
     device: torch.device | str,
 ) -> list[Subject]:
-    """The avatars of run folders, the first one's data leading.
+    """The avatars of run folders.
 
     Args:
         folders: of runs, each once.
-        names: in print, one a folder; None takes the model's.
-        moved: where their dataset and model file lie now.
-        device: that paints.
+        names: in print, one per folder; None takes the model's.
+        moved: where their dataset and model file are now.
+        device: that renders.
 
     Raises:
-        ConfigError: on names that are not one text a run, or a folder given twice.
-        DataError: when a run cannot be read, or was trained on other data than the first.
+        ConfigError: on wrong names, a folder given twice, or runs of different data.
+        DataError: when a run cannot be read.
     """
-    if names is not None and len(names) != len(folders):
-        raise ConfigError(
-            f"names: expected one a run, {len(folders)} in all (run first, then compare); got "
-            f"{len(names)}"
-        )
-    if names is not None and not all(isinstance(name, str | int | float) for name in names):
-        raise ConfigError(f"names must be texts, one a run; got {names}")
-    if names is not None and len({str(name) for name in names}) < len(names):
-        raise ConfigError(
-            f"names must differ, else their pictures cannot be told apart; got {names}"
-        )
+    if names is not None:
+        texts = {str(name) for name in names if name is not None}
+        if not len(texts) == len(names) == len(folders):
+            raise ConfigError(
+                f"names must be {len(folders)} different texts, the run's first, then those of "
+                f"compare; got {names}"
+            )
     resolved = [folder.resolve() for folder in folders]
     if twice := [f for f in folders if resolved.count(f.resolve()) > 1]:
         raise ConfigError(f"{twice[0]} is given twice; every run in run and compare must differ")
     subjects: list[Subject] = []
     for folder in folders:
-        subject = _open(folder, moved, device)
-        if subjects:
-            _check_same_data(subjects[0], subject)
-        subjects.append(subject)
-    titles = names or _distinct(subjects)
-    return [replace(s, name=str(title)) for s, title in zip(subjects, titles, strict=True)]
+        subjects.append(_open(folder, moved, device))
+        check_data(subjects[0].run, subjects[-1].run, "figures")
+    titles = [str(name) for name in names] if names is not None else _distinct(subjects)
+    return [replace(s, name=title) for s, title in zip(subjects, titles, strict=True)]
 
 
 def _open(folder: Path, moved: Moved, device: torch.device | str) -> Subject:
     config = load_config(folder, moved)
     data = build_data(config)
     avatar, marks = load_avatar(folder, config, data)
-    chosen = choices(folder)
-    model = str(chosen.get("model") or folder.resolve().name)
-    name = TITLES.get(model, model)
-    if model == "full" and departures(settings_of(config), model, str(chosen.get("data"))) == []:
+    run = read_run(folder, scored=False)
+    run = replace(run, seed=config.seed, data=run.data | {"fingerprint": fingerprint(data)})
+    name = TITLES.get(run.name, run.name)
+    if run.name == "full" and run.departures() == []:
         name = NAME
     step = int(read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"])
-    total = _iterations(config, avatar)
-    return Subject(name, model, folder, config.seed, data, avatar.to(device), marks, step, total)
-
-
-def _iterations(config: DictConfig, avatar: Avatar) -> int:
-    """What a whole run takes: Steps I and II as stretched, S's phase where S is built."""
-    schedule: Schedule = instantiate(config.training.schedule)
-    stretched = sum(round(n * schedule.stretch) for n in (schedule.step_one, schedule.step_two))
-    return stretched + (0 if avatar.segmentation is None else schedule.segmentation)
+    return Subject(name, run, data, avatar.to(device), marks, step)
 
 
 def _distinct(subjects: Sequence[Subject]) -> list[str]:
-    """Names of which no two are the same: with the seed where it differs, then with the folder."""
+    """Names that all differ: with the seed, the folder's name or its path where need be."""
     names = [s.name for s in subjects]
-    for mores in (
-        [f"seed {s.seed}" for s in subjects],
-        [s.folder.resolve().name for s in subjects],
-        [str(s.folder.resolve()) for s in subjects],
+    for more in (
+        [f"seed {s.run.seed}" for s in subjects],
+        [s.run.folder.resolve().name for s in subjects],
+        [str(s.run.folder) for s in subjects],
     ):
-        pairs = set(zip(names, mores, strict=True))
-        shared = {name for name, _ in pairs if sum(name == other for other, _ in pairs) > 1}
-        names = [
-            f"{name}, {more}" if name in shared else name
-            for name, more in zip(names, mores, strict=True)
+        found = [
+            f"{name}, {text}" if names.count(name) > 1 else name
+            for name, text in zip(names, more, strict=True)
         ]
-    return names
+        if len(set(found)) == len(found):
+            return found
+    return found
 
 
-def _check_same_data(first: Subject, other: Subject) -> None:
-    """Cameras, held-out pictures and picture size must agree, else the runs cannot be compared.
+def rivals(subjects: Sequence[Subject], shot: Shot) -> dict[str, Tensor]:
+    """``[1, 3, h, w]`` images by name: each run's, and Step I's colour of the first.
 
-    Raises:
-        DataError: naming both runs and what differs.
+    Step I's colour stands for splatting alone, unless a run is that very baseline.
     """
-    ours, theirs = first.data, other.data
-    for split, items in ours.splits.items.items():
-        if items != theirs.splits.items[split]:
-            held = set(items).symmetric_difference(theirs.splits.items[split])
-            example = "another order" if not held else "{}/{:06d}".format(*min(held))
-            raise DataError(
-                f"{first.folder} and {other.folder} cannot be compared: their split {split} holds "
-                f"other pictures ({len(items)} and {len(theirs.splits.items[split])}; {example} is "
-                "in one only); compare runs of one dataset and one protocol"
-            )
+    images = {subject.name: subject.image(shot) for subject in subjects}
+    colour = subjects[0].colour(shot)
+    if colour is not None and not any(s.run.name == "splat_only" for s in subjects):
+        images[STEP_ONE] = colour
+    return images
 
 
-def watched_items(subjects: Sequence[Subject]) -> tuple[str, list[Item]]:
-    """The split and the pictures that all of them watched while training.
+def measure(image: Tensor, truth: Tensor, settings: Settings) -> Numbers:
+    """PSNR, edge F1 and edge-pixel ratio of one image ``[1, 3, h, w]`` as it is shown.
 
-    Raises:
-        DataError: when they watched different ones.
+    Returns:
+        ``psnr`` dB, ``edge_f1``, ``edge_ratio`` (edge pixels over the ground truth's); None where
+        not defined: equal images, or a ground truth without edges.
     """
-    split, places = subjects[0].data.watched
-    for other in subjects[1:]:
-        if other.data.watched != (split, places):
-            raise DataError(
-                f"{subjects[0].folder} and {other.folder} cannot be compared: they watched "
-                "different pictures while training; give both the same data.val_pictures"
-            )
-    dataset = subjects[0].data.dataset(split)
-    return split, [dataset.items[i] for i in places]
+    f1, ratio = edge_scores(
+        image,
+        truth,
+        low=settings.canny_low,
+        high=settings.canny_high,
+        tolerance=settings.canny_tolerance,
+    )
+    scores = {"psnr": psnr(image, truth), "edge_f1": f1, "edge_ratio": ratio}
+    return {name: finite(score) for name, score in scores.items()}
 
 
-def check_same_truth(subjects: Sequence[Subject], shots: Sequence[Shot], split: str) -> None:
-    """The pictures shown must be the very same in every run's data.
-
-    Raises:
-        DataError: naming the runs and the picture.
-    """
-    first = subjects[0]
-    for other in subjects[1:]:
-        dataset = other.data.dataset(split)
-        for shot in shots:
-            theirs = dataset[dataset.items.index(shot.item)]
-            if theirs.image.shape != shot.frame.image.shape:
-                sizes = [f"{x.shape[-1]}x{x.shape[-2]}" for x in (shot.frame.image, theirs.image)]
-                differ = f"it has {sizes[0]} and {sizes[1]} pixels (width x height)"
-            elif not torch.equal(theirs.image, shot.frame.image):
-                differ = "its pixels differ"
-            elif not torch.allclose(theirs.camera.K, shot.frame.camera.K):
-                differ = "its camera differs"
-            elif not torch.equal(theirs.skeleton, shot.frame.skeleton):
-                differ = "its skeleton differs"
-            else:
-                continue
-            raise DataError(
-                f"{first.folder} and {other.folder} cannot be compared: their picture {shot.name} "
-                f"is not the same, {differ}"
-            )
+def finite(score: Tensor) -> float | None:
+    """The number in a tensor of one; None where it is not finite."""
+    value = float(score)
+    return value if math.isfinite(value) else None

@@ -1,0 +1,226 @@
+"""Run folders: which there are, and what ``metrics.json``, ``facts.json`` and ``.hydra/`` hold."""
+
+from __future__ import annotations
+
+import glob
+import json
+import math
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gsgan.evaluate.facts import choices
+from gsgan.report.spec import METRICS
+from gsgan.train.paper import departures, settings_of
+from gsgan.utils.errors import ConfigError, DataError
+
+METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"
+CONFIG = Path(".hydra") / "config.yaml"
+FACTS = {  # what is computed with; the rest is only shown
+    "data": dict, "model": str | None, "seed": int | None, "commit": str | None,
+    "iterations": int | None,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run folder.
+
+    Args:
+        folder: where it is.
+        name: of the model, or of the method whose predictions were scored.
+        data: ``name`` of the data group's choice, ``root`` (the folder's name), ``fingerprint``.
+        seed: None for predictions.
+        scores: ``{split: {variant: {metric: value}}}``.
+        settings: the training config by dotted key, without seed and paths; None for predictions.
+        facts: contents of facts.json; empty where nothing was scored yet.
+    """
+
+    folder: Path
+    name: str
+    data: dict[str, Any]
+    seed: int | None
+    scores: dict[str, dict[str, dict[str, Any]]]
+    settings: dict[str, Any] | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        seed = "no seed" if self.seed is None else f"seed {self.seed}"
+        return f"{self.folder} ({self.name}, {seed})"
+
+    def of(self, split: str, variant: str) -> dict[str, Any]:
+        """The scores of one split and variant; empty where there are none."""
+        return self.scores.get(split, {}).get(variant, {})
+
+    def images(self, split: str) -> int:
+        """How many images of a split were scored."""
+        return max((int(v["images"]) for v in self.scores.get(split, {}).values()), default=0)
+
+    def protocol(self, *splits: str) -> dict[str, Any]:
+        """The record of the published protocol in the scores of some or all splits."""
+        held = [v for s in splits or self.scores for v in self.scores.get(s, {}).values()]
+        return next((v["protocol"] for v in held if v.get("protocol")), {"name": "none"})
+
+    @property
+    def data_name(self) -> str:
+        """The dataset, and its folder where known."""
+        return ", ".join(str(self.data[key]) for key in ("name", "root") if self.data.get(key))
+
+    @property
+    def commit(self) -> str:
+        """The code that scored the run."""
+        name = self.facts.get("commit") or "unknown"
+        short = name[:9] if len(name) == 40 else name
+        return f"{short} + changes" if self.facts.get("dirty") else short
+
+    def departures(self) -> list[str] | None:
+        """Settings in which it differs from ``experiment=paper``; None where it has no config."""
+        data = str(self.data.get("name"))
+        return None if self.settings is None else departures(self.settings, self.name, data)
+
+    def planned(self, *, segmentation: bool) -> int:
+        """Iterations of the whole schedule, 0 where there is none.
+
+        Args:
+            segmentation: add the segmentation's own phase, which not every scene has.
+        """
+        schedule = {
+            key.removeprefix("training.schedule."): value
+            for key, value in (self.settings or {}).items()
+        }
+        stretch = schedule.get("stretch", 1)
+        steps = [schedule.get(phase, 0) for phase in ("step_one", "step_two")]
+        own = schedule.get("segmentation", 0) if segmentation else 0
+        return sum(round(step * stretch) for step in steps) + own
+
+
+def find_runs(given: Sequence[str]) -> list[Path]:
+    """The run folders, each once, in the order given.
+
+    Args:
+        given: run folders, folders to search for them, globs of either.
+
+    Raises:
+        ConfigError: when an entry contains no run.
+    """
+    found: dict[Path, None] = {}
+    for entry in given:
+        path = Path(entry).expanduser()
+        places = sorted(glob.glob(str(path), recursive=True)) if glob.has_magic(entry) else [path]
+        runs = [run for place in places for run in _runs_inside(Path(place).resolve())]
+        if not entry.strip() or not runs:
+            raise ConfigError(
+                f"runs: {entry!r} contains no run folder ({METRICS_FILE} or {CONFIG}); give run "
+                "folders, folders of them or globs"
+            )
+        found |= dict.fromkeys(runs)
+    return list(found)
+
+
+def _runs_inside(folder: Path) -> Iterator[Path]:
+    """The folder itself if it is a run, else the runs below it; runs are not nested."""
+    for at, below, files in os.walk(folder):
+        below[:] = sorted(name for name in below if not name.startswith("."))
+        if METRICS_FILE in files or (Path(at) / CONFIG).is_file():
+            below.clear()
+            yield Path(at)
+
+
+def read_runs(folders: Sequence[Path]) -> tuple[list[Run], dict[Path, str]]:
+    """The runs that can be read, and why the others cannot."""
+    runs, left_out = [], {}
+    for folder in folders:
+        try:
+            runs.append(read_run(folder))
+        except DataError as error:
+            text = str(error).removeprefix(f"{folder}: ")
+            left_out[folder] = text.replace(f"{folder}{os.sep}", "")
+    return runs, left_out
+
+
+def read_run(folder: Path, *, scored: bool = True) -> Run:
+    """The run in a folder.
+
+    Args:
+        folder: of the run.
+        scored: read its scores; without, a run that was never scored can be read, too.
+
+    Raises:
+        DataError: when a file is damaged, or the run is unfinished or not scored yet.
+    """
+    for name in (METRICS_FILE, FACTS_FILE) if scored else ():
+        if not (folder / name).is_file():
+            raise DataError(f"{folder}: no {name}; the run is not finished, or was not scored")
+    scores = _read_scores(folder / METRICS_FILE) if scored else {}
+    facts = _read_json(folder / FACTS_FILE) if (folder / FACTS_FILE).is_file() else {}
+    for key, kind in FACTS.items() if facts else ():
+        if not isinstance(facts.get(key), kind):
+            raise DataError(f"{folder / FACTS_FILE}: {key} cannot be {facts.get(key)!r}")
+    settings, chosen = _read_config(folder)
+    name = facts.get("model") or facts.get("method") or chosen.get("model") or folder.name
+    data = facts.get("data", {"name": chosen.get("data")})
+    run = Run(folder, str(name), data, facts.get("seed"), scores, settings, facts)
+    done, planned = facts.get("iterations"), run.planned(segmentation=False)
+    if scored and done is not None and done < planned:
+        raise DataError(f"{folder}: scored after {done} of at least {planned} iterations")
+    return run
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text()))
+    except (OSError, TypeError, ValueError, RecursionError) as error:
+        raise DataError(f"{path}: damaged ({error}); score the run again") from None
+
+
+def _read_scores(path: Path) -> dict[str, dict[str, dict[str, Any]]]:
+    found = _read_json(path)
+    try:
+        for variants in found.values():
+            for scores in variants.values():
+                numbers = [scores[m] for m in METRICS if scores.get(m) is not None]
+                if not all(math.isfinite(number) for number in (scores["images"], *numbers)):
+                    raise ValueError("a score is not finite")
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise DataError(
+            f"{path}: not as gsgan.evaluate writes it ({type(error).__name__}: {error}); score the "
+            "run again"
+        ) from None
+    return found
+
+
+def _read_config(folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:
+    """The settings by dotted key, and the groups' choices; (None, {}) for predictions."""
+    if not (folder / CONFIG).is_file():
+        return None, {}
+    try:
+        text = (folder / CONFIG).read_text()
+        # `_target_` of runs from before gsgan.training was called gsgan.train
+        config = OmegaConf.create(text.replace("gsgan.training.", "gsgan.train."))
+        if not isinstance(config, DictConfig):
+            raise ValueError("not a config")
+        return settings_of(config), choices(folder)
+    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise DataError(f"{folder / '.hydra'}: damaged ({str(error).splitlines()[0]})") from None
+
+
+def by_settings(run: Run, keys: Sequence[str]) -> Run:
+    """The run under a name that has those settings in it, so that each value has its own row.
+
+    Raises:
+        ConfigError: when the run has no such setting.
+    """
+    parts = [run.name]
+    for key in map(str, keys):
+        if run.settings is None or key not in run.settings or key == "seed":
+            raise ConfigError(f"table.by: {run} has no setting {key} (a row is over all seeds)")
+        value = run.settings[key]
+        short = f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else value
+        parts.append(f"{key.rpartition('.')[2].replace('_', ' ')} {short}")
+    return replace(run, name=", ".join(parts))

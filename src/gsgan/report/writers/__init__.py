@@ -1,1 +1,0 @@
-"""A report as text: Markdown, LaTeX, HTML, JSON, and the terminal."""
