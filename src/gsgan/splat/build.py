@@ -24,6 +24,8 @@ from typing import Any
 
 import torch
 
+from gsgan.utils.files import cache_root
+
 SOURCE = Path(__file__).with_name("native.cpp")
 HEADERS = SOURCE.with_name("kernels")
 COMPILERS = ("c++", "g++", "clang++")
@@ -114,11 +116,7 @@ def compiler() -> list[str]:
 
 def _cache_folder() -> Path:
     """Where compiled kernels live; created, for this user only, when missing."""
-    root = os.environ.get("GSGAN_CACHE") or None
-    if root is None:
-        base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-        root = os.path.join(base, "gsgan")
-    folder = Path(root) / "native"
+    folder = cache_root() / "native"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
