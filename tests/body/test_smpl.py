@@ -345,7 +345,7 @@ def test_other_files_are_told_from_models(tmp_path):
     with pytest.raises(DataError, match="holds a list; expected an SMPL model"):
         read_smpl(path)
     path.write_bytes(python2.dumps({"poses": np.zeros((1, 72))}))
-    with pytest.raises(DataError, match="is no SMPL model"):
+    with pytest.raises(DataError, match="is not an SMPL model"):
         read_smpl(path)
     path.write_bytes(b"cos\nsystem\n(S'true'\ntR.")
     with pytest.raises(DataError, match=r"os\.system"):

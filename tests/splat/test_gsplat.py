@@ -259,12 +259,12 @@ def test_it_draws_whatever_the_settings_and_says_what_it_gives_up(
     assert name == "gsplat"
     assert message in reason
     assert "may lack 0.1 of its light" in reason
-    assert reason.endswith("backend=torch keeps to them.")
+    assert reason.endswith("backend=torch has none.")
     assert reason.count(". ") == 0  # one sentence
 
 
 def test_auto_takes_it_with_the_default_accuracy_and_says_so_once(stand_in, caplog, monkeypatch):
-    monkeypatch.setattr(sys.modules["gsgan.splat.rasterise"], "_said", set())
+    monkeypatch.setattr(sys.modules["gsgan.splat.rasterise"], "_logged", set())
     gaussians, cam = scene()
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
@@ -352,14 +352,14 @@ def unsuited_cases():
     wide = gaussians.to(torch.float64), cam.to(torch.float64)
     return {
         "Gaussians are float64": wide,
-        "no Gaussians": (none, cam),
+        "zero Gaussians": (none, cam),
         "no gradient for Camera.K": (gaussians, replace(cam, K=cam.K.clone().requires_grad_())),
     }
 
 
 @pytest.mark.parametrize("message", list(unsuited_cases()))
 def test_what_it_cannot_draw_torch_does_and_says_so_once(stand_in, caplog, monkeypatch, message):
-    monkeypatch.setattr(sys.modules["gsgan.splat.rasterise"], "_said", set())
+    monkeypatch.setattr(sys.modules["gsgan.splat.rasterise"], "_logged", set())
     gaussians, cam = unsuited_cases()[message]
     resolve_backend("gsplat", CPU, STANDARD)  # measures the cap
     calls = len(stand_in.calls)

@@ -73,7 +73,7 @@ class SkinnedModel:
 
     @cached_property
     def bones(self) -> tuple[Tensor, Tensor]:
-        """``[V, n]`` joints and weights of each vertex, n the largest number of any vertex: exact."""
+        """``[V, n]`` joints and weights of each vertex, n the largest number per vertex: exact."""
         n = int((self.weights > 0).sum(dim=1).max())
         weight, index = self.weights.sort(dim=1, descending=True, stable=True)
         return index[:, :n].contiguous(), weight[:, :n].contiguous()

@@ -96,8 +96,8 @@ def _raw(path: Path) -> dict[str, Any]:
     missing = [key for key in KEYS if not isinstance(content.get(key), np.ndarray)]
     if missing:
         raise DataError(
-            f"{path} is not an SMPL model: it has no array {', '.join(missing)}; give the model file "
-            "itself (.pkl or .npz), not fitted parameters"
+            f"{path} is not an SMPL model: it has no array {', '.join(missing)}; give the model "
+            "file itself (.pkl or .npz), not fitted parameters"
         )
     return content
 
