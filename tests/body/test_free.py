@@ -117,7 +117,7 @@ def test_bones_keep_their_lengths_in_any_pose():
             torch.testing.assert_close(length, expected, atol=1e-9, rtol=0)
 
 
-def test_landmarks_lie_on_joints_they_are_named_after():
+def test_landmarks_are_at_the_joints_of_the_same_name():
     body = free_body().to(torch.float64)
     pose = poses(3)
     p, joints = body.posed_landmarks(pose), body.posed_joints(pose)
@@ -138,7 +138,7 @@ def test_pose_of_another_body_is_refused():
         free_body().pose(BodyPose(torch.zeros(1, 24, 3), torch.zeros(1, 3)))
 
 
-def test_damaged_and_missing_assets_say_so(tmp_path):
+def test_damaged_and_missing_assets_are_reported(tmp_path):
     with pytest.raises(DataError, match="is missing"):
         read_body(tmp_path / "none.npz")
     (tmp_path / "cut.npz").write_bytes(free_body_path().read_bytes()[:1000])

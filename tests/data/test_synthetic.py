@@ -1,4 +1,4 @@
-"""The synthetic dataset: whole or absent, same settings same bytes, consistent files."""
+"""The synthetic dataset: complete or absent, reproducible, with consistent files."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def fingerprint(root):
     return digest.hexdigest()
 
 
-def pictures(root, kind):
+def images(root, kind):
     paths = sorted((root / kind).rglob("*.png"))
     return [cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in paths]
 
@@ -118,7 +118,7 @@ def test_layout(dataset):
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(R) == pytest.approx(1)
     for kind in ("images", "masks", "labels"):
-        assert len(pictures(dataset, kind)) == 6
+        assert len(images(dataset, kind)) == 6
     with np.load(dataset / "landmarks3d.npz", allow_pickle=False) as f:
         assert f["p"].shape == (3, 33, 3)
         assert f["conf"].shape == f["n_views"].shape == f["reproj_px"].shape == (3, 33)
@@ -130,9 +130,9 @@ def test_layout(dataset):
         assert f["transl"].shape == (3, 3)
 
 
-def test_mask_labels_and_picture_agree(dataset):
+def test_mask_labels_and_image_agree(dataset):
     for image, mask, labels in zip(
-        *(pictures(dataset, k) for k in ("images", "masks", "labels")), strict=True
+        *(images(dataset, k) for k in ("images", "masks", "labels")), strict=True
     ):
         assert image.shape == (32, 32, 3)
         assert mask.shape == labels.shape == (32, 32)
@@ -144,8 +144,8 @@ def test_mask_labels_and_picture_agree(dataset):
 
 
 def test_every_part_is_seen(dataset):
-    seen = np.unique(np.concatenate([x.ravel() for x in pictures(dataset, "labels")]))
-    assert len(seen) >= 11  # of 13; a hand may hide behind the trunk in one tiny picture
+    seen = np.unique(np.concatenate([x.ravel() for x in images(dataset, "labels")]))
+    assert len(seen) >= 11  # of 13; a hand may hide behind the trunk in one tiny image
 
 
 def test_landmarks_project_into_the_mask(dataset):
@@ -189,7 +189,7 @@ def test_left_and_right_labels_lie_on_left_and_right_landmarks():
     assert hits >= 14  # of 16: one leg may hide the other
 
 
-def test_person_stays_in_view_and_fills_it():
+def test_person_is_in_view_and_fills_it():
     scene = build_scene(Settings(frames=24, test_frames=6))
     top, bottom = [], []
     for frame in range(24):
@@ -203,7 +203,7 @@ def test_person_stays_in_view_and_fills_it():
     assert max(bottom) - min(top) > 0.8 * 128
 
 
-def test_test_cameras_stand_between_training_cameras():
+def test_test_cameras_are_between_training_cameras():
     scene = build_scene(Settings(frames=2, test_frames=1))
     angle = {
         name: math.atan2(view.centre[0], -view.centre[1]) for name, view in scene.views.items()
@@ -217,21 +217,21 @@ def test_test_cameras_stand_between_training_cameras():
 
 
 @pytest.mark.slow
-def test_same_settings_same_bytes_whatever_the_workers(dataset, tmp_path):
+def test_bytes_do_not_depend_on_workers(dataset, tmp_path):
     again = tiny(tmp_path, workers=2)
     assert fingerprint(again) == fingerprint(dataset)
 
 
 def test_another_identity_has_other_clothes_but_the_same_shape(dataset, tmp_path):
     other = tiny(tmp_path, identity=1)
-    for a, b in zip(pictures(dataset, "labels"), pictures(other, "labels"), strict=True):
+    for a, b in zip(images(dataset, "labels"), images(other, "labels"), strict=True):
         assert np.array_equal(a, b)
-    a, b = (np.stack(pictures(r, "images")).astype(float) for r in (dataset, other))
-    shown = np.stack(pictures(dataset, "masks")) > 0
+    a, b = (np.stack(images(r, "images")).astype(float) for r in (dataset, other))
+    shown = np.stack(images(dataset, "masks")) > 0
     assert np.abs(a - b)[shown].mean() > 10
 
 
-def test_another_seed_moves_otherwise():
+def test_another_seed_gives_another_motion():
     assert (motion(20, 0)[0] - motion(20, 1)[0]).abs().max() > 0.1
 
 
@@ -243,7 +243,7 @@ def test_a_ready_dataset_is_used_again(dataset, monkeypatch):
     assert tiny(dataset.parents[2]) == dataset
 
 
-def test_stopping_half_way_leaves_nothing(tmp_path, monkeypatch):
+def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
@@ -268,7 +268,7 @@ def test_leftovers_of_a_killed_process_are_cleared(tmp_path, monkeypatch):
     assert sorted(p.name for p in folder(tmp_path).iterdir()) == [f".{name}.lock", name]
 
 
-def test_unwritable_place_is_one_sentence(tmp_path):
+def test_unwritable_folder_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="GSGAN_CACHE"):
         tiny(tmp_path / "file")
@@ -307,7 +307,7 @@ def test_cache_root_follows_the_environment(monkeypatch, tmp_path):
     assert cache_root() == tmp_path / "mine"
 
 
-def test_key_knows_every_parameter():
+def test_key_depends_on_every_parameter():
     base = dataset_key(Settings())
     changed = [
         Settings(size=64),
@@ -409,7 +409,7 @@ def test_fingers_move_while_signing():
     "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
 )
 def test_every_camera_sees_the_whole_motion(seed):
-    """Cameras are placed by fewer moments than this: what lies between them must fit as well."""
+    """Cameras are placed by fewer moments than this: those between them must fit as well."""
     scene = build_scene(Settings(frames=350, test_frames=60, seed=seed))
     for frame in range(0, 350, 5):
         vertices = scene.vertices(frame)[::23]
@@ -419,7 +419,7 @@ def test_every_camera_sees_the_whole_motion(seed):
             assert pixels.max() < 127
 
 
-def test_the_free_movement_has_poses_that_no_named_one_has():
+def test_freestyle_has_poses_of_no_other_passage():
     theta, _, names = motion(350, 0)
     turned = axis_angle_to_matrix(theta[:, 1:]).flatten(1)  # without the root
     free = torch.tensor([name == "freestyle" for name in names])
@@ -505,7 +505,7 @@ def test_square_covers_exactly_its_pixels():
     assert np.array_equal(labels, expected)
 
 
-def test_shade_has_the_value_of_the_formula():
+def test_shading_matches_the_formula():
     person = flat_person(square(1.0, 0.5))
     light = Light(direction=(0.0, 3.0, 4.0), sun=0.5, sky=0.3, ground=0.1)
     image, _, _ = PosedPerson(person, person.vertices, np.zeros(0), light).render(from_above(), 1)
@@ -514,7 +514,7 @@ def test_shade_has_the_value_of_the_formula():
     np.testing.assert_allclose(image[5, 14], (paint[0] * (0.5 * 0.8 + 0.3)) ** (1 / 2.2), rtol=1e-6)
 
 
-def test_shadow_falls_where_it_must():
+def test_shadow_falls_away_from_the_sun():
     person = flat_person(square(0.0, 1.0), square(0.5, 0.1))
     light = Light(direction=(1.0, 0.0, 1.0), sun=0.5, sky=0.3, ground=0.3)
     view = from_above(size=60, focal=60.0)

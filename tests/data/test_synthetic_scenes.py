@@ -50,7 +50,7 @@ def posed(stage, gloss=0.0, frame=1):
     return PosedPerson(stage.person, stage.vertices(frame), stage.flexion(frame), light)
 
 
-def pictures(root, kind, camera):
+def images(root, kind, camera):
     paths = sorted((root / kind / camera).glob("*.png"))
     return np.stack([cv2.imread(str(p), cv2.IMREAD_UNCHANGED) for p in paths]).astype(float)
 
@@ -95,7 +95,7 @@ def test_distort_is_opencvs_model():
     np.testing.assert_allclose(distort(np.array([[x, y]]), np.array(LENS))[0], expected, atol=1e-15)
 
 
-def test_the_ray_of_a_points_pixel_meets_the_point(stage):
+def test_the_ray_of_a_points_pixel_hits_the_point(stage):
     views = build_scene(Settings(**TINY, lens=LENS)).views
     points = stage.vertices(0)[::700]
     for view in views.values():
@@ -107,7 +107,7 @@ def test_the_ray_of_a_points_pixel_meets_the_point(stage):
         assert off.max() < 1e-8
 
 
-def test_distorted_pictures_undistort_back_onto_the_pinholes():
+def test_distorted_images_undistort_to_those_of_the_pinholes():
     """At a size at which a stripe is some pixels wide; undistorting averages neighbours."""
     lens, settings = (-0.5, 0.15, 0.003, -0.002, -0.01), {**TINY, "size": 160}
     straight = build_scene(Settings(**settings))
@@ -159,7 +159,7 @@ def test_tints_differ_between_cameras_and_average_to_none():
     A, b = np.stack([t.A for t in tints]), np.stack([t.b for t in tints])
     np.testing.assert_allclose(A.mean(axis=0), np.eye(3), atol=1e-12)
     np.testing.assert_allclose(b.mean(axis=0), 0, atol=1e-12)
-    # a camera's grey gets its gains alone, which lie within what was asked for
+    # a camera's grey gets its gains alone, which are within the requested range
     assert np.abs(A.sum(axis=2) - 1).max() <= 0.08 + 1e-12
     gaps = [np.abs(A[i] - A[j]).max() for i in range(6) for j in range(i)]
     assert min(gaps) > 0.01
@@ -182,10 +182,10 @@ def test_each_training_camera_keeps_its_tint_over_all_frames(scene):
     plain, tinted = scene(), scene(tint=0.1)
     expected = make_tints(0.1, 3, TINY.get("seed", 0))
     for camera, tint in zip(("cam00", "cam01", "cam02"), expected, strict=True):
-        masks = pictures(plain, "masks", camera)
-        assert pictures(tinted, "images", camera)[masks == 0].max() == 0
+        masks = images(plain, "masks", camera)
+        assert images(tinted, "images", camera)[masks == 0].max() == 0
         for before, after, mask in zip(
-            pictures(plain, "images", camera), pictures(tinted, "images", camera), masks,
+            images(plain, "images", camera), images(tinted, "images", camera), masks,
             strict=True,
         ):  # fmt: skip
             sure = (mask == 255) & (after.max(axis=-1) < 255) & (after.min(axis=-1) > 0)
@@ -195,9 +195,9 @@ def test_each_training_camera_keeps_its_tint_over_all_frames(scene):
             np.testing.assert_allclose(found[:, 3], tint.b, atol=0.01)
 
 
-def test_held_out_cameras_are_neutral_and_no_file_tells_the_tints(scene):
+def test_held_out_cameras_are_neutral_and_no_file_contains_the_tints(scene):
     plain, tinted = scene(), scene(tint=0.1)
-    assert np.array_equal(*(pictures(r, "images", "cam03") for r in (plain, tinted)))
+    assert np.array_equal(*(images(r, "images", "cam03") for r in (plain, tinted)))
     gain = repr(float(make_tints(0.1, 3, 0)[0].A[0, 0]))[:8]
     for path in tinted.rglob("*.json"):
         assert gain not in path.read_text()
@@ -253,7 +253,7 @@ def test_the_mirrored_sun_is_as_strong_as_requested(stage):
 # ---------------------------------------------------------------- scale
 
 
-def test_twins_of_test_cameras_see_the_person_at_their_scale(scene, stage):
+def test_scaled_test_cameras_see_the_person_at_their_scale(scene, stage):
     root = scene(test_scale=[0.5, 2])
     splits = json.loads((root / "meta.json").read_text())["splits"]
     assert splits["train_cameras"] == ["cam00", "cam01", "cam02"]
@@ -267,12 +267,10 @@ def test_twins_of_test_cameras_see_the_person_at_their_scale(scene, stage):
         assert layout.cameras[twin].K[0, 0] == scale * layout.cameras["cam03"].K[0, 0]
         expected = scale * (views["cam03"].project(p) - middle) + middle
         np.testing.assert_allclose(views[twin].project(p), expected)
-    area = {c: pictures(root, "masks", c).sum() for c in splits["test_cameras"]}
+    area = {c: images(root, "masks", c).sum() for c in splits["test_cameras"]}
     assert area["cam03_x0.5"] == pytest.approx(area["cam03"] / 4, rel=0.05)
-    small = pictures(root, "images", "cam03_x0.5")[0]
-    shrunk = cv2.resize(
-        pictures(root, "images", "cam03")[0], (24, 24), interpolation=cv2.INTER_AREA
-    )
+    small = images(root, "images", "cam03_x0.5")[0]
+    shrunk = cv2.resize(images(root, "images", "cam03")[0], (24, 24), interpolation=cv2.INTER_AREA)
     assert np.abs(small[12:36, 12:36] - shrunk).mean() < 6
     for camera in ("cam00", "cam03"):
-        assert np.array_equal(*(pictures(r, "images", camera) for r in (scene(), root)))
+        assert np.array_equal(*(images(r, "images", camera) for r in (scene(), root)))

@@ -28,7 +28,7 @@ def densify(**options: Any) -> Densify:
     return Densify(dtype=F64, **options)
 
 
-def test_counts_and_frozen_layout() -> None:
+def test_counts_and_layout() -> None:
     d = densify()
     assert d.n_points == 5400
     assert d.part_id.unique_consecutive().tolist() == list(range(24))
@@ -187,7 +187,7 @@ def test_rest_points_are_the_rest_pose_in_body_heights() -> None:
 
 def test_unseen_joints_mark_their_points() -> None:
     valid = torch.ones(4, 33, dtype=torch.bool)
-    valid[3, 1:11] = False  # the nose is enough to know where the head is
+    valid[3, 1:11] = False  # the nose is enough to place the head
     valid[0, 15] = False  # left wrist: forearm and the three bones of the hand that start there
     valid[1, :11] = False
     valid[2, [11, 12]] = False
@@ -236,7 +236,7 @@ def test_batch_items_do_not_mix() -> None:
         torch.testing.assert_close(together.scales[b : b + 1], alone.scales, atol=1e-12, rtol=0)
 
 
-def test_frames_at_hand_are_used() -> None:
+def test_given_frames_are_used() -> None:
     d, p = densify(), noisy(8)
     torch.testing.assert_close(d(p, None, bone_frames(p)).means, d(p).means)
     turned = bone_frames(p @ rotation(1).mT)
@@ -281,7 +281,7 @@ def test_even_samplers_cover_evenly() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 7, 500])
-def test_even_samplers_return_as_many_as_asked(n: int) -> None:
+def test_even_samplers_return_the_requested_number(n: int) -> None:
     for points, normals in (
         sampling.even_cylinder(n),
         sampling.even_sphere(n),
@@ -291,6 +291,7 @@ def test_even_samplers_return_as_many_as_asked(n: int) -> None:
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
 
 
+@pytest.mark.slow
 def test_shipped_templates_can_be_made_again() -> None:
     pytest.importorskip("trimesh")
     script = Path(__file__).parents[2] / "scripts" / "make_skeleton_templates.py"

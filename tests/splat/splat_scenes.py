@@ -26,7 +26,7 @@ def camera(
     batch: int = 1,
     dtype: torch.dtype = torch.float64,
 ) -> Camera:
-    """At the origin, looking along +z, principal point in the middle of the picture."""
+    """At the origin, looking along +z, principal point in the middle of the image."""
     H, W = size
     K = torch.tensor([[focal, 0, W / 2], [0, focal, H / 2], [0, 0, 1]], dtype=dtype)
     R, t = torch.eye(3, dtype=dtype), torch.zeros(3, dtype=dtype)
@@ -137,7 +137,7 @@ def naive(gaussians: Gaussians, cam: Camera, low_pass: float = 0.3) -> tuple[Ten
     order = sorted(
         range(gaussians.means.shape[1]), key=lambda i: float(R[2] @ gaussians.means[0, i] + t[2])
     )
-    picture = torch.zeros(gaussians.features.shape[-1], H, W, dtype=torch.float64)
+    image = torch.zeros(gaussians.features.shape[-1], H, W, dtype=torch.float64)
     left = torch.ones(H, W, dtype=torch.float64)
     y, x = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
     pixels = torch.stack([x, y], -1).double()
@@ -161,6 +161,6 @@ def naive(gaussians: Gaussians, cam: Camera, low_pass: float = 0.3) -> tuple[Ten
         d = pixels - (K @ (p / z))[:2]
         q = torch.einsum("hwi,ij,hwj->hw", d, torch.linalg.inv(cov), d)
         alpha = gaussians.opacities[0, i] * torch.exp(-q / 2)
-        picture += gaussians.features[0, i][:, None, None] * (left * alpha)
+        image += gaussians.features[0, i][:, None, None] * (left * alpha)
         left = left * (1 - alpha)
-    return picture, 1 - left
+    return image, 1 - left

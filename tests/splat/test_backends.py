@@ -35,7 +35,7 @@ every_setting = pytest.mark.parametrize("settings", list(ACCURACY))
 
 
 def draw(gaussians, cam, settings, backend, depth=True):
-    """The picture and the gradients of a random weighting of it."""
+    """The image and the gradients of a random weighting of it."""
     gaussians, cam = leaves(gaussians), leaves(cam)
     raster = rasterise(gaussians, cam, settings=settings, backend=backend, depth=depth)
     loss(raster).backward()
@@ -66,7 +66,7 @@ def assert_like_reference(
 
 @every_backend
 @every_setting
-def test_one_gaussian_is_the_closed_form(backend, settings):
+def test_one_gaussian_matches_the_closed_form(backend, settings):
     scale, opacity, features = 0.1, 0.8, (1.0, 0.5, 0.25)
     cam = camera((9, 11), focal=20.0)
     gaussians = one((0.0, 0.0, 2.0), scale=(scale,) * 3, opacity=opacity, features=features)
@@ -93,12 +93,12 @@ def test_two_layers_blend_front_to_back(backend):
 
 @every_backend
 @pytest.mark.parametrize("shape", ["quats", "covariances"])
-def test_equals_the_naive_loops(backend, shape):
+def test_equals_naive_loops(backend, shape):
     gaussians, cam = cloud(25), turned(camera((17, 23), focal=18.0))
     gaussians = with_covariances(gaussians) if shape == "covariances" else gaussians
-    picture, alpha = naive(gaussians, cam)
+    image, alpha = naive(gaussians, cam)
     raster = rasterise(gaussians, cam, settings=DENSE, backend=backend)
-    torch.testing.assert_close(raster.features[0], picture, rtol=0, atol=1e-10)
+    torch.testing.assert_close(raster.features[0], image, rtol=0, atol=1e-10)
     torch.testing.assert_close(raster.alpha[0, 0], alpha, rtol=0, atol=1e-10)
 
 
@@ -117,7 +117,7 @@ def turned(cam: Camera) -> Camera:
 @every_backend
 @pytest.mark.parametrize("shape", ["quats", "covariances"])
 def test_gradcheck_of_every_input(backend, shape):
-    gaussians, cam = cloud(4, 2, scale=0.15), turned(camera((5, 6), focal=6.0))
+    gaussians, cam = cloud(4, 2, scale=0.15), turned(camera((3, 4), focal=4.0))
     gaussians = with_covariances(gaussians) if shape == "covariances" else gaussians
     names = [k for k, v in vars(gaussians).items() if v is not None]
 
@@ -144,7 +144,7 @@ def test_equals_the_reference_with_the_same_settings(backend, settings, n, chann
 
 
 @fast_backend
-@pytest.mark.parametrize("channels", [1, 5, 16, 64])
+@pytest.mark.parametrize("channels", [1, 3, 5, 16, 32])
 def test_any_number_of_channels(backend, channels):
     assert_like_reference(cloud(30, channels), camera((10, 13)), CUT, backend)
 
@@ -176,19 +176,19 @@ def test_float32_is_near_the_reference_in_float64(backend, settings):
 @every_backend
 @every_setting
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_error_of_a_setting_stays_under_its_bound(backend, settings, seed):
+def test_error_of_a_setting_is_below_its_bound(backend, settings, seed):
     gaussians, cam = cloud(300, seed=seed, opacity=(0.0, 1.0)), camera()
     bound = error_bound(project(gaussians, cam, DENSE), cam.size, ACCURACY[settings])
     got = rasterise(gaussians, cam, settings=settings, backend=backend).features
     want = rasterise(gaussians, cam, settings="exact").features
     off = (got - want).abs()
     assert (off <= bound + 1e-12).all()
-    # The bound says something: it is not far above what is really lost, and 0 where nothing is.
+    # The bound is not far above the actual error, and 0 where there is none.
     assert bound.max() <= 5 * off.max()
 
 
 @every_backend
-def test_finer_settings_are_nearer(backend):
+def test_finer_settings_are_more_accurate(backend):
     gaussians, cam = cloud(300), camera()
     want = rasterise(gaussians, cam, settings="exact").features
     errors = [
@@ -199,7 +199,7 @@ def test_finer_settings_are_nearer(backend):
 
 
 @fast_backend
-def test_sigma_extent_leaves_the_same_pixels_out(backend):
+def test_sigma_extent_skips_the_same_pixels(backend):
     narrow = replace(DENSE, name="narrow", extent="sigma", radius_sigmas=1.5)
     assert_like_reference(cloud(50), camera(), narrow, backend)
 
@@ -233,7 +233,7 @@ def test_equal_depths_are_ordered_by_index(backend):
 
 
 @every_backend
-def test_a_batch_is_its_items(backend):
+def test_a_batch_equals_its_items(backend):
     gaussians = cat([cloud(50, seed=1), cloud(50, seed=2)])
     cam = cat([camera(), turned(camera(focal=40.0))])
     both, both_grads = draw(gaussians, cam, CUT, backend)
@@ -288,14 +288,14 @@ UNSEEN = {
     "at z = 0": (0.3, 0.2, 0.0),
     "on the near plane": (0.0, 0.0, 0.01),
     "far off-axis": (1e6, 0.0, 1.0),
-    "beside the picture": (-9.0, 0.0, 2.0),
+    "beside the image": (-9.0, 0.0, 2.0),
 }
 
 
 @every_backend
 @pytest.mark.parametrize("settings", ["exact", "high"])
 @pytest.mark.parametrize("where", list(UNSEEN))
-def test_unseen_gaussians_leave_no_trace(backend, settings, where):
+def test_unseen_gaussians_have_no_effect(backend, settings, where):
     hidden = one(UNSEEN[where], features=(1.0, 1.0, 1.0), scale=(0.01,) * 3)
     alone, alone_grads = draw(cloud(10), camera(), settings, backend)
     both, both_grads = draw(join(hidden, cloud(10)), camera(), settings, backend)
@@ -328,7 +328,7 @@ HARD = {
     "huge quaternion": one(quat=(1e15, 2e15, 0.0, 0.0), scale=(0.1, 0.2, 0.3)),
     "just past the near plane": one((0.001, 0.0, 0.0101), scale=(0.01,) * 3),
     "off-axis, close": one((3.0, 0.0, 0.2), scale=(1.0,) * 3),
-    "larger than the picture": one(scale=(10.0,) * 3, opacity=0.5),
+    "larger than the image": one(scale=(10.0,) * 3, opacity=0.5),
 }
 HARD = {k: replace(v, features=v.features[..., :1].expand(1, 1, 3)) for k, v in HARD.items()}
 
@@ -360,8 +360,15 @@ def test_alpha_at_the_cap(backend, settings):
 
 
 @fast_backend
-@pytest.mark.parametrize("settings", [DENSE, CUT], ids=["dense", "cut"])
-@pytest.mark.parametrize("opacity", [0.01, 0.5])
+@pytest.mark.parametrize(
+    ("settings", "opacity"),
+    [
+        (DENSE, 0.5),
+        (CUT, 0.01),
+        pytest.param(DENSE, 0.01, marks=pytest.mark.slow),
+        pytest.param(CUT, 0.5, marks=pytest.mark.slow),
+    ],
+)
 def test_5000_layers_on_one_pixel(backend, settings, opacity):
     n = 5000
     g = torch.Generator().manual_seed(0)
@@ -378,9 +385,9 @@ def test_5000_layers_on_one_pixel(backend, settings, opacity):
 
 @every_backend
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_what_an_opaque_layer_hides_still_has_its_gradient(backend, dtype):
+def test_gradient_of_an_opaque_layer_includes_the_layer_behind(backend, dtype):
     # Behind alpha = 1 nothing is seen, but the opaque layer's own gradient is what it hides:
-    # d picture / d alpha_front = c_front - c_back, exactly.
+    # d image / d alpha_front = c_front - c_back, exactly.
     front = one((1 / 30, 1 / 30, 2.0), scale=(0.1,) * 3, opacity=1.0, features=(0.75,))
     back = one((1 / 30, 1 / 30, 3.0), scale=(50.0,) * 3, opacity=1.0, features=(0.25,))
     gaussians = leaves(join(front, back).to(dtype))
@@ -412,7 +419,7 @@ def test_coincident_gaussians(backend):
 @every_backend
 def test_world_offset_of_ten_kilometres(backend):
     # The numbers are rounded to float32 far from the origin first: what is tested is what the
-    # rasteriser adds to that, so both pictures start from the same rounded numbers.
+    # rasteriser adds to that, so both images start from the same rounded numbers.
     offset = torch.tensor([1e4, -1e4, 1e4])
     cam = camera(dtype=torch.float32)
     cam = replace(cam, t=cam.t - offset)
@@ -431,12 +438,12 @@ def test_camera_inside_the_cloud(backend):
 
 
 @every_backend
-def test_gradients_only_where_asked(backend):
+def test_gradients_only_where_requested(backend):
     gaussians = cloud(10)
     gaussians = replace(gaussians, features=gaussians.features.requires_grad_())
     raster = rasterise(gaussians, camera(), settings=CUT, backend=backend)
     raster.features.sum().backward()
-    # The sum of a picture is linear in the features.
+    # The sum of a image is linear in the features.
     total = (gaussians.features.grad * gaussians.features.detach()).sum()
     torch.testing.assert_close(total, raster.features.detach().sum())
     assert not rasterise(cloud(10), camera(), settings=CUT, backend=backend).alpha.requires_grad

@@ -114,7 +114,7 @@ def test_float32_is_rounded_once():
     assert got.extents.dtype == torch.float32
 
 
-def test_what_is_not_kept_may_hold_anything():
+def test_gaussians_not_kept_may_have_any_values():
     gaussians, cam = scene("quats")
     keep = torch.ones(2, 308, dtype=torch.bool)
     keep[:, 40] = False
@@ -132,7 +132,7 @@ def test_what_is_not_kept_may_hold_anything():
             assert grad[:, 41].any()
 
 
-def test_same_bits_whatever_the_threads():
+def test_bits_do_not_depend_on_threads():
     gaussians, cam = cloud(3000, 1, batch=2), turned(camera(batch=2))
     before, results = torch.get_num_threads(), []
     try:
