@@ -315,7 +315,7 @@ def test_shipped_templates_can_be_made_again() -> None:
         ({"limbs": "all"}, "limbs must be one of paper22, all26, got 'all'"),
         ({"face_points": 0}, r"at least one point, got \(200, 0, 500\)"),
         ({"radius_ratio": 0.0}, "must be positive, got 0.0"),
-        ({"sampler": "trimesh", "points_per_limb": 64}, "ships 200 cylinder points.*64"),
+        ({"sampler": "trimesh", "points_per_limb": 64}, "has 200 cylinder points.*64"),
     ],
 )
 def test_unknown_options_are_named(options: dict[str, Any], message: str) -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -106,31 +107,25 @@ def read_body(path: Path) -> Body:
 
 def _body(arrays: dict[str, np.ndarray]) -> Body:
     def tensor(name: str) -> Tensor:
-        value = torch.from_numpy(arrays[name].copy())
-        return value if value.is_floating_point() else value.to(torch.int64)
+        whole = arrays[name].dtype.kind in "iu"
+        return torch.from_numpy(arrays[name].astype(np.int64 if whole else np.float32))
 
     def names(name: str) -> tuple[str, ...]:
         return tuple(str(n) for n in arrays[name])
 
     weight = torch.from_numpy(arrays["bone_weight"].astype(np.float32))
-    faces = torch.from_numpy(arrays["faces"].astype(np.int64))
+    faces, face_labels = tensor("faces"), tensor("face_labels")
+    stored = ("vertices", "bone_index", "joints", "face_surface", "landmarks", "landmark_bone")
+    named = ("joint", "label", "surface", "landmark", "hand")
+    fields: dict[str, Any] = {
+        **{name: tensor(name) for name in (*stored, "hand_landmarks", "hand_bone")},
+        **{f"{name}_names": names(f"{name}_names") for name in named},
+    }
     return Body(
-        vertices=tensor("vertices"),
         faces=faces,
-        bone_index=tensor("bone_index"),
         bone_weight=weight / weight.sum(dim=1, keepdim=True),
-        joints=tensor("joints"),
         parents=tuple(int(p) for p in arrays["parents"]),
-        joint_names=names("joint_names"),
-        face_labels=tensor("face_labels"),
-        vertex_labels=majority_vertex_labels(faces, tensor("face_labels"), len(arrays["vertices"])),
-        label_names=names("label_names"),
-        face_surface=tensor("face_surface"),
-        surface_names=names("surface_names"),
-        landmarks=tensor("landmarks"),
-        landmark_bone=tensor("landmark_bone"),
-        landmark_names=names("landmark_names"),
-        hand_landmarks=tensor("hand_landmarks"),
-        hand_bone=tensor("hand_bone"),
-        hand_names=names("hand_names"),
+        face_labels=face_labels,
+        vertex_labels=majority_vertex_labels(faces, face_labels, len(arrays["vertices"])),
+        **fields,
     )

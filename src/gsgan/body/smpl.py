@@ -27,7 +27,7 @@ from gsgan.body.lbs import (
     skin,
 )
 from gsgan.body.skinned import SkinnedBody
-from gsgan.body.smpl_files import Floats, SmplArrays, read_arrays
+from gsgan.body.smpl_files import Floats, read_arrays
 from gsgan.body.smpl_names import JOINT_NAMES, Parts, part_names, part_of_joint
 
 KINDS = {24: "smpl", 55: "smplx"}
@@ -231,22 +231,10 @@ def read_smpl(path: Path | str) -> SkinnedModel:
     Raises:
         DataError: when the file is missing, damaged, refused, or not such a model.
     """
-    return model_from(read_arrays(Path(path)))
-
-
-def model_from(arrays: SmplArrays) -> SkinnedModel:
-    """The model of checked arrays; the number of joints determines its kind."""
-    return SkinnedModel(
-        kind=KINDS.get(len(arrays.parents), "generic"),
-        v_template=torch.from_numpy(arrays.v_template),
-        shapedirs=torch.from_numpy(arrays.shapedirs),
-        expression_dirs=torch.from_numpy(arrays.expression_dirs),
-        posedirs=torch.from_numpy(arrays.posedirs),
-        J_regressor=torch.from_numpy(arrays.J_regressor),
-        weights=torch.from_numpy(arrays.weights),
-        parents=arrays.parents,
-        faces=torch.from_numpy(arrays.faces),
-    )
+    arrays, parents = read_arrays(Path(path))
+    kind = KINDS.get(len(parents), "generic")
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    return SkinnedModel(kind=kind, parents=parents, **tensors)
 
 
 def from_zju(Rh: ArrayLike, Th: ArrayLike, J0: ArrayLike) -> tuple[Floats, Floats]:
@@ -265,17 +253,6 @@ def from_zju(Rh: ArrayLike, Th: ArrayLike, J0: ArrayLike) -> tuple[Floats, Float
 
     Source: the release's loaders.
     """
-    orient, turned, root = _turned_root(Rh, J0)
-    return orient, np.asarray(Th, np.float64) + turned - root
-
-
-def to_zju(global_orient: ArrayLike, transl: ArrayLike, J0: ArrayLike) -> tuple[Floats, Floats]:
-    """The inverse of :func:`from_zju`: ``Rh`` and ``Th``."""
-    orient, turned, root = _turned_root(global_orient, J0)
-    return orient, np.asarray(transl, np.float64) - turned + root
-
-
-def _turned_root(rotation: ArrayLike, J0: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    orient, root = np.asarray(rotation, np.float64), np.asarray(J0, np.float64)
+    orient, root = np.asarray(Rh, np.float64), np.asarray(J0, np.float64)
     R = axis_angle_to_matrix(torch.from_numpy(orient)).numpy()
-    return orient, (R @ root[..., None])[..., 0], root
+    return orient, np.asarray(Th, np.float64) + (R @ root[..., None])[..., 0] - root

@@ -6,7 +6,6 @@ Source: keys and shapes in public loaders.
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,33 +26,12 @@ WEIGHT_TOLERANCE = 1e-3  # of the sum of a vertex's weights, and of negative wei
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class SmplArrays:
-    """The arrays of a model, float64 and int64.
-
-    Args:
-        v_template: ``[V, 3]`` metres.
-        shapedirs: ``[V, 3, S]`` metres per unit of each shape coefficient.
-        expression_dirs: ``[V, 3, E]``; E is 0 except for SMPL-X.
-        posedirs: ``[V, 3, 9 (J - 1)]`` metres per unit of each entry of the joints' ``R - 1``.
-        J_regressor: ``[J, V]``.
-        weights: ``[V, J]``, rows sum to 1.
-        parents: ``J``, -1 for the root.
-        faces: ``[F, 3]``.
-    """
-
-    v_template: Floats
-    shapedirs: Floats
-    expression_dirs: Floats
-    posedirs: Floats
-    J_regressor: Floats
-    weights: Floats
-    parents: tuple[int, ...]
-    faces: NDArray[np.int64]
-
-
-def read_arrays(path: Path) -> SmplArrays:
+def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
     """The checked arrays of a .pkl or .npz model file, recognised by content.
+
+    Returns:
+        The arrays, float64 and int64, by the names of `gsgan.body.smpl.SkinnedModel`, and the
+        parent of each joint.
 
     Raises:
         DataError: when the file is missing, damaged, holds forbidden classes, lacks an array, or
@@ -74,16 +52,13 @@ def read_arrays(path: Path) -> SmplArrays:
         "weights": expect_array(raw, "weights", (V, J), path),
     }
     checked = {name: _finite(array, name, path) for name, array in floats.items()}
-    return SmplArrays(
-        v_template=checked["v_template"],
-        shapedirs=checked["shapedirs"][..., :S],
-        expression_dirs=checked["shapedirs"][..., S:],
-        posedirs=checked["posedirs"],
-        J_regressor=checked["J_regressor"],
-        weights=_weights(checked["weights"], path),
-        parents=parents,
-        faces=_faces(expect_array(raw, "f", (None, 3), path), V, path),
-    )
+    directions = checked["shapedirs"]
+    return checked | {
+        "shapedirs": directions[..., :S],
+        "expression_dirs": directions[..., S:],
+        "weights": _weights(checked["weights"], path),
+        "faces": _faces(expect_array(raw, "f", (None, 3), path), V, path),
+    }, parents
 
 
 def _raw(path: Path) -> dict[str, Any]:

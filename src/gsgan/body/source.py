@@ -38,12 +38,6 @@ def open_body(
         return free_body()
     if kind is None or file is None:
         return None
-    return _from_file(kind, file, betas, tuple(label_names))
-
-
-def _from_file(
-    kind: str, file: str, betas: Sequence[float], label_names: tuple[str, ...]
-) -> SkinnedBody:
     from gsgan.body.smpl import read_smpl
     from gsgan.body.smpl_names import fitting_parts
 
@@ -58,4 +52,4 @@ def _from_file(
             f"{file} has {model.shapedirs.shape[-1]} shape coefficients, the data gives "
             f"{len(betas)}; give the model file that the data was fitted with"
         )
-    return model.as_body(betas, fitting_parts(label_names, model.joint_names))
+    return model.as_body(betas, fitting_parts(tuple(label_names), model.joint_names))

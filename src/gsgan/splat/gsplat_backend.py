@@ -148,9 +148,9 @@ def draw(
         render_mode="RGB+D" if want_depth else "RGB",
         rasterize_mode="antialiased" if settings.antialias else "classic",
     )
-    picture = colours.squeeze(1).movedim(-1, 1)
-    depth = picture[:, C : C + 1] if want_depth else None
-    return picture[:, :C], alphas.squeeze(1).movedim(-1, 1), depth
+    image = colours.squeeze(1).movedim(-1, 1)
+    depth = image[:, C : C + 1] if want_depth else None
+    return image[:, :C], alphas.squeeze(1).movedim(-1, 1), depth
 
 
 def _rasterization() -> Any:

@@ -49,7 +49,7 @@ class Controls:
 
 
 def neutral(frames: int) -> Controls:
-    """Standing at ease, arms hanging."""
+    """Standing, arms down."""
 
     def still(*values: float, shape: tuple[int, ...]) -> Tensor:
         return torch.tensor(values, dtype=torch.float64).expand(frames, *shape).clone()
@@ -117,7 +117,7 @@ def arm_swings(c: Controls, s: Tensor, style: Style) -> None:
 
 
 def wave(c: Controls, s: Tensor, style: Style) -> None:
-    """One hand waves beside the head, the other rests on the hip."""
+    """One hand waves beside the head, the other is on the hip."""
     _wave_arm(c, style.lead, TAU * 3 * s + style.phase, style.amplitude)
     other = 1 - style.lead
     c.wrist[:, other] = c.wrist.new_tensor([0.05, -0.08, -0.38])
@@ -183,7 +183,7 @@ def twist(c: Controls, s: Tensor, style: Style) -> None:
 
 
 def signing(c: Controls, s: Tensor, style: Style) -> None:
-    """Both hands move before the chest as in sign language, every finger with its own rhythm."""
+    """Both hands move in front of the chest as in sign language, every finger with its own rhythm."""
     _sign_arms(c, s, style)
     c.head[:, 2] += 0.2 * torch.sin(TAU * 1.5 * s)
     c.head[:, 0] += 0.12 * torch.sin(TAU * 2.5 * s + 1)
@@ -211,14 +211,14 @@ def squat_and_wave(c: Controls, s: Tensor, style: Style) -> None:
 
 
 def freestyle(c: Controls, s: Tensor, style: Style) -> None:
-    """Arms, trunk, legs and heading wander, each on its own clock: poses that no other passage has.
+    """Arms, trunk, legs and heading move independently: poses that no other passage has.
 
-    A person who trains on named movements alone is painted worst where two of them meet.
+    A model trained on the other passages alone is worst on poses between them.
     """
     for i, shift in enumerate((0.0, 2.6)):
         a = style.phase + shift
-        rise = 1.25 + 1.1 * style.amplitude * _wander(s, 4.0, a)  # 0 hangs, half a turn is up
-        around = 0.75 + 0.7 * _wander(s, 5.3, a + 1)  # 0 before the body, a quarter sideways
+        rise = 1.25 + 1.1 * style.amplitude * _wander(s, 4.0, a)  # 0: down, half a turn: up
+        around = 0.75 + 0.7 * _wander(s, 5.3, a + 1)  # 0: in front, a quarter: sideways
         reach = 0.42 + 0.09 * _wander(s, 6.1, a + 2)
         c.wrist[:, i, 0] = 0.06 + reach * torch.sin(rise) * torch.sin(around)
         c.wrist[:, i, 1] = -0.04 - reach * torch.sin(rise).clamp_min(0.1) * torch.cos(around)
