@@ -1,4 +1,4 @@
-"""The free body's asset: sound geometry, sides the right way round, rigid bones."""
+"""The free body's asset: valid geometry, left and right, rigid bones."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ BONES = [(11, 13), (13, 15), (23, 25), (25, 27), (12, 14), (14, 16), (24, 26), (
 def test_bones_keep_their_lengths_in_any_pose():
     body = free_body().to(torch.float64)
     pose = poses(4)
-    # twist joints lie inside a bone: at rest here, their bones are one rigid piece
+    # twist joints are inside a bone: at rest here, their bones are one rigid piece
     for i, name in enumerate(body.joint_names):
         if name.startswith(("upperarm02", "lowerarm02", "upperleg02", "lowerleg02")):
             pose.theta[:, i] = 0

@@ -1,4 +1,4 @@
-"""Linear blend skinning against what it must be in closed form."""
+"""Linear blend skinning against closed forms."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ def test_gradients_at_rest_are_finite_and_correct(small):
         vertices, joints = model.pose(*inputs)
         return vertices[:, ::40], joints[:, -1]
 
-    assert torch.autograd.gradcheck(some, (theta, betas, transl), atol=1e-6)
+    assert torch.autograd.gradcheck(some, (theta, betas, transl), atol=1e-6, fast_mode=True)
 
 
 def test_wrong_shapes_name_the_argument(small):
@@ -202,7 +202,7 @@ def test_wrong_shapes_name_the_argument(small):
 
 
 def test_zju_convention(small):
-    """R(Rh) LBS(zero root) + Th, about the origin, is our root turn and translation."""
+    """R(Rh) LBS(zero root) + Th, about the origin, is our root rotation and translation."""
     model, _ = small()
     rng = np.random.default_rng(0)
     Rh, Th = rng.standard_normal((2, 5, 3))

@@ -18,7 +18,7 @@ from gsgan.data.synthetic.trace import SHIRT, SHOE, TROUSERS, Light, PosedPerson
 from gsgan.utils.errors import ConfigError
 
 LENS = (-0.28, 0.09, 0.001, -0.0008, -0.01)
-# Three cameras: tints that average to none need more than two to differ from each other's mirror.
+# Three cameras: the tints of two would be each other's inverse, as their mean is none.
 TINY = {
     "size": 48,
     "train_cameras": 3,
@@ -108,7 +108,7 @@ def test_the_ray_of_a_points_pixel_hits_the_point(stage):
 
 
 def test_distorted_images_undistort_to_those_of_the_pinholes():
-    """At a size at which a stripe is some pixels wide; undistorting averages neighbours."""
+    """At a size at which stripes are several pixels wide: undistorting averages neighbours."""
     lens, settings = (-0.5, 0.15, 0.003, -0.002, -0.01), {**TINY, "size": 160}
     straight = build_scene(Settings(**settings))
     bent = build_scene(Settings(**settings, lens=lens))
@@ -159,7 +159,7 @@ def test_tints_differ_between_cameras_and_average_to_none():
     A, b = np.stack([t.A for t in tints]), np.stack([t.b for t in tints])
     np.testing.assert_allclose(A.mean(axis=0), np.eye(3), atol=1e-12)
     np.testing.assert_allclose(b.mean(axis=0), 0, atol=1e-12)
-    # a camera's grey gets its gains alone, which are within the requested range
+    # grey is changed by the gains alone, which are within the requested range
     assert np.abs(A.sum(axis=2) - 1).max() <= 0.08 + 1e-12
     gaps = [np.abs(A[i] - A[j]).max() for i in range(6) for j in range(i)]
     assert min(gaps) > 0.01

@@ -59,7 +59,7 @@ def test_limb_points_lie_on_their_cylinders(sampler: Any) -> None:
         )
         assert height.min() >= 0
         assert height.max() <= lengths[limb]
-        # spread over the whole surface, and all the way round
+        # spread over the whole surface
         assert height.mean() / lengths[limb] == pytest.approx(0.5, abs=0.05)
         mean_radial = (offset - height[:, None] * axis).mean(0).norm() / lengths[limb]
         assert mean_radial < 0.01
@@ -84,7 +84,7 @@ def test_torso_points_lie_on_the_box(sampler: Any) -> None:
     edges = torch.tensor([0.35, 0.47, 0.175], dtype=F64)  # shoulder width, spine, half the width
     local = ((points - centre) / edges * 2).abs()
     torch.testing.assert_close(local.max(-1).values, torch.ones(500, dtype=F64), atol=2e-5, rtol=0)
-    # as many points a face as it has area
+    # points per face in proportion to its area
     share = torch.bincount(local.argmax(-1), minlength=3) / 500
     areas = edges.prod() / edges
     torch.testing.assert_close(
@@ -241,14 +241,14 @@ def test_given_frames_are_used() -> None:
     torch.testing.assert_close(d(p, None, bone_frames(p)).means, d(p).means)
     turned = bone_frames(p @ rotation(1).mT)
     assert (d(p, None, turned).means - d(p).means).abs().max() > 0.01
-    # the head's frame of the 26 limb skeleton is not the 22 limb one's: made afresh
+    # the head's frame of the 26 limb skeleton is not the 22 limb one's: computed again
     d26 = densify(limbs="all26")
     torch.testing.assert_close(d26(p, None, bone_frames(p)).means, d26(p).means)
     torch.testing.assert_close(d26(p).rotations[:, 26], bone_frames(p).hubs[:, HEAD])
 
 
 def test_float32_far_away_needs_recentring() -> None:
-    """At 1e4 m float32 has a grain of 1 mm; recentred in float64 first, it is right to 1e-6."""
+    """At 1e4 m float32 has a resolution of 1 mm; recentred in float64 first, the error is 1e-6."""
     d, p = Densify(dtype=torch.float32), noisy(2)
     far, shift = p + 1e4, torch.full((1, 3), 1e4, dtype=F64)
     cam = camera((64, 64))
@@ -262,13 +262,13 @@ def test_float32_far_away_needs_recentring() -> None:
     seen, _ = near_cam.to(torch.float32).project(means)
     expected, _ = cam.project(exact.means)
     torch.testing.assert_close(seen.double(), expected, atol=1e-3, rtol=0)
-    # without it the grain shows, but no more than the grain
+    # without it the error is that resolution, but not more
     direct = d(far.float()).means.double() - 1e4
     assert 1e-4 < (direct - exact.means).abs().max() < 2e-2
 
 
 def test_even_samplers_cover_evenly() -> None:
-    """The emptiest spot is less empty than that of random points."""
+    """The largest gap is smaller than that of random points."""
     random = np.random.default_rng(0).normal(size=(500, 3))
     random /= np.linalg.norm(random, axis=1, keepdims=True)
     probe = np.random.default_rng(1).normal(size=(2000, 3))

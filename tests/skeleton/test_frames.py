@@ -174,7 +174,7 @@ def test_zero_length_bone_keeps_its_parents_frame() -> None:
 
 
 def test_a_bone_through_zero_length_does_not_jump() -> None:
-    """The elbow's bone shrinks, turns its direction round and grows: frames step by step."""
+    """The elbow's bone shrinks, reverses its direction and grows: frames step by step."""
     s = torch.linspace(-0.01, 0.01, 2001, dtype=torch.float64)
     p = rest(len(s))
     p[:, 15] = p[:, 13] + s[:, None] * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
@@ -226,7 +226,7 @@ def test_an_arm_near_the_fold_moves_without_a_jump() -> None:
 
 
 def test_hinge_twist_follows_the_bend_plane() -> None:
-    """Elbow bent square: the upper arm's hinge axis lies along the bend normal."""
+    """Elbow bent square: the upper arm's hinge axis is along the bend normal."""
     p = rest()
     p[0, 13] = p[0, 11] + 0.28 * torch.tensor([0.6, -0.6, 0.5], dtype=torch.float64)
     upper = torch.nn.functional.normalize(p[0, 13] - p[0, 11], dim=0)
@@ -249,7 +249,7 @@ def test_hinge_does_not_turn_a_straight_limb() -> None:
 
 
 def test_float32_far_from_the_origin_matches_its_own_quantised_input() -> None:
-    """Nothing is lost beyond the grain of the input: differences are taken first."""
+    """No loss beyond the resolution of the input: differences are taken first."""
     p = (noisy(3) + 1e4).float()
     a, b = bone_frames(p), bone_frames(p.double())
     torch.testing.assert_close(a.limbs.double(), b.limbs, atol=2e-5, rtol=0)

@@ -1,4 +1,4 @@
-"""6D rotations: round trip, columns that say nothing, gradients there."""
+"""6D rotations: round trip, degenerate columns, gradients."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ def test_size_is_estimated_from_the_seen_limbs() -> None:
 
 
 def test_filled_in_joints_follow_the_bent_limb() -> None:
-    """A lost hand goes where the forearm points, not where the rest pose has it."""
+    """A missing hand is placed along the forearm, not as in the rest pose."""
     p = rest()
     R = rotation(5)
     arm = [13, 15, 17, 19, 21]
@@ -74,7 +74,7 @@ def test_filled_in_joints_follow_the_bent_limb() -> None:
 
 
 def test_the_face_is_aligned_with_its_seen_joints() -> None:
-    """A turned head with one ear lost: eyes and nose tell its frame, and where the ear is."""
+    """A turned head without one ear: eyes and nose determine its frame and place the ear."""
     R = rotation(6)
     p = rest()
     p[:, :11] = p[:, :11] @ R.mT

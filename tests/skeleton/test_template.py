@@ -1,4 +1,4 @@
-"""The constants: counts and structure as MediaPipe and the method notes state them."""
+"""The constants: counts and structure of MediaPipe and the method notes."""
 
 from __future__ import annotations
 

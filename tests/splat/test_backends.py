@@ -25,7 +25,7 @@ from gsgan.scene import Camera, Gaussians, cat
 from gsgan.splat import ACCURACY, Accuracy, project, rasterise
 from gsgan.splat.reference import error_bound
 
-# No cut-off, but alphas capped: what a backend does in float64 without a shortcut.
+# No cut-off, but alphas capped: a backend in float64 without approximations.
 DENSE = replace(ACCURACY["exact"], name="dense")
 CUT = replace(ACCURACY["standard"], name="cut", dtype="float64")
 
@@ -124,7 +124,7 @@ def test_gradcheck_of_every_input(backend, shape):
     def function(*tensors):
         g = replace(gaussians, **dict(zip(names, tensors, strict=False)))
         K, R, t = tensors[len(names) :]
-        # A bottom row of K other than (0, 0, 1) is no pinhole: leave it as it is.
+        # A bottom row of K other than (0, 0, 1) is not a pinhole: keep it.
         K = torch.cat(
             [torch.cat([K[:, :1], K[:, 1:2] * K.new_tensor([0, 1, 1])], 1), cam.K[:, 2:]], 1
         )
@@ -133,7 +133,9 @@ def test_gradcheck_of_every_input(backend, shape):
 
     inputs = [getattr(gaussians, n) for n in names] + [cam.K, cam.R, cam.t]
     inputs = [x.clone().requires_grad_() for x in inputs]
-    assert torch.autograd.gradcheck(function, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
+    assert torch.autograd.gradcheck(
+        function, inputs, eps=1e-6, atol=1e-6, rtol=1e-5, fast_mode=True
+    )
 
 
 @fast_backend
@@ -163,7 +165,7 @@ def test_float32_is_near_the_reference_in_float64(backend, settings):
     got, got_grads = draw(gaussians.to(torch.float32), cam.to(torch.float32), setting, backend)
     want, want_grads = draw(gaussians, cam, replace(setting, dtype="float64"), "reference")
     assert got.features.dtype == torch.float32
-    # An alpha that rounding takes across alpha_min changes the pixel by at most alpha_min.
+    # An alpha that rounding moves across alpha_min changes the pixel by at most alpha_min.
     assert error(got.features, want.features) < 5e-6 + setting.alpha_min
     for name, grad in want_grads.items():
         off = (got_grads[name].double() - grad).norm() / grad.norm()
@@ -386,7 +388,7 @@ def test_5000_layers_on_one_pixel(backend, settings, opacity):
 @every_backend
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_gradient_of_an_opaque_layer_includes_the_layer_behind(backend, dtype):
-    # Behind alpha = 1 nothing is seen, but the opaque layer's own gradient is what it hides:
+    # Layers behind alpha = 1 are invisible, but are in the gradient of the opaque layer:
     # d image / d alpha_front = c_front - c_back, exactly.
     front = one((1 / 30, 1 / 30, 2.0), scale=(0.1,) * 3, opacity=1.0, features=(0.75,))
     back = one((1 / 30, 1 / 30, 3.0), scale=(50.0,) * 3, opacity=1.0, features=(0.25,))
@@ -418,8 +420,8 @@ def test_coincident_gaussians(backend):
 
 @every_backend
 def test_world_offset_of_ten_kilometres(backend):
-    # The numbers are rounded to float32 far from the origin first: what is tested is what the
-    # rasteriser adds to that, so both images start from the same rounded numbers.
+    # The numbers are rounded to float32 far from the origin first: the test is of the
+    # rasteriser's additional error, so both images start from the same rounded numbers.
     offset = torch.tensor([1e4, -1e4, 1e4])
     cam = camera(dtype=torch.float32)
     cam = replace(cam, t=cam.t - offset)
@@ -443,7 +445,7 @@ def test_gradients_only_where_requested(backend):
     gaussians = replace(gaussians, features=gaussians.features.requires_grad_())
     raster = rasterise(gaussians, camera(), settings=CUT, backend=backend)
     raster.features.sum().backward()
-    # The sum of a image is linear in the features.
+    # The sum of an image is linear in the features.
     total = (gaussians.features.grad * gaussians.features.detach()).sum()
     torch.testing.assert_close(total, raster.features.detach().sum())
     assert not rasterise(cloud(10), camera(), settings=CUT, backend=backend).alpha.requires_grad

@@ -1,4 +1,4 @@
-"""Memory that is used again: zeros every time, and never while somebody still holds it."""
+"""Reused memory: always zeros, and never memory that is still in use."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def test_memory_may_be_freed_in_other_threads():
 
 @pytest.mark.parametrize("backend", ["auto", "reference"])
 def test_a_caller_may_change_an_image_in_place(backend):
-    """The background is the caller's to add, also with +=."""
+    """The caller adds the background, also with +=."""
     gaussians = cloud()
     gaussians.means.requires_grad_()
     raster = rasterise(gaussians, camera(), backend=backend)

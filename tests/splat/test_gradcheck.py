@@ -1,4 +1,4 @@
-"""Finite differences in float64 where test_backends.py does not look: colour, projection alone."""
+"""Finite differences in float64, beyond test_backends.py: colour, projection alone."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ every_shape = pytest.mark.parametrize("shape", ["quats", "covariances"])
 
 
 def turned(cam: Camera) -> Camera:
-    """Skew, an off-centre principal point, non-square pixels, a turn and a shift."""
+    """Skew, an off-centre principal point, non-square pixels, a rotation and a shift."""
     axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=torch.float64)
     K = cam.K.clone()
     K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = 0.7, K[:, 0, 2] + 0.5, K[:, 1, 1] * 0.8
@@ -37,11 +37,13 @@ def scene(shape: str, n: int = 3, batch: int = 1):
 
 def checked(function, *tensors) -> bool:
     inputs = [x.detach().clone().requires_grad_() for x in tensors]
-    return torch.autograd.gradcheck(function, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
+    return torch.autograd.gradcheck(
+        function, inputs, eps=1e-6, atol=1e-6, rtol=1e-5, fast_mode=True
+    )
 
 
 def pinhole(K, like):
-    """Only the entries that a pinhole has: with others the rasteriser refuses K."""
+    """Only the entries that a pinhole has: the rasteriser refuses others."""
     entries = K.new_tensor([[1, 1, 1], [0, 1, 1], [0, 0, 0]])
     return K * entries + like.K * (1 - entries)
 

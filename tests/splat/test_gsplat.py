@@ -27,7 +27,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
 class StandIn:
-    """In place of the package: ``rasterization`` and what it was called with last."""
+    """A mock of the package: ``rasterization``, and the arguments of its calls."""
 
     def __init__(self, cap: float = 0.999) -> None:
         self.cap, self.calls = cap, []
@@ -95,7 +95,7 @@ class StandIn:
 
 
 def install(monkeypatch, module, device="cpu"):
-    """Makes ``import gsplat`` give the module, on the device that gsplat is taken to run on."""
+    """Makes ``import gsplat`` give the module, and the tests' device count as its own."""
     monkeypatch.setitem(sys.modules, "gsplat", module)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(gsplat_backend, "DEVICE", device)
@@ -111,7 +111,7 @@ def mock(monkeypatch):
 
 
 def turned(cam: Camera) -> Camera:
-    """A turn, a shift, an off-centre principal point, non-square pixels and skew."""
+    """A rotation, a shift, an off-centre principal point, non-square pixels and skew."""
     axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=torch.float64)
     K = cam.K.clone()
     K[:, 0, 2], K[:, 1, 1] = K[:, 0, 2] + 2.5, K[:, 1, 1] * 0.8
@@ -131,7 +131,7 @@ def scene(shape: str = "quats", channels: int = 3, batch: int = 2) -> tuple[Gaus
 
 
 def drawn(gaussians, cam, backend, settings=STANDARD, depth=True):
-    """The raster and its gradients; K needs none, as gsplat has none."""
+    """The raster and its gradients; none of K, as in gsplat."""
     gaussians, cam = leaves(gaussians), leaves(cam)
     cam.K.requires_grad_(False)
     raster = rasterise(gaussians, cam, settings=settings, backend=backend, depth=depth)

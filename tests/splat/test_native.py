@@ -1,4 +1,4 @@
-"""The compiled kernel against a dense float64 composite, and the ways it may be missing."""
+"""The compiled kernel against a dense float64 composite, and the reasons why it may be missing."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def _one_thread() -> Iterator[None]:
 def dense(
     p: Projected, size: tuple[int, int], cut: Accuracy, want_depth: bool
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Every Gaussian at every pixel, one after the other."""
+    """Every Gaussian at every pixel, one at a time."""
     H, W = size
     rows, columns = (torch.arange(n, dtype=p.means.dtype) + 0.5 for n in size)
     y, x = torch.meshgrid(rows, columns, indexing="ij")
@@ -133,7 +133,7 @@ def with_leaves(p: Projected) -> tuple[list[Tensor], Projected]:
 def values_and_gradients(
     composite: Composite, p: Projected, size: tuple[int, int], cut: Accuracy
 ) -> tuple[list[Tensor], list[Tensor]]:
-    """Images, and the gradients of one random weighted sum of all of them."""
+    """Images, and the gradients of a random weighted sum of all of them."""
     leaves, q = with_leaves(p)
     images = [x for x in composite(q, size, cut, True) if x is not None]
     g = torch.Generator().manual_seed(1)
@@ -146,7 +146,7 @@ def values_and_gradients(
 
 
 def in_dtype(p: Projected, dtype: torch.dtype) -> Projected:
-    """What is not geometry in that dtype, as ``project`` leaves it."""
+    """All but the geometry in that dtype, as from ``project``."""
     names = ("opacities", "features", "extents")
     return replace(p, **{name: getattr(p, name).to(dtype) for name in names})
 
@@ -177,7 +177,7 @@ def test_every_setting_and_batches(cut: Accuracy) -> None:
 @pytest.mark.parametrize("cut", [EXACT, HIGH])
 def test_float32(cut: Accuracy) -> None:
     p = scene(N=60, cut=cut, dtype=torch.float32)
-    # Nothing lies within float32 rounding of a cut-off that would matter: 1e-6 is below it.
+    # No value is within float32 rounding of a cut-off: 1e-6 is below it.
     assert_same(p, (21, 35), cut, 4e-6, 1e-5)
 
 
@@ -197,7 +197,7 @@ def test_box_extent_is_a_per_pixel_cut_off() -> None:
 @needs_kernel
 def test_gradcheck() -> None:
     p = scene(N=7, C=2, size=(9, 18), sigmas=(1.0, 4.0))
-    # Equal depths would change places under the finite differences.
+    # Equal depths would be reordered by the finite differences.
     apart = torch.tensor([[4.0, 2.0, 7.0, 1.0, 5.0, 3.0, 6.0]], dtype=torch.float64)
     p = replace(p, depths=apart)
     leaves, _ = with_leaves(p)
@@ -223,7 +223,7 @@ def test_accuracy_of_the_exponential(dtype: torch.dtype, ulps: int) -> None:
     want = torch.exp(-0.5 * q)
     relative = (alpha.double() - want).abs() / want
     assert want.min() < 1e-19
-    # Alpha is 1 - (1 - alpha): weights are what the exponential itself shows.
+    # Alpha is 1 - (1 - alpha): the weights are the exponential itself.
     features = native.composite(p, (1, 2400), EXACT, False)[0][0, 0, 0]
     relative = (features.double() - want).abs() / want
     # u = p dx is rounded twice and squared, q once: three units of the exponent's size, up to 44.
@@ -256,7 +256,7 @@ def test_depth_order_of_any_sign(dtype: torch.dtype) -> None:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("opacity", [0.001, 0.5])
 def test_five_thousand_layers(dtype: torch.dtype, opacity: float) -> None:
-    # Alike layers: C = 1 - (1 - o)^n, dC/do of layer i = T_i (1 - what shines behind it).
+    # Equal layers: C = 1 - (1 - o)^n, dC/do of layer i = T_i (1 - colour behind it).
     n = 5000
     p = one((0.5, 0.5), opacity, 3.0, n=n, dtype=dtype)
     leaves, q = with_leaves(p)
@@ -403,7 +403,7 @@ Load = Callable[..., tuple[bool, str]]
 
 @pytest.fixture
 def load_afresh(monkeypatch: pytest.MonkeyPatch) -> Load:
-    """report() without the new process."""
+    """available() and why_not() as in a fresh process."""
 
     def load(cache: Path, **environment: str) -> tuple[bool, str]:
         monkeypatch.setenv("GSGAN_CACHE", str(cache))
@@ -419,8 +419,8 @@ def is_one_sentence(text: str) -> bool:
     return text[:1].isupper() and text.endswith(".") and "\n" not in text
 
 
-def test_compiler_that_does_not_run(tmp_path: Path) -> None:
-    yes, reason = report(tmp_path, CXX="/bin/false", PATH="")
+def test_compiler_that_does_not_run(tmp_path: Path, load_afresh: Load) -> None:
+    yes, reason = load_afresh(tmp_path, CXX="/bin/false", PATH="")
     assert not yes
     assert "/bin/false" in reason
     assert is_one_sentence(reason)
@@ -514,7 +514,7 @@ def test_damaged_cache_is_rebuilt(
     folder = tmp_path / "native"
     folder.mkdir()
     whole = next(quick_compiler.parent.glob("*.so")).read_bytes()
-    # What a build would leave, had it been cut short or the disk been full.
+    # The file of an interrupted build, or of a full disk.
     key = build.cache_key([str(quick_compiler)])
     built = folder / f"{key}-{hashlib.sha256(whole).hexdigest()[:24]}.so"
     built.write_bytes(whole[: int(kept * len(whole))])

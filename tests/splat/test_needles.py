@@ -17,7 +17,7 @@ from gsgan.scene import Camera, Gaussians
 from gsgan.splat import ACCURACY, project, rasterise
 
 SIZE, FOCAL, DEPTH = 96, 400.0, 2.0
-# An alpha that rounding takes across alpha_min would hide what is measured here.
+# An alpha that rounding moves across alpha_min would dominate the error.
 HIGH = replace(ACCURACY["high"], alpha_min=1e-10)
 # The reference in float32 takes means in image coordinates: that rounds them to 1e-5 pixels.
 VALUE = {"reference": 1e-5, "torch": 1e-5, "native": 1e-6}

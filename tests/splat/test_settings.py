@@ -25,7 +25,7 @@ def test_every_preset_is_a_config_and_every_config_a_preset():
 def test_config_equals_preset(name):
     config = yaml.safe_load((CONF / f"{name}.yaml").read_text())
     assert config.pop("_target_") == "gsgan.splat.settings.Accuracy"
-    # how pixels are formed is no cut-off: conf/effects and conf/model have it
+    # the pixel's filter is not a cut-off: it is in conf/effects and conf/model
     formed = {"antialias", "low_pass", "supersample"}
     assert set(config) == {field.name for field in fields(Accuracy)} - formed
     assert Accuracy(**config) == accuracy(name)

@@ -1,4 +1,4 @@
-"""Drawing larger and averaging: what a pixel of a camera does."""
+"""Supersampling: drawing larger, then averaging."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_it_is_the_mean_of_the_larger_image(backend, name):
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_more_samples_approach_the_integral_over_a_pixel(backend):
-    """Needles a fifth of a pixel wide, where one sample a pixel is a matter of luck."""
+    """Needles a fifth of a pixel wide, where one sample per pixel is random."""
     scene = cloud(30, scale=0.012, seed=3)
     truth = rasterise(
         scene, camera((8, 10), focal=12.0), settings=replace(EXACT, low_pass=1e-4, supersample=24)

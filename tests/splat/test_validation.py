@@ -1,4 +1,4 @@
-"""What rasterise refuses, in which words, and what it drops."""
+"""The argument checks of rasterise: errors, messages, dropped Gaussians."""
 
 from __future__ import annotations
 

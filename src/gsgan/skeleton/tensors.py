@@ -101,6 +101,7 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
     def swing(rest: Tensor) -> Swing:
         return Swing(*(cast(part) for part in Swing.of(rest)))
 
+    eye = torch.eye(3, dtype=torch.float64)
     rest = number(t.rest_positions)
     directions = number(t.rest_directions)
     sorted_limbs = [limb for level in t.levels for limb in level]
@@ -124,7 +125,10 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
                 if has_hinge
                 else None,
                 across=cast(torch.stack([h, torch.linalg.cross(a, h)])),
-                about=(cast(_cross_matrix(a)), cast(a.unsqueeze(-1) * a.unsqueeze(-2))),
+                about=(
+                    cast(torch.linalg.cross(a.unsqueeze(1), eye.unsqueeze(0)).mT),
+                    cast(a.unsqueeze(-1) * a.unsqueeze(-2)),
+                ),
             )
         )
 
@@ -148,14 +152,8 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
         face_turned=index(turned),
         face_swing=swing(from_ears / from_ears.norm(dim=-1, keepdim=True)),
         omega_order=index([place[joint] for joint in range(len(t.names))]),
-        axes=cast(torch.eye(3, dtype=torch.float64)),
+        axes=cast(eye),
     )
-
-
-def _cross_matrix(v: Tensor) -> Tensor:
-    x, y, z = v.unbind(-1)
-    o = torch.zeros_like(x)
-    return torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=-1).unflatten(-1, (3, 3))
 
 
 def _two_axes(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
