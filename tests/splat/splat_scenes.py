@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians, Raster
-from gsgan.splat import native
+from gsgan.splat import ACCURACY, Accuracy, native, rasterise
 
 torch.set_num_threads(1)
 
@@ -164,3 +164,48 @@ def naive(gaussians: Gaussians, cam: Camera, low_pass: float = 0.3) -> tuple[Ten
         image += gaussians.features[0, i][:, None, None] * (left * alpha)
         left = left * (1 - alpha)
     return image, 1 - left
+
+
+# No cut-off, but alphas capped: a backend in float64 without approximations.
+DENSE = replace(ACCURACY["exact"], name="dense")
+CUT = replace(ACCURACY["standard"], name="cut", dtype="float64")
+
+every_backend = pytest.mark.parametrize("backend", BACKENDS)
+fast_backend = pytest.mark.parametrize("backend", [b for b in BACKENDS if b != "reference"])
+every_setting = pytest.mark.parametrize("settings", list(ACCURACY))
+
+
+def draw(gaussians, cam, settings, backend, depth=True):
+    """The image and the gradients of a random weighting of it."""
+    gaussians, cam = leaves(gaussians), leaves(cam)
+    raster = rasterise(gaussians, cam, settings=settings, backend=backend, depth=depth)
+    loss(raster).backward()
+    return raster, gradients(gaussians, cam)
+
+
+def assert_like_reference(
+    gaussians: Gaussians,
+    cam: Camera,
+    settings: Accuracy | str,
+    backend: str,
+    *,
+    value: float = 1e-10,
+    gradient: float = 1e-8,
+) -> None:
+    """Values and gradients equal those of the reference with the same settings."""
+    got, got_grads = draw(gaussians, cam, settings, backend)
+    want, want_grads = draw(gaussians, cam, settings, "reference")
+    for name in ("features", "alpha", "depth"):
+        assert error(getattr(got, name), getattr(want, name)) < value, name
+    for name, grad in want_grads.items():
+        assert torch.isfinite(got_grads[name]).all(), name
+        assert error(got_grads[name], grad) < gradient, name
+
+
+def turned(cam: Camera) -> Camera:
+    """Rotated, shifted, with skew, an off-centre principal point and non-square pixels."""
+    axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=cam.K.dtype)
+    K = cam.K.clone()
+    K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = 3.0, K[:, 0, 2] + 2.5, K[:, 1, 1] * 0.8
+    R = torch.matrix_exp(axis).expand_as(cam.R).clone()
+    return replace(cam, K=K, R=R, t=cam.t + torch.tensor([0.1, -0.05, 0.3], dtype=cam.t.dtype))

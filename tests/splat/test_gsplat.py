@@ -95,7 +95,7 @@ class StandIn:
 
 
 def install(monkeypatch, module, device="cpu"):
-    """Makes ``import gsplat`` give the module, and the tests' device count as its own."""
+    """Makes ``import gsplat`` give the module, supported on ``device``."""
     monkeypatch.setitem(sys.modules, "gsplat", module)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(gsplat_backend, "DEVICE", device)
