@@ -183,7 +183,7 @@ def twist(c: Controls, s: Tensor, style: Style) -> None:
 
 
 def signing(c: Controls, s: Tensor, style: Style) -> None:
-    """Both hands move in front of the chest as in sign language, every finger with its own rhythm."""
+    """Sign language in front of the chest, every finger with its own rhythm."""
     _sign_arms(c, s, style)
     c.head[:, 2] += 0.2 * torch.sin(TAU * 1.5 * s)
     c.head[:, 0] += 0.12 * torch.sin(TAU * 2.5 * s + 1)
