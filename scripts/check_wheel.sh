@@ -10,7 +10,7 @@ python3 -m venv "$work/venv"
 "$work/venv/bin/pip" install --quiet --disable-pip-version-check \
   -c "$repo/constraints.txt" "$(ls -t "$repo"/dist/gsgan-*.whl | head -1)"
 cd "$work"
-export GSGAN_CACHE="$work/cache" # nothing made by the checkout may help
+export GSGAN_CACHE="$work/cache" # no caches of the checkout
 inside=$(venv/bin/python -m zipfile -l "$(ls -t "$repo"/dist/gsgan-*.whl | head -1)")
 for file in gsgan/conf/train.yaml gsgan/body/assets/free_body.npz gsgan/body/assets/ATTRIBUTION.md \
   gsgan/splat/native.cpp gsgan/splat/kernels/tile.h gsgan/skeleton/templates.npz; do

@@ -1,8 +1,9 @@
-"""Draws the random surface samples shipped in src/gsgan/skeleton/templates.npz.
+"""Samples the random surface points of src/gsgan/skeleton/templates.npz.
 
     python scripts/make_skeleton_templates.py [output.npz]
 
-Deterministic for one trimesh version; the file is shipped so that results depend on none.
+Deterministic for one trimesh version; the file is part of the package, so that results do not
+depend on the version.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def _named(name: str, points: np.ndarray, normals: np.ndarray) -> dict[str, np.n
 
 def _cylinder(n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     mesh = trimesh.creation.cylinder(radius=1.0, height=1.0, sections=64)
-    # a limb's caps lie inside its neighbours: sample the lateral faces only
+    # a limb's caps are inside its neighbours: sample the lateral faces only
     lateral = np.abs(mesh.face_normals[:, 2]) < 0.5
     points, _ = sample_surface(mesh, n, face_weight=mesh.area_faces * lateral, seed=seed)
     normals = points * [1.0, 1.0, 0.0]

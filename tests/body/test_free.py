@@ -1,4 +1,4 @@
-"""The free body's asset: sound geometry, sides the right way round, rigid bones."""
+"""The free body's asset: valid geometry, left and right, rigid bones."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ BONES = [(11, 13), (13, 15), (23, 25), (25, 27), (12, 14), (14, 16), (24, 26), (
 def test_bones_keep_their_lengths_in_any_pose():
     body = free_body().to(torch.float64)
     pose = poses(4)
-    # twist joints lie inside a bone: at rest here, their bones are one rigid piece
+    # twist joints are inside a bone: at rest here, their bones are one rigid piece
     for i, name in enumerate(body.joint_names):
         if name.startswith(("upperarm02", "lowerarm02", "upperleg02", "lowerleg02")):
             pose.theta[:, i] = 0
@@ -117,7 +117,7 @@ def test_bones_keep_their_lengths_in_any_pose():
             torch.testing.assert_close(length, expected, atol=1e-9, rtol=0)
 
 
-def test_landmarks_lie_on_joints_they_are_named_after():
+def test_landmarks_are_at_the_joints_of_the_same_name():
     body = free_body().to(torch.float64)
     pose = poses(3)
     p, joints = body.posed_landmarks(pose), body.posed_joints(pose)
@@ -138,7 +138,7 @@ def test_pose_of_another_body_is_refused():
         free_body().pose(BodyPose(torch.zeros(1, 24, 3), torch.zeros(1, 3)))
 
 
-def test_damaged_and_missing_assets_say_so(tmp_path):
+def test_damaged_and_missing_assets_are_reported(tmp_path):
     with pytest.raises(DataError, match="is missing"):
         read_body(tmp_path / "none.npz")
     (tmp_path / "cut.npz").write_bytes(free_body_path().read_bytes()[:1000])

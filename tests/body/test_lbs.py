@@ -1,4 +1,4 @@
-"""Linear blend skinning against what it must be in closed form."""
+"""Linear blend skinning against closed forms."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_axis_angle_float32_keeps_its_digits_for_small_angles():
     assert error.abs() < 1e-7
 
 
-def test_bent_chain_has_its_end_where_trigonometry_says():
+def test_end_of_a_bent_chain_matches_trigonometry():
     rotations = torch.stack([rz(0), rz(90), rz(0)])[None]
     T = forward_kinematics(CHAIN, (-1, 0, 1), rotations, torch.tensor([[0.0, 0, 5]], dtype=D))
     tip = T[0, 2] @ torch.tensor([3.0, 0, 0, 1], dtype=D)
@@ -175,8 +175,8 @@ def test_an_smpl_model_refuses_such_weights_when_it_is_made():
         )  # fmt: skip
 
 
-def test_blending_looks_at_no_value():
-    """A look at a value makes the host wait for the device in every frame."""
+def test_blending_reads_no_value():
+    """Reading a value makes the host wait for the device in every frame."""
     from torch.utils._python_dispatch import TorchDispatchMode
 
     class NoLook(TorchDispatchMode):

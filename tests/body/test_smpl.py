@@ -1,4 +1,4 @@
-"""Models of the SMPL family: files as they are pickled, and poses known in closed form."""
+"""Models of the SMPL family: pickled files, and poses with a closed form."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from writers import python2
 from writers.smpl import PARENTS, joint_positions, smpl_arrays, write_smpl
 
 from gsgan.body import free_body, open_body, skin
-from gsgan.body.smpl import SkinnedModel, from_zju, read_smpl, to_zju
+from gsgan.body.smpl import SkinnedModel, from_zju, read_smpl
 from gsgan.body.smpl_names import CIHP, CLOTHES, SMPL_JOINTS, SMPLX_JOINTS
 from gsgan.model.segmentation import Segmentation
 from gsgan.scene import BodyPose, Camera
@@ -47,7 +47,7 @@ def small(tmp_path):
     ids=str,
 )
 @pytest.mark.parametrize("kind", ["smpl", "smplx"])
-def test_every_kind_of_file_gives_back_what_was_written(small, kind, name, options):
+def test_every_kind_of_file_is_read_back(small, kind, name, options):
     model, written = small(name, kind=kind, **options)
     assert model.kind == kind
     assert model.parents == PARENTS[kind]
@@ -59,7 +59,7 @@ def test_every_kind_of_file_gives_back_what_was_written(small, kind, name, optio
     np.testing.assert_array_equal(model.faces.numpy(), written["f"])
 
 
-def test_the_originals_sizes_are_read(tmp_path):
+def test_files_of_the_original_sizes_are_read(tmp_path):
     write_smpl(tmp_path / "SMPL_NEUTRAL.pkl", chumpy=True)
     model = read_smpl(tmp_path / "SMPL_NEUTRAL.pkl")
     assert model.v_template.shape == (6890, 3)
@@ -67,7 +67,7 @@ def test_the_originals_sizes_are_read(tmp_path):
     np.testing.assert_allclose(joints, joint_positions("smpl"), atol=1e-12)
 
 
-def test_shape_and_expression_are_told_apart_by_their_number(small):
+def test_shape_and_expression_are_split_by_their_number(small):
     arrays = smpl_arrays("smplx", SMALL)
     many = np.zeros((SMALL, 3, 400))
     model, _ = small(kind="smplx", replace={"shapedirs": many})
@@ -102,7 +102,7 @@ def test_zero_pose_is_the_shaped_rest_moved(small):
 
 
 def test_a_quarter_turn_of_one_joint(small):
-    """The left elbow about z: what hangs on it turns rigidly about it, the rest stays."""
+    """The left elbow about z: joints below it rotate rigidly about it, the rest does not move."""
     model, written = small()
     theta = torch.zeros(1, 24, 3, dtype=D)
     elbow = SMPL_JOINTS.index("left_elbow")
@@ -174,7 +174,7 @@ def test_the_root_turns_about_its_own_joint_and_expression_moves_the_face(small)
     )
 
 
-def test_gradients_at_rest_are_finite_and_right(small):
+def test_gradients_at_rest_are_finite_and_correct(small):
     model, _ = small()
     theta = torch.zeros(1, 24, 3, dtype=D, requires_grad=True)
     betas = torch.zeros(1, 2, dtype=D, requires_grad=True)
@@ -184,7 +184,7 @@ def test_gradients_at_rest_are_finite_and_right(small):
         vertices, joints = model.pose(*inputs)
         return vertices[:, ::40], joints[:, -1]
 
-    assert torch.autograd.gradcheck(some, (theta, betas, transl), atol=1e-6)
+    assert torch.autograd.gradcheck(some, (theta, betas, transl), atol=1e-6, fast_mode=True)
 
 
 def test_wrong_shapes_name_the_argument(small):
@@ -201,8 +201,8 @@ def test_wrong_shapes_name_the_argument(small):
             model.pose(**(good | {name: torch.zeros(shape)}))
 
 
-def test_zju_convention_there_and_back(small):
-    """R(Rh) LBS(zero root) + Th, about the origin, is our root turn and translation."""
+def test_zju_convention(small):
+    """R(Rh) LBS(zero root) + Th, about the origin, is our root rotation and translation."""
     model, _ = small()
     rng = np.random.default_rng(0)
     Rh, Th = rng.standard_normal((2, 5, 3))
@@ -220,13 +220,12 @@ def test_zju_convention_there_and_back(small):
     ours, _ = model.pose(poses, betas, torch.from_numpy(transl))
     torch.testing.assert_close(ours, theirs, atol=1e-12, rtol=0)
     assert np.abs(transl - Th).max() > 0.01  # skipping it would be seen
-    np.testing.assert_allclose(to_zju(orient, transl, J0), (Rh, Th), atol=1e-14)
 
 
 # --- as a body for segmentation ----------------------------------------------------------------
 
 
-def test_as_body_labels_by_the_largest_weight_the_first_of_equals(small):
+def test_as_body_labels_by_the_first_largest_weight(small):
     weights = np.zeros((SMALL, 24))
     weights[:, SMPL_JOINTS.index("head")] = 1
     weights[5] = 0
@@ -331,7 +330,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", list(WRONG))
-def test_a_model_file_that_does_not_fit_is_one_sentence(small, name):
+def test_a_model_file_of_another_body_is_refused(small, name):
     options, match = WRONG[name]
     with pytest.raises(DataError, match=match) as caught:
         small(**options)
@@ -339,13 +338,13 @@ def test_a_model_file_that_does_not_fit_is_one_sentence(small, name):
     assert "\n" not in str(caught.value)
 
 
-def test_other_files_are_told_from_models(tmp_path):
+def test_files_that_are_not_models_are_refused(tmp_path):
     path = tmp_path / "other.pkl"
     path.write_bytes(pickle.dumps([1, 2]))
     with pytest.raises(DataError, match="holds a list; expected an SMPL model"):
         read_smpl(path)
     path.write_bytes(python2.dumps({"poses": np.zeros((1, 72))}))
-    with pytest.raises(DataError, match="is no SMPL model"):
+    with pytest.raises(DataError, match="is not an SMPL model"):
         read_smpl(path)
     path.write_bytes(b"cos\nsystem\n(S'true'\ntR.")
     with pytest.raises(DataError, match=r"os\.system"):

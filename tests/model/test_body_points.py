@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsgan.body import open_body
-from gsgan.body.normals import vertex_normals
+from gsgan.body.skinned import vertex_normals
 from gsgan.data.surface_colours import body_inside
 from gsgan.effects import EffectSettings, decide
 from gsgan.model.body_points import BodyPoints, moved_normals

@@ -28,7 +28,7 @@ def densify(**options: Any) -> Densify:
     return Densify(dtype=F64, **options)
 
 
-def test_counts_and_frozen_layout() -> None:
+def test_counts_and_layout() -> None:
     d = densify()
     assert d.n_points == 5400
     assert d.part_id.unique_consecutive().tolist() == list(range(24))
@@ -59,7 +59,7 @@ def test_limb_points_lie_on_their_cylinders(sampler: Any) -> None:
         )
         assert height.min() >= 0
         assert height.max() <= lengths[limb]
-        # spread over the whole surface, and all the way round
+        # spread over the whole surface
         assert height.mean() / lengths[limb] == pytest.approx(0.5, abs=0.05)
         mean_radial = (offset - height[:, None] * axis).mean(0).norm() / lengths[limb]
         assert mean_radial < 0.01
@@ -84,7 +84,7 @@ def test_torso_points_lie_on_the_box(sampler: Any) -> None:
     edges = torch.tensor([0.35, 0.47, 0.175], dtype=F64)  # shoulder width, spine, half the width
     local = ((points - centre) / edges * 2).abs()
     torch.testing.assert_close(local.max(-1).values, torch.ones(500, dtype=F64), atol=2e-5, rtol=0)
-    # as many points a face as it has area
+    # points per face in proportion to its area
     share = torch.bincount(local.argmax(-1), minlength=3) / 500
     areas = edges.prod() / edges
     torch.testing.assert_close(
@@ -187,7 +187,7 @@ def test_rest_points_are_the_rest_pose_in_body_heights() -> None:
 
 def test_unseen_joints_mark_their_points() -> None:
     valid = torch.ones(4, 33, dtype=torch.bool)
-    valid[3, 1:11] = False  # the nose is enough to know where the head is
+    valid[3, 1:11] = False  # the nose is enough to place the head
     valid[0, 15] = False  # left wrist: forearm and the three bones of the hand that start there
     valid[1, :11] = False
     valid[2, [11, 12]] = False
@@ -236,19 +236,19 @@ def test_batch_items_do_not_mix() -> None:
         torch.testing.assert_close(together.scales[b : b + 1], alone.scales, atol=1e-12, rtol=0)
 
 
-def test_frames_at_hand_are_used() -> None:
+def test_given_frames_are_used() -> None:
     d, p = densify(), noisy(8)
     torch.testing.assert_close(d(p, None, bone_frames(p)).means, d(p).means)
     turned = bone_frames(p @ rotation(1).mT)
     assert (d(p, None, turned).means - d(p).means).abs().max() > 0.01
-    # the head's frame of the 26 limb skeleton is not the 22 limb one's: made afresh
+    # the head's frame of the 26 limb skeleton is not the 22 limb one's: computed again
     d26 = densify(limbs="all26")
     torch.testing.assert_close(d26(p, None, bone_frames(p)).means, d26(p).means)
     torch.testing.assert_close(d26(p).rotations[:, 26], bone_frames(p).hubs[:, HEAD])
 
 
 def test_float32_far_away_needs_recentring() -> None:
-    """At 1e4 m float32 has a grain of 1 mm; recentred in float64 first, it is right to 1e-6."""
+    """At 1e4 m float32 has a resolution of 1 mm; recentred in float64 first, the error is 1e-6."""
     d, p = Densify(dtype=torch.float32), noisy(2)
     far, shift = p + 1e4, torch.full((1, 3), 1e4, dtype=F64)
     cam = camera((64, 64))
@@ -262,13 +262,13 @@ def test_float32_far_away_needs_recentring() -> None:
     seen, _ = near_cam.to(torch.float32).project(means)
     expected, _ = cam.project(exact.means)
     torch.testing.assert_close(seen.double(), expected, atol=1e-3, rtol=0)
-    # without it the grain shows, but no more than the grain
+    # without it the error is that resolution, but not more
     direct = d(far.float()).means.double() - 1e4
     assert 1e-4 < (direct - exact.means).abs().max() < 2e-2
 
 
 def test_even_samplers_cover_evenly() -> None:
-    """The emptiest spot is less empty than that of random points."""
+    """The largest gap is smaller than that of random points."""
     random = np.random.default_rng(0).normal(size=(500, 3))
     random /= np.linalg.norm(random, axis=1, keepdims=True)
     probe = np.random.default_rng(1).normal(size=(2000, 3))
@@ -281,7 +281,7 @@ def test_even_samplers_cover_evenly() -> None:
 
 
 @pytest.mark.parametrize("n", [1, 7, 500])
-def test_even_samplers_return_as_many_as_asked(n: int) -> None:
+def test_even_samplers_return_the_requested_number(n: int) -> None:
     for points, normals in (
         sampling.even_cylinder(n),
         sampling.even_sphere(n),
@@ -291,6 +291,7 @@ def test_even_samplers_return_as_many_as_asked(n: int) -> None:
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
 
 
+@pytest.mark.slow
 def test_shipped_templates_can_be_made_again() -> None:
     pytest.importorskip("trimesh")
     script = Path(__file__).parents[2] / "scripts" / "make_skeleton_templates.py"
@@ -314,7 +315,7 @@ def test_shipped_templates_can_be_made_again() -> None:
         ({"limbs": "all"}, "limbs must be one of paper22, all26, got 'all'"),
         ({"face_points": 0}, r"at least one point, got \(200, 0, 500\)"),
         ({"radius_ratio": 0.0}, "must be positive, got 0.0"),
-        ({"sampler": "trimesh", "points_per_limb": 64}, "ships 200 cylinder points.*64"),
+        ({"sampler": "trimesh", "points_per_limb": 64}, "has 200 cylinder points.*64"),
     ],
 )
 def test_unknown_options_are_named(options: dict[str, Any], message: str) -> None:

@@ -1,4 +1,4 @@
-"""The drawn skeleton: analytic values, what is left out, gradients."""
+"""The drawn skeleton: analytic values, omitted segments, gradients."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_shape_range_and_groups() -> None:
     assert image.min() >= 0
     assert image.max() <= 1
     assert (image.amax((2, 3)) > 0.5).all()
-    # seen from the front, the subject's left is on the picture's right
+    # seen from the front, the subject's left is on the image's right
     columns = torch.arange(48, dtype=torch.float64)
     mean_x = (image[0].sum(1) * columns).sum(-1) / image[0].sum((1, 2))
     for part in ("arm", "hand", "leg"):
@@ -59,8 +59,8 @@ def test_shape_range_and_groups() -> None:
 
 
 @pytest.mark.parametrize(("height", "sigma"), [(512, 2.5), (256, 1.25), (64, 0.8)])
-def test_line_width_follows_the_picture(height: int, sigma: float) -> None:
-    """A vertical spine-side line: the value k pixels off it is exp(-k² / 2 sigma²)."""
+def test_line_width_scales_with_the_image(height: int, sigma: float) -> None:
+    """A vertical spine-side line: the value k pixels away is exp(-k² / 2 sigma²)."""
     p, cam = rest(), camera((height, height))
     image = draw_skeleton(p, None, cam)[0, GROUPS.index("torso")]
     px, _ = cam.project(p)
@@ -81,7 +81,7 @@ def test_far_pixels_are_exact_zeros() -> None:
     assert ((image == 0) | (image > tiny)).all()
 
 
-def test_unseen_joints_and_what_is_behind_are_left_out() -> None:
+def test_unseen_joints_and_joints_behind_the_camera_are_not_drawn() -> None:
     p, cam = rest(), camera((32, 32))
     valid = torch.ones(1, 33, dtype=torch.bool)
     valid[0, [13, 15, 19]] = False
@@ -92,7 +92,7 @@ def test_unseen_joints_and_what_is_behind_are_left_out() -> None:
     assert (draw_skeleton(p, None, behind) == 0).all()
 
 
-def test_a_limb_through_the_camera_is_left_out_with_finite_gradients() -> None:
+def test_a_limb_through_the_camera_is_not_drawn_and_has_finite_gradients() -> None:
     p, cam = rest(), camera((32, 32))
     p[0, 15] = cam.centre[0] + torch.tensor([0.0, 0.0, 0.2], dtype=torch.float64)
     p[0, 16] = cam.centre[0]
@@ -106,7 +106,7 @@ def test_a_limb_through_the_camera_is_left_out_with_finite_gradients() -> None:
     assert (p.grad[0, [15, 16]] == 0).all()
 
 
-def test_an_absurd_unseen_joint_does_not_reach_the_picture() -> None:
+def test_values_of_unseen_joints_have_no_effect() -> None:
     p, cam = rest().float(), camera((32, 32)).to(torch.float32)
     valid = torch.ones(1, 33, dtype=torch.bool)
     valid[0, 15] = False
@@ -132,7 +132,7 @@ def test_degenerate_poses_stay_finite(name: str, dtype: torch.dtype) -> None:
 
 
 def test_coincident_joints_draw_a_dot() -> None:
-    """A segment without length is its point, not a line across the picture."""
+    """A segment without length is its point, not a line across the image."""
     p, cam = rest(), camera((64, 64))
     p[0, 13], p[0, 15] = p[0, 11].clone(), p[0, 11].clone()
     image = draw_skeleton(p, None, cam)[0, GROUPS.index("left_arm")]
@@ -150,13 +150,13 @@ def test_gradcheck() -> None:
     def values(p: Tensor, t: Tensor) -> Tensor:
         return draw_skeleton(p, None, dataclasses.replace(cam, t=t))
 
-    assert torch.autograd.gradcheck(values, (p, cam.t.clone().requires_grad_()))
+    assert torch.autograd.gradcheck(values, (p, cam.t.clone().requires_grad_()), fast_mode=True)
 
 
 @pytest.mark.parametrize("size", [(64, 64), (33, 47), (1, 1)])
-def test_downscale_keeps_the_size_and_roughly_the_picture(size: tuple[int, int]) -> None:
+def test_downscale_approximates_the_image(size: tuple[int, int]) -> None:
     p, cam = rest(), camera(size)
-    # wide lines, so that the floor of the line width plays no part
+    # wide lines, so that the lower bound of the line width has no effect
     full = draw_skeleton(p, None, cam, sigma_px=64.0)
     half = draw_skeleton(p, None, cam, sigma_px=64.0, downscale=2)
     assert half.shape == full.shape == (1, 8, *size)
@@ -165,7 +165,7 @@ def test_downscale_keeps_the_size_and_roughly_the_picture(size: tuple[int, int])
         assert (half - full).abs().max() < 0.2
 
 
-def test_crop_is_the_window_of_the_whole() -> None:
+def test_a_crop_equals_the_window_of_the_image() -> None:
     p, cam = rest(), camera((64, 64))
     whole = draw_skeleton(p, None, cam)
     window = draw_skeleton(p, None, cam.crop(10, 20, (40, 30)))

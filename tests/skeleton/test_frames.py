@@ -12,8 +12,9 @@ from skeleton_poses import DEGENERATE, REST, assert_rotation, noisy, rest, rotat
 from torch import Tensor
 
 from gsgan.skeleton import MEDIAPIPE33, bone_frames, omega, rotation_from_6d
-from gsgan.skeleton.frames import BoneFrames, Swing
+from gsgan.skeleton.frames import BoneFrames
 from gsgan.skeleton.template import CHEST, HEAD, N_HUBS, PELVIS
+from gsgan.skeleton.tensors import Swing, constants
 
 LIMB = {limb: k for k, limb in enumerate(MEDIAPIPE33.limbs)}
 TWISTS: tuple[Any, ...] = ("none", "hinge")
@@ -100,7 +101,7 @@ def test_frames_turn_with_the_body(seed: int, twist: Any) -> None:
     torch.testing.assert_close(b.lengths, a.lengths, atol=1e-9, rtol=0)
 
 
-def test_only_hub_omega_sees_a_rigid_motion() -> None:
+def test_only_the_hubs_of_omega_depend_on_rigid_motions() -> None:
     p, R, R_cam = noisy(5), rotation(6), rotation(7).unsqueeze(0)
     a, b = omega(p, None, R_cam), omega(p @ R.mT + 1.0, None, R_cam)
     hubs = [*MEDIAPIPE33.shoulders, *MEDIAPIPE33.hips]
@@ -131,7 +132,7 @@ def test_omega_layout() -> None:
     torch.testing.assert_close(f.hubs[0, HEAD] @ code[9] @ at_rest, now)
 
 
-def test_omega_is_identity_where_nothing_swings() -> None:
+def test_omega_is_identity_without_swing() -> None:
     """A pose built from the rest directions: every limb and face code is the identity."""
     p = rest()
     for (a, b), d in zip(MEDIAPIPE33.limbs, MEDIAPIPE33.rest_directions, strict=True):
@@ -158,7 +159,7 @@ def test_head_falls_back_to_eyes_then_chest() -> None:
     torch.testing.assert_close(f.hubs[0, HEAD], f.hubs[0, CHEST])
 
 
-def test_a_line_along_the_spine_borrows_the_other() -> None:
+def test_a_line_along_the_spine_is_replaced_by_the_other() -> None:
     R = rotation(4)
     f = bone_frames(DEGENERATE["collinear_shoulders"] @ R.mT)
     torch.testing.assert_close(f.hubs[0, CHEST], R, atol=1e-9, rtol=0)
@@ -173,7 +174,7 @@ def test_zero_length_bone_keeps_its_parents_frame() -> None:
 
 
 def test_a_bone_through_zero_length_does_not_jump() -> None:
-    """The elbow's bone shrinks, turns its direction round and grows: frames step by step."""
+    """The elbow's bone shrinks, reverses its direction and grows: frames step by step."""
     s = torch.linspace(-0.01, 0.01, 2001, dtype=torch.float64)
     p = rest(len(s))
     p[:, 15] = p[:, 13] + s[:, None] * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
@@ -208,7 +209,7 @@ def test_roll_is_continuous_on_a_random_walk(twist: Any) -> None:
     assert turn < 3 * 2**0.5 * 10 * step / shortest
 
 
-def test_an_arm_through_the_fold_moves_without_a_jump_off_the_fold() -> None:
+def test_an_arm_near_the_fold_moves_without_a_jump() -> None:
     """The forearm sweeps past its antipode at 2 degrees: frames move by bounded steps."""
     t = torch.linspace(-0.5, 0.5, 2001, dtype=torch.float64)
     p = rest(len(t))
@@ -225,7 +226,7 @@ def test_an_arm_through_the_fold_moves_without_a_jump_off_the_fold() -> None:
 
 
 def test_hinge_twist_follows_the_bend_plane() -> None:
-    """Elbow bent square: the upper arm's hinge axis lies along the bend normal."""
+    """Elbow bent square: the upper arm's hinge axis is along the bend normal."""
     p = rest()
     p[0, 13] = p[0, 11] + 0.28 * torch.tensor([0.6, -0.6, 0.5], dtype=torch.float64)
     upper = torch.nn.functional.normalize(p[0, 13] - p[0, 11], dim=0)
@@ -240,7 +241,7 @@ def test_hinge_twist_follows_the_bend_plane() -> None:
         torch.testing.assert_close(untwisted, axis, atol=1e-6, rtol=0)
 
 
-def test_hinge_leaves_a_straight_limb_alone() -> None:
+def test_hinge_does_not_turn_a_straight_limb() -> None:
     p = DEGENERATE["straight"]
     torch.testing.assert_close(
         bone_frames(p, twist="hinge").limbs, bone_frames(p).limbs, atol=1e-6, rtol=0
@@ -248,16 +249,14 @@ def test_hinge_leaves_a_straight_limb_alone() -> None:
 
 
 def test_float32_far_from_the_origin_matches_its_own_quantised_input() -> None:
-    """Nothing is lost beyond the grain of the input: differences are taken first."""
+    """No loss beyond the resolution of the input: differences are taken first."""
     p = (noisy(3) + 1e4).float()
     a, b = bone_frames(p), bone_frames(p.double())
     torch.testing.assert_close(a.limbs.double(), b.limbs, atol=2e-5, rtol=0)
     torch.testing.assert_close(a.hubs.double(), b.hubs, atol=2e-5, rtol=0)
 
 
-def test_inference_mode_does_not_spoil_later_training() -> None:
-    from gsgan.skeleton.frames import constants
-
+def test_constants_from_inference_mode_can_be_used_for_training() -> None:
     constants.cache_clear()
     with torch.inference_mode():
         bone_frames(rest())

@@ -1,4 +1,4 @@
-"""6D rotations: round trip, columns that say nothing, gradients there."""
+"""6D rotations: round trip, degenerate columns, gradients."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from skeleton_poses import assert_rotation, rotation
 from gsgan.skeleton import rotation_from_6d, rotation_to_6d
 
 
-def test_columns_come_one_after_the_other() -> None:
+def test_order_of_the_columns() -> None:
     R = torch.arange(9.0).reshape(3, 3)
     assert rotation_to_6d(R).tolist() == [0, 3, 6, 1, 4, 7]
 

@@ -1,4 +1,4 @@
-"""Sanitise: every joint finite, seen ones untouched, stand-ins where a body would have them."""
+"""Sanitise: every joint finite, seen ones untouched, missing ones where a body has them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def lose(p: torch.Tensor, joints: list[int], value: float = NAN) -> torch.Tensor
     return p
 
 
-def test_a_whole_skeleton_passes_untouched() -> None:
+def test_a_complete_skeleton_is_unchanged() -> None:
     p = noisy(0)
     q, valid = sanitise(p, torch.ones(1, 33))
     assert torch.equal(p, q)
@@ -36,8 +36,8 @@ def test_a_whole_skeleton_passes_untouched() -> None:
 
 @pytest.mark.parametrize("value", [NAN, float("inf"), -float("inf")])
 @pytest.mark.parametrize("name", NAMES)
-def test_each_joint_alone_comes_back_to_its_rest_place(name: str, value: float) -> None:
-    """On the rest pose, turned and moved, the stand-in is the joint itself."""
+def test_each_missing_joint_is_placed_at_rest(name: str, value: float) -> None:
+    """On the rest pose, turned and moved, the filled-in joint is the joint itself."""
     R = rotation(3)
     p = rest() @ R.mT + torch.tensor([1.0, 2.0, -3.0], dtype=torch.float64)
     q, valid = sanitise(lose(p, [joint(name)], value))
@@ -45,7 +45,7 @@ def test_each_joint_alone_comes_back_to_its_rest_place(name: str, value: float) 
     torch.testing.assert_close(q, p, atol=1e-9, rtol=0)
 
 
-def test_everything_but_the_trunk_comes_back_at_the_subjects_size() -> None:
+def test_missing_limbs_have_the_subjects_size() -> None:
     trunk = list(MEDIAPIPE33.torso)
     gone = [j for j in range(33) if j not in trunk]
     p = rest() * 1.25
@@ -54,14 +54,14 @@ def test_everything_but_the_trunk_comes_back_at_the_subjects_size() -> None:
     assert valid[0].nonzero().flatten().tolist() == sorted(trunk)
 
 
-def test_size_is_taken_from_the_seen_limbs() -> None:
+def test_size_is_estimated_from_the_seen_limbs() -> None:
     p = rest() * 0.8
     q, _ = sanitise(lose(p, HANDS_FEET_HEAD))
     torch.testing.assert_close(q, p, atol=1e-9, rtol=0)
 
 
-def test_stand_ins_hang_on_the_bent_limb() -> None:
-    """A lost hand goes where the forearm points, not where the rest pose has it."""
+def test_filled_in_joints_follow_the_bent_limb() -> None:
+    """A missing hand is placed along the forearm, not as in the rest pose."""
     p = rest()
     R = rotation(5)
     arm = [13, 15, 17, 19, 21]
@@ -73,8 +73,8 @@ def test_stand_ins_hang_on_the_bent_limb() -> None:
     torch.testing.assert_close(lengths, (REST[[17, 19, 21]] - REST[15]).norm(dim=-1))
 
 
-def test_face_stands_on_the_joints_that_were_seen() -> None:
-    """A turned head with one ear lost: eyes and nose tell its frame, and where the ear is."""
+def test_the_face_is_aligned_with_its_seen_joints() -> None:
+    """A turned head without one ear: eyes and nose determine its frame and place the ear."""
     R = rotation(6)
     p = rest()
     p[:, :11] = p[:, :11] @ R.mT
@@ -82,7 +82,7 @@ def test_face_stands_on_the_joints_that_were_seen() -> None:
     torch.testing.assert_close(q, p, atol=1e-9, rtol=0)
 
 
-def test_visibility_counts_as_loss() -> None:
+def test_invisible_joints_are_filled_in() -> None:
     p, visibility = noisy(1), torch.ones(1, 33)
     visibility[0, 13], visibility[0, 14], visibility[0, 16] = 0.0, NAN, 0.2
     _, valid = sanitise(p, visibility)
@@ -98,7 +98,7 @@ def test_visibility_counts_as_loss() -> None:
     lost=st.sets(st.sampled_from([j for j in range(33) if j not in (11, 12, 23)])),
 )
 @settings(max_examples=40, deadline=None)
-def test_any_loss_moves_with_the_body(seed: int, lost: set[int]) -> None:
+def test_filled_in_joints_move_with_the_body(seed: int, lost: set[int]) -> None:
     p, R = noisy(seed), rotation(seed + 1)
     q, valid = sanitise(lose(p, sorted(lost)))
     moved, _ = sanitise(lose(p @ R.mT + 2.0, sorted(lost)))
@@ -108,7 +108,7 @@ def test_any_loss_moves_with_the_body(seed: int, lost: set[int]) -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_gradients_through_stand_ins_are_finite(dtype: torch.dtype) -> None:
+def test_gradients_through_filled_in_joints_are_finite(dtype: torch.dtype) -> None:
     """NaN joints get a zero gradient, their neighbours a finite one, through the whole chain."""
     gone = [0, 7, 13, 16, 17, 24, 27, 28]
     p = lose(noisy(2), gone).to(dtype).requires_grad_()
@@ -141,7 +141,7 @@ def test_far_from_the_origin_in_float32() -> None:
     torch.testing.assert_close(q, p, atol=2e-2, rtol=0)
 
 
-def test_a_skeleton_without_a_trunk_is_refused_by_name() -> None:
+def test_a_skeleton_without_a_trunk_is_refused() -> None:
     p = lose(noisy(0, batch=3), [])
     p[1, [11, 24]] = NAN
     with pytest.raises(
@@ -169,7 +169,7 @@ def test_limb_length_sum() -> None:
     assert limb_length_sum(rest()).item() == pytest.approx(MEDIAPIPE33.limb_length_sum)
 
 
-def test_limb_length_sum_makes_up_for_lost_limbs() -> None:
+def test_limb_length_sum_accounts_for_missing_limbs() -> None:
     p = rest(2) * 1.1
     p[0, [15, 31, 22]] = NAN
     valid = p.isfinite().all(-1)

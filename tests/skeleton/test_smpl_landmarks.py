@@ -1,4 +1,4 @@
-"""SMPL and SMPL-X to MediaPipe's 33 landmarks: known where they say, NaN elsewhere."""
+"""SMPL and SMPL-X to MediaPipe's 33 landmarks: known where the body has them, NaN elsewhere."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_batches_and_points_that_are_not_finite():
     assert not (p == 0).all(axis=-1).any()
 
 
-def test_what_is_missing_is_no_obstacle_downstream():
+def test_missing_landmarks_are_filled_in_later():
     """With joints alone the whole face is unknown; the skeleton still has finite frames."""
     joints = torch.from_numpy(to_mediapipe33(joint_positions("smpl"))[0]).float()[None]
     conf = torch.from_numpy(to_mediapipe33(joint_positions("smpl"))[1]).float()[None]

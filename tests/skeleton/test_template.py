@@ -1,4 +1,4 @@
-"""The constants: counts and structure as MediaPipe and the method notes state them."""
+"""The constants: counts and structure of MediaPipe and the method notes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_counts() -> None:
     assert [len(T.with_torso_limbs().limbs), len(T.with_torso_limbs().rest_directions)] == [26, 26]
 
 
-def test_limbs_are_the_edges_off_face_and_trunk() -> None:
+def test_limbs_are_the_edges_outside_face_and_trunk() -> None:
     off = [e for e in T.edges if max(e) > 10 and not set(e) <= set(T.torso)]
     assert sorted(off) == sorted(T.limbs)
 
@@ -43,7 +43,7 @@ def test_gnn_edges_join_the_three_components() -> None:
     assert _components(T.gnn_edges) == 1
 
 
-def test_parents_come_first_and_hold_the_joint() -> None:
+def test_parents_come_first_and_end_at_the_joint() -> None:
     for level, limbs in enumerate(T.levels):
         for limb in limbs:
             parent = T.limb_parents[limb]

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians, Raster
-from gsgan.splat import native
+from gsgan.splat import ACCURACY, Accuracy, native, rasterise
 
 torch.set_num_threads(1)
 
@@ -26,7 +26,7 @@ def camera(
     batch: int = 1,
     dtype: torch.dtype = torch.float64,
 ) -> Camera:
-    """At the origin, looking along +z, principal point in the middle of the picture."""
+    """At the origin, looking along +z, principal point in the middle of the image."""
     H, W = size
     K = torch.tensor([[focal, 0, W / 2], [0, focal, H / 2], [0, 0, 1]], dtype=dtype)
     R, t = torch.eye(3, dtype=dtype), torch.zeros(3, dtype=dtype)
@@ -137,7 +137,7 @@ def naive(gaussians: Gaussians, cam: Camera, low_pass: float = 0.3) -> tuple[Ten
     order = sorted(
         range(gaussians.means.shape[1]), key=lambda i: float(R[2] @ gaussians.means[0, i] + t[2])
     )
-    picture = torch.zeros(gaussians.features.shape[-1], H, W, dtype=torch.float64)
+    image = torch.zeros(gaussians.features.shape[-1], H, W, dtype=torch.float64)
     left = torch.ones(H, W, dtype=torch.float64)
     y, x = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
     pixels = torch.stack([x, y], -1).double()
@@ -161,6 +161,51 @@ def naive(gaussians: Gaussians, cam: Camera, low_pass: float = 0.3) -> tuple[Ten
         d = pixels - (K @ (p / z))[:2]
         q = torch.einsum("hwi,ij,hwj->hw", d, torch.linalg.inv(cov), d)
         alpha = gaussians.opacities[0, i] * torch.exp(-q / 2)
-        picture += gaussians.features[0, i][:, None, None] * (left * alpha)
+        image += gaussians.features[0, i][:, None, None] * (left * alpha)
         left = left * (1 - alpha)
-    return picture, 1 - left
+    return image, 1 - left
+
+
+# No cut-off, but alphas capped: a backend in float64 without approximations.
+DENSE = replace(ACCURACY["exact"], name="dense")
+CUT = replace(ACCURACY["standard"], name="cut", dtype="float64")
+
+every_backend = pytest.mark.parametrize("backend", BACKENDS)
+fast_backend = pytest.mark.parametrize("backend", [b for b in BACKENDS if b != "reference"])
+every_setting = pytest.mark.parametrize("settings", list(ACCURACY))
+
+
+def draw(gaussians, cam, settings, backend, depth=True):
+    """The image and the gradients of a random weighting of it."""
+    gaussians, cam = leaves(gaussians), leaves(cam)
+    raster = rasterise(gaussians, cam, settings=settings, backend=backend, depth=depth)
+    loss(raster).backward()
+    return raster, gradients(gaussians, cam)
+
+
+def assert_like_reference(
+    gaussians: Gaussians,
+    cam: Camera,
+    settings: Accuracy | str,
+    backend: str,
+    *,
+    value: float = 1e-10,
+    gradient: float = 1e-8,
+) -> None:
+    """Values and gradients equal those of the reference with the same settings."""
+    got, got_grads = draw(gaussians, cam, settings, backend)
+    want, want_grads = draw(gaussians, cam, settings, "reference")
+    for name in ("features", "alpha", "depth"):
+        assert error(getattr(got, name), getattr(want, name)) < value, name
+    for name, grad in want_grads.items():
+        assert torch.isfinite(got_grads[name]).all(), name
+        assert error(got_grads[name], grad) < gradient, name
+
+
+def turned(cam: Camera) -> Camera:
+    """Rotated, shifted, with skew, an off-centre principal point and non-square pixels."""
+    axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=cam.K.dtype)
+    K = cam.K.clone()
+    K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = 3.0, K[:, 0, 2] + 2.5, K[:, 1, 1] * 0.8
+    R = torch.matrix_exp(axis).expand_as(cam.R).clone()
+    return replace(cam, K=K, R=R, t=cam.t + torch.tensor([0.1, -0.05, 0.3], dtype=cam.t.dtype))

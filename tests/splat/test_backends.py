@@ -8,65 +8,35 @@ from dataclasses import replace
 import pytest
 import torch
 from splat_scenes import (
-    BACKENDS,
+    CUT,
+    DENSE,
+    assert_like_reference,
     camera,
     cloud,
+    draw,
     error,
+    every_backend,
+    every_setting,
+    fast_backend,
     gradients,
     join,
     leaves,
-    loss,
     naive,
     one,
+    turned,
     with_covariances,
 )
 
-from gsgan.scene import Camera, Gaussians, cat
-from gsgan.splat import ACCURACY, Accuracy, project, rasterise
+from gsgan.scene import cat
+from gsgan.splat import ACCURACY, project, rasterise
 from gsgan.splat.reference import error_bound
-
-# No cut-off, but alphas capped: what a backend does in float64 without a shortcut.
-DENSE = replace(ACCURACY["exact"], name="dense")
-CUT = replace(ACCURACY["standard"], name="cut", dtype="float64")
-
-every_backend = pytest.mark.parametrize("backend", BACKENDS)
-fast_backend = pytest.mark.parametrize("backend", [b for b in BACKENDS if b != "reference"])
-every_setting = pytest.mark.parametrize("settings", list(ACCURACY))
-
-
-def draw(gaussians, cam, settings, backend, depth=True):
-    """The picture and the gradients of a random weighting of it."""
-    gaussians, cam = leaves(gaussians), leaves(cam)
-    raster = rasterise(gaussians, cam, settings=settings, backend=backend, depth=depth)
-    loss(raster).backward()
-    return raster, gradients(gaussians, cam)
-
-
-def assert_like_reference(
-    gaussians: Gaussians,
-    cam: Camera,
-    settings: Accuracy | str,
-    backend: str,
-    *,
-    value: float = 1e-10,
-    gradient: float = 1e-8,
-) -> None:
-    """Values and gradients equal those of the reference with the same settings."""
-    got, got_grads = draw(gaussians, cam, settings, backend)
-    want, want_grads = draw(gaussians, cam, settings, "reference")
-    for name in ("features", "alpha", "depth"):
-        assert error(getattr(got, name), getattr(want, name)) < value, name
-    for name, grad in want_grads.items():
-        assert torch.isfinite(got_grads[name]).all(), name
-        assert error(got_grads[name], grad) < gradient, name
-
 
 # --- analytic values ---------------------------------------------------------------------------
 
 
 @every_backend
 @every_setting
-def test_one_gaussian_is_the_closed_form(backend, settings):
+def test_one_gaussian_matches_the_closed_form(backend, settings):
     scale, opacity, features = 0.1, 0.8, (1.0, 0.5, 0.25)
     cam = camera((9, 11), focal=20.0)
     gaussians = one((0.0, 0.0, 2.0), scale=(scale,) * 3, opacity=opacity, features=features)
@@ -93,22 +63,13 @@ def test_two_layers_blend_front_to_back(backend):
 
 @every_backend
 @pytest.mark.parametrize("shape", ["quats", "covariances"])
-def test_equals_the_naive_loops(backend, shape):
+def test_equals_naive_loops(backend, shape):
     gaussians, cam = cloud(25), turned(camera((17, 23), focal=18.0))
     gaussians = with_covariances(gaussians) if shape == "covariances" else gaussians
-    picture, alpha = naive(gaussians, cam)
+    image, alpha = naive(gaussians, cam)
     raster = rasterise(gaussians, cam, settings=DENSE, backend=backend)
-    torch.testing.assert_close(raster.features[0], picture, rtol=0, atol=1e-10)
+    torch.testing.assert_close(raster.features[0], image, rtol=0, atol=1e-10)
     torch.testing.assert_close(raster.alpha[0, 0], alpha, rtol=0, atol=1e-10)
-
-
-def turned(cam: Camera) -> Camera:
-    """Rotated, shifted, with skew, an off-centre principal point and non-square pixels."""
-    axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=cam.K.dtype)
-    K = cam.K.clone()
-    K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = 3.0, K[:, 0, 2] + 2.5, K[:, 1, 1] * 0.8
-    R = torch.matrix_exp(axis).expand_as(cam.R).clone()
-    return replace(cam, K=K, R=R, t=cam.t + torch.tensor([0.1, -0.05, 0.3], dtype=cam.t.dtype))
 
 
 # --- gradients ---------------------------------------------------------------------------------
@@ -117,14 +78,14 @@ def turned(cam: Camera) -> Camera:
 @every_backend
 @pytest.mark.parametrize("shape", ["quats", "covariances"])
 def test_gradcheck_of_every_input(backend, shape):
-    gaussians, cam = cloud(4, 2, scale=0.15), turned(camera((5, 6), focal=6.0))
+    gaussians, cam = cloud(4, 2, scale=0.15), turned(camera((3, 4), focal=4.0))
     gaussians = with_covariances(gaussians) if shape == "covariances" else gaussians
     names = [k for k, v in vars(gaussians).items() if v is not None]
 
     def function(*tensors):
         g = replace(gaussians, **dict(zip(names, tensors, strict=False)))
         K, R, t = tensors[len(names) :]
-        # A bottom row of K other than (0, 0, 1) is no pinhole: leave it as it is.
+        # A bottom row of K other than (0, 0, 1) is not a pinhole: keep it.
         K = torch.cat(
             [torch.cat([K[:, :1], K[:, 1:2] * K.new_tensor([0, 1, 1])], 1), cam.K[:, 2:]], 1
         )
@@ -133,7 +94,9 @@ def test_gradcheck_of_every_input(backend, shape):
 
     inputs = [getattr(gaussians, n) for n in names] + [cam.K, cam.R, cam.t]
     inputs = [x.clone().requires_grad_() for x in inputs]
-    assert torch.autograd.gradcheck(function, inputs, eps=1e-6, atol=1e-6, rtol=1e-5)
+    assert torch.autograd.gradcheck(
+        function, inputs, eps=1e-6, atol=1e-6, rtol=1e-5, fast_mode=True
+    )
 
 
 @fast_backend
@@ -144,7 +107,7 @@ def test_equals_the_reference_with_the_same_settings(backend, settings, n, chann
 
 
 @fast_backend
-@pytest.mark.parametrize("channels", [1, 5, 16, 64])
+@pytest.mark.parametrize("channels", [1, 3, 5, 16, 32])
 def test_any_number_of_channels(backend, channels):
     assert_like_reference(cloud(30, channels), camera((10, 13)), CUT, backend)
 
@@ -163,7 +126,7 @@ def test_float32_is_near_the_reference_in_float64(backend, settings):
     got, got_grads = draw(gaussians.to(torch.float32), cam.to(torch.float32), setting, backend)
     want, want_grads = draw(gaussians, cam, replace(setting, dtype="float64"), "reference")
     assert got.features.dtype == torch.float32
-    # An alpha that rounding takes across alpha_min changes the pixel by at most alpha_min.
+    # An alpha that rounding moves across alpha_min changes the pixel by at most alpha_min.
     assert error(got.features, want.features) < 5e-6 + setting.alpha_min
     for name, grad in want_grads.items():
         off = (got_grads[name].double() - grad).norm() / grad.norm()
@@ -176,19 +139,19 @@ def test_float32_is_near_the_reference_in_float64(backend, settings):
 @every_backend
 @every_setting
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_error_of_a_setting_stays_under_its_bound(backend, settings, seed):
+def test_error_of_a_setting_is_below_its_bound(backend, settings, seed):
     gaussians, cam = cloud(300, seed=seed, opacity=(0.0, 1.0)), camera()
     bound = error_bound(project(gaussians, cam, DENSE), cam.size, ACCURACY[settings])
     got = rasterise(gaussians, cam, settings=settings, backend=backend).features
     want = rasterise(gaussians, cam, settings="exact").features
     off = (got - want).abs()
     assert (off <= bound + 1e-12).all()
-    # The bound says something: it is not far above what is really lost, and 0 where nothing is.
+    # The bound is not far above the actual error, and 0 where there is none.
     assert bound.max() <= 5 * off.max()
 
 
 @every_backend
-def test_finer_settings_are_nearer(backend):
+def test_finer_settings_are_more_accurate(backend):
     gaussians, cam = cloud(300), camera()
     want = rasterise(gaussians, cam, settings="exact").features
     errors = [
@@ -199,7 +162,7 @@ def test_finer_settings_are_nearer(backend):
 
 
 @fast_backend
-def test_sigma_extent_leaves_the_same_pixels_out(backend):
+def test_sigma_extent_skips_the_same_pixels(backend):
     narrow = replace(DENSE, name="narrow", extent="sigma", radius_sigmas=1.5)
     assert_like_reference(cloud(50), camera(), narrow, backend)
 
@@ -233,7 +196,7 @@ def test_equal_depths_are_ordered_by_index(backend):
 
 
 @every_backend
-def test_a_batch_is_its_items(backend):
+def test_a_batch_equals_its_items(backend):
     gaussians = cat([cloud(50, seed=1), cloud(50, seed=2)])
     cam = cat([camera(), turned(camera(focal=40.0))])
     both, both_grads = draw(gaussians, cam, CUT, backend)
@@ -263,180 +226,3 @@ def test_the_same_input_gives_the_same_bits(backend, dtype):
     assert torch.equal(first.depth, second.depth)
     for name, grad in first_grads.items():
         assert torch.equal(grad, second_grads[name]), name
-
-
-# --- hard cases --------------------------------------------------------------------------------
-
-
-@every_backend
-@pytest.mark.parametrize("settings", ["exact", "high"])
-def test_no_gaussians_give_zeros_with_a_graph(backend, settings):
-    gaussians = leaves(cloud(0, 5, batch=2))
-    cam = leaves(camera((3, 4), batch=2))
-    raster = rasterise(gaussians, cam, settings=settings, backend=backend, depth=True)
-    assert raster.features.shape == (2, 5, 3, 4)
-    assert raster.alpha.shape == raster.depth.shape == (2, 1, 3, 4)
-    assert not raster.features.any()
-    assert not raster.alpha.any()
-    loss(raster).backward()
-    assert gaussians.means.grad.shape == (2, 0, 3)
-    assert not cam.t.grad.any()
-
-
-UNSEEN = {
-    "behind": (0.0, 0.0, -2.0),
-    "at z = 0": (0.3, 0.2, 0.0),
-    "on the near plane": (0.0, 0.0, 0.01),
-    "far off-axis": (1e6, 0.0, 1.0),
-    "beside the picture": (-9.0, 0.0, 2.0),
-}
-
-
-@every_backend
-@pytest.mark.parametrize("settings", ["exact", "high"])
-@pytest.mark.parametrize("where", list(UNSEEN))
-def test_unseen_gaussians_leave_no_trace(backend, settings, where):
-    hidden = one(UNSEEN[where], features=(1.0, 1.0, 1.0), scale=(0.01,) * 3)
-    alone, alone_grads = draw(cloud(10), camera(), settings, backend)
-    both, both_grads = draw(join(hidden, cloud(10)), camera(), settings, backend)
-    torch.testing.assert_close(both.features, alone.features, rtol=0, atol=1e-12)
-    for name in ("means", "quats", "scales", "opacities", "features"):
-        assert not both_grads[name][:, :1].any(), name
-        torch.testing.assert_close(both_grads[name][:, 1:], alone_grads[name], rtol=1e-6, atol=1e-9)
-    for name in ("K", "R", "t"):
-        torch.testing.assert_close(both_grads[name], alone_grads[name], rtol=1e-6, atol=1e-9)
-
-
-@every_backend
-def test_none_visible(backend):
-    gaussians = replace(cloud(10), means=-cloud(10).means)
-    raster, grads = draw(gaussians, camera(), "high", backend)
-    assert not raster.features.any()
-    assert not any(grad.any() for grad in grads.values())
-
-
-HARD = {
-    "opacity 0": one(opacity=0.0, features=(1.0,) * 3),
-    "opacity 1": one(opacity=1.0, features=(1.0,) * 3),
-    "opacity 1 in a pixel's centre": one((1 / 30, 1 / 30, 2.0), opacity=1.0, features=(1.0,) * 3),
-    "scale 1e-6": one(scale=(1e-6,) * 3, features=(1.0,) * 3),
-    "scale 1e3": one(scale=(1e3,) * 3, features=(1.0,) * 3),
-    "needle": one(scale=(1.0, 1e-4, 1e-4), quat=(0.9, 0.1, 0.3, 0.3), features=(1.0,) * 3),
-    "pancake": one(scale=(1.0, 1.0, 1e-4), quat=(0.5, 0.6, 0.3, 0.3), features=(1.0,) * 3),
-    "zero quaternion": one(quat=(0.0,) * 4, scale=(0.1, 0.2, 0.3), features=(1.0,) * 3),
-    "tiny quaternion": one(quat=(1e-15, 2e-15, 0.0, 0.0), scale=(0.1, 0.2, 0.3)),
-    "huge quaternion": one(quat=(1e15, 2e15, 0.0, 0.0), scale=(0.1, 0.2, 0.3)),
-    "just past the near plane": one((0.001, 0.0, 0.0101), scale=(0.01,) * 3),
-    "off-axis, close": one((3.0, 0.0, 0.2), scale=(1.0,) * 3),
-    "larger than the picture": one(scale=(10.0,) * 3, opacity=0.5),
-}
-HARD = {k: replace(v, features=v.features[..., :1].expand(1, 1, 3)) for k, v in HARD.items()}
-
-
-@every_backend
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("case", list(HARD))
-def test_hard_gaussians(backend, dtype, case):
-    gaussians, cam = join(HARD[case], cloud(15)).to(dtype), camera(dtype=dtype)
-    for settings in (DENSE, ACCURACY["high"], CUT):
-        got, got_grads = draw(gaussians, cam, settings, backend)
-        wide = replace(settings, dtype="float64")
-        want, want_grads = draw(
-            gaussians.to(torch.float64), cam.to(torch.float64), wide, "reference"
-        )
-        tolerance = 1e-9 if dtype == torch.float64 and settings.dtype == "float64" else 2e-4
-        assert error(got.features, want.features) < tolerance
-        assert error(got.alpha, want.alpha) < tolerance
-        for name, grad in want_grads.items():
-            assert torch.isfinite(got_grads[name]).all(), name
-            assert error(got_grads[name], grad) < 10 * tolerance, name
-
-
-@fast_backend
-@pytest.mark.parametrize("settings", [DENSE, replace(CUT, alpha_max=0.9)], ids=["dense", "capped"])
-def test_alpha_at_the_cap(backend, settings):
-    gaussians = cloud(40, scale=0.3, opacity=(0.95, 1.0))
-    assert_like_reference(gaussians, camera((9, 9)), settings, backend)
-
-
-@fast_backend
-@pytest.mark.parametrize("settings", [DENSE, CUT], ids=["dense", "cut"])
-@pytest.mark.parametrize("opacity", [0.01, 0.5])
-def test_5000_layers_on_one_pixel(backend, settings, opacity):
-    n = 5000
-    g = torch.Generator().manual_seed(0)
-    gaussians = Gaussians(
-        torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)
-        + 1e-3 * torch.rand(1, n, 3, generator=g, dtype=torch.float64),
-        torch.tensor([1.0, 0, 0, 0], dtype=torch.float64).expand(1, n, 4),
-        torch.full((1, n, 3), 0.1, dtype=torch.float64),
-        torch.full((1, n), opacity, dtype=torch.float64),
-        torch.rand(1, n, 3, generator=g, dtype=torch.float64),
-    )
-    assert_like_reference(gaussians, camera((2, 3)), settings, backend)
-
-
-@every_backend
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_what_an_opaque_layer_hides_still_has_its_gradient(backend, dtype):
-    # Behind alpha = 1 nothing is seen, but the opaque layer's own gradient is what it hides:
-    # d picture / d alpha_front = c_front - c_back, exactly.
-    front = one((1 / 30, 1 / 30, 2.0), scale=(0.1,) * 3, opacity=1.0, features=(0.75,))
-    back = one((1 / 30, 1 / 30, 3.0), scale=(50.0,) * 3, opacity=1.0, features=(0.25,))
-    gaussians = leaves(join(front, back).to(dtype))
-    cam = camera((24, 32), dtype=dtype)
-    raster = rasterise(gaussians, cam, settings=DENSE, backend=backend)
-    raster.features[0, 0, 12, 16].backward()
-    want = torch.tensor([[0.5, 0.0]], dtype=dtype)
-    torch.testing.assert_close(gaussians.opacities.grad, want, rtol=0, atol=1e-6)
-    want = torch.tensor([[[1.0], [0.0]]], dtype=dtype)
-    torch.testing.assert_close(gaussians.features.grad, want, rtol=0, atol=1e-6)
-
-
-@every_backend
-def test_coincident_gaussians(backend):
-    gaussians = one(opacity=0.01, features=(1.0,))
-    n = 3000
-    gaussians = Gaussians(
-        *(v.expand(1, n, *v.shape[2:]) for v in list(vars(gaussians).values())[:5])
-    )
-    raster, grads = draw(gaussians, camera((3, 3)), DENSE, backend)
-    variance = (30.0 * 0.1 / 2) ** 2 + 0.3
-    centre = 1 - (1 - 0.01) ** n
-    corner = 1 - (1 - 0.01 * math.exp(-0.5 * 2 / variance)) ** n
-    assert raster.alpha[0, 0, 1, 1].item() == pytest.approx(centre, abs=1e-9)
-    assert raster.alpha[0, 0, 0, 0].item() == pytest.approx(corner, abs=1e-9)
-    assert all(torch.isfinite(grad).all() for grad in grads.values())
-
-
-@every_backend
-def test_world_offset_of_ten_kilometres(backend):
-    # The numbers are rounded to float32 far from the origin first: what is tested is what the
-    # rasteriser adds to that, so both pictures start from the same rounded numbers.
-    offset = torch.tensor([1e4, -1e4, 1e4])
-    cam = camera(dtype=torch.float32)
-    cam = replace(cam, t=cam.t - offset)
-    gaussians = cloud(40, dtype=torch.float32)
-    gaussians = replace(gaussians, means=gaussians.means + offset)
-    got = rasterise(gaussians, cam, settings="high", backend=backend)
-    want = rasterise(gaussians.to(torch.float64), cam.to(torch.float64), settings="high")
-    assert error(got.features, want.features) < 2e-5
-
-
-@every_backend
-def test_camera_inside_the_cloud(backend):
-    gaussians = cloud(60, scale=0.2)
-    gaussians = replace(gaussians, means=gaussians.means - torch.tensor([0.0, 0.0, 2.0]).double())
-    assert_like_reference(gaussians, camera(), CUT, backend, value=1e-8, gradient=1e-6)
-
-
-@every_backend
-def test_gradients_only_where_asked(backend):
-    gaussians = cloud(10)
-    gaussians = replace(gaussians, features=gaussians.features.requires_grad_())
-    raster = rasterise(gaussians, camera(), settings=CUT, backend=backend)
-    raster.features.sum().backward()
-    # The sum of a picture is linear in the features.
-    total = (gaussians.features.grad * gaussians.features.detach()).sum()
-    torch.testing.assert_close(total, raster.features.detach().sum())
-    assert not rasterise(cloud(10), camera(), settings=CUT, backend=backend).alpha.requires_grad

@@ -1,4 +1,4 @@
-"""Memory that is used again: zeros every time, and never while somebody still holds it."""
+"""Reused memory: always zeros, and never memory that is still in use."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def empty(monkeypatch):
     monkeypatch.setattr(buffers, "_free", {})
 
 
-def test_memory_comes_back_clean_when_nobody_holds_it():
+def test_freed_memory_is_reused_and_cleared():
     first = buffers.zeros(SHAPE, torch.float32)
     where = first.data_ptr()
     first.fill_(7.0)
@@ -37,7 +37,7 @@ def test_memory_comes_back_clean_when_nobody_holds_it():
     assert not again.any()
 
 
-def test_what_autograd_holds_is_not_used_again():
+def test_memory_held_by_autograd_is_not_reused():
     held = buffers.zeros(SHAPE, torch.float32).add_(2.0)
     weight = torch.ones((), requires_grad=True)
     product = (held * weight).sum()
@@ -57,7 +57,7 @@ def test_small_and_large_are_aligned_zeros(dtype):
         assert not tensor.any()
 
 
-def test_no_more_is_kept_than_allowed(monkeypatch):
+def test_kept_memory_is_bounded(monkeypatch):
     monkeypatch.setattr(buffers, "KEPT", 5 << 20)
     tensors = [buffers.zeros(SHAPE, torch.float32) for _ in range(4)]
     del tensors
@@ -65,7 +65,7 @@ def test_no_more_is_kept_than_allowed(monkeypatch):
     assert 0 < buffers.kept() <= 5 << 20
 
 
-def test_sizes_that_are_no_longer_drawn_go_first(monkeypatch):
+def test_least_recently_used_sizes_are_freed_first(monkeypatch):
     monkeypatch.setattr(buffers, "KEPT", 5 << 20)
     for channels in (8, 8, 9, 7):  # 2, 2, 2.25 and 1.75 MB, one after the other
         buffers.zeros((1, channels, 256, 256), torch.float32)
@@ -75,7 +75,7 @@ def test_sizes_that_are_no_longer_drawn_go_first(monkeypatch):
     assert where > 9 * 256 * 256 * 4
 
 
-def test_pictures_may_die_in_other_threads():
+def test_memory_may_be_freed_in_other_threads():
     def draw(_: int) -> bool:
         clean = True
         for channels in (8, 9, 10, 8):
@@ -89,12 +89,12 @@ def test_pictures_may_die_in_other_threads():
 
 
 @pytest.mark.parametrize("backend", ["auto", "reference"])
-def test_a_picture_may_be_changed_in_place_by_its_caller(backend):
-    """The background is the caller's to add, also with +=."""
+def test_a_caller_may_change_an_image_in_place(backend):
+    """The caller adds the background, also with +=."""
     gaussians = cloud()
     gaussians.means.requires_grad_()
     raster = rasterise(gaussians, camera(), backend=backend)
-    picture = raster.features
-    picture += 0.5 * (1 - raster.alpha)
-    picture.sum().backward()
+    image = raster.features
+    image += 0.5 * (1 - raster.alpha)
+    image.sum().backward()
     assert gaussians.means.grad.abs().max() > 0

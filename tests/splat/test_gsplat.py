@@ -1,6 +1,6 @@
-"""The gsplat backend: its arguments against a stand-in that draws by our reference, its refusals.
+"""The gsplat backend, with a mock that draws with our reference; unsupported inputs.
 
-The stand-in has gsplat 1.5.3's signature and conventions as its documentation states them: skew is
+The mock has gsplat 1.5.3's signature and conventions of its documentation: skew is
 ignored, K gets no gradient, a covariance is read from its upper triangle. What it draws with the
 arguments it gets must be what our own backends draw.
 """
@@ -27,7 +27,7 @@ IDENTITY = (1.0, 0.0, 0.0, 0.0)
 
 
 class StandIn:
-    """In place of the package: ``rasterization`` and what it was called with last."""
+    """A mock of the package: ``rasterization``, and the arguments of its calls."""
 
     def __init__(self, cap: float = 0.999) -> None:
         self.cap, self.calls = cap, []
@@ -95,7 +95,7 @@ class StandIn:
 
 
 def install(monkeypatch, module, device="cpu"):
-    """Makes ``import gsplat`` give the module, on the device that gsplat is taken to run on."""
+    """Makes ``import gsplat`` give the module, supported on ``device``."""
     monkeypatch.setitem(sys.modules, "gsplat", module)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
     monkeypatch.setattr(gsplat_backend, "DEVICE", device)
@@ -103,7 +103,7 @@ def install(monkeypatch, module, device="cpu"):
 
 
 @pytest.fixture
-def stand_in(monkeypatch):
+def mock(monkeypatch):
     module = StandIn()
     install(monkeypatch, module)
     yield module
@@ -111,7 +111,7 @@ def stand_in(monkeypatch):
 
 
 def turned(cam: Camera) -> Camera:
-    """A turn, a shift, an off-centre principal point, non-square pixels and skew."""
+    """A rotation, a shift, an off-centre principal point, non-square pixels and skew."""
     axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=torch.float64)
     K = cam.K.clone()
     K[:, 0, 2], K[:, 1, 1] = K[:, 0, 2] + 2.5, K[:, 1, 1] * 0.8
@@ -131,7 +131,7 @@ def scene(shape: str = "quats", channels: int = 3, batch: int = 2) -> tuple[Gaus
 
 
 def drawn(gaussians, cam, backend, settings=STANDARD, depth=True):
-    """The raster and its gradients; K needs none, as gsplat has none."""
+    """The raster and its gradients; none of K, as in gsplat."""
     gaussians, cam = leaves(gaussians), leaves(cam)
     cam.K.requires_grad_(False)
     raster = rasterise(gaussians, cam, settings=settings, backend=backend, depth=depth)
@@ -157,15 +157,15 @@ def assert_same(got, want, tolerance=2e-5):
 
 @pytest.mark.parametrize("shape", ["quats", "covariances"])
 @pytest.mark.parametrize("channels", [1, 5])
-def test_values_and_gradients_are_those_of_the_reference(stand_in, shape, channels):
+def test_values_and_gradients_are_those_of_the_reference(mock, shape, channels):
     gaussians, cam = scene(shape, channels)
     assert_same(drawn(gaussians, cam, "gsplat"), drawn(gaussians, cam, "reference"))
-    assert stand_in.calls[-1].packed is False
-    assert (stand_in.calls[-1].quats is None) == (shape == "covariances")
+    assert mock.calls[-1].packed is False
+    assert (mock.calls[-1].quats is None) == (shape == "covariances")
 
 
 @pytest.mark.parametrize("changes", [{"antialias": True}, {"low_pass": 1.0}, {"near": 2.0}])
-def test_the_settings_that_gsplat_takes_are_passed_on(stand_in, changes):
+def test_the_settings_that_gsplat_takes_are_passed_on(mock, changes):
     gaussians, cam = scene()
     settings = replace(STANDARD, **changes)
     plain = drawn(gaussians, cam, "reference")[0]
@@ -174,34 +174,34 @@ def test_the_settings_that_gsplat_takes_are_passed_on(stand_in, changes):
     assert_same(drawn(gaussians, cam, "gsplat", settings), want)
 
 
-def test_supersampled_it_draws_the_larger_picture(stand_in):
+def test_supersampling_draws_the_larger_image(mock):
     gaussians, cam = scene()
     settings = replace(STANDARD, supersample=2)
     got = drawn(gaussians, cam, "gsplat", settings)
-    call, (height, width) = stand_in.calls[-1], cam.size
+    call, (height, width) = mock.calls[-1], cam.size
     assert (call.width, call.height) == (2 * width, 2 * height)
     torch.testing.assert_close(call.Ks[:, 0, :2], 2 * cam.K[:, :2])
     assert_same(got, drawn(gaussians, cam, "reference", settings))
 
 
-def test_without_depth_none_is_drawn(stand_in):
+def test_without_depth_none_is_drawn(mock):
     gaussians, cam = scene()
     got, want = drawn(gaussians, cam, "gsplat", depth=False), drawn(gaussians, cam, "torch")
     assert got[0].depth is None
-    assert stand_in.calls[-1].render_mode == "RGB"
+    assert mock.calls[-1].render_mode == "RGB"
     assert error(got[0].features, want[0].features) < 2e-5
 
 
-def test_a_camera_far_from_the_origin_costs_no_digits(stand_in):
+def test_a_camera_far_from_the_origin_costs_no_digits(mock):
     gaussians, cam = scene(batch=1)
     offset = torch.tensor([8192.0, -4096.0, 16384.0])
     gaussians = replace(gaussians, means=gaussians.means + offset)
     cam = replace(cam, t=cam.t - cam.R @ offset)
     assert_same(drawn(gaussians, cam, "gsplat"), drawn(gaussians, cam, "reference"))
-    assert stand_in.calls[-1].means.abs().max() < 10
+    assert mock.calls[-1].means.abs().max() < 10
 
 
-def test_unusable_quaternions_are_the_identity_and_length_does_not_matter(stand_in):
+def test_unusable_quaternions_are_the_identity_and_length_does_not_matter(mock):
     quats = [
         (0.0, 0.0, 0.0, 0.0),
         (1e-30, 0.0, 1e-30, 0.0),
@@ -213,14 +213,14 @@ def test_unusable_quaternions_are_the_identity_and_length_does_not_matter(stand_
     gaussians, cam = gaussians.to(torch.float32), scene(batch=1)[1]
     got, want = drawn(gaussians, cam, "gsplat"), drawn(gaussians, cam, "reference")
     assert error(got[0].features, want[0].features) < 2e-5
-    assert torch.equal(stand_in.calls[-1].quats[0, 0], torch.tensor(IDENTITY))
+    assert torch.equal(mock.calls[-1].quats[0, 0], torch.tensor(IDENTITY))
     assert got[1]["quats"].isfinite().all()
     assert not got[1]["quats"][0, :2].any()
 
 
 @pytest.mark.parametrize("shape", ["quats", "covariances"])
 @pytest.mark.filterwarnings("ignore:rasterise. dropped")
-def test_dropped_gaussians_never_reach_it(stand_in, shape):
+def test_dropped_gaussians_are_not_passed_on(mock, shape):
     gaussians, cam = scene(shape)
     gaussians.means[1, 4], gaussians.opacities[0, 2] = float("nan"), 7.0
 
@@ -233,7 +233,7 @@ def test_dropped_gaussians_never_reach_it(stand_in, shape):
         return raster, gradients(g)
 
     assert_same(run("gsplat"), run("reference"))
-    call = stand_in.calls[-1]
+    call = mock.calls[-1]
     assert call.means.isfinite().all()
     assert call.opacities[1, 4] == call.opacities[0, 2] == 0
 
@@ -252,49 +252,47 @@ def test_dropped_gaussians_never_reach_it(stand_in, shape):
     ],
 )
 @pytest.mark.parametrize("backend", ["auto", "gsplat"])
-def test_it_draws_whatever_the_settings_and_says_what_it_gives_up(
-    stand_in, backend, changes, message
-):
+def test_it_draws_with_any_settings_and_reports_the_differences(mock, backend, changes, message):
     name, reason = resolve_backend(backend, CPU, replace(STANDARD, **changes))
     assert name == "gsplat"
     assert message in reason
     assert "may lack 0.1 of its light" in reason
-    assert reason.endswith("backend=torch keeps to them.")
+    assert reason.endswith("backend=torch has none.")
     assert reason.count(". ") == 0  # one sentence
 
 
-def test_auto_takes_it_with_the_default_accuracy_and_says_so_once(stand_in, caplog, monkeypatch):
-    monkeypatch.setattr(sys.modules["gsgan.splat.rasterise"], "_said", set())
+def test_auto_uses_it_with_the_default_accuracy_and_logs_once(mock, caplog, monkeypatch):
+    monkeypatch.setattr(sys.modules["gsgan.splat.rasterise"], "_logged", set())
     gaussians, cam = scene()
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
             rasterise(gaussians, cam, settings="high")
-    assert stand_in.calls
+    assert mock.calls
     assert [r.message for r in caplog.records].count(
         resolve_backend("auto", CPU, ACCURACY["high"])[1]
     ) == 1
 
 
-def test_float64_is_left_to_others(stand_in):
+def test_float64_uses_another_backend(mock):
     name, reason = resolve_backend("gsplat", CPU, replace(STANDARD, dtype="float64"))
     assert name == "torch"
     assert "gsplat computes in float32, the settings 'standard' in float64" in reason
 
 
-def test_the_cap_is_that_of_the_version_at_hand(monkeypatch):
+def test_the_cap_is_that_of_the_installed_version(monkeypatch):
     install(monkeypatch, StandIn(cap=0.99))
     reason = resolve_backend("gsplat", CPU, STANDARD)[1]
     assert "alpha_max is 0.99, not 0.999" in reason
     assert "may lack 0.01 of its light" in reason  # T (1 - a) <= 1e-4 stops where T = 0.01
 
 
-def test_other_backends_are_taken_by_name(stand_in):
+def test_other_backends_can_be_requested(mock):
     assert resolve_backend("auto", CPU, ACCURACY["exact"]) == ("reference", "")
     assert resolve_backend("torch", CPU, STANDARD) == ("torch", "")
     assert resolve_backend("native", CPU, STANDARD)[0] != "gsplat"
 
 
-def test_hard_cases_are_judged_on_it_only_with_its_own_cut_offs(stand_in):
+def test_hard_cases_are_compared_only_with_its_own_cut_offs(mock):
     assert "gsplat" in drawing_backends(CPU, STANDARD)
     assert "gsplat" not in drawing_backends(CPU, ACCURACY["high"])
 
@@ -306,7 +304,7 @@ def test_on_another_device_torch_draws(monkeypatch):
     assert "gsplat runs on CUDA only, the Gaussians are on cpu" in reason
 
 
-def test_where_it_is_not_installed_auto_says_how_to_install_it(monkeypatch):
+def test_auto_reports_how_to_install_it(monkeypatch):
     install(monkeypatch, None, device="cuda")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     for backend in ("auto", "gsplat"):
@@ -338,7 +336,7 @@ def broken(error):
         (broken(AssertionError()), "(AssertionError)."),
     ],
 )
-def test_a_broken_package_is_no_exception(monkeypatch, module, message):
+def test_a_broken_package_raises_nothing(monkeypatch, module, message):
     install(monkeypatch, module)
     name, reason = resolve_backend("gsplat", CPU, STANDARD)
     assert name == "torch"
@@ -352,31 +350,31 @@ def unsuited_cases():
     wide = gaussians.to(torch.float64), cam.to(torch.float64)
     return {
         "Gaussians are float64": wide,
-        "no Gaussians": (none, cam),
+        "zero Gaussians": (none, cam),
         "no gradient for Camera.K": (gaussians, replace(cam, K=cam.K.clone().requires_grad_())),
     }
 
 
 @pytest.mark.parametrize("message", list(unsuited_cases()))
-def test_what_it_cannot_draw_torch_does_and_says_so_once(stand_in, caplog, monkeypatch, message):
-    monkeypatch.setattr(sys.modules["gsgan.splat.rasterise"], "_said", set())
+def test_unsupported_inputs_use_torch_and_log_once(mock, caplog, monkeypatch, message):
+    monkeypatch.setattr(sys.modules["gsgan.splat.rasterise"], "_logged", set())
     gaussians, cam = unsuited_cases()[message]
     resolve_backend("gsplat", CPU, STANDARD)  # measures the cap
-    calls = len(stand_in.calls)
+    calls = len(mock.calls)
     with caplog.at_level(logging.WARNING, logger="gsgan"):
         for _ in range(2):
             got = rasterise(gaussians, cam, settings=STANDARD, backend="gsplat")
-    assert len(stand_in.calls) == calls
+    assert len(mock.calls) == calls
     want = rasterise(gaussians, cam, settings=STANDARD, backend="torch")
     assert torch.equal(got.features, want.features)
     assert sum(message in record.message for record in caplog.records) == 1
 
 
-def test_without_gradients_a_camera_that_could_have_some_is_no_obstacle(stand_in):
+def test_without_gradients_a_camera_may_require_them(mock):
     gaussians, cam = scene()
     with torch.no_grad():
         rasterise(gaussians, leaves(cam), settings=STANDARD, backend="gsplat")
-    assert len(stand_in.calls) == 2  # the cap, and the picture
+    assert len(mock.calls) == 2  # the cap, and the image
 
 
 # --- the package itself -------------------------------------------------------------------------
@@ -390,7 +388,7 @@ needs_gsplat = pytest.mark.skipif(
 @needs_gsplat
 @pytest.mark.parametrize("shape", ["quats", "covariances"])
 @pytest.mark.parametrize("antialias", [False, True])
-def test_the_package_draws_what_torch_draws(shape, antialias):
+def test_the_package_draws_the_same_as_torch(shape, antialias):
     gaussians, cam = (x.to(CUDA) for x in scene(shape))
     # Faint, so that no pixel stops: there gsplat differs.
     gaussians = replace(gaussians, opacities=gaussians.opacities * 0.3)

@@ -20,7 +20,7 @@ WIDE = {name: replace(setting, dtype="float64") for name, setting in ACCURACY.it
 
 
 def turned(cam: Camera) -> Camera:
-    """Skew, an off-centre principal point, non-square pixels, a turn and a shift."""
+    """Skew, an off-centre principal point, non-square pixels, a rotation and a shift."""
     axis = torch.tensor([[0, -0.1, 0.05], [0.1, 0, 0.2], [-0.05, -0.2, 0]], dtype=torch.float64)
     K = cam.K.clone()
     K[:, 0, 1], K[:, 0, 2], K[:, 1, 1] = 3.0, K[:, 0, 2] + 2.5, K[:, 1, 1] * 0.8
@@ -45,7 +45,7 @@ def scene(shape: str) -> tuple[Gaussians, Camera]:
     if shape == "covariances":
         gaussians = with_covariances(gaussians)
         skew = 0.01 * torch.randn(2, 308, 3, 3, generator=torch.Generator().manual_seed(0)).double()
-        # Not symmetric, and some not positive definite: what a caller may hand in.
+        # Not symmetric, and some not positive definite: a caller may pass these.
         gaussians = replace(gaussians, covariances=gaussians.covariances + 0.1 * skew)
     return gaussians, turned(camera(batch=2))
 
@@ -54,7 +54,7 @@ def with_gradients(run, gaussians: Gaussians, cam: Camera, settings: Accuracy):
     gaussians, cam = leaves(gaussians), leaves(cam)
     p: Projected = run(gaussians, cam, settings)
     g = torch.Generator().manual_seed(1)
-    # Backends pass nothing back to what is not seen.
+    # Backends give invisible Gaussians no gradient.
     total = torch.zeros((), dtype=torch.float64)
     for name in DRAWN:
         value = getattr(p, name)
@@ -114,7 +114,7 @@ def test_float32_is_rounded_once():
     assert got.extents.dtype == torch.float32
 
 
-def test_what_is_not_kept_may_hold_anything():
+def test_gaussians_not_kept_may_have_any_values():
     gaussians, cam = scene("quats")
     keep = torch.ones(2, 308, dtype=torch.bool)
     keep[:, 40] = False
@@ -132,7 +132,7 @@ def test_what_is_not_kept_may_hold_anything():
             assert grad[:, 41].any()
 
 
-def test_same_bits_whatever_the_threads():
+def test_bits_do_not_depend_on_threads():
     gaussians, cam = cloud(3000, 1, batch=2), turned(camera(batch=2))
     before, results = torch.get_num_threads(), []
     try:

@@ -1,4 +1,4 @@
-"""Needles hundreds of pixels long, in float32, against the float64 judge: values and gradients.
+"""Needles hundreds of pixels long, in float32, against the float64 reference: values and gradients.
 
 Their exponent is a difference of terms that grow with the square of the length; each case lies in
 another direction, or the needle is looked at far from its mean.
@@ -17,9 +17,9 @@ from gsgan.scene import Camera, Gaussians
 from gsgan.splat import ACCURACY, project, rasterise
 
 SIZE, FOCAL, DEPTH = 96, 400.0, 2.0
-# An alpha that rounding takes across alpha_min would hide what is measured here.
+# An alpha that rounding moves across alpha_min would dominate the error.
 HIGH = replace(ACCURACY["high"], alpha_min=1e-10)
-# The reference in float32 takes means in picture coordinates: that rounds them to 1e-5 pixels.
+# The reference in float32 takes means in image coordinates: that rounds them to 1e-5 pixels.
 VALUE = {"reference": 1e-5, "torch": 1e-5, "native": 1e-6}
 GRADIENT = {"reference": 5e-4, "torch": 1e-4, "native": 5e-5}
 
@@ -27,7 +27,7 @@ GRADIENT = {"reference": 5e-4, "torch": 1e-4, "native": 5e-5}
 def needles(degrees: float, pixels: float, away: float = 0.0) -> tuple[Gaussians, Camera]:
     """Three needles 1e4 : 1, ``pixels`` long (one sigma), in float32.
 
-    ``away`` moves their means out of the picture, along the needle, by so many sigmas.
+    ``away`` moves their means out of the image, along the needle, by so many sigmas.
     """
     g = torch.Generator().manual_seed(0)
     length, angle = pixels * DEPTH / FOCAL, math.radians(degrees)
@@ -56,7 +56,7 @@ def draw(gaussians, cam, settings, backend):
     return raster, gradients(gaussians, cam)
 
 
-def assert_like_the_judge(backend, degrees, pixels, away=0.0):
+def assert_like_the_reference(backend, degrees, pixels, away=0.0):
     gaussians, cam = needles(degrees, pixels, away)
     got, got_grads = draw(gaussians, cam, HIGH, backend)
     exact = replace(HIGH, dtype="float64")
@@ -72,8 +72,8 @@ def assert_like_the_judge(backend, degrees, pixels, away=0.0):
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("degrees", [0.0, 0.1, 5.0, 45.0, 85.0, 89.9, 90.0, 135.0])
 @pytest.mark.parametrize("pixels", [300.0, 3000.0])
-def test_float32_needles_equal_the_judge(backend, degrees, pixels):
-    assert_like_the_judge(backend, degrees, pixels)
+def test_float32_needles_equal_the_reference(backend, degrees, pixels):
+    assert_like_the_reference(backend, degrees, pixels)
 
 
 @pytest.mark.parametrize("backend", [b for b in BACKENDS if b != "reference"])
@@ -81,12 +81,12 @@ def test_float32_needles_equal_the_judge(backend, degrees, pixels):
 @pytest.mark.parametrize("pixels", [300.0, 3000.0])
 def test_needles_whose_means_are_thousands_of_pixels_away(backend, degrees, pixels):
     # Not of the reference in float32: it rounds means where the others round differences.
-    assert_like_the_judge(backend, degrees, pixels, away=2.0)
+    assert_like_the_reference(backend, degrees, pixels, away=2.0)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 0.1, 45.0, 89.9, 90.0])
 @pytest.mark.parametrize("length", [300.0, 1e5])
-def test_factors_are_those_of_the_covariance(degrees, length):
+def test_factors_match_the_covariance(degrees, length):
     # Σ = L² d dᵀ + low-pass: along the needle q = s² / (L² + 0.3), across it q = s² / 0.3.
     p = project(*(x.to(torch.float64) for x in needles(degrees, length)), HIGH)
     angle = math.radians(degrees)

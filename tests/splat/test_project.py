@@ -32,7 +32,7 @@ def test_mean_and_covariance_of_a_gaussian_on_the_axis():
 
 
 def test_off_axis_depth_extent_shears_the_ellipse():
-    # A line along z at x/z = 0.25 moves the picture by -f x/z² per metre of depth.
+    # A line along z at x/z = 0.25 moves the image by -f x/z² per metre of depth.
     gaussians = one((0.5, 0.0, 2.0), scale=(1e-9, 1e-9, 0.1))
     p = project(gaussians, camera(focal=30.0), EXACT)
     along_x = 30.0 * 0.5 / 4 * 0.1
@@ -118,8 +118,8 @@ def test_an_opacity_below_alpha_min_has_no_extent(opacity, visible):
 
 
 @pytest.mark.parametrize(("x", "visible"), [(0.0, True), (1.2, True), (1.8, False), (-1.8, False)])
-def test_visible_where_the_footprint_meets_the_picture(x, visible):
-    # Half the picture is 16 px at 15 px/m: 1.067 m; the footprint of 0.1 m reaches 5.1 px.
+def test_visible_where_the_footprint_overlaps_the_image(x, visible):
+    # Half the image is 16 px at 15 px/m: 1.067 m; the footprint of 0.1 m reaches 5.1 px.
     assert project(one((x, 0.0, 2.0)), camera(), STANDARD).visible.item() is visible
 
 
@@ -128,7 +128,7 @@ def test_near_plane(z, visible):
     assert project(one((0.0, 0.0, z)), camera(), HIGH).visible.item() is visible
 
 
-def test_extents_and_visibility_carry_no_gradient():
+def test_extents_and_visibility_have_no_gradient():
     gaussians = cloud(5)
     p = project(replace(gaussians, means=gaussians.means.requires_grad_()), camera(), HIGH)
     assert p.means.requires_grad

@@ -25,13 +25,13 @@ def test_every_preset_is_a_config_and_every_config_a_preset():
 def test_config_equals_preset(name):
     config = yaml.safe_load((CONF / f"{name}.yaml").read_text())
     assert config.pop("_target_") == "gsgan.splat.settings.Accuracy"
-    # how pixels are formed is no cut-off: conf/effects and conf/model have it
+    # the pixel's filter is not a cut-off: it is in conf/effects and conf/model
     formed = {"antialias", "low_pass", "supersample"}
     assert set(config) == {field.name for field in fields(Accuracy)} - formed
     assert Accuracy(**config) == accuracy(name)
 
 
-def test_presets_are_the_table():
+def test_values_of_the_presets():
     table = {name: (s.alpha_min, s.transmittance_min, s.extent) for name, s in ACCURACY.items()}
     assert table == {
         "exact": (0, 0, "all"),
@@ -76,12 +76,12 @@ def test_unknown_names_are_refused():
         resolve_backend("gpu", CPU, ACCURACY["high"])
 
 
-def test_exact_goes_to_the_reference_unless_a_backend_is_forced():
+def test_exact_uses_the_reference_unless_a_backend_is_requested():
     assert resolve_backend("auto", CPU, ACCURACY["exact"]) == ("reference", "")
     assert resolve_backend("torch", CPU, ACCURACY["exact"]) == ("torch", "")
 
 
-def test_cuda_takes_torch_without_gsplat():
+def test_cuda_uses_torch_without_gsplat():
     name, reason = resolve_backend("auto", torch.device("cuda"), ACCURACY["high"])
     assert name == "torch"
     assert "gsplat is not installed" in reason
@@ -91,11 +91,11 @@ def test_cuda_takes_torch_without_gsplat():
 
 
 @needs_native
-def test_cpu_takes_native():
+def test_cpu_uses_native():
     assert resolve_backend("auto", CPU, ACCURACY["high"]) == ("native", "")
 
 
-def test_a_missing_kernel_falls_back_with_one_sentence_once(monkeypatch, caplog):
+def test_a_missing_kernel_falls_back_and_logs_once(monkeypatch, caplog):
     from gsgan.splat import native
 
     monkeypatch.setattr(native, "available", lambda: False)

@@ -1,4 +1,4 @@
-"""Drawing larger and averaging: what a pixel of a camera does."""
+"""Supersampling: drawing larger, then averaging."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ EXACT, HIGH = ACCURACY["exact"], ACCURACY["high"]
 
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("name", ["exact", "high", "standard", "draft"])
-def test_it_is_the_mean_of_the_larger_picture(backend, name):
+def test_it_is_the_mean_of_the_larger_image(backend, name):
     scene, cam = cloud(12, batch=2), camera((7, 10), batch=2)
     larger = rasterise(
         scene, cam.resize((21, 30)), settings=ACCURACY[name], backend=backend, depth=True
     )
     settings = replace(ACCURACY[name], supersample=3)
     found = rasterise(scene, cam, settings=settings, backend=backend, depth=True)
-    for picture in ("features", "alpha", "depth"):
-        mean = avg_pool2d(getattr(larger, picture), 3)
+    for image in ("features", "alpha", "depth"):
+        mean = avg_pool2d(getattr(larger, image), 3)
         assert mean.shape[-2:] == (7, 10)
-        torch.testing.assert_close(getattr(found, picture), mean, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(getattr(found, image), mean, rtol=1e-12, atol=1e-12)
     assert torch.equal(found.fine, larger.features)
     assert larger.fine is None
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_more_samples_come_nearer_to_the_integral_over_a_pixel(backend):
-    """Needles a fifth of a pixel wide, where one sample a pixel is a matter of luck."""
+def test_more_samples_approach_the_integral_over_a_pixel(backend):
+    """Needles a fifth of a pixel wide, where one sample per pixel is random."""
     scene = cloud(30, scale=0.012, seed=3)
     truth = rasterise(
         scene, camera((8, 10), focal=12.0), settings=replace(EXACT, low_pass=1e-4, supersample=24)
@@ -49,7 +49,7 @@ def test_more_samples_come_nearer_to_the_integral_over_a_pixel(backend):
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_gradients_are_those_of_the_picture(backend):
+def test_gradients_match_the_mean(backend):
     settings = replace(EXACT, supersample=2)
     scene, cam = cloud(4, 2), camera((4, 5), focal=6.0)
 
@@ -65,7 +65,7 @@ def test_gradients_are_those_of_the_picture(backend):
     assert torch.autograd.gradcheck(draw, [x.clone().requires_grad_() for x in inputs])
 
 
-def test_a_lens_is_followed_when_drawn_larger():
+def test_lens_distortion_with_supersampling():
     scene, cam = cloud(20), camera((12, 16), focal=20.0)
     cam = replace(cam, dist=torch.tensor([[-0.28, 0.09, 0.001, -0.0008, -0.01]]).double())
     settings = replace(EXACT, supersample=2)
@@ -74,7 +74,7 @@ def test_a_lens_is_followed_when_drawn_larger():
     torch.testing.assert_close(found.features, avg_pool2d(larger.features, 2))
 
 
-def test_nothing_to_draw_is_an_empty_picture():
+def test_nothing_to_draw_gives_an_empty_image():
     scene = cloud(0)
     raster = rasterise(scene, camera((3, 4)), settings=replace(HIGH, supersample=2), depth=True)
     assert raster.features.shape == (1, 3, 3, 4)

@@ -1,4 +1,4 @@
-"""What rasterise refuses, in which words, and what it drops."""
+"""The argument checks of rasterise: errors, messages, dropped Gaussians."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def test_covariances_must_be_finite():
         rasterise(replace(gaussians, quats=None, scales=None, covariances=covariances), camera())
 
 
-def test_what_is_not_used_may_hold_anything():
+def test_unused_tensors_may_have_any_values():
     gaussians = with_covariances(cloud(5))
     unused = replace(gaussians, quats=torch.full((1, 5, 4), float("nan")).double())
     want = rasterise(gaussians, camera())
@@ -98,7 +98,7 @@ def test_invalid_covariances_are_dropped():
     assert torch.equal(got.features, rasterise(rest, camera()).features)
 
 
-def test_a_gaussian_wrong_in_several_ways_counts_once():
+def test_a_gaussian_with_several_errors_counts_once():
     gaussians = spoilt("means", float("nan"))
     gaussians.scales[0, 2], gaussians.opacities[0, 4] = -1.0, 2.0
     with pytest.warns(UserWarning, match="dropped 2 of 5 invalid Gaussians"):
@@ -131,12 +131,12 @@ def test_wrong_shapes_are_refused(field, shape, message):
 
 
 @pytest.mark.parametrize("size", [(0, 32), (24, 0), (-1, 4), (2.5, 4), (24,)])
-def test_pictures_without_pixels_are_refused(size):
+def test_images_without_pixels_are_refused(size):
     with pytest.raises(ValueError, match=r"size must be \(H, W\) with both at least 1, got \("):
         replace(camera(), size=size)
 
 
-def test_half_a_shape_is_refused():
+def test_quats_without_scales_are_refused():
     with pytest.raises(ValueError, match="give quats and scales, or covariances"):
         replace(cloud(5), scales=None)
 
@@ -163,7 +163,7 @@ def test_mixed_dtypes_are_refused(field):
         rasterise(*records.values())
 
 
-def test_whole_numbers_are_refused():
+def test_integer_tensors_are_refused():
     whole = {k: v.long() for k, v in vars(cloud(5)).items() if v is not None}
     with pytest.raises(ValueError, match=r"means must be floating point, got torch.int64"):
         rasterise(Gaussians(**whole), camera())
@@ -197,7 +197,7 @@ def test_bad_cameras_are_refused(cam, message):
         rasterise(cloud(5), cam)
 
 
-def test_choices_are_checked():
+def test_unknown_options_are_refused():
     gaussians = cloud(5)
     with pytest.raises(ValueError, match="on_invalid must be error, drop or unchecked, got 'skip'"):
         rasterise(gaussians, camera(), on_invalid="skip")
@@ -218,7 +218,7 @@ def test_autocast_changes_nothing(backend):
     want = rasterise(plain, cam, backend=backend)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         got = rasterise(cast, cam, backend=backend)
-        if backend != "reference":  # plain autograd: its backward runs as the caller says
+        if backend != "reference":  # plain autograd: its backward runs in the caller's autocast
             got.features.sum().backward()
     if backend == "reference":
         got.features.sum().backward()

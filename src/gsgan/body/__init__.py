@@ -1,6 +1,6 @@
-"""Skinned bodies: linear blend skinning, the free body, and SMPL files of the user's own.
+"""Skinned bodies: linear blend skinning, the free body, and the user's SMPL files.
 
-Models of the SMPL family are in `gsgan.body.smpl`.
+Body models of the SMPL family are in `gsgan.body.smpl`.
 """
 
 from gsgan.body.free import Body, free_body, read_body

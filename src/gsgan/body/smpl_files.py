@@ -1,12 +1,11 @@
-"""A model file of the SMPL family as checked arrays, whatever pickled it.
+"""Reads a model file of the SMPL family as checked arrays.
 
-Source: keys and shapes that public loaders rely on.
+Source: keys and shapes in public loaders.
 """
 
 from __future__ import annotations
 
 import zipfile
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,45 +18,24 @@ from gsgan.utils.pickles import read_npz, read_pickle
 
 KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 SMPLX_JOINT_COUNT = 55
-# SMPL-X puts shape and expression coefficients behind one another: 300 + 100, or 10 + 10.
+# SMPL-X concatenates shape and expression coefficients: 300 + 100, or 10 + 10.
 SMPLX_SHAPES, SMPLX_ALL = 300, 400
 SMPLX_FEW_SHAPES, SMPLX_FEW_ALL = 10, 20
-WEIGHT_TOLERANCE = 1e-3  # by which a vertex's weights may miss the sum of one, or zero
+WEIGHT_TOLERANCE = 1e-3  # of the sum of a vertex's weights, and of negative weights
 
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class SmplArrays:
-    """The arrays of a model, float64 and int64.
+def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
+    """The checked arrays of a .pkl or .npz model file, recognised by content.
 
-    Args:
-        v_template: ``[V, 3]`` metres.
-        shapedirs: ``[V, 3, S]`` metres a unit of each shape coefficient.
-        expression_dirs: ``[V, 3, E]``; E is 0 but for SMPL-X.
-        posedirs: ``[V, 3, 9 (J - 1)]`` metres a unit of each entry of the joints' ``R - 1``.
-        J_regressor: ``[J, V]``.
-        weights: ``[V, J]``, rows sum to 1.
-        parents: ``J``, -1 for the root.
-        faces: ``[F, 3]``.
-    """
-
-    v_template: Floats
-    shapedirs: Floats
-    expression_dirs: Floats
-    posedirs: Floats
-    J_regressor: Floats
-    weights: Floats
-    parents: tuple[int, ...]
-    faces: NDArray[np.int64]
-
-
-def read_arrays(path: Path) -> SmplArrays:
-    """The checked arrays of a .pkl or .npz model file, told apart by content.
+    Returns:
+        The arrays, float64 and int64, by the names of `gsgan.body.smpl.SkinnedModel`, and the
+        parent of each joint.
 
     Raises:
         DataError: when the file is missing, damaged, holds forbidden classes, lacks an array, or
-            an array's shape or values do not fit.
+            an array's shape or values are wrong.
     """
     raw = _raw(path)
     v_template = expect_array(raw, "v_template", (None, 3), path)
@@ -74,16 +52,13 @@ def read_arrays(path: Path) -> SmplArrays:
         "weights": expect_array(raw, "weights", (V, J), path),
     }
     checked = {name: _finite(array, name, path) for name, array in floats.items()}
-    return SmplArrays(
-        v_template=checked["v_template"],
-        shapedirs=checked["shapedirs"][..., :S],
-        expression_dirs=checked["shapedirs"][..., S:],
-        posedirs=checked["posedirs"],
-        J_regressor=checked["J_regressor"],
-        weights=_weights(checked["weights"], path),
-        parents=parents,
-        faces=_faces(expect_array(raw, "f", (None, 3), path), V, path),
-    )
+    directions = checked["shapedirs"]
+    return checked | {
+        "shapedirs": directions[..., :S],
+        "expression_dirs": directions[..., S:],
+        "weights": _weights(checked["weights"], path),
+        "faces": _faces(expect_array(raw, "f", (None, 3), path), V, path),
+    }, parents
 
 
 def _raw(path: Path) -> dict[str, Any]:
@@ -96,14 +71,14 @@ def _raw(path: Path) -> dict[str, Any]:
     missing = [key for key in KEYS if not isinstance(content.get(key), np.ndarray)]
     if missing:
         raise DataError(
-            f"{path} is no SMPL model: it has no array {', '.join(missing)}; give the model file "
-            "itself (.pkl or .npz), not fitted parameters"
+            f"{path} is not an SMPL model: it has no array {', '.join(missing)}; give the model "
+            "file itself (.pkl or .npz), not fitted parameters"
         )
     return content
 
 
 def _shape_count(joints: int, directions: int) -> int:
-    """How many of a file's directions are body shape; the rest is expression."""
+    """Number of a file's directions that are body shape; the rest are expression."""
     if joints != SMPLX_JOINT_COUNT:
         return directions
     if directions >= SMPLX_ALL:

@@ -1,6 +1,6 @@
 """SMPL's and SMPL-X's joints and parts by name. Constants only.
 
-Source: facts that public loaders state.
+Source: public loaders.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ CLOTHES = (
     *("left_arm", "right_arm", "left_hand", "right_hand"),
     *("left_leg", "right_leg", "left_shoe", "right_shoe"),
 )
-"""The free body's parts, in its order."""
+"""The parts of the free body, in the same order."""
 
 CIHP = (
     *("background", "hat", "hair", "glove", "sunglasses", "upper_clothes", "dress", "coat"),
     *("socks", "pants", "torso_skin", "scarf", "skirt", "face", "left_arm", "right_arm"),
     *("left_leg", "right_leg", "left_shoe", "right_shoe"),
 )
-"""ZJU-MoCap's ``mask_cihp``, ids 0 to 19; there is no hand among them."""
+"""ZJU-MoCap's ``mask_cihp``, ids 0 to 19; it has no hands."""
 
 
 def part_names(parts: Parts, joint_names: tuple[str, ...]) -> tuple[str, ...]:
@@ -50,17 +50,17 @@ def part_names(parts: Parts, joint_names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def fitting_parts(label_names: tuple[str, ...], joint_names: tuple[str, ...]) -> Parts:
-    """The set whose names these are; the free body's when it is none of them."""
+    """The set of parts with these names; the free body's where there is none."""
     return next(
         (p for p in get_args(Parts) if part_names(p, joint_names) == label_names), "clothes"
     )
 
 
 def part_of_joint(parts: Parts, joint: str) -> str:
-    """The part that what moves with a joint most often belongs to.
+    """The part that vertices moved by a joint usually belong to.
 
-    Convention: a body in a shirt, trousers and shoes; the head is face (a body model does not know
-    where hair starts), the shins are legs.
+    Convention: a body in a shirt, trousers and shoes; the head is face (a body model has no
+    hairline), the shins are legs.
 
     Args:
         parts: the set of parts.
@@ -85,10 +85,7 @@ def part_of_joint(parts: Parts, joint: str) -> str:
 
 
 def group_of_part(name: str) -> str:
-    """ "left_hand", "right_hand" or "face_neck" when a part (or what hangs on a joint) is one.
-
-    The empty string for any other part.
-    """
+    """The group of a part or joint: "left_hand", "right_hand", "face_neck", or "" for any other."""
     if name == "face":
         return "face_neck"
     joint = name in SMPL_JOINTS or name in SMPLX_JOINTS

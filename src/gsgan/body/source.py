@@ -1,4 +1,4 @@
-"""The body that a dataset's poses are of: the free one, or one from the user's model file."""
+"""The body of a dataset's poses: the free body, or one from the user's model file."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ def open_body(
     betas: Sequence[float] = (),
     label_names: Sequence[str] = (),
 ) -> SkinnedBody | None:
-    """The body with part labels of its own, or None when there is no mesh of it here.
+    """The body with its part labels, or None when no mesh of it is available.
 
     Convention: arguments are plain values, as `SceneInfo` and checkpoints hold them. A model file
-    gets the set of parts that the pictures' labels name (the free body's, CIHP's, or one part a
-    joint); the free body's where they name none of these. Clothes on a model file are a guess, and
-    the names need not be the pictures' at all: see `SkinnedBody.shares_labels`.
+    gets the set of parts with the names of the images' labels (the free body's, CIHP's, or one part
+    per joint), by default the free body's. Clothes on a model file are a guess, and their names may
+    differ from the images' labels: see `SkinnedBody.shares_labels`.
 
     Args:
-        kind: "free", "smpl", "smplx", or what else the data calls it.
+        kind: "free", "smpl", "smplx", or another name from the data.
         file: the user's model file; not needed for the free body.
         betas: shape coefficients of the person.
-        label_names: the parts in the data's label pictures, background first; empty when unknown.
+        label_names: the parts in the data's label images, background first; empty when unknown.
 
     Raises:
         DataError: when the file cannot be read or is of another body.
@@ -38,12 +38,6 @@ def open_body(
         return free_body()
     if kind is None or file is None:
         return None
-    return _from_file(kind, file, betas, tuple(label_names))
-
-
-def _from_file(
-    kind: str, file: str, betas: Sequence[float], label_names: tuple[str, ...]
-) -> SkinnedBody:
     from gsgan.body.smpl import read_smpl
     from gsgan.body.smpl_names import fitting_parts
 
@@ -58,4 +52,4 @@ def _from_file(
             f"{file} has {model.shapedirs.shape[-1]} shape coefficients, the data gives "
             f"{len(betas)}; give the model file that the data was fitted with"
         )
-    return model.as_body(betas, fitting_parts(label_names, model.joint_names))
+    return model.as_body(betas, fitting_parts(tuple(label_names), model.joint_names))

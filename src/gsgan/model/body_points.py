@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from gsgan.body import SkinnedBody
-from gsgan.body.normals import vertex_normals
+from gsgan.body.skinned import vertex_normals
 from gsgan.model.skinned_points import SkinnedPoints
 from gsgan.scene import BodyPose
 from gsgan.skeleton import Points

@@ -10,10 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from gsgan.data.synthetic.make import cache_root
 from gsgan.prepare.sources import Source
 from gsgan.prepare.writing import writing
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.files import cache_root
 
 TOOL = Path(__file__).parent / "mediapipe_tool"
 SCRIPT, REQUIREMENTS = TOOL / "detect.py", TOOL / "requirements.txt"

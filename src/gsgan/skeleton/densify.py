@@ -1,4 +1,4 @@
-"""Algorithm 1: a few thousand surface points on the bones, the same body points in every pose."""
+"""Algorithm 1: a few thousand surface points on the bones, the same points in every pose."""
 
 from __future__ import annotations
 
@@ -11,15 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from gsgan.skeleton import sampling
-from gsgan.skeleton.frames import (
-    MIN_LENGTH,
-    BoneFrames,
-    Swing,
-    bone_frames,
-    check_skeleton,
-    constants,
-)
+from gsgan.skeleton.frames import MIN_LENGTH, BoneFrames, bone_frames
 from gsgan.skeleton.template import HEAD, MEDIAPIPE33, SkeletonTemplate
+from gsgan.skeleton.tensors import Swing, check_skeleton, constants
 from gsgan.utils.errors import ConfigError
 
 Torso = Literal["fit", "cube"]
@@ -29,18 +23,18 @@ Limbs = Literal["paper22", "all26"]
 
 @dataclass(frozen=True)
 class Points:
-    """Where the body's points are in one batch of poses.
+    """The points of a body in a batch of poses.
 
     Args:
         means: ``[B, N, 3]`` metres, world frame.
         rotations: ``[B, P, 3, 3]`` frames of the parts: limbs, then face, then torso. On a skinned
             body (`gsgan.model.body_points`) each point is a part, and its frame may shear.
-        origins: ``[B, P, 3]`` metres, world frame: where each part's frame sits.
-        scales: ``[B, N]`` metres, initial standard deviation, the same in all directions.
-        valid: ``[B, N]`` bool, False on parts whose joints were not seen.
+        origins: ``[B, P, 3]`` metres, world frame: origin of each part's frame.
+        scales: ``[B, N]`` metres, initial standard deviation, isotropic.
+        valid: ``[B, N]`` bool, False on parts whose joints are unseen.
         part_id: ``[N]`` int64 into the parts.
-        normals: ``[B, N, 3]`` outward, world frame, of length one; on a skinned body shorter, down
-            to zero, where the skin is flat.
+        normals: ``[B, N, 3]`` outward, world frame, unit length; on a skinned body shorter, down to
+            zero, where the skin is flat.
     """
 
     means: Tensor
@@ -57,7 +51,7 @@ class Points:
         return self.rotations.index_select(1, self.part_id)
 
     def local(self) -> Tensor:
-        """``[B, N, 3]`` metres: the points in their parts' frames, free of any rigid motion.
+        """``[B, N, 3]`` metres: the points in their parts' frames, invariant to rigid motions.
 
         Convention: frames are rotations, as densify's are.
         """
@@ -66,28 +60,28 @@ class Points:
 
 
 class Densify(nn.Module):
-    """Cylinders on the limbs, a sphere round the face, a box round the trunk.
+    """Cylinders on the limbs, a sphere around the face, a box around the trunk.
 
     Convention: unit shapes are sampled once in their part's frame and moved by similarity
-    transforms, so that index k is the same body point in every pose. The layout is frozen: limb
+    transforms, so that index k is the same body point in every pose. The layout is fixed: limb
     l has ``[n l, n (l + 1))`` with ``n = points_per_limb``, then the face, then the torso; 5400
-    points by default. Nothing is learned; nothing depends on earlier calls.
+    points by default. The module has no parameters and no state.
 
     Args:
-        template: names joints and limbs.
-        points_per_limb: on each limb's cylinder.
-        face_points: on the sphere.
-        torso_points: on the box.
+        template: joints and limbs.
+        points_per_limb: points on each limb's cylinder.
+        face_points: points on the sphere.
+        torso_points: points on the box.
         radius_ratio: cylinder radius over its length.
         face_radius_scale: sphere radius over the longest distance between face joints.
         torso: ``fit`` (as wide as shoulders or hips, as high as the spine, half as deep as wide)
-            or ``cube`` (edges as long as the longest distance between shoulders and hips).
+            or ``cube`` (edge length: the longest distance between shoulders and hips).
         sampler: ``even`` (low discrepancy) or ``trimesh`` (shipped random surface samples).
-        limbs: ``paper22``, or ``all26`` with the trunk's four edges.
-        sigma: initial standard deviation over the mean spacing ``sqrt(area / points)``.
-        torso_range: the box's edges stay within these multiples of the rest pose's (``fit``).
+        limbs: ``paper22``, or ``all26``: with the trunk's four edges.
+        sigma: initial standard deviation divided by the mean spacing ``sqrt(area / points)``.
+        torso_range: bounds of the box's edges, in multiples of the rest pose's (``fit``).
         min_length: metres, see :func:`gsgan.skeleton.bone_frames`.
-        dtype: of the buffers; None: torch's default.
+        dtype: of the buffers; torch's default by default.
 
     Raises:
         ConfigError: on an unknown option or a count below 1.
@@ -129,7 +123,7 @@ class Densify(nn.Module):
         _check_options(torso=torso, sampler=sampler, limbs=limbs)
         counts = (points_per_limb, face_points, torso_points)
         if min(counts) < 1:
-            raise ConfigError(f"Densify: every part needs at least one point, got {counts}")
+            raise ConfigError(f"Densify: every part must have at least one point, got {counts}")
         if min(radius_ratio, face_radius_scale, sigma, min_length) <= 0:
             raise ConfigError(
                 "Densify: radius_ratio, face_radius_scale, sigma and min_length must be positive, "
@@ -187,20 +181,20 @@ class Densify(nn.Module):
         """Moves the points to a pose.
 
         Convention: metres, world frame; differentiable in p. Far from the world's origin the
-        result has the grain of its dtype (1 mm at 1e4 m in float32): see
+        resolution of the dtype limits the result (1 mm at 1e4 m in float32): see
         :func:`gsgan.skeleton.recentre`.
 
         Args:
             p: ``[B, J, 3]`` finite joints (see :func:`gsgan.skeleton.sanitise`).
-            valid: ``[B, J]`` bool, False where a joint is a stand-in; None: all seen.
-            frames: of these very skeletons, when they are at hand already.
+            valid: ``[B, J]`` bool, False for joints that were filled in; None: all seen.
+            frames: of the same skeletons, if computed already.
 
         Returns:
-            Points. A part counts as seen when both ends of a limb, any face joint, or three of
-            shoulders and hips were.
+            Points. A limb counts as seen when both its ends are, the face when any face joint is,
+            the torso when three of shoulders and hips are.
 
         Raises:
-            ValueError: on a shape that does not fit the template.
+            ValueError: when a shape does not match the template.
         """
         valid = check_skeleton("Densify", p, valid, self.template)
         c = constants(self.template, p.device, p.dtype)
@@ -221,7 +215,7 @@ class Densify(nn.Module):
         trunk = self._torso_points @ (trunk_R * edges.unsqueeze(1)).mT + origins[:, -1:]
         spread = torch.cat([frames.lengths * self._limb_sigma(), self._hub_sigma(radius, edges)], 1)
         rotations = torch.cat([frames.limbs, head_R.unsqueeze(1), trunk_R.unsqueeze(1)], dim=1)
-        # Stretching a cylinder or a box along its axes leaves its normals as they are.
+        # Stretching a cylinder or a box along its axes does not change its normals.
         turned = rotations.index_select(1, self.part_id) @ self.normals.unsqueeze(-1)
         return Points(
             means=torch.cat([limbs, head, trunk], dim=1) + root,
@@ -241,7 +235,7 @@ class Densify(nn.Module):
         return torch.cat([limbs, face, torso], dim=1)
 
     def _longest(self, q: Tensor, pairs: Tensor) -> Tensor:
-        """``[B]``: the longest distance, never zero."""
+        """``[B]`` metres: the longest distance over pairs of joints, never zero."""
         d = q.index_select(1, pairs[0]) - q.index_select(1, pairs[1])
         return (d.square().sum(-1).amax(-1) + self.min_length**2).sqrt()
 
@@ -262,7 +256,7 @@ class Densify(nn.Module):
         return float(self.sigma * (2 * np.pi * self.radius_ratio / self.counts[0]) ** 0.5)
 
     def _hub_sigma(self, radius: Tensor, edges: Tensor) -> Tensor:
-        """``[B, 2]`` metres: of face and torso."""
+        """``[B, 2]`` metres: initial standard deviations of face and torso."""
         x, y, z = edges.unbind(-1)
         face = radius * float(self.sigma * (4 * np.pi / self.counts[1]) ** 0.5)
         torso = self.sigma * (2 * (x * y + y * z + z * x) / self.counts[2]).sqrt()
@@ -279,7 +273,7 @@ def _check_options(**options: str) -> None:
 
 
 def _limb_axes(template: SkeletonTemplate) -> Tensor:
-    """``[L, 3, 3]`` float64: constant rotations taking z to the limbs' rest directions."""
+    """``[L, 3, 3]`` float64: constant rotations from z to the limbs' rest directions."""
     up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     rest = torch.tensor(template.rest_directions, dtype=torch.float64)
     return Swing.of(up).to(rest.unsqueeze(1)).squeeze(1)

@@ -1,4 +1,4 @@
-"""p₂D: the skeleton projected and drawn as soft limbs, one channel a body part."""
+"""p₂D: the skeleton projected and drawn as soft limbs, one channel per body part."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from gsgan.scene import Camera
-from gsgan.skeleton.frames import check_skeleton
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
+from gsgan.skeleton.tensors import check_skeleton
 from gsgan.utils.constants import constant
 
 MIN_SEGMENT_PX = 1e-2
 """Pixels: a shorter segment is drawn as a point, with a finite slope."""
 MIN_EXPONENT = -60.0
-"""Where a line fades to zero: at 1e-26, eleven sigmas off."""
+"""Below this exponent a line is exactly zero: at 1e-26, eleven sigmas away."""
 
 
 def draw_skeleton(
@@ -33,21 +33,21 @@ def draw_skeleton(
 ) -> Tensor:
     """Draws the skeleton as the camera sees it.
 
-    Convention: a channel is the largest ``exp(-d² / 2 sigma²)`` over its group's segments, d the
+    Convention: a channel is the maximum of ``exp(-d² / 2 sigma²)`` over its group's segments, d the
     distance of the pixel's centre in pixels; 1 on the bone. ``sigma = sigma_px H / 512``, at least
-    ``min_sigma_px`` pixels of the grid it is computed on. Left out: segments with an end unseen or
-    nearer than ``near``. Joints follow the camera's lens, bones stay straight. Differentiable in p
-    and the camera.
+    ``min_sigma_px`` pixels of the grid it is computed on. Segments with an end that is unseen or
+    nearer than ``near`` are not drawn. Joints are distorted by the camera's lens, bones stay
+    straight. Differentiable in p and the camera.
 
     Args:
         p: ``[B, J, 3]`` finite joints, metres, world frame.
         valid: ``[B, J]`` bool or None.
-        camera: ``B`` cameras; its size is the picture's.
-        template: names the groups; MediaPipe's are head, torso, left and right arm, hand, leg.
-        sigma_px: line width at a picture height of 512.
+        camera: ``B`` cameras; their size is the image's.
+        template: defines the groups; MediaPipe's are head, torso, left and right arm, hand, leg.
+        sigma_px: line width at an image height of 512.
         near: metres.
         downscale: computes at 1/downscale of the size and upsamples bilinearly.
-        min_sigma_px: floor of the line width.
+        min_sigma_px: lower bound of the line width.
 
     Returns:
         ``[B, groups, H, W]`` in [0, 1].
@@ -72,10 +72,10 @@ def draw_skeleton(
     ends = _segment_ends(template, p.device)
     shown = (drawn.index_select(1, ends[0]) & drawn.index_select(1, ends[1])).unsqueeze(-1)
     a, b = (pixels.index_select(1, end) for end in ends)
-    # on the inputs: a far-off or meaningless pixel must not reach the arithmetic
+    # masked before the arithmetic: pixels of unseen joints may be anything
     a, b = torch.where(shown, a, 0.0), torch.where(shown, b, 0.0)
     distance2 = _distance2(a, b, shown, (h, w), [len(g) for _, g in template.draw_groups])
-    # below the floor the value is an exact zero: denormals would slow this and all that follows
+    # below the bound the value is exactly zero: denormals would slow down everything that follows
     exponent = (distance2 * (-0.5 / sigma**2)).clamp_min(MIN_EXPONENT)
     image = exponent.exp() - math.exp(MIN_EXPONENT)
     if downscale > 1:
@@ -85,9 +85,9 @@ def draw_skeleton(
 
 @lru_cache(maxsize=64)
 def _segment_ends(template: SkeletonTemplate, device: torch.device) -> Tensor:
-    """``[2, S]`` joints of all groups' segments; made once, not copied over in every frame."""
+    """``[2, S]`` joints of all groups' segments; cached, not copied to the device in every call."""
     segments = [edge for _, group in template.draw_groups for edge in group]
-    # tensors born in inference mode could not be used for training later
+    # tensors created in inference mode cannot be used for training later
     with torch.inference_mode(False):
         return torch.tensor(segments, device=device).T
 
@@ -98,7 +98,7 @@ def _distance2(
     """``[B, groups, h, w]`` squared pixels to each group's nearest segment; huge where none is.
 
     In a segment's own axes a pixel is ``along`` lengths from its middle and ``across`` pixels
-    off its line. Both are affine: a column term plus a row term, summed per pixel.
+    from its line. Both are affine: the sum of a column term and a row term.
     """
     h, w = size
     d = b - a
@@ -106,7 +106,7 @@ def _distance2(
     short = length2 < MIN_SEGMENT_PX**2
     length2 = torch.where(short, MIN_SEGMENT_PX**2, length2)
     d = torch.where(short, constant((MIN_SEGMENT_PX, 0.0), d), d)
-    # an unseen segment is put so far off its line that its value is an exact zero
+    # an unseen segment gets such a large distance that its value is exactly zero
     away = torch.where(shown, 0.0, 1e4 * float(max(h, w)))
 
     x = torch.arange(w, device=a.device, dtype=a.dtype) + 0.5 - a[..., :1]  # [B, S, w]
@@ -118,7 +118,7 @@ def _distance2(
     parts = ((col.unsqueeze(-2), row.unsqueeze(-1)) for col, row in (along, across))
     (along_x, along_y), (across_x, across_y) = parts
     terms = (along_x, along_y, across_x, across_y, length2.sqrt().unsqueeze(-1))
-    # group by group: the [B, segments, h, w] temporaries stay small enough for the cache
+    # per group: the [B, segments, h, w] temporaries fit into the cache
     return torch.stack(
         [_nearest(*group) for group in zip(*(t.split(counts, 1) for t in terms), strict=True)], 1
     )

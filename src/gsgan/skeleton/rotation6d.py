@@ -1,4 +1,4 @@
-"""The continuous 6D form of a rotation: its first two columns."""
+"""The continuous 6D representation of a rotation: its first two columns."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ def rotation_from_6d(x: Tensor, eps: float = 1e-5) -> Tensor:
     """The rotation nearest to two columns, by Gram-Schmidt.
 
     Convention: the columns need not be unit or orthogonal. A first column shorter than ``eps`` is
-    taken as the x axis; a second whose part across the first is shorter than ``eps`` times its own
-    length (or than ``eps``) gives way to the axis least along the first. The result is a rotation
-    and the gradient is finite in every case; in the replaced parts the gradient is zero.
+    replaced by the x axis; a second one whose part orthogonal to the first is shorter than ``eps``
+    times its own length (or than ``eps``) by the axis least along the first. The result is always
+    a rotation with a finite gradient; the gradient of replaced columns is zero.
 
     Args:
         x: ``[..., 6]``, column 0 then column 1.
-        eps: below which a column says nothing.
+        eps: length below which a column is replaced.
 
     Returns:
         ``[..., 3, 3]`` with det +1.
@@ -43,24 +43,28 @@ def rotation_from_6d(x: Tensor, eps: float = 1e-5) -> Tensor:
     a, b = x[..., :3], x[..., 3:]
     x_axis = torch.eye(3, dtype=x.dtype, device=x.device)[0].expand_as(a)
     a = torch.where((a.square().sum(-1, keepdim=True) < eps**2), x_axis, a)
-    first = _unit(a)
+    first = unit(a)
 
-    across = b - first * (first * b).sum(-1, keepdim=True)
+    part = across(first, b)
     length2 = b.square().sum(-1, keepdim=True).clamp_min(1.0)
-    unusable = across.square().sum(-1, keepdim=True) < eps**2 * length2
-    across = torch.where(unusable, orthogonal_to(first.detach()), across)
-    second = _unit(across)
-    # once more: after cancellation the first pass leaves a part along the first column
-    second = _unit(second - first * (first * second).sum(-1, keepdim=True))
+    unusable = part.square().sum(-1, keepdim=True) < eps**2 * length2
+    second = unit(torch.where(unusable, orthogonal_to(first.detach()), part))
+    # again: after cancellation the first pass leaves a part along the first column
+    second = unit(across(first, second))
     return torch.stack([first, second, torch.linalg.cross(first, second)], dim=-1)
 
 
-def orthogonal_to(unit: Tensor) -> Tensor:
-    """``[..., 3]`` unit vectors across unit vectors: the axis least along each, made orthogonal."""
-    least = unit.abs().argmin(dim=-1, keepdim=True)
-    axis = torch.zeros_like(unit).scatter(-1, least, 1.0)
-    return _unit(axis - unit * (unit * axis).sum(-1, keepdim=True))
+def orthogonal_to(axis: Tensor) -> Tensor:
+    """``[..., 3]`` unit vectors orthogonal to unit vectors: the world axis least along each."""
+    least = axis.abs().argmin(dim=-1, keepdim=True)
+    return unit(across(axis, torch.zeros_like(axis).scatter(-1, least, 1.0)))
 
 
-def _unit(v: Tensor) -> Tensor:
+def across(axis: Tensor, v: Tensor) -> Tensor:
+    """The part of v orthogonal to a unit ``axis``."""
+    return v - axis * (axis * v).sum(-1, keepdim=True)
+
+
+def unit(v: Tensor) -> Tensor:
+    """v divided by its length."""
     return v * v.square().sum(-1, keepdim=True).rsqrt()

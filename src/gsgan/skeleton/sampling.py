@@ -1,8 +1,8 @@
-"""Points spread over unit shapes, once, in the shape's own frame.
+"""Sample points on unit shapes, in the shape's own frame.
 
 Convention: float64 numpy arrays ``points [n, 3]`` and outward unit ``normals [n, 3]``. The
 cylinder has radius 1 and height 1 from z = 0 up, lateral face only (caps would be inside the
-neighbouring limb); the sphere has radius 1; the box has edges 1 round the origin.
+neighbouring limb); the sphere has radius 1; the box has edges of 1 around the origin.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ PLASTIC = 1.32471795724474602596  # root of x³ = x + 1, the two-dimensional gol
 
 
 def even_cylinder(n: int) -> Samples:
-    """``n`` points round the unit cylinder: evenly up it, a golden turn apart."""
+    """``n`` points on the unit cylinder: evenly spaced in height, a golden angle apart."""
     k = np.arange(n)
     turn = 2 * np.pi * np.modf(k * GOLDEN)[0]
     normals = np.stack([np.cos(turn), np.sin(turn), np.zeros(n)], axis=-1)
@@ -37,7 +37,7 @@ def even_sphere(n: int) -> Samples:
 
 
 def even_box(n: int, extents: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Samples:
-    """``n`` points on the unit box, as many a face as it has area when stretched to ``extents``.
+    """``n`` points on the unit box, per face in proportion to its area when scaled to ``extents``.
 
     Faces are filled by the R2 sequence (Roberts 2018), a two-dimensional golden ratio.
     """
@@ -57,8 +57,8 @@ def even_box(n: int, extents: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> S
 def shipped(shape: str, n: int) -> Samples:
     """The stored random samples of a shape: cylinder, sphere, box, or box_fit.
 
-    ``templates.npz`` was drawn once with trimesh (scripts/make_skeleton_templates.py), so that
-    results depend on no trimesh version.
+    ``templates.npz`` was sampled once with trimesh (scripts/make_skeleton_templates.py), so that
+    results do not depend on the trimesh version.
 
     Raises:
         ValueError: when the file holds another number of points than ``n``.
@@ -68,7 +68,7 @@ def shipped(shape: str, n: int) -> Samples:
         points, normals = stored[shape].astype(np.float64), stored[f"{shape}_normals"]
     if len(points) != n:
         raise ValueError(
-            f"sampler 'trimesh' ships {len(points)} {shape} points, got a wish for {n}; "
+            f"sampler 'trimesh' has {len(points)} {shape} points, {n} were requested; "
             "use sampler 'even' for other numbers"
         )
     return points, normals.astype(np.float64)

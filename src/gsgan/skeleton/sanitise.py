@@ -1,4 +1,4 @@
-"""Skeletons made whole: what was not seen is stood in for before any arithmetic touches it."""
+"""Completes skeletons: unseen joints are filled in before any arithmetic."""
 
 from __future__ import annotations
 
@@ -8,34 +8,35 @@ import torch
 from torch import Tensor
 
 from gsgan.scene import Camera
-from gsgan.skeleton.frames import BoneFrames, bone_frames, check_skeleton, constants
+from gsgan.skeleton.frames import bone_frames
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, SkeletonTemplate
+from gsgan.skeleton.tensors import check_skeleton, constants
 
 MIN_TRUNK_JOINTS = 3
-"""Of the two shoulders and two hips: with fewer there is no trunk to hang the rest on."""
+"""Of the two shoulders and two hips: with fewer the trunk's frame is undefined."""
 
 
 def limb_length_sum(
     p: Tensor, valid: Tensor | None = None, template: SkeletonTemplate = MEDIAPIPE33
 ) -> Tensor:
-    """The summed limb lengths, h_body: a measure of the subject's size that no pose changes.
+    """The sum of limb lengths, h_body: a measure of the subject's size, the same in every pose.
 
-    Convention: metres; about 2.4 times the stature. Limbs with an unseen end are made up for by
-    the share they have of the rest skeleton's sum; with no limb seen the result is NaN, so that a
-    nanmedian over frames passes it by.
+    Convention: metres; about 2.4 times the stature. Limbs with an unseen end are accounted for by
+    their share of the rest skeleton's sum; with no limb seen the result is NaN, which a nanmedian
+    over frames ignores.
 
     Args:
         p: ``[B, J, 3]`` metres; unseen joints may hold anything.
         valid: ``[B, J]`` bool or None.
-        template: names the limbs.
+        template: defines the limbs.
 
     Returns:
         ``[B]`` metres.
 
     Raises:
-        ValueError: on a shape that does not fit the template.
+        ValueError: when a shape does not match the template.
 
-    Source: method notes, section 2 (one constant a subject, the median over training frames).
+    Source: method notes, section 2 (one constant per subject, the median over training frames).
     """
     valid = check_skeleton("limb_length_sum", p, valid, template)
     c = constants(template, p.device, p.dtype)
@@ -55,31 +56,31 @@ def sanitise(
     min_visibility: float = 0.0,
     min_trunk_joints: int = MIN_TRUNK_JOINTS,
 ) -> tuple[Tensor, Tensor]:
-    """Replaces joints that were not seen, and says which.
+    """Fills in unseen joints, and marks them.
 
     Convention: metres, world frame. A joint is unseen when a coordinate is NaN or infinite or its
-    visibility is not above ``min_visibility``. One lost shoulder or hip is completed from the other
-    three; a face joint is set by the head's frame; any other at the end of its rest bone in its
-    parent's frame. Stand-ins move with the seen joints and pass gradients to them. Seen joints are
-    returned bit for bit. The check costs one device synchronisation.
+    visibility is not above ``min_visibility``. One missing shoulder or hip is completed from the
+    other three; a face joint is placed by the head's frame; any other joint at the end of its rest
+    bone in its parent's frame. Filled-in joints move with the seen ones and pass gradients to them.
+    Seen joints are returned unchanged. The check costs one device synchronisation.
 
     Args:
         p: ``[B, J, 3]``.
         visibility: ``[B, J]`` or None (all visible).
-        template: names the joints and holds the rest pose.
-        body_height: the subject's h_body as :func:`limb_length_sum` measures it, a number or
-            ``[B]``: how long the missing bones are. None: from the limbs that were seen.
-        min_visibility: at or below it a joint is unseen.
-        min_trunk_joints: shoulders and hips that must have been seen, 3 or 4.
+        template: defines the joints and the rest pose.
+        body_height: the subject's h_body as of :func:`limb_length_sum`, a number or ``[B]``,
+            which scales the missing bones. None: from the seen limbs.
+        min_visibility: a joint at or below it is unseen.
+        min_trunk_joints: number of shoulders and hips that must be seen, 3 or 4.
 
     Returns:
         ``p [B, J, 3]`` finite, and ``valid [B, J]`` bool.
 
     Raises:
-        ValueError: on a wrong shape, or when too few shoulders and hips were seen, naming batch
+        ValueError: on a wrong shape, or when too few shoulders and hips are seen, naming batch
             items and joints.
 
-    Source: method notes, sections 1 and 10 (our decision; the paper does not treat lost joints).
+    Source: method notes, sections 1 and 10 (ours; the paper does not treat missing joints).
     """
     check_skeleton("sanitise", p, None, template)
     valid = torch.isfinite(p).all(-1)
@@ -99,11 +100,11 @@ def sanitise(
 def recentre(
     p: Tensor, camera: Camera, template: SkeletonTemplate = MEDIAPIPE33
 ) -> tuple[Tensor, Camera, Tensor]:
-    """Moves the world's origin to the left hip; the picture stays the same.
+    """Moves the world's origin to the left hip; the image stays the same.
 
-    Convention: a float32 number at 1e4 m has a grain of 1 mm. A capture in far-off coordinates
-    (survey, geographic) is right in float32 only if it is recentred in float64 first, joints and
-    cameras together.
+    Convention: float32 has a resolution of 1 mm at 1e4 m. A capture in large coordinates (survey,
+    geographic) is exact in float32 only if it is recentred in float64 first, joints and cameras
+    together.
 
     Args:
         p: ``[B, J, 3]`` metres, finite.
@@ -149,7 +150,7 @@ def _filled(
         scale = torch.as_tensor(body_height, dtype=p.dtype, device=p.device)
         scale = (scale / template.limb_length_sum).expand(len(p))
 
-    rest_frames = _rest_frames(template, p.device, p.dtype)
+    rest_frames = bone_frames(c.rest.unsqueeze(0), None, template)
     q = _complete_trunk(q, valid, template, c.rest)
     q = _complete_face(q, valid, template, c.rest, scale)
     tree = set(template.incoming.values())
@@ -166,12 +167,6 @@ def _filled(
     return torch.where(valid.unsqueeze(-1), p, q + root)
 
 
-def _rest_frames(
-    template: SkeletonTemplate, device: torch.device, dtype: torch.dtype
-) -> BoneFrames:
-    return bone_frames(constants(template, device, dtype).rest.unsqueeze(0), None, template)
-
-
 def _put(q: Tensor, valid: Tensor, joints: Tensor, where_to: Tensor) -> Tensor:
     """``q`` with the unseen ones of ``joints`` at ``where_to [B, len(joints), 3]``."""
     new = torch.where(valid[:, joints].unsqueeze(-1), q[:, joints], where_to)
@@ -179,14 +174,14 @@ def _put(q: Tensor, valid: Tensor, joints: Tensor, where_to: Tensor) -> Tensor:
 
 
 def _seen_trunk_joint(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Tensor:
-    """``[B, 1, 3]``: a shoulder or hip that was seen, to measure the rest from."""
+    """``[B, 1, 3]``: a seen shoulder or hip, the origin of the completion."""
     order = torch.tensor([*template.hips, *template.shoulders], device=p.device)
     first = order[valid[:, order].to(torch.uint8).argmax(-1)]
     return p.gather(1, first[:, None, None].expand(-1, 1, 3)).detach()
 
 
 def _complete_trunk(q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: Tensor) -> Tensor:
-    """One lost corner: its partner plus the other line, at the rest skeleton's ratio."""
+    """One missing corner: its partner plus the other line, scaled by the rest skeleton's ratio."""
     (l_sh, r_sh), (l_hip, r_hip) = template.shoulders, template.hips
     ratio = (rest[l_sh] - rest[r_sh]).norm() / (rest[l_hip] - rest[r_hip]).norm()
     hips, shoulders = q[:, l_hip] - q[:, r_hip], q[:, l_sh] - q[:, r_sh]
@@ -206,7 +201,7 @@ def _complete_trunk(q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: 
 def _complete_face(
     q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: Tensor, scale: Tensor
 ) -> Tensor:
-    """Unseen face joints, on the rest face laid over the seen ones, else over the shoulders."""
+    """Unseen face joints: the rest face aligned with the seen ones, else with the shoulders."""
     hubs = bone_frames(q, valid, template).hubs
     face = torch.tensor(template.face, device=q.device)
     seen = valid[:, face].to(q.dtype).unsqueeze(-1)

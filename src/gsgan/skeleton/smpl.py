@@ -1,9 +1,9 @@
 """MediaPipe's 33 pose landmarks from the joints, and where given the vertices, of SMPL or SMPL-X.
 
-Convention: metres, any frame; what the body model does not know is NaN with confidence 0, never
-zero. Confidence 1 is a point that means the same in both; 0.5 one that lies near it.
+Convention: metres, any frame; landmarks that the body model lacks are NaN with confidence 0.
+Confidence 1: the same point in both; 0.5: a point nearby.
 
-Source: vertex numbers as public loaders state them.
+Source: vertex numbers as in public loaders.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Table:
-    """Where landmarks come from in one kind of body; later entries go before earlier ones.
+    """The source of each landmark in one kind of body; later entries override earlier ones.
 
     Args:
-        counts: numbers of joints and of vertices.
+        counts: number of joints, number of vertices.
         joints: landmark to (joint, confidence).
         vertices: landmark to (vertex, confidence).
-        midpoints: landmark to (joint, vertex) between which it lies, near enough.
+        midpoints: landmark to (joint, vertex), approximately halfway between which it lies.
     """
 
     counts: tuple[int, int]
@@ -113,8 +113,8 @@ def to_mediapipe33(
 
     Args:
         joints: ``[..., 24, 3]`` (smpl) or ``[..., 55, 3]`` (smplx) metres.
-        vertices: ``[..., 6890, 3]`` or ``[..., 10475, 3]``, or None: without them the face, the
-            heels and most of SMPL's hands are unknown.
+        vertices: ``[..., 6890, 3]`` or ``[..., 10475, 3]``, or None, which leaves the face, the
+            heels and most of SMPL's hands unknown.
         kind: "smpl" or "smplx".
 
     Returns:

@@ -1,4 +1,4 @@
-"""What a skeleton is: joint names, bones, rest shape. Constants only, no tensors.
+"""Skeleton definitions: joint names, bones, rest shape. Constants only, no tensors.
 
 Convention: body axes are x = the subject's left, y = up, z = out of the chest (right-handed),
 metres. Left and right are the person's.
@@ -22,26 +22,26 @@ N_HUBS = 3
 class SkeletonTemplate:
     """Joints, bones and rest shape of one kind of skeleton.
 
-    Compared and hashed by identity, so tensors made from it can be cached by it.
+    Compared and hashed by identity, so that it can be the key of cached tensors.
 
     Args:
         names: of the ``J`` joints.
-        edges: the connections as the landmark detector draws them.
-        limbs: (parent joint, child joint) of the bones that carry a cylinder.
-        limb_parents: per limb, the frame its own is measured from: 0 pelvis, 1 chest, 2 head,
+        edges: the connections that the landmark detector draws.
+        limbs: (parent joint, child joint) of the bones with a cylinder.
+        limb_parents: per limb, the frame that its own is relative to: 0 pelvis, 1 chest, 2 head,
             ``3 + l`` limb ``l``.
-        rest_directions: per limb, unit, in its parent's frame. Not the rest pose: they are placed
-            so that the opposite direction, where the swing is undefined, is out of reach.
+        rest_directions: per limb, unit, in its parent's frame. Not the rest pose: chosen so that
+            the opposite direction, where the swing is undefined, is out of reach.
         hinges: (upper limb, lower limb) pairs that bend about one axis.
         hinge_axes: per hinge, unit, in the upper limb's frame, across its rest direction.
         rest_positions: ``J`` points of an A-pose on the ground y = 0.
         stature: metres, sole to crown of the rest pose.
-        shoulders, hips, ears, eyes: (left, right) joints the hub frames are built from.
-        nose: joint that tells the front of the head.
-        face: joints the head's sphere encloses.
-        mirror: per joint, its twin on the other side (itself on the midline).
+        shoulders, hips, ears, eyes: (left, right) joints that define the hub frames.
+        nose: joint at the front of the head.
+        face: joints inside the head's sphere.
+        mirror: per joint, its counterpart on the other side (itself on the midline).
         draw_groups: (name, segments) of the channels of the drawn skeleton.
-        gnn_edges: the edges joined to one component, for message passing.
+        gnn_edges: the edges connected to one component, for message passing.
 
     Source: method notes, sections 1, 5 and 6; the paper names MediaPipe Pose and Algorithm 1.
     """
@@ -83,7 +83,7 @@ class SkeletonTemplate:
 
     @property
     def incoming(self) -> dict[int, int]:
-        """Per joint that ends a bone, the first limb listed that ends there."""
+        """Per joint at the end of a bone, the first limb that ends there."""
         found: dict[int, int] = {}
         for limb, (_, child) in enumerate(self.limbs):
             if child not in self.torso:
@@ -92,7 +92,7 @@ class SkeletonTemplate:
 
     @property
     def limb_length_sum(self) -> float:
-        """Metres: the summed limb lengths of the rest pose, the unit ``h_body`` is measured in."""
+        """Metres: the sum of limb lengths of the rest pose, the counterpart of ``h_body``."""
         rest = np.asarray(self.rest_positions)
         return float(sum(np.linalg.norm(rest[j] - rest[i]) for i, j in self.limbs))
 
@@ -127,7 +127,7 @@ def _mirrored(v: Vector) -> Vector:
 
 
 def _across(axis: Vector, direction: Vector) -> Vector:
-    """The part of ``axis`` across the unit ``direction``, normalised."""
+    """The part of ``axis`` orthogonal to the unit ``direction``, normalised."""
     along = sum(a * d for a, d in zip(axis, direction, strict=True))
     return _unit(*(a - along * d for a, d in zip(axis, direction, strict=True)))
 
@@ -201,11 +201,11 @@ def _about_x(v: Vector, cos: float, sin: float) -> Vector:
 
 
 def _rest_directions() -> dict[Edge, Vector]:
-    """Where each bone points when its swing is nil, in the frame it is measured from.
+    """Direction of each bone without swing, in the frame that it is relative to.
 
-    Upper arm and thigh point where their opposite is out of reach; elbow, knee and fingers go
-    straight on (opposite = folded back on themselves); the foot and the line across the palm take
-    their neutral direction, carried into the shin's and forearm's frame.
+    Upper arm and thigh point where their opposite is out of reach; elbow, knee and fingers point
+    straight on (opposite: folded back onto themselves); the foot and the line across the palm have
+    their neutral direction, in the frames of shin and forearm.
     """
     arm: Vector = _unit(0.6, -0.6, 0.5)
     leg: Vector = _unit(0.0, -0.8, 0.6)
@@ -213,7 +213,7 @@ def _rest_directions() -> dict[Edge, Vector]:
 
     def neutral(a: str, b: str) -> Vector:
         offset = [y - x for x, y in zip(rest[a], rest[b], strict=True)]
-        # the swing that takes straight down to the shin's rest direction
+        # the swing from straight down to the shin's rest direction
         return _about_x(_unit(*offset), cos=-leg[1], sin=-leg[2])
 
     left: dict[Edge, Vector] = dict.fromkeys((*_L_ARM, *_L_HAND[:3]), arm)
@@ -236,7 +236,7 @@ def _mediapipe33() -> SkeletonTemplate:
             return CHEST
         if a in (23, 24):
             return PELVIS
-        # fingers and the foot's three bones hang on the forearm and the shin
+        # parents of fingers and of the foot's three bones are the forearm and the shin
         base = {17: 15, 18: 16, 29: 27, 30: 28}.get(a, a)
         return N_HUBS + next(i for (_, b), i in index.items() if b == base)
 
@@ -282,7 +282,7 @@ def _mediapipe33() -> SkeletonTemplate:
             ("left_leg", _L_LEG + _L_FOOT),
             ("right_leg", _R_LEG + _R_FOOT),
         ),
-        # without these the face, the mouth and the body are three separate components
+        # without these edges face, mouth and body are three separate components
         gnn_edges=(*_EDGES, (0, 9), (0, 10), (0, 11), (0, 12)),
     )
 

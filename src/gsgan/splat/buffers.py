@@ -1,7 +1,7 @@
-"""Pictures' memory, used again: fresh memory costs as much as drawing on it.
+"""Reuses the memory of images: fresh memory costs as much as drawing on it.
 
-A picture of 32 channels and 512 x 512 pixels is 8192 pages, which the system maps and clears in
-every call when they are new; clearing memory that is mapped already takes a fraction of that.
+An image of 32 channels and 512 x 512 pixels is 8192 pages, which the system maps and clears in
+every call when they are new; clearing memory that is already mapped takes a fraction of that.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-CACHE_LINE = 64  # bytes: rows of tiles are whole ones
-LARGE = 1 << 20  # bytes from which memory is kept
-KEPT = 1 << 28  # bytes that a process keeps at most while nobody uses them
+CACHE_LINE = 64  # bytes; rows of tiles are whole cache lines
+LARGE = 1 << 20  # bytes from which memory is reused
+KEPT = 1 << 28  # most bytes of unused memory that a process keeps
 
 _NAMES = {torch.float32: "float32", torch.float64: "float64"}
 # By size in bytes. A deque's append and pop are atomic: finalisers run in any thread, at any time.
@@ -27,7 +27,7 @@ _free: dict[int, deque[NDArray[np.uint8]]] = {}
 def zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     """Zeros on the CPU, aligned to cache lines.
 
-    Large ones may use the memory of earlier ones that nobody holds any more.
+    Large ones may reuse the memory of earlier ones that have been freed.
 
     Args:
         shape: of the tensor.
@@ -36,10 +36,10 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
     used = math.prod(shape) * dtype.itemsize
     size = used + CACHE_LINE
     kept = _take(size) if size >= LARGE else None
-    # numpy's zeros: large ones are huge pages, which the system clears when they are touched.
+    # numpy's large zeros are huge pages, which the system clears on first access.
     memory = np.zeros(size, np.uint8) if kept is None else kept
     first = -memory.ctypes.data % CACHE_LINE
-    # Cut in numpy: a view made by torch could not be changed in place by who gets it from autograd.
+    # Sliced in numpy: autograd forbids in-place changes of views made by torch.
     array = memory[first : first + used].view(_NAMES[dtype]).reshape(shape)
     if size >= LARGE:  # the array lives as long as the tensors that share its memory
         weakref.finalize(array, _give_back, memory).atexit = False
@@ -48,12 +48,12 @@ def zeros(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
 
 
 def kept() -> int:
-    """Bytes that are kept while nobody uses them."""
+    """Bytes of unused memory that are kept for reuse."""
     return sum(size * len(same) for size, same in list(_free.items()))
 
 
 def forget() -> None:
-    """Gives back what is kept: a bench of memory begins with none."""
+    """Frees the unused memory, as before a measurement of memory."""
     _free.clear()
 
 

@@ -1,9 +1,9 @@
-"""Compiles the kernels on first use and loads them: no build step that a user sees.
+"""Compiles the kernels on first use and loads them: no build step for the user.
 
 The shared library is compiled by the system's compiler into a user cache (``GSGAN_CACHE``, else
 ``$XDG_CACHE_HOME/gsgan``, else ``~/.cache/gsgan``; subfolder ``native``) and loaded from there
-later. A file's name says what it was made from and what it holds, so that nothing stale or damaged
-is ever loaded. ``GSGAN_MARCH`` (say ``x86-64``) compiles for that processor, not for this one.
+later. A file's name contains hashes of its sources and of its content, so that no stale or damaged
+file is loaded. ``GSGAN_MARCH`` (e.g. ``x86-64``) compiles for that processor instead of this one.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ from typing import Any
 
 import torch
 
+from gsgan.utils.files import cache_root
+
 SOURCE = Path(__file__).with_name("native.cpp")
 HEADERS = SOURCE.with_name("kernels")
 COMPILERS = ("c++", "g++", "clang++")
@@ -34,7 +36,7 @@ BASE_FLAGS = (
     *("-std=c++17", "-O3", "-fPIC", "-shared", "-fopenmp-simd"),
     *("-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"),
 )
-# Tried in this order: some compilers lack OpenMP (Apple's clang), some the flag for the own CPU.
+# Tried in this order: some compilers lack OpenMP (Apple's clang), some the flags for this CPU.
 _NATIVE_FLAGS = (
     ("-march=native", "-mprefer-vector-width=512", "-fopenmp"),
     ("-march=native", "-fopenmp"),
@@ -46,31 +48,31 @@ _NATIVE_FLAGS = (
 )
 
 DTYPES = {torch.float32: "float32", torch.float64: "float64"}
-# Functions of the library, one for each dtype; each takes a job and at most one more pointer.
+# Functions of the library, one per dtype; each takes a job and at most one more pointer.
 _FUNCTIONS = ("forward", "backward", "free", "project", "project_backward")
 
 _LOCK = threading.Lock()
 
 
 class Unavailable(Exception):
-    """Why there is no kernel, in one sentence."""
+    """The kernel cannot be used; the message is one sentence with the reason."""
 
 
 def library() -> tuple[ctypes.CDLL | None, str]:
-    """The kernels, from the cache or compiled now (seconds); loaded once in a process.
+    """The kernels, from the cache or compiled now (seconds); loaded once per process.
 
     Returns:
-        The library and "", or None and one sentence of reason.
+        The library and "", or None and the reason in one sentence.
     """
     with _LOCK:  # two threads must not compile at once
         return _load_once()
 
 
 def function(name: str, dtype: torch.dtype) -> Any:
-    """A function of the library, for numbers of that dtype.
+    """A function of the library for a dtype.
 
     Raises:
-        RuntimeError: where there is no library.
+        RuntimeError: when the library is not available.
     """
     loaded, reason = library()
     if loaded is None:
@@ -98,11 +100,11 @@ def _load_once() -> tuple[ctypes.CDLL | None, str]:
 
 
 def compiler() -> list[str]:
-    """The command of the compiler; ``CXX`` is a choice that is not second-guessed."""
+    """The compiler's command; with ``CXX`` set, no other one is tried."""
     named = shlex.split(os.environ.get("CXX", ""))
     if named:
         if shutil.which(named[0]) is None:
-            raise Unavailable(f"The compiler that CXX names, {named[0]!r}, is not found.")
+            raise Unavailable(f"The compiler {named[0]!r} from CXX is not found.")
         return named
     for name in COMPILERS:
         if (path := shutil.which(name)) is not None:
@@ -113,12 +115,8 @@ def compiler() -> list[str]:
 
 
 def _cache_folder() -> Path:
-    """Where compiled kernels live; created, for this user only, when missing."""
-    root = os.environ.get("GSGAN_CACHE") or None
-    if root is None:
-        base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-        root = os.path.join(base, "gsgan")
-    folder = Path(root) / "native"
+    """Folder of the compiled kernels; created, for this user only, when missing."""
+    folder = cache_root() / "native"
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     except OSError as error:
@@ -130,13 +128,13 @@ def _cache_folder() -> Path:
 
 
 def _flags() -> tuple[tuple[str, ...], ...]:
-    """Sets of flags to try, the best first."""
+    """Sets of flags to try, best first."""
     march = os.environ.get("GSGAN_MARCH")
     return ((f"-march={march}", "-fopenmp"), (f"-march={march}",)) if march else _NATIVE_FLAGS
 
 
 def cache_key(command: list[str]) -> str:
-    """Names what a compiled kernel depends on: source, flags, compiler, CPU."""
+    """Hash of everything a compiled kernel depends on: source, flags, compiler, CPU."""
     parts = (_source(), repr(BASE_FLAGS), repr(_flags()), repr(command), _version(command), _cpu())
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
@@ -156,20 +154,20 @@ def _version(command: list[str]) -> str:
 
 
 def _cpu() -> str:
-    """What -march=native stands for here: a home folder may be shared by unlike machines."""
+    """The meaning of -march=native here: different machines may share a home folder."""
     lines = [platform.machine(), platform.processor()]
     info = Path("/proc/cpuinfo")
     if info.is_file():
-        wanted = ("model name", "flags", "CPU implementer", "CPU part", "Features")
+        fields = ("model name", "flags", "CPU implementer", "CPU part", "Features")
         lines += sorted(
-            {x for x in info.read_text(errors="replace").splitlines() if x.startswith(wanted)}
+            {x for x in info.read_text(errors="replace").splitlines() if x.startswith(fields)}
         )
     return "\n".join(lines)
 
 
 def _cached(folder: Path, key: str) -> Iterator[Path]:
-    """Whole files of that key. A file's name ends with its own hash: loading a damaged one would
-    crash the process, so those are deleted."""
+    """Intact files of that key. A file's name ends with its own hash; damaged files, which would
+    crash the process when loaded, are deleted."""
     for path in sorted(folder.glob(f"{key}-*.so")):
         if path.stem.rpartition("-")[2] == _digest(path):
             yield path
@@ -182,7 +180,7 @@ def _digest(path: Path) -> str:
 
 
 def _build(command: list[str], folder: Path, key: str) -> Path:
-    """Compiles beside the cache and renames when whole: a process that looks sees all or nothing.
+    """Compiles under a temporary name and renames when complete.
 
     Returns:
         The shared library.
@@ -220,7 +218,7 @@ def _run(command: list[str]) -> subprocess.CompletedProcess[str]:
 
 
 def open_library(path: Path) -> ctypes.CDLL | None:
-    """The library with its functions declared, or None where it cannot be loaded."""
+    """The library with its functions declared, or None when it cannot be loaded."""
     try:
         loaded = ctypes.CDLL(str(path))
         for name in _FUNCTIONS:

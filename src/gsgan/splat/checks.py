@@ -1,4 +1,4 @@
-"""What rasterise refuses: every sentence names the argument, what was expected and what came."""
+"""Argument checks of ``rasterise``: each message has the argument, the expectation, the value."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def check(
     """Checks the arguments of ``rasterise``.
 
     Returns:
-        None when all Gaussians are fine; else, for ``drop``, ``[B, N]`` bool of those that are.
+        None when all Gaussians are valid; else, for ``drop``, ``[B, N]`` bool, True where valid.
 
     Raises:
-        ValueError: naming the argument, what was expected and what came.
+        ValueError: naming the argument, the expectation and the value.
     """
     for name, value, kind in (
         ("gaussians", gaussians, Gaussians),
@@ -47,8 +47,8 @@ def check(
 
 
 def checks_for(device: torch.device) -> str:
-    """``on_invalid`` of what a model made: ``error`` on a CPU, ``unchecked`` where the host would
-    have to wait for the numbers."""
+    """``on_invalid`` for a model's output: ``error`` on a CPU, ``unchecked`` where the host would
+    have to wait for the device."""
     return "error" if device.type == "cpu" else "unchecked"
 
 
@@ -79,7 +79,7 @@ def _check_types(gaussians: Gaussians, camera: Camera) -> None:
 
 
 def _check_camera(camera: Camera, tolerance: float) -> None:
-    """K is a pinhole's, R a proper rotation; one transfer to the host for all checks."""
+    """K is a pinhole's, R a rotation; one transfer to the host for all checks."""
     K, R, t = (x.detach().double() if x.device.type != "mps" else x.detach() for x in _KRt(camera))
     identity = torch.eye(3, dtype=R.dtype, device=R.device)
     rows = [
@@ -103,8 +103,8 @@ def _check_camera(camera: Camera, tolerance: float) -> None:
             )
         if off > tolerance:
             raise ValueError(
-                f"rasterise: Camera.R of item {i} must be a rotation, but R Rᵀ is off the identity "
-                f"by {off:.3g} (tolerance {tolerance:.3g})"
+                f"rasterise: Camera.R of item {i} must be a rotation, but R Rᵀ differs from the "
+                f"identity by {off:.3g} (tolerance {tolerance:.3g})"
             )
         if det < 0:
             raise ValueError(
@@ -123,8 +123,8 @@ def _require_finite(total: float, item: int) -> None:
 
 
 def _check_gaussians(gaussians: Gaussians, on_invalid: str) -> Tensor | None:
-    """None when all are fine; else, for ``drop``, ``[B, N]`` bool of those that are."""
-    if gaussians.means.shape[1] == 0 or len(gaussians) == 0 or _all_fine(gaussians):
+    """None when all are valid; else, for ``drop``, ``[B, N]`` bool, True where valid."""
+    if gaussians.means.shape[1] == 0 or len(gaussians) == 0 or _all_valid(gaussians):
         return None
     B, N = gaussians.means.shape[:2]
     keep = torch.ones(B, N, dtype=torch.bool, device=gaussians.means.device)
@@ -139,8 +139,8 @@ def _check_gaussians(gaussians: Gaussians, on_invalid: str) -> Tensor | None:
             b, n, k = (~good).nonzero()[0].tolist()
             raise ValueError(
                 f"rasterise: {name} must be {expected}, got {value[b, n, k].item():.4g} at item "
-                f"{b}, Gaussian {n} ({int((~good).any(-1).sum())} of {B * N} are not); put them "
-                "right, or pass on_invalid='drop'"
+                f"{b}, Gaussian {n} ({int((~good).any(-1).sum())} of {B * N} are not); correct "
+                "them, or pass on_invalid='drop'"
             )
         keep &= good.all(-1)
     dropped = int((~keep).sum())
@@ -151,14 +151,14 @@ def _check_gaussians(gaussians: Gaussians, on_invalid: str) -> Tensor | None:
 
 
 def _shape_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
-    """The tensors that are used: quats and scales beside covariances are not."""
+    """The tensors that are used: with covariances, quats and scales are not."""
     found = _tensors(gaussians)
     if gaussians.covariances is not None:
         found = {k: v for k, v in found.items() if k not in ("Gaussians.quats", "Gaussians.scales")}
     return found
 
 
-def _all_fine(gaussians: Gaussians) -> bool:
+def _all_valid(gaussians: Gaussians) -> bool:
     """A sum is finite only where all its terms are: one pass, one transfer to the host."""
     used = {name: value.detach() for name, value in _shape_tensors(gaussians).items()}
     scales = used.get("Gaussians.scales")

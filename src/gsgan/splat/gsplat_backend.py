@@ -1,17 +1,17 @@
-"""Drawing with gsplat's CUDA kernels, where the package is installed.
+"""Rasterisation with gsplat's CUDA kernels, where the package is installed.
 
-gsplat has its cut-offs compiled in. What is known of them here was read in the sources of gsplat
-1.5.3; the cap on alphas, which differs between versions (0.999 in 1.5.3, 0.99 after it), is
-measured. This module was tested against a stand-in for the package and has never been run on a GPU.
+gsplat has its cut-offs compiled in. Their values here are from the sources of gsplat 1.5.3; the cap
+on alphas, which differs between versions (0.999 in 1.5.3, 0.99 in later ones), is measured. This
+module was tested against a mock of the package, never on a GPU.
 
-Where gsplat differs from ``Accuracy``, which `given_up` puts into a sentence:
+Differences between gsplat and ``Accuracy``, which `given_up` describes:
 
-- Its cut-offs are those of `COMPILED_IN`, whatever the settings say.
+- Its cut-offs are those of `COMPILED_IN`, whatever the settings.
 - It stops a pixel one layer earlier, before the layer that would leave ``transmittance_min`` or
-  less. That layer may weigh up to ``transmittance_min / (1 - alpha_max)``, see ``stop_loss``.
-- It computes in float32 throughout (the camera's place in the world is taken off in float64 before)
-  with approximate exponentials: needles lose digits.
-- Gradients are summed in no fixed order: their last bits change from run to run.
+  less. That layer's weight may be up to ``transmittance_min / (1 - alpha_max)``, see `_stop_loss`.
+- It computes in float32 throughout (the camera's position is subtracted in float64 before) with
+  approximate exponentials: needles lose digits.
+- Gradients are summed in no fixed order: their last bits differ between runs.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from gsgan.splat.project import QUAT_MIN, without
 from gsgan.splat.settings import Accuracy
 
 DEVICE = "cuda"
-# What gsplat 1.5.3 has compiled in. Its boxes reach to the alpha cut-off: the extent "opacity".
+# Cut-offs of gsplat 1.5.3. Its boxes reach to the alpha cut-off: the extent "opacity".
 COMPILED_IN: dict[str, float | str] = {
     "alpha_min": 1 / 255,
     "transmittance_min": 1e-4,
@@ -39,14 +39,14 @@ COMPILED_IN: dict[str, float | str] = {
     "dtype": "float32",
     "fov_clamp": 1.3,
 }
-TOLERANCE = 1e-5  # relative, between a setting and what is compiled in
+TOLERANCE = 1e-5  # relative, between a setting and the compiled-in value
 
 
 def why_not(settings: Accuracy, device: torch.device) -> str:
-    """Why gsplat cannot draw with these settings here; the first call may compile it (minutes).
+    """Why gsplat cannot be used with these settings here; the first call may compile it (minutes).
 
     Returns:
-        One sentence; empty where it can.
+        One sentence; empty when it can be used.
     """
     if device.type != DEVICE:
         return f"gsplat runs on CUDA only, the Gaussians are on {device}."
@@ -56,7 +56,7 @@ def why_not(settings: Accuracy, device: torch.device) -> str:
 
 
 def differences(settings: Accuracy, device: torch.device) -> list[str]:
-    """Where gsplat's cut-offs differ from the settings, a clause each; `why_not` is empty."""
+    """Differences between gsplat's cut-offs and the settings, one clause each."""
     have = {**COMPILED_IN, "alpha_max": _measured_cap(device)[0] or 0.0}
     return [
         f"{name} is {value if isinstance(value, str) else f'{value:.6g}'}, not {want}"
@@ -66,35 +66,35 @@ def differences(settings: Accuracy, device: torch.device) -> list[str]:
 
 
 def given_up(settings: Accuracy, device: torch.device) -> str:
-    """How gsplat's result differs from the settings, in one sentence; `why_not` is empty."""
+    """How gsplat's result differs from the settings, in one sentence."""
     lost = _stop_loss(_measured_cap(device)[0] or 0.0)
     found = [f"a stopped pixel may lack {lost:.2g} of its light", *differences(settings, device)]
     return (
-        f"Drawing with gsplat, the fastest here; against the settings {settings.name!r}: "
-        f"{'; '.join(found)}; backend=torch keeps to them."
+        f"Drawing with gsplat, the fastest backend here; differences from the settings "
+        f"{settings.name!r}: {'; '.join(found)}; backend=torch has none."
     )
 
 
 def unsuited(gaussians: Gaussians, camera: Camera) -> str:
-    """Why gsplat cannot draw these very Gaussians with this camera.
+    """Why gsplat cannot draw these Gaussians with this camera.
 
     Returns:
-        One sentence; empty where it can.
+        One sentence; empty when it can.
     """
     if gaussians.means.dtype == torch.float64:
         return "gsplat computes in float32, the Gaussians are float64."
     if gaussians.opacities.numel() == 0:
-        return "there are no Gaussians, which gsplat is not made for."
+        return "gsplat does not support zero Gaussians."
     if torch.is_grad_enabled() and camera.K.requires_grad:
         return "gsplat has no gradient for Camera.K, which requires one."
     return ""
 
 
 def _stop_loss(cap: float) -> float:
-    """The most light that a stopped pixel may lack: the layer at which it stops, and what is left.
+    """The largest share of light that a stopped pixel may lack.
 
-    A layer of alpha ``a`` stops the pixel where ``T (1 - a) <= transmittance_min``, and takes all
-    of ``T`` along: with alphas up to ``cap`` that is the returned part of the light.
+    A layer of alpha ``a`` stops the pixel where ``T (1 - a) <= transmittance_min``, which loses all
+    of ``T``: with alphas up to ``cap`` that is the returned share.
     """
     stop = float(COMPILED_IN["transmittance_min"])
     return 1.0 if cap >= 1 else min(1.0, stop / (1 - cap))
@@ -107,16 +107,16 @@ def draw(
     keep: Tensor | None,
     want_depth: bool,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Projects and blends in one go.
+    """Projects and blends.
 
-    Convention: as ``gsgan.splat.rasterise``, for inputs with which ``why_not`` and ``unsuited`` are
+    Convention: as ``gsgan.splat.rasterise``, for inputs for which ``why_not`` and ``unsuited`` are
     empty. Differentiable in every tensor of the Gaussians and in the camera's R and t.
 
     Args:
         gaussians: N >= 1 Gaussians per batch item, of at most float32.
         camera: one camera per batch item.
         settings: near, low_pass and antialias are passed on; the rest is compiled in.
-        keep: ``[B, N]`` bool; the others are not drawn, whatever they hold.
+        keep: ``[B, N]`` bool; the others are not drawn, whatever their values.
         want_depth: whether to blend depths too.
 
     Returns:
@@ -148,9 +148,9 @@ def draw(
         render_mode="RGB+D" if want_depth else "RGB",
         rasterize_mode="antialiased" if settings.antialias else "classic",
     )
-    picture = colours.squeeze(1).movedim(-1, 1)
-    depth = picture[:, C : C + 1] if want_depth else None
-    return picture[:, :C], alphas.squeeze(1).movedim(-1, 1), depth
+    image = colours.squeeze(1).movedim(-1, 1)
+    depth = image[:, C : C + 1] if want_depth else None
+    return image[:, :C], alphas.squeeze(1).movedim(-1, 1), depth
 
 
 def _rasterization() -> Any:
@@ -158,9 +158,9 @@ def _rasterization() -> Any:
 
 
 def _shapes(gaussians: Gaussians) -> dict[str, Tensor | None]:
-    """The arguments that say how Gaussians are shaped."""
+    """The arguments for the Gaussians' shapes."""
     if gaussians.covariances is not None:
-        # gsplat reads the upper triangle; our convention is the symmetric part.
+        # gsplat reads the upper triangle; ours uses the symmetric part.
         covariances = gaussians.covariances.float()
         return {"quats": None, "scales": None, "covars": (covariances + covariances.mT) / 2}
     assert gaussians.quats is not None
@@ -169,7 +169,7 @@ def _shapes(gaussians: Gaussians) -> dict[str, Tensor | None]:
 
 
 def _usable(quats: Tensor) -> Tensor:
-    """Quaternions whose squares neither underflow nor overflow; the identity for zero ones."""
+    """Quaternions rescaled so that squares neither underflow nor overflow; zero gives identity."""
     largest = quats.detach().abs().amax(-1, keepdim=True)
     usable = largest > QUAT_MIN
     identity = functional.pad(torch.ones_like(quats[..., :1]), (0, 3))
@@ -177,28 +177,28 @@ def _usable(quats: Tensor) -> Tensor:
 
 
 def _seen_from_the_camera(means: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Means ``[B, N, 3]`` about the camera's place, and the ``[B, 4, 4]`` transform from there.
+    """Means ``[B, N, 3]`` relative to the camera's centre, and the ``[B, 4, 4]`` view transform.
 
-    In float64, so that a camera far from the origin costs no digits. The place is a constant that
-    cancels: gradients are those of the means, R and t themselves. gsplat knows no skew, so the
-    transform holds it: ``fx x + s y`` is ``fx (x + y s / fx)``, and what is multiplied onto means
-    and shapes need not be a rotation.
+    In float64, so that a camera far from the origin costs no digits. The centre is a constant that
+    cancels: gradients are those of the means, R and t. gsplat has no skew, so the transform
+    includes it: ``fx x + s y`` is ``fx (x + y s / fx)``, and the matrix applied to means and shapes
+    need not be a rotation.
     """
     camera = camera.to(torch.float64)
-    place = camera.centre.detach()
+    centre = camera.centre.detach()
     K = camera.K.detach()
     shear = torch.eye(3, dtype=K.dtype, device=K.device).repeat(len(camera), 1, 1)
     shear[:, 0, 1] = K[:, 0, 1] / K[:, 0, 0]
-    left = camera.t.unsqueeze(-1) + camera.R @ place.unsqueeze(-1)
+    left = camera.t.unsqueeze(-1) + camera.R @ centre.unsqueeze(-1)
     top = shear @ torch.cat([camera.R, left], dim=-1)
     bottom = functional.pad(torch.ones_like(top[:, :1, :1]), (3, 0))
     viewmats = torch.cat([top, bottom], dim=1)
-    return (means.double() - place.unsqueeze(1)).float(), viewmats.float()
+    return (means.double() - centre.unsqueeze(1)).float(), viewmats.float()
 
 
 @lru_cache(maxsize=8)
 def _measured_cap(device: torch.device) -> tuple[float | None, str]:
-    """The alpha of an opaque Gaussian at its centre, or None and why there is none."""
+    """The alpha of an opaque Gaussian at its centre, or None and the reason."""
     if importlib.util.find_spec("gsplat") is None:
         return None, "gsplat is not installed: pip install 'gsgan[gsplat]'."
     gaussians = Gaussians(
@@ -214,7 +214,7 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
         with torch.no_grad():
             alpha = draw(gaussians, camera, _PROBE, None, want_depth=True)[1]
         return float(alpha), ""
-    except Exception as error:  # no compiler, an unknown GPU, another version: torch draws instead
+    except Exception as error:  # no compiler, unknown GPU, other version: torch is used
         return None, f"gsplat is installed but cannot draw here ({_one_line(error)})."
 
 

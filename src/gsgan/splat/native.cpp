@@ -4,16 +4,16 @@
 // (gcc, clang), nothing of torch. Contract and definitions: see native.py, native_project.py.
 //
 // How it works
-//   project.h   one Gaussian after the other, in double; its formulas are in lens.h.
-//   bin.h       Gaussians are put, in depth order, into lists of 16 x 16 pixel tiles.
-//   tile.h      a list is walked in chunks; a tile has 16 cells of 4 x 4 pixels, and each cell gets
+//   project.h   projects one Gaussian at a time, in double; the formulas are in ewa.h.
+//   bin.h       sorts Gaussians, in depth order, into lists of 16 x 16 pixel tiles.
+//   tile.h      processes a list in chunks; a tile has 16 cells of 4 x 4 pixels, and each cell gets
 //               the sub-list of the Gaussians that can reach it. A cell is 16 pixels: one AVX-512
 //               register of floats, two of AVX, four of SSE or NEON.
-//   place.h     an ellipse is taken relative to the tile in double, then rounded: a needle's q is
-//               right however long it is and however far off its mean.
-//   forward.h   per cell, front to back.
+//   place.h     shifts an ellipse to the tile's centre in double, then rounds: a needle's q is
+//               accurate for any length and any distance of its mean.
+//   forward.h   composites a cell, front to back.
 //   backward.h  per cell, back to front; gradients are written per (tile, Gaussian) and added in a
-//               fixed order: the result does not depend on threads.
+//               fixed order: the result does not depend on the number of threads.
 
 #include "kernels/backward.h"
 #include "kernels/bin.h"
@@ -70,7 +70,7 @@ template <class T> int backward(Job& job, const void* handle) {
     std::vector<double> sums(job.B * job.N * GEOMETRY, 0.0);
     Buffer<T> slots;
     int64_t room = 0;
-    for (int64_t first = 0; first < plan.tiles;) {  // as many tiles at a time as the budget holds
+    for (int64_t first = 0; first < plan.tiles;) {  // as many tiles at a time as the budget allows
       int64_t last = first + 1;
       while (last < plan.tiles && plan.tile_start[last + 1] - plan.tile_start[first] <= budget)
         ++last;

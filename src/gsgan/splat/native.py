@@ -1,6 +1,6 @@
 """The compiled compositing kernel for CPUs: native.cpp, built on first use, called through ctypes.
 
-Where it cannot be built ``available()`` is False, ``why_not()`` says why, nothing raises.
+When it cannot be built, ``available()`` is False and ``why_not()`` has the reason.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from gsgan.splat.project import Projected
     from gsgan.splat.settings import Accuracy
 
-# Memory the backward pass may use for gradients per (tile, Gaussian) before it adds them up.
+# Memory of the backward pass for gradients per (tile, Gaussian) before they are summed.
 SLOT_BYTES = 1 << 28
 
 _OUT_OF_MEMORY, _NOT_FINITE = 1, 2
@@ -45,20 +45,12 @@ class _Job(ctypes.Structure):
 
 
 def available() -> bool:
-    """Whether the kernel can be used here; the first call may compile it (seconds).
-
-    Returns:
-        False where no compiler is found or works; ``why_not()`` then says why.
-    """
+    """Whether the kernel can be used here; the first call may compile it (seconds)."""
     return build.library()[0] is not None
 
 
 def why_not() -> str:
-    """Why the kernel is not available.
-
-    Returns:
-        One sentence; empty where the kernel is available.
-    """
+    """Why the kernel is not available, in one sentence; empty when it is available."""
     return build.library()[1]
 
 
@@ -69,15 +61,16 @@ def composite(
 
     Convention: pixel centres at +0.5; ``alpha = min(alpha_max, o exp(-q / 2))`` inside the extent,
     skipped below ``alpha_min`` and where the incoming transmittance is below
-    ``transmittance_min``; ordered by depth, ties by index. Where alpha is capped, no gradient
-    reaches opacity and shape. Same input, same bits, whatever the number of threads
+    ``transmittance_min``; ordered by depth, ties by index. Where alpha is capped, opacity and shape
+    get no gradient. The result is bit-identical for any number of threads
     (``torch.get_num_threads()``).
 
     Args:
-        projected: the ellipses on the CPU; features float32 or float64, of which the arithmetic is.
+        projected: the ellipses on the CPU; the features' dtype, float32 or float64, is that of the
+            arithmetic.
         size: (H, W) pixels.
         settings: alpha_min, transmittance_min, alpha_max, and whether the extent is ``sigma``:
-            only then ``projected.extents`` cut at the pixel.
+            only then ``projected.extents`` cut off pixels.
         want_depth: whether to blend depths too.
 
     Returns:
@@ -88,7 +81,7 @@ def composite(
     Raises:
         ValueError: on another device or dtype, on mixed ones, and on a visible Gaussian that is not
             finite.
-        RuntimeError: where ``available()`` is False.
+        RuntimeError: when ``available()`` is False.
 
     Source: paper Sec. 3.1; tiles after 3D Gaussian splatting, gradients derived in native.cpp.
     """
@@ -114,7 +107,7 @@ def composite(
 
 @dataclass(frozen=True)
 class _Options:
-    """What is not a tensor."""
+    """The arguments that are not tensors."""
 
     size: tuple[int, int]
     cutoffs: tuple[float, float, float]
@@ -156,7 +149,7 @@ def _check(projected: Projected, size: tuple[int, int]) -> None:
 
 
 class _Plan:
-    """What the backward pass needs of the forward pass; memory of the library, freed with it."""
+    """What the backward pass needs of the forward pass; owns memory of the library."""
 
     def __init__(self, dtype: torch.dtype) -> None:
         self.pointer = ctypes.c_void_p()
@@ -218,10 +211,10 @@ class _Composite(torch.autograd.Function):
         _raise_for(run(ctypes.byref(job), ctx.plan.pointer), job)
         if not with_depth:
             outgoing.append(None)
-        wanted = [
+        needed = [
             g if need else None for g, need in zip(outgoing, ctx.needs_input_grad, strict=False)
         ]
-        return (*wanted, *[None] * (len(ctx.needs_input_grad) - len(wanted)))
+        return (*needed, *[None] * (len(ctx.needs_input_grad) - len(needed)))
 
 
 def _job(options: _Options, inputs: list[Tensor], visible: Tensor) -> _Job:
@@ -235,7 +228,7 @@ def _job(options: _Options, inputs: list[Tensor], visible: Tensor) -> _Job:
 def point(
     job: ctypes.Structure, names: tuple[str, ...], tensors: list[Tensor] | list[Tensor | None]
 ) -> None:
-    """Sets fields of a job to where tensors are; the caller keeps those alive during the call."""
+    """Sets fields of a job to tensors' addresses; the caller keeps the tensors alive."""
     for name, tensor in zip(names, tensors, strict=False):
         setattr(job, name, None if tensor is None else tensor.data_ptr())
 
@@ -250,8 +243,8 @@ def _raise_for(status: int, job: _Job) -> None:
             f"factors, opacity, depth or extent of Gaussian {n} of batch item {b}"
         )
     if status == _OUT_OF_MEMORY:
-        raise MemoryError("composite: out of memory; use a smaller picture, batch or extent")
+        raise MemoryError("composite: out of memory; use a smaller image, batch or extent")
     raise ValueError(
-        f"composite: {job.B} pictures of {job.H} x {job.W} with {job.N} Gaussians make more than "
-        "2^32 pairs of tile and Gaussian; use a smaller picture, batch or extent"
+        f"composite: {job.B} images of {job.H} x {job.W} with {job.N} Gaussians give more than "
+        "2^32 pairs of tile and Gaussian; use a smaller image, batch or extent"
     )

@@ -1,7 +1,7 @@
-"""The compiled projection for CPUs: what ``project`` computes, in one pass over the Gaussians.
+"""The compiled projection for CPUs: ``project`` in one pass over the Gaussians.
 
 The many small operations of :func:`gsgan.splat.project.project` take as long as the compositing
-kernel does. They stay the portable path, and what this one is tested against.
+kernel. They remain the portable path, and the reference in tests.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _NUMBERS = ("near", "low_pass", "alpha_min", "reach", "extent_margin", "quat_min
 
 
 class _Job(ctypes.Structure):
-    """Mirrors ``struct ProjectJob`` of kernels/lens.h field by field."""
+    """Mirrors ``struct ProjectJob`` of kernels/ewa.h field by field."""
 
     _fields_ = (
         *((name, ctypes.c_int64) for name in _SIZES),
@@ -49,24 +49,24 @@ class _Job(ctypes.Structure):
 def project(
     gaussians: Gaussians, camera: Camera, settings: Accuracy, keep: Tensor | None = None
 ) -> Projected:
-    """Projects Gaussians onto the picture, on the CPU; see ``gsgan.splat.project.project``.
+    """Projects Gaussians onto the image, on the CPU; see ``gsgan.splat.project.project``.
 
-    Convention: differentiable once, in the same inputs. Same input, same bits, whatever the number
+    Convention: differentiable once, in the same inputs. The result is bit-identical for any number
     of threads.
 
     Args:
         gaussians: N Gaussians per batch item.
         camera: one camera per batch item.
         settings: cut-offs, see ``Accuracy``.
-        keep: ``[B, N]`` bool; the others are made invisible, whatever they hold.
+        keep: ``[B, N]`` bool; the others become invisible, whatever their values.
 
     Returns:
-        The ellipses; invisible ones pass exactly zero gradients back.
+        The ellipses; invisible ones get exactly zero gradients.
 
     Raises:
-        RuntimeError: where there is no compiled kernel.
+        RuntimeError: when the kernel is not available.
 
-    Source: paper Sec. 3.1; Zwicker et al., EWA splatting; gradients derived in kernels/lens.h.
+    Source: paper Sec. 3.1; Zwicker et al., EWA splatting; gradients derived in kernels/ewa.h.
     """
     dtype = torch.promote_types(gaussians.means.dtype, settings.torch_dtype)
     K, R, t = (x.to(torch.float64) for x in (camera.K, camera.R, camera.t))
@@ -116,7 +116,7 @@ class _Project(torch.autograd.Function):
         incoming = [None if g is None else g.contiguous() for g in grads[: len(_OUTPUTS)]]
         point(job, tuple(f"g_{name}" for name in _OUTPUTS), incoming)
         needed = ctx.needs_input_grad
-        # The camera's gradients are few numbers: always computed, handed on where wanted.
+        # The camera's gradients are few numbers: always computed, returned where needed.
         outgoing = [
             None if x is None or not (need or i >= len(_INPUTS)) else torch.zeros_like(x)
             for i, (x, need) in enumerate(zip(held[:-1], needed, strict=False))
@@ -125,8 +125,8 @@ class _Project(torch.autograd.Function):
         assert held[0] is not None
         if build.function("project_backward", held[0].dtype)(ctypes.byref(job)):
             raise MemoryError("project: out of memory")
-        wanted = [g if need else None for g, need in zip(outgoing, needed, strict=False)]
-        return (*wanted, *[None] * (len(needed) - len(wanted)))
+        grads_in = [g if need else None for g, need in zip(outgoing, needed, strict=False)]
+        return (*grads_in, *[None] * (len(needed) - len(grads_in)))
 
 
 def _job(

@@ -1,4 +1,4 @@
-"""From 3D Gaussians to ellipses on the picture (EWA projection), shared by every backend."""
+"""EWA projection of 3D Gaussians to ellipses on the image, shared by every backend."""
 
 from __future__ import annotations
 
@@ -13,23 +13,22 @@ from gsgan.scene import Camera, Gaussians
 from gsgan.splat.settings import Accuracy
 from gsgan.utils.constants import constant, filled
 
-# exp(-745.2) is the smallest double above zero: beyond this a Gaussian is exactly 0.
+# exp(-745.2) is the smallest positive double: beyond this a Gaussian is exactly 0.
 EXP_UNDERFLOW = 746.0
-# Extents are rounded up by this much, so that rounding never loses a pixel that alpha_min keeps.
+# Extents are enlarged by this much, so that rounding never loses a pixel that alpha_min keeps.
 EXTENT_MARGIN = 1e-3
-# Below this a quaternion is noise, and its gradient 1/|q| would not fit into float32.
+# Below this a quaternion is noise, and its gradient 1/|q| would overflow float32.
 QUAT_MIN = 1e-20
 
 
 @dataclass(frozen=True)
 class Projected:
-    """A batch of Gaussians as ellipses on the picture; what every backend composites.
+    """A batch of Gaussians as ellipses on the image; the input of every backend.
 
     Convention: pixels, x right and y down; the centre of pixel (row i, column j) is
     ``(j + 0.5, i + 0.5)``. ``means``, ``factors`` and ``depths`` stay in float64 where the device
-    has it, for backends to round what is relative to a tile, and to tell apart layers that float32
-    would make equally deep; the rest has the dtype of the arithmetic. Entries of invisible
-    Gaussians are finite and mean nothing.
+    has it: backends round them relative to a tile, and can order layers of equal float32 depth; the
+    rest has the dtype of the arithmetic. Entries of invisible Gaussians are finite and arbitrary.
 
     Args:
         means: ``[B, N, 2]`` pixels.
@@ -37,11 +36,11 @@ class Projected:
             ``q = (p (dx + k dy))² + (r dy)²`` and ``alpha = min(alpha_max, o exp(-q / 2))``.
             A sum of squares: written out as ``a dx² + 2 b dx dy + c dy²`` the terms of a needle
             cancel, and rounding a, b, c to float32 moves its edge.
-        opacities: ``[B, N]``, anti-aliasing already in them.
+        opacities: ``[B, N]``, including anti-aliasing.
         features: ``[B, N, C]``.
         depths: ``[B, N]`` metres along the viewing axis.
         extents: ``[B, N, 2]`` pixels, half-width and half-height of the footprint; 0 where not
-            visible; carries no gradient.
+            visible; no gradient.
         visible: ``[B, N]`` bool.
     """
 
@@ -57,22 +56,22 @@ class Projected:
 def project(
     gaussians: Gaussians, camera: Camera, settings: Accuracy, keep: Tensor | None = None
 ) -> Projected:
-    """Projects Gaussians onto the picture.
+    """Projects Gaussians onto the image.
 
     Convention: differentiable in means, quats, scales, covariances, opacities, features, K, R, t.
-    Geometry is computed in float64 where the device has it (the world offset of the camera
-    cancels there, and so does the determinant of a needle); what is not ``means``, ``factors`` or
-    ``depths`` is then rounded to ``promote_types(input dtype, settings dtype)``. ``camera.dist`` is
+    Geometry is computed in float64 where the device has it (the camera's world offset and a
+    needle's determinant cancel there); everything but ``means``, ``factors`` and ``depths`` is then
+    rounded to ``promote_types(input dtype, settings dtype)``. ``camera.dist`` is
     not applied.
 
     Args:
         gaussians: N Gaussians per batch item.
         camera: one camera per batch item.
         settings: cut-offs, see ``Accuracy``.
-        keep: ``[B, N]`` bool; the others are made invisible, whatever they hold.
+        keep: ``[B, N]`` bool; the others become invisible, whatever their values.
 
     Returns:
-        The ellipses; invisible ones pass exactly zero gradients back.
+        The ellipses; invisible ones get exactly zero gradients.
 
     Source: paper Sec. 3.1; Zwicker et al., EWA splatting.
     """
@@ -80,7 +79,7 @@ def project(
     wide = torch.float64 if gaussians.means.device.type != "mps" else dtype
     if keep is not None:
         gaussians = without(gaussians, ~keep)
-    # In here the N Gaussians are the last dimension: contiguous vectors, few large operations.
+    # Here the N Gaussians are the last dimension: contiguous vectors, few large operations.
     K, R, t = camera.K.to(wide), camera.R.to(wide), camera.t.to(wide)
     x_cam = R @ gaussians.means.to(wide).mT + t.unsqueeze(-1)
     in_front = x_cam.detach()[:, 2] > settings.near
@@ -95,14 +94,14 @@ def project(
     low = settings.low_pass
     det = det_before + low * (a + c) + low * low
     a, c = a + low, c + low
-    # With Σ = [a b; b c]: Σ⁻¹ = [c -b; -b a] / det, whose factor needs no difference.
+    # With Σ = [a b; b c]: Σ⁻¹ = [c -b; -b a] / det, whose factor has no cancellation.
     factors = torch.stack([(c / det).sqrt(), -b / c, c.rsqrt()], dim=-1)
     opacities = gaussians.opacities.to(wide)
     if settings.antialias:
         opacities = opacities * _safe_sqrt(det_before / det)
     with torch.no_grad():
-        # Twice the same variance, unless a covariance that was given is not positive definite: then
-        # the factors stand for this one.
+        # The same variance, unless a given covariance is not positive definite: then that of the
+        # factors.
         a = (b * b + det) / c
         extents, visible = _footprint(means, a, c, opacities, in_front, camera.size, settings)
     return Projected(
@@ -133,8 +132,8 @@ def rotations(quats: Tensor) -> Tensor:
 
 def _rotation_entries(quats: Tensor, dim: int) -> list[Tensor]:
     """The nine entries, row by row, of the rotations of quaternions along ``dim``."""
-    # The length is divided out in two steps, so that squares neither underflow nor overflow.
-    # The first divisor needs no gradient: the result does not depend on the length.
+    # Normalised in two steps, so that squares neither underflow nor overflow. The first divisor
+    # needs no gradient: the result does not depend on the length.
     largest = quats.detach().abs().amax(dim, keepdim=True)
     usable = largest > QUAT_MIN
     w, x, y, z = (quats / torch.where(usable, largest, 1.0)).unbind(dim)
@@ -197,9 +196,9 @@ def _jacobian(
 
 
 def field_of_view(K: Tensor, size: tuple[int, int], widen: float) -> tuple[Tensor, Tensor]:
-    """Least and greatest x/z and y/z, each ``[B, 2, 1]``, of the picture widened about its middle.
+    """Least and greatest x/z and y/z, each ``[B, 2, 1]``, of the image enlarged about its middle.
 
-    The corners of the picture bound them, which holds with skew and an off-centre principal point.
+    The corners of the image bound them, which holds with skew and an off-centre principal point.
     """
     H, W = size
     corners = filled(((0, W, 0, W), (0, 0, H, H)), K) - K[:, :2, 2:]
@@ -210,7 +209,7 @@ def field_of_view(K: Tensor, size: tuple[int, int], widen: float) -> tuple[Tenso
 
 
 def _inverse(matrix: Tensor) -> Tensor:
-    """``torch.linalg.inv`` without its look at the result, for which the host would wait."""
+    """``torch.linalg.inv`` without its check of the result, for which the host would wait."""
     inverse: Tensor = torch.linalg.inv_ex(matrix).inverse
     return inverse
 
@@ -224,7 +223,7 @@ def _footprint(
     size: tuple[int, int],
     settings: Accuracy,
 ) -> tuple[Tensor, Tensor]:
-    """Half-sizes ``[B, N, 2]`` of the box that holds the footprint, and who is visible ``[B, N]``.
+    """Half-sizes ``[B, N, 2]`` of the footprint's box, and whether it is visible ``[B, N]``.
 
     ``means`` are ``[B, 2, N]``; a and c, the diagonal of the 2D covariance, ``[B, N]``.
     """
@@ -239,7 +238,7 @@ def _footprint(
     if settings.extent != "sigma":
         reach = reach * (1 + EXTENT_MARGIN) + EXTENT_MARGIN
     extents = reach.unsqueeze(1) * torch.stack([a, c], dim=1).sqrt()
-    # The outermost pixel centres are half a pixel inside the picture.
+    # The outermost pixel centres are half a pixel inside the image.
     last = filled(((W - 0.5,), (H - 0.5,)), means)
     inside = ((means + extents >= 0.5) & (means - extents <= last)).all(1)
     visible = in_front & inside & (opacities >= settings.alpha_min)

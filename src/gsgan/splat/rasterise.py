@@ -1,4 +1,4 @@
-"""rasterise(): the one entry to every backend."""
+"""rasterise(): the entry point to every backend."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from gsgan.splat.settings import Accuracy, accuracy
 
 BACKENDS = ("auto", "reference", "torch", "native", "gsplat")
 _log = logging.getLogger(__name__)
-_said: set[str] = set()
+_logged: set[str] = set()
 
 
 def rasterise(
@@ -34,29 +34,29 @@ def rasterise(
 ) -> Raster:
     """Draws Gaussians as a camera sees them.
 
-    Convention: features come back premultiplied and the background is the caller's to add.
-    Differentiable in every tensor of ``gaussians`` and in the camera's K, R and t. A lens
-    (``camera.dist``) is followed, see `gsgan.splat.lens`. Autocast has no effect in here.
+    Convention: features are premultiplied; the caller adds the background.
+    Differentiable in every tensor of ``gaussians`` and in the camera's K, R and t. Lens
+    distortion (``camera.dist``) is applied, see `gsgan.splat.lens`. Autocast has no effect.
 
     Args:
         gaussians: N >= 0 Gaussians per batch item.
         camera: one camera per batch item, of the Gaussians' dtype and device.
         settings: an ``Accuracy``, or the name of a preset.
-        backend: ``auto`` (the fastest there is on the device; what it leaves out against the
-            settings is logged once), ``reference``, ``torch``, ``native`` or ``gsplat``. One that
-            cannot draw this gives way to ``torch``, and says why once.
+        backend: ``auto`` (the fastest on the device; its differences from the settings are logged
+            once), ``reference``, ``torch``, ``native`` or ``gsplat``. A backend that cannot be used
+            is replaced by ``torch``, and the reason is logged once.
         depth: whether to return the depth (metres times alpha).
-        on_invalid: ``error`` refuses Gaussians that are not finite or have a scale <= 0; ``drop``
-            leaves them out and warns with their number; ``unchecked`` takes Gaussians and camera as
-            they are: the checks read numbers back to the host, for which a GPU waits.
-        rotation_tolerance: how far an entry of ``R Rᵀ`` may be from the identity's.
+        on_invalid: ``error`` raises on Gaussians that are not finite or have a scale <= 0; ``drop``
+            omits them and warns with their number; ``unchecked`` skips the checks of Gaussians and
+            camera, which transfer numbers to the host and so wait for a GPU.
+        rotation_tolerance: largest difference of an entry of ``R Rᵀ`` from the identity's.
 
     Returns:
-        features ``[B, C, H, W]``, alpha ``[B, 1, H, W]`` and depth, in the Gaussians' dtype; where
-        the settings supersample also what was averaged.
+        features ``[B, C, H, W]``, alpha ``[B, 1, H, W]`` and depth, in the Gaussians' dtype; with
+        supersampling also the features before averaging.
 
     Raises:
-        ValueError: naming the argument, what was expected and what came.
+        ValueError: naming the argument, the expectation and the value.
 
     Source: paper Sec. 3.1.
     """
@@ -68,7 +68,7 @@ def rasterise(
     if name == "gsplat" and (why_not := gsplat_backend.unsuited(gaussians, camera)):
         name, reason = _torch_instead_of_gsplat(why_not)
     if reason:
-        _say_once(reason)
+        _warn_once(reason)
     out = gaussians.means.dtype
     times, fine = settings.supersample, None
     drawn = camera
@@ -84,15 +84,15 @@ def rasterise(
 
 
 def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tuple[str, str]:
-    """Which backend draws, and why when it is not the one that could be expected.
+    """The backend that is used, and why when it is not the requested or the fastest one.
 
     Args:
         name: one of ``BACKENDS``.
-        device: where the Gaussians are.
-        settings: ``exact`` ones (no cut-off at all) go to the reference unless one is asked for.
+        device: of the Gaussians.
+        settings: with ``auto``, settings without cut-offs (``exact``) use the reference.
 
     Returns:
-        The backend's name, and one sentence (empty where there is nothing to say).
+        The backend's name, and a message (empty when there is nothing to report).
 
     Raises:
         ValueError: on an unknown name.
@@ -109,11 +109,8 @@ def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tupl
             return _torch_instead_of_gsplat(why_not)
         return "gsplat", gsplat_backend.given_up(settings, device)
     if device.type != "cpu":
-        asked = name == "native"
-        return (
-            "torch",
-            f"The native backend runs on CPU only; drawing with torch on {device}." * asked,
-        )
+        message = f"The native backend runs on CPU only; drawing with torch on {device}."
+        return "torch", message if name == "native" else ""
     why_not = _why_native_is_missing()
     if why_not:
         return "torch", f"Drawing with the torch backend, which is slower: {why_not}"
@@ -125,7 +122,7 @@ def _torch_instead_of_gsplat(why_not: str) -> tuple[str, str]:
 
 
 def _why_native_is_missing() -> str:
-    """Empty where the native backend can be used."""
+    """The reason, or empty when the native backend can be used."""
     try:
         native = importlib.import_module("gsgan.splat.native")
         return "" if native.available() else native.why_not()
@@ -150,7 +147,7 @@ def _draw(
 
 
 def _backend(name: str) -> tuple[Callable[..., Projected], Callable[..., Any]]:
-    """How a backend projects, and how it composites."""
+    """The projection and the compositing of a backend."""
     if name == "native":
         native_project = importlib.import_module("gsgan.splat.native_project")
         native = importlib.import_module("gsgan.splat.native")
@@ -158,7 +155,7 @@ def _backend(name: str) -> tuple[Callable[..., Projected], Callable[..., Any]]:
     return project, {"reference": reference.composite, "torch": tiles.composite}[name]
 
 
-def _say_once(sentence: str) -> None:
-    if sentence not in _said:
-        _said.add(sentence)
-        _log.warning(sentence)
+def _warn_once(message: str) -> None:
+    if message not in _logged:
+        _logged.add(message)
+        _log.warning(message)

@@ -1,4 +1,4 @@
-"""The judge: every Gaussian at every pixel, plain autograd, no tiles."""
+"""The reference: every Gaussian at every pixel, plain autograd, no tiles."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor
 from gsgan.splat.project import Projected
 from gsgan.splat.settings import Accuracy
 
-# Pixels x Gaussians held at once and item; the graph keeps a handful of such arrays per chunk.
+# Pixels x Gaussians at a time, per batch item; the graph keeps a few such arrays per chunk.
 CHUNK_ELEMENTS = 1 << 22
 
 
@@ -38,24 +38,24 @@ def composite(
     for pixels in _pixel_chunks(projected, size):
         weights, left = _blend(_alphas(front_to_back, pixels, settings), settings)
         chunks.append(torch.cat([weights @ values, 1 - left], dim=-1))
-    picture = torch.cat(chunks, dim=1).mT.unflatten(-1, size)
+    image = torch.cat(chunks, dim=1).mT.unflatten(-1, size)
     C = front_to_back.features.shape[-1]
-    return picture[:, :C], picture[:, -1:], picture[:, C : C + 1] if want_depth else None
+    return image[:, :C], image[:, -1:], image[:, C : C + 1] if want_depth else None
 
 
 def error_bound(projected: Projected, size: tuple[int, int], settings: Accuracy) -> Tensor:
-    """How far, per pixel, a setting's picture can be from the one without cut-offs.
+    """Bound, per pixel, of the error that a setting's cut-offs cause.
 
-    Convention: for features in [0, 1]; leaves the rounding of the arithmetic out.
+    Convention: for features in [0, 1]; without the rounding of the arithmetic.
 
-    Taking a layer away changes a pixel by at most its own weight, so skipped layers cost at most
-    the sum of their weights; capping an alpha costs at most the weight of what the cap takes; a
-    stopped pixel leaves out less than ``transmittance_min``.
+    Removing a layer changes a pixel by at most its own weight, so skipped layers cost at most the
+    sum of their weights; capping an alpha costs at most the weight that the cap removes; a stopped
+    pixel lacks less than ``transmittance_min``.
 
     Args:
         projected: the ellipses, projected without cut-offs.
         size: (H, W) pixels.
-        settings: whose error is to be bounded.
+        settings: the cut-offs.
 
     Returns:
         ``[B, 1, H, W]``.
@@ -82,7 +82,7 @@ def _sorted(projected: Projected) -> Projected:
 
 
 def _pixel_chunks(projected: Projected, size: tuple[int, int]) -> tuple[Tensor, ...]:
-    """Pixel centres ``[P, 2]``, row by row, as many at a time as the memory is meant for."""
+    """Pixel centres ``[P, 2]`` row by row, in chunks of at most CHUNK_ELEMENTS alphas."""
     H, W = size
     y, x = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
     per_chunk = max(1, CHUNK_ELEMENTS // max(1, projected.depths.numel()))
@@ -90,12 +90,12 @@ def _pixel_chunks(projected: Projected, size: tuple[int, int]) -> tuple[Tensor, 
 
 
 def _alphas(projected: Projected, pixels: Tensor, settings: Accuracy | None) -> Tensor:
-    """``[B, P, N]``; without settings, before any cut-off but visibility."""
+    """``[B, P, N]``; without settings, no cut-off but visibility."""
     d = pixels[:, None] - projected.means.to(pixels).unsqueeze(1)
     dx, dy = d.unbind(-1)
     p, k, r = (x.unsqueeze(1) for x in projected.factors.to(pixels).unbind(-1))
     q = (p * (dx + k * dy)).square() + (r * dy).square()
-    # Masked before exp: an invisible Gaussian then passes exact zeros back, never 0 * inf.
+    # Masked before exp: invisible Gaussians then get exactly zero gradients, never 0 * inf.
     drawn = projected.visible.unsqueeze(1).expand_as(q)
     if settings is not None and settings.extent == "sigma":
         drawn = drawn & (d.detach().abs() <= projected.extents.unsqueeze(1)).all(-1)
@@ -108,7 +108,7 @@ def _alphas(projected: Projected, pixels: Tensor, settings: Accuracy | None) -> 
 
 
 def _blend(alpha: Tensor, settings: Accuracy) -> tuple[Tensor, Tensor]:
-    """Weights ``[B, P, N]`` and the transmittance ``[B, P, 1]`` that is left at the end."""
+    """Weights ``[B, P, N]`` and the final transmittance ``[B, P, 1]``."""
     if settings.transmittance_min > 0:
         before = _transmittances(alpha.detach())[..., :-1]
         alpha = torch.where(before >= settings.transmittance_min, alpha, 0.0)

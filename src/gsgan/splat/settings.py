@@ -1,4 +1,4 @@
-"""Accuracy settings: every shortcut of the rasteriser has a name, a value and a price."""
+"""Accuracy settings: the named cut-offs of the rasteriser."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ _DTYPES = {"float32": torch.float32, "float64": torch.float64}
 
 @dataclass(frozen=True)
 class Accuracy:
-    """What the rasteriser may leave out.
+    """What the rasteriser may skip.
 
-    Two rules mean the same in every backend. A contribution with ``alpha < alpha_min`` is left out
-    of the picture. A contribution whose incoming transmittance (the product of ``1 - alpha`` over
-    the contributions in front of it that were not left out) is below ``transmittance_min`` is left
-    out, and so is everything behind it.
+    Two rules hold in every backend. A contribution with ``alpha < alpha_min`` is skipped. A
+    contribution whose incoming transmittance (the product of ``1 - alpha`` over the contributions
+    in front of it that were not skipped) is below ``transmittance_min`` is skipped, and so is
+    everything behind it.
 
     Args:
-        name: how the setting is called in configs and tables.
+        name: of the setting in configs and tables.
         alpha_min: in [0, 1); 0 keeps every contribution.
         transmittance_min: in [0, 1); 0 never stops a pixel.
         extent: ``all`` (wherever a float64 ``exp`` is not 0), ``opacity`` (the box of the ellipse
-            ``alpha >= alpha_min``: leaves nothing out that alpha_min does not) or ``sigma`` (a box
-            of ``radius_sigmas`` standard deviations).
-        dtype: ``float32`` or ``float64``: the least precision of the arithmetic. Inputs of a
-            higher one raise it.
+            ``alpha >= alpha_min``: skips nothing that alpha_min does not) or ``sigma`` (a box of
+            ``radius_sigmas`` standard deviations).
+        dtype: ``float32`` or ``float64``: the lowest precision of the arithmetic; inputs of a
+            higher precision raise it.
         radius_sigmas: half-width of the ``sigma`` box, in standard deviations, > 0.
-        near: metres, > 0; Gaussians whose mean is not farther than this are not drawn.
-        alpha_max: in (0, 1]; alphas are capped here. 1 is for float64: next to it the gradient of
-            what is hidden drowns in float32 rounding.
+        near: metres, > 0; Gaussians whose mean is nearer are not drawn.
+        alpha_max: in (0, 1]; upper bound of alphas. 1 is for float64: close to it the gradient of
+            hidden layers is lost in float32 rounding.
         low_pass: square pixels, > 0, added to the diagonal of every 2D covariance.
         fov_clamp: x/z and y/z are clamped to this many half fields of view (from the middle of
-            the picture) where the Jacobian of the projection is formed, >= 1.
+            the image) where the Jacobian of the projection is formed, >= 1.
         antialias: multiply opacities by sqrt(det before / det after) of the low-pass.
-        supersample: >= 1: draw so many times larger each way, then average. The low-pass counts in
-            the larger picture's pixels.
+        supersample: >= 1: draw this many times larger in each direction, then average. The low-pass
+            is in pixels of the larger image.
 
     Raises:
         ValueError: on a value outside its range, naming it.
@@ -78,12 +78,12 @@ class Accuracy:
 
     @property
     def torch_dtype(self) -> torch.dtype:
-        """The least floating-point type of the arithmetic."""
+        """The lowest floating-point precision of the arithmetic."""
         return _DTYPES[self.dtype]
 
     @property
     def is_dense(self) -> bool:
-        """Whether every Gaussian counts at every pixel."""
+        """Whether every Gaussian contributes to every pixel."""
         return self.extent == "all" and self.alpha_min == self.transmittance_min == 0
 
 
@@ -96,10 +96,10 @@ ACCURACY: dict[str, Accuracy] = {s.name: s for s in (exact, high, standard, draf
 
 
 def accuracy(name: str) -> Accuracy:
-    """The preset of that name.
+    """The preset with a name.
 
     Raises:
-        ValueError: on an unknown name, listing the known ones.
+        ValueError: on an unknown name.
     """
     if name not in ACCURACY:
         raise ValueError(f"accuracy: expected one of {', '.join(ACCURACY)}, got {name!r}")

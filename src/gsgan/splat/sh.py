@@ -1,4 +1,4 @@
-"""Real spherical harmonics to degree 3: colour that depends on the direction of view."""
+"""Real spherical harmonics up to degree 3: view-dependent colour."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-# Normalisations such that the integral of each squared function over the sphere is 1; the signs
-# are those of 3D Gaussian splatting (Condon-Shortley phase), so that its .ply files read as is.
+# Normalised so that each squared function integrates to 1 over the sphere; the signs are those of
+# 3D Gaussian splatting (Condon-Shortley phase), so that its .ply files can be used as they are.
 _C0 = math.sqrt(1 / (4 * math.pi))
 _C1 = math.sqrt(3 / (4 * math.pi))
 _C2 = tuple(math.sqrt(k / math.pi) for k in (15 / 4, 5 / 16, 15 / 16))
@@ -47,20 +47,20 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def sh_to_colour(sh: Tensor, directions: Tensor) -> Tensor:
-    """Colours seen along directions.
+    """Colours along directions of view.
 
     Convention: the sum of the series plus 0.5, not clamped (the caller clamps at 0). Directions
-    run from the camera to the Gaussian, in the frame the coefficients are given in.
+    run from the camera to the Gaussian, in the frame of the coefficients.
 
     Args:
         sh: ``[B, N, (d+1)², 3]`` coefficients, d from 0 to 3.
-        directions: ``[B, N, 3]``, of any length but 0; a zero one gives a finite colour.
+        directions: ``[B, N, 3]``, of any length; zero gives a finite colour.
 
     Returns:
         ``[B, N, 3]``.
 
     Raises:
-        ValueError: when the number of coefficients is no (d+1)² with d from 0 to 3.
+        ValueError: when the number of coefficients is not (d+1)² with d from 0 to 3.
 
     Source: paper Sec. 3.1; Kerbl et al., 3D Gaussian splatting.
     """
@@ -70,7 +70,7 @@ def sh_to_colour(sh: Tensor, directions: Tensor) -> Tensor:
             "sh_to_colour: sh must have shape [B, N, (d+1)², 3] with d from 0 to "
             f"{MAX_DEGREE}, got {list(sh.shape)}"
         )
-    if degree == 0:  # needs no direction: view-dependent colour is off
+    if degree == 0:  # no directions needed: view-dependent colour is off
         return _C0 * sh[..., 0, :] + 0.5
     basis = sh_basis(torch.nn.functional.normalize(directions, dim=-1), degree)
     return (basis.unsqueeze(-1) * sh).sum(-2) + 0.5

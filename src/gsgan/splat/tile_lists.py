@@ -1,4 +1,4 @@
-"""Who reaches which tile: the lists that the tiled path walks."""
+"""The list of ellipses of each tile, for the tiled path."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from gsgan.splat.project import Projected
 from gsgan.splat.settings import Accuracy
 from gsgan.utils.constants import filled
 
-# Rounding errors, in units of the last place, that q may have gathered where tiles are listed.
+# Bound of the rounding error of q where tiles are listed, in units of the last place.
 ROUNDING = 64
 
 
 @dataclass(frozen=True)
 class Tiling:
-    """How the work is cut up; changes the time and the memory, never the result.
+    """How the work is divided; affects time and memory, never the result.
 
     Args:
         tile: pixels along the side of a tile.
-        layers: ellipses of a tile's list that are blended at once.
-        block_elements: tiles x layers x pixels held at once, in each of about eight arrays.
+        layers: ellipses of a tile's list that are blended at a time.
+        block_elements: tiles x layers x pixels at a time, in each of about eight arrays.
     """
 
     tile: int = 8
@@ -32,18 +32,17 @@ class Tiling:
 
     @classmethod
     def for_device(cls, device: torch.device) -> Tiling:
-        """Blocks that stay in the cache of a CPU, or that fill a GPU."""
+        """Blocks that fit into the cache of a CPU, or that occupy a GPU."""
         return cls() if device.type == "cpu" else cls(layers=32, block_elements=1 << 24)
 
 
 @dataclass(frozen=True)
 class TileLists:
-    """Who reaches which tile, front to back.
+    """The ellipses of each tile, front to back.
 
     ``ids[starts[i] : starts[i] + counts[i]]`` are the rows (batch item x N + index) of the i-th
-    listed tile, ``tiles[i]`` its place among all (item, row, column); most layers first.
-    ``depths`` holds the counts again, on the host: all that it needs to know of the lists, read
-    back at once.
+    listed tile, ``tiles[i]`` its index among all (item, row, column); most layers first.
+    ``depths`` has the counts again, on the host, transferred at once.
     """
 
     size: tuple[int, int]
@@ -59,14 +58,16 @@ class TileLists:
 def tile_lists(
     projected: Projected, size: tuple[int, int], settings: Accuracy, tiling: Tiling
 ) -> TileLists:
-    """Lists the ellipses of each tile. The host waits twice: for the number of pairs of ellipse and
-    tile, and for the lists' lengths.
+    """Lists the ellipses of each tile.
+
+    The host waits twice for the device: for the number of pairs of ellipse and tile, and for the
+    lists' lengths.
 
     Args:
         projected: the ellipses.
         size: (H, W) pixels.
         settings: alpha_min, and whether the extent is ``sigma``.
-        tiling: how large a tile is.
+        tiling: the size of a tile.
     """
     (H, W), side = size, tiling.tile
     grid = (-(-H // side), -(-W // side))
@@ -79,7 +80,7 @@ def tile_lists(
     rows, tile_xy = _pairs(order, first, spans)
     tiles = B * grid[0] * grid[1]
     tile = (rows // max(N, 1) * grid[0] + tile_xy[:, 1]) * grid[1] + tile_xy[:, 0]
-    if settings.alpha_min > 0:  # pairs that do not meet are sorted behind the last tile
+    if settings.alpha_min > 0:  # pairs that do not intersect are sorted behind the last tile
         tile = torch.where(_reaches(projected, rows, tile_xy, settings, tiling), tile, tiles)
     tile, by_tile = tile.to(torch.int32).sort(stable=True)
     ends = torch.searchsorted(tile, torch.arange(tiles + 1, device=tile.device, dtype=tile.dtype))
@@ -107,8 +108,8 @@ def _pixel_box(projected: Projected, size: tuple[int, int], rows: Tensor) -> tup
     means = projected.means.flatten(0, 1)[rows]
     extents = projected.extents.flatten(0, 1)[rows].to(means)
     edge = filled((size[1], size[0]), means)
-    # Clamped as floats: footprints reach far beyond what integers hold. Extents are rounded: the
-    # box is rounded outwards, not to the nearest.
+    # Clamped as floats: footprints may exceed the range of integers. Extents are rounded, so the
+    # box is rounded outwards.
     first = torch.minimum((means - extents - 0.5).floor().clamp_min(0), edge)
     last = torch.minimum((means + extents - 0.5).ceil(), edge - 1).clamp_min(-1)
     return first.long(), last.long()
@@ -133,9 +134,9 @@ def _reaches(
     settings: Accuracy,
     tiling: Tiling,
 ) -> Tensor:
-    """Whether the ellipse ``alpha >= alpha_min`` meets the pixel centres of the tile.
+    """Whether the ellipse ``alpha >= alpha_min`` reaches the pixel centres of the tile.
 
-    The least q over a rectangle lies on the edges that face the mean: a point each, in closed form.
+    The minimum of q over a rectangle is on an edge that faces the mean, where it has a closed form.
     """
     p, k, r = projected.factors.flatten(0, 1)[rows].unbind(-1)
     opacities = projected.opacities.flatten(0, 1)[rows]
@@ -156,5 +157,5 @@ def _reaches(
 
 
 def with_empty_row(x: Tensor) -> Tensor:
-    """``[B, N, K]`` as rows ``[B N + 1, K]`` of which the last is 0."""
+    """``[B, N, K]`` as rows ``[B N + 1, K]``; the last one is 0."""
     return functional.pad(x.detach().flatten(0, 1), (0, 0, 0, 1))

@@ -1,10 +1,10 @@
 """The portable fast path: tiles of pixels, vectorised torch, a hand-written backward.
 
-The picture is cut into square tiles, and each tile gets the list of ellipses that reach it, front
-to back. Lists are walked in blocks of some layers, all tiles of a chunk at once, so that nearly
-all arithmetic happens in large arrays ``[tiles, layers, pixels]``. Only two recurrences run layer
-by layer, one operation each: the transmittance on the way in, and what is seen behind a layer on
-the way back. Neither takes a logarithm nor divides by ``1 - alpha``, so an opaque layer
+The image is divided into square tiles, and each tile gets the list of ellipses that reach it, front
+to back. Lists are processed in blocks of layers, all tiles of a chunk at a time, so that nearly all
+arithmetic is on large arrays ``[tiles, layers, pixels]``. Only two recurrences run layer by layer,
+one operation each: the transmittance in the forward pass, and the values behind a layer in the
+backward pass. Neither takes a logarithm nor divides by ``1 - alpha``, so an opaque layer
 (alpha = 1) and thousands of layers are no special cases.
 """
 
@@ -28,7 +28,7 @@ from gsgan.splat.project import Projected
 from gsgan.splat.settings import Accuracy
 from gsgan.splat.tile_lists import TileLists, Tiling, tile_lists, with_empty_row
 
-# u and v this large are far beyond every cut-off, and their squares still fit into float32.
+# u and v this large are far beyond every cut-off, and their squares do not overflow float32.
 U_MAX = 1e15
 
 
@@ -44,9 +44,9 @@ def composite(
     Args:
         projected: the ellipses.
         size: (H, W) pixels.
-        settings: alpha_min, transmittance_min, alpha_max, and the extent that ``projected`` holds.
+        settings: alpha_min, transmittance_min, alpha_max, and the extent of ``projected``.
         want_depth: whether to blend depths too.
-        tiling: how to cut up the work; by default what suits the device.
+        tiling: how the work is divided; by default suited to the device.
 
     Returns:
         features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``, depth ``[B, 1, H, W]`` or
@@ -67,14 +67,14 @@ def composite(
         geometry, projected.opacities, torch.cat(values, dim=-1), lists, settings, tiling
     )
     alpha = blended[:, C : C + 1]
-    # Rounding may sum the weights to 1 + 1e-7; the gradient is not to stop there.
+    # Rounding may sum the weights to 1 + 1e-7; the gradient must not stop there.
     alpha = alpha - (alpha.detach() - 1).clamp_min(0)
     return blended[:, :C], alpha, blended[:, C + 1 :] if want_depth else None
 
 
 @contextmanager
 def full_precision(device: torch.device) -> Iterator[None]:
-    """Keeps matrix products at the precision of their dtype: no autocast, TF32 or bfloat16."""
+    """Matrix products at the precision of their dtype: no autocast, TF32 or bfloat16."""
     before = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("highest")
     try:
@@ -124,7 +124,7 @@ class _Composite(torch.autograd.Function):
 
 @dataclass(frozen=True)
 class _Place:
-    """Ellipses seen from the middle of a tile: ``u + p x + w y`` and ``v + r y`` at (x, y) from it.
+    """Ellipses relative to a tile's centre: ``u + p x + w y`` and ``v + r y`` at (x, y) from it.
 
     ``q`` is the sum of their squares. Each ``[T, K]``.
     """
@@ -137,7 +137,7 @@ class _Place:
 
 
 class _Walk:
-    """Walks the lists of tiles block by block, forwards or backwards."""
+    """Processes the lists of tiles block by block, forwards or backwards."""
 
     def __init__(
         self,
@@ -149,7 +149,7 @@ class _Walk:
         tiling: Tiling,
     ) -> None:
         self.shape = geometry.shape[:2]
-        # One row more, transparent, fills up the last block of each list.
+        # An additional transparent row pads the last block of each list.
         self.geometry = with_empty_row(geometry)
         self.opacities = with_empty_row(opacities.unsqueeze(-1)).squeeze(-1)
         self.values = with_empty_row(values)
@@ -159,19 +159,19 @@ class _Walk:
         axis = torch.arange(tiling.tile, dtype=dtype, device=device) - (tiling.tile - 1) / 2
         y, x = (axis_.flatten() for axis_ in torch.meshgrid(axis, axis, indexing="ij"))
         self.xy = torch.stack([x, y])
-        # u and v are linear in the pixel's place in the tile: a small matrix product gives each.
-        # Written out as one polynomial in x and y, q would cancel: a narrow ellipse far from the
-        # middle of its tile loses the square of the digits that u and v lose.
+        # u and v are linear in the pixel's position in the tile: a small matrix product gives each.
+        # As one polynomial in x and y, q would cancel: a narrow ellipse far from the centre of its
+        # tile would lose the square of the digits that u and v lose.
         self.basis = torch.stack([torch.ones_like(x), x, y])
         tile = lists.tiles % (lists.grid[0] * lists.grid[1])
         corner = torch.stack([tile % lists.grid[1], tile // lists.grid[1]], dim=-1)
         self.centres = (corner * tiling.tile + tiling.tile / 2).to(geometry.dtype)
-        # exp of less is 0 or subnormal: slow, and below every alpha_min. Above 0 is rounding.
+        # exp of less is 0 or subnormal: slow, and below every alpha_min.
         self.least_exponent = math.log(torch.finfo(dtype).tiny)
-        # threshold() keeps what is greater; alphas equal to alpha_min are to be kept.
+        # threshold() keeps greater values; alphas equal to alpha_min must be kept.
         self.below_alpha_min = _next_below(settings.alpha_min, dtype)
-        # On a CPU, tiles that let no more light through are left out. On a GPU the host would have
-        # to wait for the answer; their layers weigh nothing either way.
+        # On a CPU, opaque tiles are skipped. On a GPU the host would have to wait for the device;
+        # their further layers have no weight either way.
         self.stops = settings.transmittance_min > 0 and device.type == "cpu"
         self.sums = self.values.new_zeros(len(self.values), 6)
         self.values_grad = torch.zeros_like(self.values)
@@ -184,7 +184,7 @@ class _Walk:
         return tuple(grad.unflatten(0, self.shape) for grad in grads)  # type: ignore[return-value]
 
     def chunks(self) -> Iterator[slice]:
-        """Ranges of listed tiles that are walked together."""
+        """Ranges of listed tiles that are processed together."""
         tiles = max(1, self.tiling.block_elements // (self.tiling.layers * self.pixels))
         for start in range(0, len(self.lists.tiles), tiles):
             yield slice(start, min(start + tiles, len(self.lists.tiles)))
@@ -204,7 +204,7 @@ class _Walk:
                 rows, before = rows[going], before[going]
                 if not len(rows):
                     break
-            else:  # most layers first: the tiles that still have some are the first ones
+            else:  # most layers first: the tiles that have layers left are the first ones
                 left = bisect_left(depths, -offset, key=neg)
                 rows, before = rows[:left], before[:left]
             if save:
@@ -219,7 +219,7 @@ class _Walk:
     def backward(self, chunk: slice, blocks: list[tuple[Tensor, Tensor]], grad: Tensor) -> None:
         """Adds a chunk's part of the gradients; ``grad [T, V, P]`` is that of its sums."""
         starts, counts = self.lists.starts[chunk], self.lists.counts[chunk]
-        # What is seen behind the blocks walked so far, times the gradient: front layers hide it.
+        # The values behind the blocks processed so far, times the gradient.
         behind = torch.zeros_like(grad[:, 0])
         for number, (rows, before) in reversed(list(enumerate(blocks))):
             ids = self._ids(starts[rows], counts[rows], number * self.tiling.layers)
@@ -235,7 +235,7 @@ class _Walk:
                 passes.mul_(keep)
             seen = values @ grad_here
             hidden, behind[rows] = _behind(alpha, seen, behind[rows])
-            # d picture / d alpha = T (what is here - what is behind).
+            # d image / d alpha = T (value of the layer - values behind it).
             d_alpha = seen.sub_(hidden).mul_(transmittance).mul_(passes)
             self._add(self.values_grad, ids, alpha.mul_(transmittance) @ grad_here.mT)
             self._add(self.sums, ids, self._whitened_sums(place, d_alpha.mul_(exponential), u, v))
@@ -273,7 +273,7 @@ class _Walk:
     def _alpha(
         self, exponential: Tensor, ids: Tensor, want_mask: bool = False
     ) -> tuple[Tensor, Tensor | None]:
-        """Alphas ``[T, K, P]`` after the cut-offs, and where gradients pass (1 or 0)."""
+        """Alphas ``[T, K, P]`` after the cut-offs, and a mask (1 or 0) of their gradients."""
         alpha = exponential * self.opacities[ids].unsqueeze(-1)
         passes = None
         if want_mask:
@@ -292,7 +292,7 @@ class _Walk:
         return weights.mul_(alpha), after
 
     def _transmittances(self, alpha: Tensor, before: Tensor) -> tuple[Tensor, Tensor]:
-        """Before each layer ``[T, K, P]``, and after the last ``[T, P]``; never stopped."""
+        """Before each layer ``[T, K, P]``, and after the last ``[T, P]``; without cut-off."""
         through, layers = 1 - alpha, torch.empty_like(alpha)
         layers[:, 0] = before
         for k in range(1, alpha.shape[1]):
@@ -314,7 +314,7 @@ class _Walk:
 
 
 def _behind(alpha: Tensor, seen: Tensor, behind: Tensor) -> tuple[Tensor, Tensor]:
-    """What lies behind each layer ``[T, K, P]``, and behind the layer in front of the block."""
+    """The values behind each layer ``[T, K, P]``, and behind the layer in front of the block."""
     layers = torch.empty_like(alpha)
     layers[:, -1] = behind
     for k in range(alpha.shape[1] - 1, 0, -1):
@@ -331,13 +331,13 @@ def _geometry_gradient(geometry: Tensor, opacities: Tensor, sums: Tensor) -> Ten
 
 @lru_cache(maxsize=16)
 def _next_below(value: float, dtype: torch.dtype) -> float:
-    """The number of that type just below a value."""
+    """The largest number of a dtype below a value."""
     rounded = torch.tensor(value, dtype=dtype)
     return torch.nextafter(rounded, rounded - 1).item()
 
 
 def _indicator(x: Tensor, least: float | Tensor) -> Tensor:
-    """1 where ``x >= least``, else 0, as numbers: multiplying is faster than selecting."""
+    """1 where ``x >= least``, else 0, as numbers: multiplication is faster than selection."""
     return torch.ge(x, least, out=torch.empty_like(x))
 
 
@@ -348,9 +348,9 @@ def _from_tiles(canvas: Tensor, B: int, lists: TileLists, tiling: Tiling) -> Ten
     return tiles.permute(0, 3, 1, 4, 2, 5).flatten(4, 5).flatten(2, 3)[..., :H, :W].contiguous()
 
 
-def _to_tiles(picture: Tensor, lists: TileLists, tiling: Tiling) -> Tensor:
+def _to_tiles(image: Tensor, lists: TileLists, tiling: Tiling) -> Tensor:
     """``[B, V, H, W]`` → ``[B * rows * columns, V, P]``, zeros beyond the edge."""
     (H, W), side, (rows, columns) = lists.size, tiling.tile, lists.grid
-    padded = functional.pad(picture, (0, columns * side - W, 0, rows * side - H))
+    padded = functional.pad(image, (0, columns * side - W, 0, rows * side - H))
     tiles = padded.unflatten(3, (columns, side)).unflatten(2, (rows, side))
     return tiles.permute(0, 2, 4, 1, 3, 5).flatten(4, 5).flatten(0, 2)

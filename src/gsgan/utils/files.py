@@ -6,6 +6,14 @@ import os
 from pathlib import Path
 
 
+def cache_root() -> Path:
+    """Folder for what gsgan can make again: GSGAN_CACHE, by default the user's cache folder."""
+    if os.environ.get("GSGAN_CACHE"):
+        return Path(os.environ["GSGAN_CACHE"]).expanduser()
+    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(base).expanduser() / "gsgan"
+
+
 def write_atomically(path: Path, content: str | bytes) -> None:
     """Writes under a temporary name beside ``path``, then renames."""
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,5 +1,5 @@
-"""The default person: a clothed figure traced from a ring of cameras, made on demand."""
+"""The default person: a clothed figure, ray-traced from a ring of cameras on first use."""
 
-from gsgan.data.synthetic.make import cache_root, ensure_synthetic, make_synthetic
+from gsgan.data.synthetic.make import ensure_synthetic
 
-__all__ = ["cache_root", "ensure_synthetic", "make_synthetic"]
+__all__ = ["ensure_synthetic"]

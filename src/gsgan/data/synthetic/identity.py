@@ -1,7 +1,7 @@
-"""Who the synthetic person is: colours and patterns drawn from a seed.
+"""Appearance of the synthetic person: colours and patterns drawn from a seed.
 
 Convention: colours are sRGB in [0, 1]; albedo is a function of the rest-pose position in metres, so
-it has no seams and no resolution. This module and trace.py need numpy only: workers start fast.
+it has no seams and no resolution.
 """
 
 from __future__ import annotations
@@ -32,10 +32,9 @@ HAIRS: tuple[Colour, ...] = (
 )
 EYES: tuple[Colour, ...] = ((0.25, 0.45, 0.65), (0.35, 0.24, 0.14), (0.30, 0.48, 0.30))
 SHIRT_PATTERNS = ("stripes", "checks", "chevrons")
-# chosen by looking at what identity 0, the default person, wears
-STREAM = 54
 TROUSER_PATTERNS = ("denim", "tartan")
 BADGES = ("star", "ring", "bolt")
+STREAM = 54  # chosen for the look of identity 0, the default person
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class Identity:
 
 
 def make_identity(seed: int) -> Identity:
-    """The person of a seed; every non-negative integer is a different one.
+    """The identity of a seed; every non-negative integer gives a different one.
 
     Raises:
         ValueError: when the seed is negative.
@@ -100,7 +99,7 @@ def _hsv(hue: float, saturation: float, value: float) -> Colour:
 
 @dataclass(frozen=True)
 class Marks:
-    """Rest-pose places the patterns hang on, metres: see :func:`marks_of`."""
+    """Rest-pose anchor points of the patterns, metres: see :func:`marks_of`."""
 
     eyes: Array
     mouth: Array
@@ -112,7 +111,7 @@ class Marks:
 
 
 def marks_of(landmarks: Array) -> Marks:
-    """The places of a body from its 33 rest landmarks ``[33, 3]``; pairs are left, right."""
+    """The anchor points of a body from its rest landmarks ``[33, 3]``; pairs are left, right."""
     p = np.asarray(landmarks, dtype=np.float64)
     shoulders, hips = p[[11, 12]], p[[23, 24]]
     chest = 0.74 * shoulders.mean(axis=0) + 0.26 * hips.mean(axis=0)
@@ -122,7 +121,7 @@ def marks_of(landmarks: Array) -> Marks:
 def albedo(identity: Identity, marks: Marks, points: Array, surface: Ints) -> Array:
     """sRGB albedo ``[N, 3]`` of rest-pose points ``[N, 3]`` on surfaces ``[N]``.
 
-    ``surface`` counts skin, hair, eye, shirt, trousers, shoe, as the free body's asset does.
+    Surfaces are numbered skin, hair, eye, shirt, trousers, shoe, as in the free body's asset.
     """
     out = np.zeros((len(points), 3))
     painters = (_skin, _hair, _eye, _shirt, _trousers, _shoe)
@@ -163,7 +162,7 @@ def _skin(who: Identity, marks: Marks, p: Array) -> Array:
     lips = ((p[:, 0] - mouth[0]) / 0.027) ** 2 + ((p[:, 2] - mouth[2]) / 0.011) ** 2
     red = np.asarray(who.skin) * np.array([0.92, 0.62, 0.62])
     out = _mix(out, red, 0.9 * (front & (lips < 1)))
-    # a watch on the left, a bracelet on the right: arms would have nothing to recognise otherwise
+    # a watch on the left, a bracelet on the right: bare arms would have no features
     for i, (colour, low, high) in enumerate(
         (((0.08, 0.08, 0.10), 0.84, 0.93), (who.shirt[2], 0.89, 0.93))
     ):
@@ -219,7 +218,7 @@ def _shirt(who: Identity, marks: Marks, p: Array) -> Array:
 
 
 def _badge(who: Identity, marks: Marks, p: Array, out: Array) -> Array:
-    """A disc with a sign on the chest, and a bar with two dots on the back."""
+    """Adds a disc with a sign on the chest, and a bar with two dots on the back."""
     x, z = p[:, 0] - marks.chest[0], p[:, 2] - marks.chest[2]
     front = p[:, 1] < marks.chest[1] - 0.02
     r = np.hypot(x, z)

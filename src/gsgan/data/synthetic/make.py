@@ -1,8 +1,9 @@
 """Writes the synthetic dataset, once, into a cache folder.
 
-The layout is the bring-your-own one: cameras.json, images/{cam}/%06d.png, masks/, labels/,
+The layout is that of a capture: cameras.json, images/{cam}/%06d.png, masks/, labels/,
 landmarks3d.npz, hands3d.npz, body_pose.npz, meta.json. A dataset is made under a temporary name and
-renamed when it is whole, so that a killed run leaves nothing that looks like one.
+renamed when complete, so that a killed run leaves nothing that looks like one. Tints are written
+nowhere: a model has to estimate them.
 """
 
 from __future__ import annotations
@@ -14,28 +15,26 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import threading
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
 import gsgan
 from gsgan.body.free import free_body
-from gsgan.data.synthetic.scene_setup import Settings, Stage, build_stage, dataset_key
+from gsgan.data.synthetic.choreography import DURATION
+from gsgan.data.synthetic.lens import LensView
+from gsgan.data.synthetic.scene_setup import Scene, Settings, build_scene, dataset_key
+from gsgan.data.synthetic.trace import View
 from gsgan.data.synthetic.worker import trace_frames
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import cache_root
 
-
-def cache_root() -> Path:
-    """Where gsgan keeps what it can make again: GSGAN_CACHE, else the user's cache folder."""
-    if os.environ.get("GSGAN_CACHE"):
-        return Path(os.environ["GSGAN_CACHE"]).expanduser()
-    base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(base).expanduser() / "gsgan"
+POLL_SECONDS = 0.05
 
 
 def ensure_synthetic(
@@ -43,9 +42,11 @@ def ensure_synthetic(
 ) -> Path:
     """The synthetic dataset with these parameters: found in the cache, or made there.
 
+    Two processes may request the same dataset at once: the second waits, then finds it.
+
     Args:
-        cache: cache folder, :func:`cache_root` unless given.
-        workers: processes that trace; does not change the result.
+        cache: cache folder, :func:`gsgan.utils.files.cache_root` by default.
+        workers: processes that trace; 1 traces in this one. Does not change the result.
         progress: whether to draw a progress bar.
         parameters: of :class:`gsgan.data.synthetic.scene_setup.Settings`.
 
@@ -53,90 +54,51 @@ def ensure_synthetic(
         The dataset's folder.
 
     Raises:
-        ConfigError: on an unknown or senseless parameter.
+        ConfigError: on an unknown parameter or one out of range.
         DataError: when the folder cannot be written.
     """
     settings = Settings.from_parameters(parameters)
     root = (cache or cache_root()) / "data" / "synthetic" / dataset_key(settings)
-    return make_synthetic(root, workers=workers, progress=progress, **asdict(settings))
-
-
-def make_synthetic(
-    root: Path, *, workers: int = 2, progress: bool = True, **parameters: Any
-) -> Path:
-    """Makes a synthetic dataset at ``root``, or leaves the same one that is already there alone.
-
-    Two processes may ask for the same folder at once: the second waits, then finds it.
-
-    Args:
-        root: the dataset's folder; its parent is made.
-        workers: processes that trace; 1 traces in this one.
-        progress: whether to draw a progress bar.
-        parameters: of :class:`gsgan.data.synthetic.scene_setup.Settings`.
-
-    Returns:
-        ``root``.
-
-    Raises:
-        ConfigError: on an unknown or senseless parameter.
-        DataError: when ``root`` holds something else, or cannot be written.
-    """
-    root, settings = Path(root), Settings.from_parameters(parameters)
-    if _is_there(root, settings):
-        return root
-    try:
-        root.parent.mkdir(parents=True, exist_ok=True)
-        _make_whole(root, settings, workers, progress)
-    except OSError as error:
-        raise DataError(
-            f"{root} cannot be written ({error}): make room, or set GSGAN_CACHE to a folder that "
-            f"you may write to"
-        ) from error
+    if not _is_complete(root):
+        try:
+            root.parent.mkdir(parents=True, exist_ok=True)
+            _make(root, settings, workers, progress)
+        except OSError as error:
+            raise DataError(
+                f"{root} cannot be written ({error}): make room, or set GSGAN_CACHE to a folder "
+                f"that you may write to"
+            ) from error
     return root
 
 
-def _make_whole(root: Path, settings: Settings, workers: int, progress: bool) -> None:
-    with _only_one(root.with_name(f".{root.name}.lock")) as alone:
-        if _is_there(root, settings):  # made while this process waited
+def _is_complete(root: Path) -> bool:
+    """Whether the dataset exists: meta.json is written last."""
+    return (root / "meta.json").is_file()
+
+
+def _make(root: Path, settings: Settings, workers: int, progress: bool) -> None:
+    with _exclusive(root.with_name(f".{root.name}.lock")) as alone:
+        if _is_complete(root):  # made while this process waited
             return
         prefix = f".{root.name}.part-"
-        if alone:  # what a killed process could not tidy up
+        if alone:  # remove what killed processes left
             for left in root.parent.glob(f"{prefix}*"):
                 shutil.rmtree(left, ignore_errors=True)
         part = Path(tempfile.mkdtemp(prefix=prefix, dir=root.parent))
         try:
             _write(part, settings, workers, progress)
             part.chmod(0o755)  # mkdtemp's are private
-            if root.is_dir():  # empty, or _is_there would have refused it
-                root.rmdir()
             part.rename(root)
         finally:
             shutil.rmtree(part, ignore_errors=True)
 
 
-def _is_there(root: Path, settings: Settings) -> bool:
-    """Whether the folder holds this very dataset; False where there is nothing."""
-    if not root.exists() or (root.is_dir() and not any(root.iterdir())):
-        return False
-    wanted = made_by(settings)
-    try:
-        found = json.loads((root / "meta.json").read_text()).get("made_by")
-    except (OSError, ValueError, AttributeError):
-        found = None
-    if found != wanted:
-        raise DataError(
-            f"{root} holds something other than the synthetic dataset asked for: "
-            f"choose another folder, or remove this one"
-        )
-    return True
-
-
 @contextlib.contextmanager
-def _only_one(lock: Path) -> Iterator[bool]:
-    """Holds a lock that the system releases when the process dies; False where there is none."""
+def _exclusive(lock: Path) -> Iterator[bool]:
+    """Holds a lock that the system releases when the process dies; False where it has no locks."""
     try:
         import fcntl
-    except ImportError:  # no such locks on Windows: two processes both work, one result is kept
+    except ImportError:  # Windows: two processes both work, and one result is kept
         yield False
         return
     with lock.open("w") as file:
@@ -149,91 +111,58 @@ def _only_one(lock: Path) -> Iterator[bool]:
 
 
 def _write(root: Path, settings: Settings, workers: int, progress: bool) -> None:
-    stage = build_stage(settings)
-    with _bar(settings, progress) as advance:
-        if workers <= 1 or settings.frames == 1:
-            for _ in trace_frames(root, stage, settings.rays_per_pixel, range(settings.frames)):
-                advance()
-        else:
-            _trace_in_processes(root, settings, min(workers, settings.frames), advance)
-    _write_cameras(root, stage)
-    _write_skeletons(root, settings, stage)
-    _write_json(root / "meta.json", _meta(settings, stage))
-
-
-@contextlib.contextmanager
-def _bar(settings: Settings, show: bool) -> Iterator[Callable[[], None]]:
     from rich.console import Console
     from rich.progress import Progress
 
-    cameras = settings.train_cameras + settings.test_cameras
-    with Progress(console=Console(stderr=True), disable=not show, transient=True) as bar:
-        text = f"tracing the synthetic person ({settings.frames} frames, {cameras} cameras)"
-        task = bar.add_task(text, total=settings.frames)
-        yield lambda: bar.advance(task)
+    scene = build_scene(settings)
+    with Progress(console=Console(stderr=True), disable=not progress, transient=True) as bar:
+        count = f"{settings.frames} frames, {len(scene.views)} cameras"
+        task = bar.add_task(f"tracing the synthetic person ({count})", total=settings.frames)
+        if workers <= 1 or settings.frames == 1:
+            for frame in range(settings.frames):
+                trace_frames(root, scene, settings.rays_per_pixel, [frame])
+                bar.advance(task)
+        else:
+            last = root / "labels" / list(scene.views)[-1]
+            for _ in _trace_in_processes(root, settings, min(workers, settings.frames)):
+                bar.update(task, completed=len(list(last.glob("*.png"))))
+    _write_skeletons(root, settings, scene)
+    cameras = {name: _calibration(view) for name, view in scene.views.items()}
+    _write_json(root / "cameras.json", cameras)
+    _write_json(root / "meta.json", _meta(settings, scene))
 
 
-def _trace_in_processes(
-    root: Path, settings: Settings, workers: int, advance: Callable[[], None]
-) -> None:
-    """Shares the frames out over processes; a failure of one ends all.
+def _trace_in_processes(root: Path, settings: Settings, workers: int) -> Iterator[None]:
+    """Divides the frames among processes; yields from time to time until all are done.
 
     Raises:
-        DataError: with the last line a failed worker said.
+        DataError: with a failed worker's last line of output.
     """
     environment = dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
     environment["PYTHONPATH"] = os.pathsep.join(p or os.getcwd() for p in sys.path)
-    command = [sys.executable, "-m", "gsgan.data.synthetic.worker"]
-    with tempfile.TemporaryFile("w+") as complaints, contextlib.ExitStack() as stack:
-        running: list[subprocess.Popen[str]] = []
-        stack.callback(_stop, running)
+    command = [sys.executable, "-m", "gsgan.data.synthetic.worker", str(root)]
+    command += [json.dumps(asdict(settings))]
+    with tempfile.TemporaryFile("w+") as errors, contextlib.ExitStack() as stack:
+        running = []
         for first in range(workers):
             process = subprocess.Popen(
-                command,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=complaints,
-                text=True,
-                env=environment,
+                [*command, str(first), str(workers)], stderr=errors, env=environment
             )
+            stack.callback(process.wait)
+            stack.callback(process.kill)
             running.append(process)
-            job = {
-                "root": str(root),
-                "settings": asdict(settings),
-                "frames": list(range(first, settings.frames, workers)),
-            }
-            assert process.stdin is not None
-            with contextlib.suppress(BrokenPipeError):  # its exit status says why
-                process.stdin.write(json.dumps(job) + "\n")
-                process.stdin.close()
-        threads = [
-            threading.Thread(target=_count, args=(p.stdout, advance), daemon=True) for p in running
-        ]
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        if any(process.wait() != 0 for process in running):
-            complaints.seek(0)
-            said = [line.strip() for line in complaints if line.strip()]
+        while None in (codes := [process.poll() for process in running]):
+            if any(codes):
+                break
+            yield
+            time.sleep(POLL_SECONDS)
+        if any(codes):
+            errors.seek(0)
+            lines = [line.strip() for line in errors if line.strip()]
             raise DataError(
                 f"a process tracing the synthetic person failed: "
-                f"{said[-1] if said else 'it was killed'}; workers=1 traces in this process"
+                f"{lines[-1] if lines else 'it was killed'}; workers=1 traces in this process"
             )
-
-
-def _count(lines: IO[str] | None, advance: Callable[[], None]) -> None:
-    for _ in lines or ():
-        advance()
-
-
-def _stop(processes: list[subprocess.Popen[str]]) -> None:
-    for process in processes:
-        if process.poll() is None:
-            process.kill()
-        process.wait()
-        if process.stdout is not None:
-            process.stdout.close()
 
 
 # ---------------------------------------------------------------- the small files
@@ -243,30 +172,28 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=1) + "\n")
 
 
-def _write_cameras(root: Path, stage: Stage) -> None:
-    cameras = {
-        name: {
-            "K": view.K.tolist(),
-            "R": view.R.tolist(),
-            "t": view.t.tolist(),
-            "dist": [0.0] * 5,
-            "size": [view.size[1], view.size[0]],
-        }
-        for name, view in stage.views.items()
+def _calibration(view: View) -> dict[str, Any]:
+    return {
+        "K": view.K.tolist(),
+        "R": view.R.tolist(),
+        "t": view.t.tolist(),
+        "dist": view.dist.tolist() if isinstance(view, LensView) else [0.0] * 5,
+        "size": [view.size[1], view.size[0]],
     }
-    _write_json(root / "cameras.json", cameras)
 
 
-def _write_skeletons(root: Path, settings: Settings, stage: Stage) -> None:
-    body, F = free_body(), settings.frames
-    pose, ids = BodyPose(stage.theta, stage.transl), np.arange(F, dtype=np.int64)
+def _write_skeletons(root: Path, settings: Settings, scene: Scene) -> None:
+    body = free_body()
+    pose, ids = BodyPose(scene.theta, scene.transl), np.arange(settings.frames, dtype=np.int64)
     p = body.posed_landmarks(pose).float().numpy()
     np.savez(
         root / "landmarks3d.npz",
         p=p,
         conf=np.ones(p.shape[:2], dtype=np.float32),
         reproj_px=np.zeros(p.shape[:2], dtype=np.float32),
-        n_views=np.full(p.shape[:2], len(stage.views), dtype=np.int64),
+        n_views=np.full(
+            p.shape[:2], settings.train_cameras + settings.test_cameras, dtype=np.int64
+        ),
         frame_id=ids,
         names=np.array(body.landmark_names),
     )
@@ -278,41 +205,35 @@ def _write_skeletons(root: Path, settings: Settings, stage: Stage) -> None:
     )
     np.savez(
         root / "body_pose.npz",
-        theta=stage.theta.numpy(),
-        transl=stage.transl.numpy(),
+        theta=scene.theta.numpy(),
+        transl=scene.transl.numpy(),
         frame_id=ids,
         joint_names=np.array(body.joint_names),
-        passage=np.array(stage.passages),
+        passage=np.array(scene.passages),
     )
 
 
-def made_by(settings: Settings) -> dict[str, Any]:
-    """What a dataset was made by: all that its bytes depend on."""
-    return {
-        "generator": "gsgan.data.synthetic",
-        "version": gsgan.__version__,
-        "key": dataset_key(settings),
-        **asdict(settings),
-    }
-
-
-def _meta(settings: Settings, stage: Stage) -> dict[str, Any]:
-    from gsgan.data.synthetic.motion import DURATION
-
+def _meta(settings: Settings, scene: Scene) -> dict[str, Any]:
+    chosen = {name: value for name, value in asdict(settings).items() if value is not None}
     return {
         "fps": settings.frames / DURATION,
         "unit": "m",
         "up_axis": "z",
         "skeleton": "mediapipe33",
         "pixel_centre": 0.5,
-        "background": "black",  # pictures come premultiplied: mixing them again darkens edges
+        "background": "black",  # images are premultiplied: blending them again darkens edges
         "body": "free",
         "label_names": list(free_body().label_names),
         "splits": {
-            "train_cameras": stage.train_cameras,
-            "test_cameras": stage.test_cameras,
-            "train_frames": stage.train_frames,
-            "test_frames": stage.test_frames,
+            "train_cameras": scene.train_cameras,
+            "test_cameras": scene.test_cameras,
+            "train_frames": scene.train_frames,
+            "test_frames": scene.test_frames,
         },
-        "made_by": made_by(settings),
+        "made_by": {
+            "generator": "gsgan.data.synthetic",
+            "version": gsgan.__version__,
+            "key": dataset_key(settings),
+            **chosen,
+        },
     }

@@ -1,16 +1,14 @@
-"""Ray tracing of the posed person: picture, alpha and part labels of one camera.
+"""Ray tracing of the posed person: image, alpha and part labels of one camera.
 
-An independent renderer: the splatting that gsgan is about has no part in its own training data.
+An independent renderer: splatting takes no part in making the training data.
 
-Convention: metres, world frame; OpenCV cameras, pixel centres at +0.5; pictures are RGB, sRGB in
+Convention: metres, world frame; OpenCV cameras, pixel centres at +0.5; images are RGB, sRGB in
 [0, 1], premultiplied on black.
 """
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +19,13 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 GAMMA = 2.2
+SHIRT, TROUSERS, SHOE = 3, 4, 5  # materials of the free body's asset
+SHININESS = 12.0  # exponent of the highlight's lobe: falls to half within about 19 degrees
 
 
 @dataclass(frozen=True)
 class Light:
-    """A sun and a sky; a person in the open.
+    """A sun and a sky, and how clothes reflect them.
 
     Args:
         direction: towards the sun, any length.
@@ -33,9 +33,11 @@ class Light:
         sky: ambient strength from above.
         ground: ambient strength from below.
         shadow_offset: metres along the normal at which shadow rays start; less gives speckles.
-        fold: how much of the light a fold at full flexion takes or adds.
+        fold: share of the light that a fold at full flexion removes or adds.
         fold_period: metres from one fold to the next.
         fold_reach: metres over which a joint's folds fade.
+        gloss: peak of the sun's highlight (Blinn-Phong) on shirt, trousers and shoes, as a share
+            of ``sun``; 0: matt.
     """
 
     direction: tuple[float, float, float] = (0.5, -0.75, 0.9)
@@ -46,11 +48,12 @@ class Light:
     fold: float = 0.38
     fold_period: float = 0.045
     fold_reach: float = 0.12
+    gloss: float = 0.0
 
 
 @dataclass(frozen=True)
 class Person:
-    """What does not change from frame to frame, in numpy.
+    """The part of the person that is constant over frames, in numpy.
 
     Args:
         vertices: ``[V, 3]`` rest positions.
@@ -60,7 +63,7 @@ class Person:
         fold_centre: ``[K, 3]`` rest positions of the joints that crease clothes.
         fold_axis: ``[K, 3]`` unit directions across their folds.
         identity: colours and patterns.
-        marks: where the patterns hang.
+        marks: anchor points of the patterns.
     """
 
     vertices: Array
@@ -87,20 +90,17 @@ class View:
         return -self.R.T @ self.t
 
     def project(self, points: Array) -> Array:
-        """``[N, 2]`` pixels of world points ``[N, 3]``, all of them before the camera."""
+        """``[N, 2]`` pixels of world points ``[N, 3]``, all in front of the camera."""
         x = (points @ self.R.T + self.t) @ self.K.T
         return x[:, :2] / x[:, 2:]
 
-
-class Tracer(Protocol):
-    """Finds the first triangle along rays."""
-
-    def first(self, origins: Array, directions: Array) -> tuple[Ints, Array]:
-        """Face index ``[N]``, -1 for a miss, and barycentric (u, v) ``[N, 2]``."""
+    def bend(self, directions: Array) -> Array:
+        """The world rays ``[N, 3]`` seen where a pinhole sees ``directions``: the same rays."""
+        return directions
 
 
-class EmbreeTracer:
-    """embreex, called directly on a triangle soup."""
+class Tracer:
+    """Finds the first of the triangles ``[F, 3, 3]`` along rays, with Embree."""
 
     def __init__(self, triangles: Array) -> None:
         from embreex.mesh_construction import TriangleMesh
@@ -110,7 +110,8 @@ class EmbreeTracer:
         self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles, dtype=np.float32))
 
     def first(self, origins: Array, directions: Array) -> tuple[Ints, Array]:
-        # OCCLUDED misreports, so that shadow rays ask for the first hit as well
+        """Face index ``[N]``, -1 for a miss, and barycentric (u, v) ``[N, 2]``."""
+        # also for shadow rays: the query OCCLUDED returns wrong results
         hit = self._scene.run(
             np.ascontiguousarray(origins, dtype=np.float32),
             np.ascontiguousarray(directions, dtype=np.float32),
@@ -120,61 +121,13 @@ class EmbreeTracer:
         return hit["primID"].astype(np.int64), np.stack([hit["u"], hit["v"]], axis=1)
 
 
-class PlainTracer:
-    """Every ray against every triangle of its batch, in numpy: slow, needs nothing."""
-
-    def __init__(self, triangles: Array, batch: int = 16) -> None:
-        self._corner = triangles[:, 0]
-        self._edge1 = triangles[:, 1] - triangles[:, 0]
-        self._edge2 = triangles[:, 2] - triangles[:, 0]
-        self._batch = batch
-
-    def first(self, origins: Array, directions: Array) -> tuple[Ints, Array]:
-        face = np.full(len(origins), -1, dtype=np.int64)
-        uv = np.zeros((len(origins), 2))
-        for start in range(0, len(origins), self._batch):
-            part = slice(start, start + self._batch)
-            face[part], uv[part] = self._some(origins[part], directions[part])
-        return face, uv
-
-    def _some(self, origins: Array, directions: Array) -> tuple[Ints, Array]:
-        p = np.cross(directions[:, None], self._edge2[None])
-        determinant = (p * self._edge1).sum(-1)
-        inverse = 1 / np.where(np.abs(determinant) < 1e-14, np.inf, determinant)
-        offset = origins[:, None] - self._corner
-        u = (offset * p).sum(-1) * inverse
-        q = np.cross(offset, self._edge1[None])
-        v = (q * directions[:, None]).sum(-1) * inverse
-        distance = (q * self._edge2).sum(-1) * inverse
-        ok = (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 0) & (inverse != 0)
-        distance = np.where(ok, distance, np.inf)
-        nearest = distance.argmin(axis=1)
-        rows = np.arange(len(origins))
-        face = np.where(np.isfinite(distance[rows, nearest]), nearest, -1)
-        return face, np.stack([u[rows, nearest], v[rows, nearest]], axis=1)
-
-
-def make_tracer(triangles: Array) -> Tracer:
-    """The fast tracer, or the plain one with a warning where embreex is missing."""
-    try:
-        return EmbreeTracer(triangles)
-    except ImportError:
-        warnings.warn(
-            "embreex is not installed, so the synthetic person is traced in plain numpy, hundreds "
-            "of times slower: pip install embreex",
-            RuntimeWarning,
-            stacklevel=2,
-        )
-        return PlainTracer(triangles)
-
-
 class PosedPerson:
-    """One moment: the tracer over the posed triangles, and what shading needs of them.
+    """The person in one pose, ready to be rendered.
 
     Args:
-        person: what does not change.
+        person: the constant part.
         vertices: ``[V, 3]`` posed positions.
-        flexion: ``[K]`` radians, how far each fold joint is bent.
+        flexion: ``[K]`` radians by which each fold joint is bent.
         light: see :class:`Light`.
     """
 
@@ -182,13 +135,13 @@ class PosedPerson:
         self.person, self.vertices, self.flexion, self.light = person, vertices, flexion, light
         triangles = vertices[person.faces]
         self.normals = vertex_normals(triangles, person.faces, len(vertices))
-        self.tracer = make_tracer(triangles)
+        self.tracer = Tracer(triangles)
 
     def render(self, view: View, rays: int) -> tuple[Array, Array, Ints]:
-        """Picture ``[H,W,3]``, alpha ``[H,W]`` and labels ``[H,W]`` seen by a camera.
+        """Image ``[H,W,3]``, alpha ``[H,W]`` and labels ``[H,W]`` seen by a camera.
 
-        ``rays`` per pixel; rays are cast only in the person's box. A pixel has the label most of
-        its rays hit, and background unless at least half of them hit the person.
+        Casts ``rays`` per pixel of the person's bounding box. A pixel's label is the one that most
+        of its rays hit; it is background unless at least half of them hit the person.
         """
         H, W = view.size
         image, alpha = np.zeros((H, W, 3)), np.zeros((H, W))
@@ -197,7 +150,7 @@ class PosedPerson:
         if right <= left or bottom <= top:
             return image, alpha, labels
         origin, directions = pixel_rays(view, (left, top, right, bottom), rays)
-        face, colour = self._shoot(origin, directions)
+        face, colour = self._shoot(origin, view.bend(directions))
         shape = (bottom - top, right - left, rays)
         window = (slice(top, bottom), slice(left, right))
         image[window] = colour.reshape(*shape, 3).mean(axis=2)
@@ -222,26 +175,32 @@ class PosedPerson:
         return face, colour
 
     def _shade(self, face: Ints, uv: Array, directions: Array) -> Array:
-        """sRGB of surface points: Lambert sun with cast shadow, hemisphere ambient, folds."""
+        """sRGB of surface points: Lambert sun, cast shadow, hemisphere ambient, folds, gloss."""
         person, light = self.person, self.light
-        corners = person.faces[face]
+        surface, corners = person.surface[face], person.faces[face]
         weight = np.concatenate([1 - uv.sum(axis=1, keepdims=True), uv], axis=1)[:, :, None]
         rest = (weight * person.vertices[corners]).sum(axis=1)
         here = (weight * self.vertices[corners]).sum(axis=1)
-        normal = (weight * self.normals[corners]).sum(axis=1)
-        normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+        normal = _unit((weight * self.normals[corners]).sum(axis=1))
         normal *= np.where((normal * directions).sum(axis=1) > 0, -1.0, 1.0)[:, None]
         sun = np.asarray(light.direction) / np.linalg.norm(light.direction)
         facing = np.maximum(normal @ sun, 0)
-        facing *= self._lit(here + light.shadow_offset * normal, sun, facing > 0)
+        lit = self._lit(here + light.shadow_offset * normal, sun, facing > 0)
         up = 0.5 + 0.5 * normal[:, 2]
-        irradiance = light.sun * facing + light.ground + (light.sky - light.ground) * up
-        irradiance *= self._folds(rest, person.surface[face])
-        paint = albedo(person.identity, person.marks, rest, person.surface[face]) ** GAMMA
-        return np.clip(paint * irradiance[:, None], 0, 1) ** (1 / GAMMA)
+        irradiance = light.sun * (facing * lit) + light.ground + (light.sky - light.ground) * up
+        irradiance *= self._folds(rest, surface)
+        paint = albedo(person.identity, person.marks, rest, surface) ** GAMMA
+        colour = np.clip(paint * irradiance[:, None], 0, 1) ** (1 / GAMMA)
+        if light.gloss > 0:
+            shiny = np.isin(surface, (SHIRT, TROUSERS, SHOE))
+            halfway = _unit(sun - directions[shiny])
+            lobe = np.maximum((normal[shiny] * halfway).sum(axis=1), 0) ** SHININESS
+            linear = colour[shiny] ** GAMMA + (light.gloss * light.sun * lit[shiny] * lobe)[:, None]
+            colour[shiny] = np.clip(linear, 0, 1) ** (1 / GAMMA)
+        return colour
 
     def _lit(self, points: Array, sun: Array, ask: NDArray[np.bool_]) -> Array:
-        """1 where the sun is seen, 0 in the shadow, for the points asked about."""
+        """1 where the sun is visible, 0 in shadow and where ``ask`` is False."""
         lit = np.zeros(len(points))
         if ask.any():
             count = int(ask.sum())
@@ -250,9 +209,9 @@ class PosedPerson:
         return lit
 
     def _folds(self, rest: Array, surface: Ints) -> Array:
-        """Factor on the light: creases that deepen as the joint beneath them bends."""
+        """Factor on the light: creases of the clothes that deepen as a joint bends."""
         light, factor = self.light, np.ones(len(rest))
-        cloth = (surface == 3) | (surface == 4)
+        cloth = (surface == SHIRT) | (surface == TROUSERS)
         p = rest[cloth]
         crease = np.zeros(len(p))
         for centre, axis, bend in zip(
@@ -276,11 +235,15 @@ def vertex_normals(triangles: Array, faces: Ints, vertices: int) -> Array:
         ],
         axis=1,
     )
-    return out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-20)
+    return _unit(out.astype(np.float64), 1e-20)
+
+
+def _unit(x: Array, least: float = 1e-12) -> Array:
+    return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), least)
 
 
 def pixel_offsets(rays: int) -> Array:
-    """``[rays, 2]`` places in a pixel in [0, 1): the centre first, then an even spread (R2)."""
+    """``[rays, 2]`` positions in a pixel, in [0, 1): the centre, then the R2 sequence."""
     g = 1.32471795724474602596  # the plastic number: x³ = x + 1
     step = np.array([1 / g, 1 / g**2])
     return np.mod(0.5 + np.arange(rays)[:, None] * step, 1.0)
@@ -299,7 +262,7 @@ def pixel_rays(view: View, box: tuple[int, int, int, int], rays: int) -> tuple[A
 
 
 def majority(part: Ints, classes: int) -> Ints:
-    """``[h, w]`` most frequent part of ``[h, w, rays]``; 0 where over half the rays miss."""
+    """``[h, w]`` most frequent part of ``[h, w, rays]``; 0 where more than half the rays miss."""
     votes = np.stack([(part == c).sum(axis=-1) for c in range(1, classes)], axis=-1)
     solid = 2 * (part > 0).sum(axis=-1) >= part.shape[-1]
     return np.where(solid, votes.argmax(axis=-1) + 1, 0)

@@ -1,6 +1,6 @@
-// Backward pass: chunks from back to front. The transmittance before each chunk was stored by the
-// forward pass, so nothing is recovered by division: alpha = 1 and a transmittance of 0 have exact
-// gradients. With R the colour behind i seen through nothing else,
+// Backward pass: chunks from back to front. The forward pass stored the transmittance before each
+// chunk, so there is no division: alpha = 1 and a transmittance of 0 have exact gradients. With R_i
+// the colour of the layers behind i alone,
 //     dL/dalpha_i = T_i (v_i - R_i),   R_{i-1} = alpha_i v_i + (1 - alpha_i) R_i.
 #pragma once
 
@@ -69,8 +69,8 @@ void backward_cell(int cell, int64_t channels, const Cutoffs<T>& cut, Scratch<T>
   }
 }
 
-// Sums an entry's records g = dL/dalpha exp(-q/2): of g, g u, g v, g u^2, g u v, g v^2. They do not
-// depend on the tile's place, so they add up over tiles; `geometry_gradient` makes gradients.
+// Sums g, g u, g v, g u^2, g u v, g v^2 over an entry's records g = dL/dalpha exp(-q/2). The sums do
+// not depend on the tile's position and add up over tiles; see `geometry_gradient`.
 template <class T> void entry_geometry(int k, const Scratch<T>& s, T* out) {
   using V = Vec<T>;
   constexpr int W = Simd<T>::W;
@@ -124,7 +124,7 @@ template <class T> void load_gradients(const Job& job, const Tile& tile, Scratch
   read(job.g_alpha, tile.b, s.alpha_grad.get());
 }
 
-// Sums of a tile's entries; slots [entries of the tile, GEOMETRY + channels].
+// Sums of a tile's entries; slots: [entries of the tile, GEOMETRY + channels].
 template <class T>
 void backward_tile(const Job& job, const Inputs<T>& in, const Plan<T>& plan, int64_t index,
                    Scratch<T>& s, T* slots) {
@@ -157,7 +157,7 @@ void backward_tile(const Job& job, const Inputs<T>& in, const Plan<T>& plan, int
   }
 }
 
-// Adds the slots of entries [from, to) to the Gaussians' sums and gradients, in the tiles' order.
+// Adds the slots of entries [from, to) to the Gaussians' sums and gradients, in tile order.
 template <class T>
 void reduce(const Job& job, const Plan<T>& plan, const T* slots, int64_t from, int64_t to,
             std::vector<int64_t>& cursor, double* sums) {
@@ -178,7 +178,7 @@ void reduce(const Job& job, const Plan<T>& plan, const T* slots, int64_t from, i
   }
 }
 
-// Gradients of mean, factors and opacity from the sums over a Gaussian's pixels: with
+// Gradients of mean, factors and opacity from the sums over a Gaussian's pixels, with
 // dalpha/dq = -alpha / 2, q = (u^2 + v^2) / UNITS^2, u = p (dx + k dy) UNITS, v = r dy UNITS.
 template <class T> void geometry_gradient(const Job& job, const Plan<T>& plan, const double* sums) {
   const Inputs<T> in(job);

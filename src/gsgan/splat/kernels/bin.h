@@ -1,4 +1,4 @@
-// Binning: each tile gets the list of the Gaussians that reach it, front to back.
+// Binning: the list of Gaussians that reach each tile, front to back.
 #pragma once
 
 #include <cstring>
@@ -15,7 +15,7 @@ struct Range {  // inclusive
   int64_t size() const { return high - low + 1; }
 };
 
-// Pixels whose centre lies within centre +- extent, widened by rounding (of an extent given as T).
+// Pixels whose centre is within centre +- extent, enlarged by rounding (of an extent in T).
 template <class T> Range pixels(double centre, double extent, int64_t size) {
   const double rounding = double(std::numeric_limits<T>::epsilon());
   const double pad = PAD + rounding * (std::abs(centre) + 4 * extent);
@@ -31,7 +31,7 @@ template <class T> T reach(T opacity, T alpha_min) {
   return opacity > 0 ? std::log2(opacity / alpha_min) : -T(1);
 }
 
-// Rises with the depth; -0 and 0 are one depth.
+// Increases with depth; -0 and 0 are equal.
 inline uint64_t sort_key(double depth) {
   depth += 0.0;
   uint64_t u;
@@ -67,7 +67,7 @@ template <class T> bool is_finite(const Inputs<T>& in, int64_t i) {
          !std::isnan(in.extents[2 * i]) && !std::isnan(in.extents[2 * i + 1]);
 }
 
-// Prepares Gaussian g of batch item b and appends the tiles it can reach, row by row. False: it is
+// Prepares Gaussian i and appends the tiles that it can reach, row by row. Returns false when it is
 // not finite.
 template <class T>
 bool reached_tiles(const Job& job, const Inputs<T>& in, int64_t i, const Plan<T>& plan,
@@ -97,7 +97,7 @@ bool reached_tiles(const Job& job, const Inputs<T>& in, int64_t i, const Plan<T>
   const double middle_x = (tx.low + 0.5) * TILE, middle_y = (ty.low + 0.5) * TILE;
   const Least<double> least(place_at<double>(ellipse, middle_x, middle_y));
   const double far = TILE * double(std::max(tx.size(), ty.size()));
-  // p, r and level are rounded to T; that scales u and v, no more.
+  // p, r and level are rounded to T, which only scales u and v.
   const double rounding = 8 * double(std::numeric_limits<T>::epsilon());
   const double bound = level * (1 + rounding) + rounding + least.margin(far);
   for (int64_t y = ty.low; y <= ty.high; ++y)
@@ -109,7 +109,7 @@ bool reached_tiles(const Job& job, const Inputs<T>& in, int64_t i, const Plan<T>
   return true;
 }
 
-// Tiles of each Gaussian, in blocks of Gaussians; fills ellipses and, as counts, gaussian_start.
+// Tiles of each Gaussian, in blocks of Gaussians; fills ellipses and gaussian_start (counts).
 template <class T>
 Status find_tiles(Job& job, Plan<T>& plan, std::vector<std::vector<int32_t>>& found) {
   const Inputs<T> in(job);
@@ -136,7 +136,7 @@ Status find_tiles(Job& job, Plan<T>& plan, std::vector<std::vector<int32_t>>& fo
   return bad >= 0 ? NOT_FINITE : OK;
 }
 
-// Turns the tiles found into lists: counts first, then every batch item's Gaussians in depth order.
+// Converts the tiles found to lists, with each batch item's Gaussians in depth order.
 template <class T> Status fill_lists(const Job& job, Plan<T>& plan) {
   const Inputs<T> in(job);
   std::vector<int64_t> cursor(plan.tile_start.begin(), plan.tile_start.end() - 1);

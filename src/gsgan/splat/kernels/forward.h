@@ -1,33 +1,33 @@
-// Forward pass: front to back, the transmittance in a register; a chunk's weights are kept, then
-// multiplied into the channels in groups.
+// Forward pass: front to back, with the transmittance in a register; a chunk's weights are stored,
+// then applied to the channels in groups.
 #pragma once
 
 #include "tile.h"
 
 namespace gsgan {
 
-// picture[c] += sum over i of w_i f_ic, for G channels of one register of pixels.
+// image[c] += sum over i of w_i f_ic, for G channels of one register of pixels.
 template <class T, int G>
 void add_channels(const T* weights, const int32_t* list, int n, const T* features, int64_t stride,
-                  T* picture) {
+                  T* image) {
   using V = Vec<T>;
   constexpr int W = Simd<T>::W;
   V acc[G];
-  for (int g = 0; g < G; ++g) acc[g] = load(picture + g * PIXELS);
+  for (int g = 0; g < G; ++g) acc[g] = load(image + g * PIXELS);
   for (int i = 0; i < n; ++i) {
     const V w = load(weights + i * W);
     const T* f = features + list[i] * stride;
     for (int g = 0; g < G; ++g) acc[g] += w * f[g];
   }
-  for (int g = 0; g < G; ++g) store(picture + g * PIXELS, acc[g]);
+  for (int g = 0; g < G; ++g) store(image + g * PIXELS, acc[g]);
 }
 
-// Composites a chunk into one cell. False when all its pixels have stopped.
+// Composites a chunk into one cell. Returns false when all its pixels have stopped.
 template <class T>
 bool forward_cell(int cell, int64_t channels, const Cutoffs<T>& cut, Scratch<T>& s) {
   using V = Vec<T>;
   constexpr int W = Simd<T>::W;
-  constexpr int PATIENCE = 8;  // entries between looks whether all pixels have stopped
+  constexpr int PATIENCE = 8;  // entries between checks whether all pixels have stopped
   const int n = s.length[cell];
   const int32_t* list = s.list[cell];
   bool alive = false;
@@ -58,7 +58,7 @@ bool forward_cell(int cell, int64_t channels, const Cutoffs<T>& cut, Scratch<T>&
 }
 
 template <class T> void start_transmittance(const Tile& t, T* to) {
-  for (int y = 0; y < TILE; ++y)  // pixels outside the picture have stopped: -1 is below any bound
+  for (int y = 0; y < TILE; ++y)  // pixels outside the image have stopped: -1 is below any bound
     for (int x = 0; x < TILE; ++x) to[pixel_of(x, y)] = x < t.width && y < t.height ? T(1) : T(-1);
 }
 

@@ -1,5 +1,5 @@
-// An ellipse seen from a point nearby, where its q is a sum of small numbers; and the least q over
-// a rectangle of pixel centres.
+// An ellipse relative to a nearby point, where its q is a sum of small numbers; and the minimum of
+// q over a rectangle of pixel centres.
 #pragma once
 
 #include <algorithm>
@@ -10,17 +10,17 @@
 
 namespace gsgan {
 
-// Pixels by which footprints are widened where tiles and cells are listed, beside the rounding of
-// the numbers themselves: it costs time, and changes no pixel.
+// Pixels by which footprints are enlarged where tiles and cells are listed, in addition to rounding
+// errors: costs time, changes no pixel.
 constexpr double PAD = 1e-3;
 
-// u and v at an origin; at (x, y) from it they are u + p x + w y and v + r y.
+// u and v at an origin; at the offset (x, y) they are u + p x + w y and v + r y.
 template <class T> struct Place {
   T u, v, p, w, r;
   T dx, dy;  // of the origin from the mean
 };
 
-// u and v this large are far beyond every cut-off; their squares still fit into the type.
+// u and v this large are far beyond every cut-off; their squares do not overflow.
 template <class T> constexpr double U_MAX = sizeof(T) == 4 ? 1e15 : 1e150;
 
 template <class T, class E> Place<T> place_at(const E& g, double x, double y) {
@@ -32,8 +32,8 @@ template <class T, class E> Place<T> place_at(const E& g, double x, double y) {
 
 template <class T> T between(T x, T low, T high) { return x < low ? low : (x > high ? high : x); }
 
-// Finds the least u^2 + v^2 over rectangles about the origin of a place. It is convex: the minimum
-// lies on an edge that faces the mean, and along an edge it is in closed form.
+// The minimum of u^2 + v^2 over rectangles about the origin of a place. It is convex: the minimum
+// is on an edge that faces the mean, and has a closed form along an edge.
 template <class T> struct Least {
   Place<T> at;
   T per_p, per_ww_rr;  // 1 / p, 1 / (w^2 + r^2)
@@ -52,7 +52,7 @@ template <class T> struct Least {
     return a < b ? a : b;
   }
 
-  // How far rounding may put the result off, for rectangles within `half` of the origin.
+  // Bound of the rounding error, for rectangles within `half` of the origin.
   T margin(T half) const {
     const T size = at.u * at.u + at.v * at.v +
                    half * half * (at.p * at.p + at.w * at.w + at.r * at.r);

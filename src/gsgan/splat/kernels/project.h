@@ -5,8 +5,8 @@
 #include <new>
 #include <vector>
 
+#include "ewa.h"
 #include "job.h"
-#include "lens.h"
 
 namespace gsgan {
 
@@ -32,7 +32,7 @@ template <class T> Blurred blurred(const ProjectJob& job, int64_t i, const View&
   return {cov, job.low_pass, job.antialias != 0};
 }
 
-// The footprint's half-sizes where it can be seen; false where not.
+// The footprint's half-sizes; false when it is not visible.
 inline bool footprint(const ProjectJob& job, const Cov2& cov, double opacity, double x, double y,
                       double& ex, double& ey) {
   double reach = job.reach;
@@ -40,7 +40,7 @@ inline bool footprint(const ProjectJob& job, const Cov2& cov, double opacity, do
   reach = reach * (1 + job.extent_margin) + job.extent_margin;
   ex = reach * std::sqrt(cov.a);
   ey = reach * std::sqrt(cov.c);
-  // The outermost pixel centres are half a pixel inside the picture.
+  // The outermost pixel centres are half a pixel inside the image.
   return x + ex >= 0.5 && y + ey >= 0.5 && x - ex <= job.W - 0.5 && y - ey <= job.H - 0.5 &&
          opacity >= job.alpha_min;
 }
@@ -69,7 +69,7 @@ template <class T> void project_one(const ProjectJob& job, const Camera& camera,
   job.visible[i] = seen;
 }
 
-// Absent gradients are 0; those of what is not seen are left at 0 whatever comes in.
+// Absent gradients are 0; invisible Gaussians keep zero gradients.
 template <class T>
 void project_one_backward(const ProjectJob& job, const Camera& camera, int64_t i,
                           CameraGradient& sum) {

@@ -1,4 +1,4 @@
-// One register of numbers: loads, sums, and the exponential. gcc's and clang's vector extensions.
+// One SIMD register: loads, sums, and the exponential, with gcc's and clang's vector extensions.
 #pragma once
 
 #include <cstdint>
@@ -35,7 +35,7 @@ template <class T> INLINE void store(T* p, Vec<T> v) { *reinterpret_cast<Vec<T>*
 template <class T> INLINE Vec<T> splat(T x) { return Vec<T>{} + x; }
 template <class V> INLINE V magnitude(V v) { return v < V{} ? -v : v; }
 
-// Lanes of two registers, by number.
+// Selects lanes of two registers.
 #if defined(__clang__) || __GNUC__ >= 12
 template <class T, int... L> INLINE Vec<T> lanes(Vec<T> a, Vec<T> b) {
   return __builtin_shufflevector(a, b, L...);
@@ -46,8 +46,8 @@ template <class T, int... L> INLINE Vec<T> lanes(Vec<T> a, Vec<T> b) {
 }
 #endif
 
-// Halves blocks of S lanes: lane i of a block is added to lane i + S / 2. The first half of the
-// result's blocks comes from a, the second from b.
+// Halves blocks of S lanes: adds lanes i and i + S / 2 of each block. The first half of the result
+// comes from a, the second from b.
 template <class T, int S, int... I>
 INLINE Vec<T> folded(Vec<T> a, Vec<T> b, std::integer_sequence<int, I...>) {
   constexpr int H = S / 2;
@@ -57,8 +57,8 @@ template <class T, int S> INLINE Vec<T> folded(Vec<T> a, Vec<T> b) {
   return folded<T, S>(a, b, std::make_integer_sequence<int, Simd<T>::W>());
 }
 
-// Sums over the lanes of each of G registers; together, because one at a time takes longer than
-// what was summed.
+// Sums over the lanes of each of G registers; together, because one at a time would take longer
+// than computing the summands.
 template <class T, int G, int S = Simd<T>::W> INLINE void sums(Vec<T>* v, T* out) {
   constexpr int W = Simd<T>::W;
   if constexpr (S == 1) {
@@ -68,7 +68,7 @@ template <class T, int G, int S = Simd<T>::W> INLINE void sums(Vec<T>* v, T* out
       for (int g = first; g < G && g < first + W; ++g) out[g] = t[g - first];
     }
   } else {
-    // Registers that hold fewer than all sums are folded with themselves: the rest is not read.
+    // An odd last register is folded with itself: its second half is not read.
     constexpr int REGISTERS = (G * S + W - 1) / W, LEFT = (REGISTERS + 1) / 2;
     for (int i = 0; i < LEFT; ++i)
       v[i] = folded<T, S>(v[2 * i], v[2 * i + 1 < REGISTERS ? 2 * i + 1 : 2 * i]);

@@ -1,5 +1,5 @@
-// A tile's working memory: its pixels, the chunk of its list that is worked on, and what a Gaussian
-// does to one register of pixels.
+// A tile's working memory: its pixels and the current chunk of its list; and the contribution of a
+// Gaussian to one register of pixels.
 #pragma once
 
 #include <cstring>
@@ -13,7 +13,7 @@ constexpr int GROUP = 8;     // channels per register block
 constexpr int GEOMETRY = 6;  // sums per entry before the features', see entry_geometry
 template <class T> constexpr int SUBS = LANES / Simd<T>::W;  // registers per cell
 
-// One thread's working memory; channels: C, and the depth when it is wanted.
+// One thread's working memory; channels: C, plus 1 with depth.
 template <class T> struct Scratch {
   Scratch(int64_t channels, bool backward)
       : features(CHUNK * channels),
@@ -33,7 +33,7 @@ template <class T> struct Scratch {
   int32_t record[CELLS][CHUNK];      // and their records
   int32_t length[CELLS];
   Buffer<T> features;                // [CHUNK, channels]
-  Buffer<T> image;                   // [channels, PIXELS]: the picture, or its gradient
+  Buffer<T> image;                   // [channels, PIXELS]: the image, or its gradient
   Buffer<T> weights, transmittance;  // [CHUNK, W], [PIXELS]
   Buffer<T> behind, alpha_grad;      // [PIXELS]
   Buffer<T> e, alpha, v;             // [CHUNK, W]
@@ -60,7 +60,7 @@ INLINE int pixel_of(int x, int y) {  // cell by cell
   return ((y / CELL) * (TILE / CELL) + x / CELL) * LANES + (y % CELL) * CELL + x % CELL;
 }
 
-// Copies between a plane of the picture [H, W] and a tile; what lies outside the picture is 0.
+// Copies between a plane [H, W] of the image and a tile; pixels outside the image are 0.
 template <class T> void read_plane(const T* plane, int64_t stride, const Tile& t, T* to) {
   if (t.width < TILE || t.height < TILE) std::fill_n(to, PIXELS, T(0));
   for (int y = 0; y < t.height; ++y) {
@@ -106,8 +106,8 @@ template <class T> INLINE uint32_t reached_cells(const Place<T>& at, T ex, T ey,
   return mask;
 }
 
-// Gathers entries [start, start + n) of a tile and sorts them into its cells that are alive. A
-// record is one (entry, cell); those of an entry are adjacent.
+// Gathers entries [start, start + n) of a tile and sorts them into its alive cells. A record is an
+// (entry, cell) pair; those of an entry are adjacent.
 template <class T>
 void load_chunk(const Job& job, const Inputs<T>& in, const Plan<T>& plan, const Tile& tile,
                 int64_t start, int n, int64_t channels, uint32_t alive, bool again,
@@ -144,7 +144,7 @@ void load_chunk(const Job& job, const Inputs<T>& in, const Plan<T>& plan, const 
   s.first[n] = records;
 }
 
-template <class T> struct Pixels {  // one register of pixel centres, from the tile's centre
+template <class T> struct Pixels {  // one register of pixel centres, relative to the tile's centre
   Vec<T> x, y;
 };
 

@@ -1,4 +1,4 @@
-"""A view through a lens that bends straight lines.
+"""A view through a distorting lens.
 
 Convention: OpenCV's model, on x/z and y/z of the camera's axes.
 """
@@ -16,8 +16,8 @@ from gsgan.utils.errors import ConfigError
 
 Array = NDArray[np.float64]
 
-EXACT = 1e-10  # of x/z: what a distorted point found again may be off by
-FURTHEST = 10.0  # of x/z: where the search for it ends
+EXACT = 1e-10  # residual of x/z up to which an undistorted point counts as found
+FURTHEST = 10.0  # bound of x/z in the search
 
 
 @dataclass(frozen=True)
@@ -27,16 +27,16 @@ class LensView(View):
     dist: Array
 
     def project(self, points: Array) -> Array:
-        """``[N, 2]`` pixels of world points ``[N, 3]``, all of them before the camera."""
+        """``[N, 2]`` pixels of world points ``[N, 3]``, all in front of the camera."""
         x = points @ self.R.T + self.t
         bent = distort(x[:, :2] / x[:, 2:], self.dist)
         return bent @ self.K[:2, :2].T + self.K[:2, 2]
 
     def bend(self, directions: Array) -> Array:
-        """The unit rays ``[N, 3]`` that a lens brings to where a pinhole would see these.
+        """The world rays ``[N, 3]``, of length one, seen where a pinhole sees ``directions``.
 
         Raises:
-            ConfigError: when the lens shows nothing at some of these places.
+            ConfigError: when the distortion cannot be inverted there.
         """
         rays = directions @ self.R.T
         straight = undistort(rays[:, :2] / rays[:, 2:], self.dist)
@@ -60,10 +60,10 @@ def undistort(points: Array, dist: Array, iterations: int = 200) -> Array:
     Args:
         points: ``[N, 2]`` as the lens shows them.
         dist: lens coefficients.
-        iterations: at most; each takes away a share of the error that is the lens's strength.
+        iterations: at most; each reduces the error by a factor that depends on the distortion.
 
     Raises:
-        ConfigError: when a place has no such point, or cannot be found: the lens folds back.
+        ConfigError: when a point has no inverse: the distortion folds back.
     """
     found = points
     for _ in range(iterations):
@@ -75,7 +75,7 @@ def undistort(points: Array, dist: Array, iterations: int = 200) -> Array:
     if lost.any():
         x, y = points[lost][0]
         raise ConfigError(
-            f"synthetic data: lens {dist.tolist()} cannot be undone within the picture, it folds "
-            f"back near x/z = {x:.2f}, y/z = {y:.2f}; give weaker coefficients"
+            f"synthetic data: lens {dist.tolist()} cannot be inverted within the image, it "
+            f"folds back near x/z = {x:.2f}, y/z = {y:.2f}; give weaker coefficients"
         )
     return found

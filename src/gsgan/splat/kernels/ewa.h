@@ -1,5 +1,5 @@
-// Projection of one Gaussian and, backwards, of the gradients of its ellipse: project.py's formulas
-// (EWA), in double, derived by hand. project.h runs them over all Gaussians.
+// EWA projection of one Gaussian and its hand-derived gradient, in double; the formulas of
+// project.py. project.h applies them to all Gaussians.
 #pragma once
 
 #include <cmath>
@@ -7,18 +7,18 @@
 
 extern "C" {
 
-// Mirrors native_project.py's _Job field by field. Arrays are contiguous; null where not wanted.
+// Mirrors native_project.py's _Job field by field. Arrays are contiguous; null where not needed.
 struct ProjectJob {
   int64_t B, N, H, W;
   int64_t threads;
   int64_t antialias;
   double near, low_pass, alpha_min;
   double reach;          // of the footprint in standard deviations; < 0: by opacity
-  double extent_margin;  // by which that is rounded up
+  double extent_margin;  // by which reach is enlarged
   double quat_min;
   const void *means, *quats, *scales, *covariances, *opacities;
   const uint8_t* keep;
-  const double *K, *R, *t, *limits;  // [B, 3, 3] twice, [B, 3], [B, 4]: least and greatest x/z, y/z
+  const double *K, *R, *t, *limits;  // [B, 3, 3] twice, [B, 3], [B, 4]: bounds of x/z and y/z
   double *out_means, *out_factors;
   void* out_opacities;
   double* out_depths;
@@ -75,8 +75,8 @@ struct Quat {
   double w = 0, x = 0, y = 0, z = 0;
 };
 
-// The quaternion over its largest component, so that squares neither underflow nor overflow;
-// `per_largest` is 0 where it is noise: then it is the identity, and has no gradient.
+// The quaternion divided by its largest component, so that squares neither underflow nor overflow.
+// Noise gives the identity and `per_largest` 0: no gradient.
 template <class T> Quat read_quat(const T* p, double least, double& per_largest) {
   const double w = p[0], x = p[1], y = p[2], z = p[3];
   const double largest = std::fmax(std::fmax(std::abs(w), std::abs(x)),
@@ -133,7 +133,7 @@ struct Camera {
         kr0(k0.x * R.x + k0.y * R.y), kr1(k1.x * R.x + k1.y * R.y) {}
 };
 
-// Sums over Gaussians; kr0, kr1 are resolved into K and R at the end.
+// Sums over Gaussians; kr0, kr1 are converted to gradients of K and R at the end.
 struct CameraGradient {
   Vec3 k0, k1, t, kr0, kr1;
   Mat3 R;
@@ -146,7 +146,7 @@ struct CameraGradient {
   }
 };
 
-// A mean in front of the camera: where it is drawn, and the Jacobian of the projection there.
+// A mean in front of the camera, its pixel, and the Jacobian of the projection there.
 struct View {
   double z, per_z, x, y;        // depth, 1 / depth, x/z, y/z
   double cx, cy;                // x/z and y/z, clamped
@@ -163,7 +163,7 @@ struct View {
   double pixel_x(const Camera& c) const { return c.k0.x * x + c.k0.y * y + c.k0.z; }
   double pixel_y(const Camera& c) const { return c.k1.x * x + c.k1.y * y + c.k1.z; }
 
-  // Gradient of the mean in camera axes, from those of its pixel, the Jacobian and the depth.
+  // Gradient of the mean in camera axes, given those of its pixel, the Jacobian and the depth.
   Vec3 backward(const Camera& c, double g_x, double g_y, Vec3 g_j0, Vec3 g_j1, double g_z,
                 CameraGradient& sum) const {
     const Vec3 e0 = per_z * g_j0, e1 = per_z * g_j1;
@@ -193,8 +193,8 @@ struct Cov2 {  // [a b; b c] and its determinant
   double a, b, c, det;
 };
 
-// J Sigma J^T of a rotation and scales. The determinant of M M^T is |u x v|^2: a sum of squares,
-// where a c - b^2 cancels.
+// J Sigma J^T for a rotation and scales. Its determinant is |u x v|^2, a sum of squares: a c - b^2
+// would cancel.
 struct RotatedScales {
   Quat q;
   double per_largest;
@@ -234,7 +234,7 @@ struct RotatedScales {
   }
 };
 
-// J Sigma J^T of a covariance, which need not be symmetric or positive definite.
+// J Sigma J^T for a covariance, which need not be symmetric or positive definite.
 struct GivenCovariance {
   Mat3 twice;  // Sigma + its transpose
   Cov2 raw;
@@ -269,7 +269,7 @@ struct GivenCovariance {
 
 // ----------------------------------------------------------------------------------------- ellipse
 
-// The low-passed covariance, its factors (p, k, r), and what anti-aliasing leaves of an opacity.
+// The low-passed covariance, its factors (p, k, r), and the opacity's anti-aliasing factor.
 struct Blurred {
   Cov2 before, after;
   double p, k, r, kept;

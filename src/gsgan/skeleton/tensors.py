@@ -1,0 +1,191 @@
+"""A skeleton template as tensors, and the shortest rotations (swings) from its directions."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsgan.skeleton.rotation6d import across, orthogonal_to, unit
+from gsgan.skeleton.template import CHEST, HEAD, N_HUBS, PELVIS, SkeletonTemplate
+
+FOLDED = 1e-4
+"""A swing with ``1 + cos(angle)`` below this is composed via the opposite direction."""
+
+
+class Swing(NamedTuple):
+    """The shortest rotations from fixed unit directions ``rest [M, 3]`` to any other."""
+
+    rest: Tensor
+    straight: Tensor
+    folded: Tensor
+
+    @classmethod
+    def of(cls, rest: Tensor) -> Swing:
+        half_turn_rest = _half_turn(rest)
+        return cls(rest, half_turn_rest, half_turn_rest @ _half_turn(orthogonal_to(rest)))
+
+    def to(self, d: Tensor, folded: float = FOLDED) -> Tensor:
+        """``[B, M, 3, 3]`` rotations from ``rest`` to the directions ``d [B, M, 3]``.
+
+        A d shorter than 1 gives a part of the rotation, a zero d none.
+
+        The swing is composed of two half turns, about ``rest`` and about the bisector of ``rest``
+        and ``d``, without a division by ``1 + cos``. Where ``1 + cos < folded`` the bisector is
+        undefined and a third half turn, about a fixed axis orthogonal to ``rest``, goes first: the
+        result still maps ``rest`` exactly to ``d``, with an arbitrary but fixed roll.
+        """
+        cos = (self.rest * d).sum(-1, keepdim=True)
+        is_folded = cos + 1.0 < folded
+        w = d + torch.where(is_folded, -self.rest, self.rest)
+        first = torch.where(is_folded.unsqueeze(-1), self.folded, self.straight)
+        return _half_turn(w) @ first
+
+
+def _half_turn(axis: Tensor) -> Tensor:
+    """``[..., 3, 3]``: ``2 a aᵀ / |a|² - I``, by half a turn about ``axis [..., 3]``."""
+    scaled = axis * (2.0 / axis.square().sum(-1, keepdim=True))
+    eye = torch.eye(3, dtype=axis.dtype, device=axis.device)
+    return scaled.unsqueeze(-1) * axis.unsqueeze(-2) - eye
+
+
+class Level(NamedTuple):
+    """Limbs of one depth: their parents' frames are in earlier levels."""
+
+    limbs: Tensor  # [M] into the template's limbs
+    parents: Tensor  # [M] into the frames so far: hubs, then limbs by level
+    swing: Swing
+    hinge: tuple[Tensor, Tensor] | None  # (upper, lower) limbs [M]; a limb without one has itself
+    across: Tensor  # [2, M, 3] hinge axis h, and rest x h
+    about: tuple[Tensor, Tensor]  # [M, 3, 3] cross-product matrix of rest, and rest restᵀ
+
+
+class Constants(NamedTuple):
+    """A template as tensors."""
+
+    rest: Tensor  # [J, 3]
+    starts: Tensor  # [L]
+    ends: Tensor  # [L]
+    levels: tuple[Level, ...]
+    limb_order: Tensor  # [L] undoes the sorting by level
+    head_from_eyes: Tensor  # [3, 3]
+    head_points: Tensor  # [5] left ear, right ear, left eye, right eye, nose
+    torso: Tensor  # [4]
+    face_turned: Tensor  # [F] face joints but the nose
+    face_swing: Swing
+    omega_order: Tensor  # [J] into pelvis, chest, head, face, limbs
+    axes: Tensor  # [3, 3] world axes
+
+
+@lru_cache(maxsize=64)
+def constants(template: SkeletonTemplate, device: torch.device, dtype: torch.dtype) -> Constants:
+    """The template's tensors on a device, cached."""
+    # tensors created in inference mode cannot be used for training later
+    with torch.inference_mode(False), torch.no_grad():
+        return _constants(template, device, dtype)
+
+
+def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) -> Constants:
+    def number(values: object) -> Tensor:
+        # in float64 first: constants are then correct to the last bit of their dtype
+        return torch.tensor(values, dtype=torch.float64)
+
+    def index(values: object) -> Tensor:
+        return torch.tensor(values, dtype=torch.int64, device=device)
+
+    def cast(value: Tensor) -> Tensor:
+        return value.to(device=device, dtype=dtype)
+
+    def swing(rest: Tensor) -> Swing:
+        return Swing(*(cast(part) for part in Swing.of(rest)))
+
+    eye = torch.eye(3, dtype=torch.float64)
+    rest = number(t.rest_positions)
+    directions = number(t.rest_directions)
+    sorted_limbs = [limb for level in t.levels for limb in level]
+    known = {hub: hub for hub in range(N_HUBS)}
+    known |= {N_HUBS + limb: N_HUBS + k for k, limb in enumerate(sorted_limbs)}
+    hinge_of = {limb: pair for pair in t.hinges for limb in pair}
+    axis_of = {limb: a for pair, a in zip(t.hinges, t.hinge_axes, strict=True) for limb in pair}
+
+    levels = []
+    for limbs in t.levels:
+        a = directions[list(limbs)]
+        h = number([axis_of.get(limb, (0.0, 0.0, 0.0)) for limb in limbs])
+        pairs = [hinge_of.get(limb, (limb, limb)) for limb in limbs]
+        has_hinge = any(limb in hinge_of for limb in limbs)
+        levels.append(
+            Level(
+                limbs=index(limbs),
+                parents=index([known[t.limb_parents[limb]] for limb in limbs]),
+                swing=swing(a),
+                hinge=(index([p[0] for p in pairs]), index([p[1] for p in pairs]))
+                if has_hinge
+                else None,
+                across=cast(torch.stack([h, torch.linalg.cross(a, h)])),
+                about=(
+                    cast(torch.linalg.cross(a.unsqueeze(1), eye.unsqueeze(0)).mT),
+                    cast(a.unsqueeze(-1) * a.unsqueeze(-2)),
+                ),
+            )
+        )
+
+    left, right = t.eyes
+    eye_frame = _two_axes(rest[left] - rest[right], rest[t.nose] - (rest[left] + rest[right]) / 2)
+    turned = [j for j in t.face if j != t.nose]
+    from_ears = rest[turned] - rest[list(t.ears)].mean(0)
+    n_turned, incoming = len(turned), t.incoming
+    place = dict.fromkeys(t.hips, PELVIS) | dict.fromkeys(t.shoulders, CHEST) | {t.nose: HEAD}
+    place |= {joint: N_HUBS + k for k, joint in enumerate(turned)}
+    place |= {joint: N_HUBS + n_turned + limb for joint, limb in incoming.items()}
+    return Constants(
+        rest=cast(rest),
+        starts=index([a for a, _ in t.limbs]),
+        ends=index([b for _, b in t.limbs]),
+        levels=tuple(levels),
+        limb_order=index([sorted_limbs.index(limb) for limb in range(len(t.limbs))]),
+        head_from_eyes=cast(head_columns(*eye_frame).mT.contiguous()),
+        head_points=index([*t.ears, *t.eyes, t.nose]),
+        torso=index(t.torso),
+        face_turned=index(turned),
+        face_swing=swing(from_ears / from_ears.norm(dim=-1, keepdim=True)),
+        omega_order=index([place[joint] for joint in range(len(t.names))]),
+        axes=cast(eye),
+    )
+
+
+def _two_axes(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Unit first axis, unit part of the second orthogonal to it, and the cross product 2 x 1."""
+    e1 = unit(first)
+    e2 = unit(across(e1, second))
+    return e1, e2, torch.linalg.cross(e2, e1)
+
+
+def head_columns(left: Tensor, front: Tensor, up: Tensor) -> Tensor:
+    return torch.stack([left, up, front], dim=-1)
+
+
+def check_skeleton(
+    owner: str, p: Tensor, valid: Tensor | None, template: SkeletonTemplate
+) -> Tensor:
+    """The validity mask, all true when None.
+
+    Raises:
+        ValueError: naming the argument, when a shape does not match the template.
+    """
+    joints = len(template.names)
+    if p.ndim != 3 or p.shape[1:] != (joints, 3) or not p.is_floating_point():
+        raise ValueError(
+            f"{owner}: p must be a float tensor of shape [B, {joints}, 3], "
+            f"got {p.dtype} {list(p.shape)}"
+        )
+    if valid is None:
+        return torch.ones(p.shape[:2], dtype=torch.bool, device=p.device)
+    if valid.shape != p.shape[:2] or valid.dtype != torch.bool:
+        raise ValueError(
+            f"{owner}: valid must be a bool tensor of shape {list(p.shape[:2])}, "
+            f"got {valid.dtype} {list(valid.shape)}"
+        )
+    return valid

@@ -1,0 +1,158 @@
+"""The compiler, the cache and the loading of the kernel, and the reasons why it may be missing."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gsgan.splat import build, native
+
+needs_kernel = pytest.mark.skipif(not native.available(), reason=native.why_not() or "available")
+
+REPORT = "from gsgan.splat import native; print(native.available(), native.why_not(), sep='|')"
+
+
+def report(cache: Path, **environment: str) -> tuple[bool, str]:
+    """available() and why_not() of a fresh process."""
+    done = subprocess.run(
+        [sys.executable, "-c", REPORT],
+        env={**os.environ, "GSGAN_CACHE": str(cache), "OMP_NUM_THREADS": "1", **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=True,
+    )
+    yes, _, reason = done.stdout.strip().partition("|")
+    return yes == "True", reason
+
+
+Load = Callable[..., tuple[bool, str]]
+
+
+@pytest.fixture
+def load_afresh(monkeypatch: pytest.MonkeyPatch) -> Load:
+    """available() and why_not() as in a fresh process."""
+
+    def load(cache: Path, **environment: str) -> tuple[bool, str]:
+        monkeypatch.setenv("GSGAN_CACHE", str(cache))
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        library, reason = build._load_once.__wrapped__()
+        return library is not None, reason
+
+    return load
+
+
+def is_one_sentence(text: str) -> bool:
+    return text[:1].isupper() and text.endswith(".") and "\n" not in text
+
+
+def test_compiler_that_does_not_run(tmp_path: Path, load_afresh: Load) -> None:
+    yes, reason = load_afresh(tmp_path, CXX="/bin/false", PATH="")
+    assert not yes
+    assert "/bin/false" in reason
+    assert is_one_sentence(reason)
+
+
+def test_no_compiler(tmp_path: Path, load_afresh: Load) -> None:
+    yes, reason = load_afresh(tmp_path, CXX="", PATH=str(tmp_path))
+    assert not yes
+    assert "No C++ compiler is found" in reason
+    assert is_one_sentence(reason)
+
+
+def test_compiler_that_cannot_compile(tmp_path: Path, load_afresh: Load) -> None:
+    # Answers --version like a compiler, then fails with a message.
+    fake = tmp_path / "fake"
+    fake.write_text(
+        '#!/bin/sh\n[ "$1" = --version ] && exit 0\necho "x.cpp:1: error: no luck" >&2\nexit 1\n'
+    )
+    fake.chmod(0o755)
+    yes, reason = load_afresh(tmp_path, CXX=str(fake))
+    assert not yes
+    assert "no luck" in reason
+    assert is_one_sentence(reason)
+    assert list((tmp_path / "native").iterdir()) == []
+
+
+def test_cache_that_cannot_be_written(tmp_path: Path, load_afresh: Load) -> None:
+    (tmp_path / "file").write_text("")
+    yes, reason = load_afresh(tmp_path / "file")
+    assert not yes
+    assert "GSGAN_CACHE" in reason
+    assert is_one_sentence(reason)
+
+
+@pytest.fixture(scope="module")
+def quick_compiler(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A compiler that compiles this one program, has no OpenMP, and takes ``SLOW`` seconds."""
+    folder = tmp_path_factory.mktemp("compiler")
+    library = shutil.copy(build.library()[0]._name, folder)
+    fake = folder / "fake"
+    fake.write_text(
+        "#!/bin/sh\n"
+        'for f in "$@"; do\n'
+        '  [ "$f" = --version ] && exit 0\n'
+        '  [ "$f" = -fopenmp ] && exit 1\n'
+        '  last="$f"\n'
+        "done\n"
+        f"sleep ${{SLOW:-0}}; cp {library} $last\n"
+    )
+    fake.chmod(0o755)
+    return fake
+
+
+@needs_kernel
+def test_builds_without_openmp(tmp_path: Path, quick_compiler: Path, load_afresh: Load) -> None:
+    assert load_afresh(tmp_path, CXX=str(quick_compiler)) == (True, "")
+
+
+@pytest.mark.slow
+@needs_kernel
+def test_one_thread_without_openmp(tmp_path: Path) -> None:
+    command = [*build.compiler(), *build.BASE_FLAGS, str(build.SOURCE), "-o", f"{tmp_path}/x.so"]
+    assert subprocess.run(command, check=False).returncode == 0
+    library = build.open_library(tmp_path / "x.so")
+    assert library is not None
+    assert library.gsgan_has_openmp() == 0
+
+
+@pytest.mark.slow
+@needs_kernel
+def test_two_processes_build_at_once(tmp_path: Path, quick_compiler: Path) -> None:
+    answers: list[tuple[bool, str]] = []
+
+    def build() -> None:
+        answers.append(report(tmp_path, CXX=str(quick_compiler), SLOW="2"))
+
+    builders = [threading.Thread(target=build) for _ in range(2)]
+    for builder in builders:
+        builder.start()
+    for builder in builders:
+        builder.join()
+    assert answers == [(True, ""), (True, "")]
+    assert len(list((tmp_path / "native").iterdir())) == 1
+
+
+@needs_kernel
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.999])
+def test_damaged_cache_is_rebuilt(
+    tmp_path: Path, quick_compiler: Path, load_afresh: Load, kept: float
+) -> None:
+    folder = tmp_path / "native"
+    folder.mkdir()
+    whole = next(quick_compiler.parent.glob("*.so")).read_bytes()
+    # The file of an interrupted build, or of a full disk.
+    key = build.cache_key([str(quick_compiler)])
+    built = folder / f"{key}-{hashlib.sha256(whole).hexdigest()[:24]}.so"
+    built.write_bytes(whole[: int(kept * len(whole))])
+    assert load_afresh(tmp_path, CXX=str(quick_compiler)) == (True, "")
+    assert [path.read_bytes() for path in folder.iterdir()] == [whole]
