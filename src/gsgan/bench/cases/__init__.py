@@ -1,17 +1,25 @@
-"""Hard cases by name: is float32 right there, in values and gradients, or does the code say no."""
+"""Numerically hard cases by name: float32 must be right in values and gradients, or refuse."""
 
-from gsgan.bench.cases.case import VERDICTS, Case, Inputs, Outputs, Row, Tolerance, judge
-from gsgan.bench.cases.registry import all_cases, table, verdicts
+from gsgan.bench.cases.case import (
+    STATUSES,
+    Case,
+    Inputs,
+    Outputs,
+    Row,
+    Tolerance,
+    all_cases,
+    compare,
+    compare_all,
+)
 
 __all__ = [
-    "VERDICTS",
+    "STATUSES",
     "Case",
     "Inputs",
     "Outputs",
     "Row",
     "Tolerance",
     "all_cases",
-    "judge",
-    "table",
-    "verdicts",
+    "compare",
+    "compare_all",
 ]
