@@ -36,7 +36,7 @@ def cases() -> Iterator[Case]:
         "every pixel zero, no biases",
         empty,
         unbiased,
-        note="The slope is 1e3 per normalisation, so 1e15 in all: right, and the reason for biases.",
+        note="The slope is 1e3 per normalisation, so 1e15 in all: this is why there are biases.",
     )
     clamped = "F is clamped to ± 1e3 before it enters; beyond, its slope is 0."
     yield _case("features of 1e9", huge, note=clamped)

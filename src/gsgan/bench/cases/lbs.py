@@ -60,7 +60,7 @@ def _case(name: str, options: dict[str, Any] | None = None, **changes: Any) -> C
 
 
 def _skinned(inputs: Inputs) -> dict[str, Tensor]:
-    """Points, covariances and normals ``[1, 4, ...]`` of the posed arm, with optional bone scales."""
+    """Points, covariances and normals ``[1, 4, ...]`` of the posed, perhaps scaled arm."""
     check_weights(inputs["weights"].detach())  # as every body does when it is made
     R = axis_angle_to_matrix(inputs["theta"])
     bones = forward_kinematics(inputs["joints"], PARENTS, R, torch.zeros_like(R[:, 0, 0]))

@@ -66,7 +66,7 @@ def _folded(p: Tensor) -> None:
 
 @_pose
 def _nearly_folded(p: Tensor) -> None:
-    """The same but for 2 degrees; hands and feet continue in the direction of forearms and shins."""
+    """The same but for 2 degrees; hands and feet go on as forearms and shins do."""
     for a, b, c in BENDS:
         beyond = [j for i, j in MEDIAPIPE33.limbs if i == c]
         back = normalize(p[:, a] - p[:, b], dim=-1)
