@@ -10,7 +10,7 @@ import pandas as pd
 from omegaconf import DictConfig
 from rich.progress import track
 
-from gsgan.bench.cases import compare_all
+from gsgan.bench.cases.case import compare_all
 from gsgan.bench.common import Bench, markdown, number, records, sentence
 from gsgan.utils.errors import GsganError
 

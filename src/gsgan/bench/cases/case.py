@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,8 +27,7 @@ FINITE_ONLY = "finite only"
 NOT_FINITE = "not finite"
 STATUSES = (RIGHT, WARNED, REFUSED, FINITE_ONLY, NOT_FINITE)
 
-MODULES = ("gaussians", "crowds", "scenes", "skeleton", "rotations", "lbs", "psi", "losses")
-MODULES += ("generator",)
+MODULES = ("gaussians", "scenes", "skeleton", "rotations", "lbs", "psi", "losses", "generator")
 """Modules of cases, in the order of the table; each has ``cases()``."""
 
 # Tolerances are stated for float32. Other types get the same number of their own roundings, but not
@@ -131,20 +131,14 @@ def compare_all(device: torch.device | str = "cpu") -> Iterator[Row]:
             yield compare(case, torch.float32, device, backend)
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """The outcome of one case on one backend.
 
-    Args:
-        case, subject: of the case.
-        backend: of the rasteriser, or ``-``.
-        value_error: see ``Tolerance.values``; NaN where nothing could be compared.
-        gradient_error: the worst input's, see ``Tolerance.gradients``; NaN likewise.
-        worst_input: the input that ``gradient_error`` is of; empty where every gradient is exact.
-        status: ``right`` (values and gradients within tolerance), ``warned`` (right, with a
-            warning), ``refused`` (ValueError), ``finite only`` or ``not finite``.
-        expected: the status that the case must get.
-        note: the case's note, and the message of a refusal or a warning.
+    ``value_error`` and ``gradient_error`` are as in ``Tolerance``, NaN where nothing could be
+    compared; ``worst_input`` is the input of the latter, empty where all gradients are exact. The
+    status is ``right`` (within tolerance), ``warned`` (right, with a warning), ``refused``
+    (ValueError), ``finite only`` or ``not finite``. The note ends with the message of a refusal
+    or a warning.
     """
 
     case: str
@@ -158,13 +152,6 @@ class Row:
     note: str
 
 
-@dataclass(frozen=True)
-class _Result:
-    outputs: dict[str, Tensor]
-    gradients: dict[str, Tensor]
-    message: str
-
-
 def compare(
     case: Case,
     dtype: torch.dtype = torch.float32,
@@ -176,43 +163,45 @@ def compare(
     Convention: gradients are those of one scalar, the outputs weighted by the same seeded normal
     numbers in both runs. An input's gradient error is 0 where both gradients are 0, and infinite
     where only the one of float64 is.
-
-    Args:
-        case: what to run.
-        dtype: of the inputs.
-        device: where to run.
-        backend: one of ``case.backends(device)``.
     """
     inputs = case.build(dtype, device)
-    if case.same_numbers:
-        exact = {k: v.double() if v.is_floating_point() else v for k, v in inputs.items()}
-    else:
+    exact = {k: v.double() if v.is_floating_point() else v for k, v in inputs.items()}
+    if not case.same_numbers:
         exact = case.build(torch.float64, device)
     try:
-        got = _result(case, inputs, backend)
+        outputs, slopes, message = _run(case, inputs, backend)
     except ValueError as error:
-        return _row(case, backend, REFUSED, str(error))
-    want = _result(case, exact, "reference")
-    floors = case.gradient_floor or {}
-    values = [_error(got.outputs[k], v, least=1.0) for k, v in want.outputs.items()]
-    gradients = {
-        k: _error(got.gradients[k], v, floor=floors.get(k, 0.0)) for k, v in want.gradients.items()
-    }
-    value_error = max(values, default=0.0)
-    worst = max(gradients, key=lambda k: gradients[k], default="")
-    gradient_error = gradients.get(worst, 0.0)
-    tolerance = case.tolerance.at(dtype)
-    if not (_finite(got.outputs, want.outputs) and _finite(got.gradients, want.gradients)):
-        status = NOT_FINITE
-    elif value_error <= tolerance.values and gradient_error <= tolerance.gradients:
-        status = WARNED if got.message else RIGHT
+        value_error = gradient_error = math.nan
+        status, message, worst = REFUSED, str(error), ""
     else:
-        status = FINITE_ONLY
-    worst = worst if gradient_error > 0 else ""
-    return _row(case, backend, status, got.message, value_error, gradient_error, worst)
+        exact_outputs, exact_slopes, _ = _run(case, exact, "reference")
+        floors = case.gradient_floor or {}
+        values = [_error(outputs[k], v, least=1.0) for k, v in exact_outputs.items()]
+        gradients = {
+            k: _error(slopes[k], v, floor=floors.get(k, 0.0)) for k, v in exact_slopes.items()
+        }
+        value_error = max(values, default=0.0)
+        worst = max(gradients, key=gradients.__getitem__, default="")
+        gradient_error = gradients.get(worst, 0.0)
+        worst = worst if gradient_error > 0 else ""
+        tolerance = case.tolerance.at(dtype)
+        if not (_finite(outputs, exact_outputs) and _finite(slopes, exact_slopes)):
+            status = NOT_FINITE
+        elif value_error <= tolerance.values and gradient_error <= tolerance.gradients:
+            status = WARNED if message else RIGHT
+        else:
+            status = FINITE_ONLY
+    note = " ".join(x for x in (case.note, f"Message: {message}" if message else "") if x)
+    return Row(
+        *(case.name, case.subject, backend, value_error, gradient_error, worst),
+        *(status, case.expect, note),
+    )
 
 
-def _result(case: Case, inputs: Inputs, backend: str) -> _Result:
+def _run(
+    case: Case, inputs: Inputs, backend: str
+) -> tuple[dict[str, Tensor], dict[str, Tensor], str]:
+    """Outputs, gradients by input, and the text of warnings."""
     leaves = {
         name: value.detach().clone().requires_grad_() if value.is_floating_point() else value
         for name, value in inputs.items()
@@ -229,7 +218,7 @@ def _result(case: Case, inputs: Inputs, backend: str) -> _Result:
         if leaf.is_floating_point()
     }
     message = " ".join(str(w.message) for w in caught if issubclass(w.category, UserWarning))
-    return _Result({k: v.detach() for k, v in outputs.items()}, gradients, message)
+    return {k: v.detach() for k, v in outputs.items()}, gradients, message
 
 
 def _weighted_sum(outputs: Outputs) -> Tensor | None:
@@ -272,20 +261,4 @@ def _finite(got: dict[str, Tensor], want: dict[str, Tensor]) -> bool:
     return all(
         got[k].shape == want[k].shape and bool((got[k].isfinite() | ~want[k].isfinite()).all())
         for k in want
-    )
-
-
-def _row(
-    case: Case,
-    backend: str,
-    status: str,
-    message: str,
-    value_error: float = math.nan,
-    gradient_error: float = math.nan,
-    worst_input: str = "",
-) -> Row:
-    note = " ".join(x for x in (case.note, f"Message: {message}" if message else "") if x)
-    return Row(
-        *(case.name, case.subject, backend, value_error, gradient_error, worst_input),
-        *(status, case.expect, note),
     )

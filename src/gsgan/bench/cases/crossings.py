@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -20,39 +20,12 @@ from gsgan.bench.cases.poses import rest
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.frames import MIN_LENGTH
 
-FADED = 20.0
-"""Frobenius norm of a frame's change over ``step / min_length``, where a baseline fades to its
-stand-in: between the two, ``s u + (1 - s²) f``, a direction turns at a rate of at most 3 over a
-length that stays above 0.4 on these paths, its stand-in may turn too; a frame changes by √2 of
-that, and a limb that swings from it by up to twice as much."""
-
-SWUNG = 8.0
-"""The same over an angle: a half turn doubles it, in the Frobenius norm it counts √2, and a hand
-swings from a forearm that swings from an arm."""
+Path = Callable[[Tensor], Tensor]
 
 
-@dataclass(frozen=True)
-class Crossing:
-    """A path through one singularity.
-
-    Args:
-        name: a few plain words.
-        path: parameters ``s [T]`` in [-1, 1] → poses ``[T, 33, 3]``; singular at s = 0.
-        rate: bound on how fast any frame turns, in Frobenius norm per unit of s.
-        jumps: how often a frame may turn at once all the same, because no continuous choice
-            exists; 0 elsewhere.
-        note: the reason of the bound, or of the jump.
-    """
-
-    name: str
-    path: Callable[[Tensor], Tensor]
-    rate: float
-    jumps: int = 0
-    note: str = ""
-
-    def poses(self, steps: int) -> Tensor:
-        """``[steps, 33, 3]`` evenly along the path; 0 is one of them where steps are odd."""
-        return self.path(torch.linspace(-1, 1, steps, dtype=torch.float64))
+def poses(path: Path, steps: int) -> Tensor:
+    """``[steps, 33, 3]`` evenly along a path; its middle is one of them where steps are odd."""
+    return path(torch.linspace(-1, 1, steps, dtype=torch.float64))
 
 
 def _vector(*xyz: float) -> Tensor:
@@ -98,7 +71,7 @@ def _bending_arm(s: Tensor, around: float = 0.0, across: float = 0.0, reach: flo
     return p
 
 
-def _shoulders_through_the_spine(s: Tensor, *direction: float) -> Tensor:
+def _shoulders_through_the_spine(s: Tensor, direction: tuple[float, float, float]) -> Tensor:
     """The shoulder line, along the spine but for a part that passes zero."""
     p = rest(len(s))
     _line(p, (11, 12), _vector(0, 0.15, 0) + _millimetres(s, 2) * _unit(*direction))
@@ -143,84 +116,54 @@ def _shoulders_round_the_hips(s: Tensor) -> Tensor:
     return p
 
 
-CROSSINGS: tuple[Crossing, ...] = (
-    Crossing(
-        "a bone through zero length",
+_EYES = "Below 1 mm the eyes' frame takes over."
+
+CROSSINGS: dict[str, tuple[Path, str]] = {
+    "a bone through zero length": (
         _shrinking_forearm,
-        3 * FADED,
-        note="Below 1 mm its swing fades to none: at most 20 times step / 1 mm.",
+        "Below 1 mm its swing fades to none: at most 20 times step / 1 mm.",
     ),
-    Crossing(
-        "an arm through straight",
+    "an arm through straight": (
         _bending_arm,
-        0.1 * SWUNG,
-        note="At most 8 times the bend's step; the hinge's weight is 0 where its axis flips.",
+        "At most 8 times the bend's step; the hinge's weight is 0 where its axis flips.",
     ),
-    Crossing(
-        "a forearm past its fold, two degrees beside",
-        lambda s: _bending_arm(s, math.pi, across=0.035),
-        0.1 / 0.035 * SWUNG,
-        note="The roll goes round with the way to the antipode: at most 8 times step / 2 degrees.",
+    "a forearm past its fold, two degrees beside": (
+        partial(_bending_arm, around=math.pi, across=0.035),
+        "The roll goes round with the way to the antipode: at most 8 times step / 2 degrees.",
     ),
-    Crossing(
-        "a forearm through its fold",
-        lambda s: _bending_arm(s, math.pi),
-        0.1 * SWUNG,
-        jumps=2,
-        note="The roll jumps 0.8 degrees before the fold and after it, the bone's direction does "
+    "a forearm through its fold": (
+        partial(_bending_arm, around=math.pi),
+        "The roll jumps 0.8 degrees before the fold and after it, the bone's direction does "
         "not: frames on a sphere cannot be combed without a whirl.",
     ),
-    Crossing(
-        "an elbow bent against its hinge",
-        lambda s: _bending_arm(s, -math.pi / 4, reach=0.2),
-        0.2 * SWUNG,
-        jumps=2,
-        note="With twist=hinge the turn into the bend plane is half a turn at half weight there, "
+    "an elbow bent against its hinge": (
+        partial(_bending_arm, around=-math.pi / 4, reach=0.2),
+        "With twist=hinge the turn into the bend plane is half a turn at half weight there, "
         "and either way is as good. With twist=none nothing happens.",
     ),
-    Crossing(
-        "shoulders through the spine's direction",
-        lambda s: _shoulders_through_the_spine(s, 0.6, 0, 0.8),
-        2 * FADED,
-        note="Below 1 mm the hips' line takes over: at most 20 times step / 1 mm.",
+    "shoulders through the spine's direction": (
+        partial(_shoulders_through_the_spine, direction=(0.6, 0, 0.8)),
+        "Below 1 mm the hips' line takes over: at most 20 times step / 1 mm.",
     ),
-    Crossing(
-        "shoulders through the spine's direction, against the hips",
-        lambda s: _shoulders_through_the_spine(s, 1, 0, 0),
-        2 * FADED,
-        jumps=2,
-        note="They pass the exact opposite of their stand-in: either way round is as good.",
+    "shoulders through the spine's direction, against the hips": (
+        partial(_shoulders_through_the_spine, direction=(1, 0, 0)),
+        "They pass the exact opposite of their stand-in: either way round is as good.",
     ),
-    Crossing(
-        "left and right changing places",
+    "left and right changing places": (
         _left_and_right_change_places,
-        2 * FADED,
-        note="Both lines vanish at once; the world's x axis takes over below 1 mm.",
+        "Both lines vanish at once; the world's x axis takes over below 1 mm.",
     ),
-    Crossing(
-        "hips through the shoulders",
+    "hips through the shoulders": (
         _hips_through_the_shoulders,
-        4 * FADED,
-        note="The spine vanishes; the world's y axis takes over below 1 mm.",
+        "The spine vanishes; the world's y axis takes over below 1 mm.",
     ),
-    Crossing(
-        "a nose through the ears' line",
-        _nose_through_the_ears,
-        4 * FADED,
-        note="Below 1 mm the eyes' frame takes over.",
-    ),
-    Crossing(
-        "ears through each other",
-        _ears_through_each_other,
-        4 * FADED,
-        note="Below 1 mm the eyes' frame takes over.",
-    ),
-    Crossing(
-        "shoulders round to the back of the hips",
+    "a nose through the ears' line": (_nose_through_the_ears, _EYES),
+    "ears through each other": (_ears_through_each_other, _EYES),
+    "shoulders round to the back of the hips": (
         _shoulders_round_the_hips,
-        0.2 * SWUNG,
-        jumps=2,
-        note="The trunk's box follows the middle of two directions, and jumps where they are "
+        "The trunk's box follows the middle of two directions, and jumps where they are "
         "opposite: it could be either side.",
     ),
-)
+}
+"""By name: parameters ``s [T]`` in [-1, 1] → poses ``[T, 33, 3]``, singular at s = 0; and the bound
+on how fast a frame turns there, or the reason why it jumps."""

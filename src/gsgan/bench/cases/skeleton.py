@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from gsgan.bench.cases.case import REFUSED, Case, Inputs, Tolerance
-from gsgan.bench.cases.crossings import CROSSINGS
+from gsgan.bench.cases.crossings import CROSSINGS, Path, poses
 from gsgan.bench.cases.poses import DEGENERATE, noisy, rest
 from gsgan.bench.cases.raster import Size, pinhole, raster_case, rendered
 from gsgan.scene import Camera, Gaussians
@@ -89,13 +89,13 @@ def cases() -> Iterator[Case]:
         tolerance=Tolerance(1e-4, 1e-3),
         note="What is nearer than the near plane is left out: points one by one, lines whole.",
     )
-    for crossing in CROSSINGS:
+    for name, (path, note) in CROSSINGS.items():
         yield _case(
-            f"sequence: {crossing.name}",
-            lambda crossing=crossing: {"p": crossing.poses(24)},  # type: ignore[misc]
+            f"sequence: {name}",
+            partial(_along, path),
             frames_and_points,
             tolerance=Tolerance(2e-4, 5e-4),
-            note=crossing.note,
+            note=note,
         )
 
 
@@ -131,6 +131,10 @@ def _sanitised(inputs: Inputs) -> dict[str, Tensor]:
 
 def _posed(pose: str) -> Inputs:
     return {"p": DEGENERATE[pose]}
+
+
+def _along(path: Path) -> Inputs:
+    return {"p": poses(path, 24)}
 
 
 def _losing(joints: list[int], value: float) -> Inputs:
