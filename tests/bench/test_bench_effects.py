@@ -7,12 +7,12 @@ import json
 import sys
 
 import pytest
-from hydra.utils import instantiate
-
-from gsgan.bench import effects, effects_case, effects_cost
 from gsgan.bench.effects_case import Row, Training
 from gsgan.bench.effects_report import Report, text, write, write_docs
 from gsgan.bench.environment import Environment
+from hydra.utils import instantiate
+
+from gsgan.bench import effects, effects_case, effects_cost
 from gsgan.utils.errors import ConfigError, GsganError
 
 WHERE = Environment("cpu", "Abacus", 1, "2026-01-01", {}, None)

@@ -10,8 +10,6 @@ from pathlib import Path
 import pytest
 import torch
 from commands import TINY, refused
-
-from gsgan.bench import trade_off_train
 from gsgan.bench.environment import environment
 from gsgan.bench.speed_painter import Way
 from gsgan.bench.trade_off_files import drawn
@@ -19,6 +17,8 @@ from gsgan.bench.trade_off_front import front, steps
 from gsgan.bench.trade_off_measure import score
 from gsgan.bench.trade_off_plots import within
 from gsgan.bench.trade_off_points import Point, Trained, asked, found_runs, standard_run, sweep
+
+from gsgan.bench import trade_off_train
 from gsgan.bench.trade_off_report import Report, Row, make_rows
 from gsgan.splat import ACCURACY
 from gsgan.train.curve import Curve, curve

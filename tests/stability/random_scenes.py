@@ -17,7 +17,7 @@ def scenes(
     log_scale: tuple[float, float] = (-6.0, 3.0),
     log_ratio: tuple[float, float] = (0.05, 4.0),
 ) -> tuple[Inputs, Size]:
-    """Gaussians in front of, beside and behind a camera anywhere, and the picture's size.
+    """Gaussians in front of, beside and behind a camera anywhere, and the image's size.
 
     Args:
         draw: hypothesis'.

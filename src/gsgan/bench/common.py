@@ -169,7 +169,7 @@ class Bench:
             docs: text of the block; None: ``text``.
         """
         write_atomically(self.folder / f"{self.name}.md", f"# {title}\n\n{text.strip()}\n")
-        content = json.dumps({"where": self.where, **record}, indent=1, allow_nan=False)
+        content = json.dumps({"where": self.where, **record}, indent=1)
         write_atomically(self.folder / f"{self.name}.json", content)
         if frame is not None:
             write_atomically(self.folder / f"{self.name}.csv", frame.to_csv(index=False))
@@ -199,7 +199,7 @@ class Store:
     """
 
     def __init__(self, path: Path, where: Mapping[str, Any], *, fresh: bool = False) -> None:
-        self.path, self.found = path, {}
+        self.path, self.found = path, dict[str, Any]()
         self.conditions = {k: v for k, v in where.items() if k not in ("date", "load")}
         self.conditions["code"] = code_digest()
         if fresh:

@@ -122,11 +122,9 @@ def check(config: DictConfig) -> None:
         ConfigError: naming the key.
     """
     check_whole(config, frames=1, repeats=1)
-    known = ", ".join(config.cases)
-    only = config.only
-    if only is not None and not (
-        OmegaConf.is_list(only) and only and set(only) <= set(config.cases)
-    ):
+    known, only = ", ".join(config.cases), config.only
+    listed = OmegaConf.is_list(only) and only and set(only) <= set(config.cases)
+    if only is not None and not listed:
         raise ConfigError(f"only must list some of {known}; got {only!r}")
     if config.real_effect not in config.cases:
         raise ConfigError(f"real_effect must be one of {known}, got {config.real_effect!r}")

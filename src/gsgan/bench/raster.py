@@ -14,7 +14,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from gsgan.bench.common import Bench, Store, check_whole
+from gsgan.bench.common import Bench, Store, check_whole, records
 from gsgan.bench.compare import choose_patches, errors, leaves, proven_bounds, truth
 from gsgan.bench.memory import peak_memory
 from gsgan.bench.raster_report import images, number_table, summary
@@ -68,7 +68,7 @@ def run(config: DictConfig, folder: Path) -> None:
     bench.write(
         "What accuracy costs in time",
         number_table(frame),
-        {"bench": OmegaConf.to_container(config), "rows": rows},
+        {"bench": OmegaConf.to_container(config), "rows": records(frame)},
         frame.drop(columns=SAMPLES),
         images(frame, n, size),
         docs=summary(frame, here, n, size, bench.where),

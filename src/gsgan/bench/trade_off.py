@@ -41,13 +41,16 @@ from gsgan.utils.timing import interleaved
 BASE = "base"
 SCORES = "metrics.json"  # what a finished run has, beside its checkpoint
 SETTINGS = ("accuracies", "precisions", "scales", "backends", "windows")
-# Of a multirun's overrides: a point is the mean over seeds, and how fast data is made has no effect.
+# Of a multirun's overrides: a point is the mean over seeds; others do not change what is trained.
 SEED = "seed"
 IGNORED = re.compile(r"^(data\.(source\.)?workers|hydra\..*|trainer(\..*)?|grid_rows)$")
 # Of a run's data: how it is read and sampled, not what is in it.
 SAMPLING = ("seed", "steps_per_epoch", "workers", "cache_mb", "batch_size", "val_pictures")
 
 Score = Callable[[Tensor, Tensor], Tensor]
+
+
+AS_TRAINED = Way()
 
 
 @dataclass(frozen=True)
@@ -65,7 +68,7 @@ class Point:
     factor: str
     label: str
     folder: Path
-    way: Way = Way()
+    way: Way = AS_TRAINED
     overrides: tuple[str, ...] = ()
 
 
@@ -384,7 +387,7 @@ def make_rows(
         )
         few["seconds"] = [seconds.get(points[i].folder) for i in group]
         few = few.astype(float)
-        row = {"factor": factor, "label": label}
+        row: dict[str, Any] = {"factor": factor, "label": label}
         row |= {name: few[name].mean(skipna=False) for name in QUALITIES}
         spread_ms = deciles([ms for i in group for ms in samples[i]])
         row |= {"left_out": int(few.left_out.sum()), "ms": spread_ms.pop("median"), **spread_ms}

@@ -171,9 +171,9 @@ def put_labels(axes: Axes, rows: pd.DataFrame, metric: str) -> None:
     taken = [Bbox.from_bounds(x - 5, y - 5, 10, 10) for x, y in points]
     for ms, value, label in zip(rows.ms, rows[metric], rows.label, strict=True):
         tried: list[tuple[int, Annotation, Bbox]] = []
-        for *offset, ha, va in PLACES:
+        for dx, dy, ha, va in PLACES:
             note = axes.annotate(
-                label, (ms, value), offset, textcoords="offset points", ha=ha, va=va, fontsize=7.5
+                label, (ms, value), (dx, dy), textcoords="offset points", ha=ha, va=va, fontsize=7.5
             )
             box = note.get_window_extent()
             outside = box.x0 < frame.x0 or box.x1 > frame.x1 or box.y1 > frame.y1
