@@ -68,7 +68,7 @@ def test_files_and_the_block_of_a_page_are_written(tmp_path):
     assert page.read_text() == "A\n<!-- bench:mine -->\n\nnew\n\n<!-- end -->\nB\n"
     assert (page.parent / "pictures" / "one.png").read_bytes() == b"png"
     assert (tmp_path / "out" / "mine.md").read_text() == "# Title\n\ntext\n"
-    assert (tmp_path / "out" / "mine.csv").read_text() == "x\n1.5\n\n"
+    assert (tmp_path / "out" / "mine.csv").read_text() == 'x\n1.5\n""\n'
     found = json.loads((tmp_path / "out" / "mine.json").read_text())
     assert found["rows"] == [{"x": 1.5}, {"x": None}]
     assert found["where"]["device"] == "cpu"

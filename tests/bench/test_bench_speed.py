@@ -133,6 +133,7 @@ def test_a_way_that_makes_no_sense_is_refused(wrong, word):
         Way(**wrong)
 
 
+@pytest.mark.slow
 def test_memory_of_painting_is_of_the_right_size(small):
     """Dense float64 blending holds Gaussians times pixels: more than tiles do."""
     _, avatar, frame = small

@@ -10,11 +10,19 @@ from typing import Any
 
 import pandas as pd
 import torch
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsgan.bench import common
 from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, sentence
 from gsgan.bench.painter import evenly
+from gsgan.effects import decide as decide_effects
+from gsgan.train.runs import build_data, load_avatar, load_config
+from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, GsganError
 from gsgan.utils.timing import interleaved, median
 
@@ -27,7 +35,7 @@ SETTINGS = ("base", "budget", "only", "train", "default", "real_base", "frames",
 
 @dataclass
 class Row:
-    """One effect in one scene, for JSON and the table.
+    """One effect in one scene.
 
     Args:
         effect: its name in the config.
@@ -36,11 +44,9 @@ class Row:
         split: whose images were scored.
         overrides: of `gsgan.train` that make the scene.
         runs: overrides by the name of the run, "off" first, then "on"; empty if nothing is trained.
-        auto: whether `auto` turned it on; None before that is known.
-        why: its reason.
-        scores: ``{"off" or "on": {"full" or "splat": dB in the person's box}}``; empty untrained.
-        paint_ms, read_ms: medians of painting and of reading a frame, by "off" and "on".
-        parameters: trained ones, by "off" and "on".
+        auto, why: whether `auto` turned it on, and its reason.
+        scores: ``{"off" or "on": {"full" or "splat": dB in the person's box}}``.
+        paint_ms, read_ms, parameters: by "off" and "on"; medians per frame.
         marks: notes that the table must carry.
     """
 
@@ -99,10 +105,11 @@ def run(config: DictConfig, folder: Path) -> None:
                 score(row, metrics)
                 measure(row, folder / "runs", config.frames, config.repeats)
             progress.advance(task)
-    text = page(rows, bench.where)
+    text, settings = page(rows, bench.where), OmegaConf.to_container(config)
+    assert isinstance(settings, dict)
     bench.console.print(text, markup=False, highlight=False)
     record = {
-        "settings": {name: _plain(config[name]) for name in SETTINGS},
+        "settings": {name: settings[name] for name in SETTINGS},
         "rows": [asdict(row) | {"gain_db": {v: row.gain(v) for v in SHOWN}} for row in rows],
         "failures": failures(rows),
     }
@@ -111,16 +118,8 @@ def run(config: DictConfig, folder: Path) -> None:
         raise GsganError("; ".join(failures(rows)))
 
 
-def _plain(value: Any) -> Any:
-    return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
-
-
 def check(config: DictConfig) -> None:
-    """Refuses wrong values before anything takes time.
-
-    Raises:
-        ConfigError: naming the key.
-    """
+    """Refuses wrong values before anything takes time."""
     check_whole(config, frames=1, repeats=1)
     known, only = ", ".join(config.cases), config.only
     listed = OmegaConf.is_list(only) and only and set(only) <= set(config.cases)
@@ -169,13 +168,6 @@ def compose(overrides: Sequence[str]) -> DictConfig:
     Raises:
         ConfigError: when an override fits nothing.
     """
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
-    from hydra.errors import HydraException
-
-    from gsgan.utils.config import config_folder
-
     outer = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
@@ -189,16 +181,7 @@ def compose(overrides: Sequence[str]) -> DictConfig:
 
 
 def decide(overrides: Sequence[str], effect: str) -> tuple[bool, str]:
-    """Whether `auto` turns an effect on in a scene, and its reason.
-
-    Raises:
-        GsganError: when the scene cannot be made or read.
-    """
-    from hydra.utils import instantiate
-
-    from gsgan.effects import decide as decide_effects
-    from gsgan.train.runs import build_data
-
+    """Whether `auto` turns an effect on in a scene, and its reason."""
     config = compose([*overrides, f"effects.{effect}=auto"])
     found = getattr(decide_effects(build_data(config).info, instantiate(config.effects)), effect)
     return found.on, found.why
@@ -215,16 +198,7 @@ def score(row: Row, metrics: Mapping[str, Any]) -> None:
 
 
 def measure(row: Row, folder: Path, frames: int, repeats: int) -> None:
-    """Times painting and reading with the effect off and on, in turn; counts parameters.
-
-    Args:
-        row: gets the figures.
-        folder: of all runs.
-        frames: held-out images gone through in each round.
-        repeats: rounds.
-    """
-    from gsgan.train.runs import build_data, load_avatar, load_config
-
+    """Times painting and reading with the effect off and on, in turn; counts parameters."""
     paint, read, count = {}, {}, 1
     for state, name in zip(("off", "on"), row.runs, strict=True):
         config = load_config(folder / name)

@@ -141,11 +141,7 @@ def run(config: DictConfig, folder: Path) -> None:
 
 
 def check(config: DictConfig) -> None:
-    """Refuses wrong values before anything takes time.
-
-    Raises:
-        ConfigError: naming the key.
-    """
+    """Refuses wrong values before anything takes time."""
     if config.run is not None and config.runs is not None:
         raise ConfigError("give run=<one run> or runs=<a multirun's folder>, not both")
     if config.run is None and config.runs is None:
@@ -180,12 +176,7 @@ def trainings(config: DictConfig, folder: Path, bench: Bench) -> list[Point]:
 
 
 def sweep(base: Sequence[str], factors: Mapping[str, Any], folder: Path) -> list[Point]:
-    """The base point, and each factor's values one at a time; a factor that is None is left out.
-
-    Raises:
-        ConfigError: when a factor is not made of ``key``, ``values`` and perhaps ``also``, or two
-            points would share a folder.
-    """
+    """The base point, and each factor's values one at a time; a factor that is None is left out."""
     last = "evaluate=false"  # the bench scores
     found = [Point(BASE, BASE, folder / BASE, overrides=(*base, last))]
     for name, choice in factors.items():
@@ -206,11 +197,7 @@ def sweep(base: Sequence[str], factors: Mapping[str, Any], folder: Path) -> list
 
 
 def runs_in(folder: Path) -> tuple[list[Point], list[str]]:
-    """The finished runs of a multirun, named by the overrides that differ; names of the others.
-
-    Raises:
-        DataError: when there is no finished run in it.
-    """
+    """The finished runs of a multirun, named by the overrides that differ; names of the others."""
     runs = sorted(path.parents[1] for path in folder.glob(f"*/{CHECKPOINT}"))
     finished = [run for run in runs if (run / SCORES).is_file()]  # else still training, or cut off
     if not finished:
@@ -247,16 +234,7 @@ def standard_run(runs: Sequence[Point]) -> Point:
 def ways(
     folder: Path, settings: Mapping[str, Any], accuracies: Mapping[str, Accuracy]
 ) -> list[Point]:
-    """One avatar in every other way that the settings name, one thing at a time.
-
-    Args:
-        folder: of its run.
-        settings: as in conf/bench_trade_off.yaml.
-        accuracies: by name.
-
-    Raises:
-        ConfigError: on an unknown setting or value.
-    """
+    """One avatar in every other way that the settings name, one thing at a time."""
     for name, known in (("accuracies", accuracies), ("windows", ("whole",))):
         unknown = set(settings.get(name) or ()) - set(known)
         if unknown:
@@ -287,7 +265,6 @@ def load(
 
     Raises:
         ConfigError: when the runs do not share their data, or the split has no frame.
-        DataError: when a run, its checkpoint or its data cannot be read.
     """
     folders = list(dict.fromkeys(point.folder for point in points))
     configs = {folder: load_config(folder, Moved.said(config)) for folder in folders}
@@ -377,20 +354,17 @@ def make_rows(
         ``factor label``, the metrics (NaN where a seed has none), ``left_out`` scores, ``ms p10
         p90`` per frame, ``memory_mb`` at its peak, ``seconds`` of training, and ``seeds``.
     """
-    groups: dict[tuple[str, str], list[int]] = {}
-    for i, point in enumerate(points):
-        groups.setdefault((point.factor, point.label), []).append(i)
+    each = pd.DataFrame(found).reindex(columns=[*QUALITIES, "left_out", "memory_mb"])
+    each["seconds"] = [seconds.get(point.folder) for point in points]
+    each = each.astype(float).assign(ms=list(samples))
     rows = []
-    for (factor, label), group in groups.items():
-        few = pd.DataFrame([found[i] for i in group]).reindex(
-            columns=[*QUALITIES, "left_out", "memory_mb"]
-        )
-        few["seconds"] = [seconds.get(points[i].folder) for i in group]
-        few = few.astype(float)
-        row: dict[str, Any] = {"factor": factor, "label": label}
-        row |= {name: few[name].mean(skipna=False) for name in QUALITIES}
-        spread_ms = deciles([ms for i in group for ms in samples[i]])
-        row |= {"left_out": int(few.left_out.sum()), "ms": spread_ms.pop("median"), **spread_ms}
-        row |= {"memory_mb": few.memory_mb.max(), "seconds": few.seconds.mean(skipna=False)}
-        rows.append({**row, "seeds": len(group)})
+    names = [[point.factor for point in points], [point.label for point in points]]
+    for (factor, label), few in each.groupby(names, sort=False):
+        mean = few[[*QUALITIES, "seconds"]].mean(skipna=False)
+        ms = deciles([ms for own in few.ms for ms in own]).values()
+        row = {"factor": factor, "label": label, **mean[list(QUALITIES)]}
+        row["left_out"] = int(few.left_out.sum())
+        row |= dict(zip(("ms", "p10", "p90"), ms, strict=True))
+        row |= {"memory_mb": few.memory_mb.max(), "seconds": mean.seconds, "seeds": len(few)}
+        rows.append(row)
     return pd.DataFrame(rows)
