@@ -103,7 +103,7 @@ def load_subject(config: DictConfig, device: torch.device) -> Subject:
     Raises:
         DataError: when the run folder, its checkpoint or its data cannot be read.
     """
-    moved = Moved.said(config)
+    moved = Moved(config.data_root, config.data_smpl)
     if config.run is not None:
         folder = Path(config.run).expanduser()
         stored = load_config(folder, moved)

@@ -145,7 +145,7 @@ def check(config: DictConfig) -> None:
     if config.run is not None and config.runs is not None:
         raise ConfigError("give run=<one run> or runs=<a multirun's folder>, not both")
     if config.run is None and config.runs is None:
-        Moved.said(config).refuse_without_run()
+        Moved(config.data_root, config.data_smpl).refuse_without_run()
     check_whole(config, repeats=1, pictures=1)
     if not isinstance(config.patience, (int, float)) or not config.patience > 0:
         raise ConfigError(f"patience must be a number above 0, got {config.patience!r}")
@@ -267,7 +267,7 @@ def load(
         ConfigError: when the runs do not share their data, or the split has no frame.
     """
     folders = list(dict.fromkeys(point.folder for point in points))
-    configs = {folder: load_config(folder, Moved.said(config)) for folder in folders}
+    configs = {folder: load_config(folder, Moved(config.data_root, config.data_smpl)) for folder in folders}
     first = folders[0]
     for folder, stored in configs.items():
         if _content(stored) != _content(configs[first]):
