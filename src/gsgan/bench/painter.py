@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -11,11 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.bench.memory import growth, peak, reset_peak
+from gsgan.bench.memory import peak_memory
 from gsgan.data.datamodule import GsganData
 from gsgan.model.avatar import Avatar
 from gsgan.scene import Frame
-from gsgan.splat import BACKENDS, Accuracy, buffers
+from gsgan.splat import BACKENDS, Accuracy
 from gsgan.utils.errors import ConfigError
 
 # Lightning's names, as in conf/trainer.
@@ -126,20 +125,9 @@ def _set_backend(avatar: Avatar, backend: str) -> None:
 
 
 def painting_memory(painter: Painter, frames: Sequence[Frame]) -> float | None:
-    """Megabytes that painting takes on top of the avatar and its inputs, at its peak.
-
-    Convention: by how much this process's peak grows over a few frames, after free memory is
-    returned to the system; on CUDA the allocator's peak. None where the system reports no peak.
-    """
-    device = frames[0].skeleton.device
-    painter(frames[0])
-    gc.collect()
-    buffers.forget()
-    reset_peak(device)
-    before = peak(device)
-    for frame in frames[:MEASURED_FRAMES]:
-        painter(frame)
-    return growth(before, peak(device))
+    """Megabytes that painting takes on top of the avatar and its inputs; None where not known."""
+    few = frames[:MEASURED_FRAMES]
+    return peak_memory(lambda: [painter(frame) for frame in few], frames[0].skeleton.device)
 
 
 def spread(data: GsganData, count: int, split: str | None = None) -> list[Frame]:

@@ -84,11 +84,7 @@ def run(config: DictConfig, folder: Path) -> None:
 
 
 def check(config: DictConfig) -> None:
-    """Refuses values out of range.
-
-    Raises:
-        ConfigError: naming the key.
-    """
+    """Refuses values out of range."""
     for name, least in {"gaussians": LEAST, "channels": 1, "sizes": 8, "compare_at": 1}.items():
         value = config[name]
         listed = OmegaConf.is_list(value) and all(isinstance(n, int) and n >= least for n in value)
@@ -128,14 +124,7 @@ def extras(config: DictConfig, n: int, size: int) -> dict[str, bool]:
 def measure_cell(
     config: DictConfig, cell: dict[str, int], found: list[Variant], device: torch.device
 ) -> list[dict[str, Any]]:
-    """One row for each variant in one scene; what was not measured is missing.
-
-    Args:
-        config: as conf/bench_raster.yaml.
-        cell: ``gaussians``, ``channels`` and ``size``.
-        found: the variants.
-        device: where.
-    """
+    """One row per variant in one scene, a cell of the grid; what was not measured is missing."""
     n, channels, size = cell.values()
     gaussians = human_cloud(n, channels, config.seed).to(device)
     camera = ring_camera(size).to(device)
@@ -155,11 +144,10 @@ def measure_cell(
             draw = partial(_draw, variant=variant)
             row |= errors(exact, gaussians, camera, bounds[variant[2]], draw)
     if wanted["memory"]:
-        scene = {"n": n, "channels": channels, "size": size, "seed": config.seed}
-        scene |= {"device": str(device), "threads": torch.get_num_threads()}
-        for row, (backend, _, setting) in zip(rows, found, strict=True):
+        for row, variant in zip(rows, found, strict=True):
             if row["both_ms"] <= 1000 * config.patience:
-                row["memory_mb"] = peak_memory(setting, backend, **scene)
+                action = partial(_draw_both, leaves(gaussians), camera, variant)
+                row["memory_mb"] = peak_memory(action, device)
     return rows
 
 
@@ -168,26 +156,15 @@ def measure_times(
 ) -> list[dict[str, Any]]:
     """Medians and samples, forward without gradients and forward with backward."""
     inputs = leaves(gaussians)
-    random = torch.Generator().manual_seed(config.seed)
-    shapes = [(1, channels, *camera.size) for channels in (gaussians.features.shape[-1], 1)]
-    weights = [torch.randn(s, generator=random).to(gaussians.means) for s in shapes]
 
     def forward(variant: Variant) -> object:
         with torch.no_grad():
             return _draw(gaussians, camera, variant)
 
-    def both(variant: Variant) -> object:
-        for value in vars(inputs).values():
-            if isinstance(value, Tensor):
-                value.grad = None
-        raster = _draw(inputs, camera, variant)
-        torch.autograd.backward([raster.features, raster.alpha], weights)
-        return raster
-
     actions: dict[tuple[int, str], Callable[[], object]] = {}
     for i, variant in enumerate(found):
         actions[i, "forward"] = partial(forward, variant)
-        actions[i, "both"] = partial(both, variant)
+        actions[i, "both"] = partial(_draw_both, inputs, camera, variant)
     device = gaussians.means.device
     samples = interleaved(actions, config.repeats, patience=config.patience, device=device)
     return [
@@ -203,3 +180,14 @@ def measure_times(
 
 def _draw(gaussians: Gaussians, camera: Camera, variant: Variant) -> Raster:
     return rasterise(gaussians, camera, settings=variant[2], backend=variant[0])
+
+
+def _draw_both(inputs: Gaussians, camera: Camera, variant: Variant) -> object:
+    """Forward and backward, the gradients of the last call forgotten."""
+    for value in vars(inputs).values():
+        if isinstance(value, Tensor):
+            value.grad = None
+    raster = _draw(inputs, camera, variant)
+    ones = [torch.ones_like(raster.features), torch.ones_like(raster.alpha)]
+    torch.autograd.backward([raster.features, raster.alpha], ones)
+    return raster

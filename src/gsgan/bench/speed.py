@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,23 +34,6 @@ from gsgan.utils.timing import timed, wait
 TOTAL, REST = "end to end", "between stages"
 
 
-@dataclass(frozen=True)
-class Subject:
-    """An avatar and frames to paint.
-
-    Args:
-        avatar: in eval mode, on its device.
-        frames: one image each, on the same device.
-        name: for people.
-        marks: notes that the table must carry.
-    """
-
-    avatar: Avatar
-    frames: Sequence[Frame]
-    name: str
-    marks: tuple[str, ...]
-
-
 def run(config: DictConfig, folder: Path) -> None:
     """Times an avatar; writes ``speed.md``, ``speed.json`` and ``speed.png``.
 
@@ -70,38 +53,39 @@ def run(config: DictConfig, folder: Path) -> None:
         raise ConfigError(f"channels_last must be true or false, got {config.channels_last!r}")
     way = Way(precision=config.precision, backend=config.backend)
     bench = Bench.start("speed", config, folder, config.block)
-    subject = load_subject(config, bench.device)
-    painter = Painter(subject.avatar, way)
+    avatar, frames, name, marks = load_subject(config, bench.device)
+    painter = Painter(avatar, way)
     with without_denormals():
         with bench.progress() as progress:
             task = progress.add_task("painting", total=config.warmup + config.frames)
             times = measure(
                 painter,
-                subject.frames,
+                frames,
                 count=config.frames,
                 warmup=config.warmup,
                 tick=lambda: progress.advance(task),
             )
-        memory = painting_memory(painter, subject.frames)
-    settings = settings_of(config, subject, bench.device)
-    told = text(times, memory, bench.where, settings, subject.marks)
+        memory = painting_memory(painter, frames)
+    settings = {"avatar": name, **settings_of(config, avatar, frames)}
+    told = text(times, memory, bench.where, settings, marks)
     bench.console.print(told, markup=False, highlight=False)
     spreads = {name: dict(row) for name, row in times.iterrows()}
     total, rest = spreads.pop(TOTAL), spreads.pop(REST)
     record = {
         "settings": settings,
-        "marks": list(subject.marks),
+        "marks": marks,
         "times_ms": {"total": total, "stages": spreads, "rest": rest},
         "memory_mb": memory,
     }
     bench.write("From skeleton to image", told, record, images={"speed.png": plot(times, settings)})
 
 
-def load_subject(config: DictConfig, device: torch.device) -> Subject:
-    """The avatar of ``run`` in its held-out poses, or an untrained one of ``config.model``.
+def load_subject(
+    config: DictConfig, device: torch.device
+) -> tuple[Avatar, list[Frame], str, list[str]]:
+    """An avatar in eval mode, frames of one image each, a name, and notes for the table.
 
-    Raises:
-        DataError: when the run folder, its checkpoint or its data cannot be read.
+    The avatar of ``run`` with its held-out poses, or an untrained one of ``config.model``.
     """
     moved = Moved(config.data_root, config.data_smpl)
     if config.run is not None:
@@ -118,15 +102,11 @@ def load_subject(config: DictConfig, device: torch.device) -> Subject:
         size = (int(config.size.picture), int(config.size.picture))
         frames = [replace(f, camera=f.camera.resize(size)) for f in spread(data, config.poses)]
     avatar = place(avatar, device, channels_last=config.channels_last)
-    return Subject(avatar, [frame.to(device) for frame in frames], name, tuple(marks))
+    return avatar, [frame.to(device) for frame in frames], name, marks
 
 
 class StageClock:
-    """Takes the place of ``Avatar.stage`` while stages are timed; waits for the device.
-
-    Args:
-        device: of the avatar.
-    """
+    """Takes the place of ``Avatar.stage`` while stages are timed; waits for the device."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -190,13 +170,12 @@ def deciles(samples: Sequence[float]) -> dict[str, float]:
     return dict(zip(("median", "p10", "p90"), map(float, found), strict=True))
 
 
-def settings_of(config: DictConfig, subject: Subject, device: torch.device) -> dict[str, Any]:
+def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> dict[str, Any]:
     """What the figures depend on, by names for people."""
-    avatar, (height, width) = subject.avatar, subject.frames[0].camera.size
-    windows = [avatar.window(frame) for frame in subject.frames]
+    height, width = frames[0].camera.size
+    windows = [avatar.window(frame) for frame in frames]
     pixels = sum(height * width if w is None else w.size[0] * w.size[1] for w in windows)
     found: dict[str, Any] = {
-        "avatar": subject.name,
         "picture": f"{width} x {height}",
         "painted": f"{pixels / (len(windows) * height * width):.0%} of its pixels",
         "precision": config.precision,
@@ -205,7 +184,7 @@ def settings_of(config: DictConfig, subject: Subject, device: torch.device) -> d
         "frames": config.frames,
     }
     if avatar.splats is not None:
-        backend, _ = resolve_backend(config.backend, device, avatar.accuracy)
+        backend, _ = resolve_backend(config.backend, frames[0].skeleton.device, avatar.accuracy)
         found |= {"accuracy": avatar.accuracy.name, "backend": backend}
         found["channels of F"] = avatar.splat_channels
         if avatar.accuracy.supersample > 1:

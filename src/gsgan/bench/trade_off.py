@@ -267,7 +267,8 @@ def load(
         ConfigError: when the runs do not share their data, or the split has no frame.
     """
     folders = list(dict.fromkeys(point.folder for point in points))
-    configs = {folder: load_config(folder, Moved(config.data_root, config.data_smpl)) for folder in folders}
+    moved = Moved(config.data_root, config.data_smpl)
+    configs = {folder: load_config(folder, moved) for folder in folders}
     first = folders[0]
     for folder, stored in configs.items():
         if _content(stored) != _content(configs[first]):

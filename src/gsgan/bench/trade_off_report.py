@@ -7,10 +7,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.text import Annotation
-from matplotlib.transforms import Bbox
 
 from gsgan.bench.common import NOTHING, markdown, number, panels, plain_ticks, png, sentence
 from gsgan.train.curve import Curve
@@ -24,7 +20,6 @@ QUALITIES = {
     "lpips": ("LPIPS", 4, -1),
 }
 ORDER = (BLACK, *COLOURS[:-1], GREY)  # the base point's first
-FAR = 8.0  # times the median time, beyond which a point would squeeze the others together
 TITLES = {
     "base": "Step I and II (full)",
     "full": "Step I and II (full)",
@@ -32,13 +27,8 @@ TITLES = {
     "lbs_splat": "baseline: Gaussians on the body (lbs_splat)",
     "image_to_image": "baseline: UNet on the drawn skeleton (image_to_image)",
 }
-# Where a label may go: offset in points, horizontal and vertical alignment.
-PLACES = (
-    *((0, 6, "center", "bottom"), (0, -6, "center", "top"), (6, 3, "left", "bottom")),
-    *((6, -3, "left", "top"), (-6, 3, "right", "bottom"), (-6, -3, "right", "top")),
-    *((8, 0, "left", "center"), (-8, 0, "right", "center"), (0, 16, "center", "bottom")),
-    *((0, -16, "center", "top"), (14, 12, "left", "bottom"), (14, -12, "left", "top")),
-)
+# Labels beside points, in turn: offset in points, horizontal and vertical alignment.
+PLACES = ((0, 6, "center", "bottom"), (0, -6, "center", "top"), (7, 0, "left", "center"))
 
 
 def front(frame: pd.DataFrame, metric: str) -> list[int]:
@@ -121,7 +111,6 @@ def images(
 def trade_off_plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
     """Metrics against milliseconds per frame, all points labelled, the front as a step line."""
     figure, all_axes = panels(len(metrics), 6.4 * len(metrics), 5.6)
-    frame = within(frame)
     for axes, metric in zip(all_axes, metrics, strict=True):
         heading, _, sign = QUALITIES[metric]
         ahead = frame.iloc[front(frame, metric)]
@@ -144,45 +133,22 @@ def trade_off_plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
         axes.margins(x=0.16, y=0.1)
         if sign < 0:
             axes.invert_yaxis()
+        for i, (_, row) in enumerate(frame[frame[metric].notna()].sort_values("ms").iterrows()):
+            dx, dy, ha, va = PLACES[i % len(PLACES)]
+            axes.annotate(
+                row.label,
+                (row.ms, row[metric]),
+                (dx, dy),
+                textcoords="offset points",
+                ha=ha,
+                va=va,
+                fontsize=7.5,
+            )
     handles, names = all_axes[0].get_legend_handles_labels()
     figure.legend(
         handles, names, loc="outside lower center", ncols=min(6, len(names)), frameon=False
     )
-    FigureCanvasAgg(figure).draw()
-    figure.set_layout_engine("none")
-    for axes, metric in zip(all_axes, metrics, strict=True):
-        put_labels(axes, frame[frame[metric].notna()], metric)
     return png(figure)
-
-
-def within(frame: pd.DataFrame) -> pd.DataFrame:
-    """Rows as drawn: one far slower than the rest stands at the edge, its label gives its time."""
-    edge, frame = FAR * frame.ms.median(), frame.copy()
-    far = frame.ms > edge
-    frame.loc[far, "label"] += [f": {number(ms)} ms →" for ms in frame.ms[far]]
-    frame.loc[far, ["ms", "p10", "p90"]] = edge
-    return frame
-
-
-def put_labels(axes: Axes, rows: pd.DataFrame, metric: str) -> None:
-    """Writes a label beside each point, at the place where it covers the fewest others."""
-    frame = axes.get_window_extent()
-    points = axes.transData.transform(rows[["ms", metric]].to_numpy(dtype=float))
-    taken = [Bbox.from_bounds(x - 5, y - 5, 10, 10) for x, y in points]
-    for ms, value, label in zip(rows.ms, rows[metric], rows.label, strict=True):
-        tried: list[tuple[int, Annotation, Bbox]] = []
-        for dx, dy, ha, va in PLACES:
-            note = axes.annotate(
-                label, (ms, value), (dx, dy), textcoords="offset points", ha=ha, va=va, fontsize=7.5
-            )
-            box = note.get_window_extent()
-            outside = box.x0 < frame.x0 or box.x1 > frame.x1 or box.y1 > frame.y1
-            tried.append((box.count_overlaps(taken) + 10 * outside, note, box))
-        best = min(tried, key=lambda one: one[0])
-        taken.append(best[2])
-        for one in tried:
-            if one is not best:
-                one[1].remove()
 
 
 def training_plot(curves: Sequence[Curve]) -> bytes:
