@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import sys
 
 import pytest
@@ -180,18 +181,44 @@ def test_compose_leaves_the_outer_command_its_hydra():
         assert GlobalHydra.instance().hydra is before
 
 
-def test_the_whole_bench_in_miniature(launched, compose, tmp_path, monkeypatch):
-    """One effect trained in its scene; the second time nothing is trained again."""
+@pytest.fixture
+def small(compose, tmp_path, monkeypatch):
+    """The config of one effect in a tiny scene."""
     monkeypatch.setenv("GSGAN_CACHE", str(tmp_path / "cache"))
     base = ",".join(f"'{x}'" for x in [*SCENE, *OFF])
-    page, out = tmp_path / "page.md", tmp_path / "out"
+    page = tmp_path / "page.md"
     page.write_text("<!-- bench:effects --><!-- end -->")
     overrides = (
         *(f"base=[{base}]", "only=[colour_correction]", "frames=1", "repeats=2"),
         *(f"docs={page}", "threads=1", "default=false"),
     )
-    config = compose("bench_effects", *overrides)
+    return compose("bench_effects", *overrides)
 
+
+def test_runs_are_scored_timed_and_written(run, small, tmp_path, monkeypatch):
+    """The same finished run stands in for the training without the effect and with it."""
+
+    def launch(arguments, log):
+        shutil.copytree(run, log.with_suffix(""))
+        return 0
+
+    monkeypatch.setattr(common, "launch", launch)
+    with pytest.raises(GsganError, match=r"gains \+0\.00 dB although it is called for"):
+        effects.run(small, tmp_path / "out")
+    rows = json.loads((tmp_path / "out" / "effects.json").read_text())["rows"]
+    found = {row["scene"]: row for row in rows}
+    assert found["default person"]["scores"] == {}
+    one = found["colour_correction"]
+    assert set(one["scores"]) == set(one["paint_ms"]) == set(one["read_ms"]) == {"off", "on"}
+    assert all(ms > 0 for ms in (*one["paint_ms"].values(), *one["read_ms"].values()))
+    assert one["marks"]
+    assert "| colour_correction |" in (tmp_path / "page.md").read_text()
+
+
+@pytest.mark.slow
+def test_the_whole_bench_in_miniature(launched, small, tmp_path):
+    """One effect trained in its scene; the second time nothing is trained again."""
+    config, page, out = small, tmp_path / "page.md", tmp_path / "out"
     message = ""
     try:
         effects.run(config, out)

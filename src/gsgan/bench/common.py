@@ -111,13 +111,11 @@ class Bench:
     """One bench at work.
 
     Args:
-        name: of its files.
-        folder: of its output.
+        name, folder: of its files.
         console: prints.
-        device: where it measures.
-        where: see :func:`environment`.
-        page: a Markdown page that gets the result; None: none.
-        block: of the page, between ``<!-- bench:block -->`` and ``<!-- end -->``.
+        device, where: it measures on; see :func:`environment`.
+        page, block: a Markdown page that gets the result, if any, between
+            ``<!-- bench:block -->`` and ``<!-- end -->``.
     """
 
     name: str
@@ -162,11 +160,9 @@ class Bench:
         """The files of the folder, each whole or not at all, and the block of the page.
 
         Args:
-            title, text: of the Markdown file.
-            record: of the JSON file, beside ``where``.
-            frame: of the CSV file.
+            title, text: of the Markdown file; the block gets ``docs``, else ``text``.
+            record, frame: of the JSON file, beside ``where``, and of the CSV file.
             images: PNG bytes by name; for the page they go into ``pictures/`` beside it.
-            docs: text of the block; None: ``text``.
         """
         write_atomically(self.folder / f"{self.name}.md", f"# {title}\n\n{text.strip()}\n")
         content = json.dumps({"where": self.where, **record}, indent=1)
@@ -190,12 +186,8 @@ def _markers(block: str) -> tuple[str, str]:
 class Store:
     """Finished measurements, one JSON record per line: an interrupted bench goes on after them.
 
-    A measurement depends on its key, the machine and the code of the package.
-
-    Args:
-        path: the JSONL file; made with its folder at the first record.
-        where: see :func:`environment`; date and load do not count.
-        fresh: forget what it holds.
+    A measurement depends on its key, the machine (less date and load) and the package's code. The
+    file is made with its folder at the first record; ``fresh`` forgets what it holds.
     """
 
     def __init__(self, path: Path, where: Mapping[str, Any], *, fresh: bool = False) -> None:

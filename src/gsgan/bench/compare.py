@@ -57,7 +57,7 @@ def choose_patches(
         gaussians: the first batch item's means decide.
         camera: of the image.
         count: requested patches; fewer when the grid has fewer.
-        side: pixels; those at the right and lower edge may be smaller.
+        side: pixels; patches at the right and lower edge may be smaller.
         seed: of the draw.
     """
     H, W = camera.size
@@ -92,16 +92,9 @@ def truth(gaussians: Gaussians, camera: Camera, patches: Sequence[Patch], seed: 
 def proven_bounds(
     gaussians: Gaussians, camera: Camera, settings: Accuracy, patches: Sequence[Patch]
 ) -> list[Tensor]:
-    """How far a setting's patches can be from those without cut-offs, rounding left out.
+    """``[1, h, w]`` float64 of each patch: how far a setting can be from one without cut-offs.
 
-    Args:
-        gaussians: a batch of one, features in [0, 1].
-        camera: of the whole image.
-        settings: whose error is bounded.
-        patches: where.
-
-    Returns:
-        ``[1, h, w]`` float64 of each patch.
+    Convention: a batch of one, features in [0, 1]; rounding is left out.
     """
     wide, wide_camera = gaussians.to(torch.float64), camera.to(torch.float64)
     with torch.no_grad():
@@ -125,10 +118,8 @@ def errors(
 
     Args:
         exact: for these Gaussians and this camera.
-        gaussians: a batch of one, features in [0, 1].
-        camera: of the whole image.
-        bounds: of the settings that ``draw`` uses, from ``proven_bounds``.
-        draw: draws the whole image.
+        gaussians, camera: of the whole image, which ``draw`` draws.
+        bounds: see ``proven_bounds``, of the settings that ``draw`` uses.
 
     Returns:
         ``value_max`` and ``value_mean`` of the differences of features and alpha; ``bound``, the

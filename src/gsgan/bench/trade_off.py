@@ -96,26 +96,7 @@ def run(config: DictConfig, folder: Path) -> None:
             bench.console.print(f"training {i + 1} of {len(runs)}: {point.folder.name}")
             train(point.overrides, point.folder)
     painters, frames, marks = load(points, config, bench)
-    store = Store(folder / "measurements.jsonl", bench.where, fresh=config.fresh)
-    found = []
-    with without_denormals(), bench.progress() as progress:
-        task = progress.add_task("", total=(config.repeats + 2) * len(points))
-        for point, painter in zip(points, painters, strict=True):
-            progress.update(task, description=f"scoring {point.factor} {point.label}")
-            key = {"run": str(point.folder), "weights": digest(point.folder), **asdict(point.way)}
-            for name in ("split", "pictures", "data_root", "data_smpl", "channels_last"):
-                key[name] = config[name]
-            key["lpips"] = OmegaConf.to_container(config.lpips)
-            found.append(store.get(key, partial(quality, painter, frames, perceptual)))
-            progress.advance(task)
-        progress.update(task, description="timing")
-        samples = times(
-            painters,
-            frames,
-            config.repeats,
-            config.patience,
-            lambda: progress.advance(task),
-        )
+    found, samples = measure(points, painters, frames, perceptual, config, bench)
     curves = {p.folder: c for p in runs if (c := curve(p.label, p.folder)) is not None}
     seconds = {at: one.seconds[-1] for at, one in curves.items()}
     frame = make_rows(points, found, samples, seconds)
@@ -294,6 +275,46 @@ def _content(config: DictConfig) -> dict[Any, Any]:
     return {k: v for k, v in data.items() if k not in SAMPLING}
 
 
+def measure(
+    points: Sequence[Point],
+    painters: Sequence[Painter],
+    frames: Sequence[Frame],
+    perceptual: Score | None,
+    config: DictConfig,
+    bench: Bench,
+) -> tuple[list[dict[str, Any]], list[list[float]]]:
+    """Of every point the scores, stored ones where there are any, and milliseconds per frame.
+
+    The times are taken in one go at the end, all points in turn on the same frame.
+    """
+    store = Store(bench.folder / "measurements.jsonl", bench.where, fresh=config.fresh)
+    found = []
+
+    def action(painter: Painter) -> Callable[[], object]:
+        cycle = itertools.cycle(frames)
+        return lambda: painter(next(cycle))
+
+    with without_denormals(), bench.progress() as progress:
+        task = progress.add_task("", total=(config.repeats + 2) * len(points))
+        for point, painter in zip(points, painters, strict=True):
+            progress.update(task, description=f"scoring {point.factor} {point.label}")
+            key = {"run": str(point.folder), "weights": digest(point.folder), **asdict(point.way)}
+            for name in ("split", "pictures", "data_root", "data_smpl", "channels_last"):
+                key[name] = config[name]
+            key["lpips"] = OmegaConf.to_container(config.lpips)
+            found.append(store.get(key, partial(quality, painter, frames, perceptual)))
+            progress.advance(task)
+        progress.update(task, description="timing")
+        samples = interleaved(
+            dict(enumerate(map(action, painters))),
+            config.repeats,
+            patience=config.patience,
+            device=bench.device,
+            tick=lambda: progress.advance(task),
+        )
+    return found, [samples[i] for i in range(len(points))]
+
+
 def quality(
     painter: Callable[[Frame], Tensor], frames: Sequence[Frame], perceptual: Score | None
 ) -> dict[str, Any]:
@@ -316,25 +337,6 @@ def quality(
         "left_out": sum(len(scores[name]) - len(finite[name]) for name in metrics),
         "memory_mb": memory,
     }
-
-
-def times(
-    painters: Sequence[Painter],
-    frames: Sequence[Frame],
-    repeats: int,
-    patience: float,
-    tick: Callable[[], None],
-) -> list[list[float]]:
-    """Milliseconds per frame of every painter, all in turn on the same frame."""
-
-    def action(painter: Painter) -> Callable[[], object]:
-        cycle = itertools.cycle(frames)
-        return lambda: painter(next(cycle))
-
-    actions = dict(enumerate(map(action, painters)))
-    device = frames[0].skeleton.device
-    samples = interleaved(actions, repeats, patience=patience, device=device, tick=tick)
-    return [samples[i] for i in range(len(painters))]
 
 
 def make_rows(
