@@ -117,6 +117,6 @@ def test_a_failed_training_is_one_sentence_with_its_last_line(tmp_path, monkeypa
         common.train(["size=tiny"], tmp_path / "runs" / "one")
 
 
-def test_training_is_a_process_of_its_own(tmp_path):
+def test_training_runs_in_another_process(tmp_path):
     assert common.launch(["size=nosuch"], tmp_path / "log") != 0
     assert "nosuch" in (tmp_path / "log").read_text()

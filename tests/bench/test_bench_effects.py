@@ -146,7 +146,7 @@ def test_wrong_keys_end_in_one_sentence(inside, override, message):
 
 @pytest.fixture
 def launched(monkeypatch):
-    """`gsgan.train` in this process: a process of its own takes seconds to start."""
+    """`gsgan.train` in this process: another process takes seconds to start."""
     started = []
 
     def launch(arguments, log):

@@ -114,10 +114,10 @@ def test_an_image_of_another_size_is_resized_to_its_own(small):
     _, avatar, frame = small
     full = Painter(avatar, Way())(frame)
     for scale in (0.5, 2.0):
-        picture = Painter(avatar, Way(scale=scale))(frame)
-        assert picture.shape == full.shape
-        assert picture.isfinite().all()
-        assert (picture - full).abs().mean() < 0.2
+        image = Painter(avatar, Way(scale=scale))(frame)
+        assert image.shape == full.shape
+        assert image.isfinite().all()
+        assert (image - full).abs().mean() < 0.2
 
 
 @pytest.mark.parametrize(

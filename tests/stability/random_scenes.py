@@ -45,7 +45,7 @@ def scenes(
     def rand(*shape: int) -> torch.Tensor:
         return torch.rand(1, n, *shape, generator=generator, dtype=torch.float64)
 
-    # Pixels over the picture and round it, depths from behind the camera to twice the distance.
+    # Pixels over the image and round it, depths from behind the camera to twice the distance.
     pixels = torch.tensor([size[1], size[0]]) * (2 * rand(2) - 0.5)
     depths = distance * (2.5 * rand(1) - 0.5)
     homogeneous = torch.cat([pixels, torch.ones_like(depths)], dim=-1)

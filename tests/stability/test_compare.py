@@ -130,7 +130,7 @@ def test_equal_infinities_are_right_and_others_are_not():
     assert other.value_error == math.inf
 
 
-def test_rounding_of_the_inputs_counts_only_where_asked():
+def test_rounding_of_the_inputs_counts_only_without_same_numbers():
     def far(inputs):
         return {"z": (inputs["x"] + 0.1).sin()}
 

@@ -84,7 +84,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def markdown(frame: pd.DataFrame) -> str:
-    """A Markdown table of a frame of text."""
+    """A Markdown table of a DataFrame of text."""
     return pages.markdown(list(frame.columns), frame.astype(str).to_numpy().tolist())
 
 
@@ -221,7 +221,7 @@ def code_digest() -> str:
 
 
 def train(overrides: Sequence[str], run: Path) -> None:
-    """`gsgan.train` in a process of its own: a finished run is left, an interrupted one resumed.
+    """`gsgan.train` in another process: a finished run is left as it is, an interrupted one resumed.
 
     Args:
         overrides: of its config.

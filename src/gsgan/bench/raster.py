@@ -134,8 +134,8 @@ def measure_cell(
             found, measure_times(config, gaussians, camera, found), strict=True
         )
     ]
-    wanted = extras(config, n, size)
-    if wanted["errors"]:
+    more = extras(config, n, size)
+    if more["errors"]:
         patches = choose_patches(gaussians, camera, config.windows, config.window, config.seed)
         exact = truth(gaussians, camera, patches, config.seed)
         settings = {setting for _, _, setting in found}
@@ -143,7 +143,7 @@ def measure_cell(
         for row, variant in zip(rows, found, strict=True):
             draw = partial(_draw, variant=variant)
             row |= errors(exact, gaussians, camera, bounds[variant[2]], draw)
-    if wanted["memory"]:
+    if more["memory"]:
         for row, variant in zip(rows, found, strict=True):
             if row["both_ms"] <= 1000 * config.patience:
                 action = partial(_draw_both, leaves(gaussians), camera, variant)

@@ -67,8 +67,8 @@ def run(config: DictConfig, folder: Path) -> None:
             )
         memory = painting_memory(painter, frames)
     settings = {"avatar": name, **settings_of(config, avatar, frames)}
-    told = text(times, memory, bench.where, settings, marks)
-    bench.console.print(told, markup=False, highlight=False)
+    page = text(times, memory, bench.where, settings, marks)
+    bench.console.print(page, markup=False, highlight=False)
     spreads = {name: dict(row) for name, row in times.iterrows()}
     total, rest = spreads.pop(TOTAL), spreads.pop(REST)
     record = {
@@ -77,7 +77,7 @@ def run(config: DictConfig, folder: Path) -> None:
         "times_ms": {"total": total, "stages": spreads, "rest": rest},
         "memory_mb": memory,
     }
-    bench.write("From skeleton to image", told, record, images={"speed.png": plot(times, settings)})
+    bench.write("From skeleton to image", page, record, images={"speed.png": plot(times, settings)})
 
 
 def load_subject(
