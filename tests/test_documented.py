@@ -16,15 +16,9 @@ REPORTS = ("ablation", "ablation_skeleton", "gan")  # blocks of docs/ablations.m
 SMALL_BENCH = {
     "raster": [
         *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "reference.gaussians=300"),
-        *("reference.size=32", "judge_at=[300]", "windows=1", "window=16", "dense=false"),
+        *("reference.size=32", "compare_at=[300]", "windows=1", "window=16"),
         "memory=false",
     ],
-    "rays": ["rays=[1]", "reference=4", "picture=16", "frames=1"],
-    "fit": [
-        *("size.picture=32", "data.source.frames=2", "data.source.rays_per_pixel=1"),
-        *("fit.shape_steps=2", "fit.sweeps=1", 'settings=["fit.sweeps=2"]'),
-    ],
-    "loader": ["data.size=32", "batches=2", "workers=[0,1]"],
     "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
     "trade-off": [
         "base=[" + ",".join(f"'{w}'" for w in [*TINY, "data.root=/path/to/capture"]) + "]",
@@ -196,7 +190,7 @@ def tiny_bench(arguments: list[str], tmp_path: Path, capture: Path) -> list[str]
             page = tmp_path / "page.md"
             shutil.copy(ROOT / argument.removeprefix("docs="), page)
             given.append(f"docs={page}")
-        elif argument.split("=")[0] not in {"repeats", "gaussians", "sizes", "dense", "size"}:
+        elif argument.split("=")[0] not in {"repeats", "gaussians", "sizes", "size"}:
             given.append(argument.strip("'"))
     small = (w.replace("/path/to/capture", str(capture)) for w in SMALL_BENCH.get(given[0], []))
     return [*given, *small]

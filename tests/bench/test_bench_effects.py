@@ -1,21 +1,20 @@
-"""`gsgan.bench effects`: decisions, runs that go on, figures off against on, an honest verdict."""
+"""`gsgan.bench effects`: decisions, runs, figures with the effect off and on, failures."""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import sys
 
 import pytest
-from hydra.utils import instantiate
 
-from gsgan.bench import effects, effects_case, effects_cost
-from gsgan.bench.effects_case import Row, Training
-from gsgan.bench.effects_report import Report, text, write, write_docs
-from gsgan.bench.environment import Environment
+from gsgan.bench import common, effects
+from gsgan.bench.effects import Row, failures, page, rows_of
 from gsgan.utils.errors import ConfigError, GsganError
 
-WHERE = Environment("cpu", "Abacus", 1, "2026-01-01", {}, None)
+WHERE = {"device": "cpu", "hardware": "Abacus", "threads": 1, "date": "", "load": None}
+WHERE |= {"versions": {}}
 OFF = [
     *("effects.view_dependence=off", "effects.distortion=off", "effects.antialias=off"),
     "effects.colour_correction=off",
@@ -39,30 +38,25 @@ def row(effect="antialias", called=True, auto=None, off=20.0, on=21.0, **more) -
     return Row(**(values | more))
 
 
-# ---------------------------------------------------------------- the report
+# ---------------------------------------------------------------- the table
 
 
 def test_the_table_shows_gain_cost_and_decision():
-    page = text(Report([row(marks=["a stand-in"])], WHERE))
-    line = next(x for x in page.splitlines() if x.startswith("| antialias"))
+    text = page([row(marks=["a stand-in"])], WHERE)
+    line = next(x for x in text.splitlines() if x.startswith("| antialias"))
     assert "on: scales differ" in line
     assert "+1.00 (20.00 → 21.00)" in line
     assert "+0.50 (19.00 → 19.50)" in line
     assert "30.00 → 31.50" in line
     assert "+72" in line
-    assert "Stand-in in use: a stand-in." in page
+    assert "Note: a stand-in." in text
 
 
-def test_what_was_not_trained_is_a_dash_and_no_failure(tmp_path):
-    bare = Row("distortion", "default person", False, False, "no lens", "novel_view")
-    report = Report([bare], WHERE)
-    assert report.failures == []
-    assert "| distortion | default person | off: no lens | – | – | novel_view | – | – | – |" in (
-        text(report)
-    )
-    write(report, tmp_path, {"repeats": 1})
-    record = json.loads((tmp_path / "effects.json").read_text())
-    assert record["rows"][0]["gain_db"] == {"full": None, "splat": None}
+def test_what_was_not_trained_is_a_dash_and_no_failure():
+    bare = Row("distortion", "default person", False, "novel_view", auto=False, why="no lens")
+    assert failures([bare]) == []
+    line = "| distortion | default person | off: no lens | – | – | novel_view | – | – | – |"
+    assert line in page([bare], WHERE)
 
 
 @pytest.mark.parametrize(
@@ -73,72 +67,58 @@ def test_what_was_not_trained_is_a_dash_and_no_failure(tmp_path):
         ([row(on=19.9)], "gains -0.10 dB although it is called for"),
     ],
 )
-def test_what_is_not_as_it_must_be_is_said(rows, complaint):
-    failures = Report(rows, WHERE).failures
-    assert len(failures) == 1
-    assert complaint in failures[0]
-    assert "(wrong)" in text(Report(rows, WHERE)) or "auto" not in complaint
+def test_a_wrong_decision_and_a_missing_gain_are_failures(rows, complaint):
+    (found,) = failures(rows)
+    assert complaint in found
+    assert "(wrong)" in page(rows, WHERE) or "auto" not in complaint
 
 
 def test_an_effect_need_not_gain_where_it_is_not_called_for():
-    assert Report([row(called=False, on=19.0)], WHERE).failures == []
-
-
-def test_the_block_of_a_page_is_rewritten(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text("before\n<!-- bench:effects -->old<!-- end -->\nafter")
-    write_docs(Report([row()], WHERE), page)
-    assert "old" not in page.read_text()
-    assert "| antialias |" in page.read_text()
-    assert page.read_text().endswith("after")
+    assert failures([row(called=False, on=19.0)]) == []
 
 
 # ---------------------------------------------------------------- what is run
 
 
 @pytest.fixture
-def bench(compose):
-    def build(*overrides):
-        return instantiate(compose("bench_effects", *overrides))
-
-    return build
+def rows(compose):
+    return lambda *overrides: list(rows_of(compose("bench_effects", *overrides)))
 
 
-def test_the_default_person_without_effects_is_trained_once(bench):
-    todo = list(effects.cells(bench()))
-    assert len(todo) == 9
-    names = [t.name for cell in todo for t in cell.runs.values()]
+def test_the_default_person_without_effects_is_trained_once(rows):
+    found = rows()
+    assert len(found) == 9
+    names = [name for row in found for name in row.runs]
     assert names.count("default-off") == 4
     assert len(set(names)) == 13
-    assert [c.row.effect for c in todo if not c.runs] == ["distortion"]
-    for cell in todo:
-        if cell.runs:
-            off, on = cell.runs["off"].overrides, cell.runs["on"].overrides
+    assert [row.effect for row in found if not row.runs] == ["distortion"]
+    for row in found:
+        if row.runs:
+            off, on = row.runs.values()
             assert on[: len(off)] == off
             assert len(on) == len(off) + 1
-            assert on[-1].startswith(f"effects.{cell.row.effect}=")
+            assert on[-1].startswith(f"effects.{row.effect}=")
 
 
-def test_only_some_and_not_on_the_default_person(bench):
-    todo = list(effects.cells(bench("only=[antialias]", "default=false")))
-    assert [(c.row.scene, list(c.runs)) for c in todo] == [
-        ("antialias", ["off", "on"]),
+def test_only_some_and_not_on_the_default_person(rows):
+    found = rows("only=[antialias]", "default=false")
+    assert [(row.scene, list(row.runs)) for row in found] == [
+        ("antialias", ["antialias-off", "antialias-on"]),
         ("default person", []),
     ]
 
 
-def test_without_training_only_auto_is_asked(bench, capture):
-    todo = list(effects.cells(bench("train=false", f"real={capture}")))
-    assert len(todo) == 10
-    assert not any(c.runs for c in todo)
+def test_without_training_only_the_decisions_are_found(rows, capture):
+    found = rows("train=false", f"real={capture}")
+    assert len(found) == 10
+    assert not any(row.runs for row in found)
 
 
-def test_the_real_capture_has_its_own_runs(bench, capture):
-    cell = list(effects.cells(bench("only=[antialias]", f"real={capture}")))[-1]
-    assert cell.row.scene == "real capture"
-    assert (cell.row.effect, cell.row.split) == ("colour_correction", "novel_pose")
-    assert {"data=capture", f"data.root='{capture}'"} <= set(cell.runs["off"].overrides)
-    assert cell.runs["on"].name == "real-capture-on"
+def test_the_real_capture_has_its_own_runs(rows, capture):
+    row = rows("only=[antialias]", f"real={capture}")[-1]
+    assert row.scene == "real capture"
+    assert (row.effect, row.split) == ("colour_correction", "novel_pose")
+    assert {"data=capture", f"data.root='{capture}'"} <= set(row.runs["real-capture-off"])
 
 
 @pytest.mark.parametrize(
@@ -154,7 +134,7 @@ def test_the_real_capture_has_its_own_runs(bench, capture):
         ("cases.antialias.split=train", "split must be one of"),
     ],
 )
-def test_senseless_keys_end_in_one_sentence(inside, override, message):
+def test_wrong_keys_end_in_one_sentence(inside, override, message):
     result = inside("bench", "effects", override)
     assert result.returncode == 1
     assert message in " ".join(result.stderr.split())
@@ -166,7 +146,7 @@ def test_senseless_keys_end_in_one_sentence(inside, override, message):
 
 @pytest.fixture
 def launched(monkeypatch):
-    """`gsgan.train` in this process: a process of its own takes seconds to start."""
+    """`gsgan.train` in this process: another process takes seconds to start."""
     started = []
 
     def launch(arguments, log):
@@ -176,26 +156,13 @@ def launched(monkeypatch):
         monkeypatch.setattr(sys, "argv", ["gsgan.train", *arguments])
         with log.open("w") as stream, contextlib.redirect_stderr(stream):
             try:
-                gsgan.train.main()
+                gsgan.train.__main__.main()
             except SystemExit as end:
                 return int(end.code or 0)
         return 0
 
-    monkeypatch.setattr(effects_case, "launch", launch)
+    monkeypatch.setattr(common, "launch", launch)
     return started
-
-
-def test_a_failed_run_is_one_sentence_with_what_it_said(launched, tmp_path):
-    training = Training("one", ("data=capture", "data.root=/nowhere"))
-    with pytest.raises(GsganError, match=r"training one failed: .*nowhere") as caught:
-        effects_case.train(training, tmp_path, fresh=False)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_process_of_its_own_trains_too(tmp_path):
-    """The launcher itself, on a run that fails before torch has anything to do."""
-    assert effects_case.launch(["size=nosuch"], tmp_path / "log") != 0
-    assert "nosuch" in (tmp_path / "log").read_text()
 
 
 def test_compose_leaves_the_outer_command_its_hydra():
@@ -207,50 +174,70 @@ def test_compose_leaves_the_outer_command_its_hydra():
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         before = GlobalHydra.instance().hydra
         assert before is not None
-        assert effects_case.compose(["size=tiny"]).size.picture == 32
+        assert effects.compose(["size=tiny"]).size.picture == 32
         assert GlobalHydra.instance().hydra is before
         with pytest.raises(ConfigError, match="nosuch"):
-            effects_case.compose(["size=nosuch"])
+            effects.compose(["size=nosuch"])
         assert GlobalHydra.instance().hydra is before
 
 
-def test_frames_for_timing_are_spread():
-    assert effects_cost.spread(10, 2) == [2, 7]
-    assert effects_cost.spread(3, 8) == [0, 1, 2]
-
-
-def test_the_whole_bench_in_miniature(launched, compose, tmp_path, monkeypatch):
-    """One effect trained in its scene; the second time nothing is trained again."""
+@pytest.fixture
+def small(compose, tmp_path, monkeypatch):
+    """The config of one effect in a tiny scene."""
     monkeypatch.setenv("GSGAN_CACHE", str(tmp_path / "cache"))
     base = ",".join(f"'{x}'" for x in [*SCENE, *OFF])
-    page, out = tmp_path / "page.md", tmp_path / "out"
+    page = tmp_path / "page.md"
     page.write_text("<!-- bench:effects --><!-- end -->")
     overrides = (
         *(f"base=[{base}]", "only=[colour_correction]", "frames=1", "repeats=2"),
         *(f"docs={page}", "threads=1", "default=false"),
     )
-    config = compose("bench_effects", *overrides)
+    return compose("bench_effects", *overrides)
 
-    said = ""
+
+def test_runs_are_scored_timed_and_written(run, small, tmp_path, monkeypatch):
+    """The same finished run stands in for the training without the effect and with it."""
+
+    def launch(arguments, log):
+        shutil.copytree(run, log.with_suffix(""))
+        return 0
+
+    monkeypatch.setattr(common, "launch", launch)
+    with pytest.raises(GsganError, match=r"gains \+0\.00 dB although it is called for"):
+        effects.run(small, tmp_path / "out")
+    rows = json.loads((tmp_path / "out" / "effects.json").read_text())["rows"]
+    found = {row["scene"]: row for row in rows}
+    assert found["default person"]["scores"] == {}
+    one = found["colour_correction"]
+    assert set(one["scores"]) == set(one["paint_ms"]) == set(one["read_ms"]) == {"off", "on"}
+    assert all(ms > 0 for ms in (*one["paint_ms"].values(), *one["read_ms"].values()))
+    assert one["marks"]
+    assert "| colour_correction |" in (tmp_path / "page.md").read_text()
+
+
+@pytest.mark.slow
+def test_the_whole_bench_in_miniature(launched, small, tmp_path):
+    """One effect trained in its scene; the second time nothing is trained again."""
+    config, page, out = small, tmp_path / "page.md", tmp_path / "out"
+    message = ""
     try:
         effects.run(config, out)
     except GsganError as error:
-        said = str(error)
+        message = str(error)
     record = json.loads((out / "effects.json").read_text())
-    assert said == "; ".join(record["failures"])
+    assert message == "; ".join(record["failures"])
     found = {r["scene"]: r for r in record["rows"]}
     assert found["default person"]["auto"] is False
+    assert found["default person"]["scores"] == {}
     one = found["colour_correction"]
     assert set(one["scores"]) == set(one["paint_ms"]) == set(one["read_ms"]) == {"off", "on"}
     assert all(ms > 0 for ms in (*one["paint_ms"].values(), *one["read_ms"].values()))
     assert one["parameters"]["on"] > one["parameters"]["off"]
     assert one["marks"]
     assert "| colour_correction |" in page.read_text()
-    assert found["default person"]["scores"] == {}
     assert len(launched) == 2
     checkpoint = out / "runs" / "colour_correction-on" / "checkpoints" / "last.ckpt"
     before = checkpoint.stat().st_mtime_ns
-    cell = next(effects.cells(instantiate(config)))
-    again = effects_case.train(cell.runs["on"], out / "runs", fresh=False)
-    assert effects_case.scores_of(again, one["split"]) == one["scores"]["on"]
+    name, words = list(next(rows_of(config)).runs.items())[1]
+    common.train([*words, "resume=true"], out / "runs" / name)
     assert checkpoint.stat().st_mtime_ns == before

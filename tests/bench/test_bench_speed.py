@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 
+import pandas as pd
 import pytest
 import torch
 from commands import refused
 
-from gsgan.bench.speed_painter import Painter, Way, painting_memory
-from gsgan.bench.speed_report import Report, picture
-from gsgan.bench.speed_stages import Spread, StageClock, Times, measure
-from gsgan.bench.speed_subject import spread
+from gsgan.bench.common import environment
+from gsgan.bench.painter import Painter, Way, evenly, painting_memory, spread
+from gsgan.bench.speed import StageClock, deciles, measure, plot, text
 from gsgan.model.avatar import UNWATCHED, unwatched
 from gsgan.splat import accuracy
 from gsgan.utils.errors import ConfigError
@@ -30,9 +30,9 @@ def small(build):
     return data, avatar.eval(), frame
 
 
-def test_spread_is_median_and_deciles():
-    assert Spread.of([float(i) for i in range(11)]) == Spread(5.0, 1.0, 9.0)
-    assert Spread.of([7.0]) == Spread(7.0, 7.0, 7.0)
+def test_the_median_and_deciles():
+    assert deciles(range(11)) == {"median": 5.0, "p10": 1.0, "p90": 9.0}
+    assert deciles([7.0]) == {"median": 7.0, "p10": 7.0, "p90": 7.0}
 
 
 def test_every_stage_is_timed_and_the_avatar_is_left_unwatched(small):
@@ -40,9 +40,11 @@ def test_every_stage_is_timed_and_the_avatar_is_left_unwatched(small):
     ticks = []
     painter = Painter(avatar, Way())
     times = measure(painter, [frame], count=3, warmup=2, tick=lambda: ticks.append(1))
-    assert list(times.stages) == ALL
+    assert list(times.index) == [*ALL, "between stages", "end to end"]
     assert len(ticks) == 5
-    assert all(0 < s.p10 <= s.median <= s.p90 for s in times.stages.values())
+    stages = times.loc[ALL]
+    assert (stages.p10 > 0).all()
+    assert ((stages.p10 <= stages["median"]) & (stages["median"] <= stages.p90)).all()
     assert avatar.stage is unwatched
     assert avatar.stage("F") is UNWATCHED
 
@@ -71,7 +73,7 @@ def test_a_stage_that_fails_leaves_the_avatar_unwatched(small):
 def test_what_a_model_lacks_has_no_stage(build, model, absent, there):
     few = ["model.surface.points=100"] if model == "lbs_splat" else []
     _, avatar, frame = build(f"model={model}", *few)
-    stages = set(measure(Painter(avatar.eval(), Way()), [frame], count=1, warmup=0).stages)
+    stages = set(measure(Painter(avatar.eval(), Way()), [frame], count=1, warmup=0).index)
     assert there <= stages
     assert not absent & stages
 
@@ -101,21 +103,21 @@ def test_ways_of_painting_do_not_reach_each_other(small):
     assert after == before
 
 
-def test_precision_reaches_the_networks_and_not_the_picture_type(small):
+def test_precision_reaches_the_networks_and_not_the_image_type(small):
     _, avatar, frame = small
     full, half = Painter(avatar, Way())(frame), Painter(avatar, Way(precision="bf16-mixed"))(frame)
     assert half.dtype == full.dtype == torch.float32
     assert 0 < (half - full).abs().max() < 0.1
 
 
-def test_a_picture_of_another_size_comes_back_in_its_own(small):
+def test_an_image_of_another_size_is_resized_to_its_own(small):
     _, avatar, frame = small
     full = Painter(avatar, Way())(frame)
     for scale in (0.5, 2.0):
-        picture = Painter(avatar, Way(scale=scale))(frame)
-        assert picture.shape == full.shape
-        assert picture.isfinite().all()
-        assert (picture - full).abs().mean() < 0.2
+        image = Painter(avatar, Way(scale=scale))(frame)
+        assert image.shape == full.shape
+        assert image.isfinite().all()
+        assert (image - full).abs().mean() < 0.2
 
 
 @pytest.mark.parametrize(
@@ -131,13 +133,14 @@ def test_a_way_that_makes_no_sense_is_refused(wrong, word):
         Way(**wrong)
 
 
+@pytest.mark.slow
 def test_memory_of_painting_is_of_the_right_size(small):
     """Dense float64 blending holds Gaussians times pixels: more than tiles do."""
     _, avatar, frame = small
     tiles = painting_memory(Painter(avatar, Way()), [frame])
     dense = painting_memory(Painter(avatar, Way(accuracy=accuracy("exact"))), [frame])
     if tiles is None or dense is None:
-        pytest.skip("this system does not tell the peak of memory")
+        pytest.skip("this system does not report a peak of memory")
     gaussians = avatar.densify.n_points
     assert dense > 4e-6 * 8 * gaussians
     assert dense > tiles
@@ -152,19 +155,25 @@ def test_the_frames_are_spread_over_a_split(small):
         spread(data, 2, "novel_view")
 
 
-def test_the_report_adds_up_and_draws(tmp_path):
-    from gsgan.bench.environment import environment
+def test_frames_are_spread_evenly():
+    assert evenly(10, 2) == [2, 7]
+    assert evenly(3, 8) == [0, 1, 2]
 
-    times = Times(
-        Spread(10, 9, 12), {"F": Spread(6, 5, 7), "UNet": Spread(3, 2, 4)}, Spread(1, 1, 1)
-    )
+
+def test_the_table_adds_up_and_the_plot_is_drawn():
+    rows = {
+        "F": (6, 5, 7),
+        "UNet": (3, 2, 4),
+        "between stages": (1, 1, 1),
+        "end to end": (10, 9, 12),
+    }
+    times = pd.DataFrame(rows, index=["median", "p10", "p90"]).T
     settings = {"avatar": "untrained avatar", "picture": "512 x 512"}
-    report = Report(times, None, environment(torch.device("cpu")), settings, ("untrained weights",))
-    text = report.text()
-    assert "| F | 6.00 | 5.00 | 7.00 | 60% |" in text
-    assert "| **end to end** | 10.0 | 9.00 | 12.0 | 100.0 frames/s |" in text
-    assert "- untrained weights" in text
-    assert picture(report).startswith(b"\x89PNG")
+    page = text(times, None, environment(torch.device("cpu")), settings, ["untrained weights"])
+    assert "| F | 6.00 | 5.00 | 7.00 | 60% |" in page
+    assert "| **end to end** | 10.0 | 9.00 | 12.0 | 100.0 frames/s |" in page
+    assert "- untrained weights" in page
+    assert plot(times, settings).startswith(b"\x89PNG")
 
 
 def test_the_command_times_a_run_and_fills_the_page(run, tmp_path, inside):

@@ -17,7 +17,7 @@ import pytest
 import torch
 from splat_scenes import camera, cloud, error, gradients, join, leaves, loss, one, with_covariances
 
-from gsgan.bench.cases.raster import drawing_backends
+from gsgan.bench.cases.case import drawing_backends
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat import ACCURACY, gsplat_backend, rasterise, resolve_backend
 

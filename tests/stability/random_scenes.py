@@ -17,7 +17,7 @@ def scenes(
     log_scale: tuple[float, float] = (-6.0, 3.0),
     log_ratio: tuple[float, float] = (0.05, 4.0),
 ) -> tuple[Inputs, Size]:
-    """Gaussians in front of, beside and behind a camera anywhere, and the picture's size.
+    """Gaussians in front of, beside and behind a camera anywhere, and the image's size.
 
     Args:
         draw: hypothesis'.
@@ -45,7 +45,7 @@ def scenes(
     def rand(*shape: int) -> torch.Tensor:
         return torch.rand(1, n, *shape, generator=generator, dtype=torch.float64)
 
-    # Pixels over the picture and round it, depths from behind the camera to twice the distance.
+    # Pixels over the image and round it, depths from behind the camera to twice the distance.
     pixels = torch.tensor([size[1], size[0]]) * (2 * rand(2) - 0.5)
     depths = distance * (2.5 * rand(1) - 0.5)
     homogeneous = torch.cat([pixels, torch.ones_like(depths)], dim=-1)

@@ -9,19 +9,18 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gsgan.bench.cases.case import Inputs, Tolerance
+from gsgan.bench.cases.case import Inputs, Tolerance, drawing_backends
 from gsgan.bench.cases.raster import (
-    drawing_backends,
-    picture,
     raster_case,
     records,
+    render,
     rotation,
     uncut,
 )
 from gsgan.splat import ACCURACY, Accuracy, project, rasterise
 from gsgan.splat.project import rotations
 from gsgan.splat.reference import error_bound
-from stability.judged import assert_as_expected
+from stability.compared import assert_as_expected
 from stability.random_scenes import scenes
 
 torch.set_num_threads(1)
@@ -31,7 +30,7 @@ HIGH = ACCURACY["high"]
 UNCUT = uncut(HIGH)
 
 search = settings(
-    max_examples=25,
+    max_examples=10,
     deadline=None,
     derandomize=True,
     database=None,
@@ -41,7 +40,7 @@ every_backend = pytest.mark.parametrize("backend", BACKENDS)
 
 
 def draw(scene: Inputs, size: tuple[int, int], backend: str, accuracy: Accuracy = HIGH):
-    return picture(scene, backend, size=size, settings=accuracy)
+    return render(scene, backend, size=size, settings=accuracy)
 
 
 def weighted(outputs):
@@ -54,7 +53,7 @@ def weighted(outputs):
 
 
 def draw_with_gradients(scene, size, backend, accuracy=HIGH):
-    """The picture, and gradients by input of a random weighting of it."""
+    """The image, and gradients by input of a random weighting of it."""
     leaves = {k: v.clone().requires_grad_() for k, v in scene.items()}
     outputs = draw(leaves, size, backend, accuracy)
     weighted(outputs).backward()
@@ -96,7 +95,7 @@ def test_values_and_gradients_are_right(backend, accuracy, drawn):
     scene = {**scene, "opacities": scene["opacities"].clamp(max=0.99)}
     # An alpha that rounding takes across alpha_min shows where a gradient is all but 0.
     case = raster_case(
-        *("random", lambda: scene),
+        *("random", "scenes", lambda: scene),
         size=size,
         settings=accuracy,
         tolerance=Tolerance(2e-5, 3e-3),
@@ -169,7 +168,7 @@ def test_opacity_0_adds_nothing_and_its_gradient_is_what_it_would_add(backend, d
     clear, gradients = draw_with_gradients(with_opacity(0.0), size, backend, UNCUT)
     for name, value in draw(without, size, backend, UNCUT).items():
         assert_same(clear[name], value, 1e-10, name)
-    # A picture is linear in one opacity.
+    # An image is linear in one opacity.
     half = draw(with_opacity(0.5), size, backend, UNCUT)
     slope = (weighted(half) - weighted(clear)) / 0.5
     assert_same(gradients["opacities"][:, n], slope.detach(), 1e-9)
@@ -178,7 +177,7 @@ def test_opacity_0_adds_nothing_and_its_gradient_is_what_it_would_add(backend, d
 @every_backend
 @search
 @given(scenes(), st.floats(-5, 5), st.floats(-5, 5))
-def test_the_picture_is_linear_in_the_features(backend, drawn, a, b):
+def test_the_image_is_linear_in_the_features(backend, drawn, a, b):
     scene, size = drawn
     others = scene["features"].flip(-1)
     first, second, mixed = (

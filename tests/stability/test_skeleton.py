@@ -1,4 +1,4 @@
-"""Hard skeletons: right against float64, no jump where none is forced, and motions that commute."""
+"""Hard skeletons: no jump of a frame where none is forced, and motions that commute."""
 
 from __future__ import annotations
 
@@ -7,50 +7,76 @@ import torch
 from hypothesis import given, settings
 from torch import Tensor
 
-from gsgan.bench.cases.crossings import CROSSINGS, Crossing
-from gsgan.bench.cases.skeleton import SKELETON, few_points
+from gsgan.bench.cases.crossings import CROSSINGS, poses
+from gsgan.bench.cases.skeleton import few_points
 from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames, omega
-from gsgan.skeleton.frames import BoneFrames
-from stability.judged import assert_as_expected, each
+from gsgan.skeleton.frames import MIN_LENGTH, BoneFrames
 from stability.motions import ANGLES, METRES, assert_rotation, rigid, skeletons
 
 CPU = torch.device("cpu")
 TWISTS = ("none", "hinge")
-property_test = settings(max_examples=25, deadline=None, derandomize=True)
 
+FADED = 20.0 * 1e-3 / MIN_LENGTH
+"""Frobenius norm of a frame's change over ``step / min_length``, where a baseline fades to its
+stand-in: between the two, ``s u + (1 - s²) f``, a direction turns at a rate of at most 3 over a
+length that stays above 0.4 on these paths, its stand-in may turn too; a frame changes by √2 of
+that, and a limb that swings from it by up to twice as much."""
 
-@each(SKELETON)
-def test_float32(case, backend):
-    assert_as_expected(case, backend)
+SWUNG = 8.0
+"""The same over an angle: a half turn doubles it, in the Frobenius norm it counts √2, and a hand
+swings from a forearm that swings from an arm."""
+
+# By crossing: a bound on how fast any frame turns, in Frobenius norm per unit of the path, and how
+# often a frame may turn at once all the same, because no continuous choice exists.
+BOUNDS = {
+    "a bone through zero length": (3 * FADED, 0),
+    "an arm through straight": (0.1 * SWUNG, 0),
+    "a forearm past its fold, two degrees beside": (0.1 / 0.035 * SWUNG, 0),
+    "a forearm through its fold": (0.1 * SWUNG, 2),
+    "an elbow bent against its hinge": (0.2 * SWUNG, 2),
+    "shoulders through the spine's direction": (2 * FADED, 0),
+    "shoulders through the spine's direction, against the hips": (2 * FADED, 2),
+    "left and right changing places": (2 * FADED, 0),
+    "hips through the shoulders": (4 * FADED, 0),
+    "a nose through the ears' line": (4 * FADED, 0),
+    "ears through each other": (4 * FADED, 0),
+    "shoulders round to the back of the hips": (0.2 * SWUNG, 2),
+}
+property_test = settings(max_examples=12, deadline=None, derandomize=True)
 
 
 def all_frames(frames: BoneFrames) -> Tensor:
     return torch.cat([frames.hubs, frames.limbs, frames.local, frames.torso[:, None]], dim=1)
 
 
-def turns(crossing: Crossing, steps: int, twist: str) -> Tensor:
+def along(crossing: str, steps: int) -> Tensor:
+    return poses(CROSSINGS[crossing][0], steps)
+
+
+def turns(crossing: str, steps: int, twist: str) -> Tensor:
     """How far the frame that turns most goes at each step, in Frobenius norm."""
-    frames = all_frames(bone_frames(crossing.poses(steps), twist=twist))
+    frames = all_frames(bone_frames(along(crossing, steps), twist=twist))
     return (frames[1:] - frames[:-1]).flatten(2).norm(dim=-1).amax(dim=1)
 
 
 @pytest.mark.parametrize("twist", TWISTS)
-@pytest.mark.parametrize("crossing", CROSSINGS, ids=lambda c: c.name)
+@pytest.mark.parametrize("crossing", CROSSINGS)
 def test_frames_turn_by_bounded_steps_through_a_singularity(crossing, twist):
     """Ten times finer steps turn ten times less: no jump, but for the ones that are forced."""
+    rate, jumps = BOUNDS[crossing]
     for steps in (400, 4000):
         step = 2 / (steps - 1)
-        over = turns(crossing, steps, twist) > crossing.rate * step
+        over = turns(crossing, steps, twist) > rate * step
         # a step of a coarse path is counted as a jump only where it is one
-        assert int(over.sum()) <= crossing.jumps
+        assert int(over.sum()) <= jumps
 
 
-@pytest.mark.parametrize("crossing", [c for c in CROSSINGS if c.jumps], ids=lambda c: c.name)
+@pytest.mark.parametrize("crossing", [name for name, (_, jumps) in BOUNDS.items() if jumps])
 def test_forced_jumps_are_there_and_keep_the_bones_directions(crossing):
     """What the note says: some frame jumps, by at most half a turn, and no bone leaves its line."""
     largest = max(float(turns(crossing, 4000, twist).max()) for twist in TWISTS)
     assert 1 < largest <= 8**0.5 + 1e-9  # half a turn is √8
-    p = crossing.poses(401)
+    p = along(crossing, 401)
     start, end = (list(ends) for ends in zip(*MEDIAPIPE33.limbs, strict=True))
     bones = torch.nn.functional.normalize(p[:, end] - p[:, start], dim=-1)
     rest = torch.tensor(MEDIAPIPE33.rest_directions, dtype=torch.float64)
@@ -60,8 +86,7 @@ def test_forced_jumps_are_there_and_keep_the_bones_directions(crossing):
 
 def test_a_fold_jumps_on_a_hair_only():
     """0.8 degrees off the fold the roll is continuous; within it, it is fixed."""
-    (fold,) = (c for c in CROSSINGS if c.name == "a forearm through its fold")
-    over = (turns(fold, 4000, "none") > 1).nonzero().flatten()
+    over = (turns("a forearm through its fold", 4000, "none") > 1).nonzero().flatten()
     angle = 0.1 * (2 * over / 3999 - 1).abs()
     assert len(over) == 2
     torch.testing.assert_close(angle, torch.full_like(angle, 0.01414), atol=1e-4, rtol=0)
@@ -120,7 +145,8 @@ def test_a_mirrored_skeleton_has_mirrored_frames(p):
 @pytest.mark.parametrize("twist", TWISTS)
 def test_gradcheck_below_the_least_length(twist):
     """Where baselines fade into their stand-ins the slope is the function's own."""
-    p = torch.cat([c.poses(7)[[2, 4]] for c in CROSSINGS if not c.jumps]).requires_grad_()
+    smooth = [name for name, (_, jumps) in BOUNDS.items() if not jumps]
+    p = torch.cat([along(name, 7)[[2, 4]] for name in smooth]).requires_grad_()
 
     def values(p: Tensor) -> tuple[Tensor, ...]:
         frames = bone_frames(p, twist=twist)

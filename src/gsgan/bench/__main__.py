@@ -1,4 +1,4 @@
-"""``python -m gsgan.bench <subject> [key=value]``: measure what things cost."""
+"""``python -m gsgan.bench <subject> [key=value]``: measure time, error and quality."""
 
 from __future__ import annotations
 
@@ -16,11 +16,8 @@ from gsgan.utils.config import FAILED, entry
 # both with _ for the subject's -.
 SUBJECTS = {
     "raster": "time against error of every backend and accuracy setting of the rasteriser",
-    "stability": "the float32 error of every hard case",
-    "rays": "what anti-aliasing of the default person costs, and the noise without it",
-    "fit": "how much noise in the landmarks their fit to the masks takes away",
-    "loader": "training pictures a second from disk",
-    "speed": "milliseconds from skeleton to picture, by stage",
+    "stability": "the float32 error of every numerically hard case",
+    "speed": "milliseconds from skeleton to image, by stage",
     "trade-off": "quality against time and memory, over settings and small trainings",
     "effects": "what each effect gains where it is called for, and costs (trains for an hour)",
 }
@@ -35,30 +32,25 @@ def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     return None, list(arguments)
 
 
-def subjects() -> str:
-    """One line a subject."""
-    lines = [f"  {name:<10} {what}" for name, what in SUBJECTS.items()]
-    return "\n".join(["python -m gsgan.bench <subject> [key=value], subjects:", *lines])
-
-
 def module_name(subject: str) -> str:
     """Of its module, and after ``bench_`` of its config."""
     return subject.replace("-", "_")
 
 
 def main() -> None:
-    """Hands the command line, less the subject, to Hydra."""
+    """Passes the command line, less the subject, to Hydra."""
     subject, rest = split(sys.argv[1:])
     if subject is None and any(word in HELP for word in rest):
-        print(subjects())
+        print("python -m gsgan.bench <subject> [key=value], subjects:")
+        for name, what in SUBJECTS.items():
+            print(f"  {name:<10} {what}")
         print("Each answers --help with its whole config.")
         return
     if subject not in SUBJECTS:
-        known = ", ".join(SUBJECTS)
-        came = "nothing was given" if subject is None else f"{subject!r} is none"
-        sentence = f"gsgan: the first word must be a subject ({known}); {came}"
+        given = "nothing was given" if subject is None else f"{subject!r} is not one"
+        message = f"gsgan: the first word must be a subject ({', '.join(SUBJECTS)}); {given}"
         Console(stderr=True, soft_wrap=True).print(
-            sentence, style="bold red", markup=False, highlight=False
+            message, style="bold red", markup=False, highlight=False
         )
         sys.exit(FAILED)
     sys.argv = [sys.argv[0], *rest]

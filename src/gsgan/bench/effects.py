@@ -2,212 +2,269 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, fields
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
+import pandas as pd
 import torch
-from omegaconf import DictConfig
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
 
-from gsgan.bench import effects_report
-from gsgan.bench.effects_case import (
-    Case,
-    Row,
-    Training,
-    decide,
-    marks_of,
-    scores_of,
-    train,
-)
-from gsgan.bench.effects_cost import measure
-from gsgan.bench.environment import environment
-from gsgan.bench.tables import check_block
-from gsgan.utils.console import make_console
+from gsgan.bench import common
+from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, sentence
+from gsgan.bench.painter import evenly
+from gsgan.effects import decide as decide_effects
+from gsgan.train.runs import build_data, load_avatar, load_config
+from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, GsganError
+from gsgan.utils.timing import interleaved, median
 
 DEFAULT, REAL = "default person", "real capture"
-STATES = ("off", "on")
-
-
-@dataclass(frozen=True)
-class EffectsBench:
-    """What is measured; each key of conf/bench_effects.yaml is one argument.
-
-    Args:
-        base: overrides of `gsgan.train` that all runs share; the effects in question are off.
-        budget: factor on the iterations, which ``base`` passes on.
-        cases: by effect, the scene that calls for it.
-        only: effects to look at; None: all.
-        train: train at all; without, only what `auto` decides is found out.
-        default: train with each effect on the default person too, where it should gain nothing.
-        real: folder of a real capture for ``real_effect``; None leaves it out.
-        real_base: further overrides for it.
-        real_effect: the effect that it calls for.
-        real_split: held-out pictures of it that are scored.
-        frames: held-out pictures painted in each round of timing.
-        repeats: rounds of timing, off and on in turn.
-        threads: of torch while timing; None: torch's choice.
-        fresh: train again what the output folder holds.
-        docs: a Markdown page whose ``bench:effects`` block is rewritten; None: none.
-
-    Raises:
-        ConfigError: naming the key that makes no sense.
-    """
-
-    base: list[str]
-    budget: float
-    cases: dict[str, Case]
-    only: list[str] | None
-    train: bool
-    default: bool
-    real: str | None
-    real_base: list[str]
-    real_effect: str
-    real_split: str
-    frames: int
-    repeats: int
-    threads: int | None = None
-    fresh: bool = False
-    docs: str | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("frames", "repeats", "threads"):
-            value = getattr(self, name)
-            if name == "threads" and value is None:
-                continue
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ConfigError(f"{name} must be a whole number of at least 1, got {value!r}")
-        unknown = sorted(set(self.only or ()) - set(self.cases))
-        if unknown or isinstance(self.only, str) or self.only == []:
-            given = self.only if isinstance(self.only, str) else ", ".join(unknown)
-            raise ConfigError(f"only must list some of {', '.join(self.cases)}; got {given!r}")
-        if self.real_effect not in self.cases:
-            raise ConfigError(
-                f"real_effect must be one of {', '.join(self.cases)}, got {self.real_effect!r}"
-            )
-        if self.real is not None and not Path(self.real).expanduser().is_dir():
-            raise ConfigError(f"real={self.real}: no such folder; give a capture's, or real=null")
-
-    def settings(self) -> dict[str, object]:
-        """The keys that a report tells."""
-        told = (
-            "base",
-            "budget",
-            "only",
-            "train",
-            "default",
-            "real_base",
-            "frames",
-            "repeats",
-        )
-        return {f.name: getattr(self, f.name) for f in fields(self) if f.name in told}
+SPLITS = ("novel_view", "novel_pose")
+SHOWN = ("full", "splat")  # the final image, Step I's colour
+SCORE = "psnr_person"
+SETTINGS = ("base", "budget", "only", "train", "default", "real_base", "frames", "repeats")
 
 
 @dataclass
-class Cell:
-    """One row to be, with the runs that it takes.
+class Row:
+    """One effect in one scene.
 
     Args:
-        row: what is known before anything is trained.
-        scene: overrides that make the scene.
-        runs: "off" and "on"; empty where nothing is trained.
+        effect: its name in the config.
+        scene: whose images were trained on.
+        called: whether the scene calls for it.
+        split: whose images were scored.
+        overrides: of `gsgan.train` that make the scene.
+        runs: overrides by the name of the run, "off" first, then "on"; empty if nothing is trained.
+        auto, why: whether `auto` turned it on, and its reason.
+        scores: ``{"off" or "on": {"full" or "splat": dB in the person's box}}``.
+        paint_ms, read_ms, parameters: by "off" and "on"; medians per frame.
+        marks: notes that the table must carry.
     """
 
-    row: Row
-    scene: list[str]
-    runs: dict[str, Training]
+    effect: str
+    scene: str
+    called: bool
+    split: str
+    overrides: list[str] = field(default_factory=list)
+    runs: dict[str, list[str]] = field(default_factory=dict)
+    auto: bool | None = None
+    why: str = ""
+    scores: dict[str, dict[str, float]] = field(default_factory=dict)
+    paint_ms: dict[str, float] = field(default_factory=dict)
+    read_ms: dict[str, float] = field(default_factory=dict)
+    parameters: dict[str, int] = field(default_factory=dict)
+    marks: list[str] = field(default_factory=list)
 
-
-def cells(bench: EffectsBench) -> Iterator[Cell]:
-    """Each effect in the scene that calls for it, in the default one, and in the real capture."""
-    plain = Training("default-off", tuple(bench.base))
-    for effect in bench.only or list(bench.cases):
-        case = bench.cases[effect]
-        on = f"effects.{effect}={case.word}"
-        called = not case.scene  # by the default person
-        if not called:
-            yield _cell(bench, Row(effect, effect, True, None, "", case.split), case.scene, on)
-        row = Row(effect, DEFAULT, called, None, "", case.split)
-        runs = {"off": plain, "on": Training(f"default-{effect}", (*bench.base, on))}
-        wanted = called or (bench.default and case.elsewhere)
-        yield Cell(row, [], runs if bench.train and wanted else {})
-    if bench.real is not None:
-        effect = bench.real_effect
-        root = Path(bench.real).expanduser().resolve()
-        scene = ["data=capture", f"data.root='{root}'", *bench.real_base]
-        on = f"effects.{effect}={bench.cases[effect].word}"
-        yield _cell(bench, Row(effect, REAL, True, None, "", bench.real_split), scene, on)
-
-
-def _cell(bench: EffectsBench, row: Row, scene: list[str], on: str) -> Cell:
-    name = f"{row.scene.replace(' ', '-')}-{{}}"
-    off = (*bench.base, *scene)
-    runs = {"off": Training(name.format("off"), off), "on": Training(name.format("on"), (*off, on))}
-    return Cell(row, scene, runs if bench.train else {})
+    def gain(self, variant: str) -> float | None:
+        """dB that the effect adds; None where either was not scored."""
+        on, off = (self.scores.get(state, {}).get(variant) for state in ("on", "off"))
+        return None if on is None or off is None else on - off
 
 
 def run(config: DictConfig, folder: Path) -> None:
-    """Decides, trains what is not trained yet, times, writes tables, prints the verdict.
+    """Decides, trains what is not trained yet, times, writes tables.
 
     Args:
         config: as conf/bench_effects.yaml.
         folder: where everything goes; runs lie under ``runs/``.
 
     Raises:
+        ConfigError: naming the key of a wrong value.
         GsganError: when a run fails; after all is written, when `auto` decided wrongly or an
             effect that was called for gained nothing.
     """
-    from hydra.utils import instantiate
-
-    bench: EffectsBench = instantiate(config)
-    if bench.docs is not None:
-        check_block(Path(bench.docs), "effects")  # now, not after training for an hour
-    if bench.threads is not None:
-        torch.set_num_threads(bench.threads)
-    console, where = make_console(), environment(torch.device("cpu"))
-    console.print(where.sentence(), highlight=False)
-    todo = list(cells(bench))
-    try:
-        work(bench, todo, folder / "runs", console)
-    except KeyboardInterrupt:
-        console.print(f"the same command goes on with {folder}", soft_wrap=True, markup=False)
-        raise
-    report = effects_report.Report([cell.row for cell in todo], where)
-    effects_report.write(report, folder, bench.settings())
-    effects_report.show(report, console)
-    if bench.docs is not None:
-        effects_report.write_docs(report, Path(bench.docs))
-    console.print(f"tables, runs and raw numbers: {folder}", markup=False, highlight=False)
-    if report.failures:
-        raise GsganError("; ".join(report.failures))
-
-
-def work(bench: EffectsBench, todo: list[Cell], runs: Path, console: Console) -> None:
-    """Fills the rows."""
-    trainings = list({t.name: t for cell in todo for t in cell.runs.values()}.values())
-    scenes = list(dict.fromkeys(tuple(cell.scene) for cell in todo))
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
+    check(config)
+    bench = Bench.start("effects", config, folder, "effects")
+    rows = list(rows_of(config))
+    trainings = {name: words for row in rows for name, words in row.runs.items()}
     metrics = {}
-    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
-        task = progress.add_task("", total=len(scenes) + len(trainings) + len(todo))
-        for scene in scenes:
-            here = [cell.row for cell in todo if tuple(cell.scene) == scene]
-            progress.update(task, description=f"deciding in {here[0].scene}")
-            found = decide([*bench.base, *scene], list(bench.cases))
-            for row in here:
-                row.auto, row.why = found[row.effect]
+    with bench.progress() as progress:
+        task = progress.add_task("", total=len(trainings) + 2 * len(rows))
+        for row in rows:
+            progress.update(task, description=f"deciding in {row.scene}")
+            row.auto, row.why = decide([*config.base, *row.overrides], row.effect)
             progress.advance(task)
-        for training in trainings:
-            progress.update(task, description=f"training {training.name}")
-            metrics[training.name] = train(training, runs, fresh=bench.fresh)
+        for name, words in trainings.items():
+            progress.update(task, description=f"training {name}")
+            at = folder / "runs" / name
+            common.train([*words, f"resume={str(not config.fresh).lower()}"], at)
+            metrics[name] = json.loads((at / "metrics.json").read_text())
             progress.advance(task)
-        for cell in todo:
-            progress.update(task, description=f"timing {cell.row.effect} in {cell.row.scene}")
-            if cell.runs:
-                scored = {state: metrics[cell.runs[state].name] for state in STATES}
-                cell.row.scores = {s: scores_of(m, cell.row.split) for s, m in scored.items()}
-                cell.row.marks = sorted({m for run in scored.values() for m in marks_of(run)})
-                measure(cell.row, cell.runs, runs, frames=bench.frames, repeats=bench.repeats)
+        for row in rows:
+            progress.update(task, description=f"timing {row.effect} in {row.scene}")
+            if row.runs:
+                score(row, metrics)
+                measure(row, folder / "runs", config.frames, config.repeats)
             progress.advance(task)
+    text, settings = page(rows, bench.where), OmegaConf.to_container(config)
+    assert isinstance(settings, dict)
+    bench.console.print(text, markup=False, highlight=False)
+    record = {
+        "settings": {name: settings[name] for name in SETTINGS},
+        "rows": [asdict(row) | {"gain_db": {v: row.gain(v) for v in SHOWN}} for row in rows],
+        "failures": failures(rows),
+    }
+    bench.write("What effects gain and cost", text, record)
+    if failures(rows):
+        raise GsganError("; ".join(failures(rows)))
+
+
+def check(config: DictConfig) -> None:
+    """Refuses wrong values before anything takes time."""
+    check_whole(config, frames=1, repeats=1)
+    known, only = ", ".join(config.cases), config.only
+    listed = OmegaConf.is_list(only) and only and set(only) <= set(config.cases)
+    if only is not None and not listed:
+        raise ConfigError(f"only must list some of {known}; got {only!r}")
+    if config.real_effect not in config.cases:
+        raise ConfigError(f"real_effect must be one of {known}, got {config.real_effect!r}")
+    if config.real is not None and not Path(config.real).expanduser().is_dir():
+        raise ConfigError(f"real={config.real}: no such folder; give a capture's, or real=null")
+    for name, case in config.cases.items():
+        if case.split not in SPLITS:
+            raise ConfigError(
+                f"cases.{name}.split must be one of {', '.join(SPLITS)}, got {case.split!r}"
+            )
+
+
+def rows_of(config: DictConfig) -> Iterator[Row]:
+    """Each effect in the scene that calls for it, in the default one, and in the real capture."""
+    for effect in config.only or list(config.cases):
+        case = config.cases[effect]
+        called = not case.scene  # by the default person
+        if not called:
+            yield _row(config, effect, effect, case.split, list(case.scene))
+        row = Row(effect, DEFAULT, called, case.split)
+        if config.train and (called or (config.default and case.get("elsewhere", True))):
+            on = f"effects.{effect}={case.word}"
+            row.runs = {"default-off": [*config.base], f"default-{effect}": [*config.base, on]}
+        yield row
+    if config.real is not None:
+        root = Path(config.real).expanduser().resolve()
+        scene = ["data=capture", f"data.root='{root}'", *config.real_base]
+        yield _row(config, config.real_effect, REAL, config.real_split, scene)
+
+
+def _row(config: DictConfig, effect: str, scene: str, split: str, overrides: list[str]) -> Row:
+    """A scene that calls for the effect, with two runs."""
+    off, name = [*config.base, *overrides], scene.replace(" ", "-")
+    on = [*off, f"effects.{effect}={config.cases[effect].word}"]
+    runs = {f"{name}-off": off, f"{name}-on": on} if config.train else {}
+    return Row(effect, scene, True, split, overrides, runs)
+
+
+def compose(overrides: Sequence[str]) -> DictConfig:
+    """The training config with these overrides, while this command's own Hydra stays as it is.
+
+    Raises:
+        ConfigError: when an override fits nothing.
+    """
+    outer = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(config_folder()), version_base="1.3"):
+            return hydra_compose("train", overrides=list(overrides))
+    except HydraException as error:
+        raise ConfigError(f"{' '.join(overrides)}: {str(error).splitlines()[0]}") from error
+    finally:
+        GlobalHydra.instance().clear()
+        GlobalHydra.instance().hydra = outer
+
+
+def decide(overrides: Sequence[str], effect: str) -> tuple[bool, str]:
+    """Whether `auto` turns an effect on in a scene, and its reason."""
+    config = compose([*overrides, f"effects.{effect}=auto"])
+    found = getattr(decide_effects(build_data(config).info, instantiate(config.effects)), effect)
+    return found.on, found.why
+
+
+def score(row: Row, metrics: Mapping[str, Any]) -> None:
+    """Fills in the PSNR in the person's box and the notes of both runs."""
+    for state, name in zip(("off", "on"), row.runs, strict=True):
+        variants = metrics[name][row.split]
+        row.scores[state] = {v: variants[v][SCORE] for v in SHOWN if v in variants}
+        splits = metrics[name].values()
+        row.marks += [m for split in splits for v in split.values() for m in v["marks"]]
+    row.marks = sorted(set(row.marks))
+
+
+def measure(row: Row, folder: Path, frames: int, repeats: int) -> None:
+    """Times painting and reading with the effect off and on, in turn; counts parameters."""
+    paint, read, count = {}, {}, 1
+    for state, name in zip(("off", "on"), row.runs, strict=True):
+        config = load_config(folder / name)
+        config.data.cache_mb = 0  # every frame is read again
+        data = build_data(config)
+        avatar, _ = load_avatar(folder / name, config, data)
+        dataset = data.dataset(row.split)
+        chosen = evenly(len(dataset), frames)
+        count, shown = len(chosen), [dataset[i] for i in chosen]
+        paint[state] = lambda a=avatar, shown=shown: [a.paint(frame).image for frame in shown]
+        read[state] = lambda d=dataset, chosen=chosen: [d[i] for i in chosen]
+        row.parameters[state] = sum(p.numel() for p in avatar.parameters())
+    with torch.no_grad():
+        for actions, found in ((paint, row.paint_ms), (read, row.read_ms)):
+            samples = interleaved(actions, repeats)
+            found |= {state: (median(ms) or 0.0) / count for state, ms in samples.items()}
+
+
+def failures(rows: Sequence[Row]) -> list[str]:
+    """What is not as it must be, a clause each."""
+    found = []
+    for row in rows:
+        name, gain = f"{row.effect} in the scene {row.scene}", row.gain("full")
+        if row.auto is not None and row.auto != row.called:
+            found.append(f"auto leaves {name} {'on' if row.auto else 'off'} ({row.why})")
+        if row.called and gain is not None and gain <= 0:
+            found.append(f"{name} gains {gain:+.2f} dB although it is called for")
+    return found
+
+
+def page(rows: Sequence[Row], where: Mapping[str, Any]) -> str:
+    """The table with what it needs to be understood."""
+    parts = [
+        f"{sentence(where)}. PSNR in the person's box on held-out images, effect off → on, of the "
+        "final image and of Step I's colour; one seed. Milliseconds per frame for painting and "
+        "for reading from disk, off and on in turn, medians.",
+        markdown(pd.DataFrame([cells(row) for row in rows])),
+    ]
+    marks = sorted({mark for row in rows for mark in row.marks})
+    return "\n\n".join([*parts, *(f"Note: {mark}." for mark in marks)])
+
+
+def cells(row: Row) -> dict[str, str]:
+    """A row of the table."""
+    auto = NOTHING if row.auto is None else ("on" if row.auto else "off")
+    wrong = row.auto is not None and row.auto != row.called
+    change = row.parameters.get("on", 0) - row.parameters.get("off", 0)
+    return {
+        "effect": row.effect,
+        "scene": row.scene,
+        "auto": auto + " (wrong)" * wrong + f": {row.why}" * bool(row.why),
+        "gain dB": _gain(row, "full"),
+        "Step I dB": _gain(row, "splat"),
+        "held out": row.split,
+        "paint ms": _change(row.paint_ms),
+        "read ms": _change(row.read_ms),
+        "parameters": f"{change:+,}" if row.parameters else NOTHING,
+    }
+
+
+def _gain(row: Row, variant: str) -> str:
+    gain = row.gain(variant)
+    if gain is None:
+        return NOTHING
+    return f"{gain:+.2f} ({_change({s: row.scores[s][variant] for s in ('off', 'on')})})"
+
+
+def _change(values: Mapping[str, float]) -> str:
+    return f"{values['off']:.2f} → {values['on']:.2f}" if values else NOTHING

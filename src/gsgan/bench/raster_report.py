@@ -1,197 +1,153 @@
-"""What the raster bench found, for people (Markdown, pictures) and for programs (CSV, JSON)."""
+"""Tables and plots of the raster bench."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
+import pandas as pd
+from matplotlib.lines import Line2D
+from matplotlib.ticker import NullFormatter
 
-from gsgan.bench.environment import Environment
-from gsgan.bench.raster_cell import Row
-from gsgan.bench.raster_marks import Line, Marks, verdict
-from gsgan.bench.tables import NOTHING, csv_text, fill_block, markdown, number
-from gsgan.utils.files import write_atomically
+from gsgan.bench.common import NOTHING, markdown, number, panels, plain_ticks, png, sentence
+from gsgan.utils.palette import BLUE, DASHES, GREEN, MARKERS, PURPLE, VERMILLION
 
-HEADER = (
-    "N", "C", "size", "backend", "setting", "forward ms", "forward + backward ms",
-    "largest error", "mean error", "proven bound", "gradient error", "worst group",
-    "largest gradient error", "peak MB",
-)  # fmt: skip
-COLUMNS = (
-    "gaussians", "channels", "size", "backend", "setting", "forward_ms", "both_ms",
-    "value_max", "value_mean", "bound", "beyond", "gradient", "gradient_max", "memory_mb",
-)  # fmt: skip
-PICTURES = ("raster_error.png", "raster_growth.png")
-GROWTH_SETTING = "standard"  # of the table of times over the whole grid
+COLOURS = {"native": BLUE, "torch": VERMILLION, "gsplat": GREEN}  # the same in every plot
+GROWTH = "standard"  # the setting of the table and plot over the whole grid
+TIMES = {"forward_ms": "forward", "both_ms": "forward + backward"}
+# Heading and significant digits of the table's columns of numbers.
+NUMBERS = {
+    "forward_ms": ("forward ms", 3),
+    "both_ms": ("forward + backward ms", 3),
+    "value_max": ("largest error", 2),
+    "value_mean": ("mean error", 2),
+    "bound": ("proven bound", 2),
+    "gradient": ("gradient error", 2),
+    "worst_group": ("worst group", 0),
+    "gradient_max": ("largest gradient error", 2),
+    "memory_mb": ("peak MB", 3),
+}
 
 
-@dataclass(frozen=True)
-class Report:
-    """Everything that one run found.
+def number_table(frame: pd.DataFrame, *, cells: bool = True) -> str:
+    """All rows in Markdown, with or without the columns N and size."""
+    shown = pd.DataFrame({"C": frame.channels, "backend": frame.backend, "setting": frame.setting})
+    if cells:
+        shown.insert(0, "N", frame.gaussians)
+        shown.insert(2, "size", frame["size"].astype(str) + "²")
+    for column, (heading, digits) in NUMBERS.items():
+        values = frame.get(column, pd.Series(index=frame.index, dtype=object))
+        shown[heading] = [number(v, digits) if digits else _text(v) for v in values]
+    return markdown(shown)
+
+
+def _text(value: Any) -> str:
+    return NOTHING if pd.isna(value) else str(value)
+
+
+def growth_table(frame: pd.DataFrame) -> str:
+    """Forward / forward + backward milliseconds of one setting over the whole grid, Markdown."""
+    rows = frame[frame.setting == GROWTH].copy()
+    rows["size"] = rows["size"].astype(str).str.rjust(6) + "²"  # in order of their numbers
+    rows["kind"] = rows.backend + ", C=" + rows.channels.astype(str)
+    rows["ms"] = [f"{number(a)} / {number(b)}" for a, b in zip(*map(rows.get, TIMES), strict=True)]
+    rows = rows.rename(columns={"gaussians": "N"})
+    wide = rows.pivot_table(index=["N", "size"], columns="kind", values="ms", aggfunc="first")
+    wide = wide.fillna(NOTHING).reset_index()
+    wide["size"] = wide["size"].str.strip()
+    return markdown(wide)
+
+
+def summary(
+    frame: pd.DataFrame, here: pd.DataFrame, n: int, size: int, where: Mapping[str, Any]
+) -> str:
+    """What the docs show: the reference scene, the growth, the plots."""
+    return "\n\n".join(
+        [
+            sentence(where) + ".",
+            "![time against error](pictures/raster_error.png)",
+            f"{n} Gaussians at {size}²; medians of interleaved runs:",
+            number_table(here, cells=False),
+            "![time against Gaussians and pixels](pictures/raster_growth.png)",
+            f"`{GROWTH}`, milliseconds forward / forward + backward:",
+            growth_table(frame),
+        ]
+    )
+
+
+def images(frame: pd.DataFrame, n: int, size: int) -> dict[str, bytes]:
+    """Both plots as PNG bytes, by file name.
 
     Args:
-        rows: of all cells.
-        reference: ``gaussians`` and ``size`` that the verdict is about.
-        marks: what must be reached.
-        rounding: of float32, on top of the proven bounds.
-        auto: the backend that ``auto`` takes, by setting.
-        where: the machine.
+        frame: all rows.
+        n, size: the reference scene, of the first plot; the second varies one of the two.
     """
-
-    rows: Sequence[Row]
-    reference: dict[str, int]
-    marks: Marks
-    rounding: float
-    auto: dict[str, str]
-    where: Environment
-
-    @property
-    def at_reference(self) -> list[Row]:
-        """The rows that the verdict is about."""
-        n, size = self.reference["gaussians"], self.reference["size"]
-        return [row for row in self.rows if (row.gaussians, row.size) == (n, size)]
-
-    @property
-    def verdict(self) -> list[Line]:
-        """Every mark with what was found."""
-        return verdict(self.rows, self.reference, self.marks, self.rounding, self.auto)
-
-
-def cells(row: Row) -> list[str]:
-    """A row of the big table, formatted."""
-    worst = NOTHING
-    if row.gradients:
-        worst = max(row.gradients, key=row.gradients.__getitem__)
-    return [
-        str(row.gaussians), str(row.channels), f"{row.size}²", row.backend, row.setting,
-        number(row.forward_ms), number(row.both_ms),
-        number(row.value_max, 2), number(row.value_mean, 2), number(row.bound, 2),
-        number(row.gradient, 2), worst, number(row.gradient_max, 2), number(row.memory_mb),
-    ]  # fmt: skip
-
-
-def verdict_table(lines: Sequence[Line]) -> str:
-    """The verdict in Markdown."""
-    rows = [[line.what, line.wanted, line.found, line.verdict] for line in lines]
-    return markdown(("must reach", "wanted", "found", "verdict"), rows)
-
-
-def growth_table(rows: Sequence[Row], setting: str = GROWTH_SETTING) -> str:
-    """Forward / forward + backward milliseconds of one setting over the whole grid, Markdown."""
-    chosen = [row for row in rows if row.setting == setting]
-    kinds = sorted({(row.backend, row.channels) for row in chosen})
-    found = {(row.gaussians, row.size, row.backend, row.channels): row for row in chosen}
-    header = ["N", "size", *(f"{backend}, C={channels}" for backend, channels in kinds)]
-    lines = []
-    for n, size in sorted({(row.gaussians, row.size) for row in chosen}):
-        times = [_both(found.get((n, size, *kind))) for kind in kinds]
-        lines.append([str(n), f"{size}²", *times])
-    return markdown(header, lines)
-
-
-def _both(row: Row | None) -> str:
-    if row is None:
-        return NOTHING
-    return f"{number(row.forward_ms)} / {number(row.both_ms)}"
-
-
-def page(report: Report) -> str:
-    """All of it in Markdown."""
-    return "\n\n".join(
-        [
-            "# What accuracy costs in time",
-            report.where.sentence(),
-            "## Verdict",
-            verdict_table(report.verdict),
-            "## All rows",
-            markdown(HEADER, [cells(row) for row in report.rows]),
-            "",
-        ]
-    )
-
-
-def summary(report: Report) -> str:
-    """What the docs show: the reference scene, the growth, the verdict, the pictures."""
-    n, size = report.reference["gaussians"], report.reference["size"]
-    scene = f"{n} Gaussians at {size}²"
-    rows = [cells(row) for row in report.at_reference]
-    narrow = [[*row[1:2], *row[3:]] for row in rows]
-    return "\n\n".join(
-        [
-            report.where.sentence() + ".",
-            f"![time against error](pictures/{PICTURES[0]})",
-            f"{scene}; medians of interleaved runs:",
-            markdown((*HEADER[1:2], *HEADER[3:]), narrow),
-            f"![time against Gaussians and pixels](pictures/{PICTURES[1]})",
-            f"`{GROWTH_SETTING}`, milliseconds forward / forward + backward:",
-            growth_table(report.rows),
-            "What must be reached, and what was found in the same run:",
-            verdict_table(report.verdict),
-        ]
-    )
-
-
-def write(report: Report, folder: Path, settings: dict[str, Any]) -> None:
-    """``raster.md``, ``raster.csv``, ``raster.json`` and the pictures, each whole or not at all."""
-    write_atomically(folder / "raster.md", page(report))
-    write_atomically(folder / "raster.csv", _csv(report.rows))
-    numbers = {
-        "where": report.where.as_dict(),
-        "bench": settings,
-        "rows": [asdict(row) for row in report.rows],
-        "verdict": [asdict(line) for line in report.verdict],
+    here = frame[(frame.gaussians == n) & (frame["size"] == size)]
+    return {
+        "raster_error.png": error_plot(here),
+        "raster_growth.png": growth_plot(frame, {"gaussians": n, "size": size}),
     }
-    write_atomically(folder / "raster.json", json.dumps(numbers, indent=1))
-    _write_pictures(report, folder)
 
 
-def write_docs(report: Report, docs: Path) -> None:
-    """Rewrites the ``bench:raster`` block of a page, and the pictures in ``pictures/`` beside it.
+def error_plot(here: pd.DataFrame) -> bytes:
+    """Time against error, one line per backend and channels through its accuracy settings.
 
-    Raises:
-        ConfigError: when the page is missing or has no such block.
+    Left: forward time and the largest value error; right: forward + backward time and the worst
+    gradient error. Rows without errors, or without any error, are left out.
     """
-    fill_block(docs, "raster", summary(report))
-    _write_pictures(report, docs.parent / "pictures")
+    figure, (left, right) = panels(2, 10.4, 4.2)
+    here = here.reindex(columns=here.columns.union(["value_max", "gradient"]))
+    settings = list(here.setting[here.value_max.notna()].unique())
+    marks = {name: MARKERS[i % len(MARKERS)] for i, name in enumerate(settings)}
+    for axes, time, error in ((left, "forward_ms", "value_max"), (right, "both_ms", "gradient")):
+        shown = here[here[error] > 0].sort_values(error, ascending=False)  # the axis has no zero
+        for (backend, channels), line in shown.groupby(["backend", "channels"]):
+            style = _style(here, backend, channels)
+            axes.plot(line[time], line[error], **style)
+            for _, row in line.iterrows():
+                axes.plot(row[time], row[error], marks[row.setting], color=style["color"], ms=7)
+        axes.set(xlabel=f"{TIMES[time]}, ms", xscale="log", yscale="log")
+        plain_ticks(axes.xaxis)
+    left.set_ylabel("largest error of a value")
+    right.set_ylabel("relative error of the worst gradient")
+    shapes = [Line2D([], [], color="black", ls="", marker=marks[name]) for name in settings]
+    right.legend(shapes, settings, fontsize=8, frameon=False)
+    if left.get_lines():
+        left.legend(fontsize=8, frameon=False)
+    return png(figure)
 
 
-def show(report: Report, console: Console) -> None:
-    """Prints the reference scene and the verdict."""
-    table = Table(title="at the reference scene")
-    wanted = [*HEADER[1:2], *HEADER[3:8], HEADER[9], HEADER[10], HEADER[13]]
-    for name in wanted:
-        table.add_column(name, justify="left" if name in ("backend", "setting") else "right")
-    for row in report.at_reference:
-        shown = dict(zip(HEADER, cells(row), strict=True))
-        table.add_row(*(shown[name] for name in wanted))
-    lines = Table(title="must reach")
-    for name in ("", "wanted", "found", "verdict"):
-        lines.add_column(name)
-    for line in report.verdict:
-        lines.add_row(line.what, line.wanted, line.found, line.verdict)
-    console.print(table)
-    console.print(lines)
+def growth_plot(frame: pd.DataFrame, reference: dict[str, int]) -> bytes:
+    """Forward + backward time at one setting against Gaussians and against pixels."""
+    figure, both = panels(2, 10.4, 4.2)
+    frame = frame[frame.setting == GROWTH]
+    for axes, axis, other in zip(both, ("gaussians", "size"), ("size", "gaussians"), strict=True):
+        shown = frame[frame[other] == reference[other]].sort_values(axis)
+        power = 2 if axis == "size" else 1
+        for (backend, channels), line in shown.groupby(["backend", "channels"]):
+            style = _style(frame, backend, channels)
+            axes.plot(line[axis] ** power, line.both_ms, marker="o", ms=4, **style)
+        name, at = ("pixels", f"N = {reference['gaussians']}") if power == 2 else (
+            "Gaussians", f"{reference['size']}²"
+        )  # fmt: skip
+        axes.set(xlabel=f"{name} ({at})", xscale="log", yscale="log")
+        ticks = sorted(shown[axis].unique())
+        axes.set_xticks([x**power for x in ticks], [f"{x}²" if power == 2 else x for x in ticks])
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        plain_ticks(axes.yaxis)
+        if len(shown):  # a line of slope 1 below the curves
+            low, high = shown[axis].min() ** power, shown[axis].max() ** power
+            floor = shown.both_ms.min() / 2
+            axes.plot([low, high], [floor, floor * high / low], "#999999", lw=1, label="linear")
+            axes.legend(fontsize=8, frameon=False)
+    both[0].set_ylabel(f"forward + backward, ms ({GROWTH})")
+    return png(figure)
 
 
-def _csv(rows: Sequence[Row]) -> str:
-    groups = sorted({name for row in rows for name in row.gradients or ()})
-    header = [*COLUMNS, *(f"gradient_{name}" for name in groups)]
-    lines = [
-        [*(getattr(row, name) for name in COLUMNS), *((row.gradients or {}).get(g) for g in groups)]
-        for row in rows
-    ]
-    return csv_text(header, lines)
-
-
-def _write_pictures(report: Report, folder: Path) -> None:
-    from gsgan.bench import raster_plots  # here: matplotlib is slow to load
-
-    write_atomically(folder / PICTURES[0], raster_plots.error_picture(report.at_reference))
-    write_atomically(
-        folder / PICTURES[1], raster_plots.growth_picture(report.rows, report.reference)
-    )
+def _style(frame: pd.DataFrame, backend: str, channels: int) -> dict[str, Any]:
+    order = sorted(frame.channels.unique())
+    return {
+        "color": COLOURS.get(backend, PURPLE),
+        "linestyle": DASHES[order.index(channels) % len(DASHES)],
+        "label": f"{backend}, C={channels}",
+    }

@@ -1,33 +1,44 @@
-"""``python -m gsgan.bench speed``: milliseconds from skeleton to picture, by stage."""
+"""``python -m gsgan.bench speed``: milliseconds from skeleton to image, by stage."""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pandas as pd
 import torch
 from omegaconf import DictConfig
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from gsgan.bench import speed_report
-from gsgan.bench.environment import environment
-from gsgan.bench.speed_painter import Painter, Way, painting_memory, without_denormals
-from gsgan.bench.speed_stages import Times, measure
-from gsgan.bench.speed_subject import Subject, trained, untrained
-from gsgan.bench.tables import check_block, fill_block
+from gsgan.bench.common import Bench, check_whole, markdown, number, panels, png, sentence
+from gsgan.bench.painter import (
+    Painter,
+    Way,
+    painting_memory,
+    place,
+    spread,
+    without_denormals,
+)
+from gsgan.model.avatar import Avatar, unwatched
+from gsgan.scene import Frame
 from gsgan.splat import resolve_backend
-from gsgan.train.runs import Moved
-from gsgan.utils.console import make_console
-from gsgan.utils.devices import pick_device
+from gsgan.train.runs import Moved, build_avatar, build_data, load_avatar, load_config
 from gsgan.utils.errors import ConfigError
+from gsgan.utils.palette import BLUE
+from gsgan.utils.timing import timed, wait
+
+TOTAL, REST = "end to end", "between stages"
 
 
 def run(config: DictConfig, folder: Path) -> None:
     """Times an avatar; writes ``speed.md``, ``speed.json`` and ``speed.png``.
 
-    Convention: one picture at a time; poses, cameras and pictures stay on the device, so reading
-    and showing are not in it.
+    Convention: one image at a time; poses, cameras and images stay on the device, so reading and
+    showing are not in it.
 
     Args:
         config: as conf/bench_speed.yaml.
@@ -37,56 +48,134 @@ def run(config: DictConfig, folder: Path) -> None:
         ConfigError: on a value out of range.
         DataError: when the run or its data cannot be read.
     """
-    _check(config)
-    if config.threads is not None:
-        torch.set_num_threads(config.threads)
+    check_whole(config, frames=1, warmup=0, poses=1, seed=0)
+    if not isinstance(config.channels_last, bool):
+        raise ConfigError(f"channels_last must be true or false, got {config.channels_last!r}")
     way = Way(precision=config.precision, backend=config.backend)
-    device, console = pick_device(config.device), make_console()
-    where = environment(device)
-    console.print(where.sentence(), highlight=False)
-    subject = _subject(config, device)
-    painter = Painter(subject.avatar, way)
+    bench = Bench.start("speed", config, folder, config.block)
+    avatar, frames, name, marks = load_subject(config, bench.device)
+    painter = Painter(avatar, way)
     with without_denormals():
-        times = _measure(config, painter, subject, console)
-        memory = painting_memory(painter, subject.frames)
-    settings = _settings(config, subject, device)
-    report = speed_report.Report(times, memory, where, settings, subject.marks)
-    speed_report.write(report, folder)
-    console.print(report.text(), markup=False, highlight=False)
-    if config.docs is not None:
-        fill_block(Path(config.docs), config.block, report.text())
-    console.print(f"table, picture and raw numbers: {folder}", markup=False, highlight=False)
+        with bench.progress() as progress:
+            task = progress.add_task("painting", total=config.warmup + config.frames)
+            times = measure(
+                painter,
+                frames,
+                count=config.frames,
+                warmup=config.warmup,
+                tick=lambda: progress.advance(task),
+            )
+        memory = painting_memory(painter, frames)
+    settings = {"avatar": name, **settings_of(config, avatar, frames)}
+    page = text(times, memory, bench.where, settings, marks)
+    bench.console.print(page, markup=False, highlight=False)
+    spreads = {name: dict(row) for name, row in times.iterrows()}
+    total, rest = spreads.pop(TOTAL), spreads.pop(REST)
+    record = {
+        "settings": settings,
+        "marks": marks,
+        "times_ms": {"total": total, "stages": spreads, "rest": rest},
+        "memory_mb": memory,
+    }
+    bench.write("From skeleton to image", page, record, images={"speed.png": plot(times, settings)})
 
 
-def _measure(config: DictConfig, painter: Painter, subject: Subject, console: Console) -> Times:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
-        task = progress.add_task("painting", total=config.warmup + config.frames)
-        return measure(
-            painter,
-            subject.frames,
-            count=config.frames,
-            warmup=config.warmup,
-            tick=lambda: progress.advance(task),
-        )
+def load_subject(
+    config: DictConfig, device: torch.device
+) -> tuple[Avatar, list[Frame], str, list[str]]:
+    """An avatar in eval mode, frames of one image each, a name, and notes for the table.
+
+    The avatar of ``run`` with its held-out poses, or an untrained one of ``config.model``.
+    """
+    moved = Moved(config.data_root, config.data_smpl)
+    if config.run is not None:
+        folder = Path(config.run).expanduser()
+        stored = load_config(folder, moved)
+        data = build_data(stored)
+        avatar, marks = load_avatar(folder, stored, data)
+        name, frames = f"trained run {folder.name}", spread(data, config.poses)
+    else:
+        moved.refuse_without_run()
+        data = build_data(config)
+        avatar, name = build_avatar(config, data), "untrained avatar"
+        marks = ["untrained weights: Gaussians are where they start, which sets what F costs"]
+        size = (int(config.size.picture), int(config.size.picture))
+        frames = [replace(f, camera=f.camera.resize(size)) for f in spread(data, config.poses)]
+    avatar = place(avatar, device, channels_last=config.channels_last)
+    return avatar, [frame.to(device) for frame in frames], name, marks
 
 
-def _subject(config: DictConfig, device: torch.device) -> Subject:
-    last = bool(config.channels_last)
-    if config.run is None:
-        Moved.said(config).refuse_without_run()
-        return untrained(config, config.poses, device, last=last)
-    folder = Path(config.run).expanduser()
-    return trained(folder, Moved.said(config), config.poses, device, last=last)
+class StageClock:
+    """Takes the place of ``Avatar.stage`` while stages are timed; waits for the device."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device = device
+        self.frame: dict[str, float] = {}  # milliseconds of each stage
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        wait(self.device)
+        start = time.perf_counter()
+        yield
+        wait(self.device)
+        took = 1000 * (time.perf_counter() - start)
+        self.frame[stage] = self.frame.get(stage, 0.0) + took
 
 
-def _settings(config: DictConfig, subject: Subject, device: torch.device) -> dict[str, Any]:
-    """What the figures depend on, by names that people read."""
-    avatar, (height, width) = subject.avatar, subject.frames[0].camera.size
-    windows = [avatar.window(frame) for frame in subject.frames]
+def measure(
+    painter: Painter,
+    frames: Sequence[Frame],
+    *,
+    count: int,
+    warmup: int,
+    tick: Callable[[], None] = lambda: None,
+) -> pd.DataFrame:
+    """Paints ``count`` frames end to end and as many by stage, in turn.
+
+    Args:
+        painter: paints.
+        frames: gone through round and round.
+        count: of frames timed each way.
+        warmup: frames before the clock starts.
+        tick: called after each frame.
+
+    Returns:
+        ``median p10 p90`` in milliseconds by stage, then ``between stages`` (of the frames timed by
+        stage, what no stage took) and ``end to end`` (without waiting between stages).
+    """
+    device = frames[0].skeleton.device
+    samples: dict[str, list[float]] = {}
+    for i in range(warmup + count):
+        frame, clock = frames[(i - warmup) % len(frames)], StageClock(device)
+        if i < warmup:
+            painter(frame)
+            tick()
+            continue
+        total = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
+        painter.avatar.stage = clock
+        try:
+            whole = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
+        finally:
+            painter.avatar.stage = unwatched
+        rest = whole - sum(clock.frame.values())
+        for name, took in {**clock.frame, REST: rest, TOTAL: total}.items():
+            samples.setdefault(name, []).append(took)
+        tick()
+    return pd.DataFrame({name: deciles(s) for name, s in samples.items()}).T
+
+
+def deciles(samples: Sequence[float]) -> dict[str, float]:
+    """The median, and the two deciles around it, linear between samples."""
+    found = np.quantile(samples, [0.5, 0.1, 0.9])
+    return dict(zip(("median", "p10", "p90"), map(float, found), strict=True))
+
+
+def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> dict[str, Any]:
+    """What the figures depend on, by names for people."""
+    height, width = frames[0].camera.size
+    windows = [avatar.window(frame) for frame in frames]
     pixels = sum(height * width if w is None else w.size[0] * w.size[1] for w in windows)
     found: dict[str, Any] = {
-        "avatar": subject.name,
         "picture": f"{width} x {height}",
         "painted": f"{pixels / (len(windows) * height * width):.0%} of its pixels",
         "precision": config.precision,
@@ -95,8 +184,8 @@ def _settings(config: DictConfig, subject: Subject, device: torch.device) -> dic
         "frames": config.frames,
     }
     if avatar.splats is not None:
-        drawing, _ = resolve_backend(config.backend, device, avatar.accuracy)
-        found |= {"accuracy": avatar.accuracy.name, "backend": drawing}
+        backend, _ = resolve_backend(config.backend, frames[0].skeleton.device, avatar.accuracy)
+        found |= {"accuracy": avatar.accuracy.name, "backend": backend}
         found["channels of F"] = avatar.splat_channels
         if avatar.accuracy.supersample > 1:
             found["F drawn"] = f"{avatar.accuracy.supersample} times as large, then averaged"
@@ -107,15 +196,45 @@ def _settings(config: DictConfig, subject: Subject, device: torch.device) -> dic
     return found
 
 
-def _check(config: DictConfig) -> None:
-    """Before anything takes time."""
-    least = {"frames": 1, "warmup": 0, "poses": 1, "seed": 0}
-    least |= {"threads": 1} if config.threads is not None else {}
-    for name, low in least.items():
-        value = config[name]
-        if not isinstance(value, int) or isinstance(value, bool) or value < low:
-            raise ConfigError(f"{name} must be a whole number of at least {low}, got {value!r}")
-    if not isinstance(config.channels_last, bool):
-        raise ConfigError(f"channels_last must be true or false, got {config.channels_last!r}")
-    if config.docs is not None:
-        check_block(Path(config.docs), config.block)
+def text(
+    times: pd.DataFrame,
+    memory: float | None,
+    where: dict[str, Any],
+    settings: dict[str, Any],
+    marks: Sequence[str],
+) -> str:
+    """The block of the page: the machine, the settings, the table, the notes."""
+    stages, total = times.drop(TOTAL), times.loc[TOTAL]
+    shares = [f"{share:.0%}" for share in stages["median"] / stages["median"].sum()]
+    table = times.map(number)
+    table.insert(0, "stage", [*stages.index, f"**{TOTAL}**"])
+    table["share"] = [*shares, f"{1000 / total['median']:.1f} frames/s"]
+    table.columns = pd.Index(["stage", "median ms", "10 % below", "90 % below", "share"])
+    how = ", ".join(f"{key} {value}" for key, value in settings.items())
+    lines = [f"{sentence(where)}.", f"{how[0].upper()}{how[1:]}.", markdown(table)]
+    lines.append(f"Peak memory on top of the avatar: {number(memory)} MB.")
+    lines += ["\n".join(f"- {mark}" for mark in marks)] if marks else []
+    return "\n\n".join(lines)
+
+
+def plot(times: pd.DataFrame, settings: dict[str, Any]) -> bytes:
+    """One bar per stage, with the deciles, as PNG bytes."""
+    rows = times.drop(TOTAL).clip(lower=0)[::-1]
+    figure, (axes,) = panels(1, 7.2, 0.9 + 0.32 * len(rows))
+    whiskers = [rows["median"] - rows.p10, rows.p90 - rows["median"]]
+    bars = axes.barh(
+        rows.index,
+        rows["median"],
+        xerr=np.maximum(whiskers, 0),
+        color=BLUE,
+        height=0.66,
+        error_kw={"lw": 1, "capsize": 2},
+    )
+    axes.bar_label(bars, [number(value) for value in rows["median"]], padding=4, fontsize=8)
+    total = number(times.loc[TOTAL, "median"])
+    title = f"{settings['avatar']}, {settings['picture']}: {total} ms end to end"
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.set_xlabel("milliseconds, each stage by itself; whiskers from the 1st to the 9th decile")
+    axes.margins(x=0.12)
+    axes.grid(visible=False)
+    return png(figure)

@@ -1,19 +1,16 @@
-"""What the trade-off bench found: rows, the front, and the text that people read."""
+"""Table and plots of the trade-off bench."""
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
-from gsgan.bench.environment import Environment
-from gsgan.bench.speed_stages import Spread
-from gsgan.bench.tables import NOTHING, markdown, number
-from gsgan.bench.trade_off_front import front
-from gsgan.bench.trade_off_points import Point, by_label
+import numpy as np
+import pandas as pd
+
+from gsgan.bench.common import NOTHING, markdown, number, panels, plain_ticks, png, sentence
 from gsgan.train.curve import Curve
+from gsgan.utils.palette import BLACK, COLOURS, DASHES, GREY, MARKERS
 
 # Metric: heading, digits, and 1 where more is better, -1 where less is.
 QUALITIES = {
@@ -22,166 +19,152 @@ QUALITIES = {
     "edge_f1": ("edge F1", 3, 1),
     "lpips": ("LPIPS", 4, -1),
 }
+ORDER = (BLACK, *COLOURS[:-1], GREY)  # the base point's first
+TITLES = {
+    "base": "Step I and II (full)",
+    "full": "Step I and II (full)",
+    "splat_only": "Step I only (splat_only)",
+    "lbs_splat": "baseline: Gaussians on the body (lbs_splat)",
+    "image_to_image": "baseline: UNet on the drawn skeleton (image_to_image)",
+}
+# Labels beside points, in turn: offset in points, horizontal and vertical alignment.
+PLACES = ((0, 6, "center", "bottom"), (0, -6, "center", "top"), (7, 0, "left", "center"))
 
 
-@dataclass(frozen=True)
-class Row:
-    """One point, the mean over its seeds.
+def front(frame: pd.DataFrame, metric: str) -> list[int]:
+    """The Pareto front: indices of the rows that no other beats, from the fastest up.
 
-    Args:
-        factor, label: what is changed from the base point, and to what.
-        psnr, ssim, edge_f1, lpips: on the held-out pictures; None where they cannot be had.
-        left_out: pictures without a finite score, of any metric.
-        ms, p10, p90: milliseconds a frame, median and deciles.
-        memory_mb: peak of painting, on top of the avatar.
-        seconds: that its training took; None where the logs do not say.
-        seeds: runs in the mean.
+    Convention: a row is beaten when another is at least as good in time and in the metric, and
+    better in one; of equal rows all stay; those without a score are left out.
     """
-
-    factor: str
-    label: str
-    psnr: float | None
-    ssim: float | None
-    edge_f1: float | None
-    lpips: float | None
-    left_out: int
-    ms: float
-    p10: float
-    p90: float
-    memory_mb: float | None
-    seconds: float | None
-    seeds: int
-
-    def better(self, metric: str) -> float | None:
-        """The metric, turned so that more is better."""
-        value: float | None = getattr(self, metric)
-        return None if value is None else QUALITIES[metric][2] * value
+    ms = frame.ms.to_numpy()
+    score = frame[metric].to_numpy(dtype=float) * QUALITIES[metric][2]
+    found = []
+    for i in np.argsort(ms, kind="stable").tolist():
+        least = (ms <= ms[i]) & (score >= score[i])
+        beaten = least & ((ms < ms[i]) | (score > score[i]))
+        if np.isfinite(score[i]) and not beaten.any():
+            found.append(i)
+    return found
 
 
-def make_rows(
-    points: Sequence[Point],
-    found: Sequence[Mapping[str, Any]],
-    samples: Sequence[Sequence[float]],
-    seconds: Mapping[Path, float | None],
-) -> list[Row]:
-    """One row a factor and label, in the points' order.
+def text(
+    frame: pd.DataFrame,
+    metric: str,
+    about: Mapping[str, Any],
+    where: Mapping[str, Any],
+    marks: Sequence[str],
+    *,
+    has_curves: bool,
+) -> str:
+    """The block of the page, less its plots.
 
     Args:
-        points: measured.
-        found: quality and memory of each.
-        samples: milliseconds of each.
-        seconds: of training, by run folder.
-    """
-    rows = []
-    for (factor, label), group in by_label(points).items():
-        spread = Spread.of([ms for i in group for ms in samples[i]])
-        memory = [m for i in group if (m := found[i]["memory_mb"]) is not None]
-        left_out = sum(
-            n for i in group for name, n in found[i].items() if name.endswith("_left_out")
-        )
-        rows.append(
-            Row(
-                factor=factor,
-                label=label,
-                **{metric: _mean([found[i].get(metric) for i in group]) for metric in QUALITIES},
-                left_out=left_out,
-                ms=spread.median,
-                p10=spread.p10,
-                p90=spread.p90,
-                memory_mb=max(memory, default=None),
-                seconds=_mean([seconds.get(points[i].folder) for i in group]),
-                seeds=len(group),
-            )
-        )
-    return rows
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    there = [value for value in values if value is not None]
-    return statistics.fmean(there) if there and len(there) == len(values) else None
-
-
-@dataclass(frozen=True)
-class Report:
-    """Everything that one run found.
-
-    Args:
-        rows: of all points.
-        curves: held-out PSNR against training time.
-        quality, second: the metrics that are drawn; the front is about the first.
-        pictures: how many were scored.
-        split: of the data.
-        subject: name of the avatar whose settings were changed.
+        frame: see ``trade_off.make_rows``.
+        metric: that the front is about.
+        about: ``pictures``, ``split`` and ``subject``.
         where: the machine.
         marks: notes that the table must carry.
+        has_curves: whether training times are known.
     """
+    notes = list(marks)
+    if frame.lpips.isna().all():
+        notes.append("LPIPS n/a: the backbone's weights are not available")
+    if frame.left_out.any():
+        notes.append(f"{frame.left_out.sum()} scores were not finite and are not in the means")
+    if not has_curves:
+        notes.append("no training times: the runs' logs hold none (val/seconds)")
+    heading = (
+        f"{about['pictures']} images of {about['split']}; settings changed on {about['subject']}; "
+        f"one image at a time. Front: nothing is as fast and scores as much "
+        f"({QUALITIES[metric][0]})."
+    )
+    listed = "\n".join(f"- {note}" for note in notes)
+    return f"{sentence(where)}.\n\n{heading}\n\n{table(frame, metric)}\n\n{listed}".strip()
 
-    rows: Sequence[Row]
-    curves: Sequence[Curve]
-    quality: str
-    second: str
-    pictures: int
-    split: str
-    subject: str
-    where: Environment
-    marks: Sequence[str]
 
-    def front(self, metric: str) -> list[int]:
-        """Indices of the rows that none beats in time and this metric."""
-        scored = [i for i, row in enumerate(self.rows) if row.better(metric) is not None]
-        better = [self.rows[i].better(metric) or 0.0 for i in scored]
-        return [scored[k] for k in front([self.rows[i].ms for i in scored], better)]
+def table(frame: pd.DataFrame, metric: str) -> str:
+    """The rows in Markdown."""
+    seeds = [f" ({n} seeds)" if n > 1 else "" for n in frame.seeds]
+    shown = pd.DataFrame({"changed": frame.factor, "to": frame.label + seeds})
+    for name, (heading, digits, _) in QUALITIES.items():
+        if frame[name].notna().any():
+            shown[heading] = [NOTHING if pd.isna(v) else f"{v:.{digits}f}" for v in frame[name]]
+    shown["ms per frame"] = frame.ms.map(number)
+    shown["10–90 %"] = frame.p10.map(number) + "–" + frame.p90.map(number)
+    shown["peak MB"] = frame.memory_mb.map(number)
+    shown["training min"] = (frame.seconds / 60).map(number)
+    best = front(frame, metric)
+    shown["front"] = ["yes" if i in best else "" for i in range(len(frame))]
+    return markdown(shown)
 
-    def table(self) -> str:
-        """The rows in Markdown."""
-        metrics = [m for m in QUALITIES if any(getattr(row, m) is not None for row in self.rows)]
-        ahead = set(self.front(self.quality))
-        header = ["changed", "to", *(QUALITIES[m][0] for m in metrics)]
-        header += ["ms a frame", "10–90 %", "peak MB", "training min", "front"]
-        lines = []
-        for i, row in enumerate(self.rows):
-            scores = [_digits(getattr(row, m), QUALITIES[m][1]) for m in metrics]
-            seeds = f" ({row.seeds} seeds)" if row.seeds > 1 else ""
-            between = f"{number(row.p10)}–{number(row.p90)}"
-            minutes = None if row.seconds is None else row.seconds / 60
-            lines.append(
-                [
-                    *(row.factor, row.label + seeds, *scores, number(row.ms), between),
-                    *(number(row.memory_mb), number(minutes), "yes" if i in ahead else ""),
-                ]
+
+def images(
+    frame: pd.DataFrame, quality: str, second: str, curves: Sequence[Curve]
+) -> dict[str, bytes]:
+    """The plots as PNG bytes by file name; without curves there is only the first."""
+    metrics = [m for m in dict.fromkeys((quality, second)) if frame[m].notna().any()]
+    found = {"trade_off.png": trade_off_plot(frame, metrics or [quality])}
+    return found | ({"trade_off_training.png": training_plot(curves)} if curves else {})
+
+
+def trade_off_plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
+    """Metrics against milliseconds per frame, all points labelled, the front as a step line."""
+    figure, all_axes = panels(len(metrics), 6.4 * len(metrics), 5.6)
+    for axes, metric in zip(all_axes, metrics, strict=True):
+        heading, _, sign = QUALITIES[metric]
+        ahead = frame.iloc[front(frame, metric)]
+        label = "front: nothing beats these"
+        axes.step(ahead.ms, ahead[metric], "#999999", where="post", lw=1.2, zorder=1, label=label)
+        for i, (factor, own) in enumerate(frame.groupby("factor", sort=False)):
+            axes.errorbar(
+                own.ms,
+                own[metric],
+                xerr=[own.ms - own.p10, own.p90 - own.ms],
+                fmt=MARKERS[i % len(MARKERS)] if i else "*",
+                color=ORDER[i % len(ORDER)],
+                ms=6.5 if i else 11,
+                elinewidth=0.6,
+                label=factor,
             )
-        return markdown(header, lines)
+        axes.set(xscale="log", xlabel="milliseconds per frame (whiskers: deciles)")
+        axes.set_ylabel(f"{heading}, {'higher' if sign > 0 else 'lower'} is better")
+        plain_ticks(axes.xaxis)
+        axes.margins(x=0.16, y=0.1)
+        if sign < 0:
+            axes.invert_yaxis()
+        for i, (_, row) in enumerate(frame[frame[metric].notna()].sort_values("ms").iterrows()):
+            dx, dy, ha, va = PLACES[i % len(PLACES)]
+            axes.annotate(
+                row.label,
+                (row.ms, row[metric]),
+                (dx, dy),
+                textcoords="offset points",
+                ha=ha,
+                va=va,
+                fontsize=7.5,
+            )
+    handles, names = all_axes[0].get_legend_handles_labels()
+    figure.legend(
+        handles, names, loc="outside lower center", ncols=min(6, len(names)), frameon=False
+    )
+    return png(figure)
 
-    def text(self) -> str:
-        """The block of the page, less its pictures."""
-        notes = list(self.marks)
-        if all(row.lpips is None for row in self.rows):
-            notes.append("LPIPS n/a: the backbone's weights are not at hand")
-        if left := sum(row.left_out for row in self.rows):
-            notes.append(f"{left} scores were not finite and are not in the means")
-        if not self.curves:
-            notes.append("no training times: the runs' logs hold none (val/seconds)")
-        about = (
-            f"{self.pictures} pictures of {self.split}; settings changed on {self.subject}; one "
-            f"picture at a time. Front: nothing is as fast and scores as much "
-            f"({QUALITIES[self.quality][0]})."
+
+def training_plot(curves: Sequence[Curve]) -> bytes:
+    """Held-out PSNR against minutes of training; seeds of one training share its colour."""
+    figure, (axes,) = panels(1, 7.6, 4.6)
+    labels = list(dict.fromkeys(curve.label for curve in curves))
+    for k, curve in enumerate(curves):
+        i = labels.index(curve.label)
+        first = curve.label not in [c.label for c in curves[:k]]
+        axes.plot(
+            np.divide(curve.seconds, 60),
+            curve.psnr,
+            color=ORDER[i % len(ORDER)],
+            linestyle=DASHES[i % len(DASHES)],
+            label=TITLES.get(curve.label, curve.label) if first else None,
         )
-        listed = "".join(f"\n- {note}" for note in notes)
-        return f"{self.where.sentence()}.\n\n{about}\n\n{self.table()}\n{listed}\n"
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {
-            "where": self.where.as_dict(),
-            "split": self.split,
-            "pictures": self.pictures,
-            "subject": self.subject,
-            "marks": list(self.marks),
-            "rows": [asdict(row) for row in self.rows],
-            "front": [self.rows[i].label for i in self.front(self.quality)],
-            "curves": [asdict(curve) for curve in self.curves],
-        }
-
-
-def _digits(value: float | None, digits: int) -> str:
-    return NOTHING if value is None else f"{value:.{digits}f}"
+    axes.set(xlabel="minutes of training", ylabel="held-out PSNR dB, logged while training")
+    axes.legend(fontsize=8.5, frameon=False, loc="lower right")
+    return png(figure)

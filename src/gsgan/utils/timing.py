@@ -20,9 +20,9 @@ def interleaved(
     device: torch.device | None = None,
     tick: Callable[[], None] | None = None,
 ) -> dict[Key, list[float]]:
-    """Times actions round robin, so that whatever disturbs the machine disturbs them all alike.
+    """Times actions round robin, so that a disturbance affects all alike.
 
-    Convention: milliseconds of wall clock, with everything the device was given done. Each action
+    Convention: milliseconds of wall clock, with all work of the device finished. Each action
     is first called once to warm up; that call is not counted, except where it took longer than
     ``patience``: then it is called once more, and the shorter of the two is its only sample.
 
@@ -30,7 +30,7 @@ def interleaved(
         actions: what to call, by name.
         repeats: rounds, at least 1.
         patience: seconds.
-        device: waited for before and after each call.
+        device: waits for it before and after each call.
         tick: called after each call.
 
     Returns:
@@ -41,7 +41,7 @@ def interleaved(
     samples: dict[Key, list[float]] = {}
     for name, action in actions.items():
         first = timed(action, device)
-        slow = first > 1000 * patience  # or a disturbance: one more call tells
+        slow = first > 1000 * patience  # or a disturbance: call once more
         samples[name] = [min(first, timed(action, device))] if slow else []
         if tick:
             tick()
@@ -59,17 +59,8 @@ def median(samples: list[float] | None) -> float | None:
     return statistics.median(samples) if samples else None
 
 
-def slope(x: list[float], y: list[float]) -> float | None:
-    """The exponent ``p`` of ``y ~ x^p`` by least squares on logarithms; None below two points."""
-    if len(set(x)) < 2:
-        return None
-    lx, ly = (torch.tensor(v, dtype=torch.float64).log() for v in (x, y))
-    lx, ly = lx - lx.mean(), ly - ly.mean()
-    return float((lx @ ly) / (lx @ lx))
-
-
 def timed(action: Callable[[], object], device: torch.device | None) -> float:
-    """Milliseconds of one call, with everything the device was given done."""
+    """Milliseconds of one call, with all work of the device finished."""
     wait(device)
     start = time.perf_counter()
     result = action()
@@ -80,6 +71,6 @@ def timed(action: Callable[[], object], device: torch.device | None) -> float:
 
 
 def wait(device: torch.device | None) -> None:
-    """Until the device has done all it was given; at once on a CPU."""
+    """Waits until the device has finished; returns at once on a CPU."""
     if device is not None and device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -1,19 +1,20 @@
-"""Pose sequences that pass through the singularities of the bone frames, and how fast frames turn.
+"""Pose sequences through the singularities of the bone frames, with bounds on how fast frames turn.
 
 A frame whose baseline is ``h`` long turns by about ``step / h`` when a joint makes a step; so below
 ``min_length`` (1 mm) it may turn by a few ``step / min_length``, and never by more: that is what
-going through a singularity without a jump means. A path straight through the point where a
-baseline changes sign turns by half a turn within a few millimetres: fast, but not at once.
+passing a singularity without a jump means. A path straight through the point where a baseline
+changes sign turns by half a turn within a few millimetres: fast, but not at once.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gsgan.bench.cases.poses import rest
 from gsgan.skeleton import MEDIAPIPE33
@@ -22,28 +23,9 @@ from gsgan.skeleton.frames import MIN_LENGTH
 Path = Callable[[Tensor], Tensor]
 
 
-@dataclass(frozen=True)
-class Crossing:
-    """A path through one singularity.
-
-    Args:
-        name: a few plain words.
-        path: parameters ``s [T]`` in [-1, 1] → poses ``[T, 33, 3]``; singular at s = 0.
-        rate: bound on how fast any frame turns, in Frobenius norm per unit of s.
-        jumps: how often a frame may turn at once all the same, because no continuous choice
-            exists; 0 elsewhere.
-        note: the reason of the bound, or of the jump.
-    """
-
-    name: str
-    path: Path
-    rate: float
-    jumps: int = 0
-    note: str = ""
-
-    def poses(self, steps: int) -> Tensor:
-        """``[steps, 33, 3]`` evenly along the path; 0 is one of them where steps are odd."""
-        return self.path(torch.linspace(-1, 1, steps, dtype=torch.float64))
+def poses(path: Path, steps: int) -> Tensor:
+    """``[steps, 33, 3]`` evenly along a path; its middle is one of them where steps are odd."""
+    return path(torch.linspace(-1, 1, steps, dtype=torch.float64))
 
 
 def _vector(*xyz: float) -> Tensor:
@@ -51,16 +33,27 @@ def _vector(*xyz: float) -> Tensor:
 
 
 def _unit(*xyz: float) -> Tensor:
-    return torch.nn.functional.normalize(_vector(*xyz), dim=0)
+    return normalize(_vector(*xyz), dim=0)
+
+
+def _millimetres(s: Tensor, count: float) -> Tensor:
+    """``[T, 1]``: so many lengths of 1 mm along the path."""
+    return count * MIN_LENGTH * s[:, None]
+
+
+def _line(p: Tensor, joints: tuple[int, int], half: Tensor) -> None:
+    """Puts the two joints ``half [T, 3]`` to either side of their middle."""
+    middle = p[:, list(joints)].mean(1)
+    p[:, joints[0]], p[:, joints[1]] = middle + half, middle - half
 
 
 def _shrinking_forearm(s: Tensor) -> Tensor:
     p = rest(len(s))
-    p[:, 15] = p[:, 13] + 3 * MIN_LENGTH * s[:, None] * _unit(-0.8, -0.5, 0.3)
+    p[:, 15] = p[:, 13] + _millimetres(s, 3) * _unit(-0.8, -0.5, 0.3)
     return p
 
 
-def _bending_arm(s: Tensor, around: float, across: float = 0.0, reach: float = 0.1) -> Tensor:
+def _bending_arm(s: Tensor, around: float = 0.0, across: float = 0.0, reach: float = 0.1) -> Tensor:
     """The forearm turns ``reach`` radians to either side of ``around`` radians off straight.
 
     It bends about the elbow's hinge, forwards where positive, and passes ``around`` at a distance
@@ -73,50 +66,43 @@ def _bending_arm(s: Tensor, around: float, across: float = 0.0, reach: float = 0
     angle = (around + reach * s)[:, None]
     d = angle.cos() * upper + angle.sin() * front + across * hinge
     p[:, 13] = p[:, 11] + 0.28 * upper
-    p[:, 15] = p[:, 13] + 0.25 * torch.nn.functional.normalize(d, dim=-1)
+    p[:, 15] = p[:, 13] + 0.25 * normalize(d, dim=-1)
     p[:, [17, 19, 21]] += p[:, 15:16] - rest()[:, 15:16]
     return p
 
 
-def _line(p: Tensor, joints: tuple[int, int], half: Tensor) -> None:
-    """The two joints lie ``half [T, 3]`` to either side of their middle."""
-    middle = p[:, list(joints)].mean(1)
-    p[:, joints[0]], p[:, joints[1]] = middle + half, middle - half
-
-
-def _shoulders_through_the_spine(s: Tensor, direction: Tensor) -> Tensor:
-    """The shoulder line, along the spine but for a part that goes through zero."""
+def _shoulders_through_the_spine(s: Tensor, direction: tuple[float, float, float]) -> Tensor:
+    """The shoulder line, along the spine but for a part that passes zero."""
     p = rest(len(s))
-    _line(p, (11, 12), _vector(0, 0.15, 0) + 2 * MIN_LENGTH * s[:, None] * direction)
+    _line(p, (11, 12), _vector(0, 0.15, 0) + _millimetres(s, 2) * _unit(*direction))
     return p
 
 
 def _left_and_right_change_places(s: Tensor) -> Tensor:
     p = rest(len(s))
-    side = _unit(0.8, 0.0, -0.6)
-    _line(p, (23, 24), 2 * MIN_LENGTH * s[:, None] * side)
-    _line(p, (11, 12), 2 * MIN_LENGTH * s[:, None] * side)
+    for joints in ((23, 24), (11, 12)):
+        _line(p, joints, _millimetres(s, 2) * _unit(0.8, 0.0, -0.6))
     return p
 
 
 def _hips_through_the_shoulders(s: Tensor) -> Tensor:
-    """The spine goes through zero, obliquely to the world's y axis."""
+    """The spine passes zero, obliquely to the world's y axis."""
     p = rest(len(s))
     shift = p[:, [23, 24]].mean(1) - p[:, [11, 12]].mean(1)
-    shift = shift + 4 * MIN_LENGTH * s[:, None] * _unit(0.1, 0.6, 0.8)
+    shift = shift + _millimetres(s, 4) * _unit(0.1, 0.6, 0.8)
     p[:, [11, 12]] = p[:, [11, 12]] + shift[:, None]
     return p
 
 
 def _nose_through_the_ears(s: Tensor) -> Tensor:
     p = rest(len(s))
-    p[:, 0] = p[:, [7, 8]].mean(1) + 4 * MIN_LENGTH * s[:, None] * _vector(0, 0, 1)
+    p[:, 0] = p[:, [7, 8]].mean(1) + _millimetres(s, 4) * _vector(0, 0, 1)
     return p
 
 
 def _ears_through_each_other(s: Tensor) -> Tensor:
     p = rest(len(s))
-    _line(p, (7, 8), 2 * MIN_LENGTH * s[:, None] * _unit(0.5, 0.6, 0.6))
+    _line(p, (7, 8), _millimetres(s, 2) * _unit(0.5, 0.6, 0.6))
     return p
 
 
@@ -130,105 +116,54 @@ def _shoulders_round_the_hips(s: Tensor) -> Tensor:
     return p
 
 
-_FADED = 20.0
-"""Frobenius norm of a frame's change over ``step / min_length``, where a baseline fades to its
-stand-in: between the two, ``s u + (1 - s²) f``, a direction turns at a rate of at most 3 over a
-length that stays above 0.4 on these paths, its stand-in may turn too; a frame changes by √2 of
-that, and a limb that swings from it by up to twice as much."""
+_EYES = "Below 1 mm the eyes' frame takes over."
 
-_SWUNG = 8.0
-"""The same over an angle: a half turn doubles it, in the Frobenius norm it counts √2, and a hand
-swings from a forearm that swings from an arm."""
-
-
-def _faded(name: str, path: Path, millimetres: float, note: str, jumps: int = 0) -> Crossing:
-    """A baseline that makes ``millimetres`` per unit of s."""
-    return Crossing(name, path, _FADED * millimetres * 1e-3 / MIN_LENGTH, jumps, note)
-
-
-def _swung(name: str, path: Path, angle: float, note: str, jumps: int = 0) -> Crossing:
-    """A bone that turns by ``angle`` per unit of s."""
-    return Crossing(name, path, _SWUNG * angle, jumps, note)
-
-
-CROSSINGS: tuple[Crossing, ...] = (
-    _faded(
-        "a bone through zero length",
+CROSSINGS: dict[str, tuple[Path, str]] = {
+    "a bone through zero length": (
         _shrinking_forearm,
-        3,
         "Below 1 mm its swing fades to none: at most 20 times step / 1 mm.",
     ),
-    _swung(
-        "an arm through straight",
-        lambda s: _bending_arm(s, 0.0),
-        0.1,
+    "an arm through straight": (
+        _bending_arm,
         "At most 8 times the bend's step; the hinge's weight is 0 where its axis flips.",
     ),
-    _swung(
-        "a forearm past its fold, two degrees beside",
-        lambda s: _bending_arm(s, math.pi, across=0.035),
-        0.1 / 0.035,
+    "a forearm past its fold, two degrees beside": (
+        partial(_bending_arm, around=math.pi, across=0.035),
         "The roll goes round with the way to the antipode: at most 8 times step / 2 degrees.",
     ),
-    _swung(
-        "a forearm through its fold",
-        lambda s: _bending_arm(s, math.pi),
-        0.1,
-        "The roll jumps 0.8 degrees before the fold and after it, the bone's direction does not: "
-        "frames on a sphere cannot be combed without a whirl.",
-        jumps=2,
+    "a forearm through its fold": (
+        partial(_bending_arm, around=math.pi),
+        "The roll jumps 0.8 degrees before the fold and after it, the bone's direction does "
+        "not: frames on a sphere cannot be combed without a whirl.",
     ),
-    _swung(
-        "an elbow bent against its hinge",
-        lambda s: _bending_arm(s, -math.pi / 4, reach=0.2),
-        0.2,
-        "With twist=hinge the turn into the bend plane is half a turn at half weight there, and "
-        "either way is as good. With twist=none nothing happens.",
-        jumps=2,
+    "an elbow bent against its hinge": (
+        partial(_bending_arm, around=-math.pi / 4, reach=0.2),
+        "With twist=hinge the turn into the bend plane is half a turn at half weight there, "
+        "and either way is as good. With twist=none nothing happens.",
     ),
-    _faded(
-        "shoulders through the spine's direction",
-        lambda s: _shoulders_through_the_spine(s, _unit(0.6, 0, 0.8)),
-        2,
+    "shoulders through the spine's direction": (
+        partial(_shoulders_through_the_spine, direction=(0.6, 0, 0.8)),
         "Below 1 mm the hips' line takes over: at most 20 times step / 1 mm.",
     ),
-    _faded(
-        "shoulders through the spine's direction, against the hips",
-        lambda s: _shoulders_through_the_spine(s, _unit(1, 0, 0)),
-        2,
+    "shoulders through the spine's direction, against the hips": (
+        partial(_shoulders_through_the_spine, direction=(1, 0, 0)),
         "They pass the exact opposite of their stand-in: either way round is as good.",
-        jumps=2,
     ),
-    _faded(
-        "left and right changing places",
+    "left and right changing places": (
         _left_and_right_change_places,
-        2,
         "Both lines vanish at once; the world's x axis takes over below 1 mm.",
     ),
-    _faded(
-        "hips through the shoulders",
+    "hips through the shoulders": (
         _hips_through_the_shoulders,
-        4,
         "The spine vanishes; the world's y axis takes over below 1 mm.",
     ),
-    _faded(
-        "a nose through the ears' line",
-        _nose_through_the_ears,
-        4,
-        "Below 1 mm the eyes' frame takes over.",
-    ),
-    _faded(
-        "ears through each other",
-        _ears_through_each_other,
-        4,
-        "Below 1 mm the eyes' frame takes over.",
-    ),
-    _swung(
-        "shoulders round to the back of the hips",
+    "a nose through the ears' line": (_nose_through_the_ears, _EYES),
+    "ears through each other": (_ears_through_each_other, _EYES),
+    "shoulders round to the back of the hips": (
         _shoulders_round_the_hips,
-        0.2,
-        "The trunk's box follows the middle of two directions, and jumps where they are opposite: "
-        "it could be either side.",
-        jumps=2,
+        "The trunk's box follows the middle of two directions, and jumps where they are "
+        "opposite: it could be either side.",
     ),
-)
+}
+"""By name: parameters ``s [T]`` in [-1, 1] → poses ``[T, 33, 3]``, singular at s = 0; and the bound
+on how fast a frame turns there, or the reason why it jumps."""

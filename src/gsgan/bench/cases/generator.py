@@ -10,16 +10,59 @@ import torch
 from torch import Tensor, nn
 
 from gsgan.bench.cases.case import Case, Inputs, Outputs, Tolerance
-from gsgan.bench.cases.poses import rounded
 from gsgan.model.generator import Generator, Style
 
-SUBJECT = "generator"
-SIDE = 16
-"""Pixels."""
+SIDE = 16  # pixels
 CHANNELS = {"F": 5, "S": 4, "p2d": 8}
 POSE = 35
-TIMES = 2
-"""F is drawn so many times larger each way, and averaged."""
+TIMES = 2  # F is drawn so many times larger each way, and averaged
+
+
+def cases() -> Iterator[Case]:
+    """All of them."""
+    half_empty, empty = partial(_inputs, person=0.5), partial(_inputs, person=0.0)
+    huge, large = partial(_inputs, scale=1e9), partial(_inputs, scale=1e6, shift=0.5)
+    unbiased = partial(_painted, biased=False)
+    yield _case("an ordinary image", _inputs)
+    yield _case("half of the pixels all zero", half_empty)
+    yield _case("every pixel zero", empty)
+    yield _case(
+        "half of the pixels all zero, no biases",
+        half_empty,
+        unbiased,
+        note="Normalising a pixel that is zero in every channel: it stays zero.",
+    )
+    yield _case(
+        "every pixel zero, no biases",
+        empty,
+        unbiased,
+        note="The slope is 1e3 per normalisation, so 1e15 in all: this is why there are biases.",
+    )
+    clamped = "F is clamped to ± 1e3 before it enters; beyond, its slope is 0."
+    yield _case("features of 1e9", huge, note=clamped)
+    yield _case("features of ± 1e6", large, note=clamped)
+    yield _case("features of 1e-6", partial(_inputs, scale=1e-6))
+    for name, half, within in (("bf16", torch.bfloat16, 0.05), ("fp16", torch.float16, 0.02)):
+        for what, make in (
+            ("an ordinary image", _inputs),
+            ("half of the pixels all zero", half_empty),
+            ("features of 1e9", huge),
+            ("features of ± 1e6", large),
+        ):
+            yield _case(
+                f"{name} autocast, {what}",
+                make,
+                partial(_in_half_precision, half=half),
+                tolerance=Tolerance(within),
+                note="The image only: half precision's gradients belong to a network whose "
+                "activations near 0 have the other sign.",
+            )
+
+
+def _case(
+    name: str, make: Callable[[], Inputs], run: Callable[..., Outputs] | None = None, **options: Any
+) -> Case:
+    return Case("generator", name, make, run or _painted, **options)
 
 
 @lru_cache(maxsize=8)
@@ -62,66 +105,10 @@ def _painted(inputs: Inputs, biased: bool = True) -> Outputs:
 
 
 def _in_half_precision(inputs: Inputs, half: torch.dtype) -> Outputs:
-    """Under autocast, which float64 (the judge) is not subject to.
+    """Under autocast, which float64 is not subject to.
 
-    The picture only. Rounding flips activations that are near 0, so the gradient is right for a
+    The image only. Rounding flips activations that are near 0, so the gradient is right for a
     slightly different network: off by 0.1 of its largest entry and more, whatever the code does.
     """
     with torch.no_grad(), torch.autocast(inputs["F"].device.type, dtype=half):
         return {"image": _painted(inputs)["image"].to(inputs["F"].dtype)}
-
-
-def _case(name: str, make: Callable[[], Inputs], note: str = "", **options: Any) -> Case:
-    fixed: dict[str, Any] = {"run": _painted, "tolerance": Tolerance(1e-5, 1e-4)}
-    return Case(name=name, subject=SUBJECT, build=rounded(make), note=note, **{**fixed, **options})
-
-
-def _pixels() -> Iterator[Case]:
-    yield _case("an ordinary picture", _inputs)
-    yield _case("half of the pixels all zero", partial(_inputs, person=0.5))
-    yield _case("every pixel zero", partial(_inputs, person=0.0))
-    yield _case(
-        "half of the pixels all zero, no biases",
-        partial(_inputs, person=0.5),
-        run=partial(_painted, biased=False),
-        note="Normalising a pixel that is zero in every channel: it stays zero.",
-    )
-    yield _case(
-        "every pixel zero, no biases",
-        partial(_inputs, person=0.0),
-        run=partial(_painted, biased=False),
-        note="The slope is 1e3 a normalisation, so 1e15 in all: right, and what biases are for.",
-    )
-
-
-def _features() -> Iterator[Case]:
-    note = "F is clamped to ± 1e3 before it enters; beyond, its slope is 0."
-    yield _case("features of 1e9", partial(_inputs, scale=1e9), note)
-    yield _case("features of ± 1e6", partial(_inputs, scale=1e6, shift=0.5), note)
-    yield _case("features of 1e-6", partial(_inputs, scale=1e-6))
-
-
-def _halves() -> Iterator[Case]:
-    """The picture with autocast is the picture without, to a few of the type's own roundings."""
-    scenes: tuple[tuple[str, Callable[[], Inputs]], ...] = (
-        ("an ordinary picture", _inputs),
-        ("half of the pixels all zero", partial(_inputs, person=0.5)),
-        ("features of 1e9", partial(_inputs, scale=1e9)),
-        ("features of ± 1e6", partial(_inputs, scale=1e6, shift=0.5)),
-    )
-    for name, half, tolerance in (
-        ("bf16", torch.bfloat16, 0.05),
-        ("fp16", torch.float16, 0.02),
-    ):
-        for what, make in scenes:
-            yield _case(
-                f"{name} autocast, {what}",
-                make,
-                run=partial(_in_half_precision, half=half),
-                tolerance=Tolerance(tolerance),
-                note="The picture only: half precision's gradients belong to a network whose "
-                "activations near 0 have the other sign.",
-            )
-
-
-GENERATOR: tuple[Case, ...] = (*_pixels(), *_features(), *_halves())

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from gsgan.bench.cases.case import REFUSED, Case, Inputs, Tolerance
-from gsgan.bench.cases.poses import rounded
-from gsgan.bench.cases.raster import pinhole, raster_case
+from gsgan.bench.cases.raster import Size, pinhole, raster_case, rendered
 from gsgan.body import (
     axis_angle_to_matrix,
     blend_transforms,
@@ -20,29 +20,47 @@ from gsgan.body import (
     skin,
 )
 from gsgan.model.body_points import moved_normals
-from gsgan.scene import Camera, Gaussians
-from gsgan.splat import Accuracy, rasterise
+from gsgan.scene import Gaussians
+from gsgan.splat import Accuracy
 
-SUBJECT = "LBS"
 PARENTS = (-1, 0, 1)
 """Shoulder, elbow, wrist: an arm along x, 0.3 m each."""
 BONES = torch.tensor([[0, 1], [1, 2], [0, 1], [2, 2]])
 """Of four points: two that bones share half and half, one nearly rigid, one rigid."""
+WEIGHTS = torch.tensor([[0.5, 0.5], [0.5, 0.5], [0.99, 0.01], [1.0, 0.0]], dtype=torch.float64)
+
+
+def cases() -> Iterator[Case]:
+    """All of them."""
+    yield _case("an ordinary pose")
+    for name, factor in (("two", 2.0), ("a half", 0.5), ("a millionth", 1e-6)):
+        note = {"note": "They are divided by their sum."}
+        yield _case(f"weights that sum to {name}", note, weights=WEIGHTS * factor)
+    for name, row in (("a vertex without weight", [0.0, 0.0]), ("a negative weight", [1.5, -0.5])):
+        weights = torch.cat([WEIGHTS.new_tensor([row]), WEIGHTS[1:]])
+        yield _case(name, {"expect": REFUSED}, weights=weights)
+    yield from _turns()
+    yield from _images()
 
 
 def _arm(**changes: Any) -> Inputs:
-    points = [[0.3, 0.04, 0.0], [0.6, 0.0, 0.04], [0.15, 0.03, 0.02], [0.7, 0.01, 0.02]]
-    weights = [[0.5, 0.5], [0.5, 0.5], [0.99, 0.01], [1.0, 0.0]]
-    theta = [[0.1, -0.2, 0.3], [0.0, 0.4, 0.2], [-0.3, 0.1, 0.2]]
-    joints = [[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]]
-    made = {"theta": theta, "weights": weights, "points": points, "joints": joints} | changes
+    made = {
+        "theta": [[0.1, -0.2, 0.3], [0.0, 0.4, 0.2], [-0.3, 0.1, 0.2]],
+        "weights": WEIGHTS,
+        "points": [[0.3, 0.04, 0.0], [0.6, 0.0, 0.04], [0.15, 0.03, 0.02], [0.7, 0.01, 0.02]],
+        "joints": [[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]],
+    } | changes
     inputs = {k: torch.as_tensor(v, dtype=torch.float64) for k, v in made.items()}
     scales = torch.tensor([0.03, 0.05, 0.02], dtype=torch.float64).expand(4, 3)
     return {**inputs, "theta": inputs["theta"].unsqueeze(0), "scales": scales.clone()}
 
 
+def _case(name: str, options: dict[str, Any] | None = None, **changes: Any) -> Case:
+    return Case("LBS", name, partial(_arm, **changes), _skinned, **(options or {}))
+
+
 def _skinned(inputs: Inputs) -> dict[str, Tensor]:
-    """Points, covariances and normals ``[1, 4, ...]`` of the posed arm; bones scaled if asked."""
+    """Points, covariances and normals ``[1, 4, ...]`` of the posed, perhaps scaled arm."""
     check_weights(inputs["weights"].detach())  # as every body does when it is made
     R = axis_angle_to_matrix(inputs["theta"])
     bones = forward_kinematics(inputs["joints"], PARENTS, R, torch.zeros_like(R[:, 0, 0]))
@@ -57,10 +75,8 @@ def _skinned(inputs: Inputs) -> dict[str, Tensor]:
     return {**posed, "normals": moved_normals(A, up)}
 
 
-def _painted(
-    inputs: Inputs, backend: str, *, size: tuple[int, int], settings: Accuracy
-) -> dict[str, Tensor]:
-    """The skinned Gaussians, and their picture."""
+def _rendered(inputs: Inputs, backend: str, *, size: Size, settings: Accuracy) -> dict[str, Tensor]:
+    """The skinned Gaussians, and their image."""
     posed = _skinned(inputs)
     gaussians = Gaussians(
         means=posed["means"],
@@ -70,30 +86,7 @@ def _painted(
         opacities=torch.full_like(posed["means"][..., 0], 0.7),
         features=inputs["points"].unsqueeze(0),
     )
-    camera = Camera(inputs["K"], inputs["R"], inputs["t"], size)
-    raster = rasterise(gaussians, camera, settings=settings, backend=backend)
-    return {**posed, "features": raster.features, "alpha": raster.alpha}
-
-
-def _case(name: str, options: dict[str, Any] | None = None, **changes: Any) -> Case:
-    return Case(
-        name=name,
-        subject=SUBJECT,
-        build=rounded(lambda: _arm(**changes)),
-        run=_skinned,
-        **(options or {}),
-    )
-
-
-def _weights() -> Iterator[Case]:
-    summed: dict[str, Any] = {"note": "They are divided by their sum."}
-    refused: dict[str, Any] = {"expect": REFUSED}
-    for name, factor in (("two", 2.0), ("a half", 0.5), ("a millionth", 1e-6)):
-        weights = (_arm()["weights"] * factor).tolist()
-        yield _case(f"weights that sum to {name}", summed, weights=weights)
-    rows = _arm()["weights"].tolist()
-    yield _case("a vertex without weight", refused, weights=[[0.0, 0.0], *rows[1:]])
-    yield _case("a negative weight", refused, weights=[[1.5, -0.5], *rows[1:]])
+    return {**posed, **rendered(gaussians, inputs, backend, size, settings)}
 
 
 def _turns() -> Iterator[Case]:
@@ -105,8 +98,8 @@ def _turns() -> Iterator[Case]:
         "equal numbers, and count as 0 below 1e-6.",
     }
     for name, angle in (("zero", 0.0), ("1e-9", 1e-9), ("a turn but for 0.003", 6.28)):
-        yield _case(f"joints turned by {name}", alike, theta=(angle * axis).tolist())
-    yield _case("joints turned by half a turn", theta=(math.pi * axis).tolist())
+        yield _case(f"joints turned by {name}", alike, theta=angle * axis)
+    yield _case("joints turned by half a turn", theta=math.pi * axis)
     yield _case(
         "joints turned by a thousandth, where the series ends",
         alike,
@@ -114,32 +107,23 @@ def _turns() -> Iterator[Case]:
     )
 
 
-def _pictures() -> Iterator[Case]:
+def _images() -> Iterator[Case]:
     """What cannot be inverted must still be drawn: each on every backend of the rasteriser."""
+    camera = pinhole(focal=40.0, t=(-0.35, 0.02, 1.0))
     twisted = [[0.0, 0, 0], [math.pi, 0, 0], [0.0, 0, 0]]
     folded = [[0.0, 0, 0], [0, 0, math.pi], [0.0, 0, 0]]
-    note = "Half and half of two opposite bones is flat: the covariance has rank 1 or 2."
-    scenes: tuple[tuple[str, dict[str, Any], dict[str, Any], str], ...] = (
-        ("elbow collapsed by twisting half a turn", {"theta": twisted}, {}, note),
-        ("elbow collapsed by folding half a turn", {"theta": folded}, {}, note),
-        ("bone scale 0", {}, {"bone scale": [1.0, 0.0, 1.0]}, "Gaussians shrink to a point."),
-        ("all bones of scale 0", {}, {"bone scale": [0.0, 0.0, 0.0]}, "All Gaussians are points."),
-    )
-    for name, changes, more, why in scenes:
-        extra = {k: torch.tensor(v, dtype=torch.float64) for k, v in more.items()}
-        camera = pinhole(focal=40.0, t=(-0.35, 0.02, 1.0))
+    flat = "Half and half of two opposite bones is flat: the covariance has rank 1 or 2."
+    for name, key, value, note in (
+        ("elbow collapsed by twisting half a turn", "theta", twisted, flat),
+        ("elbow collapsed by folding half a turn", "theta", folded, flat),
+        ("bone scale 0", "bone scale", [1.0, 0.0, 1.0], "Gaussians shrink to a point."),
+        ("all bones of scale 0", "bone scale", [0.0, 0.0, 0.0], "All Gaussians are points."),
+    ):
+        arm = {**_arm(**{key: value}), **camera}
         yield raster_case(
+            "LBS",
             name,
-            lambda changes=changes, extra=extra, camera=camera: {  # type: ignore[misc]
-                **_arm(**changes),
-                **extra,
-                **camera,
-            },
-            subject=SUBJECT,
-            draw=_painted,
-            tolerance=Tolerance(1e-5, 1e-4),
-            note=why,
+            lambda arm=arm: arm,  # type: ignore[misc]
+            draw=_rendered,
+            note=note,
         )
-
-
-LBS: tuple[Case, ...] = (_case("an ordinary pose"), *_weights(), *_turns(), *_pictures())

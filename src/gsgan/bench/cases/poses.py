@@ -5,12 +5,12 @@ Convention: float64, metres, body axes (x = the subject's left, y = up, z = out 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
-from gsgan.bench.cases.case import Inputs
 from gsgan.skeleton import MEDIAPIPE33
 
 REST = torch.tensor(MEDIAPIPE33.rest_positions, dtype=torch.float64)
@@ -29,125 +29,74 @@ def noisy(seed: int, batch: int = 1, sigma: float = 0.03) -> Tensor:
     return rest(batch) + sigma * torch.randn(batch, 33, 3, generator=generator, dtype=torch.float64)
 
 
-def rounded(make: Callable[[], Inputs]) -> Callable[[torch.dtype, torch.device], Inputs]:
-    """What ``Case.build`` wants, from inputs made in float64; integers and booleans stay."""
-
-    def build(dtype: torch.dtype, device: torch.device) -> Inputs:
-        return {
-            k: v.to(device, dtype) if v.is_floating_point() else v.to(device)
-            for k, v in make().items()
-        }
-
-    return build
-
-
-def _straight(p: Tensor) -> None:
-    """Arms and legs without a bend."""
-    for a, b, c in BENDS:
-        p[:, c] = p[:, b] + (p[:, b] - p[:, a])
-
-
-def _folded(p: Tensor) -> None:
-    """Forearm exactly back along the upper arm, shin along the thigh."""
-    for a, b, c in BENDS:
-        p[:, c] = p[:, b] - (p[:, b] - p[:, a]) * 0.9
-
-
-def _nearly_folded(p: Tensor) -> None:
-    """The same but for 2 degrees; hands and feet go on from there, as forearms and shins do."""
-    for a, b, c in BENDS:
-        beyond = [j for i, j in MEDIAPIPE33.limbs if i == c]
-        back = torch.nn.functional.normalize(p[:, a] - p[:, b], dim=-1)
-        front = back.new_tensor([[0.0, 0.0, 1.0]]).expand_as(back)
-        p[:, c] = p[:, b] + 0.25 * (back + 0.035 * torch.linalg.cross(back, front))
-        p[:, beyond] = p[:, c : c + 1] - (REST[beyond] - REST[c])
-
-
-def _antipodal(p: Tensor) -> None:
-    """Upper arms and thighs opposite to where their swing is nil."""
-    for limb in (0, 2, 12, 14):
-        a, b = MEDIAPIPE33.limbs[limb]
-        p[:, b] = p[:, a] - 0.3 * torch.tensor(MEDIAPIPE33.rest_directions[limb]).to(p)
-
-
-def _zero_length(p: Tensor) -> None:
-    p[:, 15], p[:, 25] = p[:, 13].clone(), p[:, 23].clone()
-
-
-def _tenth_of_a_millimetre(p: Tensor) -> None:
-    p[:, 15] = p[:, 13] + torch.tensor([0.0, 6e-5, 8e-5]).to(p)
-
-
-def _all_coincident(p: Tensor) -> None:
-    p[:] = p[:, :1].clone()
-
-
-def _hand_collapsed(p: Tensor) -> None:
-    p[:, [17, 19, 21]] = p[:, 15:16].clone()
-
-
-def _collinear_shoulders(p: Tensor) -> None:
-    """The shoulder line runs along the spine."""
-    p[:, 11] = torch.tensor([0.0, 1.5, 0.0])
-    p[:, 12] = torch.tensor([0.0, 1.3, 0.0])
-
-
-def _nearly_collinear_shoulders(p: Tensor) -> None:
-    """Half a millimetre off the spine, where the hips' line takes over."""
-    p[:, 11] = torch.tensor([0.0, 1.5, 2.5e-4])
-    p[:, 12] = torch.tensor([0.0, 1.3, -2.5e-4])
-
-
-def _collinear_trunk(p: Tensor) -> None:
-    _collinear_shoulders(p)
-    p[:, 23] = torch.tensor([0.0, 1.0, 0.0])
-    p[:, 24] = torch.tensor([0.0, 0.8, 0.0])
-
-
-def _collinear_along_x(p: Tensor) -> None:
-    """A trunk without width that lies along the world's x axis."""
-    for k, x in ((11, 0.5), (12, 0.4), (23, 0.1), (24, 0.0)):
-        p[:, k] = torch.tensor([x, 0.0, 0.0])
-
-
-def _collinear_head(p: Tensor) -> None:
-    """Nose on the line of the ears and of the eyes; no two distances in the face are equal."""
-    p[:, :11] += 0.01 * (noisy(0, sigma=1.0) - REST)[:, :11]
-    for k, x in ((7, 0.07), (8, -0.08), (2, 0.03), (5, -0.03), (0, 0.0)):
-        p[:, k] = torch.tensor([x, 1.55, 0.0])
-
-
-def _swapped(p: Tensor) -> None:
-    p[:] = p[:, list(MEDIAPIPE33.mirror)]
-
-
-def _back_to_front(p: Tensor) -> None:
-    """Shoulders turned half round over the hips: the two lines cancel."""
-    p[:, 11, 0], p[:, 12, 0] = -0.175, 0.175
-
-
-def _make(change: Callable[[Tensor], None]) -> Tensor:
-    p = rest()
-    change(p)
+def _placed(joints: Mapping[int, Tensor | tuple[float, ...]], base: Tensor = REST) -> Tensor:
+    p = base.expand(1, -1, -1).clone()
+    for joint, xyz in joints.items():
+        p[:, joint] = torch.as_tensor(xyz)
     return p
 
 
+def _bent(reach: float) -> Tensor:
+    """Forearms and shins on the line of upper arms and thighs: straight for 1, folded for -0.9."""
+    p = rest()
+    for a, b, c in BENDS:
+        p[:, c] = p[:, b] + (p[:, b] - p[:, a]) * reach
+    return p
+
+
+def _nearly_folded() -> Tensor:
+    """Folded but for 2 degrees; hands and feet go on as forearms and shins do."""
+    p = rest()
+    for a, b, c in BENDS:
+        beyond = [j for i, j in MEDIAPIPE33.limbs if i == c]
+        back = normalize(p[:, a] - p[:, b], dim=-1)
+        front = back.new_tensor([[0.0, 0.0, 1.0]]).expand_as(back)
+        p[:, c] = p[:, b] + 0.25 * (back + 0.035 * torch.linalg.cross(back, front))
+        p[:, beyond] = p[:, c : c + 1] - (REST[beyond] - REST[c])
+    return p
+
+
+def _antipodal() -> Tensor:
+    """Upper arms and thighs opposite to their rest directions."""
+    p = rest()
+    for limb in (0, 2, 12, 14):
+        a, b = MEDIAPIPE33.limbs[limb]
+        p[:, b] = p[:, a] - 0.3 * torch.tensor(MEDIAPIPE33.rest_directions[limb]).to(p)
+    return p
+
+
+def _collinear_head() -> Tensor:
+    """Nose on the line of the ears and of the eyes; no two distances in the face are equal."""
+    line = {k: (x, 1.55, 0.0) for k, x in ((7, 0.07), (8, -0.08), (2, 0.03), (5, -0.03), (0, 0.0))}
+    face = REST.clone()
+    face[:11] += 0.01 * (noisy(0, sigma=1.0) - REST)[0, :11]
+    return _placed(line, face)
+
+
+_SPINE = {11: (0.0, 1.5, 0.0), 12: (0.0, 1.3, 0.0)}  # the shoulder line runs along it
+_ALONG_X = ((11, 0.5), (12, 0.4), (23, 0.1), (24, 0.0))
+
 DEGENERATE: dict[str, Tensor] = {
     "rest": rest(),
-    "straight": _make(_straight),
-    "folded": _make(_folded),
-    "nearly_folded": _make(_nearly_folded),
-    "antipodal": _make(_antipodal),
-    "zero_length": _make(_zero_length),
-    "tenth_of_a_millimetre": _make(_tenth_of_a_millimetre),
-    "all_coincident": _make(_all_coincident),
-    "hand_collapsed": _make(_hand_collapsed),
-    "collinear_shoulders": _make(_collinear_shoulders),
-    "nearly_collinear_shoulders": _make(_nearly_collinear_shoulders),
-    "collinear_trunk": _make(_collinear_trunk),
-    "collinear_along_x": _make(_collinear_along_x),
-    "collinear_head": _make(_collinear_head),
-    "swapped": _make(_swapped),
-    "back_to_front": _make(_back_to_front),
+    "straight": _bent(1.0),
+    "folded": _bent(-0.9),
+    "nearly_folded": _nearly_folded(),
+    "antipodal": _antipodal(),
+    "zero_length": _placed({15: REST[13], 25: REST[23]}),
+    "tenth_of_a_millimetre": _placed({15: REST[13] + torch.tensor([0.0, 6e-5, 8e-5])}),
+    "all_coincident": _placed(dict.fromkeys(range(33), REST[0])),
+    "hand_collapsed": _placed(dict.fromkeys((17, 19, 21), REST[15])),
+    "collinear_shoulders": _placed(_SPINE),
+    # Half a millimetre off the spine, where the hips' line takes over.
+    "nearly_collinear_shoulders": _placed({11: (0.0, 1.5, 2.5e-4), 12: (0.0, 1.3, -2.5e-4)}),
+    "collinear_trunk": _placed({**_SPINE, 23: (0.0, 1.0, 0.0), 24: (0.0, 0.8, 0.0)}),
+    # A trunk without width that lies along the world's x axis.
+    "collinear_along_x": _placed({k: (x, 0.0, 0.0) for k, x in _ALONG_X}),
+    "collinear_head": _collinear_head(),
+    "swapped": rest()[:, list(MEDIAPIPE33.mirror)],
+    # Shoulders turned half round over the hips: the two lines cancel.
+    "back_to_front": _placed(
+        {k: torch.cat([REST.new_tensor([x]), REST[k, 1:]]) for k, x in ((11, -0.175), (12, 0.175))}
+    ),
 }
 """``[1, 33, 3]`` by name."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from functools import lru_cache, partial
 from typing import Any
@@ -12,15 +12,30 @@ import torch
 from torch import Tensor
 
 from gsgan.bench.cases.case import FINITE_ONLY, Case, Inputs, Tolerance
-from gsgan.bench.cases.poses import noisy, rest, rounded
-from gsgan.bench.cases.raster import Numbers, pinhole, raster_case
+from gsgan.bench.cases.poses import noisy, rest
+from gsgan.bench.cases.raster import Numbers, Size, pinhole, raster_case, rendered
 from gsgan.model.deformation import Deformation, Residuals
 from gsgan.scene import Camera
 from gsgan.skeleton import MEDIAPIPE33, Densify
-from gsgan.splat import Accuracy, rasterise
+from gsgan.splat import Accuracy
 
-SUBJECT = "Ψ"
 SH_DEGREE, FEATURES = 1, 2
+NAMES = tuple(field.name for field in fields(Residuals))
+
+
+def cases() -> Iterator[Case]:
+    """All of them."""
+    yield from _saturated()
+    yield from _quaternions()
+    eye = composed(ordinary_residuals())["means"][:, 0].detach()
+    yield _case(
+        "camera a millimetre from a Gaussian's middle",
+        "The direction it is seen from turns by step / 1 mm; float32 places it to 1e-4 of 1 mm.",
+        {"tolerance": Tolerance(1e-4, 1e-3)},
+        eye=eye + torch.tensor([[6e-4, 0.0, 8e-4]], dtype=torch.float64),
+    )
+    yield from _skinned_frames()
+    yield from _first_step()
 
 
 @lru_cache(maxsize=8)
@@ -49,7 +64,7 @@ def small_psi(dtype: torch.dtype, device: torch.device) -> Deformation:
 
 
 def ordinary_residuals(seed: int = 0, sigma: float = 0.3) -> Inputs:
-    """Ordinary ones, the pose they belong to, and where they are seen from."""
+    """Random residuals, the pose they belong to, and where they are seen from."""
     n = some_points(torch.float64, torch.device("cpu")).n_points
     generator = torch.Generator().manual_seed(seed)
     sh = ((SH_DEGREE + 1) ** 2, 3)
@@ -62,14 +77,18 @@ def ordinary_residuals(seed: int = 0, sigma: float = 0.3) -> Inputs:
 
 
 def composed(inputs: Inputs, frame: Numbers | None = None) -> dict[str, Tensor]:
-    """Ĝ of given residuals; ``frame``, the nine numbers of a matrix, is every point's in place of
-    its part's."""
+    """Ĝ of given residuals.
+
+    Args:
+        inputs: as ``ordinary_residuals`` makes them.
+        frame: the nine numbers of a matrix, for every point in place of its part's.
+    """
     p = inputs["p"]
     points = some_points(p.dtype, p.device)(p)
     if frame is not None:
         frames = p.new_tensor(frame).view(1, 1, 3, 3).expand_as(points.rotations)
         points = replace(points, rotations=frames)
-    residuals = Residuals(**{field.name: inputs[field.name] for field in fields(Residuals)})
+    residuals = Residuals(**{name: inputs[name] for name in NAMES})
     made = small_psi(p.dtype, p.device).compose(points, residuals, inputs["eye"])
     assert made.covariances is not None
     return {
@@ -84,31 +103,20 @@ def composed(inputs: Inputs, frame: Numbers | None = None) -> dict[str, Tensor]:
 def _case(
     name: str, note: str = "", options: dict[str, Any] | None = None, **changes: float | Tensor
 ) -> Case:
-    def make() -> Inputs:
-        ordinary = ordinary_residuals()
-        hard = {
-            key: torch.as_tensor(value, dtype=torch.float64).expand_as(ordinary[key]).clone()
-            for key, value in changes.items()
-        }
-        return {**ordinary, **hard}
+    def inputs() -> Inputs:
+        made = ordinary_residuals()
+        for key, value in changes.items():
+            made[key] = torch.as_tensor(value, dtype=torch.float64).expand_as(made[key]).clone()
+        return made
 
-    return Case(
-        name=name,
-        subject=SUBJECT,
-        build=rounded(make),
-        note=note,
-        **{"run": composed, **(options or {})},
-    )
+    return Case("Ψ", name, inputs, **{"run": composed, "note": note, **(options or {})})
 
 
 def _saturated() -> Iterator[Case]:
     yield _case("ordinary residuals")
     for value in (1e3, -1e3):
-        yield _case(
-            f"means' tanh saturated at {value:g}",
-            "The mean stays a quarter of a body height away; the slope is 0.",
-            means=value,
-        )
+        note = "The mean stays a quarter of a body height away; the slope is 0."
+        yield _case(f"means' tanh saturated at {value:g}", note, means=value)
     yield _case("means' tanh at 4", "Its slope is 1e-3.", means=4.0)
     yield _case(
         "means' tanh at 8",
@@ -116,59 +124,36 @@ def _saturated() -> Iterator[Case]:
         {"expect": FINITE_ONLY},
         means=8.0,
     )
-    round_ones: dict[str, Any] = {
-        "gradient_floor": {"quats": 1e-3},
-        "tolerance": Tolerance(gradients=1e-3),
-    }
+    round_ones = {"gradient_floor": {"quats": 1e-3}, "tolerance": Tolerance(gradients=1e-3)}
     same = "The Gaussians are round, so turning them makes no difference."
     for value in (1e3, -1e3):
-        yield _case(
-            f"scales' exponent at {value:g}",
-            f"Clamped before the exponential: nothing overflows, the slope is 0. {same}",
-            round_ones,
-            scales=value,
-        )
-        yield _case(
-            f"opacity's logit at {value:g}",
-            "Clamped to ± 8, where the sigmoid is off 0 and 1; the slope beyond is 0.",
-            opacities=value,
-        )
+        note = f"Clamped before the exponential: nothing overflows, the slope is 0. {same}"
+        yield _case(f"scales' exponent at {value:g}", note, round_ones, scales=value)
+        note = "Clamped to ± 8, where the sigmoid is off 0 and 1; the slope beyond is 0."
+        yield _case(f"opacity's logit at {value:g}", note, opacities=value)
         yield _case(f"colour at {value:g}", "At least 0, not bounded above.", sh=value)
-        everything = dict.fromkeys(_RESIDUALS, value)
+        everything = dict.fromkeys(NAMES, value)
         yield _case(f"every residual at {value:g}", same, round_ones, **everything)
 
 
-_RESIDUALS = tuple(field.name for field in fields(Residuals))
-
-
 def _quaternions() -> Iterator[Case]:
-    def w(value: float, x: float = 0.0) -> Tensor:
-        return torch.tensor([value, x, 0.0, 0.0], dtype=torch.float64)
-
-    yield _case(
-        "quaternion that cancels to 0",
-        "It turns nothing, and has no slope: no direction is better than another.",
-        quats=w(-1.0),
-    )
-    yield _case("quaternion that cancels to 1e-3", "Its slope is 1e3.", quats=w(-1.0, 1e-3))
-    yield _case(
-        "quaternion that cancels to 6e-8",
-        "The least float32 can hold beside 1. Its slope is 2e7, as it must be: clipping the "
-        "gradient's norm shortens that iteration's step.",
-        quats=w(-1.0 + 2.0**-24, 2.0**-25),
-    )
-    yield _case("quaternion of a thousand", quats=w(1e3, -7e2))
-
-
-def _views() -> Iterator[Case]:
-    inputs = ordinary_residuals()
-    first = composed(inputs)["means"][:, 0].detach()
-    yield _case(
-        "camera a millimetre from a Gaussian's middle",
-        "The direction it is seen from turns by step / 1 mm; float32 places it to 1e-4 of 1 mm.",
-        {"tolerance": Tolerance(1e-4, 1e-3)},
-        eye=first + torch.tensor([[6e-4, 0.0, 8e-4]], dtype=torch.float64),
-    )
+    for name, w, x, note in (
+        (
+            "that cancels to 0",
+            *(-1.0, 0.0),
+            "It turns nothing, and has no slope: no direction is better than another.",
+        ),
+        ("that cancels to 1e-3", -1.0, 1e-3, "Its slope is 1e3."),
+        (
+            "that cancels to 6e-8",
+            *(-1.0 + 2.0**-24, 2.0**-25),
+            "The least float32 can hold beside 1. Its slope is 2e7, as it must be: clipping the "
+            "gradient's norm shortens that iteration's step.",
+        ),
+        ("of a thousand", 1e3, -7e2, ""),
+    ):
+        quats = torch.tensor([w, x, 0.0, 0.0], dtype=torch.float64)
+        yield _case(f"quaternion {name}", note, quats=quats)
 
 
 def _skinned_frames() -> Iterator[Case]:
@@ -179,7 +164,7 @@ def _skinned_frames() -> Iterator[Case]:
         ("an elbow folded by 150 degrees", folded, "Half and half: a quarter as wide there."),
         (
             "two bones half a turn apart",
-            (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+            (0.0,) * 8 + (1.0,),
             "Of rank 1: means move, and colours are seen, along one line only.",
         ),
         (
@@ -191,8 +176,21 @@ def _skinned_frames() -> Iterator[Case]:
         yield _case(f"frames of {name}", note, {"run": partial(composed, frame=frame)})
 
 
+def _first_step() -> Iterator[Case]:
+    camera = pinhole(focal=20.0, axis_angle=(3.14159265358979, 0, 0), t=(0.0, 0.85, 2.6))
+    for name, p in (("the rest pose", rest()), ("an ordinary pose", noisy(5))):
+        yield raster_case(
+            "Ψ",
+            f"step 0 on {name}",
+            lambda p=p: {"p": p, **camera},  # type: ignore[misc]
+            draw=_step_zero,
+            note="Exactly densify's Gaussians, grey and half transparent; only limbs shorter than "
+            "5 mm start wider, at the least scale.",
+        )
+
+
 def _step_zero(
-    inputs: Inputs, backend: str, *, size: tuple[int, int], settings: Accuracy
+    inputs: Inputs, backend: str, *, size: Size, settings: Accuracy
 ) -> dict[str, Tensor]:
     """Ψ itself, as it is built, on a pose."""
     p = inputs["p"]
@@ -200,28 +198,4 @@ def _step_zero(
     camera = Camera(inputs["K"], inputs["R"], inputs["t"], size)
     pelvis = torch.eye(3, dtype=p.dtype, device=p.device).unsqueeze(0)
     gaussians = small_psi(p.dtype, p.device)(p, points, camera.centre, pelvis)
-    raster = rasterise(gaussians, camera, settings=settings, backend=backend)
-    return {"features": raster.features, "alpha": raster.alpha}
-
-
-def _first_step() -> Iterator[Case]:
-    camera = pinhole(focal=20.0, axis_angle=(3.14159265358979, 0, 0), t=(0.0, 0.85, 2.6))
-    poses: tuple[tuple[str, Callable[[], Tensor]], ...] = (
-        ("the rest pose", rest),
-        ("an ordinary pose", lambda: noisy(5)),
-    )
-    for name, pose in poses:
-        options: dict[str, Any] = {"subject": SUBJECT, "draw": _step_zero}
-        yield raster_case(
-            f"step 0 on {name}",
-            lambda pose=pose: {"p": pose(), **camera},  # type: ignore[misc]
-            note="Exactly densify's Gaussians, grey and half transparent; only limbs shorter than "
-            "5 mm start wider, at the least scale.",
-            **options,
-        )
-
-
-PSI: tuple[Case, ...] = (
-    *(*_saturated(), *_quaternions(), *_views()),
-    *(*_skinned_frames(), *_first_step()),
-)
+    return rendered(gaussians, inputs, backend, size, settings)

@@ -1,15 +1,15 @@
-"""What the rasteriser's hard cases are made of: small scenes, and how they are drawn and judged.
+"""Small scenes for the rasteriser's hard cases, and how they are rendered.
 
 Convention: scenes are dicts of float64 tensors with a batch of one: ``means quats scales opacities
 features`` (or ``covariances``) and ``K R t``. Ordinary Gaussians beside the hard ones are inputs of
-their own, ``other means`` and so on: the gradient of the hard ones is judged by its own size.
-Metres and pixels; the camera is at the origin and looks along +z unless said otherwise.
+their own, ``other means`` and so on, so that the gradients of the hard ones are compared by their
+own size. Metres and pixels; the camera is at the origin and looks along +z unless stated otherwise.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,97 +18,54 @@ from torch import Tensor
 
 from gsgan.bench.cases.case import Case, Inputs, Outputs
 from gsgan.scene import Camera, Gaussians
-from gsgan.splat import (
-    ACCURACY,
-    BACKENDS,
-    Accuracy,
-    gsplat_backend,
-    rasterise,
-    resolve_backend,
-)
+from gsgan.splat import ACCURACY, Accuracy, rasterise
+
+HIGH = ACCURACY["high"]
 
 SIZE = (24, 32)
-"""Height and width of the pictures, pixels."""
+"""Height and width of the images, pixels."""
 
 FOCAL = 30.0
-"""Focal length, pixels: the picture is about one metre wide a metre away."""
+"""Focal length, pixels: the image is about one metre wide a metre away."""
 
 ON_PIXEL = (0.5 * 2 / FOCAL, 0.5 * 2 / FOCAL, 2.0)
-"""Two metres away, exactly on the centre of the pixel right below the picture's middle."""
+"""Two metres away, exactly on the centre of the pixel right below the image's middle."""
 
 Numbers = Sequence[float]
 Size = tuple[int, int]
-_OTHER = "other "
 _GAUSSIANS = ("means", "quats", "scales", "covariances", "opacities", "features")
 
 
-@dataclass(frozen=True, kw_only=True)
-class RasterCase(Case):
-    """A case that is judged on each backend of the rasteriser.
-
-    Args:
-        draw: the inputs and the name of a backend → the outputs by name.
-        settings: what the pictures are drawn with, by every backend and by the judge.
-    """
-
-    draw: Callable[[Inputs, str], Outputs]
-    settings: Accuracy
-
-    def backends(self, device: torch.device) -> tuple[str, ...]:
-        """Those that draw this case's settings on the device themselves."""
-        return drawing_backends(device, self.settings)
-
-    def outputs(self, inputs: Inputs, backend: str) -> Outputs:
-        """The picture of one backend."""
-        return self.draw(inputs, backend)
-
-
 def raster_case(
+    subject: str,
     name: str,
     scene: Callable[[], Inputs],
     *,
-    subject: str = "Gaussians",
     size: Size = SIZE,
-    settings: Accuracy = ACCURACY["high"],
+    settings: Accuracy = HIGH,
     draw: Callable[..., Outputs] | None = None,
     **options: Any,
-) -> RasterCase:
-    """A case from a scene in float64.
+) -> Case:
+    """A case that runs on each backend of the rasteriser.
 
     Args:
-        name: see ``Case``.
-        scene: makes Gaussians and camera.
-        subject: see ``Case``.
+        subject, name, options: of ``Case``.
+        scene: makes Gaussians and camera in float64.
         size: (H, W) pixels.
-        settings: same cut-offs for backend and judge.
+        settings: the same for the backend and the reference.
         draw: called as ``draw(inputs, backend, size=size, settings=settings)``; by default
-            ``picture``.
-        options: further fields of ``Case``.
+            ``render``.
     """
-    drawn = partial(draw or picture, size=size, settings=settings)
-    return RasterCase(
-        name=name,
-        subject=subject,
-        build=lambda dtype, device: {k: v.to(device, dtype) for k, v in scene().items()},
-        run=partial(drawn, backend="reference"),
-        draw=drawn,
-        settings=settings,
-        **options,
-    )
+    run = partial(draw or render, size=size, settings=settings)
+    return Case(subject, name, scene, run, settings, **options)
 
 
-def picture(
-    inputs: Inputs,
-    backend: str,
-    *,
-    size: Size,
-    settings: Accuracy,
-    on_invalid: str = "error",
+def render(
+    inputs: Inputs, backend: str, *, size: Size, settings: Accuracy, on_invalid: str = "error"
 ) -> dict[str, Tensor]:
     """Features, alpha and depth of a scene."""
-    gaussians, camera = records(inputs, size)
     raster = rasterise(
-        *(gaussians, camera),
+        *records(inputs, size),
         settings=settings,
         backend=backend,
         depth=True,
@@ -118,9 +75,13 @@ def picture(
     return {"features": raster.features, "alpha": raster.alpha, "depth": raster.depth}
 
 
-def uncut(settings: Accuracy) -> Accuracy:
-    """The same settings without a cut-off."""
-    return replace(settings, name="uncut", alpha_min=0.0, transmittance_min=0.0, extent="all")
+def rendered(
+    gaussians: Gaussians, inputs: Inputs, backend: str, size: Size, settings: Accuracy
+) -> dict[str, Tensor]:
+    """Features and alpha of Gaussians that a case made, seen by the camera of its inputs."""
+    camera = Camera(inputs["K"], inputs["R"], inputs["t"], size)
+    raster = rasterise(gaussians, camera, settings=settings, backend=backend)
+    return {"features": raster.features, "alpha": raster.alpha}
 
 
 def records(inputs: Inputs, size: Size) -> tuple[Gaussians, Camera]:
@@ -129,26 +90,19 @@ def records(inputs: Inputs, size: Size) -> tuple[Gaussians, Camera]:
     return Gaussians(**parts), Camera(inputs["K"], inputs["R"], inputs["t"], size)
 
 
-def among(others: Inputs, hard: Inputs) -> Inputs:
-    """The hard Gaussians first, then the others, as inputs of their own."""
-    return {**hard, **{_OTHER + name: value for name, value in others.items()}}
-
-
 def _joined(inputs: Inputs, name: str) -> Tensor | None:
-    parts = [inputs[key] for key in (name, _OTHER + name) if key in inputs]
+    parts = [inputs[key] for key in (name, f"other {name}") if key in inputs]
     return torch.cat(parts, dim=1) if parts else None
 
 
-def drawing_backends(
-    device: torch.device | str = "cpu", settings: Accuracy = ACCURACY["high"]
-) -> tuple[str, ...]:
-    """The backends that keep to these settings on this device."""
-    device = torch.device(device)
-    names = (name for name in BACKENDS if name != "auto")
-    found = [name for name in names if resolve_backend(name, device, settings)[0] == name]
-    if "gsplat" in found and gsplat_backend.differences(settings, device):
-        found.remove("gsplat")
-    return tuple(found)
+def among(others: Inputs, hard: Inputs) -> Inputs:
+    """The hard Gaussians first, then the others, as inputs of their own."""
+    return {**hard, **{f"other {name}": value for name, value in others.items()}}
+
+
+def uncut(settings: Accuracy) -> Accuracy:
+    """The same settings without a cut-off."""
+    return replace(settings, name="uncut", alpha_min=0.0, transmittance_min=0.0, extent="all")
 
 
 def pinhole(
@@ -161,7 +115,7 @@ def pinhole(
     axis_angle: Numbers = (0.0, 0.0, 0.0),
     t: Numbers = (0.0, 0.0, 0.0),
 ) -> Inputs:
-    """K, R and t; the principal point (x, y) is the picture's middle unless given."""
+    """K, R and t; the principal point (x, y) is the image's middle unless given."""
     x, y = centre or (size[1] / 2, size[0] / 2)
     K = torch.tensor([[focal, skew, x], [0.0, focal * aspect, y], [0.0, 0.0, 1.0]])
     return {
@@ -184,18 +138,16 @@ def gaussians(
     scales: Numbers = (0.1, 0.13, 0.08),
     quat: Numbers = (1.0, 0.0, 0.0, 0.0),
     opacity: float = 0.8,
-    channels: int = 3,
-    seed: int = 1,
 ) -> Inputs:
     """Gaussians of one shape at given places; random colours."""
     n = len(means)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(1)
     return {
         "means": torch.tensor([[list(mean) for mean in means]], dtype=torch.float64),
         "quats": torch.tensor(list(quat), dtype=torch.float64).repeat(1, n, 1),
         "scales": torch.tensor(list(scales), dtype=torch.float64).repeat(1, n, 1),
         "opacities": torch.full((1, n), opacity, dtype=torch.float64),
-        "features": torch.rand(1, n, channels, generator=generator, dtype=torch.float64),
+        "features": torch.rand(1, n, 3, generator=generator, dtype=torch.float64),
     }
 
 
@@ -207,10 +159,9 @@ def cloud(
     opacity: tuple[float, float] = (0.05, 0.95),
     middle: Numbers = (0.0, 0.0, 2.0),
     extent: Numbers = (1.6, 1.2, 1.0),
-    seed: int = 0,
 ) -> Inputs:
-    """Random Gaussians that fill most of the picture, two metres away."""
-    generator = torch.Generator().manual_seed(seed)
+    """Random Gaussians that fill most of the image, two metres away."""
+    generator = torch.Generator().manual_seed(0)
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(1, n, *shape, generator=generator, dtype=torch.float64)

@@ -2,40 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
 import torch
 
-from gsgan.bench.cases.case import FINITE_ONLY, REFUSED, WARNED, Inputs, Tolerance
-from gsgan.bench.cases.raster import (
-    SIZE,
-    Numbers,
-    RasterCase,
-    cloud,
-    picture,
-    pinhole,
-    raster_case,
-)
+from gsgan.bench.cases.case import FINITE_ONLY, REFUSED, WARNED, Case, Inputs, Tolerance
+from gsgan.bench.cases.raster import SIZE, Numbers, cloud, pinhole, raster_case, render
 from gsgan.scene import Camera
 from gsgan.skeleton import MEDIAPIPE33, recentre
 
-FAR = (1e4, -2e4, 3e4)
-"""Metres: where a survey's origin may be."""
+FAR = (1e4, -2e4, 3e4)  # metres: where the origin of a survey may be
 
-TURNED: dict[str, Any] = {"axis_angle": (0.3, -0.4, 0.2), "t": (0.1, -0.2, 2.5)}
-MIDDLE = (0.2, -0.3, 0.1)
+_case = partial(raster_case, "scenes")
+
+
+def cases() -> Iterator[Case]:
+    """All of them."""
+    yield from _offsets()
+    yield from _units()
+    yield from _cameras()
+    yield from _refusals()
 
 
 def _scene(**camera: Any) -> Inputs:
-    """A cloud round ``MIDDLE`` seen by a turned camera two and a half metres away."""
-    return {**cloud(40, middle=MIDDLE), **pinhole(**{**TURNED, **camera})}
+    """A cloud seen by a turned camera two and a half metres away."""
+    turned: dict[str, Any] = {"axis_angle": (0.3, -0.4, 0.2), "t": (0.1, -0.2, 2.5)}
+    return {**cloud(40, middle=(0.2, -0.3, 0.1)), **pinhole(**{**turned, **camera})}
 
 
-def _far(offset: Numbers = FAR) -> Inputs:
-    """The same scene far from the world's origin: the same picture."""
-    scene, shift = _scene(), torch.tensor([list(offset)], dtype=torch.float64)
+def _far() -> Inputs:
+    """The same scene far from the world's origin: the same image."""
+    scene, shift = _scene(), torch.tensor([list(FAR)], dtype=torch.float64)
     moved = scene["t"] - (scene["R"] @ shift.unsqueeze(-1)).squeeze(-1)
     return {**scene, "means": scene["means"] + shift, "t": moved}
 
@@ -49,20 +48,21 @@ def _recentred() -> Inputs:
     return {**scene, "means": scene["means"] - origin.unsqueeze(1), "t": camera.t}
 
 
-def _offsets() -> Iterator[RasterCase]:
+def _offsets() -> Iterator[Case]:
+    name = "world offset of 1e4 m, {}"
     yield _case(
-        "world offset of 1e4 m, as float32 holds it",
+        name.format("as float32 holds it"),
         _far,
         note="Nothing is lost beyond the rounding of the input: the offset cancels in float64.",
     )
     yield _case(
-        "world offset of 1e4 m, recentred in float64",
+        name.format("recentred in float64"),
         _recentred,
         same_numbers=False,
-        note="Judged from the numbers before they were rounded.",
+        note="Compared with the numbers before they were rounded.",
     )
     yield _case(
-        "world offset of 1e4 m, not recentred",
+        name.format("not recentred"),
         _far,
         same_numbers=False,
         expect=FINITE_ONLY,
@@ -70,61 +70,52 @@ def _offsets() -> Iterator[RasterCase]:
     )
 
 
-def _units() -> Iterator[RasterCase]:
+def _units() -> Iterator[Case]:
+    def millimetres(*names: str) -> Inputs:
+        scene = _scene()
+        return {**scene, **{name: scene[name] * 1e3 for name in names}}
+
+    other = "Another image, but the right one of what was given."
     yield _case(
         "everything in millimetres, given as metres",
-        lambda: _in_millimetres("means", "scales", "t"),
-        note="The same picture; a capture like this is refused where it is read.",
+        lambda: millimetres("means", "scales", "t"),
+        note="The same image; a capture like this is refused where it is read.",
     )
     yield _case(
         "Gaussians in millimetres, cameras in metres",
-        lambda: _in_millimetres("means", "scales"),
-        note="Not the same picture, but the right one of what was given.",
+        lambda: millimetres("means", "scales"),
+        note=other,
     )
     yield _case(
         "Gaussians in metres, cameras in millimetres",
-        lambda: _in_millimetres("t"),
+        lambda: millimetres("t"),
         tolerance=Tolerance(gradients=5e-4),
-        note="Not the same picture, but the right one of what was given.",
+        note=other,
     )
 
 
-def _in_millimetres(*names: str) -> Inputs:
-    scene = _scene()
-    return {**scene, **{name: scene[name] * 1e3 for name in names}}
-
-
-def _cameras() -> Iterator[RasterCase]:
+def _cameras() -> Iterator[Case]:
     inside = {**cloud(40, scale=0.2, middle=(0.0, 0.0, 0.0)), **pinhole()}
     yield _case("camera inside the body", lambda: inside)
-    yield _case("K with skew", lambda: _scene(skew=4.0))
-    yield _case("principal point off centre", lambda: _scene(centre=(26.3, 5.1)))
-    yield _case(
-        "principal point outside the picture",
-        lambda: _scene(centre=(40.0, -6.0), t=(-1.9, 1.3, 2.5)),
-    )
-    yield _case("pixels that are not square", lambda: _scene(aspect=0.6))
-    yield _case(
-        "skew, off centre and not square",
-        lambda: _scene(skew=-5.0, centre=(11.0, 16.7), aspect=1.4),
-    )
-    yield _case("field of view of 160 degrees", lambda: _scene(focal=SIZE[1] / 11.3))
-    yield _case(
-        "long lens, 3 km away",
-        lambda: _scene(focal=4e4, t=(0.1, -0.2, 3e3)),
-    )
+    cameras: dict[str, dict[str, Any]] = {
+        "K with skew": {"skew": 4.0},
+        "principal point off centre": {"centre": (26.3, 5.1)},
+        "principal point outside the image": {"centre": (40.0, -6.0), "t": (-1.9, 1.3, 2.5)},
+        "pixels that are not square": {"aspect": 0.6},
+        "skew, off centre and not square": {"skew": -5.0, "centre": (11.0, 16.7), "aspect": 1.4},
+        "field of view of 160 degrees": {"focal": SIZE[1] / 11.3},
+        "long lens, 3 km away": {"focal": 4e4, "t": (0.1, -0.2, 3e3)},
+    }
+    for name, camera in cameras.items():
+        yield _case(name, partial(_scene, **camera))
 
 
-def _refusals() -> Iterator[RasterCase]:
+def _refusals() -> Iterator[Case]:
     for name, flip in (("mirrored camera", (1.0, 1.0, -1.0)), ("R that scales", (1.1, 1.1, 1.1))):
         yield _case(name, partial(_with_rotation, flip), expect=REFUSED)
     yield _case("a mean that is NaN", _with_nan, expect=REFUSED)
-    yield _case(
-        "a mean that is NaN, dropped",
-        _with_nan,
-        expect=WARNED,
-        draw=partial(picture, on_invalid="drop"),
-    )
+    drop = partial(render, on_invalid="drop")
+    yield _case("a mean that is NaN, dropped", _with_nan, expect=WARNED, draw=drop)
 
 
 def _with_rotation(diagonal: Numbers) -> Inputs:
@@ -137,10 +128,3 @@ def _with_nan() -> Inputs:
     means = scene["means"].clone()
     means[0, 7, 1] = float("nan")
     return {**scene, "means": means}
-
-
-def _case(name: str, scene: Callable[[], Inputs], **options: Any) -> RasterCase:
-    return raster_case(name, scene, subject="scenes", **options)
-
-
-SCENES: tuple[RasterCase, ...] = (*_offsets(), *_units(), *_cameras(), *_refusals())

@@ -1,8 +1,7 @@
-"""An avatar that paints in a chosen way: precision, accuracy, backend, picture size."""
+"""An avatar that paints in a chosen way: precision, accuracy, backend, image size."""
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -11,10 +10,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.bench.memory import MEGABYTE, peak, reset_peak
+from gsgan.bench.memory import peak_memory
+from gsgan.data.datamodule import GsganData
 from gsgan.model.avatar import Avatar
 from gsgan.scene import Frame
-from gsgan.splat import BACKENDS, Accuracy, buffers
+from gsgan.splat import BACKENDS, Accuracy
 from gsgan.utils.errors import ConfigError
 
 # Lightning's names, as in conf/trainer.
@@ -23,6 +23,7 @@ PRECISIONS: dict[str, torch.dtype | None] = {
     "bf16-mixed": torch.bfloat16,
     "16-mixed": torch.float16,
 }
+SPLITS = ("novel_pose", "novel_view", "train")  # frames are taken from the first that has any
 MEASURED_FRAMES = 4  # over which peak memory is taken
 
 
@@ -34,11 +35,11 @@ class Way:
         accuracy: the rasteriser's settings for F.
         precision: of the networks, one of ``PRECISIONS``.
         backend: of both rasterisations.
-        scale: of the picture's sides; another size than 1 is brought back to the picture's own.
-        whole: paint all of the picture, not the window round the person.
+        scale: of the image's sides; for another size than 1 the image is resized to its own size.
+        whole: paint the whole image, not only the window round the person.
 
     Raises:
-        ConfigError: naming the value that makes no sense.
+        ConfigError: naming the wrong value.
     """
 
     accuracy: Accuracy | None = None
@@ -48,11 +49,10 @@ class Way:
     whole: bool = False
 
     def __post_init__(self) -> None:
-        if self.precision not in PRECISIONS:
-            known = ", ".join(PRECISIONS)
-            raise ConfigError(f"precision must be one of {known}; got {self.precision!r}")
-        if self.backend not in BACKENDS:
-            raise ConfigError(f"backend must be one of {', '.join(BACKENDS)}; got {self.backend!r}")
+        for name, known in (("precision", PRECISIONS), ("backend", BACKENDS)):
+            if getattr(self, name) not in known:
+                got = getattr(self, name)
+                raise ConfigError(f"{name} must be one of {', '.join(known)}; got {got!r}")
         number = isinstance(self.scale, (int, float)) and not isinstance(self.scale, bool)
         if not number or not 0.05 <= self.scale <= 8:
             raise ConfigError(f"scale must be a number from 0.05 to 8; got {self.scale!r}")
@@ -91,7 +91,7 @@ class Painter:
 
 @contextmanager
 def without_denormals() -> Iterator[None]:
-    """As trainings run: a black background decays into denormals, which are slow on CPUs."""
+    """As in training: a black background decays into denormals, which are slow on CPUs."""
     torch.set_flush_denormal(True)
     try:
         yield
@@ -110,33 +110,48 @@ def changed(avatar: Avatar, way: Way) -> Iterator[None]:
         }
         avatar.accuracy = replace(way.accuracy, **formed)
     avatar.window_margin = None if way.whole else avatar.window_margin
-    _draw_with(avatar, way.backend)
+    _set_backend(avatar, way.backend)
     try:
         yield
     finally:
         avatar.accuracy, avatar.window_margin = before
-        _draw_with(avatar, "auto")
+        _set_backend(avatar, "auto")
 
 
-def _draw_with(avatar: Avatar, backend: str) -> None:
+def _set_backend(avatar: Avatar, backend: str) -> None:
     avatar.backend = backend
     if avatar.segmentation is not None:
         avatar.segmentation.backend = backend
 
 
 def painting_memory(painter: Painter, frames: Sequence[Frame]) -> float | None:
-    """Megabytes that painting takes on top of the avatar and its inputs, at its peak.
+    """Megabytes that painting takes on top of the avatar and its inputs; None where not known."""
+    few = frames[:MEASURED_FRAMES]
+    return peak_memory(lambda: [painter(frame) for frame in few], frames[0].skeleton.device)
 
-    Convention: by how much this process's peak grows over a few frames, after what was freed before
-    is given back to the system; on CUDA the allocator's peak. None where the system does not tell.
+
+def spread(data: GsganData, count: int, split: str | None = None) -> list[Frame]:
+    """At most ``count`` frames, evenly over a split; None takes the first of ``SPLITS``.
+
+    Raises:
+        ConfigError: when the split has no frame.
     """
-    device = frames[0].skeleton.device
-    painter(frames[0])
-    gc.collect()
-    buffers.forget()
-    reset_peak(device)
-    before = peak(device)
-    for frame in frames[:MEASURED_FRAMES]:
-        painter(frame)
-    after = peak(device)
-    return None if before is None or after is None else (after - before) / MEGABYTE
+    names = SPLITS if split is None else (split,)
+    name = next((n for n in names if len(data.dataset(n))), None)
+    if name is None:
+        why = data.reasons.get(names[0], "it has no frames")
+        raise ConfigError(f"no frame to paint in {', '.join(names)}: {why}; choose another split")
+    dataset = data.dataset(name)
+    return [dataset[i] for i in evenly(len(dataset), count)]
+
+
+def evenly(length: int, count: int) -> list[int]:
+    """At most ``count`` indices below ``length``, evenly spread."""
+    count = min(count, length)
+    return [(2 * i + 1) * length // (2 * count) for i in range(count)]
+
+
+def place(avatar: Avatar, device: torch.device, *, channels_last: bool) -> Avatar:
+    """The avatar on a device, in eval mode, its weights with channels last or not."""
+    layout = torch.channels_last if channels_last else torch.contiguous_format
+    return avatar.to(device=device, memory_format=layout).eval()  # type: ignore[call-overload]

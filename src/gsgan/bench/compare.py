@@ -1,0 +1,180 @@
+"""The error of an image and its gradients against float64 without cut-offs, on patches of it.
+
+With every Gaussian at every pixel, whole images are rarely affordable. On a patch the image is
+exactly the same: all is projected by the whole camera, then only the patch's pixels are blended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from gsgan.scene import Camera, Gaussians, Raster
+from gsgan.splat import ACCURACY, Accuracy, Projected, project, reference
+
+
+class Patch(NamedTuple):
+    """A rectangle of pixels: rows ``top`` to ``top + height``, columns alike."""
+
+    top: int
+    left: int
+    height: int
+    width: int
+
+    def of(self, image: Tensor) -> Tensor:
+        """``[..., height, width]`` of ``[..., H, W]``."""
+        rows = slice(self.top, self.top + self.height)
+        return image[..., rows, self.left : self.left + self.width]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The exact images and gradients.
+
+    Args:
+        patches: where.
+        images: ``[C + 1, h, w]`` float64 each: features, then alpha.
+        weights: of a scalar loss, the sum of ``images * weights`` over all patches.
+        gradients: of that loss, float64, by field of ``Gaussians``.
+    """
+
+    patches: Sequence[Patch]
+    images: Sequence[Tensor]
+    weights: Sequence[Tensor]
+    gradients: dict[str, Tensor]
+
+
+def choose_patches(
+    gaussians: Gaussians, camera: Camera, count: int, side: int, seed: int
+) -> list[Patch]:
+    """Disjoint patches that show something, drawn at random from a grid over the image.
+
+    Args:
+        gaussians: the first batch item's means decide.
+        camera: of the image.
+        count: requested patches; fewer when the grid has fewer.
+        side: pixels; patches at the right and lower edge may be smaller.
+        seed: of the draw.
+    """
+    H, W = camera.size
+    pixels, depths = camera.project(gaussians.means.detach())
+    x, y = pixels[0].cpu().unbind(-1)
+    seen = (depths[0].cpu() > 0) & (x >= 0) & (x < W) & (y >= 0) & (y < H)
+    cells = {(int(r // side), int(c // side)) for r, c in zip(y[seen], x[seen], strict=True)}
+    found = sorted(cells) or [(0, 0)]
+    order = torch.randperm(len(found), generator=torch.Generator().manual_seed(seed))
+    corners = sorted((found[i][0] * side, found[i][1] * side) for i in order[:count].tolist())
+    return [Patch(t, l, min(side, H - t), min(side, W - l)) for t, l in corners]
+
+
+def truth(gaussians: Gaussians, camera: Camera, patches: Sequence[Patch], seed: int) -> Truth:
+    """The exact images and gradients, by the ``exact`` setting in float64."""
+    random, settings = torch.Generator().manual_seed(seed), ACCURACY["exact"]
+    inputs = leaves(gaussians.to(torch.float64))
+    projected = project(inputs, camera.to(torch.float64), settings)
+    images, weights = [], []
+    for patch in patches:
+        moved = _moved(projected, patch)
+        size = (patch.height, patch.width)
+        features, alpha, _ = reference.composite(moved, size, settings, False)
+        image = torch.cat([features, alpha], dim=1)[0]
+        weights.append(torch.randn(image.shape, generator=random).to(image.device))
+        # Patch by patch, so that no two graphs of all Gaussians at all pixels are held at once.
+        (image * weights[-1]).sum().backward(retain_graph=True)
+        images.append(image.detach())
+    return Truth(patches, images, weights, gradients(inputs))
+
+
+def proven_bounds(
+    gaussians: Gaussians, camera: Camera, settings: Accuracy, patches: Sequence[Patch]
+) -> list[Tensor]:
+    """``[1, h, w]`` float64 of each patch: how far a setting can be from one without cut-offs.
+
+    Convention: a batch of one, features in [0, 1]; rounding is left out.
+    """
+    wide, wide_camera = gaussians.to(torch.float64), camera.to(torch.float64)
+    with torch.no_grad():
+        # Without cut-offs, but with the footprints that the setting gives.
+        footprints = project(wide, wide_camera, settings).extents
+        whole = replace(project(wide, wide_camera, ACCURACY["exact"]), extents=footprints)
+        return [
+            reference.error_bound(_moved(whole, p), (p.height, p.width), settings)[0]
+            for p in patches
+        ]
+
+
+def errors(
+    exact: Truth,
+    gaussians: Gaussians,
+    camera: Camera,
+    bounds: Sequence[Tensor],
+    draw: Callable[[Gaussians, Camera], Raster],
+) -> dict[str, Any]:
+    """Compares one way to draw with the truth.
+
+    Args:
+        exact: for these Gaussians and this camera.
+        gaussians, camera: of the whole image, which ``draw`` draws.
+        bounds: see ``proven_bounds``, of the settings that ``draw`` uses.
+
+    Returns:
+        ``value_max`` and ``value_mean`` of the differences of features and alpha; ``bound``, the
+        largest proven bound of a pixel (without rounding), and ``beyond``, the most by which a
+        pixel's error is above its own bound; ``gradient_<field>``, ``‖g - g_true‖ / ‖g_true‖``,
+        the largest of them as ``gradient`` of ``worst_group``; and ``gradient_max``, the largest
+        ``max |g - g_true| / max |g_true|`` of a field.
+    """
+    inputs = leaves(gaussians)
+    raster = draw(inputs, camera)
+    image = torch.cat([raster.features, raster.alpha], dim=1)[0]
+    shown = [patch.of(image) for patch in exact.patches]
+    terms = [(p * w.to(p)).sum() for p, w in zip(shown, exact.weights, strict=True)]
+    torch.stack(terms).sum().backward()
+    off = [(p.detach().double() - t).abs() for p, t in zip(shown, exact.images, strict=True)]
+    flat = torch.cat([error.flatten() for error in off])
+    got = {name: g.double() for name, g in gradients(inputs).items()}
+    norms = {k: relative(got[k], g, torch.linalg.norm) for k, g in exact.gradients.items()}
+    largest = (relative(got[k], g, lambda x: x.abs().max()) for k, g in exact.gradients.items())
+    worst = max(norms, key=norms.__getitem__)
+    return {
+        "value_max": float(flat.max()),
+        "value_mean": float(flat.mean()),
+        "bound": max(float(bound.max()) for bound in bounds),
+        "beyond": max(float((e - b).max()) for e, b in zip(off, bounds, strict=True)),
+        "gradient": norms[worst],
+        "worst_group": worst,
+        "gradient_max": max(largest),
+        **{f"gradient_{name}": value for name, value in norms.items()},
+    }
+
+
+def leaves(gaussians: Gaussians) -> Gaussians:
+    """A copy whose tensors collect gradients."""
+    changes: dict[str, Any] = {
+        name: value.detach().clone().requires_grad_()
+        for name, value in vars(gaussians).items()
+        if value is not None
+    }
+    return replace(gaussians, **changes)
+
+
+def gradients(gaussians: Gaussians) -> dict[str, Tensor]:
+    """What ``leaves`` collected, by field."""
+    return {name: value.grad for name, value in vars(gaussians).items() if value is not None}
+
+
+def relative(got: Tensor, want: Tensor, size: Callable[[Tensor], Tensor]) -> float:
+    """0 where both are 0, infinite where only the true one is."""
+    off, scale = float(size(got - want)), float(size(want))
+    if scale == 0:
+        return 0.0 if off == 0 else float("inf")
+    return off / scale
+
+
+def _moved(projected: Projected, patch: Patch) -> Projected:
+    corner = projected.means.new_tensor([patch.left, patch.top])
+    return replace(projected, means=projected.means - corner)
