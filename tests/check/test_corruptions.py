@@ -124,7 +124,7 @@ def test_a_camera_out_of_step_is_named(copy, check):
         for frame in range(11):
             folder = copy / kind / "cam00"
             (folder / f"{frame + 1:06d}.png").replace(folder / f"{frame:06d}.png")
-    report = check(copy, pixel_tolerance=0.5, joint_tolerance=0.02, joint_jump=1.0)
+    report = check(copy, trust={"joint_tolerance": 0.02}, joint_jump=1.0)
     (found,) = (f for f in report.findings if f.topic == "synchronisation")
     assert found.level == "error"
     assert found.sentence.startswith("camera cam00: its pictures fit the skeleton 1 frame(s) later")
@@ -257,7 +257,7 @@ def test_a_person_of_another_size_is_told(copy, check):
     edit_landmarks(copy, shrink)
     report = check(copy)
     told = " ".join(f.sentence for f in report.findings)
-    assert "the limb lengths speak for a person of 0.79" in told
+    assert "limb lengths suggest a person of 0.79" in told
     assert "in every camera the masks lie beside the skeleton" in only(report, "error")
 
 
@@ -313,7 +313,7 @@ def scale_focal(root: Path, factor: float, *names: str, centre: bool = False) ->
 
 def test_a_camera_that_is_nearly_right_is_named(copy, check):
     turn(copy, (0, 0, 1), 12)
-    sentences = [f.sentence for f in check(copy, inside_warning=0.71).findings]
+    sentences = [f.sentence for f in check(copy, trust={"min_inside": 0.71}).findings]
     assert any(s.startswith("camera cam01: joints lie") for s in sentences)
     assert not any("camera cam00" in s or "camera cam02" in s for s in sentences)
 
@@ -322,7 +322,7 @@ def test_a_camera_that_is_nearly_right_is_named(copy, check):
 def test_focal_lengths_of_half_are_named_for_what_they_are(copy, check, names):
     scale_focal(copy, 0.5, *names)
     # the tiny person is of thin discs, so all is smaller than in a capture
-    limits = {"fullness": 1.2, "inside_warning": 0.3, "inside_error": 0.2}
+    limits = {"fullness": 1.2, "trust": {"min_inside": 0.3}, "inside_error": 0.2}
     errors = [f.sentence for f in check(copy, **limits).findings if f.level == "error"]
     (told,) = (s for s in errors if "far larger than the body" in s)
     assert all(f"{name} " in told for name in names)
@@ -331,7 +331,7 @@ def test_focal_lengths_of_half_are_named_for_what_they_are(copy, check, names):
 
 def test_joints_just_outside_every_mask_are_told_once(copy, check):
     scale_focal(copy, 1.12, *(f"cam{i:02d}" for i in range(4)))
-    told = [f.sentence for f in check(copy, inside_warning=0.71, outside_all=0.002).findings]
+    told = [f.sentence for f in check(copy, trust={"min_inside": 0.71}, outside_all=0.002).findings]
     assert sum("in most cameras joints lie" in s for s in told) == 1
 
 
@@ -344,7 +344,7 @@ def test_a_camera_that_training_refuses_is_explained_by_the_check(copy, check):
 
 
 def test_without_suspects_there_is_nothing_small_to_judge():
-    from gsgan.check.blame import judge_small
+    from gsgan.check.calibration import small_errors
     from gsgan.check.settings import Limits
 
-    assert judge_small([], Limits()) == []
+    assert small_errors([], Limits()) == []

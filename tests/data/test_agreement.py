@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsgan.data.agreement import joint_distance, mask_distance
+from gsgan.data.formats.trust import joint_distance, mask_distance
 
 
 def test_joint_distance_in_metres():

@@ -611,7 +611,7 @@ BAD_INDEX = {
     "unknown body": (meta(body="smplh"), "'body' is 'smplh'; expected one of free, smpl, smplx"),
     "masks all empty": (
         blank_masks,
-        "masks/cam00/000000.png shows no person, nor does any of the 6 masks looked at",
+        "masks/cam00/000000.png shows no person, nor does any of the 6 masks compared",
     ),
     "mask 16 bit": (
         picture("masks/cam00/000001.png", np.zeros((24, 32), np.uint16)),
@@ -721,7 +721,7 @@ def test_an_empty_mask_is_noted(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path)
     cv2.imwrite(str(root / "masks/cam00/000001.png"), np.zeros((24, 32), np.uint8))
     (note,) = Layout.read(root).notes
-    assert note.startswith("camera cam00: the mask is empty at frames 1 of 4 looked at")
+    assert note.startswith("camera cam00: the mask is empty at frames 1 of 4 compared")
 
 
 def test_a_skewed_K_is_kept_and_undistorted_with_its_skew(tmp_path: Path) -> None:

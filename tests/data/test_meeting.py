@@ -15,8 +15,7 @@ from make import edit_json, write_tiny_capture
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.checks import Checks
 from gsgan.data.formats.capture import LOOKED_AT, CaptureReader
-from gsgan.data.formats.meeting import box_of, inside_share, mask_beyond
-from gsgan.data.formats.trust import Trust
+from gsgan.data.formats.trust import Trust, box_of, inside_share, mask_beyond
 from gsgan.data.layout import Layout
 from gsgan.utils.errors import DataError
 
@@ -65,7 +64,7 @@ def test_a_good_capture_needs_no_note(root: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (scale_K(0.5), r"inside: cam02 \d%; 100% in the other cameras\).*gsgan.check tells"),
+        (scale_K(0.5), r"inside: cam02 \d%; 100% in the other cameras\).*gsgan.check finds"),
         (in_mm, r"camera cam02 stands 3\.13e\+03 m from the person, the median camera 3 m"),
     ],
 )

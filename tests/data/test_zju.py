@@ -23,9 +23,8 @@ from gsgan.body.smpl_names import CIHP
 from gsgan.data.capture import CaptureDataset
 from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, natural_order
-from gsgan.data.formats.meeting import box_iou, mask_box
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
-from gsgan.data.formats.trust import Trust
+from gsgan.data.formats.trust import Trust, box_iou, mask_box
 from gsgan.data.formats.zju import ZjuReader, layout_of
 from gsgan.data.formats.zju_annots import camera_folders, frame_number, read_annots
 from gsgan.data.layout import Layout

@@ -1,12 +1,13 @@
-"""What a capture must satisfy before it is used, whatever its format: thresholds with names."""
+"""What a dataset must satisfy before it is used, in any format, with named thresholds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, inside, project
@@ -21,7 +22,7 @@ Index = Mapping[str, Mapping[int, str]]
 
 @dataclass(frozen=True)
 class Checks:
-    """What a capture must satisfy; each threshold can be set.
+    """What a dataset must satisfy; each threshold can be set.
 
     Args:
         min_joints: a frame with fewer usable joints is dropped.
@@ -29,13 +30,13 @@ class Checks:
         min_joints_in_view: a camera that sees fewer joints of a frame does not use that frame.
         max_reach: metres from the median joint; a joint further out counts as missing.
         rotation_tolerance: largest entry of ``R Rᵀ - I`` allowed.
-        distance: metres, least and greatest median distance from the cameras to the person; units
-            are wrong outside it.
-        max_behind: share of joints behind a camera from which its pose counts as wrong.
-        max_missing_masks: share of pictures without a mask that may be left out; above it, and
-            with 0 at the first one, reading stops.
-        header_stride: the header of every n-th picture of a camera is checked before anything
-            starts; 1 checks all, at about 0.1 ms a file. Sizes are checked again on decoding.
+        distance: metres, minimum and maximum median distance from the cameras to the person; units
+            are wrong outside them.
+        max_behind: share of joints behind a camera above which its pose is wrong.
+        max_missing_masks: share of images without a mask that may be left out; above it reading
+            stops.
+        header_stride: the header of every n-th image of a camera is checked when the dataset is
+            opened; 1 checks all, at about 0.1 ms per file. Sizes are checked again on decoding.
     """
 
     min_joints: int = 12
@@ -57,7 +58,7 @@ def drop_frames(
     checks: Checks,
     notes: list[str],
 ) -> Index:
-    """The images without the frames that lack a usable skeleton or pose, each reason noted.
+    """The images without the frames that lack a usable skeleton or pose; notes say why.
 
     Raises:
         DataError: when no frame is left.
@@ -119,26 +120,19 @@ def check_geometry(
     calibration: Path,
     unit_hint: str,
 ) -> None:
-    """Cameras must stand at a believable distance and look at the person.
+    """Cameras must be at a plausible distance and face the person.
 
     Args:
         calibration: the file to name.
-        unit_hint: what to look at when the distance is not believable.
+        unit_hint: what to check when the distance is not plausible.
 
     Raises:
-        DataError: when they do not, naming the camera.
+        DataError: naming the camera.
     """
     frames = sorted({f for files in images.values() for f in files})
     joints = np.stack([landmarks.p[f] for f in frames])
     valid = np.stack([landmarks.visibility[f] for f in frames]) > 0
-    centre = np.median(joints[valid], axis=0)
-    distance = float(np.median([np.linalg.norm(c.centre - centre) for c in cameras.values()]))
-    low, high = checks.distance
-    if not low <= distance <= high:
-        raise DataError(
-            f"{root}: cameras stand {distance:.3g} m from the person (median), expected "
-            f"{low:g}-{high:g} m; {unit_hint}"
-        )
+    check_distance(root, list(cameras.values()), joints[valid], checks.distance, unit_hint)
     for camera in cameras.values():
         depth = project(camera, joints)[1][valid]
         behind = float((depth <= NEAR).mean())
@@ -147,6 +141,35 @@ def check_geometry(
                 f"{calibration}, camera {camera.name}: {behind:.0%} of the joints lie "
                 "behind it; R and t must map world to camera (x_cam = R x + t), z forward"
             )
+
+
+def check_distance(
+    where: Path,
+    cameras: Sequence[CameraEntry],
+    joints: NDArray[np.float64],
+    limits: tuple[float, float],
+    hint: str,
+) -> None:
+    """The median distance from the cameras to the median joint must be plausible.
+
+    Args:
+        where: file or folder, for the message.
+        cameras: at least one.
+        joints: ``[N, 3]`` metres, visible ones.
+        limits: metres, minimum and maximum.
+        hint: what to check otherwise.
+
+    Raises:
+        DataError: when it is not; units are wrong then.
+    """
+    person = np.median(joints, axis=0)
+    distance = float(np.median([np.linalg.norm(c.centre - person) for c in cameras]))
+    low, high = limits
+    if not low <= distance <= high:
+        raise DataError(
+            f"{where}: cameras stand {distance:.3g} m from the person (median), expected "
+            f"{low:g}-{high:g} m; {hint}"
+        )
 
 
 def drop_unseen(
@@ -197,11 +220,11 @@ def drop_unmasked(
     """The images that have a mask.
 
     Args:
-        images: what is left so far.
+        images: those kept so far.
         masks: those found.
-        expected: the folder in which a camera's masks should be.
+        expected: the folder of each camera's masks.
         checks: for the share that may be missing.
-        notes: gains how many were left out.
+        notes: a note on how many were left out is appended.
 
     Raises:
         DataError: when more are missing than allowed.
@@ -243,7 +266,7 @@ def check_pictures(
     stride: int,
     calibration: Path,
 ) -> None:
-    """Sizes and channel layouts, from the headers alone.
+    """Checks sizes and channel layouts, from the headers alone.
 
     Raises:
         DataError: on the first file that does not fit.
