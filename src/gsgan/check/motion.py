@@ -63,7 +63,8 @@ def measured_joints(change: Float, template: SkeletonTemplate, share: float) -> 
     """
     measured = np.zeros(len(template.names), bool)
     changing = (np.nan_to_num(change) > share).any(0)
-    measured[np.array(template.limbs)[np.flatnonzero(changing)].ravel()] = True
+    for limb in np.flatnonzero(changing):
+        measured[list(template.limbs[limb])] = True
     return measured
 
 

@@ -36,8 +36,8 @@ img { max-width: 100%; border: 1px solid #ddd; } .wide { overflow-x: auto; }
 <h1>{{ report.title }}</h1><p class="root">{{ report.root }}</p>
 <p class="verdict {{ colour }}">{{ report.verdict }}</p>
 <ul>{% for f in report.findings %}
-<li class="{{ f.level }}"><strong>{{ f.level }}, {{ f.topic }}:</strong> {{ f.sentence }}</li>{% endfor %}
-</ul>
+<li class="{{ f.level }}"><strong>{{ f.level }}, {{ f.topic }}:</strong> {{ f.sentence }}</li>
+{% endfor %}</ul>
 {% for section in report.sections %}<h2>{{ section.title }}</h2>
 {% for line in section.aside + section.text %}<p>{{ line }}</p>{% endfor %}
 {% for table in section.tables %}<div class="wide"><table>
