@@ -167,10 +167,8 @@ def calibrations(
 
 def _body(subject: Subject, view: View, camera: CameraEntry) -> Bool:
     row = subject.rows[view.frame]
-    pixels, depth = project(camera, subject.p[row])
-    focal = abs(float(camera.K[0, 0] * view.place.scale[0]))
-    at, visible = view.place(pixels), subject.visible[row]
-    return body_silhouette(at, depth, visible, focal, view.mask.shape, subject.template)
+    small = view.small(camera)
+    return body_silhouette(small, subject.p[row], subject.visible[row], subject.template)
 
 
 def _shift(
@@ -180,7 +178,7 @@ def _shift(
     pairs = [(view.mask, _body(subject, view, camera)) for view in views]
     dx, dy = np.median([best_shift(*pair) for pair in pairs], axis=0).round().astype(int)
     after = float(np.mean([overlap(mask, moved(body, dx, dy)) for mask, body in pairs]))
-    pixels = np.array([dx, dy]) / views[0].place.scale
+    pixels = np.array([dx, dy]) / np.diag(views[0].to_small)[:2]
     depth = float(project(camera, subject.p[subject.visible])[1].mean())
     metres = float(np.linalg.norm(pixels / np.diag(camera.K)[:2])) * depth
     return (float(pixels[0]), float(pixels[1])), metres, after

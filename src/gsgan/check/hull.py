@@ -103,27 +103,26 @@ def _project(subject: Subject, view: View, voxels: Float) -> tuple[Bool, NDArray
     height, width = entry.size
     seen = (depth > NEAR) & (raw >= 0).all(1) & (raw[:, 0] < width) & (raw[:, 1] < height)
     limit = np.array(view.mask.shape[::-1]) - 1
-    pixels = np.floor(view.place(raw)).clip(0, limit).astype(np.int64)
+    pixels = np.floor(project(view.small(entry), voxels)[0]).clip(0, limit).astype(np.int64)
     inside = view.mask[pixels[:, 1], pixels[:, 0]] | ~seen
     return inside, np.where(seen[:, None], pixels, -1)
 
 
 def _covered(subject: Subject, view: View, corners: Float) -> Bool:
     """``[h, w]`` where the image shows the carved box; everywhere when the camera is in it."""
-    raw, depth = project(subject.cameras[view.camera], corners)
+    pixels, depth = project(view.small(subject.cameras[view.camera]), corners)
     if (depth < NEAR).any():
         return np.ones(view.mask.shape, bool)
-    at = np.clip(view.place(raw), -FAR_PIXELS, FAR_PIXELS).round().astype(np.int32)
+    at = np.clip(pixels, -FAR_PIXELS, FAR_PIXELS).round().astype(np.int32)
     canvas = cv2.fillConvexPoly(np.zeros(view.mask.shape, np.uint8), cv2.convexHull(at), 1)
     return np.asarray(canvas > 0)
 
 
 def _grown(subject: Subject, view: View) -> int:
     """Pixels that a voxel at the person covers, corner to corner, plus one."""
-    entry = subject.cameras[view.camera]
-    depth = max(NEAR, float(project(entry, subject.p[subject.rows[view.frame]])[1].mean()))
-    focal = float(entry.K[0, 0] * view.place.scale[0])
-    return thickness(1 + np.sqrt(2) * VOXEL * focal / depth, view.mask.shape)
+    camera = view.small(subject.cameras[view.camera])
+    depth = max(NEAR, float(project(camera, subject.p[subject.rows[view.frame]])[1].mean()))
+    return thickness(1 + np.sqrt(2) * VOXEL * camera.K[0, 0] / depth, camera.size)
 
 
 def hull_findings(score: HullScore | None, limits: Limits) -> list[Finding]:

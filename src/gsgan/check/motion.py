@@ -84,7 +84,7 @@ def frozen(p: Float, visible: Bool, least: int) -> Bool:
     same[1:] = np.linalg.norm(p[1:] - p[:-1], axis=-1) < STILL
     same[1:] &= visible[1:] & visible[:-1]
     held = np.zeros_like(same)
-    for joint in range(same.shape[1]):
+    for joint in range(p.shape[1]):
         for first, last in runs(same[:, joint]):
             if last - first + 2 >= least:  # a run of n equal steps joins n + 1 frames
                 held[first - 1 : last + 1, joint] = True

@@ -89,7 +89,7 @@ def person_window(view: View, joints: Float, size: tuple[int, int]) -> Window:
     rows, columns = np.nonzero(view.mask)
     if len(rows):
         small = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]])
-        points.append((small - view.place.offset) / view.place.scale)
+        points.append((small - view.to_small[:2, 2]) / np.diag(view.to_small)[:2])
     box = np.concatenate(points)
     if len(box) == 0:
         box = np.array([[0, 0], size[::-1]])

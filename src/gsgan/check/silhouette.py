@@ -5,12 +5,11 @@ Pure functions of arrays. Pixel centres lie at +0.5.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
-from gsgan.data.crop import NEAR
+from gsgan.data.cameras import CameraEntry
+from gsgan.data.crop import NEAR, project
 from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float
 from gsgan.skeleton.template import SkeletonTemplate
 
@@ -19,58 +18,23 @@ HEAD_RADIUS = 0.12  # metres about the middle of the face: half of a head's heig
 BOX_TAIL = 0.5  # per cent of a mask's pixels left out on each side of its box: specks
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Maps pixels of the whole image to a scaled one: ``pixel * scale + offset``.
-
-    Args:
-        scale: ``[2]`` along x and y.
-        offset: ``[2]`` pixels.
-        size: ``(H, W)`` of the scaled image.
-    """
-
-    scale: Float
-    offset: Float
-    size: tuple[int, int]
-
-    def __call__(self, pixels: Float) -> Float:
-        """``[..., 2]`` pixels of the whole image in the scaled one."""
-        return pixels * self.scale + self.offset
-
-    def resized(self, size: tuple[int, int]) -> Placement:
-        """The same image at another ``(H, W)``."""
-        factor = np.array([size[1] / self.size[1], size[0] / self.size[0]])
-        return Placement(self.scale * factor, self.offset * factor, size)
-
-
-def placement(K: Float, scaled_K: Float, size: tuple[int, int]) -> Placement:
-    """How a crop and resize moved pixels, from the intrinsics ``[3, 3]`` before and after it."""
-    change = scaled_K @ np.linalg.inv(K)
-    return Placement(np.array([change[0, 0], change[1, 1]]), change[:2, 2], size)
-
-
 def body_silhouette(
-    pixels: Float,
-    depth: Float,
-    visible: Bool,
-    focal: float,
-    size: tuple[int, int],
-    template: SkeletonTemplate,
+    camera: CameraEntry, p: Float, visible: Bool, template: SkeletonTemplate
 ) -> Bool:
     """``[H, W]`` silhouette estimated from a skeleton: thick bones, a filled trunk, a round head.
 
     Args:
-        pixels: ``[J, 2]``.
-        depth: ``[J]`` metres; joints behind the camera are left out.
+        camera: whose ``size`` the silhouette gets; distortion is left out.
+        p: ``[J, 3]`` metres; joints behind the camera are left out.
         visible: ``[J]``.
-        focal: pixels.
-        size: ``(H, W)``.
         template: bones, trunk and face.
     """
+    size = camera.size
+    pixels, depth = project(camera, p)
     canvas = np.zeros(size, np.uint8)
     drawn = visible & (depth > NEAR)
     at = np.round(np.clip(np.nan_to_num(pixels), -FAR_PIXELS, FAR_PIXELS) - 0.5).astype(np.int32)
-    metre = focal / np.maximum(depth, NEAR)  # pixels
+    metre = abs(camera.K[0, 0]) / np.maximum(depth, NEAR)  # pixels
     trunk = template.torso
     edges = [*template.limbs, *zip(trunk, (trunk[1], trunk[3], trunk[0], trunk[2]), strict=True)]
     for a, b in edges:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.check.settings import Sampling
-from gsgan.check.silhouette import Placement, body_silhouette, box, overlap, placement
+from gsgan.check.silhouette import body_silhouette, box, overlap
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.capture import CaptureDataset
 from gsgan.data.crop import project
@@ -118,7 +118,7 @@ class View:
         colour: ``[3]`` summed RGB of the person.
         weight: summed mask.
         mask: ``[h, w]`` small mask.
-        place: of the small mask.
+        to_small: ``[3, 3]`` maps pixels of the whole image to the small mask.
     """
 
     camera: str
@@ -132,7 +132,11 @@ class View:
     colour: Float
     weight: float
     mask: Bool
-    place: Placement
+    to_small: Float
+
+    def small(self, camera: CameraEntry) -> CameraEntry:
+        """A camera of the whole image as one of the small mask."""
+        return replace(camera, K=self.to_small @ camera.K, size=self.mask.shape)
 
     @property
     def known(self) -> Bool:
@@ -261,18 +265,16 @@ def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
     name, number = item
     entry, row = subject.cameras[name], subject.rows[number]
     frame = CaptureDataset(subject.layout, [item], min(sampling.size, max(entry.size)))[0]
-    K = frame.camera.K[0].double().numpy()
-    soft = frame.mask[0, 0].numpy()
-    mask, place = np.asarray(soft > 0.5), placement(entry.K, K, frame.camera.size)
-    focal = float(K[0, 0])
-    visible, distance = subject.visible[row], mask_distance(mask)
-    pixels, depth = project(entry, subject.p[row])
-    body = body_silhouette(place(pixels), depth, visible, focal, mask.shape, subject.template)
-    metre = float(np.median(depth[visible])) / focal  # per pixel, at the person
+    camera = replace(entry, K=frame.camera.K[0].double().numpy(), size=frame.camera.size)
+    focal, soft = float(camera.K[0, 0]), frame.mask[0, 0].numpy()
+    mask, visible = np.asarray(soft > 0.5), subject.visible[row]
+    body = body_silhouette(camera, subject.p[row], visible, subject.template)
+    metre = float(np.median(project(camera, subject.p[row][visible])[1])) / focal  # per pixel
+    distance = mask_distance(mask)
 
     def outside(row: int) -> Float:
-        pixels, depth = project(entry, subject.p[row])
-        return joint_distance(distance, place(pixels), depth, subject.visible[row], focal)
+        pixels, depth = project(camera, subject.p[row])
+        return joint_distance(distance, pixels, depth, subject.visible[row], focal)
 
     lagged = np.full(2 * sampling.lag + 1, np.nan)
     for i, steps in enumerate(range(-sampling.lag, sampling.lag + 1)):
@@ -280,7 +282,8 @@ def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
         if other is not None and not np.isnan(metres := outside(other)).all():
             lagged[i] = np.minimum(metres[~np.isnan(metres)], FAR).mean()
     factor = min(1.0, SMALL / max(mask.shape))
-    small = max(1, round(mask.shape[0] * factor)), max(1, round(mask.shape[1] * factor))
+    small = [max(1, round(side * factor)) for side in mask.shape[::-1]]
+    to_small = np.diag([*np.array(small) / mask.shape[::-1], 1]) @ camera.K @ np.linalg.inv(entry.K)
     return View(
         camera=name,
         frame=number,
@@ -292,6 +295,6 @@ def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
         lagged=lagged,
         colour=frame.image.double().sum((0, 2, 3)).numpy(),
         weight=float(soft.sum(dtype=np.float64)),
-        mask=cv2.resize(soft, small[::-1], interpolation=cv2.INTER_AREA) > 0.5,
-        place=place.resized(small),
+        mask=cv2.resize(soft, small, interpolation=cv2.INTER_AREA) > 0.5,
+        to_small=to_small,
     )
