@@ -8,10 +8,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from gsgan.check.agreement import colour_findings, hull_findings, mean_colours, score_hulls
 from gsgan.check.charts import Series, rig_drawing, series_chart
-from gsgan.check.colours import colour_findings, mean_colours
 from gsgan.check.frames import doubts, motion_of
-from gsgan.check.hull import hull_findings, score_hulls
 from gsgan.check.report import counted, listed
 from gsgan.check.reprojection import read_reprojection, reprojection_findings
 from gsgan.check.rig import axis_name, ground_axes, rig_findings, rig_of

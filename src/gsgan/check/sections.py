@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsgan.check import charts, colours, hull, overlays, rig
+from gsgan.check import agreement, charts, overlays, rig
 from gsgan.check.calibration import calibration_findings, score_cameras
 from gsgan.check.contents import broken_images, contents
 from gsgan.check.frames import doubts, frame_findings, motion_of
@@ -64,8 +64,8 @@ class Measured:
         self.cameras = score_cameras(subject, views, limits, sampling)
         self.wrong = frozenset(self.rig.far) | {s.name for s in self.cameras if s.wrong(limits)}
         self.unfit = self.wrong | {s.name for s in self.cameras if s.unfit(limits)}
-        self.hull = hull.score_hulls(subject, views, sampling.hull_frames)
-        self.colours = colours.mean_colours(views)
+        self.hull = agreement.score_hulls(subject, views, sampling.hull_frames)
+        self.colours = agreement.mean_colours(views)
         self.motion = motion_of(subject, limits)
         try:
             self.reprojection = read_reprojection(subject)
@@ -129,11 +129,11 @@ def sections(m: Measured) -> tuple[Section, ...]:
     colour = Section(
         "Colours of the cameras",
         aside=(COLOURS,),
-        tables=(colours.colour_table(m.colours, m.limits),),
+        tables=(agreement.colour_table(m.colours, m.limits),),
         # masks that do not fit show other things than the person
         findings=()
         if m.wrong
-        else tuple(colours.colour_findings(m.colours, m.info, m.effects, m.limits)),
+        else tuple(agreement.colour_findings(m.colours, m.info, m.effects, m.limits)),
     )
     settings = Section(
         "Settings of this check (conf/check.yaml)",
@@ -190,7 +190,7 @@ def _agreement(m: Measured) -> Section:
         tables=(Table(headers, tuple(cells), frozenset(flagged), title),),
         findings=(
             *calibration_findings(m.cameras, m.limits, min_inside, m.rig.far),
-            *(() if m.unfit else hull.hull_findings(m.hull, m.limits)),
+            *(() if m.unfit else agreement.hull_findings(m.hull, m.limits)),
             *reprojection_findings(found, m.limits),
         ),
     )
