@@ -138,7 +138,7 @@ def test_thousands_of_frames_are_indexed_once(subject, tmp_path):
     assert Counted.walks == 1
 
 
-def test_damaged_detections_are_said(subject, tmp_path):
+def test_damaged_detections_are_reported(subject, tmp_path):
     root = tmp_path / "capture"
     (root / "landmarks2d").mkdir(parents=True)
     np.savez(root / "landmarks2d/cam00.npz", p=np.zeros((3, 33, 3)), frame_id=np.arange(3))
@@ -201,7 +201,7 @@ def test_counts_and_lists():
         (b"", False),
     ],
 )
-def test_whole_files_are_told_by_their_end(tmp_path, content, whole):
+def test_complete_files_have_an_end_mark(tmp_path, content, whole):
     path = tmp_path / "picture"
     path.write_bytes(content)
     assert complete(path) == whole
@@ -215,7 +215,7 @@ def test_whole_files_are_told_by_their_end(tmp_path, content, whole):
         (lambda: Limits(shift="wide"), r"limits\.shift must be a number above 0"),
     ],
 )
-def test_settings_refuse_what_makes_no_sense(make, named):
+def test_settings_out_of_range_are_refused(make, named):
     with pytest.raises(ConfigError, match=named):
         make()
 

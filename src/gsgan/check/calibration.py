@@ -18,11 +18,11 @@ from gsgan.data.formats.trust import Bool
 
 OWN = "its own calibration"
 INVERSE = "R and t the other way round"
-MIRRORED = "mirrored pictures"
+MIRRORED = "mirrored images"
 EXTRINSICS = "R and t of"
 WHOLE = "the whole calibration of"
 ADVICE = {
-    MIRRORED: "mirror its pictures and masks back",
+    MIRRORED: "mirror its images and masks back",
     INVERSE: "invert its R and t: x_cam = R x + t is expected",
     EXTRINSICS: "check its R, t and folder name",
     WHOLE: "check its calibration and folder name",
@@ -229,7 +229,7 @@ def calibration_findings(
         sizes = listed(f"{s.name} {s.fullness:.1f}" for s in big)
         found.append(_error(
             f"masks are far larger than the body that skeleton and camera suggest (times its "
-            f"area: {sizes}): a focal length that is too short, K of smaller pictures, a skeleton "
+            f"area: {sizes}): a focal length that is too short, K of smaller images, a skeleton "
             "in another unit, or masks of more than the person"
         ))  # fmt: skip
         named |= {s.name for s in big}
@@ -303,17 +303,17 @@ def _unexplained(
 ) -> list[Finding]:
     level: Level = "error" if not score.inside >= limits.inside_error else "warning"
     if np.isnan(score.inside):
-        text = "its masks are empty, or no joint lies in its pictures; check both folders and K"
+        text = "its masks are empty, or no joint lies in its images; check both folders and K"
     elif score.shifted(limits):
         text = (
             f"its masks lie {_pixels(score)} pixels (right, down) beside the skeleton; "
             f"{_seen(score, scores)}. A crop or resize that K does not follow, or masks of other "
-            "pictures, do this"
+            "images, do this"
         )
     elif not score.inside >= min_inside:
         text = (
             f"only {_seen(score, scores)}. One camera alone points to its extrinsics, to "
-            "exchanged folder names, to lens distortion left out, or to masks of other pictures; "
+            "exchanged folder names, to lens distortion left out, or to masks of other images; "
             "see its overlays"
         )
     else:
@@ -329,7 +329,7 @@ def _all_beside(scores: Sequence[CameraScore], level: Level) -> Finding:
     return _error(
         "in every camera the masks lie beside the skeleton, by pixels right, down: "
         f"{listed(f'{s.name} {_pixels(s)}' for s in scores)}; the skeleton is moved or of another "
-        "size, or pictures were cropped and K did not follow",
+        "size, or images were cropped and K did not follow",
         level,
     )
 
@@ -338,7 +338,7 @@ def _all_wrong(scores: Sequence[CameraScore]) -> Finding:
     return _error(
         "in every camera joints lie outside the masks (inside: "
         f"{listed(f'{s.name} {s.inside:.0%}' for s in scores)}): the skeleton's axes, unit or "
-        "frame numbers do not fit the cameras, or the masks belong to other pictures"
+        "frame numbers do not fit the cameras, or the masks belong to other images"
     )
 
 
@@ -346,7 +346,7 @@ def _out_of_step(score: CameraScore) -> Finding:
     when = "later" if score.lag > 0 else "earlier"
     return Finding(
         "error", "synchronisation",
-        f"camera {score.name}: its pictures fit the skeleton {abs(score.lag)} frame(s) {when} "
+        f"camera {score.name}: its images fit the skeleton {abs(score.lag)} frame(s) {when} "
         f"better (joints {100 * score.lag_outside:.1f} cm outside the masks instead of "
         f"{100 * score.outside:.1f}); its clock or its numbering is off: add {score.lag:+d}",
     )  # fmt: skip

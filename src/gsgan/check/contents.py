@@ -34,8 +34,8 @@ def contents(data: GsganData, subject: Subject) -> Section:
         ("layout", layout.meta.layout),
         ("cameras", f"{len(subject.cameras)}: {', '.join(subject.cameras)}"),
         ("frames", f"{len(frames)}: {shortened(frames)}"),
-        ("pictures", f"{images} of {len(frames) * len(subject.cameras)} (all with a mask)"),
-        ("part labels", f"{labels} pictures" if labels else "none"),
+        ("images", f"{images} of {len(frames) * len(subject.cameras)} (all with a mask)"),
+        ("part labels", f"{labels} images" if labels else "none"),
         ("body poses", "none" if layout.poses is None else f"{len(layout.poses.theta)} frames"),
         ("skeleton", skeleton),
         *((f"split {name}", _split(data, name)) for name in splits.items),
@@ -55,7 +55,7 @@ def _split(data: GsganData, name: str) -> str:
     if not items:
         return f"empty: {data.splits.reasons.get(name, '')}"
     cameras, frames = {camera for camera, _ in items}, {frame for _, frame in items}
-    count, views = counted(len(items), "picture"), counted(len(cameras), "camera")
+    count, views = counted(len(items), "image"), counted(len(cameras), "camera")
     return f"{count}: {views}, frames {shortened(sorted(frames))}"
 
 
@@ -68,7 +68,7 @@ def missing_images(subject: Subject) -> list[Finding]:
             count = f"{len(lacking)} of the {len(every)} frames"
             texts.append(f"camera {name} lacks {count}: {shortened(lacking)}")
     if holes := sorted(set(range(every[0], every[-1] + 1, subject.step)) - set(every)):
-        text = f"no camera has a usable picture of {len(holes)} frames in between"
+        text = f"no camera has a usable image of {len(holes)} frames in between"
         texts.append(f"{text}: {shortened(holes)}")
     return [Finding("warning", "files", text) for text in texts]
 
@@ -81,7 +81,7 @@ def broken_images(broken: list[Broken]) -> list[Finding]:
             f"{camera} {spans([b.frame for b in broken if b.camera == camera])}"
             for camera in dict.fromkeys(b.camera for b in broken)
         )
-        text = f"{len(broken)} sampled pictures cannot be read: {rest}"
+        text = f"{len(broken)} sampled images cannot be read: {rest}"
         found.append(Finding("error", "files", text))
     return found
 

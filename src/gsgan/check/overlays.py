@@ -140,18 +140,18 @@ def _side(template: SkeletonTemplate, a: int, b: int) -> Colour:
     return MIDDLE
 
 
-def caption(picture: Bytes, text: str, colour: Colour) -> Bytes:
+def caption(image: Bytes, text: str, colour: Colour) -> Bytes:
     """The image under a bar of the colour with white text."""
-    bar = np.full((BAR, picture.shape[1], 3), colour, np.uint8)
+    bar = np.full((BAR, image.shape[1], 3), colour, np.uint8)
     cv2.putText(
         bar, text, (5, BAR - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA
     )
-    return np.concatenate([bar, picture])
+    return np.concatenate([bar, image])
 
 
-def encode(picture: Bytes) -> bytes:
+def encode(image: Bytes) -> bytes:
     """A JPEG of an RGB image."""
-    ok, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     if not ok:
         raise OSError("an image of the report could not be encoded as JPEG")
     return data.tobytes()

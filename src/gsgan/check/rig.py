@@ -147,6 +147,6 @@ def lens_table(subject: Subject, rig: Rig) -> Table:
             flagged.add((i, 6))
     headers = (
         "camera", "pixels", "focal fx, fy", "view", "centre (share)", "distortion", "distance m",
-        "height m", "pictures",
+        "height m", "images",
     )  # fmt: skip
     return Table(headers, tuple(rows), frozenset(flagged), "Lenses and places")

@@ -27,7 +27,7 @@ TABLE_FRAMES = 40  # doubtful frames listed
 AGREEMENT = (
     "Joints are compared with masks, undistorted. Overlap is that of the mask with the silhouette "
     "estimated from the skeleton (about 0.7 in a good capture); 'best other' is what the "
-    "calibration of another camera, mirrored pictures, or R and t the other way round would reach. "
+    "calibration of another camera, mirrored images, or R and t the other way round would reach. "
     "'Hull fills' is the share of the mask that is left when all masks together carve space: it "
     "does not need the skeleton."
 )
@@ -213,7 +213,7 @@ def _frames(m: Measured) -> Section:
     table = tuple((str(frame), "; ".join(text)) for frame, text in m.reasons.items())
     text = (
         f"{counted(len(table), 'frame')} of {len(m.subject.frames)} to distrust; skeletons were "
-        f"checked in all frames, masks in {counted(len(m.views), 'picture')}."
+        f"checked in all frames, masks in {counted(len(m.views), 'image')}."
     )
     if len(table) > TABLE_FRAMES:
         text += f" The first {TABLE_FRAMES} are listed; the JSON file has all."

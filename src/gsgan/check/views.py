@@ -201,8 +201,8 @@ def suspicious_items(subject: Subject, sampling: Sampling) -> tuple[Item, ...]:
     ``sampling.size_ratio`` times smaller or larger than its camera's median: empty or full.
     """
     cut, odd, layout = list[Item](), list[Item](), subject.layout
-    pictures = sum(len(files) for files in subject.pairs.values())
-    every = max(1, -(-2 * pictures // TAILS))  # an image and its mask each
+    images = sum(len(files) for files in subject.pairs.values())
+    every = max(1, -(-2 * images // TAILS))  # an image and its mask each
     for name, files in subject.pairs.items():
         items = [(name, frame) for frame in files[::every]]
         masks = [[path for _, path in layout.mask_files(*item)] for item in items]

@@ -77,7 +77,7 @@ def drop_frames(
             + "; ".join(f"{len(ids)} {reason}" for reason, ids in dropped.items())
         )
     if unseen := len(set(landmarks.p) - set(frames)):
-        notes.append(f"{unseen} frames in {landmarks.source} have no picture and are not used")
+        notes.append(f"{unseen} frames in {landmarks.source} have no image and are not used")
     uneven = [f"{name} {len(files)}" for name, files in images.items() if len(files) < len(frames)]
     if uneven:
         notes.append(
@@ -197,7 +197,7 @@ def drop_unseen(
         if not enough.any():
             raise DataError(
                 f"{calibration}, camera {name}: no frame has "
-                f"{checks.min_joints_in_view} joints inside the picture; check K, and that R and t "
+                f"{checks.min_joints_in_view} joints inside the image; check K, and that R and t "
                 "map world to camera (x_cam = R x + t)"
             )
         if not enough.all():
@@ -230,25 +230,25 @@ def drop_unmasked(
         DataError: when more are missing than allowed.
     """
     lacking = {c: [f for f in files if not masks[c].get(f)] for c, files in images.items()}
-    pictures = sum(len(files) for files in images.values())
+    count = sum(len(files) for files in images.values())
     missing = sum(len(frames) for frames in lacking.values())
     if missing == 0:
         return images
     camera = next(c for c, frames in lacking.items() if frames)
     frame = lacking[camera][0]
     path = (expected[camera] / Path(images[camera][frame]).name).with_suffix(".png")
-    count = f"{len(lacking[camera])} of the {len(images[camera])} of camera {camera} are missing"
+    first = f"{len(lacking[camera])} of the {len(images[camera])} of camera {camera} are missing"
     if checks.max_missing_masks == 0:
-        raise DataError(f"{path} does not exist; every picture needs a mask, and {count}")
-    share = missing / pictures
+        raise DataError(f"{path} does not exist; every image needs a mask, and {first}")
+    share = missing / count
     if share > checks.max_missing_masks:
         raise DataError(
-            f"{path} does not exist, and {share:.0%} of all {pictures} pictures have no mask "
-            f"({count}); at most {checks.max_missing_masks:.0%} may be left out: get the whole "
+            f"{path} does not exist, and {share:.0%} of all {count} images have no mask "
+            f"({first}); at most {checks.max_missing_masks:.0%} may be left out: get the whole "
             "masks, or raise max_missing_masks"
         )
     notes.append(
-        f"{missing} of {pictures} pictures have no mask and are left out "
+        f"{missing} of {count} images have no mask and are left out "
         f"(first: camera {camera}, frame {frame})"
     )
     gone = {c: set(frames) for c, frames in lacking.items()}
@@ -276,7 +276,7 @@ def check_pictures(
         for frame in list(files)[::stride]:
             image = root / files[frame]
             check_picture(image, "image", size, str(calibration))
-            by = f"the picture {image}"
+            by = f"the image {image}"
             for mask in masks[name][frame]:
                 check_picture(root / mask.path, "mask", size, by)
             if label := labels.get(name, {}).get(frame):
