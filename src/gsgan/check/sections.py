@@ -135,13 +135,6 @@ def sections(m: Measured) -> tuple[Section, ...]:
         if m.wrong
         else tuple(agreement.colour_findings(m.colours, m.info, m.effects, m.limits)),
     )
-    settings = Section(
-        "Settings of this check (conf/check.yaml)",
-        aside=tuple(
-            f"{group}: " + ", ".join(f"{name} {value:g}" for name, value in asdict(values).items())
-            for group, values in (("sampling", m.sampling), ("limits", m.limits))
-        ),
-    )
     return (
         contents(m.data, m.subject),
         *files,
@@ -151,7 +144,6 @@ def sections(m: Measured) -> tuple[Section, ...]:
         _frames(m),
         colour,
         _effects(m),
-        settings,
     )
 
 
