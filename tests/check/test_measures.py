@@ -15,8 +15,9 @@ from gsgan.check.report import counted, listed
 from gsgan.check.reprojection import read_reprojection, reprojection_findings
 from gsgan.check.rig import axis_name, ground_axes, rig_findings, rig_of
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.views import complete, evenly, measure, sampled_items
+from gsgan.check.views import complete, measure, sampled_items
 from gsgan.data.crop import project
+from gsgan.data.formats.trust import spread
 from gsgan.effects import EffectSettings
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -68,10 +69,11 @@ def test_pictures_are_the_same_moments_in_every_camera(subject):
     assert set(map(tuple, frames.values())) == {(0, 6, 11)}
 
 
-def test_evenly():
-    assert evenly((3, 4, 5), 5) == (3, 4, 5)
-    assert evenly(tuple(range(10)), 3) == (0, 4, 9)
-    assert evenly(tuple(range(10)), 1) == (0,)
+def test_values_are_spread():
+    assert spread((3, 4, 5), 5) == [3, 4, 5]
+    assert spread(range(10), 3) == [0, 4, 9]
+    assert spread(range(10), 1) == [0]
+    assert spread([], 3) == []
 
 
 def test_reprojection_of_stored_distances(subject):

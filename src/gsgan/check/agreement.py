@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from gsgan.check.report import Finding, Table
 from gsgan.check.settings import Limits
 from gsgan.check.silhouette import thickness
-from gsgan.check.views import Subject, View, evenly, grouped
+from gsgan.check.views import Subject, View, grouped
 from gsgan.data.crop import NEAR, project
-from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float
+from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float, spread
 from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import EffectSettings
 
@@ -55,10 +55,10 @@ def score_hulls(subject: Subject, views: Sequence[View], moments: int) -> HullSc
     most = max((len(seen) for seen in by_frame.values()), default=0)
     if most < LEAST_CAMERAS:
         return None
-    full = tuple(sorted(frame for frame, seen in by_frame.items() if len(seen) == most))
+    full = sorted(frame for frame, seen in by_frame.items() if len(seen) == most)
     filled: dict[str, list[float]] = {}
     without: dict[str, list[float]] = {}
-    for frame in evenly(full, moments):
+    for frame in spread(full, moments):
         for view, *shares in zip(by_frame[frame], *_shares(subject, by_frame[frame]), strict=True):
             filled.setdefault(view.camera, []).append(shares[0])
             without.setdefault(view.camera, []).append(shares[1])

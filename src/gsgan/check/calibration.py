@@ -11,10 +11,10 @@ import numpy as np
 from gsgan.check.report import Finding, Level, listed
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.silhouette import best_shift, body_silhouette, moved, overlap
-from gsgan.check.views import Subject, View, evenly, grouped
+from gsgan.check.views import Subject, View, grouped
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import project
-from gsgan.data.formats.trust import Bool
+from gsgan.data.formats.trust import Bool, spread
 
 OWN = "its own calibration"
 INVERSE = "R and t the other way round"
@@ -122,7 +122,7 @@ def score_cameras(
 def _score(
     subject: Subject, name: str, views: Sequence[View], limits: Limits, count: int
 ) -> CameraScore:
-    chosen, own = evenly(tuple(views), count), subject.cameras[name]
+    chosen, own = spread(views, count), subject.cameras[name]
     fits = {
         what: float(np.mean([overlap(v.mask, _body(subject, v, entry)) for v in chosen]))
         for what, entry in calibrations(own, subject.cameras).items()

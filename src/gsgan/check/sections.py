@@ -15,7 +15,8 @@ from gsgan.check.frames import doubts, frame_findings, motion_of
 from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.reprojection import read_reprojection, reprojection_findings
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.views import Broken, Subject, View, evenly, grouped
+from gsgan.check.views import Broken, Subject, View, grouped
+from gsgan.data.formats.trust import spread
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.table import HEADERS, rows
 from gsgan.utils.errors import DataError
@@ -107,7 +108,11 @@ class Measured:
             "stature": self.rig.stature,
             "reprojection_px": None if found is None else found.median,
             "doubtful_frames": {str(frame): text for frame, text in self.reasons.items()},
-            "settings": {"sampling": asdict(self.sampling), "limits": asdict(self.limits)},
+            "settings": {
+                "sampling": asdict(self.sampling),
+                "limits": asdict(self.limits),
+                "trust": asdict(self.subject.trust),
+            },
         }
 
 
@@ -192,9 +197,7 @@ def _overlays(m: Measured) -> Section:
     figures = [
         Figure(
             f"camera {name}",
-            overlays.strip(
-                m.subject, evenly(tuple(own), m.sampling.shown), m.sampling.tile, m.doubtful
-            ),
+            overlays.strip(m.subject, spread(own, m.sampling.shown), m.sampling.tile, m.doubtful),
         )
         for name, own in grouped(m.views).items()
     ]

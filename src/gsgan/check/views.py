@@ -19,7 +19,15 @@ from gsgan.check.silhouette import body_silhouette, box, overlap
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.capture import CaptureDataset
 from gsgan.data.crop import project
-from gsgan.data.formats.trust import TOLERANCE, Bool, Float, Trust, joint_distance, mask_distance
+from gsgan.data.formats.trust import (
+    TOLERANCE,
+    Bool,
+    Float,
+    Trust,
+    joint_distance,
+    mask_distance,
+    spread,
+)
 from gsgan.data.layout import Layout
 from gsgan.data.splits import Item
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
@@ -167,14 +175,6 @@ class Broken:
 Results = Iterable[View | Broken]
 
 
-def evenly(values: tuple[Any, ...], count: int) -> tuple[Any, ...]:
-    """At most ``count`` of the values, evenly spaced, first and last included."""
-    if len(values) <= count:
-        return values
-    chosen = np.unique(np.linspace(0, len(values) - 1, count).round().astype(int))
-    return tuple(values[i] for i in chosen)
-
-
 def grouped(views: Sequence[View]) -> dict[str, list[View]]:
     """The views by camera."""
     found: dict[str, list[View]] = {}
@@ -186,10 +186,10 @@ def grouped(views: Sequence[View]) -> dict[str, list[View]]:
 def sampled_items(subject: Subject, pictures: int) -> tuple[Item, ...]:
     """At most ``pictures`` items, at least one per camera: the same moments, evenly spaced."""
     each = max(1, pictures // len(subject.pairs))
-    moments = set(evenly(tuple(int(f) for f in subject.frames), each))
+    moments = set(spread([int(f) for f in subject.frames], each))
     items = []
     for name, files in subject.pairs.items():
-        chosen = tuple(f for f in files if f in moments) or evenly(files, each)
+        chosen = [f for f in files if f in moments] or spread(files, each)
         items += [(name, f) for f in chosen]
     return tuple(items)
 
@@ -215,7 +215,7 @@ def suspicious_items(subject: Subject, sampling: Sampling) -> tuple[Item, ...]:
         ratio = np.maximum(sizes, 1) / max(float(np.median(sizes)), 1)
         far = np.maximum(ratio, 1 / ratio) > sampling.size_ratio
         odd += [item for item, is_far in zip(items, far, strict=True) if is_far]
-    return (*cut[: sampling.pictures], *evenly(tuple(odd), sampling.pictures))
+    return (*cut[: sampling.pictures], *spread(odd, sampling.pictures))
 
 
 def complete(path: Path) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -26,6 +27,7 @@ Bytes = NDArray[np.uint8]
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 Box = tuple[float, float, float, float]
+T = TypeVar("T")
 
 LONGEST = 512  # pixels, longest side of a mask that joints are compared with
 TOLERANCE = 1.5  # pixels of that mask that a joint may always lie outside
@@ -313,11 +315,11 @@ def box_iou(a: Box, b: Box) -> float:
     return both / total if total > 0 else 0.0
 
 
-def spread(values: list[int], count: int) -> list[int]:
-    """At most ``count`` of the values, evenly spaced."""
+def spread(values: Sequence[T], count: int) -> list[T]:
+    """At most ``count`` of the values, evenly spaced, first and last included."""
     if not values or count < 1:
         return []
-    return sorted({values[round(i)] for i in np.linspace(0, len(values) - 1, count)})
+    return [values[i] for i in sorted({round(x) for x in np.linspace(0, len(values) - 1, count)})]
 
 
 def watch_masks(layout: Layout, trust: Trust) -> list[str]:
