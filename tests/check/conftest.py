@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsgan.check.findings import Report
+from gsgan.check.report import Report
 from gsgan.check.settings import Limits, Sampling
 
 
@@ -35,17 +35,25 @@ def copy(good: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def check():
-    """Checks a folder: ``check(root, pictures=48, joint_jump=0.1)``."""
+def check(monkeypatch: pytest.MonkeyPatch):
+    """Checks a folder: ``check(root, pictures=48, joint_jump=0.1, trust={"min_inside": 0.7})``."""
+    from gsgan.check import charts
     from gsgan.check.run import check_data
     from gsgan.data.datamodule import GsganData
+    from gsgan.data.formats.capture import CaptureReader
+    from gsgan.data.formats.trust import Trust
 
-    def run(root: Path, pictures: int = 48, **limits: float) -> Report:
+    for name in ("rig_drawing", "series_chart"):  # tests of the command draw them
+        monkeypatch.setattr(charts, name, lambda *_: b"<?")
+
+    def run(root: Path, pictures: int = 48, trust: dict | None = None, **limits: float) -> Report:
         sampling = Sampling(
-            pictures=pictures, hull_frames=1, trial_frames=3, shown=2, tile=60, size_ratio=1.4
+            pictures=pictures, hull_frames=1, trials=100, shown=1, tile=60, size_ratio=1.4
         )
-        # the little man's raised arm grows: his forearm is no fault of the capture
-        return check_data(GsganData(root=str(root)), sampling, Limits(limb_share=2.0, **limits))
+        reader = CaptureReader(trust=Trust(min_box_iou=0.0, **(trust or {})))
+        data = GsganData(root=str(root), reader=reader)
+        # the forearm of the test person grows as it is raised
+        return check_data(data, sampling, Limits(limb_share=2.0, **limits))
 
     return run
 
@@ -53,7 +61,7 @@ def check():
 @pytest.fixture
 def subject(good: Path):
     """The good capture as the checks see it."""
-    from gsgan.check.subject import subject_of
+    from gsgan.check.views import subject_of
     from gsgan.data.datamodule import GsganData
 
     return subject_of(GsganData(root=str(good)))

@@ -52,12 +52,12 @@ def test_a_good_capture_passes_and_leaves_a_report(good, command, tmp_path):
     ]
     assert "nothing wrong was found" in page
     assert "<script" not in page
-    assert "http" not in page.replace("http://www.w3.org/2000/svg", "")
-    pictures = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', page)
-    assert len(pictures) == 4  # a strip a camera
-    strip = cv2.imdecode(np.frombuffer(base64.b64decode(pictures[0]), np.uint8), 1)
+    assert "http" not in page
+    strips = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', page)
+    assert len(strips) == 4  # one per camera
+    strip = cv2.imdecode(np.frombuffer(base64.b64decode(strips[0]), np.uint8), 1)
     assert strip.shape == (60 + 18, 45 + 4 + 45, 3)
-    assert page.count("<svg") == 6  # the rig and five series
+    assert page.count("data:image/svg+xml;base64,") == 2  # the cameras and the series
     for camera in ("cam00", "cam01", "cam02", "cam03"):
         assert f"camera {camera}" in page
     numbers = json.loads((tmp_path / "work" / "check.json").read_text())
@@ -115,9 +115,9 @@ def test_a_root_that_is_not_set_is_one_sentence(command):
 
 
 def test_settings_that_make_no_sense_are_one_sentence(good, command):
-    code, output, _ = command(f"data.root={good}", "limits.flesh=-1")
+    code, output, _ = command(f"data.root={good}", "limits.shift=-1")
     assert code == 1
-    assert "limits.flesh must be a number above 0" in output
+    assert "limits.shift must be a number above 0" in output
     assert "Traceback" not in output
 
 
@@ -128,7 +128,7 @@ def test_strict_must_be_true_or_false(good, command):
     assert page == ""
 
 
-def test_a_report_that_cannot_be_written_is_said(good, command, tmp_path):
+def test_a_report_that_cannot_be_written_is_reported(good, command, tmp_path):
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "taken").write_text("")
     code, output, _ = command(f"data.root={good}", *FEW, report="taken/check.html")
@@ -142,10 +142,10 @@ def test_the_real_capture_has_what_is_known_of_it(command, tmp_path):
     assert code == 0
     assert "0 errors, 2 warnings" in output
     numbers = json.loads((tmp_path / "work" / "check.json").read_text())
-    told = {finding["topic"]: finding["sentence"] for finding in numbers["findings"]}
-    assert "exposure or white balance" in told["colour"]  # cam02 is dark, cam04 bright
-    assert "cam02" in told["colour"]
-    assert "cam04" in told["colour"]
+    found = {finding["topic"]: finding["sentence"] for finding in numbers["findings"]}
+    assert "exposure or white balance" in found["colour"]  # cam02 is dark, cam04 bright
+    assert "cam02" in found["colour"]
+    assert "cam04" in found["colour"]
     assert set(numbers["doubtful_frames"]) == {"64", "65"}  # the right foot, found flipped
     for camera in numbers["cameras"].values():
         assert camera["inside"] > 0.98

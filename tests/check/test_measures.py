@@ -3,80 +3,84 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from gsgan.check.charts import rig_drawing, series_chart
-from gsgan.check.colours import score_colours
-from gsgan.check.hull import carvings, judge_hulls, score_hulls
-from gsgan.check.looking import chosen_items, look_at
-from gsgan.check.reprojection import far_frames, judge_reprojection, read_reprojection
-from gsgan.check.rig import axis_name, ground_axes, judge_rig, rig_of
+from gsgan.check.agreement import colour_findings, hull_findings, mean_colours, score_hulls
+from gsgan.check.charts import Series, rig_drawing, series_chart
+from gsgan.check.frames import doubts, motion_of
+from gsgan.check.report import counted, listed
+from gsgan.check.reprojection import read_reprojection, reprojection_findings
+from gsgan.check.rig import axis_name, ground_axes, rig_findings, rig_of
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.subject import evenly
-from gsgan.check.suspects import finished
+from gsgan.check.views import complete, measure, sampled_items
 from gsgan.data.crop import project
+from gsgan.data.formats.trust import spread
+from gsgan.effects import EffectSettings
 from gsgan.utils.errors import ConfigError, DataError
 
 SAMPLING = Sampling(pictures=8, hull_frames=1)
 
 
 @pytest.fixture
-def looks(subject):
-    return look_at(subject, chosen_items(subject, 8), Limits(), SAMPLING)[0]
+def views(subject):
+    return measure(subject, sampled_items(subject, 8), SAMPLING)[0]
 
 
-def test_the_hull_of_good_masks_fills_them(subject, looks):
-    score = score_hulls(carvings(subject, looks, SAMPLING))
+def test_the_hull_of_good_masks_fills_them(subject, views):
+    score = score_hulls(subject, views, 1)
     assert all(share > 0.95 for share in score.filled.values())
-    assert judge_hulls(score, Limits()) == []
+    assert hull_findings(score, Limits()) == []
 
 
-def test_a_mask_of_elsewhere_is_named_by_the_hull_alone(subject, looks):
+def test_a_mask_of_elsewhere_is_named_by_the_hull_alone(subject, views):
     wrong = [
-        replace(look, mask=np.roll(look.mask, 12, axis=1)) if look.camera == "cam02" else look
-        for look in looks
+        replace(view, mask=np.roll(view.mask, 12, axis=1)) if view.camera == "cam02" else view
+        for view in views
     ]
-    score = score_hulls(carvings(subject, wrong, SAMPLING))
-    (finding,) = judge_hulls(score, Limits())
+    (finding,) = hull_findings(score_hulls(subject, wrong, 1), Limits())
     assert "without camera cam02" in finding.sentence
-    assert judge_hulls(score, Limits(), frozenset({"cam02"})) == []
 
 
-def test_two_cameras_cannot_tell_which_is_wrong(subject, looks):
-    two = [look for look in looks if look.camera in ("cam00", "cam01")]
-    assert score_hulls(carvings(subject, two, SAMPLING)) is None
+def test_two_cameras_cannot_show_which_is_wrong(subject, views):
+    two = [view for view in views if view.camera in ("cam00", "cam01")]
+    assert score_hulls(subject, two, 1) is None
 
 
-def test_gains_are_measured_on_shared_surface(subject, looks):
-    gains = {"cam00": 1.0, "cam01": 0.7, "cam02": 1.0, "cam03": 1.2}
-    lit = [
-        replace(look, image=0.5 * gains[look.camera] * look.soft[..., None].repeat(3, -1))
-        for look in looks
-    ]
-    colours = score_colours(lit, carvings(subject, lit, SAMPLING))
-    for name, gain in gains.items():
-        assert colours[name].gain == pytest.approx([gain] * 3, rel=1e-3)
+@pytest.mark.parametrize(("difference", "named"), [(None, True), (0.01, False), (0.2, True)])
+def test_colours_are_named_unless_shared_surface_agrees(views, difference, named):
+    """One camera is darker; the measure on shared surface decides whether exposure is the cause."""
+    dark = [replace(v, colour=v.colour * (0.7 if v.camera == "cam01" else 1)) for v in views]
+    surface = None if difference is None else SimpleNamespace(difference=difference)
+    names = ("cam00", "cam01", "cam02", "cam03")
+    info = SimpleNamespace(surface=surface, train_cameras=names)
+    colours = mean_colours(dark)
+    found = colour_findings(colours, info, EffectSettings(), Limits(colour_ratio=1.2))
+    assert ["cam01 red 0.7" in finding.sentence for finding in found] == [True] * named
+    held_out = SimpleNamespace(surface=surface, train_cameras=("cam00", "cam02"))
+    assert colour_findings(colours, held_out, EffectSettings(), Limits(colour_ratio=1.2))
 
 
 def test_pictures_are_the_same_moments_in_every_camera(subject):
-    items = chosen_items(subject, 12)
+    items = sampled_items(subject, 12)
     frames = {camera: [f for c, f in items if c == camera] for camera in subject.cameras}
     assert set(map(tuple, frames.values())) == {(0, 6, 11)}
 
 
-def test_evenly():
-    assert evenly((3, 4, 5), 5) == (3, 4, 5)
-    assert evenly(tuple(range(10)), 3) == (0, 4, 9)
-    assert evenly(tuple(range(10)), 1) == (0,)
+def test_values_are_spread():
+    assert spread((3, 4, 5), 5) == [3, 4, 5]
+    assert spread(range(10), 3) == [0, 4, 9]
+    assert spread(range(10), 1) == [0]
+    assert spread([], 3) == []
 
 
 def test_reprojection_of_stored_distances(subject):
     found = read_reprojection(subject)
     assert found.source.startswith("reproj_px")
     assert found.median == pytest.approx(0.2)
-    assert judge_reprojection(found, Limits()) == []
+    assert reprojection_findings(found, Limits()) == []
 
 
 def test_stored_distances_are_not_those_of_fitted_landmarks(subject):
@@ -99,11 +103,13 @@ def test_reprojection_of_detections_is_measured_by_camera(subject, tmp_path):
     assert found.by_camera == pytest.approx(
         {"cam00": 0.5, "cam01": 5.0, "cam02": 0.5, "cam03": 0.5}
     )
-    (finding,) = judge_reprojection(found, Limits())
+    (finding,) = reprojection_findings(found, Limits())
     assert finding.sentence.startswith("camera cam01")
-    medians, worst = far_frames(found, Limits(reprojection_frame=0.05))
-    assert np.flatnonzero(~np.isnan(worst)).tolist() == [3]
-    assert np.isnan(medians).all()
+    limits = Limits(reprojection_frame=0.05)
+    doubted = doubts(moved, [], motion_of(moved, limits), found, limits)
+    (doubt,) = (doubt for doubt in doubted if doubt.kind == "detections")
+    assert doubt.frame == subject.frames[3]
+    assert doubt.text.startswith("left_wrist ")
 
 
 class Counted(np.ndarray):
@@ -134,7 +140,7 @@ def test_thousands_of_frames_are_indexed_once(subject, tmp_path):
     assert Counted.walks == 1
 
 
-def test_damaged_detections_are_said(subject, tmp_path):
+def test_damaged_detections_are_reported(subject, tmp_path):
     root = tmp_path / "capture"
     (root / "landmarks2d").mkdir(parents=True)
     np.savez(root / "landmarks2d/cam00.npz", p=np.zeros((3, 33, 3)), frame_id=np.arange(3))
@@ -148,12 +154,12 @@ def test_units_of_a_good_capture(subject):
     assert rig.gaps == pytest.approx([90] * 4, abs=3)
     assert rig.stature == pytest.approx(1.6, abs=0.2)
     assert rig.lean < 5
-    assert judge_rig(subject, rig, Limits()) == []
+    assert rig_findings(subject, rig, Limits()) == []
 
 
 def test_a_person_of_ten_metres_is_an_error(subject):
     rig = replace(rig_of(subject), stature=10.0)
-    (finding,) = judge_rig(subject, rig, Limits())
+    (finding,) = rig_findings(subject, rig, Limits())
     assert finding.level == "error"
     assert "10 m" in finding.sentence
 
@@ -171,13 +177,19 @@ def test_ground_axes_are_right_handed_with_up(axis, sign):
 def test_drawings_are_svg_with_every_camera(subject):
     import xml.etree.ElementTree as tree
 
-    drawing = tree.fromstring(rig_drawing(subject))
-    words = {text.text for text in drawing.iter("{http://www.w3.org/2000/svg}text")}
-    assert set(subject.cameras) <= words
-    held = {"a<b": ([0, 1, 2, 3], [0.1, np.nan, 0.5, np.inf])}
-    chart = tree.fromstring(series_chart("x & y", [0, 3], held, limit=0.3))
-    words = {text.text for text in chart.iter("{http://www.w3.org/2000/svg}text")}
-    assert {"a<b", "x & y", "0.5"} <= words
+    drawing = rig_drawing(subject)
+    tree.fromstring(drawing)
+    assert all(f"<!-- {name} -->".encode() in drawing for name in subject.cameras)
+    lines = {"a<b": ([0, 1, 2, 3], [0.1, np.nan, 0.5, np.inf]), "c": ([0], [1.0])}
+    chart = series_chart([Series("x & y", lines, limit=0.3)], frozenset({2}))
+    tree.fromstring(chart)
+    assert b"<!-- a&lt;b -->" in chart
+    assert b"<!-- x &amp; y -->" in chart
+
+
+def test_counts_and_lists():
+    assert (counted(1, "error"), counted(2, "error")) == ("1 error", "2 errors")
+    assert listed(range(8)) == "0, 1, 2, 3, 4, 5 and 2 more"
 
 
 @pytest.mark.parametrize(
@@ -191,22 +203,21 @@ def test_drawings_are_svg_with_every_camera(subject):
         (b"", False),
     ],
 )
-def test_whole_files_are_told_by_their_end(tmp_path, content, whole):
+def test_complete_files_have_an_end_mark(tmp_path, content, whole):
     path = tmp_path / "picture"
     path.write_bytes(content)
-    assert finished(path) == whole
-    assert not finished(tmp_path / "absent")
+    assert complete(path) == whole
+    assert not complete(tmp_path / "absent")
 
 
 @pytest.mark.parametrize(
     ("make", "named"),
     [
         (lambda: Sampling(pictures=0), r"sampling\.pictures must be a number above 0"),
-        (lambda: Limits(flesh="thick"), r"limits\.flesh must be a number above 0"),
-        (lambda: Limits(inside_error=0.95), r"limits\.inside_error must not be above"),
+        (lambda: Limits(shift="wide"), r"limits\.shift must be a number above 0"),
     ],
 )
-def test_settings_refuse_what_makes_no_sense(make, named):
+def test_settings_out_of_range_are_refused(make, named):
     with pytest.raises(ConfigError, match=named):
         make()
 

@@ -12,9 +12,9 @@ from gsgan.check.motion import (
     frozen,
     jump_distance,
     jumped,
+    length_change,
     limb_lengths,
     measured_joints,
-    odd_limbs,
     runs,
     swapped,
 )
@@ -54,22 +54,18 @@ def test_unseen_joints_do_not_jump(p, seen):
     assert not jumped(jump_distance(p, seen), 0.2).any()
 
 
-def test_odd_limbs_need_both_limits(p, seen):
+def test_length_changes_are_shares_of_the_median(p, seen):
     lengths = limb_lengths(p, seen, MEDIAPIPE33)
     thigh = MEDIAPIPE33.limbs.index((23, 25))
     lengths[4, thigh] *= 1.5
-    odd, share = odd_limbs(lengths, share=0.3, metres=0.06)
-    assert odd[4, thigh]
-    assert share[4, thigh] == pytest.approx(0.5, abs=0.02)
-    assert not odd_limbs(lengths, share=0.3, metres=0.3)[0][4, thigh]
-    assert not odd_limbs(lengths, share=0.6, metres=0.06)[0][4, thigh]
+    assert length_change(lengths)[4, thigh] == pytest.approx(0.5, abs=0.02)
 
 
 def test_limbs_without_both_ends_are_not_judged(p, seen):
     seen[:, 25] = False
     lengths = limb_lengths(p, seen, MEDIAPIPE33)
     assert np.isnan(lengths[:, MEDIAPIPE33.limbs.index((23, 25))]).all()
-    assert not odd_limbs(lengths, 0.3, 0.06)[0][:, MEDIAPIPE33.limbs.index((23, 25))].any()
+    assert np.isnan(length_change(lengths)[:, MEDIAPIPE33.limbs.index((23, 25))]).all()
 
 
 def test_frozen_joints_are_found_from_their_first_frame_to_their_last(p, seen):
@@ -83,7 +79,8 @@ def test_frozen_joints_are_found_from_their_first_frame_to_their_last(p, seen):
 
 def test_only_joints_with_bones_that_change_are_measured(seen):
     p = skeletons(20)  # of a computed skeleton only the raised forearm changes
-    measured = measured_joints(limb_lengths(p, seen, MEDIAPIPE33), MEDIAPIPE33, share=0.05)
+    change = length_change(limb_lengths(p, seen, MEDIAPIPE33))
+    measured = measured_joints(change, MEDIAPIPE33, share=0.05)
     assert measured[[13, 15]].all()
     assert not measured[23:].any()
 
@@ -100,7 +97,7 @@ def test_an_exchange_of_one_part_is_found_in_that_part_only(p, seen, part):
     for left, right in parts[part]:
         p[8:11, [left, right]] = p[8:11, [right, left]]
     for name, pairs in parts.items():
-        found = np.flatnonzero(swapped(p, seen, pairs, ratio=2.0, metres=0.03))
+        found = np.flatnonzero(swapped(p, seen, pairs, metres=0.03))
         assert found.tolist() == ([8, 9, 10] if name == part else [])
 
 
@@ -113,7 +110,7 @@ def test_an_exchange_is_found_across_unseen_frames(p, seen):
     legs = body_parts(MEDIAPIPE33)["legs"]
     seen[8, 23:] = False
     p[9:12] = p[9:12][:, MIRROR]
-    assert np.flatnonzero(swapped(p, seen, legs, 2.0, 0.06)).tolist() == [9, 10, 11]
+    assert np.flatnonzero(swapped(p, seen, legs)).tolist() == [9, 10, 11]
 
 
 def test_facing_turns_with_exchanged_sides_and_not_with_the_person(p, seen):

@@ -315,7 +315,7 @@ def test_frames_without_landmarks_or_pose_are_dropped_and_counted(tmp_path: Path
 def test_landmarks_without_pictures_are_noted(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path, frames=2)
     write_landmarks(root, p=skeletons(5), frame_id=np.arange(5))
-    assert any("3 frames in landmarks3d.npz have no picture" in n for n in Layout.read(root).notes)
+    assert any("3 frames in landmarks3d.npz have no image" in n for n in Layout.read(root).notes)
 
 
 def test_a_frame_out_of_a_cameras_view_is_dropped_for_that_camera(tmp_path: Path) -> None:
@@ -567,7 +567,7 @@ BAD_INDEX = {
     ),
     "looks elsewhere": (
         camera(K=[[30, 0, 900], [0, 30, 12], [0, 0, 1]]),
-        "camera cam01: no frame has 4 joints inside the picture",
+        "camera cam01: no frame has 4 joints inside the image",
     ),
     "no meta.json": (remove("meta.json"), "meta.json does not exist"),
     "no unit": (meta(unit=None), "'unit' is None; expected one of m, cm, mm"),
@@ -611,7 +611,7 @@ BAD_INDEX = {
     "unknown body": (meta(body="smplh"), "'body' is 'smplh'; expected one of free, smpl, smplx"),
     "masks all empty": (
         blank_masks,
-        "masks/cam00/000000.png shows no person, nor does any of the 6 masks looked at",
+        "masks/cam00/000000.png shows no person, nor does any of the 6 masks compared",
     ),
     "mask 16 bit": (
         picture("masks/cam00/000001.png", np.zeros((24, 32), np.uint16)),
@@ -625,12 +625,12 @@ BAD_INDEX = {
     "transl shape": (poses(transl=np.zeros((3, 3))), r"'transl' must have shape \(4, 3\)"),
     "no mask": (
         remove("masks/cam01/000002.png"),
-        r"masks/cam01/000002.png does not exist; every picture needs a mask, and 1 of the 4",
+        r"masks/cam01/000002.png does not exist; every image needs a mask, and 1 of the 4",
     ),
     "no masks": (remove("masks"), "masks/cam00/000000.png does not exist"),
     "mask size": (
         picture("masks/cam01/000001.png", np.zeros((12, 16), np.uint8)),
-        r"masks/cam01/000001.png is 16x12 pixels .*the picture .*images/cam01/000001.png says",
+        r"masks/cam01/000001.png is 16x12 pixels .*the image .*images/cam01/000001.png says",
     ),
     "image size": (
         picture("images/cam01/000001.png", np.zeros((12, 16, 3), np.uint8)),
@@ -721,7 +721,7 @@ def test_an_empty_mask_is_noted(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path)
     cv2.imwrite(str(root / "masks/cam00/000001.png"), np.zeros((24, 32), np.uint8))
     (note,) = Layout.read(root).notes
-    assert note.startswith("camera cam00: the mask is empty at frames 1 of 4 looked at")
+    assert note.startswith("camera cam00: the mask is empty at frames 1 of 4 compared")
 
 
 def test_a_skewed_K_is_kept_and_undistorted_with_its_skew(tmp_path: Path) -> None:

@@ -15,8 +15,15 @@ from make import edit_json, write_tiny_capture
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.checks import Checks
 from gsgan.data.formats.capture import LOOKED_AT, CaptureReader
-from gsgan.data.formats.meeting import box_of, inside_share, mask_beyond
-from gsgan.data.formats.trust import Trust
+from gsgan.data.formats.trust import (
+    Trust,
+    box_of,
+    far_cameras,
+    inside_share,
+    joint_distance,
+    mask_beyond,
+    mask_distance,
+)
 from gsgan.data.layout import Layout
 from gsgan.utils.errors import DataError
 
@@ -65,7 +72,7 @@ def test_a_good_capture_needs_no_note(root: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (scale_K(0.5), r"inside: cam02 \d%; 100% in the other cameras\).*gsgan.check tells"),
+        (scale_K(0.5), r"inside: cam02 \d%; 100% in the other cameras\).*gsgan.check finds"),
         (in_mm, r"camera cam02 stands 3\.13e\+03 m from the person, the median camera 3 m"),
     ],
 )
@@ -77,7 +84,7 @@ def test_a_camera_that_is_wholly_wrong_is_refused(
         read(root)
     assert "\n" not in str(caught.value)
     assert str(root) in str(caught.value)
-    assert read(root, Trust(frames=0, min_box_iou=0)).notes == ()  # nothing was looked at
+    assert read(root, Trust(frames=0, min_box_iou=0)).notes == ()  # nothing is compared
 
 
 @pytest.mark.parametrize("change", [turn((0, 1, 0), 5), exchanged])
@@ -171,3 +178,30 @@ def test_timestamps_are_no_frame_numbers(root: Path) -> None:
     np.savez(root / "landmarks3d.npz", **arrays)
     with pytest.raises(DataError, match="frame_id 1700000000125 is a time stamp"):
         read(root)
+
+
+def test_joint_distance_in_metres():
+    mask = np.zeros((40, 60), bool)
+    mask[10:20, 20:40] = True
+    distance = mask_distance(mask)
+    pixels = np.array([[30.5, 15.5], [44.5, 15.5], [30.5, 29.5], [-5, 15], [np.nan, 3], [45, 15]])
+    depth = np.array([2.0, 2.0, 4.0, 2.0, 2.0, -1.0])
+    seen = np.ones(6, bool)
+    metres = joint_distance(distance, pixels, depth, seen, focal=100.0)
+    assert metres[:3] == pytest.approx([0, 5 * 2 / 100, 10 * 4 / 100])
+    assert np.isnan(metres[3:]).all()  # off the picture, unknown, behind the camera
+
+
+def test_unseen_joints_are_not_judged_and_an_empty_mask_is_infinitely_far():
+    distance = mask_distance(np.zeros((8, 8), bool))
+    pixels = np.full((2, 2), 4.0)
+    metres = joint_distance(distance, pixels, np.ones(2), np.array([True, False]), 10.0)
+    assert metres[0] == np.inf
+    assert np.isnan(metres[1])
+
+
+def test_far_cameras_are_those_beyond_the_factor() -> None:
+    metres = {"a": 3.0, "b": 3.2, "c": 31.0, "d": 0.2, "e": 2.9}
+    found = far_cameras(metres, 10.0)
+    assert list(found) == ["c", "d"]
+    assert found["c"].startswith("camera c stands 31 m from the person, the median camera 3 m")

@@ -284,10 +284,10 @@ def test_a_mask_that_is_a_picture(root: Path, smplx_file: Path) -> None:
 
 def test_masks_that_are_missing(root: Path, smplx_file: Path) -> None:
     (root / "masks/cam01/00000002.jpg").unlink()
-    assert any("1 of 12 pictures have no mask" in n for n in read(
+    assert any("1 of 12 images have no mask" in n for n in read(
         root, smplx_file, max_missing_masks=0.1
     ).notes)  # fmt: skip
-    refused(root, smplx_file, "masks/cam01/00000002", "8% of all 12 pictures have no mask")
+    refused(root, smplx_file, "masks/cam01/00000002", "8% of all 12 images have no mask")
     shutil.rmtree(root / "masks/cam01")
     refused(root, smplx_file, str(root / "masks/cam01"), "holds no masks")
 

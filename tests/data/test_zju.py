@@ -23,9 +23,8 @@ from gsgan.body.smpl_names import CIHP
 from gsgan.data.capture import CaptureDataset
 from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, natural_order
-from gsgan.data.formats.meeting import box_iou, mask_box
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
-from gsgan.data.formats.trust import Trust
+from gsgan.data.formats.trust import Trust, box_iou, mask_box
 from gsgan.data.formats.zju import ZjuReader, layout_of
 from gsgan.data.formats.zju_annots import camera_folders, frame_number, read_annots
 from gsgan.data.layout import Layout
@@ -354,8 +353,8 @@ def test_some_missing_masks_are_left_out_and_counted(original: Path, smpl_file: 
         (original / kind / "Camera_B3/000001.png").unlink()
     layout = read(original, smpl_file)
     assert 1 not in layout.images["Camera_B3"]
-    assert any("1 of 12 pictures have no mask and are left out" in n for n in layout.notes)
-    with pytest.raises(DataError, match=r"000001.png does not exist, and 8% of all 12 pictures"):
+    assert any("1 of 12 images have no mask and are left out" in n for n in layout.notes)
+    with pytest.raises(DataError, match=r"000001.png does not exist, and 8% of all 12 images"):
         read(original, smpl_file, max_missing_masks=0.05)
 
 
@@ -574,7 +573,7 @@ BAD = {
         moved_body,
         "the projected body and the masks do not meet .*check that cameras, SMPL parameters",
     ),
-    "no masks": (remove("mask", "mask_cihp"), "100% of all 12 pictures have no mask"),
+    "no masks": (remove("mask", "mask_cihp"), "100% of all 12 images have no mask"),
     "mask 16 bit": (
         lambda root: write_picture(root / "mask/Camera_B1/000000.png", GREY.astype(np.uint16)),
         "000000.png (holds uint16|has 16 bits)",

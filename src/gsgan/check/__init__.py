@@ -1,4 +1,4 @@
-"""Looking a dataset over before training: what is in it, what is wrong, which frames to distrust.
+"""Checks a dataset before training: its contents, what is wrong, which frames are doubtful.
 
-`gsgan.check.run.check_data` is the way in; every other module is one question asked of the data.
+`gsgan.check.run.check_data` is the entry point.
 """

@@ -1,4 +1,4 @@
-"""``python -m gsgan.check data=…``: look a dataset over before any training."""
+"""``python -m gsgan.check data=…``: check a dataset before training."""
 
 from __future__ import annotations
 

@@ -1,35 +1,49 @@
-"""How well each camera's calibration explains its masks, and whether another would do better."""
+"""How well each camera's calibration fits its masks, whether another would fit better, and why."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
-from gsgan.check.looking import Look
+from gsgan.check.report import Finding, Level, listed
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.silhouette import Bool, best_shift, body_silhouette, moved, overlap
-from gsgan.check.subject import Subject, evenly
+from gsgan.check.silhouette import best_shift, body_silhouette, moved, overlap
+from gsgan.check.views import Subject, View, grouped
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import project
+from gsgan.data.formats.trust import Bool, spread
 
 OWN = "its own calibration"
 INVERSE = "R and t the other way round"
-MIRRORED = "mirrored pictures"
+MIRRORED = "mirrored images"
 EXTRINSICS = "R and t of"
 WHOLE = "the whole calibration of"
-LEAST_LOOKS = 3  # at a lag in time, for it to be judged
+ADVICE = {
+    MIRRORED: "mirror its images and masks back",
+    INVERSE: "invert its R and t: x_cam = R x + t is expected",
+    EXTRINSICS: "check its R, t and folder name",
+    WHOLE: "check its calibration and folder name",
+}
+TRIED = 8  # images per camera on which calibrations are tried, at most
+LEAST_VIEWS = 3  # at a lag in time, for it to count
+LAG_METRES = 0.002  # that a lag must gain: less is noise
+LAG_LEFT = 0.01  # metres that it may leave: good captures have 0.001
+CREDIBLE_OVERLAP = 0.35  # the right calibration has 0.6 to 0.7, with slim masks 0.4
+SHARE_OF_ANY_CAMERA = 0.5  # of a standing person's joints lie in the mask from any camera
+OUTSIDE_RATIO = 3.0  # times the other cameras' distance: noisy landmarks are off in all of them
 
 
 @dataclass(frozen=True)
 class Rival:
-    """A calibration that a camera may really have.
+    """Another calibration that a camera may have.
 
     Args:
         kind: one of `INVERSE`, `MIRRORED`, `EXTRINSICS`, `WHOLE`.
         other: the camera whose calibration it takes, or empty.
-        overlap: mean overlap of mask and the body that it foretells.
+        overlap: mean overlap of mask and estimated silhouette with it.
     """
 
     kind: str
@@ -39,19 +53,19 @@ class Rival:
 
 @dataclass(frozen=True)
 class CameraScore:
-    """How well one camera's calibration explains its masks.
+    """How well one camera's calibration fits its masks.
 
     Args:
         name: the camera.
         inside: mean share of joints inside the mask.
-        overlap: mean overlap of mask and foretold body.
-        fullness: median area of the mask over that of the foretold body.
-        rivals: what else might explain the masks, best first.
-        shift: ``(dx, dy)`` pixels of the whole picture by which masks lie beside the skeleton.
+        overlap: mean overlap of mask and estimated silhouette.
+        fullness: median area of the mask over that of the estimated silhouette.
+        rivals: other calibrations, best first.
+        shift: ``(dx, dy)`` pixels of the whole image by which masks lie beside the skeleton.
         shift_metres: its length at the person.
         shift_overlap: mean overlap once the masks are moved back.
         lag: frames by which the skeleton must be moved to fit best; 0 when nothing is gained.
-        outside: metres, joints' mean distance from the mask as it is.
+        outside: metres, mean distance of the joints from the mask.
         lag_outside: the same after the lag.
     """
 
@@ -72,44 +86,56 @@ class CameraScore:
         """Of the best rival."""
         return self.rivals[0].overlap
 
+    def beaten(self, limits: Limits) -> bool:
+        """Whether another calibration fits the masks better, and well."""
+        return self.rival_overlap > max(self.overlap + limits.better_fit, CREDIBLE_OVERLAP)
+
+    def shifted(self, limits: Limits) -> bool:
+        """Whether the masks lie beside the skeleton, by more than bodies and skeletons differ."""
+        gain = self.shift_overlap - self.overlap
+        return self.shift_metres > limits.shift and gain > limits.better_fit
+
+    def oversized(self, limits: Limits) -> bool:
+        """Whether the masks are far larger than the body, and most of the body lies in them."""
+        return self.fullness > limits.fullness and self.inside > SHARE_OF_ANY_CAMERA
+
+    def wrong(self, limits: Limits) -> bool:
+        """Whether calibration or masks are wrong as a whole."""
+        outside = not self.inside >= limits.inside_error
+        return outside or self.beaten(limits) or self.oversized(limits)
+
+    def unfit(self, limits: Limits) -> bool:
+        """Whether the masks do not fit the skeleton, for any reason."""
+        return self.wrong(limits) or self.shifted(limits) or self.lag != 0
+
 
 def score_cameras(
-    subject: Subject, looks: Sequence[Look], limits: Limits, sampling: Sampling
+    subject: Subject, views: Sequence[View], limits: Limits, sampling: Sampling
 ) -> list[CameraScore]:
-    """Scores every camera of which a picture could be read."""
-    by_camera = grouped(looks)
-    rivals = max(1, 2 * len(by_camera))
-    share = max(1, sampling.trials // (rivals * max(1, len(by_camera))))
-    count = min(sampling.trial_frames, share)
+    """Scores every camera of which an image could be read."""
+    by_camera = grouped(views)
+    pairs = max(1, 2 * len(by_camera) ** 2)
+    count = min(TRIED, max(1, sampling.trials // pairs))
     return [_score(subject, name, own, limits, count) for name, own in by_camera.items()]
 
 
-def grouped(looks: Sequence[Look]) -> dict[str, list[Look]]:
-    """The looks by camera."""
-    found: dict[str, list[Look]] = {}
-    for look in looks:
-        found.setdefault(look.camera, []).append(look)
-    return found
-
-
 def _score(
-    subject: Subject, name: str, looks: Sequence[Look], limits: Limits, count: int
+    subject: Subject, name: str, views: Sequence[View], limits: Limits, count: int
 ) -> CameraScore:
-    chosen = [looks[i] for i in evenly(tuple(range(len(looks))), count)]
-    own = subject.cameras[name]
+    chosen, own = spread(views, count), subject.cameras[name]
     fits = {
-        what: float(np.mean([_fit(subject, look, entry, limits) for look in chosen]))
+        what: float(np.mean([overlap(v.mask, _body(subject, v, entry)) for v in chosen]))
         for what, entry in calibrations(own, subject.cameras).items()
     }
     here = fits.pop((OWN, ""))
     rivals = sorted((Rival(*what, fit) for what, fit in fits.items()), key=lambda r: -r.overlap)
-    shift, metres, shifted = _shift(subject, own, chosen, limits)
-    lag, outside, lagged = _lag(looks, limits)
+    shift, metres, shifted = _shift(subject, own, chosen)
+    lag, outside, lagged = _lag(views, limits)
     return CameraScore(
         name=name,
-        inside=known_mean([look.inside(limits) for look in looks if look.mask.any()]),
+        inside=known_mean([view.inside for view in views if view.mask.any()]),
         overlap=here,
-        fullness=float(np.median([look.fullness for look in looks])),
+        fullness=float(np.median([view.fullness for view in views])),
         rivals=tuple(rivals),
         shift=shift,
         shift_metres=metres,
@@ -123,7 +149,7 @@ def _score(
 def calibrations(
     own: CameraEntry, cameras: Mapping[str, CameraEntry]
 ) -> dict[tuple[str, str], CameraEntry]:
-    """Calibrations that a camera may really have, its own first, by (kind, other camera)."""
+    """Calibrations that a camera may have, its own first, by (kind, other camera)."""
     mirror = own.K.copy()
     mirror[0] = -mirror[0]
     mirror[0, 2] += own.size[1]
@@ -139,41 +165,32 @@ def calibrations(
     return found
 
 
-def _fit(subject: Subject, look: Look, camera: CameraEntry, limits: Limits) -> float:
-    return overlap(look.mask, _body(subject, look, camera, limits))
-
-
-def _body(subject: Subject, look: Look, camera: CameraEntry, limits: Limits) -> Bool:
-    row = subject.rows[look.frame]
-    pixels, depth = project(camera, subject.p[row])
-    focal = abs(float(camera.K[0, 0] * look.place.scale[0]))
-    return body_silhouette(
-        look.place(pixels), depth, subject.visible[row], focal, look.mask.shape,
-        subject.template, limits.flesh,
-    )  # fmt: skip
+def _body(subject: Subject, view: View, camera: CameraEntry) -> Bool:
+    row = subject.rows[view.frame]
+    small = view.small(camera)
+    return body_silhouette(small, subject.p[row], subject.visible[row], subject.template)
 
 
 def _shift(
-    subject: Subject, camera: CameraEntry, looks: Sequence[Look], limits: Limits
+    subject: Subject, camera: CameraEntry, views: Sequence[View]
 ) -> tuple[tuple[float, float], float, float]:
-    """The median shift in whole-picture pixels, its length in metres, the overlap without it."""
-    bodies = [_body(subject, look, camera, limits) for look in looks]
-    shifts = np.array([best_shift(l.mask, b) for l, b in zip(looks, bodies, strict=True)])
-    dx, dy = np.median(shifts, axis=0).round().astype(int)
-    after = [overlap(l.mask, moved(b, dx, dy)) for l, b in zip(looks, bodies, strict=True)]
-    pixels = np.array([dx, dy]) / looks[0].place.scale
+    """The median shift in whole-image pixels, its length in metres, the overlap without it."""
+    pairs = [(view.mask, _body(subject, view, camera)) for view in views]
+    dx, dy = np.median([best_shift(*pair) for pair in pairs], axis=0).round().astype(int)
+    after = float(np.mean([overlap(mask, moved(body, dx, dy)) for mask, body in pairs]))
+    pixels = np.array([dx, dy]) / np.diag(views[0].to_small)[:2]
     depth = float(project(camera, subject.p[subject.visible])[1].mean())
     metres = float(np.linalg.norm(pixels / np.diag(camera.K)[:2])) * depth
-    return (float(pixels[0]), float(pixels[1])), metres, float(np.mean(after))
+    return (float(pixels[0]), float(pixels[1])), metres, after
 
 
-def _lag(looks: Sequence[Look], limits: Limits) -> tuple[int, float, float]:
+def _lag(views: Sequence[View], limits: Limits) -> tuple[int, float, float]:
     """The best lag, and the mean metres outside without and with it.
 
-    A lag is held against none on the looks that know both: the first frames have none before them.
-    Empty masks say nothing.
+    Each lag is compared with none on the views that know both, as the first frames have none
+    before them. Empty masks are left out.
     """
-    table = np.array([look.lagged for look in looks if look.mask.any()])
+    table = np.array([view.lagged for view in views if view.mask.any()])
     if len(table) == 0:
         return 0, np.nan, np.nan
     reach = table.shape[1] // 2
@@ -181,11 +198,11 @@ def _lag(looks: Sequence[Look], limits: Limits) -> tuple[int, float, float]:
     outside, most = left, 0.0
     for column in range(table.shape[1]):
         known = ~np.isnan(table[:, [reach, column]]).any(1)
-        if np.count_nonzero(known) < max(LEAST_LOOKS, len(looks) / 2):
+        if np.count_nonzero(known) < max(LEAST_VIEWS, len(views) / 2):
             continue
         before, after = table[known, reach].mean(), table[known, column].mean()
-        enough = before - after >= max(limits.lag_metres, limits.lag_gain * before)
-        if enough and after <= limits.lag_left and before - after > most:
+        enough = before - after >= max(LAG_METRES, limits.lag_gain * before)
+        if enough and after <= LAG_LEFT and before - after > most:
             best, left, most = column - reach, float(after), before - after
     return best, outside, left
 
@@ -194,3 +211,170 @@ def known_mean(values: Iterable[float]) -> float:
     """Mean without the NaN; NaN when nothing is left."""
     kept = [v for v in values if not np.isnan(v)]
     return float(np.mean(kept)) if kept else np.nan
+
+
+def calibration_findings(
+    scores: Sequence[CameraScore], limits: Limits, min_inside: float, named: Iterable[str] = ()
+) -> list[Finding]:
+    """Which camera is wrong, and the usual causes.
+
+    Args:
+        scores: of all cameras.
+        limits: thresholds.
+        min_inside: share of joints inside the masks below which a camera is named.
+        named: cameras that another finding names already.
+    """
+    found, named = list[Finding](), set(named)
+    if big := [s for s in scores if s.oversized(limits) and s.name not in named]:
+        sizes = listed(f"{s.name} {s.fullness:.1f}" for s in big)
+        found.append(_error(
+            f"masks are far larger than the body that skeleton and camera suggest (times its "
+            f"area: {sizes}): a focal length that is too short, K of smaller images, a skeleton "
+            "in another unit, or masks of more than the person"
+        ))  # fmt: skip
+        named |= {s.name for s in big}
+        scores = [s for s in scores if s not in big]
+    beaten = [s for s in scores if s.beaten(limits)]
+    for one, other in combinations(beaten, 2):
+        ours, theirs = _rival_of(one, other, limits), _rival_of(other, one, limits)
+        if ours and theirs and not {one.name, other.name} & named:
+            found.append(_exchanged(one, other, ours, theirs))
+            named |= {one.name, other.name}
+    if len(scores) > 1 and not big:
+        wrong = [s for s in scores if s.wrong(limits)]
+        if all(s.shifted(limits) for s in scores):
+            return [_all_beside(scores, "error" if wrong else "warning")]
+        if len(wrong) == len(scores) and not beaten:
+            return [_all_wrong(scores)]
+    for score in scores:
+        if score in beaten and score.name not in named:
+            found.append(_better_fit(score, scores, limits))
+        elif score.lag:
+            found.append(_out_of_step(score))
+        elif score.name not in named:
+            found += _unexplained(score, scores, limits, min_inside)
+    named |= {s.name for s in scores if s.unfit(limits)}
+    return found + small_errors([s for s in scores if s.name not in named], limits)
+
+
+def _error(message: str, level: Level = "error") -> Finding:
+    return Finding(level, "calibration", message)
+
+
+def _seen(score: CameraScore, scores: Sequence[CameraScore]) -> str:
+    others = known_mean([s.inside for s in scores if s.name != score.name])
+    seen = f"{score.inside:.0%} of the joints lie inside its masks"
+    return f"{seen}, {others:.0%} in the other cameras" if len(scores) > 1 else seen
+
+
+def _rival_of(score: CameraScore, other: CameraScore, limits: Limits) -> Rival | None:
+    """The other camera's calibration, where it fits the masks about as well as the best."""
+    for rival in score.rivals:
+        if rival.other == other.name and rival.overlap > score.rival_overlap - limits.better_fit:
+            return rival
+    return None
+
+
+def _exchanged(a: CameraScore, b: CameraScore, of_a: Rival, of_b: Rival) -> Finding:
+    what = "R and t" if of_a.kind == EXTRINSICS else "calibration"
+    return _error(
+        f"cameras {a.name} and {b.name} look exchanged: the {what} of the other would fit the "
+        f"masks of each better (overlap {of_a.overlap:.2f} and {of_b.overlap:.2f}) than its own "
+        f"({a.overlap:.2f} and {b.overlap:.2f}); exchange them in the calibration, or rename the "
+        "folders"
+    )
+
+
+def _better_fit(score: CameraScore, scores: Sequence[CameraScore], limits: Limits) -> Finding:
+    best = score.rivals[0]
+    close = [r for r in score.rivals if r.overlap > best.overlap - limits.better_fit]
+    what = dict.fromkeys(f"{r.kind} {r.other}".strip() for r in close)
+    kinds = {rival.kind for rival in close}
+    advice = [text for kind, text in ADVICE.items() if kind in kinds]
+    return _error(
+        f"camera {score.name}: {' or '.join(what)} would fit its masks better (overlap "
+        f"{best.overlap:.2f}) than its own calibration ({score.overlap:.2f}); "
+        f"{_seen(score, scores)}; {', or '.join(advice)}"
+    )
+
+
+def _unexplained(
+    score: CameraScore, scores: Sequence[CameraScore], limits: Limits, min_inside: float
+) -> list[Finding]:
+    level: Level = "error" if not score.inside >= limits.inside_error else "warning"
+    if np.isnan(score.inside):
+        text = "its masks are empty, or no joint lies in its images; check both folders and K"
+    elif score.shifted(limits):
+        text = (
+            f"its masks lie {_pixels(score)} pixels (right, down) beside the skeleton; "
+            f"{_seen(score, scores)}. A crop or resize that K does not follow, or masks of other "
+            "images, do this"
+        )
+    elif not score.inside >= min_inside:
+        text = (
+            f"only {_seen(score, scores)}. One camera alone points to its extrinsics, to "
+            "exchanged folder names, to lens distortion left out, or to masks of other images; "
+            "see its overlays"
+        )
+    else:
+        return []
+    return [_error(f"camera {score.name}: {text}", level)]
+
+
+def _pixels(score: CameraScore) -> str:
+    return f"{score.shift[0]:+.0f}, {score.shift[1]:+.0f}"
+
+
+def _all_beside(scores: Sequence[CameraScore], level: Level) -> Finding:
+    return _error(
+        "in every camera the masks lie beside the skeleton, by pixels right, down: "
+        f"{listed(f'{s.name} {_pixels(s)}' for s in scores)}; the skeleton is moved or of another "
+        "size, or images were cropped and K did not follow",
+        level,
+    )
+
+
+def _all_wrong(scores: Sequence[CameraScore]) -> Finding:
+    return _error(
+        "in every camera joints lie outside the masks (inside: "
+        f"{listed(f'{s.name} {s.inside:.0%}' for s in scores)}): the skeleton's axes, unit or "
+        "frame numbers do not fit the cameras, or the masks belong to other images"
+    )
+
+
+def _out_of_step(score: CameraScore) -> Finding:
+    when = "later" if score.lag > 0 else "earlier"
+    return Finding(
+        "error", "synchronisation",
+        f"camera {score.name}: its images fit the skeleton {abs(score.lag)} frame(s) {when} "
+        f"better (joints {100 * score.lag_outside:.1f} cm outside the masks instead of "
+        f"{100 * score.outside:.1f}); its clock or its numbering is off: add {score.lag:+d}",
+    )  # fmt: skip
+
+
+def small_errors(scores: Sequence[CameraScore], limits: Limits) -> list[Finding]:
+    """Calibrations that are nearly right: joints lie just outside the masks.
+
+    Args:
+        scores: of the cameras that no other finding names.
+        limits: thresholds.
+    """
+    metres = {s.name: s.outside for s in scores if np.isfinite(s.outside)}
+    middle = float(np.median(list(metres.values()) or [0]))
+    if middle > limits.outside_all:
+        return [_error(
+            f"in most cameras joints lie {100 * middle:.1f} cm outside the masks on average (good "
+            "captures: 0.1): a focal length or unit that is slightly off in all of them, masks "
+            "that are too tight, or noisy landmarks", "warning",
+        )]  # fmt: skip
+    found = []
+    for name, own in metres.items():
+        rest = [value for other, value in metres.items() if other != name]
+        others = float(np.median(rest)) if rest else np.inf
+        if own > max(limits.outside, OUTSIDE_RATIO * others):
+            found.append(_error(
+                f"camera {name}: joints lie {100 * own:.1f} cm outside its masks on average, "
+                f"{100 * others:.1f} in the other cameras; its R, t or focal length is slightly "
+                "off (some degrees, centimetres or per cent), or its masks are worse", "warning",
+            ))  # fmt: skip
+    return found

@@ -1,24 +1,28 @@
-"""The skeleton through time: jumps, odd limbs, frozen joints, exchanged sides. Pure functions.
+"""The skeleton over time: jumps, odd limbs, frozen joints, exchanged sides. Pure functions.
 
 Convention: ``p [F, J, 3]`` metres, ``visible [F, J]``, frames in rising order. What cannot be
-judged (too few neighbours, unseen joints) is not flagged.
+measured (too few neighbours, joints not visible) is not flagged.
 """
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.check.silhouette import Bool, Float
+from gsgan.data.formats.trust import Bool, Float
 from gsgan.skeleton.template import SkeletonTemplate
 
-STILL = 1e-6  # metres: measured joints never repeat themselves this closely
+STILL = 1e-6  # metres: measured joints never repeat this closely
+SWAP_RATIO = 2.0  # exchanged sides must be this many times nearer to where they were
+SWAP_METRES = 0.06  # and this much nearer: crossing feet come close
 
 
 def jump_distance(p: Float, visible: Bool) -> Float:
-    """``[F, J]`` metres from the middle of the joint's two neighbours in time; NaN where unseen.
+    """``[F, J]`` metres from the midpoint of the joint's two neighbours in time; NaN if unknown.
 
-    A steady motion gives 0 at any speed; the first and last frame are not judged.
+    A steady motion gives 0 at any speed; the first and last frame are unknown.
     """
     distance = np.full(p.shape[:2], np.nan)
     if len(p) > 2:
@@ -31,7 +35,7 @@ def jump_distance(p: Float, visible: Bool) -> Float:
 def jumped(distance: Float, limit: float) -> Bool:
     """``[F, J]`` the peaks of `jump_distance` beyond the limit.
 
-    One stray frame also moves its neighbours' middles, by half as much; only the peak is named.
+    A stray frame also moves its neighbours' midpoints, by half as much; only the peak counts.
     """
     known = np.nan_to_num(distance)
     before, after = np.zeros_like(known), np.zeros_like(known)
@@ -40,32 +44,35 @@ def jumped(distance: Float, limit: float) -> Bool:
 
 
 def limb_lengths(p: Float, visible: Bool, template: SkeletonTemplate) -> Float:
-    """``[F, L]`` metres, NaN where an end was not seen."""
+    """``[F, L]`` metres, NaN where an end is not visible."""
     a, b = np.array(template.limbs).T
     lengths = np.linalg.norm(p[:, a] - p[:, b], axis=-1)
     return np.where(visible[:, a] & visible[:, b], lengths, np.nan)
 
 
-def odd_limbs(lengths: Float, share: float, metres: float) -> tuple[Bool, Float]:
-    """Which limbs ``[F, L]`` are off their median by more than both limits; and the share off.
-
-    Args:
-        lengths: of `limb_lengths`.
-        share: of the limb's median length.
-        metres: so that the noise of short bones does not count.
-    """
+def length_change(lengths: Float) -> Float:
+    """``[F, L]`` share by which limbs differ from their median length; NaN if unknown."""
     typical = nanmedian(lengths)
-    off = np.abs(lengths - typical)
-    relative = off / np.maximum(typical, STILL)
-    return (off > metres) & (relative > share), relative
+    return np.asarray(np.abs(lengths - typical) / np.maximum(typical, STILL))
+
+
+def measured_joints(change: Float, template: SkeletonTemplate, share: float) -> Bool:
+    """``[J]`` joints with a bone whose `length_change` exceeds ``share`` in some frame.
+
+    The bones of a posed body model keep their length, measured ones do not.
+    """
+    measured = np.zeros(len(template.names), bool)
+    changing = (np.nan_to_num(change) > share).any(0)
+    for limb in np.flatnonzero(changing):
+        measured[list(template.limbs[limb])] = True
+    return measured
 
 
 def nanmedian(values: Float) -> Float:
     """Median over the first axis, NaN where nothing is known, without a warning."""
-    known = ~np.isnan(values).all(0)
-    result = np.full(values.shape[1:], np.nan)
-    result[known] = np.nanmedian(values[:, known], axis=0)
-    return result
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.nanmedian(values, axis=0))
 
 
 def frozen(p: Float, visible: Bool, least: int) -> Bool:
@@ -77,29 +84,11 @@ def frozen(p: Float, visible: Bool, least: int) -> Bool:
     same[1:] = np.linalg.norm(p[1:] - p[:-1], axis=-1) < STILL
     same[1:] &= visible[1:] & visible[:-1]
     held = np.zeros_like(same)
-    for joint in range(len(visible[0])):
+    for joint in range(p.shape[1]):
         for first, last in runs(same[:, joint]):
             if last - first + 2 >= least:  # a run of n equal steps joins n + 1 frames
                 held[first - 1 : last + 1, joint] = True
     return held
-
-
-def measured_joints(lengths: Float, template: SkeletonTemplate, share: float) -> Bool:
-    """``[J]`` joints with a bone whose length changes by more than this share of its median.
-
-    The bones of a posed body model keep their length, measured ones do not.
-
-    Args:
-        lengths: ``[F, L]`` of `limb_lengths`.
-        template: names the limbs.
-        share: see above.
-    """
-    typical = nanmedian(lengths)
-    off = np.nan_to_num(np.abs(lengths - typical) / np.maximum(typical, STILL)).max(0)
-    measured = np.zeros(len(template.names), bool)
-    for (a, b), changes in zip(template.limbs, off > share, strict=True):
-        measured[[a, b]] |= changes
-    return measured
 
 
 def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
@@ -110,73 +99,49 @@ def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 def body_parts(template: SkeletonTemplate) -> dict[str, tuple[tuple[int, int], ...]]:
     """(left, right) joints that would be exchanged together, by the part's name."""
+    parts = {"face": set(template.face)}
+    for name, roots in (("arms", template.shoulders), ("legs", template.hips)):
+        parts[name] = set(roots)
+        for _ in template.limbs:  # every joint that hangs on the roots
+            parts[name] |= {b for a, b in template.limbs if a in parts[name]}
     pairs = [(a, b) for a, b in enumerate(template.mirror) if "left" in template.names[a]]
-    parts = {
-        "face": set(template.face),
-        "arms": _reach(template, template.shoulders),
-        "legs": _reach(template, template.hips),
-    }
     return {name: tuple(p for p in pairs if p[0] in joints) for name, joints in parts.items()}
 
 
-def _reach(template: SkeletonTemplate, roots: tuple[int, int]) -> set[int]:
-    """The roots and every joint that hangs on them by limbs."""
-    found = set(roots)
-    for _ in template.limbs:
-        found |= {b for a, b in template.limbs if a in found}
-    return found
-
-
 def swapped(
-    p: Float,
-    visible: Bool,
-    pairs: tuple[tuple[int, int], ...],
-    ratio: float,
-    metres: float,
+    p: Float, visible: Bool, pairs: tuple[tuple[int, int], ...], metres: float = SWAP_METRES
 ) -> Bool:
-    """``[F]`` frames in which a body part's left and right are exchanged against the others.
+    """``[F]`` frames in which a body part's left and right are exchanged.
 
-    Going from frame to frame the part is exchanged where exchanging brings it nearer to where it
-    was: mean distance at least ``ratio`` times and ``metres`` less. Between two exchanges lies the
-    wrong side, or the right one: the smaller half of the frames counts as wrong.
+    From frame to frame the part is exchanged where exchanging brings it nearer to where it was:
+    mean distance `SWAP_RATIO` times and ``metres`` less. The smaller half of the frames that
+    these exchanges separate counts as wrong.
 
     Args:
         p: ``[F, J, 3]``.
         visible: ``[F, J]``.
         pairs: (left, right) joints of the part.
-        ratio, metres: see above.
+        metres: see above.
     """
-    flipped = np.zeros(len(p), bool)
-    if not pairs or len(p) < 3:
-        return flipped
-    left, right = np.array(pairs).T
-    both = visible[:, left] & visible[:, right]
     state = np.zeros(len(p), bool)
+    if not pairs or len(p) < 3:
+        return state
+    sides = np.array(pairs).T
+    both = visible[:, sides[0]] & visible[:, sides[1]]
     last: int | None = None
     for f in range(len(p)):
+        if last is not None:
+            state[f] = state[last]
         if not both[f].any():
-            state[f] = state[f - 1] if f else False
             continue
-        if last is None:
-            last = f
-            continue
-        shared = both[f] & both[last]
-        exchange = False
-        if shared.any():
-            a, b = left[shared], right[shared]
-            straight = _apart(p[f, a], p[last, a]) + _apart(p[f, b], p[last, b])
-            across = _apart(p[f, a], p[last, b]) + _apart(p[f, b], p[last, a])
+        if last is not None and (shared := both[f] & both[last]).any():
+            now, then = p[f, sides[:, shared]], p[last, sides[:, shared]]
+            straight = np.linalg.norm(now - then, axis=-1).sum(0)
+            across = np.linalg.norm(now - then[::-1], axis=-1).sum(0)
             gain = (straight - across).mean() / 2
-            exchange = bool(straight.mean() > ratio * across.mean() and gain > metres)
-        state[f] = state[last] ^ exchange
-        state[last + 1 : f] = state[last]
+            state[f] ^= straight.mean() > SWAP_RATIO * across.mean() and gain > metres
         last = f
-    wrong = state.mean() <= 0.5
-    return state if wrong else ~state
-
-
-def _apart(a: Float, b: Float) -> Float:
-    return np.asarray(np.linalg.norm(a - b, axis=-1))
+    return state if state.mean() <= 0.5 else ~state
 
 
 def facing(p: Float, visible: Bool, template: SkeletonTemplate) -> Float:
@@ -186,27 +151,15 @@ def facing(p: Float, visible: Bool, template: SkeletonTemplate) -> Float:
     show the true one. All frames negative: left and right are exchanged throughout.
     """
     l_sh, r_sh, l_hip, r_hip = (p[:, j] for j in template.torso)
-    trunk = visible[:, list(template.torso)].all(1)
     front = np.cross(l_sh - r_sh, l_sh + r_sh - l_hip - r_hip)
-    votes = np.full((len(p), 3), np.nan)
-    face = [template.nose, *template.ears]
-    ahead = p[:, template.nose] - p[:, list(template.ears)].mean(1)
-    votes[:, 0] = np.where(visible[:, face].all(1), np.sign((ahead * front).sum(-1)), np.nan)
-    for column, (ankle, toe) in enumerate(toes(template), start=1):
-        ahead = p[:, toe] - p[:, ankle]
-        seen = visible[:, [ankle, toe]].all(1)
-        votes[:, column] = np.where(seen, np.sign((ahead * front).sum(-1)), np.nan)
-    known = trunk & ~np.isnan(votes).all(1)
-    result = np.full(len(p), np.nan)
-    result[known] = np.nanmean(votes[known], axis=1)
-    return result
-
-
-def toes(template: SkeletonTemplate) -> tuple[tuple[int, int], tuple[int, int]]:
-    """(ankle, toe) joints, left and right."""
-    names = template.names
-    left, right = (
-        (names.index(f"{side}_ankle"), names.index(f"{side}_foot_index"))
-        for side in ("left", "right")
-    )
-    return left, right
+    trunk = visible[:, list(template.torso)].all(1)
+    index = template.names.index
+    ends = [(list(template.ears), template.nose)]
+    ends += [([index(f"{s}_ankle")], index(f"{s}_foot_index")) for s in ("left", "right")]
+    votes = np.full((len(ends), len(p)), np.nan)
+    for vote, (behind, ahead) in zip(votes, ends, strict=True):
+        seen = trunk & visible[:, [*behind, ahead]].all(1)
+        direction = p[:, ahead] - p[:, behind].mean(1)
+        vote[seen] = np.sign((direction * front).sum(-1))[seen]
+    count = (~np.isnan(votes)).sum(0)
+    return np.where(count > 0, np.nansum(votes, axis=0) / np.maximum(count, 1), np.nan)

@@ -1,11 +1,12 @@
-"""A whole check: one pass over the data, every question asked, one report."""
+"""A whole check: one pass over the data, all measurements, one report."""
 
 from __future__ import annotations
 
 import json
 import logging
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +15,11 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rich.progress import track
 
-from gsgan.check.findings import Report
-from gsgan.check.looking import Broken, Look, chosen_items, look_at
-from gsgan.check.sections import failed, sections
+from gsgan.check.contents import unreadable
+from gsgan.check.report import Report, page, print_report
+from gsgan.check.sections import Measured, sections
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.subject import subject_of
-from gsgan.check.suspects import suspicious
+from gsgan.check.views import Results, measure, sampled_items, subject_of, suspicious_items
 from gsgan.effects import EffectSettings
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
@@ -28,7 +28,7 @@ from gsgan.utils.files import write_atomically
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-Progress = Callable[[Iterable[Look | Broken], int], Iterable[Look | Broken]]
+Progress = Callable[[Results, int], Results]
 
 
 def check_data(
@@ -42,13 +42,13 @@ def check_data(
 
     Args:
         data: it need not have been read yet.
-        sampling: how much is looked at.
-        limits: from where on something is wrong.
-        progress: wraps the results of the pass over the pictures, given their number.
-        effects: what training would be asked of the effects; None: the defaults.
+        sampling: how much is checked.
+        limits: thresholds.
+        progress: wraps the results of the pass over the images, given their number.
+        effects: settings of the effects as for training; None: the defaults.
 
     Returns:
-        The report; a dataset that cannot be read gives one with the reader's sentence.
+        The report; of a dataset that cannot be read it has the reader's message.
 
     Raises:
         ConfigError: when the data's config is wrong.
@@ -56,12 +56,15 @@ def check_data(
     try:
         subject = subject_of(data)
     except DataError as error:
-        return failed(data.root, error)
-    items = chosen_items(subject, sampling.pictures)
-    items = tuple(dict.fromkeys((*items, *suspicious(subject, sampling))))
-    looks, broken = look_at(subject, items, limits, sampling, progress)
-    asked = effects or EffectSettings()
-    return sections(data, subject, looks, broken, sampling, limits, asked)
+        return _failed(data.root, error)
+    items = (*sampled_items(subject, sampling.pictures), *suspicious_items(subject, sampling))
+    views, broken = measure(subject, tuple(dict.fromkeys(items)), sampling, progress)
+    measured = Measured(data, subject, views, broken, sampling, limits, effects or EffectSettings())
+    return Report(str(subject.layout.root), sections(measured), measured.numbers())
+
+
+def _failed(root: str | None, error: DataError) -> Report:
+    return Report(str(root), (unreadable(root, error),), {"readable": False})
 
 
 def run_check(config: DictConfig) -> Report:
@@ -70,29 +73,28 @@ def run_check(config: DictConfig) -> Report:
     Raises:
         ConfigError: on a config value that does not fit.
     """
-    # imported here: the page and the terminal are needed by commands only
-    from gsgan.check.page import page
-    from gsgan.check.terminal import print_report
-
     if not config.report:
         raise ConfigError("report is not set: give the HTML file to write, e.g. report=check.html")
-    # the reader's notes have their place in the report
+    # the reader's notes are part of the report
     logging.getLogger("gsgan.data").setLevel(logging.ERROR)
     console = make_console()
-    sampling: Sampling = instantiate(config.sampling)
-    limits: Limits = instantiate(config.limits)
+    sampling, limits = instantiate(config.sampling), instantiate(config.limits)
 
-    def shown(results: Iterable[Look | Broken], count: int) -> Iterable[Look | Broken]:
-        told = "looking at pictures"
-        return track(results, told, count, console=console, transient=True)
+    def shown(results: Results, count: int) -> Results:
+        return track(results, "checking images", count, console=console, transient=True)
 
-    report = _checked(config, sampling, limits, shown)
+    try:
+        data = instantiate(config.data)
+        report = check_data(data, sampling, limits, shown, instantiate(config.effects))
+    except InstantiationException as error:
+        if not isinstance(error.__cause__, DataError):
+            raise
+        report = _failed(config.data.get("root"), error.__cause__)
     path = Path(config.report).expanduser()
+    numbers = json.dumps(plain(report), indent=1, allow_nan=False) + "\n"
     try:
         write_atomically(path, page(report))
-        write_atomically(
-            path.with_suffix(".json"), json.dumps(plain(report), indent=1, allow_nan=False) + "\n"
-        )
+        write_atomically(path.with_suffix(".json"), numbers)
     except OSError as error:
         raise ConfigError(f"report={path} cannot be written: {error.strerror}") from None
     print_report(report, console)
@@ -100,31 +102,19 @@ def run_check(config: DictConfig) -> Report:
     return report
 
 
-def _checked(config: DictConfig, sampling: Sampling, limits: Limits, progress: Progress) -> Report:
-    try:
-        data = instantiate(config.data)
-    except InstantiationException as error:
-        if isinstance(error.__cause__, DataError):
-            return failed(config.data.get("root"), error.__cause__)
-        raise
-    return check_data(data, sampling, limits, progress, instantiate(config.effects))
-
-
 def plain(report: Report) -> dict[str, Any]:
-    """The report's findings and numbers for a machine; null stands for what is not known."""
+    """The report's findings and numbers for the JSON file; null stands for unknown."""
     return {
         "root": report.root,
         "errors": report.errors,
         "warnings": report.warnings,
-        "findings": [
-            {"level": f.level, "topic": f.topic, "sentence": f.sentence} for f in report.findings
-        ],
+        "findings": [asdict(finding) for finding in report.findings],
         **{key: _known(value) for key, value in report.numbers.items()},
     }
 
 
 def _known(value: Any) -> Any:
-    """A value without NaN and infinity, which JSON does not have."""
+    """A value without NaN and infinity, which JSON lacks."""
     if isinstance(value, dict):
         return {key: _known(held) for key, held in value.items()}
     if isinstance(value, (list, tuple)):

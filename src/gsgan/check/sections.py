@@ -1,23 +1,22 @@
-"""The report, section by section, from what was measured."""
+"""The sections of the report, from what was measured."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsgan.check import charts, colours, hull, overlays, rig
-from gsgan.check.blame import judge_cameras, misfits, wrong_cameras
-from gsgan.check.calibration import CameraScore, grouped, score_cameras
-from gsgan.check.contents import broken_pictures, contents, unreadable
-from gsgan.check.distrust import Doubt, Motion, doubts, judge_doubts, motion_of
-from gsgan.check.findings import Figure, Report, Section, Table, counted
-from gsgan.check.looking import Broken, Look
-from gsgan.check.reprojection import Reprojection, judge_reprojection, try_reprojection
+from gsgan.check import agreement, charts, overlays, rig
+from gsgan.check.calibration import calibration_findings, score_cameras
+from gsgan.check.contents import broken_images, contents
+from gsgan.check.frames import doubts, frame_findings, motion_of
+from gsgan.check.report import Figure, Finding, Section, Table, counted
+from gsgan.check.reprojection import read_reprojection, reprojection_findings
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.subject import Subject, evenly
+from gsgan.check.views import Broken, Subject, View, grouped
+from gsgan.data.formats.trust import spread
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.table import HEADERS, rows
 from gsgan.utils.errors import DataError
@@ -27,270 +26,241 @@ if TYPE_CHECKING:
 
 TABLE_FRAMES = 40  # doubtful frames listed
 AGREEMENT = (
-    "Joints are held against masks, undistorted. Overlap is that of the mask with the body that "
-    "the skeleton foretells (about 0.7 when all is well); 'best other' is what the calibration of "
-    "another camera, mirrored pictures, or R and t the other way round would reach. 'Hull fills' "
-    "is the share of the mask that is left when all masks together carve space: it does not need "
-    "the skeleton.",
+    "Joints are compared with masks, undistorted. Overlap is that of the mask with the silhouette "
+    "estimated from the skeleton (about 0.7 in a good capture); 'best other' is what the "
+    "calibration of another camera, mirrored images, or R and t the other way round would reach. "
+    "'Hull fills' is the share of the mask that is left when all masks together carve space: it "
+    "does not need the skeleton."
 )
+COLOURS = "Mean colour of the person; the side that a camera sees changes it as well as exposure."
+EFFECTS = "What is off is neither built nor computed; effects.<name>= forces one (docs/effects.md)."
+SERIES = "Over the frames; red ticks at the bottom: doubtful frames; dashed: the limit."
 
 
-@dataclass(frozen=True)
 class Measured:
-    """Everything that was measured, for the sections to share; ``blamed`` are the cameras whose
-    masks do not fit as a whole, so that they say nothing about single frames."""
+    """All measurements of a dataset, shared by the sections.
 
-    subject: Subject
-    looks: Sequence[Look]
-    cameras: Sequence[CameraScore]
-    hull: hull.HullScore | None
-    colours: dict[str, colours.Colours]
-    motion: Motion
-    reprojection: Reprojection | None
-    doubts: Sequence[Doubt]
-    rig: rig.Rig
-    blamed: frozenset[str]
-    sampling: Sampling
-    limits: Limits
+    Args:
+        data: the data module.
+        subject: its arrays.
+        views: of the sampled images.
+        broken: images that could not be read.
+        sampling, limits, effects: settings.
+    """
+
+    def __init__(
+        self,
+        data: GsganData,
+        subject: Subject,
+        views: Sequence[View],
+        broken: Sequence[Broken],
+        sampling: Sampling,
+        limits: Limits,
+        effects: EffectSettings,
+    ) -> None:
+        self.data, self.subject, self.views = data, subject, views
+        self.sampling, self.limits, self.effects = sampling, limits, effects
+        self.files = broken_images(list(broken))
+        self.rig = rig.rig_of(subject)
+        self.cameras = score_cameras(subject, views, limits, sampling)
+        self.wrong = frozenset(self.rig.far) | {s.name for s in self.cameras if s.wrong(limits)}
+        self.unfit = self.wrong | {s.name for s in self.cameras if s.unfit(limits)}
+        self.hull = agreement.score_hulls(subject, views, sampling.hull_frames)
+        self.colours = agreement.mean_colours(views)
+        self.motion = motion_of(subject, limits)
+        try:
+            self.reprojection = read_reprojection(subject)
+        except DataError as error:
+            self.reprojection = None
+            self.files.append(Finding("error", "files", str(error)))
+        self.info, self.no_info = None, ""
+        try:
+            self.info = data.info
+        except DataError as error:  # named among the findings
+            self.no_info = str(error)
+        self.doubts = doubts(
+            subject, views, self.motion, self.reprojection, limits, frozenset(self.unfit)
+        )
+        self.doubtful = frozenset(doubt.frame for doubt in self.doubts)
 
     @property
-    def wrong(self) -> frozenset[str]:
-        """Cameras whose masks are not those of their pictures' person."""
-        far = rig.far_cameras(self.rig, self.limits)
-        return wrong_cameras(self.cameras, self.limits) | frozenset(far)
+    def reasons(self) -> dict[int, list[str]]:
+        """Reasons by doubtful frame."""
+        found: dict[int, list[str]] = {}
+        for doubt in self.doubts:
+            found.setdefault(doubt.frame, []).append(doubt.text)
+        return found
 
-    @property
-    def doubtful(self) -> frozenset[int]:
-        """Frames with a reason to distrust them."""
-        return frozenset(doubt.frame for doubt in self.doubts)
+    def numbers(self) -> dict[str, object]:
+        """The scores, for the JSON file."""
+        found = self.reprojection
+        return {
+            "readable": True,
+            "cameras": {
+                s.name: asdict(s) | {"rivals": asdict(s)["rivals"][:3]} for s in self.cameras
+            },
+            "hull": None if self.hull is None else self.hull.filled,
+            "colours": {
+                name: {"mean": mean.tolist(), "to_median": ratio.tolist()}
+                for name, (mean, ratio) in self.colours.items()
+            },
+            "camera_distance": self.rig.distance,
+            "stature": self.rig.stature,
+            "reprojection_px": None if found is None else found.median,
+            "doubtful_frames": {str(frame): text for frame, text in self.reasons.items()},
+            "settings": {
+                "sampling": asdict(self.sampling),
+                "limits": asdict(self.limits),
+                "trust": asdict(self.subject.trust),
+            },
+        }
 
 
-def failed(root: str | None, error: DataError) -> Report:
-    """The report on a dataset that cannot be read."""
-    return Report(str(root), (unreadable(root, error),), {"readable": False})
-
-
-def sections(
-    data: GsganData,
-    subject: Subject,
-    looks: Sequence[Look],
-    broken: Sequence[Broken],
-    sampling: Sampling,
-    limits: Limits,
-    effects: EffectSettings,
-) -> Report:
-    """Asks every question of what was read and decoded."""
-    cameras = score_cameras(subject, looks, limits, sampling)
-    carved = hull.carvings(subject, looks, sampling)
-    reprojection, damaged = try_reprojection(subject)
-    motion = motion_of(subject, limits)
-    measured_rig = rig.rig_of(subject)
-    far = rig.far_cameras(measured_rig, limits)
-    blamed = misfits(cameras, limits) | frozenset(far)
-    m = Measured(
-        subject=subject,
-        looks=looks,
-        cameras=cameras,
-        hull=hull.score_hulls(carved),
-        colours=colours.score_colours(looks, carved),
-        motion=motion,
-        reprojection=reprojection,
-        doubts=doubts(subject, looks, motion, reprojection, limits, blamed),
-        rig=measured_rig,
-        blamed=blamed,
-        sampling=sampling,
-        limits=limits,
+def sections(m: Measured) -> tuple[Section, ...]:
+    """Every section, in reading order."""
+    files = (Section("Files", findings=tuple(m.files)),) if m.files else ()
+    units = Section(
+        "Units and cameras",
+        tables=(rig.units_table(m.subject, m.rig), rig.lens_table(m.subject, m.rig)),
+        figures=(
+            Figure(
+                "The cameras with their viewing directions (dotted), the person and the person's "
+                "path (grey).",
+                charts.rig_drawing(m.subject),
+            ),
+        ),
+        findings=tuple(rig.rig_findings(m.subject, m.rig, m.limits)),
     )
-    files = Section("Files", findings=(*broken_pictures(list(broken)), *damaged))
-    parts = (
-        contents(data, subject),
-        *((files,) if files.findings else ()),
-        _units(m),
+    colour = Section(
+        "Colours of the cameras",
+        aside=(COLOURS,),
+        tables=(agreement.colour_table(m.colours, m.limits),),
+        # masks that do not fit show other things than the person
+        findings=()
+        if m.wrong
+        else tuple(agreement.colour_findings(m.colours, m.info, m.effects, m.limits)),
+    )
+    return (
+        contents(m.data, m.subject),
+        *files,
+        units,
         _agreement(m),
         _overlays(m),
         _frames(m),
-        _colours(m),
-        _effects(data, effects),
-        _limits(m),
-    )
-    return Report(str(subject.layout.root), parts, _numbers(m))
-
-
-def _units(m: Measured) -> Section:
-    drawing = Figure(
-        "The cameras, what they see (dashed: where they look), the person and the person's way.",
-        svg=charts.rig_drawing(m.subject),
-    )
-    return Section(
-        "Units and cameras",
-        tables=(
-            rig.units_table(m.subject, m.rig),
-            rig.lens_table(m.subject, m.rig, m.limits),
-        ),
-        figures=(drawing,),
-        findings=tuple(rig.judge_rig(m.subject, m.rig, m.limits)),
+        colour,
+        _effects(m),
     )
 
 
 def _agreement(m: Measured) -> Section:
-    found = m.reprojection
+    found, min_inside = m.reprojection, m.subject.trust.min_inside
     text: tuple[str, ...] = ()
     if found is not None and not np.isnan(found.median):
         px = f"{found.median:.1f} pixels (median) from their 2D detections"
         text = (f"Joints lie {px}: {found.source}.",)
+    cells, flagged = [], set()
+    for i, s in enumerate(m.cameras):
+        filled = None if m.hull is None else m.hull.filled.get(s.name)
+        pixels = None if found is None else found.by_camera.get(s.name)
+        columns = (
+            (s.name, False),
+            (f"{s.inside:.1%}", not s.inside >= min_inside),
+            ("–" if np.isnan(s.outside) else f"{100 * s.outside:.1f}", False),
+            (f"{s.overlap:.2f}", False),
+            (f"{s.rival_overlap:.2f}", s.beaten(m.limits)),
+            (f"{s.shift[0]:+.0f}, {s.shift[1]:+.0f}", s.shifted(m.limits)),
+            (f"{s.lag:+d}" if s.lag else "0", s.lag != 0),
+            ("–", False) if filled is None else (f"{filled:.1%}", filled < m.limits.hull_warning),
+            ("–" if pixels is None else f"{pixels:.1f}", False),
+        )
+        cells.append(tuple(text for text, _ in columns))
+        flagged |= {(i, column) for column, (_, bad) in enumerate(columns) if bad}
+    headers = (
+        "camera", "joints inside mask", "outside by cm", "overlap", "best other", "shift px",
+        "lag", "hull fills", "2D px",
+    )  # fmt: skip
+    title = "Do skeleton, masks and cameras agree?"
     return Section(
         "Skeleton, masks and cameras",
         text=text,
-        aside=AGREEMENT,
-        tables=(
-            rig.agreement_table(
-                m.cameras, m.hull, {} if found is None else found.by_camera, m.limits
-            ),
-        ),
+        aside=(AGREEMENT,),
+        tables=(Table(headers, tuple(cells), frozenset(flagged), title),),
         findings=(
-            *judge_cameras(m.cameras, m.limits, rig.far_cameras(m.rig, m.limits)),
-            *hull.judge_hulls(m.hull, m.limits, m.blamed),
-            *judge_reprojection(found, m.limits),
+            *calibration_findings(m.cameras, m.limits, min_inside, m.rig.far),
+            *(() if m.unfit else agreement.hull_findings(m.hull, m.limits)),
+            *reprojection_findings(found, m.limits),
         ),
     )
 
 
 def _overlays(m: Measured) -> Section:
-    figures = []
-    for name, own in grouped(m.looks).items():
-        chosen = [own[i] for i in evenly(tuple(range(len(own))), m.sampling.shown)]
-        picture = overlays.strip(m.subject, chosen, m.limits, m.sampling.tile, m.doubtful)
-        figures.append(Figure(f"camera {name}", picture=picture))
+    figures = [
+        Figure(
+            f"camera {name}",
+            overlays.strip(m.subject, spread(own, m.sampling.shown), m.sampling.tile, m.doubtful),
+        )
+        for name, own in grouped(m.views).items()
+    ]
     return Section("Overlays", aside=(overlays.LEGEND,), figures=tuple(figures))
 
 
 def _frames(m: Measured) -> Section:
-    reasons: dict[int, list[str]] = {}
-    for doubt in m.doubts:
-        reasons.setdefault(doubt.frame, []).append(doubt.text)
-    rows = tuple((str(frame), "; ".join(text)) for frame, text in reasons.items())
-    tables = (Table(("frame", "why"), rows[:TABLE_FRAMES]),) if rows else ()
-    text = [
-        f"{counted(len(rows), 'frame')} of {len(m.subject.frames)} to distrust; skeletons were "
-        f"judged in all frames, masks in {counted(len(m.looks), 'picture')}."
-    ]
-    if len(rows) > TABLE_FRAMES:
-        text.append(f"The first {TABLE_FRAMES} are listed; the JSON beside this report has all.")
+    table = tuple((str(frame), "; ".join(text)) for frame, text in m.reasons.items())
+    text = (
+        f"{counted(len(table), 'frame')} of {len(m.subject.frames)} to distrust; skeletons were "
+        f"checked in all frames, masks in {counted(len(m.views), 'image')}."
+    )
+    if len(table) > TABLE_FRAMES:
+        text += f" The first {TABLE_FRAMES} are listed; the JSON file has all."
+    figures = [Figure(SERIES, charts.series_chart(_series(m), m.doubtful))]
+    worst = sorted(
+        (view for view in m.views if view.frame in m.doubtful),
+        key=lambda view: np.nan_to_num(view.inside),
+    )[: m.sampling.shown]
+    if worst:
+        tiles = overlays.strip(m.subject, worst, m.sampling.tile, m.doubtful, named=True)
+        title = "Doubtful frames with most joints outside the mask"
+        figures.insert(0, Figure(title, tiles))
     return Section(
         "Frames to distrust",
-        text=tuple(text),
-        tables=tables,
-        figures=(*_worst(m), *_series(m)),
-        findings=tuple(judge_doubts(m.subject, m.doubts, m.motion, m.limits)),
+        text=(text,),
+        tables=(Table(("frame", "why"), table[:TABLE_FRAMES]),) if table else (),
+        figures=tuple(figures),
+        findings=tuple(frame_findings(m.subject, m.doubts, m.motion, m.limits)),
     )
 
 
-def _worst(m: Measured) -> list[Figure]:
-    """The doubtful pictures with the lowest share of joints inside."""
-    doubtful = [look for look in m.looks if look.frame in m.doubtful]
-    if not doubtful:
-        return []
-    worst = sorted(doubtful, key=lambda look: np.nan_to_num(look.inside(m.limits)))
-    worst = worst[: m.sampling.shown]
-    picture = overlays.strip(m.subject, worst, m.limits, m.sampling.tile, m.doubtful, named=True)
-    return [Figure("Doubtful frames, where most joints lie outside the mask", picture=picture)]
-
-
-def _series(m: Measured) -> list[Figure]:
+def _series(m: Measured) -> list[charts.Series]:
     frames = [int(f) for f in m.subject.frames]
-    by_camera = grouped(m.looks)
-
-    def of_looks(measure: str) -> dict[str, tuple[list[int], list[float]]]:
-        return {
-            name: ([look.frame for look in own], [
-                look.inside(m.limits) if measure == "inside" else look.fullness for look in own
-            ])
-            for name, own in by_camera.items()
-        }  # fmt: skip
-
-    motion, limits = m.motion, m.limits
-    drawn = [
-        charts.series_chart(
-            "share of joints inside the mask", frames, of_looks("inside"),
-            limit=1 - limits.frame_outside, doubtful=m.doubtful, most=1.0,
+    by_camera = {
+        name: ([view.frame for view in own], own)
+        for name, own in (
+            (n, sorted(v, key=lambda v: v.frame)) for n, v in grouped(m.views).items()
+        )
+    }
+    inside = {n: (at, [view.inside for view in own]) for n, (at, own) in by_camera.items()}
+    fullness = {n: (at, [view.fullness for view in own]) for n, (at, own) in by_camera.items()}
+    jump = np.nan_to_num(m.motion.jump).max(1).tolist()
+    series = [
+        charts.Series("share of joints inside the mask", inside, 1 - m.limits.frame_outside),
+        charts.Series("area of the mask over that of the estimated silhouette", fullness),
+        charts.Series("largest jump of a joint, m", {"": (frames, jump)}, m.limits.joint_jump),
+        charts.Series(
+            "share of joints seen", {"": (frames, m.motion.seen.tolist())}, m.limits.seen_share
         ),
-        charts.series_chart(
-            "area of the mask over that of the foretold body", frames, of_looks("fullness"),
-            doubtful=m.doubtful, least=0.0,
-        ),
-        charts.series_chart(
-            "largest jump of a joint, m", frames,
-            {"jump": (frames, np.nan_to_num(motion.jump).max(1).tolist())},
-            limit=limits.joint_jump, doubtful=m.doubtful, least=0.0,
-        ),
-        charts.series_chart(
-            "share of joints seen", frames, {"seen": (frames, motion.seen.tolist())},
-            limit=limits.seen_share, doubtful=m.doubtful, most=1.0, least=0.0,
-        ),
-    ]  # fmt: skip
+    ]
     if m.reprojection is not None:
         worst = np.nan_to_num(m.reprojection.pixels).max(1).tolist()
+        limit = m.limits.reprojection_joint * m.reprojection.focal
         title = "farthest joint from its 2D detections, pixels"
-        limit = limits.reprojection_joint * m.reprojection.focal
-        series = {"farthest": (frames, worst)}
-        drawn.append(
-            charts.series_chart(title, frames, series, limit=limit, doubtful=m.doubtful, least=0.0)
-        )
-    captions = ["Over the frames; red marks at the foot: frames to distrust; dashed: the limit."]
-    captions += [""] * (len(drawn) - 1)
-    return [Figure(text, svg=svg) for text, svg in zip(captions, drawn, strict=True)]
+        series.append(charts.Series(title, {"": (frames, worst)}, limit))
+    return series
 
 
-def _colours(m: Measured) -> Section:
-    return Section(
-        "Colours of the cameras",
-        aside=(
-            "Mean colour of the person. On shared surface: the same parts of the visual hull seen "
-            "by two cameras, so that front and back do not pass for exposure.",
-        ),
-        tables=(colours.colour_table(m.colours, m.limits),),
-        findings=tuple(colours.judge_colours(m.colours, m.limits, m.wrong)),
-    )
-
-
-def _effects(data: GsganData, settings: EffectSettings) -> Section:
-    """What training would turn on, by the rules it goes by."""
+def _effects(m: Measured) -> Section:
+    """What training would turn on, by the same rules."""
     title = "Effects that the scene calls for"
-    try:
-        decided = decide(data.info, settings)
-    except DataError as error:  # named among the findings
-        return Section(title, text=(f"Not decided: {error}",))
-    aside = (
-        "What is off is neither built nor computed; effects.<name>= forces one (docs/effects.md)."
-    )
-    table = Table(HEADERS[:3], tuple(row[:3] for row in rows(decided)))
-    return Section(title, tables=(table,), aside=(aside,))
-
-
-def _limits(m: Measured) -> Section:
-    settings = {"sampling": asdict(m.sampling), "limits": asdict(m.limits)}
-    text = (
-        f"{group}: " + ", ".join(f"{name} {value:g}" for name, value in values.items())
-        for group, values in settings.items()
-    )
-    return Section("Settings of this check (conf/check.yaml)", aside=tuple(text))
-
-
-def _numbers(m: Measured) -> dict[str, object]:
-    reasons: dict[str, list[str]] = {}
-    for doubt in m.doubts:
-        reasons.setdefault(str(doubt.frame), []).append(doubt.text)
-    return {
-        "readable": True,
-        "cameras": {s.name: asdict(s) | {"rivals": asdict(s)["rivals"][:3]} for s in m.cameras},
-        "hull": None if m.hull is None else m.hull.filled,
-        "colours": {
-            name: {"mean": c.mean.tolist(), "to_median": c.judged.tolist()}
-            for name, c in m.colours.items()
-        },
-        "camera_distance": m.rig.distance,
-        "stature": m.rig.stature,
-        "reprojection_px": None if m.reprojection is None else m.reprojection.median,
-        "doubtful_frames": reasons,
-        "settings": {"sampling": asdict(m.sampling), "limits": asdict(m.limits)},
-    }
+    if m.info is None:
+        return Section(title, text=(f"Not decided: {m.no_info}",))
+    table = Table(HEADERS[:3], tuple(row[:3] for row in rows(decide(m.info, m.effects))))
+    return Section(title, tables=(table,), aside=(EFFECTS,))

@@ -1,86 +1,45 @@
-"""Masks and skeletons in one picture: joints outside a mask, the body that a skeleton foretells.
+"""The silhouette that a skeleton suggests, and how two silhouettes compare.
 
-Pure functions of arrays. Pixels have their centres at +0.5.
+Pure functions of arrays. Pixel centres lie at +0.5.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from gsgan.data.agreement import FAR_PIXELS
-from gsgan.data.crop import NEAR
+from gsgan.data.cameras import CameraEntry
+from gsgan.data.crop import NEAR, project
+from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float
 from gsgan.skeleton.template import SkeletonTemplate
 
-Float = NDArray[np.float64]
-Bool = NDArray[np.bool_]
-
-HEAD_RADIUS = 0.12  # metres round the middle of the face: half of a head's height
+FLESH = 0.07  # metres of body about every bone: between an arm and a thigh
+HEAD_RADIUS = 0.12  # metres about the middle of the face: half of a head's height
 BOX_TAIL = 0.5  # per cent of a mask's pixels left out on each side of its box: specks
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Where pixels of the whole picture lie in a scaled one: ``pixel * scale + offset``.
-
-    Args:
-        scale: ``[2]`` along x and y.
-        offset: ``[2]`` pixels.
-        size: ``(H, W)`` of the scaled picture.
-    """
-
-    scale: Float
-    offset: Float
-    size: tuple[int, int]
-
-    def __call__(self, pixels: Float) -> Float:
-        """``[..., 2]`` pixels of the whole picture in the scaled one."""
-        return pixels * self.scale + self.offset
-
-    def resized(self, size: tuple[int, int]) -> Placement:
-        """The same picture at another ``(H, W)``."""
-        factor = np.array([size[1] / self.size[1], size[0] / self.size[0]])
-        return Placement(self.scale * factor, self.offset * factor, size)
-
-
-def placement(K: Float, scaled_K: Float, size: tuple[int, int]) -> Placement:
-    """How a crop and resize moved pixels, from the intrinsics ``[3, 3]`` before and after it."""
-    moved = scaled_K @ np.linalg.inv(K)
-    return Placement(np.array([moved[0, 0], moved[1, 1]]), moved[:2, 2], size)
-
-
 def body_silhouette(
-    pixels: Float,
-    depth: Float,
-    visible: Bool,
-    focal: float,
-    size: tuple[int, int],
-    template: SkeletonTemplate,
-    flesh: float,
+    camera: CameraEntry, p: Float, visible: Bool, template: SkeletonTemplate
 ) -> Bool:
-    """``[H, W]`` the body that a skeleton foretells: thick bones, a filled trunk, a round head.
+    """``[H, W]`` silhouette estimated from a skeleton: thick bones, a filled trunk, a round head.
 
     Args:
-        pixels: ``[J, 2]``.
-        depth: ``[J]`` metres; joints behind the camera are left out.
+        camera: whose ``size`` the silhouette gets; distortion is left out.
+        p: ``[J, 3]`` metres; joints behind the camera are left out.
         visible: ``[J]``.
-        focal: pixels.
-        size: ``(H, W)``.
-        template: names bones, trunk and face.
-        flesh: metres round every bone.
+        template: bones, trunk and face.
     """
+    size = camera.size
+    pixels, depth = project(camera, p)
     canvas = np.zeros(size, np.uint8)
     drawn = visible & (depth > NEAR)
     at = np.round(np.clip(np.nan_to_num(pixels), -FAR_PIXELS, FAR_PIXELS) - 0.5).astype(np.int32)
-    metre = focal / np.maximum(depth, NEAR)  # pixels
+    metre = abs(camera.K[0, 0]) / np.maximum(depth, NEAR)  # pixels
     trunk = template.torso
     edges = [*template.limbs, *zip(trunk, (trunk[1], trunk[3], trunk[0], trunk[2]), strict=True)]
     for a, b in edges:
         if drawn[a] and drawn[b]:
-            width = thickness(2 * flesh * min(metre[a], metre[b]), size)
+            width = thickness(2 * FLESH * min(metre[a], metre[b]), size)
             cv2.line(canvas, at[a].tolist(), at[b].tolist(), 1, width)
     corners = [j for j in trunk if drawn[j]]
     if len(corners) > 2:
@@ -94,7 +53,7 @@ def body_silhouette(
 
 
 def thickness(pixels: float, size: tuple[int, int]) -> int:
-    """A whole line width that OpenCV can draw: at least 1, at most the picture."""
+    """A whole line width that OpenCV can draw: at least 1, at most the image."""
     return int(np.clip(round(float(pixels)), 1, min(255, max(size))))
 
 
@@ -104,36 +63,27 @@ def overlap(a: Bool, b: Bool) -> float:
     return np.count_nonzero(a & b) / union if union else 0.0
 
 
-def box(mask: Bool, tail: float = BOX_TAIL) -> Float:
-    """``[4]`` left, top, right, bottom in pixels, NaN when empty; specks are left out.
-
-    Args:
-        mask: ``[H, W]``.
-        tail: per cent of the pixels beyond each side.
-    """
+def box(mask: Bool) -> Float:
+    """``[4]`` left, top, right, bottom in pixels, NaN when empty; specks are left out."""
     rows, columns = np.nonzero(mask)
     if len(rows) == 0:
         return np.full(4, np.nan)
-    left, right = np.percentile(columns, (tail, 100 - tail))
-    top, bottom = np.percentile(rows, (tail, 100 - tail))
+    left, right = np.percentile(columns, (BOX_TAIL, 100 - BOX_TAIL))
+    top, bottom = np.percentile(rows, (BOX_TAIL, 100 - BOX_TAIL))
     return np.array([left, top, right + 1, bottom + 1])
 
 
 def best_shift(mask: Bool, body: Bool) -> tuple[int, int]:
-    """Whole pixels ``(dx, dy)`` by which the mask lies beside the body: most pixels in common."""
+    """Whole pixels ``(dx, dy)`` by which the mask lies beside the body: largest correlation."""
     height, width = mask.shape
-    shape = (2 * height, 2 * width)  # padded: a shift must not come back on the other side
+    shape = (2 * height, 2 * width)  # padded: a shift must not wrap around
     spectrum = np.fft.rfft2(mask, shape) * np.conj(np.fft.rfft2(body, shape))
     common = np.fft.irfft2(spectrum, shape)
     dy, dx = np.unravel_index(int(np.argmax(common)), shape)
     return int((dx + width) % (2 * width) - width), int((dy + height) % (2 * height) - height)
 
 
-def moved(picture: Bool, dx: int, dy: int) -> Bool:
+def moved(mask: Bool, dx: int, dy: int) -> Bool:
     """A mask moved by whole pixels, empty where nothing was."""
-    height, width = picture.shape
-    result = np.zeros_like(picture)
-    rows, columns = slice(max(dy, 0), height + min(dy, 0)), slice(max(dx, 0), width + min(dx, 0))
-    source = picture[max(-dy, 0) : height + min(-dy, 0), max(-dx, 0) : width + min(-dx, 0)]
-    result[rows, columns] = source
-    return result
+    shift = np.array([[1, 0, dx], [0, 1, dy]], np.float64)
+    return cv2.warpAffine(mask.astype(np.uint8), shift, mask.shape[::-1], flags=0) > 0

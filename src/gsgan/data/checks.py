@@ -1,12 +1,13 @@
-"""What a capture must satisfy before it is used, whatever its format: thresholds with names."""
+"""What a dataset must satisfy before it is used, in any format, with named thresholds."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, inside, project
@@ -21,7 +22,7 @@ Index = Mapping[str, Mapping[int, str]]
 
 @dataclass(frozen=True)
 class Checks:
-    """What a capture must satisfy; each threshold can be set.
+    """What a dataset must satisfy; each threshold can be set.
 
     Args:
         min_joints: a frame with fewer usable joints is dropped.
@@ -29,13 +30,13 @@ class Checks:
         min_joints_in_view: a camera that sees fewer joints of a frame does not use that frame.
         max_reach: metres from the median joint; a joint further out counts as missing.
         rotation_tolerance: largest entry of ``R Rᵀ - I`` allowed.
-        distance: metres, least and greatest median distance from the cameras to the person; units
-            are wrong outside it.
-        max_behind: share of joints behind a camera from which its pose counts as wrong.
-        max_missing_masks: share of pictures without a mask that may be left out; above it, and
-            with 0 at the first one, reading stops.
-        header_stride: the header of every n-th picture of a camera is checked before anything
-            starts; 1 checks all, at about 0.1 ms a file. Sizes are checked again on decoding.
+        distance: metres, minimum and maximum median distance from the cameras to the person; units
+            are wrong outside them.
+        max_behind: share of joints behind a camera above which its pose is wrong.
+        max_missing_masks: share of images without a mask that may be left out; above it reading
+            stops.
+        header_stride: the header of every n-th image of a camera is checked when the dataset is
+            opened; 1 checks all, at about 0.1 ms per file. Sizes are checked again on decoding.
     """
 
     min_joints: int = 12
@@ -57,7 +58,7 @@ def drop_frames(
     checks: Checks,
     notes: list[str],
 ) -> Index:
-    """The images without the frames that lack a usable skeleton or pose, each reason noted.
+    """The images without the frames that lack a usable skeleton or pose; notes say why.
 
     Raises:
         DataError: when no frame is left.
@@ -76,7 +77,7 @@ def drop_frames(
             + "; ".join(f"{len(ids)} {reason}" for reason, ids in dropped.items())
         )
     if unseen := len(set(landmarks.p) - set(frames)):
-        notes.append(f"{unseen} frames in {landmarks.source} have no picture and are not used")
+        notes.append(f"{unseen} frames in {landmarks.source} have no image and are not used")
     uneven = [f"{name} {len(files)}" for name, files in images.items() if len(files) < len(frames)]
     if uneven:
         notes.append(
@@ -119,26 +120,19 @@ def check_geometry(
     calibration: Path,
     unit_hint: str,
 ) -> None:
-    """Cameras must stand at a believable distance and look at the person.
+    """Cameras must be at a plausible distance and face the person.
 
     Args:
         calibration: the file to name.
-        unit_hint: what to look at when the distance is not believable.
+        unit_hint: what to check when the distance is not plausible.
 
     Raises:
-        DataError: when they do not, naming the camera.
+        DataError: naming the camera.
     """
     frames = sorted({f for files in images.values() for f in files})
     joints = np.stack([landmarks.p[f] for f in frames])
     valid = np.stack([landmarks.visibility[f] for f in frames]) > 0
-    centre = np.median(joints[valid], axis=0)
-    distance = float(np.median([np.linalg.norm(c.centre - centre) for c in cameras.values()]))
-    low, high = checks.distance
-    if not low <= distance <= high:
-        raise DataError(
-            f"{root}: cameras stand {distance:.3g} m from the person (median), expected "
-            f"{low:g}-{high:g} m; {unit_hint}"
-        )
+    check_distance(root, list(cameras.values()), joints[valid], checks.distance, unit_hint)
     for camera in cameras.values():
         depth = project(camera, joints)[1][valid]
         behind = float((depth <= NEAR).mean())
@@ -147,6 +141,35 @@ def check_geometry(
                 f"{calibration}, camera {camera.name}: {behind:.0%} of the joints lie "
                 "behind it; R and t must map world to camera (x_cam = R x + t), z forward"
             )
+
+
+def check_distance(
+    where: Path,
+    cameras: Sequence[CameraEntry],
+    joints: NDArray[np.float64],
+    limits: tuple[float, float],
+    hint: str,
+) -> None:
+    """The median distance from the cameras to the median joint must be plausible.
+
+    Args:
+        where: file or folder, for the message.
+        cameras: at least one.
+        joints: ``[N, 3]`` metres, visible ones.
+        limits: metres, minimum and maximum.
+        hint: what to check otherwise.
+
+    Raises:
+        DataError: when it is not; units are wrong then.
+    """
+    person = np.median(joints, axis=0)
+    distance = float(np.median([np.linalg.norm(c.centre - person) for c in cameras]))
+    low, high = limits
+    if not low <= distance <= high:
+        raise DataError(
+            f"{where}: cameras stand {distance:.3g} m from the person (median), expected "
+            f"{low:g}-{high:g} m; {hint}"
+        )
 
 
 def drop_unseen(
@@ -174,7 +197,7 @@ def drop_unseen(
         if not enough.any():
             raise DataError(
                 f"{calibration}, camera {name}: no frame has "
-                f"{checks.min_joints_in_view} joints inside the picture; check K, and that R and t "
+                f"{checks.min_joints_in_view} joints inside the image; check K, and that R and t "
                 "map world to camera (x_cam = R x + t)"
             )
         if not enough.all():
@@ -197,35 +220,35 @@ def drop_unmasked(
     """The images that have a mask.
 
     Args:
-        images: what is left so far.
+        images: those kept so far.
         masks: those found.
-        expected: the folder in which a camera's masks should be.
+        expected: the folder of each camera's masks.
         checks: for the share that may be missing.
-        notes: gains how many were left out.
+        notes: a note on how many were left out is appended.
 
     Raises:
         DataError: when more are missing than allowed.
     """
     lacking = {c: [f for f in files if not masks[c].get(f)] for c, files in images.items()}
-    pictures = sum(len(files) for files in images.values())
+    count = sum(len(files) for files in images.values())
     missing = sum(len(frames) for frames in lacking.values())
     if missing == 0:
         return images
     camera = next(c for c, frames in lacking.items() if frames)
     frame = lacking[camera][0]
     path = (expected[camera] / Path(images[camera][frame]).name).with_suffix(".png")
-    count = f"{len(lacking[camera])} of the {len(images[camera])} of camera {camera} are missing"
+    first = f"{len(lacking[camera])} of the {len(images[camera])} of camera {camera} are missing"
     if checks.max_missing_masks == 0:
-        raise DataError(f"{path} does not exist; every picture needs a mask, and {count}")
-    share = missing / pictures
+        raise DataError(f"{path} does not exist; every image needs a mask, and {first}")
+    share = missing / count
     if share > checks.max_missing_masks:
         raise DataError(
-            f"{path} does not exist, and {share:.0%} of all {pictures} pictures have no mask "
-            f"({count}); at most {checks.max_missing_masks:.0%} may be left out: get the whole "
+            f"{path} does not exist, and {share:.0%} of all {count} images have no mask "
+            f"({first}); at most {checks.max_missing_masks:.0%} may be left out: get the whole "
             "masks, or raise max_missing_masks"
         )
     notes.append(
-        f"{missing} of {pictures} pictures have no mask and are left out "
+        f"{missing} of {count} images have no mask and are left out "
         f"(first: camera {camera}, frame {frame})"
     )
     gone = {c: set(frames) for c, frames in lacking.items()}
@@ -243,7 +266,7 @@ def check_pictures(
     stride: int,
     calibration: Path,
 ) -> None:
-    """Sizes and channel layouts, from the headers alone.
+    """Checks sizes and channel layouts, from the headers alone.
 
     Raises:
         DataError: on the first file that does not fit.
@@ -253,7 +276,7 @@ def check_pictures(
         for frame in list(files)[::stride]:
             image = root / files[frame]
             check_picture(image, "image", size, str(calibration))
-            by = f"the picture {image}"
+            by = f"the image {image}"
             for mask in masks[name][frame]:
                 check_picture(root / mask.path, "mask", size, by)
             if label := labels.get(name, {}).get(frame):

@@ -1,10 +1,9 @@
 """Whether training cameras agree on the colour of surface that two of them see.
 
-Mean colours of the whole person do not tell: light from one side makes one camera's picture
-brighter. So the same surface is compared, in the same moment: the skinned body's where its mesh is
-at hand, else the visual hull's. What two cameras' colours differ by on the median is the cameras'
-doing; what is left about that median is highlights, and the noise of a surface that is not quite
-where it is taken to be.
+Mean colours of the whole person are not comparable: light from one side makes one camera's image
+brighter. So colours are compared on the same surface at the same moment: that of the skinned body
+where its mesh is available, else that of the visual hull. The median difference of two cameras is
+due to the cameras; the residual about that median is highlights, and noise of an inexact surface.
 """
 
 from __future__ import annotations
@@ -26,27 +25,27 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-VOXEL = 0.025  # metres, of the hull and of the grid that tells what is hidden
+VOXEL = 0.025  # metres, of the hull and of the occlusion test
 AIR = 0.3  # metres of space round the joints that is carved
-WIDEST = 4.0  # metres: a skeleton wider than this holds a joint gone astray
-BLUR = 0.03  # metres: surface is known to so much, so colours are compared as means over it
-WHOLE = 0.95  # of the blur must lie in the mask: outlines mix with what lies behind
-LEAST_POINTS = 30  # shared by two cameras in a moment: fewer lie at outlines, seen at a slant
+WIDEST = 4.0  # metres: a wider skeleton has a stray joint
+BLUR = 0.03  # metres: accuracy of the surface, over which colours are averaged
+WHOLE = 0.95  # share of the blur in the mask: outlines mix with the background
+LEAST_POINTS = 30  # shared by two cameras at a moment: fewer lie at outlines, at grazing angles
 LEAST_MOMENTS = 3
-COARSEST = 0.03  # metres a pixel may cover: in coarser pictures every colour is a mixture
-SLACK = 0.03  # metres by which a body may leave the mask: bare feet and hair are cut so far off
+COARSEST = 0.03  # metres per pixel: in coarser images every colour is a mixture
+SLACK = 0.03  # metres by which a body may leave the mask: masks cut off feet and hair that far
 RESIDUAL = 0.95  # the quantile: highlights cover little of a person
 
 
 @dataclass(frozen=True)
 class SurfaceColours:
-    """How training cameras differ on shared surface; colours in [0, 1].
+    """How much training cameras differ on shared surface; colours in [0, 1].
 
     Args:
         difference: the largest median difference of two cameras, in any channel.
-        error: its standard error, from one moment to the next.
-        residual: 95th percentile of what brightness differs by beyond those medians.
-        points: compared in all.
+        error: its standard error over the moments.
+        residual: 95th percentile of the difference in brightness about those medians.
+        points: number compared.
         source: ``body`` or ``hull``.
     """
 
@@ -60,16 +59,16 @@ class SurfaceColours:
 def surface_colours(
     moments: Sequence[Sequence[Frame]], body: SkinnedBody | None
 ) -> SurfaceColours | None:
-    """Compares cameras two by two.
+    """Compares cameras pairwise.
 
     Args:
-        moments: of each, one frame a camera, the same cameras in the same order, pictures of any
-            size. No two frames are held at once, so sequences that read them from disk take little
+        moments: each with one frame per camera, the same cameras in the same order, images of any
+            size. Only one frame is held at a time, so sequences that read from disk need little
             memory.
-        body: the mesh that the frames' poses move; None takes the visual hull.
+        body: the mesh that the frames' poses move; None: the visual hull.
 
     Returns:
-        None where no two cameras share enough, or pictures are too coarse.
+        None where no two cameras share enough, or images are too coarse.
     """
     if not moments or max(_pixel(frame) for frame in moments[0]) > COARSEST:
         return None
@@ -98,24 +97,24 @@ def surface_colours(
 
 
 def body_inside(frame: Frame, body: SkinnedBody) -> float | None:
-    """Share of the posed body's vertices in the picture that the mask holds, give or take 3 cm.
+    """Share of the posed body's vertices in the image that lie inside the mask, within 3 cm.
 
     Returns:
-        None where the picture shows none of them, or its mask holds nobody.
+        None where the image shows none of them, or its mask is empty.
     """
     with torch.no_grad():
         pixels, inside, depth = _place(frame, _skin(body, frame))
     empty = (frame.mask[0, 0].numpy() <= 0.5).astype(np.uint8)
     if not inside.any() or empty.all():
         return None
-    # of the body, not of the joints: where the two disagree, those may lie behind the camera
+    # depth of the body: where body and joints disagree, the joints may lie behind the camera
     reach = np.ceil(SLACK * float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside])))
     distance = cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return float((distance[pixels[inside, 1], pixels[inside, 0]] <= reach).mean())
 
 
 def _pixel(frame: Frame) -> float:
-    """Metres that a pixel covers at the person."""
+    """Metres per pixel at the person."""
     depth = float(frame.camera.to_camera(frame.skeleton)[..., 2].median())
     return depth / float(frame.camera.K[0, 0, 0])
 
@@ -130,19 +129,12 @@ def _difference(pair: list[Float]) -> tuple[float, float]:
 
 def _skin(body: SkinnedBody, frame: Frame) -> Float:
     """``[V, 3]`` metres: the vertices in the frame's pose."""
-    from gsgan.body import axis_angle_to_matrix, blend_transforms, forward_kinematics
-
     assert frame.body is not None
-    bones = forward_kinematics(
-        body.joints.float(), body.parents, axis_angle_to_matrix(frame.body.theta), frame.body.transl
-    )
-    A, t = blend_transforms(bones, body.bone_index, body.bone_weight.float())
-    points = (A @ body.vertices.float().unsqueeze(-1)).squeeze(-1) + t
-    return points[0].double().numpy()
+    return body.to(torch.float32).posed_vertices(frame.body)[0].double().numpy()
 
 
 def _hull(frames: Sequence[Frame]) -> Float:
-    """``[V, 3]`` metres: voxels that no camera's mask carves off; none of a skeleton astray."""
+    """``[V, 3]`` metres: voxels inside all masks; none where a joint is far astray."""
     joints = frames[0].skeleton[0][frames[0].visibility[0] > 0].double().numpy()
     if len(joints) == 0 or np.ptp(joints, axis=0).max() > WIDEST:
         return np.zeros((0, 3))
@@ -152,14 +144,14 @@ def _hull(frames: Sequence[Frame]) -> Float:
     for frame in frames:
         pixels, inside, _ = _place(frame, voxels)
         mask = frame.mask[0, 0].numpy() > 0.5
-        kept = ~inside  # what a camera does not show it cannot carve off
+        kept = ~inside  # voxels outside the image stay
         kept[inside] = mask[pixels[inside, 1], pixels[inside, 0]]
         voxels = voxels[kept]
     return voxels
 
 
 def _place(frame: Frame, points: Float) -> tuple[NDArray[np.int64], NDArray[np.bool_], Float]:
-    """Whole pixels ``[V, 2]``, whether they are in the picture ``[V]``, depths ``[V]``."""
+    """Whole pixels ``[V, 2]``, whether they are in the image ``[V]``, depths ``[V]``."""
     height, width = frame.camera.size
     at, depth = frame.camera.project(torch.from_numpy(points)[None].to(frame.camera.K))
     pixels = np.floor(at[0].numpy()).clip(-1, max(height, width)).astype(np.int64)
@@ -169,14 +161,14 @@ def _place(frame: Frame, points: Float) -> tuple[NDArray[np.int64], NDArray[np.b
 
 
 def _colours(frame: Frame, points: Float) -> Float:
-    """``[V, 3]`` RGB about each point, NaN where it is hidden, off the picture or at an outline."""
+    """``[V, 3]`` RGB about each point, NaN where hidden, outside the image or at an outline."""
     result = np.full((len(points), 3), np.nan)
     pixels, inside, depth = _place(frame, points)
     if not inside.any():
         return result
     height, width = frame.camera.size
     metre = float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside]))  # in pixels
-    # points are sparser than pixels: depths are compared on a grid as coarse as they are
+    # points are sparser than pixels: depths are compared on a grid of their spacing
     cell = max(1, int(np.ceil(1.5 * VOXEL * metre)))
     flat = (pixels[:, 1] // cell) * width + pixels[:, 0] // cell
     nearest = np.full(height * width, np.inf)

@@ -1,12 +1,14 @@
-"""What a user should look at before training: each doubt is one sentence."""
+"""What a user should check before training: each doubt is one sentence."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
+from gsgan.data import checks
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.joints import BODY, joint_names
 from gsgan.prepare.cleanse import BODY_BONES, bone_lengths
@@ -20,25 +22,25 @@ from gsgan.utils.errors import DataError
 
 @dataclass(frozen=True)
 class Doubts:
-    """From which values on something is reported.
+    """Thresholds above which something is reported.
 
     Args:
         reprojection: median error of one camera, in thousandths of the focal length.
         camera_turn: degrees by which refinement turned a camera.
         camera_move: metres by which refinement moved a camera.
-        flips: share of frames in which a camera's sides were swapped.
-        frozen_frames: frames in a row in which a detection stays the same to the last digit.
+        flips: share of frames in which a camera's left and right were swapped.
+        frozen_frames: frames in a row in which a detection is identical to the last digit.
         missing: share of frames in which a camera has no person or an empty mask, or a body joint
             is missing.
         undecoded: share of a video's frames that cannot be decoded; headers may be a few off.
         people: share of frames with more than one person.
-        bone: share by which a limb's length may scatter (median deviation from its median).
+        bone: scatter of a limb's length (median deviation from its median), as a share.
         lag: frames tried either way when the clocks are compared; 0 skips it.
         delay: frames by which a clock may be off.
-        delay_gain: share by which the error must fall for a delay to be believed.
+        delay_gain: share by which the error must fall for a delay to be reported.
         fps: share by which frame rates may differ.
-        distance: metres, least and greatest median distance of a camera to the person; beyond them
-            units are wrong and nothing is written.
+        distance: metres, minimum and maximum median distance from the cameras to the person;
+            outside them units are wrong and nothing is written.
     """
 
     reprojection: float = 6.0
@@ -54,7 +56,7 @@ class Doubts:
     delay: float = 0.5
     delay_gain: float = 0.05
     fps: float = 0.01
-    distance: tuple[float, float] = (0.3, 30.0)
+    distance: tuple[float, float] = checks.Checks.distance
 
 
 def doubts_about_sources(sources: Mapping[str, Source], limits: Doubts) -> list[str]:
@@ -62,25 +64,25 @@ def doubts_about_sources(sources: Mapping[str, Source], limits: Doubts) -> list[
     found = []
     rates = {name: s.fps for name, s in sources.items() if s.fps}
     if rates and max(rates.values()) > (1 + limits.fps) * min(rates.values()):
-        said = ", ".join(f"{name} {fps:g}" for name, fps in rates.items())
-        found.append(f"frame rates differ ({said}): frames are paired by number all the same")
+        text = ", ".join(f"{name} {fps:g}" for name, fps in rates.items())
+        found.append(f"frame rates differ ({text}): frames are paired by number all the same")
     counts = {name: s.count for name, s in sources.items()}
     if len(set(counts.values())) > 1:
-        said = ", ".join(f"{name} {count}" for name, count in counts.items())
-        found.append(f"cameras have different numbers of frames ({said}): was one cut or dropped?")
-    for name, source in sources.items():
-        if source.turned and not source.rotate:
-            found.append(
-                f"{name}: its metadata ask for a turn by {source.turned} degrees, which is not "
-                "obeyed; set apply_rotation=true if it was calibrated turned"
-            )
+        text = ", ".join(f"{name} {count}" for name, count in counts.items())
+        found.append(f"cameras have different numbers of frames ({text}): was one cut or dropped?")
+    found += [
+        f"{name}: its metadata ask for a turn by {source.turned} degrees, which is not "
+        "applied; set apply_rotation=true if it was calibrated turned"
+        for name, source in sources.items()
+        if source.turned and not source.rotate
+    ]
     return found
 
 
 def doubts_about_pictures(
     sources: Mapping[str, Source], written: Mapping[str, Written], limits: Doubts
 ) -> list[str]:
-    """Videos that end before their time, masks that show nobody."""
+    """Videos that end early, empty masks."""
     found = []
     for name, one in written.items():
         count, decoded = sources[name].count, one.decoded
@@ -93,36 +95,30 @@ def doubts_about_pictures(
 
 
 def doubts_about_detections(detections: Mapping[str, Detections], limits: Doubts) -> list[str]:
-    """Cameras without a person, with more than one, or with frozen joints or pictures."""
+    """Cameras without a person, with more than one, or with frozen joints or images."""
     found = []
     for name, seen in detections.items():
-        empty = float(np.mean(seen.people == 0))
+        empty, crowd = float(np.mean(seen.people == 0)), float(np.mean(seen.people > 1))
         if empty > limits.missing:
             found.append(f"{name}: no person in {empty:.0%} of the frames")
-        crowd = float(np.mean(seen.people > 1))
         if crowd > limits.people:
             found.append(
-                f"{name}: more than one person in {crowd:.0%} of the frames; the one seen best was "
-                "taken, which need not be the same one"
+                f"{name}: more than one person in {crowd:.0%} of the frames; the one detected best "
+                "was taken, which need not be the same one"
             )
-        found += _frozen(name, seen.px[:, :BODY], limits.frozen_frames)
+        runs = longest_runs(seen.px[:, :BODY])
+        stuck = [joint_names()[j] for j in np.flatnonzero(runs >= limits.frozen_frames)]
+        if len(stuck) > BODY // 2:
+            still = int(np.median(runs))
+            found.append(f"{name}: {still} frames in a row are identical: did it stand still?")
+        elif stuck:
+            joints = ", ".join(stuck)
+            found.append(f"{name}: frozen for {limits.frozen_frames} frames or more: {joints}")
     return found
 
 
-def _frozen(name: str, values: Float, limit: int) -> list[str]:
-    runs = longest_runs(values)
-    stuck = [joint_names()[j] for j in np.flatnonzero(runs >= limit)]
-    if len(stuck) > BODY // 2:
-        return [
-            f"{name}: {int(np.median(runs))} frames in a row are identical: did it stand still?"
-        ]
-    if stuck:
-        return [f"{name}: frozen for {limit} frames or more: {', '.join(stuck)}"]
-    return []
-
-
 def longest_runs(values: Float) -> np.ndarray:
-    """``[J]`` the longest run of frames in which ``values [F, J, D]`` stay exactly alike."""
+    """``[J]`` the longest run of frames in which ``values [F, J, D]`` stay identical."""
     same = (np.diff(values, axis=0) == 0).all(-1)  # NaN is never the same
     longest = np.zeros(values.shape[1], int)
     current = np.zeros(values.shape[1], int)
@@ -141,7 +137,7 @@ def doubts_about_solution(
     gain: Float,
     limits: Doubts,
 ) -> list[str]:
-    """Cameras that do not fit, swapped sides, clocks, bones, joints that are missing."""
+    """Cameras that do not fit, swapped sides, clocks, bones, missing joints."""
     found = []
     for c, name in enumerate(names):
         error = median(solution.stages["smoothed"][c])
@@ -150,7 +146,7 @@ def doubts_about_solution(
         if turned[c] > limits.camera_turn or moved_mm[c] > 1000 * limits.camera_move:
             found.append(
                 f"{name}: refinement turned it by {turned[c]:.1f} degrees and moved it by "
-                f"{moved_mm[c]:.0f} mm: it was bumped, or the calibration is another one's"
+                f"{moved_mm[c]:.0f} mm: it was bumped, or the calibration is another camera's"
             )
         swapped = float(solution.flips[c].any(-1).mean())
         if swapped > limits.flips:
@@ -160,11 +156,6 @@ def doubts_about_solution(
                 f"{name}: its clock seems {delay[c]:+.1f} frames late; if so, set "
                 f"offsets={{{name}: {round(delay[c])}}}"
             )
-    return found + _doubts_about_joints(solution, limits)
-
-
-def _doubts_about_joints(solution: Solution, limits: Doubts) -> list[str]:
-    found = []
     lost = 1 - np.isfinite(solution.p[:, :BODY]).all(-1).mean(0)
     if rare := [joint_names()[j] for j in np.flatnonzero(lost > limits.missing)]:
         found.append(f"missing in more than {limits.missing:.0%} of the frames: {', '.join(rare)}")
@@ -173,18 +164,22 @@ def _doubts_about_joints(solution: Solution, limits: Doubts) -> list[str]:
         scatter = median(np.abs(length - usual)) / usual
         if scatter > limits.bone:
             bone = f"{joint_names()[a]} to {joint_names()[b]}"
-            found.append(f"the length from {bone} scatters by {scatter:.0%} round {usual:.2f} m")
+            found.append(f"the length from {bone} scatters by {scatter:.0%} about {usual:.2f} m")
     if removed := {why: count for why, count in solution.removed.items() if count}:
-        said = ", ".join(f"{count} {why}" for why, count in removed.items())
-        found.append(f"joints taken out as impossible: {said}")
+        text = ", ".join(f"{count} {why}" for why, count in removed.items())
+        found.append(f"joints removed as impossible: {text}")
     return found
 
 
-def check_distance(cameras: Sequence[CameraEntry], p: Float, limits: Doubts, where: object) -> None:
-    """Refuses a capture whose cameras stand impossibly near or far: its unit is another one.
+def check_distance(cameras: Sequence[CameraEntry], p: Float, limits: Doubts, where: Path) -> None:
+    """Refuses a capture whose cameras are implausibly near or far.
+
+    Args:
+        p: ``[N, 3]`` metres, NaN = missing.
+        where: the file to name.
 
     Raises:
-        DataError: saying the distance found.
+        DataError: naming the distance found.
     """
     seen = p[known(p)]
     if not len(seen):
@@ -192,11 +187,5 @@ def check_distance(cameras: Sequence[CameraEntry], p: Float, limits: Doubts, whe
             f"{where}: no joint was seen by two cameras in any frame; do the cameras' frame "
             "numbers belong together?"
         )
-    person = np.median(seen, axis=0)
-    distance = float(np.median([np.linalg.norm(c.centre - person) for c in cameras]))
-    low, high = limits.distance
-    if not low <= distance <= high:
-        raise DataError(
-            f"{where}: cameras stand {distance:.3g} m from the person, expected {low:g} to "
-            f"{high:g}; is the calibration in another unit? Set unit=mm, cm or m"
-        )
+    hint = "is the calibration in another unit? Set unit=mm, cm or m"
+    checks.check_distance(where, cameras, seen, limits.distance, hint)

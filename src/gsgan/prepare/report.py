@@ -10,9 +10,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from gsgan.check.findings import Figure, Finding, Report, Section, Table
-from gsgan.check.page import page
-from gsgan.check.terminal import print_report
+from gsgan.check.report import Figure, Finding, Report, Section, Table, page, print_report
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.joints import BODY
 from gsgan.prepare.dataset import write_json

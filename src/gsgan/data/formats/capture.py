@@ -24,8 +24,7 @@ from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, read_arrays, read_json
 from gsgan.data.formats.capture_meta import BODY_BONES, Conventions, read_meta
 from gsgan.data.formats.common import without_frames
-from gsgan.data.formats.meeting import check_meeting
-from gsgan.data.formats.trust import Trust, watch_masks
+from gsgan.data.formats.trust import Trust, check_meeting, watch_masks
 from gsgan.data.layout import Found, Layout, Meta, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile, PixelRules
 from gsgan.data.skeletons import (

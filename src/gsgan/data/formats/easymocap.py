@@ -28,9 +28,8 @@ from gsgan.data.formats.common import (
     without_frames,
 )
 from gsgan.data.formats.easymocap_skeleton import read_fits, read_keypoints, read_people
-from gsgan.data.formats.meeting import check_meeting
 from gsgan.data.formats.smpl_motion import landmarks_of
-from gsgan.data.formats.trust import Trust, watch_masks
+from gsgan.data.formats.trust import Trust, check_meeting, watch_masks
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, assemble, dataset_folder
 from gsgan.data.pixels import MASK_RULES, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks

@@ -23,11 +23,10 @@ from gsgan.data.formats.common import (
     up_axis,
     without_frames,
 )
-from gsgan.data.formats.meeting import check_meeting
 from gsgan.data.formats.rig_files import Files, check_cameras, check_grey, index, leave_out
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
 from gsgan.data.formats.smplx_params import read_motion
-from gsgan.data.formats.trust import Trust, watch_masks
+from gsgan.data.formats.trust import Trust, check_meeting, watch_masks
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile, PixelRules
 from gsgan.data.skeletons import make_landmarks

@@ -1,36 +1,58 @@
-"""A look at a few masks and labels before anything starts, and how much is looked at."""
+"""Do cameras, joints and masks fit together? The rules, and the one set of thresholds.
+
+Readers apply them to a few images when a dataset is opened (`check_meeting`, `watch_masks`);
+`gsgan.check` applies the same measures and thresholds to many. Pixel centres lie at +0.5.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TypeVar
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from gsgan.data.cameras import CameraEntry
 from gsgan.data.checks import spans
+from gsgan.data.crop import NEAR, project
 from gsgan.data.files import read_grey
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
+from gsgan.utils.errors import DataError
+
+Bytes = NDArray[np.uint8]
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
+Box = tuple[float, float, float, float]
+T = TypeVar("T")
+
+LONGEST = 512  # pixels, longest side of a mask that joints are compared with
+TOLERANCE = 1.5  # pixels of that mask that a joint may always lie outside
+SAMPLED = 2000  # pixels of a mask whose distance to the joints is measured
+FAR_PIXELS = 1e4  # drawing coordinates are clipped to this: OpenCV's are 16 bit when shifted
 
 
 @dataclass(frozen=True)
 class Trust:
-    """How many pictures are looked at, and what they must satisfy.
+    """How many images are compared when a dataset is opened, and the thresholds.
 
     Args:
-        frames: compared with body and joints in every camera, evenly spaced; 0 looks at none.
-            About 20 ms a picture of 1024 x 1024.
-        min_box_iou: least overlap (IoU, median over those pictures) of the box of the projected
-            body with the box of the mask; reading stops below.
+        frames: compared with body and joints in every camera, evenly spaced; 0 for none. About
+            20 ms per image of 1024 x 1024.
+        min_box_iou: minimum overlap (IoU, median over those images) of the box of the projected
+            body with the box of the mask; below it reading stops.
         least_inside: share of a camera's joints inside its masks below which reading stops.
-        min_inside: the same, below which a note names the camera.
-        far_camera: times by which a camera may stand farther than the median one, or nearer;
-            reading stops beyond, as its ``t`` is in another unit.
+        min_inside: the same, below which a note (in `gsgan.check` a warning) names the camera.
+        far_camera: factor by which a camera may be farther than the median camera, or nearer;
+            beyond it reading stops: its ``t`` is in another unit.
         joint_tolerance: metres that a joint may lie outside the mask and count as inside.
         max_beyond: share of a camera's masks beyond all joints above which a note names it.
         joint_reach: metres from the nearest joint at which a pixel of the mask is beyond them.
-        watched_masks: masks of the first camera looked at, evenly spaced; 0 looks at none. About
-            6 ms each at 1024 x 1024.
+        watched_masks: masks of the first camera compared, evenly spaced; 0 for none. About 6 ms
+            each at 1024 x 1024.
         mask_jump: share of the median by which a mask's area may differ without a note.
     """
 
@@ -46,11 +68,258 @@ class Trust:
     mask_jump: float = 0.5
 
 
-def spread(values: list[int], count: int) -> list[int]:
-    """At most ``count`` of the values, evenly spaced."""
+@dataclass(frozen=True)
+class Meeting:
+    """One image's mask against what its camera should see.
+
+    Args:
+        camera, frame: of the image.
+        mask: its (first) file.
+        empty: the mask has no foreground.
+        iou: overlap of the boxes of mask and projected body; None when one of them is empty.
+        inside: share of the visible joints inside the mask; NaN of none.
+        beyond: share of the mask far from every visible joint; NaN of none.
+    """
+
+    camera: str
+    frame: int
+    mask: Path
+    empty: bool
+    iou: float | None
+    inside: float
+    beyond: float
+
+
+def check_meeting(
+    layout: Layout, body: Callable[[int], Float], trust: Trust, hint: str
+) -> list[str]:
+    """Checks that the projected body lies where the masks are, and that not all masks are empty.
+
+    Args:
+        layout: the dataset.
+        body: points on the body ``[N, 3]`` of a frame, metres, world.
+        trust: how many frames, and the thresholds.
+        hint: what to check when they do not fit.
+
+    Returns:
+        Notes on the cameras whose joints lie outside their masks, or masks far from their joints.
+
+    Raises:
+        DataError: naming the camera and frame that is furthest off, cameras with hardly a joint
+            inside their masks or in another unit, or the first empty mask.
+    """
+    compared = _meetings(layout, body, trust)
+    if not compared:
+        return []
+    _check_far(layout, compared[0].frame, trust)
+    if all(one.empty for one in compared):
+        raise DataError(
+            f"{compared[0].mask} shows no person, nor does any of the {len(compared)} masks "
+            "compared; expected values above 0 where the person is: check how the masks were "
+            "written"
+        )
+    ious = [(one.iou, one) for one in compared if one.iou is not None]
+    median = float(np.median([iou for iou, _ in ious])) if ious else 1.0
+    if median < trust.min_box_iou:
+        _, worst = min(ious, key=lambda pair: pair[0])
+        raise DataError(
+            f"{layout.root}: the projected body and the masks do not meet (their boxes overlap by "
+            f"{median:.2f}, expected {trust.min_box_iou:g}; worst in camera {worst.camera}, frame "
+            f"{worst.frame}: {worst.mask}); {hint}"
+        )
+    return _notes(layout.root, compared, trust, hint)
+
+
+def _meetings(layout: Layout, body: Callable[[int], Float], trust: Trust) -> list[Meeting]:
+    """The same few moments in every camera that has them."""
+    found = []
+    for frame in spread(list(layout.frames), trust.frames):
+        points, joints = body(frame), layout.landmarks.seen(frame)
+        for name in (c for c, files in layout.masks.items() if frame in files):
+            camera = layout.cameras[name]
+            mask = read_mask(layout.mask_files(name, frame), layout.pixels)
+            expected, found_box = box_of(points, camera), mask_box(mask)
+            iou = box_iou(expected, found_box) if expected and found_box else None
+            inside = inside_share(mask, camera, joints, trust.joint_tolerance)
+            beyond = mask_beyond(mask, camera, joints, trust.joint_reach)
+            path = layout.mask_path(name, frame)
+            found.append(Meeting(name, frame, path, not mask.any(), iou, inside, beyond))
+    return found
+
+
+def _check_far(layout: Layout, frame: int, trust: Trust) -> None:
+    person = np.median(layout.landmarks.seen(frame), axis=0)
+    metres = {n: float(np.linalg.norm(c.centre - person)) for n, c in layout.cameras.items()}
+    if far := far_cameras(metres, trust.far_camera):
+        raise DataError(f"{layout.root}: {next(iter(far.values()))}")
+
+
+def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
+    """A message for each camera that is ``factor`` times farther than the median one, or nearer.
+
+    Args:
+        metres: from the person, by camera.
+        factor: see `Trust.far_camera`.
+    """
+    median = float(np.median(list(metres.values())))
+    return {
+        name: f"camera {name} stands {distance:.3g} m from the person, the median camera "
+        f"{median:.3g} m; its t is probably in another unit"
+        for name, distance in metres.items()
+        if not median / factor <= distance <= median * factor
+    }
+
+
+def _notes(root: Path, compared: Sequence[Meeting], trust: Trust, hint: str) -> list[str]:
+    """One note on joints outside masks, one on masks beyond joints, where there are any."""
+    notes = []
+    inside = _means((one.camera, one.inside) for one in compared)
+    outside = {name for name, share in inside.items() if share < trust.min_inside}
+    if outside:
+        shares, others = _listed(inside, outside)
+        text = f"joints lie outside the masks (inside: {shares}{others})"
+        if min(inside.values()) < trust.least_inside:
+            raise DataError(f"{root}: {text}; {hint}: python -m gsgan.check finds the wrong camera")
+        notes.append(
+            f"{text}: python -m gsgan.check finds whether calibration, skeleton or masks are wrong"
+        )
+    beyond = _means((one.camera, one.beyond) for one in compared)
+    wide = {n for n, share in beyond.items() if share > trust.max_beyond and n not in outside}
+    if wide:
+        shares, others = _listed(beyond, wide)
+        notes.append(
+            f"masks reach more than {trust.joint_reach:g} m beyond all joints ({shares} of the "
+            f"mask{others}): focal lengths that are too short do this, masks of more than the "
+            "person, or a skeleton that lacks limbs: python -m gsgan.check reports more"
+        )
+    return notes
+
+
+def _means(values: Iterable[tuple[str, float]]) -> dict[str, float]:
+    """The mean of each camera's finite values."""
+    kept: dict[str, list[float]] = {}
+    for name, value in values:
+        if np.isfinite(value):
+            kept.setdefault(name, []).append(value)
+    return {name: float(np.mean(some)) for name, some in kept.items()}
+
+
+def _listed(means: Mapping[str, float], named: set[str]) -> tuple[str, str]:
+    """The shares of the named cameras, and the mean of the others as a clause."""
+    text = ", ".join(f"{name} {share:.0%}" for name, share in means.items() if name in named)
+    rest = [share for name, share in means.items() if name not in named]
+    return text, f"; {np.mean(rest):.0%} in the other cameras" if rest else ""
+
+
+def mask_distance(mask: Bool) -> Float:
+    """``[H, W]`` pixels from every pixel to the mask; 0 in it, infinite when it is empty."""
+    if not mask.any():
+        return np.full(mask.shape, np.inf)
+    outside = (~mask).astype(np.uint8)
+    return cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE).astype(np.float64)
+
+
+def joint_distance(
+    distance: Float, pixels: Float, depth: Float, visible: Bool, focal: float
+) -> Float:
+    """``[J]`` metres by which joints lie outside the mask; NaN where unknown.
+
+    Unknown are joints that are not visible, behind the camera, or outside the image.
+
+    Args:
+        distance: ``[H, W]`` of `mask_distance`.
+        pixels: ``[J, 2]`` of the joints in that image.
+        depth: ``[J]`` metres.
+        visible: ``[J]``.
+        focal: pixels, of that image.
+    """
+    known = np.where(np.isfinite(pixels), pixels, -1.0).clip(-1, FAR_PIXELS)
+    column, row = np.floor(known.T).astype(int)
+    height, width = distance.shape
+    usable = visible & (depth > NEAR) & (column >= 0) & (column < width) & (row >= 0)
+    usable &= row < height
+    metres = np.full(len(pixels), np.nan)
+    metres[usable] = distance[row[usable], column[usable]] * depth[usable] / focal
+    return metres
+
+
+def inside_share(mask: Bytes, camera: CameraEntry, joints: Float, tolerance: float) -> float:
+    """Share of world points ``[N, 3]`` in view that lie inside a stored mask; NaN of none.
+
+    Args:
+        mask: ``[H, W]``; an empty one gives NaN.
+        camera: of the mask.
+        joints: metres.
+        tolerance: metres that they may lie outside.
+    """
+    if not mask.any():
+        return np.nan
+    small, pixels, depth, focal = _reduced(mask, camera, joints)
+    outside = joint_distance(
+        mask_distance(small), pixels, depth, np.ones(len(joints), bool), float(focal[0])
+    )
+    known = ~np.isnan(outside)
+    allowed = np.maximum(tolerance, TOLERANCE * depth / focal[0])
+    return float((outside <= allowed)[known].mean()) if known.any() else np.nan
+
+
+def mask_beyond(mask: Bytes, camera: CameraEntry, joints: Float, reach: float) -> float:
+    """Share of a stored mask further than ``reach`` metres from all world points ``[N, 3]``.
+
+    Points behind the camera do not count; NaN without any, or of an empty mask. Evenly spaced
+    pixels represent a large mask.
+    """
+    small, pixels, depth, focal = _reduced(mask, camera, joints)
+    person, front = np.argwhere(small), depth > NEAR
+    if len(person) == 0 or not front.any():
+        return np.nan
+    some = person[:: -(-len(person) // SAMPLED), ::-1] + 0.5
+    metres = (some[:, None] - pixels[front]) / focal * depth[front, None]
+    return float((np.linalg.norm(metres, axis=-1).min(axis=1) > reach).mean())
+
+
+def _reduced(mask: Bytes, camera: CameraEntry, points: Float) -> tuple[Bool, Float, Float, Float]:
+    """The mask of at most `LONGEST` pixels; pixels ``[N, 2]``, depths ``[N]``, focal ``[2]``."""
+    step = max(1, -(-max(mask.shape) // LONGEST))
+    pixels, depth = camera.stored_pixels(points) / step, project(camera, points)[1]
+    return np.asarray(mask[::step, ::step] > 127), pixels, depth, np.diag(camera.K)[:2] / step
+
+
+def box_of(points: Float, camera: CameraEntry) -> Box | None:
+    """(left, top, right, bottom) of world points ``[N, 3]`` in the stored (distorted) image."""
+    _, depth = project(camera, points)
+    pixels = camera.stored_pixels(points[depth > NEAR])
+    if len(pixels) == 0:
+        return None
+    height, width = camera.size
+    (left, top), (right, bottom) = (
+        np.clip(edge, 0, (width, height)) for edge in (pixels.min(0), pixels.max(0))
+    )
+    return float(left), float(top), float(right), float(bottom)
+
+
+def mask_box(mask: Bytes) -> Box | None:
+    """The box of a mask's person, None when it is empty."""
+    rows, columns = (np.flatnonzero((mask > 127).any(axis)) for axis in (1, 0))
+    if len(rows) == 0:
+        return None
+    return float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
+
+
+def box_iou(a: Box, b: Box) -> float:
+    """Intersection over union of two boxes."""
+    width = min(a[2], b[2]) - max(a[0], b[0])
+    height = min(a[3], b[3]) - max(a[1], b[1])
+    both = max(width, 0.0) * max(height, 0.0)
+    total = sum((box[2] - box[0]) * (box[3] - box[1]) for box in (a, b)) - both
+    return both / total if total > 0 else 0.0
+
+
+def spread(values: Sequence[T], count: int) -> list[T]:
+    """At most ``count`` of the values, evenly spaced, first and last included."""
     if not values or count < 1:
         return []
-    return sorted({values[round(i)] for i in np.linspace(0, len(values) - 1, count)})
+    return [values[i] for i in sorted({round(x) for x in np.linspace(0, len(values) - 1, count)})]
 
 
 def watch_masks(layout: Layout, trust: Trust) -> list[str]:
@@ -60,26 +329,23 @@ def watch_masks(layout: Layout, trust: Trust) -> list[str]:
         return []
     frames = spread(sorted(layout.masks[camera]), trust.watched_masks)
     masks = (read_mask(layout.mask_files(camera, f), layout.pixels) for f in frames)
-    looked = [(mask.any(), np.count_nonzero(mask > 127)) for mask in masks]
-    seen, areas = np.array([s for s, _ in looked]), np.array([n for _, n in looked], np.float64)
-    usual = float(np.median(areas[seen])) if seen.any() else 0.0
-    off = seen & (np.abs(areas - usual) > trust.mask_jump * usual)
+    filled, areas = np.array([(mask.any(), np.count_nonzero(mask > 127)) for mask in masks]).T
+    filled = filled > 0
+    usual = float(np.median(areas[filled])) if filled.any() else 0.0
     cases = {
-        "mask is empty": ~seen,
-        f"mask's area is more than {trust.mask_jump:.0%} off the usual": off,
-    }
-    odd = {
-        case: [f for f, is_it in zip(frames, at, strict=True) if is_it]
-        for case, at in cases.items()
+        "mask is empty": ~filled,
+        f"mask's area is more than {trust.mask_jump:.0%} off the usual": filled
+        & (np.abs(areas - usual) > trust.mask_jump * usual),
     }
     return [
-        f"camera {camera}: the {case} at frames {spans(at)} of {len(frames)} looked at; look at "
-        "them, and leave bad ones out with data.reader.drop_frames"
-        for case, at in odd.items()
-        if at
+        f"camera {camera}: the {case} at frames {spans(np.array(frames)[at].tolist())} of "
+        f"{len(frames)} compared; look at them, and leave bad ones out with "
+        "data.reader.drop_frames"
+        for case, at in cases.items()
+        if at.any()
     ]
 
 
 def highest_label(root: Path, files: list[str]) -> int:
-    """The highest value in some label pictures, 0 without any."""
+    """The highest value in some label images, 0 without any."""
     return max((int(read_grey(root / path).max()) for path in files), default=0)

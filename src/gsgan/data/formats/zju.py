@@ -27,9 +27,8 @@ from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files
 from gsgan.data.formats import zju_annots, zju_caches, zju_params
 from gsgan.data.formats.common import body_model, no_joints, up_axis, without_frames
-from gsgan.data.formats.meeting import check_meeting
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
-from gsgan.data.formats.trust import Trust, highest_label, spread, watch_masks
+from gsgan.data.formats.trust import Trust, check_meeting, highest_label, spread, watch_masks
 from gsgan.data.layout import (
     BodyModel,
     Found,

@@ -1,0 +1,217 @@
+"""Whether the cameras agree with each other: their masks by the visual hull, their colours.
+
+The visual hull is independent of the skeleton: space is carved by all masks of one moment; where
+cameras and masks agree, the rest fills every mask. Leaving one camera out finds the one that carves
+away what the others show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsgan.check.report import Finding, Table
+from gsgan.check.settings import Limits
+from gsgan.check.silhouette import thickness
+from gsgan.check.views import Subject, View, grouped
+from gsgan.data.crop import NEAR, project
+from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float, spread
+from gsgan.data.scene_info import SceneInfo
+from gsgan.effects import EffectSettings
+
+AIR = 0.35  # metres of space about the joints that is carved
+VOXEL = 0.04  # metres: about a pixel of the small masks
+LEAST_CAMERAS = 3  # with two, either may be the wrong one
+GAIN = 0.1  # in the share filled, that names the camera left out
+CHANNELS = ("red", "green", "blue")
+DARK = 0.05  # darker means give no ratio
+
+
+@dataclass(frozen=True)
+class HullScore:
+    """How well the masks agree.
+
+    Args:
+        filled: share of the mask that the hull fills, by camera.
+        without: mean share in the other cameras when this one does not carve, by camera.
+    """
+
+    filled: dict[str, float]
+    without: dict[str, float]
+
+
+def score_hulls(subject: Subject, views: Sequence[View], moments: int) -> HullScore | None:
+    """Means over at most ``moments`` frames that most cameras saw, evenly spaced.
+
+    None when fewer than three cameras saw one together.
+    """
+    by_frame: dict[int, list[View]] = {}
+    for view in views:
+        by_frame.setdefault(view.frame, []).append(view)
+    most = max((len(seen) for seen in by_frame.values()), default=0)
+    if most < LEAST_CAMERAS:
+        return None
+    full = sorted(frame for frame, seen in by_frame.items() if len(seen) == most)
+    filled: dict[str, list[float]] = {}
+    without: dict[str, list[float]] = {}
+    for frame in spread(full, moments):
+        for view, *shares in zip(by_frame[frame], *_shares(subject, by_frame[frame]), strict=True):
+            filled.setdefault(view.camera, []).append(shares[0])
+            without.setdefault(view.camera, []).append(shares[1])
+    return HullScore(
+        {name: float(np.mean(values)) for name, values in filled.items()},
+        {name: float(np.mean(values)) for name, values in without.items()},
+    )
+
+
+def _shares(subject: Subject, views: Sequence[View]) -> tuple[Float, Float]:
+    """Of one moment, ``[C]`` each: the values of `HullScore`."""
+    joints = subject.p[subject.rows[views[0].frame]]
+    joints = joints[subject.visible[subject.rows[views[0].frame]]]
+    low, high = joints.min(0) - AIR, joints.max(0) + AIR
+    axes = [np.arange(a, b, VOXEL) + VOXEL / 2 for a, b in zip(low, high, strict=True)]
+    voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
+    seen = [_project(subject, view, voxels) for view in views]
+    inside = np.stack([inside for inside, _ in seen])
+    corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3)
+    masks = [view.mask & _covered(subject, view, corners) for view in views]
+    grown = [_grown(subject, view) for view in views]
+
+    def filled(kept: Bool) -> Float:
+        """Share of each mask that the kept voxels cover; NaN when empty."""
+        shares = np.full(len(views), np.nan)
+        for i, mask in enumerate(masks):
+            if mask.any():
+                canvas = np.zeros(mask.shape, np.uint8)
+                at = seen[i][1][kept]
+                at = at[at[:, 0] >= 0]
+                canvas[at[:, 1], at[:, 0]] = 1
+                covered = cv2.dilate(canvas, np.ones((grown[i], grown[i]), np.uint8)) > 0
+                shares[i] = np.count_nonzero(covered & mask) / np.count_nonzero(mask)
+        return shares
+
+    spared = []
+    for i in range(len(views)):
+        others = np.asarray(np.delete(inside, i, axis=0).all(0))
+        spared.append(float(np.nanmean(np.delete(filled(others), i))))
+    return filled(np.asarray(inside.all(0))), np.array(spared)
+
+
+def _project(subject: Subject, view: View, voxels: Float) -> tuple[Bool, NDArray[np.int64]]:
+    """Which voxels lie in the mask or outside the image; pixels, -1 outside the image."""
+    entry = subject.cameras[view.camera]
+    raw, depth = project(entry, voxels)
+    height, width = entry.size
+    seen = (depth > NEAR) & (raw >= 0).all(1) & (raw[:, 0] < width) & (raw[:, 1] < height)
+    limit = np.array(view.mask.shape[::-1]) - 1
+    pixels = np.floor(project(view.small(entry), voxels)[0]).clip(0, limit).astype(np.int64)
+    inside = view.mask[pixels[:, 1], pixels[:, 0]] | ~seen
+    return inside, np.where(seen[:, None], pixels, -1)
+
+
+def _covered(subject: Subject, view: View, corners: Float) -> Bool:
+    """``[h, w]`` where the image shows the carved box; everywhere when the camera is in it."""
+    pixels, depth = project(view.small(subject.cameras[view.camera]), corners)
+    if (depth < NEAR).any():
+        return np.ones(view.mask.shape, bool)
+    at = np.clip(pixels, -FAR_PIXELS, FAR_PIXELS).round().astype(np.int32)
+    canvas = cv2.fillConvexPoly(np.zeros(view.mask.shape, np.uint8), cv2.convexHull(at), 1)
+    return np.asarray(canvas > 0)
+
+
+def _grown(subject: Subject, view: View) -> int:
+    """Pixels that a voxel at the person covers, corner to corner, plus one."""
+    camera = view.small(subject.cameras[view.camera])
+    depth = max(NEAR, float(project(camera, subject.p[subject.rows[view.frame]])[1].mean()))
+    return thickness(1 + np.sqrt(2) * VOXEL * camera.K[0, 0] / depth, camera.size)
+
+
+def hull_findings(score: HullScore | None, limits: Limits) -> list[Finding]:
+    """Names the camera whose masks or calibration do not fit the others'."""
+    if score is None or all(share >= limits.hull_warning for share in score.filled.values()):
+        return []
+    mean = float(np.nanmean(list(score.filled.values())))
+    name, without = max(score.without.items(), key=lambda item: item[1])
+    text = f"the masks do not agree: together they fill {mean:.0%} of themselves"
+    if without - mean > GAIN:
+        text += (
+            f", and {without:.0%} without camera {name}; its masks or its calibration do not fit "
+            "the other cameras"
+        )
+    else:
+        least = min(score.filled, key=lambda name: score.filled[name])
+        text += f" (least: {least}); see the overlays"
+    return [Finding("warning", "masks", text)]
+
+
+def mean_colours(views: Sequence[View]) -> dict[str, tuple[Float, Float]]:
+    """``[3]`` mean RGB of the person, and its ratio to the median camera's, by camera."""
+    means = {
+        name: np.asarray(sum(view.colour for view in own)) / sum(view.weight for view in own)
+        for name, own in grouped(views).items()
+        if sum(view.weight for view in own) > 0
+    }
+    middle = np.maximum(np.median(list(means.values()) or [np.ones(3)], axis=0), DARK)
+    return {name: (mean, mean / middle) for name, mean in means.items()}
+
+
+def differing(colours: Mapping[str, tuple[Float, Float]], limits: Limits) -> list[str]:
+    """Cameras whose colour differs from the median camera's by more than the limit."""
+    logs = {name: np.log(np.maximum(ratio, 1e-6)) for name, (_, ratio) in colours.items()}
+    return [name for name, log in logs.items() if np.exp(np.abs(log).max()) > limits.colour_ratio]
+
+
+def colour_findings(
+    colours: Mapping[str, tuple[Float, Float]],
+    info: SceneInfo | None,
+    effects: EffectSettings,
+    limits: Limits,
+) -> list[Finding]:
+    """Names the cameras whose colours differ.
+
+    Cameras that agree on shared surface are not named: only the side that they see differs.
+
+    Args:
+        colours: of `mean_colours`.
+        info: of the training split, for the difference on shared surface; None: unknown.
+        effects: the difference from which training corrects colours.
+        limits: how much mean colours may differ.
+    """
+    surface = None if info is None else info.surface
+    agree = surface is not None and surface.difference < effects.colour_difference
+    same = info.train_cameras if info is not None and agree else ()
+    named = [name for name in differing(colours, limits) if name not in same]
+    if not named or len(colours) < 2:
+        return []
+    text = "; ".join(
+        f"{name} "
+        + ", ".join(f"{n} {v:.2f}" for n, v in zip(CHANNELS, colours[name][1], strict=True))
+        for name in named
+    )
+    why = "; seeing another side of the person does this as well"
+    if surface is not None and not agree:
+        why = f"; on shared surface training cameras differ by {surface.difference:.3f}"
+    return [
+        Finding(
+            "warning", "colour",
+            "cameras differ in exposure or white balance (times the median camera's mean colour "
+            f"of the person): {text}{why}. The table of effects shows whether training corrects "
+            "it; effects.colour_correction=on always does",
+        )
+    ]  # fmt: skip
+
+
+def colour_table(colours: Mapping[str, tuple[Float, Float]], limits: Limits) -> Table:
+    """One row per camera."""
+    rows = tuple((name, *map(_triple, values)) for name, values in colours.items())
+    named = differing(colours, limits)
+    flagged = frozenset((i, 2) for i, row in enumerate(rows) if row[0] in named)
+    return Table(("camera", "mean RGB of the person", "to the median camera"), rows, flagged)
+
+
+def _triple(values: Float) -> str:
+    return " ".join(f"{v:.2f}" for v in values)

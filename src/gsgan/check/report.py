@@ -1,0 +1,210 @@
+"""A report: findings, tables and figures in sections; as one HTML page and on the terminal."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Literal
+
+from jinja2 import Environment
+from rich.console import Console
+from rich.table import Table as RichTable
+from rich.text import Text
+
+Level = Literal["error", "warning"]
+STYLES = {"error": "bold red", "warning": "yellow"}
+KINDS = {b"\xff\xd8": "jpeg", b"\x89P": "png", b"<?": "svg+xml"}  # of a figure, by first bytes
+
+PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{{ report.title }}</title><style>
+body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 1180px; margin: 0 auto;
+  padding: 1.2em; background: #fafafa; overflow-wrap: anywhere; }
+h1 { font-size: 1.5em; margin-bottom: .1em; } h2 { font-size: 1.15em; margin: 1.8em 0 .5em; }
+li, .verdict { padding: .5em .8em; margin: .4em 0; border-radius: 4px; list-style: none; }
+ul { padding: 0; } strong, .verdict { font-weight: 600; }
+.good { background: #d3f9d8; } .warning { background: #fff3bf; } .error { background: #ffc9c9; }
+table { border-collapse: collapse; background: #fff; margin: .6em 0; }
+caption { text-align: left; font-weight: 600; padding: .3em 0; }
+th, td { border: 1px solid #ddd; padding: .25em .6em; text-align: left; vertical-align: top; }
+th { background: #f1f3f5; }
+figure { margin: .8em 0; } figcaption, .root { color: #555; font-size: .9em; }
+img { max-width: 100%; border: 1px solid #ddd; } .wide { overflow-x: auto; }
+</style></head><body>
+<h1>{{ report.title }}</h1><p class="root">{{ report.root }}</p>
+<p class="verdict {{ colour }}">{{ report.verdict }}</p>
+<ul>{% for f in report.findings %}
+<li class="{{ f.level }}"><strong>{{ f.level }}, {{ f.topic }}:</strong> {{ f.sentence }}</li>
+{% endfor %}</ul>
+{% for section in report.sections %}<h2>{{ section.title }}</h2>
+{% for line in section.aside + section.text %}<p>{{ line }}</p>{% endfor %}
+{% for table in section.tables %}<div class="wide"><table>
+{% if table.title %}<caption>{{ table.title }}</caption>{% endif %}
+<tr>{% for header in table.headers %}<th>{{ header }}</th>{% endfor %}</tr>
+{% for row in table.rows %}{% set i = loop.index0 %}<tr>{% for cell in row %}
+<td{% if (i, loop.index0) in table.flagged %} class="error"{% endif %}>{{ cell }}</td>
+{% endfor %}</tr>{% endfor %}</table></div>{% endfor %}
+{% for figure in section.figures %}<figure>
+<img alt="{{ figure.caption }}" src="{{ figure.source }}">
+<figcaption>{{ figure.caption }}</figcaption></figure>{% endfor %}
+{% endfor %}</body></html>
+"""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is wrong, or may be.
+
+    Args:
+        level: an error makes the command fail; a warning is only listed.
+        topic: one or two words: "calibration", "colour".
+        sentence: what, where, and the usual cause.
+    """
+
+    level: Level
+    topic: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text.
+
+    Args:
+        headers: of the columns.
+        rows: one cell per header each.
+        flagged: (row, column) of the cells that are out of bounds.
+        title: above the table; may be empty.
+    """
+
+    headers: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    flagged: frozenset[tuple[int, int]] = frozenset()
+    title: str = ""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """An image: an encoded JPEG, PNG or SVG.
+
+    Args:
+        caption: below it.
+        picture: the encoded bytes.
+    """
+
+    caption: str
+    picture: bytes
+
+    @property
+    def source(self) -> str:
+        """A data URL, for the page."""
+        kind = KINDS[self.picture[:2]]
+        return f"data:image/{kind};base64,{base64.b64encode(self.picture).decode()}"
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of a report.
+
+    Args:
+        title: a few words.
+        text: paragraphs.
+        tables, figures, findings: its content.
+        aside: explanations, which the terminal leaves out.
+    """
+
+    title: str
+    text: tuple[str, ...] = ()
+    tables: tuple[Table, ...] = ()
+    figures: tuple[Figure, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    aside: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything that was found.
+
+    Args:
+        root: the dataset's folder.
+        sections: in reading order.
+        numbers: the scores by name, plain values for the JSON file.
+        title: of the page.
+    """
+
+    root: str
+    sections: tuple[Section, ...]
+    numbers: dict[str, object] = field(default_factory=dict)
+    title: str = "Check of a dataset"
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """All findings, errors first."""
+        found = [f for section in self.sections for f in section.findings]
+        return tuple(sorted(found, key=lambda f: f.level != "error"))
+
+    @property
+    def errors(self) -> int:
+        """Number of findings that are errors."""
+        return sum(f.level == "error" for f in self.findings)
+
+    @property
+    def warnings(self) -> int:
+        """Number of findings that are warnings."""
+        return len(self.findings) - self.errors
+
+    @property
+    def verdict(self) -> str:
+        """One line: the number of errors and warnings."""
+        if not self.findings:
+            return "nothing wrong was found"
+        return f"{counted(self.errors, 'error')}, {counted(self.warnings, 'warning')}"
+
+
+def counted(number: int, noun: str) -> str:
+    """ "1 error", "2 errors"."""
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def listed(names: Iterable[object], most: int = 6) -> str:
+    """Names with commas, the rest of a long list counted."""
+    shown = [str(name) for name in names]
+    more = f" and {len(shown) - most} more" if len(shown) > most else ""
+    return ", ".join(shown[:most]) + more
+
+
+def page(report: Report) -> str:
+    """The report as one HTML file: no scripts, images embedded, nothing fetched."""
+    template = Environment(autoescape=True, trim_blocks=True).from_string(PAGE)
+    colour = "error" if report.errors else "warning" if report.warnings else "good"
+    return template.render(report=report, colour=colour)
+
+
+def print_report(report: Report, console: Console) -> None:
+    """Prints the tables of every section, then the findings, errors last, near the prompt."""
+    for section in report.sections:
+        if section.tables or section.text:
+            console.rule(Text(section.title), align="left", style="dim")
+        for table in section.tables:
+            console.print(_rich(table))
+        for line in section.text:
+            console.print(Text(line))
+    if report.findings:
+        console.rule(Text("Findings"), align="left", style="dim")
+    for finding in reversed(report.findings):
+        start = Text(f"{finding.level}, {finding.topic}: ", STYLES[finding.level])
+        console.print(start.append(finding.sentence, "default not bold"))
+    style = "bold red" if report.errors else "bold"
+    console.print(Text(f"{report.title}: {report.verdict}", style))
+
+
+def _rich(table: Table) -> RichTable:
+    drawn = RichTable(title=table.title or None, title_justify="left", title_style="bold")
+    for header in table.headers:
+        drawn.add_column(header, overflow="fold")
+    for i, row in enumerate(table.rows):
+        styles = ["bold red" if (i, j) in table.flagged else "" for j in range(len(row))]
+        drawn.add_row(*(Text(cell, style) for cell, style in zip(row, styles, strict=True)))
+    return drawn

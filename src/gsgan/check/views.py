@@ -1,0 +1,300 @@
+"""The dataset as arrays, and the one pass over sampled images: all that needs decoding."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsgan.check.settings import Sampling
+from gsgan.check.silhouette import body_silhouette, box, overlap
+from gsgan.data.cameras import CameraEntry
+from gsgan.data.capture import CaptureDataset
+from gsgan.data.crop import project
+from gsgan.data.formats.trust import (
+    TOLERANCE,
+    Bool,
+    Float,
+    Trust,
+    joint_distance,
+    mask_distance,
+    spread,
+)
+from gsgan.data.layout import Layout
+from gsgan.data.splits import Item
+from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
+from gsgan.utils.errors import DataError
+
+if TYPE_CHECKING:
+    from gsgan.data.datamodule import GsganData
+
+UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+FAR = 0.3  # metres: distances of joints from the mask are clipped to this before they are averaged
+SMALL = 128  # pixels, longest side of the masks that calibrations are tried on and hulls carved by
+TAILS = 20000  # files whose end is read
+TAIL = 64  # bytes: some writers append a few after the end mark
+END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}  # by first bytes
+
+
+@dataclass(frozen=True)
+class Subject:
+    """One dataset.
+
+    Args:
+        layout: the reader's index, for paths and images.
+        trust: the reader's thresholds.
+        frames: ``[F]`` rising frame numbers.
+        pairs: frame numbers that exist, by camera.
+        p: ``[F, J, 3]`` metres, finite.
+        visible: ``[F, J]``.
+        up: ``[3]`` unit, the world's up axis.
+        template: names of the joints and bones.
+    """
+
+    layout: Layout
+    trust: Trust
+    frames: NDArray[np.int64]
+    pairs: Mapping[str, tuple[int, ...]]
+    p: Float
+    visible: Bool
+    up: Float
+    template: SkeletonTemplate = MEDIAPIPE33
+
+    @property
+    def cameras(self) -> Mapping[str, CameraEntry]:
+        """Cameras by name."""
+        return self.layout.cameras
+
+    @cached_property
+    def rows(self) -> dict[int, int]:
+        """Row of ``p`` by frame number."""
+        return {int(frame): row for row, frame in enumerate(self.frames)}
+
+    @cached_property
+    def step(self) -> int:
+        """Frame numbers from one frame to the next: the median gap."""
+        return max(1, int(np.median(np.diff(self.frames)))) if len(self.frames) > 1 else 1
+
+
+def subject_of(data: GsganData) -> Subject:
+    """The dataset behind a data module, read if need be.
+
+    The reader's own comparison of masks and joints is skipped: the check compares more images.
+
+    Raises:
+        DataError: when it cannot be read.
+    """
+    trust = getattr(data.reader, "trust", None) or Trust()
+    if hasattr(data.reader, "trust"):
+        reader: Any = data.reader  # one of the dataclasses of gsgan.data.formats
+        data.reader = replace(reader, trust=replace(trust, frames=0))
+    layout = data.layout
+    frames = np.array(layout.frames, np.int64)
+    axis = layout.meta.up_axis
+    return Subject(
+        layout=layout,
+        trust=trust,
+        frames=frames,
+        pairs={name: tuple(sorted(layout.images[name])) for name in layout.camera_names},
+        p=np.stack([layout.landmarks.p[int(f)] for f in frames]),
+        visible=np.stack([layout.landmarks.visibility[int(f)] for f in frames]) > 0,
+        up=np.array(UP[axis[-1]]) * (-1.0 if axis.startswith("-") else 1.0),
+    )
+
+
+@dataclass(frozen=True)
+class View:
+    """What one image shows.
+
+    Args:
+        camera, frame: of the image.
+        outside: ``[J]`` metres by which joints lie outside the mask, NaN where unknown.
+        tolerance: metres that they may.
+        overlap: of the mask and the estimated silhouette, intersection over union.
+        fullness: area of the mask over that of the estimated silhouette.
+        reach: ``[4]`` metres by which the mask's box exceeds the silhouette's: left, top, right,
+            bottom; NaN when one of them is empty.
+        lagged: ``[2 lag + 1]`` mean metres outside with the skeleton of an earlier or later frame.
+        colour: ``[3]`` summed RGB of the person.
+        weight: summed mask.
+        mask: ``[h, w]`` small mask.
+        to_small: ``[3, 3]`` maps pixels of the whole image to the small mask.
+    """
+
+    camera: str
+    frame: int
+    outside: Float
+    tolerance: float
+    overlap: float
+    fullness: float
+    reach: Float
+    lagged: Float
+    colour: Float
+    weight: float
+    mask: Bool
+    to_small: Float
+
+    def small(self, camera: CameraEntry) -> CameraEntry:
+        """A camera of the whole image as one of the small mask."""
+        return replace(camera, K=self.to_small @ camera.K, size=self.mask.shape)
+
+    @property
+    def known(self) -> Bool:
+        """``[J]`` joints that are visible and lie in the image."""
+        return ~np.isnan(self.outside)
+
+    @property
+    def beyond(self) -> Bool:
+        """``[J]`` joints outside the mask by more than the tolerance."""
+        return self.known & (np.nan_to_num(self.outside, posinf=np.inf) > self.tolerance)
+
+    @property
+    def inside(self) -> float:
+        """Share of the known joints inside the mask, within the tolerance; NaN of none."""
+        known = np.count_nonzero(self.known)
+        return 1 - np.count_nonzero(self.beyond) / known if known else np.nan
+
+
+@dataclass(frozen=True)
+class Broken:
+    """An image that could not be read, and the reader's message."""
+
+    camera: str
+    frame: int
+    message: str
+
+
+Results = Iterable[View | Broken]
+
+
+def grouped(views: Sequence[View]) -> dict[str, list[View]]:
+    """The views by camera."""
+    found: dict[str, list[View]] = {}
+    for view in views:
+        found.setdefault(view.camera, []).append(view)
+    return found
+
+
+def sampled_items(subject: Subject, pictures: int) -> tuple[Item, ...]:
+    """At most ``pictures`` items, at least one per camera: the same moments, evenly spaced."""
+    each = max(1, pictures // len(subject.pairs))
+    moments = set(spread([int(f) for f in subject.frames], each))
+    items = []
+    for name, files in subject.pairs.items():
+        chosen = [f for f in files if f in moments] or spread(files, each)
+        items += [(name, f) for f in chosen]
+    return tuple(items)
+
+
+def suspicious_items(subject: Subject, sampling: Sampling) -> tuple[Item, ...]:
+    """Items with a file that was cut off, or a mask file of unusual size; nothing is decoded.
+
+    At most ``sampling.pictures`` of each; a mask is unusual when its file is
+    ``sampling.size_ratio`` times smaller or larger than its camera's median: empty or full.
+    """
+    cut, odd, layout = list[Item](), list[Item](), subject.layout
+    images = sum(len(files) for files in subject.pairs.values())
+    every = max(1, -(-2 * images // TAILS))  # an image and its mask each
+    for name, files in subject.pairs.items():
+        items = [(name, frame) for frame in files[::every]]
+        masks = [[path for _, path in layout.mask_files(*item)] for item in items]
+        cut += [
+            item
+            for item, paths in zip(items, masks, strict=True)
+            if not all(map(complete, [layout.image_path(*item), *paths]))
+        ]
+        sizes = np.array([p[0].stat().st_size if p[0].is_file() else 0 for p in masks], float)
+        ratio = np.maximum(sizes, 1) / max(float(np.median(sizes)), 1)
+        far = np.maximum(ratio, 1 / ratio) > sampling.size_ratio
+        odd += [item for item, is_far in zip(items, far, strict=True) if is_far]
+    return (*cut[: sampling.pictures], *spread(odd, sampling.pictures))
+
+
+def complete(path: Path) -> bool:
+    """Whether a PNG or JPEG has its end mark; True for other files, False when unreadable."""
+    try:
+        with path.open("rb") as stream:
+            start = stream.read(4)
+            stream.seek(max(0, os.fstat(stream.fileno()).st_size - TAIL))
+            tail = stream.read()
+    except OSError:
+        return False
+    marks = [end in tail for first, end in END_MARKS.items() if start.startswith(first)]
+    return all(marks) and len(start) > 0
+
+
+def measure(
+    subject: Subject,
+    items: Sequence[Item],
+    sampling: Sampling,
+    progress: Callable[[Results, int], Results] | None = None,
+) -> tuple[list[View], list[Broken]]:
+    """Decodes and measures images.
+
+    Args:
+        subject: the dataset.
+        items: which images.
+        sampling: sizes and threads.
+        progress: wraps the results as they come, given their number.
+    """
+
+    def one(item: Item) -> View | Broken:
+        try:
+            return _view(subject, item, sampling)
+        except DataError as error:
+            return Broken(*item, str(error))
+
+    def every() -> Iterator[View | Broken]:
+        with ThreadPoolExecutor(sampling.workers) as pool:
+            yield from pool.map(one, items)
+
+    results = list(every() if progress is None else progress(every(), len(items)))
+    views = [result for result in results if isinstance(result, View)]
+    return views, [result for result in results if isinstance(result, Broken)]
+
+
+def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
+    name, number = item
+    entry, row = subject.cameras[name], subject.rows[number]
+    frame = CaptureDataset(subject.layout, [item], min(sampling.size, max(entry.size)))[0]
+    camera = replace(entry, K=frame.camera.K[0].double().numpy(), size=frame.camera.size)
+    focal, soft = float(camera.K[0, 0]), frame.mask[0, 0].numpy()
+    mask, visible = np.asarray(soft > 0.5), subject.visible[row]
+    body = body_silhouette(camera, subject.p[row], visible, subject.template)
+    metre = float(np.median(project(camera, subject.p[row][visible])[1])) / focal  # per pixel
+    distance = mask_distance(mask)
+
+    def outside(row: int) -> Float:
+        pixels, depth = project(camera, subject.p[row])
+        return joint_distance(distance, pixels, depth, subject.visible[row], focal)
+
+    lagged = np.full(2 * sampling.lag + 1, np.nan)
+    for i, steps in enumerate(range(-sampling.lag, sampling.lag + 1)):
+        other = subject.rows.get(number + steps * subject.step)
+        if other is not None and not np.isnan(metres := outside(other)).all():
+            lagged[i] = np.minimum(metres[~np.isnan(metres)], FAR).mean()
+    factor = min(1.0, SMALL / max(mask.shape))
+    small = [max(1, round(side * factor)) for side in mask.shape[::-1]]
+    to_small = np.diag([*np.array(small) / mask.shape[::-1], 1]) @ camera.K @ np.linalg.inv(entry.K)
+    return View(
+        camera=name,
+        frame=number,
+        outside=outside(row),
+        tolerance=max(subject.trust.joint_tolerance, TOLERANCE * metre),
+        overlap=overlap(mask, body),
+        fullness=float(mask.sum() / max(1, int(body.sum()))),
+        reach=(box(mask) - box(body)) * np.array([-1, -1, 1, 1]) * metre,
+        lagged=lagged,
+        colour=frame.image.double().sum((0, 2, 3)).numpy(),
+        weight=float(soft.sum(dtype=np.float64)),
+        mask=cv2.resize(soft, small, interpolation=cv2.INTER_AREA) > 0.5,
+        to_small=to_small,
+    )
