@@ -89,7 +89,8 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
         def main() -> None:
             import hydra  # here, so that importing an entry point stays light
 
-            sys.argv[1:] = [f"hydra.job.name={name}", *map(spelled_out, sys.argv[1:])]
+            sys.argv[1:] = map(spelled_out, sys.argv[1:])
+            task.__module__ = f"gsgan.{name}"  # Hydra names the job by it; not "__main__"
             command = hydra.main(
                 version_base="1.3", config_path=str(config_folder()), config_name=name
             )(run)
