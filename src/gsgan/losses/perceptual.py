@@ -104,14 +104,15 @@ def _put_back(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) ->
 
 
 def _vgg_stages(path: Path) -> nn.ModuleList:
-    from torchvision.models import vgg16  # heavy: only where it is used
+    from torchvision.models.vgg import cfgs, make_layers  # heavy: only where it is used
 
-    network = vgg16(weights=None)
+    layers = make_layers(cfgs["D"])  # without the classifier, nine tenths of the weights
+    state = load_weights(path)
+    prefix = "features."
     try:
-        network.load_state_dict(load_weights(path))
+        layers.load_state_dict({k.removeprefix(prefix): state[k] for k in state if prefix in k})
     except RuntimeError as error:
         raise DataError(f"{path}: these are not torchvision's VGG-16 weights") from error
-    layers = list(network.features)
     for layer in layers:
         if isinstance(layer, nn.ReLU):
             layer.inplace = False
