@@ -1,4 +1,4 @@
-"""``gsgan.evaluate predictions=``: any method's pictures, scored as a run's own are."""
+"""``gsgan.evaluate predictions=``: any method's images, scored like those of a run."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ import pytest
 import torch
 from commands import refused
 
+from gsgan.utils.errors import GsganError
+
 DATA = ("data=capture", "data.size=32", "data.crop=null", "size=tiny", "lpips.path=null")
 
 
@@ -23,7 +25,7 @@ def given(capture: Path) -> list[str]:
 
 @pytest.fixture(scope="session")
 def painted(run: Path, capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the tiny run paints, as a method of someone else would leave it: 8-bit PNGs."""
+    """The images of the tiny run as another method would leave them: 8-bit PNGs."""
     from gsgan.train.runs import build_data, load_avatar, load_config
 
     root = tmp_path_factory.mktemp("others") / "other"
@@ -50,7 +52,7 @@ def scores(folder: Path) -> dict:
     return json.loads((folder / "metrics.json").read_text())
 
 
-def test_pictures_of_a_run_score_as_the_run_does(run, painted, given, inside):
+def test_images_of_a_run_score_as_the_run_does(run, painted, given, inside):
     """Up to the rounding to 8 bits: 0.5/255 at most a value, and the floor is the very same."""
     result = inside("evaluate", f"predictions={painted}", "method=other", *given)
     assert result.returncode == 0, result.stderr
@@ -80,7 +82,7 @@ def test_pictures_of_a_run_score_as_the_run_does(run, painted, given, inside):
     assert {p.name for p in (out / "pictures").iterdir()} == {"novel_view.png", "novel_pose.png"}
 
 
-def test_the_csv_holds_every_picture_and_its_mean_is_the_score(run):
+def test_the_csv_holds_every_image_and_its_mean_is_the_score(run):
     with (run / "scores.csv").open() as stream:
         lines = list(csv.DictReader(stream))
     for split, variants in scores(run).items():
@@ -107,7 +109,7 @@ def test_rows_by_camera_are_printed_on_request(copy, given, inside):
     assert set(scores(copy.with_name("other_scores"))) == {"novel_pose"}
 
 
-def test_a_perfect_picture_and_its_white_background(capture, given, inside, tmp_path):
+def test_the_ground_truth_as_prediction_on_white(capture, given, inside, tmp_path):
     """On white, given as it is or as alpha: the truth scores nothing but its own 8-bit rounding."""
     from gsgan.data.datamodule import GsganData
     from gsgan.metrics.regions import on_background
@@ -226,13 +228,15 @@ def resize(path: Path) -> None:
         (lambda path: path.write_bytes(b""), ("cam01/0005.png",)),
     ],
 )
-def test_one_wrong_picture_is_named_and_nothing_is_written(copy, given, inside, damage, words):
+def test_one_wrong_image_is_named_and_nothing_is_written(copy, given, inside, damage, words):
     damage(copy / "novel_pose" / "cam01" / "0005.png")
     refused(inside("evaluate", f"predictions={copy}", *given), *words)
     assert not copy.with_name("other_scores").exists()
 
 
-def test_what_does_not_fit_together_is_said(run, copy, given, inside):
+def test_arguments_that_do_not_fit_together_are_refused(run, copy, given, compose):
+    from gsgan.evaluate.command import evaluate_config
+
     here = f"predictions={copy}"
     for arguments, words in (
         ([], ("run is not set", "predictions=")),
@@ -252,7 +256,10 @@ def test_what_does_not_fit_together_is_said(run, copy, given, inside):
         ([here, *given, f"out={run}"], ("is a run folder",)),
         ([f"predictions={copy}/no", *given], ("other/no does not exist",)),
     ):
-        refused(inside("evaluate", *arguments), *words)
+        with pytest.raises(GsganError) as caught:
+            evaluate_config(compose("evaluate", *arguments))
+        for word in words:
+            assert word in str(caught.value)
 
 
 def test_another_methods_scores_are_not_overwritten(copy, given, inside):

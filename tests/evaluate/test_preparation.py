@@ -46,7 +46,9 @@ def test_else_it_is_round_the_seen_joints_with_a_larger_margin_and_says_so(data)
 
 @pytest.mark.parametrize("background", ["black", "white"])
 def test_what_is_painted_outside_the_box_is_cleared_and_only_there(data, background):
-    prepare = Preparation(Measures(region="body_box_cleared", background=background), BodyBoxes(data))
+    prepare = Preparation(
+        Measures(region="body_box_cleared", background=background), BodyBoxes(data)
+    )
     frame = data.dataset("train")[0]
     box = prepare.box(frame)
     picture = prepare.image(Prediction({FULL: torch.full_like(frame.image, 0.3)}, {}, background),

@@ -226,9 +226,7 @@ def test_miou_is_torchmetrics_jaccard_index_over_the_split():
         return each(predicted[images], labels[images])
 
     assert whole["miou"] == pytest.approx(float(jaccard(slice(3))[1:].mean()), abs=1e-6)
-    assert whole["miou_with_background"] == pytest.approx(
-        float(jaccard(slice(3)).mean()), abs=1e-6
-    )
+    assert whole["miou_with_background"] == pytest.approx(float(jaccard(slice(3)).mean()), abs=1e-6)
     first = pytest.approx(float(jaccard(slice(1))[1:].mean()), abs=1e-6)
     assert whole["cameras"]["a"]["miou"] == found.rows[FULL][0]["miou"] == first
 

@@ -110,7 +110,9 @@ def _vgg_stages(path: Path) -> nn.ModuleList:
     state = load_weights(path)
     prefix = "features."
     try:
-        layers.load_state_dict({k.removeprefix(prefix): state[k] for k in state if prefix in k})
+        layers.load_state_dict(
+            {k.removeprefix(prefix): state[k] for k in state if k.startswith(prefix)}
+        )
     except RuntimeError as error:
         raise DataError(f"{path}: these are not torchvision's VGG-16 weights") from error
     for layer in layers:
