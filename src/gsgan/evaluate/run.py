@@ -32,7 +32,7 @@ from gsgan.evaluate.split import (
     score_split,
 )
 from gsgan.evaluate.tables import PER, Results, print_table
-from gsgan.metrics.lpips import lpips, lpips_name
+from gsgan.metrics.lpips import lpips
 from gsgan.metrics.regions import BACKGROUNDS
 from gsgan.model.avatar import Avatar
 from gsgan.model.painting import Painting
@@ -122,6 +122,16 @@ def check_background(key: str, value: object) -> None:
     """
     if value not in (None, *BACKGROUNDS):
         raise ConfigError(f"{key} must be black, white or null; got {value!r}")
+
+
+def lpips_name(net: str, measures: Measures) -> str:
+    """The name of an LPIPS: backbone, input range, and order of channels and region where those are
+    not the defaults."""
+    backbone = {"vgg": "VGG", "alex": "Alex"}[net]
+    low, high = measures.lpips_range
+    order = "" if measures.lpips_channels == "rgb" else " BGR"
+    region = "" if measures.lpips_region == "full" else " mask crop 512"
+    return f"LPIPS-{backbone} [{low:g},{high:g}]{order}{region}"
 
 
 def make_scorer(config: DictConfig, data: GsganData, marks: list[str]) -> Scorer:
