@@ -62,8 +62,7 @@ def pixel_centres(camera: Camera) -> Tensor:
 
 
 def inside_hull(hull: Tensor, points: Tensor) -> Tensor:
-    """``[...]`` whether points ``[..., 2]`` lie in or on a convex polygon ``[n, 2]``; all false with
-    fewer than three corners."""
+    """``[...]`` whether points ``[..., 2]`` are in a convex polygon ``[n, 2]``; false if n < 3."""
     if len(hull) < 3:
         return torch.zeros(points.shape[:-1], dtype=torch.bool, device=hull.device)
     sides = []

@@ -54,8 +54,7 @@ def psnr_where(
 
 
 def person_box(mask: Tensor) -> Tensor:
-    """``[B, 1, H, W]`` bool, the smallest box round the person: where the mask ``[B, 1, H, W]`` is at
-    least one half."""
+    """``[B, 1, H, W]`` bool: the smallest box round the mask's pixels of at least one half."""
     person = mask >= 0.5
     return _reached(person, -1) & _reached(person, -2)
 

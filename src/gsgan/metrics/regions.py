@@ -34,7 +34,7 @@ def moved_background(image: Tensor, mask: Tensor, old: float, new: float) -> Ten
 
 
 def hard_outline(image: Tensor, mask: Tensor) -> Tensor:
-    """Unmultiplies an image on black by its mask where that is at least one half; black elsewhere."""
+    """Divides an image on black by its mask where that is at least one half; black elsewhere."""
     inside = mask >= 0.5
     return torch.where(inside, (image / mask.clamp_min(0.5)).clamp(0, 1), torch.zeros_like(image))
 

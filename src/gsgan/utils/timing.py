@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from collections.abc import Callable, Hashable, Mapping
@@ -20,17 +21,17 @@ def interleaved(
     device: torch.device | None = None,
     tick: Callable[[], None] | None = None,
 ) -> dict[Key, list[float]]:
-    """Times actions round robin, so that whatever disturbs the machine disturbs them all alike.
+    """Times actions round robin, so that other load on the machine affects all of them alike.
 
-    Convention: milliseconds of wall clock, with everything the device was given done. Each action
-    is first called once to warm up; that call is not counted, except where it took longer than
-    ``patience``: then it is called once more, and the shorter of the two is its only sample.
+    Convention: milliseconds of wall clock, device synchronised. Each action is called once to warm
+    up. If that took longer than ``patience``, it is called once more, and the shorter of the two
+    calls is its only sample.
 
     Args:
         actions: what to call, by name.
         repeats: rounds, at least 1.
         patience: seconds.
-        device: waited for before and after each call.
+        device: synchronised before and after each call.
         tick: called after each call.
 
     Returns:
@@ -41,7 +42,7 @@ def interleaved(
     samples: dict[Key, list[float]] = {}
     for name, action in actions.items():
         first = timed(action, device)
-        slow = first > 1000 * patience  # or a disturbance: one more call tells
+        slow = first > 1000 * patience
         samples[name] = [min(first, timed(action, device))] if slow else []
         if tick:
             tick()
@@ -55,7 +56,7 @@ def interleaved(
 
 
 def median(samples: list[float] | None) -> float | None:
-    """The median, or None of nothing."""
+    """The median, or None without samples."""
     return statistics.median(samples) if samples else None
 
 
@@ -63,23 +64,21 @@ def slope(x: list[float], y: list[float]) -> float | None:
     """The exponent ``p`` of ``y ~ x^p`` by least squares on logarithms; None below two points."""
     if len(set(x)) < 2:
         return None
-    lx, ly = (torch.tensor(v, dtype=torch.float64).log() for v in (x, y))
-    lx, ly = lx - lx.mean(), ly - ly.mean()
-    return float((lx @ ly) / (lx @ lx))
+    return statistics.linear_regression([math.log(v) for v in x], [math.log(v) for v in y]).slope
 
 
 def timed(action: Callable[[], object], device: torch.device | None) -> float:
-    """Milliseconds of one call, with everything the device was given done."""
+    """Milliseconds of one call, device synchronised."""
     wait(device)
     start = time.perf_counter()
     result = action()
     wait(device)
     took = 1000 * (time.perf_counter() - start)
-    del result  # freed outside the clock
+    del result  # freed after the measurement
     return took
 
 
 def wait(device: torch.device | None) -> None:
-    """Until the device has done all it was given; at once on a CPU."""
+    """Synchronises a CUDA device."""
     if device is not None and device.type == "cuda":
         torch.cuda.synchronize(device)
