@@ -46,13 +46,13 @@ def scorer(measures: Measures | None = None) -> Scorer:
     return Scorer(Preparation(measures or Measures(), None), None, "no weights", "LPIPS-VGG [-1,1]")
 
 
-def test_equal_pictures_are_kept_out_of_the_mean():
+def test_equal_images_are_kept_out_of_the_mean():
     rows = [{"psnr": score} for score in (math.inf, 30.0, 20.0, math.nan)]
     assert mean(rows, "psnr") == (25.0, 2)
     assert mean(rows, "lpips") == (None, 0)
 
 
-def test_picture_scores_name_a_reason_for_every_none():
+def test_image_scores_name_a_reason_for_every_none():
     image = torch.zeros(1, 3, 16, 16)
     result = means([image_scores(image, image)], "no weights")  # PSNR infinite, no edges
     assert result["psnr"] is None
@@ -121,7 +121,7 @@ def test_the_floor_of_a_split_is_the_background_and_its_psnr_is_known():
         assert not found.hidden_outline
 
 
-def test_an_opaque_picture_on_black_hides_its_outline_on_white_and_says_so():
+def test_an_opaque_image_on_black_hides_its_outline_on_white_and_says_so():
     f = person()
     fat = f.image.clone()
     fat[..., 0:4, 0:4] = 0.9  # painted outside the truth's mask
@@ -139,7 +139,7 @@ def test_an_opaque_picture_on_black_hides_its_outline_on_white_and_says_so():
     )
 
 
-def test_each_picture_of_an_avatar_is_put_on_white_by_its_own_alpha():
+def test_each_image_of_an_avatar_is_put_on_white_by_its_own_alpha():
     """I_pred is the truth; Step I's colour is it at half the alpha: 0.3 off, 0.15 at the edge."""
     f = person()
     painting = Painting(f.image, f.mask, features=0.5 * f.image, splat_alpha=0.5 * f.mask)
@@ -153,7 +153,7 @@ def test_each_picture_of_an_avatar_is_put_on_white_by_its_own_alpha():
     assert not found.hidden_outline
 
 
-def test_one_variant_without_alpha_takes_the_truths_mask_and_says_so():
+def test_one_variant_without_alpha_takes_the_ground_truths_mask_and_says_so():
     f = person()
 
     def predict(f: Frame, _: object) -> Prediction:
@@ -166,7 +166,7 @@ def test_one_variant_without_alpha_takes_the_truths_mask_and_says_so():
     assert not score_split([(("a", 0), f)], predict, scorer()).hidden_outline
 
 
-def test_a_picture_that_is_not_finite_is_an_error_that_names_it():
+def test_an_image_that_is_not_finite_is_an_error_that_names_it():
     f = person()
     broken = f.image.clone()
     broken[0, 0, 3, 3] = torch.nan

@@ -28,7 +28,7 @@ def test_d_ssim_is_one_minus_ssim():
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
-def test_d_ssim_of_constant_pictures_is_finite(value):
+def test_d_ssim_of_constant_images_is_finite(value):
     """Variance 0, where E[x²] - E[x]² cancels."""
     a = torch.full((1, 3, 16, 16), value, requires_grad=True)
     loss = d_ssim(a, torch.full((1, 3, 16, 16), value))
@@ -81,7 +81,7 @@ def test_unknown_gan_is_refused():
         generator_loss(maps(0.0), maps(0.0), "wgan")
 
 
-def test_a_relativistic_judge_sees_only_how_the_pair_differs():
+def test_a_relativistic_loss_sees_only_how_the_pair_differs():
     for shift in (0.0, 7.0):
         real, fake = maps(shift + 3.0), maps(shift + 1.0)
         judged, painted = (

@@ -39,7 +39,7 @@ def pair(count: int = 3, size: int = 32) -> tuple[torch.Tensor, torch.Tensor]:
     return (target + scale * noise).clamp(0, 1), target
 
 
-def test_psnr_closed_form_and_one_score_a_picture():
+def test_psnr_closed_form_and_one_score_per_image():
     target = torch.zeros(2, 3, 8, 8)
     image = torch.stack([torch.full((3, 8, 8), 0.1), torch.full((3, 8, 8), 0.01)])
     torch.testing.assert_close(psnr(image, target), torch.tensor([20.0, 40.0]))
@@ -78,7 +78,7 @@ def test_a_wrong_range_makes_ssim_higher():
     assert (ssim(image, target, value_range=2.0) > ssim(image, target)).all()
 
 
-def test_ssim_of_equal_pictures_is_one_and_of_slivers_undefined():
+def test_ssim_of_equal_images_is_one_and_of_slivers_undefined():
     image = torch.rand(3, 3, 16, 16)
     torch.testing.assert_close(ssim(image, image), torch.ones(3))
     assert float(ssim(image, 1 - image).max()) < 0.5
@@ -104,7 +104,7 @@ def test_uniform_ssim_is_its_definition_window_by_window(value_range):
     assert found.tolist() == pytest.approx(scores, abs=1e-9)
 
 
-def test_uniform_ssim_of_equal_pictures_is_one_and_of_slivers_undefined():
+def test_uniform_ssim_of_equal_images_is_one_and_of_slivers_undefined():
     image = torch.rand(2, 3, 12, 12)
     assert ssim_uniform(image, image).tolist() == [1.0, 1.0]
     grey = torch.full((1, 3, 12, 12), 0.7)
@@ -113,7 +113,7 @@ def test_uniform_ssim_of_equal_pictures_is_one_and_of_slivers_undefined():
     assert bool(ssim_uniform(image[..., :6], image[..., :6]).isnan().all())
 
 
-def test_equal_pictures_are_infinite():
+def test_equal_images_are_infinite():
     image = torch.rand(1, 3, 16, 16)
     assert math.isinf(float(psnr(image, image)))
 
@@ -210,7 +210,7 @@ def test_edges_in_the_persons_box_leave_out_those_elsewhere():
     assert math.isnan(float(ratio))
 
 
-def test_edges_counted_everywhere_are_the_whole_pictures():
+def test_edges_counted_everywhere_are_the_whole_images():
     image, target = pair()
     everywhere = torch.ones(len(image), 1, *image.shape[-2:], dtype=torch.bool)
     for whole, inside in zip(

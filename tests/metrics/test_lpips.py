@@ -71,7 +71,7 @@ def test_lpips_without_weights_is_none_with_the_reason(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("fed", RANGES)
-def test_lpips_is_torchmetrics_one_score_a_picture(scores, direct, pictures, fed):
+def test_lpips_is_torchmetrics_one_score_per_image(scores, direct, pictures, fed):
     a, b = pictures
     ours = scores[fed](a, b)
     assert ours.shape == (2,)

@@ -38,8 +38,7 @@ class Scored:
 
 
 def write_scored(scored: Scored, folder: Path, title: str) -> None:
-    """Writes the four files, each whole or not at all; metrics.json last, so that it is never newer
-    than the others."""
+    """Writes the four files, each whole or not at all; metrics.json last: if it is new, all are."""
     facts = json.dumps(scored.facts, indent=2, allow_nan=False)
     table = scored.rows.to_csv(columns=list(HEADER), index=False, lineterminator="\n")
     write_atomically(folder / SCORES_FILE, table)
