@@ -65,24 +65,19 @@ def is_part(line: str, lines: list[str]) -> bool:
 
 
 @pytest.fixture(scope="session")
-def smpl_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Model files like SMPL's and SMPL-X's, of the default person, made when asked for."""
+def model_file(shared) -> Callable[[str], Path]:
+    """A model file like SMPL's or SMPL-X's, of the default person, by kind."""
     from writers.smpl import write_smpl
 
-    folder, made = tmp_path_factory.mktemp("models"), {}
+    def run(kind: str) -> Path:
+        suffix = "pkl" if kind == "smpl" else "npz"
+        return shared(f"{kind}.{suffix}", lambda path: write_smpl(path, kind=kind))
 
-    class Files(dict):
-        def __missing__(self, kind: str) -> Path:
-            suffix = "pkl" if kind == "smpl" else "npz"
-            made[kind] = self[kind] = folder / f"{kind}.{suffix}"
-            write_smpl(made[kind], kind=kind)
-            return made[kind]
-
-    return Files()
+    return run
 
 
 @pytest.fixture
-def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
+def place(capture, run, model_file, tmp_path_factory) -> Callable[[str], str]:
     """Puts real, tiny files in the place of a documented line's placeholders."""
 
     def folder() -> Path:
@@ -92,7 +87,7 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
         from writers import zju
         from writers.common import make_subject
 
-        return zju.write_original(folder() / "CoreView_377", make_subject(smpl_files["smpl"]))
+        return zju.write_original(folder() / "CoreView_377", make_subject(model_file("smpl")))
 
     def rig(name: str) -> Path:
         from writers.avatarrex import write_avatarrex
@@ -100,13 +95,13 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
         from writers.thuman4 import write_thuman4
 
         write = write_thuman4 if name == "subject00" else write_avatarrex
-        return write(folder() / name, smplx_subject(smpl_files["smplx"]))
+        return write(folder() / name, smplx_subject(model_file("smplx")))
 
     def take() -> Path:
         from writers.common import make_subject
         from writers.easymocap import write_easymocap
 
-        return write_easymocap(folder() / "take", make_subject(smpl_files["smpl"]))
+        return write_easymocap(folder() / "take", make_subject(model_file("smpl")))
 
     def videos() -> Path:
         from capture_scenes import write_project
@@ -148,8 +143,8 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
         "/path/to/capture": lambda: capture,
         "<run folder>": lambda: run,
         "/path/to/CoreView_377": zju,
-        "/path/to/SMPL_NEUTRAL.pkl": lambda: smpl_files["smpl"],
-        "/path/to/SMPLX_NEUTRAL.npz": lambda: smpl_files["smplx"],
+        "/path/to/SMPL_NEUTRAL.pkl": lambda: model_file("smpl"),
+        "/path/to/SMPLX_NEUTRAL.npz": lambda: model_file("smplx"),
         "/path/to/subject00": lambda: rig("subject00"),
         "/path/to/avatarrex_zzr": lambda: rig("avatarrex_zzr"),
         "/path/to/take": take,
