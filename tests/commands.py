@@ -1,4 +1,4 @@
-"""Commands as a user types them: what the tests of entry points share."""
+"""Runs commands as a user does, for the tests of entry points."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ TINY = ["size=tiny", "training=smoke", "data=capture", "data.size=32", "data.cro
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
 
 
-def gsgan(command: str, *args: str, cwd: Path, timeout: int = 300, environment: dict = ENVIRONMENT):
+def gsgan(command: str, *args: str, cwd: Path, timeout: int = 300):
     """Runs ``python -m gsgan.<command>`` from another directory, as an installed user would."""
     return subprocess.run(
         [sys.executable, "-m", f"gsgan.{command}", *args],
-        cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout,
+        cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=timeout,
     )  # fmt: skip
 
 
-def train(capture: Path, run: Path, *args: str, cwd: Path | None = None):
-    return gsgan("train", *arguments(capture, run), *args, cwd=cwd or run.parent)
+def train(capture: Path, run: Path, *args: str):
+    return gsgan("train", *arguments(capture, run), *args, cwd=run.parent)
 
 
 def arguments(capture: Path, run: Path) -> list[str]:
-    """Of a tiny training run."""
+    """The overrides of a tiny training run."""
     return [*TINY, f"data.root={capture}", f"hydra.run.dir={run}"]
 
 
 def refused(result, *words: str) -> None:
-    """One sentence on stderr, a non-zero exit, no traceback."""
+    """A message with these words on stderr, a non-zero exit status, no traceback."""
     assert result.returncode != 0, result.stdout
     assert "Traceback" not in result.stderr + result.stdout
     text = " ".join(result.stderr.split())

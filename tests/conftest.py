@@ -1,13 +1,18 @@
-"""Fixtures of all tests: few threads, a tiny capture, a tiny avatar's config."""
+"""Fixtures of all tests: few threads, a tiny capture, a tiny config, a tiny trained run."""
 
 from __future__ import annotations
 
+import copy
+import fcntl
 import importlib.util
 import logging
 import os
+import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -32,7 +37,27 @@ def _loggers_stay_on() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable], Path]:
+    """``shared(name, make)``: a path made once for all workers of pytest-xdist; read only."""
+    root = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        root = root.parent
+
+    def run(name: str, make: Callable[[Path], object]) -> Path:
+        path, done = root / "shared" / name, root / f"{name}.done"
+        path.parent.mkdir(exist_ok=True)
+        with (root / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            if not done.exists():
+                make(path)
+                done.touch()
+        return path
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def capture(shared) -> Path:
     """A small capture with labels and body poses: 3 cameras (one held out), 6 frames (2 held)."""
     from make import write_tiny_capture
 
@@ -42,31 +67,36 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "train_frames": [0, 1, 2, 3],
         "test_frames": [4, 5],
     }
-    return write_tiny_capture(
-        tmp_path_factory.mktemp("capture"),
-        cameras=3,
-        frames=6,
-        size=(48, 48),
-        labels=True,
-        body_pose=True,
-        splits=splits,
-        meta={"body": "free"},
-    )
+
+    def make(folder: Path) -> None:
+        write_tiny_capture(
+            folder,
+            cameras=3,
+            frames=6,
+            size=(48, 48),
+            labels=True,
+            body_pose=True,
+            splits=splits,
+            meta={"body": "free"},
+        )
+
+    return shared("capture", make)
+
+
+@lru_cache(maxsize=128)
+def composed(name: str, *overrides: str) -> DictConfig:
+    from hydra import compose, initialize_config_dir
+
+    from gsgan.utils.config import config_folder
+
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        return compose(name, overrides=list(overrides))
 
 
 @pytest.fixture
 def compose():
     """Composes a config as the command line does: ``compose("train", "model=wo_seg")``."""
-    from hydra import compose as hydra_compose
-    from hydra import initialize_config_dir
-
-    from gsgan.utils.config import config_folder
-
-    def run(name: str, *overrides: str) -> DictConfig:
-        with initialize_config_dir(str(config_folder()), version_base="1.3"):
-            return hydra_compose(name, overrides=list(overrides))
-
-    return run
+    return lambda name, *overrides: copy.deepcopy(composed(name, *overrides))
 
 
 def entry_module(command: str) -> str:
@@ -105,16 +135,13 @@ def build(tiny):
 @pytest.fixture(autouse=True)
 def denormals():
     """Training in this process flushes denormals; other tests reckon with them."""
-    import torch
-
     yield
     torch.set_flush_denormal(False)
 
 
 @pytest.fixture
 def inside(tmp_path, monkeypatch, capfd):
-    """The same in this process, for the many ways to go wrong: seconds less each."""
-    from types import SimpleNamespace
+    """Runs a command in this process, which saves the seconds of its imports."""
 
     def run(command: str, *args: str):
         monkeypatch.chdir(tmp_path)
@@ -133,14 +160,15 @@ def inside(tmp_path, monkeypatch, capfd):
 
 
 @pytest.fixture(scope="session")
-def run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished tiny run, made by the real command."""
+def run(capture: Path, shared, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished tiny run, made by the real command once, and copied for each worker."""
     from commands import train
 
-    folder = tmp_path_factory.mktemp("runs") / "one"
-    result = train(capture, folder)
-    assert result.returncode == 0, result.stdout + result.stderr
-    assert f"run folder: {folder}" in result.stdout.replace("\n", "")
-    assert "floor" in result.stdout
-    assert "marked: perceptual loss" in result.stdout
-    return folder
+    def make(folder: Path) -> None:
+        result = train(capture, folder)
+        assert result.returncode == 0, result.stdout + result.stderr
+        assert f"run folder: {folder}" in result.stdout.replace("\n", "")
+        assert "floor" in result.stdout
+        assert "marked: perceptual loss" in result.stdout
+
+    return shutil.copytree(shared("run", make), tmp_path_factory.mktemp("runs") / "one")

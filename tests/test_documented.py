@@ -1,4 +1,7 @@
-"""Every command of the README and the docs is run: as written, but tiny."""
+"""Every command of the README and the docs runs: as written, but tiny.
+
+A line whose arguments another line of the command has too is composed, not run.
+"""
 
 from __future__ import annotations
 
@@ -39,33 +42,36 @@ SMALL_BENCH = {
 }
 
 
+FEW = {"segmentation": 2, "step_one": 2, "step_two": 4, "discriminator_start": 1, "epoch": 4}
+
+
 def documented() -> list[str]:
-    """Every ``python -m gsgan…`` of README and docs, once."""
+    """Every ``python -m gsgan.…`` of README and docs, once."""
     text = "\n".join(p.read_text() for p in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
     blocks = re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
     lines = [line.split("#")[0].strip() for block in blocks for line in block.splitlines()]
-    return sorted({line for line in lines if line.startswith("python -m gsgan")})
+    return sorted({line for line in lines if line.startswith("python -m gsgan.")})
+
+
+def is_part(line: str, lines: list[str]) -> bool:
+    """Whether another line has all words of this one."""
+    return any(set(line.split()) < set(other.split()) for other in lines)
 
 
 @pytest.fixture(scope="session")
-def smpl_files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Model files like SMPL's and SMPL-X's, of the default person, made when asked for."""
+def model_file(shared) -> Callable[[str], Path]:
+    """A model file like SMPL's or SMPL-X's, of the default person, by kind."""
     from writers.smpl import write_smpl
 
-    folder, made = tmp_path_factory.mktemp("models"), {}
+    def run(kind: str) -> Path:
+        suffix = "pkl" if kind == "smpl" else "npz"
+        return shared(f"{kind}.{suffix}", lambda path: write_smpl(path, kind=kind))
 
-    class Files(dict):
-        def __missing__(self, kind: str) -> Path:
-            suffix = "pkl" if kind == "smpl" else "npz"
-            made[kind] = self[kind] = folder / f"{kind}.{suffix}"
-            write_smpl(made[kind], kind=kind)
-            return made[kind]
-
-    return Files()
+    return run
 
 
 @pytest.fixture
-def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
+def place(capture, run, model_file, tmp_path_factory) -> Callable[[str], str]:
     """Puts real, tiny files in the place of a documented line's placeholders."""
 
     def folder() -> Path:
@@ -75,7 +81,7 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
         from writers import zju
         from writers.common import make_subject
 
-        return zju.write_original(folder() / "CoreView_377", make_subject(smpl_files["smpl"]))
+        return zju.write_original(folder() / "CoreView_377", make_subject(model_file("smpl")))
 
     def rig(name: str) -> Path:
         from writers.avatarrex import write_avatarrex
@@ -83,13 +89,13 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
         from writers.thuman4 import write_thuman4
 
         write = write_thuman4 if name == "subject00" else write_avatarrex
-        return write(folder() / name, smplx_subject(smpl_files["smplx"]))
+        return write(folder() / name, smplx_subject(model_file("smplx")))
 
     def take() -> Path:
         from writers.common import make_subject
         from writers.easymocap import write_easymocap
 
-        return write_easymocap(folder() / "take", make_subject(smpl_files["smpl"]))
+        return write_easymocap(folder() / "take", make_subject(model_file("smpl")))
 
     def videos() -> Path:
         from capture_scenes import write_project
@@ -131,8 +137,8 @@ def place(capture, run, smpl_files, tmp_path_factory) -> Callable[[str], str]:
         "/path/to/capture": lambda: capture,
         "<run folder>": lambda: run,
         "/path/to/CoreView_377": zju,
-        "/path/to/SMPL_NEUTRAL.pkl": lambda: smpl_files["smpl"],
-        "/path/to/SMPLX_NEUTRAL.npz": lambda: smpl_files["smplx"],
+        "/path/to/SMPL_NEUTRAL.pkl": lambda: model_file("smpl"),
+        "/path/to/SMPLX_NEUTRAL.npz": lambda: model_file("smplx"),
         "/path/to/subject00": lambda: rig("subject00"),
         "/path/to/avatarrex_zzr": lambda: rig("avatarrex_zzr"),
         "/path/to/take": take,
@@ -166,14 +172,12 @@ def tiny_training(arguments: list[str], capture: Path) -> list[str]:
     if {"experiment=paper", "data=thuman4"} <= set(given):  # three cameras stand in for 24
         given += ["protocol.test_cameras=[cam02]", "protocol.test_frames=2-3"]
         given += ["protocol.train_frames=0-1"]
-    return given
+    return given + [f"training.schedule.{name}={value}" for name, value in FEW.items()]
 
 
-def shorter_study(arguments: list[str], folder: Path) -> list[str]:
-    """The ablation study: the first two of what it varies, a few iterations each."""
-    given = [",".join(a.split(",")[: 1 if a.startswith("seed=") else 2]) for a in arguments]
-    few = {"segmentation": 2, "step_one": 2, "step_two": 4, "discriminator_start": 1, "epoch": 4}
-    given += [f"training.schedule.{name}={value}" for name, value in few.items()]
+def shorter_sweep(arguments: list[str], folder: Path) -> list[str]:
+    """The last of the values that it varies."""
+    given = [re.sub(r"=.*,", "=", a) if "=[" not in a else a for a in arguments]
     return [*given, f"hydra.sweep.dir={folder / 'sweep'}", "hydra.sweep.subdir=${hydra.job.num}"]
 
 
@@ -196,15 +200,24 @@ def tiny_bench(arguments: list[str], tmp_path: Path, capture: Path) -> list[str]
     return [*given, *small]
 
 
-@pytest.mark.parametrize("line", documented())
+LINES = documented()
+
+
+@pytest.mark.parametrize("line", [line for line in LINES if is_part(line, LINES)])
+def test_a_documented_command_that_is_part_of_another_composes(line, inside):
+    _, _, module, *arguments = line.replace("<run folder>", "/path/to/run").split()
+    arguments = [a.strip("'") for a in arguments if a != "-m"]
+    result = inside(module.removeprefix("gsgan."), *arguments, "--cfg", "job")
+    assert result.returncode == 0, result.stdout + result.stderr
+
+
+@pytest.mark.parametrize("line", [line for line in LINES if not is_part(line, LINES)])
 def test_every_documented_command_runs(line, place, capture, inside, tmp_path):
     _, _, module, *arguments = place(line).split()
-    name = module.removeprefix("gsgan").lstrip(".")
-    if not name:
-        return  # the bare list of commands: test_the_list_of_commands
+    name = module.removeprefix("gsgan.")
     if name == "train":
-        if any(a.startswith("experiment=ablation") for a in arguments):
-            arguments = shorter_study(arguments, tmp_path)
+        if "-m" in arguments:
+            arguments = shorter_sweep(arguments, tmp_path)
         arguments = tiny_training(arguments, capture)
     if name == "bench":
         arguments = tiny_bench(arguments, tmp_path, capture)

@@ -1,10 +1,9 @@
-"""``gsgan.evaluate predictions=``: any method's pictures, scored as a run's own are."""
+"""``gsgan.evaluate predictions=``: any method's images, scored like those of a run."""
 
 from __future__ import annotations
 
 import csv
 import json
-import math
 import shutil
 from pathlib import Path
 
@@ -13,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 from commands import refused
+
+from gsgan.utils.errors import GsganError
 
 DATA = ("data=capture", "data.size=32", "data.crop=null", "size=tiny", "lpips.path=null")
 
@@ -24,7 +25,7 @@ def given(capture: Path) -> list[str]:
 
 @pytest.fixture(scope="session")
 def painted(run: Path, capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the tiny run paints, as a method of someone else would leave it: 8-bit PNGs."""
+    """The images of the tiny run as another method would leave them: 8-bit PNGs."""
     from gsgan.train.runs import build_data, load_avatar, load_config
 
     root = tmp_path_factory.mktemp("others") / "other"
@@ -51,7 +52,7 @@ def scores(folder: Path) -> dict:
     return json.loads((folder / "metrics.json").read_text())
 
 
-def test_pictures_of_a_run_score_as_the_run_does(run, painted, given, inside):
+def test_images_of_a_run_score_as_the_run_does(run, painted, given, inside):
     """Up to the rounding to 8 bits: 0.5/255 at most a value, and the floor is the very same."""
     result = inside("evaluate", f"predictions={painted}", "method=other", *given)
     assert result.returncode == 0, result.stderr
@@ -81,7 +82,7 @@ def test_pictures_of_a_run_score_as_the_run_does(run, painted, given, inside):
     assert {p.name for p in (out / "pictures").iterdir()} == {"novel_view.png", "novel_pose.png"}
 
 
-def test_the_csv_holds_every_picture_and_its_mean_is_the_score(run):
+def test_the_csv_holds_every_image_and_its_mean_is_the_score(run):
     with (run / "scores.csv").open() as stream:
         lines = list(csv.DictReader(stream))
     for split, variants in scores(run).items():
@@ -108,7 +109,7 @@ def test_rows_by_camera_are_printed_on_request(copy, given, inside):
     assert set(scores(copy.with_name("other_scores"))) == {"novel_pose"}
 
 
-def test_a_perfect_picture_and_its_white_background(capture, given, inside, tmp_path):
+def test_the_ground_truth_as_prediction_on_white(capture, given, inside, tmp_path):
     """On white, given as it is or as alpha: the truth scores nothing but its own 8-bit rounding."""
     from gsgan.data.datamodule import GsganData
     from gsgan.metrics.regions import on_background
@@ -213,27 +214,6 @@ def test_another_background_departs_from_the_protocol(copy, given, inside):
     )
 
 
-def test_pictures_under_wrong_names(capture, given, inside, tmp_path):
-    """The truth itself, one camera's frames exchanged: an error that names the frame."""
-    from gsgan.data.datamodule import GsganData
-
-    dataset = GsganData(str(capture), size=32).dataset("novel_view")
-    root = tmp_path / "truth" / "novel_view" / "cam02"
-    root.mkdir(parents=True)
-    for i, (_, frame) in enumerate(dataset.items):
-        pixels = (dataset[i].image[0] * 255).round().byte().permute(1, 2, 0).numpy()
-        cv2.imwrite(str(root / f"{frame}.png"), pixels[..., ::-1])
-    (root / "0.png").rename(root / "x.png")
-    (root / "3.png").rename(root / "0.png")
-    (root / "x.png").rename(root / "3.png")
-    arguments = [f"predictions={tmp_path / 'truth'}", "splits=[novel_view]", *given]
-    refused(inside("evaluate", *arguments), "0.png", "frame 0", "frame 3", "right names")
-    assert not (tmp_path / "truth_scores").exists()
-    result = inside("evaluate", *arguments, "predictions_margin=null")
-    assert result.returncode == 0, result.stderr
-    assert math.isfinite(scores(tmp_path / "truth_scores")["novel_view"]["full"]["psnr"])
-
-
 def resize(path: Path) -> None:
     cv2.imwrite(str(path), np.zeros((16, 32, 3), np.uint8))
 
@@ -248,20 +228,22 @@ def resize(path: Path) -> None:
         (lambda path: path.write_bytes(b""), ("cam01/0005.png",)),
     ],
 )
-def test_one_wrong_picture_is_named_and_nothing_is_written(copy, given, inside, damage, words):
+def test_one_wrong_image_is_named_and_nothing_is_written(copy, given, inside, damage, words):
     damage(copy / "novel_pose" / "cam01" / "0005.png")
     refused(inside("evaluate", f"predictions={copy}", *given), *words)
     assert not copy.with_name("other_scores").exists()
 
 
-def test_what_does_not_fit_together_is_said(run, copy, given, inside):
+def test_arguments_that_do_not_fit_together_are_refused(run, copy, given, compose):
+    from gsgan.evaluate.command import evaluate_config
+
     here = f"predictions={copy}"
     for arguments, words in (
         ([], ("run is not set", "predictions=")),
         ([f"run={run}", here], ("both set",)),
         ([here], ("data is not set", "data.root")),
-        ([f"run={run}", *given], ("a run has its own data", "data_root=")),
-        ([f"run={run}", "method=x"], ("a run has its own method",)),
+        ([f"run={run}", *given], ("data= cannot be given with run=", "data_root=")),
+        ([f"run={run}", "method=x"], ("method= cannot be given with run=",)),
         ([here, *given, "data_root=/x"], ("data_root is for run=",)),
         ([here, *given, "data_smpl=/x"], ("data_smpl is for run=", "data.smpl")),
         ([here, *given, "per=frame"], ("per must be split or camera",)),
@@ -270,12 +252,14 @@ def test_what_does_not_fit_together_is_said(run, copy, given, inside):
         ([here, *given, "predictions_background=grey"], ("black, white or null",)),
         ([here, *given, "background=grey"], ("background must be black, white or null",)),
         ([f"run={run}", "background=grey"], ("background must be black, white or null", "'grey'")),
-        ([here, *given, "predictions_margin=1"], ("above 1, or null",)),
-        ([here, *given, f"out={copy}/scores"], ("inside the predictions",)),
+        ([here, *given, f"out={copy}/scores"], ("is inside the predictions",)),
         ([here, *given, f"out={run}"], ("is a run folder",)),
         ([f"predictions={copy}/no", *given], ("other/no does not exist",)),
     ):
-        refused(inside("evaluate", *arguments), *words)
+        with pytest.raises(GsganError) as caught:
+            evaluate_config(compose("evaluate", *arguments))
+        for word in words:
+            assert word in str(caught.value)
 
 
 def test_another_methods_scores_are_not_overwritten(copy, given, inside):
@@ -286,7 +270,7 @@ def test_another_methods_scores_are_not_overwritten(copy, given, inside):
     (copy / "novel_pose" / "notes.txt").write_text("mine")
     again = inside("evaluate", *arguments, "method=one", f"out={out}")
     assert again.returncode == 0
-    assert "not asked for and not scored: novel_pose/notes.txt" in again.stdout
+    assert "are not scored: novel_pose/notes.txt" in again.stdout
 
 
 def test_seconds_of_a_resumed_training_add_up(tiny, monkeypatch):
@@ -320,10 +304,10 @@ def test_seconds_of_a_resumed_training_add_up(tiny, monkeypatch):
 
 
 def test_cameras_of_several_sizes_share_one_grid():
-    from gsgan.evaluate.run import _one_size
+    from gsgan.evaluate.run import one_size
 
     small, large = torch.ones(3, 2, 5), torch.ones(3, 4, 3)
-    a, b = _one_size([{"x": small}, {"x": large}])
+    a, b = one_size([{"x": small}, {"x": large}])
     assert a["x"].shape == b["x"].shape == (3, 4, 5)
     assert float(a["x"].sum()) == 30.0
     assert torch.equal(a["x"][:, :2], small)

@@ -62,7 +62,7 @@ def test_a_part_imports_only_earlier_parts(part):
         if name[1:2] != [part]:
             continue
         for other in imported(path):
-            package = (other.split(".") + [""])[1]
+            package = [*other.split("."), ""][1]
             assert package in ("", *allowed), f"{'.'.join(name)} imports {other}"
 
 

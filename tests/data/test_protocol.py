@@ -234,7 +234,7 @@ def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> Non
 
     from rich.console import Console
 
-    from gsgan.evaluate.run import Wanted, evaluate_run
+    from gsgan.evaluate.run import Selection, evaluate_run
     from gsgan.train.runs import build_avatar, build_data
 
     config = compose(
@@ -254,7 +254,7 @@ def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> Non
         data=data,
         avatar=avatar,
         marks=[],
-        wanted=Wanted(pictures=0),
+        selection=Selection(pictures=0),
     )
     written = json.loads((tmp_path / "metrics.json").read_text())
     assert written == json.loads(json.dumps(results))

@@ -1,4 +1,4 @@
-"""A folder of predictions: names, what is missing, twice or too much, and files that are broken."""
+"""A folder of predictions: names, missing, repeated and extra images, broken files."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsgan.evaluate.folder import Folder, Pattern, check_headers, read_folder
+from gsgan.evaluate.predictions import Pattern, PredictionFolder, read_folder
 from gsgan.scene import Camera, Frame
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -28,7 +28,7 @@ def touch(root: Path, *names: str) -> Path:
     return root
 
 
-def read(root: Path, pattern: Pattern = DEFAULT) -> Folder:
+def read(root: Path, pattern: Pattern = DEFAULT) -> PredictionFolder:
     return read_folder(root, pattern, EXPECTED, CAMERAS, "black")
 
 
@@ -57,7 +57,7 @@ def test_every_padding_of_a_number_is_read(tmp_path):
 )  # fmt: skip
 def test_patterns_without_a_split(tmp_path, pattern, names):
     folder = read(touch(tmp_path, *names), Pattern(pattern))
-    assert list(folder.files.values()) == sorted(names)
+    assert sorted(folder.files.values()) == sorted(names)
 
 
 @pytest.mark.parametrize(
@@ -69,21 +69,21 @@ def test_patterns_without_a_split(tmp_path, pattern, names):
         ("{camera}/{view}/{frame}.png", "has the field {view}"),
     ],
 )
-def test_patterns_that_cannot_be(pattern, message):
+def test_invalid_patterns(pattern, message):
     with pytest.raises(ConfigError, match=message):
         Pattern(pattern)
 
 
-def test_a_missing_picture_is_named(tmp_path):
+def test_a_missing_image_is_named(tmp_path):
     touch(tmp_path, *ALL[:3])
     with pytest.raises(DataError, match=r"lacks 1 of 4 .* camera B \(2\), frame 12, expected as "
                                         r"novel_pose/B \(2\)/000012.png"):  # fmt: skip
         read(tmp_path)
 
 
-def test_a_folder_of_other_names_shows_what_is_there(tmp_path):
+def test_a_folder_with_other_names_lists_them(tmp_path):
     touch(tmp_path, "view/0.png", ".DS_Store")
-    with pytest.raises(DataError, match=r"lacks 4 of 4 .* in the folder there is view/0.png$"):
+    with pytest.raises(DataError, match=r"lacks 4 of 4 .* the folder contains view/0.png$"):
         read(tmp_path)
     with pytest.raises(DataError, match="does not exist"):
         read(tmp_path / "nowhere")
@@ -91,18 +91,18 @@ def test_a_folder_of_other_names_shows_what_is_there(tmp_path):
         read(tmp_path / "view" / "0.png")
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(DataError, match=r"there is nothing$"):
+    with pytest.raises(DataError, match=r"contains nothing$"):
         read(empty)
 
 
-def test_a_picture_there_twice_is_named(tmp_path):
+def test_a_repeated_image_is_named(tmp_path):
     touch(tmp_path, *ALL, "novel_view/cam10/005.png")
     with pytest.raises(DataError, match=r"camera cam10, frame 5 twice, as novel_view/cam10/005.png "
                                         r"and novel_view/cam10/5.png"):  # fmt: skip
         read(tmp_path)
 
 
-def test_files_that_nothing_asks_for_are_told(tmp_path):
+def test_extra_files_are_listed(tmp_path):
     extra = ("notes.txt", "novel_pose/cam1/000008.png", "novel_pose/cam1/0.png", "train/cam1/0.png")
     assert read(touch(tmp_path, *ALL, *extra)).extra == tuple(sorted(extra))
 
@@ -127,9 +127,9 @@ def frame() -> Frame:
 
 def one(
     tmp_path: Path, pixels: np.ndarray, name: str = "3.png", background: str = "black"
-) -> Folder:
+) -> PredictionFolder:
     assert cv2.imwrite(str(tmp_path / name), pixels)
-    return Folder(tmp_path, {("cam", 3): name}, (), background)
+    return PredictionFolder(tmp_path, {("cam", 3): name}, (), background)
 
 
 def person(value: int = 128, behind: int = 0) -> np.ndarray:
@@ -138,29 +138,29 @@ def person(value: int = 128, behind: int = 0) -> np.ndarray:
     return pixels
 
 
-def test_pictures_are_rgb_and_their_alpha_is_taken(tmp_path):
+def test_images_are_rgb_and_keep_their_alpha(tmp_path):
     found = one(tmp_path, person()).predict(frame(), ("cam", 3))
     assert not found.alphas
-    assert (found.pictures["full"][0, :, 2, 2] * 255).tolist() == pytest.approx([128, 20, 10])
+    assert (found.images["full"][0, :, 2, 2] * 255).tolist() == pytest.approx([128, 20, 10])
     alpha = np.full((*SIZE, 1), 51, np.uint8)
     found = one(tmp_path, np.concatenate([person(), alpha], -1)).predict(frame(), ("cam", 3))
     assert found.alphas["full"].aminmax() == pytest.approx((0.2, 0.2))
-    assert float(found.pictures["full"][0, 0, 2, 2]) == pytest.approx(0.2 * 128 / 255)
+    assert float(found.images["full"][0, 0, 2, 2]) == pytest.approx(0.2 * 128 / 255)
 
 
 @pytest.mark.parametrize(
     ("pixels", "message"),
     [
-        (person().astype(np.uint16) * 257, "16 bits|uint16"),
+        (person().astype(np.uint16) * 257, "16 bits"),
         (person()[..., 0], "grey"),
         (person()[:5], r"camera cam, frame 3\) is 8x5 pixels .* truth as scored is 8x6"),
     ],
 )
-def test_pictures_of_another_kind_are_refused(tmp_path, pixels, message):
+def test_images_of_another_kind_are_refused(tmp_path, pixels, message):
     folder = one(tmp_path, pixels)
-    if pixels.ndim == 3:  # a grey one may be a palette: told when it is read
+    if pixels.ndim == 3:  # a grey one may be a palette: known when it is decoded
         with pytest.raises(DataError, match=message):
-            check_headers(folder, ("cam", 3), SIZE)
+            folder.check(("cam", 3), SIZE)
     with pytest.raises(DataError, match=message):
         folder.predict(frame(), ("cam", 3))
 
@@ -179,10 +179,10 @@ def test_truncated_files_are_refused(tmp_path, kept, suffix):
         folder.predict(frame(), ("cam", 3))
 
 
-def test_a_background_that_was_not_said_is_noticed(tmp_path):
-    with pytest.raises(DataError, match=r"painted on white, expected: black; .*=white"):
+def test_an_unexpected_background_is_refused(tmp_path):
+    with pytest.raises(DataError, match=r"has a white background, expected black; .*=white"):
         one(tmp_path, person(behind=255)).predict(frame(), ("cam", 3))
-    with pytest.raises(DataError, match=r"painted on black, expected: white"):
+    with pytest.raises(DataError, match=r"has a black background, expected white"):
         one(tmp_path, person(), background="white").predict(frame(), ("cam", 3))
     one(tmp_path, person(behind=255), background="white").predict(frame(), ("cam", 3))
     one(tmp_path, person(behind=90)).predict(frame(), ("cam", 3))  # bad, but not the other one

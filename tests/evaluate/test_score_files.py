@@ -5,10 +5,11 @@ from __future__ import annotations
 import csv
 import math
 
+import pandas as pd
 import pytest
 
-from gsgan.evaluate.files import HEADER, Scored, csv_text, joined, read_rows, write_scored
-from gsgan.evaluate.scores import METRICS, Row
+from gsgan.evaluate.files import HEADER, Scored, joined, read_rows, write_scored
+from gsgan.evaluate.scores import METRICS
 from gsgan.evaluate.split import no_scores
 
 
@@ -30,27 +31,30 @@ def scored(
         "data": {"name": "d", "root": "r", "fingerprint": "f"}, "commit": commit, "dirty": None,
         "version": "1",
     }  # fmt: skip
-    row = Row("cam", 3, {"psnr": 1 / 3, "ssim": math.inf, "miou": math.nan})
-    return Scored({split: {"full": variant(protocol)}}, {split: {"full": [row]}}, facts)
+    row = {"split": split, "variant": "full", "camera": "001", "frame": 3}
+    row |= {"psnr": 1 / 3, "ssim": math.inf, "lpips": 1e-05, "miou": math.nan}
+    rows = pd.DataFrame([row], columns=HEADER)
+    return Scored({split: {"full": variant(protocol)}}, rows, facts)
 
 
 def test_the_csv_keeps_every_digit(tmp_path):
     path = tmp_path / "scores.csv"
-    path.write_text(csv_text(scored("novel_pose").rows))
+    write_scored(scored("novel_pose"), tmp_path, "t")
     with path.open() as stream:
         (line,) = csv.DictReader(stream)
     assert tuple(line) == HEADER
     assert float(line["psnr"]) == 1 / 3
-    assert (line["ssim"], line["miou"], line["lpips"]) == ("inf", "", "")
-    assert (line["split"], line["camera"], line["frame"]) == ("novel_pose", "cam", "3")
-    row = read_rows(path)["novel_pose"]["full"][0]
-    assert row == Row("cam", 3, {"psnr": 1 / 3, "ssim": math.inf})
+    assert (line["ssim"], line["miou"], line["lpips"]) == ("inf", "", "1e-05")
+    assert (line["split"], line["camera"], line["frame"]) == ("novel_pose", "001", "3")
+    pd.testing.assert_frame_equal(
+        read_rows(path), scored("novel_pose").rows, check_exact=True, check_dtype=False
+    )
 
 
 def test_scoring_one_split_keeps_the_others(tmp_path):
     write_scored(scored("novel_pose"), tmp_path, "t")
     whole, dropped = joined(scored("novel_view"), tmp_path, ("novel_view", "novel_pose"))
-    assert list(whole.results) == list(whole.rows) == ["novel_view", "novel_pose"]
+    assert list(whole.results) == list(whole.rows["split"]) == ["novel_view", "novel_pose"]
     assert dropped == []
 
 

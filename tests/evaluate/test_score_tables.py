@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 
+import pandas as pd
 from rich.console import Console
 
 from gsgan.data.measures import Measures
-from gsgan.evaluate.files import Scored, write_scored
-from gsgan.evaluate.prepare import Stage
+from gsgan.evaluate.files import HEADER, Scored, write_scored
+from gsgan.evaluate.prepare import Preparation
 from gsgan.evaluate.scores import METRICS
 from gsgan.evaluate.split import Scorer, empty_split
 from gsgan.evaluate.tables import IN_TERMINAL, markdown, notes, print_table, rows
@@ -31,7 +32,7 @@ def results(marks=("perceptual loss: stand-in",)):
     }  # fmt: skip
     scores["cameras"] = {"cam07": dict.fromkeys(METRICS) | {"psnr": 29.5}}
     split = {"full": dict(scores), "splat": dict(scores), "floor": dict(scores)}
-    scorer = Scorer(Stage(Measures(), None), None, "no weights", "LPIPS", list(marks))
+    scorer = Scorer(Preparation(Measures(), None), None, "no weights", "LPIPS", list(marks))
     return {
         "novel_view": empty_split("no camera is held out", scorer).variants,
         "novel_pose": split,
@@ -77,7 +78,7 @@ def test_cameras_have_rows_where_asked_for():
 
 
 def test_metrics_json_has_the_promised_shape(tmp_path):
-    write_scored(Scored(results(), {}, FACTS), tmp_path, "run")
+    write_scored(Scored(results(), pd.DataFrame(columns=HEADER), FACTS), tmp_path, "run")
     stored = json.loads((tmp_path / "metrics.json").read_text())
     assert set(stored) == {"novel_view", "novel_pose"}
     for split in stored.values():

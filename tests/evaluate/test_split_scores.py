@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -10,8 +11,8 @@ import torch
 from torchmetrics.classification import MulticlassJaccardIndex
 
 from gsgan.data.measures import Measures
-from gsgan.evaluate.prepare import Prediction, Stage
-from gsgan.evaluate.scores import Mean, PictureScores, SegmentationScores
+from gsgan.evaluate.prepare import Prediction, Preparation
+from gsgan.evaluate.scores import confusion, image_scores, mean, means, miou
 from gsgan.evaluate.split import FLOOR, FULL, SPLAT, Scorer, empty_split, painter, score_split
 from gsgan.metrics.image import psnr, ssim, ssim_uniform
 from gsgan.model.painting import Painting
@@ -42,21 +43,18 @@ def person(size: int = 24) -> Frame:
 
 
 def scorer(measures: Measures | None = None) -> Scorer:
-    return Scorer(Stage(measures or Measures(), None), None, "no weights", "LPIPS-VGG [-1,1]")
+    return Scorer(Preparation(measures or Measures(), None), None, "no weights", "LPIPS-VGG [-1,1]")
 
 
-def test_equal_pictures_are_kept_out_of_the_mean():
-    mean = Mean()
-    mean.update([math.inf, 30.0, 20.0, math.nan])
-    assert (mean.value, mean.count, mean.left_out) == (25.0, 2, 2)
-    assert Mean().value is None
+def test_equal_images_are_kept_out_of_the_mean():
+    rows = [{"psnr": score} for score in (math.inf, 30.0, 20.0, math.nan)]
+    assert mean(rows, "psnr") == (25.0, 2)
+    assert mean(rows, "lpips") == (None, 0)
 
 
-def test_picture_scores_name_a_reason_for_every_none():
-    scores = PictureScores(None, "no weights")
+def test_image_scores_name_a_reason_for_every_none():
     image = torch.zeros(1, 3, 16, 16)
-    scores.update(image, image)  # PSNR infinite, no edges
-    result = scores.compute()
+    result = means([image_scores(image, image)], "no weights")  # PSNR infinite, no edges
     assert result["psnr"] is None
     assert result["psnr_left_out"] == 1
     assert "finite" in result["psnr_reason"]
@@ -65,11 +63,16 @@ def test_picture_scores_name_a_reason_for_every_none():
 
 
 def test_means_by_camera_and_over_all():
-    scores, target = PictureScores(None, ""), torch.zeros(1, 3, 16, 16)
-    for error, place in ((0.1, ("a", 0)), (0.01, ("a", 1)), (0.001, ("b", 0))):
-        scores.update(target + error, target, places=[place])
-    assert scores.compute()["psnr"] == pytest.approx(40.0, abs=1e-3)
-    cameras = scores.by_camera()
+    f = person()
+    errors = {("a", 0): 0.1, ("a", 1): 0.01, ("b", 0): 0.001}
+
+    def predict(f: Frame, item: tuple[str, int]) -> Prediction:
+        return Prediction({FULL: f.image + errors[item]}, {})
+
+    scores = score_split([(item, f) for item in errors], predict, scorer()).variants[FULL]
+    assert scores["psnr"] == pytest.approx(40.0, abs=1e-3)
+    assert scores["images"] == 3
+    cameras = scores["cameras"]
     assert [cameras[c]["psnr"] for c in "ab"] == pytest.approx([30.0, 60.0], abs=1e-3)
 
 
@@ -78,23 +81,23 @@ def test_only_the_inside_of_the_box_counts_where_a_protocol_says_so():
     image, target = (torch.rand(1, 3, 24, 24, generator=generator) for _ in range(2))
     box = torch.zeros(1, 1, 24, 24, dtype=torch.bool)
     box[..., 4:14, 6:20] = True
-    scores = PictureScores(None, "", Measures(region="body_box"))
-    scores.update(image, target, box=box)
-    result, part = scores.compute(), (..., slice(4, 14), slice(6, 20))
+    measures = Measures(region="body_box")
+    result = image_scores(image, target, box=box, measures=measures)
+    part = (..., slice(4, 14), slice(6, 20))
     assert result["psnr"] == pytest.approx(float(psnr(image[part], target[part])), abs=1e-5)
     assert result["ssim"] == pytest.approx(float(ssim(image[part], target[part])), abs=1e-6)
-    scores.update(image, target, box=torch.zeros_like(box))  # not seen: counted, not averaged
-    assert scores.compute()["psnr_left_out"] == scores.compute()["ssim_left_out"] == 1
-    assert scores.compute()["psnr"] == result["psnr"]
+    unseen = image_scores(image, target, box=torch.zeros_like(box), measures=measures)
+    both = means([result, unseen])  # unseen: counted, not averaged
+    assert both["psnr_left_out"] == both["ssim_left_out"] == 1
+    assert both["psnr"] == result["psnr"]
 
 
 def test_the_window_of_ssim_is_the_protocols():
     generator = torch.Generator().manual_seed(0)
     image, target = (torch.rand(1, 3, 24, 24, generator=generator) for _ in range(2))
-    scores = PictureScores(None, "", Measures(ssim_window="uniform", ssim_range=2))
-    scores.update(image, target)
+    found = image_scores(image, target, measures=Measures(ssim_window="uniform", ssim_range=2))
     expected = float(ssim_uniform(image, target, value_range=2))
-    assert scores.compute()["ssim"] == pytest.approx(expected, abs=1e-9)
+    assert found["ssim"] == pytest.approx(expected, abs=1e-9)
     assert abs(expected - float(ssim(image, target, value_range=2))) > 1e-4
 
 
@@ -114,11 +117,11 @@ def test_the_floor_of_a_split_is_the_background_and_its_psnr_is_known():
             -10 * math.log10(power / 576), abs=1e-4
         )
         assert found.variants[FULL]["psnr"] is None  # equal: its own alpha puts it on white too
-        assert found.rows[FULL][0].scores["psnr"] == math.inf
+        assert found.rows[FULL][0]["psnr"] == math.inf
         assert not found.hidden_outline
 
 
-def test_an_opaque_picture_on_black_hides_its_outline_on_white_and_says_so():
+def test_an_opaque_image_on_black_hides_its_outline_on_white_and_says_so():
     f = person()
     fat = f.image.clone()
     fat[..., 0:4, 0:4] = 0.9  # painted outside the truth's mask
@@ -128,7 +131,7 @@ def test_an_opaque_picture_on_black_hides_its_outline_on_white_and_says_so():
 
     white = score_split([(("a", 0), f)], predict, scorer(Measures(background="white")))
     assert white.hidden_outline
-    assert white.rows[FULL][0].scores["psnr"] > 100
+    assert white.rows[FULL][0]["psnr"] > 100
     black = score_split([(("a", 0), f)], predict, scorer())
     assert not black.hidden_outline
     assert black.variants[FULL]["psnr"] == pytest.approx(
@@ -136,21 +139,21 @@ def test_an_opaque_picture_on_black_hides_its_outline_on_white_and_says_so():
     )
 
 
-def test_each_picture_of_an_avatar_is_put_on_white_by_its_own_alpha():
+def test_each_image_of_an_avatar_is_put_on_white_by_its_own_alpha():
     """I_pred is the truth; Step I's colour is it at half the alpha: 0.3 off, 0.15 at the edge."""
     f = person()
     painting = Painting(f.image, f.mask, features=0.5 * f.image, splat_alpha=0.5 * f.mask)
     avatar = SimpleNamespace(paint=lambda _: painting, segmentation=None)
     white = scorer(Measures(background="white"))
     found = score_split([(("a", 0), f)], painter(avatar), white)
-    assert found.rows[FULL][0].scores["psnr"] == math.inf
+    assert found.rows[FULL][0]["psnr"] == math.inf
     assert found.variants[SPLAT]["psnr"] == pytest.approx(
         -10 * math.log10((56 * 0.3**2 + 8 * 0.15**2) / 576), abs=1e-4
     )
     assert not found.hidden_outline
 
 
-def test_one_variant_without_alpha_takes_the_truths_mask_and_says_so():
+def test_one_variant_without_alpha_takes_the_ground_truths_mask_and_says_so():
     f = person()
 
     def predict(f: Frame, _: object) -> Prediction:
@@ -158,12 +161,12 @@ def test_one_variant_without_alpha_takes_the_truths_mask_and_says_so():
 
     found = score_split([(("a", 0), f)], predict, scorer(Measures(background="white")))
     assert found.hidden_outline
-    assert found.rows[SPLAT][0].scores["psnr"] > 100
-    assert found.rows[FULL][0].scores["psnr"] < 30
+    assert found.rows[SPLAT][0]["psnr"] > 100
+    assert found.rows[FULL][0]["psnr"] < 30
     assert not score_split([(("a", 0), f)], predict, scorer()).hidden_outline
 
 
-def test_a_picture_that_is_not_finite_is_an_error_that_names_it():
+def test_an_image_that_is_not_finite_is_an_error_that_names_it():
     f = person()
     broken = f.image.clone()
     broken[0, 0, 3, 3] = torch.nan
@@ -199,9 +202,7 @@ def segmentation(predicted: torch.Tensor, classes: int) -> torch.Tensor:
 def test_miou_counts_classes_of_the_truth_only():
     """Class 1 half right, class 2 absent from the truth but predicted once, 255 ignored."""
     labels = torch.tensor([[[0, 0, 1, 1, 255]]])
-    scores = SegmentationScores(3)
-    scores.update(segmentation(torch.tensor([[[0, 2, 1, 0, 1]]]), 3), labels)
-    result = scores.compute()
+    result = miou(confusion(segmentation(torch.tensor([[[0, 2, 1, 0, 1]]]), 3), labels))
     assert result["miou"] == pytest.approx(1 / 2)  # class 1: 1 of {2 true, 1 predicted}
     assert result["miou_with_background"] == pytest.approx((1 / 3 + 1 / 2) / 2)
 
@@ -210,26 +211,36 @@ def test_miou_is_torchmetrics_jaccard_index_over_the_split():
     generator = torch.Generator().manual_seed(0)
     predicted, labels = (torch.randint(0, 4, (3, 9, 9), generator=generator) for _ in range(2))
     labels[:, 0] = 255
-    scores = SegmentationScores(4)
-    own = scores.update(segmentation(predicted, 4), labels, [("a", 0), ("b", 0), ("b", 1)])
-    each = MulticlassJaccardIndex(4, average=None, ignore_index=255)
-    expected = each(predicted, labels)
-    assert scores.compute()["miou"] == pytest.approx(float(expected[1:].mean()), abs=1e-6)
-    assert scores.compute()["miou_with_background"] == pytest.approx(
-        float(expected.mean()), abs=1e-6
+    maps = segmentation(predicted, 4)
+    f = frame(torch.zeros(1, 3, 9, 9), torch.zeros(1, 1, 9, 9))
+    frames = [(("ab"[i > 0], i), replace(f, labels=labels[i : i + 1])) for i in range(3)]
+    found = score_split(
+        frames,
+        lambda f, item: Prediction({FULL: f.image}, {}, segmentation=maps[item[1]][None]),
+        scorer(),
     )
-    first = MulticlassJaccardIndex(4, average=None, ignore_index=255)(predicted[:1], labels[:1])
-    assert own[0]["miou"] == scores.by_camera()["a"]["miou"]
-    assert own[0]["miou"] == pytest.approx(float(first[1:].mean()), abs=1e-6)
+    whole = found.variants[FULL]
+
+    def jaccard(images: slice) -> torch.Tensor:
+        each = MulticlassJaccardIndex(4, average=None, ignore_index=255)
+        return each(predicted[images], labels[images])
+
+    assert whole["miou"] == pytest.approx(float(jaccard(slice(3))[1:].mean()), abs=1e-6)
+    assert whole["miou_with_background"] == pytest.approx(float(jaccard(slice(3)).mean()), abs=1e-6)
+    first = pytest.approx(float(jaccard(slice(1))[1:].mean()), abs=1e-6)
+    assert whole["cameras"]["a"]["miou"] == found.rows[FULL][0]["miou"] == first
 
 
 def test_miou_of_a_split_without_parts_is_none():
-    scores = SegmentationScores(3)
-    scores.update(
-        segmentation(torch.zeros(1, 1, 2, dtype=torch.long), 3), torch.zeros(1, 1, 2).long()
+    f = replace(person(), labels=torch.zeros(1, 24, 24, dtype=torch.long))
+    parts = segmentation(f.labels, 3)
+    found = score_split(
+        [(("a", 0), f)],
+        lambda f, _: Prediction({FULL: f.image}, {}, segmentation=parts),
+        scorer(),
     )
-    assert scores.compute()["miou"] is None
-    assert scores.compute()["miou_reason"]
+    assert found.variants[FULL]["miou"] is None
+    assert found.variants[FULL]["miou_reason"] == "the truth holds no part"
 
 
 def test_lpips_in_the_persons_box_sees_that_box_alone():
@@ -239,14 +250,13 @@ def test_lpips_in_the_persons_box_sees_that_box_alone():
         seen.append(tuple(image.shape))
         return (image - target).abs().flatten(1).mean(dim=1)
 
-    scores = PictureScores(spy, "")
-    target, mask = torch.zeros(2, 3, 100, 120), torch.zeros(2, 1, 100, 120)
-    mask[0, :, 10:90, 20:50] = 1  # the second picture shows nobody
+    target, mask = torch.zeros(1, 3, 100, 120), torch.zeros(1, 1, 100, 120)
+    mask[..., 10:90, 20:50] = 1
     image = target.clone()
     image[:, :, :, 90:] = 1.0  # wrong, but far from the person
-    scores.update(image, target, mask)
-    assert seen == [(2, 3, 100, 120), (1, 3, 80, 64)]  # 30 columns, widened to 64
-    result = scores.compute()
+    nobody = torch.zeros_like(mask)
+    result = means([image_scores(image, target, m, lpips=spy) for m in (mask, nobody)])
+    assert set(seen) == {(1, 3, 100, 120), (1, 3, 80, 64)}  # 30 columns, widened to 64
     assert result["lpips"] == pytest.approx(0.25)
     assert result["lpips_person"] == 0.0
     assert result["lpips_person_left_out"] == 1

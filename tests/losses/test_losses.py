@@ -28,7 +28,7 @@ def test_d_ssim_is_one_minus_ssim():
 
 
 @pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
-def test_d_ssim_of_constant_pictures_is_finite(value):
+def test_d_ssim_of_constant_images_is_finite(value):
     """Variance 0, where E[x²] - E[x]² cancels."""
     a = torch.full((1, 3, 16, 16), value, requires_grad=True)
     loss = d_ssim(a, torch.full((1, 3, 16, 16), value))
@@ -81,7 +81,7 @@ def test_unknown_gan_is_refused():
         generator_loss(maps(0.0), maps(0.0), "wgan")
 
 
-def test_a_relativistic_judge_sees_only_how_the_pair_differs():
+def test_a_relativistic_loss_sees_only_how_the_pair_differs():
     for shift in (0.0, 7.0):
         real, fake = maps(shift + 3.0), maps(shift + 1.0)
         judged, painted = (
@@ -140,20 +140,16 @@ def test_perceptual_asked_for_vgg_without_weights_says_where_to_put_them(monkeyp
         Perceptual("resnet")
 
 
-@pytest.fixture(scope="module")
-def vgg_file(tmp_path_factory):
-    """A file laid out as torchvision's VGG-16, its numbers random."""
-    from torchvision.models import vgg16
+def test_perceptual_reads_vgg_from_a_path(tmp_path):
+    """A file with torchvision's layout, its convolutions random."""
+    from torchvision.models.vgg import cfgs, make_layers
 
     torch.manual_seed(0)
-    path = tmp_path_factory.mktemp("weights") / FILES["vgg16"]
-    torch.save(vgg16(weights=None).state_dict(), path)
-    return path
-
-
-def test_perceptual_reads_vgg_from_a_path(vgg_file):
-    """The real loading code on a file with torchvision's layout."""
-    loss = Perceptual("auto", path=str(vgg_file.parent))
+    layers = make_layers(cfgs["D"]).state_dict()
+    state = {f"features.{key}": value for key, value in layers.items()}
+    torch.save(state | {"classifier.0.bias": torch.zeros(4096)}, tmp_path / FILES["vgg16"])
+    loss = Perceptual("auto", path=str(tmp_path))
+    assert torch.equal(loss.stages[0][0].weight, layers["0.weight"])
     assert loss.mark is None
     shapes = [tuple(f.shape[1:]) for f in loss.features(torch.rand(1, 3, 32, 32))]
     assert shapes == [(64, 32, 32), (128, 16, 16), (256, 8, 8), (512, 4, 4)]
@@ -162,10 +158,16 @@ def test_perceptual_reads_vgg_from_a_path(vgg_file):
     assert float(image.grad.abs().max()) > 0
 
 
-def test_lpips_reads_its_backbone_from_a_path(vgg_file):
+@pytest.mark.slow  # half a gigabyte; tests/metrics/test_lpips.py reads AlexNet's file
+def test_lpips_reads_vgg_from_a_path(tmp_path):
+    from torchvision.models import vgg16
+
     from gsgan.metrics.lpips import lpips
 
-    score, reason = lpips("vgg", str(vgg_file))
+    torch.manual_seed(0)
+    path = tmp_path / FILES["vgg16"]
+    torch.save(vgg16(weights=None).state_dict(), path)
+    score, reason = lpips("vgg", str(path))
     assert reason == ""
     a, b = torch.rand(2, 3, 64, 64), torch.rand(2, 3, 64, 64)
     assert score(a, a).shape == (2,)

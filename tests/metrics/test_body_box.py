@@ -64,7 +64,7 @@ def test_pixel_centres_decide_and_flat_polygons_cover_nothing():
     assert not inside_hull(triangle[:2], centres).any()
 
 
-def test_a_lens_bends_the_box_with_the_picture():
+def test_a_lens_bends_the_box_with_the_image():
     """The face from -0.8 to 0.8 at z = 1: its sides and corners land where the lens shows them."""
     points = torch.tensor([[-0.8, -0.8, 1.0], [0.8, 0.8, 1.0]])
     corners = box_corners(points, 0.0)

@@ -12,7 +12,6 @@ from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMe
 
 from gsgan.metrics.image import (
     edge_f1,
-    edge_ratio,
     edge_scores,
     high_frequencies,
     person_box,
@@ -40,7 +39,7 @@ def pair(count: int = 3, size: int = 32) -> tuple[torch.Tensor, torch.Tensor]:
     return (target + scale * noise).clamp(0, 1), target
 
 
-def test_psnr_closed_form_and_one_score_a_picture():
+def test_psnr_closed_form_and_one_score_per_image():
     target = torch.zeros(2, 3, 8, 8)
     image = torch.stack([torch.full((3, 8, 8), 0.1), torch.full((3, 8, 8), 0.01)])
     torch.testing.assert_close(psnr(image, target), torch.tensor([20.0, 40.0]))
@@ -79,7 +78,7 @@ def test_a_wrong_range_makes_ssim_higher():
     assert (ssim(image, target, value_range=2.0) > ssim(image, target)).all()
 
 
-def test_ssim_of_equal_pictures_is_one_and_of_slivers_undefined():
+def test_ssim_of_equal_images_is_one_and_of_slivers_undefined():
     image = torch.rand(3, 3, 16, 16)
     torch.testing.assert_close(ssim(image, image), torch.ones(3))
     assert float(ssim(image, 1 - image).max()) < 0.5
@@ -105,7 +104,7 @@ def test_uniform_ssim_is_its_definition_window_by_window(value_range):
     assert found.tolist() == pytest.approx(scores, abs=1e-9)
 
 
-def test_uniform_ssim_of_equal_pictures_is_one_and_of_slivers_undefined():
+def test_uniform_ssim_of_equal_images_is_one_and_of_slivers_undefined():
     image = torch.rand(2, 3, 12, 12)
     assert ssim_uniform(image, image).tolist() == [1.0, 1.0]
     grey = torch.full((1, 3, 12, 12), 0.7)
@@ -114,7 +113,7 @@ def test_uniform_ssim_of_equal_pictures_is_one_and_of_slivers_undefined():
     assert bool(ssim_uniform(image[..., :6], image[..., :6]).isnan().all())
 
 
-def test_equal_pictures_are_infinite():
+def test_equal_images_are_infinite():
     image = torch.rand(1, 3, 16, 16)
     assert math.isinf(float(psnr(image, image)))
 
@@ -184,17 +183,17 @@ def test_edge_f1_tolerates_one_pixel_only():
 def test_edge_ratio_counts_opencvs_edge_pixels():
     truth = square(10)
     two = torch.maximum(square(2), square(22))
-    assert float(edge_ratio(truth, truth)) == 1.0
-    assert float(edge_ratio(two, truth)) == pytest.approx(2.0, abs=1e-9)
-    assert float(edge_ratio(torch.zeros_like(truth), truth)) == 0.0
-    assert math.isnan(float(edge_ratio(truth, torch.zeros_like(truth))))
+    assert float(edge_scores(truth, truth)[1]) == 1.0
+    assert float(edge_scores(two, truth)[1]) == pytest.approx(2.0, abs=1e-9)
+    assert float(edge_scores(torch.zeros_like(truth), truth)[1]) == 0.0
+    assert math.isnan(float(edge_scores(truth, torch.zeros_like(truth))[1]))
     image, target = (x.float() for x in pair(1))
     grey = [
         cv2.cvtColor((x[0] * 255).round().byte().permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY)
         for x in (image, target)
     ]
     counts = [int(np.count_nonzero(cv2.Canny(g, 100, 200))) for g in grey]
-    assert float(edge_ratio(image, target)) == pytest.approx(counts[0] / counts[1], abs=1e-9)
+    assert float(edge_scores(image, target)[1]) == pytest.approx(counts[0] / counts[1], abs=1e-9)
 
 
 def test_edges_in_the_persons_box_leave_out_those_elsewhere():
@@ -205,13 +204,13 @@ def test_edges_in_the_persons_box_leave_out_those_elsewhere():
     f1, ratio = edge_scores(image, target, where)
     assert float(f1) == float(ratio) == 1.0
     assert float(edge_f1(image, target)) < 0.9
-    assert float(edge_ratio(image, target)) > 1.3
+    assert float(edge_scores(image, target)[1]) > 1.3
     f1, ratio = edge_scores(image, target, torch.zeros_like(where))
     assert math.isnan(float(f1))
     assert math.isnan(float(ratio))
 
 
-def test_edges_counted_everywhere_are_the_whole_pictures():
+def test_edges_counted_everywhere_are_the_whole_images():
     image, target = pair()
     everywhere = torch.ones(len(image), 1, *image.shape[-2:], dtype=torch.bool)
     for whole, inside in zip(

@@ -9,9 +9,10 @@ import torch
 from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
 from gsgan.data.measures import Measures
-from gsgan.evaluate.scores import PictureScores
+from gsgan.evaluate.run import lpips_name
+from gsgan.evaluate.scores import image_scores
 from gsgan.losses.weights import FILES
-from gsgan.metrics.lpips import lpips, lpips_name
+from gsgan.metrics.lpips import lpips
 from gsgan.metrics.regions import mask_crop
 from gsgan.utils.errors import ConfigError
 
@@ -70,7 +71,7 @@ def test_lpips_without_weights_is_none_with_the_reason(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("fed", RANGES)
-def test_lpips_is_torchmetrics_one_score_a_picture(scores, direct, pictures, fed):
+def test_lpips_is_torchmetrics_one_score_per_image(scores, direct, pictures, fed):
     a, b = pictures
     ours = scores[fed](a, b)
     assert ours.shape == (2,)
@@ -93,9 +94,8 @@ def test_the_crop_is_what_the_backbone_sees(scores, direct, pictures):
     measures = Measures(lpips_region="mask_crop_512", background="white")
     found = []
     for picture in (image, elsewhere):
-        held = PictureScores(scores[RANGES[0]], "", measures)
-        held.update(picture, target, mask)
-        found.append(held.compute()["lpips"])
+        own = image_scores(picture, target, mask, measures=measures, lpips=scores[RANGES[0]])
+        found.append(own["lpips"])
     crops = [mask_crop(x[0], mask[0], 1.0)[None].clamp(0, 1) for x in (image, target)]
     with torch.no_grad():
         assert found[0] == pytest.approx(float(direct[RANGES[0]](*crops)), abs=1e-6)
@@ -106,9 +106,9 @@ def test_channels_are_fed_in_the_order_that_is_asked_for(scores, direct, picture
     image, target = (x[:1] for x in pictures)
     found = {}
     for order in ("rgb", "bgr"):
-        held = PictureScores(scores[RANGES[0]], "", Measures(lpips_channels=order))
-        held.update(image, target)
-        found[order] = held.compute()["lpips"]
+        measures = Measures(lpips_channels=order)
+        own = image_scores(image, target, measures=measures, lpips=scores[RANGES[0]])
+        found[order] = own["lpips"]
     with torch.no_grad():
         swapped = float(direct[RANGES[0]](image[:, [2, 1, 0]], target[:, [2, 1, 0]]))
     assert found["bgr"] == pytest.approx(swapped, abs=1e-6)

@@ -18,14 +18,14 @@ from gsgan.metrics.regions import (
 )
 
 
-def test_a_premultiplied_picture_lets_the_background_through():
+def test_a_premultiplied_image_lets_the_background_through():
     image = torch.tensor([0.3, 0.0, 0.0]).view(1, 1, 1, 3).expand(1, 3, 1, 3)
     alpha = torch.tensor([1.0, 0.5, 0.0]).view(1, 1, 1, 3)
     assert on_background(image, alpha, 1.0)[0, 0, 0].tolist() == pytest.approx([0.3, 0.5, 1.0])
     assert torch.equal(on_background(image, alpha, 0.0), image)
 
 
-def test_an_opaque_picture_moves_by_the_truths_mask():
+def test_an_opaque_image_moves_by_the_ground_truths_mask():
     image = torch.tensor([0.3, 0.0, 0.4, 0.0]).view(1, 1, 1, 4).expand(1, 3, 1, 4)
     mask = torch.tensor([1.0, 1.0, 0.0, 0.0]).view(1, 1, 1, 4)
     white = moved_background(image, mask, 0.0, 1.0)
@@ -56,7 +56,7 @@ def test_cleared_pixels_are_background():
     assert cleared(image, keep, 1.0)[0, 0].tolist() == [[0.5, 1.0], [1.0, 0.5]]
 
 
-def test_a_hard_outline_is_the_picture_as_it_was_taken():
+def test_a_hard_outline_is_the_image_as_it_was_taken():
     taken = torch.tensor([0.8, 0.8, 0.8, 0.8]).view(1, 1, 1, 4).expand(1, 3, 1, 4)
     mask = torch.tensor([1.0, 0.5, 0.49, 0.0]).view(1, 1, 1, 4)
     found = hard_outline(taken * mask, mask)
@@ -86,7 +86,7 @@ def test_the_crop_is_square_centred_on_the_background():
     assert mask_crop(picture, torch.zeros(1, 20, 20), 1.0) is None
 
 
-def test_the_crops_margin_ends_at_the_pictures_border():
+def test_the_crops_margin_ends_at_the_images_border():
     picture, mask = (
         torch.arange(400.0).view(1, 20, 20).expand(3, 20, 20) / 400,
         torch.zeros(1, 20, 20),

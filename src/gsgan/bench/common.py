@@ -221,7 +221,7 @@ def code_digest() -> str:
 
 
 def train(overrides: Sequence[str], run: Path) -> None:
-    """`gsgan.train` in another process: a finished run is left as it is, an interrupted one resumed.
+    """Runs `gsgan.train` in another process; resumes an interrupted run, skips a finished one.
 
     Args:
         overrides: of its config.

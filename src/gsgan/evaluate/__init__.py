@@ -1,1 +1,1 @@
-"""Scores of runs and of any method's predictions: protocols, tables, files."""
+"""Scores of trained runs and of any method's predictions."""

@@ -1,4 +1,4 @@
-"""``python -m gsgan.evaluate``: score a run, or any method's pictures, on what was held out."""
+"""``python -m gsgan.evaluate``: score a run, or any method's images, on the held-out splits."""
 
 from __future__ import annotations
 
@@ -8,11 +8,7 @@ from gsgan.utils.config import entry
 
 
 def evaluate(config: DictConfig) -> None:
-    """Scores the run folder ``config.run``, or the pictures in ``config.predictions``.
-
-    Raises:
-        GsganError: on anything the user can put right.
-    """
+    """Scores the run folder ``config.run`` or the images in ``config.predictions``."""
     from gsgan.evaluate.command import evaluate_config
 
     evaluate_config(config)

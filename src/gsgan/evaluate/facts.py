@@ -1,4 +1,4 @@
-"""facts.json: by what, of what, and with what code scores were made."""
+"""facts.json: the method, data and code behind a set of scores."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
 FINGERPRINT = 12  # hexadecimal digits
+DIRTY = "+changes"
 SAME = ("method", "model", "protocol", "seed", "iterations", "version", "commit", "dirty")
 
 
@@ -31,8 +32,8 @@ class Method:
         data: choice of the data group, or None.
         seed: of the training, or None.
         iterations: of the training, or None.
-        train_seconds: of wall clock, all parts of a resumed run together, or None.
-        trained_by: commits that trained it, those of a resumed run's parts; None: not known.
+        train_seconds: wall clock over all parts of a resumed run, or None.
+        trained_by: commits that trained it, one per part of a resumed run; None if unknown.
     """
 
     name: str
@@ -45,13 +46,7 @@ class Method:
 
 
 def facts(method: Method, data: GsganData, device: torch.device) -> dict[str, Any]:
-    """What facts.json holds.
-
-    Args:
-        method: what is scored.
-        data: on what.
-        device: that scored.
-    """
+    """The content of facts.json."""
     try:
         version = importlib.metadata.version("gsgan")
     except importlib.metadata.PackageNotFoundError:
@@ -80,60 +75,47 @@ def facts(method: Method, data: GsganData, device: torch.device) -> dict[str, An
 
 
 def training_code() -> list[str]:
-    """What a checkpoint says of the code that trained it; empty where that is not known."""
+    """The commit that a checkpoint records; empty if unknown."""
     commit, dirty = commit_of()
-    return [] if commit is None else [commit + ("+changes" if dirty else "")]
+    return [] if commit is None else [commit + (DIRTY if dirty else "")]
 
 
 def commit_of(folder: Path | None = None) -> tuple[str | None, bool | None]:
-    """``git describe`` of the checkout that holds the code, and whether it was changed since.
-
-    (None, None) where the code is installed, or git is not at hand.
-
-    Args:
-        folder: of the code; None: of this very package.
-    """
+    """``git describe`` of the checkout that holds a folder (None: this package), and whether
+    tracked files differ from it; (None, None) outside a checkout or without git."""
     folder = folder or Path(__file__).resolve().parent
     root = next((f for f in folder.parents if (f / ".git").exists()), None)
     if root is None or not (root / "src" / "gsgan").is_dir():
         return None, None
+    options = ("--always", "--tags", "--abbrev=12", f"--dirty={DIRTY}")
+    command = ["git", "-C", str(root), "describe", *options]
     try:
-        said = [
-            subprocess.run(
-                ["git", "-C", str(root), *arguments],
-                capture_output=True, text=True, check=True, timeout=30,
-            ).stdout.strip()
-            for arguments in (
-                ("describe", "--always", "--tags", "--abbrev=12"),
-                ("status", "--porcelain", "--untracked-files=no"),
-            )
-        ]  # fmt: skip
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30)
     except (OSError, subprocess.SubprocessError):
         return None, None
-    return said[0] or None, bool(said[1])
+    found = done.stdout.strip()
+    return found.removesuffix(DIRTY) or None, found.endswith(DIRTY)
 
 
 def fingerprint(data: GsganData) -> str:
-    """A short hash of what is trained on and scored: cameras, frames, splits, picture size.
-
-    Contents of pictures are not in it, nor where they lie; of landmarks only fitted ones are.
-    """
-    layout, splits = data.layout, data.splits
-    said: dict[str, Any] = {
+    """A short hash of cameras, frames, splits, image size and fitted landmarks, independent of the
+    contents of images and of where the files are."""
+    layout = data.layout
+    content: dict[str, Any] = {
         "cameras": {name: list(camera.size) for name, camera in layout.cameras.items()},
         "frames": list(layout.frames),
-        "splits": {name: [list(item) for item in items] for name, items in splits.items.items()},
+        "splits": {k: [list(item) for item in items] for k, items in data.splits.items.items()},
         "size": data.size,
         "crop": None if data.crop is None else asdict(data.crop),
     }
-    if layout.landmarks.fitted_to:  # other skeletons are other inputs, and cut other windows
-        said["landmarks"] = layout.landmarks.digest(layout.frames)
-    plain = json.dumps(said, sort_keys=True).encode()
+    if layout.landmarks.fitted_to:  # other skeletons are other inputs, and crop other windows
+        content["landmarks"] = layout.landmarks.digest(layout.frames)
+    plain = json.dumps(content, sort_keys=True).encode()
     return hashlib.sha256(plain).hexdigest()[:FINGERPRINT]
 
 
 def choices(folder: Path) -> dict[str, Any]:
-    """The config groups' choices of a run folder, as Hydra wrote them; empty where it did not."""
+    """The config groups' choices of a run folder as Hydra recorded them, or nothing."""
     path = folder / ".hydra" / "hydra.yaml"
     if not path.is_file():
         return {}
@@ -142,24 +124,23 @@ def choices(folder: Path) -> dict[str, Any]:
 
 
 def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    """Whether two scorings may stand in one table: of one method and training on the same data,
-    wherever that lies, by the same code."""
+    """Whether two sets of scores may share a table: same method, training, data and code."""
     prints = (a["data"]["fingerprint"], b["data"]["fingerprint"])
     return prints[0] == prints[1] and all(a[key] == b[key] for key in SAME)
 
 
-def provenance(held: dict[str, Any]) -> dict[str, str]:
+def provenance(facts: dict[str, Any]) -> dict[str, str]:
     """What every row of a table carries: protocol, data, number of seeds, commit."""
-    data = held["data"]
+    data = facts["data"]
     return {
-        "protocol": held["protocol"] or "none",
+        "protocol": facts["protocol"] or "none",
         "data": f"{data['name'] or 'unknown'} ({data['root']}, {data['fingerprint']})",
-        "seeds": "none said" if held["seed"] is None else f"1 ({held['seed']})",
-        "commit": (held["commit"] or "unknown") + (", changed since" if held["dirty"] else ""),
+        "seeds": "none said" if facts["seed"] is None else f"1 ({facts['seed']})",
+        "commit": (facts["commit"] or "unknown") + (", changed since" if facts["dirty"] else ""),
     }
 
 
-def caption(held: dict[str, Any]) -> str:
-    """One line for people at a table: what its rows are of."""
-    method = held["method"] if held["model"] is None else f"{held['method']} {held['model']}"
-    return " · ".join([method, *(f"{what} {said}" for what, said in provenance(held).items())])
+def caption(facts: dict[str, Any]) -> str:
+    """One line under a table: the method and its provenance."""
+    method = facts["method"] if facts["model"] is None else f"{facts['method']} {facts['model']}"
+    return " · ".join([method, *(f"{key} {value}" for key, value in provenance(facts).items())])

@@ -1,4 +1,4 @@
-"""Pictures for people: the grid of a validation, with captions."""
+"""Image grids with captions."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from gsgan.scene import Frame
 from gsgan.utils.files import write_atomically
 
 CAPTION_HEIGHT = 22
-ERROR_GAIN = 4.0  # errors are small: shown this many times brighter, and said so in the caption
-# Background, then twelve body parts; classes beyond go round again.
+ERROR_GAIN = 4.0  # errors are small and shown brighter by this factor
+# Background, then twelve body parts; further classes repeat them.
 PALETTE = torch.tensor(
     [
         [0, 0, 0], [110, 70, 40], [240, 200, 170], [60, 120, 220], [50, 60, 110],
@@ -27,15 +27,15 @@ PALETTE = torch.tensor(
 
 
 def colour_labels(labels: Tensor) -> Tensor:
-    """``[B, H, W]`` part labels as pictures ``[B, 3, H, W]``; 255 (ignore) is white."""
+    """``[B, H, W]`` part labels as images ``[B, 3, H, W]``; 255 (ignore) is white."""
     index = torch.where(labels == 0, 0, 1 + (labels - 1) % (len(PALETTE) - 1))
-    picture = PALETTE.to(labels.device)[index].float() / 255
-    picture = torch.where((labels == 255).unsqueeze(-1), 1.0, picture)
-    return picture.permute(0, 3, 1, 2)
+    image = PALETTE.to(labels.device)[index].float() / 255
+    image = torch.where((labels == 255).unsqueeze(-1), 1.0, image)
+    return image.permute(0, 3, 1, 2)
 
 
 def error_heat(image: Tensor, target: Tensor) -> Tensor:
-    """Mean absolute error of each pixel as a heat map ``[B, 3, H, W]``, black = none."""
+    """Mean absolute error per pixel as a heat map ``[B, 3, H, W]``; black is none."""
     error = ((image - target).abs().mean(dim=1) * ERROR_GAIN).clamp(0, 1)
     heat = [
         cv2.applyColorMap((e * 255).byte().cpu().numpy(), cv2.COLORMAP_INFERNO)[..., ::-1].copy()
@@ -45,7 +45,7 @@ def error_heat(image: Tensor, target: Tensor) -> Tensor:
 
 
 def grid_rows(frame: Frame, painting: Painting) -> list[dict[str, Tensor]]:
-    """One row a batch item: pictures ``[3, H, W]`` by caption; what was not painted is absent."""
+    """One row per batch item: images ``[3, H, W]`` by caption; what was not rendered is absent."""
     assert painting.image is not None
     image, colour, parts = painting.image.clamp(0, 1), painting.colour, painting.segmentation
     columns = {
@@ -60,12 +60,12 @@ def grid_rows(frame: Frame, painting: Painting) -> list[dict[str, Tensor]]:
 
 
 def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) -> Path:
-    """Writes rows of pictures ``[3, H, W]`` as one PNG with a caption over each column.
+    """Writes rows of images ``[3, H, W]`` as one PNG with a caption over each column.
 
     Args:
-        rows: at least one row, each with the same captions; all pictures of one size.
-        path: the PNG.
-        least: pixels; smaller pictures are enlarged by a whole factor to at least this width.
+        rows: at least one row, each with the same captions; all images of one size.
+        path: of the PNG.
+        least: pixels; smaller images are enlarged by a whole factor to at least this width.
     """
     captions = list(rows[0])
     scale = max(1, -(-least // rows[0][captions[0]].shape[-1]))
@@ -79,6 +79,6 @@ def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) 
         cv2.putText(header, caption, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
     ok, data = cv2.imencode(".png", np.concatenate([header, pixels])[..., ::-1])
     if not ok:
-        raise OSError(f"{path}: the picture could not be encoded as PNG")
+        raise OSError(f"{path}: the image could not be encoded as PNG")
     write_atomically(path, data.tobytes())
     return path

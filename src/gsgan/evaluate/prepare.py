@@ -1,4 +1,4 @@
-"""Prediction and truth as a protocol scores them: background, 8 bits, what is cleared."""
+"""Predictions and ground truth as a protocol scores them: background, 8 bits, cleared regions."""
 
 from __future__ import annotations
 
@@ -21,13 +21,12 @@ from gsgan.metrics.regions import (
     on_background,
 )
 from gsgan.scene import Frame
-from gsgan.utils.errors import GsganError
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-VERTEX_MARGIN = 0.05  # metres round the body's vertices: published scoring scripts take as much
-JOINT_MARGIN = 0.2  # metres round joints, which lie inside the flesh: as `PersonCrop` takes
+VERTEX_MARGIN = 0.05  # metres round the body's vertices, as in published scoring scripts
+JOINT_MARGIN = 0.2  # metres round joints, which lie inside the flesh; as in `PersonCrop`
 HIDDEN_OUTLINE = (
     "pictures without alpha are put on the protocol's background by the truth's mask, which hides "
     "what they paint outside it"
@@ -36,19 +35,19 @@ HIDDEN_OUTLINE = (
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a method says about one frame.
+    """What a method predicts for one frame.
 
     Args:
-        pictures: by variant, ``[B, 3, H, W]``; None for a variant that it does not have.
-        alphas: by variant, ``[B, 1, H, W]`` of the pictures, which are then on black and
-            premultiplied; None or absent for opaque ones.
-        background: on which opaque pictures are painted, "black" or "white".
+        images: by variant, ``[B, 3, H, W]``.
+        alphas: by variant, ``[B, 1, H, W]`` of images on black, premultiplied; None or absent for
+            opaque images.
+        background: of opaque images, "black" or "white".
         segmentation: ``[B, classes, H, W]``, or None.
-        labels: ``[B, H, W]`` the truth in the segmentation's classes; None where those are the
-            frame's labels.
+        labels: ``[B, H, W]`` ground truth in the classes of the segmentation; None where those are
+            the frame's labels.
     """
 
-    pictures: dict[str, Tensor]
+    images: dict[str, Tensor]
     alphas: Mapping[str, Tensor | None]
     background: str = "black"
     segmentation: Tensor | None = None
@@ -56,12 +55,8 @@ class Prediction:
 
 
 class BodyBoxes:
-    """The projected 3D box of the body: round its vertices where the data has a mesh, else round
-    its joints, with a larger margin.
-
-    Args:
-        data: whose poses and body.
-    """
+    """The body's projected 3D box: round its vertices, or, without a mesh, round its joints with a
+    larger margin."""
 
     def __init__(self, data: GsganData) -> None:
         found = data.layout.meta.body
@@ -71,7 +66,7 @@ class BodyBoxes:
 
     @property
     def departures(self) -> list[str]:
-        """What a table must say when there is no mesh."""
+        """What tables must state when there is no mesh."""
         if self.body is not None:
             return []
         return [
@@ -95,8 +90,8 @@ class BodyBoxes:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """What a protocol does to pictures before they are scored.
+class Preparation:
+    """What a protocol does to images before they are scored.
 
     Args:
         measures: of the protocol.
@@ -111,30 +106,19 @@ class Stage:
         """Its grey value."""
         return BACKGROUNDS[self.measures.background]
 
-    def truth(self, frame: Frame) -> Tensor:
-        """``[B, 3, H, W]`` the truth, which the data has on black."""
+    def target(self, frame: Frame) -> Tensor:
+        """``[B, 3, H, W]`` the ground truth, which the data has on black."""
         image, mask = frame.image, frame.mask
         if self.measures.truth_outline == "hard":
             image, mask = hard_outline(image, mask), (mask >= 0.5).to(mask)
         return on_background(image, mask, self.background)
 
-    def picture(
+    def image(
         self, prediction: Prediction, variant: str, frame: Frame, box: Tensor | None
     ) -> Tensor:
-        """``[B, 3, H, W]`` a prediction beside that truth: on its background by its own alpha; an
-        opaque one as it is, or, painted on the other background, by the truth's mask.
-
-        Raises:
-            GsganError: when it is not finite.
-        """
-        image = prediction.pictures[variant]
-        if not bool(torch.isfinite(image).all()):
-            bad = int((~torch.isfinite(image)).sum())
-            raise GsganError(
-                f"frame {frame.frame_id.tolist()[0]}: {bad} values of the predicted picture are "
-                "not finite; it cannot be scored"
-            )
-        image = image.clamp(0, 1)
+        """``[B, 3, H, W]`` a prediction on the protocol's background: by its own alpha, or, where
+        it is opaque and on the other background, by the ground truth's mask."""
+        image = prediction.images[variant].clamp(0, 1)
         alpha = prediction.alphas.get(variant)
         if alpha is not None:
             image = on_background(image, alpha.clamp(0, 1), self.background).clamp(0, 1)
@@ -146,15 +130,15 @@ class Stage:
             image = cleared(image, box, self.background)
         return image
 
-    def needs_mask(self, prediction: Prediction) -> bool:
-        """Whether only the truth's mask can put one of its pictures on this background."""
-        opaque = any(prediction.alphas.get(name) is None for name in prediction.pictures)
+    def hides_outline(self, prediction: Prediction) -> bool:
+        """Whether an opaque image must be moved to this background by the ground truth's mask."""
+        opaque = any(prediction.alphas.get(name) is None for name in prediction.images)
         return opaque and prediction.background != self.measures.background
 
     def floor(self, frame: Frame) -> Tensor:
-        """``[B, 3, H, W]`` the all-background picture."""
+        """``[B, 3, H, W]`` the all-background image."""
         return torch.full_like(frame.image, self.background)
 
     def box(self, frame: Frame) -> Tensor | None:
-        """``[B, 1, H, W]`` the body's projected box, where it is asked for."""
+        """``[B, 1, H, W]`` the body's projected box, or None where it is not needed."""
         return None if self.boxes is None else self.boxes.masks(frame)

@@ -1,11 +1,12 @@
-"""Scores a method on the held-out splits: progress, pictures, tables, files."""
+"""Scores a method on the held-out splits: progress, images, tables, files."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import pandas as pd
 import torch
 from omegaconf import DictConfig
 from rich.console import Console
@@ -14,41 +15,40 @@ from torch.nn import functional
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.measures import Measures
-from gsgan.data.splits import Item
 from gsgan.evaluate.facts import Method, choices, facts
-from gsgan.evaluate.files import Scored, joined, write_scored
+from gsgan.evaluate.files import HEADER, Scored, joined, write_scored
 from gsgan.evaluate.pictures import grid_rows, write_grid
-from gsgan.evaluate.prepare import HIDDEN_OUTLINE, BodyBoxes, Stage
+from gsgan.evaluate.prepare import HIDDEN_OUTLINE, BodyBoxes, Preparation
 from gsgan.evaluate.split import (
     FULL,
+    NO_PARTS,
     SPLAT,
     VARIANTS,
     Predict,
     Scorer,
     SplitScores,
-    Watch,
     empty_split,
     painter,
     score_split,
 )
 from gsgan.evaluate.tables import PER, Results, print_table
-from gsgan.metrics.lpips import lpips, lpips_name
+from gsgan.metrics.lpips import lpips
 from gsgan.metrics.regions import BACKGROUNDS
-from gsgan.model.avatar import Avatar, Painting
-from gsgan.scene import Frame
+from gsgan.model.avatar import Avatar
+from gsgan.model.painting import Painting
 from gsgan.utils.errors import ConfigError
 
 SPLITS = ("novel_view", "novel_pose")
 
 
 @dataclass(frozen=True)
-class Wanted:
+class Selection:
     """What is scored and shown.
 
     Args:
         splits: which of `SPLITS`.
-        per: "split", or "camera" for a row a camera as well.
-        pictures: rows of the grid written per split.
+        per: "split", or "camera" for a row per camera as well.
+        pictures: rows of the image grid written per split.
 
     Raises:
         ConfigError: on another split or ``per``.
@@ -78,50 +78,64 @@ def evaluate_run(
     avatar: Avatar,
     marks: list[str],
     method: Method | None = None,
-    wanted: Wanted | None = None,
+    selection: Selection | None = None,
     out: Path | None = None,
 ) -> Results:
-    """Scores an avatar on held-out cameras and poses and writes it all into the run folder.
+    """Scores an avatar on held-out cameras and poses and writes the results into the run folder.
 
     Args:
         folder: the run folder.
-        config: for ``lpips.net`` and ``lpips.path``.
+        config: for ``lpips.net``, ``lpips.path`` and ``background``.
         console: prints the table.
         data: of the run.
         avatar: in eval mode.
         marks: notes that the tables must carry.
-        method: what is known of the training; the model's and the data's name come from the folder.
-        wanted: splits, rows, pictures.
-        out: another folder to write to, see `evaluate_method`.
+        method: of the training; the names of model and data are read from the folder.
+        selection: splits, rows, images.
+        out: another folder for the results.
 
     Returns:
-        ``{split: {variant: {metric: value}}}``, as in metrics.json.
+        As in metrics.json.
     """
     chosen = choices(folder)
-    method = replace(method or Method("gsgan"), model=chosen.get("model"), data=chosen.get("data"))
-    variants = tuple(v for v in VARIANTS if v != SPLAT or avatar.splats is not None)
-    device = next(avatar.parameters()).device
-    scorer = make_scorer(config, data, marks)
     return evaluate_method(
-        out or folder, console, data, painter(avatar), scorer, config.lpips.net,
-        method=method, device=device, variants=variants, wanted=wanted or Wanted(),
+        out or folder,
+        console,
+        data,
+        painter(avatar),
+        make_scorer(config, data, marks),
+        method=replace(
+            method or Method("gsgan"), model=chosen.get("model"), data=chosen.get("data")
+        ),
+        device=next(avatar.parameters()).device,
+        variants=tuple(v for v in VARIANTS if v != SPLAT or avatar.splats is not None),
+        selection=selection or Selection(),
         name=folder.name,
-    )  # fmt: skip
+    )
 
 
-def check_background(background: object) -> None:
-    """Refuses what is no background.
+def check_background(key: str, value: object) -> None:
+    """Checks a config value.
 
     Raises:
-        ConfigError: on another word than black or white.
+        ConfigError: unless it is black, white or None.
     """
-    if background not in (None, *BACKGROUNDS):
-        raise ConfigError(f"background must be black, white or null; got {background!r}")
+    if value not in (None, *BACKGROUNDS):
+        raise ConfigError(f"{key} must be black, white or null; got {value!r}")
+
+
+def lpips_name(net: str, measures: Measures) -> str:
+    """The name of an LPIPS: backbone, input range, and order of channels and region where those are
+    not the defaults."""
+    backbone = {"vgg": "VGG", "alex": "Alex"}[net]
+    low, high = measures.lpips_range
+    order = "" if measures.lpips_channels == "rgb" else " BGR"
+    region = "" if measures.lpips_region == "full" else " mask crop 512"
+    return f"LPIPS-{backbone} [{low:g},{high:g}]{order}{region}"
 
 
 def make_scorer(config: DictConfig, data: GsganData, marks: list[str]) -> Scorer:
-    """How the pictures of a dataset are scored: as its protocol says, or plainly, on another
-    background where the config has one.
+    """How the images of a dataset are scored: by its protocol, on the config's background.
 
     Raises:
         ConfigError: on an unknown LPIPS backbone or background.
@@ -129,17 +143,24 @@ def make_scorer(config: DictConfig, data: GsganData, marks: list[str]) -> Scorer
     """
     measures = Measures() if data.protocol is None else data.protocol.measures
     background = config.get("background")
-    check_background(background)
+    check_background("background", background)
     if background not in (None, measures.background):
         measures = replace(measures, background=background)
         marks = [*marks, f"scored on {background}"]
-    score, reason = lpips(config.lpips.net, config.lpips.path, measures.lpips_range)
-    boxes = BodyBoxes(data) if measures.needs_body_box else None
-    name = lpips_name(config.lpips.net, measures)
     if fitted := data.layout.landmarks.fitted_to:
-        told = f"skeletons fitted to the masks of {', '.join(fitted)}, held-out frames' too"
-        marks = [*marks, told]
-    return Scorer(Stage(measures, boxes), score, reason, name, marks)
+        cameras = ", ".join(fitted)
+        marks = [*marks, f"skeletons fitted to the masks of {cameras}, held-out frames' too"]
+    boxes = BodyBoxes(data) if measures.needs_body_box else None
+    record = data.protocol_record(config.lpips.net)
+    if record is not None:
+        asked = record["measures"]["background"]
+        if asked != measures.background:
+            different = f"background is {measures.background}, asked for: {asked}"
+            record["departures"].append(different)
+        record["departures"] += [] if boxes is None else boxes.departures
+    score, reason = lpips(config.lpips.net, config.lpips.path, measures.lpips_range)
+    name = lpips_name(config.lpips.net, measures)
+    return Scorer(Preparation(measures, boxes), score, reason, name, marks, record)
 
 
 def evaluate_method(
@@ -148,90 +169,67 @@ def evaluate_method(
     data: GsganData,
     predict: Predict,
     scorer: Scorer,
-    lpips_net: str,
     *,
     method: Method,
     device: torch.device,
     variants: Sequence[str],
-    wanted: Wanted,
-    no_parts: str = "the model has no segmentation",
-    watch: Watch | None = None,
-    check: Callable[[], None] | None = None,
+    selection: Selection,
+    no_parts: str = NO_PARTS,
     name: str | None = None,
 ) -> Results:
     """Scores a method's predictions and writes metrics.json, scores.csv, facts.json, metrics.md and
-    ``pictures/`` into a folder, nothing of it before all is scored.
+    ``pictures/``; nothing is written before everything is scored.
 
     Args:
-        folder: where to.
+        folder: for the results.
         console: prints progress and the table.
-        data: whose splits.
+        data: with the splits.
         predict: the method.
-        scorer: how.
-        lpips_net: backbone, for the record.
-        method: its name and what is known of it.
-        device: frames are moved there.
-        variants: that a split without frames gets.
-        wanted: splits, rows, pictures.
-        no_parts: why there is no segmentation.
-        watch: sees every prediction as scored.
-        check: called when all is scored, before anything is written; may refuse.
+        scorer: how to score.
+        method: for facts.json.
+        device: of the frames.
+        variants: of a split without frames.
+        selection: splits, rows, images.
+        no_parts: the reason given where there is no segmentation.
         name: in the title of the table; None takes the method's.
 
     Raises:
-        GsganError: on a prediction that cannot be scored.
+        GsganError: when a prediction cannot be scored.
     """
     scores: dict[str, SplitScores] = {}
-    for split in wanted.splits:
+    for split in selection.splits:
         dataset = data.dataset(split)
         if len(dataset) == 0:
             scores[split] = empty_split(data.reasons.get(split, "no frames"), scorer, variants)
             continue
-        items = _frames(data, split, device)
-        told = f"scoring {split}"
-        shown = track(items, told, len(dataset), console=console, transient=True)
-        scores[split] = score_split(shown, predict, scorer, no_parts=no_parts, watch=watch)
-    if check is not None:
-        check()
-    for split in wanted.splits:
+        order = track(range(len(dataset)), f"scoring {split}", console=console, transient=True)
+        frames = ((dataset.items[i], dataset[i].to(device)) for i in order)
+        scores[split] = score_split(frames, predict, scorer, no_parts=no_parts)
+    for split in selection.splits:
         path = folder / "pictures" / f"{split}.png"
-        write_pictures(data, split, path, wanted.pictures, predict, scorer.stage, device)
-    results = _with_protocol(scores, data, scorer, lpips_net)
-    rows = {split: found.rows for split, found in scores.items()}
-    now = Scored(results, rows, facts(method, data, device))
-    whole, dropped = joined(now, folder, SPLITS)
-    if dropped:
-        said = f"earlier scores of {', '.join(dropped)} were made otherwise and are left out"
-        console.print(said, highlight=False)
-    title = f"{name or method.name}: held-out cameras (novel_view) and poses (novel_pose)"
-    write_scored(whole, folder, title)
-    print_table(whole.results, whole.facts, console, title, wanted.per)
-    return whole.results
-
-
-def _frames(data: GsganData, split: str, device: torch.device) -> Iterator[tuple[Item, Frame]]:
-    dataset = data.dataset(split)
-    for i, item in enumerate(dataset.items):
-        yield item, dataset[i].to(device)
-
-
-def _with_protocol(
-    scores: dict[str, SplitScores], data: GsganData, scorer: Scorer, lpips_net: str
-) -> Results:
-    """The results with the protocol and every departure from it beside each variant."""
-    record = data.protocol_record(lpips_net)
-    if record is not None:
-        asked, used = record["measures"]["background"], scorer.stage.measures.background
-        if asked != used:
-            record["departures"].append(f"background is {used}, asked for: {asked}")
-        if scorer.stage.boxes is not None:
-            record["departures"] += scorer.stage.boxes.departures
-        if any(found.hidden_outline for found in scores.values()):
-            record["departures"].append(HIDDEN_OUTLINE)
-    return {
+        write_pictures(data, split, path, selection.pictures, predict, scorer.prepare, device)
+    record = scorer.protocol
+    if record is not None and any(found.hidden_outline for found in scores.values()):
+        record = record | {"departures": [*record["departures"], HIDDEN_OUTLINE]}
+    results = {
         split: {name: values | {"protocol": record} for name, values in found.variants.items()}
         for split, found in scores.items()
     }
+    rows = (
+        {"split": split, "variant": variant, **row}
+        for split, found in scores.items()
+        for variant, of_variant in found.rows.items()
+        for row in of_variant
+    )
+    now = Scored(results, pd.DataFrame(rows, columns=HEADER), facts(method, data, device))
+    whole, dropped = joined(now, folder, SPLITS)
+    if dropped:
+        names = ", ".join(dropped)
+        console.print(f"earlier scores of {names} were made in another way and are left out")
+    title = f"{name or method.name}: held-out cameras (novel_view) and poses (novel_pose)"
+    write_scored(whole, folder, title)
+    print_table(whole.results, whole.facts, console, title, selection.per)
+    return whole.results
 
 
 def write_pictures(
@@ -240,34 +238,33 @@ def write_pictures(
     path: Path,
     rows: int,
     predict: Predict,
-    stage: Stage,
+    prepare: Preparation,
     device: torch.device,
 ) -> None:
-    """A grid of ``rows`` frames spread over a split: prediction and truth as scored."""
+    """A grid of ``rows`` frames spread over a split: prediction and ground truth as scored."""
     dataset = data.dataset(split)
     rows = min(rows, len(dataset))
     grid: list[dict[str, torch.Tensor]] = []
     for i in range(rows):
         index = round((i + 0.5) * len(dataset) / rows - 0.5)
         frame, item = dataset[index].to(device), dataset.items[index]
-        prediction = predict(frame, item)
-        box = stage.box(frame)
-        shown = {name: stage.picture(prediction, name, frame, box) for name in prediction.pictures}
+        prediction, box = predict(frame, item), prepare.box(frame)
+        shown = {name: prepare.image(prediction, name, frame, box) for name in prediction.images}
         painting = Painting(
             shown[FULL], corrected=shown.get(SPLAT), segmentation=prediction.segmentation
         )
-        grid += grid_rows(replace(frame, image=stage.truth(frame)), painting)
+        grid += grid_rows(replace(frame, image=prepare.target(frame)), painting)
     if grid:
-        write_grid(_one_size(grid), path)
+        write_grid(one_size(grid), path)
 
 
-def _one_size(grid: list[dict[str, torch.Tensor]]) -> list[dict[str, torch.Tensor]]:
-    """Pictures ``[3, H, W]`` of cameras of several sizes on black of the largest size."""
-    sizes = [picture.shape[-2:] for row in grid for picture in row.values()]
+def one_size(grid: list[dict[str, torch.Tensor]]) -> list[dict[str, torch.Tensor]]:
+    """Pads images ``[3, H, W]`` of several sizes with black to the largest."""
+    sizes = [image.shape[-2:] for row in grid for image in row.values()]
     height, width = (max(size[i] for size in sizes) for i in (0, 1))
 
-    def padded(picture: torch.Tensor) -> torch.Tensor:
-        h, w = picture.shape[-2:]
-        return functional.pad(picture, (0, width - w, 0, height - h))
+    def padded(image: torch.Tensor) -> torch.Tensor:
+        h, w = image.shape[-2:]
+        return functional.pad(image, (0, width - w, 0, height - h))
 
-    return [{name: padded(picture) for name, picture in row.items()} for row in grid]
+    return [{name: padded(image) for name, image in row.items()} for row in grid]

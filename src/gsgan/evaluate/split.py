@@ -1,8 +1,8 @@
-"""Scores of a split: every frame painted, prepared, scored in each variant."""
+"""Scores of a split: every frame is predicted, prepared and scored in each variant."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,46 +10,49 @@ import torch
 from torch import Tensor
 
 from gsgan.data.splits import Item
-from gsgan.evaluate.prepare import Prediction, Stage
-from gsgan.evaluate.scores import METRICS, PART_METRICS, PictureScores, Row, SegmentationScores
+from gsgan.evaluate import scores
+from gsgan.evaluate.prepare import Prediction, Preparation
+from gsgan.evaluate.scores import METRICS, PART_METRICS
 from gsgan.metrics.image import Score
 from gsgan.model.avatar import Avatar
 from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
 
-FULL, SPLAT, FLOOR = "full", "splat", "floor"  # the floor is the all-background picture
+FULL, SPLAT, FLOOR = "full", "splat", "floor"  # the floor is the all-background image
 VARIANTS = (FULL, SPLAT, FLOOR)
+NO_PARTS = "the model has no segmentation"
 Predict = Callable[[Frame, Item], Prediction]
-Watch = Callable[[Item, Tensor, Tensor], None]
-"""Sees every item with its prediction and truth as scored."""
+Row = dict[str, Any]  # "camera", "frame", and a score by metric
 
 
 @dataclass(frozen=True)
 class Scorer:
-    """How pictures are scored.
+    """How images are scored.
 
     Args:
-        stage: what is done to them first.
+        prepare: what is done to them first.
         lpips, lpips_reason: from `gsgan.metrics.lpips.lpips`.
-        lpips_name: what its numbers are called.
+        lpips_name: backbone, range and region of LPIPS.
         marks: notes that every table must carry.
+        protocol: its record with every departure, or None.
     """
 
-    stage: Stage
+    prepare: Preparation
     lpips: Score | None
     lpips_reason: str
     lpips_name: str
     marks: list[str] = field(default_factory=list)
+    protocol: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
 class SplitScores:
-    """What became of a split.
+    """Scores of a split.
 
     Args:
         variants: ``{variant: {metric: value}}`` as in metrics.json.
-        rows: by variant, one a picture.
-        hidden_outline: a truth's mask stood in for a prediction's alpha.
+        rows: one per variant and image.
+        hidden_outline: a ground-truth mask stood in for the alpha of a prediction.
     """
 
     variants: dict[str, dict[str, Any]]
@@ -58,22 +61,20 @@ class SplitScores:
 
 
 def painter(avatar: Avatar) -> Predict:
-    """The predictions of an avatar in eval mode: I_pred as ``full``, Step I's colour as ``splat``.
-
-    Each is put on the background by its own alpha.
-    """
+    """The predictions of an avatar in eval mode: I_pred as ``full``, Step I's colour as ``splat``,
+    each with its own alpha."""
 
     def predict(frame: Frame, item: Item) -> Prediction:
         with torch.no_grad():
             painting = avatar.paint(frame)
         assert painting.image is not None
-        pictures, alphas = {FULL: painting.image}, {FULL: painting.alpha}
+        images, alphas = {FULL: painting.image}, {FULL: painting.alpha}
         if painting.colour is not None:
-            pictures[SPLAT], alphas[SPLAT] = painting.colour, painting.splat_alpha
+            images[SPLAT], alphas[SPLAT] = painting.colour, painting.splat_alpha
         parts, labels = painting.segmentation, frame.labels
         if avatar.segmentation is not None and parts is not None and labels is not None:
             parts, labels = avatar.segmentation.to_score(parts, labels)
-        return Prediction(pictures, alphas, segmentation=parts, labels=labels)
+        return Prediction(images, alphas, segmentation=parts, labels=labels)
 
     return predict
 
@@ -83,81 +84,79 @@ def score_split(
     predict: Predict,
     scorer: Scorer,
     *,
-    no_parts: str = "the model has no segmentation",
-    watch: Watch | None = None,
+    no_parts: str = NO_PARTS,
 ) -> SplitScores:
     """Scores every frame of a split.
 
     Args:
-        items: (camera and frame number, the frame) in turn, on the device that predicts.
+        items: (camera and frame number, frame) pairs, on the device that predicts.
         predict: the method.
-        scorer: how.
-        no_parts: why there is no segmentation, where there is none.
-        watch: sees every prediction with its truth.
-
-    Returns:
-        Means, cameras' means and rows: ``full`` is the prediction, ``splat`` Step I's colour where
-        there is one, ``floor`` the all-background picture; a metric that cannot be had is None with
-        ``<metric>_reason``.
+        scorer: how to score.
+        no_parts: the reason given where predictions have no segmentation.
 
     Raises:
-        GsganError: when a prediction is not finite, naming it.
+        GsganError: when a prediction is not finite, naming camera and frame.
     """
-    stage = scorer.stage
-    scores: dict[str, PictureScores] = {}
-    parts: SegmentationScores | None = None
-    count, hidden = 0, False
-    for item, frame in items:
-        target, box = stage.truth(frame), stage.box(frame)
-        prediction = predict(frame, item)
-        hidden = hidden or stage.needs_mask(prediction)
-        try:
-            pictures = {
-                name: stage.picture(prediction, name, frame, box) for name in prediction.pictures
-            }
-        except GsganError as error:
-            raise GsganError(f"camera {item[0]}, {error}") from None
-        pictures[FLOOR] = stage.floor(frame)
-        for name, picture in pictures.items():
-            if name not in scores:
-                scores[name] = PictureScores(scorer.lpips, scorer.lpips_reason, stage.measures)
-            scores[name].update(picture, target, frame.mask, box, [item])
-        if prediction.segmentation is not None and frame.labels is None:
+    prepare, hidden = scorer.prepare, False
+    rows: dict[str, list[Row]] = {}
+    matrices: dict[str, Tensor] = {}  # by camera
+    for (camera, number), frame in items:
+        target, box = prepare.target(frame), prepare.box(frame)
+        prediction = predict(frame, (camera, number))
+        hidden = hidden or prepare.hides_outline(prediction)
+        images = {}
+        for name, image in prediction.images.items():
+            if bad := int((~torch.isfinite(image)).sum()):
+                raise GsganError(
+                    f"camera {camera}, frame {number}: {bad} values of the predicted image are not "
+                    "finite; it cannot be scored"
+                )
+            images[name] = prepare.image(prediction, name, frame, box)
+        images[FLOOR] = prepare.floor(frame)
+        for name, image in images.items():
+            own = scores.image_scores(
+                image, target, frame.mask, box, measures=prepare.measures, lpips=scorer.lpips
+            )
+            rows.setdefault(name, []).append({"camera": camera, "frame": number, **own})
+        if prediction.segmentation is None:
+            continue
+        if frame.labels is None:
             no_parts = "the data has no part labels"
-        elif prediction.segmentation is not None and frame.labels is not None:
-            parts = parts or SegmentationScores(prediction.segmentation.shape[1])
-            labels = frame.labels if prediction.labels is None else prediction.labels
-            (own,) = parts.update(prediction.segmentation, labels, [item])
-            own_scores = scores[FULL].rows[-1].scores
-            own_scores |= {k: float("nan") if v is None else v for k, v in own.items()}
-        if watch is not None:
-            watch(item, pictures[FULL], target)
-        count += 1
-    variants = {name: _variant(name, s, parts, no_parts) for name, s in scores.items()}
-    for values in variants.values():
-        values |= _common(scorer, count)
-    return SplitScores(variants, {name: s.rows for name, s in scores.items()}, hidden)
-
-
-def _variant(
-    name: str, scores: PictureScores, parts: SegmentationScores | None, no_parts: str
-) -> dict[str, Any]:
-    result, cameras = scores.compute(), scores.by_camera()
-    why = {
+            continue
+        labels = frame.labels if prediction.labels is None else prediction.labels
+        matrix = scores.confusion(prediction.segmentation, labels)
+        matrices[camera] = matrices.get(camera, torch.zeros_like(matrix)) + matrix
+        rows[FULL][-1] |= scores.miou(matrix)
+    reasons = {
         FULL: no_parts,
         SPLAT: "Step I's colour is not a segmentation",
         FLOOR: "an all-background picture is not a segmentation",
-    }[name]
-    if name == FULL and parts is not None:
-        result |= parts.compute()
-        own = parts.by_camera()
-    else:
-        result |= no_scores(PART_METRICS, why)
-        own = {}
-    empty = dict.fromkeys(PART_METRICS)
-    return result | {
-        "cameras": {camera: means | own.get(camera, empty) for camera, means in cameras.items()}
     }
+    variants = {
+        name: _means(own, matrices if name == FULL else {}, reasons[name], scorer)
+        for name, own in rows.items()
+    }
+    return SplitScores(variants, rows, hidden)
+
+
+def _means(
+    rows: Sequence[Row], matrices: dict[str, Tensor], no_parts: str, scorer: Scorer
+) -> dict[str, Any]:
+    """One variant as in metrics.json."""
+    result = scores.means(rows, scorer.lpips_reason)
+    if matrices:
+        parts = scores.miou(torch.stack(list(matrices.values())).sum(0))
+        result |= parts
+        result |= {f"{m}_reason": "the truth holds no part" for m in parts if parts[m] is None}
+    else:
+        result |= no_scores(PART_METRICS, no_parts)
+    cameras = {}
+    for camera in dict.fromkeys(row["camera"] for row in rows):
+        found = scores.means(row for row in rows if row["camera"] == camera)
+        if camera in matrices:
+            found |= scores.miou(matrices[camera])
+        cameras[camera] = {metric: found.get(metric) for metric in METRICS}
+    return result | {"cameras": cameras} | _common(scorer, len(rows))
 
 
 def _common(scorer: Scorer, images: int) -> dict[str, Any]:
@@ -166,12 +165,9 @@ def _common(scorer: Scorer, images: int) -> dict[str, Any]:
 
 
 def empty_split(reason: str, scorer: Scorer, variants: Iterable[str] = VARIANTS) -> SplitScores:
-    """What a split without frames gets: every metric None, with the reason."""
-    values = {
-        name: {**no_scores(METRICS, reason), "cameras": {}, **_common(scorer, 0)}
-        for name in variants
-    }
-    return SplitScores(values, {name: [] for name in values})
+    """Scores of a split without frames: every metric None, with the reason."""
+    values = no_scores(METRICS, reason) | {"cameras": {}} | _common(scorer, 0)
+    return SplitScores({name: dict(values) for name in variants}, {name: [] for name in variants})
 
 
 def no_scores(metrics: Iterable[str], reason: str) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Results for people: a table in the terminal and in Markdown."""
+"""Tables of results: in the terminal and in Markdown."""
 
 from __future__ import annotations
 
@@ -11,128 +11,114 @@ from rich.table import Table
 
 from gsgan.evaluate.facts import caption, provenance
 from gsgan.evaluate.scores import METRICS
+from gsgan.utils import pages
 
 Results = dict[str, dict[str, dict[str, Any]]]
-HEADINGS = {
-    "psnr": "PSNR ↑",
-    "psnr_person": "in box ↑",
-    "ssim": "SSIM ↑",
-    "ssim_person": "SSIM in box ↑",
-    "lpips": "LPIPS ↓",
-    "lpips_person": "LPIPS in box ↓",
-    "edge_f1": "edge F1 ↑",
-    "edge_f1_person": "edge F1 in box ↑",
-    "edge_ratio": "edges →1",
-    "edge_ratio_person": "edges in box →1",
-    "high_frequencies": "detail →1",
-    "miou": "mIoU ↑",
-    "miou_with_background": "with background ↑",
+COLUMNS = {  # heading and number of decimals
+    "psnr": ("PSNR ↑", 2),
+    "psnr_person": ("in box ↑", 2),
+    "ssim": ("SSIM ↑", 4),
+    "ssim_person": ("SSIM in box ↑", 4),
+    "lpips": ("LPIPS ↓", 4),
+    "lpips_person": ("LPIPS in box ↓", 4),
+    "edge_f1": ("edge F1 ↑", 3),
+    "edge_f1_person": ("edge F1 in box ↑", 3),
+    "edge_ratio": ("edges →1", 2),
+    "edge_ratio_person": ("edges in box →1", 2),
+    "high_frequencies": ("detail →1", 2),
+    "miou": ("mIoU ↑", 3),
+    "miou_with_background": ("with background ↑", 3),
 }
-NOT_IN_TERMINAL = (  # a narrow one; metrics.md has them all
+NOT_IN_TERMINAL = (  # narrow terminals; metrics.md has all metrics
     *("ssim_person", "lpips_person", "edge_f1_person", "edge_ratio_person"),
     "miou_with_background",
 )
 IN_TERMINAL = tuple(m for m in METRICS if m not in NOT_IN_TERMINAL)
-_DIGITS = {
-    "psnr": 2, "psnr_person": 2, "ssim": 4, "ssim_person": 4, "lpips": 4, "lpips_person": 4,
-    "edge_f1": 3, "edge_f1_person": 3, "edge_ratio": 2, "edge_ratio_person": 2,
-    "high_frequencies": 2, "miou": 3, "miou_with_background": 3,
-}  # fmt: skip
-_VARIANTS = {
-    "full": "picture",
-    "splat": "Step I's colour",
-    "floor": "floor: background",
-}
+VARIANTS = {"full": "picture", "splat": "Step I's colour", "floor": "floor: background"}
 PER = ("split", "camera")
 
 
 def rows(
     results: Results, metrics: tuple[str, ...] = METRICS, per: str = "split"
 ) -> Iterator[list[str]]:
-    """One row per split and variant, every value formatted; what cannot be had is ``n/a``.
+    """One formatted row per split and variant; what is None shows as ``n/a``.
 
     Args:
         results: as in metrics.json.
         metrics: columns.
-        per: "camera" adds a row for each camera of a variant under it.
+        per: "camera" adds a row per camera below each variant.
     """
+
+    def formatted(values: dict[str, Any]) -> list[str]:
+        return ["n/a" if (v := values[m]) is None else f"{v:.{COLUMNS[m][1]}f}" for m in metrics]
+
     for split, variants in results.items():
         for variant, scores in variants.items():
-            named = _VARIANTS.get(variant, variant)
-            yield [split, named, str(scores["images"]), *(_format(m, scores[m]) for m in metrics)]
+            yield [split, VARIANTS[variant], str(scores["images"]), *formatted(scores)]
             for camera, means in scores["cameras"].items() if per == "camera" else ():
-                yield [split, f"  {camera}", "", *(_format(m, means[m]) for m in metrics)]
-
-
-def _format(metric: str, value: float | None) -> str:
-    return "n/a" if value is None else f"{value:.{_DIGITS[metric]}f}"
+                yield [split, f"  {camera}", "", *formatted(means)]
 
 
 def notes(results: Results) -> list[str]:
     """Every reason and mark behind the table, once each."""
     found: dict[str, None] = {}
     for split, variants in results.items():
-        scored = variants["full"]
-        if name := scored.get("lpips_name"):
+        scores = variants["full"]
+        if name := scores.get("lpips_name"):
             found[f"LPIPS is {name}"] = None
-        for mark in scored["marks"]:
+        for mark in scores["marks"]:
             found[f"marked: {mark}"] = None
-        if protocol := scored.get("protocol"):
+        if protocol := scores.get("protocol"):
             note = f"; {protocol['note']}" if protocol.get("note") else ""
             found[f"protocol: {protocol['name']} ({protocol['source']}){note}"] = None
             for departure in protocol["departures"]:
                 found[f"departs from {protocol['name']}: {departure}"] = None
-        if not scored["images"]:
-            found[f"{split}: {scored['psnr_reason']}"] = None
+        if not scores["images"]:
+            found[f"{split}: {scores['psnr_reason']}"] = None
             continue
         for metric in METRICS:
-            said = metric in ("miou_with_background", "lpips_person")  # beside the whole's
-            if not said and scored[metric] is None:
-                found[f"{metric} n/a: {scored[f'{metric}_reason']}"] = None
+            repeats = metric in ("miou_with_background", "lpips_person")  # miou's, lpips' reason
+            if not repeats and scores[metric] is None:
+                found[f"{metric} n/a: {scores[f'{metric}_reason']}"] = None
     return list(found)
 
 
 def print_table(
-    results: Results, held: dict[str, Any], console: Console, title: str, per: str = "split"
+    results: Results, facts: dict[str, Any], console: Console, title: str, per: str = "split"
 ) -> None:
-    """The rich table with its caption and notes underneath.
+    """Prints the table, its caption and its notes.
 
     Args:
         results: as in metrics.json.
-        held: as in facts.json.
+        facts: as in facts.json.
         console: to print on.
-        title: over it.
+        title: of the table.
         per: "split" or "camera".
     """
     table = Table(title=title, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("picture", no_wrap=True)
     for metric in IN_TERMINAL:
-        table.add_column(HEADINGS[metric], justify="right", no_wrap=True)
+        table.add_column(COLUMNS[metric][0], justify="right", no_wrap=True)
     previous = None
-    for split, picture, images, *scores in rows(results, IN_TERMINAL, per):
-        if split != previous:  # a column of its own would not fit a narrow terminal
+    for split, variant, images, *scores in rows(results, IN_TERMINAL, per):
+        if split != previous:  # a column for the split would not fit a narrow terminal
             table.add_section()
             table.add_row(f"[bold]{split}[/bold], {images} images")
             previous = split
-        table.add_row(picture, *scores)
+        table.add_row(variant, *scores)
     console.print(table)
-    for line in (caption(held), *notes(results)):
+    for line in (caption(facts), *notes(results)):
         console.print(f"  {line}", markup=False, highlight=False)
 
 
-def markdown(results: Results, held: dict[str, Any], title: str) -> str:
-    """The same table in Markdown, with every metric, and once more by camera; every row carries
-    what it is of."""
-    lines = [f"# {title}", "", caption(held), "", *_table(results, held, "split")]
-    lines += ["", *(f"- {note}" for note in notes(results))]
-    lines += ["", "## By camera", "", *_table(results, held, "camera")]
-    return "\n".join([*lines, ""])
-
-
-def _table(results: Results, held: dict[str, Any], per: str) -> list[str]:
-    said = provenance(held)
-    header = ["split", "picture", "images", *(HEADINGS[m] for m in METRICS), *said]
-    table = ["| " + " | ".join(header) + " |", "|" + " --- |" * len(header)]
-    return table + [
-        "| " + " | ".join([*row, *said.values()]) + " |" for row in rows(results, per=per)
-    ]
+def markdown(results: Results, facts: dict[str, Any], title: str) -> str:
+    """The table in Markdown with every metric, and again by camera; rows carry the provenance."""
+    source = provenance(facts)
+    header = ["split", "picture", "images", *(COLUMNS[m][0] for m in METRICS), *source]
+    by_split, by_camera = (
+        pages.markdown(header, [[*row, *source.values()] for row in rows(results, per=per)])
+        for per in PER
+    )
+    listed = "\n".join(f"- {note}" for note in notes(results))
+    parts = (f"# {title}", caption(facts), by_split, listed, "## By camera", by_camera)
+    return "\n\n".join(filter(None, parts)) + "\n"

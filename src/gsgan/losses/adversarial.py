@@ -1,4 +1,4 @@
-"""The GAN game and feature matching (paper Sec. 3.5)."""
+"""Adversarial losses and feature matching (paper Sec. 3.5)."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ from torch.nn import functional
 from gsgan.utils.errors import ConfigError
 
 Maps = Sequence[Sequence[Tensor]]  # per scale: feature maps, the logits last
-
-
 Term = Callable[[Tensor, Tensor], Tensor]
 softplus, relu = functional.softplus, functional.relu
 
-# name: what the discriminator, and what the generator, minimises of (real, fake) logits
+# name: (discriminator's loss, generator's loss) of (real, fake) logits
 _FORMS: dict[str, tuple[Term, Term]] = {
     "logistic": (lambda r, f: softplus(-r) + softplus(f), lambda _, f: softplus(-f)),
     "hinge": (lambda r, f: relu(1 - r) + relu(1 + f), lambda _, f: -f),
@@ -25,7 +23,7 @@ _FORMS: dict[str, tuple[Term, Term]] = {
 }
 FORMS = tuple(_FORMS)
 COMPARING = ("relativistic",)
-"""Forms whose generator is judged beside the real picture."""
+"""Forms whose generator loss depends on the real image."""
 
 
 def _form(name: str) -> tuple[Term, Term]:
@@ -40,15 +38,14 @@ def _mean_over_scales(term: Term, real: Maps, fake: Maps) -> Tensor:
 
 
 def discriminator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor:
-    """What the discriminator minimises: mean over positions, sum over scales.
+    """The discriminator's loss: mean over positions, sum over scales.
 
     Args:
-        real, fake: the discriminator's maps of a real and a painted picture.
-        form: ``logistic`` (non-saturating), ``hinge``, ``lsgan`` or ``relativistic``: how much
-            more real the real picture looks than the painted one, place by place (the paired
-            form, RpGAN, of Jolicoeur-Martineau 2019; that the pair shows one frame is ours).
-            What both share then cancels, so it is the one to take where painted pictures are
-            near their truth.
+        real, fake: the discriminator's maps of a real and a generated image.
+        form: ``logistic`` (non-saturating), ``hinge``, ``lsgan`` or ``relativistic``: compares
+            the logits of the pair at each position (the paired form, RpGAN, of
+            Jolicoeur-Martineau 2019; that both show the same frame is ours). What both share
+            cancels, so use it where generated images are close to the ground truth.
 
     Raises:
         ConfigError: on an unknown form.
@@ -57,15 +54,15 @@ def discriminator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor
 
 
 def generator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor:
-    """What the generator minimises, same conventions; ``real`` matters to a `COMPARING` form only,
-    any other may be given ``fake`` twice."""
+    """The generator's loss, same conventions; only `COMPARING` forms use ``real``, for others pass
+    ``fake`` twice."""
     return _mean_over_scales(_form(form)[1], real, fake)
 
 
 def feature_matching(real: Maps, fake: Maps) -> Tensor:
-    """L_feat: L1 between the judges' features (logits left out), real ones detached.
+    """L_feat: L1 between the discriminators' features (without logits), real ones detached.
 
-    Weighted as pix2pixHD: 4 / (number of maps) for each map, mean over scales.
+    Weighted as in pix2pixHD: 4 / (number of maps) per map, mean over scales.
 
     Source: paper Sec. 3.5.
     """

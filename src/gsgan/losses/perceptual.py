@@ -1,4 +1,4 @@
-"""L_perc: distance between features of a pretrained VGG-16, or of a marked stand-in."""
+"""L_perc: distance between features of a pretrained VGG-16, or of a marked random network."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ VGG_TAPS = (3, 8, 15, 22)  # relu1_2, relu2_2, relu3_3, relu4_3 in torchvision's
 class Perceptual(nn.Module):
     """Squared feature distance, the layers weighted by the inverse of their first losses.
 
-    No layer weights are published for this set of layers, so they are measured: over the first
-    ``warmup`` calls each layer's weight is the inverse of its mean loss (weights sum to 1), then
-    frozen and stored in the checkpoint.
+    No weights are published for these layers, so they are measured: each layer's weight is the
+    inverse of its mean loss over the first ``warmup`` calls (weights sum to 1), then frozen and
+    stored in the checkpoint.
 
     Args:
-        weights: ``vgg16`` (its file must be at hand), ``auto`` (vgg16 where at hand, else a small
-            network of fixed random weights, marked as such), or ``random``.
+        weights: ``vgg16`` (its file must exist), ``auto`` (vgg16 if its file exists, else a small
+            network with fixed random weights, marked as such), or ``random``.
         path: the weight file or its folder; None looks in the torch cache.
-        warmup: calls over which layer weights are measured.
-        width: channels of the stand-in's first layer.
+        warmup: number of calls over which layer weights are measured.
+        width: channels of the random network's first layer.
 
     Raises:
         ConfigError: on an unknown ``weights``.
-        DataError: when ``vgg16`` was asked for and its file is not there.
+        DataError: when ``vgg16`` was requested and its file does not exist.
 
     Source: paper Sec. 3.5.
     """
@@ -56,13 +56,13 @@ class Perceptual(nn.Module):
             raise ConfigError(f"perceptual.weights must be vgg16, auto or random; got {weights!r}")
         found = None if weights == "random" else find_weights("vgg16", path)
         if weights == "vgg16" and found is None:
-            raise DataError(f"VGG-16's weights are not at hand: {how_to_get('vgg16')}")
+            raise DataError(f"VGG-16's weights were not found: {how_to_get('vgg16')}")
         self.stages = _vgg_stages(found) if found else _random_stages(width)
         self.mark: str | None = None
         if not found:
             self.mark = "perceptual loss: fixed random network, not VGG-16"
         self.requires_grad_(False)
-        # Fixed weights that a file or a seed gives back have no place in our checkpoints.
+        # Fixed weights, restored from a file or a seed, are not stored in checkpoints.
         self.stages.register_state_dict_post_hook(_leave_out)
         self.register_load_state_dict_pre_hook(_put_back)
         self.warmup = warmup
@@ -72,7 +72,7 @@ class Perceptual(nn.Module):
         self.register_buffer("calls", torch.zeros((), dtype=torch.long))
 
     def features(self, image: Tensor) -> list[Tensor]:
-        """Feature maps of pictures ``[B, 3, H, W]`` in [0, 1]."""
+        """Feature maps of images ``[B, 3, H, W]`` in [0, 1]."""
         x, maps = (image - self.mean) / self.std, []
         for stage in self.stages:
             x = stage(x)
@@ -82,9 +82,9 @@ class Perceptual(nn.Module):
     def forward(self, image: Tensor, target: Tensor) -> Tensor:
         """The weighted distance; the target's features take no gradient."""
         with torch.no_grad():
-            wanted = self.features(target)
+            truth = self.features(target)
         losses = torch.stack(
-            [functional.mse_loss(a, b) for a, b in zip(self.features(image), wanted, strict=True)]
+            [functional.mse_loss(a, b) for a, b in zip(self.features(image), truth, strict=True)]
         )
         if self.training and int(self.calls) < self.warmup:
             self.calls += 1
@@ -104,14 +104,14 @@ def _put_back(module: nn.Module, state: dict[str, Any], prefix: str, *_: Any) ->
 
 
 def _vgg_stages(path: Path) -> nn.ModuleList:
-    from torchvision.models import vgg16  # heavy: only where it is used
+    from torchvision.models.vgg import cfgs, make_layers  # heavy: only where it is used
 
-    network = vgg16(weights=None)
+    layers = make_layers(cfgs["D"])  # without the classifier, nine tenths of the weights
+    found = {k[9:]: v for k, v in load_weights(path).items() if k.startswith("features.")}
     try:
-        network.load_state_dict(load_weights(path))
+        layers.load_state_dict(found)
     except RuntimeError as error:
         raise DataError(f"{path}: these are not torchvision's VGG-16 weights") from error
-    layers = list(network.features)
     for layer in layers:
         if isinstance(layer, nn.ReLU):
             layer.inplace = False
@@ -120,7 +120,7 @@ def _vgg_stages(path: Path) -> nn.ModuleList:
 
 
 def _random_stages(width: int) -> nn.ModuleList:
-    """Three small stages of fixed weights: the same for everybody, whatever the run's seed."""
+    """Three small stages with fixed weights, independent of the run's seed."""
     generator = torch.Generator().manual_seed(20250717)
     stages, channels = [], [3, width, 2 * width, 4 * width]
     for i, (a, b) in enumerate(pairwise(channels)):

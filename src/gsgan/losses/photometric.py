@@ -10,9 +10,9 @@ from gsgan.utils.precision import full_precision
 
 
 def d_ssim(image: Tensor, target: Tensor) -> Tensor:
-    """1 - SSIM, mean over pixels, of pictures ``[B, C, H, W]`` in [0, 1]; borders are reflected.
+    """1 - SSIM, mean over pixels, of images ``[B, C, H, W]`` in [0, 1]; borders are reflected.
 
-    Source: 3DGS and this paper weigh 1 - SSIM, not half of it.
+    Source: 3DGS and this paper weight 1 - SSIM, not half of it.
     """
     return d_ssim_map(image, target).mean()
 
@@ -25,19 +25,19 @@ def d_ssim_map(
     sigma: float = 1.5,
     k: tuple[float, float] = (0.01, 0.03),
 ) -> Tensor:
-    """1 - SSIM at every pixel, right in float32 on flat and on nearly equal pictures too.
+    """1 - SSIM at every pixel, accurate in float32 for flat and nearly equal images too.
 
     Convention: computed in float32 at least, autocast has no effect; borders are reflected. SSIM's
-    factors are taken from the difference of the pictures, ``1 - (μx - μy)² / …`` and
-    ``1 - var(x - y) / …``, and variances about each picture's mean. In exact arithmetic that is
-    the usual form, whose covariance cancels just where pictures agree or are flat: there it leaves
-    float32 gradients wrong by tens of per cent.
+    factors are computed from the difference of the images, ``1 - (μx - μy)² / …`` and
+    ``1 - var(x - y) / …``, with variances about each image's mean. The usual form is equal in exact
+    arithmetic, but its covariance cancels where images are equal or flat, which leaves float32
+    gradients wrong by tens of per cent.
 
     Args:
         image, target: ``[B, C, H, W]`` in [0, 1], both sides longer than half the window.
-        window: pixels, the Gaussian window's side, odd.
-        sigma: pixels, its standard deviation.
-        k: the constants that keep the quotients finite, as shares of the range.
+        window: side of the Gaussian window in pixels, odd.
+        sigma: its standard deviation in pixels.
+        k: the stabilising constants, relative to the range.
 
     Returns:
         ``[B, C, H, W]`` in [0, 2].
@@ -89,13 +89,13 @@ def photometric(
 
 
 def without_unsure(target: Tensor, image: Tensor, unsure: Tensor | None) -> Tensor:
-    """The target, with the image itself where pixels are not to be learned from.
+    """The target, with the image itself at pixels that must not contribute to a loss.
 
-    Convention: there a loss by pixels is exactly 0, gradient included; what looks at several
-    pixels at once (SSIM, networks) still sees their neighbours.
+    Convention: there a per-pixel loss and its gradient are exactly 0; losses over windows (SSIM,
+    networks) still see the neighbours.
 
     Args:
         target, image: ``[B, 3, H, W]``.
-        unsure: ``[B, 1, H, W]`` above 0 at those pixels, or None for none.
+        unsure: ``[B, 1, H, W]``, above 0 at those pixels; None for none.
     """
     return target if unsure is None else torch.where(unsure > 0, image.detach(), target)

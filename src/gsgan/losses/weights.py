@@ -1,4 +1,4 @@
-"""Where pretrained torchvision weights are looked for. Nothing is ever downloaded here."""
+"""Finds and reads pretrained torchvision weights; nothing is downloaded."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ FILES = {
 
 
 def find_weights(name: str, path: str | Path | None = None) -> Path | None:
-    """The weight file of torchvision's ``vgg16`` or ``alexnet``, or None where there is none.
+    """The weight file of torchvision's ``vgg16`` or ``alexnet``, or None if there is none.
 
     Args:
-        name: which network.
-        path: the file, or a folder that holds it; None looks in the torch cache.
+        name: of the network.
+        path: the file or its folder; None looks in the torch cache.
 
     Raises:
-        DataError: when a path was given and nothing is there.
+        DataError: when a path was given and the file does not exist.
     """
     if path is None:
         cached = Path(torch.hub.get_dir()) / "checkpoints" / FILES[name]
@@ -35,7 +35,7 @@ def find_weights(name: str, path: str | Path | None = None) -> Path | None:
 
 
 def how_to_get(name: str) -> str:
-    """One clause telling a user how to put the weights in place."""
+    """How to install the weights, as a clause of a message."""
     return (
         f"put torchvision's {FILES[name]} into $TORCH_HOME/hub/checkpoints "
         "(~/.cache/torch/hub/checkpoints unless set) or give its path"
@@ -43,7 +43,7 @@ def how_to_get(name: str) -> str:
 
 
 def load_weights(path: Path) -> dict[str, torch.Tensor]:
-    """A state dict, read without unrestricted pickle.
+    """Reads a state dict without unrestricted pickle.
 
     Raises:
         DataError: when the file is not a plain state dict.

@@ -1,3 +1,3 @@
-"""Scores of one picture or segmentation against the truth."""
+"""Scores of images against the ground truth."""
 
 import gsgan.utils.compat  # noqa: F401  (before torchmetrics, which imports torchvision)

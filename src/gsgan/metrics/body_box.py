@@ -1,4 +1,4 @@
-"""A body's axis-aligned 3D box and the pixels that its projection covers."""
+"""A body's axis-aligned 3D box and the pixels its projection covers."""
 
 from __future__ import annotations
 
@@ -9,26 +9,26 @@ from torch import Tensor
 from gsgan.lens import straight_pixels
 from gsgan.scene import Camera
 
-NEAR = 1e-2  # metres; what is nearer is not seen
+NEAR = 1e-2  # metres; what is nearer is cut off
 PAIRS = torch.combinations(torch.arange(8))
 
 
 def box_corners(points: Tensor, margin: float) -> Tensor:
-    """``[8, 3]`` corners of the box round points ``[M, 3]`` and a margin, metres, world axes."""
+    """``[8, 3]`` corners of the box round points ``[M, 3]``, metres, world axes."""
     low, high = points.amin(0) - margin, points.amax(0) + margin
     choice = torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3)
     return torch.where(choice == 1, high, low)
 
 
 def box_mask(corners: Tensor, camera: Camera) -> Tensor:
-    """Which pixels see the box: those whose centre lies in the corners' projected convex hull.
+    """The pixels whose centre lies in the convex hull of the projected corners.
 
-    What lies nearer than `NEAR` is cut off, so a box that reaches behind the camera is seen right.
-    Where the camera has a lens, each pixel is looked up where a pinhole shows what it does.
+    The box is clipped at `NEAR`, so it may reach behind the camera. With a lens, each pixel is
+    tested at its undistorted position.
 
     Args:
         corners: ``[8, 3]`` metres, world.
-        camera: of one picture.
+        camera: a single camera.
 
     Returns:
         ``[1, H, W]`` bool; all false when the box is behind the camera.
@@ -47,7 +47,7 @@ def box_mask(corners: Tensor, camera: Camera) -> Tensor:
 
 
 def in_front(x_cam: Tensor, near: float = NEAR) -> Tensor:
-    """``[M, 3]`` points whose hull is that of the corners ``[8, 3]`` beyond the near plane."""
+    """``[M, 3]`` points whose hull is the box with corners ``[8, 3]`` clipped at the near plane."""
     a, b = x_cam[PAIRS[:, 0]], x_cam[PAIRS[:, 1]]
     crosses = (a[:, 2] > near) != (b[:, 2] > near)
     a, b = a[crosses], b[crosses]
@@ -62,10 +62,7 @@ def pixel_centres(camera: Camera) -> Tensor:
 
 
 def inside_hull(hull: Tensor, points: Tensor) -> Tensor:
-    """``[...]`` whether points ``[..., 2]`` lie in a convex polygon ``[n, 2]`` or on its border.
-
-    Fewer than three corners cover nothing.
-    """
+    """``[...]`` whether points ``[..., 2]`` are in a convex polygon ``[n, 2]``; false if n < 3."""
     if len(hull) < 3:
         return torch.zeros(points.shape[:-1], dtype=torch.bool, device=hull.device)
     sides = []

@@ -1,7 +1,7 @@
-"""Scores of one picture against the truth: PSNR, SSIM, fine detail, edges.
+"""Scores of images against the ground truth: PSNR, SSIM, fine detail, edges.
 
-Convention: pictures ``[B, 3, H, W]``, RGB in [0, 1]; every function returns one score a picture,
-``[B]``, because papers report the mean over pictures, not the score of pooled errors.
+Convention: images ``[B, 3, H, W]``, RGB in [0, 1]; every function returns one score per image,
+``[B]``, because papers report the mean over images, not the score of pooled errors.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from gsgan.losses.photometric import d_ssim_map
 
 Score = Callable[[Tensor, Tensor], Tensor]
 SSIM_CONSTANTS = (0.01, 0.03)
-LEAST_SIDE = 6  # pixels: half of SSIM's window and one, below which its border cannot be reflected
+LEAST_SIDE = 6  # pixels: smaller images cannot be reflected by half of SSIM's window
 UNIFORM_WINDOW = 7  # pixels, scikit-image's default
 
 
 def psnr(
     image: Tensor, target: Tensor, *, pooling: Literal["picture", "channels"] = "picture"
 ) -> Tensor:
-    """Peak signal to noise ratio, dB; infinite for equal pictures (keep those out of means).
+    """Peak signal-to-noise ratio in dB; infinite for equal images (leave those out of means).
 
     Args:
-        image, target: pictures.
-        pooling: "picture", of one error for all channels; "channels", the mean of their PSNRs.
+        image, target: images.
+        pooling: "picture", one error for all channels; "channels", the mean of their PSNRs.
     """
     error = (image - target).square().flatten(2).mean(dim=2)
     if pooling == "picture":
@@ -45,7 +45,7 @@ def psnr_where(
     *,
     pooling: Literal["picture", "channels"] = "picture",
 ) -> Tensor:
-    """PSNR of the pixels ``where [B, 1, H, W]`` alone, dB; NaN where there is none."""
+    """PSNR of the pixels ``where [B, 1, H, W]`` in dB; NaN without any."""
     scores = [
         psnr(a[None, :, m, None], b[None, :, m, None], pooling=pooling)[0]
         for a, b, m in zip(image, target, where[:, 0], strict=True)
@@ -54,14 +54,13 @@ def psnr_where(
 
 
 def person_box(mask: Tensor) -> Tensor:
-    """``[B, 1, H, W]`` true in the smallest box that holds the person, who is where the mask
-    ``[B, 1, H, W]`` is at least one half."""
+    """``[B, 1, H, W]`` bool: the smallest box round the mask's pixels of at least one half."""
     person = mask >= 0.5
     return _reached(person, -1) & _reached(person, -2)
 
 
 def _reached(person: Tensor, along: int) -> Tensor:
-    """Rows (``along`` -1) or columns (-2) from the first to the last that hold the person."""
+    """Rows (``along`` -1) or columns (-2) from the first to the last with the person."""
     held = person.any(dim=along, keepdim=True).long()
     across = -3 - along
     before, after = held.cumsum(across), held.flip(across).cumsum(across).flip(across)
@@ -69,15 +68,15 @@ def _reached(person: Tensor, along: int) -> Tensor:
 
 
 def psnr_person(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """PSNR inside the person's box, dB; NaN without a person in ``mask [B, 1, H, W]``.
+    """PSNR inside the person's box in dB; NaN where ``mask [B, 1, H, W]`` is empty.
 
-    A frame that is mostly background scores high whatever the person looks like.
+    The PSNR of a whole frame that is mostly background is high for any person.
     """
     return psnr_where(image, target, person_box(mask))
 
 
 def ssim_person(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """SSIM's mean over the pixels of the person's box; its windows see beyond. NaN without one."""
+    """SSIM's mean over the person's box, with windows that reach beyond it; NaN without one."""
     box = person_box(mask)
     similar = (1 - d_ssim_map(image, target)).mean(dim=1, keepdim=True)
     return (similar * box).flatten(1).sum(dim=1) / box.flatten(1).sum(dim=1)
@@ -86,11 +85,11 @@ def ssim_person(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
 def ssim(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
     """Structural similarity as torchmetrics defines it (Gaussian window 11, sigma 1.5).
 
-    Not by torchmetrics' arithmetic, which in float32 gives two equal grey pictures 0.9991.
+    Its arithmetic differs: in float32 torchmetrics gives two equal grey images 0.9991.
 
     Args:
-        image, target: pictures; NaN where a side is shorter than `LEAST_SIDE`.
-        value_range: of the values, as SSIM is told; 1 is right for [0, 1].
+        image, target: images; NaN where a side is shorter than `LEAST_SIDE`.
+        value_range: of the values; 1 is correct for [0, 1].
     """
     if min(image.shape[-2:]) < LEAST_SIDE:
         return image.new_full((len(image),), torch.nan)
@@ -100,12 +99,12 @@ def ssim(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
 
 
 def ssim_uniform(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
-    """Structural similarity as scikit-image defines it by default: a uniform window of 7 pixels,
-    sample covariances, windows that lie wholly inside.
+    """Structural similarity with scikit-image's defaults: a uniform window of 7 pixels, sample
+    covariances, no windows across the border.
 
     Args:
-        image, target: pictures; NaN where a side is shorter than the window.
-        value_range: of the values, as SSIM is told; 1 is right for [0, 1].
+        image, target: images; NaN where a side is shorter than the window.
+        value_range: of the values; 1 is correct for [0, 1].
     """
     window = UNIFORM_WINDOW
     if min(image.shape[-2:]) < window:
@@ -123,44 +122,31 @@ def ssim_uniform(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> 
 
 
 def high_frequencies(image: Tensor, target: Tensor, *, above: float = 0.25) -> Tensor:
-    """Energy of the fine detail as a share of the truth's: 1 is as sharp, below 1 is blurred.
+    """Energy of fine detail relative to the ground truth's: 1 is as sharp, below 1 is blurred.
 
     Args:
-        image, target: pictures; their grey values are compared.
-        above: cycles a pixel from which a frequency counts as high (Nyquist is 0.5).
+        image, target: images; their grey values are compared.
+        above: cycles per pixel above which a frequency counts as high (Nyquist is 0.5).
 
     Returns:
-        The ratio; NaN where the truth has no such detail.
+        The ratio; NaN where the ground truth has no such detail.
     """
     height, width = image.shape[-2:]
     rows = torch.fft.fftfreq(height, device=image.device)[:, None]
     columns = torch.fft.rfftfreq(width, device=image.device)[None]
     high = (rows.square() + columns.square()).sqrt() > above
 
-    def energy(picture: Tensor) -> Tensor:
-        spectrum = torch.fft.rfft2(picture.double().mean(dim=1))
+    def energy(x: Tensor) -> Tensor:
+        spectrum = torch.fft.rfft2(x.double().mean(dim=1))
         return (spectrum.abs().square() * high).sum(dim=(-2, -1))
 
     truth = energy(target)
     return torch.where(truth > 0, energy(image) / truth, torch.nan)
 
 
-def edge_f1(
-    image: Tensor, target: Tensor, *, low: float = 100.0, high: float = 200.0, tolerance: int = 1
-) -> Tensor:
-    """F1 of Canny edges against the truth's; NaN where the truth has no edge.
-
-    Args:
-        image, target: pictures.
-        low, high: Canny's hysteresis thresholds on 8-bit grey.
-        tolerance: pixels an edge may be off.
-    """
-    return edge_scores(image, target, low=low, high=high, tolerance=tolerance)[0]
-
-
-def edge_ratio(image: Tensor, target: Tensor, *, low: float = 100.0, high: float = 200.0) -> Tensor:
-    """Canny edge pixels over the truth's, 1 is best; NaN where the truth has no edge."""
-    return edge_scores(image, target, low=low, high=high)[1]
+def edge_f1(image: Tensor, target: Tensor) -> Tensor:
+    """The first of `edge_scores`."""
+    return edge_scores(image, target)[0]
 
 
 def edge_scores(
@@ -172,12 +158,16 @@ def edge_scores(
     high: float = 200.0,
     tolerance: int = 1,
 ) -> tuple[Tensor, Tensor]:
-    """`edge_f1` and `edge_ratio` with the edges found once.
+    """F1 of Canny edges, and the ratio of their number to the ground truth's (1 is best).
 
     Args:
-        image, target: pictures.
-        where: ``[B, 1, H, W]`` bool: edges of the whole pictures, those in here counted.
-        low, high, tolerance: see `edge_f1`.
+        image, target: images.
+        where: ``[B, 1, H, W]`` bool: only edges in it are counted.
+        low, high: Canny's hysteresis thresholds on 8-bit grey.
+        tolerance: pixels an edge may be off.
+
+    Returns:
+        Two float64 ``[B]``; NaN where the ground truth has no edge.
     """
     f1, ratio = [], []
     for i, (a, b) in enumerate(zip(image, target, strict=True)):
@@ -190,9 +180,9 @@ def edge_scores(
     return torch.tensor(f1, dtype=torch.float64), torch.tensor(ratio, dtype=torch.float64)
 
 
-def canny(picture: Tensor, low: float = 100.0, high: float = 200.0) -> np.ndarray:
-    """``[H, W]`` bool: Canny's edges of one picture ``[3, H, W]``, found on 8-bit grey."""
-    rgb = (picture.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+def canny(image: Tensor, low: float = 100.0, high: float = 200.0) -> np.ndarray:
+    """``[H, W]`` bool: Canny edges of one image ``[3, H, W]``, found on 8-bit grey."""
+    rgb = (image.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
     return cv2.Canny(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), low, high) > 0
 
 

@@ -1,4 +1,4 @@
-"""LPIPS with pretrained weights, or the reason it cannot be had."""
+"""LPIPS with pretrained weights, or the reason why there is none."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsgan.data.measures import Measures
 from gsgan.losses.weights import FILES, find_weights, how_to_get, load_weights
 from gsgan.metrics.image import Score
 from gsgan.utils.errors import ConfigError
@@ -18,45 +17,34 @@ _BACKBONES = {"vgg": "vgg16", "alex": "alexnet"}
 
 
 def check_lpips(net: str, path: str | None) -> Path | None:
-    """The backbone's weight file, or None where it is not at hand.
+    """The backbone's weight file, or None if there is none.
 
     Raises:
         ConfigError: on an unknown net.
-        DataError: when a given path does not hold the weights.
+        DataError: when a given path has no weights.
     """
     if net not in _BACKBONES:
         raise ConfigError(f"lpips.net must be vgg or alex; got {net!r}")
     return find_weights(_BACKBONES[net], path)
 
 
-def lpips_name(net: str, measures: Measures) -> str:
-    """What LPIPS' numbers are called: backbone, values it is fed, and order of channels and region
-    where those are not the usual ones."""
-    backbone = {"vgg": "VGG", "alex": "Alex"}[net]
-    low, high = measures.lpips_range
-    order = "" if measures.lpips_channels == "rgb" else " BGR"
-    region = "" if measures.lpips_region == "full" else " mask crop 512"
-    return f"LPIPS-{backbone} [{low:g},{high:g}]{order}{region}"
-
-
 def lpips(
     net: str = "vgg", path: str | None = None, value_range: tuple[float, float] = (-1.0, 1.0)
 ) -> tuple[Score | None, str]:
-    """LPIPS with pretrained weights, or None with the reason it cannot be had.
-
-    Never a score from random weights, and nothing is downloaded.
+    """LPIPS with pretrained weights, or None with the reason; weights are never random and never
+    downloaded.
 
     Args:
         net: backbone, ``vgg`` or ``alex``.
         path: the backbone's torchvision weight file or its folder; None looks in the torch cache.
-        value_range: (-1, 1) feeds what the backbone expects; (0, 1) feeds pictures as they are.
+        value_range: (-1, 1) scales images as the backbone expects; (0, 1) leaves them unscaled.
 
     Returns:
-        (score, "") or (None, reason). The score clamps pictures to [0, 1].
+        (score, "") or (None, reason). The score clamps images to [0, 1].
 
     Raises:
         ConfigError: on an unknown net.
-        DataError: when a given path does not hold the weights.
+        DataError: when a given path has no weights.
     """
     found = check_lpips(net, path)
     if found is None:
@@ -75,7 +63,7 @@ def lpips(
 
 
 def _build_lpips(net: str, weights: Path, scale: bool) -> torch.nn.Module:
-    """torchmetrics' LPIPS, its backbone read from ``weights`` wherever that file lies."""
+    """torchmetrics' LPIPS, which reads only from the torch cache, with the backbone ``weights``."""
     from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
     before = torch.hub.get_dir()

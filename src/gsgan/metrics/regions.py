@@ -1,6 +1,6 @@
-"""The picture as it is scored: background, 8 bits, and the parts that are looked at.
+"""Images as they are scored: background, 8 bits, regions.
 
-Convention: pictures ``[B, 3, H, W]`` RGB in [0, 1]; masks ``[B, 1, H, W]``; a background is a grey
+Convention: images ``[B, 3, H, W]`` RGB in [0, 1]; masks ``[B, 1, H, W]``; a background is a grey
 value, 0 black or 1 white.
 """
 
@@ -15,33 +15,32 @@ from torch.nn import functional
 from gsgan.metrics.image import person_box
 
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
-CROP_MARGIN = 50  # pixels that LPIPS' crop takes round the mask's box
+CROP_MARGIN = 50  # pixels round the mask's box in LPIPS' crop
 CROP_SIZE = 512  # pixels to which it is resized
-CUT_SLACK = 1e-3  # of 1/255: keeps what is 8-bit already from falling to the number below
+CUT_SLACK = 1e-3  # of 1/255: values that are 8-bit already must not drop by one
 
 
 def on_background(image: Tensor, alpha: Tensor, background: float) -> Tensor:
-    """A picture on black, premultiplied by its alpha, put on another background."""
+    """Puts an image on black, premultiplied by its alpha, on another background."""
     return image + (1 - alpha) * background
 
 
 def moved_background(image: Tensor, mask: Tensor, old: float, new: float) -> Tensor:
-    """An opaque picture moved from one background to another by a mask that is not its own.
+    """Moves an opaque image from one background to another by the ground truth's mask.
 
-    What it paints outside the mask is pushed beyond [0, 1] and lost: errors of the outline hide.
+    What the image shows outside the mask leaves [0, 1] and is lost: errors of the outline hide.
     """
     return (image + (1 - mask) * (new - old)).clamp(0, 1)
 
 
 def hard_outline(image: Tensor, mask: Tensor) -> Tensor:
-    """A picture on black, premultiplied by its mask, as it was taken before where the mask is at
-    least one half, and black elsewhere."""
+    """Divides an image on black by its mask where that is at least one half; black elsewhere."""
     inside = mask >= 0.5
     return torch.where(inside, (image / mask.clamp_min(0.5)).clamp(0, 1), torch.zeros_like(image))
 
 
 def eight_bits(image: Tensor, how: Literal["none", "rounded", "cut"]) -> Tensor:
-    """The values that an 8-bit file would hold, "rounded" or "cut"; "none" leaves them alone."""
+    """The values of an 8-bit file, "rounded" or "cut"; "none" leaves them unchanged."""
     if how == "none":
         return image
     steps = image.clamp(0, 1) * 255
@@ -54,11 +53,11 @@ def cleared(image: Tensor, keep: Tensor, background: float) -> Tensor:
 
 
 def rectangle(where: Tensor, least: int = 1) -> tuple[slice, slice] | None:
-    """Rows and columns of the smallest rectangle that holds ``where [1, H, W]``; None if empty.
+    """Rows and columns of the smallest rectangle round ``where [1, H, W]``; None if it is empty.
 
     Args:
         where: bool.
-        least: pixels, its least side, as far as the picture reaches.
+        least: minimum side in pixels, limited by the image.
     """
     rows, columns = (where[0].any(dim=d).nonzero().flatten().tolist() for d in (1, 0))
     if not rows:
@@ -76,24 +75,24 @@ def _widened(start: int, stop: int, size: int, least: int) -> slice:
 
 
 def mask_crop(
-    picture: Tensor,
+    image: Tensor,
     mask: Tensor,
     background: float,
     *,
     margin: int = CROP_MARGIN,
     size: int = CROP_SIZE,
 ) -> Tensor | None:
-    """The person in a square: the mask's box and a margin, centred on the background, resized.
+    """The mask's box and a margin, centred in a square of the background, resized.
 
-    Convention: as the script's, whose box ends one pixel early, below and to the right, and which
-    resizes by interpolation between four pixels however much it shrinks.
+    Convention: as in the script, the box ends one pixel early at the bottom and right, and resizing
+    is bilinear without antialiasing.
 
     Args:
-        picture: ``[3, H, W]``.
-        mask: ``[1, H, W]``; the box holds where it is at least one half.
+        image: ``[3, H, W]``.
+        mask: ``[1, H, W]``; its box contains the pixels of at least one half.
         background: fills the square.
-        margin: pixels round the box; the picture's border cuts it off.
-        size: pixels, side of the result.
+        margin: pixels round the box, limited by the image.
+        size: side of the result in pixels.
 
     Returns:
         ``[3, size, size]``, or None where the mask is empty.
@@ -104,7 +103,7 @@ def mask_crop(
     if box is None:
         return None
     rows, columns = (slice(max(s.start - margin, 0), s.stop - 1 + margin) for s in box)
-    part = picture[:, rows, columns]
+    part = image[:, rows, columns]
     height, width = part.shape[-2:]
     side = max(height, width)
     top, left = (side - height) // 2, (side - width) // 2

@@ -1,4 +1,4 @@
-"""Whether a run is the paper's method: its settings against those of ``experiment=paper``."""
+"""Compares the settings of a run with those of ``experiment=paper``."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 NAME = "GaussianGAN (paper)"
-METHOD = ("model", "training", "effects", "accuracy")  # groups that say what the method is
-# Of these, what changes neither what is computed nor what is learned.
+METHOD = ("model", "training", "effects", "accuracy")  # groups that define the method
+# Keys in them that change no result.
 IDLE = (
     *("model.backend", "model.window_multiple", "model.window_least", "model.class_vote"),
     *("training.seed", "training.log_every", "training.max_skipped", "training.skip_window"),
@@ -30,20 +30,20 @@ def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def settings_of(config: DictConfig) -> dict[str, Any]:
-    """A run's config by dotted key, less what differs between seeds, machines and continuations.
+    """A run's config by dotted key, without what differs between seeds, machines and continuations.
 
     Raises:
         OmegaConfBaseException: when it cannot be resolved.
     """
-    from gsgan.train.runs import record  # here: it brings torch
+    from gsgan.train.runs import record  # here: it imports torch
 
     seedless = config.copy()
-    seedless.seed = 0  # data and training refer to it
+    seedless.seed = 0  # data and training interpolate it
     return dict(flat(record(seedless)))
 
 
 def departures(settings: Mapping[str, Any], model: str, data: str) -> list[str] | None:
-    """Keys in which a run is not what ``experiment=paper`` makes of its model and data.
+    """Keys in which a run differs from ``experiment=paper`` with its model and data.
 
     Args:
         settings: of the run, resolved, by dotted key.
@@ -51,7 +51,7 @@ def departures(settings: Mapping[str, Any], model: str, data: str) -> list[str] 
         data: choice of the data group.
 
     Returns:
-        None where such a model or data set is not in conf/.
+        None for a model or dataset that is not in conf/.
     """
     from hydra.errors import HydraException
 
@@ -68,12 +68,12 @@ def departures(settings: Mapping[str, Any], model: str, data: str) -> list[str] 
 
 
 def _word(value: Any) -> Any:
-    """YAML reads a bare on or off as true or false."""
+    """A value as YAML 1.1 reads it: a bare on or off is a bool."""
     return {"on": True, "off": False}.get(value, value) if isinstance(value, str) else value
 
 
 def clause(keys: list[str], most: int = 6) -> str:
-    """The departures in one clause."""
+    """The departures as a clause of a sentence."""
     more = f" and {len(keys) - most} more" if len(keys) > most else ""
     return f"differs from experiment=paper in {', '.join(keys[:most])}{more}"
 
@@ -96,7 +96,7 @@ def _paper(model: str, data: str) -> dict[str, Any]:
 
 
 def _hydra() -> AbstractContextManager[Any]:
-    """Hydra as the running command has it, or for this call."""
+    """Initialises Hydra for this call, unless the running command has."""
     from hydra import initialize_config_dir
     from hydra.core.global_hydra import GlobalHydra
 

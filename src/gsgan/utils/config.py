@@ -1,4 +1,4 @@
-"""Where the config lies, and how an entry point starts, fails and says so."""
+"""The config folder, and the entry point of a command: start, errors, exit status."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def config_folder() -> Path:
     """conf/: inside the package when installed, beside src/ in a checkout.
 
     Raises:
-        GsganError: when neither is there.
+        GsganError: when neither exists.
     """
     package = Path(__file__).resolve().parents[1]
     for folder in (package / "conf", package.parents[1] / "conf"):
@@ -37,10 +37,10 @@ def config_folder() -> Path:
 
 
 def folder_name(overrides: str) -> str:
-    """The folder of a sweep's run: its overrides, as far as a name may be long and have signs.
+    """The folder name of a run in a sweep: its overrides, shortened, in characters that need no
+    quotes in a shell or in ``run=<folder>``.
 
-    A name that had to be changed ends in a digest of the overrides: no two runs share a folder. No
-    sign in it means anything to a shell or in ``run=<folder>``.
+    A name that had to be changed ends in a digest of the overrides, so no two runs share a folder.
     """
     name = re.sub(r"[^A-Za-z0-9_.+-]", "_", overrides)
     if name == overrides and len(name) <= LONGEST_NAME:
@@ -50,8 +50,8 @@ def folder_name(overrides: str) -> str:
 
 
 def if_gpu(then: object, otherwise: object) -> object:
-    """One of two values: whether CUDA can be used here."""
-    import torch  # here, so that importing an entry point stays light
+    """The first value if CUDA is available, else the second."""
+    import torch  # here: importing an entry point stays fast
 
     return then if torch.cuda.is_available() else otherwise
 
@@ -61,10 +61,10 @@ OmegaConf.register_new_resolver("if_gpu", if_gpu, replace=True)
 
 
 def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], None]]:
-    """Makes a function of a config into a command: Hydra's grammar, errors as one sentence.
+    """Turns a function of a config into a command with Hydra's grammar and one-sentence errors.
 
     Args:
-        name: the config file, without ``.yaml``, and the command's name.
+        name: of the config file, without ``.yaml``, and of the command.
     """
 
     def decorate(task: Callable[[DictConfig], None]) -> Callable[[], None]:
@@ -75,19 +75,19 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
             try:
                 task(config)
             except KeyboardInterrupt:
-                _say("interrupted")
+                _print_error("interrupted")
                 sys.exit(130)
             except Exception as error:
-                sentence = one_sentence(error)
-                if sentence is None:
+                message = one_sentence(error)
+                if message is None:
                     raise
-                _say(sentence)
+                _print_error(message)
                 _remove_unused_folder()
                 sys.exit(FAILED)
 
         @functools.wraps(task)
         def main() -> None:
-            import hydra  # here, so that importing an entry point stays light
+            import hydra  # here: importing an entry point stays fast
 
             sys.argv[1:] = map(spelled_out, sys.argv[1:])
             command = hydra.main(
@@ -101,13 +101,13 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
 
 
 def spelled_out(argument: str) -> str:
-    """``effects=[antialias]`` as ``effects.only=[antialias]``: Hydra would look for such files."""
+    """``effects=[antialias]`` as ``effects.only=[antialias]``: Hydra would look for files."""
     found = EFFECTS_LIST.fullmatch(argument)
     return argument if found is None else f"effects.only={found[1]}"
 
 
 def one_sentence(error: BaseException) -> str | None:
-    """What to tell the user, or None for a bug, whose traceback is worth more."""
+    """The message for the user, or None for a bug, which keeps its traceback."""
     if isinstance(error, GsganError):
         return _without_worker(error)
     if isinstance(error, InstantiationException):
@@ -124,7 +124,7 @@ def one_sentence(error: BaseException) -> str | None:
 
 
 def _without_worker(error: GsganError) -> str:
-    """The sentence alone, when a DataLoader's worker process put its traceback before it."""
+    """The message without the traceback that a DataLoader's worker process puts before it."""
     text = str(error)
     if not text.startswith("Caught "):
         return text
@@ -132,16 +132,16 @@ def _without_worker(error: GsganError) -> str:
 
 
 def _remove_unused_folder() -> None:
-    """Takes back the run folder that Hydra made, when nothing of a run is in it."""
+    """Removes the run folder that Hydra made if it has nothing but Hydra's files."""
     settings = HydraConfig.get()
     subfolder = settings.output_subdir
-    if subfolder is None:  # this command has no folder of its own
+    if subfolder is None:  # the command has no run folder
         return
     folder = Path(settings.runtime.output_dir)
     if {path.name for path in folder.iterdir()} <= {subfolder, f"{settings.job.name}.log"}:
         shutil.rmtree(folder)
 
 
-def _say(sentence: str) -> None:
+def _print_error(message: str) -> None:
     console = Console(stderr=True, soft_wrap=True)
-    console.print(f"gsgan: {sentence}", style="bold red", markup=False, highlight=False)
+    console.print(f"gsgan: {message}", style="bold red", markup=False, highlight=False)

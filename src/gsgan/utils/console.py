@@ -1,13 +1,13 @@
-"""The console that runs print to."""
+"""The console that commands print to."""
 
 from __future__ import annotations
 
 from rich.console import Console
 
-LEAST_WIDTH = 100  # columns: a table cut to a log file's default 80 cannot be read
+LEAST_WIDTH = 100  # columns: tables cut to the 80 of a log file cannot be read
 
 
 def make_console() -> Console:
-    """The terminal; where output goes to a file, lines of at least 100 columns."""
+    """A console on stdout, at least 100 columns wide where that is a file."""
     console = Console()
     return console if console.is_terminal else Console(width=max(LEAST_WIDTH, console.width))

@@ -1,4 +1,4 @@
-"""Small constant tensors, made once for each device: copying one over would make the host wait."""
+"""Small constant tensors, made once per device: copying them each time would synchronise."""
 
 from __future__ import annotations
 
@@ -10,20 +10,18 @@ from torch import Tensor
 
 
 def constant(values: Any, like: Tensor) -> Tensor:
-    """The values, tuples of numbers, as a tensor of the dtype and device of ``like``; not to be
-    written to."""
+    """Nested tuples of numbers as a tensor with the dtype and device of ``like``; read only."""
     return _constant(values, like.dtype, like.device)
 
 
 @lru_cache(maxsize=1024)
 def _constant(values: Any, dtype: torch.dtype, device: torch.device) -> Tensor:
-    with torch.inference_mode(False):  # born in it, it could not be used for training later
+    with torch.inference_mode(False):  # an inference tensor could not be used in training later
         return torch.tensor(values, dtype=dtype, device=device)
 
 
 def filled(values: Any, like: Tensor) -> Tensor:
-    """`constant` for values that change from call to call: written on the device, number by
-    number."""
+    """Like `constant` for values that change between calls: filled on the device, not copied."""
     if isinstance(values, tuple):
         return torch.stack([filled(value, like) for value in values])
     return like.new_full((), values)

@@ -1,4 +1,4 @@
-"""Which device a command runs on."""
+"""The device of a command."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ from gsgan.utils.errors import ConfigError
 
 
 def pick_device(name: str) -> torch.device:
-    """The device of that name; ``auto`` takes CUDA where there is one.
+    """The device of a name, checked to be usable.
 
     Args:
-        name: ``auto``, ``cpu``, ``cuda`` or any other torch device.
-
-    Returns:
-        A device that tensors can be made on.
+        name: ``auto`` (CUDA if available), ``cpu``, ``cuda`` or any other torch device.
 
     Raises:
-        ConfigError: when it cannot be used here.
+        ConfigError: when it is not usable.
     """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")

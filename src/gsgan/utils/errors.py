@@ -1,15 +1,15 @@
-"""The errors that reach a user as one sentence, without a traceback."""
+"""Errors that are shown to the user as one sentence, without a traceback."""
 
 from __future__ import annotations
 
 
 class GsganError(Exception):
-    """Something a user can put right: the message names what, where and what to do."""
+    """An error that the user can fix: the message names what, where and what to do."""
 
 
 class DataError(GsganError):
-    """A dataset on disk is missing, damaged or not what its layout promises."""
+    """A file or folder is missing, damaged or has unexpected content."""
 
 
 class ConfigError(GsganError):
-    """A config value is unknown or does not fit the others."""
+    """A config value is unknown or contradicts another."""

@@ -1,4 +1,4 @@
-"""Where mixed precision must not reach: geometry, rasteriser, SSIM."""
+"""Full precision for geometry, rasteriser and SSIM under autocast."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from torch import Tensor
 
 
 def full_precision(like: Tensor) -> torch.autocast:
-    """A context without autocast on the device of ``like``: bf16 projections are off by pixels."""
+    """Disables autocast on the device of ``like``: bf16 projections are off by pixels."""
     return torch.autocast(like.device.type, enabled=False)

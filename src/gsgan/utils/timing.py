@@ -20,17 +20,17 @@ def interleaved(
     device: torch.device | None = None,
     tick: Callable[[], None] | None = None,
 ) -> dict[Key, list[float]]:
-    """Times actions round robin, so that a disturbance affects all alike.
+    """Times actions round robin, so that other load on the machine affects all of them alike.
 
-    Convention: milliseconds of wall clock, with all work of the device finished. Each action
-    is first called once to warm up; that call is not counted, except where it took longer than
-    ``patience``: then it is called once more, and the shorter of the two is its only sample.
+    Convention: milliseconds of wall clock, device synchronised. Each action is called once to warm
+    up. If that took longer than ``patience``, it is called once more, and the shorter of the two
+    calls is its only sample.
 
     Args:
         actions: what to call, by name.
         repeats: rounds, at least 1.
         patience: seconds.
-        device: waits for it before and after each call.
+        device: synchronised before and after each call.
         tick: called after each call.
 
     Returns:
@@ -41,7 +41,7 @@ def interleaved(
     samples: dict[Key, list[float]] = {}
     for name, action in actions.items():
         first = timed(action, device)
-        slow = first > 1000 * patience  # or a disturbance: call once more
+        slow = first > 1000 * patience
         samples[name] = [min(first, timed(action, device))] if slow else []
         if tick:
             tick()
@@ -55,22 +55,22 @@ def interleaved(
 
 
 def median(samples: list[float] | None) -> float | None:
-    """The median, or None of nothing."""
+    """The median, or None without samples."""
     return statistics.median(samples) if samples else None
 
 
 def timed(action: Callable[[], object], device: torch.device | None) -> float:
-    """Milliseconds of one call, with all work of the device finished."""
+    """Milliseconds of one call, device synchronised."""
     wait(device)
     start = time.perf_counter()
     result = action()
     wait(device)
     took = 1000 * (time.perf_counter() - start)
-    del result  # freed outside the clock
+    del result  # freed after the measurement
     return took
 
 
 def wait(device: torch.device | None) -> None:
-    """Waits until the device has finished; returns at once on a CPU."""
+    """Synchronises a CUDA device."""
     if device is not None and device.type == "cuda":
         torch.cuda.synchronize(device)

@@ -9,7 +9,7 @@ from matplotlib.colors import to_hex, to_rgb
 from torch import Tensor
 
 from gsgan.evaluate.pictures import colour_labels
-from gsgan.evaluate.scores import SegmentationScores
+from gsgan.evaluate.scores import confusion, miou
 from gsgan.model.segmentation import IGNORE, Segmentation
 from gsgan.report.figures.layout import (
     Drawing,
@@ -85,12 +85,11 @@ def agreement(parts: Tensor, labels: Tensor) -> Numbers:
         parts: ``[1, classes, h, w]`` S.
         labels: ``[1, h, w]``; 255 is left out.
     """
-    scores = SegmentationScores(parts.shape[1])
-    scores.update(parts, labels)
     ours, seen = parts.argmax(dim=1), labels != IGNORE
     person = seen & ((ours > 0) | (labels > 0))
-    share = float((ours != labels)[person].double().mean()) if person.any() else None
-    return {"miou": scores.compute()["miou"], "wrong_share": share}
+    wrong = person & (ours != labels)
+    share = float(wrong.sum() / person.sum()) if person.any() else None
+    return {"miou": miou(confusion(parts, labels))["miou"], "wrong_share": share}
 
 
 def disagreement(ours: Tensor, labels: Tensor) -> Tensor:

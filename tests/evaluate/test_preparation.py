@@ -1,4 +1,4 @@
-"""What a protocol does to pictures, on real frames: the body's box, clearing, 8 bits."""
+"""What a protocol does to images, on real frames: the body's box, clearing, 8 bits."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.measures import Measures
-from gsgan.evaluate.prepare import JOINT_MARGIN, VERTEX_MARGIN, BodyBoxes, Prediction, Stage
+from gsgan.evaluate.prepare import JOINT_MARGIN, VERTEX_MARGIN, BodyBoxes, Prediction, Preparation
 from gsgan.evaluate.split import FULL
 from gsgan.metrics.body_box import box_corners, box_mask
 
@@ -46,27 +46,29 @@ def test_else_it_is_round_the_seen_joints_with_a_larger_margin_and_says_so(data)
 
 @pytest.mark.parametrize("background", ["black", "white"])
 def test_what_is_painted_outside_the_box_is_cleared_and_only_there(data, background):
-    stage = Stage(Measures(region="body_box_cleared", background=background), BodyBoxes(data))
+    prepare = Preparation(
+        Measures(region="body_box_cleared", background=background), BodyBoxes(data)
+    )
     frame = data.dataset("train")[0]
-    box = stage.box(frame)
-    picture = stage.picture(Prediction({FULL: torch.full_like(frame.image, 0.3)}, {}, background),
+    box = prepare.box(frame)
+    picture = prepare.image(Prediction({FULL: torch.full_like(frame.image, 0.3)}, {}, background),
                             FULL, frame, box)  # fmt: skip
     inside = box.expand_as(picture)
     assert bool((picture[inside] == 0.3).all())
-    assert bool((picture[~inside] == stage.background).all())
-    assert float(stage.truth(frame)[0, 0, 0, 0]) == stage.background
+    assert bool((picture[~inside] == prepare.background).all())
+    assert float(prepare.target(frame)[0, 0, 0, 0]) == prepare.background
 
 
 def test_boxes_that_nothing_asks_for_are_not_made(data):
     frame = data.dataset("train")[0]
-    assert Stage(Measures(), None).box(frame) is None
+    assert Preparation(Measures(), None).box(frame) is None
 
 
 def test_the_truth_is_outlined_as_the_protocol_says(data):
     frame = GsganData(str(data.layout.root), size=20).dataset("train")[0]
     edge = (frame.mask > 0.05) & (frame.mask < 0.95)
     assert bool(edge.any())  # the outline of this data is soft
-    hard = Stage(Measures(truth_outline="hard", background="white"), None).truth(frame)
+    hard = Preparation(Measures(truth_outline="hard", background="white"), None).target(frame)
     outside = (frame.mask < 0.5).expand_as(hard)
     assert bool((hard[outside] == 1).all())
     taken = (frame.image / frame.mask.clamp_min(1e-6)).clamp(0, 1)
@@ -75,9 +77,9 @@ def test_the_truth_is_outlined_as_the_protocol_says(data):
 
 def test_values_are_clamped_before_8_bits(data):
     frame = data.dataset("train")[0]
-    stage = Stage(Measures(eight_bits="cut"), None)
+    prepare = Preparation(Measures(eight_bits="cut"), None)
     wild = torch.full_like(frame.image, 1.7)
     wild[..., 0] = -3.0
     wild[..., 1] = 0.5
-    picture = stage.picture(Prediction({FULL: wild}, {}), FULL, frame, None)
+    picture = prepare.image(Prediction({FULL: wild}, {}), FULL, frame, None)
     assert torch.equal(picture[0, 0, 0, :3] * 255, torch.tensor([0.0, 127.0, 255.0]))
