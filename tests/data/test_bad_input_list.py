@@ -206,7 +206,7 @@ def test_pictures_that_cannot_be(
     frame = next(iter(layout.images[camera]))
     image, mask = layout.image_path(camera, frame), layout.mask_path(camera, frame)
     damages: tuple[tuple[Path, Callable[[tuple[int, int]], bytes], str], ...] = (
-        (image, empty, "is not a whole PNG or JPEG"),
+        (image, empty, "is not a valid PNG or JPEG"),
         (image, cmyk, "is a CMYK JPEG"),
         (image, deep, "has 16 bits a channel"),
         (mask, deep, "has 16 bits a channel"),

@@ -580,9 +580,9 @@ BAD_INDEX = {
     "landmarks not npz": (write("landmarks3d.npz", b"hello"), "landmarks3d.npz"),
     "landmarks cut off": (
         write("landmarks3d.npz", b"PK\x03\x04" + bytes(40)),
-        "landmarks3d.npz is not a whole npz file",
+        "landmarks3d.npz is not a valid npz file",
     ),
-    "landmarks pickled": (pickled, "holds pickled Python objects.*refused"),
+    "landmarks pickled": (pickled, "asks for pickled Python objects.*nothing was run"),
     "landmarks shape": (
         landmarks(p=np.zeros((4, 25, 3))),
         r"'p' must have shape \(any, 33, 3\), found \(4, 25, 3\)",
@@ -636,15 +636,15 @@ BAD_INDEX = {
         picture("images/cam01/000001.png", np.zeros((12, 16, 3), np.uint8)),
         r"images/cam01/000001.png is 16x12 pixels .*cameras.json says 32x24",
     ),
-    "image not an image": (write("images/cam00/000001.png", b"text"), "not a whole PNG or JPEG"),
-    "image empty": (write("images/cam00/000001.png", b""), "not a whole PNG or JPEG"),
+    "image not an image": (write("images/cam00/000001.png", b"text"), "not a valid PNG or JPEG"),
+    "image empty": (write("images/cam00/000001.png", b""), "not a valid PNG or JPEG"),
     "image cut in header": (
         write("images/cam00/000001.png", b"\x89PNG\r\n\x1a\n\0\0"),
-        "not a whole PNG or JPEG",
+        "not a valid PNG or JPEG",
     ),
     "jpeg without a frame": (
         write("images/cam00/000001.png", b"\xff\xd8\xff\xda\0\0"),
-        "not a whole PNG or JPEG",
+        "not a valid PNG or JPEG",
     ),
     "image 16 bit": (
         picture("images/cam00/000001.png", np.zeros((24, 32, 3), np.uint16)),
@@ -753,8 +753,8 @@ def test_arrays_that_would_unpack_to_too_much_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     root = write_tiny_capture(tmp_path)
-    monkeypatch.setattr("gsgan.utils.pickles.LARGEST_MEMBER", 1000)
-    with pytest.raises(DataError, match=r"landmarks3d.npz is not a whole npz file .p would"):
+    monkeypatch.setattr("gsgan.utils.pickles.LARGEST_ARRAY", 1000)
+    with pytest.raises(DataError, match=r"landmarks3d.npz is not a valid npz file .p would"):
         Layout.read(root)
 
 

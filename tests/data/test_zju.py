@@ -495,7 +495,7 @@ def swapped_lists(root: Path) -> None:
 GREY = np.zeros((40, 40), np.uint8)
 BAD = {
     "no annots": (remove("annots.npy"), "is not a ZJU-MoCap subject: it has neither annots.npy"),
-    "annots cut": (cut("annots.npy", 0.5), "annots.npy is not a whole .npy file"),
+    "annots cut": (cut("annots.npy", 0.5), "annots.npy is not a valid .npy file"),
     "annots of code": (evil, r"annots.npy asks for (posix|nt|os)\.system"),
     "no cams": (annots(lambda c: c.pop("cams") and None), "annots.npy has no 'cams'"),
     "no D": (annots(lambda c: c["cams"].pop("D") and None), "cams has no list 'D'"),
@@ -560,12 +560,12 @@ BAD = {
         lambda root: edit(root / "new_params/2.npy", lambda c: c.pop("Rh") is None),
         "2.npy has no 'Rh'",
     ),
-    "parameters cut": (cut("new_params/1.npy", 0.7), "1.npy is not a whole .npy file"),
+    "parameters cut": (cut("new_params/1.npy", 0.7), "1.npy is not a valid .npy file"),
     "vertices of another fit": (
         moved_vertices,
         "new_params and .*new_vertices do not belong together: .* 8.7 cm off",
     ),
-    "vertices cut": (cut("new_vertices/0.npy", 0.7), "0.npy is not a whole .npy file"),
+    "vertices cut": (cut("new_vertices/0.npy", 0.7), "0.npy is not a valid .npy file"),
     "vertices of another body": (
         lambda root: np.save(root / "new_vertices/0.npy", np.zeros((778, 3))),
         r"must hold vertices of shape \(6890, 3\), found \(778, 3\)",
@@ -585,7 +585,7 @@ BAD = {
     ),
     "image empty": (
         lambda root: (root / "Camera_B3/000000.jpg").write_bytes(b""),
-        "000000.jpg is not a whole PNG or JPEG",
+        "000000.jpg is not a valid PNG or JPEG",
     ),
     "image of another size": (
         picture("Camera_B3/000000.jpg", np.zeros((20, 30, 3), np.uint8)),
@@ -668,7 +668,7 @@ CACHE_DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
         lambda root: turned_twice(root / "mesh_infos.pkl"),
         "mesh_infos.pkl, frame 2: the first 3 numbers of 'poses' must be 0, found up to 0.1",
     ),
-    "cameras cut": ("humannerf", cut("cameras.pkl", 0.5), "cameras.pkl is not a whole pickle"),
+    "cameras cut": ("humannerf", cut("cameras.pkl", 0.5), "cameras.pkl is not a valid pickle"),
     "cameras a list": (
         "humannerf",
         lambda root: (root / "cameras.pkl").write_bytes(pickle.dumps([1])),
@@ -706,7 +706,7 @@ CACHE_DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "object npz": (
         "arah",
         lambda root: np.savez(root / "models/000001.npz", betas=np.array([Evil()], object)),
-        "000001.npz (asks for|has no|is not a whole)",
+        "000001.npz (asks for|has no|is not a valid)",
     ),
 }
 

@@ -68,7 +68,7 @@ def read_header(path: Path) -> Header:
     except (struct.error, LookupError, ValueError):
         header = None
     if header is None:
-        raise DataError(f"{path} is not a whole PNG or JPEG file; copy or export it again")
+        raise DataError(f"{path} is not a valid PNG or JPEG file; copy or export it again")
     return header
 
 
