@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 
 import pytest
+from gsgan.data.speed import LoaderSpeed
 
 from gsgan.bench.loader import rows, run
-from gsgan.data.speed import LoaderSpeed
 from gsgan.utils.errors import ConfigError
 
 

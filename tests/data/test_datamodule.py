@@ -17,6 +17,7 @@ import torch
 from make import skeletons, write_landmarks, write_tiny_capture
 
 from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order
+from gsgan.data.formats.capture import read_capture
 from gsgan.data.layout import Layout
 from gsgan.data.splits import make_splits, parse_frames, parse_names
 from gsgan.scene import Frame
@@ -43,7 +44,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def layout(capture: Path) -> Layout:
-    return Layout.read(capture)
+    return read_capture(capture)
 
 
 # --- splits -------------------------------------------------------------------------------------
@@ -74,7 +75,7 @@ def test_splits_of_the_config_with_ranges_and_the_rest(layout: Layout) -> None:
 
 def test_splits_of_meta_json_give_way_to_the_config(tmp_path: Path) -> None:
     held = {"test_cameras": ["cam01"], "train_frames": [0, 1], "test_frames": [2, 3]}
-    layout = Layout.read(write_tiny_capture(tmp_path, splits=held))
+    layout = read_capture(write_tiny_capture(tmp_path, splits=held))
     splits = make_splits(layout)
     assert (splits.train_cameras, splits.test_cameras) == (("cam00",), ("cam01",))
     assert (splits.train_frames, splits.test_frames) == ((0, 1), (2, 3))
@@ -330,11 +331,11 @@ def test_a_capture_may_be_posed_by_the_users_own_smpl_file(tmp_path: Path) -> No
 def test_labels_are_counted_without_the_ignore_value(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path, cameras=1, frames=2, labels=True)
     cv2.imwrite(str(root / "labels/cam00/000001.png"), np.full((24, 32), 255, np.uint8))
-    layout = Layout.read(root)
+    layout = read_capture(root)
     assert count_labels(layout, (("cam00", 0), ("cam00", 1))) == 3
     assert count_labels(layout, (("cam00", 1),)) == 1
     names = write_tiny_capture(tmp_path / "n", labels=True, meta={"label_names": list("abcde")})
-    assert count_labels(Layout.read(names), ()) == 5
+    assert count_labels(read_capture(names), ()) == 5
 
 
 def test_body_height_passes_over_frames_with_holes(tmp_path: Path) -> None:

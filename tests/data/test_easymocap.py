@@ -22,8 +22,8 @@ from writers.easymocap import (
     write_people,
 )
 
-from gsgan.data.capture import CaptureDataset
 from gsgan.data.checks import Checks
+from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.formats.smpl_motion import Motion, posed
 from gsgan.data.formats.trust import Trust

@@ -15,7 +15,7 @@ import pytest
 from formats_list import FORMATS, Format
 from writers.common import Subject
 
-from gsgan.data.capture import CaptureDataset
+from gsgan.data.dataset import CaptureDataset
 from gsgan.utils.errors import GsganError
 
 pytestmark = [

@@ -11,8 +11,9 @@ import torch
 from make import write_tiny_capture
 from torch.utils.data import DataLoader, Dataset
 
-from gsgan.data.capture import CaptureDataset, PictureCache
 from gsgan.data.datamodule import GsganData, _quiet_worker
+from gsgan.data.dataset import CaptureDataset, PictureCache
+from gsgan.data.formats.capture import read_capture
 from gsgan.data.layout import Layout
 from gsgan.scene import Frame
 
@@ -33,7 +34,9 @@ def resident() -> int:
 @pytest.fixture(scope="module")
 def layout(tmp_path_factory: pytest.TempPathFactory) -> Layout:
     root = tmp_path_factory.mktemp("memory") / "c"
-    return Layout.read(write_tiny_capture(root, cameras=2, frames=6, size=(256, 256), suffix="jpg"))
+    return read_capture(
+        write_tiny_capture(root, cameras=2, frames=6, size=(256, 256), suffix="jpg")
+    )
 
 
 def long_dataset(layout: Layout, count: int) -> CaptureDataset:
@@ -68,7 +71,7 @@ def test_the_measurement_sees_pictures_that_are_kept(layout: Layout) -> None:
 def index_bytes(root: Path) -> int:
     tracemalloc.start()
     try:
-        layout = Layout.read(root)
+        layout = read_capture(root)
         held = tracemalloc.get_traced_memory()[0]
         assert layout.frames
     finally:

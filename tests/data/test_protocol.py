@@ -11,6 +11,7 @@ import pytest
 from make import write_tiny_capture
 
 from gsgan.data.datamodule import GsganData
+from gsgan.data.formats.capture import read_capture
 from gsgan.data.layout import Layout
 from gsgan.data.measures import CHOICES, Measures
 from gsgan.data.protocol import Protocol
@@ -29,7 +30,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def layout(root: Path) -> Layout:
-    return Layout.read(root)
+    return read_capture(root)
 
 
 def test_frames_may_have_a_step() -> None:

@@ -11,8 +11,8 @@ import torch
 from make import write_tiny_capture
 from operators import Calls
 
-from gsgan.data.capture import CaptureDataset
 from gsgan.data.datamodule import GsganData, default_workers
+from gsgan.data.dataset import CaptureDataset
 from gsgan.skeleton import MEDIAPIPE33
 
 MOUTH = [MEDIAPIPE33.names.index(name) for name in ("mouth_left", "mouth_right")]

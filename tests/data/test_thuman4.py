@@ -17,11 +17,11 @@ from writers.common import write_picture
 from writers.smplx_rig import SmplxSubject
 from writers.thuman4 import write_thuman4
 
-from gsgan.data.capture import CaptureDataset
 from gsgan.data.checks import Checks
-from gsgan.data.formats.rig_files import read_missing
+from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.smpl_motion import Motion, posed
 from gsgan.data.formats.smplx_params import read_motion
+from gsgan.data.formats.smplx_rig import read_missing
 from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Layout

@@ -20,8 +20,8 @@ from writers.common import Subject, make_subject, write_object, write_picture
 from writers.smpl import write_smpl
 
 from gsgan.body.smpl_names import CIHP
-from gsgan.data.capture import CaptureDataset
 from gsgan.data.checks import Checks
+from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import frame_files, natural_order
 from gsgan.data.formats.meeting import box_iou, mask_box
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed

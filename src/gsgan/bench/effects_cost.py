@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from gsgan.bench.effects_case import Row, Training
-from gsgan.data.capture import CaptureDataset
 from gsgan.data.datamodule import GsganData
+from gsgan.data.dataset import CaptureDataset
 from gsgan.model.avatar import Avatar
 from gsgan.scene import Frame
 from gsgan.utils.timing import interleaved, median

@@ -22,8 +22,8 @@ from gsgan.check.silhouette import (
 )
 from gsgan.check.subject import Subject, evenly
 from gsgan.data.agreement import joint_distance, mask_distance
-from gsgan.data.capture import CaptureDataset
 from gsgan.data.crop import project
+from gsgan.data.dataset import CaptureDataset
 from gsgan.data.splits import Item
 from gsgan.utils.errors import DataError
 

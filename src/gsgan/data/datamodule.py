@@ -18,10 +18,11 @@ import torch
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, Subset
 
-from gsgan.data.capture import CaptureDataset, Lens, PictureCache
+from gsgan.data.checks import Checks
 from gsgan.data.crop import PersonCrop
+from gsgan.data.dataset import CaptureDataset, Lens, PictureCache
 from gsgan.data.formats.capture import CaptureReader
-from gsgan.data.layout import Checks, Layout
+from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
 from gsgan.data.sampler import StepSampler, pass_order
 from gsgan.data.scene_info import SceneInfo, count_labels, scene_info
@@ -160,7 +161,7 @@ class GsganData(LightningDataModule):
         limit = int(self.cache_mb * 2**20) // (2 * self.workers + 1)
         cache = PictureCache(limit)
         trained = sorted({frame for _, frame in splits.items["train"]})
-        skeletons = complete_skeletons(layout, trained)
+        skeletons = complete_skeletons(layout.landmarks, layout.frames, trained)
         self._datasets = {
             name: CaptureDataset(
                 layout, splits.items[name], self.size, self.crop, cache, self.lens, skeletons

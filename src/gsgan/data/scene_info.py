@@ -13,10 +13,10 @@ import torch
 from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.capture import CaptureDataset
+from gsgan.data.dataset import CaptureDataset
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
-from gsgan.data.skeletons import body_height, joints_of
+from gsgan.data.skeletons import body_height
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
 from gsgan.scene import Frame
@@ -111,7 +111,7 @@ def scene_info(
         held_out: datasets of the held-out items; none of their pictures is looked at.
     """
     frames = sorted({frame for _, frame in splits.items["train"]})
-    p, valid = joints_of(layout, frames)
+    p, valid = layout.landmarks.joints(frames)
     middles = torch.stack([q[v].mean(0) for q, v in zip(p, valid, strict=True)])
     cameras = {camera for camera, _ in splits.items["train"]}
     tested = {camera for data in held_out for camera, _ in data.items} - cameras

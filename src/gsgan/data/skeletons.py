@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,9 +15,6 @@ from torch import Tensor
 from gsgan.data.files import LARGEST_FRAME
 from gsgan.skeleton import limb_length_sum, sanitise
 from gsgan.utils.errors import DataError
-
-if TYPE_CHECKING:
-    from gsgan.data.layout import Layout
 
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
@@ -46,8 +43,13 @@ class Landmarks:
         return hashlib.sha256(b"".join(held)).hexdigest()
 
     def seen(self, frame: int) -> Float:
-        """``[N, 3]`` the joints of a frame that are no stand-ins."""
+        """``[N, 3]`` the joints of a frame that were seen."""
         return self.p[frame][self.visibility[frame] > 0]
+
+    def joints(self, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Joints ``[F, J, 3]`` metres, and which of them were seen ``[F, J]`` bool."""
+        p, visibility = (np.stack([part[f] for f in frames]) for part in (self.p, self.visibility))
+        return torch.from_numpy(p), torch.from_numpy(visibility) > 0
 
 
 @dataclass(frozen=True)
@@ -157,28 +159,24 @@ def fill_missing(p: Float, valid: Bool, ids: NDArray[np.int64]) -> Float:
     return filled
 
 
-def joints_of(layout: Layout, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Joints ``[F, J, 3]`` metres and which of them were seen ``[F, J]`` bool, of some frames."""
-    marks = layout.landmarks
-    p, visibility = (np.stack([part[f] for f in frames]) for part in (marks.p, marks.visibility))
-    return torch.from_numpy(p), torch.from_numpy(visibility) > 0
-
-
 def body_height(p: Tensor, valid: Tensor) -> float:
     """Metres: the summed limb lengths, median over frames, see `limb_length_sum`."""
     return float(limb_length_sum(p, valid).nanmedian())
 
 
-def complete_skeletons(layout: Layout, trained: Sequence[int]) -> dict[int, Float]:
-    """Every frame's joints ``[J, 3]`` metres, stand-ins in place of those that were not seen.
+def complete_skeletons(
+    landmarks: Landmarks, frames: Sequence[int], trained: Sequence[int]
+) -> dict[int, Float]:
+    """Every frame's joints ``[J, 3]`` metres, with estimates of those that were not seen.
 
-    Done once for a capture, so that no frame is repaired while it is painted: some templates'
-    joints no body model has (the mouth), so with SMPL every frame would be.
+    Done once per capture, so that no frame is repaired while it is rendered: some of a template's
+    joints are in no body model (the mouth), so with SMPL every frame would be.
 
     Args:
-        layout: the capture.
-        trained: frames that set the body's height, which says how long the missing bones are.
+        landmarks: of the capture.
+        frames: to complete.
+        trained: frames that set the body's height, which gives the length of missing bones.
     """
-    height = body_height(*joints_of(layout, trained))
-    p, _ = sanitise(*joints_of(layout, layout.frames), body_height=height)
-    return dict(zip(layout.frames, p.numpy(), strict=True))
+    height = body_height(*landmarks.joints(trained))
+    p, _ = sanitise(*landmarks.joints(frames), body_height=height)
+    return dict(zip(frames, p.numpy(), strict=True))

@@ -7,8 +7,9 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
+from gsgan.data.checks import spans
 from gsgan.data.files import LARGEST_FRAME
-from gsgan.data.layout import Layout, spans
+from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
 from gsgan.utils.errors import ConfigError, DataError
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from cachetools import LRUCache
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -22,7 +22,8 @@ from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL
 from gsgan.data.splits import Item
 from gsgan.scene import BodyPose, Camera, Frame
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.checks import whole
+from gsgan.utils.errors import DataError
 
 Bytes = NDArray[np.uint8]
 Lens = Literal["undistort", "ignore", "raw"]
@@ -51,37 +52,20 @@ class Picture:
         return sum(part.nbytes for part in parts if part is not None)
 
 
-class PictureCache:
-    """The most recently used pictures, within a bound on their bytes.
+class PictureCache(LRUCache[Item, Picture]):
+    """The most recently used images.
 
     Args:
         limit: bytes; 0 keeps nothing.
     """
 
     def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.nbytes = 0
-        self._held: OrderedDict[Item, Picture] = OrderedDict()
+        super().__init__(maxsize=limit)
 
-    def get(self, key: Item) -> Picture | None:
-        """The picture, if it is still held."""
-        if key in self._held:
-            self._held.move_to_end(key)
-        return self._held.get(key)
-
-    def clear(self) -> None:
-        """Lets go of all."""
-        self._held.clear()
-        self.nbytes = 0
-
-    def put(self, key: Item, picture: Picture) -> None:
-        """Holds a picture, letting go of the longest unused ones; too large a one is not held."""
-        if picture.nbytes > self.limit or key in self._held:
-            return
-        self._held[key] = picture
-        self.nbytes += picture.nbytes
-        while self.nbytes > self.limit:
-            self.nbytes -= self._held.popitem(last=False)[1].nbytes
+    @staticmethod
+    def getsizeof(value: Picture) -> int:
+        """Bytes of an image."""
+        return value.nbytes
 
 
 class CaptureDataset(Dataset[Frame]):
@@ -104,7 +88,7 @@ class CaptureDataset(Dataset[Frame]):
             and says so in ``camera.dist`` (five coefficients; lenses with more are undistorted).
 
     Raises:
-        ConfigError: when the size is not a positive number.
+        ConfigError: when the size is not a whole number above 0.
     """
 
     def __init__(
@@ -117,14 +101,12 @@ class CaptureDataset(Dataset[Frame]):
         lens: Lens = "undistort",
         skeletons: Mapping[int, NDArray[np.float64]] | None = None,
     ) -> None:
-        if size is not None and (not isinstance(size, int) or size < 1):
-            raise ConfigError(f"data.size must be a whole number of pixels above 0, got {size!r}")
         self.layout = layout
         self.items = tuple(items)
-        self.size = size
+        self.size = None if size is None else whole("data.size", size, 1)
         self.crop = crop
         self.lens = lens
-        self.cache = cache or PictureCache(0)
+        self.cache = PictureCache(0) if cache is None else cache
         self.skeletons = layout.landmarks.p if skeletons is None else skeletons
         self._indices = {name: i for i, name in enumerate(layout.camera_names)}
 
@@ -141,7 +123,8 @@ class CaptureDataset(Dataset[Frame]):
         picture = self.cache.get(item)
         if picture is None:
             picture = self._load(item)
-            self.cache.put(item, picture)
+            if picture.nbytes <= self.cache.maxsize:
+                self.cache[item] = picture
         return Frame(
             image=_unit(picture.image)[None],
             mask=_unit(picture.mask)[None, None],
@@ -162,9 +145,12 @@ class CaptureDataset(Dataset[Frame]):
         camera, window = self.layout.cameras[item[0]], self.window(item)
         mapping = self._mapping(camera, window)
         taken = cropping.take(np.full(camera.size, 255, np.uint8), window, mapping, exact=True)
-        size = window.size if self.size is None else (self.size, self.size)
-        taken = cropping.resize(taken, size, exact=True)
+        taken = cropping.resize(taken, self._target(window), exact=True)
         return None if taken.all() else _unit(taken)[None, None]
+
+    def _target(self, window: Window) -> tuple[int, int]:
+        """``(H, W)`` of the images."""
+        return window.size if self.size is None else (self.size, self.size)
 
     def window(self, item: Item) -> Window:
         """Which part of the (undistorted) picture an item shows."""
@@ -203,7 +189,7 @@ class CaptureDataset(Dataset[Frame]):
         camera, window = self.layout.cameras[item[0]], self.window(item)
         rules = self.layout.pixels
         mapping = self._mapping(camera, window)
-        size = window.size if self.size is None else (self.size, self.size)
+        size = self._target(window)
 
         def fit(picture: Bytes, exact: bool) -> Bytes:
             return cropping.resize(cropping.take(picture, window, mapping, exact), size, exact)
