@@ -49,7 +49,7 @@ class CameraEntry:
         return bool(np.any(self.dist != 0))
 
     def stored_pixels(self, points: Float) -> Float:
-        """``[N, 2]`` where world points ``[N, 3]`` lie in the stored, distorted picture.
+        """``[N, 2]`` where world points ``[N, 3]`` lie in the stored, distorted image.
 
         Skew counts, which OpenCV's own projection drops. Points behind the camera get meaningless
         pixels: mask them by depth.

@@ -1,4 +1,4 @@
-"""Files as a dataset holds them: picture headers, pictures, JSON, arrays.
+"""Files as a dataset holds them: image headers, images, JSON, arrays.
 
 Every function turns what can be wrong with a file into one `DataError` that names the file, what
 was expected and what was found. Nothing here unpickles.
@@ -68,7 +68,7 @@ def read_header(path: Path) -> Header:
 
 
 def check_picture(path: Path, kind: str, size: tuple[int, int], expected_by: str) -> None:
-    """Refuses a picture whose header does not fit its use, without decoding it.
+    """Refuses an image whose header does not fit its use, without decoding it.
 
     Args:
         path: the file.
@@ -107,8 +107,8 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
     Raises:
         DataError: when the file is missing, damaged or cut off.
     """
-    picture = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), np.uint8)
+    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
@@ -155,15 +155,15 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
         data = path.read_bytes()
     except OSError as error:
         raise _unreadable(path, error) from None
-    picture = None
+    image = None
     if data and not cut_off(data):
         with contextlib.suppress(cv2.error):  # e.g. a header that claims 2³¹ pixels
-            picture = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
-    if picture is None:
+            image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
+    if image is None:
         raise DataError(
             f"{path} is damaged or cut off after {len(data)} bytes; copy or export it again"
         )
-    return picture
+    return image
 
 
 def cut_off(data: bytes) -> bool:
@@ -219,7 +219,7 @@ def frame_files(
     suffixes: tuple[str, ...],
     number: Callable[[str], int | None] | None = None,
 ) -> dict[int, str]:
-    """Paths relative to ``root`` of the pictures in one of its folders, by frame number.
+    """Paths relative to ``root`` of the images in one of its folders, by frame number.
 
     Args:
         root: the dataset.

@@ -1,6 +1,6 @@
 """How the pixels of a dataset become RGB, alpha and part numbers: named rules, applied on reading.
 
-Convention: a mask rule says what the numbers in a mask file mean; several masks of one picture are
+Convention: a mask rule says what the numbers in a mask file mean; several masks of one image are
 joined (a pixel is the person's when any of them says so). All results are uint8.
 """
 
@@ -28,7 +28,7 @@ JPEG_SUFFIXES = (".jpg", ".jpeg")
 
 
 class MaskFile(NamedTuple):
-    """One mask of one picture.
+    """One mask of one image.
 
     Args:
         rule: one of `MASK_RULES`.
@@ -50,14 +50,14 @@ class PixelRules:
     """How a format's files are to be understood.
 
     Args:
-        colour_order: of the stored pictures; a file is nearly always "rgb", whatever library
+        colour_order: of the stored images; a file is nearly always "rgb", whatever library
             reads it.
-        composed: pictures are already composed on black by their mask.
+        composed: images are already composed on black by their mask.
         threshold: for the mask rule of that name.
         mask_sampling: how masks are undistorted and resized: "linear" for soft alphas, "nearest"
             for masks of two values.
         label_table: 256 part numbers, what each stored label becomes; None keeps them.
-        ignore_band: pixels of the stored picture, side of the square by which the mask is dilated
+        ignore_band: pixels of the stored image, side of the square by which the mask is dilated
             and eroded; labels in the band between become "ignore". 0 leaves it out.
         unsure_band: the same for colours: pixels in that band are not to be learned from.
         unsure_alpha: nor are those whose alpha lies strictly between these two; None leaves it out.
@@ -90,7 +90,7 @@ def read_image(path: Path, rules: PixelRules) -> Bytes:
 
 
 def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
-    """``[H, W]`` 0..255: the masks of one picture, each by its rule, joined by their maximum.
+    """``[H, W]`` 0..255: the masks of one image, each by its rule, joined by their maximum.
 
     Args:
         files: (rule, path), at least one.
@@ -106,7 +106,7 @@ def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
             raise DataError(
                 f"{path} is {mask.shape[1]}x{mask.shape[0]} pixels (width x height), but "
                 f"{files[0][1]} is {joined.shape[1]}x{joined.shape[0]}; both are masks of one "
-                "picture and must agree"
+                "image and must agree"
             )
         joined = np.maximum(joined, mask)
     return joined
@@ -141,7 +141,7 @@ def read_labels(
     """``[H, W]`` part numbers, mapped by the rules' table; 255 is "ignore".
 
     Args:
-        path: the label picture.
+        path: the label image.
         rules: of the dataset.
         names: the parts, background first; None when their number is not known.
         named_by: who names them, for the message.

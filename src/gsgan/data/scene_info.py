@@ -57,11 +57,11 @@ class SceneInfo:
         spread: degrees, the largest angle between two training cameras seen from ``centre``.
         scale_train: pixels a metre at the person, smallest and largest of the training cameras'
             medians.
-        scale_test: the same of held-out pictures; None without any.
+        scale_test: the same of held-out images; None without any.
         surface: how colours differ between training cameras on the same surface, or None where
             they share too little.
         darkest: brightness in [0, 1] of the person's darkest percent.
-        body_inside: share of the posed body that masks of training pictures hold; None where there
+        body_inside: share of the posed body that masks of training images hold; None where there
             is no body pose or no mesh.
     """
 
@@ -107,8 +107,8 @@ def scene_info(
         layout: the capture.
         splits: of the capture.
         dataset: of the training items; its cache keeps what is decoded here.
-        samples: pictures a camera from which colours are taken, evenly spaced.
-        held_out: datasets of the held-out items; none of their pictures is looked at.
+        samples: images a camera from which colours are taken, evenly spaced.
+        held_out: datasets of the held-out items; none of their images is looked at.
     """
     frames = sorted({frame for _, frame in splits.items["train"]})
     p, valid = layout.landmarks.joints(frames)
@@ -160,7 +160,7 @@ def _triple(values: torch.Tensor) -> tuple[float, float, float]:
 def count_labels(layout: Layout, items: tuple[Item, ...]) -> int:
     """Part labels, background included: as the data names them, else the highest one found.
 
-    Without names every label picture of the items is read once.
+    Without names every label image of the items is read once.
     """
     if not layout.labels:
         return 0
@@ -181,7 +181,7 @@ def foreground_colours(
 
     Args:
         dataset: whose cameras to look at.
-        samples: pictures a camera, evenly spaced over its frames.
+        samples: images a camera, evenly spaced over its frames.
 
     Returns:
         Mean RGB, mask-weighted, by camera name; and the brightness of the darkest percent.

@@ -113,7 +113,7 @@ def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
     if len(ids) and ids.max() > LARGEST_FRAME:
         raise DataError(
             f"{where}: frame_id {ids.max()} is a time stamp, not a frame number up to "
-            f"{LARGEST_FRAME}; number the frames 0, 1, 2 … alike in pictures and landmarks"
+            f"{LARGEST_FRAME}; number the frames 0, 1, 2 … alike in images and landmarks"
         )
     values, counts = np.unique(ids, return_counts=True)
     if len(values) != len(ids):

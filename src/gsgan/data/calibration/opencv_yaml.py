@@ -199,7 +199,7 @@ def _names(intri: Storage) -> list[str]:
 
 
 def _lens(dist: np.ndarray) -> list[float]:
-    """All coefficients without a tail of zeros: thin prisms and tilts (12, 14) are refused later."""
+    """Without trailing zeros: thin prisms and tilts (12 or 14 coefficients) are refused later."""
     values: list[float] = dist.reshape(-1).tolist()
     return values if any(values[MAX_LENS:]) else values[:MAX_LENS]
 

@@ -248,7 +248,7 @@ def read_people(
         ids = ", ".join(map(str, sorted(seen))) or "nobody"
         raise DataError(
             f"{root / folder} has no person {person} in the {len(there)} of its {len(files)} files "
-            f"that belong to pictures (found: {ids}); set data.reader.person"
+            f"that belong to images (found: {ids}); set data.reader.person"
         )
     if lacking := [frame for frame in there if frame not in found]:
         notes.append(f"{folder} lacks person {person} at frames {spans(lacking)}")

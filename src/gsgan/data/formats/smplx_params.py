@@ -137,12 +137,12 @@ def _coefficients(arrays: dict[str, Any], key: str, most: int, path: Path) -> Fl
 def _usable(
     path: Path, frames: Collection[int], values: Float, notes: list[str]
 ) -> NDArray[np.int64]:
-    """Rising numbers of the frames that have pictures and finite numbers."""
+    """Rising numbers of the frames that have images and finite numbers."""
     there = [f for f in sorted(frames) if f < len(values)]
     ids = np.array([f for f in there if np.isfinite(values[f]).all()], np.int64)
     if not len(ids):
         raise DataError(
-            f"{path} has {len(values)} rows, but no finite one of a frame that has pictures; "
+            f"{path} has {len(values)} rows, but no finite one of a frame that has images; "
             "expected row i to be frame i"
         )
     if lost := sorted(set(there) - set(ids.tolist())):

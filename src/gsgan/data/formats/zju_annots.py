@@ -47,7 +47,7 @@ class Annots:
 
 
 def frame_number(stem: str) -> int | None:
-    """The frame number in a picture's name, 313's and 315's long names included."""
+    """The frame number in an image's name, 313's and 315's long names included."""
     named = NAMED_FRAME.search(stem)
     return frame_of(named[1]) if named else last_number(stem)
 
@@ -85,17 +85,17 @@ def _as_list(value: Any) -> list[Any] | None:
 
 
 def _folders(path: Path, ims: Any, cameras: int) -> tuple[str, ...] | None:
-    """The folder of each camera, the same in every frame, or None without a list of pictures."""
+    """The folder of each camera, the same in every frame, or None without a list of images."""
     first: tuple[str, ...] | None = None
     for number, entry in enumerate(_as_list(ims) or ()):
         names = _as_list(entry.get("ims")) if isinstance(entry, Mapping) else None
         if names is None:
-            raise DataError(f"{path}: ims[{number}] has no list 'ims' of picture names")
+            raise DataError(f"{path}: ims[{number}] has no list 'ims' of image names")
         folders = tuple(str(PurePosixPath(str(name).replace("\\", "/")).parent) for name in names)
         if len(folders) != cameras:
             raise DataError(
-                f"{path}: ims[{number}] lists {len(folders)} pictures, but cams has {cameras} "
-                f"cameras; the pictures' folders are {', '.join(folders[:30])}"
+                f"{path}: ims[{number}] lists {len(folders)} images, but cams has {cameras} "
+                f"cameras; the images' folders are {', '.join(folders[:30])}"
             )
         if first is None:
             first = folders
@@ -103,10 +103,10 @@ def _folders(path: Path, ims: Any, cameras: int) -> tuple[str, ...] | None:
             other = next(i for i in range(cameras) if folders[i] != first[i])
             raise DataError(
                 f"{path}: ims[{number}] has {folders[other]} where ims[0] has {first[other]}; "
-                "pictures must be listed in the order of the cameras"
+                "images must be listed in the order of the cameras"
             )
     if first is not None and len(set(first)) != len(first):
-        raise DataError(f"{path}: two cameras share the picture folder {first[0]}")
+        raise DataError(f"{path}: two cameras share the image folder {first[0]}")
     return first
 
 
@@ -125,11 +125,11 @@ def camera_folders(root: Path, annots: Annots, notes: list[str]) -> dict[str, st
     found = _folders_there(root)
     if len(found) != len(annots.K):
         raise DataError(
-            f"{annots.path} has {len(annots.K)} cameras and lists no pictures, but there are "
-            f"{len(found)} picture folders ({', '.join(found) or 'none'}); get the annots.npy that "
+            f"{annots.path} has {len(annots.K)} cameras and lists no images, but there are "
+            f"{len(found)} image folders ({', '.join(found) or 'none'}); get the annots.npy that "
             "lists them"
         )
-    notes.append(f"{annots.path.name} lists no pictures; the index is rebuilt from the folders")
+    notes.append(f"{annots.path.name} lists no images; the index is rebuilt from the folders")
     return found
 
 
@@ -137,7 +137,7 @@ def _place(root: Path, folder: str) -> str:
     """The place of a folder that annots.npy names; copies are often rearranged."""
     parts = PurePosixPath(folder).parts
     if not parts or ".." in parts or PurePosixPath(folder).is_absolute():
-        raise DataError(f"{root}: annots lists pictures in {folder!r}, which is not a folder in it")
+        raise DataError(f"{root}: annots lists images in {folder!r}, which is not a folder in it")
     for place in (folder, parts[-1], f"images/{parts[-1]}"):
         if (root / place).is_dir():
             return place
@@ -154,7 +154,7 @@ def _folders_there(root: Path) -> dict[str, str]:
 def index_images(
     root: Path, folders: Mapping[str, str], notes: list[str]
 ) -> dict[str, dict[int, str]]:
-    """The pictures of each camera by frame number.
+    """The images of each camera by frame number.
 
     Raises:
         DataError: when there is none at all.
@@ -165,11 +165,11 @@ def index_images(
     if empty := [name for name, files in images.items() if not files]:
         if len(empty) == len(images):
             raise DataError(
-                f"{root}: no camera folder holds pictures; expected e.g. "
+                f"{root}: no camera folder holds images; expected e.g. "
                 f"{next(iter(folders.values()))}/000000.jpg"
             )
         notes.append(
-            f"{len(empty)} of {len(images)} cameras have no pictures here: {', '.join(empty)}"
+            f"{len(empty)} of {len(images)} cameras have no images here: {', '.join(empty)}"
         )
     return images
 
@@ -190,7 +190,7 @@ def annots_cameras(
     Raises:
         DataError: naming the camera whose calibration is wrong.
     """
-    pictures = next(files for files in images.values() if files)
+    some = next(files for files in images.values() if files)
     cameras = {}
     for i, (name, files) in enumerate(images.items()):
         cameras[name] = make_camera(
@@ -200,7 +200,7 @@ def annots_cameras(
             R=annots.R[i],
             t=annots.T[i],
             dist=annots.D[i],
-            size=picture_size(root, files or pictures),
+            size=picture_size(root, files or some),
             scale=MILLIMETRES,
             pixel_centre=pixel_centre,
             rotation_tolerance=rotation_tolerance,

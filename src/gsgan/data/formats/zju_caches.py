@@ -62,7 +62,7 @@ def humannerf(
     images = {HUMANNERF_CAMERA: frame_files(root, "images", (".png", ".jpg"))}
     masks = frame_files(root, "masks", (".png", ".jpg"))
     if not images[HUMANNERF_CAMERA]:
-        raise DataError(f"{root / 'images'} holds no pictures; expected frame_000000.png and so on")
+        raise DataError(f"{root / 'images'} holds no images; expected frame_000000.png and so on")
     camera = _still_camera(root, images[HUMANNERF_CAMERA], pixel_centre, checks)
     motion, joints = _mesh_infos(root / "mesh_infos.pkl")
     return Found(
@@ -206,7 +206,7 @@ def _arah_cameras(
             raise DataError(f"{where}: expected an object with K, R, T and D")
         images[name] = frame_files(root, name, (".jpg", ".jpeg"))
         if not images[name]:
-            raise DataError(f"{root / name} holds no pictures, but {path.name} lists that camera")
+            raise DataError(f"{root / name} holds no images, but {path.name} lists that camera")
         cameras[name] = make_camera(
             where,
             name,
