@@ -24,11 +24,12 @@ from writers.easymocap import (
 
 from gsgan.data.checks import Checks
 from gsgan.data.dataset import CaptureDataset
+from gsgan.data.files import read_colour
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.formats.smpl_motion import Motion, posed
 from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Layout
-from gsgan.data.pixels import read_image, read_mask
+from gsgan.data.pixels import read_mask
 from gsgan.skeleton.smpl import to_mediapipe33
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -172,7 +173,7 @@ def test_pictures_and_masks_are_those_that_were_written(written: Path, subject: 
         for c, name in enumerate(NAMES):
             mask = read_mask(layout.mask_files(name, frame), layout.pixels)
             assert np.array_equal(mask, np.where(subject.labels[i][c] > 0, 255, 0))
-            image = read_image(layout.image_path(name, frame), layout.pixels).astype(int)
+            image = read_colour(layout.image_path(name, frame)).astype(int)
             assert np.abs(image - subject.images[i][c]).mean() < 12
 
 

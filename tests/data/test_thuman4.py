@@ -19,13 +19,14 @@ from writers.thuman4 import write_thuman4
 
 from gsgan.data.checks import Checks
 from gsgan.data.dataset import CaptureDataset
+from gsgan.data.files import read_colour
 from gsgan.data.formats.smpl_motion import Motion, posed
 from gsgan.data.formats.smplx_params import read_motion
 from gsgan.data.formats.smplx_rig import read_missing
 from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Layout
-from gsgan.data.pixels import read_image, read_mask, read_unsure
+from gsgan.data.pixels import read_mask, read_unsure
 from gsgan.data.splits import make_splits
 from gsgan.skeleton.smpl import to_mediapipe33
 from gsgan.utils.errors import ConfigError, DataError
@@ -127,7 +128,7 @@ def test_pictures_and_masks_are_those_that_were_written(
             clear = np.abs(alpha - 127.5) > 12  # what a JPEG at quality 100 cannot turn
             assert np.array_equal(mask[clear], np.where(alpha > 127, 255, 0)[clear])
             assert set(np.unique(mask)) <= {0, 255}
-            image = read_image(layout.image_path(name, frame), layout.pixels).astype(int)
+            image = read_colour(layout.image_path(name, frame)).astype(int)
             assert np.abs(image - smplx_subject.images[i][c]).mean() < 12  # chroma of a small JPEG
 
 
@@ -257,7 +258,7 @@ def test_a_picture_that_is_gone_shifts_nothing(
     (root / "images/cam00/00000001.jpg").unlink()
     layout = read(root, smplx_file)
     assert list(layout.images["cam00"]) == [0, 2, 3]
-    image = read_image(layout.image_path("cam00", 2), layout.pixels).astype(int)
+    image = read_colour(layout.image_path("cam00", 2)).astype(int)
     assert np.abs(image - smplx_subject.images[2][0]).mean() < 12
 
 

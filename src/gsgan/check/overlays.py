@@ -15,6 +15,7 @@ from gsgan.check.subject import Subject
 from gsgan.data import crop as cropping
 from gsgan.data import pixels as reading
 from gsgan.data.crop import NEAR, Window
+from gsgan.data.files import read_colour
 from gsgan.skeleton.template import SkeletonTemplate
 
 Bytes = NDArray[np.uint8]
@@ -102,7 +103,7 @@ def _read(
     mapping = None
     if camera.distorted:
         mapping = cropping.undistort_map(camera.K, camera.dist, window)
-    image = reading.read_image(layout.image_path(look.camera, look.frame), layout.pixels)
+    image = read_colour(layout.image_path(look.camera, look.frame))
     mask = reading.read_mask(layout.mask_files(look.camera, look.frame), layout.pixels)
     image, mask = (
         cropping.resize(cropping.take(picture, window, mapping, False), size, False)

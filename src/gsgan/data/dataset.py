@@ -18,6 +18,7 @@ from gsgan.data import crop as cropping
 from gsgan.data import pixels
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import PersonCrop, Window
+from gsgan.data.files import read_colour
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL
 from gsgan.data.splits import Item
@@ -199,7 +200,7 @@ class CaptureDataset(Dataset[Frame]):
         mask_files = self.layout.mask_files(*item)
         mask = pixels.read_mask(mask_files, rules)
         unsure = pixels.read_unsure(mask_files, mask, rules)
-        image = pixels.read_image(self.layout.image_path(*item), rules)
+        image = read_colour(self.layout.image_path(*item))
         self._check_size(self.layout.image_path(*item), image, camera)
         self._check_size(self.layout.mask_path(*item), mask, camera)
         # Blacked out before anything is interpolated, so that no background bleeds in.

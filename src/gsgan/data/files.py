@@ -1,7 +1,7 @@
-"""Files as a dataset holds them: image headers, images, JSON, arrays.
+"""Files of a dataset: image headers, images, JSON, arrays.
 
-Every function turns what can be wrong with a file into one `DataError` that names the file, what
-was expected and what was found. Nothing here unpickles.
+Every function turns problems with a file into one `DataError` that names the file, the expected
+and the actual content. Nothing here unpickles.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LARGEST_FRAME = 10**9  # frame numbers beyond it are dates or damage
 
 
 class Header(NamedTuple):
-    """The header of an image file, which says how to decode it.
+    """The header of an image file.
 
     Args:
         size: ``(H, W)`` pixels.
@@ -74,7 +74,7 @@ def check_picture(path: Path, kind: str, size: tuple[int, int], expected_by: str
         path: the file.
         kind: "image", "mask" or "labels".
         size: ``(H, W)`` that it must have.
-        expected_by: who says so, for the message.
+        expected_by: the file or setting that requires it, for the message.
 
     Raises:
         DataError: on a wrong size, bit depth, or channel layout.
@@ -82,7 +82,7 @@ def check_picture(path: Path, kind: str, size: tuple[int, int], expected_by: str
     header = read_header(path)
     if header.size != size:
         raise DataError(
-            f"{path} is {_wh(header.size)} pixels (width x height), but {expected_by} says "
+            f"{path} is {_wh(header.size)} pixels (width x height), but {expected_by} has "
             f"{_wh(size)}; scale one of them so that they agree"
         )
     if header.depth > 8 or (kind == "labels" and header.depth != 8):
@@ -102,7 +102,7 @@ def _wh(size: tuple[int, int]) -> str:
 
 
 def read_colour(path: Path) -> NDArray[np.uint8]:
-    """``[H, W, 3]`` uint8 RGB, as stored: an EXIF rotation is not applied, calibration knows none.
+    """``[H, W, 3]`` uint8 RGB, as stored: EXIF rotations, unknown to calibrations, are not applied.
 
     Raises:
         DataError: when the file is missing, damaged or cut off.
@@ -167,7 +167,7 @@ def _decode(path: Path, flags: int) -> NDArray[Any]:
 
 
 def cut_off(data: bytes) -> bool:
-    """Whether a JPEG lacks its end marker; some decoders fill the rest with grey, silently."""
+    """Whether a JPEG lacks its end marker; some decoders silently fill the rest with grey."""
     scan = data.rfind(JPEG_SCAN)
     return data[:2] == JPEG_SIGNATURE and (scan < 0 or data.find(JPEG_END, scan) < 0)
 
@@ -182,7 +182,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """The object in a JSON file.
 
     Raises:
-        DataError: when the file is missing, is not JSON, or holds something else than an object.
+        DataError: when the file is missing, is not JSON, or is not an object.
     """
     content = read_json_value(path)
     if not isinstance(content, dict):
@@ -191,7 +191,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_json_value(path: Path) -> Any:
-    """What a JSON file holds, of whatever type.
+    """The content of a JSON file, of any type.
 
     Raises:
         DataError: when the file is missing or is not JSON.
@@ -205,7 +205,7 @@ def read_json_value(path: Path) -> Any:
 
 
 def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """The named arrays of an npz file, those that are there.
+    """The named arrays of an npz file, without those that are absent.
 
     Raises:
         DataError: when the file is missing or no npz, an array is too large, or holds objects.
@@ -224,7 +224,7 @@ def frame_files(
     Args:
         root: the dataset.
         folder: relative to it; empty when it does not exist.
-        suffixes: of the files to take, lower case.
+        suffixes: of the files to list, lower case.
         number: frame number of a file's stem; by default the last group of digits.
 
     Raises:
@@ -258,7 +258,7 @@ def unnumbered(path: Path) -> DataError:
         return DataError(
             f"{path} is named by a date or time stamp ({digits[-1][:24]}), not by a frame number "
             f"up to {LARGEST_FRAME}; stamps differ between cameras: number the frames 0, 1, 2 … "
-            "alike in all of them"
+            "equally in all of them"
         )
     return DataError(f"{path} has no frame number in its name; expected e.g. 000012{path.suffix}")
 

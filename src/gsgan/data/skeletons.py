@@ -1,4 +1,4 @@
-"""Skeletons and body poses by frame number, with their holes filled by stand-ins."""
+"""Skeletons and body poses by frame number, with estimates for missing joints."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 SKELETONS = {"mediapipe33": 33}
-HUBS = (11, 12, 23, 24)  # shoulders and hips: the bone frames of the whole body hang on them
+HUBS = (11, 12, 23, 24)  # shoulders and hips: the bone frames of the whole body depend on them
 
 
 @dataclass(frozen=True)
 class Landmarks:
     """Skeletons by frame: ``p [J, 3]`` metres, finite, ``visibility [J]`` in [0, 1].
 
-    A joint of visibility 0 is a stand-in for one that was not seen. ``source`` names the file or
-    folder they come from, for messages; ``fitted_to`` the cameras whose masks `gsgan.fit` moved
-    them to fit, none for landmarks as they were found.
+    A joint of visibility 0 is an estimate. ``source`` names the file or folder of the landmarks,
+    for messages; ``fitted_to`` the cameras to whose masks `gsgan.fit` moved them, empty for
+    landmarks that were not fitted.
     """
 
     p: Mapping[int, Float]
@@ -69,11 +69,11 @@ def make_landmarks(
     notes: list[str],
     source: str = "landmarks3d.npz",
 ) -> Landmarks:
-    """Skeletons of all frames, holes filled with stand-ins of visibility 0.
+    """Skeletons of all frames, missing joints filled with estimates of visibility 0.
 
     A joint is missing where it is not finite, its confidence is not above 0, or it lies further
-    than ``max_reach`` from the rest of the body. It then stands where it was in the nearest frame
-    that has it, or at the mean of the frame's joints.
+    than ``max_reach`` from the rest of the body. It takes its position in the nearest frame that
+    has it, or the mean of the frame's joints.
 
     Args:
         ids: ``[F]`` frame numbers in any order, each once.
@@ -81,7 +81,7 @@ def make_landmarks(
         conf: ``[F, J]``.
         max_reach: metres from the median joint.
         notes: gains a sentence when joints are too far.
-        source: where they come from, for messages.
+        source: file or folder, for messages.
     """
     visibility = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0).clip(0, 1)
     far = _far_joints(p, visibility > 0, max_reach)
@@ -131,12 +131,12 @@ def _far_joints(p: Float, valid: Bool, reach: float) -> Bool:
 
 
 def fill_missing(p: Float, valid: Bool, ids: NDArray[np.int64]) -> Float:
-    """Finite stand-ins for missing joints.
+    """Finite estimates of missing joints.
 
     Args:
         p: ``[F, J, 3]``, anything where not valid.
         valid: ``[F, J]``.
-        ids: ``[F]`` rising frame numbers: what counts as near in time.
+        ids: ``[F]`` rising frame numbers, which define the nearest frame.
 
     Returns:
         ``[F, J, 3]``: the joint of the nearest frame that has it (the earlier of two), else the

@@ -70,40 +70,31 @@ class Storage:
     values: dict[str, Any]
 
     def strings(self, key: str) -> list[str] | None:
-        """A list of names, quoted or not; None without the key.
-
-        Raises:
-            DataError: when it is something else.
-        """
-        value = self.values.get(key)
-        if value is not None and not (
-            isinstance(value, list) and all(isinstance(name, str) for name in value)
-        ):
-            raise DataError(f"{self.path}: '{key}' must be a list of names; export it again")
-        return value
+        """A list of names, quoted or not; None without the key, `DataError` on anything else."""
+        names: list[str] | None = self._get(key, list, "a list of names")
+        return None if names is None else [str(name) for name in names]
 
     def number(self, key: str) -> float | None:
-        """One number, infinite and NaN ones too; None without the key.
-
-        Raises:
-            DataError: when it is something else.
-        """
-        value = self.values.get(key)
+        """One number, infinite and NaN too; None without the key, `DataError` on anything else."""
+        text = self._get(key, str, "a number")
         try:
-            return None if value is None else _float(value)
-        except (ValueError, AttributeError):
-            raise DataError(f"{self.path}: '{key}' must be a number; export it again") from None
+            return None if text is None else _float(text)
+        except ValueError:
+            raise self._wrong(key, "a number") from None
 
     def matrix(self, key: str) -> NDArray[np.float64] | None:
-        """``[rows, cols]``, or None without the key.
+        """``[rows, cols]``; None without the key, `DataError` on anything else."""
+        matrix: NDArray[np.float64] | None = self._get(key, np.ndarray, "an !!opencv-matrix")
+        return matrix
 
-        Raises:
-            DataError: when it is no ``!!opencv-matrix``.
-        """
+    def _get(self, key: str, kind: type, expected: str) -> Any:
         value = self.values.get(key)
-        if value is not None and not isinstance(value, np.ndarray):
-            raise DataError(f"{self.path}: '{key}' must be an !!opencv-matrix; export it again")
+        if value is not None and not isinstance(value, kind):
+            raise self._wrong(key, expected)
         return value
+
+    def _wrong(self, key: str, expected: str) -> DataError:
+        return DataError(f"{self.path}: '{key}' must be {expected}; export it again")
 
 
 def read_storage(path: Path) -> Storage:
