@@ -56,7 +56,7 @@ def test_memory_does_not_grow_with_the_pictures_read(layout: Layout) -> None:
         read += frame.image.nbytes + frame.mask.nbytes
     assert read > 150 * MIB  # else nothing is proved
     assert resident() - before < 24 * MIB
-    assert 0 < dataset.cache.nbytes <= CACHE
+    assert 0 < dataset.cache.currsize <= CACHE
 
 
 def test_the_measurement_sees_pictures_that_are_kept(layout: Layout) -> None:
@@ -98,7 +98,7 @@ class Watched(Dataset[tuple[Frame, torch.Tensor]]):
 
     def __getitem__(self, index: int) -> tuple[Frame, torch.Tensor]:
         frame = self.dataset[index]
-        return frame, torch.tensor([os.getpid(), resident(), self.dataset.cache.nbytes])
+        return frame, torch.tensor([os.getpid(), resident(), self.dataset.cache.currsize])
 
 
 def test_workers_keep_no_more_than_their_cache_and_read_the_same(layout: Layout) -> None:

@@ -90,7 +90,7 @@ def test_cameras_are_those_that_were_written(
         assert np.allclose(entry.t, camera.t, atol=1e-6)
         assert entry.size == (44, 52)  # imgSize is [52, 44]
         assert not entry.distorted
-    assert layout.notes == ("0 pictures named in " + str(written / "missing_img_files.txt") + (
+    assert layout.notes == ("0 images named in " + str(written / "missing_img_files.txt") + (
         " are left out, 0 of them with a file"
     ),)  # fmt: skip
 
@@ -208,7 +208,7 @@ def test_the_unsure_band_is_an_option(root: Path, smplx_file: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"ignore_band": -1}, "ignore_band must be 0 or more"),
+        ({"ignore_band": -1}, "ignore_band must be a whole number of at least 0"),
         ({"ignore_alpha": (250, 5)}, "two rising alphas"),
     ],
 )
@@ -236,7 +236,7 @@ def test_listed_files_are_left_out_of_every_split(
         assert ("cam02", 3) not in items
     assert len(splits.items["train"]) == 2 * 3 - 1
     assert 3 not in layout.images["cam02"]
-    assert "3 pictures named in" in layout.notes[0]
+    assert "3 images named in" in layout.notes[0]
     assert "2 of them with a file" in layout.notes[0]
 
 
@@ -245,11 +245,11 @@ def test_a_list_that_is_none(root: Path, smplx_file: Path) -> None:
     path.write_text("cam00/00000001.jpg\nnothing here\n")
     refused(root, smplx_file, str(path), "line 2", "cam00/00000012.jpg", "nothing here")
     path.write_text("".join(f"cam01/{i:08d}.jpg\n" for i in range(4)))
-    refused(root, smplx_file, str(path), "leaves no picture of camera cam01")
+    refused(root, smplx_file, str(path), "leaves no image of camera cam01")
     path.write_bytes(b"\xff\xfe\x00")
     refused(root, smplx_file, str(path), "cannot be read as text")
     path.unlink()
-    assert "every picture that is there is used" in read(root, smplx_file).notes[0]
+    assert "every image in the folders is used" in read(root, smplx_file).notes[0]
 
 
 def test_a_picture_that_is_gone_shifts_nothing(
@@ -277,7 +277,7 @@ def test_a_mask_of_another_size(root: Path, smplx_file: Path) -> None:
 
 def test_a_mask_that_is_a_picture(root: Path, smplx_file: Path) -> None:
     shutil.copy(root / "images/cam01/00000000.jpg", root / "masks/cam01/00000000.jpg")
-    refused(root, smplx_file, "masks/cam01/00000000.jpg is a colour picture", "8-bit grey")
+    refused(root, smplx_file, "masks/cam01/00000000.jpg is a colour image", "8-bit grey")
     grey = cv2.imread(str(root / "masks/cam02/00000000.jpg"))  # three equal channels will do
     write_picture(root / "masks/cam01/00000000.jpg", grey)
     read(root, smplx_file, trust=NO_LOOK)
@@ -382,7 +382,7 @@ def test_another_subjects_parameters_do_not_meet_the_masks(root: Path, smplx_fil
         (lambda a: a.update(transl=np.array([["a"] * 3] * 4)), "'transl' must hold numbers"),
         (lambda a: a.update(betas=np.ones((1, 30))), "has 30 coefficients, the model file 10"),
         (lambda a: a.update(betas=np.full((1, 10), np.nan)), "'betas' must hold finite numbers"),
-        (lambda a: a["transl"].fill(np.inf), "no finite one of a frame that has pictures"),
+        (lambda a: a["transl"].fill(np.inf), "no finite one of a frame that has images"),
     ],
 )
 def test_parameters_that_cannot_be(

@@ -346,7 +346,7 @@ def test_a_camera_without_pictures_keeps_its_index(original: Path, smpl_file: Pa
     layout = read(original, smpl_file)
     assert layout.camera_names == ("Camera_B1", "Camera_B2", "Camera_B3")
     assert not layout.images["Camera_B2"]
-    assert any("1 of 3 cameras have no pictures here: Camera_B2" in n for n in layout.notes)
+    assert any("1 of 3 cameras have no images here: Camera_B2" in n for n in layout.notes)
 
 
 def test_some_missing_masks_are_left_out_and_counted(original: Path, smpl_file: Path) -> None:
@@ -501,11 +501,11 @@ BAD = {
     "no D": (annots(lambda c: c["cams"].pop("D") and None), "cams has no list 'D'"),
     "K of fewer cameras": (
         annots(lambda c: c["cams"].update(K=c["cams"]["K"][:2])),
-        "cams must hold one K, R, T and D a camera, found 2 K, 3 R",
+        "cams must hold one K, R, T and D per camera, found 2 K, 3 R",
     ),
     "ims of fewer cameras": (
         annots(lambda c: c["ims"][0].update(ims=c["ims"][0]["ims"][:2])),
-        r"ims\[0\] lists 2 pictures, but cams has 3 cameras.*Camera_B1, Camera_B2",
+        r"ims\[0\] lists 2 images, but cams has 3 cameras.*Camera_B1, Camera_B2",
     ),
     "ims in another order": (
         swapped_lists,
@@ -513,11 +513,11 @@ BAD = {
     ),
     "no list, wrong number of folders": (
         folder_without_list,
-        r"has 3 cameras and lists no pictures, but there are 4 picture folders \(Camera_B1, ",
+        r"has 3 cameras and lists no images, but there are 4 image folders \(Camera_B1, ",
     ),
     "no pictures": (
         remove("Camera_B1", "Camera_B2", "Camera_B3"),
-        "no camera folder holds pictures; expected e.g. Camera_B1/000000.jpg",
+        "no camera folder holds images; expected e.g. Camera_B1/000000.jpg",
     ),
     "T in metres": (
         cams("T", lambda T: T / 1000, None),
@@ -545,7 +545,7 @@ BAD = {
     ),
     "no common frame": (
         lambda root: [p.rename(p.with_name(f"9{p.name}")) for p in (root / "new_params").iterdir()],
-        r"new_params has no parameters of any frame that has pictures; it holds 4 files",
+        r"new_params has no parameters of any frame that has images; it holds 4 files",
     ),
     "poses of 66": (params(poses=np.zeros((1, 66))), r"2.npy: 'poses' must hold 72 or 69 numbers"),
     "root turned twice": (
@@ -589,7 +589,7 @@ BAD = {
     ),
     "image of another size": (
         picture("Camera_B3/000000.jpg", np.zeros((20, 30, 3), np.uint8)),
-        "is 40x40 pixels .* says 30x20",
+        "is 40x40 pixels .* has 30x20",
     ),
     "frame twice": (
         lambda root: shutil.copy(root / "Camera_B1/000001.jpg", root / "Camera_B1/0001.jpg"),
@@ -632,8 +632,8 @@ def test_model_files_that_do_not_fit(written: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"masks": "all"}, "data.reader.masks must be both, mask or mask_cihp, got 'all'"),
-        ({"fit": "best"}, "data.reader.fit must be auto, refit, refined, first"),
+        ({"masks": "all"}, "data.reader.masks must be one of both, mask_cihp, mask, got 'all'"),
+        ({"fit": "best"}, "data.reader.fit must be one of auto, refit, refined, first"),
         ({"drop_frames": "a-b"}, "data.reader.drop_frames must be frame numbers"),
         ({"drop_frames": "0-9"}, "leaves no frame"),
     ],
@@ -691,13 +691,13 @@ CACHE_DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
         lambda root: (root / "mesh_infos.pkl").write_bytes(pickle.dumps(Evil())),
         r"mesh_infos.pkl asks for .*system",
     ),
-    "no pictures": ("humannerf", remove("images"), "images holds no pictures"),
+    "no pictures": ("humannerf", remove("images"), "images holds no images"),
     "no names": (
         "arah",
         lambda root: (root / "cam_params.json").write_text("{}"),
         "cam_params.json has no list 'all_cam_names'",
     ),
-    "camera without pictures": ("arah", remove("2"), "2 holds no pictures, but cam_params.json"),
+    "camera without pictures": ("arah", remove("2"), "2 holds no images, but cam_params.json"),
     "no models": (
         "arah",
         lambda root: [p.unlink() for p in (root / "models").iterdir()],

@@ -117,8 +117,10 @@ def _usable(
     known = set(layout.frames)
     train, test = (tuple(f for f in side if f in known) for side in frames)
     missing = sorted({f for side in frames for f in side} - known)
+    if not missing:
+        return train, test, ()
     note = f"{len(missing)} frames {whose} are not usable or do not exist: {spans(missing)}"
-    return train, test, (note,) if missing else ()
+    return train, test, (note,)
 
 
 def _require_training(
