@@ -63,7 +63,7 @@ def test_looking_a_scene_over_holds_few_images_at_once(tmp_path, monkeypatch):
     def watched(self, index):
         nonlocal most, reads
         frame = plain(self, index)
-        gc.collect()
+        gc.collect(0)
         alive.add(frame.image)
         most, reads = max(most, len(alive)), reads + 1
         return frame
