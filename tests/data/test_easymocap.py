@@ -246,7 +246,7 @@ def test_pictures_without_calibration_and_the_other_way_round(root: Path) -> Non
     assert "lists cameras without images, left out: 2" in layout.notes[0]
     shutil.rmtree(root / "images")
     (root / "videos").mkdir()
-    refused(root, "images holds no camera's folder", "extract the frames of videos/")
+    refused(root, "images holds no folder of a camera", "extract the frames of videos/")
 
 
 def test_an_empty_camera(root: Path) -> None:
