@@ -32,14 +32,7 @@ from gsgan.scene import Frame, cat
 from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.errors import ConfigError
 
-__all__ = [
-    "GsganData",
-    "SceneInfo",
-    "StepSampler",
-    "count_labels",
-    "pass_order",
-    "scene_info",
-]
+__all__ = ["GsganData", "SceneInfo", "StepSampler", "count_labels", "pass_order", "scene_info"]
 
 log = logging.getLogger(__name__)
 

@@ -176,17 +176,22 @@ def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:
 def _protocol_cameras(
     layout: Layout, protocol: Protocol
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Both sides by name; None on one side means all cameras that the other does not name."""
-    sides = [
+    """Both sides by name."""
+    train, test = (
         None if side is None else tuple(camera_name(layout, c, protocol.name) for c in side)
         for side in (protocol.train_cameras, protocol.test_cameras)
-    ]
-    train, test = sides
-    everything = layout.camera_names
+    )
+    return _complete(layout.camera_names, train, test)
+
+
+def _complete(
+    everything: tuple[T, ...], train: tuple[T, ...] | None, test: tuple[T, ...] | None
+) -> tuple[tuple[T, ...], tuple[T, ...]]:
+    """Both sides; one that is None takes everything outside the other."""
     if train is None:
-        train = tuple(c for c in everything if c not in (test or ()))
+        train = tuple(x for x in everything if x not in (test or ()))
     if test is None:
-        test = tuple(c for c in everything if c not in train)
+        test = tuple(x for x in everything if x not in train)
     return train, test
 
 
@@ -228,10 +233,7 @@ def _pair(
         )
         if train is None and test is None:
             continue
-        if train is None:
-            train = tuple(x for x in everything if x not in (test or ()))
-        if test is None:
-            test = tuple(x for x in everything if x not in train)
+        train, test = _complete(everything, train, test)
         if both := sorted(set(train) & set(test)):
             raise ConfigError(
                 f"{where}train_{name} and {where}test_{name} share {both[0]}; test images must "
@@ -264,29 +266,19 @@ def parse_frames(value: Any, where: str) -> tuple[int, ...]:
     Raises:
         ConfigError: when a part is neither.
     """
-    if isinstance(value, bool) or not isinstance(value, (int, str, Iterable)):
-        raise ConfigError(f"{where} must be frame numbers or ranges such as 0-55, got {value!r}")
-    if isinstance(value, int):
-        value = [value]
-    parts = value.split(",") if isinstance(value, str) else list(value)
+    parts = value.split(",") if isinstance(value, str) else value
     frames: set[int] = set()
-    for part in parts:
-        if isinstance(part, int) and not isinstance(part, bool):
-            frames.add(part)
-            continue
+    for part in parts if isinstance(parts, Iterable) else (parts,):
         match = FRAME_RANGE.fullmatch(str(part))
-        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
-        step = int(match[3] or 1) if match else 1
-        if last < first or step < 1:
+        first, last, step = (match[1], match[2] or match[1], match[3] or 1) if match else (1, 0, 1)
+        some = range(int(first), int(last) + 1, int(step) or 1)
+        if not some or int(step) < 1:
             raise ConfigError(f"{where} must be frame numbers or ranges such as 0-55, got {part!r}")
-        some = range(first, last + 1, step)
-        if len(some) > MOST_FRAMES:
-            raise ConfigError(f"{where}: {part!r} is more than {MOST_FRAMES} frames")
-        frames.update(some)
-        if len(frames) > MOST_FRAMES:
+        if len(some) + len(frames) > MOST_FRAMES:
             raise ConfigError(f"{where} names more than {MOST_FRAMES} frames")
-    if frames and max(frames) > LARGEST_FRAME:
-        raise ConfigError(
-            f"{where} names frame {max(frames)}; frame numbers end at {LARGEST_FRAME}"
-        )
+        if some[-1] > LARGEST_FRAME:
+            raise ConfigError(
+                f"{where} names frame {some[-1]}; frame numbers end at {LARGEST_FRAME}"
+            )
+        frames.update(some)
     return tuple(sorted(frames))

@@ -17,13 +17,7 @@ from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, last_number, read_json
 from gsgan.data.formats.common import one_mask_each, picture_size, up_axis
-from gsgan.data.formats.smpl_motion import (
-    Motion,
-    landmarks_of,
-    one_shape,
-    parameter,
-    refuse_root,
-)
+from gsgan.data.formats.smpl_motion import Motion, landmarks_of, one_shape, parameter, refuse_root
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import IGNORE_LABEL, PixelRules
 from gsgan.data.skeletons import Landmarks, make_landmarks
