@@ -447,7 +447,7 @@ def test_pickled_parameters_pass_the_gate_or_are_refused(root: Path, smplx_file:
 def test_joints_need_the_users_model(root: Path, smplx_file: Path, smpl_file: Path) -> None:
     refused(root, None, str(root), "SMPL-X parameters but no joints", "data.smpl=/path/to/your")
     refused(root, smpl_file, str(smpl_file), "24 joints", "SMPL-X (55 joints)")
-    with pytest.raises(ConfigError, match="is no file"):
+    with pytest.raises(ConfigError, match="does not exist"):
         read(root, root / "SMPLX.npz")
 
 

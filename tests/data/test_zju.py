@@ -619,7 +619,7 @@ def test_joints_need_a_model_file_or_a_cache(written: Path) -> None:
 
 
 def test_model_files_that_do_not_fit(written: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"data.smpl=.*none.pkl is no file"):
+    with pytest.raises(ConfigError, match=r"data.smpl=.*none.pkl does not exist"):
         read(written, tmp_path / "none.pkl")
     write_smpl(tmp_path / "x.npz", "smplx", vertices=60)
     with pytest.raises(DataError, match=r"x.npz is a model of 55 joints.*SMPL \(24 joints\)"):

@@ -140,7 +140,7 @@ def _short(raw: Any, limit: int = 120) -> str:
 
 
 def check_rotation(where: str, R: Float, tolerance: float) -> None:
-    """Refuses a matrix that is no rotation.
+    """Refuses a matrix that is not a rotation.
 
     Raises:
         DataError: on a sheared or mirrored matrix.

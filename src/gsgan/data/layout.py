@@ -1,4 +1,4 @@
-"""A dataset on disk, validated and indexed, whatever its format: `CaptureDataset` reads from it.
+"""A dataset on disk, validated and indexed, in the same form for every format.
 
 A reader (`gsgan.data.formats`) finds the files and hands them to `assemble`, which checks every
 format in the same way. Files are matched by camera name and by frame number, never by position:

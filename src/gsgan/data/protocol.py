@@ -85,13 +85,13 @@ class Protocol:
     def departures(
         self, *, lpips_net: str, scale: float | None, padded: bool = False
     ) -> Iterator[str]:
-        """Where the images or the backbone are not what the protocol asks for, one sentence each.
+        """Departures of images and backbone from the protocol, one sentence each.
 
         Args:
             lpips_net: the backbone in use.
             scale: fraction of the stored size at which images are scored; None when they are cut
                 round the person.
-            padded: black is added to whole images to make them square.
+            padded: whole images are padded with black to squares.
         """
         if lpips_net != self.lpips_net:
             yield f"LPIPS backbone is {lpips_net}, requested: {self.lpips_net}"

@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsgan.body import SkinnedBody, open_body
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.layout import Layout
@@ -21,9 +22,6 @@ from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
 from gsgan.scene import Frame
 from gsgan.utils.errors import DataError
-
-if TYPE_CHECKING:
-    from gsgan.body import SkinnedBody
 
 SOLID = 0.9  # of the mask: pixels at the outline are darkened by the black behind them
 
@@ -237,8 +235,6 @@ def _scales(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
 
 def _mesh(layout: Layout) -> SkinnedBody | None:
     """The body that the capture's poses move; None if they or its model file are missing."""
-    from gsgan.body import open_body
-
     body = layout.meta.body
     if body is None or layout.poses is None:
         return None

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-import scipy.sparse
 from numpy.typing import NDArray
 
 from gsgan.utils.errors import DataError
@@ -137,6 +136,8 @@ class _Sparse(_StandIn):
     """``scipy.sparse.csc_matrix``, as a dense array."""
 
     def array(self) -> NDArray[Any]:
+        import scipy.sparse  # takes long, and few files need it
+
         shape = self.state["_shape"] if "_shape" in self.state else self.state["shape"]
         _expect(math.prod(shape) * 8 <= LARGEST_ARRAY, f"a sparse matrix of shape {shape}")
         parts = [_numbers(self.state[key]) for key in ("data", "indices", "indptr")]

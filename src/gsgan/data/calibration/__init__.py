@@ -1,4 +1,4 @@
-"""Calibration files of other tools, told apart by their content."""
+"""Calibration files of other tools, recognised by their content."""
 
 from gsgan.data.calibration.find import Calibration, find_calibration, read_calibration
 

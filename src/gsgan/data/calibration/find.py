@@ -14,7 +14,7 @@ from gsgan.data.calibration.toml_tables import read_toml
 from gsgan.data.cameras import CameraEntry
 from gsgan.utils.errors import DataError
 
-HEAD = 65536  # bytes enough to tell the formats apart
+HEAD = 65536  # bytes that are enough to recognise the format
 PATTERNS = ("cameras.json", "intri.yml", "intri.yaml", "*.qca.txt", "*.qca", "*.toml")
 KNOWN = (
     "OpenCV YAML (intri.yml beside extri.yml), TOML of Pose2Sim or aniposelib, Qualisys .qca.txt, "

@@ -44,7 +44,7 @@ def _matrix(loader: _Loader, node: yaml.MappingNode) -> NDArray[np.float64]:
     if not fits:
         problem = "a matrix must have rows, cols, a type of one channel and rows x cols numbers"
         raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
-    with np.errstate(over="ignore"):  # what is infinite in single precision is refused later
+    with np.errstate(over="ignore"):  # infinite values are refused later
         single = re.fullmatch(SINGLE, kind)
         rounded = values.astype(np.float32 if single else np.float64)
     return rounded.astype(np.float64).reshape(rows, cols)

@@ -28,7 +28,7 @@ def read_qualisys(
     sensor's corner, so the video window's left and top come off.
 
     Raises:
-        DataError: when it is no such file, or a number is missing or impossible.
+        DataError: when it is another kind of file, or a number is missing or impossible.
     """
     try:
         root = ElementTree.fromstring(path.read_bytes())

@@ -124,7 +124,7 @@ def landmarks_path(root: Path, name: str | None) -> Path:
     """The skeletons' file: in the capture's folder unless its path is absolute.
 
     Raises:
-        DataError: when it does not exist, or is no npz.
+        DataError: when it does not exist, or is not an npz file.
     """
     if name is None:
         return root / LANDMARKS

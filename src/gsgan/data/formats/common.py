@@ -128,7 +128,7 @@ def no_joints(root: Path, has: str, model: str, otherwise: str = "") -> DataErro
 
     Args:
         root: the dataset.
-        has: its content in place of joints, e.g. "SMPL parameters and vertices".
+        has: its content instead of joints, e.g. "SMPL parameters and vertices".
         model: the required model, e.g. "SMPL (SMPL_NEUTRAL.pkl)".
         otherwise: another way out, as the end of a sentence.
     """
@@ -154,7 +154,9 @@ def body_model(smpl: str | None, kind: str) -> tuple[Path, SkinnedModel] | None:
         return None
     path = Path(smpl).expanduser()
     if not path.is_file():
-        raise ConfigError(f"data.smpl={smpl} is no file; expected an SMPL or SMPL-X .pkl or .npz")
+        raise ConfigError(
+            f"data.smpl={smpl} does not exist; expected an SMPL or SMPL-X .pkl or .npz"
+        )
     model = read_smpl(path)
     require_kind(model, kind, path)
     return path, model

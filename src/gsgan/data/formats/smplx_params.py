@@ -124,7 +124,7 @@ def _expectation(key: str, width: int | None, found: int, raw: Any) -> str:
 
 
 def _coefficients(arrays: dict[str, Any], key: str, most: int, path: Path) -> Float:
-    """``[N, n]``, n at most what the model has; further ones must be 0."""
+    """``[N, n]``, n at most the model's number; further ones must be 0."""
     values = _rows(arrays, key, None, path)
     if np.any(values[:, most:] != 0):
         raise DataError(

@@ -190,7 +190,7 @@ def camera_size(
     """``(H, W)`` by ``imgSize [width, height]``, else of the first image.
 
     Raises:
-        DataError: when it is no size, or is written height first.
+        DataError: when it is not a size, or is written height first.
     """
     height, width = picture_size(root, files)
     if "imgSize" not in entry:

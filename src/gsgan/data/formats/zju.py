@@ -1,4 +1,4 @@
-"""Reader of ZJU-MoCap in each of its layouts, told apart by their files.
+"""Reader of ZJU-MoCap in each of its layouts, recognised by their files.
 
 ::
 

@@ -78,7 +78,7 @@ def read_annots(root: Path) -> Annots:
 
 
 def _as_list(value: Any) -> list[Any] | None:
-    """The entries of a list or array, None for what is neither."""
+    """The entries of a list or array, None for anything else."""
     if isinstance(value, np.ndarray) and value.ndim > 0:
         return list(value)
     return list(value) if isinstance(value, (list, tuple)) else None
@@ -111,7 +111,7 @@ def _folders(path: Path, ims: Any, cameras: int) -> tuple[str, ...] | None:
 
 
 def camera_folders(root: Path, annots: Annots, notes: list[str]) -> dict[str, str]:
-    """Picture folder by camera name, in the order of annots.npy.
+    """Image folder by camera name, in the order of annots.npy.
 
     A camera's name is its folder's name. Folders come from the list of images; where that is
     empty, from the existing folders, which must be as many as the cameras.
