@@ -75,7 +75,7 @@ DAMAGE = {
     "no keys": (HEAD + "- 1\n", "it has no keys"),
     "empty": ("", "it has no keys"),
     "two documents": (HEAD + MATRIX + HEAD + MATRIX, "not readable as OpenCV YAML"),
-    "deep": (HEAD + "M: " + "[" * 1500, "not readable as OpenCV YAML"),
+    "deep": (HEAD + "M: " + "[" * 300, "not readable as OpenCV YAML"),
     "an alias of itself": (HEAD + "M: &a [ *a ]\n", "recursive node"),
     "an escape": (HEAD + 'M: "\\UFFFFFFFF"\n', "not readable as OpenCV YAML"),
     "a nul": (HEAD + "M: \0\n", "not readable as OpenCV YAML"),
