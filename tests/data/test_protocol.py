@@ -189,9 +189,7 @@ def test_the_data_follows_the_protocol_and_records_it(root: Path) -> None:
 
 def test_splits_are_given_once(root: Path) -> None:
     data = GsganData(str(root), protocol=ONE, test_cameras=["cam02"])
-    with pytest.raises(
-        ConfigError, match="protocol one sets the splits"
-    ):
+    with pytest.raises(ConfigError, match="protocol one sets the splits"):
         data.setup()
 
 
