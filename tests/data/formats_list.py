@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
 from make import write_tiny_capture
 from writers import zju
 from writers.avatarrex import write_avatarrex
@@ -78,3 +79,9 @@ FORMATS = (
         lambda root, smpl: EasymocapReader()(root, Checks(), str(smpl)),
     ),
 )
+COMMON = ("capture", "zju_original", "thuman4", "easymocap")
+PARAMETERS = [
+    pytest.param(kind, id=kind.name, marks=() if kind.name in COMMON else pytest.mark.slow)
+    for kind in FORMATS
+]
+"""All formats; those that share most code with a common one are for the slow tests."""

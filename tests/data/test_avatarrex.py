@@ -13,9 +13,10 @@ from writers.common import write_picture
 from writers.smplx_rig import SmplxSubject
 
 from gsgan.data.checks import Checks
+from gsgan.data.files import read_colour
 from gsgan.data.formats.avatarrex import AvatarrexReader
 from gsgan.data.layout import Layout
-from gsgan.data.pixels import read_image, read_mask
+from gsgan.data.pixels import read_mask
 from gsgan.skeleton.smpl import to_mediapipe33
 from gsgan.utils.errors import DataError
 
@@ -50,7 +51,7 @@ def test_read_equals_written(root: Path, smplx_subject: SmplxSubject, smplx_file
         assert layout.cameras[name].size == camera.size[::-1]
         assert layout.image_path(name, 1) == root / name / "00000001.jpg"
         assert layout.mask_path(name, 1) == root / name / "mask/pha/00000001.jpg"
-        image = read_image(layout.image_path(name, 1), layout.pixels).astype(int)
+        image = read_colour(layout.image_path(name, 1)).astype(int)
         assert np.abs(image - s.images[1][c]).mean() < 12
         alpha = s.alphas[1][c].astype(int)
         clear = np.abs(alpha - 127.5) > 12

@@ -17,6 +17,7 @@ import torch
 from make import skeletons, write_landmarks, write_tiny_capture
 
 from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order
+from gsgan.data.formats.capture import read_capture
 from gsgan.data.layout import Layout
 from gsgan.data.splits import make_splits, parse_frames, parse_names
 from gsgan.scene import Frame
@@ -43,7 +44,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def layout(capture: Path) -> Layout:
-    return Layout.read(capture)
+    return read_capture(capture)
 
 
 # --- splits -------------------------------------------------------------------------------------
@@ -74,7 +75,7 @@ def test_splits_of_the_config_with_ranges_and_the_rest(layout: Layout) -> None:
 
 def test_splits_of_meta_json_give_way_to_the_config(tmp_path: Path) -> None:
     held = {"test_cameras": ["cam01"], "train_frames": [0, 1], "test_frames": [2, 3]}
-    layout = Layout.read(write_tiny_capture(tmp_path, splits=held))
+    layout = read_capture(write_tiny_capture(tmp_path, splits=held))
     splits = make_splits(layout)
     assert (splits.train_cameras, splits.test_cameras) == (("cam00",), ("cam01",))
     assert (splits.train_frames, splits.test_frames) == ((0, 1), (2, 3))
@@ -86,7 +87,7 @@ def test_splits_of_meta_json_give_way_to_the_config(tmp_path: Path) -> None:
 def test_frames_that_are_not_there_are_noted(layout: Layout) -> None:
     splits = make_splits(layout, train_frames="5-20", test_frames=[0, 99])
     assert (splits.train_frames, splits.test_frames) == ((5, 6, 7, 8, 9), (0,))
-    assert splits.notes == ("12 frames of the splits are not usable or not there: 10-20, 99",)
+    assert splits.notes == ("12 frames of the splits are not usable or do not exist: 10-20, 99",)
 
 
 @pytest.mark.parametrize(
@@ -233,7 +234,7 @@ def test_workers_load_the_same(capture: Path) -> None:
     for a, b in zip(alone.train_dataloader(), helped.train_dataloader(), strict=True):
         assert torch.equal(a.image, b.image)
         assert torch.equal(a.frame_id, b.frame_id)
-    assert alone.dataset("train").cache.limit // 3 == helped.dataset("train").cache.limit
+    assert alone.dataset("train").cache.maxsize // 3 == helped.dataset("train").cache.maxsize
 
 
 def test_empty_split_has_no_loader_but_a_reason(capture: Path) -> None:
@@ -276,7 +277,7 @@ def test_notes_reach_the_log(tmp_path: Path, caplog: pytest.LogCaptureFixture) -
     with caplog.at_level(logging.WARNING, logger="gsgan"):
         GsganData(str(root), test_frames=[3, 77]).setup()
     assert "lengths converted from mm to metres" in caplog.text
-    assert "1 frames of the splits are not usable or not there: 77" in caplog.text
+    assert "1 frames of the splits are not usable or do not exist: 77" in caplog.text
 
 
 def test_scene_info(capture: Path) -> None:
@@ -330,11 +331,11 @@ def test_a_capture_may_be_posed_by_the_users_own_smpl_file(tmp_path: Path) -> No
 def test_labels_are_counted_without_the_ignore_value(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path, cameras=1, frames=2, labels=True)
     cv2.imwrite(str(root / "labels/cam00/000001.png"), np.full((24, 32), 255, np.uint8))
-    layout = Layout.read(root)
+    layout = read_capture(root)
     assert count_labels(layout, (("cam00", 0), ("cam00", 1))) == 3
     assert count_labels(layout, (("cam00", 1),)) == 1
     names = write_tiny_capture(tmp_path / "n", labels=True, meta={"label_names": list("abcde")})
-    assert count_labels(Layout.read(names), ()) == 5
+    assert count_labels(read_capture(names), ()) == 5
 
 
 def test_body_height_passes_over_frames_with_holes(tmp_path: Path) -> None:
@@ -348,10 +349,10 @@ def test_body_height_passes_over_frames_with_holes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"batch_size": 0}, "data.batch_size must be a number of at least 1, got 0"),
-        ({"steps_per_epoch": 0}, "data.steps_per_epoch must be a number of at least 1"),
-        ({"workers": -1}, "data.workers must be a number of at least 0"),
-        ({"seed": -1}, "data.seed must be a number of at least 0"),
+        ({"batch_size": 0}, "data.batch_size must be a whole number of at least 1, got 0"),
+        ({"steps_per_epoch": 0}, "data.steps_per_epoch must be a whole number of at least 1"),
+        ({"workers": -1}, "data.workers must be a whole number of at least 0"),
+        ({"seed": -1}, "data.seed must be a whole number of at least 0"),
         ({"cache_mb": "much"}, "data.cache_mb must be a number of at least 0, got 'much'"),
         ({"crop": "face"}, "data.crop must be null or person, got 'face'"),
         ({"root": None}, "data.root is not set: give the folder of a capture"),
@@ -364,7 +365,7 @@ def test_config_values_out_of_range(capture: Path, keys: dict[str, Any], message
 
 def test_batches_need_one_size(capture: Path) -> None:
     GsganData(str(capture), batch_size=2).setup()
-    with pytest.raises(ConfigError, match=r"data.size is not set and pictures differ in size"):
+    with pytest.raises(ConfigError, match=r"data.size is not set and images differ in size"):
         GsganData(str(capture), batch_size=2, crop="person").setup()
 
 

@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,13 +23,14 @@ from writers.easymocap import (
     write_people,
 )
 
-from gsgan.data.capture import CaptureDataset
 from gsgan.data.checks import Checks
+from gsgan.data.dataset import CaptureDataset
+from gsgan.data.files import read_colour
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.formats.smpl_motion import Motion, posed
 from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Layout
-from gsgan.data.pixels import read_image, read_mask
+from gsgan.data.pixels import read_mask
 from gsgan.skeleton.smpl import to_mediapipe33
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -172,7 +174,7 @@ def test_pictures_and_masks_are_those_that_were_written(written: Path, subject: 
         for c, name in enumerate(NAMES):
             mask = read_mask(layout.mask_files(name, frame), layout.pixels)
             assert np.array_equal(mask, np.where(subject.labels[i][c] > 0, 255, 0))
-            image = read_image(layout.image_path(name, frame), layout.pixels).astype(int)
+            image = read_colour(layout.image_path(name, frame)).astype(int)
             assert np.abs(image - subject.images[i][c]).mean() < 12
 
 
@@ -211,7 +213,7 @@ def test_mask_rules(root: Path) -> None:
 
 def test_masks_that_are_missing(root: Path) -> None:
     (root / "mask").rename(root / "mask-schp")
-    refused(root, str(root / "mask"), "every picture needs a mask", "data.reader.masks")
+    refused(root, str(root / "mask"), "every image needs a mask", "data.reader.masks")
     assert read(root, masks="mask-schp").frames == (0, 1, 2, 3)
 
 
@@ -236,21 +238,21 @@ def test_a_camera_in_one_file_only(root: Path) -> None:
 
 def test_pictures_without_calibration_and_the_other_way_round(root: Path) -> None:
     shutil.copytree(root / "images/1", root / "images/4")
-    refused(root, "images/4 is no camera of", "intri.yml", "which lists 1, 2, 10")
+    refused(root, "images/4 is not a camera of", "intri.yml", "which lists 1, 2, 10")
     shutil.rmtree(root / "images/4")
     shutil.rmtree(root / "images/2")
     layout = read(root)
     assert layout.camera_names == ("1", "10")
-    assert "lists cameras without pictures, left out: 2" in layout.notes[0]
+    assert "lists cameras without images, left out: 2" in layout.notes[0]
     shutil.rmtree(root / "images")
     (root / "videos").mkdir()
-    refused(root, "images holds no camera's folder", "extract the frames of videos/")
+    refused(root, "images holds no folder of a camera", "extract the frames of videos/")
 
 
 def test_an_empty_camera(root: Path) -> None:
     for path in (root / "images/2").iterdir():
         path.unlink()
-    refused(root, str(root / "images/2"), "holds no pictures")
+    refused(root, str(root / "images/2"), "holds no images")
 
 
 def test_another_size_than_calibrated(root: Path) -> None:
@@ -313,8 +315,8 @@ def test_joints_of_three_columns_have_confidence_one(root: Path) -> None:
         (lambda p: p[0].update(keypoints3d=[[0, 0, 0, 1]] * 17), "'keypoints3d' must have shape"),
         (lambda p: p[0].update(keypoints3d="none"), "'keypoints3d' must have shape"),
         (lambda p: p[0].pop("keypoints3d"), "'keypoints3d' must have shape"),
-        (lambda p: p[0].update(id="first"), "needs a whole 'id' of their own, found first"),
-        (lambda p: p.append(p[0]), "needs a whole 'id' of their own, found 0"),
+        (lambda p: p[0].update(id="first"), "needs a whole 'id' that no other has, found first"),
+        (lambda p: p.append(p[0]), "needs a whole 'id' that no other has, found 0"),
         (lambda p: p.append(3), "must hold a list of people"),
     ],
 )
@@ -388,3 +390,41 @@ def test_the_config_reads_it_in_worker_processes(written: Path, smpl_file: Path,
     assert next(iter(data.train_dataloader())).image.shape == (1, 3, 16, 16)
     assert data.info.skeleton_source == "smpl24 -> mediapipe33"
     assert data.splits.test_cameras == ("10",)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"K": np.diag([-50.0, 50.0, 1.0])}, "camera 2: the focal lengths in K must be above 0"),
+        ({"dist": np.zeros(3)}, "camera 2: dist must hold 4, 5 or 8"),
+        ({"R": np.diag([1.0, 1.0, -1.0])}, "camera 2: R mirrors"),
+        ({"R": np.array([[1, 0.1, 0], [0, 1, 0], [0, 0, 1]])}, "camera 2: R is not a rotation"),
+        ({"t": np.array([0.0, 0.0, -3.0])}, "of the joints lie behind it|joints inside the pic"),
+    ],
+)
+def test_bad_cameras_are_refused(
+    subject: Subject, tmp_path: Path, values: dict[str, np.ndarray], message: str
+) -> None:
+    root = write_easymocap(tmp_path / "e", subject)
+    cameras = list(subject.cameras)
+    cameras[1] = replace(cameras[1], **values)
+    write_rig(root, replace(subject, cameras=tuple(cameras)))
+    with pytest.raises(DataError, match=message) as caught:
+        EasymocapReader()(root, Checks())
+    assert "\n" not in str(caught.value)
+
+
+def write_rig(root: Path, subject: Subject) -> None:
+    """The calibration anew, with Rot alone: R as a vector can be nothing but a rotation."""
+    write_calibration(root, subject)
+    text = (root / "extri.yml").read_text()
+    parts = text.split("\nR_")
+    whole = [part.partition("\nRot_")[2] for part in parts[1:]]
+    (root / "extri.yml").write_text("\nRot_".join([parts[0], *whole]))
+
+
+def test_sizes_come_from_images_if_absent(subject: Subject, tmp_path: Path) -> None:
+    root = write_easymocap(tmp_path / "e", subject)
+    write_calibration(root, subject, sizes=False)
+    sizes = {camera.size for camera in EasymocapReader()(root, Checks()).cameras.values()}
+    assert sizes == {(40, 40)}

@@ -11,8 +11,9 @@ import torch
 from make import write_tiny_capture
 from torch.utils.data import DataLoader, Dataset
 
-from gsgan.data.capture import CaptureDataset, PictureCache
 from gsgan.data.datamodule import GsganData, _quiet_worker
+from gsgan.data.dataset import CaptureDataset, PictureCache
+from gsgan.data.formats.capture import read_capture
 from gsgan.data.layout import Layout
 from gsgan.scene import Frame
 
@@ -33,7 +34,9 @@ def resident() -> int:
 @pytest.fixture(scope="module")
 def layout(tmp_path_factory: pytest.TempPathFactory) -> Layout:
     root = tmp_path_factory.mktemp("memory") / "c"
-    return Layout.read(write_tiny_capture(root, cameras=2, frames=6, size=(256, 256), suffix="jpg"))
+    return read_capture(
+        write_tiny_capture(root, cameras=2, frames=6, size=(256, 256), suffix="jpg")
+    )
 
 
 def long_dataset(layout: Layout, count: int) -> CaptureDataset:
@@ -53,7 +56,7 @@ def test_memory_does_not_grow_with_the_pictures_read(layout: Layout) -> None:
         read += frame.image.nbytes + frame.mask.nbytes
     assert read > 150 * MIB  # else nothing is proved
     assert resident() - before < 24 * MIB
-    assert 0 < dataset.cache.nbytes <= CACHE
+    assert 0 < dataset.cache.currsize <= CACHE
 
 
 def test_the_measurement_sees_pictures_that_are_kept(layout: Layout) -> None:
@@ -68,7 +71,7 @@ def test_the_measurement_sees_pictures_that_are_kept(layout: Layout) -> None:
 def index_bytes(root: Path) -> int:
     tracemalloc.start()
     try:
-        layout = Layout.read(root)
+        layout = read_capture(root)
         held = tracemalloc.get_traced_memory()[0]
         assert layout.frames
     finally:
@@ -95,7 +98,7 @@ class Watched(Dataset[tuple[Frame, torch.Tensor]]):
 
     def __getitem__(self, index: int) -> tuple[Frame, torch.Tensor]:
         frame = self.dataset[index]
-        return frame, torch.tensor([os.getpid(), resident(), self.dataset.cache.nbytes])
+        return frame, torch.tensor([os.getpid(), resident(), self.dataset.cache.currsize])
 
 
 def test_workers_keep_no_more_than_their_cache_and_read_the_same(layout: Layout) -> None:

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
+from gsgan.data.files import read_colour
 from gsgan.data.pixels import (
     MaskFile,
     PixelRules,
     mask_file,
-    read_image,
     read_labels,
     read_mask,
     with_ignored_border,
@@ -115,11 +115,10 @@ def test_labels_go_through_their_table(grey: Path) -> None:
         read_labels(grey, RULES, ["none", "a"], "CIHP")
 
 
-def test_colour_order_is_that_of_the_file(tmp_path: Path) -> None:
+def test_colours_come_red_first(tmp_path: Path) -> None:
     path = tmp_path / "red.png"
     cv2.imwrite(str(path), np.array([[[0, 0, 255]]], np.uint8))  # OpenCV: red last
-    assert read_image(path, RULES)[0, 0].tolist() == [255, 0, 0]
-    assert read_image(path, PixelRules(colour_order="bgr"))[0, 0].tolist() == [0, 0, 255]
+    assert read_colour(path)[0, 0].tolist() == [255, 0, 0]
 
 
 def test_the_band_lies_on_both_sides_of_the_outline() -> None:

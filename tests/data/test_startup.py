@@ -11,8 +11,8 @@ import torch
 from make import write_tiny_capture
 from operators import Calls
 
-from gsgan.data.capture import CaptureDataset
 from gsgan.data.datamodule import GsganData, default_workers
+from gsgan.data.dataset import CaptureDataset
 from gsgan.skeleton import MEDIAPIPE33
 
 MOUTH = [MEDIAPIPE33.names.index(name) for name in ("mouth_left", "mouth_right")]
@@ -63,7 +63,7 @@ def test_looking_a_scene_over_holds_few_images_at_once(tmp_path, monkeypatch):
     def watched(self, index):
         nonlocal most, reads
         frame = plain(self, index)
-        gc.collect()
+        gc.collect(0)
         alive.add(frame.image)
         most, reads = max(most, len(alive)), reads + 1
         return frame

@@ -17,15 +17,16 @@ from writers.common import write_picture
 from writers.smplx_rig import SmplxSubject
 from writers.thuman4 import write_thuman4
 
-from gsgan.data.capture import CaptureDataset
 from gsgan.data.checks import Checks
-from gsgan.data.formats.rig_files import read_missing
+from gsgan.data.dataset import CaptureDataset
+from gsgan.data.files import read_colour
 from gsgan.data.formats.smpl_motion import Motion, posed
 from gsgan.data.formats.smplx_params import read_motion
+from gsgan.data.formats.smplx_rig import read_missing
 from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Layout
-from gsgan.data.pixels import read_image, read_mask, read_unsure
+from gsgan.data.pixels import read_mask, read_unsure
 from gsgan.data.splits import make_splits
 from gsgan.skeleton.smpl import to_mediapipe33
 from gsgan.utils.errors import ConfigError, DataError
@@ -89,7 +90,7 @@ def test_cameras_are_those_that_were_written(
         assert np.allclose(entry.t, camera.t, atol=1e-6)
         assert entry.size == (44, 52)  # imgSize is [52, 44]
         assert not entry.distorted
-    assert layout.notes == ("0 pictures named in " + str(written / "missing_img_files.txt") + (
+    assert layout.notes == ("0 images named in " + str(written / "missing_img_files.txt") + (
         " are left out, 0 of them with a file"
     ),)  # fmt: skip
 
@@ -127,7 +128,7 @@ def test_pictures_and_masks_are_those_that_were_written(
             clear = np.abs(alpha - 127.5) > 12  # what a JPEG at quality 100 cannot turn
             assert np.array_equal(mask[clear], np.where(alpha > 127, 255, 0)[clear])
             assert set(np.unique(mask)) <= {0, 255}
-            image = read_image(layout.image_path(name, frame), layout.pixels).astype(int)
+            image = read_colour(layout.image_path(name, frame)).astype(int)
             assert np.abs(image - smplx_subject.images[i][c]).mean() < 12  # chroma of a small JPEG
 
 
@@ -207,7 +208,7 @@ def test_the_unsure_band_is_an_option(root: Path, smplx_file: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"ignore_band": -1}, "ignore_band must be 0 or more"),
+        ({"ignore_band": -1}, "ignore_band must be a whole number of at least 0"),
         ({"ignore_alpha": (250, 5)}, "two rising alphas"),
     ],
 )
@@ -235,7 +236,7 @@ def test_listed_files_are_left_out_of_every_split(
         assert ("cam02", 3) not in items
     assert len(splits.items["train"]) == 2 * 3 - 1
     assert 3 not in layout.images["cam02"]
-    assert "3 pictures named in" in layout.notes[0]
+    assert "3 images named in" in layout.notes[0]
     assert "2 of them with a file" in layout.notes[0]
 
 
@@ -244,11 +245,11 @@ def test_a_list_that_is_none(root: Path, smplx_file: Path) -> None:
     path.write_text("cam00/00000001.jpg\nnothing here\n")
     refused(root, smplx_file, str(path), "line 2", "cam00/00000012.jpg", "nothing here")
     path.write_text("".join(f"cam01/{i:08d}.jpg\n" for i in range(4)))
-    refused(root, smplx_file, str(path), "leaves no picture of camera cam01")
+    refused(root, smplx_file, str(path), "leaves no image of camera cam01")
     path.write_bytes(b"\xff\xfe\x00")
     refused(root, smplx_file, str(path), "cannot be read as text")
     path.unlink()
-    assert "every picture that is there is used" in read(root, smplx_file).notes[0]
+    assert "every image in the folders is used" in read(root, smplx_file).notes[0]
 
 
 def test_a_picture_that_is_gone_shifts_nothing(
@@ -257,7 +258,7 @@ def test_a_picture_that_is_gone_shifts_nothing(
     (root / "images/cam00/00000001.jpg").unlink()
     layout = read(root, smplx_file)
     assert list(layout.images["cam00"]) == [0, 2, 3]
-    image = read_image(layout.image_path("cam00", 2), layout.pixels).astype(int)
+    image = read_colour(layout.image_path("cam00", 2)).astype(int)
     assert np.abs(image - smplx_subject.images[2][0]).mean() < 12
 
 
@@ -276,7 +277,7 @@ def test_a_mask_of_another_size(root: Path, smplx_file: Path) -> None:
 
 def test_a_mask_that_is_a_picture(root: Path, smplx_file: Path) -> None:
     shutil.copy(root / "images/cam01/00000000.jpg", root / "masks/cam01/00000000.jpg")
-    refused(root, smplx_file, "masks/cam01/00000000.jpg is a colour picture", "8-bit grey")
+    refused(root, smplx_file, "masks/cam01/00000000.jpg is a colour image", "8-bit grey")
     grey = cv2.imread(str(root / "masks/cam02/00000000.jpg"))  # three equal channels will do
     write_picture(root / "masks/cam01/00000000.jpg", grey)
     read(root, smplx_file, trust=NO_LOOK)
@@ -381,7 +382,7 @@ def test_another_subjects_parameters_do_not_meet_the_masks(root: Path, smplx_fil
         (lambda a: a.update(transl=np.array([["a"] * 3] * 4)), "'transl' must hold numbers"),
         (lambda a: a.update(betas=np.ones((1, 30))), "has 30 coefficients, the model file 10"),
         (lambda a: a.update(betas=np.full((1, 10), np.nan)), "'betas' must hold finite numbers"),
-        (lambda a: a["transl"].fill(np.inf), "no finite one of a frame that has pictures"),
+        (lambda a: a["transl"].fill(np.inf), "no finite one of a frame that has images"),
     ],
 )
 def test_parameters_that_cannot_be(
@@ -446,7 +447,7 @@ def test_pickled_parameters_pass_the_gate_or_are_refused(root: Path, smplx_file:
 def test_joints_need_the_users_model(root: Path, smplx_file: Path, smpl_file: Path) -> None:
     refused(root, None, str(root), "SMPL-X parameters but no joints", "data.smpl=/path/to/your")
     refused(root, smpl_file, str(smpl_file), "24 joints", "SMPL-X (55 joints)")
-    with pytest.raises(ConfigError, match="is no file"):
+    with pytest.raises(ConfigError, match="does not exist"):
         read(root, root / "SMPLX.npz")
 
 

@@ -20,8 +20,8 @@ from writers.common import Subject, make_subject, write_object, write_picture
 from writers.smpl import write_smpl
 
 from gsgan.body.smpl_names import CIHP
-from gsgan.data.capture import CaptureDataset
 from gsgan.data.checks import Checks
+from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import frame_files, natural_order
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
 from gsgan.data.formats.trust import Trust, box_iou, mask_box
@@ -345,7 +345,7 @@ def test_a_camera_without_pictures_keeps_its_index(original: Path, smpl_file: Pa
     layout = read(original, smpl_file)
     assert layout.camera_names == ("Camera_B1", "Camera_B2", "Camera_B3")
     assert not layout.images["Camera_B2"]
-    assert any("1 of 3 cameras have no pictures here: Camera_B2" in n for n in layout.notes)
+    assert any("1 of 3 cameras have no images here: Camera_B2" in n for n in layout.notes)
 
 
 def test_some_missing_masks_are_left_out_and_counted(original: Path, smpl_file: Path) -> None:
@@ -494,17 +494,17 @@ def swapped_lists(root: Path) -> None:
 GREY = np.zeros((40, 40), np.uint8)
 BAD = {
     "no annots": (remove("annots.npy"), "is not a ZJU-MoCap subject: it has neither annots.npy"),
-    "annots cut": (cut("annots.npy", 0.5), "annots.npy is not a whole .npy file"),
+    "annots cut": (cut("annots.npy", 0.5), "annots.npy is not a valid .npy file"),
     "annots of code": (evil, r"annots.npy asks for (posix|nt|os)\.system"),
     "no cams": (annots(lambda c: c.pop("cams") and None), "annots.npy has no 'cams'"),
     "no D": (annots(lambda c: c["cams"].pop("D") and None), "cams has no list 'D'"),
     "K of fewer cameras": (
         annots(lambda c: c["cams"].update(K=c["cams"]["K"][:2])),
-        "cams must hold one K, R, T and D a camera, found 2 K, 3 R",
+        "cams must hold one K, R, T and D per camera, found 2 K, 3 R",
     ),
     "ims of fewer cameras": (
         annots(lambda c: c["ims"][0].update(ims=c["ims"][0]["ims"][:2])),
-        r"ims\[0\] lists 2 pictures, but cams has 3 cameras.*Camera_B1, Camera_B2",
+        r"ims\[0\] lists 2 images, but cams has 3 cameras.*Camera_B1, Camera_B2",
     ),
     "ims in another order": (
         swapped_lists,
@@ -512,11 +512,11 @@ BAD = {
     ),
     "no list, wrong number of folders": (
         folder_without_list,
-        r"has 3 cameras and lists no pictures, but there are 4 picture folders \(Camera_B1, ",
+        r"has 3 cameras and lists no images, but there are 4 image folders \(Camera_B1, ",
     ),
     "no pictures": (
         remove("Camera_B1", "Camera_B2", "Camera_B3"),
-        "no camera folder holds pictures; expected e.g. Camera_B1/000000.jpg",
+        "no camera folder holds images; expected e.g. Camera_B1/000000.jpg",
     ),
     "T in metres": (
         cams("T", lambda T: T / 1000, None),
@@ -544,7 +544,7 @@ BAD = {
     ),
     "no common frame": (
         lambda root: [p.rename(p.with_name(f"9{p.name}")) for p in (root / "new_params").iterdir()],
-        r"new_params has no parameters of any frame that has pictures; it holds 4 files",
+        r"new_params has no parameters of any frame that has images; it holds 4 files",
     ),
     "poses of 66": (params(poses=np.zeros((1, 66))), r"2.npy: 'poses' must hold 72 or 69 numbers"),
     "root turned twice": (
@@ -559,12 +559,12 @@ BAD = {
         lambda root: edit(root / "new_params/2.npy", lambda c: c.pop("Rh") is None),
         "2.npy has no 'Rh'",
     ),
-    "parameters cut": (cut("new_params/1.npy", 0.7), "1.npy is not a whole .npy file"),
+    "parameters cut": (cut("new_params/1.npy", 0.7), "1.npy is not a valid .npy file"),
     "vertices of another fit": (
         moved_vertices,
         "new_params and .*new_vertices do not belong together: .* 8.7 cm off",
     ),
-    "vertices cut": (cut("new_vertices/0.npy", 0.7), "0.npy is not a whole .npy file"),
+    "vertices cut": (cut("new_vertices/0.npy", 0.7), "0.npy is not a valid .npy file"),
     "vertices of another body": (
         lambda root: np.save(root / "new_vertices/0.npy", np.zeros((778, 3))),
         r"must hold vertices of shape \(6890, 3\), found \(778, 3\)",
@@ -584,11 +584,11 @@ BAD = {
     ),
     "image empty": (
         lambda root: (root / "Camera_B3/000000.jpg").write_bytes(b""),
-        "000000.jpg is not a whole PNG or JPEG",
+        "000000.jpg is not a valid PNG or JPEG",
     ),
     "image of another size": (
         picture("Camera_B3/000000.jpg", np.zeros((20, 30, 3), np.uint8)),
-        "is 40x40 pixels .* says 30x20",
+        "is 40x40 pixels .* has 30x20",
     ),
     "frame twice": (
         lambda root: shutil.copy(root / "Camera_B1/000001.jpg", root / "Camera_B1/0001.jpg"),
@@ -618,7 +618,7 @@ def test_joints_need_a_model_file_or_a_cache(written: Path) -> None:
 
 
 def test_model_files_that_do_not_fit(written: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"data.smpl=.*none.pkl is no file"):
+    with pytest.raises(ConfigError, match=r"data.smpl=.*none.pkl does not exist"):
         read(written, tmp_path / "none.pkl")
     write_smpl(tmp_path / "x.npz", "smplx", vertices=60)
     with pytest.raises(DataError, match=r"x.npz is a model of 55 joints.*SMPL \(24 joints\)"):
@@ -631,8 +631,8 @@ def test_model_files_that_do_not_fit(written: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"masks": "all"}, "data.reader.masks must be both, mask or mask_cihp, got 'all'"),
-        ({"fit": "best"}, "data.reader.fit must be auto, refit, refined, first"),
+        ({"masks": "all"}, "data.reader.masks must be one of both, mask_cihp, mask, got 'all'"),
+        ({"fit": "best"}, "data.reader.fit must be one of auto, refit, refined, first"),
         ({"drop_frames": "a-b"}, "data.reader.drop_frames must be frame numbers"),
         ({"drop_frames": "0-9"}, "leaves no frame"),
     ],
@@ -667,7 +667,7 @@ CACHE_DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
         lambda root: turned_twice(root / "mesh_infos.pkl"),
         "mesh_infos.pkl, frame 2: the first 3 numbers of 'poses' must be 0, found up to 0.1",
     ),
-    "cameras cut": ("humannerf", cut("cameras.pkl", 0.5), "cameras.pkl is not a whole pickle"),
+    "cameras cut": ("humannerf", cut("cameras.pkl", 0.5), "cameras.pkl is not a valid pickle"),
     "cameras a list": (
         "humannerf",
         lambda root: (root / "cameras.pkl").write_bytes(pickle.dumps([1])),
@@ -690,13 +690,13 @@ CACHE_DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
         lambda root: (root / "mesh_infos.pkl").write_bytes(pickle.dumps(Evil())),
         r"mesh_infos.pkl asks for .*system",
     ),
-    "no pictures": ("humannerf", remove("images"), "images holds no pictures"),
+    "no pictures": ("humannerf", remove("images"), "images holds no images"),
     "no names": (
         "arah",
         lambda root: (root / "cam_params.json").write_text("{}"),
         "cam_params.json has no list 'all_cam_names'",
     ),
-    "camera without pictures": ("arah", remove("2"), "2 holds no pictures, but cam_params.json"),
+    "camera without pictures": ("arah", remove("2"), "2 holds no images, but cam_params.json"),
     "no models": (
         "arah",
         lambda root: [p.unlink() for p in (root / "models").iterdir()],
@@ -705,7 +705,7 @@ CACHE_DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
     "object npz": (
         "arah",
         lambda root: np.savez(root / "models/000001.npz", betas=np.array([Evil()], object)),
-        "000001.npz (asks for|has no|is not a whole)",
+        "000001.npz (asks for|has no|is not a valid)",
     ),
 }
 

@@ -296,8 +296,8 @@ def test_a_lens_with_more_coefficients_is_undistorted_where_others_stay(tmp_path
     """What ``effects.impossible=off`` makes of ``project``: never a lens that is half known."""
     from make import write_tiny_capture
 
-    from gsgan.data.capture import CaptureDataset
     from gsgan.data.datamodule import GsganData
+    from gsgan.data.dataset import CaptureDataset
 
     root = write_tiny_capture(
         tmp_path / "rational", cameras=3, frames=2, size=(64, 64), dist=(*LENS, 0.01, 0, 0)

@@ -184,8 +184,8 @@ def zju(tmp_path_factory):
 
 
 def frames_of(folder, smpl):
-    from gsgan.data.capture import CaptureDataset
     from gsgan.data.checks import Checks
+    from gsgan.data.dataset import CaptureDataset
     from gsgan.data.formats.zju import ZjuReader
 
     layout = ZjuReader()(folder, Checks(), str(smpl))

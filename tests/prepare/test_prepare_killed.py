@@ -14,7 +14,7 @@ import pytest
 from capture_scenes import write_project
 from rich.console import Console
 
-from gsgan.data.layout import Layout
+from gsgan.data.formats.capture import read_capture
 from gsgan.prepare.inputs import in_parallel
 from gsgan.prepare.options import Options
 from gsgan.prepare.progress import Bars
@@ -97,7 +97,7 @@ def test_a_killed_process_leaves_nothing_half_and_is_taken_up(
     assert prepare(given, quiet()) == out
     assert pictures(out) == whole
     assert [p for p in out.rglob("*") if p.name.endswith(".part")] == []
-    assert len(Layout.read(out).frames) == 4
+    assert len(read_capture(out).frames) == 4
 
 
 def test_an_earlier_dataset_outlives_a_kill(
@@ -107,9 +107,9 @@ def test_an_earlier_dataset_outlives_a_kill(
     prepare(options(project, out, frames="0-2"), quiet())
     again = options(project, out, overwrite=True)
     assert killed(lambda: prepare(again, quiet()), STAGES["the report"])
-    assert len(Layout.read(out).frames) == 3  # the earlier one is still there
+    assert len(read_capture(out).frames) == 3  # the earlier one is still there
     assert killed(lambda: prepare(again, quiet()), lambda place, _: place == out)
-    assert len(Layout.read(tmp_path / ".out.old").frames) == 3  # moved aside, not lost
+    assert len(read_capture(tmp_path / ".out.old").frames) == 3  # moved aside, not lost
     prepare(again, quiet())
     assert pictures(out) == whole
     assert not (tmp_path / ".out.old").exists()

@@ -15,7 +15,7 @@ from rich.console import Console
 from test_prepare_points3d import write_trc
 
 import gsgan.prepare.mediapipe as tool
-from gsgan.data.layout import Layout
+from gsgan.data.formats.capture import read_capture
 from gsgan.prepare import pictures
 from gsgan.prepare.__main__ import prepare as command
 from gsgan.prepare.options import Options
@@ -47,7 +47,7 @@ def quiet() -> Console:
 
 def test_videos_become_a_capture_that_training_reads(project: Path):
     out = prepare(options(project), quiet())
-    layout = Layout.read(out)
+    layout = read_capture(out)
     assert layout.camera_names == ("cam00", "cam01", "cam02")
     assert layout.frames == tuple(range(FRAMES))
     assert (layout.meta.fps, layout.meta.up_axis) == (30.0, "z")
@@ -78,7 +78,7 @@ def test_the_report_tells_every_stage_and_shows_overlays(project: Path):
 def test_pictures_are_undistorted_and_scaled(project: Path):
     small = pictures.PictureFiles(scale=0.5, format="png")
     out = prepare(options(project, pictures=small), quiet())
-    camera = Layout.read(out).cameras["cam00"]
+    camera = read_capture(out).cameras["cam00"]
     assert camera.size == (SIZE[1] // 2, SIZE[0] // 2)
     given = json.loads((project / "cameras.json").read_text())["cam00"]
     np.testing.assert_allclose(camera.K[:2], np.array(given["K"])[:2] / 2)
@@ -99,7 +99,7 @@ def test_the_same_again_is_left_alone_and_another_refused(project: Path):
     with pytest.raises(DataError, match="overwrite=true"):
         prepare(options(project, pictures=small), quiet())
     prepare(options(project, pictures=small, overwrite=True, keep_work=False), quiet())
-    assert Layout.read(out).cameras["cam00"].size == (40, 48)
+    assert read_capture(out).cameras["cam00"].size == (40, 48)
     assert [p.name for p in out.parent.iterdir() if p.name.startswith(".")] == []
 
 
@@ -129,13 +129,13 @@ def test_a_killed_run_leaves_no_dataset_and_goes_on_where_it_was(project: Path, 
     monkeypatch.setattr("gsgan.prepare.solving.solve", None)  # found again, not solved again
     out = prepare(options(project, workers=1), quiet())
     assert len(written) == len(set(written)) == 2 * CAMERAS * FRAMES
-    assert len(Layout.read(out).frames) == FRAMES
+    assert len(read_capture(out).frames) == FRAMES
 
 
 def test_a_camera_that_missed_pictures_and_masks_keeps_the_rest(project: Path):
     (project / "masks" / "cam01" / "000003.png").unlink()
     out = prepare(options(project, frames="1-5"), quiet())
-    layout = Layout.read(out)
+    layout = read_capture(out)
     assert sorted(layout.images["cam01"]) == [1, 2, 4, 5]
     assert sorted(layout.images["cam00"]) == [1, 2, 3, 4, 5]
 
@@ -143,7 +143,7 @@ def test_a_camera_that_missed_pictures_and_masks_keeps_the_rest(project: Path):
 def test_offsets_move_a_cameras_numbers(project: Path):
     late = options(project, offsets={"cam02": 1})
     out = prepare(late, quiet())
-    assert sorted(Layout.read(out).images["cam02"]) == list(
+    assert sorted(read_capture(out).images["cam02"]) == list(
         range(1, FRAMES)
     )  # frame 6 is its own alone
     with pytest.raises(ConfigError, match="offsets name cam09"):
@@ -157,7 +157,7 @@ def test_folders_of_pictures_need_a_frame_rate(project: Path):
     with pytest.raises(ConfigError, match="give fps"):
         prepare(options(project), quiet())
     out = prepare(options(project, fps=25), quiet())
-    assert Layout.read(out).meta.fps == 25
+    assert read_capture(out).meta.fps == 25
 
 
 def in_centimetres(project: Path) -> None:
@@ -204,7 +204,7 @@ def test_what_is_wrong_is_said_in_one_sentence(project: Path, break_it, more, wh
 def test_joints_of_another_tool_take_the_place_of_detections(project: Path):
     given = write_trc(project / "person.trc", skeletons(FRAMES))
     out = prepare(options(project, landmarks="nowhere", landmarks3d=str(given)), quiet())
-    assert Layout.read(out).frames == tuple(range(FRAMES))
+    assert read_capture(out).frames == tuple(range(FRAMES))
     found = np.load(out / "landmarks3d.npz")
     assert (found["conf"][:, 1] == 0).all()  # an eye that the file does not know
     np.testing.assert_allclose(found["p"][:, 11], skeletons(FRAMES)[:, 11], atol=1e-3)
@@ -282,7 +282,7 @@ def with_stub(project: Path, monkeypatch, bad: str = "") -> Options:
 def test_the_tool_is_run_once_a_camera(project: Path, monkeypatch):
     given = with_stub(project, monkeypatch)
     out = prepare(given, quiet())
-    assert len(Layout.read(out).frames) == FRAMES
+    assert len(read_capture(out).frames) == FRAMES
     calls = []
     monkeypatch.setattr("gsgan.prepare.inputs.detect", lambda *a, **k: calls.append(a))
     smoother = {"pictures": pictures.PictureFiles(scale=0.5), "overwrite": True}

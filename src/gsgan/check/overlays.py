@@ -12,6 +12,7 @@ from gsgan.check.views import Subject, View
 from gsgan.data import crop as cropping
 from gsgan.data import pixels as reading
 from gsgan.data.crop import NEAR, Window
+from gsgan.data.files import read_colour
 from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float
 from gsgan.skeleton.template import SkeletonTemplate
 
@@ -74,7 +75,7 @@ def tile(subject: Subject, view: View, height: int) -> Bytes:
             cropping.take(whole, window, mapping, False), (height, round(height * ASPECT)), False
         )
         for whole in (
-            reading.read_image(subject.layout.image_path(*item), rules),
+            read_colour(subject.layout.image_path(*item)),
             reading.read_mask(subject.layout.mask_files(*item), rules),
         )
     )

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from gsgan.check.settings import Sampling
 from gsgan.check.silhouette import body_silhouette, box, overlap
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.capture import CaptureDataset
 from gsgan.data.crop import project
+from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.trust import (
     TOLERANCE,
     Bool,

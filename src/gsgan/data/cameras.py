@@ -1,4 +1,4 @@
-"""One calibrated camera, and what is wrong with a calibration, in one sentence."""
+"""One calibrated camera, checked and converted from raw calibration values."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsgan.utils.arrays import as_floats
 from gsgan.utils.errors import DataError
 
 Float = NDArray[np.float64]
@@ -23,7 +24,7 @@ class CameraEntry:
     """One calibrated camera, float64 numpy.
 
     Args:
-        name: as in the calibration and, mostly, in the folder names.
+        name: as in the calibration.
         K: ``[3, 3]`` pixels, pixel centres at +0.5.
         R: ``[3, 3]`` world to camera.
         t: ``[3]`` metres.
@@ -40,7 +41,7 @@ class CameraEntry:
 
     @property
     def centre(self) -> Float:
-        """``[3]`` metres: where the camera stands."""
+        """``[3]`` metres: the position of the camera."""
         return -self.R.T @ self.t
 
     @property
@@ -49,9 +50,9 @@ class CameraEntry:
         return bool(np.any(self.dist != 0))
 
     def stored_pixels(self, points: Float) -> Float:
-        """``[N, 2]`` where world points ``[N, 3]`` lie in the stored, distorted picture.
+        """``[N, 2]`` world points ``[N, 3]`` in the stored, distorted image.
 
-        Skew counts, which OpenCV's own projection drops. Points behind the camera get meaningless
+        Skew is applied, unlike in OpenCV's own projection. Points behind the camera get meaningless
         pixels: mask them by depth.
         """
         if len(points) == 0:
@@ -85,11 +86,11 @@ def make_camera(
         dist: 0, 4, 5 or 8 numbers, or None.
         size: ``(H, W)`` pixels.
         scale: metres in one unit of the file.
-        pixel_centre: where the file's K puts the centre of the first pixel, 0 or 0.5.
+        pixel_centre: the centre of the first pixel in the file's K, 0 or 0.5.
         rotation_tolerance: largest entry of ``R Rᵀ - I`` allowed.
 
     Raises:
-        DataError: naming the camera and what is wrong.
+        DataError: naming the camera and the problem.
     """
     K = _intrinsics(where, K)
     K[:2, 2] += 0.5 - pixel_centre
@@ -114,15 +115,12 @@ def _intrinsics(where: str, raw: Any) -> Float:
 
 
 def numbers(where: str, raw: Any, key: str, shape: tuple[int, ...]) -> Float:
-    """Finite float64 numbers of a shape; a column or row where a vector is due is flattened.
+    """Finite float64 numbers of a shape; a column or row in place of a vector is flattened.
 
     Raises:
         DataError: when they are something else.
     """
-    try:
-        array = np.array(raw, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        array = np.full(1, np.nan)
+    array = as_floats(raw)
     if array.size == int(np.prod(shape)) and array.ndim > len(shape):
         array = array.reshape(shape)  # a translation is often written as a column
     if array.shape != shape or not np.isfinite(array).all():
@@ -132,7 +130,7 @@ def numbers(where: str, raw: Any, key: str, shape: tuple[int, ...]) -> Float:
     return array
 
 
-SHORT = reprlib.Repr()  # what is nested deeply or without end is not printed to its end
+SHORT = reprlib.Repr()  # deeply or endlessly nested values are not printed in full
 SHORT.maxlevel, SHORT.maxlist, SHORT.maxtuple, SHORT.maxother = 4, 16, 16, 400
 
 
@@ -142,7 +140,7 @@ def _short(raw: Any, limit: int = 120) -> str:
 
 
 def check_rotation(where: str, R: Float, tolerance: float) -> None:
-    """Refuses what is no rotation.
+    """Refuses a matrix that is not a rotation.
 
     Raises:
         DataError: on a sheared or mirrored matrix.
@@ -168,10 +166,7 @@ def distortion(where: str, raw: Any) -> Float:
     padded = np.zeros(8)
     if raw is None or (isinstance(raw, (list, tuple)) and not raw):
         return padded
-    try:
-        dist = np.array(raw, np.float64).reshape(-1)
-    except (TypeError, ValueError, OverflowError):
-        dist = np.full(1, np.nan)
+    dist = as_floats(raw).reshape(-1)
     if len(dist) not in DISTORTION_LENGTHS or not np.isfinite(dist).all():
         raise DataError(
             f"{where}: dist must hold 4, 5 or 8 finite numbers (k1 k2 p1 p2 k3 ...), "

@@ -1,4 +1,4 @@
-"""The LightningDataModule: one capture, its splits, its loaders, and what the scene is like."""
+"""The LightningDataModule: one capture, its splits, its loaders, and facts about the scene."""
 
 from __future__ import annotations
 
@@ -18,37 +18,39 @@ import torch
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, Subset
 
-from gsgan.data.capture import CaptureDataset, Lens, PictureCache
+from gsgan.data.checks import Checks
 from gsgan.data.crop import PersonCrop
+from gsgan.data.dataset import CaptureDataset, Lens, PictureCache
 from gsgan.data.formats.capture import CaptureReader
-from gsgan.data.layout import Checks, Layout
+from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
 from gsgan.data.sampler import StepSampler, pass_order
 from gsgan.data.scene_info import SceneInfo, count_labels, scene_info
 from gsgan.data.skeletons import complete_skeletons
 from gsgan.data.splits import SPLITS, Splits, make_splits, protocol_splits
 from gsgan.scene import Frame, cat
+from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.errors import ConfigError
 
-__all__ = [
-    "GsganData",
-    "SceneInfo",
-    "StepSampler",
-    "count_labels",
-    "pass_order",
-    "scene_info",
-]
+__all__ = ["GsganData", "SceneInfo", "StepSampler", "count_labels", "pass_order", "scene_info"]
 
 log = logging.getLogger(__name__)
 
 MOST_WORKERS = 8
+LENSES: dict[str, Lens] = {
+    "auto": "undistort",
+    "on": "undistort",
+    "undistort": "undistort",
+    "off": "ignore",
+    "project": "raw",
+}
 
 Reader = Callable[[str | Path, Checks, str | None], Layout]
-"""A dataset's folder, what it must satisfy, the user's body model file: the layout."""
+"""The layout of a dataset's folder, by thresholds and the user's body model file."""
 
 
 def _quiet_worker(_: int) -> None:
-    cv2.setNumThreads(0)  # one thread a worker process; OpenCV's pool does not survive a fork
+    cv2.setNumThreads(0)  # one thread per worker process; OpenCV's pool does not survive a fork
 
 
 class GsganData(LightningDataModule):
@@ -58,24 +60,23 @@ class GsganData(LightningDataModule):
         root: the folder; or None when ``source`` makes it.
         reader: of the dataset's format (`gsgan.data.formats`); None is the bring-your-own layout.
         smpl: the user's SMPL or SMPL-X model file, for datasets whose poses need one.
-        protocol: who trains and who tests, as a publication has it; None leaves it to the data
-            and the keys below.
-        source: called without arguments, makes the dataset if need be and returns its folder.
-        size: side of the square pictures in pixels; None keeps them as they are.
-        crop: "person" or a `PersonCrop` cuts round the person; None keeps the full picture.
-        batch_size: items a batch.
+        protocol: the splits of a publication; None takes those of the dataset or the keys below.
+        source: called without arguments, makes the dataset if needed and returns its folder.
+        size: side of the square images in pixels; None keeps their size.
+        crop: "person" or a `PersonCrop` cuts round the person; None keeps the full image.
+        batch_size: items per batch.
         train_cameras, test_cameras, train_frames, test_frames, test_share: see `make_splits`.
-        val_pictures: pictures watched while training.
-        steps_per_epoch: batches an epoch; None is one pass over the training items.
-        workers: loading processes; 0 loads in this one; None: 0 without a GPU, else up to
-            `MOST_WORKERS`, as many as there are processors for each GPU.
+        val_pictures: held-out images rendered during training.
+        steps_per_epoch: batches per epoch; None is one pass over the training items.
+        workers: loading processes; 0 loads in this one; None is 0 without a GPU, else up to
+            `MOST_WORKERS`, one per processor that each GPU has.
         seed: of the order of training items.
-        cache_mb: bound on decoded pictures kept in memory, all loading processes together.
-        info_samples: pictures a camera from which the mean foreground colour is taken.
+        cache_mb: bound on decoded images kept in memory, over all loading processes.
+        info_samples: images per camera for the mean foreground colour.
         min_joints: a frame with fewer usable joints is dropped.
-        distortion: ``auto`` and ``undistort`` undistort pictures on reading; ``off`` takes them as
-            a pinhole's; ``project`` leaves them as taken, with the lens in ``camera.dist``.
-        wanted: what the root should be, for the message when it is not set.
+        distortion: ``auto`` and ``undistort`` undistort images on reading; ``off`` treats them as
+            a pinhole's; ``project`` keeps the distortion, with the lens in ``camera.dist``.
+        wanted: description of the root, for the message when it is not set.
 
     Raises:
         ConfigError: when neither root nor source is given, or a number is out of range.
@@ -108,7 +109,10 @@ class GsganData(LightningDataModule):
     ) -> None:
         super().__init__()
         if root is None and source is None:
-            raise ConfigError(_root_not_set(wanted))
+            raise ConfigError(
+                f"data.root is not set: give the folder of {wanted}, e.g. "
+                "data.root=/path/to/capture"
+            )
         self.root = root
         self.source = source
         self.reader = CaptureReader() if reader is None else reader
@@ -116,7 +120,7 @@ class GsganData(LightningDataModule):
         self.protocol = protocol
         self.size = size
         self.crop = _crop(crop)
-        self.batch_size = _at_least("batch_size", batch_size, 1)
+        self.batch_size = whole("data.batch_size", batch_size, 1)
         self.split_keys = {
             "train_cameras": train_cameras,
             "test_cameras": test_cameras,
@@ -125,14 +129,14 @@ class GsganData(LightningDataModule):
             "test_share": test_share,
         }
         if steps_per_epoch is not None:
-            _at_least("steps_per_epoch", steps_per_epoch, 1)
+            whole("data.steps_per_epoch", steps_per_epoch, 1)
         self.steps_per_epoch = steps_per_epoch
-        self.val_pictures = _at_least("val_pictures", val_pictures, 1)
-        self.workers = default_workers() if workers is None else _at_least("workers", workers, 0)
-        self.seed = _at_least("seed", seed, 0)
-        self.cache_mb = _at_least("cache_mb", cache_mb, 0)
-        self.info_samples = _at_least("info_samples", info_samples, 1)
-        self.checks = replace(Checks(), min_joints=_at_least("min_joints", min_joints, 1))
+        self.val_pictures = whole("data.val_pictures", val_pictures, 1)
+        self.workers = default_workers() if workers is None else whole("data.workers", workers, 0)
+        self.seed = whole("data.seed", seed, 0)
+        self.cache_mb = at_least("data.cache_mb", cache_mb, 0)
+        self.info_samples = whole("data.info_samples", info_samples, 1)
+        self.checks = replace(Checks(), min_joints=whole("data.min_joints", min_joints, 1))
         self.lens = _lens(distortion)
         self._datasets: dict[str, CaptureDataset] | None = None
         self._layout: Layout | None = None
@@ -140,11 +144,11 @@ class GsganData(LightningDataModule):
         self._info: SceneInfo | None = None
 
     def prepare_data(self) -> None:
-        """Makes the dataset where a ``source`` does; one process a machine."""
+        """Makes the dataset if it has a ``source``; one process per machine."""
         self._folder()
 
     def setup(self, stage: str | None = None) -> None:
-        """Reads and checks the layout, once; logs what was converted or dropped.
+        """Reads and checks the layout, once; logs conversions and omissions.
 
         Raises:
             DataError: see the reader and `make_splits`.
@@ -160,7 +164,7 @@ class GsganData(LightningDataModule):
         limit = int(self.cache_mb * 2**20) // (2 * self.workers + 1)
         cache = PictureCache(limit)
         trained = sorted({frame for _, frame in splits.items["train"]})
-        skeletons = complete_skeletons(layout, trained)
+        skeletons = complete_skeletons(layout.landmarks, layout.frames, trained)
         self._datasets = {
             name: CaptureDataset(
                 layout, splits.items[name], self.size, self.crop, cache, self.lens, skeletons
@@ -172,7 +176,7 @@ class GsganData(LightningDataModule):
     def _folder(self) -> str | Path:
         if self.root is not None:
             return self.root
-        assert self.source is not None  # __init__ saw to it
+        assert self.source is not None  # checked in __init__
         return self.source()
 
     def _split(self, layout: Layout) -> Splits:
@@ -181,16 +185,16 @@ class GsganData(LightningDataModule):
         given = [k for k, v in self.split_keys.items() if k != "test_share" and v is not None]
         if given:
             raise ConfigError(
-                f"data.{given[0]} is set, but protocol {self.protocol.name} says who trains and "
-                "who tests; leave one of them out"
+                f"data.{given[0]} is set, but protocol {self.protocol.name} sets the splits; leave "
+                "one of them out"
             )
         return protocol_splits(layout, self.protocol)
 
     def protocol_record(self, lpips_net: str) -> dict[str, Any] | None:
-        """What is written beside every score: the protocol and where this run departs from it.
+        """The record beside every score: the protocol and where this run departs from it.
 
         Args:
-            lpips_net: the backbone that LPIPS is computed with.
+            lpips_net: LPIPS's backbone.
         """
         if self.protocol is None:
             return None
@@ -198,14 +202,14 @@ class GsganData(LightningDataModule):
         scale = None if self.crop is not None else (self.size or sides[0]) / sides[0]
         oblong = any(c.size[0] != c.size[1] for c in self.layout.cameras.values())
         padded = self.crop is None and self.size is not None and oblong
-        said = self.protocol.departures(lpips_net=lpips_net, scale=scale, padded=padded)
-        return self.protocol.record() | {"departures": list(said)}
+        departures = self.protocol.departures(lpips_net=lpips_net, scale=scale, padded=padded)
+        return self.protocol.record() | {"departures": list(departures)}
 
     def _check_one_size(self) -> None:
         sizes = {camera.size: name for name, camera in self.layout.cameras.items()}
         if self.size is None and self.batch_size > 1 and (self.crop or len(sizes) > 1):
             raise ConfigError(
-                "data.size is not set and pictures differ in size, so batches of "
+                "data.size is not set and images differ in size, so batches of "
                 f"{self.batch_size} cannot be made; set data.size (e.g. 512) or data.batch_size=1"
             )
 
@@ -218,7 +222,7 @@ class GsganData(LightningDataModule):
 
     @property
     def splits(self) -> Splits:
-        """Who trains and who tests."""
+        """The training and held-out items."""
         self.setup()
         assert self._splits is not None
         return self._splits
@@ -230,7 +234,7 @@ class GsganData(LightningDataModule):
 
     @property
     def info(self) -> SceneInfo:
-        """What the training split tells about the scene, found on first use."""
+        """Facts about the scene from the training split, computed on first use."""
         if self._info is None:
             train = self.dataset("train")
             held_out = [self.dataset(name) for name in SPLITS[1:]]
@@ -255,7 +259,7 @@ class GsganData(LightningDataModule):
         return self._datasets[split]
 
     def labelled(self, split: str) -> Subset[Frame]:
-        """The items of a split whose pictures have part labels; perhaps none."""
+        """The items of a split whose images have part labels; may be empty."""
         dataset, labels = self.dataset(split), self.layout.label_path
         return Subset(dataset, [i for i, item in enumerate(dataset.items) if labels(*item)])
 
@@ -282,12 +286,12 @@ class GsganData(LightningDataModule):
         return name, [(2 * i + 1) * most // (2 * count) for i in range(count)]
 
     def val_dataloader(self) -> DataLoader[Frame]:
-        """The pictures of `watched`."""
+        """The images of `watched`."""
         name, places = self.watched
         return self._loader(Subset(self.dataset(name), places))
 
     def test_dataloader(self) -> list[DataLoader[Frame]]:
-        """One loader a held-out split that is not empty, as in `eval_names`."""
+        """One loader per held-out split that is not empty, as in `eval_names`."""
         return [self._loader(self.dataset(name)) for name in self.eval_names]
 
     def transfer_batch_to_device(
@@ -317,17 +321,13 @@ class GsganData(LightningDataModule):
 
 
 def default_workers() -> int:
-    """Loading processes per training process: one processor is left for that itself."""
+    """Loading processes per training process, which keeps one processor for itself."""
     gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if not gpus:
         return 0
     mine = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
     processors = mine or os.cpu_count() or 1
     return max(0, min(MOST_WORKERS, processors // gpus - 1))
-
-
-def _root_not_set(wanted: str) -> str:
-    return f"data.root is not set: give the folder of {wanted}, e.g. data.root=/path/to/capture"
 
 
 def _refuse_leak(layout: Layout, splits: Splits) -> None:
@@ -341,30 +341,13 @@ def _refuse_leak(layout: Layout, splits: Splits) -> None:
 
 
 def _crop(crop: PersonCrop | str | None) -> PersonCrop | None:
-    if crop is None or isinstance(crop, PersonCrop):
-        return crop
     if crop == "person":
         return PersonCrop()
+    if crop is None or isinstance(crop, PersonCrop):
+        return crop
     raise ConfigError(f"data.crop must be null or person, got {crop!r}")
 
 
-def _at_least(name: str, value: Any, least: int) -> Any:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= least:
-        raise ConfigError(f"data.{name} must be a number of at least {least}, got {value!r}")
-    return value
-
-
 def _lens(distortion: str) -> Lens:
-    """What is done about the lens on reading."""
-    words: dict[str, Lens] = {
-        "auto": "undistort",
-        "on": "undistort",
-        "undistort": "undistort",
-        "off": "ignore",
-        "project": "raw",
-    }
-    if distortion not in words:
-        raise ConfigError(
-            f"effects.distortion must be one of {', '.join(words)}; got {distortion!r}"
-        )
-    return words[distortion]
+    """The treatment of lens distortion on reading."""
+    return LENSES[one_of("effects.distortion", distortion, LENSES)]

@@ -1,4 +1,4 @@
-"""The 33 + 21 + 21 joints of a capture, and where other detectors keep them."""
+"""The 33 + 21 + 21 joints of a capture, and their numbers in other detectors."""
 
 from __future__ import annotations
 
@@ -30,58 +30,22 @@ def flip_groups(hands: bool) -> tuple[tuple[tuple[int, int], ...], ...]:
     return HEAD_PAIRS, ARM_PAIRS + (HAND_PAIRS if hands else ()), LEG_PAIRS
 
 
-# Other detectors' numbers by MediaPipe's; a joint that is not listed they do not know.
-_COCO = {
-    0: 0,
-    2: 1,
-    5: 2,
-    7: 3,
-    8: 4,
-    11: 5,
-    12: 6,
-    13: 7,
-    14: 8,
-    15: 9,
-    16: 10,
-    23: 11,
-    24: 12,
-    25: 13,
-    26: 14,
-    27: 15,
-    28: 16,
-}
-_BODY_25 = {
-    0: 0,
-    2: 16,
-    5: 15,
-    7: 18,
-    8: 17,
-    11: 5,
-    12: 2,
-    13: 6,
-    14: 3,
-    15: 7,
-    16: 4,
-    23: 12,
-    24: 9,
-    25: 13,
-    26: 10,
-    27: 14,
-    28: 11,
-    29: 21,
-    30: 24,
-    31: 19,
-    32: 22,
-}
-_HALPE_26 = {**_COCO, 29: 24, 30: 25, 31: 20, 32: 21}
+# Other detectors' joint numbers by MediaPipe's, for those that both have.
+_SHARED = (0, 2, 5, 7, 8, *range(11, 17), *range(23, 29))  # nose, eyes, ears, arms, legs
+_FEET = (29, 30, 31, 32)  # heels, then toes; the left one first
+_COCO = {landmark: joint for joint, landmark in enumerate(_SHARED)}
+_BODY_25 = dict(
+    zip(
+        _SHARED + _FEET,
+        (0, 16, 15, 18, 17, 5, 2, 6, 3, 7, 4, 12, 9, 13, 10, 14, 11, 21, 24, 19, 22),
+        strict=True,
+    )
+)
+_HALPE_26 = _COCO | dict(zip(_FEET, (24, 25, 20, 21), strict=True))
 _WHOLE_BODY = {
     **_COCO,
-    29: 19,
-    30: 22,
-    31: 17,
-    32: 20,
-    **{BODY + j: 91 + j for j in range(HAND)},
-    **{BODY + HAND + j: 112 + j for j in range(HAND)},
+    **dict(zip(_FEET, (19, 22, 17, 20), strict=True)),
+    **{BODY + j: 91 + j for j in range(2 * HAND)},
 }
 SETS: dict[int, tuple[str, dict[int, int]]] = {
     17: ("COCO", _COCO),
@@ -90,7 +54,7 @@ SETS: dict[int, tuple[str, dict[int, int]]] = {
     33: ("MediaPipe", {j: j for j in range(BODY)}),
     133: ("COCO-WholeBody", _WHOLE_BODY),
 }
-# Where hands are known but the body's hand joints are not: little finger, index, thumb.
+# The body's hand joints from the hands: little finger, index, thumb.
 FROM_HANDS = {
     17: BODY + 17,
     19: BODY + 5,

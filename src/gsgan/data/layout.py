@@ -1,16 +1,19 @@
-"""A dataset on disk, validated and indexed, whatever its format: what `CaptureDataset` reads from.
+"""A dataset on disk, validated and indexed, in the same form for every format.
 
-A reader (`gsgan.data.formats`) finds what lies where and hands it to `assemble`, which checks it
-in the same way for every format. Everything is joined by camera name and by frame number, never by
-position: one dropped picture must not shift the rest.
+A reader (`gsgan.data.formats`) finds the files and hands them to `assemble`, which checks every
+format in the same way. Files are matched by camera name and by frame number, never by position:
+one missing image must not shift the others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.checks import (
@@ -21,29 +24,14 @@ from gsgan.data.checks import (
     drop_frames,
     drop_unmasked,
     drop_unseen,
-    spans,
 )
-from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules
-from gsgan.data.skeletons import Landmarks, Poses, fill_missing
+from gsgan.data.pixels import MaskFile, PixelRules
+from gsgan.data.skeletons import Landmarks, Poses
 from gsgan.utils.errors import DataError
 
-__all__ = [
-    "IGNORE_LABEL",
-    "BodyModel",
-    "CameraEntry",
-    "Checks",
-    "Found",
-    "Landmarks",
-    "Layout",
-    "Meta",
-    "Poses",
-    "assemble",
-    "dataset_folder",
-    "fill_missing",
-    "spans",
-]
-
 MaskIndex = Mapping[str, Mapping[int, tuple[MaskFile, ...]]]
+Points = Callable[[int], NDArray[np.float64]]
+"""A frame's points on or in the body, ``[N, 3]`` metres."""
 
 
 @dataclass(frozen=True)
@@ -63,20 +51,20 @@ class BodyModel:
 
 @dataclass(frozen=True)
 class Meta:
-    """What is known of a capture as a whole.
+    """Facts about a capture as a whole.
 
     Args:
         unit: of the lengths in its files: m, cm or mm.
-        fps: frames a second, or None when it is not said.
+        fps: frames per second, or None if unknown.
         up_axis: of the world, e.g. "z" or "-y".
         skeleton: name of the landmark set.
-        skeleton_source: where the landmarks come from, e.g. "smpl24 -> mediapipe33".
+        skeleton_source: origin of the landmarks, e.g. "smpl24 -> mediapipe33".
         body: the skinned body that the poses move, or None.
         label_names: names of the part numbers, background first, or None.
-        labels_named_by: who gives those names, for messages.
-        splits: train_cameras, test_cameras, train_frames, test_frames as the data has them,
+        labels_named_by: the source of those names, for messages.
+        splits: train_cameras, test_cameras, train_frames, test_frames of the dataset itself,
             unchecked.
-        layout: which format this is, in words.
+        layout: name of the format.
     """
 
     unit: str = "m"
@@ -91,85 +79,74 @@ class Meta:
     layout: str = "bring-your-own"
 
 
-@dataclass(frozen=True)
-class Found:
-    """What a reader found, each part checked by itself but not yet against the others.
+@dataclass(frozen=True, kw_only=True)
+class _Contents:
+    root: Path
+    meta: Meta
+    cameras: Mapping[str, CameraEntry]
+    images: Index
+    masks: MaskIndex
+    labels: Index = field(default_factory=dict)
+    landmarks: Landmarks
+    poses: Poses | None = None
+    pixels: PixelRules = field(default_factory=PixelRules)
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Found(_Contents):
+    """The files that a reader found; they are not yet checked against each other.
 
     Args:
         root: the dataset's folder; all paths are relative to it.
         meta: about the whole.
-        cameras: by name, in the order that `camera_index` counts.
+        cameras: by name, in the order of `camera_index`.
         images: by camera and frame.
-        masks: by camera and frame, one or more a picture; pictures may lack theirs.
-        mask_folders: where a camera's masks should be, for messages.
-        labels: by camera and frame; empty when there are none.
+        masks: by camera and frame, one or more per image; images may lack theirs.
+        mask_folder: where the masks of ``{camera}`` are expected, for messages.
+        labels: by camera and frame; empty without labels.
         landmarks: by frame.
         poses: by frame, or None.
-        pixels: how the files are to be understood.
+        pixels: how to decode the files.
         calibration: the file that holds the cameras, for messages.
-        unit_hint: what to look at when distances are not believable.
-        notes: one sentence for each thing converted or left out so far.
+        unit_hint: what to check when distances are implausible.
+        points: points on the body's surface, compared with the masks; None compares the joints.
+        notes: one sentence for each conversion or omission so far.
     """
 
-    root: Path
-    meta: Meta
-    cameras: Mapping[str, CameraEntry]
-    images: Index
-    masks: MaskIndex
-    mask_folders: Mapping[str, Path]
-    labels: Index
-    landmarks: Landmarks
-    poses: Poses | None
-    pixels: PixelRules
+    mask_folder: str = "mask/{camera}"
     calibration: Path
     unit_hint: str
-    notes: tuple[str, ...] = ()
+    points: Points | None = None
 
 
-@dataclass(frozen=True)
-class Layout:
-    """A capture on disk, validated and indexed; no picture is decoded.
+@dataclass(frozen=True, kw_only=True)
+class Layout(_Contents):
+    """A capture on disk, validated and indexed; no image is decoded.
 
     Args:
         root: the folder.
         meta: about the whole.
-        cameras: by name; `camera_index` counts in this order.
+        cameras: by name, in the order of `camera_index`.
         frames: usable frame numbers, rising.
         images: paths relative to the root by camera and frame, usable ones only.
-        masks: the same for masks, one or more a picture.
-        labels: the same for part labels; empty when the capture has none.
+        masks: the same for masks, one or more per image.
+        labels: the same for part labels; empty without labels.
         landmarks: by frame.
         poses: by frame, or None.
-        pixels: how the files are to be understood.
-        notes: one sentence for each thing converted, dropped or left out.
+        pixels: how to decode the files.
+        notes: one sentence for each conversion or omission.
     """
 
-    root: Path
-    meta: Meta
-    cameras: Mapping[str, CameraEntry]
     frames: tuple[int, ...]
-    images: Index
-    masks: MaskIndex
-    labels: Index
-    landmarks: Landmarks
-    poses: Poses | None
-    pixels: PixelRules
-    notes: tuple[str, ...]
-
-    @classmethod
-    def read(cls, root: str | Path, checks: Checks | None = None) -> Layout:
-        """Reads a folder in the bring-your-own layout, see `gsgan.data.formats.capture`."""
-        from gsgan.data.formats.capture import read_capture
-
-        return read_capture(root, checks)
 
     @property
     def camera_names(self) -> tuple[str, ...]:
-        """All cameras, in the order that `camera_index` counts."""
+        """All cameras, in the order of `camera_index`."""
         return tuple(self.cameras)
 
     def image_path(self, camera: str, frame: int) -> Path:
-        """The picture of a camera and frame."""
+        """The image of a camera and frame."""
         return self.root / self.images[camera][frame]
 
     def mask_path(self, camera: str, frame: int) -> Path:
@@ -181,7 +158,7 @@ class Layout:
         return [(mask.rule, self.root / mask.path) for mask in self.masks[camera][frame]]
 
     def label_path(self, camera: str, frame: int) -> Path | None:
-        """The part labels of a camera and frame, or None when it has none."""
+        """The part labels of a camera and frame, or None without labels."""
         name = self.labels.get(camera, {}).get(frame)
         return None if name is None else self.root / name
 
@@ -190,31 +167,31 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
     """The dataset's folder.
 
     Raises:
-        DataError: when it is not there, saying what was expected in it.
+        DataError: when it does not exist, naming the ``expected`` content.
     """
     folder = Path(root).expanduser()
     if not folder.is_dir():
-        what = "is a file, not a folder" if folder.exists() else "does not exist"
-        raise DataError(f"data.root={root} {what}; expected the folder that holds {expected}")
+        problem = "is a file, not a folder" if folder.exists() else "does not exist"
+        raise DataError(f"data.root={root} {problem}; expected the folder that holds {expected}")
     return folder
 
 
 def assemble(found: Found, checks: Checks) -> Layout:
-    """Checks what was found against itself and leaves out what cannot be used.
+    """Checks the files against each other and leaves out those that cannot be used.
 
     Raises:
         DataError: for whatever is missing or contradictory, naming the file.
     """
-    root, cameras, notes = found.root, found.cameras, list(found.notes)
-    images = drop_frames(root, found.images, found.landmarks, found.poses, checks, notes)
-    check_geometry(
-        root, cameras, images, found.landmarks, checks, found.calibration, found.unit_hint
-    )
-    images = drop_unseen(cameras, images, found.landmarks, checks, found.calibration, notes)
-    images = drop_unmasked(images, found.masks, found.mask_folders, checks, notes)
+    root, cameras, marks, notes = found.root, found.cameras, found.landmarks, list(found.notes)
+    calibration = found.calibration
+    images = drop_frames(root, found.images, marks, found.poses, checks, notes)
+    check_geometry(root, cameras, images, marks, checks, calibration, found.unit_hint)
+    images = drop_unseen(cameras, images, marks, checks, calibration, notes)
+    folders = {name: root / found.mask_folder.format(camera=name) for name in cameras}
+    images = drop_unmasked(images, found.masks, folders, checks, notes)
     masks = {c: {f: found.masks[c][f] for f in files} for c, files in images.items()}
     labels = _labels_of(images, found.labels, notes)
-    check_pictures(root, cameras, images, masks, labels, checks.header_stride, found.calibration)
+    check_pictures(root, cameras, images, masks, labels, checks.header_stride, calibration)
     return Layout(
         root=root,
         meta=found.meta,
@@ -223,7 +200,7 @@ def assemble(found: Found, checks: Checks) -> Layout:
         images=images,
         masks=masks,
         labels=labels,
-        landmarks=found.landmarks,
+        landmarks=marks,
         poses=found.poses,
         pixels=found.pixels,
         notes=tuple(notes),
@@ -232,8 +209,8 @@ def assemble(found: Found, checks: Checks) -> Layout:
 
 def _labels_of(images: Index, found: Index, notes: list[str]) -> Index:
     labels = {c: {f: p for f, p in found.get(c, {}).items() if f in images[c]} for c in images}
-    pictures = sum(len(files) for files in images.values())
-    lacking = pictures - sum(len(files) for files in labels.values())
-    if 0 < lacking < pictures:
-        notes.append(f"{lacking} of {pictures} pictures have no labels, they count as 'ignore'")
-    return labels if lacking < pictures else {}
+    count = sum(len(files) for files in images.values())
+    missing = count - sum(len(files) for files in labels.values())
+    if 0 < missing < count:
+        notes.append(f"{missing} of {count} images have no labels, they count as 'ignore'")
+    return labels if missing < count else {}

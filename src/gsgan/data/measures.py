@@ -1,4 +1,4 @@
-"""What of a picture is scored, and how: the named choices in which published evaluations differ."""
+"""The scored region of an image and the variants of the metrics in published evaluations."""
 
 from __future__ import annotations
 
@@ -23,28 +23,28 @@ CHOICES: dict[str, tuple[Any, ...]] = {
 
 @dataclass(frozen=True)
 class Measures:
-    """What of a picture is scored, and how.
+    """The scored region of an image, and the variants of the metrics.
 
     Args:
-        region: "full" picture; "body_box_cleared", the full picture with the prediction cleared to
+        region: "full" image; "body_box_cleared", the full image with the prediction cleared to
             the background outside the body's projected 3D box; "body_box", PSNR inside that box
-            only and SSIM on the rectangle round it, both pictures cleared outside.
-        background: on which truth and prediction are compared.
-        lpips_region: "full" picture, or "mask_crop_512": the truth's mask and 50 px, in a square of
+            only and SSIM on the rectangle round it, both images cleared outside.
+        background: on which ground truth and prediction are compared.
+        lpips_region: "full" image, or "mask_crop_512": the true mask and 50 px, in a square of
             the background, resized to 512.
-        lpips_range: values that the backbone is fed: [-1, 1] as it expects, or [0, 1] unscaled,
-            which comes out smaller.
-        lpips_channels: their order; "bgr" as scripts feed it that read pictures by OpenCV.
+        lpips_range: range of the backbone's input: [-1, 1] as it expects, or [0, 1] unscaled,
+            which gives smaller values.
+        lpips_channels: their order; "bgr" as in scripts that read images with OpenCV.
         ssim_window: "gaussian" of 11 pixels, or "uniform" of 7, scikit-image's default.
-        ssim_range: of the values, as SSIM is told: 1, or 2 as tools assume that take floats for
-            -1 to 1, which comes out higher.
+        ssim_range: of the values, as passed to SSIM: 1, or 2 as tools assume for floats in [-1, 1],
+            which gives higher values.
         psnr_pooling: "picture", one error for all channels; "channels", the mean of their PSNRs.
         eight_bits: whether predictions are "rounded" or "cut" to 8 bits first.
-        truth_outline: "soft", put on the background by its mask as alpha; "hard", as it was taken
+        truth_outline: "soft", composed on the background with its mask as alpha; "hard", the image
             where the mask is at least one half, and the background elsewhere.
 
     Raises:
-        ConfigError: on a value that is none of these.
+        ConfigError: on an unknown value.
 
     Source: the publications' scoring scripts, which differ in these.
     """
@@ -66,15 +66,12 @@ class Measures:
         for name, choices in CHOICES.items():
             value = getattr(self, name)
             if isinstance(value, bool) or value not in choices:
+                listed = (str(list(c)) if isinstance(c, tuple) else str(c) for c in choices)
                 raise ConfigError(
-                    f"protocol.measures.{name} must be {_listed(choices)}; got {value!r}"
+                    f"protocol.measures.{name} must be {' or '.join(listed)}; got {value!r}"
                 )
 
     @property
     def needs_body_box(self) -> bool:
-        """Whether the body's projected box is asked for at all."""
+        """Whether the region depends on the body's projected box."""
         return self.region != "full"
-
-
-def _listed(choices: tuple[Any, ...]) -> str:
-    return " or ".join(str(list(c)) if isinstance(c, tuple) else str(c) for c in choices)

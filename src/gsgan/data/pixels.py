@@ -1,7 +1,7 @@
-"""How the pixels of a dataset become RGB, alpha and part numbers: named rules, applied on reading.
+"""Masks, part labels and uncertain pixels of a dataset: named rules, applied on reading.
 
-Convention: a mask rule says what the numbers in a mask file mean; several masks of one picture are
-joined (a pixel is the person's when any of them says so). All results are uint8.
+Convention: a mask rule defines the meaning of the numbers in a mask file; several masks of one
+image are joined by their maximum. All results are uint8.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.files import read_colour, read_grey, read_stored
+from gsgan.data.files import read_grey, read_stored
 from gsgan.utils.errors import DataError
 
 Bytes = NDArray[np.uint8]
@@ -28,7 +28,7 @@ JPEG_SUFFIXES = (".jpg", ".jpeg")
 
 
 class MaskFile(NamedTuple):
-    """One mask of one picture.
+    """One mask of one image.
 
     Args:
         rule: one of `MASK_RULES`.
@@ -47,23 +47,20 @@ def mask_file(rule: str, path: str) -> MaskFile:
 
 @dataclass(frozen=True)
 class PixelRules:
-    """How a format's files are to be understood.
+    """How to decode a format's files.
 
     Args:
-        colour_order: of the stored pictures; a file is nearly always "rgb", whatever library
-            reads it.
-        composed: pictures are already composed on black by their mask.
+        composed: images are already composed on black by their mask.
         threshold: for the mask rule of that name.
         mask_sampling: how masks are undistorted and resized: "linear" for soft alphas, "nearest"
-            for masks of two values.
-        label_table: 256 part numbers, what each stored label becomes; None keeps them.
-        ignore_band: pixels of the stored picture, side of the square by which the mask is dilated
+            for binary masks.
+        label_table: 256 part numbers, one per stored label; None keeps the labels.
+        ignore_band: pixels of the stored image, side of the square by which the mask is dilated
             and eroded; labels in the band between become "ignore". 0 leaves it out.
-        unsure_band: the same for colours: pixels in that band are not to be learned from.
-        unsure_alpha: nor are those whose alpha lies strictly between these two; None leaves it out.
+        unsure_band: the same for colours: pixels in that band are left out of the loss.
+        unsure_alpha: pixels of an alpha strictly between these two are too; None leaves out none.
     """
 
-    colour_order: Literal["rgb", "bgr"] = "rgb"
     composed: bool = False
     threshold: int = 128
     mask_sampling: Literal["linear", "nearest"] = "linear"
@@ -79,25 +76,15 @@ class PixelRules:
             )
 
 
-def read_image(path: Path, rules: PixelRules) -> Bytes:
-    """``[H, W, 3]`` RGB.
-
-    Raises:
-        DataError: when the file is missing or damaged.
-    """
-    image = read_colour(path)
-    return image if rules.colour_order == "rgb" else image[..., ::-1]
-
-
 def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
-    """``[H, W]`` 0..255: the masks of one picture, each by its rule, joined by their maximum.
+    """``[H, W]`` 0..255: the masks of one image, each by its rule, joined by their maximum.
 
     Args:
         files: (rule, path), at least one.
         rules: of the dataset.
 
     Raises:
-        DataError: when a file is missing, damaged, or does not fit its rule or the others' size.
+        DataError: when a file is missing, damaged, does not fit its rule, or differs in size.
     """
     joined = _one_mask(*files[0], rules)
     for rule, path in files[1:]:
@@ -106,7 +93,7 @@ def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
             raise DataError(
                 f"{path} is {mask.shape[1]}x{mask.shape[0]} pixels (width x height), but "
                 f"{files[0][1]} is {joined.shape[1]}x{joined.shape[0]}; both are masks of one "
-                "picture and must agree"
+                "image and must agree"
             )
         joined = np.maximum(joined, mask)
     return joined
@@ -141,10 +128,10 @@ def read_labels(
     """``[H, W]`` part numbers, mapped by the rules' table; 255 is "ignore".
 
     Args:
-        path: the label picture.
+        path: the label image.
         rules: of the dataset.
-        names: the parts, background first; None when their number is not known.
-        named_by: who names them, for the message.
+        names: the parts, background first; None if unknown.
+        named_by: the source of the names, for the message.
 
     Raises:
         DataError: when the file is damaged or holds a part that has no name.
@@ -184,11 +171,11 @@ def outline(mask: Bytes, band: int) -> NDArray[np.bool_]:
 
 
 def read_unsure(files: Sequence[tuple[str, Path]], mask: Bytes, rules: PixelRules) -> Bytes | None:
-    """``[H, W]`` 255 at pixels that are not to be learned from, or None when the rules know none.
+    """``[H, W]`` 255 at pixels that are left out of the loss, or None without such a rule.
 
     Args:
-        files: (rule, path) of the masks, which are decoded again when the rules ask for alphas.
-        mask: ``[H, W]`` 0..255, what `read_mask` made of them.
+        files: (rule, path) of the masks, decoded again when the rules use alphas.
+        mask: ``[H, W]`` 0..255, the result of `read_mask`.
         rules: of the dataset.
 
     Raises:

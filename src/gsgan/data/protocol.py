@@ -1,7 +1,7 @@
-"""Published evaluation protocols: which cameras and frames, which part of the picture, which LPIPS.
+"""Published evaluation protocols: cameras, frames, region of the image, LPIPS.
 
 Numbers of two protocols do not belong in one table; so a protocol has a name, is written beside
-every score, and says where a run departs from it.
+every score, and lists where a run departs from it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from gsgan.utils.errors import ConfigError
 
 @dataclass(frozen=True)
 class Protocol:
-    """Who trains, who tests, and what is measured.
+    """The training split, the held-out split, and the measures of a published evaluation.
 
     Args:
         name: of the protocol.
@@ -25,12 +25,12 @@ class Protocol:
         test_cameras: the same; None for all that do not train.
         train_frames: "0-55", "0-495:5" (every fifth), lists of them; or such by subject.
         test_frames: the same.
-        measures: what of the pictures is scored, and how.
-        scale: pictures are scored at this share of their stored size.
+        measures: the scored region of the images, and the variants of the metrics.
+        scale: images are scored at this fraction of their stored size.
         lpips_net: backbone.
-        source: where this is written down.
-        note: what else a reader of the numbers has to know.
-        subject: whose frames, where they differ by subject.
+        source: of this definition.
+        note: further remarks for readers of the numbers.
+        subject: selects the frames, where they differ by subject.
 
     Raises:
         ConfigError: on a value out of range.
@@ -60,7 +60,7 @@ class Protocol:
         """The frames of one side, for the subject where they differ by subject.
 
         Raises:
-            ConfigError: when they do, and the subject is not set or not known.
+            ConfigError: when they do, and the subject is not set or unknown.
         """
         frames = self.train_frames if side == "train" else self.test_frames
         if not isinstance(frames, Mapping):
@@ -85,19 +85,19 @@ class Protocol:
     def departures(
         self, *, lpips_net: str, scale: float | None, padded: bool = False
     ) -> Iterator[str]:
-        """Where the pictures or the backbone are not what the protocol asks for, one sentence each.
+        """Departures of images and backbone from the protocol, one sentence each.
 
         Args:
             lpips_net: the backbone in use.
-            scale: share of the stored size at which pictures are scored; None when they are cut
+            scale: fraction of the stored size at which images are scored; None when they are cut
                 round the person.
-            padded: black is added to whole pictures to make them square.
+            padded: whole images are padded with black to squares.
         """
         if lpips_net != self.lpips_net:
-            yield f"LPIPS backbone is {lpips_net}, asked for: {self.lpips_net}"
+            yield f"LPIPS backbone is {lpips_net}, requested: {self.lpips_net}"
         if scale is None:
-            yield "pictures are cut round the person, asked for: whole pictures (data.crop=null)"
+            yield "images are cut round the person, requested: whole images (data.crop=null)"
         elif abs(scale - self.scale) > 1e-3:
-            yield f"pictures are scored at scale {scale:.3g}, asked for: {self.scale:g} (data.size)"
+            yield f"images are scored at scale {scale:.3g}, requested: {self.scale:g} (data.size)"
         if padded:
-            yield "pictures are padded to squares with black, asked for: as stored (data.size=null)"
+            yield "images are padded to squares with black, requested: as stored (data.size=null)"

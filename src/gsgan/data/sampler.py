@@ -11,17 +11,17 @@ from torch.utils.data.distributed import DistributedSampler
 
 
 class StepSampler(DistributedSampler[int]):
-    """Draws the item of every global step from (seed, step) alone.
+    """Draws the items of every global step from (seed, step) alone.
 
     An epoch is ``steps`` batches. Draws run through shuffled passes over all items, each item once
-    a pass, across epoch borders; so a resumed run sees the order of an unbroken one. It is a
+    per pass, across epoch borders; so a resumed run sees the order of an unbroken one. It is a
     `DistributedSampler` because Lightning would wrap and reshuffle anything else on several
     processes; the processes share the draws of a step between them.
 
     Args:
         items: number of items.
-        batch_size: items a batch and process.
-        steps: batches an epoch.
+        batch_size: items per batch and process.
+        steps: batches per epoch.
         seed: of the shuffles.
         replicas: number of processes.
         rank: of this process.

@@ -1,4 +1,4 @@
-"""What the training split tells about the scene."""
+"""Facts about the scene, computed from the training split."""
 
 from __future__ import annotations
 
@@ -6,63 +6,61 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from gsgan.body import SkinnedBody, open_body
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.capture import CaptureDataset
+from gsgan.data.dataset import CaptureDataset
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
-from gsgan.data.skeletons import body_height, joints_of
+from gsgan.data.skeletons import body_height
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
 from gsgan.scene import Frame
 from gsgan.utils.errors import DataError
-
-if TYPE_CHECKING:
-    from gsgan.body import SkinnedBody
 
 SOLID = 0.9  # of the mask: pixels at the outline are darkened by the black behind them
 
 
 @dataclass(frozen=True)
 class SceneInfo:
-    """What the training split tells about the scene; plain values, so a checkpoint can hold it.
+    """Facts about the scene, computed from the training split; plain values, for checkpoints.
 
     Args:
         camera_names: all cameras; `Frame.camera_index` counts in this order.
-        n_train_cameras: cameras that train.
+        n_train_cameras: cameras of the training split.
         has_distortion: a lens coefficient of a training camera is not zero.
-        has_labels: there are part labels of training images.
-        has_body_pose: there is a body pose for every frame.
+        has_labels: training images have part labels.
+        has_body_pose: every frame has a body pose.
         body: kind of the skinned body ("free", "smpl", "smplx"), or None.
         skeleton: name of the landmark set.
         n_labels: part labels, background included; 0 without labels.
-        label_names: their names where the capture gives them.
+        label_names: their names, empty if unknown.
         foreground: mean RGB in [0, 1] of the person, by train camera name.
         body_height: metres, median over frames of the summed limb lengths.
         centre: metres, median position of the person: the middle of the capture volume.
         up_axis: of the world, e.g. "z" or "-y".
         fps: frames a second, or None.
-        frames: how many frames train.
-        skeleton_source: where the landmarks come from, e.g. "smpl24 -> mediapipe33".
+        frames: number of training frames.
+        skeleton_source: origin of the landmarks, e.g. "smpl24 -> mediapipe33".
         body_file: the user's model file of the body, None for the free body.
         betas: shape of that body.
         train_cameras: names, in the order of ``camera_names``.
         held_out_distortion: a lens coefficient of a held-out camera is not zero.
         has_rational_lens: a lens has coefficients beyond the fifth (k4, k5, k6).
         spread: degrees, the largest angle between two training cameras seen from ``centre``.
-        scale_train: pixels a metre at the person, smallest and largest of the training cameras'
-            medians.
-        scale_test: the same of held-out pictures; None without any.
-        surface: how colours differ between training cameras on the same surface, or None where
+        scale_train: pixels per metre at the person, smallest and largest of the training
+            cameras' medians.
+        scale_test: the same for held-out images; None without any.
+        surface: colour differences between training cameras on the same surface, or None if
             they share too little.
         darkest: brightness in [0, 1] of the person's darkest percent.
-        body_inside: share of the posed body that masks of training pictures hold; None where there
-            is no body pose or no mesh.
+        body_inside: share of the posed body that lies inside the masks of training images; None
+            without a body pose or mesh.
     """
 
     camera_names: tuple[str, ...]
@@ -101,17 +99,17 @@ def scene_info(
     samples: int,
     held_out: Sequence[CaptureDataset] = (),
 ) -> SceneInfo:
-    """What the training split tells about the scene.
+    """Computes the facts about the scene from the training split.
 
     Args:
         layout: the capture.
         splits: of the capture.
-        dataset: of the training items; its cache keeps what is decoded here.
-        samples: pictures a camera from which colours are taken, evenly spaced.
-        held_out: datasets of the held-out items; none of their pictures is looked at.
+        dataset: of the training items; its cache keeps the decoded images.
+        samples: images per camera to take colours from, evenly spaced.
+        held_out: datasets of the held-out items; their images are not read.
     """
     frames = sorted({frame for _, frame in splits.items["train"]})
-    p, valid = joints_of(layout, frames)
+    p, valid = layout.landmarks.joints(frames)
     middles = torch.stack([q[v].mean(0) for q, v in zip(p, valid, strict=True)])
     cameras = {camera for camera, _ in splits.items["train"]}
     tested = {camera for data in held_out for camera, _ in data.items} - cameras
@@ -158,9 +156,9 @@ def _triple(values: torch.Tensor) -> tuple[float, float, float]:
 
 
 def count_labels(layout: Layout, items: tuple[Item, ...]) -> int:
-    """Part labels, background included: as the data names them, else the highest one found.
+    """Part labels, background included: as many as have names, else up to the highest one.
 
-    Without names every label picture of the items is read once.
+    Without names every label image of the items is read once.
     """
     if not layout.labels:
         return 0
@@ -180,8 +178,8 @@ def foreground_colours(
     """Colours of the person in [0, 1].
 
     Args:
-        dataset: whose cameras to look at.
-        samples: pictures a camera, evenly spaced over its frames.
+        dataset: of the images.
+        samples: images per camera, evenly spaced over its frames.
 
     Returns:
         Mean RGB, mask-weighted, by camera name; and the brightness of the darkest percent.
@@ -214,7 +212,7 @@ def _evenly(values: Sequence[int], count: int) -> list[int]:
 
 
 def _spread(cameras: Sequence[CameraEntry], centre: NDArray[np.float64]) -> float:
-    """Degrees between the two directions in which cameras stand furthest apart."""
+    """Degrees between the two viewing directions that are furthest apart."""
     ways = [camera.centre - centre for camera in cameras]
     ways = [way / max(float(np.linalg.norm(way)), 1e-9) for way in ways]
     cosines = [float(a @ b) for a, b in combinations(ways, 2)]
@@ -222,7 +220,7 @@ def _spread(cameras: Sequence[CameraEntry], centre: NDArray[np.float64]) -> floa
 
 
 def _scales(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
-    """Pixels a metre at the person: the smallest and the largest camera's median."""
+    """Pixels per metre at the person: the smallest and the largest camera's median."""
     medians = []
     for indices in _by_camera(dataset).values():
         each = []
@@ -236,9 +234,7 @@ def _scales(dataset: CaptureDataset, samples: int) -> tuple[float, float]:
 
 
 def _mesh(layout: Layout) -> SkinnedBody | None:
-    """The body that the capture's poses move; None where they or its model file are missing."""
-    from gsgan.body import open_body
-
+    """The body that the capture's poses move; None if they or its model file are missing."""
     body = layout.meta.body
     if body is None or layout.poses is None:
         return None
@@ -262,9 +258,9 @@ def _shared_surface(
     samples: int,
     mesh: SkinnedBody | None,
 ) -> SurfaceColours | None:
-    """Colours compared in moments that every training camera saw; None with a single camera.
+    """Colours compared in frames of all training cameras, on the mesh or else the visual hull.
 
-    Without a mesh the visual hull has to do.
+    None with a single camera.
     """
     index = {item: i for i, item in enumerate(dataset.items)}
     shared = sorted({f for _, f in dataset.items if all((c, f) in index for c in cameras)})
@@ -275,7 +271,7 @@ def _shared_surface(
 
 
 class _Moment(Sequence[Frame]):
-    """Frames of one moment, each read when it is asked for: all of them at full size are GBs."""
+    """Frames of one moment, each read on access: all of them at full size take GBs."""
 
     def __init__(self, dataset: CaptureDataset, indices: Sequence[int]) -> None:
         self.dataset, self.indices = dataset, indices

@@ -1,11 +1,11 @@
-"""Skeletons and body poses by frame number, with their holes filled by stand-ins."""
+"""Skeletons and body poses by frame number, with estimates for missing joints."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,23 +16,20 @@ from gsgan.data.files import LARGEST_FRAME
 from gsgan.skeleton import limb_length_sum, sanitise
 from gsgan.utils.errors import DataError
 
-if TYPE_CHECKING:
-    from gsgan.data.layout import Layout
-
 Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 SKELETONS = {"mediapipe33": 33}
-HUBS = (11, 12, 23, 24)  # shoulders and hips: the bone frames of the whole body hang on them
+HUBS = (11, 12, 23, 24)  # shoulders and hips: the bone frames of the whole body depend on them
 
 
 @dataclass(frozen=True)
 class Landmarks:
     """Skeletons by frame: ``p [J, 3]`` metres, finite, ``visibility [J]`` in [0, 1].
 
-    A joint of visibility 0 is a stand-in for one that was not seen. ``source`` names the file or
-    folder they come from, for messages; ``fitted_to`` the cameras whose masks `gsgan.fit` moved
-    them to fit, none for landmarks as they were found.
+    A joint of visibility 0 is an estimate. ``source`` names the file or folder of the landmarks,
+    for messages; ``fitted_to`` the cameras to whose masks `gsgan.fit` moved them, empty for
+    landmarks that were not fitted.
     """
 
     p: Mapping[int, Float]
@@ -46,8 +43,13 @@ class Landmarks:
         return hashlib.sha256(b"".join(held)).hexdigest()
 
     def seen(self, frame: int) -> Float:
-        """``[N, 3]`` the joints of a frame that are no stand-ins."""
+        """``[N, 3]`` the joints of a frame that were seen."""
         return self.p[frame][self.visibility[frame] > 0]
+
+    def joints(self, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
+        """Joints ``[F, J, 3]`` metres, and which of them were seen ``[F, J]`` bool."""
+        p, visibility = (np.stack([part[f] for f in frames]) for part in (self.p, self.visibility))
+        return torch.from_numpy(p), torch.from_numpy(visibility) > 0
 
 
 @dataclass(frozen=True)
@@ -67,11 +69,11 @@ def make_landmarks(
     notes: list[str],
     source: str = "landmarks3d.npz",
 ) -> Landmarks:
-    """Skeletons of all frames, holes filled with stand-ins of visibility 0.
+    """Skeletons of all frames, missing joints filled with estimates of visibility 0.
 
     A joint is missing where it is not finite, its confidence is not above 0, or it lies further
-    than ``max_reach`` from the rest of the body. It then stands where it was in the nearest frame
-    that has it, or at the mean of the frame's joints.
+    than ``max_reach`` from the rest of the body. It takes its position in the nearest frame that
+    has it, or the mean of the frame's joints.
 
     Args:
         ids: ``[F]`` frame numbers in any order, each once.
@@ -79,7 +81,7 @@ def make_landmarks(
         conf: ``[F, J]``.
         max_reach: metres from the median joint.
         notes: gains a sentence when joints are too far.
-        source: where they come from, for messages.
+        source: file or folder, for messages.
     """
     visibility = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0).clip(0, 1)
     far = _far_joints(p, visibility > 0, max_reach)
@@ -111,7 +113,7 @@ def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
     if len(ids) and ids.max() > LARGEST_FRAME:
         raise DataError(
             f"{where}: frame_id {ids.max()} is a time stamp, not a frame number up to "
-            f"{LARGEST_FRAME}; number the frames 0, 1, 2 … alike in pictures and landmarks"
+            f"{LARGEST_FRAME}; number the frames 0, 1, 2 … alike in images and landmarks"
         )
     values, counts = np.unique(ids, return_counts=True)
     if len(values) != len(ids):
@@ -129,12 +131,12 @@ def _far_joints(p: Float, valid: Bool, reach: float) -> Bool:
 
 
 def fill_missing(p: Float, valid: Bool, ids: NDArray[np.int64]) -> Float:
-    """Finite stand-ins for missing joints.
+    """Finite estimates of missing joints.
 
     Args:
         p: ``[F, J, 3]``, anything where not valid.
         valid: ``[F, J]``.
-        ids: ``[F]`` rising frame numbers: what counts as near in time.
+        ids: ``[F]`` rising frame numbers, which define the nearest frame.
 
     Returns:
         ``[F, J, 3]``: the joint of the nearest frame that has it (the earlier of two), else the
@@ -157,28 +159,24 @@ def fill_missing(p: Float, valid: Bool, ids: NDArray[np.int64]) -> Float:
     return filled
 
 
-def joints_of(layout: Layout, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Joints ``[F, J, 3]`` metres and which of them were seen ``[F, J]`` bool, of some frames."""
-    marks = layout.landmarks
-    p, visibility = (np.stack([part[f] for f in frames]) for part in (marks.p, marks.visibility))
-    return torch.from_numpy(p), torch.from_numpy(visibility) > 0
-
-
 def body_height(p: Tensor, valid: Tensor) -> float:
     """Metres: the summed limb lengths, median over frames, see `limb_length_sum`."""
     return float(limb_length_sum(p, valid).nanmedian())
 
 
-def complete_skeletons(layout: Layout, trained: Sequence[int]) -> dict[int, Float]:
-    """Every frame's joints ``[J, 3]`` metres, stand-ins in place of those that were not seen.
+def complete_skeletons(
+    landmarks: Landmarks, frames: Sequence[int], trained: Sequence[int]
+) -> dict[int, Float]:
+    """Every frame's joints ``[J, 3]`` metres, with estimates of those that were not seen.
 
-    Done once for a capture, so that no frame is repaired while it is painted: some templates'
-    joints no body model has (the mouth), so with SMPL every frame would be.
+    Done once per capture, so that no frame is repaired while it is rendered: some of a template's
+    joints are in no body model (the mouth), so with SMPL every frame would be.
 
     Args:
-        layout: the capture.
-        trained: frames that set the body's height, which says how long the missing bones are.
+        landmarks: of the capture.
+        frames: to complete.
+        trained: frames that set the body's height, which gives the length of missing bones.
     """
-    height = body_height(*joints_of(layout, trained))
-    p, _ = sanitise(*joints_of(layout, layout.frames), body_height=height)
-    return dict(zip(layout.frames, p.numpy(), strict=True))
+    height = body_height(*landmarks.joints(trained))
+    p, _ = sanitise(*landmarks.joints(frames), body_height=height)
+    return dict(zip(frames, p.numpy(), strict=True))

@@ -1,14 +1,15 @@
-"""Which cameras and frames train, and which are held out."""
+"""Splits a capture by cameras and frames: training, held-out views, held-out poses."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
+from gsgan.data.checks import spans
 from gsgan.data.files import LARGEST_FRAME
-from gsgan.data.layout import Layout, spans
+from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -17,12 +18,13 @@ T = TypeVar("T", int, str)
 FRAME_RANGE = re.compile(r"\s*(\d{1,18})\s*(?:-\s*(\d{1,18})\s*)?(?::\s*(\d{1,18})\s*)?")
 MOST_FRAMES = 10**7  # bounds the memory that a range from a file can ask for
 SPLITS = ("train", "novel_view", "novel_pose")
+SIDES: tuple[Literal["train", "test"], ...] = ("train", "test")
 Item = tuple[str, int]  # camera name, frame number
 
 
 @dataclass(frozen=True)
 class Splits:
-    """Held-in and held-out cameras and frames.
+    """Training and held-out cameras and frames.
 
     ``train`` is train cameras × train frames, ``novel_view`` test cameras × train frames,
     ``novel_pose`` train cameras × test frames.
@@ -52,8 +54,8 @@ def make_splits(
 ) -> Splits:
     """Splits a capture by cameras and by frames.
 
-    For cameras, and likewise for frames: what the config gives comes first, then what meta.json
-    gives, else all cameras train and the last ``test_share`` of the frames test. Where only one
+    For cameras, and likewise for frames: the config comes first, then meta.json; without both all
+    cameras are for training and the last ``test_share`` of the frames is held out. Where only one
     side of a pair is given, the other takes the rest.
 
     Args:
@@ -62,7 +64,7 @@ def make_splits(
         test_cameras: names, or None.
         train_frames: numbers and "a-b" ranges (both ends included), or None.
         test_frames: the same.
-        test_share: in [0, 1), the share of frames held out when nothing says which.
+        test_share: in [0, 1), the share of frames held out by default.
 
     Raises:
         DataError: when a camera does not exist, or nothing is left to train on.
@@ -70,7 +72,7 @@ def make_splits(
     """
     if not 0 <= test_share < 1:
         raise ConfigError(f"data.test_share must be in [0, 1), got {test_share}")
-    meta, notes = layout.meta.splits, list[str]()
+    meta = layout.meta.splits
     cameras = _pair(
         layout.camera_names,
         (train_cameras, test_cameras),
@@ -85,7 +87,7 @@ def make_splits(
                 f"{layout.root} has no camera {camera}; it has {', '.join(layout.camera_names)}"
             )
     cut = len(layout.frames) - int(len(layout.frames) * test_share)
-    wanted = _pair(
+    frames = _pair(
         layout.frames,
         (train_frames, test_frames),
         (meta.get("train_frames"), meta.get("test_frames")),
@@ -93,27 +95,35 @@ def make_splits(
         parse=parse_frames,
         name="frames",
     )
-    known = set(layout.frames)
-    train, test = (tuple(f for f in side if f in known) for side in wanted)
-    if lacking := [f for side in wanted for f in side if f not in known]:
-        notes.append(
-            f"{len(lacking)} frames of the splits are not usable or not there: {spans(lacking)}"
-        )
+    train, test, notes = _usable(layout, frames, "of the splits")
     items = {
         "train": _items(layout, cameras[0], train),
         "novel_view": _items(layout, cameras[1], train),
         "novel_pose": _items(layout, cameras[0], test),
     }
-    _need_training(layout, items, cameras[0], train)
+    _require_training(layout, items, cameras[0], train)
     reasons = {}
     if not items["novel_view"]:
         reasons["novel_view"] = "no camera is held out (data.test_cameras)"
     if not items["novel_pose"]:
         reasons["novel_pose"] = "no frame is held out (data.test_frames)"
-    return Splits(*cameras, train, test, items, reasons, tuple(notes))
+    return Splits(*cameras, train, test, items, reasons, notes)
 
 
-def _need_training(
+def _usable(
+    layout: Layout, frames: Sequence[Sequence[int]], whose: str
+) -> tuple[tuple[int, ...], tuple[int, ...], tuple[str, ...]]:
+    """The train and test frames that the capture has, and a note on the others."""
+    known = set(layout.frames)
+    train, test = (tuple(f for f in side if f in known) for side in frames)
+    missing = sorted({f for side in frames for f in side} - known)
+    if not missing:
+        return train, test, ()
+    note = f"{len(missing)} frames {whose} are not usable or do not exist: {spans(missing)}"
+    return train, test, (note,)
+
+
+def _require_training(
     layout: Layout, items: dict[str, tuple[Item, ...]], cameras: Sequence[str], train: Sequence[int]
 ) -> None:
     if not items["train"]:
@@ -131,8 +141,8 @@ def _items(layout: Layout, cameras: Sequence[str], frames: Sequence[int]) -> tup
 def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:
     """Splits a capture as a published protocol does.
 
-    Train cameras × train frames train; test cameras × test frames test: as ``novel_view`` where
-    the frame trains (from other cameras), else as ``novel_pose``.
+    Train cameras × train frames are for training; test cameras × test frames are held out: as
+    ``novel_view`` where the frame is also a training frame (of other cameras), else ``novel_pose``.
 
     Args:
         layout: the capture.
@@ -140,56 +150,48 @@ def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:
 
     Raises:
         DataError: when a camera does not exist, or nothing is left to train on.
-        ConfigError: when a picture would both train and test, or a value is malformed.
+        ConfigError: when an image is in both splits, or a value is malformed.
     """
     train_cameras, test_cameras = _protocol_cameras(layout, protocol)
-    wanted = [
-        parse_frames(value, f"protocol.{side}_frames")
-        for value, side in ((protocol.frames("train"), "train"), (protocol.frames("test"), "test"))
-    ]
-    known = set(layout.frames)
-    train, test = (tuple(f for f in side if f in known) for side in wanted)
-    lacking = sorted({f for side in wanted for f in side if f not in known})
-    notes = (
-        [
-            f"{len(lacking)} frames that protocol {protocol.name} asks for are not usable or not "
-            f"there: {spans(lacking)}"
-        ]
-        if lacking
-        else []
-    )
+    frames = [parse_frames(protocol.frames(side), f"protocol.{side}_frames") for side in SIDES]
+    train, test, notes = _usable(layout, frames, f"of protocol {protocol.name}")
     trained = set(train)
     both = set(train_cameras) & set(test_cameras)
     if both and trained & set(test):
         raise ConfigError(
-            f"protocol {protocol.name}: camera {min(both)} trains and tests frame "
-            f"{min(trained & set(test))}; what is tested must not train"
+            f"protocol {protocol.name}: frame {min(trained & set(test))} of camera {min(both)} is "
+            "in both splits; test images must not be used for training"
         )
     items = {
         "train": _items(layout, train_cameras, train),
         "novel_view": _items(layout, test_cameras, [f for f in test if f in trained]),
         "novel_pose": _items(layout, test_cameras, [f for f in test if f not in trained]),
     }
-    _need_training(layout, items, train_cameras, train)
-    why = f"protocol {protocol.name} tests none"
+    _require_training(layout, items, train_cameras, train)
+    why = f"protocol {protocol.name} has none"
     reasons = {name: why for name in SPLITS[1:] if not items[name]}
-    return Splits(train_cameras, test_cameras, train, test, items, reasons, tuple(notes))
+    return Splits(train_cameras, test_cameras, train, test, items, reasons, notes)
 
 
 def _protocol_cameras(
     layout: Layout, protocol: Protocol
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Both sides by name; None on one side means all cameras that the other does not name."""
-    sides = [
+    """Both sides by name."""
+    train, test = (
         None if side is None else tuple(camera_name(layout, c, protocol.name) for c in side)
         for side in (protocol.train_cameras, protocol.test_cameras)
-    ]
-    train, test = sides
-    everything = layout.camera_names
+    )
+    return _complete(layout.camera_names, train, test)
+
+
+def _complete(
+    everything: tuple[T, ...], train: tuple[T, ...] | None, test: tuple[T, ...] | None
+) -> tuple[tuple[T, ...], tuple[T, ...]]:
+    """Both sides; one that is None takes everything outside the other."""
     if train is None:
-        train = tuple(c for c in everything if c not in (test or ()))
+        train = tuple(x for x in everything if x not in (test or ()))
     if test is None:
-        test = tuple(c for c in everything if c not in train)
+        test = tuple(x for x in everything if x not in train)
     return train, test
 
 
@@ -197,20 +199,20 @@ def camera_name(layout: Layout, camera: str | int, protocol: str) -> str:
     """The name of a camera given by name or by its index in `Layout.camera_names`.
 
     Raises:
-        DataError: when there is no such camera, listing those there are.
+        DataError: when there is no such camera, listing the existing ones.
     """
     names = layout.camera_names
     listed = ", ".join(names)
     if isinstance(camera, int):
         if not 0 <= camera < len(names):
             raise DataError(
-                f"{layout.root}: protocol {protocol} asks for the camera of index {camera}, but "
+                f"{layout.root}: protocol {protocol} requests the camera of index {camera}, but "
                 f"there are {len(names)}, 0 to {len(names) - 1}: {listed}"
             )
         return names[camera]
     if camera not in layout.cameras:
         raise DataError(
-            f"{layout.root}: protocol {protocol} asks for camera {camera}; there are {listed}"
+            f"{layout.root}: protocol {protocol} requests camera {camera}; the capture has {listed}"
         )
     return camera
 
@@ -223,7 +225,7 @@ def _pair(
     parse: Callable[[Any, str], tuple[T, ...]],
     name: str,
 ) -> tuple[tuple[T, ...], tuple[T, ...]]:
-    """The train and test side of cameras or of frames, wholly from the first source that speaks."""
+    """The train and test side of cameras or of frames, both from the first source that has any."""
     for values, where in ((config, "data."), (meta, "meta.json, splits.")):
         train, test = (
             None if value is None else parse(value, f"{where}{side}_{name}")
@@ -231,14 +233,11 @@ def _pair(
         )
         if train is None and test is None:
             continue
-        if train is None:
-            train = tuple(x for x in everything if x not in (test or ()))
-        if test is None:
-            test = tuple(x for x in everything if x not in train)
+        train, test = _complete(everything, train, test)
         if both := sorted(set(train) & set(test)):
             raise ConfigError(
-                f"{where}train_{name} and {where}test_{name} share {both[0]}; what is tested must "
-                "not train"
+                f"{where}train_{name} and {where}test_{name} share {both[0]}; test images must "
+                "not be used for training"
             )
         return train, test
     return default
@@ -267,29 +266,19 @@ def parse_frames(value: Any, where: str) -> tuple[int, ...]:
     Raises:
         ConfigError: when a part is neither.
     """
-    if isinstance(value, bool) or not isinstance(value, (int, str, Iterable)):
-        raise ConfigError(f"{where} must be frame numbers or ranges such as 0-55, got {value!r}")
-    if isinstance(value, int):
-        value = [value]
-    parts = value.split(",") if isinstance(value, str) else list(value)
+    parts = value.split(",") if isinstance(value, str) else value
     frames: set[int] = set()
-    for part in parts:
-        if isinstance(part, int) and not isinstance(part, bool):
-            frames.add(part)
-            continue
+    for part in parts if isinstance(parts, Iterable) else (parts,):
         match = FRAME_RANGE.fullmatch(str(part))
-        first, last = (int(match[1]), int(match[2] or match[1])) if match else (1, 0)
-        step = int(match[3] or 1) if match else 1
-        if last < first or step < 1:
+        first, last, step = (match[1], match[2] or match[1], match[3] or 1) if match else (1, 0, 1)
+        some = range(int(first), int(last) + 1, int(step) or 1)
+        if not some or int(step) < 1:
             raise ConfigError(f"{where} must be frame numbers or ranges such as 0-55, got {part!r}")
-        some = range(first, last + 1, step)
-        if len(some) > MOST_FRAMES:
-            raise ConfigError(f"{where}: {part!r} is more than {MOST_FRAMES} frames")
-        frames.update(some)
-        if len(frames) > MOST_FRAMES:
+        if len(some) + len(frames) > MOST_FRAMES:
             raise ConfigError(f"{where} names more than {MOST_FRAMES} frames")
-    if frames and max(frames) > LARGEST_FRAME:
-        raise ConfigError(
-            f"{where} names frame {max(frames)}; frame numbers end at {LARGEST_FRAME}"
-        )
+        if some[-1] > LARGEST_FRAME:
+            raise ConfigError(
+                f"{where} names frame {some[-1]}; frame numbers end at {LARGEST_FRAME}"
+            )
+        frames.update(some)
     return tuple(sorted(frames))

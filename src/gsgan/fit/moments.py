@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsgan.data.capture import CaptureDataset, PictureCache
 from gsgan.data.datamodule import GsganData
+from gsgan.data.dataset import CaptureDataset, PictureCache
 from gsgan.fit.fitter import Fitter, around
 from gsgan.fit.settings import Fit
 from gsgan.fit.shape import RigidShape

@@ -11,8 +11,8 @@ from pathlib import Path
 from rich.console import Console
 
 from gsgan.data.cameras import CameraEntry
+from gsgan.data.formats.capture import read_capture
 from gsgan.data.joints import BODY
-from gsgan.data.layout import Layout
 from gsgan.prepare.dataset import is_there, standing_axis, write_small_files
 from gsgan.prepare.doubts import (
     doubts_about_detections,
@@ -199,7 +199,7 @@ def _read_back(root: Path) -> None:
         DataError: when it could not be trained on.
     """
     try:
-        Layout.read(root)
+        read_capture(root)
     except DataError as error:
         raise DataError(f"nothing was made, because training could not read it: {error}") from None
 

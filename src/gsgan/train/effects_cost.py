@@ -9,8 +9,8 @@ import torch
 from omegaconf import DictConfig
 from torch import nn
 
-from gsgan.data.capture import CaptureDataset
 from gsgan.data.datamodule import GsganData
+from gsgan.data.dataset import CaptureDataset
 from gsgan.effects.table import Cost
 from gsgan.model.avatar import Avatar
 from gsgan.scene import Frame

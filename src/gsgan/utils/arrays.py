@@ -1,10 +1,11 @@
-"""Arrays out of files: present, of the expected shape, and numbers, or one clear sentence."""
+"""Arrays from files: present, of the expected shape, and numbers, or one clear sentence."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.utils.errors import DataError
@@ -18,14 +19,22 @@ def expect_array(
     Raises:
         DataError: when it is missing, has another shape, or holds no numbers.
     """
-    wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+    expected = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
     if name not in arrays:
-        raise DataError(f"{path} has no array '{name}'; expected one of shape {wanted}")
+        raise DataError(f"{path} has no array '{name}'; expected one of shape {expected}")
     array = arrays[name]
     if array.ndim != len(shape) or any(
-        want is not None and want != have for want, have in zip(shape, array.shape, strict=True)
+        due is not None and due != found for due, found in zip(shape, array.shape, strict=True)
     ):
-        raise DataError(f"{path}: '{name}' must have shape {wanted}, found {array.shape}")
+        raise DataError(f"{path}: '{name}' must have shape {expected}, found {array.shape}")
     if array.dtype.kind not in "iuf":
         raise DataError(f"{path}: '{name}' must hold numbers, found {array.dtype}")
     return array
+
+
+def as_floats(raw: Any) -> NDArray[np.float64]:
+    """A float64 copy of lists or arrays; empty when they are ragged or hold no numbers."""
+    try:
+        return np.array(raw, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        return np.zeros(0)

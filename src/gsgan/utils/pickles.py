@@ -1,8 +1,8 @@
-"""Pickled data read without running it: SMPL files, ``annots.npy``, caches of other projects.
+"""Reads pickled data without running it: SMPL files, ``annots.npy``, caches of other projects.
 
-A pickle is a program. Here it may build dicts, lists, numbers, text and numpy arrays, and name the
-few classes in `ALLOWED`, each replaced by a stand-in of ours; anything else is refused by name
-before it is called. Whatever is wrong with a file becomes one `DataError`.
+A pickle is a program. `_Unpickler` lets it build dicts, lists, numbers, text and numpy arrays, and
+name the few classes in `ALLOWED`, which are replaced by the stand-ins below; any other name is
+refused before it is used.
 """
 
 from __future__ import annotations
@@ -10,74 +10,174 @@ from __future__ import annotations
 import io
 import math
 import pickle
+import re
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.utils import pickle_types as types
 from gsgan.utils.errors import DataError
-from gsgan.utils.pickle_scan import Refused, check_unfolded, scan
-from gsgan.utils.pickle_types import Budget, Call, StandIn
 
-GROWTH, SPARE_BYTES = 4, 2**28
-"""Arrays may take ``GROWTH`` times the file's size and ``SPARE_BYTES`` more (sparse matrices)."""
-LARGEST_MEMBER = 2**30  # bytes of one array in an npz, unpacked
-SPARSE = {"csc": types.SparseColumns, "csr": types.SparseRows, "coo": types.Sparse}
-
-Name = tuple[str, str]
+NDARRAY = "numpy.ndarray"  # pickles only name the class
+LARGEST_ARRAY = 2**30  # bytes of one array, unpacked
+DTYPE = re.compile(r"[<>|=]?([?bBhHiIlLqQefdgFDG]|[biufcSU][0-9]{1,6}|O8?)")
 
 
-def _allowed() -> dict[Name, Callable[[Budget], Any]]:
-    """What a pickle may name: (module, name) to what it gets, given the file's budget."""
-    core = ("numpy.core", "numpy._core")
-    table: dict[Name, Callable[[Budget], Any]] = {
-        ("numpy", "ndarray"): lambda _: types.ARRAY_TYPE,
-        ("numpy", "dtype"): lambda _: Call(types.DType),
-        ("_codecs", "encode"): lambda budget: Call(partial(types.encode, budget)),
-        ("chumpy.ch", "Ch"): lambda _: types.Chumpy,
-        ("chumpy.reordering", "Select"): lambda _: types.ChumpySelect,
-    }
-    for module in core:
-        table |= {
-            (f"{module}.multiarray", "_reconstruct"): lambda b: Call(partial(types.reconstruct, b)),
-            (f"{module}.multiarray", "scalar"): lambda _: Call(types.scalar),
-            (f"{module}.numeric", "_frombuffer"): lambda b: Call(partial(types.from_buffer, b)),
-        }
-    for kind, stand_in in SPARSE.items():
-        for module in (f"scipy.sparse.{kind}", f"scipy.sparse._{kind}"):
-            for name in (f"{kind}_matrix", f"{kind}_array"):
-                table[module, name] = lambda _, stand_in=stand_in: stand_in  # type: ignore[misc]
-    for module in ("copyreg", "copy_reg"):
-        table[module, "_reconstructor"] = lambda _: Call(types.reconstructor)
-    for module in ("builtins", "__builtin__"):
-        table |= {(module, "object"): lambda _: object, (module, "set"): lambda _: set}
-    return table
+class _Refused(pickle.UnpicklingError):
+    """The pickle names something that is not in `ALLOWED`."""
 
 
-ALLOWED = _allowed()
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, data: bytes, budget: Budget) -> None:
-        super().__init__(io.BytesIO(data), encoding="latin1")
-        self.budget = budget
+class _Unpickler(pickle._Unpickler):
+    """In Python: a damaged file makes the one in C reserve as much memory as a number names."""
 
     def find_class(self, module: str, name: str) -> Any:
-        make = ALLOWED.get((module, name))
-        if make is None:
-            raise Refused(f"{module}.{name}")
-        return make(self.budget)
+        known = RENAMED.get(module, module), name
+        if known not in ALLOWED:
+            raise _Refused(f"{module}.{name}")
+        return ALLOWED[known]
+
+
+def _expect(condition: bool, otherwise: str) -> None:
+    if not condition:
+        raise pickle.UnpicklingError(otherwise)
+
+
+class _DType:
+    """``numpy.dtype``, of plain numbers, text and objects; its state only sets the byte order."""
+
+    def __init__(self, name: Any, *_align_and_copy: Any) -> None:
+        known = isinstance(name, str) and DTYPE.fullmatch(name) is not None
+        _expect(known, f"it holds arrays of type {str(name)[:40]!r}")
+        self.value = np.dtype(name)
+
+    def __setstate__(self, state: Any) -> None:
+        order, *record = state[1:5]
+        _expect(record == [None] * 3, "it holds record arrays")
+        if order in ("<", ">"):
+            self.value = self.value.newbyteorder(order)
+
+
+class _Array(np.ndarray):
+    """An array that is being read; numpy itself does not check all of its state."""
+
+    def __setstate__(self, state: Any) -> None:
+        shape, dtype, fortran, content = state[-4:]
+        if dtype.value.hasobject:
+            _expect(isinstance(content, list), "an array of objects has no list of them")
+            count = len(content)
+        else:
+            content = _bytes(content)
+            count = len(content) / dtype.value.itemsize
+        fits = min(shape, default=0) >= 0 and math.prod(shape) == count
+        _expect(fits, "the shape of an array does not fit its content")
+        super().__setstate__((1, shape, dtype.value, bool(fortran), content))  # type: ignore[arg-type]
+
+
+def _bytes(content: Any) -> bytes:
+    return content.encode("latin1") if isinstance(content, str) else bytes(content)  # str: Python 2
+
+
+def _reconstruct(kind: Any, *_shape_and_code: Any) -> _Array:
+    _expect(kind is NDARRAY, "it builds an array of an unknown class")
+    return np.empty(0).view(_Array)
+
+
+def _from_buffer(content: Any, dtype: _DType, shape: Any, order: Any) -> NDArray[Any]:
+    """How protocol 5 writes arrays."""
+    flat = np.frombuffer(content, dtype.value).astype(dtype.value.newbyteorder("="))
+    return flat.reshape(shape, order=order)
+
+
+def _scalar(dtype: _DType, content: Any) -> Any:
+    return np.frombuffer(_bytes(content), dtype.value)[0]
+
+
+def _encode(text: str, encoding: str) -> bytes:
+    """How Python 3 writes bytes for Python 2."""
+    _expect(encoding == "latin1", f"it encodes text as {encoding}")
+    return text.encode("latin1")
+
+
+def _reconstructor(kind: Any, base: Any, _state: Any) -> Any:
+    """How protocols 0 and 1 make objects."""
+    known = isinstance(kind, type) and issubclass(kind, _StandIn) and base is object
+    _expect(known, "it builds an object of an unknown class")
+    return kind()
+
+
+class _StandIn:
+    """Keeps the state of an object whose class is not loaded."""
+
+    def __init__(self, *_arguments: Any) -> None:
+        self.state: dict[str, Any] = {}
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = dict(state)
+
+    def array(self) -> NDArray[Any]:
+        """The array that the object stands for."""
+        return _numbers(self.state["x"])  # chumpy.ch.Ch
+
+
+class _Select(_StandIn):
+    """``chumpy.reordering.Select``: some entries of another array."""
+
+    def array(self) -> NDArray[Any]:
+        chosen = _numbers(self.state["a"]).ravel()[_numbers(self.state["idxs"])]
+        shape = self.state.get("preferred_shape")
+        return chosen if shape is None else chosen.reshape(shape)
+
+
+class _Sparse(_StandIn):
+    """``scipy.sparse.csc_matrix``, as a dense array."""
+
+    def array(self) -> NDArray[Any]:
+        import scipy.sparse  # takes long, and few files need it
+
+        shape = self.state["_shape"] if "_shape" in self.state else self.state["shape"]
+        _expect(math.prod(shape) * 8 <= LARGEST_ARRAY, f"a sparse matrix of shape {shape}")
+        parts = [_numbers(self.state[key]) for key in ("data", "indices", "indptr")]
+        matrix = scipy.sparse.csc_matrix(tuple(parts), shape)
+        matrix.check_format(full_check=True)
+        return np.asarray(matrix.toarray(), np.float64)
+
+
+def _numbers(value: Any) -> NDArray[Any]:
+    array = value.array() if isinstance(value, _StandIn) else np.asarray(value)
+    _expect(not array.dtype.hasobject, "an array of numbers holds objects")
+    return array
+
+
+ALLOWED: dict[tuple[str, str], Any] = {
+    ("numpy", "ndarray"): NDARRAY,
+    ("numpy", "dtype"): _DType,
+    ("numpy.core.multiarray", "_reconstruct"): _reconstruct,
+    ("numpy.core.multiarray", "scalar"): _scalar,
+    ("numpy.core.numeric", "_frombuffer"): _from_buffer,
+    ("_codecs", "encode"): _encode,
+    ("copyreg", "_reconstructor"): _reconstructor,
+    ("builtins", "object"): object,
+    ("builtins", "set"): set,
+    ("chumpy.ch", "Ch"): _StandIn,
+    ("chumpy.reordering", "Select"): _Select,
+    ("scipy.sparse.csc", "csc_matrix"): _Sparse,
+}
+RENAMED = {
+    "__builtin__": "builtins",  # in Python 2
+    "copy_reg": "copyreg",
+    "numpy._core.multiarray": "numpy.core.multiarray",  # in numpy 2
+    "numpy._core.numeric": "numpy.core.numeric",
+    "scipy.sparse._csc": "scipy.sparse.csc",
+}
 
 
 @contextmanager
 def _as_data_error(path: Path, what: str) -> Iterator[None]:
-    """Anything that goes wrong inside becomes a sentence that names the file."""
+    """Turns whatever goes wrong inside into one sentence that names the file."""
     try:
         yield
     except DataError:
@@ -86,27 +186,23 @@ def _as_data_error(path: Path, what: str) -> Iterator[None]:
         raise DataError(f"{path} does not exist") from None
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
-    except Refused as error:
+    except _Refused as error:
         raise DataError(
-            f"{path} asks for {error}, which is not on the list of harmless classes (a pickle can "
-            "run code); nothing was run: save its content as plain arrays with numpy.savez"
+            f"{path} asks for {error}, which is not allowed, since a pickle can run code; nothing "
+            "was run: save its content as plain arrays with numpy.savez"
         ) from None
     except Exception as error:
+        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        reason = " ".join(reason.split())[:160] or type(error).__name__
         raise DataError(
-            f"{path} is not a whole {what} ({_reason(error)}); copy or export it again"
+            f"{path} is not a valid {what} ({reason}); copy or export it again"
         ) from None
-
-
-def _reason(error: Exception) -> str:
-    text = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-    text = " ".join(text.split())[:160]
-    return text or type(error).__name__
 
 
 def read_pickle(path: Path) -> Any:
-    """What a .pkl file holds, sparse matrices and chumpy's values as plain arrays.
+    """The content of a .pkl file, with sparse matrices and chumpy's values as plain arrays.
 
-    Convention: text and bytes of Python 2 are read as latin1; arrays deep inside tuples may be of a
+    Convention: text and bytes of Python 2 are read as latin1; arrays inside tuples may be of a
     subclass of ndarray.
 
     Args:
@@ -120,124 +216,67 @@ def read_pickle(path: Path) -> Any:
 
 
 def _load(data: bytes) -> Any:
-    scan(data)
-    budget = Budget(GROWTH * len(data) + SPARE_BYTES)
-    content = _Unpickler(data, budget).load()
-    check_unfolded(content, len(data))
-    return _plain(content, budget)
+    return _plain(_Unpickler(io.BytesIO(data), encoding="latin1").load(), set())
 
 
-def _plain(root: Any, budget: Budget) -> Any:
-    """The same with stand-ins as arrays, in dicts, lists and arrays of objects."""
-    box = [root]
-    todo: list[Any] = [box]
-    seen: set[int] = set()
-    while todo:
-        holder = todo.pop()
-        if isinstance(holder, np.ndarray):
-            holder = holder.reshape(-1)
-        entries = list(holder.items()) if isinstance(holder, dict) else list(enumerate(holder))
-        for key, value in entries:
-            new = value
-            if isinstance(value, StandIn):
-                new = types.as_array(value, budget)
-            if isinstance(new, types.Array):
-                new = new.view(np.ndarray)
-            if new is not value:
-                holder[key] = new
-            if _holds_objects(new) and id(new) not in seen:
-                seen.add(id(new))
-                todo.append(new)
-    return box[0]
-
-
-def _holds_objects(value: Any) -> bool:
-    return isinstance(value, dict | list) or (
-        isinstance(value, np.ndarray) and value.dtype.hasobject
-    )
+def _plain(value: Any, seen: set[int]) -> Any:
+    """The same with plain arrays in place of stand-ins, in dicts, lists and arrays of objects."""
+    if isinstance(value, _StandIn):
+        value = value.array()
+    if isinstance(value, _Array):
+        value = value.view(np.ndarray)
+    objects = isinstance(value, np.ndarray) and value.dtype.hasobject
+    if id(value) in seen or not (objects or isinstance(value, dict | list)):
+        return value
+    seen.add(id(value))
+    flat = value.reshape(-1) if objects else value
+    for key in list(flat) if isinstance(flat, dict) else range(len(flat)):
+        flat[key] = _plain(flat[key], seen)
+    return value
 
 
 def read_npy(path: Path) -> Any:
-    """What a .npy file holds: a plain array, or the object of a 0-d array of objects.
-
-    Args:
-        path: of numpy's format 1 or 2; ``annots.npy`` gives its dict.
+    """The content of a .npy file: a plain array, or the object of a 0-d array of objects.
 
     Raises:
-        DataError: when the file is missing, damaged, shorter or longer than its header promises,
-            or names a class that is not allowed.
+        DataError: when the file is missing, damaged, or names a class that is not allowed.
     """
     with _as_data_error(path, ".npy file"), path.open("rb") as stream:
-        return _read_array(stream, path.stat().st_size)
+        return _read_array(stream)
 
 
 def read_npz(
     path: Path, names: Iterable[str] | None = None, *, objects: bool = True
 ) -> dict[str, Any]:
-    """The arrays of an .npz file by name, objects through the same gate as a pickle.
+    """The arrays of an .npz file by name.
 
     Args:
         path: of numpy's format.
-        names: the arrays wanted (those that are not there are left out); None for all.
-        objects: whether an array may hold objects.
+        names: of the requested arrays, those that are absent left out; None for all.
+        objects: whether an array may hold objects, read like a pickle.
 
     Raises:
         DataError: when the file is missing or damaged, an array would unpack to more than
-            `LARGEST_MEMBER` bytes, or names a class that is not allowed.
+            `LARGEST_ARRAY` bytes, or names a class that is not allowed.
     """
     with _as_data_error(path, "npz file"), zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
         found = {}
-        for name in members if names is None else names:
-            if (info := members.get(name)) is None:
-                continue
-            if info.file_size > LARGEST_MEMBER:
-                raise ValueError(f"{name} would unpack to {info.file_size} bytes")
-            with archive.open(info) as stream:
-                content = io.BytesIO(stream.read())
-            if not objects:
-                _refuse_objects(content, path)
-            found[name] = _read_array(content, info.file_size)
+        for name in members if names is None else members.keys() & set(names):
+            size = members[name].file_size
+            _expect(size <= LARGEST_ARRAY, f"{name} would unpack to {size} bytes")
+            stream = io.BytesIO(archive.read(members[name]))
+            found[name] = _read_array(stream, objects)
         return found
 
 
-def _refuse_objects(stream: BinaryIO, path: Path) -> None:
-    if _header(stream)[2].hasobject:
-        raise DataError(
-            f"{path} holds pickled Python objects, which can run code when read and are refused; "
-            "save plain numeric arrays with numpy.savez"
-        )
-    stream.seek(0)
-
-
-def _read_array(stream: BinaryIO, size: int) -> Any:
-    shape, fortran, dtype = _header(stream)
-    if dtype.hasobject:
-        return _objects(stream.read(), shape, dtype)
-    held, promised = size - stream.tell(), math.prod(shape) * dtype.itemsize
-    if held != promised or dtype.itemsize == 0 or min(shape, default=0) < 0:
-        raise ValueError(
-            f"its header promises {promised} bytes of {dtype} {shape}, {held} are there"
-        )
-    content = np.frombuffer(bytearray(stream.read(promised)), dtype)  # writable
-    return content.reshape(shape, order="F" if fortran else "C")
-
-
-def _header(stream: BinaryIO) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    version = np.lib.format.read_magic(stream)
-    readers = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
-    if version not in readers:
-        raise ValueError(f"version {version} of the format, expected 1 or 2")
-    return readers[version](stream)
-
-
-def _objects(data: bytes, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Any:
-    content = _load(data)
-    fits = isinstance(content, np.ndarray) and content.dtype == dtype and content.shape == shape
-    if not fits:
-        raise ValueError("its header and its content differ")
-    array: NDArray[Any] = content
-    return array.item() if array.ndim == 0 else array
+def _read_array(stream: BinaryIO, objects: bool = True) -> Any:
+    try:
+        return np.lib.format.read_array(stream, allow_pickle=False)
+    except ValueError as error:
+        if "allow_pickle" not in str(error):
+            raise
+    if not objects:
+        raise _Refused("pickled Python objects")
+    content = _load(stream.read())  # the header has been read
+    return content.item() if isinstance(content, np.ndarray) and content.ndim == 0 else content

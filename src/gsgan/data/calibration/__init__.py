@@ -1,4 +1,4 @@
-"""Calibration files of other tools, told apart by what is in them."""
+"""Calibration files of other tools, recognised by their content."""
 
 from gsgan.data.calibration.find import Calibration, find_calibration, read_calibration
 

@@ -1,4 +1,4 @@
-"""Which calibration format a file holds, and where one may lie in a capture folder."""
+"""Finds the calibration file in a capture folder, and its format."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from gsgan.data.calibration.cameras_json import read_cameras_json
 from gsgan.data.calibration.opencv_yaml import read_opencv_yaml
-from gsgan.data.calibration.own_json import read_own_json
 from gsgan.data.calibration.qualisys import read_qualisys
 from gsgan.data.calibration.toml_tables import read_toml
 from gsgan.data.cameras import CameraEntry
 from gsgan.utils.errors import DataError
 
-HEAD = 65536  # bytes enough to tell the formats apart
+HEAD = 65536  # bytes that are enough to recognise the format
 PATTERNS = ("cameras.json", "intri.yml", "intri.yaml", "*.qca.txt", "*.qca", "*.toml")
 KNOWN = (
     "OpenCV YAML (intri.yml beside extri.yml), TOML of Pose2Sim or aniposelib, Qualisys .qca.txt, "
@@ -29,8 +29,8 @@ class Calibration:
     Args:
         path: the file.
         format: its name in words.
-        cameras: by name, metres, K with pixel centres at +0.5; a size of (0, 0) is not known.
-        notes: one sentence for each thing left out or unusual.
+        cameras: by name, metres, K with pixel centres at +0.5; a size of (0, 0) is unknown.
+        notes: one sentence for each omission or oddity.
     """
 
     path: Path
@@ -50,7 +50,7 @@ class Reader(Protocol):
 FORMATS: dict[str, tuple[Callable[[str], bool], Reader]] = {
     "OpenCV YAML": (lambda head: head.lstrip().startswith("%YAML"), read_opencv_yaml),
     "Qualisys": (lambda head: "<calibration" in head and "<camera" in head, read_qualisys),
-    "cameras.json": (lambda head: head.lstrip().startswith("{"), read_own_json),
+    "cameras.json": (lambda head: head.lstrip().startswith("{"), read_cameras_json),
     "TOML": (lambda head: "[" in head and "matrix" in head, read_toml),
 }
 
@@ -63,11 +63,11 @@ def read_calibration(
     Args:
         path: the file; for OpenCV YAML either of the two.
         unit_scale: metres in one unit of its lengths, None for the format's own (Qualisys mm,
-            else m; cameras.json says it in meta.json).
-        pixel_centre: where K puts the first pixel's centre, 0 or 0.5; cameras.json says it itself.
+            else m; meta.json gives it for cameras.json).
+        pixel_centre: where K puts the first pixel's centre, 0 or 0.5; not read for cameras.json.
 
     Raises:
-        DataError: when it is none of the formats, or what it says cannot be.
+        DataError: when it is none of the formats, or a value is impossible.
     """
     try:
         with path.open("rb") as stream:
@@ -82,16 +82,19 @@ def read_calibration(
             if not cameras:
                 raise DataError(f"{path} ({name}) lists no camera that can be used")
             return Calibration(path, name, cameras, tuple(notes))
-    raise DataError(f"{path} is not a calibration that is known; expected {KNOWN}")
+    raise DataError(f"{path} is not a known calibration; expected {KNOWN}")
 
 
 def find_calibration(folder: Path) -> Path:
-    """The one calibration file in a capture folder, or in a folder in it named like calibration.
+    """The only calibration file in a capture folder, or in its subfolders named like calibration.
 
     Raises:
         DataError: when there is none, or more than one.
     """
-    places = [folder, *sorted(p for p in folder.glob("*") if p.is_dir() and _named_so(p))]
+    places = [
+        folder,
+        *sorted(p for p in folder.glob("*") if p.is_dir() and "calib" in p.name.lower()),
+    ]
     found = sorted({p for place in places for pattern in PATTERNS for p in place.glob(pattern)})
     found = [p for p in found if p.suffix != ".toml" or "matrix" in _text(p)]  # not a config file
     if not found:
@@ -102,10 +105,6 @@ def find_calibration(folder: Path) -> Path:
             f"{folder} holds more than one calibration ({names}); give calibration=<file>"
         )
     return found[0]
-
-
-def _named_so(folder: Path) -> bool:
-    return "calib" in folder.name.lower()
 
 
 def _text(path: Path) -> str:

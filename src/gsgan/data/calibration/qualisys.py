@@ -23,12 +23,12 @@ def read_qualisys(
 ) -> tuple[dict[str, CameraEntry], list[str]]:
     """Video cameras by serial, in natural order.
 
-    Convention: positions in mm (or ``scale``); ``R = diag(1, -1, -1) r`` with r as the rows of the
-    file say, ``t = -R C``; focal lengths and centre in 1/64 pixel, the centre counted from the
+    Convention: positions in mm (or ``scale``); ``R = diag(1, -1, -1) r`` with r as the file's
+    rows, ``t = -R C``; focal lengths and centre in 1/64 pixel, the centre counted from the
     sensor's corner, so the video window's left and top come off.
 
     Raises:
-        DataError: when it is no such file, or a number is missing or cannot be.
+        DataError: when it is another kind of file, or a number is missing or impossible.
     """
     try:
         root = ElementTree.fromstring(path.read_bytes())

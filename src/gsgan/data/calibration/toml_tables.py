@@ -1,4 +1,4 @@
-"""TOML with one table a camera, as Pose2Sim and aniposelib write it."""
+"""TOML with one table per camera, as Pose2Sim and aniposelib write it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def read_toml(
     """Cameras by name: size [w, h], matrix, distortions, rotation (Rodrigues), translation.
 
     Convention: world to camera; metres as Pose2Sim writes them. aniposelib keeps the unit of its
-    calibration board, often mm, and does not say which: give it with ``unit``.
+    calibration board, often mm, without naming it: give it with ``unit``.
 
     Raises:
         DataError: when a table lacks a key, is a fisheye's, or holds something else.

@@ -1,1 +1,4 @@
-"""One reader a format; each makes a `gsgan.data.layout.Found` and hands it to `assemble`."""
+"""One reader per format: a subclass of `common.FolderReader` whose ``find`` returns a `Found`.
+
+A new format is one module here and one file in conf/data, which names the reader by ``_target_``.
+"""

@@ -5,7 +5,7 @@
     calibration_full.json   {serial: {K 9, R 9, T 3, imgSize [w, h]}}, metres
     {serial}/%08d.jpg       {serial}/mask/pha/%08d.jpg    matting alphas
     smpl_params.npz         SMPL-X, row i = frame i
-    missing_img_files.txt   optional: pictures to leave out, one a line
+    missing_img_files.txt   optional: images to leave out, one per line
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from gsgan.data.formats.smplx_rig import Places, SmplxRigReader
 class AvatarrexReader(SmplxRigReader):
     """Reads a subject of AvatarReX; settings as `SmplxRigReader`."""
 
+    contents: ClassVar[str] = "calibration_full.json, smpl_params.npz and a folder for each camera"
     places: ClassVar[Places] = Places(
         layout="AvatarReX",
-        contents="calibration_full.json, smpl_params.npz and a folder for each camera",
         calibration="calibration_full.json",
         images="{camera}",
         masks="{camera}/mask/pha",

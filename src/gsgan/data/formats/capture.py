@@ -19,41 +19,35 @@ from typing import Any
 
 import numpy as np
 
-from gsgan.data.cameras import EXPECTED, CameraEntry, make_camera, numbers
+from gsgan.data.calibration.cameras_json import (
+    METRES,
+    Conventions,
+    choose,
+    read_cameras,
+    read_conventions,
+)
+from gsgan.data.cameras import CameraEntry
 from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, read_arrays, read_json
-from gsgan.data.formats.capture_meta import BODY_BONES, Conventions, read_meta
-from gsgan.data.formats.common import without_frames
-from gsgan.data.formats.trust import Trust, check_meeting, watch_masks
-from gsgan.data.layout import Found, Layout, Meta, assemble, dataset_folder
-from gsgan.data.pixels import MaskFile, PixelRules
-from gsgan.data.skeletons import (
-    SKELETONS,
-    Landmarks,
-    Poses,
-    make_landmarks,
-    whole_frame_ids,
-)
+from gsgan.data.formats.common import IMAGES, finish, one_mask_each
+from gsgan.data.formats.trust import Trust
+from gsgan.data.layout import BodyModel, Found, Layout, Meta, dataset_folder
+from gsgan.data.pixels import PixelRules
+from gsgan.data.skeletons import SKELETONS, Landmarks, Poses, make_landmarks, whole_frame_ids
 from gsgan.utils.arrays import expect_array
+from gsgan.utils.checks import is_number
 from gsgan.utils.errors import DataError
 
 LANDMARKS = "landmarks3d.npz"
-IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
-MASK_SUFFIXES = (".png",)
+MASKS = (".png",)
+BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
 LOOKED_AT = Trust(min_box_iou=0.0)
-"""Landmarks lie inside the body and may lack limbs: their box says little about the mask's."""
+"""Landmarks lie inside the body and may lack limbs, hence min_box_iou=0."""
 
 
 @dataclass(frozen=True)
 class CaptureReader:
-    """Reads a capture in the bring-your-own layout; what is looked at is a setting.
-
-    Args:
-        landmarks: the skeletons' file, in the capture's folder unless its path is absolute; None
-            is landmarks3d.npz.
-        drop_frames: frames to leave out, e.g. "360-370", or None.
-        trust: which pictures are looked at.
-    """
+    """Reads a capture in the bring-your-own layout; for the arguments see `read_capture`."""
 
     landmarks: str | None = None
     drop_frames: Any = None
@@ -72,13 +66,13 @@ def read_capture(
     drop_frames: Any = None,
     landmarks: str | None = None,
 ) -> Layout:
-    """Reads and checks everything but most pictures' pixels.
+    """Reads a capture in the bring-your-own layout and checks all but most images' pixels.
 
     Args:
         root: the folder that holds cameras.json.
         checks: thresholds, `Checks()` when None.
         smpl: the user's model file, for poses of an SMPL or SMPL-X body.
-        trust: which pictures are looked at.
+        trust: which images are compared with the landmarks.
         drop_frames: frames to leave out, e.g. "360-370", or None.
         landmarks: the skeletons' file, in the folder unless its path is absolute; None is
             landmarks3d.npz.
@@ -90,7 +84,9 @@ def read_capture(
     root = dataset_folder(root, "cameras.json, images/ and masks/")
     notes: list[str] = []
     cameras_json = read_json(root / "cameras.json")
-    meta, conventions = read_meta(root / "meta.json", smpl)
+    meta_json = read_json(root / "meta.json")
+    meta = read_meta(root / "meta.json", meta_json, smpl)
+    conventions = read_conventions(root / "meta.json", meta_json)
     if conventions.scale != 1.0:
         notes.append(f"lengths converted from {meta.unit} to metres")
     cameras = read_cameras(root / "cameras.json", cameras_json, conventions, checks)
@@ -103,18 +99,14 @@ def read_capture(
     if (root / "body_pose.npz").exists():
         poses = read_poses(root / "body_pose.npz", meta, conventions)
         meta = _with_shape(meta, root / "body_pose.npz")
-    masks = {name: _files_of(root, "masks", name) for name in cameras}
     found = Found(
         root=root,
         meta=meta,
         cameras=cameras,
         images=images,
-        masks={
-            name: {f: (MaskFile("grey", path),) for f, path in files.items()}
-            for name, files in masks.items()
-        },
-        mask_folders={name: root / "masks" / name for name in cameras},
-        labels={name: _files_of(root, "labels", name) for name in cameras},
+        masks=one_mask_each({c: frame_files(root, f"masks/{c}", MASKS) for c in cameras}, "grey"),
+        mask_folder="masks/{camera}",
+        labels={c: frame_files(root, f"labels/{c}", MASKS) for c in cameras},
         landmarks=skeletons,
         poses=poses,
         pixels=PixelRules(composed=conventions.composed),
@@ -124,21 +116,15 @@ def read_capture(
         ),
         notes=tuple(notes),
     )
-    layout = assemble(without_frames(found, drop_frames), checks)
-    doubts = check_meeting(
-        layout,
-        layout.landmarks.seen,
-        trust,
-        "check that cameras, landmarks and masks belong together",
-    )
-    return replace(layout, notes=(*layout.notes, *doubts, *watch_masks(layout, trust)))
+    hint = "check that cameras, landmarks and masks belong together"
+    return finish(found, checks, trust, hint, drop_frames)
 
 
 def landmarks_path(root: Path, name: str | None) -> Path:
     """The skeletons' file: in the capture's folder unless its path is absolute.
 
     Raises:
-        DataError: when it is not there, or no npz.
+        DataError: when it does not exist, or is not an npz file.
     """
     if name is None:
         return root / LANDMARKS
@@ -152,44 +138,30 @@ def landmarks_path(root: Path, name: str | None) -> Path:
     return path
 
 
-def read_cameras(
-    path: Path, content: Mapping[str, Any], conventions: Conventions, checks: Checks
-) -> dict[str, CameraEntry]:
-    """The cameras of cameras.json by name, in metres, pixel centres moved to +0.5.
+def read_meta(path: Path, content: Mapping[str, Any], smpl: str | None = None) -> Meta:
+    """Facts about the capture from the content of meta.json, where only ``unit`` is required.
 
     Raises:
-        DataError: naming the camera and what is wrong with its calibration.
+        DataError: on a missing unit or an unknown value.
     """
-    if not content:
-        raise DataError(f"{path} lists no camera")
-    return {
-        name: _camera(f"{path}, camera {name}", name, entry, conventions, checks)
-        for name, entry in content.items()
-    }
-
-
-def _camera(
-    where: str, name: str, entry: Any, conventions: Conventions, checks: Checks
-) -> CameraEntry:
-    if not isinstance(entry, dict):
-        raise DataError(f"{where}: expected an object with {EXPECTED}")
-    for key in ("K", "R", "t", "size"):
-        if key not in entry:
-            raise DataError(f"{where}: '{key}' is missing; expected {EXPECTED}")
-    size = numbers(where, entry["size"], "size", (2,))
-    if np.any(size < 1) or np.any(size != np.round(size)):
-        raise DataError(f"{where}: size must be [width, height] in pixels, found {entry['size']}")
-    return make_camera(
-        where,
-        name,
-        K=entry["K"],
-        R=entry["R"],
-        t=entry["t"],
-        dist=entry.get("dist"),
-        size=(int(size[1]), int(size[0])),
-        scale=conventions.scale,
-        pixel_centre=conventions.pixel_centre,
-        rotation_tolerance=checks.rotation_tolerance,
+    fps, names, body = (content.get(key) for key in ("fps", "label_names", "body"))
+    if fps is not None and not (is_number(fps) and fps > 0):
+        raise DataError(f"{path}: 'fps' is {fps!r}; expected a number above 0")
+    if names is not None and not (isinstance(names, list) and len(names) > 1):
+        raise DataError(f"{path}: 'label_names' must list the background and every part by name")
+    splits = content.get("splits") or {}
+    if not isinstance(splits, dict):
+        raise DataError(f"{path}: 'splits' must be an object with train_cameras, test_frames, ...")
+    if body is not None:
+        choose(path, content, "body", None, tuple(BODY_BONES))
+    return Meta(
+        unit=choose(path, content, "unit", None, tuple(METRES)),
+        fps=None if fps is None else float(fps),
+        up_axis=choose(path, content, "up_axis", "z", ("x", "y", "z", "-x", "-y", "-z")),
+        skeleton=choose(path, content, "skeleton", "mediapipe33", tuple(SKELETONS)),
+        body=None if body is None else BodyModel(body, smpl if body != "free" else None),
+        label_names=None if names is None else tuple(map(str, names)),
+        splits=splits,
     )
 
 
@@ -219,16 +191,10 @@ def _index_images(root: Path, cameras: Mapping[str, CameraEntry]) -> dict[str, d
             f"{root / 'cameras.json'} lists the camera {missing[0]}, but {folder / missing[0]} "
             f"does not exist; there are {', '.join(sorted(found)) or 'none'}"
         )
-    images = {name: _files_of(root, "images", name, IMAGE_SUFFIXES) for name in cameras}
+    images = {name: frame_files(root, f"images/{name}", IMAGES) for name in cameras}
     if empty := [name for name, files in images.items() if not files]:
-        raise DataError(f"{folder / empty[0]} holds no frames; expected .jpg or .png pictures")
+        raise DataError(f"{folder / empty[0]} holds no frames; expected .jpg or .png images")
     return images
-
-
-def _files_of(
-    root: Path, kind: str, camera: str, suffixes: tuple[str, ...] = MASK_SUFFIXES
-) -> dict[int, str]:
-    return frame_files(root, f"{kind}/{camera}", suffixes)
 
 
 def read_landmarks(

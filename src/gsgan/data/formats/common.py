@@ -1,80 +1,111 @@
-"""What several readers share."""
+"""The shared part of the readers: settings, the user's body model, and the final checks."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.cameras import CameraEntry
+from gsgan.data.checks import Checks
 from gsgan.data.files import read_header
 from gsgan.data.formats.smpl_motion import require_kind
-from gsgan.data.layout import Found
+from gsgan.data.formats.trust import Trust, check_meeting, watch_masks
+from gsgan.data.layout import Found, Layout, assemble, dataset_folder
+from gsgan.data.pixels import MaskFile, mask_file
 from gsgan.data.splits import parse_frames
 from gsgan.utils.errors import ConfigError, DataError
 
+IMAGES = (".jpg", ".jpeg", ".png")
 AXES = ("x", "y", "z")
 
 
-def no_joints(root: Path, has: str, model: str, otherwise: str = "") -> DataError:
-    """The error for a dataset whose skeleton needs a body model that was not given.
+@dataclass(frozen=True, kw_only=True)
+class FolderReader:
+    """Reads a published dataset's folder; a subclass finds its files and sets the defaults.
 
     Args:
-        root: the dataset.
-        has: what it holds in place of joints, e.g. "SMPL parameters and vertices".
-        model: what is needed, e.g. "SMPL (SMPL_NEUTRAL.pkl)".
-        otherwise: another way out, as the end of a sentence.
+        drop_frames: frames to leave out, e.g. "360-370", or None.
+        distance: metres, see `Checks`.
+        max_missing_masks: share of images without a mask that may be left out.
+        header_stride: see `Checks`.
+        pixel_centre: where K puts the centre of the first pixel: 0 as OpenCV calibrates.
+        trust: which images are compared with the body.
     """
-    return DataError(
-        f"{root} holds {has} but no joints, and joints need the regressor of the body model: give "
-        f"data.smpl=/path/to/your {model} file, which has its own licence and is not part of this "
-        f"project{otherwise}"
-    )
+
+    drop_frames: Any = None
+    distance: tuple[float, float] = (0.5, 20.0)
+    max_missing_masks: float = 0.05
+    header_stride: int = 20
+    pixel_centre: float = 0.0
+    trust: Trust = field(default_factory=Trust)
+
+    contents: ClassVar[str]
+    """The folder's content, for messages."""
+    hint: ClassVar[str]
+    """What to check when body and masks do not agree."""
+
+    def __call__(self, root: str | Path, checks: Checks, smpl: str | None = None) -> Layout:
+        """Reads and checks everything except most images' pixels.
+
+        Args:
+            root: the dataset's folder.
+            checks: thresholds of all formats.
+            smpl: the user's SMPL or SMPL-X model file.
+
+        Raises:
+            DataError: for whatever is missing, damaged or contradictory, naming the file.
+        """
+        folder = dataset_folder(root, self.contents)
+        checks = replace(
+            checks,
+            distance=(self.distance[0], self.distance[1]),
+            max_missing_masks=self.max_missing_masks,
+            header_stride=self.header_stride,
+        )
+        found = self.find(folder, checks, smpl)
+        return finish(found, checks, self.trust_of(found), self.hint, self.drop_frames)
+
+    def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
+        """The dataset's files, each checked by itself.
+
+        Raises:
+            DataError: for whatever is missing or damaged, naming the file.
+        """
+        raise NotImplementedError
+
+    def trust_of(self, found: Found) -> Trust:
+        """Which images are compared with the body."""
+        return self.trust
 
 
-def model_file(smpl: str | None) -> Path | None:
-    """The user's body model file.
-
-    Raises:
-        ConfigError: when it was named and is not there.
-    """
-    if smpl is None:
-        return None
-    path = Path(smpl).expanduser()
-    if not path.is_file():
-        raise ConfigError(f"data.smpl={smpl} is no file; expected an SMPL or SMPL-X .pkl or .npz")
-    return path
-
-
-def body_model(smpl: str | None, kind: str) -> tuple[Path, SkinnedModel] | None:
-    """The user's body model file and the model in it, None without a file.
-
-    Args:
-        smpl: the file.
-        kind: "smpl" or "smplx", which it must be.
-
-    Raises:
-        ConfigError: when it was named and is not there.
-        DataError: when it is damaged, or of another kind.
-    """
-    path = model_file(smpl)
-    if path is None:
-        return None
-    model = read_smpl(path)
-    require_kind(model, kind, path)
-    return path, model
-
-
-def without_frames(found: Found, dropped: Any) -> Found:
-    """What was found, without the pictures of some frames.
+def finish(
+    found: Found, checks: Checks, trust: Trust, hint: str, drop_frames: Any = None
+) -> Layout:
+    """Checks the files against each other and a few masks against the body.
 
     Args:
         found: by a reader.
-        dropped: frames such as "360-370", or None.
+        checks: thresholds.
+        trust: which images are compared.
+        hint: what to check when body and masks do not agree.
+        drop_frames: frames to leave out, or None.
+
+    Raises:
+        DataError: for whatever is missing or contradictory, naming the file.
+        ConfigError: when ``drop_frames`` is malformed or leaves no frame.
+    """
+    layout = assemble(without_frames(found, drop_frames), checks)
+    doubts = check_meeting(layout, found.points or layout.landmarks.seen, trust, hint)
+    return replace(layout, notes=(*layout.notes, *doubts, *watch_masks(layout, trust)))
+
+
+def without_frames(found: Found, dropped: Any) -> Found:
+    """The same without the images of some frames, such as "360-370"; None keeps all.
 
     Raises:
         ConfigError: when none is left, or the value is malformed.
@@ -91,6 +122,45 @@ def without_frames(found: Found, dropped: Any) -> Found:
     return replace(found, images=images)
 
 
+def no_joints(root: Path, has: str, model: str, otherwise: str = "") -> DataError:
+    """The error for a dataset whose skeleton needs a body model that was not given.
+
+    Args:
+        root: the dataset.
+        has: its content instead of joints, e.g. "SMPL parameters and vertices".
+        model: the required model, e.g. "SMPL (SMPL_NEUTRAL.pkl)".
+        otherwise: another way out, as the end of a sentence.
+    """
+    return DataError(
+        f"{root} holds {has} but no joints, and joints need the regressor of the body model: give "
+        f"data.smpl=/path/to/your {model} file, which has its own licence and is not part of this "
+        f"project{otherwise}"
+    )
+
+
+def body_model(smpl: str | None, kind: str) -> tuple[Path, SkinnedModel] | None:
+    """The user's body model file and the model in it, None without a file.
+
+    Args:
+        smpl: the file.
+        kind: "smpl" or "smplx", which it must be.
+
+    Raises:
+        ConfigError: when the file does not exist.
+        DataError: when it is damaged, or of another kind.
+    """
+    if smpl is None:
+        return None
+    path = Path(smpl).expanduser()
+    if not path.is_file():
+        raise ConfigError(
+            f"data.smpl={smpl} does not exist; expected an SMPL or SMPL-X .pkl or .npz"
+        )
+    model = read_smpl(path)
+    require_kind(model, kind, path)
+    return path, model
+
+
 def up_axis(cameras: Iterable[CameraEntry]) -> str:
     """The world axis nearest to the mean of the cameras' upward directions, e.g. "-z"."""
     up = np.mean([-camera.R[1] for camera in cameras], axis=0)
@@ -99,9 +169,19 @@ def up_axis(cameras: Iterable[CameraEntry]) -> str:
 
 
 def picture_size(root: Path, files: Mapping[int, str]) -> tuple[int, int]:
-    """``(H, W)`` of a camera's first picture.
+    """``(H, W)`` of a camera's first image.
 
     Raises:
         DataError: when it is damaged.
     """
     return read_header(root / next(iter(files.values()))).size
+
+
+def one_mask_each(
+    files: Mapping[str, Mapping[int, str]], rule: str
+) -> dict[str, dict[int, tuple[MaskFile, ...]]]:
+    """Masks by camera and frame, one file per image, all of one rule."""
+    return {
+        name: {f: (mask_file(rule, path),) for f, path in paths.items()}
+        for name, paths in files.items()
+    }

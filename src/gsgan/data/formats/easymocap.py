@@ -11,56 +11,63 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.checks import Checks
-from gsgan.data.files import frame_files, natural_order
+from gsgan.data.checks import Checks, spans
+from gsgan.data.files import frame_files, natural_order, read_json_value
 from gsgan.data.formats.common import (
+    IMAGES,
+    FolderReader,
     body_model,
     no_joints,
     picture_size,
     up_axis,
-    without_frames,
 )
-from gsgan.data.formats.easymocap_skeleton import read_fits, read_keypoints, read_people
-from gsgan.data.formats.smpl_motion import landmarks_of
-from gsgan.data.formats.trust import Trust, check_meeting, watch_masks
-from gsgan.data.layout import BodyModel, Found, Layout, Meta, assemble, dataset_folder
+from gsgan.data.formats.smpl_motion import landmarks_of, zju_motion
+from gsgan.data.joints import BODY, FROM_HANDS, HAND, SETS
+from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import MASK_RULES, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.arrays import as_floats
+from gsgan.utils.checks import one_of
+from gsgan.utils.errors import DataError
 
-CONTENTS = "intri.yml, extri.yml, images/, mask/, and keypoints3d/ or smpl/"
+Float = NDArray[np.float64]
+
 SKELETONS = {"smpl": "smpl24 -> mediapipe33", "keypoints3d": "body25 -> mediapipe33"}
 RESULTS = ("{kind}", "output/{kind}", "output-{kind}/{kind}")
-PICTURES = (".jpg", ".jpeg", ".png")
-MASKS = (".png", ".jpg")
 PEOPLE = 1000  # bound on the person's number in a mask's name
+PEOPLE_KEYS = ("annots", "people")
+ID_KEYS = ("id", "personID")
+
+BODY_25 = 25
+WITH_HANDS = BODY_25 + 2 * HAND
+COUNTS = (BODY_25, WITH_HANDS, WITH_HANDS + 51)  # body; and hands, left first; and face
+BODY_25_TO_33 = SETS[BODY_25][1]
+HANDS_TO_33 = {landmark: BODY_25 + joint - BODY for landmark, joint in FROM_HANDS.items()}
 
 
-@dataclass(frozen=True)
-class EasymocapReader:
-    """Reads a folder of EasyMocap; every threshold is a setting.
+@dataclass(frozen=True, kw_only=True)
+class EasymocapReader(FolderReader):
+    """Reads a folder of EasyMocap.
 
     Args:
-        skeleton: "smpl" (fits), "keypoints3d", or "auto" for the first that is there and can be
+        skeleton: "smpl" (fits), "keypoints3d", or "auto" for the first that exists and can be
             used: fits need ``data.smpl``.
-        person: whose skeleton, by EasyMocap's id, and whose masks where their names say it.
+        person: EasyMocap's id of the person whose skeleton, and whose masks where their names
+            hold an id, are read.
         masks: folder of the masks, relative to the root.
-        mask_rule: what their numbers mean, one of `gsgan.data.pixels.MASK_RULES`.
+        mask_rule: how masks are decoded, one of `gsgan.data.pixels.MASK_RULES`.
         threshold: for the rule of that name, and for "nonzero" where masks are JPEGs.
-        drop_frames: frames to leave out, e.g. "360-370", or None.
-        distance: metres, see `Checks`.
-        max_missing_masks: share of pictures without a mask that may be left out.
-        header_stride: see `Checks`.
-        pixel_centre: where K puts the centre of the first pixel: 0 as OpenCV calibrates.
-        fps: pictures a second, or None.
-        trust: which pictures are looked at.
+        fps: frames per second, or None.
     """
 
     skeleton: str = "auto"
@@ -68,57 +75,30 @@ class EasymocapReader:
     masks: str = "mask"
     mask_rule: str = "nonzero"
     threshold: int = 128
-    drop_frames: Any = None
     distance: tuple[float, float] = (0.3, 30.0)
-    max_missing_masks: float = 0.05
-    header_stride: int = 20
-    pixel_centre: float = 0.0
     fps: float | None = None
-    trust: Trust = field(default_factory=Trust)
+
+    contents: ClassVar[str] = "intri.yml, extri.yml, images/, mask/, and keypoints3d/ or smpl/"
+    hint: ClassVar[str] = (
+        "check that calibration, skeleton and masks are of one recording and one person "
+        "(data.reader.person)"
+    )
 
     def __post_init__(self) -> None:
-        for key, allowed in (("skeleton", ("auto", *SKELETONS)), ("mask_rule", MASK_RULES)):
-            if getattr(self, key) not in allowed:
-                raise ConfigError(
-                    f"data.reader.{key} must be one of {', '.join(allowed)}, "
-                    f"got {getattr(self, key)!r}"
-                )
+        one_of("data.reader.skeleton", self.skeleton, ("auto", *SKELETONS))
+        one_of("data.reader.mask_rule", self.mask_rule, MASK_RULES)
 
-    def __call__(self, root: str | Path, checks: Checks, smpl: str | None = None) -> Layout:
-        """Reads and checks everything but most pictures' pixels.
-
-        Args:
-            root: the folder that holds intri.yml and images/.
-            checks: thresholds of all formats.
-            smpl: the user's SMPL model file, for fits.
+    def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
+        """The dataset's files, each checked by itself.
 
         Raises:
-            DataError: for whatever is missing, damaged or contradictory, naming the file.
+            DataError: for whatever is missing or damaged, naming the file.
         """
-        folder = dataset_folder(root, CONTENTS)
-        checks = replace(
-            checks,
-            distance=(self.distance[0], self.distance[1]),
-            max_missing_masks=self.max_missing_masks,
-            header_stride=self.header_stride,
-        )
-        found = self._find(folder, checks, smpl)
-        layout = assemble(without_frames(found, self.drop_frames), checks)
-        doubts = check_meeting(
-            layout,
-            layout.landmarks.seen,
-            self.trust,
-            "check that calibration, skeleton and masks are of one recording and one person "
-            "(data.reader.person)",
-        )
-        return replace(layout, notes=(*layout.notes, *doubts, *watch_masks(layout, self.trust)))
-
-    def _find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
         notes: list[str] = []
-        names = camera_folders(root)
-        images = {name: frame_files(root, f"images/{name}", PICTURES) for name in names}
+        names = camera_folders(root, self.contents)
+        images = {name: frame_files(root, f"images/{name}", IMAGES) for name in names}
         if empty := [name for name, files in images.items() if not files]:
-            raise DataError(f"{root / 'images' / empty[0]} holds no pictures; expected 000000.jpg")
+            raise DataError(f"{root / 'images' / empty[0]} holds no images; expected 000000.jpg")
         cameras = self._cameras(root, images, notes)
         frames = {f for files in images.values() for f in files}
         kind, place = self._source(root, smpl)
@@ -128,7 +108,7 @@ class EasymocapReader:
             given = body_model(smpl, "smpl")
             if given is None:
                 raise no_joints(root, f"SMPL parameters ({place}/)", "SMPL (SMPL_NEUTRAL.pkl)")
-            motion = read_fits(people, given[1], notes)
+            motion = zju_motion(people, given[1], notes)
             body = BodyModel("smpl", str(given[0]), tuple(motion.betas[0].tolist()))
             ids, (p, conf) = motion.ids, landmarks_of(given[1], motion)
         else:
@@ -145,8 +125,7 @@ class EasymocapReader:
             cameras=cameras,
             images=images,
             masks=self._masks(root, names),
-            mask_folders={name: root / self.masks / name for name in names},
-            labels={},
+            mask_folder=f"{self.masks}/{{camera}}",
             landmarks=make_landmarks(ids, p, conf, checks.max_reach, notes, source=f"{place}/"),
             poses=None if motion is None else motion.poses(f"{place}/"),
             pixels=PixelRules(threshold=self.threshold),
@@ -156,16 +135,16 @@ class EasymocapReader:
         )
 
     def _source(self, root: Path, smpl: str | None) -> tuple[str, str]:
-        """Which skeletons to use, and the folder that holds them."""
+        """The kind of skeletons to use, and their folder."""
         places = {}
         for kind in SKELETONS if self.skeleton == "auto" else (self.skeleton,):
             folders = [pattern.format(kind=kind) for pattern in RESULTS]
             if there := [folder for folder in folders if (root / folder).is_dir()]:
                 places[kind] = there[0]
         if not places:
-            wanted = "keypoints3d/ or smpl/" if self.skeleton == "auto" else f"{self.skeleton}/"
+            names = "keypoints3d/ or smpl/" if self.skeleton == "auto" else f"{self.skeleton}/"
             raise DataError(
-                f"{root} has no skeletons; expected {wanted} in it, or in output/: run EasyMocap's "
+                f"{root} has no skeletons; expected {names} in it, or in output/: run EasyMocap's "
                 "reconstruction first"
             )
         usable = [kind for kind in places if kind != "smpl" or smpl is not None]
@@ -175,18 +154,18 @@ class EasymocapReader:
     def _cameras(
         self, root: Path, images: Mapping[str, Mapping[int, str]], notes: list[str]
     ) -> dict[str, CameraEntry]:
-        """The cameras that took pictures, by name, in natural order."""
+        """The cameras that have images, by name, in natural order."""
         path = root / "intri.yml"
         calibration = read_calibration(path, pixel_centre=self.pixel_centre)
         notes += calibration.notes
         known = calibration.cameras
         if lacking := [name for name in images if name not in known]:
             raise DataError(
-                f"{root / 'images' / lacking[0]} is no camera of {path}, which lists "
+                f"{root / 'images' / lacking[0]} is not a camera of {path}, which lists "
                 f"{', '.join(known)}; cameras are paired by name: rename the folder or calibrate it"
             )
         if idle := [name for name in known if name not in images]:
-            notes.append(f"{path} lists cameras without pictures, left out: {', '.join(idle)}")
+            notes.append(f"{path} lists cameras without images, left out: {', '.join(idle)}")
         return {
             name: known[name]
             if min(known[name].size) > 0
@@ -195,46 +174,144 @@ class EasymocapReader:
         }
 
     def _masks(self, root: Path, names: list[str]) -> dict[str, dict[int, tuple[MaskFile, ...]]]:
-        """By camera and frame; the person's own where names say whose they are."""
+        """By camera and frame; only the person's own where the names hold an id."""
         if not (root / self.masks).is_dir():
             raise DataError(
-                f"{root / self.masks} does not exist; every picture needs a mask, expected "
+                f"{root / self.masks} does not exist; every image needs a mask, expected "
                 f"{self.masks}/<camera>/000000.png (data.reader.masks names the folder)"
             )
         found = {}
         for name in names:
-            files = frame_files(root, f"{self.masks}/{name}", MASKS, _frame_and_person)
+            files = frame_files(root, f"{self.masks}/{name}", (".png", ".jpg"), _frame_and_person)
             own: dict[int, tuple[MaskFile, ...]] = {}
-            for key, path in sorted(files.items()):  # a mask of nobody in particular comes first
-                frame, whose = divmod(key, PEOPLE)
-                if whose in (0, self.person + 1):
+            for key, path in sorted(files.items()):  # a mask without an id comes first
+                frame, number = divmod(key, PEOPLE)
+                if number in (0, self.person + 1):
                     own[frame] = (mask_file(self.mask_rule, path),)
             found[name] = own
         return found
 
 
-def camera_folders(root: Path) -> list[str]:
-    """Names of the cameras that have a folder of pictures, in natural order.
+def camera_folders(root: Path, contents: str) -> list[str]:
+    """Names of the cameras that have a folder of images, in natural order.
 
     Raises:
         DataError: when there is none.
     """
     for name in ("intri.yml", "extri.yml"):
         if not (root / name).is_file():
-            raise DataError(f"{root / name} does not exist; a folder of EasyMocap holds {CONTENTS}")
+            raise DataError(f"{root / name} does not exist; a folder of EasyMocap holds {contents}")
     place = root / "images"
     names = [p.name for p in place.glob("*") if p.is_dir() and not p.name.startswith(".")]
     if not names:
         hint = "extract the frames of videos/" if (root / "videos").is_dir() else "copy it whole"
         raise DataError(
-            f"{place} holds no camera's folder; a folder of EasyMocap holds {CONTENTS}: {hint}"
+            f"{place} holds no folder of a camera; a folder of EasyMocap holds {contents}: {hint}"
         )
     return sorted(names, key=natural_order)
 
 
 def _frame_and_person(stem: str) -> int | None:
-    """One number of both: "000012_1" is frame 12 of person 1, "000012" is nobody's."""
+    """One number of both: "000012_1" is frame 12 of person 1, "000012" has no id."""
     match = re.fullmatch(r"(\d+)(?:_(\d{1,2}))?", stem)
     if match is None:
         return None
     return int(match[1]) * PEOPLE + (int(match[2]) + 1 if match[2] else 0)
+
+
+def read_people(
+    root: Path, folder: str, frames: Collection[int], person: int, notes: list[str]
+) -> dict[int, tuple[str, Mapping[str, Any]]]:
+    """One person's entry, with the file's name for messages, by frame.
+
+    Args:
+        root: the dataset.
+        folder: of the JSON files, relative to it.
+        frames: that have images.
+        person: the requested ``id``.
+        notes: gains the frames that lack the person, or hold others too.
+
+    Raises:
+        DataError: on a damaged file, or when the person is in none.
+    """
+    files = frame_files(root, folder, (".json",))
+    found, seen, crowded = {}, set[int](), list[int]()
+    there = sorted(set(frames) & set(files))
+    for frame in there:
+        people = _people(root / files[frame])
+        seen |= set(people)
+        if len(people) > 1:
+            crowded.append(frame)
+        if person in people:
+            found[frame] = (f"{root / files[frame]}, person {person}", people[person])
+    if not found:
+        ids = ", ".join(map(str, sorted(seen))) or "nobody"
+        raise DataError(
+            f"{root / folder} has no person {person} in the {len(there)} of its {len(files)} files "
+            f"that belong to images (found: {ids}); set data.reader.person"
+        )
+    if lacking := [frame for frame in there if frame not in found]:
+        notes.append(f"{folder} lacks person {person} at frames {spans(lacking)}")
+    if crowded:
+        notes.append(
+            f"{folder} has more people than person {person} at frames {spans(crowded)}; masks must "
+            "be of that person alone"
+        )
+    return found
+
+
+def _people(path: Path) -> dict[int, Mapping[str, Any]]:
+    """All people in a file by id."""
+    content = read_json_value(path)
+    if isinstance(content, Mapping):
+        content = next((content[key] for key in PEOPLE_KEYS if key in content), None)
+    if not isinstance(content, list) or not all(isinstance(p, Mapping) for p in content):
+        raise DataError(f"{path} must hold a list of people, each an object with 'id'")
+    found: dict[int, Mapping[str, Any]] = {}
+    for entry in content:
+        number = next((entry[key] for key in ID_KEYS if key in entry), None)
+        if isinstance(number, bool) or not isinstance(number, int) or number in found:
+            raise DataError(
+                f"{path}: each person needs a whole 'id' that no other has, found {number}"
+            )
+        found[number] = entry
+    return found
+
+
+def read_keypoints(
+    people: Mapping[int, tuple[str, Mapping[str, Any]]],
+) -> tuple[NDArray[np.int64], Float, Float]:
+    """MediaPipe's 33 landmarks from BODY_25, with hands where they are there.
+
+    Convention: joints that BODY_25 lacks (corners of the eyes, mouth; without hands also fingers)
+    and joints that were not seen, for which EasyMocap writes zeros, are NaN with confidence 0.
+
+    Returns:
+        ``ids [F]`` rising, ``p [F, 33, 3]`` metres and ``conf [F, 33]``.
+
+    Raises:
+        DataError: on another number of joints.
+    """
+    p, conf = np.full((len(people), BODY, 3), np.nan), np.zeros((len(people), BODY))
+    for row, (where, entry) in enumerate(people.values()):
+        joints = _joints(where, entry.get("keypoints3d"))
+        table = BODY_25_TO_33 | (HANDS_TO_33 if len(joints) > BODY_25 else {})
+        taken = joints[list(table.values())]
+        seen = np.isfinite(taken).all(axis=1) & (taken[:, 3] > 0)
+        to = np.array(list(table))[seen]
+        p[row, to], conf[row, to] = taken[seen, :3], taken[seen, 3]
+    return np.array(list(people), np.int64), p, conf
+
+
+def _joints(where: str, raw: Any) -> Float:
+    """``[J, 4]`` x, y, z and confidence, which is 1 where the file has none."""
+    joints = as_floats(raw)
+    if joints.ndim != 2 or len(joints) not in COUNTS or joints.shape[1] not in (3, 4):
+        counts = ", ".join(map(str, COUNTS))
+        raise DataError(
+            f"{where}: 'keypoints3d' must have shape (J, 4) with J one of {counts} (BODY_25, with "
+            f"hands, with face), found {joints.shape if joints.size else type(raw).__name__}"
+        )
+    if joints.shape[1] == 3:
+        joints = np.concatenate([joints, np.ones((len(joints), 1))], axis=1)
+    return joints

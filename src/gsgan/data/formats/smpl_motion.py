@@ -10,14 +10,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsgan.body.smpl import SkinnedModel
+from gsgan.body.smpl import SkinnedModel, from_zju
 from gsgan.data.skeletons import Poses
 from gsgan.skeleton.smpl import TABLES, to_mediapipe33
+from gsgan.utils.arrays import as_floats
 from gsgan.utils.errors import DataError
 
 Float = NDArray[np.float64]
 MODEL_NAMES = {"smpl": "SMPL", "smplx": "SMPL-X"}
 CHUNK = 32  # frames posed at once: bounds memory, nothing else
+SHAPE_TOLERANCE = 1e-4  # spread of a shape coefficient over frames that is not worth a note
+ROOT_TOLERANCE = 1e-6  # radians in poses[:3] that count as none
+ZJU_POSES, ZJU_SHAPES = (72, 69), 10  # 69: without the root, which Rh turns
 
 
 @dataclass(frozen=True)
@@ -55,16 +59,10 @@ class Motion:
         )
 
 
-def one_shape(betas: Float, tolerance: float, notes: list[str]) -> Float:
-    """``[S]`` the subject's shape: the median over frames, with a note when they differ.
-
-    Args:
-        betas: ``[F, S]``.
-        tolerance: largest spread of a coefficient that is not worth a note.
-        notes: gains a sentence.
-    """
+def one_shape(betas: Float, notes: list[str]) -> Float:
+    """``[S]`` the subject's shape: the median of ``betas [F, S]``, with a note when they differ."""
     spread = float(np.ptp(betas, axis=0).max(initial=0))
-    if spread > tolerance:
+    if spread > SHAPE_TOLERANCE:
         notes.append(
             f"the body's shape changes between frames (by up to {spread:.2g} in a coefficient); "
             "its median is used"
@@ -73,22 +71,21 @@ def one_shape(betas: Float, tolerance: float, notes: list[str]) -> Float:
 
 
 def require_kind(model: SkinnedModel, kind: str, path: object) -> None:
-    """Refuses SMPL where SMPL-X is due, the other way round, and meshes of another topology.
+    """Refuses SMPL in place of SMPL-X, the reverse, and meshes of another topology.
 
     Raises:
         DataError: naming the file and what it holds.
     """
     if model.kind != kind:
-        wanted = f"{MODEL_NAMES[kind]} ({TABLES[kind].counts[0]} joints)"
         raise DataError(
             f"{path} is a model of {len(model.parents)} joints; this dataset's parameters are of "
-            f"{wanted}"
+            f"{MODEL_NAMES[kind]} ({TABLES[kind].counts[0]} joints)"
         )
     count, found = TABLES[kind].counts[1], len(model.v_template)
     if found != count:
         raise DataError(
             f"{path} has {found} vertices; expected the {count} of {MODEL_NAMES[kind]}, "
-            "by whose numbers landmarks go: get the model from its own site"
+            "whose numbers the landmarks use: get the model from its own site"
         )
 
 
@@ -110,7 +107,7 @@ def landmarks_of(
 ) -> tuple[Float, Float]:
     """MediaPipe's 33 landmarks ``p [F, 33, 3]`` (NaN = unknown) and ``conf [F, 33]``.
 
-    Only the vertices that landmarks lie on are posed: some 0.1 ms a frame in place of 10.
+    Only the vertices that landmarks lie on are posed: about 0.1 ms per frame instead of 10.
     """
     small, vertices = _only(model, landmark_vertices(model.kind))
     p, conf = [], []
@@ -162,9 +159,9 @@ def parameter(content: Any, key: str, sizes: tuple[int, ...], where: str) -> Flo
     """One frame's parameter as finite numbers, flat.
 
     Args:
-        content: what the file holds.
+        content: of the file.
         key: of the parameter.
-        sizes: numbers it may have.
+        sizes: allowed lengths.
         where: the file, for messages.
 
     Raises:
@@ -174,13 +171,57 @@ def parameter(content: Any, key: str, sizes: tuple[int, ...], where: str) -> Flo
     if not isinstance(content, Mapping) or key not in content:
         held = ", ".join(map(str, content)) if isinstance(content, Mapping) else "something else"
         raise DataError(f"{where} has no '{key}'; expected {expected} numbers, found {held[:120]}")
-    try:
-        values = np.asarray(content[key], np.float64).reshape(-1)
-    except (TypeError, ValueError, OverflowError):
-        values = np.full(0, np.nan)
+    values = as_floats(content[key]).reshape(-1)
     if len(values) not in sizes:
         found = getattr(content[key], "shape", type(content[key]).__name__)
         raise DataError(f"{where}: '{key}' must hold {expected} numbers, found {found}")
     if not np.isfinite(values).all():
         raise DataError(f"{where}: '{key}' must hold finite numbers, found NaN or infinity")
     return values
+
+
+def zju_motion(
+    entries: Mapping[int, tuple[str, Any]], model: SkinnedModel, notes: list[str]
+) -> Motion:
+    """A motion from ZJU-MoCap's parameters, which EasyMocap writes too.
+
+    Convention: the files' pose is ``R(Rh) x + Th`` of the body with an unrotated root, about the
+    model's origin (`gsgan.body.smpl.from_zju`); metres.
+
+    Args:
+        entries: by frame, a name for messages and ``poses`` (72, or 69 without the root),
+            ``shapes`` (10), ``Rh`` (3), ``Th`` (3).
+        model: SMPL.
+        notes: gains a sentence when the shape changes between frames.
+
+    Raises:
+        DataError: when a parameter is missing, of another length, not finite, or the root turns.
+    """
+    rows = []
+    for where, content in entries.values():
+        poses = parameter(content, "poses", ZJU_POSES, where)
+        poses = np.concatenate([np.zeros(ZJU_POSES[0] - len(poses)), poses])
+        refuse_root(poses, where)
+        sizes = {"shapes": ZJU_SHAPES, "Rh": 3, "Th": 3}
+        rows.append([poses, *(parameter(content, key, (n,), where) for key, n in sizes.items())])
+    poses, shapes, Rh, Th = (np.stack(column) for column in zip(*rows, strict=True))
+    shape = one_shape(shapes, notes)[: model.shapedirs.shape[-1]]
+    J0 = model.rest_joints(torch.from_numpy(shape[None]))[0, 0].numpy()
+    theta = poses.reshape(len(rows), -1, 3).copy()
+    theta[:, 0], transl = from_zju(Rh, Th, J0)
+    ids = np.array(list(entries), np.int64)
+    return Motion(ids, theta, transl, np.repeat(shape[None], len(ids), axis=0))
+
+
+def refuse_root(poses: Float, where: str) -> None:
+    """Refuses a pose ``[72]`` that turns the root, which Rh does in ZJU-MoCap's convention.
+
+    Raises:
+        DataError: naming the file.
+    """
+    turn = float(np.abs(poses[:3]).max())
+    if turn > ROOT_TOLERANCE:
+        raise DataError(
+            f"{where}: the first 3 numbers of 'poses' must be 0, found up to {turn:.3g}; "
+            "the root's rotation belongs in Rh"
+        )

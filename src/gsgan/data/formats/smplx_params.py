@@ -1,4 +1,4 @@
-"""SMPL-X parameters of a whole take in one npz, as THuman4.0 and AvatarReX hold them.
+"""SMPL-X parameters of a whole sequence in one npz, as in THuman4.0 and AvatarReX.
 
 Convention: metres, axis-angle; row i is frame i; the first row of betas is the subject's. Hands are
 full rotations away from the flat hand (``use_pca=False, flat_hand_mean=True`` in smplx's terms).
@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from gsgan.body.smpl import SkinnedModel
 from gsgan.data.checks import spans
 from gsgan.data.formats.smpl_motion import Motion
+from gsgan.utils.arrays import as_floats
 from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_npz
 
 Float = NDArray[np.float64]
 
-# In the order of SMPL-X's joints: numbers a frame of each.
+# In the order of SMPL-X's joints: numbers per frame of each.
 POSES = {
     "global_orient": 3,
     "body_pose": 63,
@@ -39,13 +40,13 @@ SMPL_BODY = 69
 def read_motion(
     path: Path, frames: Collection[int], model: SkinnedModel, notes: list[str]
 ) -> Motion:
-    """The parameters of the frames that have some, in the model's own convention.
+    """The parameters of the frames that have any, in the model's own convention.
 
     Args:
         path: smpl_params.npz.
-        frames: that have pictures.
+        frames: that have images.
         model: SMPL-X.
-        notes: gains a sentence for each thing left out.
+        notes: gains a sentence for each omission.
 
     Raises:
         DataError: on a damaged file, a missing or misshapen array, or one of SMPL.
@@ -90,17 +91,14 @@ def _pose(arrays: dict[str, Any], key: str, count: int, path: Path) -> Float:
 def _same_count(key: str, found: int, count: int, path: Path) -> None:
     if found != count:
         raise DataError(
-            f"{path}: '{key}' has {found} rows and 'transl' {count}; expected one a frame in both"
+            f"{path}: '{key}' has {found} rows and 'transl' {count}; expected one per frame in both"
         )
 
 
 def _rows(arrays: dict[str, Any], key: str, width: int | None, path: Path) -> Float:
     """``[N, width]`` of an array ``[N, ...]``."""
     raw = arrays[key]
-    try:
-        values = np.asarray(raw, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        values = np.zeros(0)
+    values = as_floats(raw)
     values = (
         values.reshape(len(values), -1) if values.ndim > 1 and values.size else np.zeros((0, 0))
     )
@@ -112,21 +110,21 @@ def _rows(arrays: dict[str, Any], key: str, width: int | None, path: Path) -> Fl
 def _expectation(key: str, width: int | None, found: int, raw: Any) -> str:
     if key == "body_pose" and found == SMPL_BODY:
         return (
-            f"'body_pose' has {SMPL_BODY} numbers a frame, those of SMPL; expected SMPL-X's "
-            f"{width} (21 joints): fit SMPL-X to the take, or use its own smpl_params.npz"
+            f"'body_pose' has {SMPL_BODY} numbers per frame, those of SMPL; expected SMPL-X's "
+            f"{width} (21 joints): fit SMPL-X to the sequence, or use its own smpl_params.npz"
         )
-    wanted = f"(frames, {width or 'any'})"
+    expected = f"(frames, {width or 'any'})"
     shape = getattr(raw, "shape", type(raw).__name__)
     if key in HANDS and 0 < found < POSES[key]:
         return (
-            f"'{key}' has {found} numbers a frame, which look like PCA coefficients; expected "
+            f"'{key}' has {found} numbers per frame, which look like PCA coefficients; expected "
             f"{width} (15 joints, use_pca=False)"
         )
-    return f"'{key}' must hold numbers of shape {wanted}, found {shape}"
+    return f"'{key}' must hold numbers of shape {expected}, found {shape}"
 
 
 def _coefficients(arrays: dict[str, Any], key: str, most: int, path: Path) -> Float:
-    """``[N, n]``, n at most what the model has; further ones must be 0."""
+    """``[N, n]``, n at most the model's number; further ones must be 0."""
     values = _rows(arrays, key, None, path)
     if np.any(values[:, most:] != 0):
         raise DataError(
@@ -139,12 +137,12 @@ def _coefficients(arrays: dict[str, Any], key: str, most: int, path: Path) -> Fl
 def _usable(
     path: Path, frames: Collection[int], values: Float, notes: list[str]
 ) -> NDArray[np.int64]:
-    """Rising numbers of the frames that have pictures and finite numbers."""
+    """Rising numbers of the frames that have images and finite numbers."""
     there = [f for f in sorted(frames) if f < len(values)]
     ids = np.array([f for f in there if np.isfinite(values[f]).all()], np.int64)
     if not len(ids):
         raise DataError(
-            f"{path} has {len(values)} rows, but no finite one of a frame that has pictures; "
+            f"{path} has {len(values)} rows, but no finite one of a frame that has images; "
             "expected row i to be frame i"
         )
     if lost := sorted(set(there) - set(ids.tolist())):

@@ -5,7 +5,7 @@
     calibration.json        {cam00: {K 9, R 9, T 3, imgSize [w, h]}}, metres
     images/cam00/%08d.jpg   masks/cam00/%08d.jpg    matting alphas
     smpl_params.npz         SMPL-X, row i = frame i
-    missing_img_files.txt   pictures to leave out, one a line
+    missing_img_files.txt   images to leave out, one per line
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from gsgan.data.formats.smplx_rig import Places, SmplxRigReader
 class Thuman4Reader(SmplxRigReader):
     """Reads a subject of THuman4.0; settings as `SmplxRigReader`."""
 
+    contents: ClassVar[str] = "calibration.json, smpl_params.npz, images/ and masks/"
     places: ClassVar[Places] = Places(
         layout="THuman4.0",
-        contents="calibration.json, smpl_params.npz, images/ and masks/",
         calibration="calibration.json",
         images="images/{camera}",
         masks="masks/{camera}",

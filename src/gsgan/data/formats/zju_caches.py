@@ -1,4 +1,4 @@
-"""ZJU-MoCap as HumanNeRF and ARAH (3DGS-Avatar) arrange it: caches that hold joints already."""
+"""ZJU-MoCap as HumanNeRF and ARAH (3DGS-Avatar) arrange it: caches that hold joints."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ from gsgan.body.smpl_names import CIHP
 from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, last_number, read_json
-from gsgan.data.formats.common import picture_size, up_axis
-from gsgan.data.formats.smpl_motion import Motion, landmarks_of, one_shape, parameter
-from gsgan.data.formats.zju_params import still_root
+from gsgan.data.formats.common import one_mask_each, picture_size, up_axis
+from gsgan.data.formats.smpl_motion import Motion, landmarks_of, one_shape, parameter, refuse_root
 from gsgan.data.layout import BodyModel, Found, Meta
-from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
+from gsgan.data.pixels import IGNORE_LABEL, PixelRules
 from gsgan.data.skeletons import Landmarks, make_landmarks
 from gsgan.skeleton.smpl import to_mediapipe33
 from gsgan.utils.errors import DataError
@@ -32,8 +31,14 @@ JOINTS = 24
 HUMANNERF_CAMERA = "camera"
 CIHP_TABLE = tuple(i if i < len(CIHP) else IGNORE_LABEL for i in range(256))
 STILL = 1e-6  # by which a camera's numbers may differ between frames
-ARAH_KEYS = (*("betas", "Jtr_posed", "trans", "root_orient", "pose_body", "pose_hand"),)
-SHAPE_TOLERANCE = 1e-4
+ARAH_SIZES = {
+    "root_orient": 3,
+    "pose_body": 63,
+    "pose_hand": 6,
+    "trans": 3,
+    "betas": 10,
+    "Jtr_posed": JOINTS * 3,
+}
 JOINTS_ONLY = "smpl24 joints only -> mediapipe33"
 
 
@@ -42,7 +47,7 @@ def humannerf(
 ) -> Found:
     """One camera's view of a subject, as HumanNeRF prepares it.
 
-    The cache has no body shape, so the SMPL file is of no use to it.
+    The cache has no body shape, so the SMPL file is not used.
 
     Raises:
         DataError: on a damaged file, or a camera that moves.
@@ -51,7 +56,7 @@ def humannerf(
     images = {HUMANNERF_CAMERA: frame_files(root, "images", (".png", ".jpg"))}
     masks = frame_files(root, "masks", (".png", ".jpg"))
     if not images[HUMANNERF_CAMERA]:
-        raise DataError(f"{root / 'images'} holds no pictures; expected frame_000000.png and so on")
+        raise DataError(f"{root / 'images'} holds no images; expected frame_000000.png and so on")
     camera = _still_camera(root, images[HUMANNERF_CAMERA], pixel_centre, checks)
     motion, joints = _mesh_infos(root / "mesh_infos.pkl")
     return Found(
@@ -61,9 +66,8 @@ def humannerf(
         ),
         cameras={HUMANNERF_CAMERA: camera},
         images=images,
-        masks={HUMANNERF_CAMERA: {f: (mask_file("nonzero", p),) for f, p in masks.items()}},
-        mask_folders={HUMANNERF_CAMERA: root / "masks"},
-        labels={},
+        masks=one_mask_each({HUMANNERF_CAMERA: masks}, "nonzero"),
+        mask_folder="masks",
         landmarks=_from_joints(motion.ids, joints, checks, notes, "mesh_infos.pkl"),
         poses=motion.poses("mesh_infos.pkl"),
         pixels=PixelRules(mask_sampling="nearest"),
@@ -87,7 +91,7 @@ def _still_camera(
         first = first or now
         if any(not np.allclose(now[key], first[key], STILL, STILL) for key in first):
             raise DataError(f"{where}: the camera moves; expected the same one in every frame")
-    assert first is not None  # _by_frame saw to it
+    assert first is not None  # _by_frame is not empty
     E = first["extrinsics"].reshape(4, 4)
     return make_camera(
         f"{path}, frame {next(iter(entries))}",
@@ -122,7 +126,7 @@ def _mesh_infos(path: Path) -> tuple[Motion, Float]:
     for frame, entry in entries.items():
         where = f"{path}, frame {frame}"
         rows.append([parameter(entry, key, (size,), where) for key, size in sizes.items()])
-        still_root(rows[-1][0], where)
+        refuse_root(rows[-1][0], where)
     poses, Rh, Th, joints, rest = (np.stack(column) for column in zip(*rows, strict=True))
     R = axis_angle_to_matrix(torch.from_numpy(Rh)).numpy()
     in_world = joints.reshape(-1, JOINTS, 3) @ R.transpose(0, 2, 1) + Th[:, None]
@@ -142,7 +146,7 @@ def _from_joints(
 def arah(
     root: Path, checks: Checks, model: SkinnedModel | None, smpl: Path | None, pixel_centre: float
 ) -> Found:
-    """All cameras of a subject as ARAH prepares them; with a model file, its vertices too.
+    """All cameras of a subject as ARAH prepares them; a model file adds landmarks on vertices.
 
     Raises:
         DataError: on a damaged file, naming it.
@@ -169,8 +173,8 @@ def arah(
         ),
         cameras=cameras,
         images=images,
-        masks={c: {f: (MaskFile("label", p),) for f, p in parts[c].items()} for c in parts},
-        mask_folders={name: root / name for name in cameras},
+        masks=one_mask_each(parts, "label"),
+        mask_folder="{camera}",
         labels=parts,
         landmarks=landmarks,
         poses=motion.poses("models/"),
@@ -196,7 +200,7 @@ def _arah_cameras(
             raise DataError(f"{where}: expected an object with K, R, T and D")
         images[name] = frame_files(root, name, (".jpg", ".jpeg"))
         if not images[name]:
-            raise DataError(f"{root / name} holds no pictures, but {path.name} lists that camera")
+            raise DataError(f"{root / name} holds no images, but {path.name} lists that camera")
         cameras[name] = make_camera(
             where,
             name,
@@ -215,18 +219,15 @@ def _arah_models(root: Path, notes: list[str]) -> tuple[Motion, Float]:
     files = frame_files(root, "models", (".npz",))
     if not files:
         raise DataError(f"{root / 'models'} holds no 000000.npz and so on")
-    sizes = {"root_orient": 3, "pose_body": 63, "pose_hand": 6, "trans": 3}
     rows = []
     for path in files.values():
-        content = read_npz(root / path, ARAH_KEYS)
-        row = [parameter(content, key, (n,), str(root / path)) for key, n in sizes.items()]
-        row += [parameter(content, "betas", (10,), str(root / path))]
-        rows.append([*row, parameter(content, "Jtr_posed", (JOINTS * 3,), str(root / path))])
+        content, where = read_npz(root / path, ARAH_SIZES), str(root / path)
+        rows.append([parameter(content, key, (n,), where) for key, n in ARAH_SIZES.items()])
     root_orient, body, hand, trans, betas, joints = (
         np.stack(column) for column in zip(*rows, strict=True)
     )
     theta = np.concatenate([root_orient, body, hand], axis=1).reshape(-1, JOINTS, 3)
-    shape = one_shape(betas, SHAPE_TOLERANCE, notes)
+    shape = one_shape(betas, notes)
     ids = np.array(list(files), np.int64)
     motion = Motion(ids, theta, trans, np.repeat(shape[None], len(ids), axis=0))
     return motion, joints.reshape(-1, JOINTS, 3)

@@ -1,8 +1,7 @@
-"""A capture as a torch dataset of `Frame`, one camera and one moment an item."""
+"""A capture as a torch dataset of `Frame`, one camera and one moment per item."""
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from cachetools import LRUCache
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
@@ -18,11 +18,13 @@ from gsgan.data import crop as cropping
 from gsgan.data import pixels
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import PersonCrop, Window
+from gsgan.data.files import read_colour
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL
 from gsgan.data.splits import Item
 from gsgan.scene import BodyPose, Camera, Frame
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.checks import whole
+from gsgan.utils.errors import DataError
 
 Bytes = NDArray[np.uint8]
 Lens = Literal["undistort", "ignore", "raw"]
@@ -30,13 +32,13 @@ Lens = Literal["undistort", "ignore", "raw"]
 
 @dataclass(frozen=True)
 class Picture:
-    """Decoded, undistorted, cropped and resized pixels, still bytes: what the cache holds.
+    """Decoded, undistorted, cropped and resized pixels, still bytes, as cached.
 
     Args:
         image: ``[3, H, W]`` RGB on black.
         mask: ``[H, W]`` 0..255.
         labels: ``[H, W]`` part numbers, or None.
-        unsure: ``[H, W]`` 255 where the colours are not to be learned from, or None.
+        unsure: ``[H, W]`` 255 where colours are left out of the loss, or None.
     """
 
     image: Bytes
@@ -51,60 +53,43 @@ class Picture:
         return sum(part.nbytes for part in parts if part is not None)
 
 
-class PictureCache:
-    """The most recently used pictures, within a bound on their bytes.
+class PictureCache(LRUCache[Item, Picture]):
+    """The most recently used images.
 
     Args:
         limit: bytes; 0 keeps nothing.
     """
 
     def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.nbytes = 0
-        self._held: OrderedDict[Item, Picture] = OrderedDict()
+        super().__init__(maxsize=limit)
 
-    def get(self, key: Item) -> Picture | None:
-        """The picture, if it is still held."""
-        if key in self._held:
-            self._held.move_to_end(key)
-        return self._held.get(key)
-
-    def clear(self) -> None:
-        """Lets go of all."""
-        self._held.clear()
-        self.nbytes = 0
-
-    def put(self, key: Item, picture: Picture) -> None:
-        """Holds a picture, letting go of the longest unused ones; too large a one is not held."""
-        if picture.nbytes > self.limit or key in self._held:
-            return
-        self._held[key] = picture
-        self.nbytes += picture.nbytes
-        while self.nbytes > self.limit:
-            self.nbytes -= self._held.popitem(last=False)[1].nbytes
+    @staticmethod
+    def getsizeof(value: Picture) -> int:
+        """Bytes of an image."""
+        return value.nbytes
 
 
 class CaptureDataset(Dataset[Frame]):
     """Items of a capture as `Frame` with batch size 1; collate them with `gsgan.scene.cat`.
 
-    Images are RGB in [0, 1] on black, cut to the window and scaled; K follows. As a rule they are
-    undistorted with K kept, and ``camera.dist`` is None. The window comes from the skeleton and
+    Images are RGB in [0, 1] on black, cut to the window and scaled; K follows. By default they are
+    undistorted with K kept, and ``camera.dist`` is None. The window depends on the skeleton and
     camera alone. Labels keep 255 as "ignore".
 
     Args:
         layout: the capture.
         items: (camera, frame) pairs, as in `Splits.items`.
-        size: side of the square pictures in pixels, or None for the window as it is.
-        crop: None for the full picture, padded to a square when a size is given.
+        size: side of the square images in pixels, or None for the window as it is.
+        crop: None for the full image, padded to a square when a size is given.
         cache: shared between datasets of one layout, size and crop, without an item in two of them;
             None decodes every time.
         skeletons: ``[33, 3]`` by frame, without gaps, see `complete_skeletons`; None takes the
             capture's own, with NaN where a joint was not seen.
-        lens: ``undistort``; ``ignore`` takes pictures as a pinhole's; ``raw`` leaves them as taken
-            and says so in ``camera.dist`` (five coefficients; lenses with more are undistorted).
+        lens: ``undistort``; ``ignore`` treats images as a pinhole's; ``raw`` keeps the
+            distortion, in ``camera.dist`` (five coefficients; lenses with more are undistorted).
 
     Raises:
-        ConfigError: when the size is not a positive number.
+        ConfigError: when the size is not a whole number above 0.
     """
 
     def __init__(
@@ -117,14 +102,12 @@ class CaptureDataset(Dataset[Frame]):
         lens: Lens = "undistort",
         skeletons: Mapping[int, NDArray[np.float64]] | None = None,
     ) -> None:
-        if size is not None and (not isinstance(size, int) or size < 1):
-            raise ConfigError(f"data.size must be a whole number of pixels above 0, got {size!r}")
         self.layout = layout
         self.items = tuple(items)
-        self.size = size
+        self.size = None if size is None else whole("data.size", size, 1)
         self.crop = crop
         self.lens = lens
-        self.cache = cache or PictureCache(0)
+        self.cache = PictureCache(0) if cache is None else cache
         self.skeletons = layout.landmarks.p if skeletons is None else skeletons
         self._indices = {name: i for i, name in enumerate(layout.camera_names)}
 
@@ -138,36 +121,42 @@ class CaptureDataset(Dataset[Frame]):
             DataError: when one of its files is damaged, naming the file.
         """
         name, frame = item = self.items[index]
-        picture = self.cache.get(item)
-        if picture is None:
-            picture = self._load(item)
-            self.cache.put(item, picture)
+        decoded = self.cache.get(item)
+        if decoded is None:
+            decoded = self._load(item)
+            if decoded.nbytes <= self.cache.maxsize:
+                self.cache[item] = decoded
         return Frame(
-            image=_unit(picture.image)[None],
-            mask=_unit(picture.mask)[None, None],
+            image=_unit(decoded.image)[None],
+            mask=_unit(decoded.mask)[None, None],
             camera=self.camera(item),
             skeleton=_float(self.skeletons[frame]),
             visibility=_float(self.layout.landmarks.visibility[frame]),
             frame_id=torch.tensor([frame]),
             camera_index=torch.tensor([self._indices[name]]),
             body=self._body(frame),
-            labels=_labels(picture.labels),
-            unsure=None if picture.unsure is None else _unit(picture.unsure)[None, None],
+            labels=_labels(decoded.labels),
+            unsure=None if decoded.unsure is None else _unit(decoded.unsure)[None, None],
         )
 
     def inside(self, index: int) -> Tensor | None:
-        """``[1, 1, H, W]`` 1 where a pixel of the item lies in what the camera took; None where
-        all do. Windows reach beyond borders, and undistorted pictures have empty rims."""
+        """``[1, 1, H, W]`` 1 where a pixel of the item lies in the stored image; None where all do.
+
+        Windows reach beyond borders, and undistorted images have empty rims.
+        """
         item = self.items[index]
         camera, window = self.layout.cameras[item[0]], self.window(item)
         mapping = self._mapping(camera, window)
         taken = cropping.take(np.full(camera.size, 255, np.uint8), window, mapping, exact=True)
-        size = window.size if self.size is None else (self.size, self.size)
-        taken = cropping.resize(taken, size, exact=True)
+        taken = cropping.resize(taken, self._target(window), exact=True)
         return None if taken.all() else _unit(taken)[None, None]
 
+    def _target(self, window: Window) -> tuple[int, int]:
+        """``(H, W)`` of the images."""
+        return window.size if self.size is None else (self.size, self.size)
+
     def window(self, item: Item) -> Window:
-        """Which part of the (undistorted) picture an item shows."""
+        """Which part of the (undistorted) image an item shows."""
         camera = self.layout.cameras[item[0]]
         if self.crop is not None:
             joints = self.layout.landmarks.p[item[1]]
@@ -180,7 +169,7 @@ class CaptureDataset(Dataset[Frame]):
         return Window(0, 0, camera.size)
 
     def camera(self, item: Item) -> Camera:
-        """The camera of the item's picture: window and scale are in its K."""
+        """The camera of the item's image: window and scale are in its K."""
         window = self.window(item)
         entry = self.layout.cameras[item[0]]
         camera = _camera(entry, self._raw(entry))
@@ -190,11 +179,11 @@ class CaptureDataset(Dataset[Frame]):
         return camera.to(torch.float32)
 
     def _raw(self, camera: CameraEntry) -> bool:
-        """Whether the camera's pictures keep their distortion, and say so."""
+        """Whether the camera's images keep their distortion, with ``camera.dist`` set."""
         return self.lens == "raw" and camera.distorted and not camera.dist[5:].any()
 
     def _mapping(self, camera: CameraEntry, window: Window) -> NDArray[np.float32] | None:
-        """Where the window's pixels lie in the picture as taken; None for a pinhole."""
+        """Where the window's pixels lie in the stored image; None for a pinhole."""
         if not camera.distorted or self.lens == "ignore" or self._raw(camera):
             return None
         return cropping.undistort_map(camera.K, camera.dist, window)
@@ -203,15 +192,15 @@ class CaptureDataset(Dataset[Frame]):
         camera, window = self.layout.cameras[item[0]], self.window(item)
         rules = self.layout.pixels
         mapping = self._mapping(camera, window)
-        size = window.size if self.size is None else (self.size, self.size)
+        size = self._target(window)
 
-        def fit(picture: Bytes, exact: bool) -> Bytes:
-            return cropping.resize(cropping.take(picture, window, mapping, exact), size, exact)
+        def fit(image: Bytes, exact: bool) -> Bytes:
+            return cropping.resize(cropping.take(image, window, mapping, exact), size, exact)
 
         mask_files = self.layout.mask_files(*item)
         mask = pixels.read_mask(mask_files, rules)
         unsure = pixels.read_unsure(mask_files, mask, rules)
-        image = pixels.read_image(self.layout.image_path(*item), rules)
+        image = read_colour(self.layout.image_path(*item))
         self._check_size(self.layout.image_path(*item), image, camera)
         self._check_size(self.layout.mask_path(*item), mask, camera)
         # Blacked out before anything is interpolated, so that no background bleeds in.
@@ -225,10 +214,10 @@ class CaptureDataset(Dataset[Frame]):
         return Picture(np.ascontiguousarray(image.transpose(2, 0, 1)), mask, labels, unsure)
 
     @staticmethod
-    def _check_size(path: Path, picture: Bytes, camera: CameraEntry) -> None:
-        """Headers are checked before anything starts, but not all where there are very many."""
-        if picture.shape[:2] != camera.size:
-            h, w = picture.shape[:2]
+    def _check_size(path: Path, image: Bytes, camera: CameraEntry) -> None:
+        """Only some headers are checked at the start, see `Checks.header_stride`."""
+        if image.shape[:2] != camera.size:
+            h, w = image.shape[:2]
             raise DataError(
                 f"{path} is {w}x{h} pixels (width x height), but camera {camera.name} has "
                 f"{camera.size[1]}x{camera.size[0]}; scale one of them so that they agree"
