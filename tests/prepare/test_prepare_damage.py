@@ -20,14 +20,13 @@ from test_prepare_points3d import write_trc
 import gsgan.prepare.mediapipe as tool
 from gsgan.data.calibration import read_calibration
 from gsgan.data.joints import BODY
+from gsgan.data.layout import Layout
+from gsgan.prepare.dataset import publish
 from gsgan.prepare.doubts import Doubts, doubts_about_pictures
-from gsgan.prepare.landmarks import read_detections
-from gsgan.prepare.masks import MaskTidying, check_values
+from gsgan.prepare.landmarks import read_detections, read_points3d
 from gsgan.prepare.options import Options
-from gsgan.prepare.pictures import PictureFiles, Written, write_pictures
-from gsgan.prepare.points3d import read_points3d
+from gsgan.prepare.pictures import MaskTidying, PictureFiles, Written, check_values, write_pictures
 from gsgan.prepare.rig import undistort_points
-from gsgan.prepare.run import _publish
 from gsgan.prepare.sources import Source
 from gsgan.prepare.work import Work
 from gsgan.utils.errors import ConfigError, DataError, GsganError
@@ -72,7 +71,7 @@ def test_short_videos_and_empty_masks_are_doubted(tmp_path: Path):
         cv2.imwrite(str(masks[n]), np.full((4, 6), 255 * (n > 0), np.uint8))
     source = Source("cam0", tmp_path, (4, 6), 30.0, files, 7)
     given = (tmp_path, camera, source, masks)
-    rest = (0, PictureFiles(), MaskTidying(), lambda: None)
+    rest = (0, PictureFiles(), MaskTidying(), lambda *_: None)
     whole = Written([0, 1, 2, 3], empty=1, decoded=4)
     assert write_pictures(*given, range(9), *rest) == whole
     assert write_pictures(*given, range(9), *rest) == whole  # all there already
@@ -199,8 +198,9 @@ def test_an_old_dataset_stays_when_the_new_one_cannot_take_its_place(tmp_path: P
         replace(start, end)
 
     monkeypatch.setattr(os, "replace", failing)
+    monkeypatch.setattr(Layout, "read", lambda _: None)
     with pytest.raises(DataError, match="cannot be written"):
-        _publish(new, out)
+        publish(new, out)
     assert (out / "out").is_file()
 
 

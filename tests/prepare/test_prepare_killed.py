@@ -15,10 +15,9 @@ from capture_scenes import write_project
 from rich.console import Console
 
 from gsgan.data.layout import Layout
-from gsgan.prepare.inputs import in_parallel
 from gsgan.prepare.options import Options
-from gsgan.prepare.progress import Bars
 from gsgan.prepare.run import prepare
+from gsgan.prepare.work import each_camera
 
 LIMIT = 120  # seconds after which the child is taken to hang
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork, no child to kill")
@@ -117,18 +116,17 @@ def test_an_earlier_dataset_outlives_a_kill(
 
 def test_one_failure_or_an_interrupt_stops_the_other_cameras_at_their_next_picture() -> None:
     steps: list[int] = []
-    with Bars("working", ["a", "b", "c"]) as bars:
 
-        def work(index: int) -> None:
-            if index == 0:
-                while not steps:
-                    time.sleep(0.001)
-                raise KeyboardInterrupt
-            for step in range(10**6):
-                bars.advance("b")
-                steps.append(step)
+    def work(name: str, report: Callable[[int, int], None]) -> None:
+        if name == "a":
+            while not steps:
                 time.sleep(0.001)
+            raise KeyboardInterrupt
+        for step in range(10**6):
+            report(step, 10**6)
+            steps.append(step)
+            time.sleep(0.001)
 
-        with pytest.raises(KeyboardInterrupt):
-            in_parallel(work, range(3), 2, bars.stop)
+    with pytest.raises(KeyboardInterrupt):
+        each_camera(work, "working", ["a", "b", "c"], 2)
     assert 0 < len(steps) < 10**4

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from capture_scenes import ring
 
-from gsgan.prepare.pairing import fit_size, pair_cameras
+from gsgan.prepare.sources import fit_size, pair_cameras
 from gsgan.utils.errors import DataError
 
 

@@ -10,7 +10,7 @@ import pytest
 from make import skeletons
 
 from gsgan.data.joints import SETS
-from gsgan.prepare.points3d import read_points3d, without_frozen
+from gsgan.prepare.landmarks import read_points3d, without_frozen
 from gsgan.utils.errors import DataError
 
 MARKERS = {
@@ -84,7 +84,7 @@ def test_last_values_of_gap_filling_are_taken_out():
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        (lambda text: "hello", "no .trc file"),
+        (lambda text: "hello", "not a .trc file"),
         (lambda text: text.replace("\tm\n", "\tfeet\n"), "Units is 'feet'"),
         (lambda text: text.replace("1.58", "x.yz"), "holds no numbers"),
         (lambda text: text.replace("Shoulder", "Sh").replace("Hip", "H"), "no shoulders and hips"),

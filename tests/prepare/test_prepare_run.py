@@ -126,7 +126,7 @@ def test_a_killed_run_leaves_no_dataset_and_goes_on_where_it_was(project: Path, 
         prepare(options(project, workers=1), quiet())
     assert not (project.parent / "out").exists()
     monkeypatch.setattr(pictures, "_write", lambda *a: (written.append(a[0]), write(*a)))
-    monkeypatch.setattr("gsgan.prepare.solving.solve", None)  # found again, not solved again
+    monkeypatch.setattr("gsgan.prepare.run.solve", None)  # found again, not solved again
     out = prepare(options(project, workers=1), quiet())
     assert len(written) == len(set(written)) == 2 * CAMERAS * FRAMES
     assert len(Layout.read(out).frames) == FRAMES
@@ -180,14 +180,14 @@ def no_detections(project: Path) -> None:
     [
         (lambda p: None, {"unit": "mm"}, r"cameras\.json: cameras stand 0\.003 m .* unit=mm"),
         (in_centimetres, {}, r"cameras\.json: cameras stand 3\d\d m .* unit=mm, cm or m"),
-        (lambda p: None, {"source": "nowhere"}, r"nowhere is no folder"),
+        (lambda p: None, {"source": "nowhere"}, r"nowhere is not a folder"),
         (lambda p: (p / "cameras.json").unlink(), {}, "holds no calibration"),
         (lambda p: (p / "pose" / "cam01.npz").unlink(), {}, "no landmarks of the camera cam01"),
         (lambda p: (p / "pose" / "cam01.npz").write_bytes(b"PK"), {}, r"cam01\.npz"),
         (lambda p: (p / "videos" / "cam01.avi").write_bytes(b"RIFF"), {}, r"cam01\.avi"),
         (lambda p: (p / "masks" / "cam00" / "000001.png").write_bytes(b"x"), {}, r"000001\.png"),
         (no_detections, {}, "no body joint of any frame came out in 3D"),
-        (lambda p: None, {"frames": "90-99"}, "no frame is left"),
+        (lambda p: None, {"frames": "90-99"}, "frames=90-99 leaves no frame"),
         (lambda p: None, {"cameras": {"cam00": "cam01"}}, "more than one video"),
         (lambda p: None, {"unit": "inch"}, "unit must be one of"),
         (lambda p: None, {"source": None}, "give source="),
@@ -284,7 +284,7 @@ def test_the_tool_is_run_once_a_camera(project: Path, monkeypatch):
     out = prepare(given, quiet())
     assert len(Layout.read(out).frames) == FRAMES
     calls = []
-    monkeypatch.setattr("gsgan.prepare.inputs.detect", lambda *a, **k: calls.append(a))
+    monkeypatch.setattr("gsgan.prepare.mediapipe._detect", lambda *a, **k: calls.append(a))
     smoother = {"pictures": pictures.PictureFiles(scale=0.5), "overwrite": True}
     prepare(Options(**(vars(given) | smoother)), quiet())
     assert calls == []

@@ -8,13 +8,11 @@ from capture_scenes import LENS, ring, seen, turned
 from make import distorted_pixels, skeletons
 
 from gsgan.data.joints import flip_groups
-from gsgan.prepare.cleanse import Cleansing, cleanse
-from gsgan.prepare.desync import clock_errors
+from gsgan.prepare.cleanse import Cleansing, cleanse, smooth
 from gsgan.prepare.flips import FlipSearch, apply_flips, find_flips
 from gsgan.prepare.refine import Refinement, camera_moves, refine_rig
 from gsgan.prepare.rig import Rig, undistort_points
-from gsgan.prepare.smooth import smooth
-from gsgan.prepare.solve import Settings, Solution, solve, stage_medians
+from gsgan.prepare.solve import Settings, Solution, clock_errors, solve, stage_medians
 from gsgan.prepare.triangulate import Triangulation, linear_points
 from gsgan.utils.errors import ConfigError
 

@@ -26,7 +26,7 @@ from gsgan.fit.moments import Moments, make_fitter
 from gsgan.fit.picture import fit_picture
 from gsgan.fit.settings import Fit
 from gsgan.prepare.dataset import write_npz
-from gsgan.prepare.writing import writing
+from gsgan.prepare.work import writing
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.console import make_console
 from gsgan.utils.devices import pick_device

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -13,6 +14,7 @@ from gsgan.prepare.rig import Float, Rig, known
 from gsgan.prepare.triangulate import MIN_VIEWS
 from gsgan.utils.errors import ConfigError
 
+Ints = NDArray[np.int64]
 SETTLED = 1e-7  # relative change of the cost at which the search ends
 LEAST_SQUARE = 1e-12  # square pixels: keeps the residual's scaling finite at an error of 0
 
@@ -74,9 +76,7 @@ def refine_rig(
 
     def rig_at(x: Float) -> Rig:
         turn, move = np.moveaxis(x[:cameras].reshape(-1, 2, 3), 1, 0)
-        return replace(
-            start, R=Rotation.from_rotvec(turn).as_matrix() @ start.R, t=start.t + move
-        )
+        return replace(start, R=Rotation.from_rotvec(turn).as_matrix() @ start.R, t=start.t + move)
 
     def priors(rig: Rig) -> Float:
         turned = _turns(given, rig) / np.radians(settings.rotation_prior)
@@ -109,7 +109,7 @@ def _similar(rig: Rig, x: Float) -> Rig:
     return replace(rig, R=R, t=-np.einsum("cij,cj->ci", R, centres))
 
 
-def _sparsity(camera: Float, point: Float, cameras: int, points: int) -> sparse.csr_matrix:
+def _sparsity(camera: Ints, point: Ints, cameras: int, points: int) -> sparse.csr_matrix:
     """Which parameters each residual depends on: its camera's 6 and its point's 3."""
     at_camera = 6 * camera[:, None] + np.arange(6)
     at_point = 6 * cameras + 3 * point[:, None] + np.arange(3)
