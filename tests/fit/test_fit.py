@@ -257,7 +257,7 @@ def test_a_stopped_fit_goes_on_to_the_same_end(fit, monkeypatch, tmp_path, capsy
     monkeypatch.setattr(Fitter, "sweep", sweep)
     capsys.readouterr()
     again = fit(name="again.npz")
-    assert "going on after 2 of 3 sweeps" in capsys.readouterr().out
+    assert "resuming after 2 of 3 sweeps" in capsys.readouterr().out
     np.testing.assert_array_equal(whole["p"], again["p"])
     assert not list(tmp_path.glob(".*fitting"))
 
@@ -272,7 +272,7 @@ def test_a_stopped_fit_does_not_go_on_with_other_masks(fit, people, monkeypatch,
     cv2.imwrite(str(file), cv2.dilate(cv2.imread(str(file), 0), np.ones((3, 3), np.uint8)))
     capsys.readouterr()
     fit("overwrite=true", root=other)
-    assert "starting anew" in capsys.readouterr().out
+    assert "starting again" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("left", ["other settings", "damage"])
@@ -286,7 +286,7 @@ def test_what_does_not_fit_is_not_gone_on_from(fit, monkeypatch, tmp_path, capsy
             fit("fit.prior=0.5", name="again.npz")
         monkeypatch.undo()
     again = fit("overwrite=true", name="again.npz")
-    assert "starting anew" in capsys.readouterr().out
+    assert "starting again" in capsys.readouterr().out
     np.testing.assert_array_equal(whole["p"], again["p"])
 
 

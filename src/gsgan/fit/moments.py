@@ -1,4 +1,4 @@
-"""The frames of a capture as the fit sees them."""
+"""The frames of a capture that the fit uses, with their images."""
 
 from __future__ import annotations
 
@@ -11,30 +11,29 @@ from numpy.typing import NDArray
 
 from gsgan.data.capture import CaptureDataset, PictureCache
 from gsgan.data.datamodule import GsganData
-from gsgan.fit.fitter import Fitter, around
-from gsgan.fit.settings import Fit
+from gsgan.fit.fitter import Fit, Fitter, around
 from gsgan.fit.shape import RigidShape
 from gsgan.scene import Frame
 from gsgan.skeleton import limb_length_sum
 from gsgan.utils.errors import DataError
 
-USUAL = 0.75  # quantile of the masks' areas that counts as usual: crumbs may be the most
+USUAL = 0.75  # quantile of the masks' areas that counts as usual: most may be nearly empty
 
 
 class Moments:
-    """The frames of a capture and their pictures by the cameras that train.
+    """The frames of a capture and their images by the training cameras.
 
-    Held-out cameras are not looked at: what they saw is for scoring only. Pictures without a
-    person, or nearly so, are left out, and frames that have none left.
+    Held-out cameras are not used: their images are for evaluation only. Images without a person, or
+    nearly so, are left out, and frames without any other image.
 
     Args:
         data: the capture.
-        device: the pictures go there.
+        device: of the images.
         least_mask: see `Fit`.
-        advance: called after each picture is looked at.
+        advance: called after each image is read.
 
     Raises:
-        DataError: when no picture is left.
+        DataError: when no image is left.
     """
 
     def __init__(
@@ -63,12 +62,11 @@ class Moments:
         self._places: dict[int, list[int]] = {frame: [] for frame in self.frames}
         for place in places:
             self._places[items[place][1]].append(place)
-        marks = layout.landmarks
-        self.skeletons = self._stacked(marks.p)
-        self.visibility = self._stacked(marks.visibility)
+        self.skeletons = self._stacked(layout.landmarks.p)
+        self.visibility = self._stacked(layout.landmarks.visibility)
 
     def pictures(self, i: int) -> list[Frame]:
-        """The pictures of the i-th frame, one a camera; ``unsure`` beyond the camera's border."""
+        """The images of the i-th frame, one per camera; ``unsure`` outside the camera's image."""
         return [self._picture(place) for place in self._places[self.frames[i]]]
 
     def _picture(self, place: int) -> Frame:
@@ -81,10 +79,10 @@ class Moments:
         return frame.to(self.device)
 
     def _usable(self, least: float, advance: Callable[[], None]) -> list[int]:
-        """Places of the pictures whose masks hold enough of the person; finds borders by the way.
+        """Positions of the images whose masks hold enough of the person; also finds borders.
 
-        Counted is what the fit compares, in square metres at the person: a mask shrinks with the
-        distance, and another person's lies elsewhere.
+        Areas are of the compared part, in square metres at the person: a mask shrinks with the
+        distance, and other persons are elsewhere in the image.
         """
         areas = []
         for place in range(len(self.dataset)):
@@ -110,14 +108,8 @@ class Moments:
 def make_fitter(
     settings: Fit, moments: Moments, seed: int = 0, start: torch.Tensor | None = None
 ) -> Fitter:
-    """The fit before its first step.
-
-    Args:
-        start: ``[F, J, 3]`` metres, skeletons in place of the capture's own.
-    """
+    """The fit before its first step, from ``start [F, J, 3]`` metres or the capture's skeletons."""
     start = moments.skeletons if start is None else start
     limb_sum = float(limb_length_sum(start, moments.visibility > 0).nanmedian())
-    shape = RigidShape(settings.densify, limb_sum, settings.accuracy)
-    return Fitter(
-        shape.to(moments.device), start, moments.visibility, moments.pictures, settings, seed
-    )
+    shape = RigidShape(settings.densify, limb_sum, settings.accuracy).to(moments.device)
+    return Fitter(shape, start, moments.visibility, moments.pictures, settings, seed)
