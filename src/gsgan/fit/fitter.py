@@ -28,24 +28,10 @@ ABOVE_ZERO = {"least_mask", "sweeps", "cameras", "noise", "joint_rate", "shape_r
 
 @dataclass(frozen=True)
 class Fit:
-    """Settings of the fit; docs/data.md measures what most of them give and cost.
-
-    Args:
-        densify: skeleton to points.
-        accuracy: the rasteriser's settings.
-        least_mask: images with a smaller share of the usual mask area are left out.
-        shape_steps: steps on the shape alone, before joints move.
-        sweeps: passes over all frames; each moves every frame's joints once, and the shape.
-        cameras: most cameras per step, drawn at random.
-        noise: metres, standard deviation of a landmark: the unit of the two priors.
-        prior: weight of the joints' mean squared displacement.
-        bones: weight of the limbs' mean squared difference from their median lengths.
-        joint_rate: Adam's learning rate of the joints, metres.
-        shape_rate: Adam's learning rate of the shape.
-        hold: share of the sweeps before the learning rates fall.
+    """Settings of the fit, see conf/fit/standard.yaml; docs/data.md has measurements.
 
     Raises:
-        ConfigError: on a value out of its range.
+        ConfigError: when a value is out of its range.
     """
 
     densify: Densify

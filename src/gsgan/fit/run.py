@@ -15,7 +15,6 @@ from hydra.utils import instantiate
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsgan import __version__
 from gsgan.data.datamodule import GsganData
@@ -25,7 +24,7 @@ from gsgan.fit.fitter import Agreement, Fit, Fitter
 from gsgan.fit.moments import Moments, make_fitter
 from gsgan.fit.picture import fit_picture
 from gsgan.prepare.dataset import write_npz
-from gsgan.prepare.work import writing
+from gsgan.prepare.work import progress, writing
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.console import make_console
 from gsgan.utils.devices import pick_device
@@ -62,7 +61,7 @@ def run_fit(config: DictConfig) -> Path:
         raise ConfigError(f"out={config.out} holds the landmarks themselves; give another name")
     original = read_arrays(source, ("p", "conf", "frame_id", "fitted_to"))
     device = pick_device(config.device)
-    with _bars(console) as bars:
+    with progress(console) as bars:
         task = bars.add_task("masks", total=None)
         moments = Moments(data, device, settings.least_mask, lambda: bars.advance(task))
     notes = []
@@ -92,11 +91,6 @@ def run_fit(config: DictConfig) -> Path:
 def _print(console: Console, lines: list[str]) -> None:
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
-
-
-def _bars(console: Console) -> Progress:
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    return Progress(*columns, TimeRemainingColumn(), console=console, transient=True)
 
 
 def _out(config: DictConfig) -> Path:
@@ -161,7 +155,7 @@ def _resumed(
 def _work(fitter: Fitter, partial: Path, key: str, console: Console) -> None:
     """All remaining steps; the state is saved after each sweep."""
     settings, frames = fitter.settings, len(fitter.start)
-    with _bars(console) as bars:
+    with progress(console) as bars:
         task = bars.add_task("shape", total=settings.shape_steps, completed=fitter.shaped)
         while fitter.shaped < settings.shape_steps:
             fitter.shape_step()

@@ -23,15 +23,10 @@ REACH = 3  # standard deviations at which the smoothing kernel ends
 
 @dataclass(frozen=True)
 class Cleansing:
-    """What counts as impossible.
-
-    Args:
-        max_reach: metres from the median joint of the frame.
-        bone: share by which a bone may differ from its median length, 0.3 = 30 %.
-        hand_bone: the same for the palm's bones, which are short and less certain.
+    """What counts as impossible, see conf/prepare.yaml.
 
     Raises:
-        ConfigError: when a value is not positive.
+        ConfigError: when a value is out of its range.
     """
 
     max_reach: float = 1.5
@@ -46,14 +41,10 @@ class Cleansing:
 
 @dataclass(frozen=True)
 class Smoothing:
-    """How trajectories are smoothed.
-
-    Args:
-        seconds: standard deviation of the Gaussian that weighs neighbouring frames; 0 leaves the
-            points as triangulated.
+    """How trajectories are smoothed, see conf/prepare.yaml.
 
     Raises:
-        ConfigError: when it is negative.
+        ConfigError: when a value is out of its range.
     """
 
     seconds: float = 0.02

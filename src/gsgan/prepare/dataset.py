@@ -7,17 +7,19 @@ import io
 import json
 import os
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import gsgan
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.joints import BODY, hand_names
 from gsgan.data.layout import Layout
-from gsgan.prepare.pictures import PictureFiles
+from gsgan.prepare.inputs import Inputs
+from gsgan.prepare.options import Options
 from gsgan.prepare.rig import Float, known
 from gsgan.prepare.solve import Solution
 from gsgan.prepare.work import writing
@@ -26,6 +28,7 @@ from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_atomically
 
 GENERATOR = "gsgan.prepare"
+Frames = NDArray[np.int64]
 
 
 def is_there(out: Path, key: str, overwrite: bool) -> bool:
@@ -79,34 +82,25 @@ def publish(root: Path, out: Path) -> None:
 
 
 def write_small_files(
-    root: Path,
-    *,
-    cameras: Sequence[CameraEntry],
-    files: PictureFiles,
-    frames: Sequence[int],
-    solution: Solution,
-    fps: float,
-    up_axis: str | None,
-    key: str,
+    root: Path, options: Options, inputs: Inputs, frames: Frames, solution: Solution, key: str
 ) -> list[CameraEntry]:
     """cameras.json, landmarks3d.npz, hands3d.npz, landmarks2d/, meta.json.
 
     Args:
         root: the dataset.
-        cameras: refined, of the images as taken.
-        files: how the images are written.
+        options: how images are written, and the world's up axis.
+        inputs: cameras and frame rate.
         frames: ``[F]`` numbers.
-        solution: all ``F`` frames.
-        fps: frames per second.
-        up_axis: of the world; None for the axis along which the person stands.
+        solution: of these frames.
         key: of the inputs and settings, see `is_there`.
 
     Returns:
         The cameras of the written images.
     """
+    files, cameras = options.pictures, solution.rig.entries(inputs.cameras)
     written = [files.camera(camera) for camera in cameras]
     write_json(root / "cameras.json", {camera.name: _camera(camera) for camera in written})
-    frame_id, p, conf = np.array(frames, np.int64), solution.p, solution.conf
+    p, conf = solution.p, solution.conf
     error = solution.error[:, :, :BODY] * files.scale
     seen = np.isfinite(error)
     mean = np.where(seen, error, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
@@ -116,7 +110,7 @@ def write_small_files(
         conf=conf[:, :BODY].astype(np.float32),
         reproj_px=np.where(seen.any(0), mean, np.nan).astype(np.float32),
         n_views=solution.views[:, :BODY].astype(np.int16),
-        frame_id=frame_id,
+        frame_id=frames,
         names=np.array(MEDIAPIPE33.names),
         edges=np.array(MEDIAPIPE33.edges),
     )
@@ -125,7 +119,7 @@ def write_small_files(
             root / "hands3d.npz",
             p=p[:, BODY:].astype(np.float32),
             conf=conf[:, BODY:].astype(np.float32),
-            frame_id=frame_id,
+            frame_id=frames,
             names=np.array(hand_names()),
         )
     for c, camera in enumerate(cameras) if solution.seen.any() else ():
@@ -134,13 +128,13 @@ def write_small_files(
             root / "landmarks2d" / f"{camera.name}.npz",
             p=(solution.uv[c, :, :BODY] * ratio).astype(np.float32),
             conf=solution.seen[c, :, :BODY].astype(np.float32),
-            frame_id=frame_id,
+            frame_id=frames,
             undistorted=np.array(True),
         )
     meta = {
-        "fps": fps,
+        "fps": inputs.fps,
         "unit": "m",
-        "up_axis": up_axis or standing_axis(p),
+        "up_axis": options.up_axis or standing_axis(p),
         "skeleton": "mediapipe33",
         "pixel_centre": 0.5,
         "made_by": {"generator": GENERATOR, "version": gsgan.__version__, "key": key},

@@ -17,13 +17,7 @@ Pairs = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True)
 class FlipSearch:
-    """How swapped sides are found.
-
-    Args:
-        enabled: whether to look for them at all.
-        gain: mean loss per detection (0.7 is an error of ``scale``) that swapping a camera's left
-            and right must save.
-        iterations: of reweighting during the search; fewer than the final triangulation needs.
+    """How swapped sides are found, see conf/prepare.yaml.
 
     Raises:
         ConfigError: when a value is out of its range.

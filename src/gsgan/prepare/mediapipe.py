@@ -24,15 +24,7 @@ READY = ".ready"  # written last: an environment without it is incomplete
 
 @dataclass(frozen=True)
 class MediaPipe:
-    """The landmark tool and its environment.
-
-    Args:
-        folder: of the environment; None for one in the user's cache.
-        python: that creates it, 3.11 or 3.12; None for this one, or one on the PATH.
-        threads: processors that one camera's detector may use; 0 for all.
-        confidence: lowest score of a person to be found.
-        tracking: lowest score of a person to be tracked to the next image.
-        margin: of the mask's crop beyond the joints, as a share of the person's height.
+    """The landmark tool and its environment, see conf/prepare.yaml.
 
     Raises:
         ConfigError: when a value is out of its range.
@@ -60,15 +52,10 @@ class MediaPipe:
         return cache_root() / "tools" / "mediapipe-0.10.21"
 
     @property
-    def key(self) -> dict[str, object]:
+    def key(self) -> list[object]:
         """What the detections depend on."""
-        return {
-            "script": SCRIPT.read_text(),
-            "requirements": REQUIREMENTS.read_text(),
-            "confidence": self.confidence,
-            "tracking": self.tracking,
-            "margin": self.margin,
-        }
+        tool = SCRIPT.read_text(), REQUIREMENTS.read_text()
+        return [*tool, self.confidence, self.tracking, self.margin]
 
 
 def run_tool(

@@ -22,11 +22,7 @@ FREE = ("out", "setup", "workers", "overwrite", "keep_work")  # do not change th
 
 @dataclass(frozen=True)
 class Overlays:
-    """Images in the report.
-
-    Args:
-        frames: sampled, evenly; 0 for none.
-        size: pixels, side of each square.
+    """Images in the report, see conf/prepare.yaml.
 
     Raises:
         ConfigError: when a value is out of its range.

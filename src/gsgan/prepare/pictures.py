@@ -26,15 +26,10 @@ PERSON = 128  # alpha that at least one pixel of them must have
 
 @dataclass(frozen=True)
 class MaskTidying:
-    """How a mask becomes the person's alpha.
-
-    Args:
-        levels: alpha in [0, 1]; below the first becomes 0, above the second 1, between them a ramp:
-            removes the haze that networks leave around the person. [0, 1] leaves masks unchanged.
-        least_blob: pieces smaller than this share of the largest one are removed; 0 keeps all.
+    """How a mask becomes the person's alpha, see conf/prepare.yaml.
 
     Raises:
-        ConfigError: when the levels do not rise within [0, 1], or the share is not in [0, 1].
+        ConfigError: when a value is out of its range.
     """
 
     levels: tuple[float, float] = (0.3, 0.8)
@@ -49,13 +44,7 @@ class MaskTidying:
 
 @dataclass(frozen=True)
 class PictureFiles:
-    """How images are written.
-
-    Args:
-        scale: size of the written images, 0.5 = half.
-        format: "jpg" or "png" of the images; masks are always PNG.
-        quality: of JPEG, 1..100.
-        png_compression: 0..9 of masks and PNG images; higher is smaller and slower.
+    """How images and masks are written, see conf/prepare.yaml.
 
     Raises:
         ConfigError: when a value is out of its range.

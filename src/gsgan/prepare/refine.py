@@ -21,18 +21,10 @@ LEAST_SQUARE = 1e-12  # square pixels: keeps the residual's scaling finite at an
 
 @dataclass(frozen=True)
 class Refinement:
-    """How far camera poses may follow the landmarks.
+    """How far camera poses may follow the landmarks, see conf/prepare.yaml.
 
     Landmarks cannot determine the world's origin, orientation or scale; the two priors fix them by
     the least change of the given calibration.
-
-    Args:
-        rounds: of refinement and new triangulation; 0 keeps the given calibration.
-        steps: of the optimiser per round.
-        frames: at most so many, evenly spaced, are used.
-        scale: error at which a detection counts half, in thousandths of the focal length.
-        rotation_prior: standard deviation of the calibration's rotations, degrees.
-        position_prior: standard deviation of the calibration's positions, metres.
 
     Raises:
         ConfigError: when a value is out of its range.

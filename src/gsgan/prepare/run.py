@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from gsgan.data.cameras import CameraEntry
 from gsgan.data.joints import BODY
 from gsgan.data.splits import parse_frames
-from gsgan.prepare.dataset import is_there, publish, write_small_files
+from gsgan.prepare.dataset import Frames, is_there, publish, write_small_files
 from gsgan.prepare.doubts import (
     check_distance,
     doubts_about_detections,
@@ -35,8 +34,6 @@ from gsgan.prepare.work import Work, digest, each_camera
 from gsgan.utils.errors import DataError
 
 STAGE_VERSION = 2  # incremented when the same settings begin to give another result
-
-Frames = NDArray[np.int64]
 
 
 def prepare(options: Options, console: Console) -> Path:
@@ -61,19 +58,9 @@ def prepare(options: Options, console: Console) -> Path:
         frames, solution = _solved(options, inputs, detections, work, console)
     else:
         frames, solution = _adopted(options, inputs)
-    cameras = solution.rig.entries(inputs.cameras)
     root = work.place("dataset", [key, STAGE_VERSION])
-    written = _write_pictures(options, inputs, cameras, masks, frames, solution, root)
-    small = write_small_files(
-        root,
-        cameras=cameras,
-        files=options.pictures,
-        frames=frames.tolist(),
-        solution=solution,
-        fps=inputs.fps,
-        up_axis=options.up_axis,
-        key=key,
-    )
+    written = _write_pictures(options, inputs, masks, frames, solution, root)
+    small = write_small_files(root, options, inputs, frames, solution, key)
     turned, moved = camera_moves(Rig.of(inputs.cameras), solution.rig)
     clocks, limits = (solution.delay, solution.gain), options.doubts
     doubts = [
@@ -166,7 +153,6 @@ def _chosen(options: Options, frames: Frames) -> Bool:
 def _write_pictures(
     options: Options,
     inputs: Inputs,
-    cameras: Sequence[CameraEntry],
     masks: Mapping[str, Mapping[int, Path]],
     frames: Frames,
     solution: Solution,
@@ -184,12 +170,12 @@ def _write_pictures(
             "3D; expected landmarks that two cameras see at the same frame number, not NaN and "
             "with confidence above 0"
         )
-    by_name = {camera.name: camera for camera in cameras}
+    cameras = {c.name: c for c in solution.rig.entries(inputs.cameras)}
 
     def one(name: str, report: Callable[[int, int], None]) -> Written:
         return write_pictures(
             root,
-            by_name[name],
+            cameras[name],
             inputs.sources[name],
             masks[name],
             posed,
@@ -199,4 +185,4 @@ def _write_pictures(
             report,
         )
 
-    return each_camera(one, "writing images", list(by_name), options.workers)
+    return each_camera(one, "writing images", list(cameras), options.workers)

@@ -240,7 +240,7 @@ def clock_errors(
         return delay, gain
     for c in range(C):
         others = np.arange(C) != c
-        p = triangulation.points(rig.without(c), _flat(uv[others]), _flat(weight[others])).p
+        p = triangulation.points(rig[others], _flat(uv[others]), _flat(weight[others])).p
         expected = rig.project(p)[0][c].reshape(uv.shape[1:])
         seen = np.where((weight[c] > 0)[..., None], uv[c], np.nan)
         errors = []

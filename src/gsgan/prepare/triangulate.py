@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from gsgan.data.crop import NEAR
-from gsgan.prepare.rig import Bool, Float, Rig
+from gsgan.prepare.rig import Bool, Float, Rig, known
 from gsgan.utils.errors import ConfigError
 
 MIN_VIEWS = 2
@@ -36,19 +36,9 @@ class Points:
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Settings of the triangulation.
+    """Settings of the triangulation, see conf/prepare.yaml.
 
     Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
-
-    Args:
-        min_confidence: detections at or below are not used.
-        scale: error at which a detection counts half (Cauchy's weight).
-        iterations: of reweighting.
-        max_pairs: camera pairs tried as a start; with more cameras, a spread-out part of them.
-        max_elongation: largest ratio of a point's uncertainty along its least and most certain
-            direction; beyond it the rays are too parallel and the point is missing.
-        max_error: a point whose median error is larger is missing.
-        chunk: points processed at once, which bounds memory; the result is the same.
 
     Raises:
         ConfigError: when a value is out of its range.
@@ -69,18 +59,38 @@ class Triangulation:
                     f"triangulation.{name} must be above 0, got {getattr(self, name)!r}"
                 )
 
+    def plain(self, rig: Rig, uv: Float, weight: Float) -> Float:
+        """The weighted linear (DLT) solution, without outlier rejection.
+
+        Args:
+            rig: ``C`` cameras.
+            uv: ``[C, N, 2]`` undistorted pixels; ignored where the weight is 0.
+            weight: ``[C, N]`` at least 0.
+
+        Returns:
+            ``[N, 3]`` metres, NaN where fewer than two cameras have a weight.
+        """
+        parts = self._chunks(uv, weight)
+        return np.concatenate([_solve(*_rows(rig, u, w), w)[0] for u, w in parts])
+
     def points(self, rig: Rig, uv: Float, weight: Float) -> Points:
-        """Robust points, see `robust_points`, in chunks."""
-        parts = [robust_points(rig, *part, self) for part in self._chunks(uv, weight)]
+        """Points that most detections agree on, by reweighting from the best pair of cameras.
+
+        Convention: the loss is Cauchy's, ``log(1 + (r/scale)²)`` of the reprojection error r, times
+        the weight. A point is NaN with fewer than two weighted views, with rays too parallel
+        (``max_elongation``), or when its detections contradict each other (``max_error``).
+
+        Args:
+            rig: ``C`` cameras.
+            uv: ``[C, N, 2]`` undistorted pixels, NaN allowed where the weight is 0.
+            weight: ``[C, N]`` confidence, at least 0.
+        """
+        parts = [_robust(rig, *part, self) for part in self._chunks(uv, weight)]
         return Points(
             p=np.concatenate([part.p for part in parts]),
             weight=np.concatenate([part.weight for part in parts], axis=1),
             error=np.concatenate([part.error for part in parts], axis=1),
         )
-
-    def plain(self, rig: Rig, uv: Float, weight: Float) -> Float:
-        """Linear points ``[N, 3]``, see `linear_points`, in chunks."""
-        return np.concatenate([linear_points(rig, *part) for part in self._chunks(uv, weight)])
 
     def _chunks(self, uv: Float, weight: Float) -> Iterator[tuple[Float, Float]]:
         for start in range(0, max(uv.shape[1], 1), self.chunk):
@@ -88,34 +98,8 @@ class Triangulation:
             yield uv[:, part], weight[:, part]
 
 
-def linear_points(rig: Rig, uv: Float, weight: Float) -> Float:
-    """The weighted linear (DLT) solution, without outlier rejection.
-
-    Args:
-        rig: ``C`` cameras.
-        uv: ``[C, N, 2]`` undistorted pixels; ignored where the weight is 0.
-        weight: ``[C, N]`` at least 0.
-
-    Returns:
-        ``[N, 3]`` metres, NaN where fewer than two cameras have a weight.
-    """
-    return _solve(*_rows(rig, uv, weight), weight)[0]
-
-
-def robust_points(rig: Rig, uv: Float, weight: Float, settings: Triangulation) -> Points:
-    """Points that most detections agree on, by reweighting from the best pair of cameras.
-
-    Convention: the loss is Cauchy's, ``log(1 + (r/scale)²)`` of the reprojection error r, times the
-    weight. A point is NaN with fewer than two weighted views, with rays too parallel
-    (``max_elongation``), or when its detections contradict each other (``max_error``).
-
-    Args:
-        rig: ``C`` cameras.
-        uv: ``[C, N, 2]`` undistorted pixels, NaN allowed where the weight is 0.
-        weight: ``[C, N]`` confidence, at least 0.
-        settings: scale and limits.
-    """
-    weight = np.where(np.isfinite(uv).all(-1) & (weight > settings.min_confidence), weight, 0.0)
+def _robust(rig: Rig, uv: Float, weight: Float, settings: Triangulation) -> Points:
+    weight = np.where(known(uv) & (weight > settings.min_confidence), weight, 0.0)
     a, b = _rows(rig, uv, weight)
     p, reweighted = _best_pair(rig, uv, weight, a, b, settings), weight
     information = np.zeros((p.shape[0], 3, 3))

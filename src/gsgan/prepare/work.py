@@ -41,6 +41,14 @@ def writing(path: Path) -> Iterator[None]:
         raise DataError(f"{path} cannot be written ({error.strerror or error})") from None
 
 
+def progress(console: Console, disable: bool = False) -> Progress:
+    """Progress bars that disappear when done: title, bar, count, remaining time."""
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    return Progress(
+        *columns, TimeRemainingColumn(), console=console, transient=True, disable=disable
+    )
+
+
 def each_camera(
     task: Callable[[str, Callable[[int, int], None]], T],
     what: str,
@@ -60,14 +68,7 @@ def each_camera(
         workers: tasks at once.
     """
     stop, console = threading.Event(), Console(stderr=True)
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    bars = Progress(
-        *columns,
-        TimeRemainingColumn(),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )
+    bars = progress(console, disable=not console.is_terminal)
     rows = {name: bars.add_task(f"{what}: {name}", total=None) for name in names}
 
     def run(name: str) -> T:
