@@ -53,7 +53,7 @@ def fit_picture(
     sheet = caption(np.concatenate(lines), LEGEND, BAR)
     ok, data = cv2.imencode(".png", sheet[..., ::-1])
     if not ok:
-        raise DataError("the picture of the fit could not be encoded as PNG")
+        raise DataError("the image of the fit could not be encoded as PNG")
     return data.tobytes()
 
 
