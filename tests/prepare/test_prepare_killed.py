@@ -15,8 +15,11 @@ from capture_scenes import write_project
 from rich.console import Console
 
 from gsgan.data.layout import Layout
-from gsgan.prepare.options import Options
+from gsgan.prepare.flips import FlipSearch
+from gsgan.prepare.options import Options, Overlays
+from gsgan.prepare.refine import Refinement
 from gsgan.prepare.run import prepare
+from gsgan.prepare.solve import Settings
 from gsgan.prepare.work import each_camera
 
 LIMIT = 120  # seconds after which the child is taken to hang
@@ -29,7 +32,13 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def options(project: Path, out: Path, **more) -> Options:
-    given = {"landmarks": str(project / "pose"), "masks": str(project / "masks"), "workers": 1}
+    given = {
+        "landmarks": str(project / "pose"),
+        "masks": str(project / "masks"),
+        "workers": 1,
+        "solve": Settings(flips=FlipSearch(enabled=False), refinement=Refinement(rounds=0)),
+        "overlays": Overlays(frames=1, size=64),
+    }
     return Options(source=str(project), out=str(out), **(given | more))
 
 

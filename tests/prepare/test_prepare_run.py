@@ -18,8 +18,11 @@ import gsgan.prepare.mediapipe as tool
 from gsgan.data.layout import Layout
 from gsgan.prepare import pictures
 from gsgan.prepare.__main__ import prepare as command
-from gsgan.prepare.options import Options
+from gsgan.prepare.flips import FlipSearch
+from gsgan.prepare.options import Options, Overlays
+from gsgan.prepare.refine import Refinement
 from gsgan.prepare.run import prepare
+from gsgan.prepare.solve import Settings
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 CAMERAS, FRAMES, SIZE = 3, 6, (96, 80)
@@ -32,7 +35,10 @@ def project(tmp_path: Path) -> Path:
 
 
 def options(project: Path, **more) -> Options:
+    """Quick settings; the stages themselves are tested in test_prepare_solve.py."""
     given = {
+        "solve": Settings(flips=FlipSearch(enabled=False), refinement=Refinement(rounds=0)),
+        "overlays": Overlays(frames=1, size=64),
         "source": str(project),
         "out": str(project.parent / "out"),
         "landmarks": str(project / "pose"),
@@ -46,7 +52,7 @@ def quiet() -> Console:
 
 
 def test_videos_become_a_capture_that_training_reads(project: Path):
-    out = prepare(options(project), quiet())
+    out = prepare(options(project, solve=Settings()), quiet())
     layout = Layout.read(out)
     assert layout.camera_names == ("cam00", "cam01", "cam02")
     assert layout.frames == tuple(range(FRAMES))
