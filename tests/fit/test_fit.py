@@ -23,8 +23,8 @@ from gsgan.data.formats.capture import CaptureReader
 from gsgan.evaluate.facts import fingerprint
 from gsgan.evaluate.run import make_scorer
 from gsgan.fit import run as running
-from gsgan.fit.fitter import Fitter, _wrong, around
-from gsgan.fit.moments import Moments, make_fitter
+from gsgan.fit.fitter import Fitter, _wrong
+from gsgan.fit.moments import Moments, around
 from gsgan.fit.run import run_fit
 from gsgan.train.runs import CHECKPOINT, checkpoint_to_resume, training_record
 from gsgan.utils.config import config_folder
@@ -105,7 +105,7 @@ def test_the_masks_are_filled_better(people, compose):
     moments = Moments(data, torch.device("cpu"))
     chance = torch.Generator().manual_seed(0)
     noisy = moments.skeletons + 0.03 * torch.randn(moments.skeletons.shape, generator=chance)
-    fitter = make_fitter(instantiate(config.fit), moments, 0, noisy)
+    fitter = Fitter(instantiate(config.fit), moments, 0, noisy)
     for _ in range(40):
         fitter.shape_step()
     while not fitter.done:
@@ -136,7 +136,7 @@ def test_joints_in_one_place_keep_gradients_finite(people, compose):
     start = moments.skeletons.clone()
     start[0, 13] = start[0, 11]  # an upper arm of no length
     start[1] = start[1, :1]  # a person of one point
-    fitter = make_fitter(instantiate(config.fit), moments, 0, start)
+    fitter = Fitter(instantiate(config.fit), moments, 0, start)
     fitter.shape_step()
     fitter.sweep()
     assert fitter.joints().isfinite().all()
@@ -216,7 +216,7 @@ def test_outside_the_image_alpha_costs_nothing(people, tmp_path, compose):
     everything = torch.ones_like(frame.mask)
     assert float(_wrong(everything, frame)[beyond].max()) == 0
     whole = instantiate(compose("fit", *QUICK).fit)
-    fitter = make_fitter(whole, moments)
+    fitter = Fitter(whole, moments)
     fitter.shape.forward = lambda *_: everything  # alpha of 1 wherever the window is
     seen = [around(moments.skeletons[0], one) for one in moments.pictures(0)]
     everything = torch.ones(1, 1, *seen[0].mask.shape[-2:])

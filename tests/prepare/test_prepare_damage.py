@@ -24,7 +24,7 @@ from gsgan.data.layout import Layout
 from gsgan.prepare.dataset import publish
 from gsgan.prepare.doubts import Doubts, doubts_about_pictures
 from gsgan.prepare.landmarks import read_detections, read_points3d
-from gsgan.prepare.options import Options
+from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.pictures import MaskTidying, PictureFiles, Written, check_values, write_pictures
 from gsgan.prepare.rig import undistort_points
 from gsgan.prepare.sources import Source
@@ -34,7 +34,7 @@ from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 def test_a_folder_with_a_users_file_is_never_taken_away(tmp_path: Path):
     (tmp_path / "thesis.txt").write_text("do not lose")
-    given = tool.MediaPipe(folder=str(tmp_path), python=sys.executable)
+    given = MediaPipe(folder=str(tmp_path), python=sys.executable)
     with pytest.raises(ConfigError, match="holds something else"):
         tool.ensure_environment(given, True, print)
     assert (tmp_path / "thesis.txt").read_text() == "do not lose"
@@ -42,7 +42,7 @@ def test_a_folder_with_a_users_file_is_never_taken_away(tmp_path: Path):
 
 def test_a_half_made_environment_is_made_again(tmp_path: Path):
     place = tmp_path / "env"
-    missing = tool.MediaPipe(folder=str(place), python=str(tmp_path / "python9"))
+    missing = MediaPipe(folder=str(place), python=str(tmp_path / "python9"))
     for _ in range(2):  # the second time the folder is there, with the marker
         with pytest.raises(DataError, match="python9 cannot be started"):
             tool.ensure_environment(missing, True, print)

@@ -19,7 +19,7 @@ from gsgan.data.layout import Layout
 from gsgan.prepare import pictures
 from gsgan.prepare.__main__ import prepare as command
 from gsgan.prepare.flips import FlipSearch
-from gsgan.prepare.options import Options, Overlays
+from gsgan.prepare.options import MediaPipe, Options, Overlays
 from gsgan.prepare.refine import Refinement
 from gsgan.prepare.run import prepare
 from gsgan.prepare.solve import Settings
@@ -281,7 +281,7 @@ def with_stub(project: Path, monkeypatch, bad: str = "") -> Options:
     script = project.parent / f"stub{bad}.py"
     script.write_text(STUB.format(root=str(project), bad=bad))
     monkeypatch.setattr(tool, "SCRIPT", script)
-    mediapipe = tool.MediaPipe(folder=str(environment))
+    mediapipe = MediaPipe(folder=str(environment))
     return options(project, landmarks="mediapipe", masks="mediapipe", mediapipe=mediapipe)
 
 
@@ -303,13 +303,13 @@ def test_a_failing_tool_says_its_last_line(project: Path, monkeypatch):
 
 
 def test_the_environment_is_only_made_when_asked(project: Path):
-    missing = tool.MediaPipe(folder=str(project / "nothing"))
+    missing = MediaPipe(folder=str(project / "nothing"))
     with pytest.raises(ConfigError, match="add setup=true"):
         prepare(options(project, landmarks="mediapipe", mediapipe=missing), quiet())
     assert not (project / "nothing").exists()
 
 
 def test_a_python_that_is_not_there_is_named(tmp_path: Path):
-    missing = tool.MediaPipe(folder=str(tmp_path / "env"), python=str(tmp_path / "python9"))
+    missing = MediaPipe(folder=str(tmp_path / "env"), python=str(tmp_path / "python9"))
     with pytest.raises(DataError, match="python9 cannot be started"):
         tool.ensure_environment(missing, True, print)

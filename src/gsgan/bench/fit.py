@@ -16,7 +16,8 @@ from torch import Tensor
 from gsgan.bench.environment import environment
 from gsgan.bench.tables import check_block, csv_text, fill_block, markdown
 from gsgan.data.datamodule import GsganData
-from gsgan.fit.moments import Moments, make_fitter
+from gsgan.fit.fitter import Fitter
+from gsgan.fit.moments import Moments
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
@@ -112,8 +113,8 @@ def _fitted(changed: DictConfig, override: str) -> tuple[float, Fitted]:
     truth = moments.skeletons
     chance = torch.Generator().manual_seed(changed.seed)
     noisy = truth + changed.noise * torch.randn(truth.shape, generator=chance)
-    fitter = make_fitter(settings, moments, changed.seed, noisy)
-    make_fitter(instantiate(changed.fit), moments, changed.seed, noisy).shape_step()  # warm
+    fitter = Fitter(settings, moments, changed.seed, noisy)
+    Fitter(instantiate(changed.fit), moments, changed.seed, noisy).shape_step()  # warm
     began = time.perf_counter()
     while fitter.shaped < fitter.settings.shape_steps:
         fitter.shape_step()

@@ -11,18 +11,16 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from gsgan.fit.moments import Moments, around
 from gsgan.fit.shape import RigidShape
 from gsgan.scene import Frame
-from gsgan.skeleton import Densify
+from gsgan.skeleton import Densify, limb_length_sum
 from gsgan.splat import Accuracy
 from gsgan.utils.errors import ConfigError
-from gsgan.window import body_window
 
 BETAS = (0.9, 0.99)
 LENGTH_FLOOR = 1e-12  # square metres
 FINAL_RATE = 0.02  # of the learning rates, in the last sweep
-NEAR = 0.01  # metres: nearer joints have no place in the image
-MARGIN = 0.25  # metres around the joints, as the avatar's windows: wider only costs time
 ABOVE_ZERO = {"least_mask", "sweeps", "cameras", "noise", "joint_rate", "shape_rate"}
 
 
@@ -86,38 +84,32 @@ class Fitter:
     two priors of `Fit`. Colours are not used. Joints that were not seen do not move.
 
     Args:
-        shape: of the person.
-        skeletons: ``[F, J, 3]`` metres, finite.
-        visibility: ``[F, J]`` in [0, 1].
-        pictures: returns the images of the i-th frame, at least one, one per camera, with a person
-            in each mask; ``unsure`` where a pixel is unknown.
         settings: see `Fit`.
+        moments: frames, images and skeletons.
         seed: of the order of frames and cameras.
+        start: ``[F, J, 3]`` metres, finite; None for the capture's skeletons.
 
     Source: ours. A detector's landmarks are off by centimetres where flesh hides the joint, which
     no generator can compensate (docs/data.md).
     """
 
     def __init__(
-        self,
-        shape: RigidShape,
-        skeletons: Tensor,
-        visibility: Tensor,
-        pictures: Callable[[int], Sequence[Frame]],
-        settings: Fit,
-        seed: int = 0,
+        self, settings: Fit, moments: Moments, seed: int = 0, start: Tensor | None = None
     ) -> None:
-        self.shape, self.pictures, self.settings, self.seed = shape, pictures, settings, seed
-        self.start, self.visibility = skeletons, visibility
-        self.seen = visibility > 0
-        count, joints = visibility.shape
-        self.moves = nn.Embedding(count, 3 * joints, sparse=True).to(skeletons.device)
+        self.settings, self.moments, self.seed = settings, moments, seed
+        self.start = start = moments.skeletons if start is None else start
+        self.visibility, self.seen = moments.visibility, moments.visibility > 0
+        limb_sum = float(limb_length_sum(start, self.seen).nanmedian())
+        shape = RigidShape(settings.densify, limb_sum, settings.accuracy).to(moments.device)
+        self.shape = shape
+        count, joints = self.seen.shape
+        self.moves = nn.Embedding(count, 3 * joints, sparse=True).to(start.device)
         nn.init.zeros_(self.moves.weight)
         self.shape_optimiser = torch.optim.Adam(shape.parameters(), settings.shape_rate, BETAS)
         self.joint_optimiser = torch.optim.SparseAdam(
             self.moves.parameters(), settings.joint_rate, BETAS
         )
-        limbs = torch.tensor(shape.densify.template.edges, device=skeletons.device)
+        limbs = torch.tensor(shape.densify.template.edges, device=start.device)
         self.ends = limbs[:, 0], limbs[:, 1]
         self.shaped, self.swept = 0, 0
 
@@ -230,7 +222,7 @@ class Fitter:
         return self.shape(skeleton[None], self.visibility[i][None], frame.camera)
 
     def _windows(self, i: int) -> list[Frame]:
-        return [around(self.start[i], frame) for frame in self.pictures(i)]
+        return [around(self.start[i], frame) for frame in self.moments.pictures(i)]
 
     def _lengths(self, skeletons: Tensor) -> Tensor:
         """``[..., L]`` metres; the floor keeps the gradient of a limb of no length finite."""
@@ -245,14 +237,6 @@ class Fitter:
         factor = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * fallen))
         self.shape_optimiser.param_groups[0]["lr"] = self.settings.shape_rate * factor
         self.joint_optimiser.param_groups[0]["lr"] = self.settings.joint_rate * factor
-
-
-def around(skeleton: Tensor, frame: Frame) -> Frame:
-    """The part of an image around ``skeleton [J, 3]`` that is compared with the mask."""
-    window = body_window(
-        skeleton[None], frame.camera, margin=MARGIN, multiple=16, least=32, near=NEAR
-    )
-    return window.frame(frame)
 
 
 def _wrong(alpha: Tensor, frame: Frame) -> Tensor:

@@ -8,15 +8,16 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from gsgan.data.capture import CaptureDataset, PictureCache
 from gsgan.data.datamodule import GsganData
-from gsgan.fit.fitter import Fit, Fitter, around
-from gsgan.fit.shape import RigidShape
 from gsgan.scene import Frame
-from gsgan.skeleton import limb_length_sum
 from gsgan.utils.errors import DataError
+from gsgan.window import body_window
 
+NEAR = 0.01  # metres: nearer joints have no place in the image
+MARGIN = 0.25  # metres around the joints, as the avatar's windows: wider only costs time
 USUAL = 0.75  # quantile of the masks' areas that counts as usual: most may be nearly empty
 
 
@@ -29,7 +30,7 @@ class Moments:
     Args:
         data: the capture.
         device: of the images.
-        least_mask: see `Fit`.
+        least_mask: least share of the usual mask area.
         advance: called after each image is read.
 
     Raises:
@@ -53,7 +54,7 @@ class Moments:
         cache = PictureCache(int(data.cache_mb * 2**20))
         self.dataset = CaptureDataset(layout, items, data.size, data.crop, cache, data.lens)
         self.cameras, self.device = cameras, device
-        self._unseen: dict[int, torch.Tensor] = {}
+        self._unseen: dict[int, Tensor] = {}
         places = self._usable(least_mask, advance)
         if not places:
             raise DataError(f"{layout.root}: the masks of {', '.join(cameras)} hold no person")
@@ -100,16 +101,14 @@ class Moments:
         usual = float(np.quantile(known, USUAL)) if known else np.inf
         return [place for place, area in enumerate(areas) if area >= least * usual]
 
-    def _stacked(self, by_frame: Mapping[int, NDArray[np.float64]]) -> torch.Tensor:
+    def _stacked(self, by_frame: Mapping[int, NDArray[np.float64]]) -> Tensor:
         values = np.stack([by_frame[frame] for frame in self.frames])
         return torch.from_numpy(values).to(self.device, torch.float32)
 
 
-def make_fitter(
-    settings: Fit, moments: Moments, seed: int = 0, start: torch.Tensor | None = None
-) -> Fitter:
-    """The fit before its first step, from ``start [F, J, 3]`` metres or the capture's skeletons."""
-    start = moments.skeletons if start is None else start
-    limb_sum = float(limb_length_sum(start, moments.visibility > 0).nanmedian())
-    shape = RigidShape(settings.densify, limb_sum, settings.accuracy).to(moments.device)
-    return Fitter(shape, start, moments.visibility, moments.pictures, settings, seed)
+def around(skeleton: Tensor, frame: Frame) -> Frame:
+    """The part of an image around ``skeleton [J, 3]`` that is compared with the mask."""
+    window = body_window(
+        skeleton[None], frame.camera, margin=MARGIN, multiple=16, least=32, near=NEAR
+    )
+    return window.frame(frame)

@@ -22,21 +22,19 @@ BAR = (70, 70, 70)
 LEGEND = "green: mask   orange: the shape before   blue: after"
 
 
-def fit_picture(
-    fitter: Fitter, frames: Sequence[int], names: Sequence[str], joints: Tensor, shown: int
-) -> bytes:
+def fit_picture(fitter: Fitter, names: Sequence[str], joints: Tensor, shown: int) -> bytes:
     """A PNG: evenly spaced frames as rows, cameras as columns.
 
     Args:
         fitter: after the fit.
-        frames: their numbers.
         names: of all cameras, in the order of `camera_index`.
         joints: ``[F, J, 3]`` the fitted skeletons.
         shown: rows, at most.
     """
+    moments = fitter.moments
     rows = {
-        i: {int(frame.camera_index): frame for frame in fitter.pictures(i)}
-        for i in sampled(len(frames), shown)
+        i: {int(frame.camera_index): frame for frame in moments.pictures(i)}
+        for i in sampled(len(moments.frames), shown)
     }
     columns = sorted(set().union(*rows.values()))
     lines = []
@@ -44,7 +42,7 @@ def fit_picture(
         tiles = [
             caption(
                 _tile(fitter, i, row.get(camera), joints[i]),
-                f"{names[camera]}  frame {frames[i]}",
+                f"{names[camera]}  frame {moments.frames[i]}",
                 BAR,
             )
             for camera in columns

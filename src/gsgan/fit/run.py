@@ -21,10 +21,9 @@ from gsgan.data.datamodule import GsganData
 from gsgan.data.files import read_arrays
 from gsgan.data.formats.capture import LANDMARKS, CaptureReader, landmarks_path
 from gsgan.fit.fitter import Agreement, Fit, Fitter
-from gsgan.fit.moments import Moments, make_fitter
+from gsgan.fit.moments import Moments
 from gsgan.fit.picture import fit_picture
-from gsgan.prepare.dataset import write_npz
-from gsgan.prepare.work import progress, writing
+from gsgan.prepare.work import progress, write_npz, writing
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.console import make_console
 from gsgan.utils.devices import pick_device
@@ -80,7 +79,7 @@ def run_fit(config: DictConfig) -> Path:
     before, after = (fitter.agreement(s) for s in (moments.skeletons, joints))
     moved = (joints - moments.skeletons).norm(dim=-1)
     write_npz(out, **_arrays(original, METRES[layout.meta.unit], moments, joints, moved))
-    picture = fit_picture(fitter, moments.frames, layout.camera_names, joints, config.shown)
+    picture = fit_picture(fitter, layout.camera_names, joints, config.shown)
     with writing(out):
         write_atomically(out.with_suffix(".png"), picture)
     partial.unlink(missing_ok=True)
@@ -137,7 +136,7 @@ def _resumed(
     settings: Fit, moments: Moments, seed: int, partial: Path, key: str, console: Console
 ) -> Fitter:
     """The fit as a stopped process left it, or a new one."""
-    fitter = make_fitter(settings, moments, seed)
+    fitter = Fitter(settings, moments, seed)
     if not partial.is_file():
         return fitter
     try:
@@ -149,7 +148,7 @@ def _resumed(
     except Exception:  # damaged: torch.load and load_state_dict raise many kinds
         pass
     console.print("an earlier fit had other settings or data: starting again")
-    return make_fitter(settings, moments, seed)
+    return Fitter(settings, moments, seed)
 
 
 def _work(fitter: Fitter, partial: Path, key: str, console: Console) -> None:

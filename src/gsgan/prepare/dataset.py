@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
 import shutil
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +20,9 @@ from gsgan.prepare.inputs import Inputs
 from gsgan.prepare.options import Options
 from gsgan.prepare.rig import Float, known
 from gsgan.prepare.solve import Solution
-from gsgan.prepare.work import writing
+from gsgan.prepare.work import write_json, write_npz, writing
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.errors import DataError
-from gsgan.utils.files import write_atomically
 
 GENERATOR = "gsgan.prepare"
 Frames = NDArray[np.int64]
@@ -151,30 +148,6 @@ def _camera(camera: CameraEntry) -> dict[str, Any]:
         "dist": [0.0] * 5,
         "size": [camera.size[1], camera.size[0]],
     }
-
-
-def write_npz(path: Path, **arrays: Any) -> None:
-    """Writes an npz completely or not at all."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)
-    with writing(path):
-        write_atomically(path, stream.getvalue())
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes a JSON file completely or not at all; NaN becomes null."""
-    with writing(path):
-        write_atomically(path, json.dumps(_plain(content), indent=1) + "\n")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return int(value) if isinstance(value, np.integer) else value
 
 
 def standing_axis(p: Float) -> str:

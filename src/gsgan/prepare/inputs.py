@@ -9,7 +9,7 @@ from pathlib import Path
 from gsgan.data.calibration import Calibration, find_calibration, read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.prepare.landmarks import Detections, find_landmarks, read_detections
-from gsgan.prepare.mediapipe import run_tool
+from gsgan.prepare.mediapipe import run_tool, tool_key
 from gsgan.prepare.options import MEDIAPIPE, Options
 from gsgan.prepare.pictures import check_values, find_masks
 from gsgan.prepare.sources import Source, find_sources, fit_size, pair_cameras
@@ -47,7 +47,7 @@ class Inputs:
             place = options.folder(name)
             files = sorted(p for p in (place, *place.rglob("*")) if p.is_file())
             parts += [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
-        return [*parts, options.mediapipe.key if options.needs_tool else None]
+        return [*parts, tool_key(options.mediapipe) if options.needs_tool else None]
 
 
 def read_inputs(options: Options) -> Inputs:
@@ -107,16 +107,7 @@ def read_people(
     names, found = list(inputs.sources), dict[str, Path]()
     masks: dict[str, dict[int, Path]] = {}
     if options.needs_tool:
-        found, masks = run_tool(
-            options.mediapipe,
-            inputs.sources,
-            work,
-            hands=options.hands,
-            masks=options.masks == MEDIAPIPE,
-            setup=options.setup,
-            workers=options.workers,
-            say=say,
-        )
+        found, masks = run_tool(options, inputs.sources, work, say)
     if options.masks != MEDIAPIPE:
         masks = find_masks(options.folder("masks"), names)
         for name, files in masks.items():

@@ -7,10 +7,10 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 from gsgan.data.synthetic.make import cache_root
+from gsgan.prepare.options import MEDIAPIPE, MediaPipe, Options
 from gsgan.prepare.sources import Source
 from gsgan.prepare.work import Work, each_camera, writing
 from gsgan.utils.errors import ConfigError, DataError
@@ -22,64 +22,23 @@ MARKER = ".gsgan-mediapipe"  # written first: a folder with it was made here and
 READY = ".ready"  # written last: an environment without it is incomplete
 
 
-@dataclass(frozen=True)
-class MediaPipe:
-    """The landmark tool and its environment, see conf/prepare.yaml.
+def environment_of(tool: MediaPipe) -> Path:
+    """The environment's folder, which need not exist."""
+    if tool.folder is not None:
+        return Path(tool.folder).expanduser()
+    return cache_root() / "tools" / "mediapipe-0.10.21"
 
-    Raises:
-        ConfigError: when a value is out of its range.
-    """
 
-    folder: str | None = None
-    python: str | None = None
-    threads: int = 1
-    confidence: float = 0.5
-    tracking: float = 0.5
-    margin: float = 0.15
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.confidence <= 1 and 0 <= self.tracking <= 1 and self.margin >= 0):
-            raise ConfigError(
-                "mediapipe.confidence and .tracking must be 0 to 1 and .margin at least 0, got "
-                f"{self.confidence!r}, {self.tracking!r} and {self.margin!r}"
-            )
-
-    @property
-    def environment(self) -> Path:
-        """The environment's folder, which need not exist."""
-        if self.folder is not None:
-            return Path(self.folder).expanduser()
-        return cache_root() / "tools" / "mediapipe-0.10.21"
-
-    @property
-    def key(self) -> list[object]:
-        """What the detections depend on."""
-        tool = SCRIPT.read_text(), REQUIREMENTS.read_text()
-        return [*tool, self.confidence, self.tracking, self.margin]
+def tool_key(tool: MediaPipe) -> list[object]:
+    """What the detections depend on."""
+    files = SCRIPT.read_text(), REQUIREMENTS.read_text()
+    return [*files, tool.confidence, tool.tracking, tool.margin]
 
 
 def run_tool(
-    tool: MediaPipe,
-    sources: Mapping[str, Source],
-    work: Work,
-    *,
-    hands: bool,
-    masks: bool,
-    setup: bool,
-    workers: int,
-    say: Callable[[str], None],
+    options: Options, sources: Mapping[str, Source], work: Work, say: Callable[[str], None]
 ) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
     """Runs MediaPipe on every source without a stored result.
-
-    Args:
-        tool: its settings.
-        sources: by name.
-        work: where results are stored.
-        hands: whether to find hands too.
-        masks: whether to find masks too.
-        setup: whether a missing environment may be created.
-        workers: cameras at once.
-        say: prints a line.
 
     Returns:
         By source: the npz of landmarks, and the masks by frame number.
@@ -88,18 +47,19 @@ def run_tool(
         ConfigError: when the environment is missing and may not be created.
         DataError: when the tool fails or finds nobody in a source.
     """
+    tool, hands, masks = options.mediapipe, options.hands, options.masks == MEDIAPIPE
     results, folders = {}, {}
     for name, source in sources.items():
-        key = [source.fingerprint(), source.rotate, tool.key, hands, masks]
+        key = [source.fingerprint(), source.rotate, tool_key(tool), hands, masks]
         folders[name] = work.place(f"mediapipe-{name}", key)
         results[name] = folders[name].with_suffix(".npz")
     # The npz is written last: where it exists, the masks are complete, too.
     missing = [name for name in sources if not results[name].is_file()]
     if missing:
-        python = ensure_environment(tool, setup, say)
+        python = ensure_environment(tool, options.setup, say)
 
         def one(name: str, report: Callable[[int, int], None]) -> None:
-            slot = missing.index(name) % workers
+            slot = missing.index(name) % options.workers
             command = [str(python), str(SCRIPT), "--source", str(sources[name].path)]
             command += ["--out", str(results[name]), "--hands", str(int(hands))]
             command += ["--rotate", str(int(sources[name].rotate)), "--slot", str(slot)]
@@ -108,7 +68,7 @@ def run_tool(
             command += ["--masks", str(folders[name])] if masks else []
             _detect(command, sources[name].path, report)
 
-        each_camera(one, "finding landmarks", missing, workers)
+        each_camera(one, "finding landmarks", missing, options.workers)
     found = {
         name: {int(path.stem): path for path in sorted(folder.glob("*.png"))}
         for name, folder in folders.items()
@@ -148,7 +108,7 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
             no suitable Python is found.
         DataError: when it cannot be created.
     """
-    place = tool.environment
+    place = environment_of(tool)
     python = place / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
     if (place / READY).is_file() and python.exists():
         return python

@@ -10,7 +10,6 @@ from typing import Any
 from gsgan.data.files import LARGEST_FRAME
 from gsgan.prepare.doubts import Doubts
 from gsgan.prepare.landmarks import UNITS
-from gsgan.prepare.mediapipe import MediaPipe
 from gsgan.prepare.pictures import MaskTidying, PictureFiles
 from gsgan.prepare.solve import Settings
 from gsgan.utils.errors import ConfigError
@@ -18,6 +17,29 @@ from gsgan.utils.errors import ConfigError
 MEDIAPIPE = "mediapipe"
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 FREE = ("out", "setup", "workers", "overwrite", "keep_work")  # do not change the dataset
+
+
+@dataclass(frozen=True)
+class MediaPipe:
+    """The landmark tool and its environment, see conf/prepare.yaml.
+
+    Raises:
+        ConfigError: when a value is out of its range.
+    """
+
+    folder: str | None = None
+    python: str | None = None
+    threads: int = 1
+    confidence: float = 0.5
+    tracking: float = 0.5
+    margin: float = 0.15
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.confidence <= 1 and 0 <= self.tracking <= 1 and self.margin >= 0):
+            raise ConfigError(
+                "mediapipe.confidence and .tracking must be 0 to 1 and .margin at least 0, got "
+                f"{self.confidence!r}, {self.tracking!r} and {self.margin!r}"
+            )
 
 
 @dataclass(frozen=True)

@@ -20,13 +20,12 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, PersonCrop, Window, cut, project, resize
 from gsgan.data.files import read_colour, read_grey
 from gsgan.data.joints import BODY
-from gsgan.prepare.dataset import write_json
 from gsgan.prepare.inputs import Inputs
 from gsgan.prepare.options import Options
 from gsgan.prepare.pictures import sampled
 from gsgan.prepare.rig import FOCAL, Float, known
 from gsgan.prepare.solve import Solution, median, stage_medians
-from gsgan.prepare.work import writing
+from gsgan.prepare.work import write_json, writing
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.files import write_atomically
 

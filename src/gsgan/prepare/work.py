@@ -1,13 +1,14 @@
-"""The working folder of a run, work in parallel with progress bars, and errors of the disk."""
+"""The working folder of a run, parallel work with progress bars, and safe writing of files."""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import shutil
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -19,6 +20,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import write_atomically
 
 T = TypeVar("T")
 KEY_LENGTH = 12
@@ -39,6 +41,30 @@ def writing(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise DataError(f"{path} cannot be written ({error.strerror or error})") from None
+
+
+def write_npz(path: Path, **arrays: Any) -> None:
+    """Writes an npz completely or not at all."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    with writing(path):
+        write_atomically(path, stream.getvalue())
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes a JSON file completely or not at all; NaN becomes null."""
+    with writing(path):
+        write_atomically(path, json.dumps(_plain(content), indent=1) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return int(value) if isinstance(value, np.integer) else value
 
 
 def progress(console: Console, disable: bool = False) -> Progress:
