@@ -45,7 +45,7 @@ QUICK = [
 
 @pytest.fixture(scope="module")
 def people(tmp_path_factory) -> Path:
-    """Four cameras round a person, one held out, landmarks in centimetres."""
+    """Four cameras around a person, one held out, landmarks in centimetres."""
     splits = {"train_cameras": ["cam00", "cam01", "cam02"], "test_cameras": ["cam03"]}
     root = tmp_path_factory.mktemp("people")
     return write_tiny_capture(root, cameras=4, frames=4, size=(96, 96), unit="cm", splits=splits)
@@ -130,7 +130,7 @@ def test_an_unseen_joint_stays_missing(fit, people, tmp_path):
     assert found["conf"][1, 25] == 0
 
 
-def test_joints_in_one_place_keep_gradients_finite(people, compose):
+def test_coincident_joints_keep_gradients_finite(people, compose):
     config = compose("fit", f"data.root={people}", *QUICK)
     moments = Moments(instantiate(config.data, _convert_="all"), torch.device("cpu"))
     start = moments.skeletons.clone()
@@ -164,7 +164,7 @@ def test_colours_are_not_used(fit, fitted, people, tmp_path):
 @pytest.mark.parametrize(
     "hole", ["no mask of a moment", "a bystander in a moment", "a crumb in one mask"]
 )
-def test_an_empty_mask_spoils_no_other_frame(fit, people, tmp_path, capsys, hole):
+def test_an_empty_mask_does_not_affect_other_frames(fit, people, tmp_path, capsys, hole):
     holed = shutil.copytree(people, tmp_path / "holed")
     whole = "moment" in hole
     for camera in ("cam00", "cam01", "cam02")[: 3 if whole else 1]:
@@ -302,7 +302,7 @@ def test_another_state_is_not_resumed(fit, fitted, monkeypatch, tmp_path, capsys
     np.testing.assert_array_equal(whole["p"], again["p"])
 
 
-def test_the_picture_shows_every_camera(fit, tmp_path):
+def test_the_image_shows_every_camera(fit, tmp_path):
     fit("shown=2")
     picture = cv2.imread(str(tmp_path / "fit.png"))
     assert picture.shape[1] == 3 * 300

@@ -1,4 +1,4 @@
-"""What goes wrong outside of the method: damaged files, full disks, folders of other people."""
+"""Damaged files, full disks, folders with other content."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from gsgan.prepare.work import Work
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 
-def test_a_folder_with_a_users_file_is_never_taken_away(tmp_path: Path):
+def test_a_folder_with_a_users_file_is_never_removed(tmp_path: Path):
     (tmp_path / "thesis.txt").write_text("do not lose")
     given = MediaPipe(folder=str(tmp_path), python=sys.executable)
     with pytest.raises(ConfigError, match="holds something else"):
@@ -62,7 +62,7 @@ def test_masks_of_small_numbers_are_refused(tmp_path: Path, value: int, refused:
         check_values(tmp_path, files)
 
 
-def test_short_videos_and_empty_masks_are_doubted(tmp_path: Path):
+def test_short_videos_and_empty_masks_are_reported(tmp_path: Path):
     camera = ring(size=(6, 4))[0]
     files, masks = {}, {}
     for n in range(4):
@@ -74,8 +74,8 @@ def test_short_videos_and_empty_masks_are_doubted(tmp_path: Path):
     rest = (0, PictureFiles(), MaskTidying(), lambda *_: None)
     whole = Written([0, 1, 2, 3], empty=1, decoded=4)
     assert write_pictures(*given, range(9), *rest) == whole
-    assert write_pictures(*given, range(9), *rest) == whole  # all there already
-    assert write_pictures(*given, range(2), *rest).decoded is None  # nobody looked
+    assert write_pictures(*given, range(9), *rest) == whole  # all exist already
+    assert write_pictures(*given, range(2), *rest).decoded is None  # not read to the end
     limits = Doubts()
     found = doubts_about_pictures({"cam0": source}, {"cam0": whole}, limits)
     assert found == [
@@ -104,7 +104,7 @@ def test_the_tool_reads_pictures_as_stored_and_by_number(tmp_path: Path, monkeyp
     turned = data[:2] + b"\xff\xe1" + struct.pack(">H", len(tiff) + 2) + tiff + data[2:]
     for name in ("10.jpg", "9.jpg"):
         (tmp_path / name).write_bytes(turned)
-    assert cv2.imread(str(tmp_path / "9.jpg")).shape == (6, 4, 3)  # the tag is a real one
+    assert cv2.imread(str(tmp_path / "9.jpg")).shape == (6, 4, 3)  # the tag is valid
     count, pictures = detector.open_source(tmp_path, 0)
     read = list(pictures)
     assert (count, [number for number, _ in read]) == (2, [9, 10])
@@ -157,7 +157,7 @@ def test_frame_numbers_must_be_whole(tmp_path: Path, number: float):
         read_points3d(path)
 
 
-def test_damaged_results_are_made_again_and_a_full_disk_is_said(tmp_path: Path, monkeypatch):
+def test_damaged_results_are_made_again_and_a_full_disk_is_reported(tmp_path: Path, monkeypatch):
     work = Work(tmp_path)
     assert work.arrays("a", 1, lambda: {"x": np.arange(3)})["x"].tolist() == [0, 1, 2]
     path = work.place("a", 1).with_suffix(".npz")
@@ -173,7 +173,7 @@ def test_damaged_results_are_made_again_and_a_full_disk_is_said(tmp_path: Path, 
         work.arrays("a", 2, lambda: {"x": np.arange(2)})
 
 
-def test_results_with_other_keys_are_forgotten_stage_by_stage(tmp_path: Path):
+def test_results_with_other_keys_are_removed_by_stage(tmp_path: Path):
     for stage in ("tool-a", "tool-a-b", "solution"):
         for key in (1, 2):
             Work(tmp_path).arrays(stage, key, lambda: {"x": np.zeros(1)})
@@ -183,10 +183,10 @@ def test_results_with_other_keys_are_forgotten_stage_by_stage(tmp_path: Path):
     work.forget_others()
     left = {p.name for p in tmp_path.iterdir() if p.name.startswith("tool-a-")}
     assert {name for name in left if "tool-a-b-" not in name} == {kept.name, f"{kept.name}.npz"}
-    assert len(list(tmp_path.iterdir())) == 10  # stages that the run did not come by stay
+    assert len(list(tmp_path.iterdir())) == 10  # stages that the run did not use stay
 
 
-def test_an_old_dataset_stays_when_the_new_one_cannot_take_its_place(tmp_path: Path, monkeypatch):
+def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(tmp_path: Path, monkeypatch):
     new, out, replace = tmp_path / "new", tmp_path / "out", os.replace
     for folder in (new, out):
         folder.mkdir()
@@ -212,7 +212,7 @@ def test_options_of_the_wrong_kind(more: dict):
         Options("source", "out", **more)
 
 
-def test_strong_lenses_are_undone_to_the_corners():
+def test_strong_lenses_are_undistorted_to_the_corners():
     camera = ring(dist=(-0.3, 0, 0, 0, 0))[0]
     h, w = camera.size
     straight = np.array([[0, 0], [w, 0], [0, h], [w, h], [w / 3, h / 4]], np.float64)
@@ -261,7 +261,7 @@ READERS = {
 
 
 @pytest.mark.parametrize("kind", READERS)
-def test_damaged_files_end_in_one_sentence_or_are_read(tmp_path: Path, kind: str):
+def test_damaged_files_are_one_sentence_or_read(tmp_path: Path, kind: str):
     read, write = READERS[kind]
     path = write(tmp_path)
     data, rng = path.read_bytes(), np.random.default_rng(5)

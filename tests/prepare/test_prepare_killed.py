@@ -1,4 +1,4 @@
-"""A process that is really killed (SIGKILL), at any stage: the next run makes the same dataset."""
+"""A process killed (SIGKILL) at any stage: the next run makes the same dataset."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from gsgan.prepare.run import prepare
 from gsgan.prepare.solve import Settings
 from gsgan.prepare.work import each_camera
 
-LIMIT = 120  # seconds after which the child is taken to hang
+LIMIT = 120  # seconds after which the child counts as hanging
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork, no child to kill")
 
 
@@ -68,7 +68,7 @@ def killed(run: Callable[[], object], stop: Callable[[Path, int], bool]) -> bool
         try:
             run()
         finally:
-            os._exit(3)  # it came to its end, or broke
+            os._exit(3)  # it finished, or failed
     _, status = os.waitpid(child, 0)
     return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
 
@@ -90,12 +90,12 @@ STAGES: dict[str, Callable[[Path, int], bool]] = {
 
 @pytest.fixture(scope="module")
 def whole(project: Path) -> dict[str, bytes]:
-    """The pictures of a run that nothing disturbed."""
+    """The images of an undisturbed run."""
     return pictures(prepare(options(project, project.parent / "undisturbed"), quiet()))
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_killed_process_leaves_nothing_half_and_is_taken_up(
+def test_a_killed_process_leaves_nothing_incomplete_and_is_resumed(
     project: Path, whole: dict[str, bytes], tmp_path: Path, stage: str
 ) -> None:
     out = tmp_path / "out"
@@ -123,7 +123,7 @@ def test_an_earlier_dataset_outlives_a_kill(
     assert not (tmp_path / ".out.old").exists()
 
 
-def test_one_failure_or_an_interrupt_stops_the_other_cameras_at_their_next_picture() -> None:
+def test_a_failure_or_an_interrupt_stops_the_other_cameras() -> None:
     steps: list[int] = []
 
     def work(name: str, report: Callable[[int, int], None]) -> None:

@@ -52,7 +52,7 @@ def write_trc(path: Path, p: np.ndarray, unit: str = "m") -> Path:
 
 
 @pytest.mark.parametrize("unit", ["m", "mm"])
-def test_trc_units_axes_and_names_are_undone(tmp_path: Path, unit: str):
+def test_trc_units_axes_and_names_are_converted(tmp_path: Path, unit: str):
     p = skeletons(4)
     p[2, 15] = np.nan
     found = read_points3d(write_trc(tmp_path / "a.trc", p, unit))
@@ -72,7 +72,7 @@ def test_zeros_of_gap_filling_are_missing(tmp_path: Path):
     assert found.conf[1, 16] == 0
 
 
-def test_last_values_of_gap_filling_are_taken_out():
+def test_repeated_values_of_gap_filling_are_removed():
     p = np.random.default_rng(0).standard_normal((20, 2, 3))
     p[5:13, 1], p[15:18, 0] = p[5, 1], p[15, 0]
     found, count = without_frozen(p, frames=8)

@@ -30,7 +30,7 @@ CAMERAS, FRAMES, SIZE = 3, 6, (96, 80)
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """A project folder: videos, calibration, 2D landmarks and masks of a person that is known."""
+    """A project folder: videos, calibration, 2D landmarks and masks of a known person."""
     return write_project(tmp_path / "project", CAMERAS, FRAMES, SIZE)
 
 
@@ -70,7 +70,7 @@ def test_videos_become_a_capture_that_training_reads(project: Path):
     assert (hands["conf"] == 0).all()
 
 
-def test_the_report_tells_every_stage_and_shows_overlays(project: Path):
+def test_the_report_has_every_stage_and_overlays(project: Path):
     out = prepare(options(project), quiet())
     numbers = json.loads((out / "report.json").read_text())
     assert list(numbers["error_px"]) == ["plain", "robust", "flips", "refined", "smoothed"]
@@ -109,7 +109,7 @@ def test_the_same_again_is_left_alone_and_another_refused(project: Path):
     assert [p.name for p in out.parent.iterdir() if p.name.startswith(".")] == []
 
 
-def test_what_is_not_ours_is_never_overwritten(project: Path):
+def test_other_folders_are_never_overwritten(project: Path):
     out = project.parent / "out"
     out.mkdir()
     (out / "thesis.txt").write_text("do not lose")
@@ -118,7 +118,7 @@ def test_what_is_not_ours_is_never_overwritten(project: Path):
     assert (out / "thesis.txt").read_text() == "do not lose"
 
 
-def test_a_killed_run_leaves_no_dataset_and_goes_on_where_it_was(project: Path, monkeypatch):
+def test_a_killed_run_leaves_no_dataset_and_resumes(project: Path, monkeypatch):
     write, written = pictures._write, []
 
     def dying(path, pixels, files):
@@ -138,7 +138,7 @@ def test_a_killed_run_leaves_no_dataset_and_goes_on_where_it_was(project: Path, 
     assert len(Layout.read(out).frames) == FRAMES
 
 
-def test_a_camera_that_missed_pictures_and_masks_keeps_the_rest(project: Path):
+def test_a_camera_with_missing_masks_keeps_the_rest(project: Path):
     (project / "masks" / "cam01" / "000003.png").unlink()
     out = prepare(options(project, frames="1-5"), quiet())
     layout = Layout.read(out)
@@ -199,7 +199,7 @@ def no_detections(project: Path) -> None:
         (lambda p: None, {"source": None}, "give source="),
     ],
 )
-def test_what_is_wrong_is_said_in_one_sentence(project: Path, break_it, more, what):
+def test_errors_are_one_sentence(project: Path, break_it, more, what):
     break_it(project)
     with pytest.raises(GsganError, match=what) as failure:
         prepare(options(project, **more), quiet())
@@ -285,7 +285,7 @@ def with_stub(project: Path, monkeypatch, bad: str = "") -> Options:
     return options(project, landmarks="mediapipe", masks="mediapipe", mediapipe=mediapipe)
 
 
-def test_the_tool_is_run_once_a_camera(project: Path, monkeypatch):
+def test_the_tool_runs_once_per_camera(project: Path, monkeypatch):
     given = with_stub(project, monkeypatch)
     out = prepare(given, quiet())
     assert len(Layout.read(out).frames) == FRAMES
@@ -296,7 +296,7 @@ def test_the_tool_is_run_once_a_camera(project: Path, monkeypatch):
     assert calls == []
 
 
-def test_a_failing_tool_says_its_last_line(project: Path, monkeypatch):
+def test_the_message_of_a_failing_tool_is_its_last_line(project: Path, monkeypatch):
     with pytest.raises(DataError, match=r"cam01\.avi: the MediaPipe tool failed: the stub refuses"):
         prepare(with_stub(project, monkeypatch, bad="cam01"), quiet())
     assert not (project.parent / "out").exists()
@@ -309,7 +309,7 @@ def test_the_environment_is_only_made_when_asked(project: Path):
     assert not (project / "nothing").exists()
 
 
-def test_a_python_that_is_not_there_is_named(tmp_path: Path):
+def test_a_missing_python_is_named(tmp_path: Path):
     missing = MediaPipe(folder=str(tmp_path / "env"), python=str(tmp_path / "python9"))
     with pytest.raises(DataError, match="python9 cannot be started"):
         tool.ensure_environment(missing, True, print)

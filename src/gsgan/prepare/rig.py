@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR
-from gsgan.data.layout import CameraEntry
 
 FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
 
