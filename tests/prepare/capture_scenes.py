@@ -1,4 +1,4 @@
-"""Rigs, motions and files for the tests of `gsgan.prepare`: everything about them is known."""
+"""Rigs, motions and files with known ground truth for the tests of `gsgan.prepare`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LENS = (-0.05, 0.14, 0.0006, -0.0007, 0.01)
 
 
 def ring(angles: Sequence[float] = ANGLES, size=(1080, 1920), dist=(0,) * 5) -> list[CameraEntry]:
-    """Cameras round the person, metres, pixel centres at +0.5; ``size`` is (w, h)."""
+    """Cameras around the person, metres, pixel centres at +0.5; ``size`` is (w, h)."""
     cameras = []
     for i, angle in enumerate(angles):
         raw = ring_camera(angle, size)

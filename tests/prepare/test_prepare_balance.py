@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from gsgan.prepare.mediapipe import READY, MediaPipe
-from gsgan.prepare.options import Options
+from gsgan.prepare.mediapipe import READY, environment_of
+from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.run import prepare
 
 ROOT = Path(__file__).parents[2]
@@ -21,9 +21,9 @@ VIDEOS = ROOT.parent / "shared" / "data" / "balance_videos"
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not VIDEOS.is_dir(), reason="the balance videos are not at hand")
+@pytest.mark.skipif(not VIDEOS.is_dir(), reason="the balance videos are not available")
 @pytest.mark.skipif(
-    not (MediaPipe().environment / READY).is_file(),
+    not (environment_of(MediaPipe()) / READY).is_file(),
     reason="no MediaPipe environment: python -m gsgan.prepare … setup=true makes it",
 )
 def test_real_videos_become_a_capture_that_trains(tmp_path: Path):

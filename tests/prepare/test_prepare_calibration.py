@@ -1,4 +1,4 @@
-"""Calibration files: what one tool wrote is read back as the cameras it meant."""
+"""Calibration files of other tools are read as the cameras that they describe."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ from gsgan.data.calibration import find_calibration, read_calibration
 from gsgan.utils.errors import DataError
 
 
-def equal(found, wanted, lens: int = 5) -> None:
-    assert list(found) == [c.name for c in wanted]
-    for camera in wanted:
+def equal(found, expected, lens: int = 5) -> None:
+    assert list(found) == [c.name for c in expected]
+    for camera in expected:
         read = found[camera.name]
         assert read.size == camera.size
         np.testing.assert_allclose(read.K, camera.K, atol=1e-9)
@@ -90,7 +90,7 @@ def test_qualisys_units_axes_and_window(tmp_path: Path, left: int):
     assert any("77" in note for note in calibration.notes)  # the marker camera is left out
 
 
-def test_own_json_says_its_unit_itself(tmp_path: Path):
+def test_own_json_has_its_unit(tmp_path: Path):
     cameras = ring(dist=LENS)
     equal(read_calibration(write_own(tmp_path / "cameras.json", cameras)).cameras, cameras)
     (tmp_path / "meta.json").write_text('{"unit": "mm"}')
@@ -108,7 +108,7 @@ def test_pixel_centre_is_a_setting(tmp_path: Path):
 @pytest.mark.parametrize(
     "content", ["", "hello", "%YAML:1.0\n---\nx: [", "<calibration><camera", "[a]\nmatrix = ["]
 )
-def test_damaged_files_are_told_in_one_sentence(tmp_path: Path, content: str):
+def test_errors_are_one_sentence(tmp_path: Path, content: str):
     path = tmp_path / "intri.yml"
     path.write_text(content)
     (tmp_path / "extri.yml").write_text(content)

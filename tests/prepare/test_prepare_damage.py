@@ -1,4 +1,4 @@
-"""What goes wrong outside of the method: damaged files, full disks, folders of other people."""
+"""Damaged files, full disks, folders with other content."""
 
 from __future__ import annotations
 
@@ -20,22 +20,21 @@ from test_prepare_points3d import write_trc
 import gsgan.prepare.mediapipe as tool
 from gsgan.data.calibration import read_calibration
 from gsgan.data.joints import BODY
+from gsgan.data.layout import Layout
+from gsgan.prepare.dataset import publish
 from gsgan.prepare.doubts import Doubts, doubts_about_pictures
-from gsgan.prepare.landmarks import read_detections
-from gsgan.prepare.masks import MaskTidying, check_values
-from gsgan.prepare.options import Options
-from gsgan.prepare.pictures import PictureFiles, Written, write_pictures
-from gsgan.prepare.points3d import read_points3d
+from gsgan.prepare.landmarks import read_detections, read_points3d
+from gsgan.prepare.options import MediaPipe, Options
+from gsgan.prepare.pictures import MaskTidying, PictureFiles, Written, check_values, write_pictures
 from gsgan.prepare.rig import undistort_points
-from gsgan.prepare.run import _publish
 from gsgan.prepare.sources import Source
 from gsgan.prepare.work import Work
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 
-def test_a_folder_with_a_users_file_is_never_taken_away(tmp_path: Path):
+def test_a_folder_with_a_users_file_is_never_removed(tmp_path: Path):
     (tmp_path / "thesis.txt").write_text("do not lose")
-    given = tool.MediaPipe(folder=str(tmp_path), python=sys.executable)
+    given = MediaPipe(folder=str(tmp_path), python=sys.executable)
     with pytest.raises(ConfigError, match="holds something else"):
         tool.ensure_environment(given, True, print)
     assert (tmp_path / "thesis.txt").read_text() == "do not lose"
@@ -43,7 +42,7 @@ def test_a_folder_with_a_users_file_is_never_taken_away(tmp_path: Path):
 
 def test_a_half_made_environment_is_made_again(tmp_path: Path):
     place = tmp_path / "env"
-    missing = tool.MediaPipe(folder=str(place), python=str(tmp_path / "python9"))
+    missing = MediaPipe(folder=str(place), python=str(tmp_path / "python9"))
     for _ in range(2):  # the second time the folder is there, with the marker
         with pytest.raises(DataError, match="python9 cannot be started"):
             tool.ensure_environment(missing, True, print)
@@ -63,7 +62,7 @@ def test_masks_of_small_numbers_are_refused(tmp_path: Path, value: int, refused:
         check_values(tmp_path, files)
 
 
-def test_short_videos_and_empty_masks_are_doubted(tmp_path: Path):
+def test_short_videos_and_empty_masks_are_reported(tmp_path: Path):
     camera = ring(size=(6, 4))[0]
     files, masks = {}, {}
     for n in range(4):
@@ -72,11 +71,11 @@ def test_short_videos_and_empty_masks_are_doubted(tmp_path: Path):
         cv2.imwrite(str(masks[n]), np.full((4, 6), 255 * (n > 0), np.uint8))
     source = Source("cam0", tmp_path, (4, 6), 30.0, files, 7)
     given = (tmp_path, camera, source, masks)
-    rest = (0, PictureFiles(), MaskTidying(), lambda: None)
+    rest = (0, PictureFiles(), MaskTidying(), lambda *_: None)
     whole = Written([0, 1, 2, 3], empty=1, decoded=4)
     assert write_pictures(*given, range(9), *rest) == whole
-    assert write_pictures(*given, range(9), *rest) == whole  # all there already
-    assert write_pictures(*given, range(2), *rest).decoded is None  # nobody looked
+    assert write_pictures(*given, range(9), *rest) == whole  # all exist already
+    assert write_pictures(*given, range(2), *rest).decoded is None  # not read to the end
     limits = Doubts()
     found = doubts_about_pictures({"cam0": source}, {"cam0": whole}, limits)
     assert found == [
@@ -105,7 +104,7 @@ def test_the_tool_reads_pictures_as_stored_and_by_number(tmp_path: Path, monkeyp
     turned = data[:2] + b"\xff\xe1" + struct.pack(">H", len(tiff) + 2) + tiff + data[2:]
     for name in ("10.jpg", "9.jpg"):
         (tmp_path / name).write_bytes(turned)
-    assert cv2.imread(str(tmp_path / "9.jpg")).shape == (6, 4, 3)  # the tag is a real one
+    assert cv2.imread(str(tmp_path / "9.jpg")).shape == (6, 4, 3)  # the tag is valid
     count, pictures = detector.open_source(tmp_path, 0)
     read = list(pictures)
     assert (count, [number for number, _ in read]) == (2, [9, 10])
@@ -158,7 +157,7 @@ def test_frame_numbers_must_be_whole(tmp_path: Path, number: float):
         read_points3d(path)
 
 
-def test_damaged_results_are_made_again_and_a_full_disk_is_said(tmp_path: Path, monkeypatch):
+def test_damaged_results_are_made_again_and_a_full_disk_is_reported(tmp_path: Path, monkeypatch):
     work = Work(tmp_path)
     assert work.arrays("a", 1, lambda: {"x": np.arange(3)})["x"].tolist() == [0, 1, 2]
     path = work.place("a", 1).with_suffix(".npz")
@@ -174,7 +173,7 @@ def test_damaged_results_are_made_again_and_a_full_disk_is_said(tmp_path: Path, 
         work.arrays("a", 2, lambda: {"x": np.arange(2)})
 
 
-def test_results_with_other_keys_are_forgotten_stage_by_stage(tmp_path: Path):
+def test_results_with_other_keys_are_removed_by_stage(tmp_path: Path):
     for stage in ("tool-a", "tool-a-b", "solution"):
         for key in (1, 2):
             Work(tmp_path).arrays(stage, key, lambda: {"x": np.zeros(1)})
@@ -184,10 +183,10 @@ def test_results_with_other_keys_are_forgotten_stage_by_stage(tmp_path: Path):
     work.forget_others()
     left = {p.name for p in tmp_path.iterdir() if p.name.startswith("tool-a-")}
     assert {name for name in left if "tool-a-b-" not in name} == {kept.name, f"{kept.name}.npz"}
-    assert len(list(tmp_path.iterdir())) == 10  # stages that the run did not come by stay
+    assert len(list(tmp_path.iterdir())) == 10  # stages that the run did not use stay
 
 
-def test_an_old_dataset_stays_when_the_new_one_cannot_take_its_place(tmp_path: Path, monkeypatch):
+def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(tmp_path: Path, monkeypatch):
     new, out, replace = tmp_path / "new", tmp_path / "out", os.replace
     for folder in (new, out):
         folder.mkdir()
@@ -199,8 +198,9 @@ def test_an_old_dataset_stays_when_the_new_one_cannot_take_its_place(tmp_path: P
         replace(start, end)
 
     monkeypatch.setattr(os, "replace", failing)
+    monkeypatch.setattr(Layout, "read", lambda _: None)
     with pytest.raises(DataError, match="cannot be written"):
-        _publish(new, out)
+        publish(new, out)
     assert (out / "out").is_file()
 
 
@@ -212,7 +212,7 @@ def test_options_of_the_wrong_kind(more: dict):
         Options("source", "out", **more)
 
 
-def test_strong_lenses_are_undone_to_the_corners():
+def test_strong_lenses_are_undistorted_to_the_corners():
     camera = ring(dist=(-0.3, 0, 0, 0, 0))[0]
     h, w = camera.size
     straight = np.array([[0, 0], [w, 0], [0, h], [w, h], [w / 3, h / 4]], np.float64)
@@ -261,7 +261,7 @@ READERS = {
 
 
 @pytest.mark.parametrize("kind", READERS)
-def test_damaged_files_end_in_one_sentence_or_are_read(tmp_path: Path, kind: str):
+def test_damaged_files_are_one_sentence_or_read(tmp_path: Path, kind: str):
     read, write = READERS[kind]
     path = write(tmp_path)
     data, rng = path.read_bytes(), np.random.default_rng(5)

@@ -20,8 +20,7 @@ from gsgan.prepare.doubts import (
     longest_runs,
 )
 from gsgan.prepare.landmarks import Detections
-from gsgan.prepare.masks import MaskTidying, find_masks, tidy
-from gsgan.prepare.overlays import sampled
+from gsgan.prepare.pictures import MaskTidying, find_masks, sampled, tidy
 from gsgan.prepare.solve import Settings, Solution, solve
 from gsgan.prepare.sources import Source, find_sources
 from gsgan.utils.errors import ConfigError, DataError
@@ -175,7 +174,7 @@ def test_sources_that_cannot_be_used(tmp_path: Path):
     imwrite(str(tmp_path / "cam" / "1.png"), np.zeros((4, 6, 3), np.uint8))
     assert find_sources(tmp_path)["cam"].size == (4, 6)
     (tmp_path / "cam.mp4").write_bytes(b"none")
-    with pytest.raises(DataError, match=r"cam\.mp4 is no video"):
+    with pytest.raises(DataError, match=r"cam\.mp4 cannot be opened"):
         find_sources(tmp_path)
     (tmp_path / "cam.mp4").unlink()
     (tmp_path / "cam").rename(tmp_path / "other")

@@ -1,4 +1,4 @@
-"""A process that is really killed (SIGKILL), at any stage: the next run makes the same dataset."""
+"""A process killed (SIGKILL) at any stage: the next run makes the same dataset."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from capture_scenes import write_project
 from rich.console import Console
 
 from gsgan.data.formats.capture import read_capture
-from gsgan.prepare.inputs import in_parallel
-from gsgan.prepare.options import Options
-from gsgan.prepare.progress import Bars
+from gsgan.prepare.flips import FlipSearch
+from gsgan.prepare.options import Options, Overlays
+from gsgan.prepare.refine import Refinement
 from gsgan.prepare.run import prepare
+from gsgan.prepare.solve import Settings
+from gsgan.prepare.work import each_camera
 
-LIMIT = 120  # seconds after which the child is taken to hang
+LIMIT = 120  # seconds after which the child counts as hanging
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork, no child to kill")
 
 
@@ -30,7 +32,13 @@ def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def options(project: Path, out: Path, **more) -> Options:
-    given = {"landmarks": str(project / "pose"), "masks": str(project / "masks"), "workers": 1}
+    given = {
+        "landmarks": str(project / "pose"),
+        "masks": str(project / "masks"),
+        "workers": 1,
+        "solve": Settings(flips=FlipSearch(enabled=False), refinement=Refinement(rounds=0)),
+        "overlays": Overlays(frames=1, size=64),
+    }
     return Options(source=str(project), out=str(out), **(given | more))
 
 
@@ -60,7 +68,7 @@ def killed(run: Callable[[], object], stop: Callable[[Path, int], bool]) -> bool
         try:
             run()
         finally:
-            os._exit(3)  # it came to its end, or broke
+            os._exit(3)  # it finished, or failed
     _, status = os.waitpid(child, 0)
     return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
 
@@ -82,12 +90,12 @@ STAGES: dict[str, Callable[[Path, int], bool]] = {
 
 @pytest.fixture(scope="module")
 def whole(project: Path) -> dict[str, bytes]:
-    """The pictures of a run that nothing disturbed."""
+    """The images of an undisturbed run."""
     return pictures(prepare(options(project, project.parent / "undisturbed"), quiet()))
 
 
 @pytest.mark.parametrize("stage", STAGES)
-def test_a_killed_process_leaves_nothing_half_and_is_taken_up(
+def test_a_killed_process_leaves_nothing_incomplete_and_is_resumed(
     project: Path, whole: dict[str, bytes], tmp_path: Path, stage: str
 ) -> None:
     out = tmp_path / "out"
@@ -115,20 +123,19 @@ def test_an_earlier_dataset_outlives_a_kill(
     assert not (tmp_path / ".out.old").exists()
 
 
-def test_one_failure_or_an_interrupt_stops_the_other_cameras_at_their_next_picture() -> None:
+def test_a_failure_or_an_interrupt_stops_the_other_cameras() -> None:
     steps: list[int] = []
-    with Bars("working", ["a", "b", "c"]) as bars:
 
-        def work(index: int) -> None:
-            if index == 0:
-                while not steps:
-                    time.sleep(0.001)
-                raise KeyboardInterrupt
-            for step in range(10**6):
-                bars.advance("b")
-                steps.append(step)
+    def work(name: str, report: Callable[[int, int], None]) -> None:
+        if name == "a":
+            while not steps:
                 time.sleep(0.001)
+            raise KeyboardInterrupt
+        for step in range(10**6):
+            report(step, 10**6)
+            steps.append(step)
+            time.sleep(0.001)
 
-        with pytest.raises(KeyboardInterrupt):
-            in_parallel(work, range(3), 2, bars.stop)
+    with pytest.raises(KeyboardInterrupt):
+        each_camera(work, "working", ["a", "b", "c"], 2)
     assert 0 < len(steps) < 10**4

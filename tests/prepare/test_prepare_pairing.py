@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from capture_scenes import ring
 
-from gsgan.prepare.pairing import fit_size, pair_cameras
+from gsgan.prepare.sources import fit_size, pair_cameras
 from gsgan.utils.errors import DataError
 
 
@@ -32,12 +32,12 @@ def test_given_names_win_and_may_be_numbers():
         (["a"], ["a"], {"z": "a"}, r"names what is not there"),
     ],
 )
-def test_what_does_not_pair_lists_both_sides(sources, cameras, given, what):
+def test_unpaired_names_list_both_sides(sources, cameras, given, what):
     with pytest.raises(DataError, match=what):
         pair_cameras(sources, cameras, given)
 
 
-def test_a_few_pixels_less_keep_k_and_are_noted():
+def test_a_few_missing_pixels_keep_k_and_are_noted():
     camera = ring(size=(1088, 1920))[0]
     fitted, note = fit_size(camera, "left", (1920, 1080), 16, Path("rig"))
     assert (fitted.name, fitted.size) == ("left", (1920, 1080))

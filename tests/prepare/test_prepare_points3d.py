@@ -10,7 +10,7 @@ import pytest
 from make import skeletons
 
 from gsgan.data.joints import SETS
-from gsgan.prepare.points3d import read_points3d, without_frozen
+from gsgan.prepare.landmarks import read_points3d, without_frozen
 from gsgan.utils.errors import DataError
 
 MARKERS = {
@@ -52,7 +52,7 @@ def write_trc(path: Path, p: np.ndarray, unit: str = "m") -> Path:
 
 
 @pytest.mark.parametrize("unit", ["m", "mm"])
-def test_trc_units_axes_and_names_are_undone(tmp_path: Path, unit: str):
+def test_trc_units_axes_and_names_are_converted(tmp_path: Path, unit: str):
     p = skeletons(4)
     p[2, 15] = np.nan
     found = read_points3d(write_trc(tmp_path / "a.trc", p, unit))
@@ -72,7 +72,7 @@ def test_zeros_of_gap_filling_are_missing(tmp_path: Path):
     assert found.conf[1, 16] == 0
 
 
-def test_last_values_of_gap_filling_are_taken_out():
+def test_repeated_values_of_gap_filling_are_removed():
     p = np.random.default_rng(0).standard_normal((20, 2, 3))
     p[5:13, 1], p[15:18, 0] = p[5, 1], p[15, 0]
     found, count = without_frozen(p, frames=8)
@@ -84,7 +84,7 @@ def test_last_values_of_gap_filling_are_taken_out():
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        (lambda text: "hello", "no .trc file"),
+        (lambda text: "hello", "not a .trc file"),
         (lambda text: text.replace("\tm\n", "\tfeet\n"), "Units is 'feet'"),
         (lambda text: text.replace("1.58", "x.yz"), "holds no numbers"),
         (lambda text: text.replace("Shoulder", "Sh").replace("Hip", "H"), "no shoulders and hips"),

@@ -18,8 +18,11 @@ import gsgan.prepare.mediapipe as tool
 from gsgan.data.formats.capture import read_capture
 from gsgan.prepare import pictures
 from gsgan.prepare.__main__ import prepare as command
-from gsgan.prepare.options import Options
+from gsgan.prepare.flips import FlipSearch
+from gsgan.prepare.options import MediaPipe, Options, Overlays
+from gsgan.prepare.refine import Refinement
 from gsgan.prepare.run import prepare
+from gsgan.prepare.solve import Settings
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 CAMERAS, FRAMES, SIZE = 3, 6, (96, 80)
@@ -27,12 +30,15 @@ CAMERAS, FRAMES, SIZE = 3, 6, (96, 80)
 
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
-    """A project folder: videos, calibration, 2D landmarks and masks of a person that is known."""
+    """A project folder: videos, calibration, 2D landmarks and masks of a known person."""
     return write_project(tmp_path / "project", CAMERAS, FRAMES, SIZE)
 
 
 def options(project: Path, **more) -> Options:
+    """Quick settings; the stages themselves are tested in test_prepare_solve.py."""
     given = {
+        "solve": Settings(flips=FlipSearch(enabled=False), refinement=Refinement(rounds=0)),
+        "overlays": Overlays(frames=1, size=64),
         "source": str(project),
         "out": str(project.parent / "out"),
         "landmarks": str(project / "pose"),
@@ -46,7 +52,7 @@ def quiet() -> Console:
 
 
 def test_videos_become_a_capture_that_training_reads(project: Path):
-    out = prepare(options(project), quiet())
+    out = prepare(options(project, solve=Settings()), quiet())
     layout = read_capture(out)
     assert layout.camera_names == ("cam00", "cam01", "cam02")
     assert layout.frames == tuple(range(FRAMES))
@@ -64,7 +70,7 @@ def test_videos_become_a_capture_that_training_reads(project: Path):
     assert (hands["conf"] == 0).all()
 
 
-def test_the_report_tells_every_stage_and_shows_overlays(project: Path):
+def test_the_report_has_every_stage_and_overlays(project: Path):
     out = prepare(options(project), quiet())
     numbers = json.loads((out / "report.json").read_text())
     assert list(numbers["error_px"]) == ["plain", "robust", "flips", "refined", "smoothed"]
@@ -103,7 +109,7 @@ def test_the_same_again_is_left_alone_and_another_refused(project: Path):
     assert [p.name for p in out.parent.iterdir() if p.name.startswith(".")] == []
 
 
-def test_what_is_not_ours_is_never_overwritten(project: Path):
+def test_other_folders_are_never_overwritten(project: Path):
     out = project.parent / "out"
     out.mkdir()
     (out / "thesis.txt").write_text("do not lose")
@@ -112,7 +118,7 @@ def test_what_is_not_ours_is_never_overwritten(project: Path):
     assert (out / "thesis.txt").read_text() == "do not lose"
 
 
-def test_a_killed_run_leaves_no_dataset_and_goes_on_where_it_was(project: Path, monkeypatch):
+def test_a_killed_run_leaves_no_dataset_and_resumes(project: Path, monkeypatch):
     write, written = pictures._write, []
 
     def dying(path, pixels, files):
@@ -126,13 +132,13 @@ def test_a_killed_run_leaves_no_dataset_and_goes_on_where_it_was(project: Path, 
         prepare(options(project, workers=1), quiet())
     assert not (project.parent / "out").exists()
     monkeypatch.setattr(pictures, "_write", lambda *a: (written.append(a[0]), write(*a)))
-    monkeypatch.setattr("gsgan.prepare.solving.solve", None)  # found again, not solved again
+    monkeypatch.setattr("gsgan.prepare.run.solve", None)  # found again, not solved again
     out = prepare(options(project, workers=1), quiet())
     assert len(written) == len(set(written)) == 2 * CAMERAS * FRAMES
     assert len(read_capture(out).frames) == FRAMES
 
 
-def test_a_camera_that_missed_pictures_and_masks_keeps_the_rest(project: Path):
+def test_a_camera_with_missing_masks_keeps_the_rest(project: Path):
     (project / "masks" / "cam01" / "000003.png").unlink()
     out = prepare(options(project, frames="1-5"), quiet())
     layout = read_capture(out)
@@ -180,20 +186,20 @@ def no_detections(project: Path) -> None:
     [
         (lambda p: None, {"unit": "mm"}, r"cameras\.json: cameras stand 0\.003 m .* unit=mm"),
         (in_centimetres, {}, r"cameras\.json: cameras stand 3\d\d m .* unit=mm, cm or m"),
-        (lambda p: None, {"source": "nowhere"}, r"nowhere is no folder"),
+        (lambda p: None, {"source": "nowhere"}, r"nowhere is not a folder"),
         (lambda p: (p / "cameras.json").unlink(), {}, "holds no calibration"),
         (lambda p: (p / "pose" / "cam01.npz").unlink(), {}, "no landmarks of the camera cam01"),
         (lambda p: (p / "pose" / "cam01.npz").write_bytes(b"PK"), {}, r"cam01\.npz"),
         (lambda p: (p / "videos" / "cam01.avi").write_bytes(b"RIFF"), {}, r"cam01\.avi"),
         (lambda p: (p / "masks" / "cam00" / "000001.png").write_bytes(b"x"), {}, r"000001\.png"),
         (no_detections, {}, "no body joint of any frame came out in 3D"),
-        (lambda p: None, {"frames": "90-99"}, "no frame is left"),
+        (lambda p: None, {"frames": "90-99"}, "frames=90-99 leaves no frame"),
         (lambda p: None, {"cameras": {"cam00": "cam01"}}, "more than one video"),
         (lambda p: None, {"unit": "inch"}, "unit must be one of"),
         (lambda p: None, {"source": None}, "give source="),
     ],
 )
-def test_what_is_wrong_is_said_in_one_sentence(project: Path, break_it, more, what):
+def test_errors_are_one_sentence(project: Path, break_it, more, what):
     break_it(project)
     with pytest.raises(GsganError, match=what) as failure:
         prepare(options(project, **more), quiet())
@@ -275,35 +281,35 @@ def with_stub(project: Path, monkeypatch, bad: str = "") -> Options:
     script = project.parent / f"stub{bad}.py"
     script.write_text(STUB.format(root=str(project), bad=bad))
     monkeypatch.setattr(tool, "SCRIPT", script)
-    mediapipe = tool.MediaPipe(folder=str(environment))
+    mediapipe = MediaPipe(folder=str(environment))
     return options(project, landmarks="mediapipe", masks="mediapipe", mediapipe=mediapipe)
 
 
-def test_the_tool_is_run_once_a_camera(project: Path, monkeypatch):
+def test_the_tool_runs_once_per_camera(project: Path, monkeypatch):
     given = with_stub(project, monkeypatch)
     out = prepare(given, quiet())
     assert len(read_capture(out).frames) == FRAMES
     calls = []
-    monkeypatch.setattr("gsgan.prepare.inputs.detect", lambda *a, **k: calls.append(a))
+    monkeypatch.setattr("gsgan.prepare.mediapipe._detect", lambda *a, **k: calls.append(a))
     smoother = {"pictures": pictures.PictureFiles(scale=0.5), "overwrite": True}
     prepare(Options(**(vars(given) | smoother)), quiet())
     assert calls == []
 
 
-def test_a_failing_tool_says_its_last_line(project: Path, monkeypatch):
+def test_the_message_of_a_failing_tool_is_its_last_line(project: Path, monkeypatch):
     with pytest.raises(DataError, match=r"cam01\.avi: the MediaPipe tool failed: the stub refuses"):
         prepare(with_stub(project, monkeypatch, bad="cam01"), quiet())
     assert not (project.parent / "out").exists()
 
 
 def test_the_environment_is_only_made_when_asked(project: Path):
-    missing = tool.MediaPipe(folder=str(project / "nothing"))
+    missing = MediaPipe(folder=str(project / "nothing"))
     with pytest.raises(ConfigError, match="add setup=true"):
         prepare(options(project, landmarks="mediapipe", mediapipe=missing), quiet())
     assert not (project / "nothing").exists()
 
 
-def test_a_python_that_is_not_there_is_named(tmp_path: Path):
-    missing = tool.MediaPipe(folder=str(tmp_path / "env"), python=str(tmp_path / "python9"))
+def test_a_missing_python_is_named(tmp_path: Path):
+    missing = MediaPipe(folder=str(tmp_path / "env"), python=str(tmp_path / "python9"))
     with pytest.raises(DataError, match="python9 cannot be started"):
         tool.ensure_environment(missing, True, print)

@@ -1,4 +1,4 @@
-"""Triangulation, flips, refinement, smoothing on motions whose truth is known."""
+"""Triangulation, flips, refinement, smoothing on motions with known ground truth."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ from capture_scenes import LENS, ring, seen, turned
 from make import distorted_pixels, skeletons
 
 from gsgan.data.joints import flip_groups
-from gsgan.prepare.cleanse import Cleansing, cleanse
-from gsgan.prepare.desync import clock_errors
+from gsgan.prepare.cleanse import Cleansing, cleanse, smooth
 from gsgan.prepare.flips import FlipSearch, apply_flips, find_flips
 from gsgan.prepare.refine import Refinement, camera_moves, refine_rig
 from gsgan.prepare.rig import Rig, undistort_points
-from gsgan.prepare.smooth import smooth
-from gsgan.prepare.solve import Settings, Solution, solve, stage_medians
-from gsgan.prepare.triangulate import Triangulation, linear_points
+from gsgan.prepare.solve import Settings, Solution, clock_errors, solve, stage_medians
+from gsgan.prepare.triangulate import Triangulation
 from gsgan.utils.errors import ConfigError
 
 GROUPS = flip_groups(hands=False)
@@ -39,16 +37,16 @@ def test_undistortion_inverts_the_lens():
 def test_exact_detections_give_exact_points():
     rig, p, uv, conf = seen(ring())
     truth = p.reshape(-1, 3)
-    np.testing.assert_allclose(linear_points(rig, flat(uv), flat(conf)), truth, atol=1e-9)
+    np.testing.assert_allclose(Triangulation().plain(rig, flat(uv), flat(conf)), truth, atol=1e-9)
     points = Triangulation().points(rig, flat(uv), flat(conf))
     np.testing.assert_allclose(points.p, truth, atol=1e-9)
     assert points.error.max() < 1e-6
 
 
-def test_one_wild_detection_is_outvoted():
+def test_one_outlier_is_rejected():
     rig, p, uv, conf = seen(ring(), noise=1.0)
-    uv[2, :, 15] += [300, -200]  # one camera takes another thing for the left wrist
-    plain = linear_points(rig, flat(uv), flat(conf)).reshape(p.shape)
+    uv[2, :, 15] += [300, -200]  # one camera detects the left wrist elsewhere
+    plain = Triangulation().plain(rig, flat(uv), flat(conf)).reshape(p.shape)
     robust = Triangulation().points(rig, flat(uv), flat(conf)).p.reshape(p.shape)
     off = [np.linalg.norm(found - p, axis=-1)[:, 15].max() for found in (plain, robust)]
     assert off[0] > 0.1
@@ -65,10 +63,10 @@ def test_too_few_views_and_zero_weight_are_missing_not_zero():
     assert np.isnan(points.p[[4, 5]]).all()
     assert (points.weight[:, [4, 5]] == 0).all()
     assert np.isfinite(points.p[6]).all()
-    assert np.isnan(linear_points(rig, flat(uv), flat(conf))[[4, 5]]).all()
+    assert np.isnan(Triangulation().plain(rig, flat(uv), flat(conf))[[4, 5]]).all()
 
 
-def test_rays_that_are_nearly_parallel_are_not_believed():
+def test_points_on_nearly_parallel_rays_are_missing():
     rig, _, uv, conf = seen(ring(angles=(0.0, 0.003)))
     assert np.isnan(Triangulation().points(rig, flat(uv), flat(conf)).p).all()
     loose = Triangulation(max_elongation=1e4)
@@ -83,7 +81,7 @@ def test_detections_that_contradict_each_other_are_missing():
     assert np.isfinite(np.delete(points.p, 3, axis=0)).all()
 
 
-def test_a_point_behind_the_cameras_costs_but_breaks_nothing():
+def test_a_point_behind_the_cameras_has_an_infinite_error():
     rig, _, uv, conf = seen(ring(), frames=1)
     behind = -1000 * np.ones((33, 3))
     assert np.isinf(rig.errors(behind, flat(uv))).any()
@@ -91,7 +89,7 @@ def test_a_point_behind_the_cameras_costs_but_breaks_nothing():
     assert conf.all()
 
 
-def test_chunks_and_spread_out_pairs_change_nothing_that_matters():
+def test_chunks_and_fewer_pairs_give_the_same_points():
     rig, p, uv, conf = seen(ring(angles=np.linspace(0, 6, 9)), noise=0.5)
     whole = Triangulation().points(rig, flat(uv), flat(conf)).p
     chunked = Triangulation(chunk=50).points(rig, flat(uv), flat(conf)).p
@@ -108,16 +106,16 @@ def planted(shape: tuple[int, int, int]) -> np.ndarray:
     return flips
 
 
-def test_planted_flips_are_found_and_put_right():
+def test_planted_flips_are_found_and_corrected():
     rig, p, uv, conf = seen(ring(), noise=1.0)
     flips = planted((4, 12, 3))
     swapped = apply_flips(uv, flips, GROUPS)
     assert np.abs(swapped - uv).max() > 50
     found = find_flips(rig, swapped, conf, GROUPS, FlipSearch(), Triangulation())
-    # Small pairs (the eyes) seen edge-on cannot be told, and need not.
+    # Small pairs (the eyes) seen edge-on cannot be determined, and need not.
     np.testing.assert_array_equal(found[..., 1:], flips[..., 1:])
-    put_right = apply_flips(swapped, found, GROUPS)
-    np.testing.assert_allclose(put_right[:, :, 11:], uv[:, :, 11:])
+    corrected = apply_flips(swapped, found, GROUPS)
+    np.testing.assert_allclose(corrected[:, :, 11:], uv[:, :, 11:])
     assert p.shape[0] == 12
 
 
@@ -127,7 +125,7 @@ def test_no_flips_where_there_are_none():
     assert found[..., 1:].sum() == 0
 
 
-def test_all_cameras_swapped_for_a_moment_is_told_from_the_motion():
+def test_a_swap_in_all_cameras_is_found_from_the_motion():
     rig, _, uv, conf = seen(ring(), frames=20)
     flips = np.zeros((4, 20, 3), bool)
     flips[:, 8:11] = True
@@ -158,7 +156,7 @@ def relative(rig: Rig) -> Rig:
     return Rig(rig.K, R, rig.t - np.einsum("cij,j->ci", R, rig.t[0]))
 
 
-def test_refinement_leaves_a_right_calibration_alone():
+def test_refinement_keeps_a_correct_calibration():
     rig, p, uv, conf = seen(ring())
     found = refine_rig(rig, rig, p.reshape(-1, 3), flat(uv), flat(conf), Refinement())
     turned_by, moved_by = camera_moves(rig, found)
@@ -198,7 +196,7 @@ def test_smoothing_keeps_a_parabola_and_its_gaps():
     assert known.sum() == p.size - 3 * 5
 
 
-def test_smoothing_halves_noise_and_trusts_by_weight():
+def test_smoothing_halves_noise_and_respects_weights():
     rng = np.random.default_rng(0)
     time = np.arange(200) / 60
     truth = np.zeros((200, 1, 3))
@@ -211,13 +209,13 @@ def test_smoothing_halves_noise_and_trusts_by_weight():
     assert found[:90].std() < 0.6 * noisy[:90].std()
 
 
-def test_no_smoothing_and_lonely_points_stay_as_they_are():
+def test_without_smoothing_or_neighbours_points_stay():
     p = np.random.default_rng(1).standard_normal((5, 2, 3))
     np.testing.assert_array_equal(smooth(p, np.ones((5, 2)), np.arange(5.0), 0.0), p)
     np.testing.assert_array_equal(smooth(p, np.ones((5, 2)), np.arange(5.0), 0.1), p)
 
 
-def test_cleansing_takes_out_what_no_body_has():
+def test_cleansing_removes_impossible_joints():
     p = skeletons(1).repeat(10, axis=0)
     p[3, 15] += [5, 0, 0]  # a wrist five metres away
     p[6, 27] += [0, 0, 0.3]  # a shin a good deal too short
@@ -239,23 +237,21 @@ def test_a_late_clock_is_measured():
     assert gain[1] > 0.5
     delay, gain = clock_errors(rig, uv, conf, Triangulation(), lag=6)
     np.testing.assert_allclose(delay, 0, atol=0.05)
-    assert np.isnan(
-        clock_errors(rig.without(0).without(0), uv[2:], conf[2:], Triangulation(), 3)[0]
-    ).all()
+    assert np.isnan(clock_errors(rig[2:], uv[2:], conf[2:], Triangulation(), 3)[0]).all()
 
 
 def test_all_stages_together_end_near_the_truth():
-    rig, p, uv, conf = seen(ring(), frames=30, noise=2.0)
-    flips = np.zeros((4, 30, 3), bool)
-    flips[1, :9] = True
+    rig, p, uv, conf = seen(ring(), frames=16, noise=2.0)
+    flips = np.zeros((4, 16, 3), bool)
+    flips[1, :5] = True
     swapped = apply_flips(uv, flips, GROUPS)
     given = turned(rig, 3, degrees=1.0, metres=0.02)
-    found = solve(given, np.arange(30) / 60, swapped, conf, Settings())
+    found = solve(given, np.arange(16) / 60, swapped, conf, Settings())
     medians = {name: values[0] for name, values in stage_medians(found.stages).items()}
     assert list(medians) == ["plain", "robust", "flips", "refined", "smoothed"]
     assert medians["plain"] > 5
     assert medians["refined"] < 2.5
-    assert found.flips[1, :9, 1:].all()
+    assert found.flips[1, :5, 1:].all()
     error = np.linalg.norm(found.p - p, axis=-1)
     assert np.nanmedian(error) < 0.02
     again = Solution.from_arrays(found.to_arrays(), given.K)

@@ -11,7 +11,7 @@ def fit(config: DictConfig) -> None:
     """Moves the landmarks of ``config.data`` until the person fits its masks.
 
     Raises:
-        GsganError: on anything the user can put right.
+        GsganError: on anything the user can correct.
     """
     from gsgan.fit.run import run_fit
 

@@ -1,26 +1,67 @@
-"""The fit itself: one shape for all frames, and a move of every joint in every frame."""
+"""The fit: one shape for all frames, and a displacement of every joint in every frame."""
 
 from __future__ import annotations
 
 import math
 import random
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from gsgan.fit.settings import Fit
+from gsgan.fit.moments import Moments, around
 from gsgan.fit.shape import RigidShape
 from gsgan.scene import Frame
-from gsgan.window import body_window
+from gsgan.skeleton import Densify, limb_length_sum
+from gsgan.splat import Accuracy
+from gsgan.utils.errors import ConfigError
 
 BETAS = (0.9, 0.99)
 LENGTH_FLOOR = 1e-12  # square metres
-FINAL_RATE = 0.02  # of the rates, at the last sweep
-NEAR = 0.01  # metres, nearer than which a joint has no place in the picture
-MARGIN = 0.25  # metres round the joints, as the avatar's windows: wider only costs time
+FINAL_RATE = 0.02  # of the learning rates, in the last sweep
+ABOVE_ZERO = {"least_mask", "sweeps", "cameras", "noise", "joint_rate", "shape_rate"}
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Settings of the fit, see conf/fit/standard.yaml; docs/data.md has measurements.
+
+    Raises:
+        ConfigError: when a value is out of its range.
+    """
+
+    densify: Densify
+    accuracy: Accuracy
+    least_mask: float = 0.1
+    shape_steps: int = 150
+    sweeps: int = 20
+    cameras: int = 8
+    noise: float = 0.02
+    prior: float = 0.02
+    bones: float = 0.02
+    joint_rate: float = 0.004
+    shape_rate: float = 0.01
+    hold: float = 0.4
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value, default = getattr(self, field.name), field.default
+            if not isinstance(default, int | float):
+                if value is None:
+                    raise ConfigError(
+                        f"fit.{field.name} cannot be null; conf/fit/standard.yaml has it"
+                    )
+                continue
+            kind = int if isinstance(default, int) else (int, float)
+            fits = isinstance(value, kind) and not isinstance(value, bool) and value >= 0
+            if not fits or (field.name in ABOVE_ZERO and value == 0):
+                what = "a whole number" if kind is int else "a number"
+                least = "above 0" if field.name in ABOVE_ZERO else "of at least 0"
+                raise ConfigError(f"fit.{field.name} must be {what} {least}, got {value!r}")
+        if self.hold > 1:
+            raise ConfigError(f"fit.hold is a share of the sweeps, at most 1; got {self.hold!r}")
 
 
 @dataclass(frozen=True)
@@ -28,8 +69,8 @@ class Agreement:
     """How well the shape fills the masks.
 
     Args:
-        iou: overlap over union of alpha and mask at a half, mean over pictures.
-        share: the alpha that is wrong, as a share of the mask, mean over frames.
+        iou: intersection over union of alpha and mask above 0.5, mean over images.
+        share: wrong alpha as a share of the mask, mean over frames.
     """
 
     iou: float
@@ -40,50 +81,46 @@ class Fitter:
     """Moves joints until one rigid-limbed shape fills the masks of all cameras.
 
     A frame's loss is the alpha that differs from the mask as a share of the mask's area, plus the
-    two priors of `Fit`. Colours are not looked at. Joints that were not seen do not move.
+    two priors of `Fit`. Colours are not used. Joints that were not seen do not move.
 
     Args:
-        shape: of the person.
-        skeletons: ``[F, J, 3]`` metres, finite.
-        visibility: ``[F, J]`` in [0, 1].
-        pictures: gives the pictures of frame number i, at least one, one a camera, with a person
-            in each mask; ``unsure`` where they say nothing.
         settings: see `Fit`.
+        moments: frames, images and skeletons.
         seed: of the order of frames and cameras.
+        start: ``[F, J, 3]`` metres, finite; None for the capture's skeletons.
 
-    Source: ours. Landmarks of a detector are off by centimetres where flesh hides the joint, and no
-    painter can make up for that (docs/data.md).
+    Source: ours. A detector's landmarks are off by centimetres where flesh hides the joint, which
+    no generator can compensate (docs/data.md).
     """
 
     def __init__(
-        self,
-        shape: RigidShape,
-        skeletons: Tensor,
-        visibility: Tensor,
-        pictures: Callable[[int], Sequence[Frame]],
-        settings: Fit,
-        seed: int = 0,
+        self, settings: Fit, moments: Moments, seed: int = 0, start: Tensor | None = None
     ) -> None:
-        self.shape, self.pictures, self.settings, self.seed = shape, pictures, settings, seed
-        self.start, self.visibility = skeletons, visibility
-        self.seen = visibility > 0
-        count, joints = visibility.shape
-        self.moves = nn.Embedding(count, 3 * joints, sparse=True).to(skeletons.device)
+        self.settings, self.moments, self.seed = settings, moments, seed
+        self.start = start = moments.skeletons if start is None else start
+        self.visibility, self.seen = moments.visibility, moments.visibility > 0
+        limb_sum = float(limb_length_sum(start, self.seen).nanmedian())
+        shape = RigidShape(settings.densify, limb_sum, settings.accuracy).to(moments.device)
+        self.shape = shape
+        count, joints = self.seen.shape
+        self.moves = nn.Embedding(count, 3 * joints, sparse=True).to(start.device)
         nn.init.zeros_(self.moves.weight)
-        self.of_shape = torch.optim.Adam(shape.parameters(), settings.shape_rate, BETAS)
-        self.of_joints = torch.optim.SparseAdam(self.moves.parameters(), settings.joint_rate, BETAS)
-        limbs = torch.tensor(shape.densify.template.edges, device=skeletons.device)
+        self.shape_optimiser = torch.optim.Adam(shape.parameters(), settings.shape_rate, BETAS)
+        self.joint_optimiser = torch.optim.SparseAdam(
+            self.moves.parameters(), settings.joint_rate, BETAS
+        )
+        limbs = torch.tensor(shape.densify.template.edges, device=start.device)
         self.ends = limbs[:, 0], limbs[:, 1]
         self.shaped, self.swept = 0, 0
 
     @property
     def done(self) -> bool:
-        """Whether nothing is left to do."""
+        """Whether all sweeps are done."""
         return self.swept >= self.settings.sweeps
 
     @torch.no_grad()
     def joints(self) -> Tensor:
-        """``[F, J, 3]`` metres: the skeletons as they stand now."""
+        """``[F, J, 3]`` metres: the current skeletons."""
         return self.start + self._moved(torch.arange(len(self.start)))
 
     def shape_step(self) -> float:
@@ -91,19 +128,21 @@ class Fitter:
         chance = random.Random(f"{self.seed} shape {self.shaped}")
         i = chance.randrange(len(self.start))
         share = self._share(i, torch.zeros_like(self.start[i]), chance)
-        self.of_shape.zero_grad()
+        self.shape_optimiser.zero_grad()
         share.backward()  # type: ignore[no-untyped-call]
-        self.of_shape.step()
+        self.shape_optimiser.step()
         self.shaped += 1
         return share.item()
 
     def sweep(self, advance: Callable[[], None] = lambda: None) -> float:
-        """One step on every frame, in an order drawn by chance. Returns the mean share."""
+        """One step on every frame, in random order. Returns the mean share."""
         settings, chance = self.settings, random.Random(f"{self.seed} sweep {self.swept}")
         self._set_rates()
         known = self.seen[:, self.ends[0]] & self.seen[:, self.ends[1]]
         lengths = torch.where(known, self._lengths(self.joints()), torch.nan)
-        usual = lengths.nanmedian(dim=0).values.nan_to_num(0.0)  # of limbs never seen: not used
+        usual = lengths.nanmedian(dim=0).values.nan_to_num(
+            0.0
+        )  # limbs that were never seen are not used
         order = list(range(len(self.start)))
         chance.shuffle(order)
         total = 0.0
@@ -114,11 +153,11 @@ class Fitter:
             if settings.bones:
                 off = torch.where(known[i], self._lengths(self.start[i] + move) - usual, 0.0)
                 loss = loss + settings.bones * (off / settings.noise).square().mean()
-            self.of_shape.zero_grad()
-            self.of_joints.zero_grad()
+            self.shape_optimiser.zero_grad()
+            self.joint_optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
-            self.of_shape.step()
-            self.of_joints.step()
+            self.shape_optimiser.step()
+            self.joint_optimiser.step()
             total += share.item()
             advance()
         self.swept += 1
@@ -126,14 +165,14 @@ class Fitter:
 
     @torch.no_grad()
     def agreement(self, skeletons: Tensor) -> Agreement:
-        """How well the shape as it is now fills the masks with these ``[F, J, 3]`` skeletons."""
+        """How well the current shape fills the masks with these ``[F, J, 3]`` skeletons."""
         ious, shares = [], []
         for i, skeleton in enumerate(skeletons):
             wrong = area = 0.0
             for frame in self._windows(i):
                 alpha = self._alpha(i, skeleton, frame)
-                judged = True if frame.unsure is None else frame.unsure < 0.5
-                person, mask = (alpha > 0.5) & judged, (frame.mask > 0.5) & judged
+                sure = True if frame.unsure is None else frame.unsure < 0.5
+                person, mask = (alpha > 0.5) & sure, (frame.mask > 0.5) & sure
                 either = (person | mask).sum().item()
                 if either:
                     ious.append((person & mask).sum().item() / either)
@@ -144,24 +183,24 @@ class Fitter:
         return Agreement(_mean(ious), _mean(shares))
 
     def outline(self, i: int, skeleton: Tensor, frame: Frame) -> Tensor:
-        """Alpha ``[1, 1, H, W]`` of the shape in a whole picture of frame number i."""
+        """Alpha ``[1, 1, H, W]`` of the shape in a whole image of the i-th frame."""
         with torch.no_grad():
             return self._alpha(i, skeleton, frame)
 
     def state_dict(self) -> dict[str, Any]:
-        """All that a later process needs to go on."""
+        """The state from which a later process can resume."""
         return {
             "shape": self.shape.state_dict(),
             "moves": self.moves.state_dict(),
-            "of_shape": self.of_shape.state_dict(),
-            "of_joints": self.of_joints.state_dict(),
+            "shape_optimiser": self.shape_optimiser.state_dict(),
+            "joint_optimiser": self.joint_optimiser.state_dict(),
             "shaped": self.shaped,
             "swept": self.swept,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes on from there."""
-        for name in ("shape", "moves", "of_shape", "of_joints"):
+        """Restores a state."""
+        for name in ("shape", "moves", "shape_optimiser", "joint_optimiser"):
             getattr(self, name).load_state_dict(state[name])
         self.shaped, self.swept = state["shaped"], state["swept"]
 
@@ -183,7 +222,7 @@ class Fitter:
         return self.shape(skeleton[None], self.visibility[i][None], frame.camera)
 
     def _windows(self, i: int) -> list[Frame]:
-        return [around(self.start[i], frame) for frame in self.pictures(i)]
+        return [around(self.start[i], frame) for frame in self.moments.pictures(i)]
 
     def _lengths(self, skeletons: Tensor) -> Tensor:
         """``[..., L]`` metres; the floor keeps the gradient of a limb of no length finite."""
@@ -196,20 +235,12 @@ class Fitter:
         rest = max(self.settings.sweeps - held, 1e-9)
         fallen = min(max(self.swept - held, 0) / rest, 1)
         factor = FINAL_RATE + (1 - FINAL_RATE) * 0.5 * (1 + math.cos(math.pi * fallen))
-        self.of_shape.param_groups[0]["lr"] = self.settings.shape_rate * factor
-        self.of_joints.param_groups[0]["lr"] = self.settings.joint_rate * factor
-
-
-def around(skeleton: Tensor, frame: Frame) -> Frame:
-    """The part of a picture round ``skeleton`` ``[J, 3]``: all that is compared."""
-    window = body_window(
-        skeleton[None], frame.camera, margin=MARGIN, multiple=16, least=32, near=NEAR
-    )
-    return window.frame(frame)
+        self.shape_optimiser.param_groups[0]["lr"] = self.settings.shape_rate * factor
+        self.joint_optimiser.param_groups[0]["lr"] = self.settings.joint_rate * factor
 
 
 def _wrong(alpha: Tensor, frame: Frame) -> Tensor:
-    """How far alpha is from the mask; 0 where the picture says nothing."""
+    """How far alpha is from the mask; 0 where the image is unknown."""
     off = (alpha - frame.mask).abs()
     return off if frame.unsure is None else off * (1 - frame.unsure)
 

@@ -1,4 +1,4 @@
-"""The frames of a capture as the fit sees them."""
+"""The frames of a capture that the fit uses, with their images."""
 
 from __future__ import annotations
 
@@ -8,33 +8,33 @@ from dataclasses import replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset, PictureCache
-from gsgan.fit.fitter import Fitter, around
-from gsgan.fit.settings import Fit
-from gsgan.fit.shape import RigidShape
 from gsgan.scene import Frame
-from gsgan.skeleton import limb_length_sum
 from gsgan.utils.errors import DataError
+from gsgan.window import body_window
 
-USUAL = 0.75  # quantile of the masks' areas that counts as usual: crumbs may be the most
+NEAR = 0.01  # metres: nearer joints have no place in the image
+MARGIN = 0.25  # metres around the joints, as the avatar's windows: wider only costs time
+USUAL = 0.75  # quantile of the masks' areas that counts as usual: most may be nearly empty
 
 
 class Moments:
-    """The frames of a capture and their pictures by the cameras that train.
+    """The frames of a capture and their images by the training cameras.
 
-    Held-out cameras are not looked at: what they saw is for scoring only. Pictures without a
-    person, or nearly so, are left out, and frames that have none left.
+    Held-out cameras are not used: their images are for evaluation only. Images without a person, or
+    nearly so, are left out, and frames without any other image.
 
     Args:
         data: the capture.
-        device: the pictures go there.
-        least_mask: see `Fit`.
-        advance: called after each picture is looked at.
+        device: of the images.
+        least_mask: least share of the usual mask area.
+        advance: called after each image is read.
 
     Raises:
-        DataError: when no picture is left.
+        DataError: when no image is left.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Moments:
         cache = PictureCache(int(data.cache_mb * 2**20))
         self.dataset = CaptureDataset(layout, items, data.size, data.crop, cache, data.lens)
         self.cameras, self.device = cameras, device
-        self._unseen: dict[int, torch.Tensor] = {}
+        self._unseen: dict[int, Tensor] = {}
         places = self._usable(least_mask, advance)
         if not places:
             raise DataError(f"{layout.root}: the masks of {', '.join(cameras)} hold no person")
@@ -63,12 +63,11 @@ class Moments:
         self._places: dict[int, list[int]] = {frame: [] for frame in self.frames}
         for place in places:
             self._places[items[place][1]].append(place)
-        marks = layout.landmarks
-        self.skeletons = self._stacked(marks.p)
-        self.visibility = self._stacked(marks.visibility)
+        self.skeletons = self._stacked(layout.landmarks.p)
+        self.visibility = self._stacked(layout.landmarks.visibility)
 
     def pictures(self, i: int) -> list[Frame]:
-        """The pictures of the i-th frame, one a camera; ``unsure`` beyond the camera's border."""
+        """The images of the i-th frame, one per camera; ``unsure`` outside the camera's image."""
         return [self._picture(place) for place in self._places[self.frames[i]]]
 
     def _picture(self, place: int) -> Frame:
@@ -81,10 +80,10 @@ class Moments:
         return frame.to(self.device)
 
     def _usable(self, least: float, advance: Callable[[], None]) -> list[int]:
-        """Places of the pictures whose masks hold enough of the person; finds borders by the way.
+        """Positions of the images whose masks hold enough of the person; also finds borders.
 
-        Counted is what the fit compares, in square metres at the person: a mask shrinks with the
-        distance, and another person's lies elsewhere.
+        Areas are of the compared part, in square metres at the person: a mask shrinks with the
+        distance, and other persons are elsewhere in the image.
         """
         areas = []
         for place in range(len(self.dataset)):
@@ -102,22 +101,14 @@ class Moments:
         usual = float(np.quantile(known, USUAL)) if known else np.inf
         return [place for place, area in enumerate(areas) if area >= least * usual]
 
-    def _stacked(self, by_frame: Mapping[int, NDArray[np.float64]]) -> torch.Tensor:
+    def _stacked(self, by_frame: Mapping[int, NDArray[np.float64]]) -> Tensor:
         values = np.stack([by_frame[frame] for frame in self.frames])
         return torch.from_numpy(values).to(self.device, torch.float32)
 
 
-def make_fitter(
-    settings: Fit, moments: Moments, seed: int = 0, start: torch.Tensor | None = None
-) -> Fitter:
-    """The fit before its first step.
-
-    Args:
-        start: ``[F, J, 3]`` metres, skeletons in place of the capture's own.
-    """
-    start = moments.skeletons if start is None else start
-    limb_sum = float(limb_length_sum(start, moments.visibility > 0).nanmedian())
-    shape = RigidShape(settings.densify, limb_sum, settings.accuracy)
-    return Fitter(
-        shape.to(moments.device), start, moments.visibility, moments.pictures, settings, seed
+def around(skeleton: Tensor, frame: Frame) -> Frame:
+    """The part of an image around ``skeleton [J, 3]`` that is compared with the mask."""
+    window = body_window(
+        skeleton[None], frame.camera, margin=MARGIN, multiple=16, least=32, near=NEAR
     )
+    return window.frame(frame)

@@ -1,4 +1,4 @@
-"""A person of one shape, for silhouettes: rigid parts of Gaussians that the skeleton moves."""
+"""A person of one shape, for silhouettes: rigid limbs of Gaussians that the skeleton moves."""
 
 from __future__ import annotations
 
@@ -9,35 +9,28 @@ from gsgan.scene import Camera, Gaussians
 from gsgan.skeleton import Densify, bone_frames, sanitise
 from gsgan.splat import Accuracy, rasterise
 
+OPACITY = 0.5  # initial
+BOUND = 0.25  # metres: a Gaussian stays this close to its point
+
 
 class RigidShape(nn.Module):
-    """Gaussians on Alg. 1's points with residuals that no pose changes.
+    """Gaussians on Alg. 1's points, with residuals that do not depend on the pose.
 
-    What a pose cannot change, noise in the landmarks cannot hide in: where the posed shape does not
-    fill the masks, the joints are in the wrong place.
+    Such a shape cannot absorb noise in the landmarks: where it does not fill the masks, the joints
+    are in the wrong place.
 
     Args:
         densify: skeleton to points.
         limb_sum: metres, the subject's summed limb lengths.
         accuracy: the rasteriser's settings.
-        opacity: initial opacity.
-        bound: metres a Gaussian may leave its point by.
     """
 
-    def __init__(
-        self,
-        densify: Densify,
-        limb_sum: float,
-        accuracy: Accuracy,
-        opacity: float = 0.5,
-        bound: float = 0.25,
-    ) -> None:
+    def __init__(self, densify: Densify, limb_sum: float, accuracy: Accuracy) -> None:
         super().__init__()
         self.densify, self.limb_sum, self.accuracy = densify, limb_sum, accuracy
-        self.bound = bound
         self.offsets = nn.Parameter(torch.zeros(densify.n_points, 3))
         self.log_scales = nn.Parameter(torch.zeros(densify.n_points, 3))
-        logit = torch.tensor(opacity).logit().item()
+        logit = torch.tensor(OPACITY).logit().item()
         self.logits = nn.Parameter(torch.full((densify.n_points,), logit))
 
     def forward(self, skeleton: Tensor, visibility: Tensor, camera: Camera) -> Tensor:
@@ -50,7 +43,7 @@ class RigidShape(nn.Module):
         """
         p, valid = sanitise(skeleton, visibility, self.densify.template, self.limb_sum)
         points = self.densify(p, valid, bone_frames(p, valid, self.densify.template))
-        offsets = self.bound * torch.tanh(self.offsets / self.bound)
+        offsets = BOUND * torch.tanh(self.offsets / BOUND)
         means = points.means + (points.frames @ offsets.unsqueeze(-1)).squeeze(-1)
         scales = points.scales.unsqueeze(-1) * self.log_scales.clamp(-3, 3).exp()
         axes = points.frames * scales.unsqueeze(-2)

@@ -11,7 +11,7 @@ def prepare(config: DictConfig) -> None:
     """Makes the dataset ``config.out`` from the videos and calibration in ``config.source``.
 
     Raises:
-        GsganError: on anything the user can put right.
+        GsganError: on anything the user can correct.
     """
     from hydra.utils import instantiate
 

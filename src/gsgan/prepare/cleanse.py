@@ -1,4 +1,4 @@
-"""Joints that no body could have are taken out: too far away, bones of the wrong length."""
+"""Trajectories: joints that no body can have are removed, the rest is smoothed in time."""
 
 from __future__ import annotations
 
@@ -10,25 +10,23 @@ from gsgan.data.joints import ALL, BODY, HAND, PALM
 from gsgan.prepare.rig import Bool, Float, known
 from gsgan.utils.errors import ConfigError
 
-# Bones that keep their length, by the end that is doubted when one does not.
+Bones = tuple[tuple[int, int], ...]
+# Bones of constant length, as (inner, outer) joint: the outer one is removed when it differs.
 BODY_BONES = (
     *((11, 13), (13, 15), (12, 14), (14, 16)),
     *((23, 25), (25, 27), (24, 26), (26, 28)),
 )
 HAND_BONES = tuple((start, start + knuckle) for start in (BODY, BODY + HAND) for knuckle in PALM)
+DEGREE = 2  # of the polynomial that smooths
+REACH = 3  # standard deviations at which the smoothing kernel ends
 
 
 @dataclass(frozen=True)
 class Cleansing:
-    """What counts as impossible.
-
-    Args:
-        max_reach: metres from the median joint of the frame.
-        bone: share by which a bone may differ from its median length, 0.3 = 30 %.
-        hand_bone: the same for the hand's palm bones, which are short and less certain.
+    """What counts as impossible, see conf/prepare.yaml.
 
     Raises:
-        ConfigError: when a value is not positive.
+        ConfigError: when a value is out of its range.
     """
 
     max_reach: float = 1.5
@@ -41,11 +39,26 @@ class Cleansing:
                 raise ConfigError(f"cleansing.{name} must be above 0, got {getattr(self, name)!r}")
 
 
-def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
-    """Points with the impossible ones NaN, and how many were taken out for which reason.
+@dataclass(frozen=True)
+class Smoothing:
+    """How trajectories are smoothed, see conf/prepare.yaml.
 
-    Convention: of a bone with the wrong length the outer end goes; of a hand with most palm bones
-    wrong, the whole hand. Medians are over all frames, so a person of any size fits.
+    Raises:
+        ConfigError: when a value is out of its range.
+    """
+
+    seconds: float = 0.02
+
+    def __post_init__(self) -> None:
+        if not self.seconds >= 0:
+            raise ConfigError(f"smoothing.seconds must be at least 0, got {self.seconds!r}")
+
+
+def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
+    """Points with the impossible ones set to NaN, and how many were removed for which reason.
+
+    Convention: of a bone with the wrong length the outer end is removed; of a hand with most palm
+    bones wrong, the whole hand. Medians are over all frames, so a person of any size fits.
 
     Args:
         p: ``[F, J, 3]`` metres, NaN = missing; J is 33 or 75.
@@ -55,13 +68,12 @@ def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
     far = _far(p, settings.max_reach)
     p[far] = np.nan
     wrong = np.zeros(far.shape, bool)
-    for joint, bad in _wrong_bones(p, BODY_BONES, settings.bone).items():
+    for (_, joint), bad in zip(BODY_BONES, _off(p, BODY_BONES, settings.bone).T, strict=True):
         wrong[:, joint] |= bad
     if p.shape[1] == ALL:
-        bones = _wrong_bones(p, HAND_BONES, settings.hand_bone)
-        for start in (BODY, BODY + HAND):
-            palm = np.stack([bones[start + knuckle] for knuckle in PALM])
-            wrong[:, start : start + HAND] |= (palm.sum(0) * 2 > len(PALM))[:, None]
+        palms = _off(p, HAND_BONES, settings.hand_bone).reshape(len(p), 2, len(PALM))
+        most = palms.sum(-1) * 2 > len(PALM)
+        wrong[:, BODY:] |= most.repeat(HAND, axis=1)
     wrong &= known(p)
     p[wrong] = np.nan
     return p, {"too far away": int(far.sum()), "bone length": int(wrong.sum())}
@@ -75,18 +87,48 @@ def _far(p: Float, reach: float) -> Bool:
     return seen & (np.linalg.norm(p - centre, axis=-1) > reach)
 
 
-def bone_lengths(p: Float, bones: tuple[tuple[int, int], ...]) -> Float:
+def bone_lengths(p: Float, bones: Bones) -> Float:
     """``[F, B]`` metres, NaN where an end is missing."""
     ends = np.array(bones)
     return np.asarray(np.linalg.norm(p[:, ends[:, 1]] - p[:, ends[:, 0]], axis=-1))
 
 
-def _wrong_bones(p: Float, bones: tuple[tuple[int, int], ...], share: float) -> dict[int, Bool]:
-    """Outer joint of each bone, and in which frames ``[F]`` its length is off."""
+def _off(p: Float, bones: Bones, share: float) -> Bool:
+    """``[F, B]`` whether a bone's length differs from its median by more than the share."""
     lengths = bone_lengths(p, bones)
-    seen = np.isfinite(lengths)
-    usual = [
-        np.median(one[ok]) if ok.any() else 1.0 for one, ok in zip(lengths.T, seen.T, strict=True)
-    ]
-    off = np.where(seen, np.abs(lengths / np.maximum(usual, 1e-9) - 1), 0.0) > share
-    return {outer: off[:, i] for i, (_, outer) in enumerate(bones)}
+    known_lengths = (one[np.isfinite(one)] for one in lengths.T)
+    usual = [max(np.median(one), 1e-9) if one.size else 1.0 for one in known_lengths]
+    return np.asarray(np.abs(lengths / usual - 1) > share)
+
+
+def smooth(p: Float, weight: Float, time: Float, seconds: float) -> Float:
+    """Each point replaced by the value of a parabola fitted to its neighbourhood in time.
+
+    Convention: a missing point (NaN, or weight 0) stays NaN and is ignored by its neighbours; a
+    motion with constant acceleration is unchanged, gaps or not. With fewer than three known frames
+    in the neighbourhood the point is left as it is. (Savitzky-Golay with weights, gaps and uneven
+    time, which `scipy.signal.savgol_filter` does not have.)
+
+    Args:
+        p: ``[F, J, 3]`` metres, NaN = missing.
+        weight: ``[F, J]`` at least 0.
+        time: ``[F]`` seconds, rising; it need not be even.
+        seconds: standard deviation of the Gaussian neighbourhood.
+    """
+    usable = known(p) & (weight > 0)
+    filled, weight = np.where(usable[..., None], p, 0.0), np.where(usable, weight, 0.0)
+    out = np.where(usable[..., None], p, np.nan)
+    if seconds == 0:
+        return out
+    for f, now in enumerate(time):
+        near = np.abs(time - now) <= REACH * seconds
+        s = (time[near] - now) / seconds
+        basis = s[:, None] ** np.arange(DEGREE + 1)
+        w = np.exp(-0.5 * s**2)[:, None] * weight[near]
+        enough = usable[f] & (usable[near].sum(0) > DEGREE)
+        normal = np.einsum("fj,fa,fb->jab", w, basis, basis)
+        right = np.einsum("fj,fa,fjx->jax", w, basis, filled[near])
+        normal[~enough] = np.eye(DEGREE + 1)
+        fitted = np.linalg.solve(normal, right)[:, 0]
+        out[f] = np.where(enough[:, None], fitted, out[f])
+    return out

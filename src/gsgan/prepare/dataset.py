@@ -1,32 +1,35 @@
-"""The small files of the finished capture, and whether one is there already."""
+"""The dataset's folder: its small files, and how it replaces an earlier one."""
 
 from __future__ import annotations
 
 import contextlib
-import io
 import json
-from collections.abc import Mapping, Sequence
+import os
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import gsgan
 from gsgan.data.cameras import CameraEntry
+from gsgan.data.formats.capture import read_capture
 from gsgan.data.joints import BODY, hand_names
-from gsgan.prepare.pictures import PictureFiles
+from gsgan.prepare.inputs import Inputs
+from gsgan.prepare.options import Options
 from gsgan.prepare.rig import Float, known
 from gsgan.prepare.solve import Solution
-from gsgan.prepare.writing import writing
+from gsgan.prepare.work import write_json, write_npz, writing
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.errors import DataError
-from gsgan.utils.files import write_atomically
 
 GENERATOR = "gsgan.prepare"
+Frames = NDArray[np.int64]
 
 
 def is_there(out: Path, key: str, overwrite: bool) -> bool:
-    """Whether ``out`` holds this very dataset.
+    """Whether ``out`` holds the dataset with this key.
 
     Raises:
         DataError: when it holds something else and may not be overwritten.
@@ -48,76 +51,92 @@ def is_there(out: Path, key: str, overwrite: bool) -> bool:
     )
 
 
+def publish(root: Path, out: Path) -> None:
+    """Moves the finished dataset ``root`` to ``out`` in one step; if that fails, an old one stays.
+
+    Raises:
+        DataError: when training could not read it, or it cannot be moved.
+    """
+    with writing(root):
+        for part in root.rglob(".*.part"):  # of a run that was killed while it wrote a file
+            part.unlink()
+    try:
+        read_capture(root)
+    except DataError as error:
+        raise DataError(f"nothing was made, because training could not read it: {error}") from None
+    old = out.with_name(f".{out.name}.old")
+    with writing(out):
+        if out.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            os.replace(out, old)
+        try:
+            os.replace(root, out)
+        except OSError:
+            if old.exists():
+                os.replace(old, out)
+            raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
 def write_small_files(
-    root: Path,
-    *,
-    cameras: Sequence[CameraEntry],
-    files: PictureFiles,
-    frames: Sequence[int],
-    solution: Solution,
-    conf: Float,
-    fps: float,
-    up_axis: str,
-    made_by: Mapping[str, Any],
+    root: Path, options: Options, inputs: Inputs, frames: Frames, solution: Solution, key: str
 ) -> list[CameraEntry]:
     """cameras.json, landmarks3d.npz, hands3d.npz, landmarks2d/, meta.json.
 
     Args:
-        root: the dataset in the making.
-        cameras: refined, of the pictures as taken.
-        files: how the pictures are written.
+        root: the dataset.
+        options: how images are written, and the world's up axis.
+        inputs: cameras and frame rate.
         frames: ``[F]`` numbers.
-        solution: all ``F`` frames.
-        conf: ``[C, F, J]`` confidence of the detections, sides put right.
-        fps: frames a second.
-        up_axis: of the world.
-        made_by: for meta.json.
+        solution: of these frames.
+        key: of the inputs and settings, see `is_there`.
 
     Returns:
-        The cameras of the written pictures.
+        The cameras of the written images.
     """
+    files, cameras = options.pictures, solution.rig.entries(inputs.cameras)
     written = [files.camera(camera) for camera in cameras]
     write_json(root / "cameras.json", {camera.name: _camera(camera) for camera in written})
-    frame_id, C = np.array(frames, np.int64), len(cameras)
+    p, conf = solution.p, solution.conf
     error = solution.error[:, :, :BODY] * files.scale
+    seen = np.isfinite(error)
+    mean = np.where(seen, error, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
     write_npz(
         root / "landmarks3d.npz",
-        p=solution.p[:, :BODY].astype(np.float32),
-        conf=solution.conf[:, :BODY].astype(np.float32),
-        reproj_px=_mean(error).astype(np.float32),
+        p=p[:, :BODY].astype(np.float32),
+        conf=conf[:, :BODY].astype(np.float32),
+        reproj_px=np.where(seen.any(0), mean, np.nan).astype(np.float32),
         n_views=solution.views[:, :BODY].astype(np.int16),
-        frame_id=frame_id,
+        frame_id=frames,
         names=np.array(MEDIAPIPE33.names),
         edges=np.array(MEDIAPIPE33.edges),
     )
-    if solution.p.shape[1] > BODY:
+    if p.shape[1] > BODY:
         write_npz(
             root / "hands3d.npz",
-            p=solution.p[:, BODY:].astype(np.float32),
-            conf=solution.conf[:, BODY:].astype(np.float32),
-            frame_id=frame_id,
+            p=p[:, BODY:].astype(np.float32),
+            conf=conf[:, BODY:].astype(np.float32),
+            frame_id=frames,
             names=np.array(hand_names()),
         )
-    for c in range(C) if conf.any() else ():
-        ratio = np.array(written[c].size[::-1]) / np.array(cameras[c].size[::-1])
+    for c, camera in enumerate(cameras) if solution.seen.any() else ():
+        ratio = np.array(written[c].size[::-1]) / np.array(camera.size[::-1])
         write_npz(
-            root / "landmarks2d" / f"{cameras[c].name}.npz",
+            root / "landmarks2d" / f"{camera.name}.npz",
             p=(solution.uv[c, :, :BODY] * ratio).astype(np.float32),
-            conf=conf[c, :, :BODY].astype(np.float32),
-            frame_id=frame_id,
+            conf=solution.seen[c, :, :BODY].astype(np.float32),
+            frame_id=frames,
             undistorted=np.array(True),
         )
-    write_json(
-        root / "meta.json",
-        {
-            "fps": fps,
-            "unit": "m",
-            "up_axis": up_axis,
-            "skeleton": "mediapipe33",
-            "pixel_centre": 0.5,
-            "made_by": {"generator": GENERATOR, "version": gsgan.__version__, **made_by},
-        },
-    )
+    meta = {
+        "fps": inputs.fps,
+        "unit": "m",
+        "up_axis": options.up_axis or standing_axis(p),
+        "skeleton": "mediapipe33",
+        "pixel_centre": 0.5,
+        "made_by": {"generator": GENERATOR, "version": gsgan.__version__, "key": key},
+    }
+    write_json(root / "meta.json", meta)
     return written
 
 
@@ -129,37 +148,6 @@ def _camera(camera: CameraEntry) -> dict[str, Any]:
         "dist": [0.0] * 5,
         "size": [camera.size[1], camera.size[0]],
     }
-
-
-def _mean(error: Float) -> Float:
-    """``[F, J]`` mean over the cameras that see a joint, NaN where none does."""
-    seen = np.isfinite(error)
-    mean = np.where(seen, error, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
-    return np.where(seen.any(0), mean, np.nan)
-
-
-def write_npz(path: Path, **arrays: Any) -> None:
-    """An npz that is there whole or not at all."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)
-    with writing(path):
-        write_atomically(path, stream.getvalue())
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """A JSON file that is there whole or not at all; NaN becomes null."""
-    with writing(path):
-        write_atomically(path, json.dumps(_plain(content), indent=1) + "\n")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return int(value) if isinstance(value, np.integer) else value
 
 
 def standing_axis(p: Float) -> str:

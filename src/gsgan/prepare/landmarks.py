@@ -1,7 +1,9 @@
-"""Detected 2D landmarks from files: MediaPipe npz, OpenPose-style JSON, EasyMocap JSON."""
+"""Landmarks from files: 2D of MediaPipe, OpenPose, EasyMocap; 3D of Pose2Sim and EasyMocap."""
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,30 +15,50 @@ from numpy.typing import NDArray
 from gsgan.data.files import frame_files, read_arrays, read_json
 from gsgan.data.joints import ALL, BODY, FROM_HANDS, HAND, LEFT, RIGHT, SETS
 from gsgan.data.skeletons import whole_frame_ids
-from gsgan.prepare.rig import Float
+from gsgan.prepare.rig import Float, known
+from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import DataError
 
 PIXEL_CENTRE = 0.5  # added to detectors that count from the centre of the first pixel
 OPENPOSE_KEYS = ("pose_keypoints_2d", "hand_left_keypoints_2d", "hand_right_keypoints_2d")
 EASYMOCAP_KEYS = ("keypoints", "handl2d", "handr2d")
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+TRC_HEADER = 5  # lines before the first frame; markers are named in the fourth
+TRC_AXES = [2, 0, 1]  # Pose2Sim writes (y, z, x) so that y is up: columns of x, y, z
+SYNONYMS = {"bigtoe": "footindex"}  # joint names of other tools, without side
 
 
 @dataclass(frozen=True)
 class Detections:
-    """What one camera saw of the 75 joints (33 body, 21 left hand, 21 right hand).
+    """One camera's detections of the 75 joints (33 body, 21 left hand, 21 right hand).
 
     Args:
         frame_id: ``[F]`` rising.
-        px: ``[F, 75, 2]`` pixels of the picture as stored, pixel centres at +0.5; NaN = not seen.
-        conf: ``[F, 75]`` 0..1, 0 = not seen.
-        people: ``[F]`` how many persons were found.
+        px: ``[F, 75, 2]`` pixels of the image as stored, pixel centres at +0.5; NaN = not seen.
+        conf: ``[F, 75]`` in [0, 1], 0 = not seen.
+        people: ``[F]`` number of persons found.
     """
 
     frame_id: NDArray[np.int64]
     px: Float
     conf: Float
     people: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Points3D:
+    """3D joints that another tool triangulated.
+
+    Args:
+        frame_id: ``[F]`` rising.
+        p: ``[F, 33, 3]`` metres, in the calibration's world; NaN = missing.
+        conf: ``[F, 33]`` 0 = missing.
+    """
+
+    frame_id: NDArray[np.int64]
+    p: Float
+    conf: Float
 
 
 def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
@@ -46,7 +68,9 @@ def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
         DataError: when a camera has none, listing what is there.
     """
     if not folder.is_dir():
-        raise DataError(f"landmarks={folder} is no folder; expected <camera>.npz or <camera>_json/")
+        raise DataError(
+            f"landmarks={folder} is not a folder; expected <camera>.npz or <camera>_json/ in it"
+        )
     found = {}
     for name in names:
         places = [folder / f"{name}.npz", folder / f"{name}_json", folder / name]
@@ -65,14 +89,38 @@ def read_detections(path: Path) -> Detections:
     """Detections of one camera from an npz or a folder of JSON files.
 
     Raises:
-        DataError: on a damaged file or a set of joints that is not known.
+        DataError: on a damaged file or an unknown set of joints.
     """
     detections = _read_folder(path) if path.is_dir() else _read_npz(path)
     order = np.argsort(detections.frame_id)
-    conf = np.where(np.isfinite(detections.px).all(-1), np.nan_to_num(detections.conf), 0.0)
+    conf = np.where(known(detections.px), np.nan_to_num(detections.conf), 0.0)
     conf = np.clip(conf, 0.0, 1.0)[order]
     px = np.where(conf[..., None] > 0, detections.px[order], np.nan)
     return Detections(detections.frame_id[order], px, conf, detections.people[order])
+
+
+def gather(
+    detections: Mapping[str, Detections], offsets: Mapping[str, int]
+) -> tuple[NDArray[np.int64], Float, Float]:
+    """All cameras' detections by common frame numbers.
+
+    Args:
+        detections: by camera.
+        offsets: frames to add to a camera's numbers to get the common ones.
+
+    Returns:
+        ``frames [F]`` rising, those of any camera; ``px [C, F, 75, 2]`` NaN = not seen;
+        ``conf [C, F, 75]``.
+    """
+    ids = [d.frame_id + int(offsets.get(name, 0)) for name, d in detections.items()]
+    frames = np.unique(np.concatenate(ids))
+    frames = frames[frames >= 0]  # file names hold no negative numbers
+    px = np.full((len(ids), len(frames), ALL, 2), np.nan)
+    conf = np.zeros(px.shape[:3])
+    for c, (own, seen) in enumerate(zip(ids, detections.values(), strict=True)):
+        at = np.searchsorted(frames, own[own >= 0])
+        px[c, at], conf[c, at] = seen.px[own >= 0], seen.conf[own >= 0]
+    return frames, px, conf
 
 
 def _read_npz(path: Path) -> Detections:
@@ -85,22 +133,22 @@ def _read_npz(path: Path) -> Detections:
     for name, part in (("left", LEFT), ("right", RIGHT)):
         if name in arrays:
             px[:, part] = expect_array(arrays, name, (F, HAND, 2), path)
-            conf[:, part] = 1.0  # MediaPipe says nothing of a hand's joints one by one
+            conf[:, part] = 1.0  # MediaPipe has no confidence per hand joint
     people = np.asarray((conf[:, :BODY] > 0).any(1), np.int64)
     return Detections(frame_id, px, conf, people)
 
 
-def _read_folder(path: Path) -> Detections:
+def _json_files(path: Path) -> dict[int, Path]:
     files = frame_files(path.parent, path.name, (".json",))
     if not files:
-        raise DataError(f"{path} holds no JSON files; expected one a frame")
-    frames = [_read_frame(path.parent / file) for file in files.values()]
-    return Detections(
-        frame_id=np.array(list(files), np.int64),
-        px=np.stack([px for px, _, _ in frames]),
-        conf=np.stack([conf for _, conf, _ in frames]),
-        people=np.array([people for _, _, people in frames], np.int64),
-    )
+        raise DataError(f"{path} holds no JSON files; expected one per frame, numbered")
+    return {number: path.parent / files[number] for number in sorted(files)}
+
+
+def _read_folder(path: Path) -> Detections:
+    files = _json_files(path)
+    px, conf, people = zip(*map(_read_frame, files.values()), strict=True)
+    return Detections(np.array(list(files)), np.stack(px), np.stack(conf), np.array(people))
 
 
 def _read_frame(path: Path) -> tuple[Float, Float, int]:
@@ -114,7 +162,7 @@ def _read_frame(path: Path) -> tuple[Float, Float, int]:
     read = [_person(path, person, keys) for person in people]
     if not read:
         return np.full((ALL, 2), np.nan), np.zeros(ALL), 0
-    px, conf = max(read, key=lambda one: float(one[1].sum()))  # who is seen best
+    px, conf = max(read, key=lambda one: float(one[1].sum()))  # the person seen best
     return px, conf, len(read)
 
 
@@ -122,59 +170,142 @@ def _person(path: Path, person: Any, keys: tuple[str, ...]) -> tuple[Float, Floa
     if not isinstance(person, Mapping):
         raise DataError(f"{path}: a person must be an object, found {type(person).__name__}")
     px, conf = np.full((ALL, 2), np.nan), np.zeros(ALL)
+
+    def put(joints: list[int], triples: Float) -> None:
+        seen = known(triples) & (triples[:, 2] > 0)
+        px[joints] = np.where(seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan)
+        conf[joints] = np.where(seen, triples[:, 2], 0.0)
+
     body = _triples(path, person, keys[0])
     if len(body):
         if len(body) not in SETS:
-            known = ", ".join(f"{n} ({name})" for n, (name, _) in SETS.items())
-            raise DataError(f"{path}: '{keys[0]}' holds {len(body)} joints; known are {known}")
+            sets = ", ".join(f"{n} ({name})" for n, (name, _) in SETS.items())
+            raise DataError(f"{path}: '{keys[0]}' holds {len(body)} joints; known are {sets}")
         numbers = SETS[len(body)][1]
-        _put(px, conf, list(numbers), body[list(numbers.values())])
+        put(list(numbers), body[list(numbers.values())])
     for key, part in zip(keys[1:], (LEFT, RIGHT), strict=True):
         hand = _triples(path, person, key)
         if len(hand) == HAND:
-            _put(px, conf, list(range(part.start, part.stop)), hand)
+            put(list(range(part.start, part.stop)), hand)
     for target, origin in FROM_HANDS.items():
         if conf[target] == 0:
             px[target], conf[target] = px[origin], conf[origin]
     return px, conf
 
 
-def _put(px: Float, conf: Float, joints: list[int], triples: Float) -> None:
-    seen = np.isfinite(triples).all(-1) & (triples[:, 2] > 0)
-    px[joints] = np.where(seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan)
-    conf[joints] = np.where(seen, triples[:, 2], 0.0)
-
-
 def _triples(path: Path, person: Mapping[str, Any], key: str) -> Float:
     """``[n, 3]`` x, y, confidence; OpenPose writes them flat, EasyMocap in rows."""
     try:
-        flat = np.array(person.get(key) or [], np.float64).reshape(-1)
+        return np.array(person.get(key) or [], np.float64).reshape(-1, 3)
     except (TypeError, ValueError, OverflowError):
-        flat = np.zeros(1)
-    if len(flat) % 3:
-        raise DataError(f"{path}: '{key}' must hold x, y, confidence for every joint")
-    return flat.reshape(-1, 3)
+        raise DataError(f"{path}: '{key}' must hold x, y, confidence for every joint") from None
 
 
-def gather(
-    detections: Mapping[str, Detections], offsets: Mapping[str, int]
-) -> tuple[NDArray[np.int64], Float, Float]:
-    """All cameras' detections on one clock.
+def read_points3d(path: Path) -> Points3D:
+    """3D joints from a .trc file or a folder of EasyMocap JSON files; exact zeros are missing.
+
+    Raises:
+        DataError: when it is neither, damaged, or without shoulders and hips.
+    """
+    points = _read_people_folder(path) if path.is_dir() else _read_trc(path)
+    order = np.argsort(points.frame_id)
+    p = np.where((points.p == 0).all(-1, keepdims=True), np.nan, points.p)[order]
+    conf = np.where(known(p), points.conf[order], 0.0)
+    p = np.where((conf > 0)[..., None], p, np.nan)
+    if not (conf[:, [11, 12, 23, 24]] > 0).any():
+        raise DataError(f"{path} has no shoulders and hips; expected a whole body's joints")
+    return Points3D(points.frame_id[order], p, conf)
+
+
+def without_frozen(p: Float, frames: int) -> tuple[Float, int]:
+    """Points without those that stay exactly the same: gaps that another tool filled.
 
     Args:
-        detections: by camera.
-        offsets: frames to add to a camera's numbers to get the common ones.
+        p: ``[F, J, 3]``, NaN = missing.
+        frames: runs of this length or more are removed except for their first frame.
 
     Returns:
-        ``frames [F]`` rising, those of any camera; ``px [C, F, 75, 2]`` NaN = not seen;
-        ``conf [C, F, 75]``.
+        The points, and how many were removed.
     """
-    clocks = [d.frame_id + int(offsets.get(name, 0)) for name, d in detections.items()]
-    frames = np.unique(np.concatenate(clocks))
-    frames = frames[frames >= 0]  # file names hold no negative numbers
-    px = np.full((len(clocks), len(frames), ALL, 2), np.nan)
-    conf = np.zeros(px.shape[:3])
-    for c, (clock, seen) in enumerate(zip(clocks, detections.values(), strict=True)):
-        at = np.searchsorted(frames, clock[clock >= 0])
-        px[c, at], conf[c, at] = seen.px[clock >= 0], seen.conf[clock >= 0]
-    return frames, px, conf
+    same = np.zeros(p.shape[:2], bool)
+    same[1:] = (np.diff(p, axis=0) == 0).all(-1)
+    frozen = np.zeros_like(same)
+    for j in range(p.shape[1]):
+        edges = np.flatnonzero(np.diff(np.r_[False, same[:, j], False]))
+        for start, end in edges.reshape(-1, 2):
+            frozen[start:end, j] = end - start + 1 >= frames
+    return np.where(frozen[..., None], np.nan, p), int(frozen.sum())
+
+
+def _read_trc(path: Path) -> Points3D:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} cannot be read as a .trc file ({error})") from None
+    if len(lines) <= TRC_HEADER or "Units" not in lines[1]:
+        raise DataError(f"{path} is not a .trc file; expected five lines of header, then frames")
+    unit = dict(zip(lines[1].split(), lines[2].split(), strict=False)).get("Units")
+    if unit not in UNITS:
+        raise DataError(f"{path}: Units is {unit!r}; expected one of {', '.join(UNITS)}")
+    markers = [name for name in lines[3].rstrip("\t").split("\t")[2:] if name]
+    rows = [
+        _numbers(path, line, 2 + 3 * len(markers)) for line in lines[TRC_HEADER:] if line.strip()
+    ]
+    table = np.array(rows).reshape(-1, 2 + 3 * len(markers))
+    read = table[:, 2:].reshape(len(table), len(markers), 3)[..., TRC_AXES] * UNITS[unit]
+    p = np.full((len(table), BODY, 3), np.nan)
+    for marker, name in enumerate(markers):
+        if (joint := _joint(name)) is not None:
+            p[:, joint] = read[:, marker]
+    return Points3D(whole_frame_ids(table[:, 0], str(path)), p, np.ones(p.shape[:2]))
+
+
+def _numbers(path: Path, line: str, count: int) -> list[float]:
+    """Frame, time and the markers' coordinates; an empty cell is missing."""
+    cells = (line.split("\t") + [""] * count)[:count]
+    try:
+        numbers = [float(cell) if cell.strip() else np.nan for cell in cells]
+    except ValueError as error:
+        raise DataError(f"{path}: a frame holds no numbers ({error})") from None
+    if not np.isfinite(numbers[0]):
+        raise DataError(f"{path}: a line has no frame number")
+    return numbers
+
+
+def _joint(name: str) -> int | None:
+    """The MediaPipe joint of a marker: LShoulder, left_shoulder, Lknee, LBigToe, Nose."""
+    word = re.sub(r"[^a-z]", "", name.lower())
+    side = re.match(r"left|right|l(?!eft)|r(?!ight)", word)
+    if word == "nose" or side is None:
+        return 0 if word == "nose" else None
+    part = word[side.end() :]
+    joint = ("left" if side[0][0] == "l" else "right") + SYNONYMS.get(part, part)
+    plain = [name.replace("_", "") for name in MEDIAPIPE33.names]
+    return plain.index(joint) if joint in plain else None
+
+
+def _read_people_folder(path: Path) -> Points3D:
+    files = _json_files(path)
+    both = np.stack([_read_people(file) for file in files.values()])
+    return Points3D(np.array(list(files)), both[..., :3], both[..., 3])
+
+
+def _read_people(path: Path) -> Float:
+    """``[33, 4]`` x, y, z, confidence of the person seen best; EasyMocap's zeros stay zeros."""
+    try:
+        people: Any = json.loads(path.read_text(encoding="utf-8"))
+        read = [np.array(person["keypoints3d"], np.float64) for person in people]
+    except (OSError, ArithmeticError, ValueError, TypeError, LookupError, RecursionError) as error:
+        raise DataError(
+            f"{path} is not an EasyMocap keypoints3d file: expected a list of persons ({error})"
+        ) from None
+    out, numbers = np.zeros((BODY, 4)), SETS[25][1]
+    for joints in read:
+        if joints.ndim != 2 or len(joints) < 25 or joints.shape[1] not in (3, 4):
+            raise DataError(f"{path}: keypoints3d has shape {joints.shape}; expected (25, 4)")
+        if joints.shape[1] == 3:
+            joints = np.c_[joints, np.ones(len(joints))]
+        body = joints[list(numbers.values())]
+        if body[:, 3].sum() > out[:, 3].sum():
+            out[list(numbers)] = body
+    return out

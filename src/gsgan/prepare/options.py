@@ -1,4 +1,4 @@
-"""Everything that `gsgan.prepare` can be told, as conf/prepare.yaml lists it."""
+"""The options of `gsgan.prepare`, as conf/prepare.yaml lists them."""
 
 from __future__ import annotations
 
@@ -9,26 +9,64 @@ from typing import Any
 
 from gsgan.data.files import LARGEST_FRAME
 from gsgan.prepare.doubts import Doubts
-from gsgan.prepare.masks import MaskTidying
-from gsgan.prepare.mediapipe import MediaPipe
-from gsgan.prepare.overlays import Overlays
-from gsgan.prepare.pictures import PictureFiles
+from gsgan.prepare.landmarks import UNITS
+from gsgan.prepare.pictures import MaskTidying, PictureFiles
 from gsgan.prepare.solve import Settings
 from gsgan.utils.errors import ConfigError
 
-UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 MEDIAPIPE = "mediapipe"
 AXES = ("x", "y", "z", "-x", "-y", "-z")
-# What does not change the dataset that comes out.
-FREE = ("out", "setup", "workers", "overwrite", "keep_work")
+FREE = ("out", "setup", "workers", "overwrite", "keep_work")  # do not change the dataset
+
+
+@dataclass(frozen=True)
+class MediaPipe:
+    """The landmark tool and its environment, see conf/prepare.yaml.
+
+    Raises:
+        ConfigError: when a value is out of its range.
+    """
+
+    folder: str | None = None
+    python: str | None = None
+    threads: int = 1
+    confidence: float = 0.5
+    tracking: float = 0.5
+    margin: float = 0.15
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.confidence <= 1 and 0 <= self.tracking <= 1 and self.margin >= 0):
+            raise ConfigError(
+                "mediapipe.confidence and .tracking must be 0 to 1 and .margin at least 0, got "
+                f"{self.confidence!r}, {self.tracking!r} and {self.margin!r}"
+            )
+
+
+@dataclass(frozen=True)
+class Overlays:
+    """Images in the report, see conf/prepare.yaml.
+
+    Raises:
+        ConfigError: when a value is out of its range.
+    """
+
+    frames: int = 4
+    size: int = 420
+
+    def __post_init__(self) -> None:
+        if not (self.frames >= 0 and self.size > 0):
+            raise ConfigError(
+                "overlays.frames must be at least 0 and overlays.size above 0, got "
+                f"{self.frames!r} and {self.size!r}"
+            )
 
 
 @dataclass(frozen=True)
 class Options:
-    """The config of `gsgan.prepare`; the meaning of each key stands in conf/prepare.yaml.
+    """The config of `gsgan.prepare`; conf/prepare.yaml explains each key.
 
     Raises:
-        ConfigError: on a value that cannot be.
+        ConfigError: on an invalid value.
     """
 
     source: str | None
@@ -59,16 +97,18 @@ class Options:
     overlays: Overlays = field(default_factory=Overlays)
 
     def __post_init__(self) -> None:
-        for name in ("source", "out"):
+        for name, what in (("source", "folder with the videos"), ("out", "folder to make")):
             if not getattr(self, name):
-                what = {"source": "the folder with the videos", "out": "the folder to make"}[name]
                 raise ConfigError(f"give {name}=<{what}>")
-        if self.unit is not None and self.unit not in UNITS:
-            raise ConfigError(f"unit must be one of {', '.join(UNITS)}, got {self.unit!r}")
-        if self.pixel_centre not in (0, 0.5):
-            raise ConfigError(f"pixel_centre must be 0 or 0.5, got {self.pixel_centre!r}")
-        if self.up_axis is not None and self.up_axis not in AXES:
-            raise ConfigError(f"up_axis must be one of {', '.join(AXES)}, got {self.up_axis!r}")
+        for name, allowed in (
+            ("unit", tuple(UNITS)),
+            ("up_axis", AXES),
+            ("pixel_centre", (0, 0.5)),
+        ):
+            value = getattr(self, name)
+            if value is not None and value not in allowed:
+                listed = ", ".join(map(str, allowed))
+                raise ConfigError(f"{name} must be one of {listed}, got {value!r}")
         if self.fps is not None and not (isinstance(self.fps, int | float) and self.fps > 0):
             raise ConfigError(f"fps must be a number above 0, got {self.fps!r}")
         if not isinstance(self.workers, int) or self.workers < 1:
@@ -96,7 +136,7 @@ class Options:
 
     @property
     def unit_scale(self) -> float | None:
-        """Metres in one unit of the calibration, None for the format's own."""
+        """Metres per unit of the calibration, None for the format's own."""
         return None if self.unit is None else UNITS[self.unit]
 
     def record(self) -> dict[str, Any]:

@@ -1,9 +1,10 @@
-"""Pictures and masks of the finished capture: undistorted, scaled, written one by one."""
+"""Images and masks of the finished capture: found, cleaned, undistorted, scaled, written."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Mapping
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,24 +14,37 @@ from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Window, resize, take, undistort_map
-from gsgan.data.files import read_grey
-from gsgan.prepare.masks import MaskTidying, tidy
-from gsgan.prepare.sources import Source
-from gsgan.prepare.writing import writing
+from gsgan.data.files import frame_files, last_number, read_grey
+from gsgan.prepare.sources import PICTURE_SUFFIXES, Source
+from gsgan.prepare.work import writing
 from gsgan.utils.errors import ConfigError, DataError
 
 Bytes = NDArray[np.uint8]
+PROBED = 8  # masks per camera whose values are checked before any work is done
+PERSON = 128  # alpha that at least one pixel of them must have
+
+
+@dataclass(frozen=True)
+class MaskTidying:
+    """How a mask becomes the person's alpha, see conf/prepare.yaml.
+
+    Raises:
+        ConfigError: when a value is out of its range.
+    """
+
+    levels: tuple[float, float] = (0.3, 0.8)
+    least_blob: float = 0.02
+
+    def __post_init__(self) -> None:
+        if len(self.levels) != 2 or not 0 <= self.levels[0] < self.levels[1] <= 1:
+            raise ConfigError(f"masks.levels must be two rising numbers in 0..1, got {self.levels}")
+        if not 0 <= self.least_blob <= 1:
+            raise ConfigError(f"masks.least_blob must be in 0..1, got {self.least_blob!r}")
 
 
 @dataclass(frozen=True)
 class PictureFiles:
-    """How pictures are written.
-
-    Args:
-        scale: size of the written pictures, 0.5 = half.
-        format: "jpg" or "png" of the images; masks are always PNG.
-        quality: of JPEG, 1..100.
-        png_compression: 0..9 of masks and PNG images; higher is smaller and slower.
+    """How images and masks are written, see conf/prepare.yaml.
 
     Raises:
         ConfigError: when a value is out of its range.
@@ -48,11 +62,11 @@ class PictureFiles:
             raise ConfigError(f"pictures.format must be jpg or png, got {self.format!r}")
 
     def size(self, size: tuple[int, int]) -> tuple[int, int]:
-        """``(H, W)`` of the written picture."""
+        """``(H, W)`` of the written image."""
         return max(1, round(size[0] * self.scale)), max(1, round(size[1] * self.scale))
 
     def camera(self, camera: CameraEntry) -> CameraEntry:
-        """The camera of the written pictures: no distortion, K at their size."""
+        """The camera of the written images: no distortion, K at their size."""
         size = self.size(camera.size)
         K = camera.K.copy()
         K[0] *= size[1] / camera.size[1]
@@ -62,18 +76,80 @@ class PictureFiles:
 
 @dataclass(frozen=True)
 class Written:
-    """What one camera's pictures came to.
+    """The result of writing one camera's images.
 
     Args:
-        frames: common numbers that are there now.
-        empty: how many of their masks show nobody.
-        decoded: pictures that the source gave before it ended; None when it was not read to its
-            end.
+        frames: common numbers that exist now.
+        empty: number of empty masks among them.
+        decoded: images that the source gave before it ended; None when it was not read to its end.
     """
 
     frames: list[int]
     empty: int
     decoded: int | None
+
+
+def sampled(count: int, most: int) -> list[int]:
+    """At most ``most`` of ``count`` positions, evenly spaced."""
+    if not (count and most):
+        return []
+    return np.unique(((np.arange(most) + 0.5) * count / most).astype(int)).tolist()
+
+
+def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]:
+    """Given masks by camera and frame number: <camera>/%06d.png, or %06d_<person>.png.
+
+    Raises:
+        DataError: when a camera has none.
+    """
+    found = {}
+    for name in names:
+        place = folder / name
+        stems = [p.stem for p in place.glob("*") if p.suffix.lower() in PICTURE_SUFFIXES]
+        of_persons = bool(stems) and all(re.fullmatch(r"\d+_\d+", stem) for stem in stems)
+        number = _first_number if of_persons else last_number
+        files = frame_files(folder, name, PICTURE_SUFFIXES, number)
+        if not files:
+            raise DataError(
+                f"{place} holds no masks; expected masks={folder} to hold <camera>/000000.png and "
+                f"so on for {name}"
+            )
+        found[name] = {number: folder / path for number, path in files.items()}
+    return found
+
+
+def _first_number(stem: str) -> int | None:
+    return int(stem.partition("_")[0])
+
+
+def check_values(folder: Path, files: Mapping[int, Path]) -> None:
+    """Rejects 0 and 1, or part numbers, which would mean a nearly transparent person.
+
+    A single faint mask is legitimate (someone leaves the image), so several are read.
+
+    Raises:
+        DataError: when no pixel of them reaches `PERSON`, or one is damaged.
+    """
+    paths = [files[number] for number in sorted(files)]
+    highest = max((int(read_grey(paths[i]).max()) for i in sampled(len(paths), PROBED)), default=0)
+    if 0 < highest < PERSON:
+        raise DataError(
+            f"{folder} holds masks with values up to {highest}; small numbers are labels, expected "
+            "alpha from 0 to 255 (write the person as 255)"
+        )
+
+
+def tidy(mask: Bytes, settings: MaskTidying) -> Bytes:
+    """A mask ``[H, W]`` 0..255 with its levels stretched and small pieces removed."""
+    low, high = (255 * level for level in settings.levels)
+    table = np.clip((np.arange(256) - low) / (high - low), 0, 1)
+    mask = np.asarray(cv2.LUT(mask, np.round(255 * table).astype(np.uint8)), np.uint8)
+    if settings.least_blob == 0:
+        return mask
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((mask > 0).astype(np.uint8))
+    areas = stats[:, cv2.CC_STAT_AREA].copy()
+    areas[0] = 0  # the background
+    return np.asarray(mask * (areas >= settings.least_blob * areas.max())[labels], np.uint8)
 
 
 def write_pictures(
@@ -85,23 +161,23 @@ def write_pictures(
     offset: int,
     files: PictureFiles,
     tidying: MaskTidying,
-    advance: Callable[[], None],
+    report: Callable[[int, int], None],
 ) -> Written:
-    """Writes images/{camera}/%06d and masks/{camera}/%06d.png; what is there already stays.
+    """Writes images/{camera}/%06d and masks/{camera}/%06d.png; existing files stay.
 
     Args:
-        root: the dataset in the making.
+        root: the dataset.
         camera: as calibrated, lens included.
-        source: its pictures.
-        masks: by the source's own frame number, as the pictures are stored.
-        frames: common frame numbers to write; those without a mask are passed over.
-        offset: what makes a source's number a common one.
+        source: its images.
+        masks: by the source's own frame number, of the images as stored.
+        frames: common frame numbers to write; those without a mask are skipped.
+        offset: added to a source's number to get the common one.
         files: formats and scale.
         tidying: of the masks.
-        advance: called after every frame of ``frames``.
+        report: called after each frame with the number of frames done and in total.
 
     Raises:
-        DataError: when a picture or mask is damaged or of the wrong size, or the disk is full.
+        DataError: when an image or mask is damaged or of the wrong size, or the disk is full.
     """
     image_folder, mask_folder = root / "images" / camera.name, root / "masks" / camera.name
     for folder in (image_folder, mask_folder):
@@ -109,7 +185,7 @@ def write_pictures(
             folder.mkdir(parents=True, exist_ok=True)
     window = Window(0, 0, camera.size)
     mapping = undistort_map(camera.K, camera.dist, window) if camera.distorted else None
-    size, written, empty, decoded = files.size(camera.size), list[int](), 0, 0
+    size, written, empty, decoded, done = files.size(camera.size), list[int](), 0, 0, 0
     last = max(frames, default=-1)
     for number, picture in source.pictures():
         frame = number + offset
@@ -118,13 +194,14 @@ def write_pictures(
         decoded += 1
         if frame not in frames:
             continue
-        advance()
+        done += 1
+        report(done, len(frames))
         if number not in masks:
             continue
         image_path = image_folder / f"{frame:06d}.{files.format}"
         mask_path = mask_folder / f"{frame:06d}.png"
         written.append(frame)
-        if _there(image_path) and _there(mask_path):
+        if _exists(image_path) and _exists(mask_path):
             empty += not read_grey(mask_path).any()
             continue
         mask = tidy(read_grey(masks[number]), tidying)
@@ -141,8 +218,8 @@ def write_pictures(
     return Written(written, empty, decoded)
 
 
-def _there(path: Path) -> bool:
-    """Whether an earlier run wrote it; a file without content is what a power cut leaves."""
+def _exists(path: Path) -> bool:
+    """Whether an earlier run wrote it; a power cut may leave a file without content."""
     return path.is_file() and path.stat().st_size > 0
 
 

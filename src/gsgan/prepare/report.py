@@ -1,123 +1,133 @@
-"""The report of a preparation: errors before and after every stage, overlays, doubts."""
+"""The report of a preparation: errors after every stage, overlays, doubts."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
+from gsgan.check.overlays import LEFT, MIDDLE, RIGHT, caption, draw, encode
 from gsgan.check.report import Figure, Finding, Report, Section, Table, page, print_report
 from gsgan.data.cameras import CameraEntry
+from gsgan.data.crop import NEAR, PersonCrop, Window, cut, project, resize
+from gsgan.data.files import read_colour, read_grey
 from gsgan.data.joints import BODY
-from gsgan.prepare.dataset import write_json
 from gsgan.prepare.inputs import Inputs
 from gsgan.prepare.options import Options
-from gsgan.prepare.overlays import LEGEND, overlay_row, sampled
-from gsgan.prepare.rig import FOCAL, Float
-from gsgan.prepare.solve import Solution, stage_medians
-from gsgan.prepare.writing import writing
+from gsgan.prepare.pictures import sampled
+from gsgan.prepare.rig import FOCAL, Float, known
+from gsgan.prepare.solve import Solution, median, stage_medians
+from gsgan.prepare.work import write_json, writing
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.files import write_atomically
 
+Bytes = NDArray[np.uint8]
 STAGES = {
     "plain": "plain weighted triangulation (DLT)",
     "robust": "robust triangulation",
-    "flips": "left and right put right",
+    "flips": "left and right corrected",
     "refined": "camera poses refined",
     "smoothed": "cleansed and smoothed: what is written",
 }
+BAR = (70, 70, 70)
+EMPTY = 60  # grey of a tile without image
+FAR = 10_000  # pixels: drawing stops there
+LEGEND = (
+    "Blue: the person's left, orange: the right, white: the middle. Lines: the 3D joints "
+    "projected; large dots: detections, sides corrected. Green: the mask's outline and box; "
+    "yellow: the joints' box."
+)
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the report tells.
+    """The content of the report.
 
     Args:
-        inputs: pictures and calibration.
-        cameras: of the written pictures.
+        inputs: images and calibration.
+        cameras: of the written images.
         frames: ``F`` common numbers.
-        written: frames with picture and mask, by camera.
+        written: frames with image and mask, by camera.
         solution: of all frames.
         turned: ``[C]`` degrees by which refinement turned the cameras.
-        moved_mm: ``[C]`` how far it moved them.
-        delay: ``[C]`` frames by which clocks are late, NaN = not known.
+        moved_mm: ``[C]`` millimetres by which it moved them.
         doubts: one sentence each.
-        fps: frames a second.
     """
 
     inputs: Inputs
-    cameras: tuple[CameraEntry, ...]
-    frames: tuple[int, ...]
+    cameras: Sequence[CameraEntry]
+    frames: Sequence[int]
     written: Mapping[str, list[int]]
     solution: Solution
     turned: Float
     moved_mm: Float
-    delay: Float
-    doubts: tuple[str, ...]
-    fps: float
+    doubts: Sequence[str]
 
 
 def write_report(root: Path, outcome: Outcome, options: Options, console: Console) -> None:
     """Writes report.html and report.json into the dataset and prints the tables."""
-    report = make_report(root, outcome, options)
-    with writing(root / "report.html"):
-        write_atomically(root / "report.html", page(report))
-    write_json(root / "report.json", report.numbers)
-    print_report(report, console)
-
-
-def make_report(root: Path, outcome: Outcome, options: Options) -> Report:
-    """The report; nothing is written."""
-    numbers = numbers_of(outcome, options)
-    findings = tuple(Finding("warning", "capture", sentence) for sentence in outcome.doubts)
+    kept = {frame for frames in outcome.written.values() for frame in frames}
+    dropped = [frame for frame in outcome.frames if frame not in kept]
+    numbers = _numbers(outcome, options, dropped)
+    notes = [*outcome.inputs.notes]
+    notes += [f"{len(outcome.frames)} frames at {numbers['fps']:g} per second"]
+    if dropped:
+        shown = ", ".join(map(str, dropped[:20])) + (" ..." if len(dropped) > 20 else "")
+        notes.append(f"{len(dropped)} frames dropped, without skeleton or mask: {shown}")
     sections = (
         Section(
             "How well joints and cameras agree",
-            ("Median reprojection error in pixels of the full-size picture, over all detections.",),
-            tables=(_stage_table(outcome, options), _camera_table(outcome)),
-            findings=findings,
+            ("Median reprojection error in pixels of the full-size image, over all detections.",),
+            tables=(_stage_table(outcome, options), _camera_table(numbers["cameras"])),
+            findings=tuple(Finding("warning", "capture", doubt) for doubt in outcome.doubts),
         ),
-        Section("Overlays", aside=(LEGEND,), figures=_figures(root, outcome, options)),
-        Section("Joints", tables=(_joint_table(outcome),)),
-        Section("Notes", outcome.inputs.notes + _count_notes(outcome)),
+        Section(
+            "Overlays", aside=(LEGEND,), figures=_figures(root, outcome, options, sorted(kept))
+        ),
+        Section("Joints", tables=(_joint_table(outcome.solution),)),
+        Section("Notes", tuple(notes)),
     )
-    return Report(str(options.folder("out")), sections, numbers, title="Preparation of a capture")
+    out = str(options.folder("out"))
+    report = Report(out, sections, numbers, title="Preparation of a capture")
+    with writing(root / "report.html"):
+        write_atomically(root / "report.html", page(report))
+    write_json(root / "report.json", numbers)
+    print_report(report, console)
 
 
-def numbers_of(outcome: Outcome, options: Options) -> dict[str, Any]:
-    """report.json: everything that is told, as plain values."""
-    stages = stage_medians(outcome.solution.stages)
-    names = [camera.name for camera in outcome.cameras]
+def _numbers(outcome: Outcome, options: Options, dropped: list[int]) -> dict[str, Any]:
+    """The content of report.json."""
+    solution, calibration = outcome.solution, outcome.inputs.calibration
+    stages = stage_medians(solution.stages)
     by_camera = {
-        name: {
+        camera.name: {
             "error_px": {stage: values[1][c] for stage, values in stages.items()},
             "turned_degrees": float(outcome.turned[c]),
             "moved_mm": float(outcome.moved_mm[c]),
-            "flipped_share": float(outcome.solution.flips[c].any(-1).mean()),
-            "delay_frames": float(outcome.delay[c]),
-            "frames_with_person": int(np.isfinite(outcome.solution.error[c]).any(-1).sum()),
-            "frames_written": len(outcome.written[name]),
+            "flipped_share": float(solution.flips[c].any(-1).mean()),
+            "delay_frames": float(solution.delay[c]),
+            "frames_with_person": int(np.isfinite(solution.error[c]).any(-1).sum()),
+            "frames_written": len(outcome.written[camera.name]),
         }
-        for c, name in enumerate(names)
+        for c, camera in enumerate(outcome.cameras)
     }
-    found = np.isfinite(outcome.solution.p[:, :BODY]).all(-1).mean(0)
+    found = known(solution.p[:, :BODY]).mean(0)
     return {
         "error_px": {stage: values[0] for stage, values in stages.items()},
         "detections_used": {stage: values[2] for stage, values in stages.items()},
         "cameras": by_camera,
         "joints_found": dict(zip(MEDIAPIPE33.names, found.tolist(), strict=True)),
         "frames": len(outcome.frames),
-        "frames_dropped": list(_dropped(outcome)),
-        "joints_removed": outcome.solution.removed,
-        "fps": outcome.fps,
-        "calibration": {
-            "file": outcome.inputs.calibration.path.name,
-            "format": outcome.inputs.calibration.format,
-        },
+        "frames_dropped": dropped,
+        "joints_removed": solution.removed,
+        "fps": outcome.inputs.fps,
+        "calibration": {"file": calibration.path.name, "format": calibration.format},
         "notes": list(outcome.inputs.notes),
         "doubts": list(outcome.doubts),
         "settings": options.record(),
@@ -125,79 +135,89 @@ def numbers_of(outcome: Outcome, options: Options) -> dict[str, Any]:
 
 
 def _stage_table(outcome: Outcome, options: Options) -> Table:
-    names = [camera.name for camera in outcome.cameras]
     limits = options.doubts.reprojection * outcome.solution.rig.focal / FOCAL
-    rows, flagged = [], set()
-    for i, (stage, (whole, each, used)) in enumerate(
-        stage_medians(outcome.solution.stages).items()
-    ):
-        rows.append((STAGES[stage], _px(whole), *map(_px, each), f"{used:.1%}"))
+    rows: list[tuple[str, ...]] = []
+    flagged: set[tuple[int, int]] = set()
+    for stage, (whole, each, used) in stage_medians(outcome.solution.stages).items():
         if stage == "smoothed":
-            flagged = {(i, c + 2) for c, error in enumerate(each) if error > limits[c]}
-    headers = ("after", "all", *names, "detections used")
+            flagged = {(len(rows), c + 2) for c, error in enumerate(each) if error > limits[c]}
+        cells = ("-" if np.isnan(error) else f"{error:.2f}" for error in (whole, *each))
+        rows.append((STAGES[stage], *cells, f"{used:.1%}"))
+    headers = ("after", "all", *(camera.name for camera in outcome.cameras), "detections used")
     return Table(headers, tuple(rows), frozenset(flagged), "Error in pixels")
 
 
-def _px(error: float) -> str:
-    return "-" if np.isnan(error) else f"{error:.2f}"
-
-
-def _camera_table(outcome: Outcome) -> Table:
+def _camera_table(cameras: Mapping[str, Mapping[str, Any]]) -> Table:
     rows = tuple(
         (
-            camera.name,
-            f"{outcome.turned[c]:.2f}°",
-            f"{outcome.moved_mm[c]:.0f} mm",
-            f"{outcome.solution.flips[c].any(-1).mean():.0%}",
-            "?" if np.isnan(outcome.delay[c]) else f"{outcome.delay[c]:+.2f}",
-            str(len(outcome.written[camera.name])),
+            name,
+            f"{one['turned_degrees']:.2f}°",
+            f"{one['moved_mm']:.0f} mm",
+            f"{one['flipped_share']:.0%}",
+            "?" if np.isnan(one["delay_frames"]) else f"{one['delay_frames']:+.2f}",
+            str(one["frames_written"]),
         )
-        for c, camera in enumerate(outcome.cameras)
+        for name, one in cameras.items()
     )
-    headers = ("camera", "turned", "moved", "sides swapped", "frames late", "pictures")
+    headers = ("camera", "turned", "moved", "sides swapped", "frames late", "images")
     return Table(headers, rows, title="Cameras, after refinement")
 
 
-def _joint_table(outcome: Outcome) -> Table:
-    p, error = outcome.solution.p[:, :BODY], outcome.solution.error[:, :, :BODY]
-    found = np.isfinite(p).all(-1).mean(0)
+def _joint_table(solution: Solution) -> Table:
+    found, views = known(solution.p).mean(0), solution.views.mean(0)
     rows = []
     for j, name in enumerate(MEDIAPIPE33.names):
-        seen = error[..., j][np.isfinite(error[..., j])]
-        px = f"{np.median(seen):.1f}" if seen.size else "-"
-        views = outcome.solution.views[:, j].mean()
-        rows.append((name, f"{found[j]:.0%}", px, f"{views:.1f}"))
-    headers = ("joint", "frames found", "error px", "cameras that agree")
-    return Table(headers, tuple(rows))
+        error = median(solution.error[..., j])
+        px = "-" if np.isnan(error) else f"{error:.1f}"
+        rows.append((name, f"{found[j]:.0%}", px, f"{views[j]:.1f}"))
+    return Table(("joint", "frames found", "error px", "cameras that agree"), tuple(rows))
 
 
-def _figures(root: Path, outcome: Outcome, options: Options) -> tuple[Figure, ...]:
-    everywhere = sorted({f for frames in outcome.written.values() for f in frames})
-    chosen = [everywhere[i] for i in sampled(len(everywhere), options.overlays.frames)]
-    if not chosen:
-        return ()
-    at = [outcome.frames.index(frame) for frame in chosen]
-    p, uv = outcome.solution.p[at, :BODY], outcome.solution.uv[:, at, :BODY]
+def _figures(
+    root: Path, outcome: Outcome, options: Options, kept: Sequence[int]
+) -> tuple[Figure, ...]:
+    """Per camera, its tiles of some frames side by side."""
+    chosen = [kept[i] for i in sampled(len(kept), options.overlays.frames)]
     figures = []
-    for c, camera in enumerate(outcome.cameras):
-        full = outcome.inputs.cameras[c].size
-        ratio = np.array(camera.size[::-1]) / np.array(full[::-1])
-        seen = uv[c] * ratio
-        suffix = options.pictures.format
-        row = overlay_row(root, camera, suffix, chosen, p, seen, options.overlays)
-        figures.append(Figure(f"{camera.name}: frames {', '.join(map(str, chosen))}", picture=row))
+    for c, camera in enumerate(outcome.cameras if chosen else ()):
+        ratio = np.array(camera.size[::-1]) / np.array(outcome.inputs.cameras[c].size[::-1])
+        tiles = []
+        for frame in chosen:
+            at = outcome.frames.index(frame)
+            p, uv = outcome.solution.p[at, :BODY], outcome.solution.uv[c, at, :BODY] * ratio
+            files = (
+                root / "images" / camera.name / f"{frame:06d}.{options.pictures.format}",
+                root / "masks" / camera.name / f"{frame:06d}.png",
+            )
+            tile = _tile(*files, camera, p, uv, options.overlays.size)
+            tiles.append(caption(tile, f"{camera.name}  frame {frame}", BAR))
+        title = f"{camera.name}: frames {', '.join(map(str, chosen))}"
+        figures.append(Figure(title, picture=encode(np.concatenate(tiles, axis=1))))
     return tuple(figures)
 
 
-def _dropped(outcome: Outcome) -> list[int]:
-    kept = {frame for frames in outcome.written.values() for frame in frames}
-    return [frame for frame in outcome.frames if frame not in kept]
+def _tile(image: Path, mask: Path, camera: CameraEntry, p: Float, uv: Float, size: int) -> Bytes:
+    """Joints ``p [33, 3]``, detections ``uv [33, 2]`` and mask on the image around the person."""
+    if not image.is_file():
+        return np.full((size, size, 3), EMPTY, np.uint8)
+    pixels, depth = project(camera, np.nan_to_num(p))
+    drawn = known(p) & (depth > NEAR)
+    window = PersonCrop().window(camera, np.nan_to_num(p), drawn)
+    picture, alpha = (
+        resize(cut(one, window), (size, size), exact=False)
+        for one in (read_colour(image), read_grey(mask))
+    )
+    at, nothing = _placed(pixels, window, size), np.zeros(len(p), bool)
+    picture = draw(np.ascontiguousarray(picture), alpha, at, drawn, nothing, MEDIAPIPE33)
+    at = _placed(uv, window, size)
+    for joint in np.flatnonzero(known(at)):
+        name, place = MEDIAPIPE33.names[joint], np.round(at[joint] - 0.5).astype(int).tolist()
+        colour = LEFT if "left" in name else RIGHT if "right" in name else MIDDLE
+        cv2.circle(picture, place, 4, (0, 0, 0), -1, cv2.LINE_AA)
+        cv2.circle(picture, place, 3, colour, -1, cv2.LINE_AA)
+    return picture
 
 
-def _count_notes(outcome: Outcome) -> tuple[str, ...]:
-    dropped = _dropped(outcome)
-    notes = [f"{len(outcome.frames)} frames at {outcome.fps:g} a second; {len(dropped)} dropped"]
-    if dropped:
-        shown = ", ".join(map(str, dropped[:20])) + (" ..." if len(dropped) > 20 else "")
-        notes.append(f"dropped, without skeleton or mask: {shown}")
-    return tuple(notes)
+def _placed(pixels: Float, window: Window, size: int) -> Float:
+    scaled = (pixels - [window.left, window.top]) * (size / window.size[0])
+    return np.clip(scaled, -FAR, FAR)

@@ -1,4 +1,4 @@
-"""A rig of calibrated cameras as stacked arrays, and how points pass through it."""
+"""A rig of calibrated cameras as stacked arrays, and the projection of points into it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsgan.data.crop import NEAR
 
 FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
 
-# OpenCV stops after 5 steps unless told otherwise, pixels off in the corners of a strong lens.
+# OpenCV's default of 5 iterations is pixels off in the corners of a strong lens.
 CONVERGED = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
 # Only OpenCV 5 takes the criteria without "Iter".
 _undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)
@@ -47,7 +47,7 @@ class Rig:
 
     @property
     def centres(self) -> Float:
-        """``[C, 3]`` metres: where the cameras stand."""
+        """``[C, 3]`` metres: the cameras' positions."""
         return -np.einsum("cji,cj->ci", self.R, self.t)
 
     @property
@@ -56,10 +56,10 @@ class Rig:
         return (self.K[:, 0, 0] + self.K[:, 1, 1]) / 2
 
     def normalised(self, uv: Float) -> tuple[Rig, Float]:
-        """The rig as if every focal length were `FOCAL` pixels, and detections that go with it.
+        """The rig with focal lengths of `FOCAL` pixels, and detections to match.
 
-        Thresholds in such pixels hold for pictures of any size, and cameras of different sizes
-        count alike.
+        Thresholds in such pixels hold for images of any size, and cameras of different sizes count
+        alike.
 
         Args:
             uv: ``[C, ..., 2]`` undistorted pixels.
@@ -69,10 +69,8 @@ class Rig:
         K[:, :2] *= ratio[:, None, None]
         return replace(self, K=K), uv * ratio.reshape(-1, *[1] * (uv.ndim - 1))
 
-    def without(self, camera: int) -> Rig:
-        """The rig less one camera."""
-        keep = np.arange(len(self)) != camera
-        return Rig(self.K[keep], self.R[keep], self.t[keep])
+    def __getitem__(self, cameras: Bool | slice) -> Rig:
+        return Rig(self.K[cameras], self.R[cameras], self.t[cameras])
 
     def entries(self, cameras: Sequence[CameraEntry]) -> list[CameraEntry]:
         """The cameras with this rig's R and t."""
@@ -88,11 +86,9 @@ class Rig:
         return uvw[..., :2], x[..., 2]
 
     def errors(self, p: Float, uv: Float) -> Float:
-        """Reprojection errors ``[C, N]`` in pixels; infinite behind a camera, NaN where unseen.
+        """Reprojection errors ``[C, N]`` of ``p [N, 3]`` metres against pixels ``uv [C, N, 2]``.
 
-        Args:
-            p: ``[N, 3]`` metres.
-            uv: ``[C, N, 2]`` undistorted pixels.
+        Infinite behind a camera, NaN where unseen.
         """
         pixels, depth = self.project(p)
         error = np.linalg.norm(pixels - uv, axis=-1)
@@ -105,12 +101,7 @@ def known(points: Float) -> Bool:
 
 
 def undistort_points(camera: CameraEntry, px: Float) -> Float:
-    """Where points would lie without the lens; K is kept, skew included. NaN stays NaN.
-
-    Args:
-        camera: whose lens it was.
-        px: ``[..., 2]`` pixels as stored.
-    """
+    """Pixels ``px [..., 2]`` without lens distortion; K stays, skew included. NaN stays NaN."""
     seen = known(px)
     if not camera.distorted or not seen.any():
         return np.asarray(px, np.float64)

@@ -2,226 +2,187 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import threading
-from collections.abc import Mapping, Sequence
+import hashlib
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
-from gsgan.data.cameras import CameraEntry
-from gsgan.data.formats.capture import read_capture
 from gsgan.data.joints import BODY
-from gsgan.prepare.dataset import is_there, standing_axis, write_small_files
+from gsgan.data.splits import parse_frames
+from gsgan.prepare.dataset import Frames, is_there, publish, write_small_files
 from gsgan.prepare.doubts import (
+    check_distance,
     doubts_about_detections,
     doubts_about_pictures,
     doubts_about_solution,
     doubts_about_sources,
 )
-from gsgan.prepare.inputs import (
-    Inputs,
-    frame_rate,
-    in_parallel,
-    read_inputs,
-    read_landmarks,
-    read_masks,
-    run_tool,
-)
-from gsgan.prepare.landmarks import Detections
-from gsgan.prepare.options import MEDIAPIPE, Options
+from gsgan.prepare.inputs import Inputs, read_inputs, read_people
+from gsgan.prepare.landmarks import Detections, gather, read_points3d
+from gsgan.prepare.options import Options
 from gsgan.prepare.pictures import Written, write_pictures
-from gsgan.prepare.progress import Bars
 from gsgan.prepare.refine import camera_moves
 from gsgan.prepare.report import Outcome, write_report
-from gsgan.prepare.rig import Rig, known
-from gsgan.prepare.solving import STAGE_VERSION, Solved, solve_detections, take_points
-from gsgan.prepare.work import Work, digest
-from gsgan.prepare.writing import writing
+from gsgan.prepare.rig import Bool, Rig, known, undistort_points
+from gsgan.prepare.solve import Solution, adopt, solve
+from gsgan.prepare.work import Work, digest, each_camera
 from gsgan.utils.errors import DataError
+
+STAGE_VERSION = 2  # incremented when the same settings begin to give another result
 
 
 def prepare(options: Options, console: Console) -> Path:
-    """Makes the dataset ``options.out``, or leaves the same one that is already there alone.
+    """Makes the dataset ``options.out``; the same dataset that exists already is left alone.
 
     Returns:
         Its folder.
 
     Raises:
-        DataError: on whatever is wrong with the pictures, calibration, landmarks or masks.
-        ConfigError: on options that do not fit.
+        DataError: on anything wrong with the images, calibration, landmarks or masks.
+        ConfigError: on options that do not fit the data.
     """
     out = options.folder("out")
     inputs = read_inputs(options)
-    key = digest([STAGE_VERSION, options.record(), _fingerprint(options, inputs)])
+    key = digest([STAGE_VERSION, options.record(), inputs.fingerprint(options)])
     if is_there(out, key, options.overwrite):
-        console.print(f"{out} is there already, made from the same pictures and settings")
+        console.print(f"{out} exists already, made from the same images and settings")
         return out
     work = Work.beside(out)
-    names = list(inputs.sources)
-    found, masked = run_tool(options, inputs.sources, work, console.print)
-    masks = read_masks(options, names, masked)
+    detections, masks = read_people(options, inputs, work, console.print)
     if options.landmarks3d is None:
-        detections = read_landmarks(options, names, found)
-        solved = solve_detections(options, inputs, detections, work, console)
+        frames, solution = _solved(options, inputs, detections, work, console)
     else:
-        detections, solved = {}, take_points(options, inputs)
-    cameras = solved.solution.rig.entries(inputs.cameras)
+        frames, solution = _adopted(options, inputs)
     root = work.place("dataset", [key, STAGE_VERSION])
-    written = _write_pictures(options, inputs, cameras, masks, solved, root)
-    outcome = _write_rest(options, inputs, cameras, detections, solved, written, root, key)
+    written = _write_pictures(options, inputs, masks, frames, solution, root)
+    small = write_small_files(root, options, inputs, frames, solution, key)
+    turned, moved = camera_moves(Rig.of(inputs.cameras), solution.rig)
+    clocks, limits = (solution.delay, solution.gain), options.doubts
+    doubts = [
+        *doubts_about_sources(inputs.sources, limits),
+        *doubts_about_pictures(inputs.sources, written, limits),
+        *doubts_about_detections(detections, limits),
+        *doubts_about_solution(solution, list(inputs.sources), turned, moved, *clocks, limits),
+    ]
+    frames_of = {name: one.frames for name, one in written.items()}
+    outcome = Outcome(inputs, small, frames.tolist(), frames_of, solution, turned, moved, doubts)
     write_report(root, outcome, options, console)
-    _forget_parts(root)
-    _read_back(root)
-    _publish(root, out)
+    publish(root, out)
     work.forget_others()
     if not options.keep_work:
         work.remove()
-    told = (
+    lines = (
         f"{out} is ready; look at {out / 'report.html'}, then",
         f"python -m gsgan.check data=capture data.root={out}",
         f"python -m gsgan.fit data=capture data.root={out} out={out / 'landmarks3d_fit.npz'}",
         f"python -m gsgan.train data=capture data.root={out} "
         "data.reader.landmarks=landmarks3d_fit.npz",
     )
-    console.print("\n".join(told), markup=False, highlight=False, soft_wrap=True)
+    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     return out
 
 
-def _fingerprint(options: Options, inputs: Inputs) -> list[object]:
-    """All that is read: pictures, calibration, landmark and mask files, the tool."""
-    parts: list[object] = [source.fingerprint() for source in inputs.sources.values()]
-    parts += [inputs.calibration.path.name, *(str(c) for c in inputs.cameras)]
-    for name in ("landmarks", "landmarks3d", "masks"):
-        if getattr(options, name) in (None, MEDIAPIPE):
-            continue
-        place = options.folder(name)
-        files = sorted(p for p in (place, *place.rglob("*")) if p.is_file())
-        parts += [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
-    return [*parts, options.mediapipe.key if options.needs_tool else None]
+def _solved(
+    options: Options,
+    inputs: Inputs,
+    detections: Mapping[str, Detections],
+    work: Work,
+    console: Console,
+) -> tuple[Frames, Solution]:
+    """Triangulates 2D landmarks, or loads the result of an earlier run on the same ones.
+
+    Raises:
+        DataError: when no frame is left, or the cameras are implausibly near or far.
+    """
+    frames, px, conf = gather(detections, options.offsets or {})
+    chosen = _chosen(options, frames)
+    joints = slice(None if options.hands else BODY)
+    frames, px, conf = frames[chosen], px[:, chosen, joints], conf[:, chosen, joints]
+    time, rig = frames / inputs.fps, Rig.of(inputs.cameras)
+    uv = np.stack([undistort_points(c, p) for c, p in zip(inputs.cameras, px, strict=True)])
+    flat = uv.reshape(len(rig), -1, 2), conf.reshape(len(rig), -1)
+    rough = options.solve.triangulation.plain(rig, *flat)
+    check_distance(inputs.cameras, rough, options.doubts, inputs.calibration.path)
+    arrays = (np.ascontiguousarray(a) for a in (rig.K, rig.R, rig.t, uv, conf, time))
+    hashes = [hashlib.sha256(array.tobytes()).hexdigest() for array in arrays]
+    lag = options.doubts.lag
+    key = [STAGE_VERSION, options.record()["solve"], lag, hashes]
+
+    def make() -> dict[str, NDArray[Any]]:
+        with console.status("solving") as status:
+            return solve(rig, time, uv, conf, options.solve, lag, status.update).to_arrays()
+
+    return frames, Solution.from_arrays(work.arrays("solution", key, make), rig.K)
+
+
+def _adopted(options: Options, inputs: Inputs) -> tuple[Frames, Solution]:
+    """The joints of another tool.
+
+    Raises:
+        DataError: when they cannot be read, or the cameras are implausibly near or far.
+    """
+    points = read_points3d(options.folder("landmarks3d"))
+    chosen = _chosen(options, points.frame_id)
+    points = replace(
+        points,
+        frame_id=points.frame_id[chosen],
+        p=points.p[chosen],
+        conf=points.conf[chosen],
+    )
+    p, where = points.p.reshape(-1, 3), inputs.calibration.path
+    check_distance(inputs.cameras, p, options.doubts, where)
+    rig, frozen = Rig.of(inputs.cameras), options.doubts.frozen_frames
+    return points.frame_id, adopt(rig, points, inputs.fps, options.solve, frozen)
+
+
+def _chosen(options: Options, frames: Frames) -> Bool:
+    """``[F]`` which frames ``options.frames`` selects."""
+    chosen = np.ones(len(frames), bool)
+    if options.frames is not None:
+        chosen = np.isin(frames, parse_frames(options.frames, "frames"))
+    if not chosen.any():
+        raise DataError(f"{options.folder('source')}: frames={options.frames} leaves no frame")
+    return chosen
 
 
 def _write_pictures(
     options: Options,
     inputs: Inputs,
-    cameras: Sequence[CameraEntry],
     masks: Mapping[str, Mapping[int, Path]],
-    solved: Solved,
+    frames: Frames,
+    solution: Solution,
     root: Path,
 ) -> dict[str, Written]:
-    """Pictures of every frame that has a skeleton; the frames written, by camera."""
-    posed = known(solved.solution.p[:, :BODY]).any(1)
-    frames = set(solved.frames[posed].tolist())
-    if not frames:
+    """Writes the images of every frame that has a skeleton.
+
+    Raises:
+        DataError: when no frame has one, or an image or mask cannot be read or written.
+    """
+    posed = set(frames[known(solution.p[:, :BODY]).any(1)].tolist())
+    if not posed:
         raise DataError(
             f"{options.landmarks3d or options.landmarks}: no body joint of any frame came out in "
             "3D; expected landmarks that two cameras see at the same frame number, not NaN and "
             "with confidence above 0"
         )
-    names = [camera.name for camera in cameras]
-    lock = threading.Lock()
-    with Bars("writing pictures", names, len(frames)) as bars:
+    cameras = {c.name: c for c in solution.rig.entries(inputs.cameras)}
 
-        def one(index: int) -> Written:
-            name = names[index]
+    def one(name: str, report: Callable[[int, int], None]) -> Written:
+        return write_pictures(
+            root,
+            cameras[name],
+            inputs.sources[name],
+            masks[name],
+            posed,
+            options.offset(name),
+            options.pictures,
+            options.mask_tidying,
+            report,
+        )
 
-            def advance() -> None:
-                with lock:
-                    bars.advance(name)
-
-            return write_pictures(
-                root,
-                cameras[index],
-                inputs.sources[name],
-                masks[name],
-                frames,
-                options.offset(name),
-                options.pictures,
-                options.mask_tidying,
-                advance,
-            )
-
-        lists = in_parallel(one, range(len(names)), options.workers, bars.stop)
-    return dict(zip(names, lists, strict=True))
-
-
-def _write_rest(
-    options: Options,
-    inputs: Inputs,
-    cameras: Sequence[CameraEntry],
-    detections: Mapping[str, Detections],
-    solved: Solved,
-    written: Mapping[str, Written],
-    root: Path,
-    key: str,
-) -> Outcome:
-    solution, names = solved.solution, [camera.name for camera in cameras]
-    fps = frame_rate(options, inputs.sources)
-    small = write_small_files(
-        root,
-        cameras=cameras,
-        files=options.pictures,
-        frames=solved.frames.tolist(),
-        solution=solution,
-        conf=solved.conf,
-        fps=fps,
-        up_axis=options.up_axis or standing_axis(solution.p),
-        made_by={"key": key},
-    )
-    turned, moved = camera_moves(Rig.of(inputs.cameras), solution.rig)
-    doubts = [
-        *doubts_about_sources(inputs.sources, options.doubts),
-        *doubts_about_pictures(inputs.sources, written, options.doubts),
-        *doubts_about_detections(detections, options.doubts),
-        *doubts_about_solution(
-            solution, names, turned, moved, solved.delay, solved.gain, options.doubts
-        ),
-    ]
-    return Outcome(
-        inputs=inputs,
-        cameras=tuple(small),
-        frames=tuple(solved.frames.tolist()),
-        written={name: one.frames for name, one in written.items()},
-        solution=solution,
-        turned=turned,
-        moved_mm=moved,
-        delay=solved.delay,
-        doubts=tuple(doubts),
-        fps=fps,
-    )
-
-
-def _read_back(root: Path) -> None:
-    """Reads the dataset as training will, before it appears.
-
-    Raises:
-        DataError: when it could not be trained on.
-    """
-    try:
-        read_capture(root)
-    except DataError as error:
-        raise DataError(f"nothing was made, because training could not read it: {error}") from None
-
-
-def _forget_parts(root: Path) -> None:
-    """Takes away what a run that was killed in the middle of a file left of it."""
-    with writing(root):
-        for part in root.rglob(".*.part"):
-            part.unlink()
-
-
-def _publish(root: Path, out: Path) -> None:
-    """Lets the whole dataset appear in one step; when that fails, an earlier one stays."""
-    old = out.with_name(f".{out.name}.old")
-    with writing(out):
-        if out.exists():
-            shutil.rmtree(old, ignore_errors=True)
-            os.replace(out, old)
-        try:
-            os.replace(root, out)
-        except OSError:
-            if old.exists():
-                os.replace(old, out)
-            raise
-    shutil.rmtree(old, ignore_errors=True)
+    return each_camera(one, "writing images", list(cameras), options.workers)

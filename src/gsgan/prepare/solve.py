@@ -1,4 +1,4 @@
-"""From 2D detections to 3D joints and better camera poses, with the error after every stage."""
+"""From 2D detections to 3D joints and refined cameras, with the error after every stage."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.joints import ALL, BODY, flip_groups
-from gsgan.prepare.cleanse import Cleansing, cleanse
+from gsgan.prepare.cleanse import Cleansing, Smoothing, cleanse, smooth
 from gsgan.prepare.flips import FlipSearch, apply_flips, find_flips
+from gsgan.prepare.landmarks import Points3D, without_frozen
 from gsgan.prepare.refine import Refinement, refine_rig
-from gsgan.prepare.rig import FOCAL, Bool, Float, Rig
-from gsgan.prepare.smooth import Smoothing, smooth
-from gsgan.prepare.triangulate import Points, Triangulation
+from gsgan.prepare.rig import FOCAL, Bool, Float, Rig, known
+from gsgan.prepare.triangulate import MIN_VIEWS, Points, Triangulation
 
-FIELDS = ("p", "conf", "views", "error", "uv", "flips")  # of a solution, kept as they are
+ARRAYS = ("p", "conf", "views", "error", "uv", "seen", "flips", "delay", "gain")
 Say = Callable[[str], None]
 
 
@@ -34,7 +34,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Solution:
-    """What was found.
+    """Joints, cameras, and how well they agree.
 
     Args:
         rig: refined.
@@ -42,10 +42,12 @@ class Solution:
         conf: ``[F, J]`` mean confidence of the cameras that see the joint, 0 where missing.
         views: ``[F, J]`` cameras whose detection lies within the triangulation's ``scale``.
         error: ``[C, F, J]`` final reprojection error, full-size undistorted pixels, NaN = not seen.
-        uv: ``[C, F, J, 2]`` undistorted detections with the sides put right.
+        uv: ``[C, F, J, 2]`` undistorted detections with the sides corrected.
+        seen: ``[C, F, J]`` their confidence.
         flips: ``[C, F, G]`` sides that were swapped.
+        delay, gain: ``[C]`` of each camera's clock, see `clock_errors`.
         stages: name of each stage and its body errors ``[C, F, 33]``.
-        removed: joints taken out, by reason.
+        removed: number of joints removed, by reason.
     """
 
     rig: Rig
@@ -54,14 +56,17 @@ class Solution:
     views: NDArray[np.int64]
     error: Float
     uv: Float
+    seen: Float
     flips: Bool
+    delay: Float
+    gain: Float
     stages: dict[str, Float]
     removed: dict[str, int]
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """All of it as plain arrays, but for K."""
+        """All of it as plain arrays, except K."""
         return {
-            **{name: getattr(self, name) for name in FIELDS},
+            **{name: getattr(self, name) for name in ARRAYS},
             "R": self.rig.R,
             "t": self.rig.t,
             "stage_names": np.array(list(self.stages)),
@@ -77,12 +82,18 @@ class Solution:
             rig=Rig(K, arrays["R"], arrays["t"]),
             stages=dict(zip(arrays["stage_names"].tolist(), arrays["stages"], strict=True)),
             removed=dict(zip(arrays["reasons"].tolist(), arrays["removed"].tolist(), strict=True)),
-            **{name: arrays[name] for name in FIELDS},
+            **{name: arrays[name] for name in ARRAYS},
         )
 
 
 def solve(
-    rig: Rig, time: Float, uv: Float, conf: Float, settings: Settings, say: Say = lambda _: None
+    rig: Rig,
+    time: Float,
+    uv: Float,
+    conf: Float,
+    settings: Settings,
+    lag: int = 0,
+    say: Say = lambda _: None,
 ) -> Solution:
     """All stages: plain, robust, flips, refined, smoothed.
 
@@ -92,23 +103,21 @@ def solve(
         uv: ``[C, F, J, 2]`` undistorted pixels, NaN = not seen; J is 33, or 75 with hands.
         conf: ``[C, F, J]`` 0 = not seen.
         settings: of every stage.
-        say: is told what begins.
+        lag: frames tried either way when clocks are compared; 0 skips it.
+        say: called with the name of each stage.
     """
-    triangulation, J, K, pixels = settings.triangulation, uv.shape[2], rig.K, uv
-    to_pixels = (rig.focal / FOCAL)[:, None, None]
+    triangulation, given, pixels, full = settings.triangulation, rig, uv, conf
+    groups = flip_groups(hands=uv.shape[2] == ALL)
     rig, uv = rig.normalised(uv)
-    given = rig
-    conf = np.where(conf > triangulation.min_confidence, conf, 0.0)
-    groups, stages = flip_groups(hands=J == ALL), dict[str, Float]()
-    say("triangulating")
-    plain = triangulation.plain(rig, _flat(uv), _flat(conf))
-    stages["plain"] = _body(rig.errors(plain, _flat(uv)), uv)
-    points = triangulation.points(rig, _flat(uv), _flat(conf))
-    stages["robust"] = _body(points.error, uv)
+    start, conf = rig, np.where(conf > triangulation.min_confidence, conf, 0.0)
     flips = np.zeros((*conf.shape[:2], len(groups)), bool)
     sided, weight = uv, conf
+    stages = dict[str, Float]()
 
-    def put_right() -> Points:
+    def record(stage: str, error: Float) -> None:
+        stages[stage] = error.reshape(conf.shape)[:, :, :BODY]
+
+    def triangulate() -> Points:
         nonlocal flips, sided, weight
         if settings.flips.enabled:
             say("looking for swapped sides")
@@ -116,33 +125,71 @@ def solve(
             sided, weight = (apply_flips(v, flips, groups) for v in (uv, conf))
         return triangulation.points(rig, _flat(sided), _flat(weight))
 
-    points = put_right()
-    stages["flips"] = _body(points.error, uv)
+    say("triangulating")
+    plain = triangulation.plain(rig, _flat(uv), _flat(conf))
+    record("plain", rig.errors(plain, _flat(uv)))
+    record("robust", triangulation.points(rig, _flat(uv), _flat(conf)).error)
+    points = triangulate()
+    record("flips", points.error)
     for _ in range(settings.refinement.rounds):
         say("refining the cameras")
-        rig = _refined(given, rig, points, sided, weight, settings.refinement)
-        points = put_right()
-    stages["refined"] = _body(points.error, uv)
-    p = points.p.reshape(-1, J, 3)
-    p, removed = cleanse(p, settings.cleansing)
+        rig = _refined(start, rig, points, sided, weight, settings.refinement)
+        points = triangulate()
+    record("refined", points.error)
+    p, removed = cleanse(points.p.reshape(*conf.shape[1:], 3), settings.cleansing)
     trust = _mean_seen(points.weight.reshape(conf.shape), weight)
     p = smooth(p, trust, time, settings.smoothing.seconds)
     error = rig.errors(p.reshape(-1, 3), _flat(sided)).reshape(conf.shape)
     error = np.where(weight > 0, error, np.nan)
-    stages["smoothed"] = error[:, :, :BODY]
-    known = np.isfinite(p).all(-1)
-    views = (np.nan_to_num(error, nan=np.inf) <= triangulation.scale).sum(0)
-    conf3d = np.where(known, _mean_seen(weight, weight), 0.0)
+    record("smoothed", error)
+    say("comparing the clocks")
+    seen = apply_flips(full, flips, groups)
+    delay, gain = clock_errors(rig, sided[:, :, :BODY], seen[:, :, :BODY], triangulation, lag)
+    to_pixels = (given.focal / FOCAL)[:, None, None]
     return Solution(
-        rig=Rig(K, rig.R, rig.t),
+        rig=Rig(given.K, rig.R, rig.t),
         p=p,
-        conf=conf3d,
-        views=views,
+        conf=np.where(known(p), _mean_seen(weight, weight), 0.0),
+        views=(np.nan_to_num(error, nan=np.inf) <= triangulation.scale).sum(0),
         error=error * to_pixels,
         uv=apply_flips(pixels, flips, groups),
+        seen=seen,
         flips=flips,
+        delay=delay,
+        gain=gain,
         stages={name: one * to_pixels for name, one in stages.items()},
         removed=removed,
+    )
+
+
+def adopt(rig: Rig, points: Points3D, fps: float, settings: Settings, frozen: int) -> Solution:
+    """Another tool's joints, cleansed and smoothed; the cameras stay as calibrated.
+
+    Args:
+        rig: as calibrated.
+        points: the joints.
+        fps: frames per second.
+        settings: of cleansing and smoothing.
+        frozen: runs of identical joints of this length are removed, see `without_frozen`.
+    """
+    p, stuck = without_frozen(points.p, frozen)
+    p, removed = cleanse(p, settings.cleansing)
+    p = smooth(p, points.conf, points.frame_id / fps, settings.smoothing.seconds)
+    C, (F, J) = len(rig), points.conf.shape
+    unseen, unknown = np.full((C, F, J), np.nan), np.full(C, np.nan)
+    return Solution(
+        rig=rig,
+        p=p,
+        conf=np.where(known(p), points.conf, 0.0),
+        views=np.zeros((F, J), np.int64),
+        error=unseen,
+        uv=np.full((C, F, J, 2), np.nan),
+        seen=np.zeros((C, F, J)),
+        flips=np.zeros((C, F, len(flip_groups(hands=False))), bool),
+        delay=unknown,
+        gain=unknown,
+        stages={"smoothed": unseen},
+        removed=removed | {"frozen": stuck},
     )
 
 
@@ -150,25 +197,68 @@ def _flat(values: Float) -> Float:
     return values.reshape(values.shape[0], -1, *values.shape[3:])
 
 
-def _body(error: Float, uv: Float) -> Float:
-    return error.reshape(uv.shape[:3])[:, :, :BODY]
-
-
 def _refined(
     given: Rig, rig: Rig, points: Points, uv: Float, weight: Float, settings: Refinement
 ) -> Rig:
-    """The rig refined on evenly spread frames and the body's joints: hands are less certain."""
-    C, F, J = weight.shape
-    count = min(F, settings.frames)
-    chosen = np.unique(np.linspace(0, F - 1, count).round().astype(int))
+    """The rig refined on evenly spaced frames and the body's joints: hands are less certain."""
+    _, F, J = weight.shape
+    chosen = np.unique(np.linspace(0, F - 1, min(F, settings.frames)).round().astype(int))
     p = points.p.reshape(F, J, 3)[chosen, :BODY].reshape(-1, 3)
-    uv = uv[:, chosen, :BODY].reshape(C, -1, 2)
-    return refine_rig(given, rig, p, uv, weight[:, chosen, :BODY].reshape(C, -1), settings)
+    uv, weight = (_flat(values[:, chosen, :BODY]) for values in (uv, weight))
+    return refine_rig(given, rig, p, uv, weight, settings)
 
 
 def _mean_seen(values: Float, weight: Float) -> Float:
     """``[F, J]`` mean over the cameras that see a joint."""
     return np.asarray(values.sum(0) / np.maximum((weight > 0).sum(0), 1))
+
+
+def clock_errors(
+    rig: Rig, uv: Float, weight: Float, triangulation: Triangulation, lag: int
+) -> tuple[Float, Float]:
+    """Each camera's delay against the others, and the gain of correcting it.
+
+    Convention: frames; with a positive delay the camera shows a later moment than the others at the
+    same number, so its numbers should grow by that much. Points are triangulated without the
+    camera, so three cameras are needed; with two the delay is NaN. Between frames a parabola
+    through the three best lags decides.
+
+    Args:
+        rig: ``C`` cameras.
+        uv: ``[C, F, J, 2]`` undistorted pixels.
+        weight: ``[C, F, J]``.
+        triangulation: its settings.
+        lag: frames tried either way.
+
+    Returns:
+        ``delay [C]`` and ``gain [C]``, the share by which the median error falls.
+    """
+    C, F, _ = weight.shape
+    delay, gain, lag = np.full(C, np.nan), np.full(C, np.nan), min(lag, F - 1)
+    rig, uv = rig.normalised(uv)
+    if C <= MIN_VIEWS or lag < 1:
+        return delay, gain
+    for c in range(C):
+        others = np.arange(C) != c
+        p = triangulation.points(rig[others], _flat(uv[others]), _flat(weight[others])).p
+        expected = rig.project(p)[0][c].reshape(uv.shape[1:])
+        seen = np.where((weight[c] > 0)[..., None], uv[c], np.nan)
+        errors = []
+        for s in range(-lag, lag + 1):  # the camera's frame f against the others' frame f - s
+            ours, theirs = seen[max(s, 0) : F + min(s, 0)], expected[max(-s, 0) : F - max(s, 0)]
+            errors.append(median(np.linalg.norm(ours - theirs, axis=-1)))
+        if np.isfinite(errors[lag]):
+            best = int(np.nanargmin(errors))
+            delay[c] = lag - best - _vertex(errors[max(best - 1, 0) : best + 2])
+            gain[c] = 1 - errors[best] / max(errors[lag], 1e-12)
+    return delay, gain
+
+
+def _vertex(values: list[float]) -> float:
+    """Where a parabola through values at -1, 0, 1 is lowest; 0 with fewer values or none lowest."""
+    if len(values) < 3 or not values[0] - 2 * values[1] + values[2] > 0:
+        return 0.0
+    return 0.5 * (values[0] - values[2]) / (values[0] - 2 * values[1] + values[2])
 
 
 def stage_medians(stages: dict[str, Float]) -> dict[str, tuple[float, list[float], float]]:
@@ -185,6 +275,6 @@ def stage_medians(stages: dict[str, Float]) -> dict[str, tuple[float, list[float
 
 
 def median(values: Float) -> float:
-    """The median of what is finite; NaN of nothing."""
+    """The median of the finite values, NaN when there are none."""
     finite = values[np.isfinite(values)]
     return float(np.median(finite)) if finite.size else float("nan")

@@ -1,15 +1,17 @@
-"""The pictures of a capture: one video, or one folder of pictures, a camera."""
+"""The recordings: one video or one folder of images per camera, and which camera took which."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import frame_files, natural_order, read_colour, read_header
 from gsgan.utils.errors import DataError
 
@@ -22,17 +24,17 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Source:
-    """One camera's video or folder of pictures.
+    """One camera's video or folder of images.
 
     Args:
         name: file stem or folder name.
         path: of the video or folder.
         size: ``(H, W)`` pixels as read.
-        fps: frames a second, None for pictures or when the video does not say.
+        fps: frames per second, None for images or when the video does not have it.
         files: of a folder, by number; empty for a video.
-        count: pictures, as a video's header claims; not always true.
-        turned: degrees of rotation that the video's metadata ask for.
-        rotate: whether they are obeyed.
+        count: images; for a video its header's value, which may be wrong.
+        turned: degrees of rotation in the video's metadata.
+        rotate: whether that rotation is applied.
     """
 
     name: str
@@ -45,32 +47,18 @@ class Source:
     rotate: bool = False
 
     def pictures(self) -> Iterator[tuple[int, Bytes]]:
-        """(number, BGR picture ``[H, W, 3]``), in order; a video's are numbered from 0.
+        """(number, BGR image ``[H, W, 3]``), in order; a video's are numbered from 0.
 
         Raises:
-            DataError: when a picture is damaged or the video cannot be opened.
+            DataError: when an image is damaged or the video cannot be opened.
         """
-        return self._from_files() if self.files else self._from_video()
-
-    def _from_files(self) -> Iterator[tuple[int, Bytes]]:
+        if not self.files:
+            yield from enumerate(_decoded(_open(self.path, self.rotate)))
         for number, path in self.files.items():
             yield number, np.asarray(cv2.cvtColor(read_colour(path), cv2.COLOR_RGB2BGR), np.uint8)
 
-    def _from_video(self) -> Iterator[tuple[int, Bytes]]:
-        video = _open(self.path, self.rotate)
-        try:
-            number = 0
-            while True:
-                ok, picture = video.read()
-                if not ok:
-                    return
-                yield number, np.asarray(picture, np.uint8)
-                number += 1
-        finally:
-            video.release()
-
     def fingerprint(self) -> list[str | int]:
-        """What changes when the pictures do: names, sizes and times of the files."""
+        """Names, sizes and times of the files: changes when the images do."""
         paths = list(self.files.values()) if self.files else [self.path]
         return [
             part
@@ -80,34 +68,35 @@ class Source:
 
 
 def find_sources(folder: Path, rotate: bool = False) -> dict[str, Source]:
-    """Every camera's pictures in a folder, or in videos/ or images/ inside it, in natural order.
+    """Every camera's images in a folder, or in videos/ or images/ inside it, in natural order.
 
     Args:
-        folder: with one video or one subfolder of pictures a camera.
-        rotate: whether rotation metadata of videos is obeyed.
+        folder: with one video or one subfolder of images per camera.
+        rotate: whether rotation metadata of videos is applied.
 
     Raises:
         DataError: when there are none, or two videos have the same stem.
     """
     if not folder.is_dir():
         raise DataError(
-            f"source={folder} is no folder; expected one video or one folder of pictures a camera"
+            f"source={folder} is not a folder; expected one with a video or a folder of images per "
+            "camera"
         )
     for place in (*(folder / name for name in INSIDE), folder):
         if place.is_dir() and (sources := _sources_in(place, rotate)):
             return sources
     raise DataError(
-        f"{folder} holds no videos ({' '.join(VIDEO_SUFFIXES)}) and no folders of pictures "
-        f"({' '.join(PICTURE_SUFFIXES)}); expected one a camera"
+        f"{folder} holds no videos ({' '.join(VIDEO_SUFFIXES)}) and no folders of images "
+        f"({' '.join(PICTURE_SUFFIXES)}); expected one per camera"
     )
 
 
 def _sources_in(folder: Path, rotate: bool) -> dict[str, Source]:
     sources: dict[str, Source] = {}
     for path in sorted(folder.iterdir(), key=lambda p: natural_order(p.name)):
+        source = None
         if path.name.startswith("."):
             continue
-        source = None
         if path.is_dir():
             source = _picture_folder(folder, path)
         elif path.suffix.lower() in VIDEO_SUFFIXES:
@@ -117,7 +106,7 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Source]:
         if source.name in sources:
             raise DataError(
                 f"{folder} holds {sources[source.name].path.name} and {path.name}, two sources of "
-                f"the camera {source.name}; take one away"
+                f"the camera {source.name}; remove one"
             )
         sources[source.name] = source
     return sources
@@ -134,23 +123,110 @@ def _picture_folder(root: Path, path: Path) -> Source | None:
 
 def _video(path: Path, rotate: bool) -> Source:
     video = _open(path, rotate)
-    try:
-        fps = float(video.get(cv2.CAP_PROP_FPS))
-        turned = int(video.get(cv2.CAP_PROP_ORIENTATION_META))
-        count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
-        ok, picture = video.read()  # what the header says of the size may differ from the pictures
-    finally:
-        video.release()
-    if not ok:
-        raise DataError(f"{path} holds no picture that can be decoded; convert it to H.264 MP4")
-    size = picture.shape[0], picture.shape[1]
-    known = fps if np.isfinite(fps) and fps > 0 else None
-    return Source(path.stem, path, size, known, {}, count, turned, rotate)
+    fps = float(video.get(cv2.CAP_PROP_FPS))
+    turned = int(video.get(cv2.CAP_PROP_ORIENTATION_META))
+    count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
+    first = next(_decoded(video), None)  # the header's size may differ from the images'
+    if first is None:
+        raise DataError(f"{path} holds no image that can be decoded; convert it to H.264 MP4")
+    rate = fps if np.isfinite(fps) and fps > 0 else None
+    return Source(path.stem, path, (len(first), len(first[0])), rate, {}, count, turned, rotate)
 
 
 def _open(path: Path, rotate: bool) -> cv2.VideoCapture:
     video = cv2.VideoCapture(str(path))
     if not video.isOpened():
-        raise DataError(f"{path} is no video that can be opened; convert it to H.264 MP4")
+        raise DataError(f"{path} cannot be opened as a video; convert it to H.264 MP4")
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(rotate))
     return video
+
+
+def _decoded(video: cv2.VideoCapture) -> Iterator[Bytes]:
+    """The images of a video, which is closed at the end."""
+    try:
+        while True:
+            ok, picture = video.read()
+            if not ok:
+                return
+            yield np.asarray(picture, np.uint8)
+    finally:
+        video.release()
+
+
+def pair_cameras(
+    sources: Sequence[str], cameras: Sequence[str], given: Mapping[str, object]
+) -> dict[str, str]:
+    """The calibrated camera of each source.
+
+    Convention: as ``given``; else the same name, ignoring case; else the one camera whose name
+    stands between separators in the source's name ("Miqus_5_21474": 21474). Never by position.
+
+    Args:
+        sources: names of videos or folders.
+        cameras: names in the calibration.
+        given: source name to camera name.
+
+    Raises:
+        DataError: when a source has no camera or two have the same, listing both sides.
+    """
+    both = f"videos: {', '.join(sources)}; calibration: {', '.join(cameras)}"
+    pairs = {str(source): str(camera) for source, camera in given.items()}
+    for source, camera in pairs.items():
+        if source not in sources or camera not in cameras:
+            raise DataError(f"cameras={{{source}: {camera}}} names what is not there ({both})")
+    for source in sources:
+        if source not in pairs:
+            matching = _matching(source, cameras)
+            if len(matching) != 1:
+                raise DataError(
+                    f"no one camera of the calibration matches the video {source} ({both}); set "
+                    f"cameras={{{source}: <calibration name>, …}}"
+                )
+            pairs[source] = matching[0]
+    taken = list(pairs.values())
+    if twice := sorted({camera for camera in taken if taken.count(camera) > 1}):
+        raise DataError(
+            f"the camera {twice[0]} of the calibration matches more than one video ({both}); set "
+            "cameras={video: calibration name, …}"
+        )
+    return {source: pairs[source] for source in sources}
+
+
+def _matching(source: str, cameras: Sequence[str]) -> list[str]:
+    if source in cameras:
+        return [source]
+    words = re.split(r"[^0-9a-z]+", source.lower())
+    same = [camera for camera in cameras if camera.lower() == source.lower()]
+    return same or [camera for camera in cameras if camera.lower() in words]
+
+
+def fit_size(
+    camera: CameraEntry, name: str, size: tuple[int, int], crop_px: int, where: Path
+) -> tuple[CameraEntry, str | None]:
+    """A camera with its source's name and image size, and a note when the sizes differ.
+
+    Convention: a few missing columns or rows were cut off at the right or bottom, where codecs cut,
+    so K stays.
+
+    Args:
+        camera: as calibrated; a size of (0, 0) is unknown.
+        name: of the source.
+        size: ``(H, W)`` of its images.
+        crop_px: most pixels that may be missing.
+        where: the calibration file.
+
+    Raises:
+        DataError: when the sizes differ by more: the calibration is of another resolution.
+    """
+    fitted = replace(camera, name=name, size=size)
+    if camera.size in (size, (0, 0)):
+        return fitted, None
+    (h, w), (H, W) = size, camera.size
+    if max(abs(H - h), abs(W - w)) > crop_px:
+        raise DataError(
+            f"{where}: the camera {camera.name} is calibrated for {W}x{H} pixels, but the images "
+            f"of {name} have {w}x{h}; calibrate at that size, or convert the video back"
+        )
+    return fitted, (
+        f"{name}: {w}x{h} pixels, calibrated as {W}x{H}; treated as cut at the right and bottom"
+    )

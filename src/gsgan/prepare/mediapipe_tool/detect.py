@@ -1,9 +1,9 @@
-"""Finds body and hand landmarks, and the person's mask, in one video or folder of pictures.
+"""Finds body and hand landmarks, and the person's mask, in one video or folder of images.
 
 Runs in its own environment (requirements.txt beside it); `gsgan.prepare.mediapipe` starts it.
-Prints ``<pictures done> <pictures in all>`` a line. Writes an npz:
+Prints a line ``<images done> <images in total>`` per image. Writes an npz:
 
-    px (F,33,2), conf (F,33)     pixels of the picture as stored, first pixel's centre at (0.5, 0.5)
+    px (F,33,2), conf (F,33)     pixels of the image as stored, first pixel's centre at (0.5, 0.5)
     left, right (F,21,2)         the person's hands; NaN = not found
     frame_id (F,), size (2,) [w, h]
 
@@ -30,28 +30,32 @@ JOINTS, HAND = 33, 21
 def main() -> None:
     options = parse()
     if options.threads and hasattr(os, "sched_setaffinity"):
-        # MediaPipe offers no thread count; the processors it may use bound it.
+        # MediaPipe has no option for the number of threads; the allowed processors bound it.
         allowed = sorted(os.sched_getaffinity(0))
         first = options.slot * options.threads
         chosen = {allowed[(first + i) % len(allowed)] for i in range(options.threads)}
         os.sched_setaffinity(0, chosen)
     cv2.setNumThreads(options.threads or -1)
     count, pictures = open_source(Path(options.source), options.rotate)
-    if options.masks:
-        Path(options.masks).mkdir(parents=True, exist_ok=True)
+    folder = Path(options.masks) if options.masks else None
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, list[Any]] = {}
     size = (0, 0)
-    with Detector(options) as detector:
-        for done, (frame, picture) in enumerate(pictures, start=1):
-            size = picture.shape[1], picture.shape[0]
-            landmarks = detector.landmarks(picture)
-            for name, value in (*landmarks.items(), ("frame_id", frame)):
-                found.setdefault(name, []).append(value)
-            if options.masks:
-                write_mask(Path(options.masks), frame, detector.mask(picture, landmarks["px"]))
-            print(done, max(done, count), flush=True)
+    detector = Detector(options)
+    for done, (frame, picture) in enumerate(pictures, start=1):
+        size = picture.shape[1], picture.shape[0]
+        landmarks = detector.landmarks(picture)
+        for name, value in (*landmarks.items(), ("frame_id", frame)):
+            found.setdefault(name, []).append(value)
+        if folder is not None:
+            mask = detector.mask(picture, landmarks["px"])
+            if mask is not None:
+                cv2.imwrite(str(folder / f"{frame:06d}.png"), mask)
+        print(done, max(done, count), flush=True)
+    detector.close()
     if not found:
-        raise SystemExit(f"{options.source} holds no picture that can be decoded")
+        raise SystemExit(f"{options.source} holds no image that can be decoded")
     out = Path(options.out)
     part = out.with_name(f".{out.name}")
     with part.open("wb") as stream:
@@ -62,21 +66,21 @@ def main() -> None:
 
 def parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--source", required=True, help="a video, or a folder of pictures")
+    parser.add_argument("--source", required=True, help="a video, or a folder of images")
     parser.add_argument("--out", required=True, help="npz to write")
     parser.add_argument("--masks", default="", help="folder for masks; none are made without it")
     parser.add_argument("--hands", type=int, default=1, help="1: find the hands too")
-    parser.add_argument("--rotate", type=int, default=0, help="1: obey rotation metadata")
+    parser.add_argument("--rotate", type=int, default=0, help="1: apply rotation metadata")
     parser.add_argument("--threads", type=int, default=0, help="processors to use; 0: all")
-    parser.add_argument("--slot", type=int, default=0, help="which of several that run at once")
-    parser.add_argument("--confidence", type=float, default=0.5, help="least, to find a person")
-    parser.add_argument("--tracking", type=float, default=0.5, help="least, to keep following")
+    parser.add_argument("--slot", type=int, default=0, help="number among those that run at once")
+    parser.add_argument("--confidence", type=float, default=0.5, help="lowest, to find a person")
+    parser.add_argument("--tracking", type=float, default=0.5, help="lowest, to keep tracking")
     parser.add_argument("--margin", type=float, default=0.15, help="of the mask's crop, share")
     return parser.parse_args()
 
 
 def open_source(path: Path, rotate: int) -> tuple[int, Iterator[tuple[int, Any]]]:
-    """How many pictures (0: unknown), and an iterator of (frame number, BGR picture)."""
+    """Number of images (0: unknown), and an iterator of (frame number, BGR image)."""
     if path.is_dir():
         files = {
             int(re.findall(r"[0-9]+", p.stem)[-1]): p
@@ -86,7 +90,7 @@ def open_source(path: Path, rotate: int) -> tuple[int, Iterator[tuple[int, Any]]
         return len(files), ((frame, read_picture(files[frame])) for frame in sorted(files))
     video = cv2.VideoCapture(str(path))
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(rotate))
-    return int(video.get(cv2.CAP_PROP_FRAME_COUNT)), read_video(video)
+    return int(video.get(cv2.CAP_PROP_FRAME_COUNT)), enumerate(read_video(video))
 
 
 def read_picture(path: Path) -> Any:
@@ -97,21 +101,20 @@ def read_picture(path: Path) -> Any:
     return picture
 
 
-def read_video(video: cv2.VideoCapture) -> Iterator[tuple[int, Any]]:
-    for frame in range(10**9):
+def read_video(video: cv2.VideoCapture) -> Iterator[Any]:
+    ok, picture = video.read()
+    while ok:
+        yield picture
         ok, picture = video.read()
-        if not ok:
-            return
-        yield frame, picture
 
 
 class Detector:
-    """One video's detectors: they follow the person from picture to picture, so one a video."""
+    """The detectors of one video: they track the person from image to image."""
 
     def __init__(self, options: argparse.Namespace) -> None:
         solutions = mp.solutions
         common = {
-            "model_complexity": 1,  # the one whose weights the package brings along
+            "model_complexity": 1,  # its weights come with the package
             "min_detection_confidence": options.confidence,
             "min_tracking_confidence": options.tracking,
         }
@@ -123,10 +126,7 @@ class Detector:
             static_image_mode=True, enable_segmentation=True, **common
         )
 
-    def __enter__(self) -> "Detector":
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self.body.close()
         self.segmenter.close()
 
@@ -143,7 +143,7 @@ class Detector:
         }
 
     def mask(self, picture: Any, px: Any) -> Any:
-        """0..255 of the whole picture, found in a crop round the person; None: nobody there."""
+        """0..255 of the whole image, found in a crop around the person; None: nobody there."""
         if not np.isfinite(px).all():
             return None
         height, width = picture.shape[:2]
@@ -163,15 +163,10 @@ class Detector:
 
 
 def pixels(landmarks: Any, size: tuple[int, int], count: int) -> Any:
-    """``[count, 2]``; MediaPipe's numbers are shares of the picture's width and height."""
+    """``[count, 2]``; MediaPipe's numbers are shares of the image's width and height."""
     if landmarks is None:
         return np.full((count, 2), np.nan, np.float32)
     return np.array([(p.x * size[0], p.y * size[1]) for p in landmarks.landmark], np.float32)
-
-
-def write_mask(folder: Path, frame: int, mask: Any) -> None:
-    if mask is not None:
-        cv2.imwrite(str(folder / f"{frame:06d}.png"), mask)
 
 
 if __name__ == "__main__":
