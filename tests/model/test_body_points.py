@@ -227,7 +227,7 @@ def test_the_figure_of_densify_says_where_the_points_are(build, tmp_path):
 
 def test_without_the_frames_body_pose_it_says_what_is_missing(build):
     _, avatar, frame = build(ON)
-    with pytest.raises(ValueError, match="sit on the body; give its pose"):
+    with pytest.raises(ValueError, match="skinned body; give its body pose"):
         avatar.paint(replace(frame, body=None))
 
 
@@ -242,8 +242,8 @@ def test_models_without_psi_refuse_it_in_one_sentence(build, model):
     [
         (1.0, "on", "100 % of the posed body"),
         (0.95, "on", "95 %"),
-        (0.9, "off", "the skeleton is trusted more"),
-        (None, "off", "mesh is not at hand"),
+        (0.9, "off", "the skeleton fits better"),
+        (None, "off", "mesh cannot be read"),
     ],
 )
 def test_auto_trusts_a_pose_that_fits_the_masks(build, inside, value, why):

@@ -78,7 +78,7 @@ def _in_the_model(
         config,
         data,
         vertex_labels=S.vertex_labels if S is not None and S.voted else None,
-        effects=avatar.effects.switched_off(name, "to see what it costs"),
+        effects=avatar.effects.without(name, "to see what it costs"),
     ).to(frame.image.device)
     added = _parameters(avatar) - _parameters(without)
     if not rounds:

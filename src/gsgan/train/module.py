@@ -14,7 +14,6 @@ import torch
 from lightning import LightningModule
 from torch import Tensor, nn
 
-from gsgan.effects import Effect, Effects
 from gsgan.losses.adversarial import discriminator_loss
 from gsgan.losses.perceptual import Perceptual
 from gsgan.losses.photometric import without_unsure
@@ -59,6 +58,7 @@ class AvatarTraining(LightningModule):
         average_every: iterations from one of its updates to the next, which counts for as many.
         rollback: what is done when the rendered person vanishes.
         record: plain config values stored with every checkpoint.
+        scene: facts about the scene as plain values, likewise, for `gsgan.load`.
 
     Source: paper Alg. 2.
     """
@@ -82,6 +82,7 @@ class AvatarTraining(LightningModule):
         average_every: int = 1,
         rollback: Rollback | None = None,
         record: dict[str, Any] | None = None,
+        scene: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
@@ -96,7 +97,7 @@ class AvatarTraining(LightningModule):
             if every < 1:
                 raise ConfigError(f"training.{name} must be at least 1, got {every}")
         self.max_skipped, self.skip_window = max_skipped, skip_window
-        self.record = record or {}
+        self.record, self.scene = record or {}, scene
         self.rollback = rollback or Rollback()
         self.average, self.average_every = None, average_every
         if average is not None:
@@ -421,11 +422,12 @@ class AvatarTraining(LightningModule):
             "marks": self.marks,
             "record": self.record,
             "effects": self.avatar.effects.plain(),
+            "scene": self.scene,
         }
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         state = checkpoint["gsgan"]
-        _same_effects(state.get("effects"), self.avatar.effects)
+        self.avatar.effects.check_same(state.get("effects"))
         self.step = state["step"]
         self.rollback.done = state["rollbacks"]
         self.start_psnr = state["start_psnr"]
@@ -450,18 +452,3 @@ def _fit_schedule(schedule: Schedule, avatar: Avatar) -> Schedule:
     return replace(
         schedule, step_one=one, step_two=two, discriminator_start=start, degree_every=every
     )
-
-
-def _same_effects(stored: dict[str, Any] | None, now: Effects) -> None:
-    """Refuses to go on with a run whose data called for other effects when it began."""
-    if stored is None:
-        return
-    before = Effects.from_plain(stored)
-    for name, effect in now:
-        was: Effect = getattr(before, name)
-        if was.value != effect.value:
-            raise ConfigError(
-                f"effects.{name}: the run began with {was.value} ({was.why}), its data now calls "
-                f"for {effect.value} ({effect.why}); set effects.{name}={was.value}, or "
-                "resume=false to start over"
-            )

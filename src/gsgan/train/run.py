@@ -75,8 +75,10 @@ def run_training(config: DictConfig) -> None:
     refuse_long_cpu_run(config, data, module, module.schedule.total - done)
     module.code = training_code()
     describe(console, folder, data, module, config.trainer.accelerator)
-    where = training_device(config.trainer.accelerator)
-    costs = effect_costs(config, data, module.avatar, config.effects.measure, where)
+    costs = None
+    if config.effects.measure:
+        where = training_device(config.trainer.accelerator)
+        costs = effect_costs(config, data, module.avatar, config.effects.measure, where)
     console.print(effects_table(module.avatar.effects, costs))
     if resume is not None:
         console.print(f"going on from {resume}", soft_wrap=True)
