@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
-from gsgan.data.crop import Window, take, undistort_map
+from gsgan.data.crop import Window, distort, take, undistort_map
 from gsgan.data.datamodule import GsganData
 from gsgan.data.synthetic import ensure_synthetic
 from gsgan.data.synthetic.scene_setup import Settings, build_stage, dataset_key
 from gsgan.data.synthetic.scenes import SceneOptions, ensure_scene, make
-from gsgan.data.synthetic.scenes.lens import LensView, distort, undistort
+from gsgan.data.synthetic.scenes.lens import LensView, undistort
 from gsgan.data.synthetic.scenes.make import build_scene, options_key
 from gsgan.data.synthetic.scenes.photograph import Gloss, PhotographedPerson
 from gsgan.data.synthetic.scenes.tint import Tint, make_tints

@@ -188,9 +188,11 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
     stored(module, tmp_path)
     avatar, _ = load_avatar(tmp_path, config, data)
     assert getattr(avatar, part) is not None
-    for place in ("avatar", "parts"):
+    for place in ("assemble", "parts"):
         monkeypatch.setattr(f"gsgan.model.{place}.open_body", lambda *_: None)
-    with pytest.raises(DataError, match=rf"with {said}, .* no model file; set data\.smpl"):
+    with pytest.raises(
+        DataError, match=rf"{said},? .*cannot be built.* no model file; set data\.smpl"
+    ):
         load_avatar(tmp_path, config, data)
 
 

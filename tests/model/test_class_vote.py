@@ -286,7 +286,7 @@ def test_votes_of_another_body_are_refused(foreign, tiny):
 
     config = tiny(f"data.root={foreign}")
     with pytest.raises(DataError, match="labels of 7 vertices, which do not fit the free body"):
-        build_avatar(config, build_data(config), torch.ones(7).long())
+        build_avatar(config, build_data(config), vertex_labels=torch.ones(7).long())
 
 
 def test_without_pictures_foreign_labels_are_refused(foreign, tiny):

@@ -13,8 +13,7 @@ from torch import Tensor, nn
 
 from gsgan.fit.settings import Fit
 from gsgan.fit.shape import RigidShape
-from gsgan.scene import Frame
-from gsgan.window import body_window
+from gsgan.scene import Frame, body_window
 
 BETAS = (0.9, 0.99)
 LENGTH_FLOOR = 1e-12  # square metres

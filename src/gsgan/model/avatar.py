@@ -18,7 +18,7 @@ from gsgan.model.generator import Generator
 from gsgan.model.painting import Painting
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
-from gsgan.scene import BodyPose, Camera, Frame, Gaussians, cat
+from gsgan.scene import BodyPose, Camera, Frame, Gaussians, Window, body_window, cat
 from gsgan.skeleton import (
     MEDIAPIPE33,
     BoneFrames,
@@ -34,7 +34,6 @@ from gsgan.splat import Accuracy, rasterise
 from gsgan.splat.checks import checks_for
 from gsgan.utils.errors import GsganError
 from gsgan.utils.precision import full_precision
-from gsgan.window import Window, body_window
 
 LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in an image 512 high
 SKELETON_CHANNELS = len(MEDIAPIPE33.draw_groups)

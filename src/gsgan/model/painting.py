@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsgan.scene import Gaussians
-from gsgan.window import Window
+from gsgan.scene import Gaussians, Window
 
 
 @dataclass(frozen=True)

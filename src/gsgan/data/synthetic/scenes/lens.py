@@ -1,4 +1,4 @@
-"""A view through a lens that bends straight lines.
+"""A view through a lens that distorts.
 
 Convention: OpenCV's model, on x/z and y/z of the camera's axes.
 """
@@ -7,17 +7,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsgan.data.crop import distort
 from gsgan.data.synthetic.trace import View
 from gsgan.utils.errors import ConfigError
 
 Array = NDArray[np.float64]
 
-EXACT = 1e-10  # of x/z: what a distorted point found again may be off by
-FURTHEST = 10.0  # of x/z: where the search for it ends
+EXACT = 1e-10  # of x/z: largest error of an undistorted point
+FURTHEST = 10.0  # of x/z: bound of the search for it
 
 
 @dataclass(frozen=True)
@@ -27,13 +27,13 @@ class LensView(View):
     dist: Array
 
     def project(self, points: Array) -> Array:
-        """``[N, 2]`` pixels of world points ``[N, 3]``, all of them before the camera."""
+        """``[N, 2]`` pixels of world points ``[N, 3]``, all in front of the camera."""
         x = points @ self.R.T + self.t
-        bent = distort(x[:, :2] / x[:, 2:], self.dist)
-        return bent @ self.K[:2, :2].T + self.K[:2, 2]
+        shown = distort(x[:, :2] / x[:, 2:], self.dist)
+        return shown @ self.K[:2, :2].T + self.K[:2, 2]
 
     def bend(self, directions: Array) -> Array:
-        """The unit rays ``[N, 3]`` that a lens brings to where a pinhole would see these.
+        """The unit rays ``[N, 3]`` that a lens shows where a pinhole would show these.
 
         Raises:
             ConfigError: when the lens shows nothing at some of these places.
@@ -44,26 +44,16 @@ class LensView(View):
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def distort(points: Array, dist: Array) -> Array:
-    """``[N, 2]`` where a lens shows points ``[N, 2]`` of the z = 1 plane."""
-    if len(points) == 0:
-        return points
-    before = np.concatenate([points, np.ones((len(points), 1))], axis=1)
-    nothing = np.zeros(3)
-    shown = cv2.projectPoints(before, nothing, nothing, np.eye(3), dist)[0]
-    return np.asarray(shown, dtype=np.float64).reshape(-1, 2)
-
-
 def undistort(points: Array, dist: Array, iterations: int = 200) -> Array:
-    """The inverse of :func:`distort`, exact to `EXACT`.
+    """The inverse of `gsgan.data.crop.distort`, exact to `EXACT`, by fixed-point iteration.
 
     Args:
         points: ``[N, 2]`` as the lens shows them.
         dist: lens coefficients.
-        iterations: at most; each takes away a share of the error that is the lens's strength.
+        iterations: at most; the stronger the lens, the more it takes.
 
     Raises:
-        ConfigError: when a place has no such point, or cannot be found: the lens folds back.
+        ConfigError: when some place has no such point: the lens folds back.
     """
     found = points
     for _ in range(iterations):
@@ -75,7 +65,7 @@ def undistort(points: Array, dist: Array, iterations: int = 200) -> Array:
     if lost.any():
         x, y = points[lost][0]
         raise ConfigError(
-            f"synthetic data: lens {dist.tolist()} cannot be undone within the picture, it folds "
+            f"synthetic data: lens {dist.tolist()} cannot be undone within the image, it folds "
             f"back near x/z = {x:.2f}, y/z = {y:.2f}; give weaker coefficients"
         )
     return found
