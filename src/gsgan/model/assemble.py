@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from hydra.utils import instantiate
@@ -125,10 +125,13 @@ def assemble_avatar(
     """
     _check(accuracy, densify, deformation, surface, pose_encoder, generator, backend, twist)
     if effects is None:
-        splats = densify is not None or surface is not None
-        model = ModelParts(splats, densify is not None, body_points is not None)
+        model = ModelParts(
+            splats=densify is not None or surface is not None,
+            points=densify is not None,
+            body_points=body_points is not None,
+        )
         effects = decide(scene, settings or EffectSettings(), model)
-    formation = {"low_pass": low_pass, "antialias": effects.antialias.on}
+    formation: dict[str, Any] = {"low_pass": low_pass, "antialias": effects.antialias.on}
     # Stature, from limb lengths: the skeleton measures it and no pose changes it.
     body_height = float(scene.body_height) * MEDIAPIPE33.stature / MEDIAPIPE33.limb_length_sum
     sizes = {"body_height": body_height, "sh_degree": effects.degree}
@@ -143,7 +146,7 @@ def assemble_avatar(
         rest, joints = (on_body or densify).rest_points, len(MEDIAPIPE33.names)
         psi = deformation(rest_points=rest, joints=joints, **sizes)
     skin = None if surface is None else surface(body=_surface_body(scene), **sizes)
-    splats = psi or skin
+    splats: Deformation | SurfaceGaussians | None = psi or skin
     S, why = None, "the model leaves it out"
     if segmentation is not None:
         body, why = labelled_body(scene, class_vote or ClassVote(), pictures, vertex_labels)

@@ -163,7 +163,11 @@ class Avatar(nn.Module):
         seen = valid.to(p)
         if visibility is not None:
             seen = seen * visibility.reshape(-1, visibility.shape[-1]).to(p)
-        cameras = cat([camera] * len(p)) if len(camera) == 1 else camera
+        if len(camera) not in (1, len(p)):
+            raise ValueError(
+                f"render: expected 1 camera or 1 per skeleton, {len(p)}; got {len(camera)}"
+            )
+        cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
         body = None if body is None else body.to(device)
         painting = self._paint(p, seen, cameras.to(device), body)
         assert painting.image is not None and painting.alpha is not None  # noqa: PT018

@@ -13,7 +13,7 @@ from torch.nn import functional
 from gsgan.body import SkinnedBody
 from gsgan.model.classes import IGNORE, class_map
 from gsgan.model.skinned_points import SkinnedPoints
-from gsgan.scene import BodyPose, Camera, Gaussians, Raster
+from gsgan.scene import BodyPose, Camera, Frame, Gaussians, Raster
 from gsgan.splat import accuracy as named_accuracy
 from gsgan.splat import rasterise
 from gsgan.splat.checks import checks_for
@@ -148,6 +148,17 @@ class Segmentation(nn.Module):
         raster = self.raster(pose, camera)
         covered = raster.alpha if self.all_classed else raster.features.sum(dim=1, keepdim=True)
         return torch.cat([(1 - covered).clamp_min(0), raster.features], dim=1)
+
+    def loss(self, frame: Frame) -> Tensor:
+        """What S learns from a frame: its labels, or its mask where the data has no labels."""
+        assert frame.body is not None
+        if self.common is not None:
+            alpha = self.raster(frame.body, frame.camera).alpha
+            return silhouette_loss(alpha, frame.mask, frame.unsure)
+        labels = torch.full_like(frame.mask[:, 0], IGNORE, dtype=torch.long)
+        if frame.labels is not None:  # else nothing is learned from this image
+            labels = self.truth(frame.labels)
+        return segmentation_loss(self(frame.body, frame.camera), labels)
 
 
 def _classes_as_loaded(segmentation: nn.Module, _: Any) -> None:

@@ -196,7 +196,9 @@ def scene_of(plain: Mapping[str, Any]) -> SceneInfo:
     from gsgan.data.scene_info import SceneInfo
     from gsgan.data.surface_colours import SurfaceColours
 
-    values = {k: tuple(v) if isinstance(v, list) else v for k, v in plain.items()}
+    values: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in plain.items()
+    }
     if values["surface"] is not None:
         values["surface"] = SurfaceColours(**values["surface"])
     return SceneInfo(**values)
