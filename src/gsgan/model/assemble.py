@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
 from hydra.utils import instantiate
@@ -77,16 +77,13 @@ def assemble_avatar(
     low_pass: float = 0.3,
     supersample: int = 1,
     backend: str = "auto",
-    twist: Literal["none", "hinge"] = "none",
-    window_margin: float | None = 0.25,
-    window_multiple: int = 16,
-    window_least: int = 32,
     class_vote: ClassVote | None = None,
     pictures: Pictures | None = None,
     vertex_labels: Tensor | None = None,
     labelled: bool | None = None,
     effects: Effects | None = None,
     settings: EffectSettings | None = None,
+    **options: Any,
 ) -> Avatar:
     """Builds each part with its sizes and puts them together.
 
@@ -110,20 +107,36 @@ def assemble_avatar(
         low_pass: square pixels, of the image as drawn, that F and S add to every ellipse.
         supersample: F is drawn so many times larger each way and averaged.
         backend: that rasterises F and S, see `gsgan.splat.rasterise`.
-        twist, window_margin, window_multiple, window_least: see `Avatar`.
         class_vote: gives S's vertices their parts where the data's labels are not the body's own.
         pictures: training frames with labels, for that vote.
         vertex_labels: ``[V]`` int64, the result of an earlier vote, which is then not repeated.
         labelled: whether S was trained on part labels; None: whether the data has some.
         effects: decided when training began; None decides them here.
         settings: for that decision; None: the defaults.
+        options: of `Avatar`: twist, window_margin, window_multiple, window_least.
 
     Raises:
         ConfigError: on a forced effect that is not possible, or a key that is not read.
         DataError: when the data lacks the body that the model needs.
         ValueError: on parts that do not go together.
     """
-    _check(accuracy, densify, deformation, surface, pose_encoder, generator, backend, twist)
+    _check_accuracy(accuracy)
+    if (
+        densify is not None
+        and densify.template is not MEDIAPIPE33
+        and options.get("twist", "none") != "none"
+    ):
+        raise ValueError("twist=hinge goes with densify.limbs=paper22 only")
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+    if (deformation is None) != (densify is None):
+        raise ValueError("Avatar: densify and deformation go together; got only one of them")
+    if deformation is not None and surface is not None:
+        raise ValueError("Avatar: give a deformation or a surface, got both")
+    if deformation is None and surface is None and generator is None:
+        raise ValueError("Avatar: nothing paints; give a deformation, a surface or a generator")
+    if (generator is None) != (pose_encoder is None):
+        raise ValueError("Avatar: generator and pose_encoder go together; got only one of them")
     if effects is None:
         model = ModelParts(
             splats=densify is not None or surface is not None,
@@ -182,10 +195,7 @@ def assemble_avatar(
         generator=unet,
         colour=colour,
         backend=backend,
-        twist=twist,
-        window_margin=window_margin,
-        window_multiple=window_multiple,
-        window_least=window_least,
+        **options,
     )
 
 
@@ -210,16 +220,8 @@ def naming_group(group: str) -> Iterator[None]:
         raise ConfigError(f"{group}: {error}") from error
 
 
-def _check(
-    accuracy: Accuracy,
-    densify: Densify | None,
-    deformation: object,
-    surface: object,
-    pose_encoder: object,
-    generator: object,
-    backend: str,
-    twist: str,
-) -> None:
+def _check_accuracy(accuracy: Accuracy) -> None:
+    """Refuses accuracy values that would be overwritten by the model and the effects."""
     for name, place in (
         ("low_pass", "model.low_pass"),
         ("supersample", "model.supersample"),
@@ -227,18 +229,6 @@ def _check(
     ):
         if getattr(accuracy, name) != getattr(Accuracy, name):
             raise ConfigError(f"accuracy.{name} is not read; set {place}")
-    if densify is not None and densify.template is not MEDIAPIPE33 and twist != "none":
-        raise ValueError("twist=hinge goes with densify.limbs=paper22 only")
-    if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
-    if (deformation is None) != (densify is None):
-        raise ValueError("Avatar: densify and deformation go together; got only one of them")
-    if deformation is not None and surface is not None:
-        raise ValueError("Avatar: give a deformation or a surface, got both")
-    if deformation is None and surface is None and generator is None:
-        raise ValueError("Avatar: nothing paints; give a deformation, a surface or a generator")
-    if (generator is None) != (pose_encoder is None):
-        raise ValueError("Avatar: generator and pose_encoder go together; got only one of them")
 
 
 def _body_of(scene: SceneInfo) -> SkinnedBody:
