@@ -149,7 +149,7 @@ def test_killed_half_way_and_resumed_ends_with_the_same_weights(run, capture, tm
     assert torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)["gsgan"]["step"] == 8
     resumed = inside("train", *given)
     assert resumed.returncode == 0, resumed.stderr
-    assert "going on from" in resumed.stdout
+    assert "resuming from" in resumed.stdout
     assert (folder / "logs" / "metrics.csv").is_file()  # the first part's log is kept
     assert (folder / "logs_000008" / "metrics.csv").is_file()
     assert same(weights(run), weights(folder))

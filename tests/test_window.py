@@ -5,8 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsgan.scene import Camera, Frame
-from gsgan.window import Window, body_window
+from gsgan.scene import Camera, Frame, Window, body_window
 
 HEIGHT, WIDTH = 60, 100
 

@@ -1,4 +1,4 @@
-"""The nouns of gsgan: Camera, Gaussians, Raster, Frame.
+"""The nouns of gsgan: Camera, Gaussians, Raster, BodyPose, Frame, Window; and the lens model.
 
 Convention: metres, world frame; OpenCV cameras (x right, y down, z forward) with
 ``x_cam = R @ x_world + t``; pixel centres at +0.5; the first dimension is the batch, one camera
@@ -7,100 +7,50 @@ and one pose per batch item; images are RGB in [0, 1].
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
-from gsgan.lens import distort_within
 from gsgan.utils.constants import constant
+from gsgan.utils.records import TensorRecord, cat
 
-S = TypeVar("S", bound="_TensorRecord")
+__all__ = [
+    "BodyPose",
+    "Camera",
+    "Frame",
+    "Gaussians",
+    "Raster",
+    "Window",
+    "body_window",
+    "cat",
+    "distort",
+    "distort_within",
+    "fold_radius",
+]
 
-
-@dataclass(frozen=True)
-class _TensorRecord:
-    """A frozen dataclass whose tensors (nested ones too) move and stack together."""
-
-    def to(self: S, *args: Any, **kwargs: Any) -> S:
-        """A copy with every tensor sent through ``Tensor.to``; integer labels keep their dtype."""
-        changes: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, _TensorRecord):
-                changes[field.name] = value.to(*args, **kwargs)
-            elif isinstance(value, Tensor):
-                changes[field.name] = _to(value, *args, **kwargs)
-        return replace(self, **changes)
-
-    def __getitem__(self: S, index: slice) -> S:
-        """The batch items of a slice; the batch dimension stays."""
-        if not isinstance(index, slice):
-            raise TypeError(f"{type(self).__name__} takes a slice of the batch, got {index!r}")
-        changes: dict[str, Any] = {}
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, (_TensorRecord, Tensor)) or (
-                isinstance(value, tuple) and field.metadata.get("batched")
-            ):
-                changes[field.name] = value[index]
-        return replace(self, **changes)
-
-
-def _to(value: Tensor, *args: Any, **kwargs: Any) -> Tensor:
-    if value.is_floating_point():
-        return value.to(*args, **kwargs)
-    kwargs = {k: v for k, v in kwargs.items() if k != "dtype"}
-    args = tuple(a for a in args if not isinstance(a, torch.dtype))
-    return value.to(*args, **kwargs) if args or kwargs else value
-
-
-def cat(records: Sequence[S]) -> S:
-    """Joins records of one type along the batch dimension.
-
-    Raises:
-        ValueError: when the list is empty, or a field is present in some records only.
-    """
-    if not records:
-        raise ValueError("cat: expected at least one record, got none")
-    first, changes = records[0], {}
-    for field in fields(first):
-        values = [getattr(record, field.name) for record in records]
-        if len({value is None for value in values}) == 2:
-            raise ValueError(
-                f"cat: {type(first).__name__}.{field.name} is present in some records only"
-            )
-        if isinstance(values[0], _TensorRecord):
-            changes[field.name] = cat(values)
-        elif isinstance(values[0], Tensor):
-            changes[field.name] = torch.cat(values)
-        elif any(value != values[0] for value in values):
-            raise ValueError(
-                f"cat: {type(first).__name__}.{field.name} differs between records: {values}"
-            )
-    return replace(first, **changes)
+RIM = 0.999  # share of a lens's fold radius: points beyond it are shown there
 
 
 def _check(owner: str, name: str, value: Tensor, *shape: int | None) -> None:
     if not isinstance(value, Tensor):
         raise ValueError(f"{owner}: {name} must be a tensor, got {type(value).__name__}")
-    wanted = [("B", "N", "C")[i] if size is None else str(size) for i, size in enumerate(shape)]
+    expected = [("B", "N", "C")[i] if size is None else str(size) for i, size in enumerate(shape)]
     if value.ndim != len(shape) or any(
-        want is not None and want != have for want, have in zip(shape, value.shape, strict=True)
+        size is not None and size != got for size, got in zip(shape, value.shape, strict=True)
     ):
         raise ValueError(
-            f"{owner}: {name} must have shape [{', '.join(wanted)}], got {list(value.shape)}"
+            f"{owner}: {name} must have shape [{', '.join(expected)}], got {list(value.shape)}"
         )
 
 
 @dataclass(frozen=True)
-class Camera(_TensorRecord):
-    """A batch of cameras of one picture size, pinholes or with a lens.
+class Camera(TensorRecord):
+    """A batch of cameras of one image size, pinholes or with a lens.
 
     Args:
-        K: ``[B, 3, 3]`` intrinsics in pixels of the picture, skew allowed.
+        K: ``[B, 3, 3]`` intrinsics in pixels of the image, skew allowed.
         R: ``[B, 3, 3]`` world to camera rotation, det +1.
         t: ``[B, 3]`` metres, ``x_cam = R @ x_world + t``.
         size: ``(H, W)`` pixels, both at least 1.
@@ -140,7 +90,7 @@ class Camera(_TensorRecord):
 
     @property
     def centre(self) -> Tensor:
-        """``[B, 3]`` metres: where the camera stands in the world."""
+        """``[B, 3]`` metres: the camera's position in the world."""
         return -(self.R.mT @ self.t.unsqueeze(-1)).squeeze(-1)
 
     def to_camera(self, points: Tensor) -> Tensor:
@@ -151,8 +101,8 @@ class Camera(_TensorRecord):
         """Pixel positions ``[B, M, 2]`` and depths ``[B, M]`` of world points ``[B, M, 3]``.
 
         Points nearer than ``near`` metres are divided by ``near`` instead of their depth: their
-        pixels are finite but meaningless, so mask them by the returned depth. A lens (``dist``) is
-        followed; what lies beyond its fold is shown at the fold's rim.
+        pixels are finite but meaningless, so mask them by the returned depth. Lens distortion is
+        applied; points beyond the lens's fold are shown at its rim.
         """
         x_cam = self.to_camera(points)
         depth = x_cam[..., 2]
@@ -168,24 +118,24 @@ class Camera(_TensorRecord):
         return replace(self, K=self.K - shift, size=size)
 
     def resize(self, size: tuple[int, int]) -> Camera:
-        """The camera of the whole picture resampled to ``size = (H, W)``."""
+        """The camera of the whole image resampled to ``size = (H, W)``."""
         scale = constant((size[1] / self.size[1], size[0] / self.size[0], 1.0), self.K)
         return replace(self, K=self.K * scale[:, None], size=size)
 
 
 @dataclass(frozen=True)
-class Gaussians(_TensorRecord):
+class Gaussians(TensorRecord):
     """A batch of 3D Gaussians, activated (no logs or logits).
 
-    Shape comes from ``quats`` and ``scales``, or from ``covariances`` (LBS blends give shapes that
-    no rotation and scale describe).
+    The shape is ``quats`` and ``scales``, or ``covariances`` (blended bone transforms shear, which
+    no rotation and scale describes).
 
     Args:
         means: ``[B, N, 3]`` metres.
         quats: ``[B, N, 4]`` w x y z, normalised on use.
         scales: ``[B, N, 3]`` metres, > 0.
         opacities: ``[B, N]`` in [0, 1].
-        features: ``[B, N, C]``, whatever is to be blended: colours, features, class votes.
+        features: ``[B, N, C]``, the values to blend: colours, features, class probabilities.
         covariances: ``[B, N, 3, 3]`` square metres, in place of quats and scales.
 
     Raises:
@@ -220,15 +170,15 @@ class Gaussians(_TensorRecord):
 
 
 @dataclass(frozen=True)
-class Raster(_TensorRecord):
-    """What the rasteriser returns.
+class Raster(TensorRecord):
+    """The rasteriser's output.
 
     Args:
-        features: ``[B, C, H, W]`` premultiplied by alpha; the background is the caller's to add.
+        features: ``[B, C, H, W]`` premultiplied by alpha; the caller adds the background.
         alpha: ``[B, 1, H, W]`` in [0, 1].
-        depth: ``[B, 1, H, W]`` metres times alpha, or None when it was not asked for.
-        fine: ``[B, C, kH, kW]`` features before k² of them were averaged to a pixel, or None where
-            the settings supersample nothing.
+        depth: ``[B, 1, H, W]`` metres times alpha, or None when it was not requested.
+        fine: ``[B, C, kH, kW]`` features before supersampling averages k² of them to a pixel, or
+            None without supersampling.
     """
 
     features: Tensor
@@ -238,7 +188,7 @@ class Raster(_TensorRecord):
 
 
 @dataclass(frozen=True)
-class BodyPose(_TensorRecord):
+class BodyPose(TensorRecord):
     """The pose of a skinned body.
 
     Args:
@@ -251,20 +201,20 @@ class BodyPose(_TensorRecord):
 
 
 @dataclass(frozen=True)
-class Frame(_TensorRecord):
+class Frame(TensorRecord):
     """One moment seen by one camera, batched.
 
     Args:
         image: ``[B, 3, H, W]`` RGB in [0, 1], black where the mask is 0.
         mask: ``[B, 1, H, W]`` in [0, 1].
-        camera: of this very picture (crops already in K).
-        skeleton: ``[B, J, 3]`` metres, finite; joints never seen hold a stand-in and visibility 0.
-        visibility: ``[B, J]`` in [0, 1].
+        camera: of this image (crops already in K).
+        skeleton: ``[B, J, 3]`` metres, finite; joints not seen hold a stand-in.
+        visibility: ``[B, J]`` in [0, 1]; 0 for stand-ins.
         frame_id: ``[B]`` int64, the number in the file name.
         camera_index: ``[B]`` int64 into the dataset's camera names.
         body: pose of the skinned body, or None when the data has none.
         labels: ``[B, H, W]`` int64 part labels, 0 = background, or None.
-        unsure: ``[B, 1, H, W]`` 1 where the colours are not to be learned from, or None.
+        unsure: ``[B, 1, H, W]`` 1 where colours are excluded from the losses, or None.
     """
 
     image: Tensor
@@ -280,3 +230,150 @@ class Frame(_TensorRecord):
 
     def __len__(self) -> int:
         return self.image.shape[0]
+
+
+@dataclass(frozen=True)
+class Window:
+    """One box per batch item, all of one size: the part of the image that holds the person.
+
+    Args:
+        corners: ``(top, left)`` of each item, pixels.
+        size: ``(H, W)`` of every box.
+        picture: ``(H, W)`` of the whole image.
+    """
+
+    corners: tuple[tuple[int, int], ...]
+    size: tuple[int, int]
+    picture: tuple[int, int]
+
+    def camera(self, camera: Camera) -> Camera:
+        """The cameras of the boxes."""
+        boxes = [
+            camera[i : i + 1].crop(top, left, self.size)
+            for i, (top, left) in enumerate(self.corners)
+        ]
+        return cat(boxes)
+
+    def cut(self, picture: Tensor) -> Tensor:
+        """``[B, ..., H, W]`` reduced to the boxes."""
+        height, width = self.size
+        boxes = [
+            picture[i : i + 1, ..., top : top + height, left : left + width]
+            for i, (top, left) in enumerate(self.corners)
+        ]
+        return torch.cat(boxes)
+
+    def frame(self, frame: Frame) -> Frame:
+        """The frame seen through the boxes."""
+        return replace(
+            frame,
+            image=self.cut(frame.image),
+            mask=self.cut(frame.mask),
+            labels=None if frame.labels is None else self.cut(frame.labels),
+            unsure=None if frame.unsure is None else self.cut(frame.unsure),
+            camera=self.camera(frame.camera),
+        )
+
+    def paste(self, boxes: Tensor) -> Tensor:
+        """``[B, C, h, w]`` boxes back in whole images, zeros around them."""
+        (height, width), (whole_height, whole_width) = self.size, self.picture
+        pasted = [
+            functional.pad(
+                boxes[i : i + 1],
+                (left, whole_width - left - width, top, whole_height - top - height),
+            )
+            for i, (top, left) in enumerate(self.corners)
+        ]
+        return torch.cat(pasted)
+
+
+def body_window(
+    p: Tensor, camera: Camera, *, margin: float, multiple: int, least: int, near: float
+) -> Window:
+    """The boxes round the projected joints; they depend on skeleton and camera only.
+
+    Args:
+        p: ``[B, J, 3]`` metres, finite.
+        camera: B cameras.
+        margin: metres kept round every joint (hair, fingertips, clothes).
+        multiple: sides are rounded up to multiples of so many pixels, where the image has room.
+        least: pixels, the shortest side, where the image has room.
+        near: metres; with a joint nearer than this the box is the whole image.
+
+    Returns:
+        Boxes inside the image.
+    """
+    height, width = camera.size
+    pixels, depth = camera.project(p)
+    focal = torch.stack([camera.K[:, 0, 0], camera.K[:, 1, 1]], dim=-1)
+    reach = margin * focal[:, None] / depth.clamp_min(near).unsqueeze(-1)
+    low = (pixels - reach).amin(dim=1).floor()
+    high = (pixels + reach).amax(dim=1).ceil()
+    everywhere = constant((width, height), low)
+    behind = (depth < near).any(dim=1, keepdim=True)
+    low = torch.where(behind, torch.zeros_like(low), low).clamp_min(0).minimum(everywhere - 1)
+    high = torch.where(behind, everywhere.expand_as(high), high).clamp_min(1).minimum(everywhere)
+    bounds = torch.cat([low, high], dim=-1).long().tolist()
+    w = _side(max(least, *(x1 - x0 for x0, _, x1, _ in bounds)), multiple, width)
+    h = _side(max(least, *(y1 - y0 for _, y0, _, y1 in bounds)), multiple, height)
+    corners = tuple(
+        (_start(y0, y1, h, height), _start(x0, x1, w, width)) for x0, y0, x1, y1 in bounds
+    )
+    return Window(corners, (h, w), (height, width))
+
+
+def _side(length: int, multiple: int, limit: int) -> int:
+    return min(-(-max(1, length) // multiple) * multiple, limit)
+
+
+def _start(low: int, high: int, side: int, limit: int) -> int:
+    """Where a box of ``side`` begins that is centred on [low, high) and inside [0, limit)."""
+    return min(max(0, (low + high - side) // 2), limit - side)
+
+
+# -- lenses: OpenCV's model (k1 k2 p1 p2 k3) on x/z and y/z of the camera's axes
+
+
+def distort(points: Tensor, dist: Tensor) -> tuple[Tensor, Tensor]:
+    """Where lenses ``[B, 5]`` show points ``[B, M, 2]`` of the z = 1 plane.
+
+    Returns:
+        The points ``[B, M, 2]`` and their derivatives ``[B, M, 2, 2]``.
+    """
+    x, y = points.unbind(-1)
+    k1, k2, p1, p2, k3 = (c.unsqueeze(-1) for c in dist.unbind(-1))
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))  # of radial, by x it is slope * x
+    shown = [
+        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+    ]
+    across = slope * x * y + 2 * p1 * x + 2 * p2 * y
+    rows = [
+        torch.stack([radial + slope * x * x + 2 * p1 * y + 6 * p2 * x, across], dim=-1),
+        torch.stack([across, radial + slope * y * y + 6 * p1 * y + 2 * p2 * x], dim=-1),
+    ]
+    return torch.stack(shown, dim=-1), torch.stack(rows, dim=-2)
+
+
+def distort_within(points: Tensor, dist: Tensor) -> Tensor:
+    """The points of `distort`, those beyond the lens's fold clamped to its rim.
+
+    The polynomial folds points beyond that radius back into the image, which no lens does.
+    """
+    radius = points.norm(dim=-1, keepdim=True).clamp_min(torch.finfo(points.dtype).tiny)
+    rim = RIM * fold_radius(dist).to(points.dtype)[:, None, None]
+    return distort(points * (rim / radius).clamp_max(1), dist)[0]
+
+
+def fold_radius(dist: Tensor) -> Tensor:
+    """``[B]`` of x/z, y/z: where lenses ``[B, 5]`` first fold back, p1 and p2 aside; else inf."""
+    k1, k2, _, _, k3 = dist.double().unbind(-1)
+    # the slope 1 + 3 k1 s + 5 k2 s² + 7 k3 s³ by s = r², as a cubic in 1/s, whose first term is 1
+    companion = torch.zeros(*k1.shape, 3, 3, dtype=k1.dtype, device=k1.device)
+    companion[..., 0, :] = torch.stack([-3 * k1, -5 * k2, -7 * k3], dim=-1)
+    companion[..., 1, 0] = companion[..., 2, 1] = 1
+    roots = torch.linalg.eigvals(companion)
+    real = roots.imag.abs() < 1e-9 * roots.abs()
+    return torch.where(real, roots.real, 0).clamp_min(0).amax(dim=-1).rsqrt()

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from gsgan.data.crop import Window, take, undistort_map
+from gsgan.data.crop import Window, distort, take, undistort_map
 from gsgan.data.datamodule import GsganData
-from gsgan.data.synthetic.lens import LensView, distort, undistort
+from gsgan.data.synthetic.lens import LensView, undistort
 from gsgan.data.synthetic.scene_setup import Settings, build_scene, dataset_key
 from gsgan.data.synthetic.scenes import ensure_scene
 from gsgan.data.synthetic.tint import Tint, make_tints

@@ -780,7 +780,7 @@ def test_the_config_trains_with_segmentation_on_cihp_labels(
     assert avatar.segmentation is not None
     painting = avatar.paint(data.dataset("train")[0])
     assert painting.segmentation is not None
-    assert "class vote over 9 pictures" in avatar.segmentation_why
+    assert "class vote over 9 images" in avatar.segmentation_why
     assert painting.segmentation.shape == (1, avatar.segmentation.classes, 32, 32)
     assert set(avatar.segmentation.map.names) < set(CIHP)
     assert painting.image is not None

@@ -8,7 +8,7 @@ import pytest
 
 from gsgan.data.scene_info import SceneInfo
 from gsgan.data.surface_colours import SurfaceColours
-from gsgan.effects import NAMES, Effects, EffectSettings, decide
+from gsgan.effects import NAMES, Effects, EffectSettings, ModelParts, decide
 from gsgan.effects.settings import CHOICES
 from gsgan.effects.table import Cost, rows
 from gsgan.utils.errors import ConfigError
@@ -175,16 +175,30 @@ def test_a_list_leaves_lenses_to_their_own_word(word):
     assert named.distortion.on
 
 
-def test_without_a_forced_effect_is_refused_and_a_wanted_one_goes():
-    auto = decide(scene(body_inside=1.0), EffectSettings())
-    assert auto.body_points.on
-    assert not auto.without("body_points", "no room").body_points.on
-    forced = decide(scene(), EffectSettings(body_points="on"))
-    with pytest.raises(ConfigError, match=r"effects\.body_points=on is not possible: no room"):
-        forced.without("body_points", "no room")
-    lenient = decide(scene(), EffectSettings(body_points="on", impossible="off"))
-    assert lenient.body_points.on
-    assert not lenient.without("body_points", "no room").body_points.on
+@pytest.mark.parametrize(
+    ("model", "effect", "why"),
+    [
+        (ModelParts(points=False), "body_points", "puts no points on the skeleton"),
+        (ModelParts(body_points=False), "body_points", "leaves them out"),
+        (ModelParts(splats=False), "antialias", "splats nothing"),
+    ],
+)
+def test_an_effect_that_the_model_lacks_is_off_or_refused(model, effect, why):
+    auto = decide(scene(body_inside=1.0, scale_test=(51.0, 590.0)), EffectSettings(), model)
+    assert why in getattr(auto, effect).why
+    assert not getattr(auto, effect).on
+    forced = EffectSettings(**{effect: "on"})
+    with pytest.raises(ConfigError, match=rf"effects\.{effect}=on is not possible: .*{why}"):
+        decide(scene(), forced, model)
+    assert not getattr(decide(scene(), replace(forced, impossible="off"), model), effect).on
+
+
+def test_points_on_a_body_need_its_model_file():
+    bare = scene(body="smpl", body_inside=1.0)
+    assert "no model file" in decide(bare, EffectSettings()).body_points.why
+    with pytest.raises(ConfigError, match="no model file"):
+        decide(bare, EffectSettings(body_points="on"))
+    assert decide(replace(bare, body_file="m.pkl"), EffectSettings()).body_points.on
 
 
 def test_decisions_survive_a_checkpoint(tmp_path):

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from gsgan.lens import bend, distort, fold_radius, straight_pixels, undistort
-from gsgan.scene import Camera, Gaussians
+from gsgan.scene import Camera, Gaussians, distort, fold_radius
 from gsgan.splat import accuracy, rasterise
+from gsgan.splat.lens import bend, straight_pixels, undistort
 
 BARREL = [-0.28, 0.09, 0.001, -0.0008, -0.01]
 PINCUSHION = [0.2, 0.05, -0.002, 0.001, 0.0]
@@ -25,7 +25,7 @@ def grid(reach: float = 0.6) -> torch.Tensor:
 @pytest.mark.parametrize("dist", [BARREL, PINCUSHION, [0.0] * 5])
 def test_as_opencv_has_it_and_back(dist):
     lens, x = torch.tensor([dist], dtype=torch.float64), grid()
-    bent = distort(x, lens)
+    bent = distort(x, lens)[0]
     before = np.concatenate([x[0].numpy(), np.ones((len(x[0]), 1))], axis=1)
     zero = np.zeros(3)
     theirs = cv2.projectPoints(before, zero, zero, np.eye(3), np.array(dist))[0][:, 0]
@@ -46,7 +46,7 @@ def test_what_the_model_shows_again_beyond_its_fold_is_not_found():
     """1 - 0.8 r² + 0.2 r⁴ rises again beyond r = 1.36: no lens shows that a second time."""
     lens = torch.tensor([[-0.8, 0.2, 0.0, 0.0, 0.0]], dtype=torch.float64)
     again = torch.tensor([[[0.3, 0.0], [1.9, 0.0], [1.5, 1.5]]], dtype=torch.float64)
-    assert undistort(distort(again, lens), lens)[1][0].tolist() == [True, False, False]
+    assert undistort(distort(again, lens)[0], lens)[1][0].tolist() == [True, False, False]
 
 
 def test_the_fold_is_where_the_slope_first_vanishes():
@@ -64,7 +64,7 @@ def test_the_fold_is_where_the_slope_first_vanishes():
 def test_gradients_of_distort_are_finite_and_right():
     lens = torch.tensor([BARREL], dtype=torch.float64)
     x = grid()[:, ::40].clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda p: distort(p, lens), x)
+    assert torch.autograd.gradcheck(lambda p: distort(p, lens)[0], x)
 
 
 def camera(dist, size=(40, 48)) -> Camera:

@@ -6,9 +6,8 @@ from dataclasses import replace
 
 import torch
 
-from gsgan.lens import distort
 from gsgan.metrics.body_box import box_corners, box_mask, inside_hull, pixel_centres
-from gsgan.scene import Camera
+from gsgan.scene import Camera, distort
 
 
 def camera(size: tuple[int, int] = (20, 20), focal: float = 10.0) -> Camera:
@@ -73,7 +72,7 @@ def test_a_lens_bends_the_box_with_the_image():
     seen = box_mask(corners, replace(pinhole, dist=lens))[0]
     nothing = replace(pinhole, dist=torch.zeros(1, 5))
     assert torch.equal(box_mask(corners, nothing), box_mask(corners, pinhole))
-    shown = distort(torch.tensor([[[0.8, 0.0], [0.8, 0.8]]]), lens)[0] * 100 + 100
+    shown = distort(torch.tensor([[[0.8, 0.0], [0.8, 0.8]]]), lens)[0][0] * 100 + 100
     assert seen[100].nonzero().amax() == int(shown[0, 0] - 0.5)  # last centre left of the side
     diagonal = seen.diagonal().nonzero().amax()
     assert diagonal == int(shown[1, 0] - 0.5)

@@ -188,9 +188,11 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
     stored(module, tmp_path)
     avatar, _ = load_avatar(tmp_path, config, data)
     assert getattr(avatar, part) is not None
-    for place in ("avatar", "parts"):
+    for place in ("assemble", "parts"):
         monkeypatch.setattr(f"gsgan.model.{place}.open_body", lambda *_: None)
-    with pytest.raises(DataError, match=rf"with {said}, .* no model file; set data\.smpl"):
+    with pytest.raises(
+        DataError, match=rf"{said},? .*cannot be built.* no model file; set data\.smpl"
+    ):
         load_avatar(tmp_path, config, data)
 
 
@@ -228,7 +230,7 @@ def test_the_figure_of_densify_says_where_the_points_are(build, tmp_path):
 
 def test_without_the_frames_body_pose_it_says_what_is_missing(build):
     _, avatar, frame = build(ON)
-    with pytest.raises(ValueError, match="sit on the body; give its pose"):
+    with pytest.raises(ValueError, match="skinned body; give its body pose"):
         avatar.paint(replace(frame, body=None))
 
 
@@ -243,8 +245,8 @@ def test_models_without_psi_refuse_it_in_one_sentence(build, model):
     [
         (1.0, "on", "100 % of the posed body"),
         (0.95, "on", "95 %"),
-        (0.9, "off", "the skeleton is trusted more"),
-        (None, "off", "mesh is not at hand"),
+        (0.9, "off", "the skeleton fits better"),
+        (None, "off", "mesh cannot be read"),
     ],
 )
 def test_auto_trusts_a_pose_that_fits_the_masks(build, inside, value, why):

@@ -127,7 +127,7 @@ def test_background_ignored_and_unknown_pixels_have_no_vote():
     body = rigid(plate(2.0))
     labels = torch.zeros(SIZE, SIZE)
     labels[:, ::3], labels[:, 1::3] = 255, 9
-    with pytest.raises(DataError, match=r"in none of the 1 pictures .* or choose model=wo_seg"):
+    with pytest.raises(DataError, match=r"in none of 1 images .* or choose model=wo_seg"):
         ClassVote()(body, [picture(labels)], 4)
     labels[SIZE // 2] = 3
     assert (ClassVote()(body, [picture(labels)] * 2, 4).labels == 3).all()
@@ -250,7 +250,7 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_
     config = tiny(f"data.root={foreign}", FEW)
     data, module = build_training(config)
     avatar = module.avatar
-    assert "class vote over 2 pictures" in avatar.segmentation_why
+    assert "class vote over 2 images" in avatar.segmentation_why
     assert avatar.segmentation.map.names[0] == "cloth 0"
     assert avatar.segmentation.classes > 2
     path = tmp_path / "run" / CHECKPOINT
@@ -286,7 +286,7 @@ def test_votes_of_another_body_are_refused(foreign, tiny):
 
     config = tiny(f"data.root={foreign}")
     with pytest.raises(DataError, match="labels of 7 vertices, which do not fit the free body"):
-        build_avatar(config, build_data(config), torch.ones(7).long())
+        build_avatar(config, build_data(config), vertex_labels=torch.ones(7).long())
 
 
 def test_without_pictures_foreign_labels_are_refused(foreign, tiny):
@@ -295,5 +295,5 @@ def test_without_pictures_foreign_labels_are_refused(foreign, tiny):
     from gsgan.train.runs import build_data
 
     config = tiny(f"data.root={foreign}")
-    with pytest.raises(DataError, match="no training picture with labels"):
+    with pytest.raises(DataError, match="no training image with labels"):
         instantiate(config.model)(scene=build_data(config).info)

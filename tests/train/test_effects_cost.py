@@ -1,12 +1,15 @@
-"""What effects add, as the table at a run's start says it."""
+"""The costs of effects, as the table at a run's start shows them with ``effects.measure``."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from gsgan.train.effects_cost import effect_costs, training_device
+from gsgan.train.effects_cost import effect_costs
+from gsgan.train.run import training_device
 from gsgan.train.runs import build_avatar, build_data
+
+CPU = torch.device("cpu")
 
 
 def test_parameters_are_those_that_go_when_the_effect_goes(tiny):
@@ -15,7 +18,7 @@ def test_parameters_are_those_that_go_when_the_effect_goes(tiny):
     data = build_data(config)
     avatar = build_avatar(config, data).train()
     before = torch.get_rng_state()
-    costs = effect_costs(config, data, avatar, 1)
+    costs = effect_costs(config, data, avatar, 1, CPU)
     assert torch.equal(torch.get_rng_state(), before)
     assert avatar.training
     assert {name for name, cost in costs.items() if cost.ms is not None} == {
@@ -25,9 +28,25 @@ def test_parameters_are_those_that_go_when_the_effect_goes(tiny):
     plain = build_avatar(tiny("effects=none", "effects.colour_correction=on"), data)
     more = sum(p.numel() for p in avatar.parameters()) - sum(p.numel() for p in plain.parameters())
     assert costs["view_dependence"].parameters == more > 0
-    untimed = effect_costs(config, data, avatar, 0)
-    assert untimed["view_dependence"].parameters == more
-    assert all(cost.ms is None for cost in untimed.values())
+
+
+def test_nothing_is_measured_unless_requested(capture, inside, tmp_path, monkeypatch):
+    from commands import arguments
+
+    def refuse(*_):
+        raise AssertionError("measured")
+
+    monkeypatch.setattr("gsgan.train.effects_cost.effect_costs", refuse)
+    words = (
+        *arguments(capture, tmp_path / "run"),
+        "evaluate=false",
+        "training.schedule.step_two=0",
+    )
+    result = inside("train", *words)
+    assert result.returncode == 0, result.stderr
+    assert "random background" in result.stdout
+    assert "parameters" in result.stdout
+    assert " ms " not in result.stdout
 
 
 @pytest.mark.parametrize("word", ["undistort", "project"])
@@ -40,7 +59,7 @@ def test_lenses_cost_reading_or_painting_and_no_parameters(tiny, tmp_path, word)
     )  # fmt: skip
     config = tiny("effects=none", f"effects.distortion={word}", f"data.root={root}", "data.size=64")
     data = build_data(config)
-    cost = effect_costs(config, data, build_avatar(config, data), 1)["distortion"]
+    cost = effect_costs(config, data, build_avatar(config, data), 1, CPU)["distortion"]
     assert cost.parameters == 0
     assert cost.ms is not None
 

@@ -14,8 +14,8 @@ from gsgan.losses.adversarial import FORMS, generator_loss
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.painting import Painting
 from gsgan.model.segmentation import silhouette_loss
-from gsgan.train.averaging import MovingAverage
-from gsgan.train.losses import StepOneLoss, StepTwoLoss, judged
+from gsgan.train.losses import StepOneLoss, StepTwoLoss, discriminate
+from gsgan.train.optimisers import MovingAverage
 from gsgan.train.runs import load_avatar
 from gsgan.utils.errors import ConfigError, GsganError
 
@@ -158,7 +158,7 @@ def test_step_two_compares_on_white_by_alpha_and_mask():
 
     def terms(loss: StepTwoLoss) -> dict[str, torch.Tensor]:
         painting = Painting(image, alpha)
-        return loss.terms(painting, frame, anchor=None, perceptual=None, judge=None, step=0)
+        return loss.terms(painting, frame, anchor=None, perceptual=None, discriminator=None, step=0)
 
     found = terms(weights)
     off = ((image + 1 - alpha) - (frame.image + 1 - frame.mask)).detach() * (frame.unsure == 0)
@@ -176,7 +176,7 @@ def test_the_generators_fourth_channel_learns_from_alpha_alone(make):
     module, _, data = make("size.rgb_skip=false", "training.step_two.perceptual_every=1")
     frame = data.dataset("train")[0]
     last = module.avatar.generator.paint.weight
-    terms = module.step_two_terms(module.avatar.paint(frame), frame, play=True)
+    terms = module.step_two_terms(module.avatar.paint(frame), frame, adversarial=True)
     assert {"alpha", "photometric", "anchor", "adversarial"} <= set(terms)
     slopes = {
         name: torch.autograd.grad(term, last, retain_graph=True, allow_unused=True)[0]
@@ -455,7 +455,7 @@ def test_every_phase_runs_under_bf16_autocast(make):
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert module.avatar.window(frame) is not None
         mixed = module.avatar.paint(frame)
-        terms = module.step_two_terms(mixed, frame, play=True)
+        terms = module.step_two_terms(mixed, frame, adversarial=True)
         torch.stack(list(terms.values())).sum().backward()
     assert torch.equal(plain.features, mixed.features)
     assert mixed.image.dtype == torch.float32
@@ -474,35 +474,37 @@ def test_float16_is_refused_before_anything_trains(make, monkeypatch):
     module.on_fit_start()
 
 
-def test_the_discriminators_rate_spans_the_game_alone(make):
+def test_the_discriminators_rate_spans_the_gan_alone(make):
     module, _, _ = make("training.schedule.step_two=40", "training.schedule.discriminator_start=20")
-    start, end = module.schedule.game
+    start, end = module.schedule.adversarial_span
     recipe = module.recipes["discriminator"].rate
     rates = []
     for module.step in (start, end - 1):
         rates.append(module._rate("discriminator"))
     assert rates[0] == recipe.peak
-    assert rates[1] < 0.2 * recipe.peak  # it fell within the game, not before
+    assert rates[1] < 0.2 * recipe.peak  # it fell within the GAN phase, not before
 
 
 def test_a_comparing_gan_without_feature_matching_still_sees_the_real_picture():
     torch.manual_seed(0)
-    judge = Discriminator(scales=1, base=4, layers=2, norm="none")
+    critic = Discriminator(scales=1, base=4, layers=2, norm="none")
     image = torch.rand(1, 3, 16, 16, requires_grad=True)
     frame = SimpleNamespace(image=torch.rand(1, 3, 16, 16), unsure=None)
     weights = StepTwoLoss(adversarial=2.0, feature_matching=0.0, gan="relativistic", alpha=0.0)
     painting = Painting(image, image[:, :1])
-    terms = weights.terms(painting, frame, anchor=None, perceptual=None, judge=judge, step=0)
-    expected = 2 * generator_loss(judge(frame.image), judge(image), "relativistic")
+    terms = weights.terms(
+        painting, frame, anchor=None, perceptual=None, discriminator=critic, step=0
+    )
+    expected = 2 * generator_loss(critic(frame.image), critic(image), "relativistic")
     assert float(terms["adversarial"]) == pytest.approx(float(expected), rel=1e-6)
     terms["adversarial"].backward()
     assert float(image.grad.abs().max()) > 0
 
 
-def test_a_comparing_gan_judges_in_full_precision():
-    judge, image = Discriminator(scales=1, base=4, layers=2, norm="none"), torch.rand(1, 3, 16, 16)
+def test_a_comparing_gan_runs_the_discriminator_in_full_precision():
+    critic, image = Discriminator(scales=1, base=4, layers=2, norm="none"), torch.rand(1, 3, 16, 16)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        kinds = {gan: judged(judge, image, gan)[0][-1].dtype for gan in FORMS}
+        kinds = {gan: discriminate(critic, image, gan)[0][-1].dtype for gan in FORMS}
     assert kinds.pop("relativistic") == torch.float32
     assert set(kinds.values()) == {torch.bfloat16}
 

@@ -16,9 +16,9 @@ def test_phases_follow_each_other():
     assert (s.total, s.epochs) == (9, 3)
     assert [s.adversarial(i) for i in range(9)] == [False] * 6 + [True] * 3
     assert s.bounds(STEP_TWO) == (5, 9)
-    assert s.game == (6, 9)
+    assert s.adversarial_span == (6, 9)
     late = Schedule(segmentation=2, step_one=3, step_two=4, discriminator_start=9)
-    assert late.game == (9, 9)
+    assert late.adversarial_span == (9, 9)
     assert not any(late.adversarial(i) for i in range(9))
 
 

@@ -1,7 +1,7 @@
-"""Where to look in a picture, and how the looked-at part is cut out.
+"""Crops of images round the person, undistorted and resampled.
 
-A window is found from the skeleton and the camera alone, never from the picture or its mask: at
-test time nothing else is known, and a box that follows the true mask would tell the answer.
+A crop follows from the skeleton and the camera alone, never from the image or its mask: at test
+time nothing else is known, and a box that follows the true mask would leak the answer.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ Float = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
 Pixels = NDArray[np.float32]
 
-NEAR = 1e-2  # metres; nothing nearer is seen
+NEAR = 1e-2  # metres: points nearer than this are not seen
 
 
 class View(Protocol):
-    """What a window needs to know of a camera: ``K R t`` as in `gsgan.scene`, size ``(H, W)``."""
+    """The parts of a camera that cropping needs: ``K R t`` as in `gsgan.scene`, size ``(H, W)``."""
 
     @property
     def K(self) -> Float: ...
@@ -36,8 +36,8 @@ class View(Protocol):
 
 
 @dataclass(frozen=True)
-class Window:
-    """A rectangle of whole pixels; it may reach beyond the picture.
+class Crop:
+    """A rectangle of whole pixels; it may reach beyond the image.
 
     Args:
         top: row of its first pixel.
@@ -48,6 +48,9 @@ class Window:
     top: int
     left: int
     size: tuple[int, int]
+
+
+Window = Crop  # former name
 
 
 def project(view: View, points: Float) -> tuple[Float, Float]:
@@ -63,7 +66,7 @@ def project(view: View, points: Float) -> tuple[Float, Float]:
 
 
 def inside(view: View, points: Float) -> NDArray[np.bool_]:
-    """``[...]`` whether world points ``[..., 3]`` land in the picture; False for NaN."""
+    """``[...]`` whether world points ``[..., 3]`` project into the image; False for NaN."""
     pixels, depth = project(view, points)
     height, width = view.size
     u, v = pixels[..., 0], pixels[..., 1]
@@ -72,10 +75,10 @@ def inside(view: View, points: Float) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class PersonCrop:
-    """A square window round the projected joints.
+    """A square crop round the projected joints.
 
     Args:
-        margin: metres of flesh, hair and cloth taken round every joint; landmarks lie inside the
+        margin: metres kept round every joint for flesh, hair and cloth: landmarks lie inside the
             body, and the crown is about 0.2 m above the ears.
 
     Raises:
@@ -90,17 +93,16 @@ class PersonCrop:
 
     def window(
         self, view: View, joints: Float, usable: NDArray[np.bool_], dist: Float | None = None
-    ) -> Window:
-        """The window round the usable joints, cut to the picture, then made square.
+    ) -> Crop:
+        """The crop round the usable joints, clipped to the image, then made square.
 
-        A joint far outside the picture shows nothing, so the box does not follow it; the square
-        may still reach beyond the border.
+        Joints outside the image do not widen it; the square may still reach beyond the border.
 
         Args:
             view: the camera.
             joints: ``[J, 3]`` metres, world frame, finite.
-            usable: ``[J]`` which of them to go by; joints behind the camera are left out as well.
-            dist: ``[8]`` the lens, where the picture keeps its distortion; None: a pinhole's.
+            usable: ``[J]`` which of them count; joints behind the camera never do.
+            dist: ``[8]`` the lens, where the image keeps its distortion; None: a pinhole's.
         """
         height, width = view.size
         pixels, depth = project(view, joints)
@@ -116,128 +118,130 @@ class PersonCrop:
         high = np.clip((pixels[taken] + reach).max(0), 0, limit)
         side = max(1, int(np.ceil((high - low).max())))
         left, top = np.floor((low + high - side) / 2).astype(int)
-        return Window(int(top), int(left), (side, side))
+        return Crop(int(top), int(left), (side, side))
 
 
-def square_window(size: tuple[int, int]) -> Window:
-    """The smallest centred square that holds a whole picture of size ``(H, W)``."""
+def square_window(size: tuple[int, int]) -> Crop:
+    """The smallest centred square that holds a whole image of size ``(H, W)``."""
     side = max(size)
-    return Window((size[0] - side) // 2, (size[1] - side) // 2, (side, side))
+    return Crop((size[0] - side) // 2, (size[1] - side) // 2, (side, side))
 
 
-def cut(picture: Bytes, window: Window) -> Bytes:
-    """``[h, w, ...]`` the window of a picture ``[H, W, ...]``, zero beyond the border."""
+def cut(picture: Bytes, crop: Crop) -> Bytes:
+    """``[h, w, ...]`` the crop of an image ``[H, W, ...]``, zero beyond the border."""
     height, width = picture.shape[:2]
-    h, w = window.size
+    h, w = crop.size
     result = np.zeros((h, w, *picture.shape[2:]), picture.dtype)
-    top, left = max(window.top, 0), max(window.left, 0)
-    bottom, right = min(window.top + h, height), min(window.left + w, width)
+    top, left = max(crop.top, 0), max(crop.left, 0)
+    bottom, right = min(crop.top + h, height), min(crop.left + w, width)
     if bottom > top and right > left:
-        rows = slice(top - window.top, bottom - window.top)
-        columns = slice(left - window.left, right - window.left)
+        rows = slice(top - crop.top, bottom - crop.top)
+        columns = slice(left - crop.left, right - crop.left)
         result[rows, columns] = picture[top:bottom, left:right]
     return result
 
 
-def undistort_map(K: Float, dist: Float, window: Window) -> NDArray[np.float32]:
-    """``[h, w, 2]`` where each pixel of an undistorted window lies in the distorted picture.
+def undistort_map(K: Float, dist: Float, crop: Crop) -> NDArray[np.float32]:
+    """``[h, w, 2]`` where each pixel of an undistorted crop lies in the distorted image.
 
-    Coordinates are what `cv2.remap` takes (pixel centres at whole numbers). K is kept, skew
+    Coordinates as `cv2.remap` takes them (pixel centres at whole numbers). K is kept, skew
     included, which `cv2.undistort` would drop. Beyond the radius where the lens model folds back
-    on itself the map points outside the picture.
+    the map points outside the image.
 
     Args:
         K: ``[3, 3]``, pixel centres at +0.5.
         dist: ``[8]`` OpenCV order k1 k2 p1 p2 k3 k4 k5 k6.
-        window: of the undistorted picture.
+        crop: of the undistorted image.
     """
-    if K[0, 1] == 0:  # OpenCV's own is ten times as fast, but knows no skew
-        u, v = _opencv_map(K, dist, window)
+    if K[0, 1] == 0:  # OpenCV's own is ten times as fast, but ignores skew
+        u, v = _opencv_map(K, dist, crop)
     else:
-        u, v = _skewed_map(K, dist, window)
-    limit = fold_radius(K, dist, window)
+        u, v = _skewed_map(K, dist, crop)
+    limit = fold_radius(K, dist, crop)
     if limit is not None:
-        x, y = _rays(K, window)
+        x, y = _rays(K, crop)
         beyond = x * x + y * y > limit**2
         u[beyond], v[beyond] = -1e4, -1e4
     return np.stack([u, v], axis=-1)
 
 
-def _opencv_map(K: Float, dist: Float, window: Window) -> tuple[Pixels, Pixels]:
-    h, w = window.size
+def _opencv_map(K: Float, dist: Float, crop: Crop) -> tuple[Pixels, Pixels]:
+    h, w = crop.size
     stored = K.copy()
     stored[:2, 2] -= 0.5  # to OpenCV's pixel centres
     seen = stored.copy()
-    seen[:2, 2] -= (window.left, window.top)
+    seen[:2, 2] -= (crop.left, crop.top)
     u, v = cv2.initUndistortRectifyMap(stored, dist, np.eye(3), seen, (w, h), cv2.CV_32FC1)
     return np.asarray(u, np.float32), np.asarray(v, np.float32)
 
 
-def _skewed_map(K: Float, dist: Float, window: Window) -> tuple[Pixels, Pixels]:
-    x_d, y_d = _bent(dist, *_rays(K, window))
-    u = K[0, 0] * x_d + K[0, 1] * y_d + K[0, 2] - 0.5
-    v = K[1, 1] * y_d + K[1, 2] - 0.5
-    return u.astype(np.float32), v.astype(np.float32)
+def _skewed_map(K: Float, dist: Float, crop: Crop) -> tuple[Pixels, Pixels]:
+    shown = distort(np.stack(_rays(K, crop), axis=-1), dist)
+    pixels = shown @ K[:2, :2].T + K[:2, 2] - 0.5
+    return pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
 
 
-def _bent(dist: Float, x: Float, y: Float) -> tuple[Float, Float]:
-    """Where the lens shows x/z and y/z."""
-    p1, p2 = dist[2:4]
-    r2 = x * x + y * y
-    factor = _radial(dist, r2)
-    x_d = x * factor + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    y_d = y * factor + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    return x_d, y_d
+def distort(points: Float, dist: Float) -> Float:
+    """``[..., 2]`` where a lens shows points ``[..., 2]`` of the z = 1 plane, by OpenCV.
+
+    Args:
+        points: x/z and y/z.
+        dist: ``[4, 5 or 8]`` OpenCV order k1 k2 p1 p2 k3 k4 k5 k6.
+    """
+    if points.size == 0:
+        return points
+    rays = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1).reshape(-1, 3)
+    nothing = np.zeros(3)
+    shown = cv2.projectPoints(rays, nothing, nothing, np.eye(3), dist)[0]
+    return np.asarray(shown, np.float64).reshape(points.shape)
 
 
 def _through_lens(K: Float, dist: Float, pixels: Float) -> Float:
     """``[M, 2]`` where the lens shows what a pinhole shows at pixels ``[M, 2]``."""
-    y = (pixels[:, 1] - K[1, 2]) / K[1, 1]
-    x = (pixels[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
-    x, y = _bent(dist, x, y)
-    return np.stack([K[0, 0] * x + K[0, 1] * y + K[0, 2], K[1, 1] * y + K[1, 2]], axis=-1)
+    shown = distort(np.stack(_unproject(K, pixels[:, 0], pixels[:, 1]), axis=-1), dist)
+    return shown @ K[:2, :2].T + K[:2, 2]
 
 
-def _rays(K: Float, window: Window) -> tuple[Float, Float]:
-    """``[h, w]`` each: x/z and y/z of the window's pixels."""
-    h, w = window.size
-    v, u = np.mgrid[window.top : window.top + h, window.left : window.left + w] + 0.5
+def _unproject(K: Float, u: Float, v: Float) -> tuple[Float, Float]:
+    """x/z and y/z of pixels."""
     y = (v - K[1, 2]) / K[1, 1]
     return (u - K[0, 2] - K[0, 1] * y) / K[0, 0], y
 
 
-def _radial(dist: Float, r2: Float) -> Float:
-    k1, k2, _, _, k3, k4, k5, k6 = dist
-    up = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    return up / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+def _rays(K: Float, crop: Crop) -> tuple[Float, Float]:
+    """``[h, w]`` each: x/z and y/z of the crop's pixels."""
+    h, w = crop.size
+    v, u = np.mgrid[crop.top : crop.top + h, crop.left : crop.left + w] + 0.5
+    return _unproject(K, u, v)
 
 
-def fold_radius(K: Float, dist: Float, window: Window, samples: int = 256) -> float | None:
-    """The radius (of x/z, y/z) beyond which the lens model folds back, None within the window.
+def fold_radius(K: Float, dist: Float, crop: Crop, samples: int = 256) -> float | None:
+    """The radius (of x/z, y/z) beyond which the lens model folds back, None within the crop.
 
     Args:
-        samples: radii looked at, from the middle to the window's furthest corner.
+        samples: radii tested, from the centre to the crop's furthest corner.
     """
-    h, w = window.size
-    corners = np.array([(i, j) for i in (0.5, h - 0.5) for j in (0.5, w - 0.5)])
-    y = (window.top + corners[:, 0] - K[1, 2]) / K[1, 1]
-    x = (window.left + corners[:, 1] - K[0, 2] - K[0, 1] * y) / K[0, 0]
-    radii = np.linspace(0, np.sqrt((x * x + y * y).max()), samples)
-    folded = np.flatnonzero(np.diff(radii * _radial(dist, radii**2)) <= 0)
+    h, w = crop.size
+    top, left = crop.top, crop.left
+    corners = np.array([(left + x, top + y) for x in (0.5, w - 0.5) for y in (0.5, h - 0.5)])
+    radii = np.linspace(0, np.hypot(*_unproject(K, *corners.T)).max(), samples)
+    radial = np.where(np.isin(np.arange(8), (2, 3)), 0, dist)  # without p1 and p2
+    shown = distort(np.stack([radii, np.zeros(samples)], axis=-1), radial)[:, 0]
+    folded = np.flatnonzero(np.diff(shown) <= 0)
     return float(radii[folded[0]]) if len(folded) else None
 
 
-def take(picture: Bytes, window: Window, mapping: NDArray[np.float32] | None, exact: bool) -> Bytes:
-    """The window of a picture, undistorted where a mapping is given, zero beyond the border.
+def take(picture: Bytes, crop: Crop, mapping: NDArray[np.float32] | None, exact: bool) -> Bytes:
+    """A crop of an image, undistorted where a mapping is given, zero beyond the border.
 
     Args:
         picture: ``[H, W]`` or ``[H, W, C]``.
-        window: what to take.
-        mapping: of `undistort_map` for the same window, or None for a pinhole camera.
-        exact: keep values as they are (labels) instead of mixing neighbours.
+        crop: what to take.
+        mapping: `undistort_map` of the same crop, or None for a pinhole camera.
+        exact: take the nearest value (labels) instead of interpolating.
     """
     if mapping is None:
-        return cut(picture, window)
+        return cut(picture, crop)
     mode = cv2.INTER_NEAREST if exact else cv2.INTER_LINEAR
     maps = (mapping[..., 0], mapping[..., 1])
     taken = cv2.remap(
@@ -247,7 +251,7 @@ def take(picture: Bytes, window: Window, mapping: NDArray[np.float32] | None, ex
 
 
 def resize(picture: Bytes, size: tuple[int, int], exact: bool) -> Bytes:
-    """A picture resampled to ``(H, W)``; edges stay edges, so K scales with the size alone.
+    """An image resampled to ``(H, W)``; its borders stay, so K scales with the size alone.
 
     Shrinking averages areas, enlarging interpolates linearly, ``exact`` takes the nearest value.
     """
@@ -268,8 +272,8 @@ def black_out(image: Bytes, mask: Bytes, composed: bool) -> Bytes:
     Args:
         image: as taken, or already composed on black.
         mask: 0..255.
-        composed: the image was mixed with black by this mask when it was made; mixing it again
-            would darken soft edges twice, so only pixels outside the mask are cleared.
+        composed: the image was blended with black by this mask before; blending again would
+            darken soft edges twice, so only pixels outside the mask are cleared.
     """
     if composed:
         return image * (mask > 0)[..., None]

@@ -1,13 +1,9 @@
-"""The rules: what the training split says, and the user wishes, to one decision an effect.
-
-Each rule takes the scene, the settings and the user's word, and returns the effect. A word that
-the scene makes impossible raises `Impossible`, which becomes one sentence or leaves the effect off.
-"""
+"""The rules: from the training split and the user's settings to one decision per effect."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from gsgan.effects.record import OFF, Effect, Effects
@@ -17,150 +13,159 @@ from gsgan.utils.errors import ConfigError
 if TYPE_CHECKING:
     from gsgan.data.scene_info import SceneInfo
 
-FORCED = "the config says so"
-TOO_LITTLE = "too little surface is shared by two cameras, or pictures are too coarse, to tell"
+FORCED = "set in the config"
+TOO_LITTLE = "the cameras share too little surface, or images are too coarse, to compare colours"
+RATIONAL = (
+    "a lens has coefficients beyond the fifth (k4, k5, k6), which rendering does not support; "
+    "choose effects.distortion=undistort"
+)
 
 
-class Impossible(Exception):
-    """An effect that this scene cannot have, and why."""
-
-
-def decide(info: SceneInfo, settings: EffectSettings) -> Effects:
-    """What this scene calls for.
-
-    Convention: pure; what the model lacks is taken out later (`gsgan.model.avatar`).
+@dataclass(frozen=True)
+class ModelParts:
+    """The parts of a model that effects act on; the default is the full model.
 
     Args:
-        info: what the training split tells about the scene.
-        settings: the user's words and the thresholds.
+        splats: it renders Gaussians.
+        points: it places Gaussians on the skeleton.
+        body_points: its config has a part that places them on a body instead.
+    """
+
+    splats: bool = True
+    points: bool = True
+    body_points: bool = True
+
+    def lacks(self, effect: str) -> str | None:
+        """Why the model cannot have an effect; None where it can."""
+        if effect == "distortion":
+            return None
+        if effect == "body_points":
+            if not self.points:
+                return "this model puts no points on the skeleton"
+            return None if self.body_points else "the model leaves them out"
+        return None if self.splats else "this model splats nothing"
+
+
+def decide(info: SceneInfo, settings: EffectSettings, model: ModelParts | None = None) -> Effects:
+    """The effects of a run, decided once from the training split.
+
+    Args:
+        info: facts about the scene, measured on the training split.
+        settings: requested values and thresholds.
+        model: what the model can have; None: everything.
 
     Raises:
-        ConfigError: when an effect is forced that the scene cannot have.
+        ConfigError: when a forced effect is not possible in this scene or model.
     """
-    found = {name: _one(name, info, settings) for name in CHOICES}
+    model = model or ModelParts()
+    found = {name: _one(name, info, settings, model) for name in CHOICES}
     cameras = info.train_cameras if found["colour_correction"].on else ()
     return Effects(**found, cameras=cameras)
 
 
-def _one(name: str, info: SceneInfo, settings: EffectSettings) -> Effect:
-    wish = settings.wish(name)
-    none: str | int = 0 if name == "view_dependence" else OFF
-    if wish in (OFF, 0):
-        return Effect(none, FORCED)
-    try:
-        effect = _RULES[name](info, settings, wish)
-    except Impossible as reason:
-        if settings.impossible == "error":
-            raise ConfigError(f"effects.{name}={wish} is not possible: {reason}") from None
-        return Effect(none, str(reason))
-    # the model, too, may lack what an effect needs
-    return replace(effect, forced=effect.forced and settings.impossible == "error")
+def _one(name: str, info: SceneInfo, settings: EffectSettings, model: ModelParts) -> Effect:
+    requested = settings.requested(name)
+    off: str | int = 0 if name == "view_dependence" else OFF
+    if requested in (OFF, 0):
+        return Effect(off, FORCED)
+    reason = _impossible(name, info, requested) or model.lacks(name)
+    if reason is not None:
+        if requested != AUTO and settings.impossible == "error":
+            raise ConfigError(f"effects.{name}={requested} is not possible: {reason}")
+        return Effect("undistort" if reason == RATIONAL else off, reason)
+    if requested == AUTO:
+        return _RULES[name](info, settings)
+    if name == "distortion" and requested == "on":
+        requested = "undistort"
+    if name == "view_dependence" and requested == "on":
+        requested = max(1, most_degree(info, settings))
+    return Effect(requested, FORCED, forced=True)
 
 
-def _view_dependence(info: SceneInfo, settings: EffectSettings, wish: str | int) -> Effect:
-    if isinstance(wish, int):
-        return Effect(wish, FORCED, forced=True)
+def _impossible(name: str, info: SceneInfo, requested: str | int) -> str | None:
+    """Why the scene cannot have an effect; None where it can."""
+    if name == "distortion":
+        if not (info.has_distortion or info.held_out_distortion):
+            return "no camera of this data has a lens coefficient other than zero"
+        return RATIONAL if requested == "project" and info.has_rational_lens else None
+    if name == "colour_correction" and info.n_train_cameras < 2:
+        return "one training camera has no other to differ from"
+    if name == "body_points" and not info.has_body_pose:
+        return "the data has no body pose"
+    if name == "body_points" and info.body != "free" and info.body_file is None:
+        return f"the data's poses are of the body {info.body!r}, of which there is no model file"
+    return None
+
+
+def _view_dependence(info: SceneInfo, settings: EffectSettings) -> Effect:
     cameras, degree = info.n_train_cameras, most_degree(info, settings)
-    if wish == "on":
-        return Effect(max(1, degree), f"{FORCED}; {cameras} training cameras", forced=True)
     if degree == 0 and cameras < settings.degree_cameras[0]:
-        return Effect(0, f"{cameras} training camera sees every moment from one side only")
+        return Effect(0, f"{cameras} training camera sees each moment from one side only")
     if degree == 0:
-        return Effect(0, f"the training cameras stand within {info.spread:.0f} degrees")
+        return Effect(0, f"the training cameras are within {info.spread:.0f} degrees")
     if info.surface is None:
         return Effect(0, TOO_LITTLE)
     left, limit = info.surface.residual, settings.view_residual
     if left < limit:
-        return Effect(0, f"shared surface looks alike to {left:.3f} (limit {limit:g})")
+        return Effect(0, f"shared surface differs by only {left:.3f} (limit {limit:g})")
     why = f"shared surface differs by {left:.3f} (limit {limit:g}); {cameras} cameras"
     return Effect(degree, why)
 
 
 def most_degree(info: SceneInfo, settings: EffectSettings) -> int:
-    """The degree that so many cameras so far apart can tell, 0 to 3."""
+    """The highest degree, 0 to 3, that this number and spread of cameras can resolve."""
     if info.spread < settings.view_spread:
         return 0
     return sum(info.n_train_cameras >= count for count in settings.degree_cameras)
 
 
-def _distortion(info: SceneInfo, settings: EffectSettings, wish: str | int) -> Effect:
-    if not (info.has_distortion or info.held_out_distortion):
-        if wish != AUTO:
-            raise Impossible("no camera of this data has a lens coefficient other than zero")
-        return Effect(OFF, "all lens coefficients are zero")
-    if wish == "project":
-        if info.has_rational_lens:
-            if settings.impossible == OFF:  # data.capture does the same
-                return Effect("undistort", "a lens has k4, k5 or k6, which painting does not know")
-            raise Impossible(
-                "a lens has coefficients beyond the fifth (k4, k5, k6), which painting does not "
-                "know; choose effects.distortion=undistort"
-            )
-        return Effect(
-            "project", "pictures stay as taken: what is painted follows the lens", forced=True
-        )
-    why = "a lens coefficient is not zero: pictures are undistorted on reading"
-    return Effect("undistort", why if wish == AUTO else FORCED, forced=wish != AUTO)
+def _distortion(info: SceneInfo, settings: EffectSettings) -> Effect:
+    return Effect("undistort", "a lens coefficient is not zero: images are undistorted when read")
 
 
-def _antialias(info: SceneInfo, settings: EffectSettings, wish: str | int) -> Effect:
-    if wish != AUTO:
-        return Effect("on", FORCED, forced=True)
+def _antialias(info: SceneInfo, settings: EffectSettings) -> Effect:
     if info.scale_test is None:
-        return Effect(OFF, "nothing is held out to differ in scale")
+        return Effect(OFF, "there are no held-out images that could differ in scale")
     (low, high), (least, most) = info.scale_train, info.scale_test
     ratio = max(most / high, low / least)
-    said = f"held-out pictures have {ratio:.2f} times the scale of training's"
+    measured = f"held-out images have {ratio:.2f} times the scale of training images"
     if ratio < settings.scale_ratio:
-        return Effect(OFF, f"{said} at most (limit {settings.scale_ratio:g})")
-    return Effect("on", f"{said} or its inverse (limit {settings.scale_ratio:g})")
+        return Effect(OFF, f"{measured} at most (limit {settings.scale_ratio:g})")
+    return Effect("on", f"{measured} or its inverse (limit {settings.scale_ratio:g})")
 
 
-def _colour_correction(info: SceneInfo, settings: EffectSettings, wish: str | int) -> Effect:
-    if info.n_train_cameras < 2:
-        if wish != AUTO:
-            raise Impossible("one training camera has no other to agree with")
-        return Effect(OFF, "one training camera has no other to agree with")
-    if wish != AUTO:
-        return Effect("on", FORCED, forced=True)
+def _colour_correction(info: SceneInfo, settings: EffectSettings) -> Effect:
     seen = info.surface
     if seen is None:
         return Effect(OFF, TOO_LITTLE)
-    said = f"two cameras differ by {seen.difference:.3f} on shared surface"
+    measured = f"two cameras differ by {seen.difference:.3f} on shared surface"
     noise = max(settings.colour_share * seen.residual, settings.colour_errors * seen.error)
     if seen.difference < settings.colour_difference:
-        return Effect(OFF, f"{said} at most (limit {settings.colour_difference:g})")
+        return Effect(OFF, f"{measured} at most (limit {settings.colour_difference:g})")
     if seen.difference < noise:
-        return Effect(OFF, f"{said}, which highlights or chance explain (limit {noise:.3f})")
-    return Effect("on", f"{said} (limit {max(noise, settings.colour_difference):.3f})")
+        return Effect(OFF, f"{measured}, within highlights and noise (limit {noise:.3f})")
+    return Effect("on", f"{measured} (limit {max(noise, settings.colour_difference):.3f})")
 
 
-def _body_points(info: SceneInfo, settings: EffectSettings, wish: str | int) -> Effect:
-    if not info.has_body_pose:
-        if wish != AUTO:
-            raise Impossible("the data has no body pose")
-        return Effect(OFF, "the data has no body pose")
-    if wish != AUTO:
-        return Effect("on", FORCED, forced=True)
+def _body_points(info: SceneInfo, settings: EffectSettings) -> Effect:
     if info.body_inside is None:
-        return Effect(OFF, "the body's mesh is not at hand")
-    said = f"{100 * info.body_inside:.0f} % of the posed body lies inside the masks"
+        return Effect(OFF, "the body's mesh cannot be read")
+    measured = f"{100 * info.body_inside:.0f} % of the posed body lies inside the masks"
     limit = f"limit {100 * settings.body_inside:g} %"
     if info.body_inside < settings.body_inside:
-        return Effect(OFF, f"{said} ({limit}): the skeleton is trusted more")
-    return Effect("on", f"{said} ({limit})")
+        return Effect(OFF, f"{measured} ({limit}): the skeleton fits better")
+    return Effect("on", f"{measured} ({limit})")
 
 
-def _random_background(info: SceneInfo, settings: EffectSettings, wish: str | int) -> Effect:
-    if wish != AUTO:
-        return Effect("on", FORCED, forced=True)
-    said = f"the person's darkest percent has brightness {info.darkest:.2f}"
+def _random_background(info: SceneInfo, settings: EffectSettings) -> Effect:
+    measured = f"the person's darkest percent has brightness {info.darkest:.2f}"
+    limit = f"limit {settings.dark:g}"
     if info.darkest < settings.dark:
-        return Effect("on", f"{said} (limit {settings.dark:g}): on black it could turn transparent")
-    return Effect(OFF, f"{said} (limit {settings.dark:g})")
+        return Effect("on", f"{measured} ({limit}): on black it could turn transparent")
+    return Effect(OFF, f"{measured} ({limit})")
 
 
-_RULES: dict[str, Callable[[SceneInfo, EffectSettings, str | int], Effect]] = {
+_RULES: dict[str, Callable[[SceneInfo, EffectSettings], Effect]] = {
     "view_dependence": _view_dependence,
     "distortion": _distortion,
     "antialias": _antialias,

@@ -1,4 +1,4 @@
-"""The decision: every effect with its value and the reason, as plain values for a checkpoint."""
+"""The decisions: every effect with its value and the reason, as plain values for a checkpoint."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class Effect:
     """One effect.
 
     Args:
-        value: ``off``; else ``on``, a mode's name, or a degree above 0.
-        why: the reason, half a sentence.
-        forced: the user said so.
+        value: ``off``, ``on``, a mode, or a degree.
+        why: the reason, a clause.
+        forced: requested by the user, not decided from the data.
     """
 
     value: str | int
@@ -40,11 +40,12 @@ class Effects:
 
     Args:
         view_dependence: degree of the spherical harmonics, 0 to 3.
-        distortion: ``undistort``, or ``project``: pictures stay as taken, Gaussians follow.
-        antialias: opacities make up for the rasteriser's low-pass.
-        colour_correction: an affine map of colours a training camera.
-        body_points: G sits on the surface of the posed body, not on the skeleton's shapes.
-        random_background: Step I compares pictures over a random colour.
+        distortion: ``undistort`` images when reading, or ``project``: images stay distorted and
+            Gaussians follow the lens.
+        antialias: opacities compensate for the rasteriser's low-pass filter.
+        colour_correction: an affine colour map per training camera.
+        body_points: G lies on the surface of the posed body, not on the skeleton's shapes.
+        random_background: Step I compares images over a random colour.
         cameras: training cameras in the order of the colour corrections.
     """
 
@@ -61,24 +62,11 @@ class Effects:
 
     @property
     def degree(self) -> int:
-        """Of the spherical harmonics."""
+        """Degree of the spherical harmonics."""
         return int(self.view_dependence.value)
 
     def without(self, name: str, why: str) -> Effects:
-        """The same with one effect off.
-
-        Raises:
-            ConfigError: when the user forced it.
-        """
-        effect: Effect = getattr(self, name)
-        if not effect.on:
-            return self
-        if effect.forced:
-            raise ConfigError(f"effects.{name}={effect.value} is not possible: {why}")
-        return self.switched_off(name, why)
-
-    def switched_off(self, name: str, why: str) -> Effects:
-        """The same with one effect off, whoever asked for it."""
+        """A copy with one effect off."""
         off = Effect(0 if name == "view_dependence" else OFF, why)
         return replace(self, **{name: off})  # type: ignore[arg-type]
 
@@ -88,9 +76,30 @@ class Effects:
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> Effects:
-        """From what `plain` gave; an effect it does not know is off."""
+        """The inverse of `plain`; effects that are unknown are dropped, missing ones are off."""
         found = {name: Effect(**values[name]) for name in NAMES if name in values}
         return cls(**found, cameras=tuple(values.get("cameras", ())))
+
+    def check_same(self, stored: Mapping[str, Any] | None) -> None:
+        """Refuses to resume a run that began with other effects.
+
+        Args:
+            stored: of `plain`, when the run began; None where it was not stored.
+
+        Raises:
+            ConfigError: naming the effect and how to go on.
+        """
+        if stored is None:
+            return
+        before = Effects.from_plain(stored)
+        for name, effect in self:
+            was: Effect = getattr(before, name)
+            if was.value != effect.value:
+                raise ConfigError(
+                    f"effects.{name}: the run began with {was.value} ({was.why}), but now it is "
+                    f"{effect.value} ({effect.why}); set effects.{name}={was.value}, or "
+                    "resume=false to start over"
+                )
 
 
 NAMES = tuple(field.name for field in fields(Effects) if field.name != "cameras")

@@ -1,4 +1,4 @@
-"""What the user asks of each effect, and from where on `auto` calls for it."""
+"""The values requested for each effect, and the thresholds of ``auto``."""
 
 from __future__ import annotations
 
@@ -17,37 +17,42 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "body_points": ON_OFF,
     "random_background": ON_OFF,
 }
+LEAST = {  # smallest value of each number
+    **dict.fromkeys(("view_residual", "colour_difference", "colour_share", "colour_errors"), 0),
+    **dict.fromkeys(("dark", "body_inside", "measure"), 0),
+    "scale_ratio": 1,
+}
 
 
 @dataclass(frozen=True)
 class EffectSettings:
-    """One word an effect, and the thresholds of ``auto``; see conf/effects/auto.yaml for reasons.
+    """A requested value per effect, and thresholds (reasons: conf/effects/auto.yaml).
 
-    Convention: ``auto`` lets the scene decide, ``off`` builds and computes nothing, every other
-    word forces the effect. YAML reads a bare on or off as true or false; both are understood.
+    Convention: ``auto`` decides from the scene, ``off`` builds and computes nothing, any other
+    value forces the effect. YAML's bare on and off arrive as true and false and are accepted.
 
     Args:
-        view_dependence: ``auto``, ``off``, ``on`` (the degree that the cameras can tell), 0 to 3.
-        distortion: ``auto``, ``off`` (pictures are taken as a pinhole's), ``undistort`` (or ``on``:
-            pictures are undistorted on reading), or ``project`` (pictures stay as taken: Gaussians
-            and joints follow the lens).
+        view_dependence: ``auto``, ``off``, ``on`` (the degree that the cameras resolve), 0 to 3.
+        distortion: ``auto``, ``off`` (images are treated as a pinhole's), ``undistort`` or ``on``
+            (images are undistorted when read), ``project`` (images stay distorted: Gaussians and
+            joints follow the lens).
         antialias, colour_correction, body_points, random_background: ``auto``, ``on``, ``off``.
-        only: names of effects: these are on, all others off, whatever else is said, except that
-            lenses are followed as ``distortion`` says; None: no list.
-        impossible: what becomes of a forced effect that this scene cannot have: ``error``, ``off``.
-        view_residual: see ``auto``; likewise the others.
+        only: names of effects: these are on and all others off, except that lenses follow
+            ``distortion``; None: no list.
+        impossible: what a forced effect that is not possible does: ``error``, or ``off``.
+        view_residual: colour difference in [0, 1].
         view_spread: degrees.
-        degree_cameras: training cameras from which on degree 1, 2, 3 is taken.
+        degree_cameras: training cameras needed for degree 1, 2, 3.
         colour_difference: of colours in [0, 1].
-        colour_share: of the residual.
+        colour_share: share of the residual.
         colour_errors: standard errors.
-        scale_ratio: of pixels a metre.
+        scale_ratio: ratio of pixels per metre.
         dark: brightness in [0, 1].
         body_inside: share in [0, 1].
-        measure: rounds in which a run times each effect that is on before it begins; 0: none.
+        measure: rounds in which a run times each effect before training; 0: none.
 
     Raises:
-        ConfigError: on a value that is not one of these, naming it.
+        ConfigError: on a value that is not allowed, naming it.
     """
 
     view_dependence: str | int | bool = AUTO
@@ -67,53 +72,43 @@ class EffectSettings:
     scale_ratio: float = 1.3
     dark: float = 0.25
     body_inside: float = 0.95
-    measure: int = 5
+    measure: int = 0
 
     def __post_init__(self) -> None:
         for name in CHOICES:
-            object.__setattr__(self, name, _word(name, getattr(self, name)))
+            object.__setattr__(self, name, _choice(name, getattr(self, name)))
         if self.impossible is False:  # YAML's off
             object.__setattr__(self, "impossible", "off")
         if self.impossible not in ("error", "off"):
             raise ConfigError(f"effects.impossible must be error or off, got {self.impossible!r}")
-        for name in (
-            *("view_residual", "view_spread", "colour_difference", "colour_share"),
-            *("colour_errors", "dark", "body_inside"),
-        ):
-            _at_least(name, getattr(self, name), 0)
-        _at_least("scale_ratio", self.scale_ratio, 1)
-        _at_least("measure", self.measure, 0)
-        counts = tuple(self.degree_cameras)
-        if len(counts) != 3 or list(counts) != sorted(counts):
-            raise ConfigError(
-                f"effects.degree_cameras must be three rising numbers, got {list(counts)}"
-            )
-        unknown = sorted(set(self.only or ()) - set(CHOICES))
-        if unknown or isinstance(self.only, str):
-            raise ConfigError(
-                f"effects.only must list some of {', '.join(CHOICES)}; got "
-                f"{', '.join(unknown) if not isinstance(self.only, str) else self.only}"
-            )
+        for name, least in LEAST.items():
+            value = getattr(self, name)
+            number = isinstance(value, (int, float)) and not isinstance(value, bool)
+            if not number or not value >= least:
+                raise ConfigError(
+                    f"effects.{name} must be a number of at least {least}, got {value!r}"
+                )
+        counts = list(self.degree_cameras)
+        if len(counts) != 3 or counts != sorted(counts):
+            raise ConfigError(f"effects.degree_cameras must be three rising numbers, got {counts}")
+        listed = [self.only] if isinstance(self.only, str) else list(self.only or ())
+        if isinstance(self.only, str) or set(listed) - set(CHOICES):
+            raise ConfigError(f"effects.only must list some of {', '.join(CHOICES)}; got {listed}")
 
-    def wish(self, name: str) -> str | int:
-        """What is asked of an effect, the list ``only`` taken into account."""
-        said: str | int = getattr(self, name)
+    def requested(self, name: str) -> str | int:
+        """The value requested for an effect, with ``only`` taken into account."""
+        value: str | int = getattr(self, name)
         if self.only is None:
-            return said
-        if name not in self.only:  # a lens is the camera's, not a choice
-            return said if name == "distortion" else "off"
-        return "on" if said in (AUTO, "off", 0) else said
+            return value
+        if name not in self.only:  # a lens belongs to the camera: it is not a choice
+            return value if name == "distortion" else "off"
+        return "on" if value in (AUTO, "off", 0) else value
 
 
-def _word(name: str, value: str | int | bool) -> str | int:
-    if value is True or value is False:
+def _choice(name: str, value: str | int | bool) -> str | int:
+    if isinstance(value, bool):
         value = "on" if value else "off"
     if value not in CHOICES[name]:
         choices = ", ".join(map(str, CHOICES[name]))
         raise ConfigError(f"effects.{name} must be one of {choices}; got {value!r}")
     return value
-
-
-def _at_least(name: str, value: object, least: float) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not value >= least:
-        raise ConfigError(f"effects.{name} must be a number of at least {least}, got {value!r}")

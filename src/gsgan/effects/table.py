@@ -1,4 +1,4 @@
-"""The table of effects that a run and a check begin with."""
+"""The table of effects that a run and a check print."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ UNKNOWN = "–"
 
 @dataclass(frozen=True)
 class Cost:
-    """What an effect that is on adds.
+    """The cost of an effect that is on.
 
     Args:
-        parameters: to the model.
-        ms: to a picture, measured; None where it was not.
+        parameters: added to the model.
+        ms: added per image; None where it was not measured.
     """
 
     parameters: int = 0
@@ -35,7 +35,7 @@ class Cost:
 
 
 def rows(effects: Effects, costs: Mapping[str, Cost] | None = None) -> list[tuple[str, ...]]:
-    """A row an effect: name, value, why, parameters and milliseconds added; nothing for off."""
+    """One row per effect: name, value, why, parameters, milliseconds; no cost for effects off."""
     found: list[tuple[str, ...]] = []
     for name, effect in effects:
         value = str(effect.value) if effect.on else "off"
@@ -44,10 +44,9 @@ def rows(effects: Effects, costs: Mapping[str, Cost] | None = None) -> list[tupl
         cost = (costs or {}).get(name)
         added = ("", "")
         if effect.on:
-            ms = None if cost is None else cost.ms
             added = (
                 UNKNOWN if cost is None else f"{cost.parameters:,}",
-                UNKNOWN if ms is None else f"{ms:.2f}",
+                UNKNOWN if cost is None or cost.ms is None else f"{cost.ms:.2f}",
             )
         found.append((NAMED[name], value, effect.why, *added))
     return found

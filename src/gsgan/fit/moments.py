@@ -12,9 +12,8 @@ from torch import Tensor
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.dataset import CaptureDataset, PictureCache
-from gsgan.scene import Frame
+from gsgan.scene import Frame, body_window
 from gsgan.utils.errors import DataError
-from gsgan.window import body_window
 
 NEAR = 0.01  # metres: nearer joints have no place in the image
 MARGIN = 0.25  # metres around the joints, as the avatar's windows: wider only costs time

@@ -6,8 +6,8 @@ import cv2
 import torch
 from torch import Tensor
 
-from gsgan.lens import straight_pixels
 from gsgan.scene import Camera
+from gsgan.splat.lens import straight_pixels
 
 NEAR = 1e-2  # metres; what is nearer is cut off
 PAIRS = torch.combinations(torch.arange(8))

@@ -1,4 +1,4 @@
-"""G on a skinned body: fixed points of its surface, where the data has a pose that fits."""
+"""G on a skinned body: fixed points of its surface, for data with a body pose that fits."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from gsgan.model.skinned_points import SkinnedPoints
 from gsgan.scene import BodyPose
 from gsgan.skeleton import Points
 
-NORMAL_FLOOR = 1e-2  # less lets rounding decide where a skin is flat
+NORMAL_FLOOR = 1e-2  # below it rounding errors dominate where skinning is flat
 
 
 class BodyPoints(nn.Module):
-    """Takes the place of densify: each point rides on its vertex by linear blend skinning.
+    """Replaces densify: each point moves with its vertex by linear blend skinning.
 
-    A body pose says what 33 landmarks cannot: how the trunk bends and forearms turn. Ψ then has to
-    learn shape, colour and what changes with the pose, not where the surface is.
+    A body pose holds what 33 landmarks lack: how the trunk bends and forearms turn. Ψ then learns
+    shape, colour and pose-dependent change, not where the surface is.
 
     Args:
         body: vertices, weights and joints.
@@ -60,7 +60,7 @@ class BodyPoints(nn.Module):
         return len(self.points)
 
     def forward(self, pose: BodyPose) -> Points:
-        """G in pose; each point is a part of its own, its frame the linear part of its skinning.
+        """G in pose; each point is its own part, its frame the linear part of its skinning.
 
         Args:
             pose: B poses of the body.
@@ -81,8 +81,8 @@ class BodyPoints(nn.Module):
 def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
     """``[B, N, 3]`` normals of a surface that linear maps ``A`` ``[B, N, 3, 3]`` move.
 
-    By the cofactors, which are det(A) A⁻ᵀ without the division. Where skinning flattens a point's
-    neighbourhood there is no normal: it fades to zero, from about NORMAL_FLOOR of the area at rest.
+    By the cofactors: det(A) A⁻ᵀ without the division. Where skinning flattens a point's
+    neighbourhood the normal fades to zero, from about NORMAL_FLOOR of the area at rest.
     """
     x, y, z = A.unbind(-1)
     cofactors = [torch.linalg.cross(a, b) for a, b in ((y, z), (z, x), (x, y))]

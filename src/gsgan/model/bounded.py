@@ -1,4 +1,4 @@
-"""A clamp from beyond which a parameter can come back."""
+"""A clamp with a gradient back into its range."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class _Bounded(torch.autograd.Function):
 def bounded(x: Tensor, low: float, high: float) -> Tensor:
     """``x`` clamped to [low, high], with a gradient that leads back.
 
-    Convention: beyond a bound the gradient is 0 where a step against it would lead further out,
-    and passes where it leads back in. A plain clamp has none there: what once crosses the bound
-    never learns again.
+    Convention: beyond a bound the gradient is 0 where a step against it would lead further out, and
+    passes where it leads back in. A plain clamp has none there: a parameter that once crossed the
+    bound would never learn again.
 
     Source: ours.
     """

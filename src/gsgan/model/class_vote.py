@@ -1,4 +1,4 @@
-"""Which part each vertex of a body shows: a majority vote over the data's label pictures."""
+"""The part label of each vertex: a majority vote over the data's label images."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from gsgan.scene import Camera, Frame
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
 
-NEIGHBOUR = 4  # the neighbour whose distance says how wide the gaps between vertices are
+NEIGHBOUR = 4  # the neighbour whose distance measures the gaps between vertices
 CELLS = 2.0  # cells of the depth map across the median occluder's radius
-WIDEST = 8  # cells, the largest occluder's radius: one close to the lens would fill the map
+WIDEST = 8  # cells, largest occluder radius: one close to the camera would fill the map
 MOST_CELLS = 2048  # along a side of the depth map, however far the discs spread
 ROWS = 1024  # vertices compared with all others at a time
 
 
 class Pictures(Protocol):
-    """Frames by number: a dataset."""
+    """Indexed frames: a dataset."""
 
     def __len__(self) -> int: ...
     def __getitem__(self, index: int, /) -> Frame: ...
 
 
 class Votes(NamedTuple):
-    """The outcome of a vote.
+    """The result of a vote.
 
     Args:
         labels: ``[V]`` int64, the data's label of each vertex, never 0.
-        decided: share of the vertices with a majority; the others took their nearest one's.
-        pictures: how many were looked at.
+        decided: share of the vertices with a majority; the others took the nearest one's.
+        pictures: number of images used.
     """
 
     labels: Tensor
@@ -46,19 +46,19 @@ class Votes(NamedTuple):
 
 @dataclass(frozen=True)
 class ClassVote:
-    """Settings of the vote; calling it holds the vote.
+    """Settings of the vote; call it to vote.
 
-    A vertex votes for the label at its pixel in every picture in which it is not hidden behind
-    the body itself. Background and ignored pixels are no votes: there the fit is off, or the label
-    picture is empty. Vertices without a majority (never seen, or a tie) take the label of the
-    nearest vertex with one, at rest. Nothing is random.
+    A vertex votes for the label at its pixel in every image in which the body itself does not hide
+    it. Background and ignored pixels do not count: there the fit is off, or the label image is
+    empty. Vertices without a majority (never seen, or a tie) take the label of the nearest vertex
+    with one, at rest. Nothing is random.
 
     Args:
-        vote_frames: most pictures looked at, spread evenly over those that have labels.
-        occluder_radius: how far a vertex hides what lies behind it, in distances to its fourth
-            neighbour: 1 closes the gaps of an even mesh.
+        vote_frames: most images used, spread evenly over those that have labels.
+        occluder_radius: radius within which a vertex hides what is behind it, in distances to its
+            fourth neighbour: 1 closes the gaps of an even mesh.
         depth_tolerance: metres behind the nearest surface that still count as seen: more than
-            neighbours differ on a slanted surface, less than a limb is thick.
+            neighbours differ on a slanted surface, less than a limb's thickness.
 
     Source: paper Sec. 3.4 (one class a vertex); the vote is ours.
     """
@@ -76,15 +76,15 @@ class ClassVote:
             )
 
     def __call__(self, body: SkinnedBody, pictures: Pictures, n_labels: int) -> Votes:
-        """Holds the vote.
+        """Votes.
 
         Args:
-            body: vertices and weights; its labels are not looked at.
+            body: vertices and weights; its labels are ignored.
             pictures: frames of one item each, with labels and a body pose.
             n_labels: labels of the data, background included.
 
         Raises:
-            DataError: when a picture's file is damaged, or no vertex lies on a labelled pixel.
+            DataError: when an image file is damaged, or no vertex lies on a labelled pixel.
         """
         count = min(self.vote_frames, len(pictures))
         chosen = [(2 * i + 1) * len(pictures) // (2 * count) for i in range(count)]
@@ -94,9 +94,8 @@ class ClassVote:
             self._count(votes, body, reach, pictures[index])
         if not votes.any():
             raise DataError(
-                f"labels: in none of the {count} pictures looked at does the posed body lie on a "
-                "labelled pixel; check that labels, cameras and body poses belong together, or "
-                "choose model=wo_seg"
+                f"labels: in none of {count} images does the posed body lie on a labelled pixel; "
+                "check that labels, cameras and body poses belong together, or choose model=wo_seg"
             )
         labels, decided = _majority(votes)
         decided = decided if decided.any() else votes.any(dim=1)  # ties alone: the first label
@@ -104,7 +103,7 @@ class ClassVote:
         return Votes(labels, float(decided.double().mean()), count)
 
     def _count(self, votes: Tensor, body: SkinnedBody, reach: Tensor, frame: Frame) -> None:
-        """Adds one picture's votes to ``[V, n_labels]``."""
+        """Adds one image's votes to ``[V, n_labels]``."""
         if frame.labels is None or frame.body is None:
             return
         posed = body.posed_vertices(frame.body)[0]
@@ -120,11 +119,11 @@ class ClassVote:
 
 
 def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Tensor:
-    """``[V]`` bool: points not hidden behind others, each of which is a disc that faces the camera.
+    """``[V]`` bool: points not hidden behind others, each a disc that faces the camera.
 
-    Convention: a depth map of its own, its cells a fraction of the discs, so that the answer does
-    not depend on the picture's size. Points at or behind the camera, or well outside the picture,
-    are neither seen nor in the way.
+    Convention: the depth map's cells are a fraction of the discs, so the result does not depend on
+    the image size. Points at or behind the camera, or well outside the image, are neither seen nor
+    occluders.
 
     Args:
         points: ``[V, 3]`` metres, world.
@@ -200,11 +199,11 @@ def neighbour_distance(vertices: Tensor) -> Tensor:
 
 
 def _shown(chosen: Sequence[int]) -> Iterable[int]:
-    """The same numbers, with a progress bar on a terminal."""
+    """The numbers, with a progress bar on a terminal."""
     console = make_console()
     return track(
         chosen,
-        "voting for each vertex's part",
+        "voting on each vertex's part",
         console=console,
         transient=True,
         disable=not console.is_terminal,

@@ -1,4 +1,4 @@
-"""Which parts of the data's label pictures get a channel of S."""
+"""The classes of S: which of the data's labels get a channel."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ FACE = "face_neck"
 
 @dataclass(frozen=True)
 class ClassMap:
-    """The classes of S, and what the data's labels are among them.
+    """The classes of S, and the class of each of the data's labels.
 
-    Convention: class 0 is the background. Labels that no vertex carries are numbered after the
-    channels: S cannot learn them, and a score counts them as missed.
+    Convention: class 0 is the background. Labels that no vertex has are numbered after the
+    channels: S cannot learn them, and scores count them as missed.
 
     Args:
         names: of the channels, background first.
@@ -39,11 +39,11 @@ class ClassMap:
 
     @property
     def truth_classes(self) -> int:
-        """Classes that the truth may hold, those without a channel included."""
+        """Classes of the ground truth, those without a channel included."""
         return len(self.names) + len(self.absent)
 
     def as_table(self) -> Tensor:
-        """``[256]`` int64: the class of each label; unnamed ones and 255 are to be ignored."""
+        """``[256]`` int64: the class of each label; IGNORE for unnamed ones and 255."""
         table = torch.full((256,), IGNORE)
         table[: len(self.table)] = torch.tensor(self.table)
         return table
@@ -57,12 +57,12 @@ def class_map(
     Args:
         label_names: of the data's labels, background first.
         vertex_labels: ``[V]`` int64, the label of each vertex of the body.
-        mode: ``body``: every label that a vertex carries. ``hands``: the left and the right hand;
-            all else counts as background, and still hides what lies behind it.
+        mode: ``body``: every label that a vertex has. ``hands``: the left and the right hand; the
+            rest counts as background, and still occludes.
         face: with ``hands``, the face (and neck, where the labels join them) as a third class.
 
     Raises:
-        ConfigError: on another mode, or when a hand or face is wanted that no label names.
+        ConfigError: on another mode, or when no label names a requested hand or face.
     """
     if mode not in MODES:
         raise ConfigError(f"model.segmentation.mode must be {' or '.join(MODES)}; got {mode!r}")
@@ -80,13 +80,13 @@ def class_map(
 
 
 def _hands(label_names: Sequence[str], face: bool) -> ClassMap:
-    wanted = (*HANDS, FACE) if face else HANDS
+    requested = (*HANDS, FACE) if face else HANDS
     groups = [group_of_part(name) for name in label_names]
-    lacking = [name for name in wanted if name not in groups]
+    lacking = [name for name in requested if name not in groups]
     if lacking:
         raise ConfigError(
-            f"model.segmentation.mode=hands needs labels for {', '.join(wanted)}, but the labels "
-            f"name no {' and no '.join(lacking)} ({', '.join(label_names)}); choose mode=body"
+            f"model.segmentation.mode=hands needs labels for {', '.join(requested)}, but they name "
+            f"no {' and no '.join(lacking)} ({', '.join(label_names)}); choose mode=body"
         )
-    table = tuple(1 + wanted.index(group) if group in wanted else 0 for group in groups)
-    return ClassMap(names=("background", *wanted), absent=(), table=table)
+    table = tuple(1 + requested.index(g) if g in requested else 0 for g in groups)
+    return ClassMap(names=("background", *requested), absent=(), table=table)

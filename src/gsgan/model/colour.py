@@ -1,4 +1,4 @@
-"""Per-camera colour correction: what exposure and white balance do to a painted picture."""
+"""Per-camera colour correction: exposure and white balance of a painted image."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from gsgan.utils.precision import full_precision
 
 
 class ColourCorrection(nn.Module):
-    """An affine map of colours a training camera; cameras that never trained keep the picture.
+    """An affine colour map per training camera; held-out cameras keep the image.
 
-    Convention: pictures are on black, so the constant term is weighted by alpha and the background
-    stays black. The mean of all maps is the identity, exactly: else the person could take up one
-    tint and every map its inverse, and a camera that never trained would see that tint.
+    Convention: images are on black, so the constant term is weighted by alpha and the background
+    stays black. The mean of all maps is exactly the identity: otherwise the person could take on a
+    tint and every map its inverse, and held-out cameras would show that tint.
 
     Args:
         trained: names of the training cameras, the order of the parameters.
@@ -32,7 +32,7 @@ class ColourCorrection(nn.Module):
             )
         self.offsets = nn.Parameter(torch.zeros(len(trained), 3, 4))
         rows = [trained.index(name) if name in trained else len(trained) for name in cameras]
-        # names, not numbers, tie a map to a camera: other data may count them otherwise
+        # by name, not number: other data may order cameras differently
         self.register_buffer("rows", torch.tensor(rows), persistent=False)
 
     @property
@@ -42,13 +42,13 @@ class ColourCorrection(nn.Module):
         return identity + self.offsets - self.offsets.mean(dim=0)
 
     def of_cameras(self, camera_index: Tensor) -> Tensor:
-        """``[B, 3, 4]`` the maps of cameras ``[B]``; the identity for one that never trained."""
+        """``[B, 3, 4]`` the maps of cameras ``[B]``; the identity for held-out ones."""
         affine = self.affine
         identity = torch.eye(3, 4, dtype=affine.dtype, device=affine.device)
         return torch.cat([affine, identity[None]])[self.rows[camera_index]]
 
     def forward(self, picture: Tensor, alpha: Tensor, camera_index: Tensor) -> Tensor:
-        """The picture as these cameras take it: ``A c + b alpha``. Autocast has no effect.
+        """The image as these cameras record it, ``A c + b alpha``, in full precision.
 
         Args:
             picture: ``[B, 3, H, W]`` RGB on black.

@@ -1,4 +1,4 @@
-"""Ψ: the pose-guided deformation that turns fixed Gaussians G into Ĝ (paper Sec. 3.3)."""
+"""Ψ: the pose-guided deformation of fixed Gaussians G into Ĝ (paper Sec. 3.3)."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
 from gsgan.utils.constants import constant
 
-QUAT_FLOOR = 1e-12  # added under the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
+QUAT_FLOOR = 1e-12  # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
 
 
 @dataclass(frozen=True)
 class Residuals:
-    """ΔG, raw: what Ψ regresses for each point, before bounds and activations.
+    """ΔG, raw: Ψ's output for each point, before bounds and activations.
 
     means ``[B,N,3]``, quats ``[B,N,4]``, scales ``[B,N,3]``, opacities ``[B,N]``,
     sh ``[B,N,(d+1)²,3]``, features ``[B,N,F]``.
@@ -48,19 +48,18 @@ class Deformation(nn.Module):
         body_height: metres, the subject's constant length scale.
         joints: joints in the skeleton.
         width, layers: the MLP's trunk.
-        embedding: learned numbers a point.
+        embedding: learned numbers per point.
         features: channels beside the three of colour.
         sh_degree: 0 (no view dependence) to 3.
         rest_octaves, position_octaves: positional encodings of the rest and the posed point.
-        normals: Ψ is told where each point's surface looks, which is what light depends on.
-        free_table: also learn one residual a point that does not depend on the pose.
-        pose_frame: ``world``, or ``pelvis``: the pose code turned with the pelvis, so that it
-            says nothing of the subject's heading.
+        normals: each point's surface normal is an input: shading depends on it.
+        free_table: also learn one pose-independent residual per point.
+        pose_frame: ``world``, or ``pelvis``: the pose code in the pelvis frame, without the
+            subject's heading.
         opacity: initial opacity of every point.
-        mean_bound: body heights a mean may leave its point by; None lifts the bound.
+        mean_bound: largest distance of a mean from its point, body heights; None: unbounded.
         scale_min, scale_max: body heights, the range of every scale (`bounded`).
-        logit_bound: opacity logits are kept within ± this, where the sigmoid still has a gradient
-            (`bounded`).
+        logit_bound: opacity logits are kept within ± this, where the sigmoid has a gradient.
 
     Source: paper Sec. 3.3; the table beside the MLP is ours.
     """
@@ -98,7 +97,7 @@ class Deformation(nn.Module):
             raise ValueError(f"Deformation: layers must be at least 2, got {layers}")
         points = rest_points.shape[0]
         self.body_height, self.features, self.sh_degree = float(body_height), features, sh_degree
-        self.active_degree = sh_degree  # training raises it; what is above is not computed
+        self.active_degree = sh_degree  # raised during training; higher degrees are not computed
         self.position_octaves, self.pose_frame = position_octaves, pose_frame
         self.opacity, self.mean_bound, self.logit_bound = opacity, mean_bound, logit_bound
         self.scale_range = (scale_min, scale_max)
@@ -144,8 +143,7 @@ class Deformation(nn.Module):
 
     def _head(self, x: Tensor) -> tuple[Tensor, tuple[int, ...]]:
         """The raw residuals ``[B, N, ...]`` and the sizes of their parts, without the harmonics
-        above the active degree. Those start at zero and get no gradient until they are active, so
-        that computing them all later changes nothing."""
+        above the active degree: those start at zero and get no gradient until they are active."""
         if self.active_degree >= self.sh_degree:
             raw = self.head(x)
             return raw if self.table is None else raw + self.table, self.parts

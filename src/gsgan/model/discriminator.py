@@ -12,14 +12,13 @@ NORMS = ("instance", "none")
 
 
 class PatchDiscriminator(nn.Module):
-    """One scale: 4×4 convolutions down to a map of logits.
+    """One scale: 4×4 convolutions to a map of logits.
 
     Args:
         base: channels of the first layer.
-        layers: feature layers; all but the last halve the picture.
-        norm: ``instance``, or ``none``. Instance normalisation makes the contrast of every
-            channel the same, and with it goes how sharp the picture is (docs/ablations.md has
-            what each learnt of nearly right pictures).
+        layers: feature layers; all but the last halve the resolution.
+        norm: ``instance``, or ``none``. Instance normalisation equalises the contrast of every
+            channel, and so hides how sharp the image is (measured in docs/ablations.md).
 
     Raises:
         ConfigError: on an unknown norm.
@@ -50,7 +49,7 @@ class PatchDiscriminator(nn.Module):
         self.apply(_initialise if normal else _initialise_without_norm)
 
     def forward(self, image: Tensor) -> list[Tensor]:
-        """Feature maps, then the logits, of a picture ``[B, 3, H, W]``."""
+        """Feature maps, then the logits, of an image ``[B, 3, H, W]``."""
         maps = [image]
         for block in self.blocks:
             maps.append(block(maps[-1]))
@@ -58,10 +57,10 @@ class PatchDiscriminator(nn.Module):
 
 
 class Discriminator(nn.Module):
-    """The same judge at several scales, unconditional (the picture only).
+    """Patch discriminators at several scales, unconditional (they see the image only).
 
     Args:
-        scales: judges; each sees the picture halved once more.
+        scales: number of discriminators; each sees the image at half the previous resolution.
         base, layers, norm: as `PatchDiscriminator`.
 
     Source: paper Sec. 3.5; scales, widths and normalisation are pix2pixHD's.
@@ -71,6 +70,7 @@ class Discriminator(nn.Module):
         self, *, scales: int = 2, base: int = 64, layers: int = 4, norm: str = "instance"
     ) -> None:
         super().__init__()
+        # the name is kept for checkpoints
         self.judges = nn.ModuleList(PatchDiscriminator(base, layers, norm) for _ in range(scales))
         self.stride = 2 ** (layers - 1 + scales - 1)
 
@@ -78,18 +78,18 @@ class Discriminator(nn.Module):
         """For each scale its feature maps with the logits last.
 
         Raises:
-            ValueError: when the picture is so small that the coarsest map has a single pixel:
-                nothing is left to judge by place, and instance normalisation would erase it.
+            ValueError: when the coarsest map would have a single pixel, which instance
+                normalisation erases.
         """
         if min(image.shape[-2:]) < 2 * self.stride:
             raise ValueError(
-                f"Discriminator: a picture of {tuple(image.shape[-2:])} is too small for "
+                f"Discriminator: an image of {tuple(image.shape[-2:])} is too small for "
                 f"{len(self.judges)} scales: "
                 f"at least {2 * self.stride} pixels, or fewer layers"
             )
         results = []
-        for judge in self.judges:
-            results.append(judge(image))
+        for patches in self.judges:
+            results.append(patches(image))
             image = functional.avg_pool2d(image, 3, stride=2, padding=1, count_include_pad=False)
         return results
 
@@ -102,7 +102,7 @@ def _initialise(module: nn.Module) -> None:
 
 
 def _initialise_without_norm(module: nn.Module) -> None:
-    """He et al. 2015: unscaled, the signal would die out under weights of 0.02."""
+    """He et al. 2015: without normalisation the signal would vanish under weights of 0.02."""
     if isinstance(module, nn.Conv2d):
         nn.init.kaiming_normal_(module.weight, a=SLOPE, nonlinearity="leaky_relu")
         if module.bias is not None:

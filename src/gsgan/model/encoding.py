@@ -28,5 +28,5 @@ def positional_encoding(x: Tensor, octaves: int) -> Tensor:
 
 
 def encoded_size(dimensions: int, octaves: int) -> int:
-    """How many numbers `positional_encoding` makes of ``dimensions`` coordinates."""
+    """Size of the `positional_encoding` of ``dimensions`` coordinates."""
     return dimensions * (1 + 2 * octaves)

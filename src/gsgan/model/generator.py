@@ -1,4 +1,4 @@
-"""The generator: a UNet with two encoders, styled by the pose (paper Sec. 3.5)."""
+"""The generator: a UNet with two encoders, modulated by the pose (paper Sec. 3.5)."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class Encoder(nn.Module):
 class Style(nn.Module):
     """Per-pixel normalisation, then scale and shift from E_s's level and the pose code g.
 
-    Normalising over channels at each pixel (not over the picture) keeps colours independent of how
-    much of the frame is background. Both maps start at zero: the style starts as the identity.
-    Without style channels g alone scales and shifts.
+    Normalising over channels at each pixel (not over the image) keeps colours independent of how
+    much of the image is background. Both maps start at zero: the style starts as the identity.
+    Without style channels only g scales and shifts.
     """
 
     def __init__(self, channels: int, style_channels: int, pose_channels: int) -> None:
@@ -81,23 +81,23 @@ class DecoderLevel(nn.Module):
 
 
 class Generator(nn.Module):
-    """F ⊕ S ⊕ p₂D and g to the picture and its alpha.
+    """F ⊕ S ⊕ p₂D and g to the image and its alpha.
 
     Args:
         feature_channels: channels of F, colour included.
         segmentation_channels: channels of S; 0 leaves S out (``wo_seg``).
         skeleton_channels: channels of p₂D.
         pose_channels: length of g.
-        supersample: F is drawn so many times larger each way; that picture's pixels then enter
-            E_c as channels beside their average, 1 for none.
+        supersample: F is drawn so many times larger each way; its pixels then enter E_c as channels
+            beside their average; 1 for none.
         base: channels at full resolution.
-        multipliers: channels of each level in units of ``base``; one level a halving.
-        style: what scales and shifts the decoder: ``film``, at every pixel by E_s(F) and g, or
-            ``pose``, by g alone: E_s is then not built.
+        multipliers: channels of each level in units of ``base``; each level halves the resolution.
+        style: how the decoder is scaled and shifted: ``film``, at every pixel by E_s(F) and g, or
+            ``pose``, by g alone, without E_s.
         style_share: E_s's width as a share of E_c's.
-        rgb_skip: paint a correction of Step I's colour and alpha instead of the whole picture;
-            the last layer then starts at zero, and training from Step I's picture.
-        output: ``linear`` (clamped only when shown: an all-black start can recover) or
+        rgb_skip: paint a correction of Step I's colour and alpha instead of the whole image; the
+            last layer then starts at zero, and training at Step I's image.
+        output: ``linear`` (clamped on output only: an all-black start can recover) or
             ``sigmoid``.
         feature_bound: F is clamped to ± this before it enters (half precision overflows).
 
@@ -162,7 +162,7 @@ class Generator(nn.Module):
         Args:
             F: ``[B, C, H, W]`` rendered features, the first three channels Step I's colour.
             S: ``[B, classes, H, W]`` part probabilities, or None when built without.
-            p2d: ``[B, 8, H, W]`` the drawn skeleton; None when it is F already (image_to_image).
+            p2d: ``[B, 8, H, W]`` the drawn skeleton; None when it is F (image_to_image).
             g: ``[B, 35]`` the pose code.
             fine: ``[B, C, kH, kW]``, F before it was averaged; given where built to supersample.
             alpha: ``[B, 1, H, W]`` of F; given where built with ``rgb_skip``.
@@ -194,11 +194,11 @@ class Generator(nn.Module):
 
     def _check_fine(self, height: int, width: int, fine: Tensor | None) -> None:
         k = self.supersample
-        wanted = None if k == 1 else (k * height, k * width)
+        expected = None if k == 1 else (k * height, k * width)
         given = None if fine is None else tuple(fine.shape[-2:])
-        if wanted != given:
+        if expected != given:
             raise ValueError(
-                f"Generator: built with supersample={k}, so fine must be {wanted} pixels, "
+                f"Generator: built with supersample={k}, so fine must be {expected} pixels, "
                 f"got {given}"
             )
 
@@ -210,7 +210,7 @@ class Generator(nn.Module):
 
 
 def start_at_zero(layer: nn.Module) -> None:
-    """Weight and bias 0: the layer adds nothing until training finds it useful."""
+    """Sets weight and bias to 0: the layer adds nothing at first."""
     for parameter in layer.parameters():
         nn.init.zeros_(parameter)
 

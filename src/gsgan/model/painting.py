@@ -1,4 +1,4 @@
-"""What an avatar makes of one pose seen by one camera: every map of the way to the picture."""
+"""The output of an avatar: the image and every map that led to it."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from gsgan.scene import Gaussians
-from gsgan.window import Window
+from gsgan.scene import Gaussians, Window
 
 
 @dataclass(frozen=True)
 class Painting:
-    """What an avatar makes of one pose seen by one camera.
+    """The output of an avatar for one pose and camera per batch item.
 
     Args:
         image: ``[B, 3, H, W]`` I_pred on black, not clamped; None when only Step I was requested.
@@ -24,8 +23,8 @@ class Painting:
         splat_alpha: ``[B, 1, H, W]`` of F.
         segmentation: ``[B, classes, H, W]`` S, or None where it was not built.
         gaussians: Ĝ.
-        corrected: ``[B, 3, H, W]`` Step I's colour as the camera takes it, where colours are
-            corrected; F stays as it was.
+        corrected: ``[B, 3, H, W]`` Step I's colour, colour-corrected for the camera where that
+            effect is on; F is not corrected.
     """
 
     image: Tensor | None
@@ -38,13 +37,13 @@ class Painting:
 
     @property
     def colour(self) -> Tensor | None:
-        """``[B, 3, H, W]`` Step I's picture C on black."""
+        """``[B, 3, H, W]`` Step I's image C on black."""
         if self.corrected is not None:
             return self.corrected
         return None if self.features is None else self.features[:, :3]
 
     def pasted(self, window: Window) -> Painting:
-        """The same in the whole picture, all background outside the window."""
+        """The same in the whole image, background outside the window."""
 
         def paste(x: Tensor | None) -> Tensor | None:
             return None if x is None else window.paste(x)

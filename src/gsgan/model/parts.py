@@ -1,4 +1,4 @@
-"""The body that S splats, with a label of the data on every vertex."""
+"""The body that S splats, with one of the data's labels per vertex."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ def labelled_body(
     pictures: Pictures | None = None,
     vertex_labels: Tensor | None = None,
 ) -> tuple[SkinnedBody | None, str]:
-    """The body, and a clause that says where its labels come from, or why there is none.
+    """The body, and a clause on where its labels come from, or why there is no body.
 
-    The body's own labels are kept where they are the data's, and where the data has none; else the
-    labels of a checkpoint are taken, or the vote is held.
+    The body's own labels are used where they are the data's, or the data has none; otherwise those
+    of a checkpoint, or of a vote.
 
     Args:
-        scene: what the training data is like.
-        vote: holds the vote.
-        pictures: training frames with labels; None where no vote can be held.
-        vertex_labels: ``[V]`` int64, the outcome of an earlier vote.
+        scene: facts about the training split.
+        vote: settings of the vote.
+        pictures: training frames with labels, for the vote.
+        vertex_labels: ``[V]`` int64, the result of an earlier vote.
 
     Raises:
-        DataError: when a vote is called for and cannot be held, or the labels are not the body's.
+        DataError: when a vote is needed and not possible, or the labels do not fit the body.
     """
     if not scene.has_body_pose:
         return None, "the data has no body pose"
@@ -60,21 +60,20 @@ def labelled_body(
         return body.voted(vertex_labels, names), "parts voted when training began"
     if pictures is None or len(pictures) == 0:
         raise DataError(
-            f"labels: the pictures' parts are {', '.join(names)}, the {scene.body} body's are "
-            "others, and no training picture with labels is at hand to vote on them; choose "
-            "model=wo_seg"
+            f"labels: the images' parts are {', '.join(names)}, the {scene.body} body has others, "
+            "and there is no training image with labels to vote on them; choose model=wo_seg"
         )
     votes = vote(body, pictures, len(names))
     body = body.voted(votes.labels, names)
     missing = len(names) - 1 - len(votes.labels.unique())
     return body, (
-        f"class vote over {votes.pictures} pictures: {votes.decided:.0%} of the vertices decided, "
+        f"class vote over {votes.pictures} images: {votes.decided:.0%} of the vertices decided, "
         f"{missing} of {len(names) - 1} parts on none"
     )
 
 
 def label_names(scene: SceneInfo) -> tuple[str, ...]:
-    """Names of the data's labels, background first; numbers where it gives none."""
+    """Names of the data's labels, background first; numbered where it has none."""
     numbered = ("background", *(f"part {i}" for i in range(1, scene.n_labels)))
     return scene.label_names or numbered
 
@@ -82,7 +81,7 @@ def label_names(scene: SceneInfo) -> tuple[str, ...]:
 def _check_number(scene: SceneInfo, body: SkinnedBody) -> None:
     if scene.n_labels > len(body.label_names):
         raise DataError(
-            f"labels: the pictures hold {scene.n_labels} parts, the {scene.body} body has "
+            f"labels: the images have {scene.n_labels} parts, the {scene.body} body has "
             f"{len(body.label_names)} ({', '.join(body.label_names)}); map them to these ids, or "
             "choose model=wo_seg"
         )

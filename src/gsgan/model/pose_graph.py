@@ -11,11 +11,11 @@ from torch.nn import functional
 from gsgan.model.encoding import encoded_size, positional_encoding
 from gsgan.skeleton import MEDIAPIPE33, SkeletonTemplate
 
-READOUT_START = 0.8  # standard deviation of g at the start, of joint channels' of 1
+READOUT_START = 0.8  # initial standard deviation of g for joint channels of 1
 
 
 class GraphLayer(nn.Module):
-    """One graph convolution with weights of its own for every joint.
+    """One graph convolution with separate weights for every joint.
 
     ``h' = (A ∘ W_A) (h_j W_j) + b``: the adjacency's entries are learned where the mask allows.
 
@@ -52,7 +52,7 @@ class PoseGraph(nn.Module):
     Args:
         template: the skeleton's joints and edges.
         width: channels of the hidden layers.
-        joint_channels: channels a joint ends with.
+        joint_channels: output channels per joint.
         octaves: positional encoding of Ω.
         readout: ``edge``, each number of g from the two joints of its edge (35 is the number of
             MediaPipe edges), or ``linear``, from all joints.
@@ -60,7 +60,7 @@ class PoseGraph(nn.Module):
     Raises:
         ValueError: on another readout.
 
-    Source: paper Sec. 3.5, which does not say how joints become g.
+    Source: paper Sec. 3.5, which leaves open how joints become g.
     """
 
     edges: Tensor

@@ -13,7 +13,7 @@ from torch.nn import functional
 from gsgan.body import SkinnedBody
 from gsgan.model.classes import IGNORE, class_map
 from gsgan.model.skinned_points import SkinnedPoints
-from gsgan.scene import BodyPose, Camera, Gaussians, Raster
+from gsgan.scene import BodyPose, Camera, Frame, Gaussians, Raster
 from gsgan.splat import accuracy as named_accuracy
 from gsgan.splat import rasterise
 from gsgan.splat.checks import checks_for
@@ -26,13 +26,13 @@ class Segmentation(nn.Module):
     """Canonical Gaussians on a body's vertices, moved by LBS, rendered as class probabilities.
 
     Learned: quats, scales, opacities. Fixed: positions, skinning weights, the one-hot class of
-    each vertex. Where skinning weights mix, the blend is no rotation, so the deformed shape is
-    kept as a covariance. Vertices of no class (all but the hands, with ``mode=hands``) are splatted
-    too: they hide what lies behind them, and count as background.
+    each vertex. Blends of bone transforms are no rotations, so deformed shapes are covariances.
+    Vertices of no class (all but the hands, with ``mode=hands``) are splatted too: they occlude,
+    and count as background.
 
     Args:
         body: vertices, weights, joints and part labels.
-        mode: which classes there are, ``body`` or ``hands``, see `gsgan.model.classes.class_map`.
+        mode: the classes, ``body`` or ``hands``, see `gsgan.model.classes.class_map`.
         hands_face: with ``hands``, the face as a third class.
         points: vertices used, spread evenly over the surface; None for all.
         opacity: initial opacity.
@@ -49,7 +49,7 @@ class Segmentation(nn.Module):
     one_hot: Tensor
     vertex_labels: Tensor
     truth_table: Tensor
-    backend = "auto"  # exchanged by benches: who rasterises
+    backend = "auto"  # of the rasteriser; replaced by benches
 
     def __init__(
         self,
@@ -67,7 +67,7 @@ class Segmentation(nn.Module):
         self.accuracy = named_accuracy(accuracy)
         self.points = SkinnedPoints(body, points)
         self.map = class_map(body.label_names, body.vertex_labels, mode, hands_face)
-        # What was voted is kept, so that no vote is held again; the body's own needs no keeping.
+        # Voted labels are saved, so that the vote is not repeated; the body's own are not.
         self.voted = body.label_source == "vote"
         self.register_buffer("vertex_labels", body.vertex_labels, persistent=self.voted)
         self.register_buffer("truth_table", self.map.as_table(), persistent=False)
@@ -97,15 +97,15 @@ class Segmentation(nn.Module):
         return len(self.map)
 
     def truth(self, labels: Tensor) -> Tensor:
-        """The data's label pictures ``[B, H, W]`` as classes of S; 255 is to be ignored.
+        """The data's label images ``[B, H, W]`` as classes of S; 255 is ignored.
 
-        Labels that no vertex carries become classes beyond S's channels, up to
-        ``map.truth_classes``: a score counts them as missed, the loss passes over them.
+        Labels that no vertex has become classes beyond S's channels, up to ``map.truth_classes``:
+        scores count them as missed, the loss ignores them.
         """
         return self.truth_table[labels]
 
     def to_score(self, segmentation: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
-        """S with empty channels for the classes that no vertex carries, and the truth for it."""
+        """S with empty channels for the classes that no vertex has, and its ground truth."""
         padded = functional.pad(segmentation, (0, 0, 0, 0, 0, len(self.map.absent)))
         return padded, self.truth(labels)
 
@@ -144,14 +144,25 @@ class Segmentation(nn.Module):
             )
 
     def forward(self, pose: BodyPose, camera: Camera) -> Tensor:
-        """S ``[B, classes, H, W]``: probabilities; channel 0 is what no class covers."""
+        """S ``[B, classes, H, W]``: probabilities; channel 0 is the rest."""
         raster = self.raster(pose, camera)
         covered = raster.alpha if self.all_classed else raster.features.sum(dim=1, keepdim=True)
         return torch.cat([(1 - covered).clamp_min(0), raster.features], dim=1)
 
+    def loss(self, frame: Frame) -> Tensor:
+        """The loss of a frame: on its labels, or on its mask where the data has no labels."""
+        assert frame.body is not None
+        if self.common is not None:
+            alpha = self.raster(frame.body, frame.camera).alpha
+            return silhouette_loss(alpha, frame.mask, frame.unsure)
+        labels = torch.full_like(frame.mask[:, 0], IGNORE, dtype=torch.long)
+        if frame.labels is not None:  # else nothing is learned from this image
+            labels = self.truth(frame.labels)
+        return segmentation_loss(self(frame.body, frame.camera), labels)
+
 
 def _classes_as_loaded(segmentation: nn.Module, _: Any) -> None:
-    """A checkpoint's votes take effect where they differ from those just held."""
+    """Applies a checkpoint's voted labels."""
     assert isinstance(segmentation, Segmentation)
     segmentation.one_hot.copy_(segmentation._classes_of_points())
 
@@ -159,13 +170,13 @@ def _classes_as_loaded(segmentation: nn.Module, _: Any) -> None:
 def segmentation_loss(segmentation: Tensor, labels: Tensor, floor: float = 1e-6) -> Tensor:
     """Cross-entropy of rendered probabilities: mean of -log(P of the true class + floor).
 
-    The maps are probabilities already, so there is no softmax. Pixels whose label has no channel
-    (255, and classes that no vertex carries) are left out; with no other pixel the loss is 0.
+    There is no softmax: the maps are probabilities. Pixels whose label has no channel (255, and
+    classes that no vertex has) are left out; with no other pixel the loss is 0.
 
     Args:
         segmentation: ``[B, classes, H, W]``.
         labels: ``[B, H, W]`` int64, see `Segmentation.truth`.
-        floor: added inside the logarithm, so that a class never hit still has a gradient.
+        floor: added inside the logarithm, so that a class without splats has a gradient.
 
     Source: ours; the maps are those of paper Sec. 3.4.
     """
@@ -183,7 +194,7 @@ def silhouette_loss(
     Args:
         alpha: ``[B, 1, H, W]`` of `Segmentation.raster`.
         mask: ``[B, 1, H, W]`` in [0, 1].
-        unsure: ``[B, 1, H, W]`` above 0 where pixels are left out, or None.
+        unsure: ``[B, 1, H, W]`` above 0 at pixels to leave out, or None.
         floor: added inside the logarithms.
 
     Returns:

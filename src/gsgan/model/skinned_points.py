@@ -1,4 +1,4 @@
-"""Gaussians that ride on a skinned body: canonical points, moved by linear blend skinning."""
+"""Canonical points on a skinned body, moved by linear blend skinning."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsgan.scene import BodyPose
 
 
 class SkinnedPoints(nn.Module):
-    """Points spread evenly over a body's vertices, and how a pose moves them and their shapes.
+    """Points spread evenly over a body's vertices, moved with a pose.
 
     Args:
         body: vertices, weights and joints.
@@ -56,7 +56,7 @@ class SkinnedPoints(nn.Module):
     def blend(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
         """The affine map of each point: ``A [B, N, 3, 3]`` and ``t [B, N, 3]``.
 
-        Where skinning weights mix, A is no rotation: keep shapes as covariances ``A Σ Aᵀ``.
+        A blends rotations and is none itself: transform shapes as covariances ``A Σ Aᵀ``.
         """
         bones = forward_kinematics(
             self.joints, self.parents, axis_angle_to_matrix(pose.theta), pose.transl

@@ -17,10 +17,10 @@ from gsgan.splat.sh import sh_to_colour
 
 
 class SurfaceGaussians(nn.Module):
-    """Canonical Gaussians that learn where on the body they sit, their shape and their colour.
+    """Canonical Gaussians with learned offsets from the body, shapes and colours.
 
-    Nothing depends on the pose but the skinning: the family of GauHuman and 3DGS-Avatar, without
-    their pose-dependent networks.
+    Only the skinning depends on the pose: the family of GauHuman and 3DGS-Avatar, without their
+    pose-dependent networks.
 
     Args:
         body: vertices, weights and joints.
@@ -29,7 +29,7 @@ class SurfaceGaussians(nn.Module):
         sh_degree: 0 (no view dependence) to 3.
         opacity: initial opacity.
         scale: initial standard deviation, as a share of the distance to the nearest neighbour.
-        mean_bound: body heights a mean may leave its vertex by.
+        mean_bound: largest distance of a mean from its vertex, body heights.
         scale_min, scale_max: body heights, the range of every scale.
         logit_bound: opacity logits are kept within ± this.
 
@@ -56,7 +56,7 @@ class SurfaceGaussians(nn.Module):
         self.points = SkinnedPoints(body, points)
         count = len(self.points)
         self.features, self.sh_degree, self.body_height = 0, sh_degree, float(body_height)
-        self.active_degree = sh_degree  # training raises it; what is above is not computed
+        self.active_degree = sh_degree  # raised during training; higher degrees are not computed
         self.mean_bound, self.logit_bound = mean_bound, logit_bound
         self.scale_range = (scale_min, scale_max)
         self.offsets = nn.Parameter(torch.zeros(count, 3))
@@ -68,8 +68,8 @@ class SurfaceGaussians(nn.Module):
         self.sh = nn.Parameter(torch.zeros(count, (sh_degree + 1) ** 2, 3))
 
     def parameter_groups(self) -> list[tuple[list[nn.Parameter], float]]:
-        """(parameters, multiplier of the learning rate): an MLP's output moves faster than a
-        bare parameter at the same rate."""
+        """(parameters, multiplier of the learning rate): bare parameters need higher rates than an
+        MLP's weights."""
         return [
             ([self.offsets, self.quats], 1.0),
             ([self.log_scales], 5.0),

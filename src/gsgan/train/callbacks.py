@@ -1,18 +1,22 @@
-"""What a run shows while it works: picture grids and a line per validation."""
+"""Output of a run while it trains: image grids, a line per validation, whole checkpoints."""
 
 from __future__ import annotations
 
+import io
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+import torch
 from lightning import Callback, LightningModule, Trainer
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from rich.console import Console
 from torch import Tensor
 
 from gsgan.evaluate.pictures import grid_rows, write_grid
 from gsgan.model.avatar import Painting
 from gsgan.scene import Frame
+from gsgan.utils.files import write_atomically
 
 if TYPE_CHECKING:
     from gsgan.train.module import AvatarTraining
@@ -23,11 +27,11 @@ def _training(module: LightningModule) -> AvatarTraining:
 
 
 class PictureGrid(Callback):
-    """Writes truth, Step-I colour, S, I_pred and error at each validation.
+    """Writes ground truth, Step I's colour, S, I_pred and error at each validation.
 
     Args:
-        folder: where ``step_000000.png`` goes.
-        rows: pictures a grid, spread over the validation frames.
+        folder: of ``step_000000.png``.
+        rows: images per grid, spread over the validation frames.
     """
 
     def __init__(self, folder: Path, rows: int = 4) -> None:
@@ -49,11 +53,11 @@ class PictureGrid(Callback):
         if (
             trainer.is_global_zero
             and isinstance(outputs, Painting)
-            and self._wants(trainer, batch_idx)
+            and self._shows(trainer, batch_idx)
         ):
             self._collected += grid_rows(batch, outputs)[:1]
 
-    def _wants(self, trainer: Trainer, batch_idx: int) -> bool:
+    def _shows(self, trainer: Trainer, batch_idx: int) -> bool:
         total = int(sum(trainer.num_val_batches))
         stride = max(1, total // max(1, self.rows))
         return batch_idx % stride == 0 and len(self._collected) < self.rows
@@ -63,8 +67,8 @@ class PictureGrid(Callback):
             write_grid(self._collected, self.folder / f"step_{_training(module).step:06d}.png")
 
 
-class Narrator(Callback):
-    """One line a validation: iteration, phase, scores, time left."""
+class ProgressLines(Callback):
+    """Prints a line per validation: iteration, phase, scores, time left."""
 
     def __init__(self, console: Console) -> None:
         self.console = console
@@ -90,3 +94,18 @@ class Narrator(Callback):
             left = spent / done * (total - step)
             line += f"  {done / spent:5.1f} it/s, {left / 60:4.1f} min left"
         self.console.print(line, highlight=False, soft_wrap=True)
+
+
+class AtomicCheckpoints(TorchCheckpointIO):
+    """Writes beside the old checkpoint and renames: a kill leaves the old one or the new one.
+
+    Lightning's own writer copies from the system's temporary folder, which a kill can cut off.
+    """
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None
+    ) -> None:
+        """Saves a checkpoint to a local path."""
+        buffer = io.BytesIO()
+        torch.save(checkpoint, buffer)
+        write_atomically(Path(path), buffer.getvalue())

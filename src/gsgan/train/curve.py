@@ -14,7 +14,7 @@ SECONDS, QUALITY, COLOUR = "val/seconds", "val/psnr", "val/psnr_splat"
 
 
 class Point(NamedTuple):
-    """One validation: seconds of training, dB of the picture and of Step I's colour, iteration."""
+    """One validation: seconds of training, dB of the image and of Step I's colour, iteration."""
 
     seconds: float
     psnr: float
@@ -27,9 +27,9 @@ class Curve:
     """One training.
 
     Args:
-        label: whose.
+        label: name of the run.
         seconds: of training until each validation, rising.
-        psnr: dB, mean over the pictures watched.
+        psnr: dB, mean over the validation images.
         colour: dB, of Step I's colour; empty where the log lacks it.
     """
 
@@ -42,8 +42,8 @@ class Curve:
 def curve(label: str, run: Path) -> Curve | None:
     """The curve of a run folder, its resumed parts joined; None where its logs hold none.
 
-    A part that went on from a checkpoint repeats what an interruption cut off after it: the later
-    part counts, from the iteration in its folder's name and from its first moment on.
+    A resumed part repeats the iterations after its checkpoint: the later part counts, from the
+    iteration in its folder's name and from its first validation on.
 
     Raises:
         DataError: when a log cannot be read.
@@ -66,14 +66,14 @@ def curve(label: str, run: Path) -> Curve | None:
 
 
 def _validations(log: Path) -> list[Point]:
-    """Each validation; a last line that a kill cut short is passed over."""
+    """Each validation; an incomplete last line is skipped."""
     try:
         text = log.read_text(encoding="utf-8")
         rows = list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
     except (OSError, UnicodeError, csv.Error) as error:
         raise DataError(
             f"{log}: not a readable log of a training ({type(error).__name__}); remove it to go on "
-            "without what it tells"
+            "without it"
         ) from error
     found: list[Point] = []
     for row in rows:
@@ -85,7 +85,7 @@ def _validations(log: Path) -> list[Point]:
 
 
 def _start(log: Path) -> float:
-    """The iteration a resumed part began at: its folder is called ``logs_000250``."""
+    """First iteration of a resumed part, from its folder's name, e.g. ``logs_000250``."""
     number = log.parent.name.rpartition("_")[2]
     return float(number) if number.isdecimal() else math.inf
 

@@ -1,4 +1,4 @@
-"""What Step I and Step II minimise: weights, and the sums they weigh (paper Sec. 3.5, Alg. 2)."""
+"""The losses of Step I and Step II: weights and weighted sums (paper Sec. 3.5, Alg. 2)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class StepOneLoss:
         feature_head: weight of the same loss on a linear readout of F; without it F's further
             channels get no gradient in Step I. 0 builds no readout.
         alpha: weight of L1 between the splats' alpha and the mask, where images are compared on
-            black only; over a random colour the other terms supervise alpha already.
+            black; over a random colour the other terms supervise alpha.
 
     Source: paper Sec. 3.5 (λ = 0.2); readout and alpha are ours.
     """
@@ -58,7 +58,7 @@ class StepOneLoss:
         pixels = {"l1": self.l1, "ssim": self.ssim}
         loss = photometric(painting.colour + behind, target, unsure=frame.unsure, **pixels)
         if head is not None:
-            # No bias where nothing is: the readout commutes with alpha blending.
+            # the bias weighted by alpha: the readout commutes with alpha blending
             read = functional.conv2d(painting.features, head.weight)
             read = read + painting.splat_alpha * head.bias.view(1, 3, 1, 1)  # type: ignore[union-attr]
             loss = loss + self.feature_head * photometric(
@@ -72,13 +72,14 @@ class StepOneLoss:
         return loss
 
 
-def judged(judge: Discriminator, image: Tensor, gan: str) -> list[list[Tensor]]:
-    """The discriminator's maps of a picture; in full precision where the GAN's form compares two,
-    since bf16 rounds away what nearly equal pictures differ in."""
+def discriminate(discriminator: Discriminator, image: Tensor, gan: str) -> list[list[Tensor]]:
+    """The discriminator's maps of an image; in full precision where the GAN's form compares two
+    images, since bf16 rounds away small differences."""
     if gan not in COMPARING:
-        return judge(image)  # type: ignore[no-any-return]
+        return discriminator(image)  # type: ignore[no-any-return]
     with full_precision(image):
-        return judge(image.to(next(judge.parameters()).dtype))  # type: ignore[no-any-return]
+        dtype = next(discriminator.parameters()).dtype
+        return discriminator(image.to(dtype))  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)
@@ -87,16 +88,16 @@ class StepTwoLoss:
 
     Args:
         l1, l2, ssim: photometric terms on I_pred (the paper's footnote: l2 reconstruction).
-        alpha: weight of the same terms with both images on white, I_pred by its alpha, the truth
-            by its mask: what supervises that alpha. (Between alpha and mask directly, the default
-            person scored 0.2 dB less on white and 0.15 dB less on black.)
+        alpha: weight of the same terms with both images on white, I_pred by its alpha, the ground
+            truth by its mask: supervises that alpha. (Comparing alpha with the mask directly scored
+            0.2 dB less on white and 0.15 dB less on black for the default person.)
         perceptual: L_perc.
         perceptual_every: compute L_perc only every so many iterations (its weight is multiplied
             by as much); VGG is the costliest term on a CPU.
         adversarial: L_GAN.
         feature_matching: L_feat, between the discriminator's features.
         gan: ``logistic``, ``hinge``, ``lsgan`` or ``relativistic``.
-        anchor: weight of L_Ψ, which keeps C a picture while Ψ learns from the generator.
+        anchor: weight of L_Ψ, which keeps C an image while Ψ learns from the generator.
         detach_features: keep the generator's gradient out of Ψ (ablation).
 
     Source: paper Sec. 3.5 and Alg. 2, an unweighted sum of L_GAN, L_perc and L_feat; weights, the
@@ -127,8 +128,8 @@ class StepTwoLoss:
             )
 
     @property
-    def plays(self) -> bool:
-        """Whether a discriminator is needed at all."""
+    def adversarial_terms(self) -> bool:
+        """Whether any term needs the discriminator."""
         return bool(self.adversarial or self.feature_matching)
 
     def terms(
@@ -138,17 +139,17 @@ class StepTwoLoss:
         *,
         anchor: Tensor | None,
         perceptual: Perceptual | None,
-        judge: Discriminator | None,
+        discriminator: Discriminator | None,
         step: int,
     ) -> dict[str, Tensor]:
         """The generator's losses, weighted, by name.
 
         Args:
-            painting: with I_pred and its alpha.
-            frame: what it should be.
+            painting: I_pred and its alpha.
+            frame: the ground truth.
             anchor: L_Ψ of the same painting; None leaves it out.
             perceptual: L_perc; None leaves it out.
-            judge: the discriminator; None while it does not play.
+            discriminator: None before the GAN starts.
             step: the iteration, for ``perceptual_every``.
         """
         image, alpha = painting.image, painting.alpha
@@ -164,16 +165,18 @@ class StepTwoLoss:
         if perceptual is not None and step % self.perceptual_every == 0:
             scale = self.perceptual * self.perceptual_every
             terms["perceptual"] = scale * perceptual(image, target)
-        if judge is not None:
-            terms |= self._game(judge, image, target)
+        if discriminator is not None:
+            terms |= self._adversarial(discriminator, image, target)
         return terms
 
-    def _game(self, judge: Discriminator, image: Tensor, target: Tensor) -> dict[str, Tensor]:
+    def _adversarial(
+        self, discriminator: Discriminator, image: Tensor, target: Tensor
+    ) -> dict[str, Tensor]:
         terms = {}
-        real = fake = judged(judge, image, self.gan)
+        real = fake = discriminate(discriminator, image, self.gan)
         if self.feature_matching or self.gan in COMPARING:
             with torch.no_grad():
-                real = judged(judge, target, self.gan)
+                real = discriminate(discriminator, target, self.gan)
         if self.adversarial:
             terms["adversarial"] = self.adversarial * generator_loss(real, fake, self.gan)
         if self.feature_matching:

@@ -1,4 +1,4 @@
-"""How each optimiser is built, clipped and guarded."""
+"""Optimisers, gradient clipping and the moving average of weights."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Literal
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
 
+from gsgan.model.avatar import Avatar
 from gsgan.train.schedule import Rate
 from gsgan.utils.errors import ConfigError
 
@@ -18,9 +20,9 @@ class Recipe:
     """Adam with a rate schedule and a gradient-norm clip.
 
     Args:
-        rate: learning rate over the phases in which the optimiser works.
-        span: of an optimiser that works in Steps I and II, what the rate's shares are of: ``both``
-            steps, or ``step_one``, after which the rate stays as it ended.
+        rate: learning rate over the phases of the optimiser.
+        span: of psi and colour: the rate's shares are of ``both`` steps, or of ``step_one``, after
+            which the rate stays.
         betas: Adam's. A second beta of 0.99 keeps Ψ from a collapse (`Rollback`).
         eps: Adam's.
         clip: largest gradient norm; None leaves gradients alone.
@@ -37,13 +39,33 @@ class Recipe:
             raise ConfigError(f"training.recipes: span must be both or step_one, got {self.span!r}")
 
     def build(self, groups: Iterable[tuple[list[nn.Parameter], float]]) -> torch.optim.Adam:
-        """Adam over (parameters, rate multiplier) groups; parameters that take no gradient wait."""
+        """Adam over groups of (parameters, rate multiplier)."""
         return torch.optim.Adam(
             [{"params": p, "lr": self.rate.peak * k, "multiplier": k} for p, k in groups if p],
             betas=tuple(self.betas),  # type: ignore[arg-type]
             eps=self.eps,
             fused=True,
         )
+
+
+def parameter_groups(
+    avatar: Avatar, feature_head: nn.Module | None, discriminator: nn.Module | None
+) -> dict[str, list[tuple[list[nn.Parameter], float]]]:
+    """Groups of (parameters, rate multiplier) by optimiser, for the parts that are built."""
+    groups = {}
+    if avatar.segmentation is not None:
+        groups["segmentation"] = avatar.segmentation.parameter_groups()
+    if avatar.splats is not None:
+        head = list(feature_head.parameters()) if feature_head is not None else []
+        groups["psi"] = [*avatar.splats.parameter_groups(), (head, 1.0)]
+    if avatar.colour is not None:
+        groups["colour"] = [(list(avatar.colour.parameters()), 1.0)]
+    if avatar.generator is not None and avatar.pose_encoder is not None:
+        pose = list(avatar.pose_encoder.parameters())
+        groups["generator"] = [([*avatar.generator.parameters(), *pose], 1.0)]
+    if discriminator is not None:
+        groups["discriminator"] = [(list(discriminator.parameters()), 1.0)]
+    return groups
 
 
 def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
@@ -56,3 +78,53 @@ def clip(optimiser: torch.optim.Optimizer, largest: float | None) -> Tensor:
     """Clips all gradients together and returns their norm before clipping."""
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
     return nn.utils.clip_grad_norm_(parameters, float("inf") if largest is None else largest)
+
+
+Tensors = tuple[Tensor, ...] | list[Tensor]
+
+
+class MovingAverage(nn.Module):
+    """An exponential moving average of a module's parameters.
+
+    Convention: the average starts as a copy at the first update and forgets it quickly: the decay
+    at update n is ``min(decay ** every, (1 + n) / (10 + n))``. Buffers are copied, not
+    averaged.
+
+    Args:
+        module: to average.
+        decay: in [0, 1); how much of the average each iteration keeps.
+        every: iterations between updates.
+
+    Raises:
+        ConfigError: on a decay out of range.
+
+    Source: ours; the usual average of a generator's weights.
+    """
+
+    def __init__(self, module: nn.Module, decay: float, every: int = 1) -> None:
+        super().__init__()
+        if not 0 <= decay < 1:
+            raise ConfigError(f"training.average must be null or in [0, 1), got {decay!r}")
+        self.decay = decay**every
+        self.copy = AveragedModel(module, multi_avg_fn=self._blend)
+        self.copy.requires_grad_(False)
+
+    @property
+    def module(self) -> nn.Module:
+        """The averaged module."""
+        return self.copy.module
+
+    @property
+    def started(self) -> bool:
+        """Whether there was an update."""
+        return int(self.copy.n_averaged) > 0
+
+    def update(self, module: nn.Module) -> None:
+        """Adds the module's present weights to the average."""
+        self.copy.update_parameters(module)
+
+    def _blend(self, averaged: Tensors, current: Tensors, count: Tensor | int) -> None:
+        n = int(count)
+        decay = min(self.decay, (1 + n) / (10 + n))
+        with torch.no_grad():
+            torch._foreach_lerp_(averaged, current, 1 - decay)

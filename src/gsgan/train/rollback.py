@@ -1,7 +1,8 @@
-"""Catching a collapse: the person vanishes without a NaN, and the last good state comes back."""
+"""Guards of a training: skipped steps, and the way back from a collapse."""
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,22 +10,22 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.errors import ConfigError, GsganError
 
 
 @dataclass
 class Rollback:
-    """Compares rendered alpha with the masks, keeps the last good state and restores it.
+    """Restores the last good state when the rendered person vanishes.
 
-    Convention: the two are averaged over recent iterations, so that a fall within an epoch shows.
-    Optimisers start afresh after a return: their momenta point into the collapse.
+    Every opacity can fall to 0 for good without a non-finite gradient: then the rendered alpha
+    falls far below the masks'.
 
-    Every opacity can fall to 0 for good without a gradient that is not finite: then the rendered
-    alpha falls far below the masks'.
+    Convention: both are averaged over recent iterations, so that a fall within an epoch shows.
+    Optimisers restart after a restoration: their momenta point into the collapse.
 
     Args:
         collapse: alpha below this share of the masks' is a collapse.
-        healthy: alpha of at least this share of the masks' is a state worth keeping.
+        healthy: alpha of at least this share of the masks' marks a good state.
         memory: share of the average that each iteration keeps.
         most: restorations before the run is stopped.
         slower: factor on Ψ's learning rate after each restoration.
@@ -63,10 +64,10 @@ class Rollback:
         return self.slower**self.done
 
     def share(self, over_ranks: Callable[[Tensor], Tensor] = lambda value: value) -> float:
-        """Rendered alpha as a share of the masks'; infinite before anything was seen.
+        """Rendered alpha as a share of the masks'; infinite before the first iteration.
 
         Args:
-            over_ranks: means of a tensor over all processes. All of them must call this together.
+            over_ranks: mean of a tensor over all processes, which must all call this.
         """
         if self.alpha is None or self.mask is None:
             return float("inf")
@@ -74,21 +75,21 @@ class Rollback:
         return alpha / mask if mask else float("inf")
 
     def watch(self, alpha: Tensor, mask: Tensor) -> None:
-        """Takes in one iteration's alpha and mask."""
+        """Adds one iteration's alpha and mask."""
         for name, value in (("alpha", alpha), ("mask", mask)):
             now, before = value.detach().mean(), getattr(self, name)
             before = torch.zeros_like(now) if before is None else before
             mixed = self.memory * before + (1 - self.memory) * now
-            # a value that is not finite is a gradient's matter, not a collapse
+            # non-finite values are left to the gradients' check
             setattr(self, name, torch.where(torch.isfinite(now), mixed, before))
 
     def keep(self, module: nn.Module, share: float) -> None:
-        """Keeps a copy of the state when it is a good one."""
+        """Keeps a copy of the state when it is good."""
         if share >= self.healthy:
             self._state = {k: v.detach().clone() for k, v in module.state_dict().items()}
 
     def restore(self, module: nn.Module, optimisers: Sequence[torch.optim.Optimizer]) -> bool:
-        """Puts the last good state back; False where there is none or it was put back too often."""
+        """Restores the last good state; False where there is none, or after too many times."""
         if self._state is None or self.done >= self.most:
             return False
         self.done += 1
@@ -97,3 +98,38 @@ class Rollback:
         for optimiser in optimisers:
             optimiser.state.clear()
         return True
+
+
+class SkippedSteps:
+    """Counts iterations with non-finite gradients and stops a run that has too many.
+
+    Args:
+        most: within the window, at which the run stops.
+        window: iterations.
+    """
+
+    def __init__(self, most: int, window: int) -> None:
+        self.most, self.window = most, window
+        self.steps: deque[int] = deque()  # within the window
+
+    def add(self, step: int, names: Sequence[str]) -> str:
+        """A message on the skipped step of these optimisers.
+
+        Raises:
+            GsganError: when there were too many.
+        """
+        if step not in self.steps:  # the discriminator's may follow the generator's
+            self.steps.append(step)
+        while self.steps[0] <= step - self.window:
+            self.steps.popleft()
+        count = f"{len(self.steps)} of the last {self.window} iterations"
+        if len(self.steps) >= self.most:
+            raise GsganError(
+                f"training stopped at iteration {step}: {count} had gradients that were not "
+                "finite; check the data, lower the learning rates (training.recipes.*.rate.peak), "
+                "or go on with a larger training.max_skipped"
+            )
+        return (
+            f"iteration {step}: a gradient of {', '.join(names)} was not finite; skipped "
+            f"({count}, at most {self.most})"
+        )

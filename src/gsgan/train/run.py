@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import re
 import time
 import warnings
@@ -30,9 +31,7 @@ from gsgan.evaluate.run import evaluate_run
 from gsgan.metrics.lpips import check_lpips
 from gsgan.model.avatar import Avatar
 from gsgan.splat import resolve_backend
-from gsgan.train.callbacks import Narrator, PictureGrid
-from gsgan.train.checkpoints import AtomicCheckpoints
-from gsgan.train.effects_cost import effect_costs, training_device
+from gsgan.train.callbacks import AtomicCheckpoints, PictureGrid, ProgressLines
 from gsgan.train.module import AvatarTraining
 from gsgan.train.runs import CHECKPOINT, build_training, checkpoint_to_resume, read_checkpoint
 from gsgan.utils.console import make_console
@@ -47,7 +46,7 @@ LOGS = re.compile(r"logs(_\d+)?")  # of a run, and of its resumed parts
 
 
 def run_training(config: DictConfig) -> None:
-    """Trains, evaluates, and says where everything lies.
+    """Trains, evaluates and prints where the results are.
 
     Raises:
         GsganError: see `gsgan.train.runs.checkpoint_to_resume` and the data module.
@@ -62,31 +61,32 @@ def run_training(config: DictConfig) -> None:
     data, module = build_training(config)
     seed_everything(config.seed, workers=True, verbose=False)
     resume = checkpoint_to_resume(folder, module.record, module.marks) if config.resume else None
+    done = 0 if resume is None else int(read_checkpoint(resume)["gsgan"]["step"])
     if resume is None:
         remove_old_results(folder)
-    elif finished(folder, module, config):
+    elif done >= module.schedule.total and (not config.evaluate or scored(folder)):
         console.print(
             f"{folder}: trained and scored before; nothing to do (gsgan.evaluate scores it again)",
             soft_wrap=True,
         )
         return
 
-    done = 0 if resume is None else _step_of(resume)
     refuse_long_cpu_run(config, data, module, module.schedule.total - done)
     module.code = training_code()
-    describe(console, folder, data, module, config.trainer.accelerator)
-    where = training_device(config.trainer.accelerator)
-    costs = effect_costs(config, data, module.avatar, config.effects.measure, where)
-    console.print(effects_table(module.avatar.effects, costs))
+    describe(console, folder, config, data, module)
     if resume is not None:
-        console.print(f"going on from {resume}", soft_wrap=True)
-    trainer = build_trainer(config, folder, module, data, console, resume)
+        console.print(f"resuming from {resume}", soft_wrap=True)
+    module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    logs = "logs" if resume is None else f"logs_{done:06d}"
+    trainer = build_trainer(config, folder, module, data, console, logs)
     try:
-        fit(trainer, module, data, resume)
+        if resume is None:  # curves start at the untrained avatar
+            trainer.validate(module, data, verbose=False)
+        trainer.fit(module, data, ckpt_path=None if resume is None else str(resume))
     except SystemExit:  # Lightning's answer to Ctrl-C
         console.print(
             f"interrupted at iteration {module.step}; the same command with "
-            f"hydra.run.dir={folder} goes on from its last checkpoint",
+            f"hydra.run.dir={folder} resumes from its last checkpoint",
             soft_wrap=True,
         )
         raise
@@ -95,16 +95,20 @@ def run_training(config: DictConfig) -> None:
     report_progress(console, folder, module)
     if config.evaluate:
         module.to(trainer.strategy.root_device)  # Lightning leaves it on the CPU
-        avatar = module.shown.eval()
-        method = Method(
-            "gsgan",
-            seed=config.seed,
-            iterations=module.step,
-            train_seconds=module.train_seconds,
-            trained_by=tuple(module.code),
-        )
         evaluate_run(
-            folder, config, console, data=data, avatar=avatar, marks=module.marks, method=method
+            folder,
+            config,
+            console,
+            data=data,
+            avatar=module.shown.eval(),
+            marks=module.marks,
+            method=Method(
+                "gsgan",
+                seed=config.seed,
+                iterations=module.step,
+                train_seconds=module.train_seconds,
+                trained_by=tuple(module.code),
+            ),
         )
     console.print(f"run folder: {folder}", soft_wrap=True)
 
@@ -112,17 +116,17 @@ def run_training(config: DictConfig) -> None:
 def refuse_long_cpu_run(
     config: DictConfig, data: GsganData, module: AvatarTraining, iterations: int
 ) -> None:
-    """Stops a run whose ``iterations`` would take very long because ``trainer=auto`` found no GPU.
+    """Refuses a run that would take very long because ``trainer=auto`` found no GPU.
 
     Raises:
-        ConfigError: with the price, and what makes it smaller.
+        ConfigError: with the estimated time, and what to do.
     """
     chosen = not OmegaConf.is_interpolation(config.trainer, "accelerator")
     if chosen or config.trainer.accelerator != "cpu":
         return
     frame = data.dataset("train")[0]
     with torch.no_grad():
-        module.avatar.paint(frame)  # what is built once is built
+        module.avatar.paint(frame)  # warm-up
         began = time.perf_counter()
         module.avatar.paint(frame)
         seconds = time.perf_counter() - began
@@ -139,24 +143,20 @@ def refuse_long_cpu_run(
         )
 
 
-def finished(folder: Path, module: AvatarTraining, config: DictConfig) -> bool:
-    """Whether the run has all its iterations, and its scores where they are wanted: a sweep that
-    is started again passes over it."""
+def scored(folder: Path) -> bool:
+    """Whether the run's scores are newer than its checkpoint."""
     checkpoint, scores = folder / CHECKPOINT, folder / "metrics.json"
-    if _step_of(checkpoint) < module.schedule.total:
-        return False
-    newer = scores.is_file() and scores.stat().st_mtime >= checkpoint.stat().st_mtime
-    return newer or not config.evaluate
+    return scores.is_file() and scores.stat().st_mtime >= checkpoint.stat().st_mtime
 
 
 def remove_old_results(folder: Path) -> None:
-    """Removes what an earlier run left in a folder that starts over."""
+    """Removes the results of an earlier run from a folder that starts over."""
     for name in (*NAMES, PROGRESS, CHECKPOINT):
         (folder / name).unlink(missing_ok=True)
     for scores in folder.glob("on_*/*"):  # on another background
         if scores.name in NAMES:
             scores.unlink()
-    for log in folder.glob("logs*/metrics.csv"):  # else its curve would be drawn as the new run's
+    for log in folder.glob("logs*/metrics.csv"):  # else its curve would be shown as the new run's
         if LOGS.fullmatch(log.parent.name):
             log.unlink(missing_ok=True)
             with suppress(OSError):  # it holds more: not all of it is ours
@@ -164,7 +164,7 @@ def remove_old_results(folder: Path) -> None:
 
 
 def report_progress(console: Console, folder: Path, module: AvatarTraining) -> None:
-    """Held-out PSNR at the start and at the end, on the pictures watched while training."""
+    """Held-out PSNR at the start and at the end, on the validation images."""
     start, end = module.start_psnr, module.last_psnr
     if start is None or end is None:
         return
@@ -175,26 +175,18 @@ def report_progress(console: Console, folder: Path, module: AvatarTraining) -> N
     )
 
 
-def fit(trainer: Trainer, module: AvatarTraining, data: GsganData, resume: Path | None) -> None:
-    """Validates the untrained avatar once (the start of every curve), then trains."""
-    module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    if resume is None:
-        trainer.validate(module, data, verbose=False)
-    trainer.fit(module, data, ckpt_path=None if resume is None else str(resume))
-
-
 def build_trainer(
     config: DictConfig,
     folder: Path,
     module: AvatarTraining,
     data: GsganData,
     console: Console,
-    resume: Path | None,
+    logs: str,
 ) -> Trainer:
-    """The Trainer of the config; schedule and loader set its length."""
+    """The Trainer of the config, as long as the schedule."""
     callbacks: list[Any] = [
         PictureGrid(folder / "pictures", config.grid_rows),
-        Narrator(console),
+        ProgressLines(console),
         ModelCheckpoint(
             dirpath=folder / CHECKPOINT.parent,
             filename=CHECKPOINT.stem,
@@ -209,27 +201,26 @@ def build_trainer(
         max_epochs=-(-module.schedule.total // len(data.train_dataloader())),
         callbacks=callbacks,
         plugins=[AtomicCheckpoints()],
-        # A logger starts its files anew: each part of a resumed run has a folder of its own.
-        logger=instantiate(
-            config.logger, version="logs" if resume is None else f"logs_{_step_of(resume):06d}"
-        ),
+        # a logger overwrites its files: each part of a resumed run has its own folder
+        logger=instantiate(config.logger, version=logs),
         enable_progress_bar=console.is_terminal,
     )
 
 
 def describe(
-    console: Console, folder: Path, data: GsganData, module: AvatarTraining, accelerator: str
+    console: Console, folder: Path, config: DictConfig, data: GsganData, module: AvatarTraining
 ) -> None:
-    """What is trained on what, and which stand-ins are in use."""
+    """Prints the data, the parts with their sizes, the effects and the stand-ins in use."""
     info, avatar = data.info, module.avatar
+    device = training_device(config.trainer.accelerator)
     held_out = ", ".join(f"{len(data.dataset(name))} {name}" for name in data.eval_names)
     table = Table(title=f"gsgan: {folder}", show_header=False)
     table.add_row(
         "data",
-        f"{len(data.dataset('train'))} training pictures: {info.n_train_cameras} cameras, "
+        f"{len(data.dataset('train'))} training images: {info.n_train_cameras} cameras, "
         f"{info.frames} frames; held out: {held_out}",
     )
-    for name, part in parts(avatar, module).items():
+    for name, part in parts(module).items():
         table.add_row(name, f"{sum(p.numel() for p in part.parameters()):,} parameters")
     if avatar.segmentation is None:
         table.add_row("segmentation S", f"not built: {avatar.segmentation_why}")
@@ -237,10 +228,8 @@ def describe(
         source = "part labels" if info.has_labels else "masks: the data has no part labels"
         table.add_row("", f"{avatar.segmentation_why}; S learns from {source}")
     if avatar.splats is not None:
-        # why it is this one is logged when it first draws
-        device = training_device(accelerator)
         table.add_row("rasteriser", resolve_backend(avatar.backend, device, avatar.accuracy)[0])
-    table.add_row("an image costs", cost(avatar, data))
+    table.add_row("cost of an image", cost(avatar, data))
     s = module.schedule
     table.add_row(
         "schedule", f"segmentation {s.segmentation}, Step I {s.step_one}, Step II {s.step_two}"
@@ -248,10 +237,24 @@ def describe(
     console.print(table)
     for mark in module.marks:
         console.print(f"stand-in in use: {mark}", highlight=False)
+    costs = None
+    if config.effects.measure:
+        from gsgan.train.effects_cost import effect_costs
+
+        costs = effect_costs(config, data, avatar, config.effects.measure, device)
+    console.print(effects_table(avatar.effects, costs))
 
 
-def parts(avatar: Avatar, module: AvatarTraining) -> dict[str, torch.nn.Module]:
-    """The trained parts by name; those not built are absent."""
+def training_device(accelerator: str) -> torch.device:
+    """Where Lightning will put the model of this process."""
+    if accelerator == "cpu" or not torch.cuda.is_available():
+        return torch.device("cpu")
+    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
+
+
+def parts(module: AvatarTraining) -> dict[str, torch.nn.Module]:
+    """The trained parts by name, those that are built."""
+    avatar = module.avatar
     found = {
         "Ψ": avatar.deformation,
         "surface": avatar.surface,
@@ -265,9 +268,9 @@ def parts(avatar: Avatar, module: AvatarTraining) -> dict[str, torch.nn.Module]:
 
 
 def cost(avatar: Avatar, data: GsganData) -> str:
-    """Arithmetic of the networks for one training picture, counted by running it once.
+    """Arithmetic of the networks for one training image, counted by running it once.
 
-    The rasterisers are not in it: what they do depends on the settings (`python -m gsgan.bench`).
+    The rasterisers are left out: their cost depends on the settings (`python -m gsgan.bench`).
     """
     frame = data.dataset("train")[0].to(next(avatar.parameters()).device)
     with torch.no_grad(), FlopCounterMode(display=False) as counter:
@@ -277,12 +280,8 @@ def cost(avatar: Avatar, data: GsganData) -> str:
     return f"{counter.get_total_flops() / 1e9:.2f} GFLOP in the networks, {width} x {height} pixels"
 
 
-def _step_of(checkpoint: Path) -> int:
-    return int(read_checkpoint(checkpoint)["gsgan"]["step"])
-
-
 def _quiet_lightning() -> None:
-    """Keeps what a user has to read on the screen, and tips and device lists off it."""
+    """Silences Lightning's tips and device lists."""
     for name in ("lightning.pytorch", "lightning.fabric", "lightning"):
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")

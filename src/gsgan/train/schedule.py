@@ -1,13 +1,14 @@
-"""When what is trained, and at which rate: pure maps from the iteration to a value."""
+"""Schedules: pure functions from the iteration to a phase, a degree or a learning rate."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from gsgan.utils.errors import ConfigError
 
 SEGMENTATION, STEP_ONE, STEP_TWO = "segmentation", "step I", "step II"
+FROM_MASKS = 800  # iterations of S, at most, where two numbers learn from masks (docs/effects.md)
 
 
 @dataclass(frozen=True)
@@ -20,10 +21,10 @@ class Schedule:
         step_two: iterations in which generator, discriminator and Ψ learn together.
         discriminator_start: iterations into Step II before the GAN starts.
         epoch: iterations between checkpoints; Lightning's epoch is this many sampled batches.
-        stretch: factor on Steps I and II, for a variant whose iterations are cheaper: the same
-            time for every variant, where the same iterations would starve the simpler ones.
-        degree_every: iterations of Steps I and II after which the degree of the spherical harmonics
-            rises by one, from 0; 0 takes them all at once.
+        stretch: factor on Steps I and II, for variants whose iterations are cheaper, so that all
+            train equally long.
+        degree_every: iterations after which the degree of the spherical harmonics rises by one,
+            from 0; 0 uses all degrees at once.
 
     Source: paper Alg. 2; of the numbers in conf/training only Step I's 10,000 are the paper's.
     """
@@ -50,9 +51,40 @@ class Schedule:
         if self.total == 0:
             raise ConfigError("schedule: every phase has 0 iterations, so there is nothing to do")
 
+    def fitted(
+        self, *, segmentation: bool, from_masks: bool, splats: bool, generator: bool
+    ) -> Schedule:
+        """The schedule of a model with these parts, stretched.
+
+        Without S its phase is left out; without a generator Step I gets Step II's iterations, and
+        without splats the other way round, so that every variant trains equally long.
+
+        Args:
+            segmentation: S is built.
+            from_masks: S learns from masks, not labels.
+            splats, generator: these are built.
+        """
+        one, two, start, degree = (
+            round(n * self.stretch)
+            for n in (self.step_one, self.step_two, self.discriminator_start, self.degree_every)
+        )
+        if not generator:
+            one, two = one + two, 0
+        if not splats:
+            one, two = 0, one + two
+        most = FROM_MASKS if from_masks else self.segmentation
+        return replace(
+            self,
+            segmentation=min(self.segmentation, most) if segmentation else 0,
+            step_one=one,
+            step_two=two,
+            discriminator_start=start,
+            degree_every=degree,
+        )
+
     @property
     def epochs(self) -> int:
-        """Epochs the whole run takes, the last one perhaps cut short."""
+        """Epochs of the whole run; the last may be shorter."""
         return math.ceil(self.total / self.epoch)
 
     @property
@@ -82,14 +114,14 @@ class Schedule:
         return ends[phase]
 
     @property
-    def game(self) -> tuple[int, int]:
-        """First iteration the discriminator plays, and the first after its last."""
+    def adversarial_span(self) -> tuple[int, int]:
+        """First iteration of the GAN, and the first after its last."""
         start, end = self.bounds(STEP_TWO)
         return min(start + self.discriminator_start, end), end
 
     def adversarial(self, step: int) -> bool:
-        """Whether the discriminator plays at this iteration."""
-        start, end = self.game
+        """Whether the GAN trains at this iteration."""
+        start, end = self.adversarial_span
         return start <= step < end
 
 

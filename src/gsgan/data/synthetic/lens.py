@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from gsgan.data.crop import distort
 from gsgan.data.synthetic.trace import View
 from gsgan.utils.errors import ConfigError
 
@@ -29,8 +29,8 @@ class LensView(View):
     def project(self, points: Array) -> Array:
         """``[N, 2]`` pixels of world points ``[N, 3]``, all in front of the camera."""
         x = points @ self.R.T + self.t
-        bent = distort(x[:, :2] / x[:, 2:], self.dist)
-        return bent @ self.K[:2, :2].T + self.K[:2, 2]
+        shown = distort(x[:, :2] / x[:, 2:], self.dist)
+        return shown @ self.K[:2, :2].T + self.K[:2, 2]
 
     def bend(self, directions: Array) -> Array:
         """The world rays ``[N, 3]``, of length one, seen where a pinhole sees ``directions``.
@@ -44,18 +44,8 @@ class LensView(View):
         return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
 
-def distort(points: Array, dist: Array) -> Array:
-    """``[N, 2]`` where a lens shows points ``[N, 2]`` of the z = 1 plane."""
-    if len(points) == 0:
-        return points
-    before = np.concatenate([points, np.ones((len(points), 1))], axis=1)
-    nothing = np.zeros(3)
-    shown = cv2.projectPoints(before, nothing, nothing, np.eye(3), dist)[0]
-    return np.asarray(shown, dtype=np.float64).reshape(-1, 2)
-
-
 def undistort(points: Array, dist: Array, iterations: int = 200) -> Array:
-    """The inverse of :func:`distort`, exact to `EXACT`.
+    """The inverse of `gsgan.data.crop.distort`, exact to `EXACT`, by fixed-point iteration.
 
     Args:
         points: ``[N, 2]`` as the lens shows them.

@@ -11,9 +11,8 @@ from torch import Tensor
 from gsgan.data.checks import spans
 from gsgan.data.datamodule import GsganData
 from gsgan.data.splits import SPLITS, Item
-from gsgan.scene import Camera, Frame, cat
+from gsgan.scene import Camera, Frame, Window, body_window, cat
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.window import Window, body_window
 
 NEAR = 0.01  # metres: with a joint nearer the camera than this, the whole image is shown
 LEAST = 16  # pixels, the shortest side

@@ -1,0 +1,253 @@
+"""Builds an avatar: the parts of a config, sized to a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from torch import Tensor, nn
+
+from gsgan.body import SkinnedBody, open_body
+from gsgan.effects import Effects, EffectSettings, ModelParts, decide
+from gsgan.model.avatar import SKELETON_CHANNELS, Avatar
+from gsgan.model.body_points import BodyPoints
+from gsgan.model.class_vote import ClassVote, Pictures
+from gsgan.model.colour import ColourCorrection
+from gsgan.model.deformation import Deformation
+from gsgan.model.generator import Generator
+from gsgan.model.parts import labelled_body
+from gsgan.model.segmentation import Segmentation
+from gsgan.model.surface import SurfaceGaussians
+from gsgan.skeleton import MEDIAPIPE33, Densify
+from gsgan.splat import BACKENDS, Accuracy
+from gsgan.utils.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from gsgan.data.scene_info import SceneInfo  # loads the data package
+
+
+def build_avatar(
+    config: DictConfig,
+    scene: SceneInfo,
+    pictures: Pictures | None = None,
+    *,
+    vertex_labels: Tensor | None = None,
+    effects: Effects | None = None,
+    labelled: bool | None = None,
+) -> Avatar:
+    """The untrained avatar of a config, its weights from ``config.seed``; see `assemble_avatar`.
+
+    Raises:
+        ConfigError: when a value under ``model`` is not allowed.
+        DataError: when the data lacks what the model needs.
+    """
+    if config.model.get("densify") is not None and "_target_" not in config.model.densify:
+        raise ConfigError(
+            "experiment=paper changes parts that this model does not have; it goes with "
+            "model=full, wo_feat, wo_seg, wo_gcn or splat_only"
+        )
+    torch.manual_seed(config.seed)
+    with naming_group("model"):
+        avatar: Avatar = instantiate(config.model)(
+            scene=scene,
+            pictures=pictures,
+            vertex_labels=vertex_labels,
+            labelled=labelled,
+            effects=effects,
+            settings=effect_settings(config),
+        )
+    return avatar
+
+
+def assemble_avatar(
+    scene: SceneInfo,
+    densify: Densify | None,
+    deformation: Callable[..., Deformation] | None,
+    segmentation: Callable[..., Segmentation] | None,
+    pose_encoder: nn.Module | None,
+    generator: Callable[..., Generator] | None,
+    accuracy: Accuracy,
+    surface: Callable[..., SurfaceGaussians] | None = None,
+    body_points: Callable[..., BodyPoints] | None = None,
+    low_pass: float = 0.3,
+    supersample: int = 1,
+    backend: str = "auto",
+    class_vote: ClassVote | None = None,
+    pictures: Pictures | None = None,
+    vertex_labels: Tensor | None = None,
+    labelled: bool | None = None,
+    effects: Effects | None = None,
+    settings: EffectSettings | None = None,
+    **options: Any,
+) -> Avatar:
+    """Builds each part with its sizes and puts them together.
+
+    Convention: parts whose sizes depend on the scene arrive as functions of those sizes
+    (``_partial_`` in the config). Each group of parts draws from its own seed, so leaving one out
+    does not change the start of the others.
+
+    Args:
+        scene: facts about the training split: body height, body, labels.
+        densify: skeleton to points.
+        deformation: Ψ, given rest points, body height, number of joints and SH degree; goes with
+            densify.
+        surface: in place of Ψ, any Gaussians that move with the body (``lbs_splat``), given the
+            body, its height and the SH degree. Without either nothing is splatted and the UNet
+            paints the drawn skeleton alone (``image_to_image``).
+        body_points: in place of densify where that effect is on, given the body and its height.
+        segmentation: S, given a body; None leaves it out (``wo_seg``).
+        pose_encoder: Ω (or the flat skeleton) to g; goes with generator.
+        generator: the UNet, given its channel counts; None makes Step I's colour the image.
+        accuracy: the rasteriser's settings for F.
+        low_pass: square pixels, of the image as drawn, that F and S add to every ellipse.
+        supersample: F is drawn so many times larger each way and averaged.
+        backend: that rasterises F and S, see `gsgan.splat.rasterise`.
+        class_vote: gives S's vertices their parts where the data's labels are not the body's own.
+        pictures: training frames with labels, for that vote.
+        vertex_labels: ``[V]`` int64, the result of an earlier vote, which is then not repeated.
+        labelled: whether S was trained on part labels; None: whether the data has some.
+        effects: decided when training began; None decides them here.
+        settings: for that decision; None: the defaults.
+        options: of `Avatar`: twist, window_margin, window_multiple, window_least.
+
+    Raises:
+        ConfigError: on a forced effect that is not possible, or a key that is not read.
+        DataError: when the data lacks the body that the model needs.
+        ValueError: on parts that do not go together.
+    """
+    _check_accuracy(accuracy)
+    if (
+        densify is not None
+        and densify.template is not MEDIAPIPE33
+        and options.get("twist", "none") != "none"
+    ):
+        raise ValueError("twist=hinge goes with densify.limbs=paper22 only")
+    if backend not in BACKENDS:
+        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
+    if (deformation is None) != (densify is None):
+        raise ValueError("Avatar: densify and deformation go together; got only one of them")
+    if deformation is not None and surface is not None:
+        raise ValueError("Avatar: give a deformation or a surface, got both")
+    if deformation is None and surface is None and generator is None:
+        raise ValueError("Avatar: nothing paints; give a deformation, a surface or a generator")
+    if (generator is None) != (pose_encoder is None):
+        raise ValueError("Avatar: generator and pose_encoder go together; got only one of them")
+    if effects is None:
+        model = ModelParts(
+            splats=densify is not None or surface is not None,
+            points=densify is not None,
+            body_points=body_points is not None,
+        )
+        effects = decide(scene, settings or EffectSettings(), model)
+    formation: dict[str, Any] = {"low_pass": low_pass, "antialias": effects.antialias.on}
+    # Stature, from limb lengths: the skeleton measures it and no pose changes it.
+    body_height = float(scene.body_height) * MEDIAPIPE33.stature / MEDIAPIPE33.limb_length_sum
+    sizes = {"body_height": body_height, "sh_degree": effects.degree}
+
+    seed = torch.initial_seed()
+    torch.manual_seed(seed + 1)
+    on_body = None
+    if densify is not None and body_points is not None and effects.body_points.on:
+        on_body = body_points(body=_body_of(scene), body_height=body_height)
+    psi = None
+    if densify is not None and deformation is not None:
+        rest, joints = (on_body or densify).rest_points, len(MEDIAPIPE33.names)
+        psi = deformation(rest_points=rest, joints=joints, **sizes)
+    skin = None if surface is None else surface(body=_surface_body(scene), **sizes)
+    splats: Deformation | SurfaceGaussians | None = psi or skin
+    S, why = None, "the model leaves it out"
+    if segmentation is not None:
+        body, why = labelled_body(scene, class_vote or ClassVote(), pictures, vertex_labels)
+        if body is not None:
+            S = segmentation(body=body, labelled=scene.has_labels if labelled is None else labelled)
+            S.accuracy, S.backend = replace(S.accuracy, **formation), backend
+
+    torch.manual_seed(seed + 2)
+    unet = None
+    if generator is not None and pose_encoder is not None:
+        unet = generator(
+            feature_channels=SKELETON_CHANNELS if splats is None else 3 + splats.features,
+            segmentation_channels=S.classes if S else 0,
+            skeleton_channels=SKELETON_CHANNELS if splats else 0,
+            pose_channels=pose_encoder.channels,
+            supersample=supersample if splats else 1,
+        )
+    colour = None
+    if effects.colour_correction.on:
+        colour = ColourCorrection(effects.cameras, scene.camera_names)
+    return Avatar(
+        effects=effects,
+        accuracy=replace(accuracy, supersample=supersample, **formation),
+        limb_length_sum=float(scene.body_height),
+        body_height=body_height,
+        deformation=psi,
+        densify=None if on_body else densify,
+        body_points=on_body,
+        surface=skin,
+        segmentation=S,
+        segmentation_why=why,
+        pose_encoder=pose_encoder,
+        generator=unet,
+        colour=colour,
+        backend=backend,
+        **options,
+    )
+
+
+def effect_settings(config: DictConfig) -> EffectSettings:
+    """The effects group of a config; the defaults for runs older than that group.
+
+    Raises:
+        ConfigError: on a value that is not allowed.
+    """
+    if config.get("effects") is None:
+        return EffectSettings()
+    settings: EffectSettings = instantiate(config.effects)
+    return settings
+
+
+@contextmanager
+def naming_group(group: str) -> Iterator[None]:
+    """Turns an error of a constructor into a ConfigError that names the config group."""
+    try:
+        yield
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ConfigError(f"{group}: {error}") from error
+
+
+def _check_accuracy(accuracy: Accuracy) -> None:
+    """Refuses accuracy values that would be overwritten by the model and the effects."""
+    for name, place in (
+        ("low_pass", "model.low_pass"),
+        ("supersample", "model.supersample"),
+        ("antialias", "effects.antialias"),
+    ):
+        if getattr(accuracy, name) != getattr(Accuracy, name):
+            raise ConfigError(f"accuracy.{name} is not read; set {place}")
+
+
+def _body_of(scene: SceneInfo) -> SkinnedBody:
+    body = open_body(scene.body, scene.body_file, scene.betas)
+    if body is None:
+        raise DataError(
+            f"effects.body_points=on cannot be built: the data's poses are of the body "
+            f"{scene.body!r}, of which there is no model file; set data.smpl"
+        )
+    return body
+
+
+def _surface_body(scene: SceneInfo) -> SkinnedBody:
+    body = None
+    if scene.has_body_pose:
+        body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
+    if body is None:
+        raise DataError(
+            "model.surface: Gaussians on the body need a body pose for every frame and the "
+            "body's mesh, and this data lacks one; choose model=splat_only or model=full"
+        )
+    return body

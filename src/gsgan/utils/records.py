@@ -1,0 +1,75 @@
+"""Frozen dataclasses of tensors that move between devices and stack together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+S = TypeVar("S", bound="TensorRecord")
+
+
+@dataclass(frozen=True)
+class TensorRecord:
+    """A frozen dataclass whose tensors (nested ones too) move and stack together."""
+
+    def to(self: S, *args: Any, **kwargs: Any) -> S:
+        """A copy with every tensor sent through ``Tensor.to``; integer labels keep their dtype."""
+        changes: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, TensorRecord):
+                changes[field.name] = value.to(*args, **kwargs)
+            elif isinstance(value, Tensor):
+                changes[field.name] = _to(value, *args, **kwargs)
+        return replace(self, **changes)
+
+    def __getitem__(self: S, index: slice) -> S:
+        """The batch items of a slice; the batch dimension stays."""
+        if not isinstance(index, slice):
+            raise TypeError(f"{type(self).__name__} takes a slice of the batch, got {index!r}")
+        changes: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, (TensorRecord, Tensor)) or (
+                isinstance(value, tuple) and field.metadata.get("batched")
+            ):
+                changes[field.name] = value[index]
+        return replace(self, **changes)
+
+
+def _to(value: Tensor, *args: Any, **kwargs: Any) -> Tensor:
+    if value.is_floating_point():
+        return value.to(*args, **kwargs)
+    kwargs = {k: v for k, v in kwargs.items() if k != "dtype"}
+    args = tuple(a for a in args if not isinstance(a, torch.dtype))
+    return value.to(*args, **kwargs) if args or kwargs else value
+
+
+def cat(records: Sequence[S]) -> S:
+    """Joins records of one type along the batch dimension.
+
+    Raises:
+        ValueError: when the list is empty, or a field is present in some records only.
+    """
+    if not records:
+        raise ValueError("cat: expected at least one record, got none")
+    first, changes = records[0], {}
+    for field in fields(first):
+        values = [getattr(record, field.name) for record in records]
+        if len({value is None for value in values}) == 2:
+            raise ValueError(
+                f"cat: {type(first).__name__}.{field.name} is present in some records only"
+            )
+        if isinstance(values[0], TensorRecord):
+            changes[field.name] = cat(values)
+        elif isinstance(values[0], Tensor):
+            changes[field.name] = torch.cat(values)
+        elif any(value != values[0] for value in values):
+            raise ValueError(
+                f"cat: {type(first).__name__}.{field.name} differs between records: {values}"
+            )
+    return replace(first, **changes)

@@ -1,0 +1,101 @@
+"""``gsgan.load`` and ``Avatar.render``: five lines of Python from a run folder to an image."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+
+import pytest
+import torch
+
+import gsgan
+from gsgan.metrics.regions import on_background
+from gsgan.scene import cat
+from gsgan.train.runs import CHECKPOINT, CONFIG, build_data, load_avatar, load_config
+from gsgan.utils.errors import DataError, GsganError
+
+
+@pytest.fixture(scope="module")
+def scored(run):
+    """What evaluation paints of a training frame: (frame, painting)."""
+    config = load_config(run)
+    data = build_data(config)
+    frame = data.dataset("train")[0]
+    with torch.no_grad():
+        return frame, load_avatar(run, config, data)[0].paint(frame)
+
+
+def test_a_loaded_avatar_renders_what_evaluation_paints(run, scored, tmp_path):
+    """Bit for bit, without the dataset."""
+    frame, painting = scored
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    text = (copy / CONFIG).read_text()
+    (copy / CONFIG).write_text(text.replace("root: /", "root: /no/longer/there/"))
+    avatar = gsgan.load(str(copy), device="cpu")
+    assert not avatar.training
+    image = avatar.render(frame.skeleton[0], frame.camera, body=frame.body)
+    assert torch.equal(image, painting.image.clamp(0, 1))
+    on_white = avatar.render(frame.skeleton, frame.camera, body=frame.body, background=1.0)
+    expected = on_background(painting.image.clamp(0, 1), painting.alpha.clamp(0, 1), 1.0)
+    assert torch.equal(on_white, expected.clamp(0, 1))
+    with pytest.raises(ValueError, match="expected 1 camera or 1 per skeleton, 3; got 2"):
+        avatar.render(frame.skeleton.repeat(3, 1, 1), cat([frame.camera] * 2), body=frame.body)
+
+
+def test_one_camera_serves_many_poses_and_lost_joints_are_replaced(run, scored):
+    frame, _ = scored
+    avatar = gsgan.load(run, device="cpu")
+    skeletons = frame.skeleton.repeat(2, 1, 1)
+    skeletons[1, 15] = float("nan")
+    body = cat([frame.body, frame.body])
+    images = avatar.render(skeletons, frame.camera, body=body, background=(1.0, 0.0, 0.0))
+    assert images.shape == (2, *frame.image.shape[1:])
+    assert torch.isfinite(images).all()
+
+
+def test_a_missing_body_pose_is_one_sentence(run, scored):
+    frame, _ = scored
+    with pytest.raises(GsganError, match=r"trained with a body pose .* body=gsgan\.scene"):
+        gsgan.load(run, device="cpu").render(frame.skeleton, frame.camera)
+
+
+def test_an_older_checkpoint_needs_the_dataset(run, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(run, copy)
+    checkpoint = torch.load(copy / CHECKPOINT, weights_only=True)
+    del checkpoint["gsgan"]["scene"]
+    torch.save(checkpoint, copy / CHECKPOINT)
+    new, old = gsgan.load(run, device="cpu").state_dict(), gsgan.load(copy).cpu().state_dict()
+    assert all(torch.equal(new[name], old[name]) for name in new.keys() | old.keys())
+    text = (copy / CONFIG).read_text()
+    (copy / CONFIG).write_text(text.replace("root: /", "root: /no/longer/there/"))
+    with pytest.raises(DataError, match="does not exist, the dataset of"):
+        gsgan.load(copy)
+
+
+def test_a_folder_without_a_run_or_a_checkpoint_is_one_sentence(run, tmp_path):
+    with pytest.raises(DataError, match="not a run folder"):
+        gsgan.load(tmp_path)
+    (tmp_path / ".hydra").mkdir()
+    shutil.copy(run / CONFIG, tmp_path / CONFIG)
+    with pytest.raises(DataError, match="the run has no checkpoint yet"):
+        gsgan.load(tmp_path)
+
+
+def test_a_config_of_an_older_gsgan_is_read_under_its_new_names(run, tmp_path):
+    (tmp_path / ".hydra").mkdir()
+    text = (run / CONFIG).read_text()
+    old = text.replace("gsgan.model.assemble.assemble_avatar", "gsgan.model.avatar.Avatar")
+    assert old != text
+    (tmp_path / CONFIG).write_text(old.replace("gsgan.train.", "gsgan.training."))
+    assert load_config(tmp_path) == load_config(run)
+
+
+def test_importing_gsgan_is_light():
+    code = "import sys, gsgan; print('torch' in sys.modules)"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert out.stdout.strip() == "False"
+    with pytest.raises(AttributeError, match="no attribute 'lode'"):
+        _ = gsgan.lode
