@@ -221,7 +221,7 @@ def code_digest() -> str:
 
 
 def train(overrides: Sequence[str], run: Path) -> None:
-    """`gsgan.train` in another process: a finished run is left as it is, an interrupted one resumed.
+    """`gsgan.train` in another process: a finished run is left alone, an interrupted one resumed.
 
     Args:
         overrides: of its config.
