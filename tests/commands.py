@@ -15,11 +15,11 @@ TINY = ["size=tiny", "training=smoke", "data=capture", "data.size=32", "data.cro
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1", "COLUMNS": "120"}
 
 
-def gsgan(command: str, *args: str, cwd: Path, timeout: int = 300):
+def gsgan(command: str, *args: str, cwd: Path, timeout: int = 300, environment: dict = ENVIRONMENT):
     """Runs ``python -m gsgan.<command>`` from another directory, as an installed user would."""
     return subprocess.run(
         [sys.executable, "-m", f"gsgan.{command}", *args],
-        cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=timeout,
+        cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout,
     )  # fmt: skip
 
 
