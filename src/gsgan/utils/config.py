@@ -7,7 +7,7 @@ import hashlib
 import re
 import shutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -56,6 +56,12 @@ def if_gpu(then: object, otherwise: object) -> object:
     return then if torch.cuda.is_available() else otherwise
 
 
+def by_name(name: str, choices: Mapping[str, str], default: str) -> str:
+    """The choice listed for a name, else the default."""
+    return choices.get(name, default)
+
+
+OmegaConf.register_new_resolver("by_name", by_name, replace=True)
 OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
 OmegaConf.register_new_resolver("if_gpu", if_gpu, replace=True)
 
