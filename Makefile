@@ -1,15 +1,15 @@
-# make help lists the verbs. Each sets up .venv by itself, once.
+# make help lists the targets. Each creates .venv on first use.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-# Passed on: make train ARGS="model=wo_seg seed=1", make test ARGS="-k densify"
+# Passed on, e.g. make train ARGS="model=wo_seg seed=1", make test ARGS="-k densify"
 ARGS ?=
 
 .DEFAULT_GOAL := help
 .PHONY: help install train test test-slow lint format wheel clean
 
-help: ## list the verbs
+help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
 
 install: $(STAMP) ## prepare .venv (Python 3.11 or newer; PYTHON=… chooses which)
@@ -24,8 +24,8 @@ $(STAMP): pyproject.toml constraints.txt
 train: $(STAMP) ## train an avatar of the default person, then score it (minutes on 2 cores)
 	$(BIN)/python -m gsgan.train experiment=demo $(ARGS)
 
-test: $(STAMP) ## run the tests with coverage, a process a core (ARGS: one process, no coverage)
-	$(BIN)/python -m pytest $(if $(ARGS),$(ARGS),-n auto --dist worksteal --cov --cov-report=term:skip-covered --cov-fail-under=85)
+test: $(STAMP) ## run the tests with coverage, one process per core (ARGS: one process, no coverage)
+	$(BIN)/python -m pytest $(if $(ARGS),$(ARGS),-n auto --dist worksteal --cov --cov-report=term:skip-covered --cov-fail-under=90)
 
 test-slow: $(STAMP) ## run the tests that take minutes
 	$(BIN)/python -m pytest -m slow $(ARGS)
@@ -35,12 +35,12 @@ lint: $(STAMP) ## ruff and mypy
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-format: $(STAMP) ## let ruff rewrite what it can
+format: $(STAMP) ## fix and format the code with ruff
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 wheel: $(STAMP) ## build the wheel into dist/
 	$(BIN)/python -m build --wheel --outdir dist .
 
-clean: ## remove .venv and build output; runs stay
+clean: ## remove .venv and build output; keeps runs
 	rm -rf $(VENV) dist build
