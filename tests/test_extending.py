@@ -1,16 +1,59 @@
-"""The examples of docs/extending.md: a loss term, a generator, a splatting baseline."""
+"""The examples of docs/extending.md: a dataset format, a loss term, a generator, a baseline."""
 
 from __future__ import annotations
 
+import json
+import shutil
+
+import numpy as np
 import torch
 from torch import Tensor, nn
 
+from gsgan.data.cameras import make_camera
+from gsgan.data.files import frame_files
+from gsgan.data.formats.common import FolderReader, one_mask_each, picture_size
+from gsgan.data.layout import Found, Meta
+from gsgan.data.skeletons import make_landmarks
 from gsgan.model.painting import Painting
 from gsgan.model.skinned_points import SkinnedPoints
 from gsgan.scene import BodyPose, Frame, Gaussians
-from gsgan.train.runs import build_training
+from gsgan.train.runs import build_data, build_training
 
 HERE = __name__
+
+
+class NpzReader(FolderReader):
+    """A dataset format: two .npz files, and folders of images and masks for each camera."""
+
+    contents = "cameras.npz, skeletons.npz, CAMERA/ and CAMERA_mask/"
+    hint = "check that cameras.npz and skeletons.npz have the same world frame and unit"
+
+    def find(self, root, checks, smpl) -> Found:
+        images, masks, cameras = {}, {}, {}
+        file = root / "cameras.npz"
+        with np.load(file) as arrays:
+            for name, K, R, t in zip(
+                *(arrays[key] for key in ("name", "K", "R", "t")), strict=True
+            ):
+                images[name] = frame_files(root, name, (".png",))
+                masks[name] = frame_files(root, f"{name}_mask", (".png",))
+                size = picture_size(root, images[name])
+                cameras[name] = make_camera(
+                    f"{file}: {name}", name, K=K, R=R, t=t, dist=None, size=size
+                )
+        with np.load(root / "skeletons.npz") as arrays:
+            p, ids = arrays["p"], arrays["frame"]
+        return Found(
+            root=root,
+            meta=Meta(layout="npz"),
+            cameras=cameras,
+            images=images,
+            masks=one_mask_each(masks, "grey"),
+            mask_folder="{camera}_mask",
+            landmarks=make_landmarks(ids, p, np.ones(p.shape[:2]), checks.max_reach, []),
+            calibration=file,
+            unit_hint="lengths must be in metres",
+        )
 
 
 class Smoothness(nn.Module):
@@ -59,6 +102,27 @@ class Blobs(nn.Module):
         return Gaussians(
             means, quats, torch.full_like(means, self.size), features[..., 0] * 0 + 0.9, features
         )
+
+
+def test_a_dataset_format(tiny, capture, tmp_path):
+    stored = json.loads((capture / "cameras.json").read_text())
+    np.savez(
+        tmp_path / "cameras.npz",
+        name=list(stored),
+        **{key: [camera[key] for camera in stored.values()] for key in ("K", "R", "t")},
+    )
+    with np.load(capture / "landmarks3d.npz") as arrays:
+        np.savez(tmp_path / "skeletons.npz", p=arrays["p"], frame=arrays["frame_id"])
+    for name in stored:
+        shutil.copytree(capture / "images" / name, tmp_path / name)
+        shutil.copytree(capture / "masks" / name, tmp_path / f"{name}_mask")
+    reader = ("~data.reader", f"+data.reader={{_target_: {HERE}.NpzReader}}")
+    here = build_data(tiny(*reader, f"data.root={tmp_path}", "data.test_cameras=[cam02]"))
+    there = build_data(tiny("data.test_cameras=[cam02]"))
+    mine, theirs = here.dataset("train")[0], there.dataset("train")[0]
+    assert torch.equal(mine.image, theirs.image)
+    assert torch.equal(mine.skeleton, theirs.skeleton)
+    assert torch.equal(mine.camera.K, theirs.camera.K)
 
 
 def test_a_loss_term(tiny):

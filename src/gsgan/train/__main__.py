@@ -11,7 +11,7 @@ def train(config: DictConfig) -> None:
     """Builds data, avatar and training from the config, fits, evaluates.
 
     Raises:
-        GsganError: on anything the user can put right.
+        GsganError: on input or settings that the user has to change.
     """
     from gsgan.train.run import run_training
 
