@@ -20,17 +20,7 @@ MARK = "as printed"  # in the label of every row of the paper's
 
 @dataclass(frozen=True)
 class PaperTable:
-    """One table of the paper.
-
-    Args:
-        title: which table.
-        data: the data set.
-        rows: ``{label, beside, values: {subject: {metric: text}}}``, as printed; ``beside`` is the
-            model whose row it belongs to.
-        protocol, split, subject: what a run must follow to stand beside it.
-        reason: why no run may; None where one may.
-        note: what else a reader has to know.
-    """
+    """One table of the paper; `paper.yaml` explains the keys."""
 
     title: str
     data: str
@@ -80,10 +70,9 @@ class PaperTable:
         shown = [m for m in METRICS if any(m in values for *_, values in cells)]
         rows = [self._row(f"{label}, {s}", [v.get(m) for m in shown]) for label, s, v in cells]
         remarks = [f"Not beside the scores above: {why}."]
-        if self.note:
-            remarks.append(f"{self.note[:1].upper()}{self.note[1:]}.")
+        remarks += [f"{self.note[:1].upper()}{self.note[1:]}."] if self.note else []
         title = f"As printed, not measured here: {self.title}"
-        return Grid(title, [heading(m) for m in shown], rows, tuple(remarks))
+        return Grid(title, [heading(m) for m in shown], rows, remarks)
 
     def _row(self, label: str, texts: Sequence[str | None], notes: tuple[str, ...] = ()) -> Row:
         cells = [Cell(NOT_HAD) if t is None else Cell(t, {"paper": float(t)}) for t in texts]

@@ -6,13 +6,13 @@ from datetime import datetime
 from pathlib import Path
 
 from hydra.utils import instantiate
-from omegaconf import DictConfig, ListConfig
+from omegaconf import DictConfig
 
 from gsgan.report.paper import read_paper
 from gsgan.report.runs import find_runs, read_runs
 from gsgan.report.spec import TableSpec
 from gsgan.report.table import build
-from gsgan.report.write import MARKDOWN, WRITERS, Report, print_report
+from gsgan.report.write import MARKDOWN, WRITERS, print_report
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
@@ -29,21 +29,20 @@ def run_report(config: DictConfig) -> None:
         ConfigError: when neither ``runs`` nor ``run`` is set, and as the two parts do.
         DataError: when a run or its data cannot be read.
     """
-    tables, figures = config.runs not in (None, "", []), config.run is not None
-    if not tables and not figures:
+    if not config.runs and config.run is None:
         raise ConfigError(
             "runs and run are not set: give runs=[<run folder>,<sweep folder>,…] for tables, or "
             "run=<run folder> for figures"
         )
-    if tables:
+    if config.runs:
         make_tables(config)
-    if figures:
+    if config.run is not None:
         from gsgan.report.figures.run import make_figures  # here: it imports matplotlib
 
         make_figures(config)
 
 
-def make_tables(config: DictConfig) -> Report:
+def make_tables(config: DictConfig) -> None:
     """Writes the table ``config.table`` of ``config.runs`` into ``config.out``.
 
     Raises:
@@ -51,10 +50,6 @@ def make_tables(config: DictConfig) -> Report:
             folder that cannot be written.
     """
     given = [config.runs] if isinstance(config.runs, str) else config.runs
-    if not isinstance(given, list | ListConfig):
-        raise ConfigError(f"runs must be a list of folders, got {given!r}")
-    if not isinstance(config.allow_dirty, bool):
-        raise ConfigError(f"allow_dirty must be true or false, got {config.allow_dirty!r}")
     spec: TableSpec = instantiate(config.table)
     paper = None if spec.paper is None else read_paper(spec.paper)
     page = None if config.fill is None else Path(str(config.fill)).expanduser()
@@ -80,7 +75,6 @@ def make_tables(config: DictConfig) -> Report:
         raise ConfigError(f"{where} cannot be written: {error.strerror}") from None
     console = make_console()
     print_report(report, console)
-    console.print(f"tables: {folder}/{{{','.join(files)}}}", markup=False, soft_wrap=True)
-    if page is not None:
-        console.print(f"filled: {page}", markup=False, soft_wrap=True)
-    return report
+    filled = "" if page is None else f"\nfilled: {page}"
+    done = f"tables: {folder}/{{{','.join(files)}}}{filled}"
+    console.print(done, markup=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Run folders: which there are, and what ``metrics.json``, ``facts.json`` and ``.hydra/`` hold."""
+"""Run folders: which there are, what they hold, and whether two may stand together."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import glob
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,8 @@ from gsgan.utils.errors import ConfigError, DataError
 
 METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"
 CONFIG = Path(".hydra") / "config.yaml"
-FACTS = {  # what is computed with; the rest is only shown
-    "data": dict, "model": str | None, "seed": int | None, "commit": str | None,
-    "iterations": int | None,
-}  # fmt: skip
+DATA = "data (cameras, frames, split, image size, crop or fitted landmarks)"
+TOLERANCE = 1e-3  # between equal floats, for rounding
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class Run:
     @property
     def commit(self) -> str:
         """The code that scored the run."""
-        name = self.facts.get("commit") or "unknown"
+        name = str(self.facts.get("commit") or "unknown")
         short = name[:9] if len(name) == 40 else name
         return f"{short} + changes" if self.facts.get("dirty") else short
 
@@ -90,14 +88,40 @@ class Run:
         Args:
             segmentation: add the segmentation's own phase, which not every scene has.
         """
-        schedule = {
-            key.removeprefix("training.schedule."): value
-            for key, value in (self.settings or {}).items()
-        }
-        stretch = schedule.get("stretch", 1)
-        steps = [schedule.get(phase, 0) for phase in ("step_one", "step_two")]
-        own = schedule.get("segmentation", 0) if segmentation else 0
+        start, settings = "training.schedule.", self.settings or {}
+        stretch = settings.get(f"{start}stretch", 1)
+        steps = [settings.get(start + phase, 0) for phase in ("step_one", "step_two")]
+        own = settings.get(f"{start}segmentation", 0) if segmentation else 0
         return sum(round(step * stretch) for step in steps) + own
+
+
+def check_same(where: str, what: str, found: Iterable[tuple[Run, Any]]) -> None:
+    """Refuses runs that differ.
+
+    Args:
+        where: name of the table or figure, for the message.
+        what: the values are.
+        found: runs with their values; None is not compared. In dicts, null is as good as no key.
+
+    Raises:
+        ConfigError: naming two runs and what differs.
+    """
+    known = [(run, value) for run, value in found if value is not None]
+    for run, value in known[1:]:
+        first, expected = known[0]
+        text = f"{expected} and {value}"
+        if isinstance(value, dict):
+            keys = value.keys() | expected.keys()
+            text = ", ".join(sorted(k for k in keys if value.get(k) != expected.get(k)))
+            same = not text
+        elif isinstance(value, float):
+            same = math.isclose(value, expected, rel_tol=0, abs_tol=TOLERANCE)
+        else:
+            same = value == expected
+        if not same:
+            raise ConfigError(
+                f"{where}: {first} and {run} differ in {what}: {text}; leave one of them out"
+            )
 
 
 def find_runs(given: Sequence[str]) -> list[Path]:
@@ -157,11 +181,10 @@ def read_run(folder: Path, *, scored: bool = True) -> Run:
     for name in (METRICS_FILE, FACTS_FILE) if scored else ():
         if not (folder / name).is_file():
             raise DataError(f"{folder}: no {name}; the run is not finished, or was not scored")
-    scores = _read_scores(folder / METRICS_FILE) if scored else {}
-    facts = _read_json(folder / FACTS_FILE) if (folder / FACTS_FILE).is_file() else {}
-    for key, kind in FACTS.items() if facts else ():
-        if not isinstance(facts.get(key), kind):
-            raise DataError(f"{folder / FACTS_FILE}: {key} cannot be {facts.get(key)!r}")
+    scores = _read_json(folder / METRICS_FILE, _check_scores) if scored else {}
+    facts = {}
+    if (folder / FACTS_FILE).is_file():
+        facts = _read_json(folder / FACTS_FILE, lambda facts: facts["data"].get("name"))
     settings, chosen = _read_config(folder)
     name = facts.get("model") or facts.get("method") or chosen.get("model") or folder.name
     data = facts.get("data", {"name": chosen.get("data")})
@@ -172,27 +195,22 @@ def read_run(folder: Path, *, scored: bool = True) -> Run:
     return run
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def _read_json(path: Path, check: Callable[[Any], object]) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text()))
-    except (OSError, TypeError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: damaged ({error}); score the run again") from None
-
-
-def _read_scores(path: Path) -> dict[str, dict[str, dict[str, Any]]]:
-    found = _read_json(path)
-    try:
-        for variants in found.values():
-            for scores in variants.values():
-                numbers = [scores[m] for m in METRICS if scores.get(m) is not None]
-                if not all(math.isfinite(number) for number in (scores["images"], *numbers)):
-                    raise ValueError("a score is not finite")
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+        found: dict[str, Any] = json.loads(path.read_text())
+        check(found)
+    except (OSError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
         raise DataError(
-            f"{path}: not as gsgan.evaluate writes it ({type(error).__name__}: {error}); score the "
-            "run again"
+            f"{path}: damaged ({type(error).__name__}: {error}); score the run again"
         ) from None
     return found
+
+
+def _check_scores(found: dict[str, dict[str, dict[str, Any]]]) -> None:
+    for scores in (scores for variants in found.values() for scores in variants.values()):
+        numbers = [scores[m] for m in METRICS if scores.get(m) is not None]
+        if not all(math.isfinite(number) for number in (scores["images"], *numbers)):
+            raise ValueError("a score is not finite")
 
 
 def _read_config(folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:

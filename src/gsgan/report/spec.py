@@ -43,12 +43,10 @@ def heading(metric: str) -> str:
     return f"{METRICS[metric].heading} {METRICS[metric].better}"
 
 
-def written(metric: str, value: float, *, signed: bool = False) -> str:
+def written(metric: str, value: float) -> str:
     """A value with the metric's digits and a typographic minus; zero has no sign."""
-    text = f"{value:{'+' if signed else ''}.{METRICS[metric].digits}f}"
-    if float(text) == 0:
-        text = text.lstrip("+-")
-    return text.replace("-", "−")
+    text = f"{value:.{METRICS[metric].digits}f}"
+    return text.lstrip("-") if float(text) == 0 else text.replace("-", "−")
 
 
 @dataclass(frozen=True)
@@ -65,29 +63,10 @@ class RowSpec:
     label: str | None = None
     variant: str = PAINTED
 
-    @property
-    def title(self) -> str:
-        """The row's first column."""
-        return self.run if self.label is None else self.label
-
 
 @dataclass(frozen=True)
 class TableSpec:
-    """One table.
-
-    Args:
-        name: of the table, and of its block in a page.
-        title: its heading.
-        metrics: columns; one grid per metric where subjects are the columns.
-        splits: one grid per split.
-        rows: in this order, shown even where there is no run yet; None takes all runs.
-        by: dotted config keys whose values make rows of their own, to show a sweep over settings.
-        variants: images that make rows, where ``rows`` is None.
-        subjects: columns, one per subject; None for metrics as columns.
-        data: the only data set allowed; None allows any one.
-        apart: give each data set and protocol its own grids instead of refusing to mix them.
-        reference: the row that others are compared with, seed by seed; None compares nothing.
-        paper: entry in paper.yaml whose printed numbers go with it, or None.
+    """One table; `conf/table/plain.yaml` explains the keys.
 
     Raises:
         ConfigError: on an unknown metric or a value of the wrong kind.
@@ -102,8 +81,6 @@ class TableSpec:
     variants: Sequence[str] = (PAINTED,)
     subjects: Sequence[str] | None = None
     data: str | None = None
-    apart: bool = False
-    reference: str | None = None
     paper: str | None = None
 
     def __post_init__(self) -> None:
@@ -120,29 +97,11 @@ class TableSpec:
         for key, known, values in (
             ("metrics", list(METRICS), self.metrics),
             ("variants", [PAINTED, SPLAT], variants),
-            ("apart", [False, True], [self.apart]),
         ):
             if unknown := [str(value) for value in values if value not in known]:
-                raise ConfigError(
-                    f"table.{key} has {', '.join(unknown)}; known: {', '.join(map(str, known))}"
-                )
+                raise ConfigError(f"table.{key} has {', '.join(unknown)}; known: {', '.join(known)}")
         if self.by is not None and self.rows is not None:
             raise ConfigError("table.by makes rows of its own, so table.rows must be null")
-
-    def row_specs(self, names: Sequence[str]) -> list[RowSpec]:
-        """The table's rows.
-
-        Args:
-            names: of all runs, for a table without fixed rows.
-        """
-        if self.rows is not None:
-            return list(self.rows)
-        ordered = sorted(names, key=lambda name: (name != self.reference, _natural(name)))
-        return [
-            RowSpec(name, f"{name}: Step I's colour" if variant == SPLAT else None, variant)
-            for name in ordered
-            for variant in self.variants
-        ]
 
 
 def _row(given: RowSpec | Mapping[str, Any]) -> RowSpec:
@@ -154,7 +113,7 @@ def _row(given: RowSpec | Mapping[str, Any]) -> RowSpec:
         ) from None
 
 
-def _natural(name: str) -> list[str | float]:
+def natural(name: str) -> list[str | float]:
     """A sort key: numbers by value, the words between them by letters."""
     parts = re.split(r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d+)?)", name)
     return [float(part) if i % 2 else part for i, part in enumerate(parts)]

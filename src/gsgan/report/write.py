@@ -51,19 +51,18 @@ class Grid:
     title: str
     columns: Sequence[str]
     rows: Sequence[Row]
-    remarks: tuple[str, ...] = ()
+    remarks: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
 class Report:
-    """All that is shown: tables, one row per run, remarks, (folder, reason) of runs left out."""
+    """All that is shown, one record per run (JSON only), and reasons by folder of runs left out."""
 
     name: str
     title: str
     grids: Sequence[Grid]
-    runs: Grid
-    remarks: Sequence[str] = ()
-    left_out: Sequence[tuple[str, str]] = ()
+    runs: Sequence[Mapping[str, Any]]
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     def notes(self) -> dict[str, str]:
         """A number for every note, in the order of appearance."""
@@ -105,17 +104,15 @@ class Format:
             return pattern.format(self.escape(text)) + raised
 
         origin = ORIGIN if self.origin and any(row.origin for row in grid.rows) else ()
-        frame = pd.DataFrame(
+        rows = [
             [
-                [
-                    cell(row.label, row.notes, "{}" if row.kind == "run" else self.italic),
-                    *(cell(c.text, c.notes, self.bold if c.best else "{}") for c in row.cells),
-                    *map(self.escape, (*row.origin, *origin)[: len(origin)]),
-                ]
-                for row in grid.rows
-            ],
-            columns=[self.escape(name) for name in ("", *grid.columns, *origin)],
-        )
+                cell(row.label, row.notes, "{}" if row.kind == "run" else self.italic),
+                *(cell(c.text, c.notes, self.bold if c.best else "{}") for c in row.cells),
+                *(self.escape(text) for text in row.origin if origin),
+            ]
+            for row in grid.rows
+        ]
+        frame = pd.DataFrame(rows, columns=[*map(self.escape, ("", *grid.columns, *origin))])
         return "\n\n".join([self.table(self.escape(grid.title), frame), *self.lines(grid.remarks)])
 
     def lines(self, texts: Iterable[str]) -> list[str]:
@@ -123,11 +120,10 @@ class Format:
         return [self.line.format(self.escape(text)) for text in texts]
 
     def body(self, report: Report) -> str:
-        """All but the title and the list of runs."""
+        """All but the title."""
         notes = report.notes()
         below = [f"{number}: {note}" for note, number in notes.items()]
-        below += report.remarks
-        below += [f"Left out: {folder}: {reason}" for folder, reason in report.left_out]
+        below += [f"Left out: {folder}: {reason}" for folder, reason in report.left_out.items()]
         return "\n\n".join([*(self.grid(grid, notes) for grid in report.grids), *self.lines(below)])
 
 
@@ -194,14 +190,12 @@ p {{ color: #555; font-size: .9em; max-width: 60em; }} sup {{ line-height: 0; fo
 
 def markdown_page(report: Report) -> str:
     """report.md."""
-    runs = MARKDOWN.grid(report.runs, {})
-    return f"# {MARKDOWN.escape(report.title)}\n\n{MARKDOWN.body(report)}\n\n{runs}\n"
+    return f"# {MARKDOWN.escape(report.title)}\n\n{MARKDOWN.body(report)}\n"
 
 
 def html_page(report: Report) -> str:
     """report.html: one file, no scripts, nothing fetched."""
-    body = f"{HTML.body(report)}\n{HTML.grid(report.runs, {})}"
-    return HTML_PAGE.format(title=html.escape(report.title), body=body)
+    return HTML_PAGE.format(title=html.escape(report.title), body=HTML.body(report))
 
 
 def latex_page(report: Report) -> str:
@@ -211,34 +205,22 @@ def latex_page(report: Report) -> str:
 
 
 def json_page(report: Report) -> str:
-    """report.json: every cell's text, numbers and notes, every row's origin."""
+    """report.json: every cell's text, numbers and notes, every row's origin, every run."""
 
-    def rows(grid: Grid) -> list[dict[str, Any]]:
-        return [
-            {
-                "label": row.label,
-                "kind": row.kind,
-                "cells": {
-                    name: {"text": cell.text, **cell.numbers, "notes": list(cell.notes)}
-                    for name, cell in zip(grid.columns, row.cells, strict=True)
-                },
-                "notes": list(row.notes),
-                **dict(zip(ORIGIN, row.origin, strict=False)),
-            }
-            for row in grid.rows
-        ]
+    def plain(row: Row, columns: Sequence[str]) -> dict[str, Any]:
+        cells = {
+            name: {"text": cell.text, **cell.numbers, "notes": cell.notes}
+            for name, cell in zip(columns, row.cells, strict=True)
+        }
+        origin = dict(zip(ORIGIN, row.origin, strict=False))
+        return {"label": row.label, "kind": row.kind, "cells": cells, "notes": row.notes, **origin}
 
-    held = {
-        "table": report.name,
-        "title": report.title,
-        "grids": [
-            {"title": g.title, "columns": list(g.columns), "rows": rows(g), "remarks": g.remarks}
-            for g in report.grids
-        ],
-        "runs": rows(report.runs),
-        "remarks": list(report.remarks),
-        "left_out": [{"folder": name, "reason": why} for name, why in report.left_out],
-    }
+    grids = [
+        {**vars(grid), "rows": [plain(row, grid.columns) for row in grid.rows]}
+        for grid in report.grids
+    ]
+    held = {"table": report.name, "title": report.title, "grids": grids, "runs": report.runs}
+    held["left_out"] = [{"folder": f, "reason": why} for f, why in report.left_out.items()]
     return json.dumps(held, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
