@@ -99,7 +99,9 @@ class TableSpec:
             ("variants", [PAINTED, SPLAT], variants),
         ):
             if unknown := [str(value) for value in values if value not in known]:
-                raise ConfigError(f"table.{key} has {', '.join(unknown)}; known: {', '.join(known)}")
+                raise ConfigError(
+                    f"table.{key} has {', '.join(unknown)}; known: {', '.join(known)}"
+                )
         if self.by is not None and self.rows is not None:
             raise ConfigError("table.by makes rows of its own, so table.rows must be null")
 

@@ -1,4 +1,4 @@
-"""The avatars that a figure shows side by side: rendering, measuring, naming."""
+"""What a figure shows: images of a split, and the avatars that render them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from gsgan.data.checks import spans
 from gsgan.data.datamodule import GsganData
-from gsgan.data.splits import Item
+from gsgan.data.splits import SPLITS, Item
 from gsgan.evaluate.facts import fingerprint
 from gsgan.metrics.image import edge_scores, psnr
 from gsgan.model.avatar import Avatar, Painting
-from gsgan.report.comparable import check_data
-from gsgan.report.figures.layout import Settings
-from gsgan.report.figures.shots import Shot
-from gsgan.report.runs import Run, read_run
+from gsgan.report.runs import DATA, Run, check_same, read_run
+from gsgan.scene import Camera, Frame, Window, body_window, cat
 from gsgan.train.paper import NAME
 from gsgan.train.runs import (
     CHECKPOINT,
@@ -28,8 +27,11 @@ from gsgan.train.runs import (
     load_config,
     read_checkpoint,
 )
+from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
 
+NEAR = 0.01  # metres: with a joint nearer the camera than this, the whole image is shown
+LEAST = 16  # pixels, the shortest side of a window
 TITLES = {  # of models, in print
     "full": "gsgan",
     "wo_seg": "w/o S",
@@ -43,6 +45,107 @@ STEP_ONE = "Step I's colour"
 Numbers = dict[str, float | None]
 
 
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One image of a split, and the part of it that a figure shows.
+
+    Args:
+        item: (camera name, frame number).
+        frame: the ground truth, whole image.
+        window: the part shown.
+    """
+
+    item: Item
+    frame: Frame
+    window: Window
+
+    @property
+    def name(self) -> str:
+        """As files of a capture are named: camera/frame."""
+        return f"{self.item[0]}/{self.item[1]:06d}"
+
+    @property
+    def truth(self) -> Tensor:
+        """``[1, 3, h, w]`` the ground truth as shown."""
+        return self.window.cut(self.frame.image)
+
+    @property
+    def camera(self) -> Camera:
+        """Of the part shown."""
+        return self.window.camera(self.frame.camera)
+
+
+def choose_items(
+    data: GsganData,
+    split: str,
+    *,
+    frames: Sequence[int] | None,
+    camera: str | None,
+    count: int,
+    one_camera: bool = False,
+) -> list[Item]:
+    """Camera and frame of each image to show.
+
+    Args:
+        data: of the run.
+        split: "train", "novel_view" or "novel_pose".
+        frames: numbers, in the order shown; None spreads ``count`` evenly over the split's.
+        camera: its name; None takes the split's cameras in turn, one per image.
+        count: of images, where ``frames`` is None; fewer where the split has fewer.
+        one_camera: all images come from one camera.
+
+    Raises:
+        ConfigError: on an unknown split, camera or frame.
+        DataError: when the split is empty.
+    """
+    items = data.splits.items[one_of("split", split, SPLITS)]
+    if not items:
+        others = ", ".join(f"split={name}" for name in SPLITS if data.splits.items[name])
+        raise DataError(f"split {split} has no images: {data.reasons[split]}; use {others}")
+    cameras = list(dict.fromkeys(name for name, _ in items))
+    if camera is not None and camera not in cameras:
+        names = ", ".join(cameras)
+        raise ConfigError(f"camera {camera} is not in split {split}, which has {names}")
+    if one_camera and camera is None:  # the first with all the frames requested, or the first
+        whole = (c for c in cameras if all((c, frame) in items for frame in frames or ()))
+        camera = next(whole, cameras[0])
+    held = [item for item in items if camera in (None, item[0])]
+    known = sorted({frame for _, frame in held})
+    if frames is None:
+        count = min(count, len(known))
+        frames = [known[(2 * i + 1) * len(known) // (2 * count)] for i in range(count)]
+    if lacking := [frame for frame in frames if frame not in known]:
+        of = f"split {split}" if camera is None else f"camera {camera} in split {split}"
+        raise ConfigError(f"frames: {of} lacks {spans(lacking)}; it has {spans(known)}")
+    chosen = []
+    for place, frame in enumerate(frames):
+        seen_by = [item for item in held if item[1] == frame]
+        chosen.append(seen_by[(2 * place + 1) * len(seen_by) // (2 * len(frames))])
+    return chosen
+
+
+def make_shots(data: GsganData, split: str, items: Sequence[Item], margin: float) -> list[Shot]:
+    """Images of a split; their windows have one size where the images have.
+
+    Args:
+        data: of the run.
+        split: whose dataset holds the items.
+        items: from `choose_items`.
+        margin: metres around the joints.
+    """
+    dataset = data.dataset(split)
+    frames = [dataset[dataset.items.index(item)] for item in items]
+    one_size = len({frame.camera.size for frame in frames}) == 1
+    shots: list[Shot] = []
+    for batch in [frames] if one_size else [[frame] for frame in frames]:
+        p, camera = torch.cat([f.skeleton for f in batch]), cat([f.camera for f in batch])
+        boxes = body_window(p, camera, margin=margin, multiple=1, least=LEAST, near=NEAR)
+        for corner, frame in zip(boxes.corners, batch, strict=True):
+            window = Window((corner,), boxes.size, boxes.picture)
+            shots.append(Shot(items[len(shots)], frame, window))
+    return shots
+
+
 @dataclass
 class Subject:
     """A trained avatar with its run and data.
@@ -53,7 +156,6 @@ class Subject:
         data: of the run.
         avatar: in eval mode, on the device that renders.
         marks: that every figure of it must carry.
-        step: iterations trained.
     """
 
     name: str
@@ -61,7 +163,6 @@ class Subject:
     data: GsganData
     avatar: Avatar
     marks: list[str]
-    step: int = 0
     _painted: dict[Item, Painting] = field(default_factory=dict, repr=False)
 
     def paint(self, shot: Shot) -> Painting:
@@ -74,29 +175,19 @@ class Subject:
             device = next(self.avatar.parameters()).device
             with torch.no_grad():
                 painting = self.avatar.paint(shot.frame.to(device))
-            kept = {  # of F only the colour: all channels of every shot would fill the memory
-                name: None if part is None else part.cpu()
-                for name, part in (
-                    ("image", painting.image),
-                    ("features", painting.colour),
-                    ("segmentation", painting.segmentation),
-                )
-            }
-            if any(part is not None and not bool(part.isfinite().all()) for part in kept.values()):
-                raise DataError(
-                    f"{self.run.folder}: its image of {shot.name} is not finite; train it again"
-                )
+            # of F only the colour: all channels of every shot would fill the memory
+            parts = (painting.image, painting.colour, painting.segmentation)
+            image, colour, labels = (None if part is None else part.cpu() for part in parts)
+            for part in (image, colour, labels):
+                if part is not None and not bool(part.isfinite().all()):
+                    folder = self.run.folder
+                    raise DataError(
+                        f"{folder}: its image of {shot.name} is not finite; train again"
+                    )
             gaussians = None if painting.gaussians is None else painting.gaussians.to("cpu")
-            self._painted[shot.item] = Painting(**kept, gaussians=gaussians)
+            kept = Painting(image, features=colour, segmentation=labels, gaussians=gaussians)
+            self._painted[shot.item] = kept
         return self._painted[shot.item]
-
-    @property
-    def notes(self) -> list[str]:
-        """Its marks, and that its training is unfinished where it is."""
-        total = self.run.planned(segmentation=self.avatar.segmentation is not None)
-        if total is None or self.step >= total:
-            return self.marks
-        return [*self.marks, f"{self.name} is unfinished: {self.step} of {total} iterations"]
 
     def image(self, shot: Shot) -> Tensor:
         """``[1, 3, h, w]`` I_pred in [0, 1], as shown."""
@@ -127,7 +218,7 @@ def open_subjects(
 
     Args:
         folders: of runs, each once.
-        names: in print, one per folder; None takes the model's.
+        names: in print, one per folder; None takes the model's, with more where they are equal.
         moved: where their dataset and model file are now.
         device: that renders.
 
@@ -135,21 +226,27 @@ def open_subjects(
         ConfigError: on wrong names, a folder given twice, or runs of different data.
         DataError: when a run cannot be read.
     """
-    if names is not None:
-        texts = {str(name) for name in names if name is not None}
-        if not len(texts) == len(names) == len(folders):
-            raise ConfigError(
-                f"names must be {len(folders)} different texts, the run's first, then those of "
-                f"compare; got {names}"
-            )
-    resolved = [folder.resolve() for folder in folders]
-    if twice := [f for f in folders if resolved.count(f.resolve()) > 1]:
-        raise ConfigError(f"{twice[0]} is given twice; every run in run and compare must differ")
+    if names is not None and not len(set(map(str, names))) == len(names) == len(folders):
+        raise ConfigError(
+            f"names must be {len(folders)} different texts, the run's first, then those of "
+            f"compare; got {names}"
+        )
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise ConfigError("a run is given twice; every run in run and compare must differ")
     subjects: list[Subject] = []
     for folder in folders:
         subjects.append(_open(folder, moved, device))
-        check_data(subjects[0].run, subjects[-1].run, "figures")
-    titles = [str(name) for name in names] if names is not None else _distinct(subjects)
+        check_same("figures", DATA, [(s.run, s.run.data["fingerprint"]) for s in subjects])
+    models = [s.name for s in subjects]
+    titles = models if names is None else list(map(str, names))
+    for more in (
+        [f"seed {s.run.seed}" for s in subjects],
+        [s.run.folder.resolve().name for s in subjects],
+        [str(s.run.folder) for s in subjects],
+    ):
+        if len(set(titles)) < len(titles):
+            pairs = zip(models, more, strict=True)
+            titles = [m if models.count(m) < 2 else f"{m}, {text}" for m, text in pairs]
     return [replace(s, name=title) for s, title in zip(subjects, titles, strict=True)]
 
 
@@ -163,24 +260,10 @@ def _open(folder: Path, moved: Moved, device: torch.device | str) -> Subject:
     if run.name == "full" and run.departures() == []:
         name = NAME
     step = int(read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"])
-    return Subject(name, run, data, avatar.to(device), marks, step)
-
-
-def _distinct(subjects: Sequence[Subject]) -> list[str]:
-    """Names that all differ: with the seed, the folder's name or its path where need be."""
-    names = [s.name for s in subjects]
-    for more in (
-        [f"seed {s.run.seed}" for s in subjects],
-        [s.run.folder.resolve().name for s in subjects],
-        [str(s.run.folder) for s in subjects],
-    ):
-        found = [
-            f"{name}, {text}" if names.count(name) > 1 else name
-            for name, text in zip(names, more, strict=True)
-        ]
-        if len(set(found)) == len(found):
-            return found
-    return found
+    total = run.planned(segmentation=avatar.segmentation is not None)
+    if step < total:
+        marks = [*marks, f"{folder} is unfinished: {step} of {total} iterations"]
+    return Subject(name, run, data, avatar.to(device), marks)
 
 
 def rivals(subjects: Sequence[Subject], shot: Shot) -> dict[str, Tensor]:
@@ -195,20 +278,14 @@ def rivals(subjects: Sequence[Subject], shot: Shot) -> dict[str, Tensor]:
     return images
 
 
-def measure(image: Tensor, truth: Tensor, settings: Settings) -> Numbers:
+def measure(image: Tensor, truth: Tensor) -> Numbers:
     """PSNR, edge F1 and edge-pixel ratio of one image ``[1, 3, h, w]`` as it is shown.
 
     Returns:
         ``psnr`` dB, ``edge_f1``, ``edge_ratio`` (edge pixels over the ground truth's); None where
         not defined: equal images, or a ground truth without edges.
     """
-    f1, ratio = edge_scores(
-        image,
-        truth,
-        low=settings.canny_low,
-        high=settings.canny_high,
-        tolerance=settings.canny_tolerance,
-    )
+    f1, ratio = edge_scores(image, truth)
     scores = {"psnr": psnr(image, truth), "edge_f1": f1, "edge_ratio": ratio}
     return {name: finite(score) for name, score in scores.items()}
 
