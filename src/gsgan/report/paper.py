@@ -36,25 +36,22 @@ class PaperTable:
         if self.reason is not None:
             return self.reason
         for run in runs:
-            if run.data.get("name") != self.data:
-                return f"runs here are of {run.data_name}, the paper's of {self.data}"
+            record = run.protocol(split)
+            for mine, printed in (
+                (f"of {run.data.get('name')}", f"of {self.data}"),
+                (f"of protocol {record['name']}", f"of protocol {self.protocol}"),
+                (f"of {split}", f"of {self.split}"),
+            ):
+                if mine != printed:
+                    return f"runs here are {mine}, the paper's {printed}"
             if self.subject and subject_of(run.data.get("root"), [self.subject]) is None:
                 return f"runs here are of {run.data_name}, the paper's of subject {self.subject}"
-            record = run.protocol(split)
-            if record["name"] != self.protocol:
-                return f"runs here follow protocol {record['name']}, the paper's {self.protocol}"
             if record.get("departures"):
                 return f"runs here depart from {self.protocol}: {'; '.join(record['departures'])}"
-        if split != self.split:
-            return f"these are {split} scores, the paper's {self.split}"
         return None
 
     def beside(self, columns: Sequence[tuple[str | None, str]]) -> dict[str, list[Row]]:
-        """Its rows by the model that they belong to.
-
-        Args:
-            columns: subject (None: the table's own) and metric of each.
-        """
+        """Its rows by model; ``columns``: subject (None: the table's own) and metric of each."""
         note = f"{MARK} in {self.title}" + (f"; {self.note}" if self.note else "")
         found: dict[str, list[Row]] = {}
         for held in self.rows:
@@ -81,13 +78,13 @@ class PaperTable:
         return Row(f"{label} ({MARK})", cells, origin, "paper", notes)
 
 
-def read_paper(name: str, file: Path = FILE) -> PaperTable:
+def read_paper(name: str) -> PaperTable:
     """A table of paper.yaml.
 
     Raises:
         ConfigError: when there is no such table.
     """
-    tables: Any = OmegaConf.to_container(OmegaConf.load(file))
+    tables: Any = OmegaConf.to_container(OmegaConf.load(FILE))
     if name not in tables:
-        raise ConfigError(f"table.paper={name}: {file.name} has {', '.join(tables)}")
+        raise ConfigError(f"table.paper={name}: {FILE.name} has {', '.join(tables)}")
     return PaperTable(**tables[name])

@@ -1,4 +1,4 @@
-"""The command: tables of ``runs``, figures of ``run``, or both."""
+"""Tables of ``runs``: reads the runs, builds one table, writes it in every format."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from pathlib import Path
 
 from hydra.utils import instantiate
 from omegaconf import DictConfig
+from rich.markdown import Markdown
 
 from gsgan.report.paper import read_paper
 from gsgan.report.runs import find_runs, read_runs
 from gsgan.report.spec import TableSpec
 from gsgan.report.table import build
-from gsgan.report.write import MARKDOWN, WRITERS, print_report
+from gsgan.report.write import MARKDOWN, TERMINAL, pages
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
@@ -20,26 +21,6 @@ from gsgan.utils.pages import check_block, fill_block
 
 CURVES = "report.png"
 BLOCK_END = "<!-- /report -->"
-
-
-def run_report(config: DictConfig) -> None:
-    """``gsgan.report``.
-
-    Raises:
-        ConfigError: when neither ``runs`` nor ``run`` is set, and as the two parts do.
-        DataError: when a run or its data cannot be read.
-    """
-    if not config.runs and config.run is None:
-        raise ConfigError(
-            "runs and run are not set: give runs=[<run folder>,<sweep folder>,…] for tables, or "
-            "run=<run folder> for figures"
-        )
-    if config.runs:
-        make_tables(config)
-    if config.run is not None:
-        from gsgan.report.figures.run import make_figures  # here: it imports matplotlib
-
-        make_figures(config)
 
 
 def make_tables(config: DictConfig) -> None:
@@ -58,9 +39,9 @@ def make_tables(config: DictConfig) -> None:
         check_block(page, start, BLOCK_END, key="fill")
     runs, left_out = read_runs(find_runs([str(entry) for entry in given]))
     report = build(spec, runs, left_out, paper, allow_dirty=config.allow_dirty)
-    now = datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
     folder = Path(str(config.out or f"runs/report/{now}")).expanduser()
-    files: dict[str, str | bytes] = {name: text(report) for name, text in WRITERS.items()}
+    files: dict[str, str | bytes] = dict(pages(report))
     if spec.by:
         from gsgan.report.curves import curves  # here: it imports matplotlib
 
@@ -74,7 +55,7 @@ def make_tables(config: DictConfig) -> None:
         where = error.filename or folder
         raise ConfigError(f"{where} cannot be written: {error.strerror}") from None
     console = make_console()
-    print_report(report, console)
+    console.print(Markdown(TERMINAL.body(report)))
     filled = "" if page is None else f"\nfilled: {page}"
     done = f"tables: {folder}/{{{','.join(files)}}}{filled}"
     console.print(done, markup=False, soft_wrap=True)

@@ -83,11 +83,8 @@ class Run:
         return None if self.settings is None else departures(self.settings, self.name, data)
 
     def planned(self, *, segmentation: bool) -> int:
-        """Iterations of the whole schedule, 0 where there is none.
-
-        Args:
-            segmentation: add the segmentation's own phase, which not every scene has.
-        """
+        """Iterations of the whole schedule, 0 where there is none; ``segmentation`` adds the phase
+        of its own, which not every scene has."""
         start, settings = "training.schedule.", self.settings or {}
         stretch = settings.get(f"{start}stretch", 1)
         steps = [settings.get(start + phase, 0) for phase in ("step_one", "step_two")]
@@ -96,12 +93,7 @@ class Run:
 
 
 def check_same(where: str, what: str, found: Iterable[tuple[Run, Any]]) -> None:
-    """Refuses runs that differ.
-
-    Args:
-        where: name of the table or figure, for the message.
-        what: the values are.
-        found: runs with their values; None is not compared. In dicts, null is as good as no key.
+    """Runs must not differ; None is not compared, and in dicts null is as good as no key.
 
     Raises:
         ConfigError: naming two runs and what differs.
@@ -125,10 +117,7 @@ def check_same(where: str, what: str, found: Iterable[tuple[Run, Any]]) -> None:
 
 
 def find_runs(given: Sequence[str]) -> list[Path]:
-    """The run folders, each once, in the order given.
-
-    Args:
-        given: run folders, folders to search for them, globs of either.
+    """The run folders in folders, sweeps and globs of either, each once, in the order given.
 
     Raises:
         ConfigError: when an entry contains no run.
@@ -169,11 +158,7 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Run], dict[Path, str]]:
 
 
 def read_run(folder: Path, *, scored: bool = True) -> Run:
-    """The run in a folder.
-
-    Args:
-        folder: of the run.
-        scored: read its scores; without, a run that was never scored can be read, too.
+    """The run in a folder; with ``scored=False`` also one that was never scored.
 
     Raises:
         DataError: when a file is damaged, or the run is unfinished or not scored yet.

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from gsgan.data.splits import SPLITS
+from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
 
 PAINTED, SPLAT, FLOOR = "full", "splat", "floor"  # variants in metrics.json
@@ -51,13 +53,8 @@ def written(metric: str, value: float) -> str:
 
 @dataclass(frozen=True)
 class RowSpec:
-    """One row: the runs of a model or method, and which of their images are scored.
-
-    Args:
-        run: name of the model or method.
-        label: the row's first column; None takes the name.
-        variant: ``full`` for the final image, ``splat`` for Step I's colour.
-    """
+    """One row: the runs of a model or method, its label (None: the name), and ``full`` for the
+    final image or ``splat`` for Step I's colour."""
 
     run: str
     label: str | None = None
@@ -69,7 +66,7 @@ class TableSpec:
     """One table; `conf/table/plain.yaml` explains the keys.
 
     Raises:
-        ConfigError: on an unknown metric or a value of the wrong kind.
+        ConfigError: on an unknown metric, split or variant, or where a list must not be empty.
     """
 
     name: str
@@ -84,35 +81,21 @@ class TableSpec:
     paper: str | None = None
 
     def __post_init__(self) -> None:
-        for key in ("metrics", "splits", "variants", "subjects", "rows", "by"):
-            held, optional = getattr(self, key), key in ("subjects", "rows", "by")
-            right = isinstance(held, Sequence) and not isinstance(held, str) and len(held) > 0
-            if not right and not (optional and held is None):
-                raise ConfigError(f"table.{key} must be a list of at least one, got {held!r}")
-        if self.rows is not None:
-            object.__setattr__(self, "rows", [_row(row) for row in self.rows])
+        rows: Any = self.rows
+        if rows is not None:
+            object.__setattr__(self, "rows", [RowSpec(**row) for row in rows])
         if self.subjects is not None:
             object.__setattr__(self, "subjects", [str(subject) for subject in self.subjects])
+        if self.by and rows is not None:
+            raise ConfigError("table.by makes rows of its own, so table.rows must be null")
         variants = [*self.variants, *(row.variant for row in self.rows or ())]
         for key, known, values in (
-            ("metrics", list(METRICS), self.metrics),
-            ("variants", [PAINTED, SPLAT], variants),
+            ("metrics", METRICS, self.metrics),
+            ("splits", SPLITS, self.splits),
+            ("variants", (PAINTED, SPLAT), variants),
         ):
-            if unknown := [str(value) for value in values if value not in known]:
-                raise ConfigError(
-                    f"table.{key} has {', '.join(unknown)}; known: {', '.join(known)}"
-                )
-        if self.by is not None and self.rows is not None:
-            raise ConfigError("table.by makes rows of its own, so table.rows must be null")
-
-
-def _row(given: RowSpec | Mapping[str, Any]) -> RowSpec:
-    try:
-        return given if isinstance(given, RowSpec) else RowSpec(**given)
-    except TypeError:
-        raise ConfigError(
-            f"table.rows must be like {{run: wo_seg, label: w/o S, variant: full}}, got {given!r}"
-        ) from None
+            for value in values or [None]:
+                one_of(f"table.{key}", value, known)
 
 
 def natural(name: str) -> list[str | float]:

@@ -32,7 +32,7 @@ SPREAD = (
     "Mean ± sample standard deviation over seeds, as many as the column seeds says; one seed has "
     "no spread."
 )
-SPLITS = {"novel_view": "held-out cameras", "novel_pose": "held-out poses"}
+SPLIT_TITLES = {"novel_view": " (held-out cameras)", "novel_pose": " (held-out poses)"}
 FACTS = ("version", "iterations", "train_seconds", "device", "torch", "date")
 PER_SUBJECT = ("subject", "train_frames", "test_frames")  # of a protocol, differ by subject
 NO_SEED = "None"  # of predictions and of the all-background image
@@ -41,14 +41,7 @@ Values = dict[str, tuple[float | None, str | None]]  # by seed: value, why missi
 
 @dataclass(frozen=True)
 class Part:
-    """One grid: the scores of one split.
-
-    Args:
-        spec: the table.
-        runs: all that it shows.
-        split: whose scores.
-        metric: the one shown where subjects are the columns, else None.
-    """
+    """One grid: the scores of one split, of one ``metric`` where subjects are the columns."""
 
     spec: TableSpec
     runs: Sequence[Run]
@@ -108,19 +101,16 @@ class Part:
         return found
 
     def _over_subjects(self, runs: Sequence[Run], variant: str) -> Values:
-        """The mean over subjects, seed by seed where all subjects have the same seeds."""
-        held = {s: self.values(runs, variant, s) for s in self.spec.subjects or ()}
-        known = {
-            subject: {seed: value for seed, (value, _) in found.items() if value is not None}
-            for subject, found in held.items()
-        }
-        if missing := [subject for subject, found in known.items() if not found]:
-            return {NO_SEED: (None, f"no mean over subjects: {', '.join(missing)} missing")}
-        first, *others = known.values()
-        if all(found.keys() == first.keys() for found in others):
-            return {s: (statistics.fmean(f[s] for f in known.values()), None) for s in first}
-        mean = statistics.fmean(statistics.fmean(found.values()) for found in known.values())
-        return {NO_SEED: (mean, "mean of the subjects' means, without spread: their seeds differ")}
+        """The mean over subjects, seed by seed."""
+        held = [self.values(runs, variant, subject) for subject in self.spec.subjects or ()]
+        scores = [
+            {seed: value for seed, (value, _) in found.items() if value is not None}
+            for found in held
+        ]
+        seeds = scores[0].keys()
+        if not seeds or any(found.keys() != seeds for found in scores):
+            return {NO_SEED: (None, "no mean over subjects: not all have scores of these seeds")}
+        return {s: (statistics.fmean(found[s] for found in scores), None) for s in seeds}
 
     def check(self, allow_dirty: bool) -> None:
         """Raises ConfigError where a column or a row would mix what does not belong together."""
@@ -177,14 +167,7 @@ def build(
     *,
     allow_dirty: bool = False,
 ) -> Report:
-    """A table with everything that belongs below it.
-
-    Args:
-        spec: the table.
-        runs: all that can be read.
-        left_out: reasons by folder for those that cannot.
-        paper: the numbers that the paper prints for it.
-        allow_dirty: let runs of uncommitted code stand beside others.
+    """A table of ``runs``, with the reasons for those ``left_out`` and the ``paper``'s numbers.
 
     Raises:
         ConfigError: when runs in one column or row differ in more than they may, or no run is left.
@@ -259,7 +242,7 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
     rows = _with_best([*rows, *(row for left in printed.values() for row in left)], part)
     floor = [mean_cell(m, part.values(part.runs, FLOOR, c)) for c, m in columns.items()]
     rows.append(Row(FLOOR_LABEL, floor, (NOT_HAD, *_origin(part.runs)), "floor"))
-    title = f"{part.split} ({SPLITS[part.split]})" if part.split in SPLITS else part.split
+    title = f"{part.split}{SPLIT_TITLES.get(part.split, '')}"
     if part.metric is None:
         return Grid(title, [part.heading(m) for m in columns], rows, [SPREAD])
     return Grid(f"{part.heading(part.metric)}, {title}", list(columns), rows, [SPREAD])

@@ -10,8 +10,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import pandas as pd
-from rich.console import Console
-from rich.markdown import Markdown
 
 from gsgan.utils.pages import markdown as markdown_table
 
@@ -78,15 +76,8 @@ def common(texts: Iterable[str]) -> str:
 
 @dataclass(frozen=True)
 class Format:
-    """How text is written in one format.
-
-    Args:
-        escape: plain text to text of the format.
-        table: of a title and cells, both escaped.
-        italic, bold, raised: patterns for labels, best values, and the numbers of notes.
-        line: pattern for a remark.
-        origin: whether tables have the columns of `ORIGIN`.
-    """
+    """How text is written in one format: escaped, as a table of a title and cells, and by patterns
+    for labels, best values, numbers of notes and remarks; ``origin`` adds the columns `ORIGIN`."""
 
     escape: Callable[[str], str]
     table: Callable[[str, pd.DataFrame], str]
@@ -188,24 +179,12 @@ p {{ color: #555; font-size: .9em; max-width: 60em; }} sup {{ line-height: 0; fo
 """
 
 
-def markdown_page(report: Report) -> str:
-    """report.md."""
-    return f"# {MARKDOWN.escape(report.title)}\n\n{MARKDOWN.body(report)}\n"
+def pages(report: Report) -> dict[str, str]:
+    """The files of a report by name.
 
-
-def html_page(report: Report) -> str:
-    """report.html: one file, no scripts, nothing fetched."""
-    return HTML_PAGE.format(title=html.escape(report.title), body=HTML.body(report))
-
-
-def latex_page(report: Report) -> str:
-    """report.tex: one ``table`` per grid, for ``\\input``."""
-    packages = "% needs \\usepackage{booktabs} and, for wide tables, \\usepackage{graphicx}"
-    return f"{packages}\n\n{LATEX.body(report)}\n"
-
-
-def json_page(report: Report) -> str:
-    """report.json: every cell's text, numbers and notes, every row's origin, every run."""
+    LaTeX has a ``table`` per grid, for ``\\input``; HTML is one file without scripts; JSON has
+    every cell's text, numbers and notes, every row's origin, and every run.
+    """
 
     def plain(row: Row, columns: Sequence[str]) -> dict[str, Any]:
         cells = {
@@ -221,17 +200,10 @@ def json_page(report: Report) -> str:
     ]
     held = {"table": report.name, "title": report.title, "grids": grids, "runs": report.runs}
     held["left_out"] = [{"folder": f, "reason": why} for f, why in report.left_out.items()]
-    return json.dumps(held, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def print_report(report: Report, console: Console) -> None:
-    """The scores without their origin, which would take their width, and all remarks."""
-    console.print(Markdown(TERMINAL.body(report)))
-
-
-WRITERS = {
-    "report.md": markdown_page,
-    "report.tex": latex_page,
-    "report.html": html_page,
-    "report.json": json_page,
-}
+    packages = "% needs \\usepackage{booktabs} and, for wide tables, \\usepackage{graphicx}"
+    return {
+        "report.md": f"# {MARKDOWN.escape(report.title)}\n\n{MARKDOWN.body(report)}\n",
+        "report.tex": f"{packages}\n\n{LATEX.body(report)}\n",
+        "report.html": HTML_PAGE.format(title=html.escape(report.title), body=HTML.body(report)),
+        "report.json": json.dumps(held, indent=1, allow_nan=False, ensure_ascii=False) + "\n",
+    }

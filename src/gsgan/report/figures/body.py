@@ -94,11 +94,7 @@ def densify(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settin
 
 
 def pose_of(subject: Subject, shot: Shot) -> Pose:
-    """The skeleton as the model gets it, with substitutes for joints that were not seen.
-
-    Returns:
-        p ``[1, J, 3]`` metres, valid ``[1, J]`` bool, bone frames.
-    """
+    """The skeleton as the model gets it: p ``[1, J, 3]`` metres, valid ``[1, J]``, bone frames."""
     frame, avatar = shot.frame, subject.avatar
     p, valid = frame.skeleton, frame.visibility > 0
     return p, valid, bone_frames(p, valid, avatar.template, twist=avatar.twist)
@@ -142,7 +138,8 @@ def draw_points(axes: Axes, placed: Densify | BodyPoints, pose: Pose, shot: Shot
     pixels, depth = (x[0].numpy() for x in shot.camera.project(points.means))
     keep = np.flatnonzero(points.valid[0].numpy() & (depth > NEAR))
     order = keep[np.argsort(-depth[keep])]
-    axes.scatter(*pixels[order].T, s=1.1, c=colours[order], linewidths=0, rasterized=True)
+    x, y = pixels[order].T
+    axes.scatter(x, y, s=1.1, c=colours[order], linewidths=0, rasterized=True)
     return len(order)
 
 
@@ -189,10 +186,7 @@ def draw_gaussians(axes: Axes, gaussians: Gaussians, shot: Shot, accuracy: Accur
 
 
 def ellipses(factors: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Axes of ellipses from `Projected.factors`.
-
-    Args:
-        factors: ``[N, 3]`` (p, k, r) of the inverse 2D covariance.
+    """Axes of ellipses from `Projected.factors` ``[N, 3]``.
 
     Returns:
         One standard deviation along the first and second axis, pixels, and the first axis's angle
@@ -256,11 +250,9 @@ def segmentation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: S
 
 
 def agreement(parts: Tensor, labels: Tensor) -> Numbers:
-    """mIoU of one image, and the share of the person's pixels whose part is wrong.
+    """mIoU of S ``[1, classes, h, w]``, and the share of the person's pixels whose part is wrong.
 
-    Args:
-        parts: ``[1, classes, h, w]`` S.
-        labels: ``[1, h, w]``; 255 is left out.
+    Pixels of ``labels`` ``[1, h, w]`` that are 255 are left out.
     """
     ours, seen = parts.argmax(dim=1), labels != IGNORE
     person = seen & ((ours > 0) | (labels > 0))
@@ -292,6 +284,6 @@ def _legend(labels: Tensor, names: Sequence[str]) -> dict[str, str]:
     legend = {}
     for part in filter(None, labels.unique().tolist()):
         name = names[part].replace("_", " ") if part < len(names) else f"part {part}"
-        rgb = colour_labels(torch.full((1, 1, 1), part)).flatten().tolist()
-        legend["not scored" if part == IGNORE else name] = to_hex(rgb)
+        red, green, blue = colour_labels(torch.full((1, 1, 1), part)).flatten().tolist()
+        legend["not scored" if part == IGNORE else name] = to_hex((red, green, blue))
     return legend

@@ -29,7 +29,7 @@ from gsgan.report.figures.layout import (
     legend_foot,
     written,
 )
-from gsgan.report.figures.subjects import Numbers, Shot, Subject, finite, measure, rivals
+from gsgan.report.figures.subjects import Numbers, Shot, Subject, finite, measure
 from gsgan.train.curve import curve
 from gsgan.utils.errors import DataError
 from gsgan.utils.palette import BLACK, COLOURS, MARKERS, SKY, VERMILLION
@@ -40,6 +40,7 @@ ERROR_COLOURS = "magma_r"  # pale is no error; even steps of lightness, in grey 
 LEVELS = 255.0
 DETAIL = 0.35  # sides of the ablation's box, as a share of the image's
 HEIGHT = 0.75  # of the training figure, as a share of its width
+STEP_ONE = "Step I's colour"
 Images = list[dict[str, Tensor]]  # per shot, by name
 
 
@@ -131,14 +132,9 @@ def ablation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setti
 
 
 def most_disputed(images: Tensor, share: float) -> tuple[slice, slice]:
-    """Where images of the same scene differ most from each other.
+    """Rows and columns where images ``[n, 3, h, w]`` of one scene differ most from each other.
 
-    Args:
-        images: ``[n, 3, h, w]``.
-        share: the box's sides as a share of the images'.
-
-    Returns:
-        Rows and columns of the box, of the images' own aspect.
+    The box's sides are a ``share`` of the images'.
     """
     spread = images.var(dim=0, unbiased=False).mean(dim=0)[None, None]
     size = [max(1, round(share * side)) for side in spread.shape[-2:]]
@@ -262,11 +258,8 @@ def training(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setti
                 f"{subject.run.folder} has no log of two validations and their time (logger=csv "
                 "writes one)"
             )
-        numbers[subject.name] = {
-            "seconds": found.seconds,
-            "psnr": found.psnr,
-            "psnr_colour": found.colour,
-        }
+        parts = (found.seconds, found.psnr, found.colour)
+        numbers[subject.name] = dict(zip(("seconds", "psnr", "psnr_colour"), parts, strict=True))
         minutes = [second / 60 for second in found.seconds]
         look: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "lw": 1.0}
         marker = MARKERS[k % len(MARKERS)]
@@ -297,11 +290,17 @@ def training(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setti
 def _measured(
     subjects: Sequence[Subject], shots: Sequence[Shot], *, splatting: bool = False
 ) -> tuple[Images, dict[str, dict[str, Numbers]]]:
-    """Images of each shot by run, and their measures; ``splatting`` adds `rivals`' column."""
-    images = [
-        rivals(subjects, shot) if splatting else {s.name: s.image(shot) for s in subjects}
-        for shot in shots
-    ]
+    """Images of each shot by run, and their measures.
+
+    Args:
+        splatting: add Step I's colour of the first run, unless a run is of splatting alone.
+    """
+    images: Images = []
+    for shot in shots:
+        images.append({subject.name: subject.image(shot) for subject in subjects})
+        colour = subjects[0].colour(shot)
+        if splatting and colour is not None and all(s.run.name != "splat_only" for s in subjects):
+            images[-1][STEP_ONE] = colour
     return images, {
         shot.name: {name: measure(image, shot.truth) for name, image in held.items()}
         for shot, held in zip(shots, images, strict=True)

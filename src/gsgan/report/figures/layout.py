@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -51,13 +51,8 @@ class Settings:
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure with its caption and numbers.
-
-    Args:
-        figure: of matplotlib.
-        caption: whole sentences, Markdown: what is shown and how its numbers were measured.
-        numbers: ``{image: {panel: {measure: value}}}``, None where a measure is not defined.
-    """
+    """A figure, its caption (whole sentences, Markdown), and the numbers in it by image, panel and
+    measure, None where a measure is not defined."""
 
     figure: Figure
     caption: str
@@ -68,13 +63,11 @@ class Unavailable(Exception):
     """What the runs lack for a figure; the other figures are still made."""
 
 
-@contextmanager
-def style(settings: Settings) -> Iterator[None]:
+def style(settings: Settings) -> AbstractContextManager[None]:
     """Fonts and lines of every figure; text in the PDF stays text (TrueType)."""
     look: dict[Any, Any] = {"font.family": "DejaVu Sans", "font.size": settings.font}
     look |= {"pdf.fonttype": 42, "axes.linewidth": 0.5, "savefig.dpi": settings.dpi}
-    with matplotlib.rc_context(look):
-        yield
+    return matplotlib.rc_context(look)
 
 
 @dataclass(frozen=True)

@@ -33,27 +33,15 @@ from gsgan.utils.errors import ConfigError, DataError
 NEAR = 0.01  # metres: with a joint nearer the camera than this, the whole image is shown
 LEAST = 16  # pixels, the shortest side of a window
 TITLES = {  # of models, in print
-    "full": "gsgan",
-    "wo_seg": "w/o S",
-    "wo_gcn": "w/o GCN",
-    "wo_feat": "w/o L_feat",
-    "splat_only": "splat only",
-    "lbs_splat": "LBS splat",
-    "image_to_image": "image to image",
-}
-STEP_ONE = "Step I's colour"
+    "full": "gsgan", "wo_seg": "w/o S", "wo_gcn": "w/o GCN", "wo_feat": "w/o L_feat",
+    "splat_only": "splat only", "lbs_splat": "LBS splat", "image_to_image": "image to image",
+}  # fmt: skip
 Numbers = dict[str, float | None]
 
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """One image of a split, and the part of it that a figure shows.
-
-    Args:
-        item: (camera name, frame number).
-        frame: the ground truth, whole image.
-        window: the part shown.
-    """
+    """One image of a split, (camera name, frame number), and the part of it that is shown."""
 
     item: Item
     frame: Frame
@@ -86,13 +74,8 @@ def choose_items(
 ) -> list[Item]:
     """Camera and frame of each image to show.
 
-    Args:
-        data: of the run.
-        split: "train", "novel_view" or "novel_pose".
-        frames: numbers, in the order shown; None spreads ``count`` evenly over the split's.
-        camera: its name; None takes the split's cameras in turn, one per image.
-        count: of images, where ``frames`` is None; fewer where the split has fewer.
-        one_camera: all images come from one camera.
+    Where ``frames`` is None, ``count`` are spread evenly over the split; where ``camera`` is None, its
+    cameras are taken in turn, one per image, or only the first (``one_camera``).
 
     Raises:
         ConfigError: on an unknown split, camera or frame.
@@ -106,9 +89,8 @@ def choose_items(
     if camera is not None and camera not in cameras:
         names = ", ".join(cameras)
         raise ConfigError(f"camera {camera} is not in split {split}, which has {names}")
-    if one_camera and camera is None:  # the first with all the frames requested, or the first
-        whole = (c for c in cameras if all((c, frame) in items for frame in frames or ()))
-        camera = next(whole, cameras[0])
+    if one_camera:
+        camera = camera or cameras[0]
     held = [item for item in items if camera in (None, item[0])]
     known = sorted({frame for _, frame in held})
     if frames is None:
@@ -125,14 +107,8 @@ def choose_items(
 
 
 def make_shots(data: GsganData, split: str, items: Sequence[Item], margin: float) -> list[Shot]:
-    """Images of a split; their windows have one size where the images have.
-
-    Args:
-        data: of the run.
-        split: whose dataset holds the items.
-        items: from `choose_items`.
-        margin: metres around the joints.
-    """
+    """Images of a split in windows ``margin`` metres around the joints, of one size where the images
+    have one."""
     dataset = data.dataset(split)
     frames = [dataset[dataset.items.index(item)] for item in items]
     one_size = len({frame.camera.size for frame in frames}) == 1
@@ -148,15 +124,8 @@ def make_shots(data: GsganData, split: str, items: Sequence[Item], margin: float
 
 @dataclass
 class Subject:
-    """A trained avatar with its run and data.
-
-    Args:
-        name: above its images.
-        run: its folder and settings, with the fingerprint of ``data``.
-        data: of the run.
-        avatar: in eval mode, on the device that renders.
-        marks: that every figure of it must carry.
-    """
+    """A trained avatar in eval mode on the device that renders, its name in print, its run with the
+    fingerprint of ``data``, and the marks that every figure of it must carry."""
 
     name: str
     run: Run
@@ -209,18 +178,9 @@ class Subject:
 
 
 def open_subjects(
-    folders: Sequence[Path],
-    names: Sequence[str] | None,
-    moved: Moved,
-    device: torch.device | str,
+    folders: Sequence[Path], names: Sequence[str] | None, moved: Moved, device: torch.device | str
 ) -> list[Subject]:
-    """The avatars of run folders.
-
-    Args:
-        folders: of runs, each once.
-        names: in print, one per folder; None takes the model's, with more where they are equal.
-        moved: where their dataset and model file are now.
-        device: that renders.
+    """The avatars of run folders; without ``names`` they have their models', with more where equal.
 
     Raises:
         ConfigError: on wrong names, a folder given twice, or runs of different data.
@@ -233,10 +193,8 @@ def open_subjects(
         )
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise ConfigError("a run is given twice; every run in run and compare must differ")
-    subjects: list[Subject] = []
-    for folder in folders:
-        subjects.append(_open(folder, moved, device))
-        check_same("figures", DATA, [(s.run, s.run.data["fingerprint"]) for s in subjects])
+    subjects = [_open(folder, moved, device) for folder in folders]
+    check_same("figures", DATA, [(s.run, s.run.data["fingerprint"]) for s in subjects])
     models = [s.name for s in subjects]
     titles = models if names is None else list(map(str, names))
     for more in (
@@ -264,18 +222,6 @@ def _open(folder: Path, moved: Moved, device: torch.device | str) -> Subject:
     if step < total:
         marks = [*marks, f"{folder} is unfinished: {step} of {total} iterations"]
     return Subject(name, run, data, avatar.to(device), marks)
-
-
-def rivals(subjects: Sequence[Subject], shot: Shot) -> dict[str, Tensor]:
-    """``[1, 3, h, w]`` images by name: each run's, and Step I's colour of the first.
-
-    Step I's colour stands for splatting alone, unless a run is that very baseline.
-    """
-    images = {subject.name: subject.image(shot) for subject in subjects}
-    colour = subjects[0].colour(shot)
-    if colour is not None and not any(s.run.name == "splat_only" for s in subjects):
-        images[STEP_ONE] = colour
-    return images
 
 
 def measure(image: Tensor, truth: Tensor) -> Numbers:
