@@ -16,7 +16,7 @@ def report(config: DictConfig) -> None:
             "run=<run folder> for figures"
         )
     if config.runs:
-        from gsgan.report.run import make_tables
+        from gsgan.report.table import make_tables
 
         make_tables(config)
     if config.run is not None:

@@ -6,7 +6,7 @@ import glob
 import json
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -92,28 +92,33 @@ class Run:
         return sum(round(step * stretch) for step in steps) + own
 
 
-def check_same(where: str, what: str, found: Iterable[tuple[Run, Any]]) -> None:
-    """Runs must not differ; None is not compared, and in dicts null is as good as no key.
+def check_same(where: str, runs: Sequence[Run], facts: Sequence[Mapping[str, Any]]) -> None:
+    """Runs must not differ in ``facts``, one mapping per run.
+
+    None is not compared; within a dict, null is as good as no key.
 
     Raises:
         ConfigError: naming two runs and what differs.
     """
-    known = [(run, value) for run, value in found if value is not None]
-    for run, value in known[1:]:
-        first, expected = known[0]
-        text = f"{expected} and {value}"
-        if isinstance(value, dict):
-            keys = value.keys() | expected.keys()
-            text = ", ".join(sorted(k for k in keys if value.get(k) != expected.get(k)))
-            same = not text
-        elif isinstance(value, float):
-            same = math.isclose(value, expected, rel_tol=0, abs_tol=TOLERANCE)
-        else:
-            same = value == expected
-        if not same:
-            raise ConfigError(
-                f"{where}: {first} and {run} differ in {what}: {text}; leave one of them out"
-            )
+    first: dict[str, tuple[Run, Any]] = {}
+    for run, held in zip(runs, facts, strict=True):
+        for what, value in held.items():
+            if value is None:
+                continue
+            other, expected = first.setdefault(what, (run, value))
+            text = f"{expected} and {value}"
+            if isinstance(value, dict):
+                keys = value.keys() | expected.keys()
+                text = ", ".join(sorted(k for k in keys if value.get(k) != expected.get(k)))
+                same = not text
+            elif isinstance(value, float):
+                same = math.isclose(value, expected, rel_tol=0, abs_tol=TOLERANCE)
+            else:
+                same = value == expected
+            if not same:
+                raise ConfigError(
+                    f"{where}: {other} and {run} differ in {what}: {text}; leave one of them out"
+                )
 
 
 def find_runs(given: Sequence[str]) -> list[Path]:
@@ -223,7 +228,5 @@ def by_settings(run: Run, keys: Sequence[str]) -> Run:
     for key in map(str, keys):
         if run.settings is None or key not in run.settings or key == "seed":
             raise ConfigError(f"table.by: {run} has no setting {key} (a row is over all seeds)")
-        value = run.settings[key]
-        short = f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else value
-        parts.append(f"{key.rpartition('.')[2].replace('_', ' ')} {short}")
+        parts.append(f"{key.rpartition('.')[2].replace('_', ' ')} {run.settings[key]}")
     return replace(run, name=", ".join(parts))

@@ -94,7 +94,9 @@ class TableSpec:
             ("splits", SPLITS, self.splits),
             ("variants", (PAINTED, SPLAT), variants),
         ):
-            for value in values or [None]:
+            if not values:
+                raise ConfigError(f"table.{key} must be a list of at least one")
+            for value in values:
                 one_of(f"table.{key}", value, known)
 
 

@@ -1,4 +1,4 @@
-"""A table of runs: its rows and columns, statistics over seeds, and what belongs below it."""
+"""Tables of ``runs``: rows and columns, statistics over seeds, and what belongs below them."""
 
 from __future__ import annotations
 
@@ -6,10 +6,16 @@ import os
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
-from gsgan.report.paper import PaperTable
-from gsgan.report.runs import DATA, Run, by_settings, check_same
+from hydra.utils import instantiate
+from omegaconf import DictConfig
+from rich.markdown import Markdown
+
+from gsgan.report.paper import PaperTable, read_paper
+from gsgan.report.runs import DATA, Run, by_settings, check_same, find_runs, read_runs
 from gsgan.report.spec import (
     FLOOR,
     MEAN,
@@ -23,10 +29,26 @@ from gsgan.report.spec import (
     subject_of,
     written,
 )
-from gsgan.report.write import NO_RUN, NOT_HAD, Cell, Grid, Report, Row, common
+from gsgan.report.write import (
+    MARKDOWN,
+    NO_RUN,
+    NOT_HAD,
+    TERMINAL,
+    Cell,
+    Grid,
+    Report,
+    Row,
+    common,
+    pages,
+)
 from gsgan.train.paper import NAME, clause
+from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
+from gsgan.utils.files import write_atomically
+from gsgan.utils.pages import check_block, fill_block
 
+CURVES = "report.png"
+BLOCK_END = "<!-- /report -->"
 FLOOR_LABEL = "all background (floor)"
 SPREAD = (
     "Mean ± sample standard deviation over seeds, as many as the column seeds says; one seed has "
@@ -35,6 +57,7 @@ SPREAD = (
 SPLIT_TITLES = {"novel_view": " (held-out cameras)", "novel_pose": " (held-out poses)"}
 FACTS = ("version", "iterations", "train_seconds", "device", "torch", "date")
 PER_SUBJECT = ("subject", "train_frames", "test_frames")  # of a protocol, differ by subject
+DIRTY = "uncommitted changes of the code (allow_dirty=true allows them)"
 NO_SEED = "None"  # of predictions and of the all-background image
 Values = dict[str, tuple[float | None, str | None]]  # by seed: value, why missing or incomplete
 
@@ -56,24 +79,16 @@ class Part:
         return dict.fromkeys([*(self.spec.subjects or ()), MEAN], self.metric)
 
     def heading(self, metric: str) -> str:
-        """Of a metric, with LPIPS' backbone and region as far as runs have it."""
+        """Of a metric; LPIPS with its backbone and region, where runs have it."""
         named = common(_lpips(run, self.split) or "" for run in self.runs)
-        if not metric.startswith("lpips") or not named:
-            return heading(metric)
-        if metric == "lpips_person":  # of the box, whatever region the protocol's LPIPS has
-            named = f"{named.split(' mask crop')[0]} in box"
-        return f"{named} {METRICS[metric].better}"
+        return f"{named} ↓" if metric == "lpips" and named else heading(metric)
 
-    def of(self, name: str, column: str | None = None) -> list[Run]:
-        """The runs of a model or method, in all columns or in one."""
-        runs = self.runs if column is None else self.runs_of(column)
-        return [run for run in runs if run.name == name]
-
-    def runs_of(self, column: str) -> list[Run]:
-        """The runs that a column shows."""
+    def of(self, name: str | None, column: str = MEAN) -> list[Run]:
+        """The runs of a model or method (None: of all) that a column shows."""
+        shown = self.runs if name is None else [run for run in self.runs if run.name == name]
         if self.metric is None or column == MEAN:
-            return list(self.runs)
-        return [run for run in self.runs if subject_of(run.data.get("root"), [column])]
+            return list(shown)
+        return [run for run in shown if subject_of(run.data.get("root"), [column])]
 
     @property
     def rows(self) -> list[RowSpec]:
@@ -88,21 +103,20 @@ class Part:
             if any(run.of(self.split, variant) for run in self.of(name))
         ]
 
-    def values(self, runs: Sequence[Run], variant: str, column: str) -> Values:
-        """One cell's scores by seed; the all-background image has one for all runs."""
+    def values(self, name: str | None, variant: str, column: str) -> Values:
+        """One cell's scores by seed; the all-background image (name None) has one for all runs."""
         if column == MEAN:
-            return self._over_subjects(runs, variant)
-        shown = [run for run in self.runs_of(column) if run in runs]
-        metric = self.columns[column]
-        found = {str(run.seed): _value(run, self.split, variant, metric) for run in shown}
-        if variant == FLOOR:  # one for all: they are of the same data
+            return self._over_subjects(name, variant)
+        metric, runs = self.columns[column], self.of(name, column)
+        found = {str(run.seed): _value(run, self.split, variant, metric) for run in runs}
+        if name is None and found:  # one for all: they are of the same data
             scored = [pair for pair in found.values() if pair[0] is not None]
-            return {NO_SEED: (scored or list(found.values()))[0]} if found else {}
+            return {NO_SEED: (scored or list(found.values()))[0]}
         return found
 
-    def _over_subjects(self, runs: Sequence[Run], variant: str) -> Values:
+    def _over_subjects(self, name: str | None, variant: str) -> Values:
         """The mean over subjects, seed by seed."""
-        held = [self.values(runs, variant, subject) for subject in self.spec.subjects or ()]
+        held = [self.values(name, variant, subject) for subject in self.spec.subjects or ()]
         scores = [
             {seed: value for seed, (value, _) in found.items() if value is not None}
             for found in held
@@ -114,49 +128,84 @@ class Part:
 
     def check(self, allow_dirty: bool) -> None:
         """Raises ConfigError where a column or a row would mix what does not belong together."""
-        for column in self.columns:
-            self._check_column(column, allow_dirty)
-            for name in {run.name for run in self.runs} if column != MEAN else ():
-                self._check_row(self.of(name, column))
-
-    def _check_row(self, runs: Sequence[Run]) -> None:
-        """The runs of one row may differ in their seed only."""
         where = f"table {self.spec.name}, {self.split}"
-        by_seed: dict[int | None, Run] = {}
-        for run in runs:
-            if (other := by_seed.setdefault(run.seed, run)) is not run:
-                raise ConfigError(
-                    f"{where}: {other} and {run} have the same row and seed; leave one of them out"
-                )
-        kinds = [("predictions" if r.seed is None else "a model trained here") for r in runs]
-        check_same(where, "kind", zip(runs, kinds, strict=True))
-        check_same(where, "settings", [(run, run.settings) for run in runs])
-        check_same(where, "iterations", [(run, run.facts.get("iterations")) for run in runs])
-        marks = ["; ".join(r.of(self.split, PAINTED).get("marks", [])) or "none" for r in runs]
-        check_same(where, "marks", zip(runs, marks, strict=True))
+        for column in self.columns:
+            scored = [run for run in self.of(None, column) if run.images(self.split)]
+            mean = column == MEAN
+            facts = [_column_facts(run, self.split, mean, allow_dirty) for run in scored]
+            check_same(where, scored, facts)
+            for name in {run.name for run in self.runs} if column != MEAN else ():
+                row = self.of(name, column)
+                if len({run.seed for run in row}) < len(row):
+                    names = " and ".join(map(str, row))
+                    raise ConfigError(f"{where}: {names} have the same row and seed; leave one out")
+                check_same(where, row, [_row_facts(run, self.split) for run in row])
 
-    def _check_column(self, column: str, allow_dirty: bool) -> None:
-        """The runs of one column must be of the same data, protocol, LPIPS and kind of code.
 
-        A mean over subjects is of different data by design.
-        """
-        where, split = f"table {self.spec.name}, {self.split}", self.split
-        runs = [run for run in self.runs_of(column) if run.images(split)]
-        records = [run.protocol(split) for run in runs]
-        if column == MEAN:
-            records = [{k: v for k, v in r.items() if k not in PER_SUBJECT} for r in records]
-        else:
-            check_same(where, DATA, [(run, str(run.data.get("fingerprint"))) for run in runs])
-            check_same(where, "images scored", [(run, run.images(split)) for run in runs])
-            floors = [(run, run.of(split, FLOOR).get("psnr")) for run in runs]
-            check_same(where, "PSNR of an all-background image", floors)
-        names = [(run, record["name"]) for run, record in zip(runs, records, strict=True)]
-        check_same(where, "protocol", names)
-        check_same(where, "values of the protocol", zip(runs, records, strict=True))
-        check_same(where, "LPIPS", [(run, _lpips(run, split)) for run in runs])
-        if not allow_dirty:
-            code = "uncommitted changes of the code (allow_dirty=true allows them)"
-            check_same(where, code, [(run, bool(run.facts.get("dirty"))) for run in runs])
+def _row_facts(run: Run, split: str) -> dict[str, Any]:
+    """What the runs of one row have in common: all but the seed."""
+    return {
+        "kind": "predictions" if run.seed is None else "a model trained here",
+        "settings": run.settings,
+        "iterations": run.facts.get("iterations"),
+        "marks": "; ".join(run.of(split, PAINTED).get("marks", [])) or "none",
+    }
+
+
+def _column_facts(run: Run, split: str, mean: bool, allow_dirty: bool) -> dict[str, Any]:
+    """What the runs of one column have in common; those of a mean over subjects differ in data."""
+    record = run.protocol(split)
+    facts = {
+        "protocol": record["name"],
+        "LPIPS": _lpips(run, split),
+        DIRTY: None if allow_dirty else bool(run.facts.get("dirty")),
+    }
+    if mean:
+        return facts | {"the protocol's": {k: v for k, v in record.items() if k not in PER_SUBJECT}}
+    return facts | {
+        DATA: str(run.data.get("fingerprint")),
+        "images scored": run.images(split),
+        "PSNR of an all-background image": run.of(split, FLOOR).get("psnr"),
+        "the protocol's": record,
+    }
+
+
+def make_tables(config: DictConfig) -> None:
+    """Writes the table ``config.table`` of ``config.runs`` into ``config.out``.
+
+    Raises:
+        ConfigError: on runs that do not exist or do not belong into one table, or on a page or
+            folder that cannot be written.
+    """
+    given = [config.runs] if isinstance(config.runs, str) else config.runs
+    spec: TableSpec = instantiate(config.table)
+    paper = None if spec.paper is None else read_paper(spec.paper)
+    page = None if config.fill is None else Path(str(config.fill)).expanduser()
+    start = f"<!-- report:{spec.name} -->"
+    if page is not None:
+        check_block(page, start, BLOCK_END, key="fill")
+    runs, left_out = read_runs(find_runs([str(entry) for entry in given]))
+    report = build(spec, runs, left_out, paper, allow_dirty=config.allow_dirty)
+    now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
+    folder = Path(str(config.out or f"runs/report/{now}")).expanduser()
+    files: dict[str, str | bytes] = dict(pages(report))
+    if spec.by:
+        from gsgan.report.curves import curves  # here: it imports matplotlib
+
+        files |= {CURVES: image} if (image := curves(report)) else {}
+    try:
+        for name, content in files.items():
+            write_atomically(folder / name, content)
+        if page is not None:
+            fill_block(page, start, BLOCK_END, MARKDOWN.body(report), key="fill")
+    except OSError as error:
+        where = error.filename or folder
+        raise ConfigError(f"{where} cannot be written: {error.strerror}") from None
+    console = make_console()
+    console.print(Markdown(TERMINAL.body(report)))
+    filled = "" if page is None else f"\nfilled: {page}"
+    done = f"tables: {folder}/{{{','.join(files)}}}{filled}"
+    console.print(done, markup=False, soft_wrap=True)
 
 
 def build(
@@ -198,17 +247,15 @@ def build(
         | {key: run.facts.get(key) for key in FACTS}
         for run in taken
     ]
-    reasons_by_name = {names[folder]: reason for folder, reason in left_out.items()}
-    return Report(spec.name, spec.title, _grids(parts, paper), records, reasons_by_name)
+    left = {names[folder]: reason for folder, reason in left_out.items()}
+    return Report(spec.name, spec.title, _grids(parts, paper), records, left)
 
 
 def _no_place(spec: TableSpec, run: Run) -> str | None:
     """Why the table has no place for a run; raises ConfigError on another data set's."""
     if spec.data not in (None, run.data.get("name")):
-        raise ConfigError(
-            f"table {spec.name} is of {spec.data}, but {run} is of {run.data_name}; leave it out "
-            "of runs, or use table=plain"
-        )
+        what = f"is of {spec.data}, but {run} is of {run.data_name}"
+        raise ConfigError(f"table {spec.name} {what}; leave it out of runs, or use table=plain")
     if spec.subjects and subject_of(run.data.get("root"), spec.subjects) is None:
         return f"its subject is none of {', '.join(spec.subjects)} ({run.data_name})"
     if spec.rows is not None and run.name not in {row.run for row in spec.rows}:
@@ -240,7 +287,7 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
         if spec.variant == PAINTED:
             rows += printed.pop(spec.run, [])
     rows = _with_best([*rows, *(row for left in printed.values() for row in left)], part)
-    floor = [mean_cell(m, part.values(part.runs, FLOOR, c)) for c, m in columns.items()]
+    floor = [mean_cell(m, part.values(None, FLOOR, c)) for c, m in columns.items()]
     rows.append(Row(FLOOR_LABEL, floor, (NOT_HAD, *_origin(part.runs)), "floor"))
     title = f"{part.split}{SPLIT_TITLES.get(part.split, '')}"
     if part.metric is None:
@@ -249,11 +296,10 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
 
 
 def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
-    runs, label = part.of(spec.run), spec.label or spec.run
+    runs, label, shown = part.of(spec.run), spec.label or spec.run, (spec.run, spec.variant)
     if not runs:
         cells = [Cell(NO_RUN, {"n": 0}) for _ in part.columns]
         return Row(label, cells, ("0", NO_RUN, NO_RUN, NO_RUN), notes=("no scored run",))
-    values = [(m, part.values(runs, spec.variant, c)) for c, m in part.columns.items()]
     notes = list(dict.fromkeys(_marks(runs, part.split)))
     if beside_paper:  # named as the paper's method where all runs are
         departures = [run.departures() for run in runs]
@@ -262,11 +308,10 @@ def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
         elif found := next(filter(None, departures), None):
             notes.append(clause(found))
         else:
-            whole = (spec.run, spec.variant) == ("full", PAINTED)
-            label = NAME if whole else f"{NAME}, {label}"
+            label = NAME if shown == ("full", PAINTED) else f"{NAME}, {label}"
     counts = [len(part.of(spec.run, column)) for column in part.columns if column != MEAN]
     seeds = " to ".join(map(str, dict.fromkeys((min(counts), max(counts)))))
-    cells = [mean_cell(metric, found) for metric, found in values]
+    cells = [mean_cell(m, part.values(*shown, c)) for c, m in part.columns.items()]
     return Row(label, cells, (seeds, *_origin(runs)), notes=tuple(notes))
 
 

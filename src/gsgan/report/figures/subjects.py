@@ -74,7 +74,7 @@ def choose_items(
 ) -> list[Item]:
     """Camera and frame of each image to show.
 
-    Where ``frames`` is None, ``count`` are spread evenly over the split; where ``camera`` is None, its
+    Without ``frames``, ``count`` of them are spread evenly over the split; without ``camera``, its
     cameras are taken in turn, one per image, or only the first (``one_camera``).
 
     Raises:
@@ -107,8 +107,8 @@ def choose_items(
 
 
 def make_shots(data: GsganData, split: str, items: Sequence[Item], margin: float) -> list[Shot]:
-    """Images of a split in windows ``margin`` metres around the joints, of one size where the images
-    have one."""
+    """Images of a split in windows that reach ``margin`` metres beyond the joints, all of one size
+    where the images are."""
     dataset = data.dataset(split)
     frames = [dataset[dataset.items.index(item)] for item in items]
     one_size = len({frame.camera.size for frame in frames}) == 1
@@ -194,7 +194,8 @@ def open_subjects(
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise ConfigError("a run is given twice; every run in run and compare must differ")
     subjects = [_open(folder, moved, device) for folder in folders]
-    check_same("figures", DATA, [(s.run, s.run.data["fingerprint"]) for s in subjects])
+    runs = [subject.run for subject in subjects]
+    check_same("figures", runs, [{DATA: run.data["fingerprint"]} for run in runs])
     models = [s.name for s in subjects]
     titles = models if names is None else list(map(str, names))
     for more in (
