@@ -12,7 +12,6 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.colors import to_hex, to_rgb, to_rgba_array
-from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.evaluate.pictures import colour_labels
@@ -129,7 +128,9 @@ def draw_points(axes: Axes, placed: Densify | BodyPoints, pose: Pose, shot: Shot
     fit_to(axes, shot)
     if isinstance(placed, BodyPoints):
         assert shot.frame.body is not None
-        points, colours = placed(shot.frame.body), bone_colours(placed)
+        points, skin = placed(shot.frame.body), placed.points
+        most = skin.bone_index.gather(1, skin.bone_weight.argmax(dim=1, keepdim=True))[:, 0]
+        colours = colormaps["tab20"](7 * most.numpy() % 20)  # neighbouring bones differ
     else:
         points = placed(*pose)
         colours = to_rgba_array(np.array(part_colours(placed))[points.part_id.numpy()])
@@ -141,13 +142,6 @@ def draw_points(axes: Axes, placed: Densify | BodyPoints, pose: Pose, shot: Shot
     x, y = pixels[order].T
     axes.scatter(x, y, s=1.1, c=colours[order], linewidths=0, rasterized=True)
     return len(order)
-
-
-def bone_colours(placed: BodyPoints) -> NDArray[np.float64]:
-    """``[N, 4]`` RGBA of the bone that moves each point most; neighbouring bones differ."""
-    weights, bones = placed.points.bone_weight, placed.points.bone_index
-    most = bones.gather(1, weights.argmax(dim=1, keepdim=True))[:, 0].numpy()
-    return np.asarray(colormaps["tab20"](7 * most % 20))
 
 
 def part_colours(densify: Densify) -> list[str]:
@@ -225,10 +219,15 @@ def segmentation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: S
     for shot in shots:
         numbers[shot.name], row = {}, [Panel(shot.truth)]
         for subject in able:
-            parts, truth = _parts(subject, shot)
+            parts, module = subject.paint(shot).segmentation, subject.avatar.segmentation
+            assert parts is not None
+            assert module is not None
+            assert shot.frame.labels is not None
+            cut = shot.window.cut
+            parts, truth = module.to_score(cut(parts), cut(shot.frame.labels))
             ours, found = parts.argmax(dim=1), agreement(parts, truth)
             wrong = found["wrong_share"]
-            share = "n/a" if wrong is None else f"{100 * wrong:.1f} % wrong"
+            share = written(None if wrong is None else 100 * wrong, 1, " % wrong")
             row += [] if subject is not able[0] else [Panel(colour_labels(truth))]
             row.append(Panel(colour_labels(ours), f"mIoU {written(found['miou'], 3)}"))
             row.append(Panel(disagreement(ours, truth), share, framed=True))
@@ -267,16 +266,6 @@ def disagreement(ours: Tensor, labels: Tensor) -> Tensor:
     wrong = ((ours != labels) & (labels != IGNORE)).unsqueeze(1)
     rgb = torch.tensor(to_rgb(VERMILLION))
     return torch.where(wrong, rgb[None, :, None, None], grey.unsqueeze(1))
-
-
-def _parts(subject: Subject, shot: Shot) -> tuple[Tensor, Tensor]:
-    """S and the true parts of a shot, both in the run's classes."""
-    parts, labels, module = subject.parts(shot), shot.frame.labels, subject.avatar.segmentation
-    assert parts is not None
-    assert labels is not None
-    assert module is not None
-    padded, truth = module.to_score(parts, shot.window.cut(labels))
-    return padded, truth.to(parts.device)
 
 
 def _legend(labels: Tensor, names: Sequence[str]) -> dict[str, str]:

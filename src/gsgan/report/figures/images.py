@@ -37,9 +37,7 @@ from gsgan.utils.palette import BLACK, COLOURS, MARKERS, SKY, VERMILLION
 FOUND, MISSED, INVENTED = BLACK, SKY, VERMILLION  # edges
 NEAR = 1  # pixels an edge may be off, as in edge F1
 ERROR_COLOURS = "magma_r"  # pale is no error; even steps of lightness, in grey print too
-LEVELS = 255.0
 DETAIL = 0.35  # sides of the ablation's box, as a share of the image's
-HEIGHT = 0.75  # of the training figure, as a share of its width
 STEP_ONE = "Step I's colour"
 Images = list[dict[str, Tensor]]  # per shot, by name
 
@@ -80,31 +78,16 @@ def strip(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings
     return Drawing(sheet.figure, caption, numbers)
 
 
-def comparison(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
+def comparison(
+    subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings, *, detail: bool = False
+) -> Drawing:
     """A row per shot: the ground truth and each run's image, with PSNR and edge F1.
 
-    Source: the paper's comparison figure.
-    """
-    images, numbers = _measured(subjects, shots)
-    panels = []
-    for shot, held in zip(shots, images, strict=True):
-        panels.append([Panel(shot.truth)])
-        for name, image in held.items():
-            found = numbers[shot.name][name]
-            note = f"{_decibels(found)}\nF1 {written(found['edge_f1'], 3)}"
-            panels[-1].append(Panel(image, note))
-    sheet = Sheet(panels, settings, width=settings.page, titles=["truth", *images[0]])
-    caption = "The ground truth and each run's image, with PSNR and the F1 of Canny edges."
-    return Drawing(sheet.figure, caption, numbers)
+    With ``detail`` a second row magnifies the box in which the runs differ most: where the variance
+    between their images is largest. The ground truth has no part in it, so it favours no run.
 
-
-def ablation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
-    """Two rows per shot: the images, and below them the box in which the runs differ most.
-
-    The box is measured, not chosen: where the variance between the runs' images is largest. The
-    ground truth has no part in it, so it favours no run.
-
-    Source: the paper's ablation triplet (full, w/o GCN, w/o S).
+    Source: the paper's comparison figure; with ``detail`` its ablation triplet (full, w/o GCN,
+    w/o S).
     """
     images, numbers = _measured(subjects, shots)
     panels: list[list[Panel]] = []
@@ -113,20 +96,24 @@ def ablation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setti
         above, below = [Panel(shot.truth)], [Panel(shot.truth[..., *box])]
         for name, image in held.items():
             found = numbers[shot.name][name]
-            found["psnr_detail"] = finite(psnr(image[..., *box], shot.truth[..., *box]))
-            above.append(Panel(image, _decibels(found)))
-            below.append(Panel(image[..., *box], written(found["psnr_detail"], 2, " dB")))
-        panels += [above, below]
+            above.append(Panel(image, f"{_decibels(found)}\nF1 {written(found['edge_f1'], 3)}"))
+            if detail:
+                found["psnr_detail"] = finite(psnr(image[..., *box], shot.truth[..., *box]))
+                below.append(Panel(image[..., *box], written(found["psnr_detail"], 2, " dB")))
+        panels += [above, below] if detail else [above]
     sheet = Sheet(panels, settings, width=settings.page, titles=["truth", *images[0]])
+    caption = "The ground truth and each run's image, with PSNR and the F1 of Canny edges"
+    if not detail:
+        return Drawing(sheet.figure, f"{caption}.", numbers)
     for i, (rows, columns) in enumerate(boxes):
         size = columns.stop - columns.start, rows.stop - rows.start
         for whole, magnified in zip(sheet.axes[2 * i], sheet.axes[2 * i + 1], strict=True):
             frame = Rectangle((columns.start, rows.start), *size, fill=False, ec=VERMILLION, lw=0.8)
             whole.add_patch(frame)
             magnified.spines[:].set(visible=True, color=VERMILLION, linewidth=1.6)
-    caption = (
-        "The ground truth and each run's image, with PSNR; below, magnified, the box in which the "
-        "runs' images differ most from each other, with PSNR in the box."
+    caption += (
+        "; below, magnified, the box in which the runs' images differ most from each other, with "
+        "PSNR in the box."
     )
     return Drawing(sheet.figure, caption, numbers)
 
@@ -230,7 +217,7 @@ def errors(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setting
 
 def error_levels(image: Tensor, truth: Tensor) -> Tensor:
     """``[h, w]``: |image - truth| of ``[1, 3, h, w]``, mean over channels, levels of 255."""
-    return (image - truth).abs().mean(dim=1)[0].double() * LEVELS
+    return (image - truth).abs().mean(dim=1)[0].double() * 255
 
 
 def scale_end(values: Tensor) -> float:
@@ -245,7 +232,7 @@ def training(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setti
     Raises:
         Unavailable: when a run has no log that can be read.
     """
-    figure = Figure((settings.column, HEIGHT * settings.column), layout="constrained")
+    figure = Figure((settings.column, 0.75 * settings.column), layout="constrained")
     axes = figure.add_subplot()
     shown, solid, numbers = [], [], {}
     for k, subject in enumerate(subjects):

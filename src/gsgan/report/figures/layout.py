@@ -82,18 +82,11 @@ class Panel:
 
 
 class Sheet:
-    """A figure of equal panels, the widest that fits; text that does not fit is made smaller.
+    """Equal panels by row, the widest that fit into ``width`` inches, with titles above the
+    columns, names left of the rows, and ``foot`` inches for a legend or colour bar.
 
-    Args:
-        panels: by row.
-        settings: sizes.
-        width: inches, at most.
-        titles: above the columns, of one line or more.
-        names: at the left of the rows.
-        foot: inches kept at the bottom for a legend or colour bar.
-
-    Attributes:
-        axes: ``[rows, columns]``, in pixels of the images, pixel centres at +0.5.
+    Text that does not fit is made smaller. ``axes`` are ``[rows, columns]``, in pixels of the
+    images, pixel centres at +0.5.
     """
 
     def __init__(

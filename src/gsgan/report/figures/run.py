@@ -7,6 +7,7 @@ import json
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot], Settings], Drawi
     "errors": images.errors,
     "strip": images.strip,
     "comparison": images.comparison,
-    "ablation": images.ablation,
+    "ablation": partial(images.comparison, detail=True),
     "training": images.training,
 }
 COMPARE = ("comparison", "ablation")  # need a second run
@@ -66,8 +67,7 @@ def make_figures(config: DictConfig) -> None:
     for folder in folders:
         load_config(folder, moved)  # refuses what is not a run folder before anything is written
     try:
-        write_atomically(out / ".probe", "")
-        (out / ".probe").unlink()
+        out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"out={out}: cannot be written to ({error.strerror})") from error
     logging.getLogger("fontTools").setLevel(logging.WARNING)  # it logs every glyph of a PDF
@@ -141,14 +141,13 @@ def _draw(
                     f"skeleton of {shot.name}; leave one of them out"
                 )
     drawing = FIGURES[name](subjects, shots, settings)
-    about = f"Split {split}."
+    about = ""
     if name != "training":
         about = (
-            f"Images: {', '.join(shot.name for shot in shots)}. Numbers are of the windows shown, "
-            f"which reach at least {settings.margin:g} m beyond the joints, not of whole images. "
-            + about
+            f" Images: {', '.join(shot.name for shot in shots)}. Numbers are of the windows shown, "
+            f"which reach at least {settings.margin:g} m beyond the joints, not of whole images."
         )
-    return replace(drawing, caption=f"{drawing.caption} {about}")
+    return replace(drawing, caption=f"{drawing.caption}{about} Split {split}.")
 
 
 def _list(value: Any) -> list[Any]:

@@ -147,12 +147,9 @@ class Subject:
             # of F only the colour: all channels of every shot would fill the memory
             parts = (painting.image, painting.colour, painting.segmentation)
             image, colour, labels = (None if part is None else part.cpu() for part in parts)
-            for part in (image, colour, labels):
-                if part is not None and not bool(part.isfinite().all()):
-                    folder = self.run.folder
-                    raise DataError(
-                        f"{folder}: its image of {shot.name} is not finite; train again"
-                    )
+            if not all(part is None or part.isfinite().all() for part in (image, colour, labels)):
+                where = f"{self.run.folder}: its image of {shot.name}"
+                raise DataError(f"{where} is not finite; train it again")
             gaussians = None if painting.gaussians is None else painting.gaussians.to("cpu")
             kept = Painting(image, features=colour, segmentation=labels, gaussians=gaussians)
             self._painted[shot.item] = kept
@@ -171,11 +168,6 @@ class Subject:
             return None
         return shot.window.cut(colour).clamp(0, 1)
 
-    def parts(self, shot: Shot) -> Tensor | None:
-        """``[1, classes, h, w]`` S as shown, or None where the model has none."""
-        parts = self.paint(shot).segmentation
-        return None if parts is None else shot.window.cut(parts)
-
 
 def open_subjects(
     folders: Sequence[Path], names: Sequence[str] | None, moved: Moved, device: torch.device | str
@@ -188,25 +180,21 @@ def open_subjects(
     """
     if names is not None and not len(set(map(str, names))) == len(names) == len(folders):
         raise ConfigError(
-            f"names must be {len(folders)} different texts, the run's first, then those of "
-            f"compare; got {names}"
+            f"names must be {len(folders)} different texts, the run's first; got {names}"
         )
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise ConfigError("a run is given twice; every run in run and compare must differ")
     subjects = [_open(folder, moved, device) for folder in folders]
     runs = [subject.run for subject in subjects]
     check_same("figures", runs, [{DATA: run.data["fingerprint"]} for run in runs])
-    models = [s.name for s in subjects]
-    titles = models if names is None else list(map(str, names))
-    for more in (
-        [f"seed {s.run.seed}" for s in subjects],
-        [s.run.folder.resolve().name for s in subjects],
-        [str(s.run.folder) for s in subjects],
-    ):
-        if len(set(titles)) < len(titles):
-            pairs = zip(models, more, strict=True)
-            titles = [m if models.count(m) < 2 else f"{m}, {text}" for m, text in pairs]
-    return [replace(s, name=title) for s, title in zip(subjects, titles, strict=True)]
+    if names is None:
+        models = [s.name for s in subjects]
+        seeds = [f"seed {run.seed}" for run in runs]
+        places = [folder.resolve().name for folder in folders], list(map(str, folders))
+        more = next(texts for texts in (seeds, *places) if len(set(texts)) == len(texts))
+        pairs = zip(models, more, strict=True)
+        names = [m if models.count(m) < 2 else f"{m}, {text}" for m, text in pairs]
+    return [replace(s, name=str(name)) for s, name in zip(subjects, names, strict=True)]
 
 
 def _open(folder: Path, moved: Moved, device: torch.device | str) -> Subject:
