@@ -173,7 +173,7 @@ def test_one_seed_twice_is_refused(tmp_path):
 def test_protocols_of_one_name_and_other_values_are_refused(tmp_path):
     a = write_run(tmp_path / "a", psnr=30.0, record=protocol("p"))
     b = write_run(tmp_path / "b", seed=1, psnr=30.0, record=protocol("p", scale=1.0))
-    with pytest.raises(ConfigError, match="differ in the protocol's: scale"):
+    with pytest.raises(ConfigError, match="differ in values of the protocol: scale"):
         report_of(table(), a, b)
 
 

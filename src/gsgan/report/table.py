@@ -161,12 +161,13 @@ def _column_facts(run: Run, split: str, mean: bool, allow_dirty: bool) -> dict[s
         DIRTY: None if allow_dirty else bool(run.facts.get("dirty")),
     }
     if mean:
-        return facts | {"the protocol's": {k: v for k, v in record.items() if k not in PER_SUBJECT}}
+        record = {k: v for k, v in record.items() if k not in PER_SUBJECT}
+        return facts | {"values of the protocol": record}
     return facts | {
         DATA: str(run.data.get("fingerprint")),
         "images scored": run.images(split),
         "PSNR of an all-background image": run.of(split, FLOOR).get("psnr"),
-        "the protocol's": record,
+        "values of the protocol": record,
     }
 
 

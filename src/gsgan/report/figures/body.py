@@ -106,7 +106,7 @@ def fit_to(axes: Axes, shot: Shot) -> None:
     axes.set_aspect("equal", adjustable="box")
 
 
-def draw_bones(axes: Axes, pose: Pose, shot: Shot, width: float = 1.4) -> None:
+def draw_bones(axes: Axes, pose: Pose, shot: Shot) -> None:
     """The skeleton in its groups' colours, far bones first, joints as dots."""
     fit_to(axes, shot)
     p, valid, _ = pose
@@ -115,8 +115,8 @@ def draw_bones(axes: Axes, pose: Pose, shot: Shot, width: float = 1.4) -> None:
     bones = [edge for edge in BONE_COLOURS if shown[list(edge)].all()]
     bones.sort(key=lambda edge: -depth[list(edge)].mean())
     lines, colours = [pixels[list(edge)] for edge in bones], [BONE_COLOURS[e] for e in bones]
-    axes.add_collection(LineCollection(lines, colors=colours, linewidths=width, capstyle="round"))
-    axes.plot(*pixels[shown].T, ".", color="#222222", ms=width * 1.6, mew=0)
+    axes.add_collection(LineCollection(lines, colors=colours, linewidths=1.4, capstyle="round"))
+    axes.plot(*pixels[shown].T, ".", color="#222222", ms=2.2, mew=0)
 
 
 def draw_points(axes: Axes, placed: Densify | BodyPoints, pose: Pose, shot: Shot) -> int:
