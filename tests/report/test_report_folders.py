@@ -137,6 +137,6 @@ def test_scored_predictions_stand_beside_a_run(run, capture, tmp_path, inside):
     assert result.returncode == 0, result.stderr
     report = report_of(table(metrics=["psnr"]), run, tmp_path / "black_scores")
     (grid,) = report.grids
-    assert [r.label for r in grid.rows] == ["black", "full", "all background (floor)"]
+    assert [r.label for r in grid.rows] == ["full", "black", "all background (floor)"]
     assert texts(row(grid, "black")) == texts(row(grid, "all background (floor)"))
     assert row(grid, "black").origin[0] == "1"
