@@ -214,8 +214,7 @@ def test_a_run_from_before_body_points_and_low_pass_loads_as_it_was_trained(tiny
 def test_the_figure_of_densify_says_where_the_points_are(build, tmp_path):
     from gsgan.report.figures.body import densify
     from gsgan.report.figures.layout import Settings
-    from gsgan.report.figures.shots import make_shots
-    from gsgan.report.figures.subjects import Subject
+    from gsgan.report.figures.subjects import Subject, make_shots
     from gsgan.report.runs import Run
 
     for word, said in (("on", "the bone that moves them most"), ("off", "Algorithm 1 puts on")):

@@ -14,12 +14,16 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from gsgan.report.figures import images
-from gsgan.report.figures.body import draw_gaussians, ellipses, part_colours
+from gsgan.report.figures.body import (
+    agreement,
+    disagreement,
+    draw_gaussians,
+    ellipses,
+    part_colours,
+)
 from gsgan.report.figures.layout import Panel, Settings, Sheet, Unavailable, style, written
 from gsgan.report.figures.run import FIGURES
-from gsgan.report.figures.segmentation import agreement, disagreement
-from gsgan.report.figures.shots import choose_items, make_shots
-from gsgan.report.figures.subjects import Subject, measure
+from gsgan.report.figures.subjects import Subject, choose_items, make_shots, measure
 from gsgan.report.runs import Run
 from gsgan.scene import Camera, Gaussians
 from gsgan.skeleton import Densify
@@ -50,13 +54,13 @@ def pinhole() -> Camera:
 def test_measures_in_closed_form():
     truth = torch.zeros(1, 3, 16, 16)
     truth[..., 4:12, 4:12] = 0.8
-    found = measure(truth + 0.1, truth, SETTINGS)
+    found = measure(truth + 0.1, truth)
     assert found["psnr"] == pytest.approx(20, abs=1e-4)
     assert found["edge_f1"] == 1
     assert found["edge_ratio"] == 1
-    same = measure(truth, truth, SETTINGS)
+    same = measure(truth, truth)
     assert same["psnr"] is None  # infinite
-    blank = measure(truth, torch.zeros_like(truth), SETTINGS)
+    blank = measure(truth, torch.zeros_like(truth))
     assert blank["edge_f1"] is None
     assert blank["edge_ratio"] is None
     assert written(None, 2, " dB") == "n/a"
@@ -66,13 +70,11 @@ def test_edges_found_missing_and_invented_have_their_colours():
     truth, edges = np.zeros((8, 8), bool), np.zeros((8, 8), bool)
     truth[1, 1] = truth[6, 6] = True
     edges[1, 2] = edges[6, 1] = True  # one pixel off, and far from any
-    painted = images.paint_edges(edges, truth, tolerance=1)
+    painted = images.paint_edges(edges, truth)
     colours = {images.FOUND: (1, 2), images.MISSED: (6, 6), images.INVENTED: (6, 1)}
     for colour, (row, column) in colours.items():
         assert painted[row, column].tolist() == rgb(colour)
     assert (painted != 255).any(-1).sum() == 3
-    strict = images.paint_edges(edges, truth, tolerance=0)
-    assert strict[1, 2].tolist() == rgb(images.INVENTED)
 
 
 def test_errors_are_levels_of_255_and_share_one_scale():
@@ -145,7 +147,7 @@ def test_ellipses_are_as_wide_as_the_supersampled_image_has_them():
     larger = project(gaussians, camera.resize((128, 128)), accuracy)
     wanted, _, _ = ellipses(larger.factors[0].double())
     axes = Figure().add_subplot()
-    draw_gaussians(axes, gaussians, SimpleNamespace(camera=camera), accuracy, sigmas=1.0)
+    draw_gaussians(axes, gaussians, SimpleNamespace(camera=camera), accuracy)
     (drawn,) = axes.collections
     assert 2 * float(drawn.get_widths()[0]) == pytest.approx(2 * float(wanted[0]), rel=1e-4)
 
@@ -178,8 +180,7 @@ def test_a_panel_holds_its_image_and_text_fits_its_width():
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("font", 0), ("dpi", 1.5), ("detail", 2.0), ("page", "wide"),
-     ("canny_tolerance", -1), ("column", 0.1), ("page", math.inf), ("dpi", 10**8),
+    [("font", 0), ("dpi", 10**8), ("page", "wide"), ("column", 0.1), ("page", math.inf),
      ("margin", math.nan)],
 )  # fmt: skip
 def test_settings_that_cannot_be_are_refused(key, value):
@@ -299,16 +300,6 @@ def test_what_is_kept_of_a_painting_is_on_the_cpu(build):
     assert kept.gaussians is not None
     want = painted(shot.frame).corrected
     assert torch.equal(subject.colour(shot), shot.window.cut(want).clamp(0, 1))
-
-
-def test_an_unfinished_run_is_marked(build):
-    subject = subject_of(build)
-    schedule = {"step_one": 4, "step_two": 6, "segmentation": 2}
-    settings = {f"training.schedule.{name}": count for name, count in schedule.items()}
-    subject = replace(subject, run=replace(subject.run, settings=settings))
-    assert replace(subject, step=12).notes == []
-    half = replace(subject, step=3, marks=["stand-in"])
-    assert half.notes == ["stand-in", "full is unfinished: 3 of 12 iterations"]
 
 
 def test_a_splat_only_run_stands_for_splatting_alone(build):

@@ -32,10 +32,10 @@ def test_beside_the_same_data_subject_protocol_and_split(tmp_path):
 
 
 APART = {
-    "synthetic": ({"data": None, "record": None}, "of synthetic, person, the paper's of zju"),
+    "synthetic": ({"data": None, "record": None}, "of synthetic, the paper's of zju_mocap"),
     "another subject": ({"data": zju(386)}, "CoreView_386, the paper's of subject 377"),
-    "no protocol": ({"record": None}, "follow protocol none"),
-    "another protocol": ({"record": protocol("zju_gauhuman")}, "follow protocol zju_gauhuman"),
+    "no protocol": ({"record": None}, "of protocol none"),
+    "another protocol": ({"record": protocol("zju_gauhuman")}, "of protocol zju_gauhuman"),
     "a departure": ({"record": protocol("paper_zju", departures=["at scale 1"])}, "at scale 1"),
 }
 
@@ -73,7 +73,7 @@ def test_only_runs_of_experiment_paper_have_the_papers_name(tmp_path, monkeypatc
 def test_another_split_is_not_the_papers(tmp_path):
     run = paper_run(tmp_path / "a", splits=("novel_pose",))
     spec = table(**(ABLATION | VIEW | {"splits": ["novel_pose"]}))
-    assert "novel_pose scores, the paper's novel_view" in report_of(spec, run).grids[-1].remarks[0]
+    assert "of novel_pose, the paper's of novel_view" in report_of(spec, run).grids[-1].remarks[0]
 
 
 def test_the_six_subjects_beside_ours(tmp_path):

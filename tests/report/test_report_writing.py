@@ -8,9 +8,10 @@ from html.parser import HTMLParser
 
 import pytest
 from rich.console import Console
+from rich.markdown import Markdown
 
 from gsgan.report import write
-from gsgan.report.write import Cell, Grid, Report, Row, print_report
+from gsgan.report.write import Cell, Grid, Report, Row
 
 NASTY = r"a_b & 50% <b>|x|</b> {y} #1 $2 ~ ^ \cmd *[z]* ± −"
 ORIGIN = ("3", "data_set, my_377", "none", "abc123")
@@ -25,8 +26,7 @@ def report():
         Row("floor", [Cell("15.00"), Cell("n/a", {}, ("no parts",))], ORIGIN, "floor", ("a note",)),
     ]
     grid = Grid("novel_pose: 100% [f00d]", ["PSNR ↑", "mIoU [a] ↑"], rows, ("Row − full.",))
-    runs = Grid("Runs", ["row"], [Row("folder_a", [Cell("full")])])
-    return Report("t", "A & B", [grid], runs, ["Remark_1."], [("bad_run", "damaged <x>")])
+    return Report("t", "A & B", [grid], [{"folder": "folder_a"}], {"bad_run": "damaged <x>"})
 
 
 def test_notes_are_numbered_in_the_order_of_appearance(report):
@@ -34,21 +34,19 @@ def test_notes_are_numbered_in_the_order_of_appearance(report):
 
 
 def test_markdown_tables_have_as_many_cells_in_every_row(report):
-    text = write.markdown_page(report)
+    text = write.pages(report)["report.md"]
     lines = [line for line in text.splitlines() if line.startswith("|")]
     counts = [len(re.findall(r"(?<!\\)\|", line)) for line in lines]
-    assert counts == [8] * 5 + [3] * 3
+    assert counts == [8] * 5
     assert r"\<b\>" in text
     assert r"\$2 \~ ^" in text  # neither a formula nor struck out
     assert "bad_run" in text
     assert "**31.00 ± 1.00**" in text
     assert "<sup>1</sup>" in text
-    assert "**Runs**" in text
-    assert "**Runs**" not in write.MARKDOWN.body(report)
 
 
 def test_latex_is_escaped_balanced_and_rectangular(report):
-    text = write.latex_page(report)
+    text = write.pages(report)["report.tex"]
     for name in ("table", "tabular"):
         begins, ends = (text.count(rf"\{word}{{{name}}}") for word in ("begin", "end"))
         assert begins == ends == 1
@@ -100,12 +98,12 @@ class Tags(HTMLParser):
 
 def test_html_is_well_formed_escaped_and_fetches_nothing(report):
     tags = Tags()
-    tags.feed(write.html_page(report))
+    tags.feed(write.pages(report)["report.html"])
     assert not tags.open
     assert not {"script", "link", "img", "b"} & set(tags.seen)
     assert NASTY in tags.text
     assert "damaged <x>" in tags.text
-    assert "<em>GAN (paper)</em>" in write.html_page(report)
+    assert "<em>GAN (paper)</em>" in write.pages(report)["report.html"]
 
 
 def test_html_does_not_cut_long_texts_off():
@@ -115,16 +113,17 @@ def test_html_does_not_cut_long_texts_off():
 
 
 def test_json_holds_every_number(report):
-    held = json.loads(write.json_page(report))
+    held = json.loads(write.pages(report)["report.json"])
     first = held["grids"][0]["rows"][0]
     assert first["cells"]["PSNR ↑"] == {"text": "31.00 ± 1.00", "mean": 31.0, "notes": []}
     assert first["commit"] == "abc123"
+    assert held["runs"] == [{"folder": "folder_a"}]
     assert held["left_out"] == [{"folder": "bad_run", "reason": "damaged <x>"}]
 
 
 def test_the_terminal_shows_it_all_without_markup(report):
     console = Console(record=True, width=160)
-    print_report(report, console)
+    console.print(Markdown(write.TERMINAL.body(report)))
     text = console.export_text()
     for word in (
         NASTY,

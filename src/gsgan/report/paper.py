@@ -20,17 +20,7 @@ MARK = "as printed"  # in the label of every row of the paper's
 
 @dataclass(frozen=True)
 class PaperTable:
-    """One table of the paper.
-
-    Args:
-        title: which table.
-        data: the data set.
-        rows: ``{label, beside, values: {subject: {metric: text}}}``, as printed; ``beside`` is the
-            model whose row it belongs to.
-        protocol, split, subject: what a run must follow to stand beside it.
-        reason: why no run may; None where one may.
-        note: what else a reader has to know.
-    """
+    """One table of the paper; `paper.yaml` explains the keys."""
 
     title: str
     data: str
@@ -46,25 +36,22 @@ class PaperTable:
         if self.reason is not None:
             return self.reason
         for run in runs:
-            if run.data.get("name") != self.data:
-                return f"runs here are of {run.data_name}, the paper's of {self.data}"
+            record = run.protocol(split)
+            for mine, printed in (
+                (f"of {run.data.get('name')}", f"of {self.data}"),
+                (f"of protocol {record['name']}", f"of protocol {self.protocol}"),
+                (f"of {split}", f"of {self.split}"),
+            ):
+                if mine != printed:
+                    return f"runs here are {mine}, the paper's {printed}"
             if self.subject and subject_of(run.data.get("root"), [self.subject]) is None:
                 return f"runs here are of {run.data_name}, the paper's of subject {self.subject}"
-            record = run.protocol(split)
-            if record["name"] != self.protocol:
-                return f"runs here follow protocol {record['name']}, the paper's {self.protocol}"
             if record.get("departures"):
                 return f"runs here depart from {self.protocol}: {'; '.join(record['departures'])}"
-        if split != self.split:
-            return f"these are {split} scores, the paper's {self.split}"
         return None
 
     def beside(self, columns: Sequence[tuple[str | None, str]]) -> dict[str, list[Row]]:
-        """Its rows by the model that they belong to.
-
-        Args:
-            columns: subject (None: the table's own) and metric of each.
-        """
+        """Its rows by model; ``columns``: subject (None: the table's own) and metric of each."""
         note = f"{MARK} in {self.title}" + (f"; {self.note}" if self.note else "")
         found: dict[str, list[Row]] = {}
         for held in self.rows:
@@ -80,10 +67,9 @@ class PaperTable:
         shown = [m for m in METRICS if any(m in values for *_, values in cells)]
         rows = [self._row(f"{label}, {s}", [v.get(m) for m in shown]) for label, s, v in cells]
         remarks = [f"Not beside the scores above: {why}."]
-        if self.note:
-            remarks.append(f"{self.note[:1].upper()}{self.note[1:]}.")
+        remarks += [f"{self.note[:1].upper()}{self.note[1:]}."] if self.note else []
         title = f"As printed, not measured here: {self.title}"
-        return Grid(title, [heading(m) for m in shown], rows, tuple(remarks))
+        return Grid(title, [heading(m) for m in shown], rows, remarks)
 
     def _row(self, label: str, texts: Sequence[str | None], notes: tuple[str, ...] = ()) -> Row:
         cells = [Cell(NOT_HAD) if t is None else Cell(t, {"paper": float(t)}) for t in texts]
@@ -92,13 +78,13 @@ class PaperTable:
         return Row(f"{label} ({MARK})", cells, origin, "paper", notes)
 
 
-def read_paper(name: str, file: Path = FILE) -> PaperTable:
+def read_paper(name: str) -> PaperTable:
     """A table of paper.yaml.
 
     Raises:
         ConfigError: when there is no such table.
     """
-    tables: Any = OmegaConf.to_container(OmegaConf.load(file))
+    tables: Any = OmegaConf.to_container(OmegaConf.load(FILE))
     if name not in tables:
-        raise ConfigError(f"table.paper={name}: {file.name} has {', '.join(tables)}")
+        raise ConfigError(f"table.paper={name}: {FILE.name} has {', '.join(tables)}")
     return PaperTable(**tables[name])

@@ -1,4 +1,4 @@
-"""Run folders: which there are, and what ``metrics.json``, ``facts.json`` and ``.hydra/`` hold."""
+"""Run folders: which there are, what they hold, and whether two may stand together."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import glob
 import json
 import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,10 +22,8 @@ from gsgan.utils.errors import ConfigError, DataError
 
 METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"
 CONFIG = Path(".hydra") / "config.yaml"
-FACTS = {  # what is computed with; the rest is only shown
-    "data": dict, "model": str | None, "seed": int | None, "commit": str | None,
-    "iterations": int | None,
-}  # fmt: skip
+DATA = "data (cameras, frames, split, image size, crop or fitted landmarks)"
+TOLERANCE = 1e-3  # between equal floats, for rounding
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class Run:
     @property
     def commit(self) -> str:
         """The code that scored the run."""
-        name = self.facts.get("commit") or "unknown"
+        name = str(self.facts.get("commit") or "unknown")
         short = name[:9] if len(name) == 40 else name
         return f"{short} + changes" if self.facts.get("dirty") else short
 
@@ -85,26 +83,46 @@ class Run:
         return None if self.settings is None else departures(self.settings, self.name, data)
 
     def planned(self, *, segmentation: bool) -> int:
-        """Iterations of the whole schedule, 0 where there is none.
-
-        Args:
-            segmentation: add the segmentation's own phase, which not every scene has.
-        """
-        schedule = {
-            key.removeprefix("training.schedule."): value
-            for key, value in (self.settings or {}).items()
-        }
-        stretch = schedule.get("stretch", 1)
-        steps = [schedule.get(phase, 0) for phase in ("step_one", "step_two")]
-        own = schedule.get("segmentation", 0) if segmentation else 0
+        """Iterations of the whole schedule, 0 where there is none; ``segmentation`` adds the phase
+        of its own, which not every scene has."""
+        start, settings = "training.schedule.", self.settings or {}
+        stretch = settings.get(f"{start}stretch", 1)
+        steps = [settings.get(start + phase, 0) for phase in ("step_one", "step_two")]
+        own = settings.get(f"{start}segmentation", 0) if segmentation else 0
         return sum(round(step * stretch) for step in steps) + own
 
 
-def find_runs(given: Sequence[str]) -> list[Path]:
-    """The run folders, each once, in the order given.
+def check_same(where: str, runs: Sequence[Run], facts: Sequence[Mapping[str, Any]]) -> None:
+    """Runs must not differ in ``facts``, one mapping per run.
 
-    Args:
-        given: run folders, folders to search for them, globs of either.
+    None is not compared; within a dict, null is as good as no key.
+
+    Raises:
+        ConfigError: naming two runs and what differs.
+    """
+    first: dict[str, tuple[Run, Any]] = {}
+    for run, held in zip(runs, facts, strict=True):
+        for what, value in held.items():
+            if value is None:
+                continue
+            other, expected = first.setdefault(what, (run, value))
+            text = f"{expected} and {value}"
+            if isinstance(value, dict):
+                keys = value.keys() | expected.keys()
+                text = ", ".join(sorted(k for k in keys if value.get(k) != expected.get(k)))
+                same = not text
+            elif isinstance(value, float):
+                same = math.isclose(value, expected, rel_tol=0, abs_tol=TOLERANCE)
+            else:
+                same = value == expected
+            if not same:
+                raise ConfigError(
+                    f"{where}: {other} and {run} differ in {what}: {text}; leave one of them out"
+                )
+
+
+def find_runs(given: Sequence[str]) -> list[Path]:
+    """The run folders in folders, sweeps and globs of either, each once, in the order given.
 
     Raises:
         ConfigError: when an entry contains no run.
@@ -145,11 +163,7 @@ def read_runs(folders: Sequence[Path]) -> tuple[list[Run], dict[Path, str]]:
 
 
 def read_run(folder: Path, *, scored: bool = True) -> Run:
-    """The run in a folder.
-
-    Args:
-        folder: of the run.
-        scored: read its scores; without, a run that was never scored can be read, too.
+    """The run in a folder; with ``scored=False`` also one that was never scored.
 
     Raises:
         DataError: when a file is damaged, or the run is unfinished or not scored yet.
@@ -157,11 +171,10 @@ def read_run(folder: Path, *, scored: bool = True) -> Run:
     for name in (METRICS_FILE, FACTS_FILE) if scored else ():
         if not (folder / name).is_file():
             raise DataError(f"{folder}: no {name}; the run is not finished, or was not scored")
-    scores = _read_scores(folder / METRICS_FILE) if scored else {}
-    facts = _read_json(folder / FACTS_FILE) if (folder / FACTS_FILE).is_file() else {}
-    for key, kind in FACTS.items() if facts else ():
-        if not isinstance(facts.get(key), kind):
-            raise DataError(f"{folder / FACTS_FILE}: {key} cannot be {facts.get(key)!r}")
+    scores = _read_json(folder / METRICS_FILE, _check_scores) if scored else {}
+    facts = {}
+    if (folder / FACTS_FILE).is_file():
+        facts = _read_json(folder / FACTS_FILE, lambda facts: facts["data"].get("name"))
     settings, chosen = _read_config(folder)
     name = facts.get("model") or facts.get("method") or chosen.get("model") or folder.name
     data = facts.get("data", {"name": chosen.get("data")})
@@ -172,27 +185,22 @@ def read_run(folder: Path, *, scored: bool = True) -> Run:
     return run
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def _read_json(path: Path, check: Callable[[Any], object]) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text()))
-    except (OSError, TypeError, ValueError, RecursionError) as error:
-        raise DataError(f"{path}: damaged ({error}); score the run again") from None
-
-
-def _read_scores(path: Path) -> dict[str, dict[str, dict[str, Any]]]:
-    found = _read_json(path)
-    try:
-        for variants in found.values():
-            for scores in variants.values():
-                numbers = [scores[m] for m in METRICS if scores.get(m) is not None]
-                if not all(math.isfinite(number) for number in (scores["images"], *numbers)):
-                    raise ValueError("a score is not finite")
-    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+        found: dict[str, Any] = json.loads(path.read_text())
+        check(found)
+    except (OSError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
         raise DataError(
-            f"{path}: not as gsgan.evaluate writes it ({type(error).__name__}: {error}); score the "
-            "run again"
+            f"{path}: damaged ({type(error).__name__}: {error}); score the run again"
         ) from None
     return found
+
+
+def _check_scores(found: dict[str, dict[str, dict[str, Any]]]) -> None:
+    for scores in (scores for variants in found.values() for scores in variants.values()):
+        numbers = [scores[m] for m in METRICS if scores.get(m) is not None]
+        if not all(math.isfinite(number) for number in (scores["images"], *numbers)):
+            raise ValueError("a score is not finite")
 
 
 def _read_config(folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:
@@ -220,7 +228,5 @@ def by_settings(run: Run, keys: Sequence[str]) -> Run:
     for key in map(str, keys):
         if run.settings is None or key not in run.settings or key == "seed":
             raise ConfigError(f"table.by: {run} has no setting {key} (a row is over all seeds)")
-        value = run.settings[key]
-        short = f"{value:g}" if isinstance(value, float) and float(f"{value:g}") == value else value
-        parts.append(f"{key.rpartition('.')[2].replace('_', ' ')} {short}")
+        parts.append(f"{key.rpartition('.')[2].replace('_', ' ')} {run.settings[key]}")
     return replace(run, name=", ".join(parts))

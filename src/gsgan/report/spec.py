@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+from gsgan.data.splits import SPLITS
+from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
 
 PAINTED, SPLAT, FLOOR = "full", "splat", "floor"  # variants in metrics.json
@@ -43,54 +45,28 @@ def heading(metric: str) -> str:
     return f"{METRICS[metric].heading} {METRICS[metric].better}"
 
 
-def written(metric: str, value: float, *, signed: bool = False) -> str:
+def written(metric: str, value: float) -> str:
     """A value with the metric's digits and a typographic minus; zero has no sign."""
-    text = f"{value:{'+' if signed else ''}.{METRICS[metric].digits}f}"
-    if float(text) == 0:
-        text = text.lstrip("+-")
-    return text.replace("-", "−")
+    text = f"{value:.{METRICS[metric].digits}f}"
+    return text.lstrip("-") if float(text) == 0 else text.replace("-", "−")
 
 
 @dataclass(frozen=True)
 class RowSpec:
-    """One row: the runs of a model or method, and which of their images are scored.
-
-    Args:
-        run: name of the model or method.
-        label: the row's first column; None takes the name.
-        variant: ``full`` for the final image, ``splat`` for Step I's colour.
-    """
+    """One row: the runs of a model or method, its label (None: the name), and ``full`` for the
+    final image or ``splat`` for Step I's colour."""
 
     run: str
     label: str | None = None
     variant: str = PAINTED
 
-    @property
-    def title(self) -> str:
-        """The row's first column."""
-        return self.run if self.label is None else self.label
-
 
 @dataclass(frozen=True)
 class TableSpec:
-    """One table.
-
-    Args:
-        name: of the table, and of its block in a page.
-        title: its heading.
-        metrics: columns; one grid per metric where subjects are the columns.
-        splits: one grid per split.
-        rows: in this order, shown even where there is no run yet; None takes all runs.
-        by: dotted config keys whose values make rows of their own, to show a sweep over settings.
-        variants: images that make rows, where ``rows`` is None.
-        subjects: columns, one per subject; None for metrics as columns.
-        data: the only data set allowed; None allows any one.
-        apart: give each data set and protocol its own grids instead of refusing to mix them.
-        reference: the row that others are compared with, seed by seed; None compares nothing.
-        paper: entry in paper.yaml whose printed numbers go with it, or None.
+    """One table; `conf/table/plain.yaml` explains the keys.
 
     Raises:
-        ConfigError: on an unknown metric or a value of the wrong kind.
+        ConfigError: on an unknown metric, split or variant, or where a list must not be empty.
     """
 
     name: str
@@ -102,59 +78,29 @@ class TableSpec:
     variants: Sequence[str] = (PAINTED,)
     subjects: Sequence[str] | None = None
     data: str | None = None
-    apart: bool = False
-    reference: str | None = None
     paper: str | None = None
 
     def __post_init__(self) -> None:
-        for key in ("metrics", "splits", "variants", "subjects", "rows", "by"):
-            held, optional = getattr(self, key), key in ("subjects", "rows", "by")
-            right = isinstance(held, Sequence) and not isinstance(held, str) and len(held) > 0
-            if not right and not (optional and held is None):
-                raise ConfigError(f"table.{key} must be a list of at least one, got {held!r}")
-        if self.rows is not None:
-            object.__setattr__(self, "rows", [_row(row) for row in self.rows])
+        rows: Any = self.rows
+        if rows is not None:
+            object.__setattr__(self, "rows", [RowSpec(**row) for row in rows])
         if self.subjects is not None:
             object.__setattr__(self, "subjects", [str(subject) for subject in self.subjects])
+        if self.by and rows is not None:
+            raise ConfigError("table.by makes rows of its own, so table.rows must be null")
         variants = [*self.variants, *(row.variant for row in self.rows or ())]
         for key, known, values in (
-            ("metrics", list(METRICS), self.metrics),
-            ("variants", [PAINTED, SPLAT], variants),
-            ("apart", [False, True], [self.apart]),
+            ("metrics", METRICS, self.metrics),
+            ("splits", SPLITS, self.splits),
+            ("variants", (PAINTED, SPLAT), variants),
         ):
-            if unknown := [str(value) for value in values if value not in known]:
-                raise ConfigError(
-                    f"table.{key} has {', '.join(unknown)}; known: {', '.join(map(str, known))}"
-                )
-        if self.by is not None and self.rows is not None:
-            raise ConfigError("table.by makes rows of its own, so table.rows must be null")
-
-    def row_specs(self, names: Sequence[str]) -> list[RowSpec]:
-        """The table's rows.
-
-        Args:
-            names: of all runs, for a table without fixed rows.
-        """
-        if self.rows is not None:
-            return list(self.rows)
-        ordered = sorted(names, key=lambda name: (name != self.reference, _natural(name)))
-        return [
-            RowSpec(name, f"{name}: Step I's colour" if variant == SPLAT else None, variant)
-            for name in ordered
-            for variant in self.variants
-        ]
+            if not values:
+                raise ConfigError(f"table.{key} must be a list of at least one")
+            for value in values:
+                one_of(f"table.{key}", value, known)
 
 
-def _row(given: RowSpec | Mapping[str, Any]) -> RowSpec:
-    try:
-        return given if isinstance(given, RowSpec) else RowSpec(**given)
-    except TypeError:
-        raise ConfigError(
-            f"table.rows must be like {{run: wo_seg, label: w/o S, variant: full}}, got {given!r}"
-        ) from None
-
-
-def _natural(name: str) -> list[str | float]:
+def natural(name: str) -> list[str | float]:
     """A sort key: numbers by value, the words between them by letters."""
     parts = re.split(r"((?<= )-?\d+(?:\.\d+)?(?:e[+-]?\d+)?)", name)
     return [float(part) if i % 2 else part for i, part in enumerate(parts)]

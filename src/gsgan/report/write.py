@@ -10,8 +10,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import pandas as pd
-from rich.console import Console
-from rich.markdown import Markdown
 
 from gsgan.utils.pages import markdown as markdown_table
 
@@ -51,19 +49,18 @@ class Grid:
     title: str
     columns: Sequence[str]
     rows: Sequence[Row]
-    remarks: tuple[str, ...] = ()
+    remarks: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
 class Report:
-    """All that is shown: tables, one row per run, remarks, (folder, reason) of runs left out."""
+    """All that is shown, one record per run (JSON only), and reasons by folder of runs left out."""
 
     name: str
     title: str
     grids: Sequence[Grid]
-    runs: Grid
-    remarks: Sequence[str] = ()
-    left_out: Sequence[tuple[str, str]] = ()
+    runs: Sequence[Mapping[str, Any]]
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     def notes(self) -> dict[str, str]:
         """A number for every note, in the order of appearance."""
@@ -79,15 +76,8 @@ def common(texts: Iterable[str]) -> str:
 
 @dataclass(frozen=True)
 class Format:
-    """How text is written in one format.
-
-    Args:
-        escape: plain text to text of the format.
-        table: of a title and cells, both escaped.
-        italic, bold, raised: patterns for labels, best values, and the numbers of notes.
-        line: pattern for a remark.
-        origin: whether tables have the columns of `ORIGIN`.
-    """
+    """How text is written in one format: escaped, as a table of a title and cells, and by patterns
+    for labels, best values, numbers of notes and remarks; ``origin`` adds the columns `ORIGIN`."""
 
     escape: Callable[[str], str]
     table: Callable[[str, pd.DataFrame], str]
@@ -105,17 +95,15 @@ class Format:
             return pattern.format(self.escape(text)) + raised
 
         origin = ORIGIN if self.origin and any(row.origin for row in grid.rows) else ()
-        frame = pd.DataFrame(
+        rows = [
             [
-                [
-                    cell(row.label, row.notes, "{}" if row.kind == "run" else self.italic),
-                    *(cell(c.text, c.notes, self.bold if c.best else "{}") for c in row.cells),
-                    *map(self.escape, (*row.origin, *origin)[: len(origin)]),
-                ]
-                for row in grid.rows
-            ],
-            columns=[self.escape(name) for name in ("", *grid.columns, *origin)],
-        )
+                cell(row.label, row.notes, "{}" if row.kind == "run" else self.italic),
+                *(cell(c.text, c.notes, self.bold if c.best else "{}") for c in row.cells),
+                *(self.escape(text) for text in row.origin if origin),
+            ]
+            for row in grid.rows
+        ]
+        frame = pd.DataFrame(rows, columns=[*map(self.escape, ("", *grid.columns, *origin))])
         return "\n\n".join([self.table(self.escape(grid.title), frame), *self.lines(grid.remarks)])
 
     def lines(self, texts: Iterable[str]) -> list[str]:
@@ -123,11 +111,10 @@ class Format:
         return [self.line.format(self.escape(text)) for text in texts]
 
     def body(self, report: Report) -> str:
-        """All but the title and the list of runs."""
+        """All but the title."""
         notes = report.notes()
         below = [f"{number}: {note}" for note, number in notes.items()]
-        below += report.remarks
-        below += [f"Left out: {folder}: {reason}" for folder, reason in report.left_out]
+        below += [f"Left out: {folder}: {reason}" for folder, reason in report.left_out.items()]
         return "\n\n".join([*(self.grid(grid, notes) for grid in report.grids), *self.lines(below)])
 
 
@@ -192,64 +179,31 @@ p {{ color: #555; font-size: .9em; max-width: 60em; }} sup {{ line-height: 0; fo
 """
 
 
-def markdown_page(report: Report) -> str:
-    """report.md."""
-    runs = MARKDOWN.grid(report.runs, {})
-    return f"# {MARKDOWN.escape(report.title)}\n\n{MARKDOWN.body(report)}\n\n{runs}\n"
+def pages(report: Report) -> dict[str, str]:
+    """The files of a report by name.
 
+    LaTeX has a ``table`` per grid, for ``\\input``; HTML is one file without scripts; JSON has
+    every cell's text, numbers and notes, every row's origin, and every run.
+    """
 
-def html_page(report: Report) -> str:
-    """report.html: one file, no scripts, nothing fetched."""
-    body = f"{HTML.body(report)}\n{HTML.grid(report.runs, {})}"
-    return HTML_PAGE.format(title=html.escape(report.title), body=body)
+    def plain(row: Row, columns: Sequence[str]) -> dict[str, Any]:
+        cells = {
+            name: {"text": cell.text, **cell.numbers, "notes": cell.notes}
+            for name, cell in zip(columns, row.cells, strict=True)
+        }
+        origin = dict(zip(ORIGIN, row.origin, strict=False))
+        return {"label": row.label, "kind": row.kind, "cells": cells, "notes": row.notes, **origin}
 
-
-def latex_page(report: Report) -> str:
-    """report.tex: one ``table`` per grid, for ``\\input``."""
+    grids = [
+        {**vars(grid), "rows": [plain(row, grid.columns) for row in grid.rows]}
+        for grid in report.grids
+    ]
+    held = {"table": report.name, "title": report.title, "grids": grids, "runs": report.runs}
+    held["left_out"] = [{"folder": f, "reason": why} for f, why in report.left_out.items()]
     packages = "% needs \\usepackage{booktabs} and, for wide tables, \\usepackage{graphicx}"
-    return f"{packages}\n\n{LATEX.body(report)}\n"
-
-
-def json_page(report: Report) -> str:
-    """report.json: every cell's text, numbers and notes, every row's origin."""
-
-    def rows(grid: Grid) -> list[dict[str, Any]]:
-        return [
-            {
-                "label": row.label,
-                "kind": row.kind,
-                "cells": {
-                    name: {"text": cell.text, **cell.numbers, "notes": list(cell.notes)}
-                    for name, cell in zip(grid.columns, row.cells, strict=True)
-                },
-                "notes": list(row.notes),
-                **dict(zip(ORIGIN, row.origin, strict=False)),
-            }
-            for row in grid.rows
-        ]
-
-    held = {
-        "table": report.name,
-        "title": report.title,
-        "grids": [
-            {"title": g.title, "columns": list(g.columns), "rows": rows(g), "remarks": g.remarks}
-            for g in report.grids
-        ],
-        "runs": rows(report.runs),
-        "remarks": list(report.remarks),
-        "left_out": [{"folder": name, "reason": why} for name, why in report.left_out],
+    return {
+        "report.md": f"# {MARKDOWN.escape(report.title)}\n\n{MARKDOWN.body(report)}\n",
+        "report.tex": f"{packages}\n\n{LATEX.body(report)}\n",
+        "report.html": HTML_PAGE.format(title=html.escape(report.title), body=HTML.body(report)),
+        "report.json": json.dumps(held, indent=1, allow_nan=False, ensure_ascii=False) + "\n",
     }
-    return json.dumps(held, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def print_report(report: Report, console: Console) -> None:
-    """The scores without their origin, which would take their width, and all remarks."""
-    console.print(Markdown(TERMINAL.body(report)))
-
-
-WRITERS = {
-    "report.md": markdown_page,
-    "report.tex": latex_page,
-    "report.html": html_page,
-    "report.json": json_page,
-}

@@ -1,4 +1,4 @@
-"""Figures of images side by side: teaser, strip, comparison, ablation, canny, errors."""
+"""Figures of images side by side, and of training: all but densify and segmentation."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgb
+from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from torch import Tensor
 from torch.nn import functional
@@ -28,13 +29,16 @@ from gsgan.report.figures.layout import (
     legend_foot,
     written,
 )
-from gsgan.report.figures.shots import Shot
-from gsgan.report.figures.subjects import Numbers, Subject, finite, measure, rivals
-from gsgan.utils.palette import BLACK, SKY, VERMILLION
+from gsgan.report.figures.subjects import Numbers, Shot, Subject, finite, measure
+from gsgan.train.curve import curve
+from gsgan.utils.errors import DataError
+from gsgan.utils.palette import BLACK, COLOURS, MARKERS, SKY, VERMILLION
 
 FOUND, MISSED, INVENTED = BLACK, SKY, VERMILLION  # edges
+NEAR = 1  # pixels an edge may be off, as in edge F1
 ERROR_COLOURS = "magma_r"  # pale is no error; even steps of lightness, in grey print too
-LEVELS = 255.0
+DETAIL = 0.35  # sides of the ablation's box, as a share of the image's
+STEP_ONE = "Step I's colour"
 Images = list[dict[str, Tensor]]  # per shot, by name
 
 
@@ -44,8 +48,7 @@ def teaser(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setting
     Source: the paper's teaser.
     """
     subject = subjects[0]
-    images = _images([subject], shots)
-    numbers = _measured(images, shots, settings)
+    images, numbers = _measured([subject], shots)
     below = [Panel(image) for held in images for image in held.values()]
     panels = [[Panel(None, framed=True)] * len(shots), below]
     sheet = Sheet(panels, settings, width=settings.page, names=["skeleton", "image"])
@@ -64,8 +67,7 @@ def strip(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings
 
     Source: the paper's strip of the sign language sequence.
     """
-    images = _images(subjects, shots)
-    numbers = _measured(images, shots, settings)
+    images, numbers = _measured(subjects, shots)
     panels = [[Panel(shot.truth) for shot in shots]]
     for name in images[0]:
         notes = [_decibels(numbers[shot.name][name]) for shot in shots]
@@ -76,71 +78,50 @@ def strip(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings
     return Drawing(sheet.figure, caption, numbers)
 
 
-def comparison(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
+def comparison(
+    subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings, *, detail: bool = False
+) -> Drawing:
     """A row per shot: the ground truth and each run's image, with PSNR and edge F1.
 
-    Source: the paper's comparison figure.
+    With ``detail`` a second row magnifies the box in which the runs differ most: where the variance
+    between their images is largest. The ground truth has no part in it, so it favours no run.
+
+    Source: the paper's comparison figure; with ``detail`` its ablation triplet (full, w/o GCN,
+    w/o S).
     """
-    images = _images(subjects, shots)
-    numbers = _measured(images, shots, settings)
-    panels = []
-    for shot, held in zip(shots, images, strict=True):
-        panels.append([Panel(shot.truth)])
-        for name, image in held.items():
-            found = numbers[shot.name][name]
-            note = f"{_decibels(found)}\nF1 {written(found['edge_f1'], 3)}"
-            panels[-1].append(Panel(image, note))
-    sheet = Sheet(panels, settings, width=settings.page, titles=["truth", *images[0]])
-    caption = "The ground truth and each run's image, with PSNR and the F1 of Canny edges."
-    return Drawing(sheet.figure, caption, numbers)
-
-
-def ablation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
-    """Two rows per shot: the images, and below them the box in which the runs differ most.
-
-    The box is measured, not chosen: where the variance between the runs' images is largest. The
-    ground truth has no part in it, so it favours no run.
-
-    Source: the paper's ablation triplet (full, w/o GCN, w/o S).
-    """
-    images = _images(subjects, shots)
-    numbers = _measured(images, shots, settings)
+    images, numbers = _measured(subjects, shots)
     panels: list[list[Panel]] = []
-    boxes: list[tuple[slice, slice] | None] = []
-    for shot, held in zip(shots, images, strict=True):
-        box = most_disputed(torch.cat(list(held.values())), settings.detail)
+    boxes = [most_disputed(torch.cat(list(held.values())), DETAIL) for held in images]
+    for shot, held, box in zip(shots, images, boxes, strict=True):
         above, below = [Panel(shot.truth)], [Panel(shot.truth[..., *box])]
         for name, image in held.items():
             found = numbers[shot.name][name]
-            found["psnr_detail"] = finite(psnr(image[..., *box], shot.truth[..., *box]))
-            above.append(Panel(image, _decibels(found)))
-            below.append(Panel(image[..., *box], written(found["psnr_detail"], 2, " dB")))
-        panels += [above, below]
-        boxes += [box, None]
+            above.append(Panel(image, f"{_decibels(found)}\nF1 {written(found['edge_f1'], 3)}"))
+            if detail:
+                found["psnr_detail"] = finite(psnr(image[..., *box], shot.truth[..., *box]))
+                below.append(Panel(image[..., *box], written(found["psnr_detail"], 2, " dB")))
+        panels += [above, below] if detail else [above]
     sheet = Sheet(panels, settings, width=settings.page, titles=["truth", *images[0]])
-    for row, shown in zip(sheet.axes, boxes, strict=True):
-        for axes in row:
-            if shown is None:  # the magnified
-                axes.spines[:].set(visible=True, color=VERMILLION, linewidth=1.6)
-                continue
-            (top, height), (left, width) = ((side.start, side.stop - side.start) for side in shown)
-            axes.add_patch(Rectangle((left, top), width, height, fill=False, ec=VERMILLION, lw=0.8))
-    caption = (
-        "The ground truth and each run's image, with PSNR; below, magnified, the box in which the "
-        "runs' images differ most from each other, with PSNR in the box."
+    caption = "The ground truth and each run's image, with PSNR and the F1 of Canny edges"
+    if not detail:
+        return Drawing(sheet.figure, f"{caption}.", numbers)
+    for i, (rows, columns) in enumerate(boxes):
+        size = columns.stop - columns.start, rows.stop - rows.start
+        for whole, magnified in zip(sheet.axes[2 * i], sheet.axes[2 * i + 1], strict=True):
+            frame = Rectangle((columns.start, rows.start), *size, fill=False, ec=VERMILLION, lw=0.8)
+            whole.add_patch(frame)
+            magnified.spines[:].set(visible=True, color=VERMILLION, linewidth=1.6)
+    caption += (
+        "; below, magnified, the box in which the runs' images differ most from each other, with "
+        "PSNR in the box."
     )
     return Drawing(sheet.figure, caption, numbers)
 
 
 def most_disputed(images: Tensor, share: float) -> tuple[slice, slice]:
-    """The box with the largest variance between images of one thing.
+    """Rows and columns where images ``[n, 3, h, w]`` of one scene differ most from each other.
 
-    Args:
-        images: ``[runs, 3, h, w]``.
-        share: the box's sides as a share of the images'.
-
-    Returns:
-        Rows and columns of the box, of the images' own aspect.
+    The box's sides are a ``share`` of the images'.
     """
     spread = images.var(dim=0, unbiased=False).mean(dim=0)[None, None]
     size = [max(1, round(share * side)) for side in spread.shape[-2:]]
@@ -156,37 +137,33 @@ def canny(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings
 
     Source: the paper's Canny figure; edge ratio and F1 are ours.
     """
-    images = [rivals(subjects, shot) for shot in shots]
-    numbers = _measured(images, shots, settings)
-    low, high, tolerance = settings.canny_low, settings.canny_high, settings.canny_tolerance
+    images, numbers = _measured(subjects, shots, splatting=True)
     panels = []
     for shot, held in zip(shots, images, strict=True):
-        truth = canny_edges(shot.truth[0], low, high)
-        painted = paint_edges(truth, truth, tolerance)
-        panels.append([Panel(painted, f"{truth.sum()} px", framed=True)])
+        truth = canny_edges(shot.truth[0])
+        panels.append([Panel(paint_edges(truth, truth), f"{truth.sum()} px", framed=True)])
         for name, image in held.items():
             found = numbers[shot.name][name]
             note = f"ratio {written(found['edge_ratio'], 2)}\nF1 {written(found['edge_f1'], 3)}"
-            painted = paint_edges(canny_edges(image[0], low, high), truth, tolerance)
-            panels[-1].append(Panel(painted, note, framed=True))
+            panels[-1].append(Panel(paint_edges(canny_edges(image[0]), truth), note, framed=True))
     titles, foot = ["truth", *images[0]], legend_foot(1, settings)
     width = settings.column if len(titles) <= 3 else settings.page
     sheet = Sheet(panels, settings, width=width, titles=titles, foot=foot)
     sheet.legend({"edge": FOUND, "missing": MISSED, "not in the truth": INVENTED}, columns=3)
     caption = (
-        f"Canny edges (thresholds {low:g} and {high:g} on 8-bit grey); below the ground truth, "
-        "their number of pixels. Ratio: edge pixels over the ground truth's. F1: of edges, "
-        f"{tolerance} px off allowed."
+        "Canny edges (thresholds 100 and 200 on 8-bit grey); below the ground truth, their number "
+        f"of pixels. Ratio: edge pixels over the ground truth's. F1: of edges, {NEAR} px off "
+        "allowed."
     )
     return Drawing(sheet.figure, caption, numbers)
 
 
-def paint_edges(edges: np.ndarray, truth: np.ndarray, tolerance: int) -> np.ndarray:
+def paint_edges(edges: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Edges ``[h, w]`` as an RGB image ``[h, w, 3]`` of bytes on white.
 
-    As in edge F1, an edge is found where the other image has one within ``tolerance`` pixels.
+    As in edge F1, an edge is found where the other image has one within `NEAR` pixels.
     """
-    kernel = np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
+    kernel = np.ones((2 * NEAR + 1, 2 * NEAR + 1), np.uint8)
     near_truth, near_edges = (cv2.dilate(e.astype(np.uint8), kernel) > 0 for e in (truth, edges))
     painted = np.full((*edges.shape, 3), 255, np.uint8)
     for colour, where in (
@@ -206,17 +183,16 @@ def errors(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setting
 
     Source: the paper's error maps of GaussianGAN and splatting alone.
     """
-    images = [rivals(subjects, shot) for shot in shots]
+    images, numbers = _measured(subjects, shots, splatting=True)
     names = list(images[0])
     if len(names) < 2:
         raise Unavailable(f"{names[0]} has no second image; add a run as compare=[<folder>]")
-    numbers = _measured(images, shots, settings)
     maps = [
         {name: error_levels(image, shot.truth) for name, image in held.items()}
         for shot, held in zip(shots, images, strict=True)
     ]
     every = torch.cat([error.flatten() for held in maps for error in held.values()])
-    top = settings.error_max or scale_end(every)
+    top = scale_end(every)
     how: dict[str, Any] = {"cmap": ERROR_COLOURS, "norm": Normalize(0, top)}
     panels = []
     for shot, held, found in zip(shots, images, maps, strict=True):
@@ -241,7 +217,7 @@ def errors(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setting
 
 def error_levels(image: Tensor, truth: Tensor) -> Tensor:
     """``[h, w]``: |image - truth| of ``[1, 3, h, w]``, mean over channels, levels of 255."""
-    return (image - truth).abs().mean(dim=1)[0].double() * LEVELS
+    return (image - truth).abs().mean(dim=1)[0].double() * 255
 
 
 def scale_end(values: Tensor) -> float:
@@ -250,16 +226,70 @@ def scale_end(values: Tensor) -> float:
     return max(5.0, 5.0 * math.ceil(high / 5.0))
 
 
-def _images(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Images:
-    return [{subject.name: subject.image(shot) for subject in subjects} for shot in shots]
+def training(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
+    """PSNR of the watched images against minutes, a line per run, Step I's colour dashed.
+
+    Raises:
+        Unavailable: when a run has no log that can be read.
+    """
+    figure = Figure((settings.column, 0.75 * settings.column), layout="constrained")
+    axes = figure.add_subplot()
+    shown, solid, numbers = [], [], {}
+    for k, subject in enumerate(subjects):
+        try:
+            found = curve(subject.name, subject.run.folder)
+        except DataError as error:
+            raise Unavailable(str(error)) from error
+        if found is None or found.seconds[-1] <= 0:
+            raise Unavailable(
+                f"{subject.run.folder} has no log of two validations and their time (logger=csv "
+                "writes one)"
+            )
+        parts = (found.seconds, found.psnr, found.colour)
+        numbers[subject.name] = dict(zip(("seconds", "psnr", "psnr_colour"), parts, strict=True))
+        minutes = [second / 60 for second in found.seconds]
+        look: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "lw": 1.0}
+        marker = MARKERS[k % len(MARKERS)]
+        solid += axes.plot(minutes, found.psnr, marker=marker, markersize=3, **look)
+        lines = [found.psnr]
+        if subject.avatar.generator is not None and found.colour:
+            axes.plot(minutes, found.colour, ls="--", **look)
+            lines.append(found.colour)
+        # without the untrained start, many dB below the rest
+        shown += [v for line in lines for m, v in zip(minutes, line, strict=True) if m > 0]
+    small = settings.font - 1
+    axes.set_xlabel("minutes of training", fontsize=small)
+    axes.set_ylabel("PSNR of watched images, dB", fontsize=small)
+    axes.tick_params(labelsize=small)
+    room = 0.08 * max(max(shown) - min(shown), 0.1)
+    axes.set(xlim=(0, None), ylim=(min(shown) - room, max(shown) + room))
+    axes.grid(visible=True, alpha=0.25)
+    legend = axes.legend(solid, [""] * len(solid), fontsize=small, frameon=False, loc=4)
+    for text, name in zip(legend.get_texts(), numbers, strict=True):
+        text.set(text=name, parse_math=False)
+    caption = (
+        f"PSNR of the {len(shots)} held-out images that were watched while training, against "
+        "minutes of training; dashed, Step I's colour of the same model."
+    )
+    return Drawing(figure, caption, {"training": numbers})
 
 
 def _measured(
-    images: Images, shots: Sequence[Shot], settings: Settings
-) -> dict[str, dict[str, Numbers]]:
-    """The measures of each image, by shot and name."""
-    return {
-        shot.name: {name: measure(image, shot.truth, settings) for name, image in held.items()}
+    subjects: Sequence[Subject], shots: Sequence[Shot], *, splatting: bool = False
+) -> tuple[Images, dict[str, dict[str, Numbers]]]:
+    """Images of each shot by run, and their measures.
+
+    Args:
+        splatting: add Step I's colour of the first run, unless a run is of splatting alone.
+    """
+    images: Images = []
+    for shot in shots:
+        images.append({subject.name: subject.image(shot) for subject in subjects})
+        colour = subjects[0].colour(shot)
+        if splatting and colour is not None and all(s.run.name != "splat_only" for s in subjects):
+            images[-1][STEP_ONE] = colour
+    return images, {
+        shot.name: {name: measure(image, shot.truth) for name, image in held.items()}
         for shot, held in zip(shots, images, strict=True)
     }
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
@@ -17,7 +16,7 @@ from matplotlib.patches import Patch
 from matplotlib.text import Text
 from torch import Tensor
 
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.checks import between
 
 GAP = 0.05  # inches between panels
 EDGE = 0.02  # inches around the whole, so that no frame is cut off
@@ -26,13 +25,13 @@ LINE = 1.4 / 72  # inches per line and point of font size
 BAR_FOOT = 0.46  # inches that a colour bar needs in the foot
 LIMITS = {  # of settings: what is readable and fits into memory
     "column": (1, 50), "page": (2, 50), "tallest": (0.3, 50), "font": (1, 20), "dpi": (1, 2400),
-    "canny_tolerance": (0, 100), "detail": (0.01, 1),
+    "margin": (0, 1e6),
 }  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How figures look and how the images in them are measured; `conf/report.yaml` has units.
+    """How figures look; `conf/report.yaml` has units.
 
     Raises:
         ConfigError: on a value outside `LIMITS`.
@@ -42,37 +41,18 @@ class Settings:
     page: float = 7.16
     tallest: float = 1.9
     font: float = 8.0
-    dpi: int = 300
+    dpi: float = 300
     margin: float = 0.2
-    canny_low: float = 100.0
-    canny_high: float = 200.0
-    canny_tolerance: int = 1
-    error_max: float | None = None
-    sigmas: float = 1.0
-    detail: float = 0.35
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name == "error_max" and value is None:
-                continue
-            kind = int if name in ("dpi", "canny_tolerance") else int | float
-            low, high = LIMITS.get(name, (1e-6, 1e6))
-            if not isinstance(value, kind) or not low <= value <= high:
-                what = "a whole number" if kind is int else "a number"
-                raise ConfigError(
-                    f"settings.{name} must be {what} from {low:g} to {high:g}, got {value!r}"
-                )
+        for name, limits in LIMITS.items():
+            between(f"settings.{name}", getattr(self, name), *limits)
 
 
 @dataclass(frozen=True)
 class Drawing:
-    """A figure with its caption and numbers.
-
-    Args:
-        figure: of matplotlib.
-        caption: whole sentences, Markdown: what is shown and how its numbers were measured.
-        numbers: ``{image: {panel: {measure: value}}}``, None where a measure is not defined.
-    """
+    """A figure, its caption (whole sentences, Markdown), and the numbers in it by image, panel and
+    measure, None where a measure is not defined."""
 
     figure: Figure
     caption: str
@@ -83,31 +63,17 @@ class Unavailable(Exception):
     """What the runs lack for a figure; the other figures are still made."""
 
 
-@contextmanager
-def style(settings: Settings) -> Iterator[None]:
+def style(settings: Settings) -> AbstractContextManager[None]:
     """Fonts and lines of every figure; text in the PDF stays text (TrueType)."""
-    look: dict[Any, Any] = {
-        "font.family": "DejaVu Sans",
-        "font.size": settings.font,
-        "pdf.fonttype": 42,
-        "axes.linewidth": 0.5,
-        "savefig.dpi": settings.dpi,
-    }
-    with matplotlib.rc_context(look):
-        yield
+    look: dict[Any, Any] = {"font.family": "DejaVu Sans", "font.size": settings.font}
+    look |= {"pdf.fonttype": 42, "axes.linewidth": 0.5, "savefig.dpi": settings.dpi}
+    return matplotlib.rc_context(look)
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One image of a sheet.
-
-    Args:
-        image: ``[1, 3, h, w]`` in [0, 1], or ``[h, w, …]`` as matplotlib takes it; None leaves the
-            panel empty.
-        note: below it, of one line or more.
-        framed: whether it has a frame.
-        how: further options of ``imshow``.
-    """
+    """One image ``[1, 3, h, w]`` in [0, 1], or ``[h, w, …]`` as matplotlib takes it, or none, with
+    a note below it, a frame, and further options of ``imshow``."""
 
     image: Tensor | np.ndarray | None
     note: str = ""
@@ -116,18 +82,11 @@ class Panel:
 
 
 class Sheet:
-    """A figure of equal panels, the widest that fits; text that does not fit is made smaller.
+    """Equal panels by row, the widest that fit into ``width`` inches, with titles above the
+    columns, names left of the rows, and ``foot`` inches for a legend or colour bar.
 
-    Args:
-        panels: by row.
-        settings: sizes.
-        width: inches, at most.
-        titles: above the columns, of one line or more.
-        names: at the left of the rows.
-        foot: inches kept at the bottom for a legend or colour bar.
-
-    Attributes:
-        axes: ``[rows, columns]``, in pixels of the images, pixel centres at +0.5.
+    Text that does not fit is made smaller. ``axes`` are ``[rows, columns]``, in pixels of the
+    images, pixel centres at +0.5.
     """
 
     def __init__(
@@ -167,21 +126,17 @@ class Sheet:
         self.axes = self.figure.subplots(rows, columns, squeeze=False, gridspec_kw=places)
         for i, row in enumerate(panels):
             for axes, panel, image in zip(self.axes[i], row, shown[i], strict=True):
-                self._fill(axes, panel, image)
+                axes.set(xticks=[], yticks=[])
+                axes.spines[:].set_visible(panel.framed)
+                if image is not None:
+                    extent = (0, image.shape[1], image.shape[0], 0)
+                    axes.imshow(image, interpolation="nearest", extent=extent, **panel.how)
                 self._fit([axes.set_xlabel(panel.note, size=self.small, labelpad=2)], panel_width)
         plain: dict[str, Any] = {"parse_math": False, "size": settings.font}  # "$x" is no formula
         heads = [a.set_title(t, pad=2, **plain) for a, t in zip(self.axes[0], titles, strict=False)]
         self._fit(heads, panel_width)
         for axes, name in zip(self.axes[:, 0], names, strict=False):
             self._fit([axes.set_ylabel(name, labelpad=2, **plain)], panel_height)
-
-    def _fill(self, axes: Axes, panel: Panel, image: np.ndarray | None) -> None:
-        axes.set(xticks=[], yticks=[])
-        axes.spines[:].set_visible(panel.framed)
-        if image is not None:
-            height, width = image.shape[:2]
-            extent = (0, width, height, 0)
-            axes.imshow(image, interpolation="nearest", extent=extent, **panel.how)
 
     def _fit(self, texts: Sequence[Text], room: float) -> None:
         """Gives texts the largest common size at which none is longer than ``room`` inches."""

@@ -7,22 +7,21 @@ import json
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
 
-from gsgan.report.comparable import check_frame
 from gsgan.report.figures import images
-from gsgan.report.figures.body import densify
+from gsgan.report.figures.body import densify, segmentation
 from gsgan.report.figures.layout import Drawing, Settings, Unavailable, style
-from gsgan.report.figures.segmentation import segmentation
-from gsgan.report.figures.shots import Shot, choose_items, make_shots
-from gsgan.report.figures.subjects import Subject, open_subjects
-from gsgan.report.figures.training import training
+from gsgan.report.figures.subjects import Shot, Subject, choose_items, make_shots, open_subjects
 from gsgan.train.runs import Moved, load_config
+from gsgan.utils.checks import one_of, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.devices import pick_device
 from gsgan.utils.errors import ConfigError, DataError
@@ -44,8 +43,8 @@ FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot], Settings], Drawi
     "errors": images.errors,
     "strip": images.strip,
     "comparison": images.comparison,
-    "ablation": images.ablation,
-    "training": training,
+    "ablation": partial(images.comparison, detail=True),
+    "training": images.training,
 }
 COMPARE = ("comparison", "ablation")  # need a second run
 
@@ -57,35 +56,44 @@ def make_figures(config: DictConfig) -> None:
         ConfigError: on a wrong value, runs of different data, or when no figure could be made.
         DataError: when a run or its data cannot be read.
     """
-    folders = [Path(str(f)).expanduser() for f in (config.run, *(_list(config.compare) or []))]
-    names = _chosen("figures", config.figures, list(FIGURES))
-    if config.figures is None and len(folders) == 1:
-        names = [name for name in names if name not in COMPARE]
-    formats = _chosen("formats", config.formats, list(METADATA))
-    if config.settings is None or config.shots is None:
-        raise ConfigError("settings and shots are tables of values; leave them out, or set a key")
+    folders = [Path(str(f)).expanduser() for f in (config.run, *_list(config.compare))]
+    names = [one_of("figures", name, FIGURES) for name in _list(config.figures)]
+    if not names:
+        names = [name for name in FIGURES if len(folders) > 1 or name not in COMPARE]
+    formats = [one_of("formats", name, METADATA) for name in _list(config.formats) or METADATA]
     settings: Settings = instantiate(config.settings)
     out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
-    moved = Moved.said(config)
+    moved = Moved.from_config(config)
     for folder in folders:
         load_config(folder, moved)  # refuses what is not a run folder before anything is written
     try:
-        write_atomically(out / ".probe", "")
-        (out / ".probe").unlink()
+        out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"out={out}: cannot be written to ({error.strerror})") from error
     logging.getLogger("fontTools").setLevel(logging.WARNING)  # it logs every glyph of a PDF
-    subjects = open_subjects(folders, _list(config.names), moved, pick_device(config.device))
-    console, made, left_out = make_console(), {}, {}
+    subjects = open_subjects(folders, config.names, moved, pick_device(config.device))
+    console, left_out = make_console(), {}
+    made: dict[str, dict[str, Any]] = {}
     with style(settings):
-        for name in track(names, "drawing figures", console=console, transient=True):
+        for name in track(list(dict.fromkeys(names)), "drawing", console=console, transient=True):
             try:
                 drawing = _draw(name, subjects, config, settings)
             except Unavailable as reason:
                 left_out[name] = f"{name}: left out, {reason}"
                 continue
-            made[name] = _entry(drawing, subjects)
-            made[name]["files"] = _save(drawing, out / name, formats)
+            for kind in formats:
+                stream = io.BytesIO()
+                drawing.figure.savefig(stream, format=kind, metadata=METADATA[kind])
+                write_atomically(out / f"{name}.{kind}", stream.getvalue())
+            panels = [panel for held in drawing.numbers.values() for panel in held]
+            shown = [subject for subject in subjects if subject.name in panels]
+            made[name] = {
+                "caption": drawing.caption,
+                "numbers": drawing.numbers,
+                "runs": {subject.name: str(subject.run.folder) for subject in shown},
+                "marks": sorted({mark for subject in shown for mark in subject.marks}),
+                "files": [f"{name}.{kind}" for kind in formats],
+            }
             _write_record(out, made)  # now, so that a stopped command leaves no stale numbers
     if not made:
         raise ConfigError(f"no figure could be made: {'; '.join(left_out.values())}")
@@ -111,84 +119,51 @@ def _draw(
             )
         items = [data.dataset(split).items[i] for i in places]
     else:
-        split, frames = config.split, _list(config.frames)
+        split = config.split
+        frames = [whole("frames", frame, 0) for frame in dict.fromkeys(_list(config.frames))]
         items = choose_items(
             data,
             split,
-            frames=frames and [_whole("frames", frame) for frame in dict.fromkeys(frames)],
+            frames=frames or None,
             camera=None if config.camera is None else str(config.camera),
-            count=_whole(f"shots.{name}", config.shots.get(name)),
+            count=whole(f"shots.{name}", config.shots.get(name), 1),
             one_camera=name == "strip",
         )
     shots = make_shots(data, split, items, settings.margin)
     for subject in subjects[1:]:
         dataset = subject.data.dataset(split)
         for shot in shots:
-            theirs = dataset[dataset.items.index(shot.item)]
-            check_frame(subjects[0].run, subject.run, shot.name, (shot.frame, theirs))
+            a, b = shot.frame, dataset[dataset.items.index(shot.item)]
+            pairs = ((a.image, b.image), (a.camera.K, b.camera.K), (a.skeleton, b.skeleton))
+            if not all(torch.equal(x, y) for x, y in pairs):
+                raise ConfigError(
+                    f"figures: {subjects[0].run} and {subject.run} differ in the image, camera or "
+                    f"skeleton of {shot.name}; leave one of them out"
+                )
     drawing = FIGURES[name](subjects, shots, settings)
-    about = f"Split {split}."
+    about = ""
     if name != "training":
         about = (
-            f"Images: {', '.join(shot.name for shot in shots)}. Numbers are of the windows shown, "
-            f"which reach at least {settings.margin:g} m beyond the joints, not of whole images. "
-            + about
+            f" Images: {', '.join(shot.name for shot in shots)}. Numbers are of the windows shown, "
+            f"which reach at least {settings.margin:g} m beyond the joints, not of whole images."
         )
-    return replace(drawing, caption=f"{drawing.caption} {about}")
+    return replace(drawing, caption=f"{drawing.caption}{about} Split {split}.")
 
 
-def _list(value: Any) -> list[Any] | None:
-    """A list as it is, one value as a list of one."""
-    if value is None:
-        return None
-    return list(value) if OmegaConf.is_list(value) else [value]
-
-
-def _chosen(key: str, value: Any, known: list[str]) -> list[str]:
-    """The names requested, each once; null requests all."""
-    names = known if value is None else list(dict.fromkeys(_list(value) or []))
-    unknown = [str(name) for name in names if name not in known]
-    if unknown or not names:
-        got = ", ".join(unknown) or "none"
-        raise ConfigError(f"{key} must be among {', '.join(known)}; got {got}")
-    return names
-
-
-def _whole(key: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or value < (key != "frames"):
-        raise ConfigError(f"{key} must be a whole number, shots of at least 1; got {value!r}")
-    return value
-
-
-def _entry(drawing: Drawing, subjects: Sequence[Subject]) -> dict[str, Any]:
-    shown = [s for s in subjects if any(s.name in panels for panels in drawing.numbers.values())]
-    return {
-        "caption": drawing.caption,
-        "numbers": drawing.numbers,
-        "runs": {subject.name: str(subject.run.folder) for subject in shown},
-        "marks": sorted({note for subject in shown for note in subject.notes}),
-    }
-
-
-def _save(drawing: Drawing, stem: Path, formats: Sequence[str]) -> list[str]:
-    """Writes the figure in each format; returns the files' names."""
-    for name in formats:
-        stream = io.BytesIO()
-        drawing.figure.savefig(stream, format=name, metadata=METADATA[name])
-        write_atomically(stem.with_suffix(f".{name}"), stream.getvalue())
-    return [f"{stem.name}.{name}" for name in formats]
+def _list(value: Any) -> list[Any]:
+    """A list as it is, one value as a list of one, null as none."""
+    if OmegaConf.is_list(value):
+        return list(value)
+    return [] if value is None else [value]
 
 
 def _write_record(out: Path, made: dict[str, dict[str, Any]]) -> None:
     """Numbers as JSON and captions as Markdown, beside those of figures made here before."""
     try:
-        before = json.loads((out / RECORD).read_text())
-        kept = {k: v for k, v in before.items() if {"caption", "runs", "marks"} <= v.keys()}
-    except (OSError, ValueError, AttributeError):
-        kept = {}
-    record = {
-        name: made.get(name) or kept[name] for name in FIGURES if name in made or name in kept
-    }
+        record = {**json.loads((out / RECORD).read_text()), **made}
+    except (OSError, ValueError):
+        record = made
+    record = {name: record[name] for name in FIGURES if name in record}
     write_atomically(out / RECORD, json.dumps(record, indent=1, allow_nan=False) + "\n")
     parts = ["# Captions"]
     for name, entry in record.items():

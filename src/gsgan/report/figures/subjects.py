@@ -1,4 +1,4 @@
-"""The avatars that a figure shows side by side: rendering, measuring, naming."""
+"""What a figure shows: images of a split, and the avatars that render them."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from gsgan.data.checks import spans
 from gsgan.data.datamodule import GsganData
-from gsgan.data.splits import Item
+from gsgan.data.splits import SPLITS, Item
 from gsgan.evaluate.facts import fingerprint
 from gsgan.metrics.image import edge_scores, psnr
 from gsgan.model.avatar import Avatar, Painting
-from gsgan.report.comparable import check_data
-from gsgan.report.figures.layout import Settings
-from gsgan.report.figures.shots import Shot
-from gsgan.report.runs import Run, read_run
+from gsgan.report.runs import DATA, Run, check_same, read_run
+from gsgan.scene import Camera, Frame, Window, body_window, cat
 from gsgan.train.paper import NAME
 from gsgan.train.runs import (
     CHECKPOINT,
@@ -28,40 +27,111 @@ from gsgan.train.runs import (
     load_config,
     read_checkpoint,
 )
+from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
 
+NEAR = 0.01  # metres: with a joint nearer the camera than this, the whole image is shown
+LEAST = 16  # pixels, the shortest side of a window
 TITLES = {  # of models, in print
-    "full": "gsgan",
-    "wo_seg": "w/o S",
-    "wo_gcn": "w/o GCN",
-    "wo_feat": "w/o L_feat",
-    "splat_only": "splat only",
-    "lbs_splat": "LBS splat",
-    "image_to_image": "image to image",
-}
-STEP_ONE = "Step I's colour"
+    "full": "gsgan", "wo_seg": "w/o S", "wo_gcn": "w/o GCN", "wo_feat": "w/o L_feat",
+    "splat_only": "splat only", "lbs_splat": "LBS splat", "image_to_image": "image to image",
+}  # fmt: skip
 Numbers = dict[str, float | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One image of a split, (camera name, frame number), and the part of it that is shown."""
+
+    item: Item
+    frame: Frame
+    window: Window
+
+    @property
+    def name(self) -> str:
+        """As files of a capture are named: camera/frame."""
+        return f"{self.item[0]}/{self.item[1]:06d}"
+
+    @property
+    def truth(self) -> Tensor:
+        """``[1, 3, h, w]`` the ground truth as shown."""
+        return self.window.cut(self.frame.image)
+
+    @property
+    def camera(self) -> Camera:
+        """Of the part shown."""
+        return self.window.camera(self.frame.camera)
+
+
+def choose_items(
+    data: GsganData,
+    split: str,
+    *,
+    frames: Sequence[int] | None,
+    camera: str | None,
+    count: int,
+    one_camera: bool = False,
+) -> list[Item]:
+    """Camera and frame of each image to show.
+
+    Without ``frames``, ``count`` of them are spread evenly over the split; without ``camera``, its
+    cameras are taken in turn, one per image, or only the first (``one_camera``).
+
+    Raises:
+        ConfigError: on an unknown split, camera or frame.
+        DataError: when the split is empty.
+    """
+    items = data.splits.items[one_of("split", split, SPLITS)]
+    if not items:
+        others = ", ".join(f"split={name}" for name in SPLITS if data.splits.items[name])
+        raise DataError(f"split {split} has no images: {data.reasons[split]}; use {others}")
+    cameras = list(dict.fromkeys(name for name, _ in items))
+    if camera is not None and camera not in cameras:
+        names = ", ".join(cameras)
+        raise ConfigError(f"camera {camera} is not in split {split}, which has {names}")
+    if one_camera:
+        camera = camera or cameras[0]
+    held = [item for item in items if camera in (None, item[0])]
+    known = sorted({frame for _, frame in held})
+    if frames is None:
+        count = min(count, len(known))
+        frames = [known[(2 * i + 1) * len(known) // (2 * count)] for i in range(count)]
+    if lacking := [frame for frame in frames if frame not in known]:
+        of = f"split {split}" if camera is None else f"camera {camera} in split {split}"
+        raise ConfigError(f"frames: {of} lacks {spans(lacking)}; it has {spans(known)}")
+    chosen = []
+    for place, frame in enumerate(frames):
+        seen_by = [item for item in held if item[1] == frame]
+        chosen.append(seen_by[(2 * place + 1) * len(seen_by) // (2 * len(frames))])
+    return chosen
+
+
+def make_shots(data: GsganData, split: str, items: Sequence[Item], margin: float) -> list[Shot]:
+    """Images of a split in windows that reach ``margin`` metres beyond the joints, all of one size
+    where the images are."""
+    dataset = data.dataset(split)
+    frames = [dataset[dataset.items.index(item)] for item in items]
+    one_size = len({frame.camera.size for frame in frames}) == 1
+    shots: list[Shot] = []
+    for batch in [frames] if one_size else [[frame] for frame in frames]:
+        p, camera = torch.cat([f.skeleton for f in batch]), cat([f.camera for f in batch])
+        boxes = body_window(p, camera, margin=margin, multiple=1, least=LEAST, near=NEAR)
+        for corner, frame in zip(boxes.corners, batch, strict=True):
+            window = Window((corner,), boxes.size, boxes.picture)
+            shots.append(Shot(items[len(shots)], frame, window))
+    return shots
 
 
 @dataclass
 class Subject:
-    """A trained avatar with its run and data.
-
-    Args:
-        name: above its images.
-        run: its folder and settings, with the fingerprint of ``data``.
-        data: of the run.
-        avatar: in eval mode, on the device that renders.
-        marks: that every figure of it must carry.
-        step: iterations trained.
-    """
+    """A trained avatar in eval mode on the device that renders, its name in print, its run with the
+    fingerprint of ``data``, and the marks that every figure of it must carry."""
 
     name: str
     run: Run
     data: GsganData
     avatar: Avatar
     marks: list[str]
-    step: int = 0
     _painted: dict[Item, Painting] = field(default_factory=dict, repr=False)
 
     def paint(self, shot: Shot) -> Painting:
@@ -74,29 +144,16 @@ class Subject:
             device = next(self.avatar.parameters()).device
             with torch.no_grad():
                 painting = self.avatar.paint(shot.frame.to(device))
-            kept = {  # of F only the colour: all channels of every shot would fill the memory
-                name: None if part is None else part.cpu()
-                for name, part in (
-                    ("image", painting.image),
-                    ("features", painting.colour),
-                    ("segmentation", painting.segmentation),
-                )
-            }
-            if any(part is not None and not bool(part.isfinite().all()) for part in kept.values()):
-                raise DataError(
-                    f"{self.run.folder}: its image of {shot.name} is not finite; train it again"
-                )
+            # of F only the colour: all channels of every shot would fill the memory
+            parts = (painting.image, painting.colour, painting.segmentation)
+            image, colour, labels = (None if part is None else part.cpu() for part in parts)
+            if not all(part is None or part.isfinite().all() for part in (image, colour, labels)):
+                where = f"{self.run.folder}: its image of {shot.name}"
+                raise DataError(f"{where} is not finite; train it again")
             gaussians = None if painting.gaussians is None else painting.gaussians.to("cpu")
-            self._painted[shot.item] = Painting(**kept, gaussians=gaussians)
+            kept = Painting(image, features=colour, segmentation=labels, gaussians=gaussians)
+            self._painted[shot.item] = kept
         return self._painted[shot.item]
-
-    @property
-    def notes(self) -> list[str]:
-        """Its marks, and that its training is unfinished where it is."""
-        total = self.run.planned(segmentation=self.avatar.segmentation is not None)
-        if total is None or self.step >= total:
-            return self.marks
-        return [*self.marks, f"{self.name} is unfinished: {self.step} of {total} iterations"]
 
     def image(self, shot: Shot) -> Tensor:
         """``[1, 3, h, w]`` I_pred in [0, 1], as shown."""
@@ -111,46 +168,33 @@ class Subject:
             return None
         return shot.window.cut(colour).clamp(0, 1)
 
-    def parts(self, shot: Shot) -> Tensor | None:
-        """``[1, classes, h, w]`` S as shown, or None where the model has none."""
-        parts = self.paint(shot).segmentation
-        return None if parts is None else shot.window.cut(parts)
-
 
 def open_subjects(
-    folders: Sequence[Path],
-    names: Sequence[str] | None,
-    moved: Moved,
-    device: torch.device | str,
+    folders: Sequence[Path], names: Sequence[str] | None, moved: Moved, device: torch.device | str
 ) -> list[Subject]:
-    """The avatars of run folders.
-
-    Args:
-        folders: of runs, each once.
-        names: in print, one per folder; None takes the model's.
-        moved: where their dataset and model file are now.
-        device: that renders.
+    """The avatars of run folders; without ``names`` they have their models', with more where equal.
 
     Raises:
         ConfigError: on wrong names, a folder given twice, or runs of different data.
         DataError: when a run cannot be read.
     """
-    if names is not None:
-        texts = {str(name) for name in names if name is not None}
-        if not len(texts) == len(names) == len(folders):
-            raise ConfigError(
-                f"names must be {len(folders)} different texts, the run's first, then those of "
-                f"compare; got {names}"
-            )
-    resolved = [folder.resolve() for folder in folders]
-    if twice := [f for f in folders if resolved.count(f.resolve()) > 1]:
-        raise ConfigError(f"{twice[0]} is given twice; every run in run and compare must differ")
-    subjects: list[Subject] = []
-    for folder in folders:
-        subjects.append(_open(folder, moved, device))
-        check_data(subjects[0].run, subjects[-1].run, "figures")
-    titles = [str(name) for name in names] if names is not None else _distinct(subjects)
-    return [replace(s, name=title) for s, title in zip(subjects, titles, strict=True)]
+    if names is not None and not len(set(map(str, names))) == len(names) == len(folders):
+        raise ConfigError(
+            f"names must be {len(folders)} different texts, the run's first; got {names}"
+        )
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise ConfigError("a run is given twice; every run in run and compare must differ")
+    subjects = [_open(folder, moved, device) for folder in folders]
+    runs = [subject.run for subject in subjects]
+    check_same("figures", runs, [{DATA: run.data["fingerprint"]} for run in runs])
+    if names is None:
+        models = [s.name for s in subjects]
+        seeds = [f"seed {run.seed}" for run in runs]
+        places = [folder.resolve().name for folder in folders], list(map(str, folders))
+        more = next(texts for texts in (seeds, *places) if len(set(texts)) == len(texts))
+        pairs = zip(models, more, strict=True)
+        names = [m if models.count(m) < 2 else f"{m}, {text}" for m, text in pairs]
+    return [replace(s, name=str(name)) for s, name in zip(subjects, names, strict=True)]
 
 
 def _open(folder: Path, moved: Moved, device: torch.device | str) -> Subject:
@@ -163,52 +207,20 @@ def _open(folder: Path, moved: Moved, device: torch.device | str) -> Subject:
     if run.name == "full" and run.departures() == []:
         name = NAME
     step = int(read_checkpoint(folder / CHECKPOINT)["gsgan"]["step"])
-    return Subject(name, run, data, avatar.to(device), marks, step)
+    total = run.planned(segmentation=avatar.segmentation is not None)
+    if step < total:
+        marks = [*marks, f"{folder} is unfinished: {step} of {total} iterations"]
+    return Subject(name, run, data, avatar.to(device), marks)
 
 
-def _distinct(subjects: Sequence[Subject]) -> list[str]:
-    """Names that all differ: with the seed, the folder's name or its path where need be."""
-    names = [s.name for s in subjects]
-    for more in (
-        [f"seed {s.run.seed}" for s in subjects],
-        [s.run.folder.resolve().name for s in subjects],
-        [str(s.run.folder) for s in subjects],
-    ):
-        found = [
-            f"{name}, {text}" if names.count(name) > 1 else name
-            for name, text in zip(names, more, strict=True)
-        ]
-        if len(set(found)) == len(found):
-            return found
-    return found
-
-
-def rivals(subjects: Sequence[Subject], shot: Shot) -> dict[str, Tensor]:
-    """``[1, 3, h, w]`` images by name: each run's, and Step I's colour of the first.
-
-    Step I's colour stands for splatting alone, unless a run is that very baseline.
-    """
-    images = {subject.name: subject.image(shot) for subject in subjects}
-    colour = subjects[0].colour(shot)
-    if colour is not None and not any(s.run.name == "splat_only" for s in subjects):
-        images[STEP_ONE] = colour
-    return images
-
-
-def measure(image: Tensor, truth: Tensor, settings: Settings) -> Numbers:
+def measure(image: Tensor, truth: Tensor) -> Numbers:
     """PSNR, edge F1 and edge-pixel ratio of one image ``[1, 3, h, w]`` as it is shown.
 
     Returns:
         ``psnr`` dB, ``edge_f1``, ``edge_ratio`` (edge pixels over the ground truth's); None where
         not defined: equal images, or a ground truth without edges.
     """
-    f1, ratio = edge_scores(
-        image,
-        truth,
-        low=settings.canny_low,
-        high=settings.canny_high,
-        tolerance=settings.canny_tolerance,
-    )
+    f1, ratio = edge_scores(image, truth)
     scores = {"psnr": psnr(image, truth), "edge_f1": f1, "edge_ratio": ratio}
     return {name: finite(score) for name, score in scores.items()}
 
