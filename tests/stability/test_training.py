@@ -10,11 +10,11 @@ import torch
 from lightning import Trainer
 from torch.utils.data import DataLoader
 
-from gsgan.bench.cases.poses import DEGENERATE
 from gsgan.scene import Frame, cat
 from gsgan.train.module import AvatarTraining
 from gsgan.train.runs import build_training
 from gsgan.utils.errors import GsganError
+from stability.cases.poses import DEGENERATE
 
 TO_WORLD = torch.tensor([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 """Body axes (y up, facing z) to the capture's (z up, facing -y)."""
