@@ -32,11 +32,6 @@ def split(arguments: Sequence[str]) -> tuple[str | None, list[str]]:
     return None, list(arguments)
 
 
-def module_name(subject: str) -> str:
-    """Of its module, and after ``bench_`` of its config."""
-    return subject.replace("-", "_")
-
-
 def main() -> None:
     """Passes the command line, less the subject, to Hydra."""
     subject, rest = split(sys.argv[1:])
@@ -57,7 +52,7 @@ def main() -> None:
         )
         sys.exit(FAILED)
     sys.argv = [sys.argv[0], *rest]
-    name = module_name(subject)
+    name = subject.replace("-", "_")
 
     def bench(config: DictConfig) -> None:
         from hydra.core.hydra_config import HydraConfig

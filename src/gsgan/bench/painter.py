@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.bench.memory import peak_memory
+from gsgan.bench.common import peak_memory
 from gsgan.data.datamodule import GsganData
 from gsgan.model.avatar import Avatar
 from gsgan.scene import Frame
 from gsgan.splat import BACKENDS, Accuracy
+from gsgan.utils.checks import between, one_of
 from gsgan.utils.errors import ConfigError
 
 # Lightning's names, as in conf/trainer.
@@ -49,13 +50,9 @@ class Way:
     whole: bool = False
 
     def __post_init__(self) -> None:
-        for name, known in (("precision", PRECISIONS), ("backend", BACKENDS)):
-            if getattr(self, name) not in known:
-                got = getattr(self, name)
-                raise ConfigError(f"{name} must be one of {', '.join(known)}; got {got!r}")
-        number = isinstance(self.scale, (int, float)) and not isinstance(self.scale, bool)
-        if not number or not 0.05 <= self.scale <= 8:
-            raise ConfigError(f"scale must be a number from 0.05 to 8; got {self.scale!r}")
+        one_of("precision", self.precision, PRECISIONS)
+        one_of("backend", self.backend, BACKENDS)
+        between("scale", self.scale, 0.05, 8)
 
 
 class Painter:
