@@ -37,13 +37,12 @@ from gsgan.utils.errors import GsganError
 from gsgan.utils.files import write_atomically
 
 NOTHING = "–"  # what was not measured
-PACKAGES = ("gsgan", "torch", "gsplat")
 
 
 def environment(device: torch.device) -> dict[str, Any]:
     """Device, hardware, threads, date, versions and load, without which figures mean nothing."""
     versions = {"Python": platform.python_version()}
-    for name in PACKAGES:
+    for name in ("gsgan", "torch", "gsplat"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
     return {
@@ -105,22 +104,14 @@ def check_whole(config: DictConfig, **least: int) -> None:
 
 @dataclass(frozen=True)
 class Bench:
-    """One bench at work.
+    """One bench at work."""
 
-    Args:
-        name, folder: of its files.
-        console: prints.
-        device, where: it measures on; see :func:`environment`.
-        page: a Markdown page that gets the result, if any, between ``<!-- bench:name -->`` (with
-            ``-`` for ``_``) and ``<!-- end -->``.
-    """
-
-    name: str
-    folder: Path
+    name: str  # of its files, and with - for _ of its block in the page
+    folder: Path  # of its files
     console: Console
     device: torch.device
-    where: dict[str, Any]
-    page: Path | None
+    where: dict[str, Any]  # it measures; see `environment`
+    page: Path | None  # a Markdown page that gets the result
 
     @classmethod
     def start(cls, name: str, config: DictConfig, folder: Path) -> Bench:

@@ -112,19 +112,12 @@ class Patch(NamedTuple):
 
 @dataclass(frozen=True)
 class Truth:
-    """The exact images and gradients.
-
-    Args:
-        patches: where.
-        images: ``[C + 1, h, w]`` float64 each: features, then alpha.
-        weights: of a scalar loss, the sum of ``images * weights`` over all patches.
-        gradients: of that loss, float64, by field of ``Gaussians``.
-    """
+    """The exact images and gradients."""
 
     patches: Sequence[Patch]
-    images: Sequence[Tensor]
-    weights: Sequence[Tensor]
-    gradients: dict[str, Tensor]
+    images: Sequence[Tensor]  # [C + 1, h, w] float64 each: features, then alpha
+    weights: Sequence[Tensor]  # of a scalar loss, the sum of images * weights over all patches
+    gradients: dict[str, Tensor]  # of that loss, float64, by field of Gaussians
 
 
 def choose_patches(

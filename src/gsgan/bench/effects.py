@@ -31,34 +31,22 @@ SCORE = "psnr_person"
 
 @dataclass
 class Row:
-    """One effect in one scene.
+    """One effect in one scene. Dicts by "off" and "on", but for ``runs``."""
 
-    Args:
-        effect: its name in the config.
-        scene: whose images were trained on.
-        called: whether the scene calls for it.
-        split: whose images were scored.
-        overrides: of `gsgan.train` that make the scene.
-        runs: overrides by the name of the run, "off" first, then "on"; empty if nothing is trained.
-        auto, why: whether `auto` turned it on, and its reason.
-        scores: ``{"off" or "on": {"full" or "splat": dB in the person's box}}``.
-        paint_ms, read_ms, parameters: by "off" and "on"; medians per frame.
-        marks: notes that the table must carry.
-    """
-
-    effect: str
-    scene: str
-    called: bool
-    split: str
-    overrides: list[str] = field(default_factory=list)
+    effect: str  # its name in the config
+    scene: str  # whose images were trained on
+    called: bool  # whether the scene calls for it
+    split: str  # whose images were scored
+    overrides: list[str] = field(default_factory=list)  # of `gsgan.train` that make the scene
+    # Overrides by the name of the run, off first, then on; empty if nothing is trained.
     runs: dict[str, list[str]] = field(default_factory=dict)
-    auto: bool = False
+    auto: bool = False  # whether `auto` turned it on
     why: str = ""
-    scores: dict[str, dict[str, float]] = field(default_factory=dict)
-    paint_ms: dict[str, float] = field(default_factory=dict)
+    scores: dict[str, dict[str, float]] = field(default_factory=dict)  # dB by SHOWN
+    paint_ms: dict[str, float] = field(default_factory=dict)  # medians per frame
     read_ms: dict[str, float] = field(default_factory=dict)
     parameters: dict[str, int] = field(default_factory=dict)
-    marks: list[str] = field(default_factory=list)
+    marks: list[str] = field(default_factory=list)  # notes that the table must carry
 
     def gain(self, variant: str) -> float | None:
         """dB that the effect adds; None where either was not scored."""

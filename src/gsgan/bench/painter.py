@@ -30,24 +30,13 @@ MEASURED_FRAMES = 4  # over which peak memory is taken
 
 @dataclass(frozen=True)
 class Way:
-    """How an avatar paints; what is None stays as it was trained.
+    """How an avatar paints. Raises ConfigError, naming the wrong value."""
 
-    Args:
-        accuracy: the rasteriser's settings for F.
-        precision: of the networks, one of ``PRECISIONS``.
-        backend: of both rasterisations.
-        scale: of the image's sides; for another size than 1 the image is resized to its own size.
-        whole: paint the whole image, not only the window round the person.
-
-    Raises:
-        ConfigError: naming the wrong value.
-    """
-
-    accuracy: Accuracy | None = None
-    precision: str = "32-true"
-    backend: str = "auto"
-    scale: float = 1.0
-    whole: bool = False
+    accuracy: Accuracy | None = None  # of F; None: as it was trained
+    precision: str = "32-true"  # of the networks, one of PRECISIONS
+    backend: str = "auto"  # of both rasterisations
+    scale: float = 1.0  # of the image's sides; the image is resized to its own size
+    whole: bool = False  # paint the whole image, not only the window round the person
 
     def __post_init__(self) -> None:
         one_of("precision", self.precision, PRECISIONS)
@@ -56,12 +45,7 @@ class Way:
 
 
 class Painter:
-    """Paints frames with one avatar in one way; several painters may share an avatar.
-
-    Args:
-        avatar: in eval mode, on its device.
-        way: how.
-    """
+    """Paints frames with one avatar, in eval mode, in one way; painters may share an avatar."""
 
     def __init__(self, avatar: Avatar, way: Way) -> None:
         self.avatar, self.way = avatar, way

@@ -14,29 +14,8 @@ from matplotlib.lines import Line2D
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from gsgan.bench.common import (
-    NOTHING,
-    Bench,
-    check_whole,
-    markdown,
-    number,
-    panels,
-    peak_memory,
-    plain_ticks,
-    png,
-    records,
-    sentence,
-)
-from gsgan.bench.compare import (
-    LEAST,
-    choose_patches,
-    errors,
-    human_cloud,
-    leaves,
-    proven_bounds,
-    ring_camera,
-    truth,
-)
+from gsgan.bench import common, compare
+from gsgan.bench.common import NOTHING, check_whole, markdown, number
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.splat import BACKENDS, Accuracy, rasterise, resolve_backend
 from gsgan.utils.checks import at_least, whole
@@ -46,7 +25,6 @@ from gsgan.utils.timing import interleaved, median
 
 # The reference holds every Gaussian at every pixel: others are compared with it, it is not timed.
 TIMED = tuple(backend for backend in BACKENDS if backend not in ("auto", "reference"))
-SAMPLES = ["forward_samples", "both_samples"]  # in the JSON only
 COLOURS = {"native": BLUE, "torch": VERMILLION, "gsplat": GREEN}
 GROWTH = "standard"  # the setting of the table over the whole grid
 TIMES = {"forward_ms": "forward", "both_ms": "forward + backward"}
@@ -80,7 +58,7 @@ def run(config: DictConfig, folder: Path) -> None:
     """
     check(config)
     settings = {str(name): instantiate(one) for name, one in config.settings.items()}
-    bench = Bench.start("raster", config, folder)
+    bench = common.Bench.start("raster", config, folder)
     grid = [(n, c, s) for n in config.gaussians for c in config.channels for s in config.sizes]
     rows: list[dict[str, Any]] = []
     with bench.progress() as progress:
@@ -97,10 +75,10 @@ def run(config: DictConfig, folder: Path) -> None:
     bench.write(
         "What accuracy costs in time",
         number_table(frame),
-        {"bench": OmegaConf.to_container(config), "rows": records(frame)},
-        frame.drop(columns=SAMPLES),
+        {"bench": OmegaConf.to_container(config), "rows": common.records(frame)},
+        frame,
         {"raster_error.png": error_plot(here)},
-        docs=summary(frame, here, n, size, bench.where),
+        docs=summary(frame, here, bench.where),
     )
     beyond = frame[frame.beyond > config.rounding] if "beyond" in frame else frame[:0]
     if len(beyond):
@@ -114,12 +92,13 @@ def run(config: DictConfig, folder: Path) -> None:
 
 def check(config: DictConfig) -> None:
     """Refuses values out of range."""
-    for name, least in {"gaussians": LEAST, "channels": 1, "sizes": 8, "compare_at": 1}.items():
+    least = {"gaussians": compare.LEAST, "channels": 1, "sizes": 8, "compare_at": 1}
+    for name in least:
         listed = OmegaConf.is_list(config[name])
         if not listed or (not config[name] and name != "compare_at"):
             raise ConfigError(f"{name} must be a list of whole numbers, got {config[name]}")
         for value in config[name]:
-            whole(name, value, least)
+            whole(name, value, least[name])
     check_whole(config, repeats=1, windows=1, window=1, seed=0)
     check_whole(config.reference, gaussians=1, size=1)
     check_whole(config.exact_upto, **dict.fromkeys(config.exact_upto, 0))
@@ -149,34 +128,35 @@ def measure_cell(
 ) -> list[dict[str, Any]]:
     """One row per variant in one scene, a cell of the grid; what was not measured is missing."""
     n, channels, size = cell.values()
-    gaussians = human_cloud(n, channels, config.seed).to(device)
-    camera = ring_camera(size).to(device)
+    gaussians = compare.human_cloud(n, channels, config.seed).to(device)
+    camera = compare.ring_camera(size).to(device)
     times = measure_times(config, gaussians, camera, found)
     rows = [
         {**cell, "backend": backend, "setting": name, **own}
         for (backend, name, _), own in zip(found, times, strict=True)
     ]
     if n in config.compare_at:
-        patches = choose_patches(gaussians, camera, config.windows, config.window, config.seed)
-        exact = truth(gaussians, camera, patches, config.seed)
+        many, side, seed = config.windows, config.window, config.seed
+        patches = compare.choose_patches(gaussians, camera, many, side, seed)
+        exact = compare.truth(gaussians, camera, patches, seed)
         settings = {setting for _, _, setting in found}
-        bounds = {s: proven_bounds(gaussians, camera, s, patches) for s in settings}
+        bounds = {s: compare.proven_bounds(gaussians, camera, s, patches) for s in settings}
         for row, variant in zip(rows, found, strict=True):
             draw = partial(_draw, variant=variant)
-            row |= errors(exact, gaussians, camera, bounds[variant[2]], draw)
+            row |= compare.errors(exact, gaussians, camera, bounds[variant[2]], draw)
     if config.memory and (n, size) == (config.reference.gaussians, config.reference.size):
         for row, variant in zip(rows, found, strict=True):
             if row["both_ms"] <= 1000 * config.patience:
-                action = partial(_draw_both, leaves(gaussians), camera, variant)
-                row["memory_mb"] = peak_memory(action, device)
+                action = partial(_draw_both, compare.leaves(gaussians), camera, variant)
+                row["memory_mb"] = common.peak_memory(action, device)
     return rows
 
 
 def measure_times(
     config: DictConfig, gaussians: Gaussians, camera: Camera, found: list[Variant]
 ) -> list[dict[str, Any]]:
-    """Medians and samples, forward without gradients and forward with backward."""
-    inputs = leaves(gaussians)
+    """Median milliseconds, forward without gradients and forward with backward."""
+    inputs = compare.leaves(gaussians)
     actions: dict[tuple[int, str], Callable[[], object]] = {}
     for i, variant in enumerate(found):
         actions[i, "forward"] = partial(torch.no_grad()(_draw), gaussians, camera, variant)
@@ -185,7 +165,6 @@ def measure_times(
     samples = interleaved(actions, config.repeats, patience=config.patience, device=device)
     return [
         {f"{kind}_ms": median(samples[i, kind]) for kind in ("forward", "both")}
-        | {f"{kind}_samples": samples[i, kind] for kind in ("forward", "both")}
         for i in range(len(found))
     ]
 
@@ -205,12 +184,11 @@ def _draw_both(inputs: Gaussians, camera: Camera, variant: Variant) -> object:
     return raster
 
 
-def number_table(frame: pd.DataFrame, *, cells: bool = True) -> str:
-    """All rows in Markdown, with or without the columns N and size."""
-    shown = pd.DataFrame({"C": frame.channels, "backend": frame.backend, "setting": frame.setting})
-    if cells:
-        shown.insert(0, "N", frame.gaussians)
-        shown.insert(2, "size", frame["size"].astype(str) + "²")
+def number_table(frame: pd.DataFrame) -> str:
+    """All rows in Markdown."""
+    shown = pd.DataFrame({"N": frame.gaussians, "C": frame.channels})
+    shown["size"] = frame["size"].astype(str) + "²"
+    shown = shown.join(frame[["backend", "setting"]])
     for column, (heading, digits) in NUMBERS.items():
         values = frame.get(column, pd.Series(index=frame.index, dtype=object))
         shown[heading] = [
@@ -230,16 +208,14 @@ def growth_table(frame: pd.DataFrame) -> str:
     return markdown(wide)
 
 
-def summary(
-    frame: pd.DataFrame, here: pd.DataFrame, n: int, size: int, where: Mapping[str, Any]
-) -> str:
-    """What the docs show: the reference scene, the plot, the growth."""
+def summary(frame: pd.DataFrame, here: pd.DataFrame, where: Mapping[str, Any]) -> str:
+    """What the docs show: the plot, the rows of the reference scene, the growth."""
     return "\n\n".join(
         [
-            sentence(where) + ".",
+            common.sentence(where) + ".",
             "![time against error](pictures/raster_error.png)",
-            f"{n} Gaussians at {size}²; medians of interleaved runs:",
-            number_table(here, cells=False),
+            "Medians of interleaved runs:",
+            number_table(here),
             f"`{GROWTH}`, milliseconds forward / forward + backward:",
             growth_table(frame),
         ]
@@ -252,7 +228,7 @@ def error_plot(here: pd.DataFrame) -> bytes:
     Left: forward time and the largest value error; right: forward + backward time and the worst
     gradient error. Rows without errors, or without any error, are left out.
     """
-    figure, (left, right) = panels(2, 10.4, 4.2)
+    figure, (left, right) = common.panels(2, 10.4, 4.2)
     here = here.reindex(columns=here.columns.union(["value_max", "gradient"]))
     settings = list(here.setting[here.value_max.notna()].unique())
     marks = {name: MARKERS[i % len(MARKERS)] for i, name in enumerate(settings)}
@@ -265,11 +241,11 @@ def error_plot(here: pd.DataFrame) -> bytes:
             for _, row in line.iterrows():
                 axes.plot(row[time], row[error], marks[row.setting], color=colour, ms=7)
         axes.set(xlabel=f"{TIMES[time]}, ms", xscale="log", yscale="log")
-        plain_ticks(axes.xaxis)
+        common.plain_ticks(axes.xaxis)
     left.set_ylabel("largest error of a value")
     right.set_ylabel("relative error of the worst gradient")
     shapes = [Line2D([], [], color="black", ls="", marker=marks[name]) for name in settings]
     right.legend(shapes, settings, fontsize=8, frameon=False)
     if left.get_lines():
         left.legend(fontsize=8, frameon=False)
-    return png(figure)
+    return common.png(figure)

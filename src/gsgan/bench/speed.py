@@ -122,14 +122,7 @@ def measure(
     warmup: int,
     tick: Callable[[], object] = lambda: None,
 ) -> pd.DataFrame:
-    """Paints ``count`` frames end to end and as many by stage, in turn.
-
-    Args:
-        painter: paints.
-        frames: gone through round and round.
-        count: of frames timed each way.
-        warmup: frames before the clock starts.
-        tick: called after each frame.
+    """Paints ``count`` frames end to end and as many by stage, in turn, after ``warmup`` frames.
 
     Returns:
         ``median p10 p90`` in milliseconds by stage, then ``between stages`` (of the frames timed by

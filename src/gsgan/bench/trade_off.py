@@ -16,18 +16,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from gsgan.bench.common import (
-    NOTHING,
-    Bench,
-    check_whole,
-    markdown,
-    number,
-    panels,
-    plain_ticks,
-    png,
-    records,
-    sentence,
-)
+from gsgan.bench import common
+from gsgan.bench.common import NOTHING, Bench, markdown, number
 from gsgan.bench.painter import Painter, Way, painting_memory, place, spread, without_denormals
 from gsgan.bench.speed import deciles
 from gsgan.metrics.image import edge_f1, psnr, ssim
@@ -63,17 +53,11 @@ Score = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True)
 class Point:
-    """An avatar, and the way it paints.
+    """An avatar, and the way it paints."""
 
-    Args:
-        factor, label: what differs from other runs or from the trained way, and its value.
-        folder: of the avatar's run.
-        way: how it paints.
-    """
-
-    factor: str
-    label: str
-    folder: Path
+    factor: str  # what differs from other runs, or from the way it was trained
+    label: str  # its value
+    folder: Path  # of the run
     way: Way = AS_TRAINED
 
 
@@ -88,7 +72,7 @@ def run(config: DictConfig, folder: Path) -> None:
         ConfigError: on a wrong value.
         DataError: when a run or its data cannot be read.
     """
-    check_whole(config, repeats=1, pictures=1)
+    common.check_whole(config, repeats=1, pictures=1)
     above("patience", config.patience)
     one_of("split", config.split, ("novel_pose", "novel_view"))
     one_of("quality", config.quality, QUALITIES)
@@ -107,7 +91,7 @@ def run(config: DictConfig, folder: Path) -> None:
     record = {
         **about,
         "marks": marks,
-        "rows": records(frame),
+        "rows": common.records(frame),
         "front": [frame.label[i] for i in front(frame, config.quality)],
     }
     second = "edge_f1" if perceptual is None else "lpips"
@@ -273,15 +257,9 @@ def make_rows(
 ) -> pd.DataFrame:
     """One row per factor and label, the mean over its seeds, in the points' order.
 
-    Args:
-        points: measured.
-        found: see ``quality``, of each.
-        samples: milliseconds of each.
-        seconds: of training, by run folder.
-
-    Returns:
-        ``factor label``, the metrics (NaN where a seed has none), ``left_out`` scores, ``ms p10
-        p90`` per frame, ``memory_mb`` at its peak, ``seconds`` of training, and ``seeds``.
+    Of ``quality`` and milliseconds of each point, and seconds of training by run folder:
+    ``factor label``, the metrics (NaN where a seed has none), ``left_out`` scores, ``ms p10 p90``
+    per frame, ``memory_mb`` at its peak, ``seconds``, and ``seeds``.
     """
     each = pd.DataFrame(found).reindex(columns=[*QUALITIES, "left_out", "memory_mb"])
     each["seconds"] = [seconds.get(point.folder) for point in points]
@@ -289,7 +267,7 @@ def make_rows(
     rows = []
     names = [[point.factor for point in points], [point.label for point in points]]
     for (factor, label), few in each.groupby(names, sort=False):
-        ms = deciles(np.concatenate(few.ms.tolist()))
+        ms = deciles([ms for own in few.ms for ms in own])
         row = {"factor": factor, "label": label, "ms": ms.pop("median"), **ms}
         row |= few[[*QUALITIES, "seconds"]].mean(skipna=False)
         row |= {"left_out": int(few.left_out.sum()), "memory_mb": few.memory_mb.max()}
@@ -333,7 +311,7 @@ def text(
         f"({QUALITIES[metric][0]})."
     )
     listed = "\n".join(f"- {note}" for note in notes)
-    return f"{sentence(where)}.\n\n{heading}\n\n{table(frame, metric)}\n\n{listed}".strip()
+    return f"{common.sentence(where)}.\n\n{heading}\n\n{table(frame, metric)}\n\n{listed}".strip()
 
 
 def table(frame: pd.DataFrame, metric: str) -> str:
@@ -358,39 +336,27 @@ def plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
     A metric without any score has no panel, unless none has one.
     """
     metrics = [m for m in metrics if frame[m].notna().any()] or metrics[:1]
-    figure, all_axes = panels(len(metrics), 6.4 * len(metrics), 5.6)
+    figure, all_axes = common.panels(len(metrics), 6.4 * len(metrics), 5.6)
     for axes, metric in zip(all_axes, metrics, strict=True):
         heading, _, sign = QUALITIES[metric]
         ahead = frame.iloc[front(frame, metric)]
         label = "front: nothing beats these"
         axes.step(ahead.ms, ahead[metric], "#999999", where="post", lw=1.2, zorder=1, label=label)
         for i, (factor, own) in enumerate(frame.groupby("factor", sort=False)):
-            look: dict[str, Any] = {
-                "color": ORDER[i % len(ORDER)],
-                "ms": 6.5 if i else 11,
-                "elinewidth": 0.6,
-            }
             whiskers = [own.ms - own.p10, own.p90 - own.ms]
-            mark = MARKERS[i % len(MARKERS)] if i else "*"
-            axes.errorbar(own.ms, own[metric], xerr=whiskers, fmt=mark, label=factor, **look)
+            mark, colour = MARKERS[i % len(MARKERS)] if i else "*", ORDER[i % len(ORDER)]
+            axes.errorbar(
+                own.ms, own[metric], xerr=whiskers, fmt=mark, color=colour, label=factor, ms=8
+            )
         axes.set(xscale="log", xlabel="milliseconds per frame (whiskers: deciles)")
         axes.set_ylabel(f"{heading}, {'higher' if sign > 0 else 'lower'} is better")
-        plain_ticks(axes.xaxis)
+        common.plain_ticks(axes.xaxis)
         axes.margins(x=0.16, y=0.1)
         if sign < 0:
             axes.invert_yaxis()
         for i, (_, row) in enumerate(frame[frame[metric].notna()].sort_values("ms").iterrows()):
-            offset = (0, -13 if i % 2 else 6)  # points
-            axes.annotate(
-                row.label,
-                (row.ms, row[metric]),
-                offset,
-                textcoords="offset points",
-                ha="center",
-                fontsize=7.5,
-            )
-    handles, names = all_axes[0].get_legend_handles_labels()
-    figure.legend(
-        handles, names, loc="outside lower center", ncols=min(6, len(names)), frameon=False
-    )
-    return png(figure)
+            side = "bottom" if i % 2 else "top"
+            axes.text(row.ms, row[metric], f"\n{row.label}\n", ha="center", va=side, fontsize=7.5)
+    shown = all_axes[0].get_legend_handles_labels()
+    figure.legend(*shown, loc="outside lower center", ncols=6, frameon=False)
+    return common.png(figure)
