@@ -52,14 +52,12 @@ def run(page: str | None, folder: Path, device: str = "auto") -> None:
         GsganError: when a case gets another status than expected, after all is written.
     """
     config = OmegaConf.create({"device": device, "threads": None, "docs": page})
-    bench = Bench.start("stability", config, folder, "stability")
+    bench = Bench.start("stability", config, folder)
     rows = compare_all(bench.device)
     frame = pd.DataFrame(list(track(rows, "comparing", console=bench.console, transient=True)))
-    text = table(frame)
-    bench.console.print(text, markup=False, highlight=False, soft_wrap=True)
     bench.write(
         "Hard cases: float32 against float64",
-        f"{sentence(bench.where)}.\n\n{text}",
+        f"{sentence(bench.where)}.\n\n{table(frame)}",
         {"rows": records(frame)},
         frame,
         docs=summary(frame, bench.where),

@@ -25,7 +25,7 @@ SMALL_BENCH = {
     "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
     "trade-off": [
         *("settings.accuracies=[draft]", "settings.scales=[0.5]", "settings.backends=[]"),
-        *("repeats=1", "pictures=1"),
+        *("settings.precisions=[]", "settings.windows=[]", "repeats=1", "pictures=1"),
     ],
     "effects": [
         *("train=false", "only=[distortion]"),

@@ -59,7 +59,7 @@ def with_pose(frame: Frame, name: str) -> Frame:
 
 
 def assert_finite(module: AvatarTraining) -> None:
-    assert not module.skipped
+    assert not module.skipped.steps
     for name, value in module.state_dict().items():
         assert value.isfinite().all(), name
     for optimiser in module.trainer.optimizers:
@@ -90,7 +90,7 @@ def poison(module: AvatarTraining, name: str, steps: set[int], value: float) -> 
 
 
 @pytest.mark.parametrize(
-    ("part", "value"), [*((part, math.nan) for part in PARTS), ("psi", math.inf)]
+    ("part", "value"), [(part, math.inf if part == "psi" else math.nan) for part in PARTS]
 )
 def test_a_gradient_that_is_not_finite_skips_its_step_and_is_counted(make, part, value):
     """The second of three iterations is spoiled: the part rests there, and learns after it."""
@@ -107,10 +107,10 @@ def test_a_gradient_that_is_not_finite_skips_its_step_and_is_counted(make, part,
     module.training_step = watched
     fit([frame] * 3)
     assert module.step == 3
-    assert list(module.skipped) == [1]
+    assert list(module.skipped.steps) == [1]
     assert torch.equal(seen[0], seen[1])
     assert not torch.equal(seen[1], seen[2])
-    module.skipped.clear()
+    module.skipped.steps.clear()
     assert_finite(module)
 
 
