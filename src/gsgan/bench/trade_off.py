@@ -355,8 +355,8 @@ def plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
         if sign < 0:
             axes.invert_yaxis()
         for i, (_, row) in enumerate(frame[frame[metric].notna()].sort_values("ms").iterrows()):
-            side = "bottom" if i % 2 else "top"
-            axes.text(row.ms, row[metric], f"\n{row.label}\n", ha="center", va=side, fontsize=7.5)
+            va, ha = (("bottom", "center"), ("top", "center"), ("center", "left"))[i % 3]
+            axes.text(row.ms, row[metric], f"\n   {row.label}   \n", ha=ha, va=va, fontsize=7.5)
     shown = all_axes[0].get_legend_handles_labels()
     figure.legend(*shown, loc="outside lower center", ncols=6, frameon=False)
     return common.png(figure)
