@@ -24,16 +24,8 @@ SMALL_BENCH = {
     ],
     "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
     "trade-off": [
-        "base=[" + ",".join(f"'{w}'" for w in [*TINY, "data.root=/path/to/capture"]) + "]",
-        *(f"factors.{f}=null" for f in ("points_on_body", "points_per_limb", "channels_of_F")),
-        *(
-            "factors.supersampling=null",
-            "factors.generator_width=null",
-            "factors.model=null",
-            "settings.accuracies=[draft]",
-            "settings.scales=[0.5]",
-        ),
-        *("settings.backends=[]", "repeats=1", "pictures=1"),
+        *("settings.accuracies=[draft]", "settings.scales=[0.5]", "settings.backends=[]"),
+        *("settings.precisions=[]", "settings.windows=[]", "repeats=1", "pictures=1"),
     ],
     "effects": [
         *("train=false", "only=[distortion]"),

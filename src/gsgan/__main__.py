@@ -7,7 +7,7 @@ COMMANDS = {
     "gsgan.train": "train an avatar, then score it on the held-out splits",
     "gsgan.evaluate": "score a run, run=<folder>, or any method's images, predictions=<folder>",
     "gsgan.report": "tables of scored runs, runs=[<folder>,…], and figures of a run, run=<folder>",
-    "gsgan.bench": "measure speed and accuracy: raster, stability, effects, speed, trade-off",
+    "gsgan.bench": "measure speed and accuracy: raster, speed, trade-off, effects",
 }
 
 

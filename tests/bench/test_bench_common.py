@@ -1,4 +1,4 @@
-"""The machine, tables, blocks of a page, and measurements that an interrupted bench keeps."""
+"""The machine, tables, blocks of a page, memory, trainings."""
 
 from __future__ import annotations
 
@@ -11,10 +11,8 @@ import torch
 from omegaconf import OmegaConf
 
 from gsgan.bench import common
-from gsgan.bench.common import Bench, Store, cpu_name, environment, number, sentence
+from gsgan.bench.common import Bench, cpu_name, environment, number, sentence
 from gsgan.utils.errors import ConfigError, GsganError
-
-WHERE = {"device": "cpu", "threads": 1, "date": "2026-01-01", "load": 1.0}
 
 
 def test_the_machine_is_named_without_its_host():
@@ -54,7 +52,7 @@ def test_numbers_have_their_significant_digits(value, digits, shown):
 
 def start(folder, page=None):
     config = OmegaConf.create({"threads": None, "docs": page and str(page), "device": "cpu"})
-    return Bench.start("mine", config, folder, "mine")
+    return Bench.start("mine", config, folder)
 
 
 def test_files_and_the_block_of_a_page_are_written(tmp_path):
@@ -81,32 +79,6 @@ def test_a_page_without_the_block_is_refused_at_the_start(tmp_path):
         start(tmp_path, page)
 
 
-def measured(store: Store, key: dict, value: object) -> object:
-    return store.get(key, lambda: value)
-
-
-def test_a_measurement_is_kept_for_its_key_machine_and_code(tmp_path, monkeypatch):
-    path = tmp_path / "deep" / "m.jsonl"
-    assert measured(Store(path, WHERE), {"n": 1}, [1.5]) == [1.5]
-    assert measured(Store(path, WHERE | {"load": 9.0}), {"n": 1}, "again") == [1.5]
-    assert measured(Store(path, WHERE | {"threads": 2}), {"n": 1}, "again") == "again"
-    assert measured(Store(path, WHERE), {"n": 2}, "again") == "again"
-    monkeypatch.setattr(common, "code_digest", lambda: "other")
-    assert measured(Store(path, WHERE), {"n": 1}, "other") == "other"
-    monkeypatch.undo()
-    assert measured(Store(path, WHERE, fresh=True), {"n": 1}, "fresh") == "fresh"
-
-
-def test_a_line_cut_short_is_ignored_and_does_not_damage_the_next(tmp_path):
-    store = Store(tmp_path / "m.jsonl", WHERE)
-    measured(store, {"n": 1}, "whole")
-    measured(store, {"n": 2}, "cut")
-    store.path.write_bytes(store.path.read_bytes()[:-9])
-    measured(Store(store.path, WHERE), {"n": 3}, "after")
-    store = Store(store.path, WHERE)
-    assert [measured(store, {"n": n}, "new") for n in (1, 2, 3)] == ["whole", "new", "after"]
-
-
 def test_a_failed_training_is_one_sentence_with_its_last_line(tmp_path, monkeypatch):
     def launch(arguments, log):
         log.write_text("some lines\ngsgan: no data\n")
@@ -120,3 +92,12 @@ def test_a_failed_training_is_one_sentence_with_its_last_line(tmp_path, monkeypa
 def test_training_runs_in_another_process(tmp_path):
     assert common.launch(["size=nosuch"], tmp_path / "log") != 0
     assert "nosuch" in (tmp_path / "log").read_text()
+
+
+def test_peak_memory_is_what_an_action_takes_on_top_of_what_is_held():
+    held = torch.ones(20_000_000)  # 80 MB that must not count
+    found = common.peak_memory(lambda: torch.ones(5_000_000).exp(), torch.device("cpu"))
+    if found is None:
+        pytest.skip("this system does not report a peak of memory")
+    assert 20 < found < 70
+    assert held.sum() == 20_000_000

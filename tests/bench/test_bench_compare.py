@@ -12,12 +12,13 @@ from gsgan.bench.compare import (
     choose_patches,
     errors,
     gradients,
+    human_cloud,
     leaves,
     proven_bounds,
     relative,
+    ring_camera,
     truth,
 )
-from gsgan.bench.scene import human_cloud, ring_camera
 from gsgan.scene import Raster
 from gsgan.splat import ACCURACY, Accuracy, rasterise
 

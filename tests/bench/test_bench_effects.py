@@ -8,10 +8,12 @@ import shutil
 import sys
 
 import pytest
+from hydra import initialize_config_dir
 
 from gsgan.bench import common, effects
 from gsgan.bench.effects import Row, failures, page, rows_of
-from gsgan.utils.errors import ConfigError, GsganError
+from gsgan.utils.config import config_folder
+from gsgan.utils.errors import GsganError
 
 WHERE = {"device": "cpu", "hardware": "Abacus", "threads": 1, "date": "", "load": None}
 WHERE |= {"versions": {}}
@@ -108,17 +110,10 @@ def test_only_some_and_not_on_the_default_person(rows):
     ]
 
 
-def test_without_training_only_the_decisions_are_found(rows, capture):
-    found = rows("train=false", f"real={capture}")
-    assert len(found) == 10
+def test_without_training_only_the_decisions_are_found(rows):
+    found = rows("train=false")
+    assert len(found) == 9
     assert not any(row.runs for row in found)
-
-
-def test_the_real_capture_has_its_own_runs(rows, capture):
-    row = rows("only=[antialias]", f"real={capture}")[-1]
-    assert row.scene == "real capture"
-    assert (row.effect, row.split) == ("colour_correction", "novel_pose")
-    assert {"data=capture", f"data.root='{capture}'"} <= set(row.runs["real-capture-off"])
 
 
 @pytest.mark.parametrize(
@@ -129,8 +124,6 @@ def test_the_real_capture_has_its_own_runs(rows, capture):
         ("only=[]", "only must list some of"),
         ("repeats=0", "repeats must be"),
         ("frames=1.5", "frames must be"),
-        ("real=nosuch/folder", "no such folder"),
-        ("real_effect=depth", "real_effect must be one of"),
         ("cases.antialias.split=train", "split must be one of"),
     ],
 )
@@ -165,25 +158,9 @@ def launched(monkeypatch):
     return started
 
 
-def test_compose_leaves_the_outer_command_its_hydra():
-    from hydra import initialize_config_dir
-    from hydra.core.global_hydra import GlobalHydra
-
-    from gsgan.utils.config import config_folder
-
-    with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        before = GlobalHydra.instance().hydra
-        assert before is not None
-        assert effects.compose(["size=tiny"]).size.picture == 32
-        assert GlobalHydra.instance().hydra is before
-        with pytest.raises(ConfigError, match="nosuch"):
-            effects.compose(["size=nosuch"])
-        assert GlobalHydra.instance().hydra is before
-
-
 @pytest.fixture
 def small(compose, tmp_path, monkeypatch):
-    """The config of one effect in a tiny scene."""
+    """The config of one effect in a tiny scene, with Hydra as in the command."""
     monkeypatch.setenv("GSGAN_CACHE", str(tmp_path / "cache"))
     base = ",".join(f"'{x}'" for x in [*SCENE, *OFF])
     page = tmp_path / "page.md"
@@ -192,7 +169,9 @@ def small(compose, tmp_path, monkeypatch):
         *(f"base=[{base}]", "only=[colour_correction]", "frames=1", "repeats=2"),
         *(f"docs={page}", "threads=1", "default=false"),
     )
-    return compose("bench_effects", *overrides)
+    config = compose("bench_effects", *overrides)
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        yield config
 
 
 def test_runs_are_scored_timed_and_written(run, small, tmp_path, monkeypatch):
@@ -239,5 +218,5 @@ def test_the_whole_bench_in_miniature(launched, small, tmp_path):
     checkpoint = out / "runs" / "colour_correction-on" / "checkpoints" / "last.ckpt"
     before = checkpoint.stat().st_mtime_ns
     name, words = list(next(rows_of(config)).runs.items())[1]
-    common.train([*words, "resume=true"], out / "runs" / name)
+    common.train(words, out / "runs" / name)
     assert checkpoint.stat().st_mtime_ns == before

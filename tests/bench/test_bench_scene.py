@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsgan.bench.scene import LEAST, human_cloud, ring_camera
+from gsgan.bench.compare import LEAST, human_cloud, ring_camera
 from gsgan.splat import rasterise
 
 

@@ -1,4 +1,4 @@
-"""`gsgan.bench trade-off`: front, curves, points and rows in closed form; tiny real trainings."""
+"""`gsgan.bench trade-off`: front, curves, points and rows in closed form; a multirun of two."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from commands import TINY, refused
+from commands import refused
 
-from gsgan.bench import common
 from gsgan.bench.painter import Way
 from gsgan.bench.trade_off import (
     Point,
+    front,
     make_rows,
+    plot,
     quality,
     runs_in,
     standard_run,
-    sweep,
+    table,
+    text,
     ways,
 )
-from gsgan.bench.trade_off_report import front, images, table, text
 from gsgan.splat import ACCURACY
 from gsgan.train.curve import Curve, curve
 from gsgan.utils.errors import ConfigError, DataError
@@ -30,14 +31,7 @@ from gsgan.utils.errors import ConfigError, DataError
 WHERE = {"device": "cpu", "hardware": "Abacus", "threads": 1, "date": "", "load": None}
 WHERE |= {"versions": {}}
 HEAD = "epoch,step,val/psnr,val/psnr_splat,val/seconds\n"
-SMALL = ["repeats=1", "pictures=2", "settings.accuracies=[draft]", "settings.scales=[0.5]"]
-NO_FACTORS = [
-    f"factors.{name}=null"
-    for name in (
-        *("points_on_body", "points_per_limb"),
-        *("channels_of_F", "supersampling", "generator_width", "model"),
-    )
-]
+SMALL = ["repeats=1", "pictures=1", "settings.accuracies=[draft]", "settings.scales=[0.5]"]
 
 
 def rows_of(*rows: tuple[str, float, float | None], lpips: float = math.nan) -> pd.DataFrame:
@@ -92,26 +86,6 @@ def test_a_training_logs_how_long_it_took(run):
     assert found.seconds[-1] > 0
 
 
-def test_a_sweep_changes_one_thing_at_a_time(tmp_path):
-    factors = {"size_of_it": {"key": "a.b", "values": [1, "x/y"]}, "none": None}
-    points = sweep(["p=q"], factors, tmp_path)
-    assert [(p.factor, p.label) for p in points] == [
-        *(("base", "base"), ("size of it", "1"), ("size of it", "x/y"))
-    ]
-    assert points[2].overrides == ("p=q", "a.b=x/y", "evaluate=false")
-    assert points[2].folder == tmp_path / "size_of_it-x_y"
-    beside = {"n": {"key": "a", "values": [1], "also": ["b=2"]}}
-    assert sweep(["p=q"], beside, tmp_path)[1].overrides[:3] == ("p=q", "b=2", "a=1")
-
-
-@pytest.mark.parametrize(
-    "factors", [{"a": 3}, {"a": {"key": "b"}}, {"a": {"key": "b", "values": [1, 1]}}]
-)
-def test_a_factor_that_makes_no_sense_is_refused(factors, tmp_path):
-    with pytest.raises(ConfigError, match="a"):
-        sweep([], factors, tmp_path)
-
-
 def fake_run(folder: Path, name: str, *words: str, finished: bool = True) -> Path:
     run = folder / name
     (run / "checkpoints").mkdir(parents=True)
@@ -146,9 +120,8 @@ def test_settings_make_one_point_each_and_unknown_ones_are_refused(tmp_path):
     assert found["bf16-mixed"].precision == "bf16-mixed"
     assert found["whole picture"].whole
     assert found["× 0.5"].scale == 0.5
-    for wrong in ({"colours": [1]}, {"accuracies": ["best"]}, {"windows": ["half"]}):
-        with pytest.raises(ConfigError, match=next(iter(wrong))):
-            ways(tmp_path, wrong, ACCURACY)
+    with pytest.raises(ConfigError, match=r"settings.accuracies must be one of .* got 'best'"):
+        ways(tmp_path, {"accuracies": ["best"]}, ACCURACY)
 
 
 def points_of(*names: tuple[str, str]) -> list[Point]:
@@ -181,19 +154,15 @@ def test_the_table_marks_the_front_and_lower_lpips_is_better():
 
 def test_what_is_missing_is_noted():
     about = {"pictures": 4, "split": "novel_pose", "subject": "base"}
-    page = text(rows_of(("a", 1, 20)), "psnr", about, WHERE, ["a mark"], has_curves=False)
+    page = text(rows_of(("a", 1, 20)), "psnr", about, WHERE, ["a mark"])
     assert "LPIPS n/a" in page
-    assert "no training times" in page
     assert "- a mark" in page
 
 
-def test_plots_are_drawn_with_and_without_curves_and_scores():
+def test_the_plot_is_drawn_with_and_without_scores():
     frame = rows_of(*((f"point {i}", 1 + i % 3, 20 + i) for i in range(9)))
-    assert set(images(frame, "psnr", "lpips", [])) == {"trade_off.png"}
-    curves = [Curve("full", (0, 60), (10, 20)), Curve("full", (0, 50), (10, 21))]
-    found = images(rows_of(("alone", 1, None), lpips=0.2), "psnr", "lpips", curves)
-    assert all(png.startswith(b"\x89PNG") for png in found.values())
-    assert len(found) == 2
+    for rows in (frame, rows_of(("alone", 1, None), lpips=0.2), rows_of(("none", 1, None))):
+        assert plot(rows, ["psnr", "lpips"]).startswith(b"\x89PNG")
 
 
 def test_scores_are_means_of_finite_ones(build):
@@ -207,40 +176,7 @@ def test_scores_are_means_of_finite_ones(build):
     assert "lpips" not in found
 
 
-def test_the_command_trains_a_sweep_and_goes_on_where_it_stopped(
-    run, capture, tmp_path, inside, monkeypatch
-):
-    started = []
-
-    def launch(arguments, log):  # a training is tested elsewhere: a finished run stands in
-        started.append(arguments)
-        shutil.copytree(run, log.with_suffix(""), dirs_exist_ok=True)
-        return 0
-
-    monkeypatch.setattr(common, "launch", launch)
-    out = tmp_path / "out"
-    words = ",".join(f"'{w}'" for w in [*TINY, f"data.root={capture}"])
-    given = [f"base=[{words}]", *NO_FACTORS, *SMALL]
-    given += ["settings.backends=[]", f"hydra.run.dir={out}", "patience=100"]
-    first = inside("bench", "trade-off", *given)
-    assert first.returncode == 0, first.stderr + first.stdout
-    assert "training 1 of 1: base" in first.stdout
-    assert started[0][-2:] == ["evaluate=false", f"hydra.run.dir='{out / 'runs' / 'base'}'"]
-    found = json.loads((out / "trade_off.json").read_text())
-    labels = [r["label"] for r in found["rows"]]
-    assert labels == ["base", "draft", "bf16-mixed", "× 0.5", "whole picture"]
-    assert all(r["psnr"] > 5 and r["ms"] > 0 for r in found["rows"])
-    assert found["rows"][0]["seconds"] > 0
-    assert (out / "trade_off_training.png").is_file()
-    lines = (out / "measurements.jsonl").read_text().splitlines()
-    again = inside("bench", "trade-off", *given)
-    assert again.returncode == 0, again.stderr
-    assert (out / "measurements.jsonl").read_text().splitlines() == lines
-    scores = [row["psnr"] for row in json.loads((out / "trade_off.json").read_text())["rows"]]
-    assert scores == [row["psnr"] for row in found["rows"]]
-
-
-def test_the_command_takes_a_sweep_that_there_is(run, tmp_path, inside):
+def test_the_command_compares_a_multirun(run, tmp_path, inside):
     for name in ("one", "two"):
         shutil.copytree(run, tmp_path / "sweep" / name)
     words = tmp_path / "sweep" / "two" / ".hydra" / "overrides.yaml"
@@ -250,12 +186,17 @@ def test_the_command_takes_a_sweep_that_there_is(run, tmp_path, inside):
     page.parent.mkdir()
     page.write_text("<!-- bench:trade-off -->\nold\n<!-- end -->\n")
     given = [f"runs={tmp_path / 'sweep'}", *SMALL, f"hydra.run.dir={tmp_path / 'out'}"]
-    given += [f"settings.{name}=[]" for name in ("accuracies", "precisions", "backends", "windows")]
+    given += ["settings.backends=[]", "settings.precisions=[]"]
     done = inside("bench", "trade-off", *given, f"docs={page}")
     assert done.returncode == 0, done.stderr
     assert "left out, not finished: three" in done.stdout
     assert "| twist | odd |" in page.read_text()
     assert (page.parent / "pictures" / "trade_off.png").is_file()
+    found = json.loads((tmp_path / "out" / "trade_off.json").read_text())["rows"]
+    labels = [row["label"] for row in found]
+    assert labels == ["base", "odd", "draft", "× 0.5", "whole picture"]
+    assert all(row["psnr"] > 5 and row["ms"] > 0 for row in found)
+    assert found[0]["seconds"] > 0
     config = tmp_path / "sweep" / "two" / ".hydra" / "config.yaml"
     config.write_text(config.read_text().replace("size: 32", "size: 16"))
     refused(inside("bench", "trade-off", *given), "two", "other data")
@@ -264,19 +205,17 @@ def test_the_command_takes_a_sweep_that_there_is(run, tmp_path, inside):
 @pytest.mark.parametrize(
     ("given", "words"),
     [
-        (["run=a", "runs=b"], ["not both"]),
-        (["run=/nowhere"], ["/nowhere", "last.ckpt"]),
+        (["run=a", "runs=b"], ["either run="]),
+        ([], ["either run="]),
+        (["run=/nowhere"], ["/nowhere", "not a run folder"]),
         (["runs=/nowhere"], ["/nowhere", "no finished run"]),
         (["repeats=0"], ["repeats"]),
         (["pictures=none"], ["pictures"]),
         (["patience=0"], ["patience"]),
         (["quality=beauty"], ["quality", "psnr"]),
         (["split=train"], ["split"]),
-        (["settings.scales=[0]"], ["scale"]),
-        (["settings.precisions=[int8]"], ["precision"]),
-        (["factors.model=3"], ["factors.model"]),
         (["docs=/nowhere.md"], ["/nowhere.md"]),
     ],
 )
-def test_what_makes_no_sense_ends_in_one_sentence_before_training(inside, given, words):
+def test_what_makes_no_sense_ends_in_one_sentence(inside, given, words):
     refused(inside("bench", "trade-off", *given), *words)

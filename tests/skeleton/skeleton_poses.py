@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
+from stability.cases.poses import DEGENERATE, REST, noisy, rest
 from torch import Tensor
 
-from gsgan.bench.cases.poses import DEGENERATE, REST, noisy, rest
 from gsgan.scene import Camera
 from gsgan.skeleton import MEDIAPIPE33
 

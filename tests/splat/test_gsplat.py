@@ -16,8 +16,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 from splat_scenes import camera, cloud, error, gradients, join, leaves, loss, one, with_covariances
+from stability.cases.case import drawing_backends
 
-from gsgan.bench.cases.case import drawing_backends
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat import ACCURACY, gsplat_backend, rasterise, resolve_backend
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from gsgan.bench.cases.case import FINITE_ONLY, Case, compare
+from stability.cases.case import FINITE_ONLY, Case, compare
 
 torch.set_num_threads(1)
 

@@ -6,8 +6,8 @@ import torch
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsgan.bench.cases.poses import DEGENERATE, noisy
-from gsgan.bench.cases.raster import rotation
+from stability.cases.poses import DEGENERATE, noisy
+from stability.cases.raster import rotation
 
 ANGLES = st.tuples(*[st.floats(-3.1, 3.1)] * 3)
 METRES = st.tuples(*[st.floats(-5.0, 5.0)] * 3)

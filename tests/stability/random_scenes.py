@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from hypothesis import strategies as st
 
-from gsgan.bench.cases.case import Inputs
-from gsgan.bench.cases.raster import pinhole
+from stability.cases.case import Inputs
+from stability.cases.raster import pinhole
 
 Size = tuple[int, int]
 

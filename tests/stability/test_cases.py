@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from gsgan.bench.cases.case import REFUSED, STATUSES, all_cases
+from stability.cases.case import REFUSED, STATUSES, all_cases
 from stability.compared import assert_as_expected
 
 CASES = all_cases()

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsgan.bench.cases import case as module
-from gsgan.bench.cases.case import Case, Tolerance, all_cases, compare, compare_all
+from stability.cases import case as module
+from stability.cases.case import Case, Tolerance, all_cases, compare, compare_all
 
 
 class Spoiled(torch.autograd.Function):

@@ -22,10 +22,6 @@ def run_suite(environment: dict[str, str], *arguments: str) -> None:
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
 
 
-def test_narrow_gaussians():
-    run_suite(PORTABLE, str(HERE / "test_cases.py"), "-k", "float32 and low-pass")
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("environment", [PORTABLE, AVX2], ids=["portable", "avx2"])
 def test_every_case(environment):

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from gsgan.bench.cases.lbs import BONES, PARENTS
-from gsgan.bench.cases.raster import rotation
 from gsgan.body import axis_angle_to_matrix, blend_transforms, forward_kinematics, skin
+from stability.cases.lbs import BONES, PARENTS
+from stability.cases.raster import rotation
 from stability.motions import ANGLES, METRES, assert_rotation
 
 JOINTS = torch.tensor([[0.0, 0, 0], [0.3, 0, 0], [0.6, 0, 0]], dtype=torch.float64)

@@ -9,10 +9,10 @@ import torch
 from kornia.losses import ssim_loss
 from torchmetrics.functional.image import structural_similarity_index_measure
 
-from gsgan.bench.cases.losses import PAIRS
 from gsgan.evaluate.scores import image_scores, means
 from gsgan.losses.photometric import d_ssim
 from gsgan.metrics.image import psnr, ssim
+from stability.cases.losses import PAIRS
 
 
 @pytest.mark.parametrize("name", PAIRS)

@@ -9,17 +9,17 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from gsgan.bench.cases.case import Inputs, Tolerance, drawing_backends
-from gsgan.bench.cases.raster import (
+from gsgan.splat import ACCURACY, Accuracy, project, rasterise
+from gsgan.splat.project import rotations
+from gsgan.splat.reference import error_bound
+from stability.cases.case import Inputs, Tolerance, drawing_backends
+from stability.cases.raster import (
     raster_case,
     records,
     render,
     rotation,
     uncut,
 )
-from gsgan.splat import ACCURACY, Accuracy, project, rasterise
-from gsgan.splat.project import rotations
-from gsgan.splat.reference import error_bound
 from stability.compared import assert_as_expected
 from stability.random_scenes import scenes
 

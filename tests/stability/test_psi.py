@@ -7,11 +7,11 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gsgan.bench.cases.poses import DEGENERATE, noisy, rest
-from gsgan.bench.cases.psi import composed, ordinary_residuals, small_psi, some_points
-from gsgan.bench.cases.raster import SIZE, pinhole
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat import rasterise
+from stability.cases.poses import DEGENERATE, noisy, rest
+from stability.cases.psi import composed, ordinary_residuals, small_psi, some_points
+from stability.cases.raster import SIZE, pinhole
 from stability.motions import ANGLES, METRES, rigid
 
 CPU = torch.device("cpu")

@@ -7,10 +7,10 @@ import torch
 from hypothesis import given, settings
 from torch import Tensor
 
-from gsgan.bench.cases.crossings import CROSSINGS, poses
-from gsgan.bench.cases.skeleton import few_points
 from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames, omega
 from gsgan.skeleton.frames import MIN_LENGTH, BoneFrames
+from stability.cases.crossings import CROSSINGS, poses
+from stability.cases.skeleton import few_points
 from stability.motions import ANGLES, METRES, assert_rotation, rigid, skeletons
 
 CPU = torch.device("cpu")

@@ -1,9 +1,10 @@
-"""What all benches share: the machine, tables, files, resuming, and training runs."""
+"""What all benches share: the machine, tables, files, memory, training runs, plots."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
+import ctypes
+import gc
 import importlib.metadata
 import io
 import json
@@ -27,20 +28,21 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from gsgan.splat import buffers
 from gsgan.utils import pages
+from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
 from gsgan.utils.devices import pick_device
-from gsgan.utils.errors import ConfigError, GsganError
+from gsgan.utils.errors import GsganError
 from gsgan.utils.files import write_atomically
 
 NOTHING = "–"  # what was not measured
-PACKAGES = ("gsgan", "torch", "gsplat")
 
 
 def environment(device: torch.device) -> dict[str, Any]:
     """Device, hardware, threads, date, versions and load, without which figures mean nothing."""
     versions = {"Python": platform.python_version()}
-    for name in PACKAGES:
+    for name in ("gsgan", "torch", "gsplat"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             versions[name] = importlib.metadata.version(name)
     return {
@@ -95,39 +97,24 @@ def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
 
 
 def check_whole(config: DictConfig, **least: int) -> None:
-    """Refuses keys that are not whole numbers of at least so much.
-
-    Raises:
-        ConfigError: naming the key.
-    """
+    """Raises ConfigError for keys that are not whole numbers of at least so much."""
     for name, low in least.items():
-        value = config[name]
-        if not isinstance(value, int) or isinstance(value, bool) or value < low:
-            raise ConfigError(f"{name} must be a whole number of at least {low}, got {value!r}")
+        whole(name, config[name], low)
 
 
 @dataclass(frozen=True)
 class Bench:
-    """One bench at work.
+    """One bench at work."""
 
-    Args:
-        name, folder: of its files.
-        console: prints.
-        device, where: it measures on; see :func:`environment`.
-        page, block: a Markdown page that gets the result, if any, between
-            ``<!-- bench:block -->`` and ``<!-- end -->``.
-    """
-
-    name: str
-    folder: Path
+    name: str  # of its files, and with - for _ of its block in the page
+    folder: Path  # of its files
     console: Console
     device: torch.device
-    where: dict[str, Any]
-    page: Path | None
-    block: str
+    where: dict[str, Any]  # it measures; see `environment`
+    page: Path | None  # a Markdown page that gets the result
 
     @classmethod
-    def start(cls, name: str, config: DictConfig, folder: Path, block: str) -> Bench:
+    def start(cls, name: str, config: DictConfig, folder: Path) -> Bench:
         """Sets threads, finds the device, and prints where it measures.
 
         Raises:
@@ -137,11 +124,16 @@ class Bench:
             check_whole(config, threads=1)
             torch.set_num_threads(config.threads)
         device, page = pick_device(config.get("device", "cpu")), config.docs and Path(config.docs)
+        bench = cls(name, folder, make_console(), device, environment(device), page)
         if page is not None:  # now, not after measuring for an hour
-            pages.check_block(page, *_markers(block), key="docs")
-        bench = cls(name, folder, make_console(), device, environment(device), page, block)
+            pages.check_block(page, *bench.markers, key="docs")
         bench.console.print(sentence(bench.where), highlight=False)
         return bench
+
+    @property
+    def markers(self) -> tuple[str, str]:
+        """Of the block in the page."""
+        return f"<!-- bench:{self.name.replace('_', '-')} -->", "<!-- end -->"
 
     def progress(self) -> Progress:
         """A bar with a description."""
@@ -157,13 +149,14 @@ class Bench:
         images: Mapping[str, bytes] | None = None,
         docs: str | None = None,
     ) -> None:
-        """The files of the folder, each whole or not at all, and the block of the page.
+        """Prints the text; writes the files of the folder and the block of the page.
 
         Args:
             title, text: of the Markdown file; the block gets ``docs``, else ``text``.
             record, frame: of the JSON file, beside ``where``, and of the CSV file.
             images: PNG bytes by name; for the page they go into ``pictures/`` beside it.
         """
+        self.console.print(text, markup=False, highlight=False, soft_wrap=True)
         write_atomically(self.folder / f"{self.name}.md", f"# {title}\n\n{text.strip()}\n")
         content = json.dumps({"where": self.where, **record}, indent=1)
         write_atomically(self.folder / f"{self.name}.json", content)
@@ -174,50 +167,40 @@ class Bench:
             if self.page is not None:
                 write_atomically(self.page.parent / "pictures" / name, png)
         if self.page is not None:
-            block = text if docs is None else docs
-            pages.fill_block(self.page, *_markers(self.block), block, key="docs")
+            pages.fill_block(self.page, *self.markers, docs or text, key="docs")
         self.console.print(f"tables and raw numbers: {self.folder}", markup=False, highlight=False)
 
 
-def _markers(block: str) -> tuple[str, str]:
-    return f"<!-- bench:{block} -->", "<!-- end -->"
+def peak_memory(action: Callable[[], object], device: torch.device) -> float | None:
+    """Megabytes by which the peak of this process grows while ``action`` runs a second time.
 
-
-class Store:
-    """Finished measurements, one JSON record per line: an interrupted bench goes on after them.
-
-    A measurement depends on its key, the machine (less date and load) and the package's code. The
-    file is made with its folder at the first record; ``fresh`` forgets what it holds.
+    Convention: free memory is returned to the system first, and the system's record of the peak is
+    reset (``VmHWM`` of Linux); on CUDA it is the allocator's peak. None where neither is known.
     """
-
-    def __init__(self, path: Path, where: Mapping[str, Any], *, fresh: bool = False) -> None:
-        self.path, self.found = path, dict[str, Any]()
-        self.conditions = {k: v for k, v in where.items() if k not in ("date", "load")}
-        self.conditions["code"] = code_digest()
-        if fresh:
-            path.unlink(missing_ok=True)
-        for line in path.read_text(errors="replace").splitlines() if path.is_file() else ():
-            with contextlib.suppress(ValueError, TypeError):  # a line that a kill cut short
-                self.found |= dict([json.loads(line)])
-
-    def get(self, key: Mapping[str, Any], measure: Callable[[], Any]) -> Any:
-        """What was measured under a key of JSON values; measured now if it is missing."""
-        text = json.dumps({**self.conditions, **key}, sort_keys=True)
-        name = hashlib.sha256(text.encode()).hexdigest()[:16]
-        if name not in self.found:
-            self.found[name] = measure()
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            with self.path.open("a") as stream:
-                stream.write(f"\n{json.dumps([name, self.found[name]])}\n")
-        return self.found[name]
+    action()  # what is built once is built
+    gc.collect()
+    buffers.forget()
+    if device.type == "cuda":
+        torch.cuda.reset_peak_memory_stats(device)
+    else:
+        with contextlib.suppress(OSError, AttributeError):  # glibc keeps what was freed for reuse
+            ctypes.CDLL(None).malloc_trim(0)
+        with contextlib.suppress(OSError), open("/proc/self/clear_refs", "w") as stream:
+            stream.write("5")
+    before = _peak(device)
+    action()
+    after = _peak(device)
+    return None if before is None or after is None else (after - before) / 1e6
 
 
-def code_digest() -> str:
-    """A name of the package's code."""
-    package, found = Path(__file__).resolve().parents[1], hashlib.sha256()
-    for path in sorted(p for p in package.rglob("*") if p.suffix in (".py", ".cpp", ".h")):
-        found.update(path.name.encode() + b"\0" + path.read_bytes())
-    return found.hexdigest()[:16]
+def _peak(device: torch.device) -> float | None:
+    """Bytes: the most that was held since the reset."""
+    if device.type == "cuda":
+        return float(torch.cuda.max_memory_allocated(device))
+    with contextlib.suppress(OSError, StopIteration), open("/proc/self/status") as stream:
+        line = next(line for line in stream if line.startswith("VmHWM:"))
+        return 1024.0 * int(line.split()[1])
+    return None
 
 
 def train(overrides: Sequence[str], run: Path) -> None:

@@ -1,5 +1,6 @@
-"""The error of an image and its gradients against float64 without cut-offs, on patches of it.
+"""The scene of the raster bench, and errors of its image and gradients on patches of it.
 
+The scene is one person before a camera of the default ring; the truth is float64 without cut-offs.
 With every Gaussian at every pixel, whole images are rarely affordable. On a patch the image is
 exactly the same: all is projected by the whole camera, then only the patch's pixels are blended.
 """
@@ -13,8 +14,86 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from gsgan.scene import Camera, Gaussians, Raster
+from gsgan.body.free import free_body
+from gsgan.data.synthetic import scene_setup
+from gsgan.data.synthetic.motion import motion
+from gsgan.scene import BodyPose, Camera, Gaussians, Raster
+from gsgan.skeleton import MEDIAPIPE33, Densify
 from gsgan.splat import ACCURACY, Accuracy, Projected, project, reference
+
+LEAST = len(MEDIAPIPE33.limbs) + 2  # Gaussians: one per part
+# How far the Gaussians are from those that an avatar starts with; about as in a trained one.
+SCALE_SPREAD = 0.5  # standard deviation of the logarithm of each axis's scale
+SCALE_RANGE = (1e-4, 0.06)  # body heights, the bounds of Ψ
+JITTER = 0.5  # how far a mean leaves its surface point, in the point's initial scales
+OPACITY_LOGIT = (0.5, 1.5)  # mean and standard deviation
+
+
+def human_cloud(n: int, channels: int, seed: int = 0) -> Gaussians:
+    """Gaussians as an avatar of the default person has them, ``n`` exactly.
+
+    Convention: world frame, metres, float32, a batch of one; features in [0, 1]. The same
+    arguments give the same numbers, and the same person whatever ``n`` is: more points are smaller.
+
+    Args:
+        n: Gaussians, at least one for each part (``LEAST``).
+        channels: of the features.
+        seed: of shapes, opacities and features.
+
+    Raises:
+        ValueError: on too few Gaussians.
+    """
+    if n < LEAST:
+        raise ValueError(f"human_cloud: n must be at least {LEAST}, one per part, got {n}")
+    random = torch.Generator().manual_seed(seed)
+
+    def normal(*size: int) -> Tensor:
+        return torch.randn(1, n, *size, generator=random, dtype=torch.float64)
+
+    points = _densify(n)(default_person())
+    sigma = points.scales.unsqueeze(-1)
+    low, high = (bound * MEDIAPIPE33.stature for bound in SCALE_RANGE)
+    scales = (sigma * torch.exp(SCALE_SPREAD * normal(3))).clamp(low, high)
+    mean, spread = OPACITY_LOGIT
+    return Gaussians(
+        means=points.means + JITTER * sigma * normal(3),
+        quats=normal(4),
+        scales=scales,
+        opacities=torch.sigmoid(mean + spread * normal()),
+        features=torch.rand(1, n, channels, generator=random, dtype=torch.float64),
+    ).to(torch.float32)
+
+
+def ring_camera(size: int) -> Camera:
+    """The first camera of the default ring, ``size`` pixels square, float32, a batch of one."""
+    settings = scene_setup.Settings(size=size)
+    view = scene_setup.ring(settings, scene_setup.extent(free_body(), settings.seed))[0]
+    K, R, t = (torch.as_tensor(x).unsqueeze(0) for x in (view.K, view.R, view.t))
+    return Camera(K, R, t, view.size).to(torch.float32)
+
+
+def default_person() -> Tensor:
+    """``[1, 33, 3]`` float64 joints of the default person's first frame, metres, world frame."""
+    settings = scene_setup.Settings()
+    theta, transl, _ = motion(settings.frames, settings.seed)
+    return (
+        free_body()
+        .to(torch.float64)
+        .posed_landmarks(BodyPose(theta[:1].double(), transl[:1].double()))
+    )
+
+
+def _densify(n: int) -> Densify:
+    """Points on limbs, face and torso in the proportions of the default layout."""
+    limbs = len(MEDIAPIPE33.limbs)
+    per_limb = max(1, n * 200 // (200 * limbs + 500 + 500))
+    rest = n - per_limb * limbs
+    return Densify(
+        points_per_limb=per_limb,
+        face_points=rest // 2,
+        torso_points=rest - rest // 2,
+        dtype=torch.float64,
+    )
 
 
 class Patch(NamedTuple):
@@ -33,19 +112,12 @@ class Patch(NamedTuple):
 
 @dataclass(frozen=True)
 class Truth:
-    """The exact images and gradients.
-
-    Args:
-        patches: where.
-        images: ``[C + 1, h, w]`` float64 each: features, then alpha.
-        weights: of a scalar loss, the sum of ``images * weights`` over all patches.
-        gradients: of that loss, float64, by field of ``Gaussians``.
-    """
+    """The exact images and gradients."""
 
     patches: Sequence[Patch]
-    images: Sequence[Tensor]
-    weights: Sequence[Tensor]
-    gradients: dict[str, Tensor]
+    images: Sequence[Tensor]  # [C + 1, h, w] float64 each: features, then alpha
+    weights: Sequence[Tensor]  # of a scalar loss, the sum of images * weights over all patches
+    gradients: dict[str, Tensor]  # of that loss, float64, by field of Gaussians
 
 
 def choose_patches(
@@ -114,11 +186,11 @@ def errors(
     bounds: Sequence[Tensor],
     draw: Callable[[Gaussians, Camera], Raster],
 ) -> dict[str, Any]:
-    """Compares one way to draw with the truth.
+    """Compares the whole image that ``draw`` draws with the truth.
 
     Args:
         exact: for these Gaussians and this camera.
-        gaussians, camera: of the whole image, which ``draw`` draws.
+        gaussians, camera: given to ``draw``.
         bounds: see ``proven_bounds``, of the settings that ``draw`` uses.
 
     Returns:

@@ -10,10 +10,7 @@ from typing import Any
 
 import pandas as pd
 import torch
-from hydra import compose as hydra_compose
-from hydra import initialize_config_dir
-from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
+from hydra import compose
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
@@ -22,47 +19,34 @@ from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, sentence
 from gsgan.bench.painter import evenly
 from gsgan.effects import decide as decide_effects
 from gsgan.train.runs import build_data, load_avatar, load_config
-from gsgan.utils.config import config_folder
+from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, GsganError
 from gsgan.utils.timing import interleaved, median
 
-DEFAULT, REAL = "default person", "real capture"
+DEFAULT = "default person"
 SPLITS = ("novel_view", "novel_pose")
 SHOWN = ("full", "splat")  # the final image, Step I's colour
 SCORE = "psnr_person"
-SETTINGS = ("base", "budget", "only", "train", "default", "real_base", "frames", "repeats")
 
 
 @dataclass
 class Row:
-    """One effect in one scene.
+    """One effect in one scene. Dicts by "off" and "on", but for ``runs``."""
 
-    Args:
-        effect: its name in the config.
-        scene: whose images were trained on.
-        called: whether the scene calls for it.
-        split: whose images were scored.
-        overrides: of `gsgan.train` that make the scene.
-        runs: overrides by the name of the run, "off" first, then "on"; empty if nothing is trained.
-        auto, why: whether `auto` turned it on, and its reason.
-        scores: ``{"off" or "on": {"full" or "splat": dB in the person's box}}``.
-        paint_ms, read_ms, parameters: by "off" and "on"; medians per frame.
-        marks: notes that the table must carry.
-    """
-
-    effect: str
-    scene: str
-    called: bool
-    split: str
-    overrides: list[str] = field(default_factory=list)
+    effect: str  # its name in the config
+    scene: str  # whose images were trained on
+    called: bool  # whether the scene calls for it
+    split: str  # whose images were scored
+    overrides: list[str] = field(default_factory=list)  # of `gsgan.train` that make the scene
+    # Overrides by the name of the run, off first, then on; empty if nothing is trained.
     runs: dict[str, list[str]] = field(default_factory=dict)
-    auto: bool | None = None
+    auto: bool = False  # whether `auto` turned it on
     why: str = ""
-    scores: dict[str, dict[str, float]] = field(default_factory=dict)
-    paint_ms: dict[str, float] = field(default_factory=dict)
+    scores: dict[str, dict[str, float]] = field(default_factory=dict)  # dB by SHOWN
+    paint_ms: dict[str, float] = field(default_factory=dict)  # medians per frame
     read_ms: dict[str, float] = field(default_factory=dict)
     parameters: dict[str, int] = field(default_factory=dict)
-    marks: list[str] = field(default_factory=list)
+    marks: list[str] = field(default_factory=list)  # notes that the table must carry
 
     def gain(self, variant: str) -> float | None:
         """dB that the effect adds; None where either was not scored."""
@@ -83,7 +67,7 @@ def run(config: DictConfig, folder: Path) -> None:
             effect that was called for gained nothing.
     """
     check(config)
-    bench = Bench.start("effects", config, folder, "effects")
+    bench = Bench.start("effects", config, folder)
     rows = list(rows_of(config))
     trainings = {name: words for row in rows for name, words in row.runs.items()}
     metrics = {}
@@ -91,13 +75,12 @@ def run(config: DictConfig, folder: Path) -> None:
         task = progress.add_task("", total=len(trainings) + 2 * len(rows))
         for row in rows:
             progress.update(task, description=f"deciding in {row.scene}")
-            row.auto, row.why = decide([*config.base, *row.overrides], row.effect)
+            decide(row, config.base)
             progress.advance(task)
         for name, words in trainings.items():
             progress.update(task, description=f"training {name}")
-            at = folder / "runs" / name
-            common.train([*words, f"resume={str(not config.fresh).lower()}"], at)
-            metrics[name] = json.loads((at / "metrics.json").read_text())
+            common.train(words, folder / "runs" / name)
+            metrics[name] = json.loads((folder / "runs" / name / "metrics.json").read_text())
             progress.advance(task)
         for row in rows:
             progress.update(task, description=f"timing {row.effect} in {row.scene}")
@@ -105,15 +88,12 @@ def run(config: DictConfig, folder: Path) -> None:
                 score(row, metrics)
                 measure(row, folder / "runs", config.frames, config.repeats)
             progress.advance(task)
-    text, settings = page(rows, bench.where), OmegaConf.to_container(config)
-    assert isinstance(settings, dict)
-    bench.console.print(text, markup=False, highlight=False)
     record = {
-        "settings": {name: settings[name] for name in SETTINGS},
+        "settings": OmegaConf.to_container(config),
         "rows": [asdict(row) | {"gain_db": {v: row.gain(v) for v in SHOWN}} for row in rows],
         "failures": failures(rows),
     }
-    bench.write("What effects gain and cost", text, record)
+    bench.write("What effects gain and cost", page(rows, bench.where), record)
     if failures(rows):
         raise GsganError("; ".join(failures(rows)))
 
@@ -121,70 +101,35 @@ def run(config: DictConfig, folder: Path) -> None:
 def check(config: DictConfig) -> None:
     """Refuses wrong values before anything takes time."""
     check_whole(config, frames=1, repeats=1)
-    known, only = ", ".join(config.cases), config.only
+    only = config.only
     listed = OmegaConf.is_list(only) and only and set(only) <= set(config.cases)
     if only is not None and not listed:
-        raise ConfigError(f"only must list some of {known}; got {only!r}")
-    if config.real_effect not in config.cases:
-        raise ConfigError(f"real_effect must be one of {known}, got {config.real_effect!r}")
-    if config.real is not None and not Path(config.real).expanduser().is_dir():
-        raise ConfigError(f"real={config.real}: no such folder; give a capture's, or real=null")
+        raise ConfigError(f"only must list some of {', '.join(config.cases)}; got {only!r}")
     for name, case in config.cases.items():
-        if case.split not in SPLITS:
-            raise ConfigError(
-                f"cases.{name}.split must be one of {', '.join(SPLITS)}, got {case.split!r}"
-            )
+        one_of(f"cases.{name}.split", case.split, SPLITS)
 
 
 def rows_of(config: DictConfig) -> Iterator[Row]:
-    """Each effect in the scene that calls for it, in the default one, and in the real capture."""
+    """Each effect in the scene that calls for it, and in the default one."""
     for effect in config.only or list(config.cases):
-        case = config.cases[effect]
-        called = not case.scene  # by the default person
-        if not called:
-            yield _row(config, effect, effect, case.split, list(case.scene))
-        row = Row(effect, DEFAULT, called, case.split)
-        if config.train and (called or (config.default and case.get("elsewhere", True))):
-            on = f"effects.{effect}={case.word}"
-            row.runs = {"default-off": [*config.base], f"default-{effect}": [*config.base, on]}
+        case, base = config.cases[effect], list(config.base)
+        turn_on, scene = f"effects.{effect}={case.word}", list(case.scene)
+        if scene:
+            off = [*base, *scene]
+            runs = {f"{effect}-off": off, f"{effect}-on": [*off, turn_on]} if config.train else {}
+            yield Row(effect, effect, True, case.split, scene, runs)
+        row = Row(effect, DEFAULT, not scene, case.split)
+        if config.train and (not scene or (config.default and case.get("elsewhere", True))):
+            row.runs = {"default-off": base, f"default-{effect}": [*base, turn_on]}
         yield row
-    if config.real is not None:
-        root = Path(config.real).expanduser().resolve()
-        scene = ["data=capture", f"data.root='{root}'", *config.real_base]
-        yield _row(config, config.real_effect, REAL, config.real_split, scene)
 
 
-def _row(config: DictConfig, effect: str, scene: str, split: str, overrides: list[str]) -> Row:
-    """A scene that calls for the effect, with two runs."""
-    off, name = [*config.base, *overrides], scene.replace(" ", "-")
-    on = [*off, f"effects.{effect}={config.cases[effect].word}"]
-    runs = {f"{name}-off": off, f"{name}-on": on} if config.train else {}
-    return Row(effect, scene, True, split, overrides, runs)
-
-
-def compose(overrides: Sequence[str]) -> DictConfig:
-    """The training config with these overrides, while this command's own Hydra stays as it is.
-
-    Raises:
-        ConfigError: when an override fits nothing.
-    """
-    outer = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(str(config_folder()), version_base="1.3"):
-            return hydra_compose("train", overrides=list(overrides))
-    except HydraException as error:
-        raise ConfigError(f"{' '.join(overrides)}: {str(error).splitlines()[0]}") from error
-    finally:
-        GlobalHydra.instance().clear()
-        GlobalHydra.instance().hydra = outer
-
-
-def decide(overrides: Sequence[str], effect: str) -> tuple[bool, str]:
-    """Whether `auto` turns an effect on in a scene, and its reason."""
-    config = compose([*overrides, f"effects.{effect}=auto"])
-    found = getattr(decide_effects(build_data(config).info, instantiate(config.effects)), effect)
-    return found.on, found.why
+def decide(row: Row, base: Sequence[str]) -> None:
+    """Fills in whether `auto` turns the effect on in the scene, and its reason."""
+    config = compose("train", [*base, *row.overrides, f"effects.{row.effect}=auto"])
+    decisions = decide_effects(build_data(config).info, instantiate(config.effects))
+    found = getattr(decisions, row.effect)
+    row.auto, row.why = found.on, found.why
 
 
 def score(row: Row, metrics: Mapping[str, Any]) -> None:
@@ -222,7 +167,7 @@ def failures(rows: Sequence[Row]) -> list[str]:
     found = []
     for row in rows:
         name, gain = f"{row.effect} in the scene {row.scene}", row.gain("full")
-        if row.auto is not None and row.auto != row.called:
+        if row.auto != row.called:
             found.append(f"auto leaves {name} {'on' if row.auto else 'off'} ({row.why})")
         if row.called and gain is not None and gain <= 0:
             found.append(f"{name} gains {gain:+.2f} dB although it is called for")
@@ -235,21 +180,20 @@ def page(rows: Sequence[Row], where: Mapping[str, Any]) -> str:
         f"{sentence(where)}. PSNR in the person's box on held-out images, effect off → on, of the "
         "final image and of Step I's colour; one seed. Milliseconds per frame for painting and "
         "for reading from disk, off and on in turn, medians.",
-        markdown(pd.DataFrame([cells(row) for row in rows])),
+        markdown(pd.DataFrame([_cells(row) for row in rows])),
     ]
     marks = sorted({mark for row in rows for mark in row.marks})
     return "\n\n".join([*parts, *(f"Note: {mark}." for mark in marks)])
 
 
-def cells(row: Row) -> dict[str, str]:
+def _cells(row: Row) -> dict[str, str]:
     """A row of the table."""
-    auto = NOTHING if row.auto is None else ("on" if row.auto else "off")
-    wrong = row.auto is not None and row.auto != row.called
+    wrong = " (wrong)" if row.auto != row.called else ""
     change = row.parameters.get("on", 0) - row.parameters.get("off", 0)
     return {
         "effect": row.effect,
         "scene": row.scene,
-        "auto": auto + " (wrong)" * wrong + f": {row.why}" * bool(row.why),
+        "auto": f"{'on' if row.auto else 'off'}{wrong}: {row.why}",
         "gain dB": _gain(row, "full"),
         "Step I dB": _gain(row, "splat"),
         "held out": row.split,

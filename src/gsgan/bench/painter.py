@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.bench.memory import peak_memory
+from gsgan.bench.common import peak_memory
 from gsgan.data.datamodule import GsganData
 from gsgan.model.avatar import Avatar
 from gsgan.scene import Frame
 from gsgan.splat import BACKENDS, Accuracy
+from gsgan.utils.checks import between, one_of
 from gsgan.utils.errors import ConfigError
 
 # Lightning's names, as in conf/trainer.
@@ -29,42 +30,22 @@ MEASURED_FRAMES = 4  # over which peak memory is taken
 
 @dataclass(frozen=True)
 class Way:
-    """How an avatar paints; what is None stays as it was trained.
+    """How an avatar paints. Raises ConfigError, naming the wrong value."""
 
-    Args:
-        accuracy: the rasteriser's settings for F.
-        precision: of the networks, one of ``PRECISIONS``.
-        backend: of both rasterisations.
-        scale: of the image's sides; for another size than 1 the image is resized to its own size.
-        whole: paint the whole image, not only the window round the person.
-
-    Raises:
-        ConfigError: naming the wrong value.
-    """
-
-    accuracy: Accuracy | None = None
-    precision: str = "32-true"
-    backend: str = "auto"
-    scale: float = 1.0
-    whole: bool = False
+    accuracy: Accuracy | None = None  # of F; None: as it was trained
+    precision: str = "32-true"  # of the networks, one of PRECISIONS
+    backend: str = "auto"  # of both rasterisations
+    scale: float = 1.0  # of the image's sides; the image is resized to its own size
+    whole: bool = False  # paint the whole image, not only the window round the person
 
     def __post_init__(self) -> None:
-        for name, known in (("precision", PRECISIONS), ("backend", BACKENDS)):
-            if getattr(self, name) not in known:
-                got = getattr(self, name)
-                raise ConfigError(f"{name} must be one of {', '.join(known)}; got {got!r}")
-        number = isinstance(self.scale, (int, float)) and not isinstance(self.scale, bool)
-        if not number or not 0.05 <= self.scale <= 8:
-            raise ConfigError(f"scale must be a number from 0.05 to 8; got {self.scale!r}")
+        one_of("precision", self.precision, PRECISIONS)
+        one_of("backend", self.backend, BACKENDS)
+        between("scale", self.scale, 0.05, 8)
 
 
 class Painter:
-    """Paints frames with one avatar in one way; several painters may share an avatar.
-
-    Args:
-        avatar: in eval mode, on its device.
-        way: how.
-    """
+    """Paints frames with one avatar, in eval mode, in one way; painters may share an avatar."""
 
     def __init__(self, avatar: Avatar, way: Way) -> None:
         self.avatar, self.way = avatar, way

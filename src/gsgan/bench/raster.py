@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,29 +10,43 @@ from typing import Any
 import pandas as pd
 import torch
 from hydra.utils import instantiate
+from matplotlib.lines import Line2D
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from gsgan.bench.common import Bench, Store, check_whole, records
-from gsgan.bench.compare import choose_patches, errors, leaves, proven_bounds, truth
-from gsgan.bench.memory import peak_memory
-from gsgan.bench.raster_report import images, number_table, summary
-from gsgan.bench.scene import LEAST, human_cloud, ring_camera
+from gsgan.bench import common, compare
+from gsgan.bench.common import NOTHING, check_whole, markdown, number
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.splat import BACKENDS, Accuracy, rasterise, resolve_backend
+from gsgan.utils.checks import at_least, whole
 from gsgan.utils.errors import ConfigError, GsganError
+from gsgan.utils.palette import BLUE, DASHES, GREEN, MARKERS, PURPLE, VERMILLION
 from gsgan.utils.timing import interleaved, median
 
 # The reference holds every Gaussian at every pixel: others are compared with it, it is not timed.
 TIMED = tuple(backend for backend in BACKENDS if backend not in ("auto", "reference"))
-SAMPLES = ["forward_samples", "both_samples"]  # in the JSON only
+COLOURS = {"native": BLUE, "torch": VERMILLION, "gsplat": GREEN}
+GROWTH = "standard"  # the setting of the table over the whole grid
+TIMES = {"forward_ms": "forward", "both_ms": "forward + backward"}
+# Heading and significant digits of the table's columns of numbers.
+NUMBERS = {
+    "forward_ms": ("forward ms", 3),
+    "both_ms": ("forward + backward ms", 3),
+    "value_max": ("largest error", 2),
+    "value_mean": ("mean error", 2),
+    "bound": ("proven bound", 2),
+    "gradient": ("gradient error", 2),
+    "worst_group": ("worst group", 0),
+    "gradient_max": ("largest gradient error", 2),
+    "memory_mb": ("peak MB", 3),
+}
 
 Variant = tuple[str, str, Accuracy]
 """A backend, and an accuracy setting with the name it is shown under."""
 
 
 def run(config: DictConfig, folder: Path) -> None:
-    """Measures what is not measured yet, writes tables and images.
+    """Measures every cell of the grid, writes tables and a plot.
 
     Args:
         config: as conf/bench_raster.yaml.
@@ -45,8 +58,7 @@ def run(config: DictConfig, folder: Path) -> None:
     """
     check(config)
     settings = {str(name): instantiate(one) for name, one in config.settings.items()}
-    bench = Bench.start("raster", config, folder, "raster")
-    store = Store(folder / "measurements.jsonl", bench.where, fresh=config.fresh)
+    bench = common.Bench.start("raster", config, folder)
     grid = [(n, c, s) for n in config.gaussians for c in config.channels for s in config.sizes]
     rows: list[dict[str, Any]] = []
     with bench.progress() as progress:
@@ -55,23 +67,18 @@ def run(config: DictConfig, folder: Path) -> None:
             progress.update(task, description=f"N={n} C={channels} {size}²")
             found = variants(config, settings, n, bench.device)
             cell = {"gaussians": n, "channels": channels, "size": size}
-            key = {**cell, "variants": [(b, s, asdict(a)) for b, s, a in found]}
-            for name in ("repeats", "patience", "seed", "windows", "window"):
-                key[name] = config[name]
-            key |= {name: bool(on) for name, on in extras(config, n, size).items()}
-            rows += store.get(key, partial(measure_cell, config, cell, found, bench.device))
+            rows += measure_cell(config, cell, found, bench.device)
             progress.advance(task)
     frame = pd.DataFrame(rows)
     n, size = config.reference.gaussians, config.reference.size
     here = frame[(frame.gaussians == n) & (frame["size"] == size)]
-    bench.console.print(number_table(here), markup=False, highlight=False, soft_wrap=True)
     bench.write(
         "What accuracy costs in time",
         number_table(frame),
-        {"bench": OmegaConf.to_container(config), "rows": records(frame)},
-        frame.drop(columns=SAMPLES),
-        images(frame, n, size),
-        docs=summary(frame, here, n, size, bench.where),
+        {"bench": OmegaConf.to_container(config), "rows": common.records(frame)},
+        frame,
+        {"raster_error.png": error_plot(here)},
+        docs=summary(frame, here, bench.where),
     )
     beyond = frame[frame.beyond > config.rounding] if "beyond" in frame else frame[:0]
     if len(beyond):
@@ -85,17 +92,18 @@ def run(config: DictConfig, folder: Path) -> None:
 
 def check(config: DictConfig) -> None:
     """Refuses values out of range."""
-    for name, least in {"gaussians": LEAST, "channels": 1, "sizes": 8, "compare_at": 1}.items():
-        value = config[name]
-        listed = OmegaConf.is_list(value) and all(isinstance(n, int) and n >= least for n in value)
-        if not listed or (not value and name != "compare_at"):
-            raise ConfigError(f"{name} must list whole numbers of at least {least}, got {value}")
+    least = {"gaussians": compare.LEAST, "channels": 1, "sizes": 8, "compare_at": 1}
+    for name in least:
+        listed = OmegaConf.is_list(config[name])
+        if not listed or (not config[name] and name != "compare_at"):
+            raise ConfigError(f"{name} must be a list of whole numbers, got {config[name]}")
+        for value in config[name]:
+            whole(name, value, least[name])
     check_whole(config, repeats=1, windows=1, window=1, seed=0)
     check_whole(config.reference, gaussians=1, size=1)
     check_whole(config.exact_upto, **dict.fromkeys(config.exact_upto, 0))
     for name in ("patience", "rounding"):
-        if isinstance(config[name], bool) or not isinstance(config[name], (int, float)):
-            raise ConfigError(f"{name} must be a number, got {config[name]!r}")
+        at_least(name, config[name], 0)
     listed = OmegaConf.is_list(config.backends) and set(config.backends) <= set(TIMED)
     if config.backends != "auto" and not listed:
         known = ", ".join(TIMED)
@@ -115,65 +123,48 @@ def variants(
     ]
 
 
-def extras(config: DictConfig, n: int, size: int) -> dict[str, bool]:
-    """What else than time is measured in a cell."""
-    here = (n, size) == (config.reference.gaussians, config.reference.size)
-    return {"errors": n in config.compare_at, "memory": config.memory and here}
-
-
 def measure_cell(
     config: DictConfig, cell: dict[str, int], found: list[Variant], device: torch.device
 ) -> list[dict[str, Any]]:
     """One row per variant in one scene, a cell of the grid; what was not measured is missing."""
     n, channels, size = cell.values()
-    gaussians = human_cloud(n, channels, config.seed).to(device)
-    camera = ring_camera(size).to(device)
+    gaussians = compare.human_cloud(n, channels, config.seed).to(device)
+    camera = compare.ring_camera(size).to(device)
+    times = measure_times(config, gaussians, camera, found)
     rows = [
-        {**cell, "backend": backend, "setting": name, **times}
-        for (backend, name, _), times in zip(
-            found, measure_times(config, gaussians, camera, found), strict=True
-        )
+        {**cell, "backend": backend, "setting": name, **own}
+        for (backend, name, _), own in zip(found, times, strict=True)
     ]
-    more = extras(config, n, size)
-    if more["errors"]:
-        patches = choose_patches(gaussians, camera, config.windows, config.window, config.seed)
-        exact = truth(gaussians, camera, patches, config.seed)
+    if n in config.compare_at:
+        many, side, seed = config.windows, config.window, config.seed
+        patches = compare.choose_patches(gaussians, camera, many, side, seed)
+        exact = compare.truth(gaussians, camera, patches, seed)
         settings = {setting for _, _, setting in found}
-        bounds = {s: proven_bounds(gaussians, camera, s, patches) for s in settings}
+        bounds = {s: compare.proven_bounds(gaussians, camera, s, patches) for s in settings}
         for row, variant in zip(rows, found, strict=True):
             draw = partial(_draw, variant=variant)
-            row |= errors(exact, gaussians, camera, bounds[variant[2]], draw)
-    if more["memory"]:
+            row |= compare.errors(exact, gaussians, camera, bounds[variant[2]], draw)
+    if config.memory and (n, size) == (config.reference.gaussians, config.reference.size):
         for row, variant in zip(rows, found, strict=True):
             if row["both_ms"] <= 1000 * config.patience:
-                action = partial(_draw_both, leaves(gaussians), camera, variant)
-                row["memory_mb"] = peak_memory(action, device)
+                action = partial(_draw_both, compare.leaves(gaussians), camera, variant)
+                row["memory_mb"] = common.peak_memory(action, device)
     return rows
 
 
 def measure_times(
     config: DictConfig, gaussians: Gaussians, camera: Camera, found: list[Variant]
 ) -> list[dict[str, Any]]:
-    """Medians and samples, forward without gradients and forward with backward."""
-    inputs = leaves(gaussians)
-
-    def forward(variant: Variant) -> object:
-        with torch.no_grad():
-            return _draw(gaussians, camera, variant)
-
+    """Median milliseconds, forward without gradients and forward with backward."""
+    inputs = compare.leaves(gaussians)
     actions: dict[tuple[int, str], Callable[[], object]] = {}
     for i, variant in enumerate(found):
-        actions[i, "forward"] = partial(forward, variant)
+        actions[i, "forward"] = partial(torch.no_grad()(_draw), gaussians, camera, variant)
         actions[i, "both"] = partial(_draw_both, inputs, camera, variant)
     device = gaussians.means.device
     samples = interleaved(actions, config.repeats, patience=config.patience, device=device)
     return [
-        {
-            "forward_ms": median(samples[i, "forward"]),
-            "both_ms": median(samples[i, "both"]),
-            "forward_samples": samples[i, "forward"],
-            "both_samples": samples[i, "both"],
-        }
+        {f"{kind}_ms": median(samples[i, kind]) for kind in ("forward", "both")}
         for i in range(len(found))
     ]
 
@@ -191,3 +182,70 @@ def _draw_both(inputs: Gaussians, camera: Camera, variant: Variant) -> object:
     ones = [torch.ones_like(raster.features), torch.ones_like(raster.alpha)]
     torch.autograd.backward([raster.features, raster.alpha], ones)
     return raster
+
+
+def number_table(frame: pd.DataFrame) -> str:
+    """All rows in Markdown."""
+    shown = pd.DataFrame({"N": frame.gaussians, "C": frame.channels})
+    shown["size"] = frame["size"].astype(str) + "²"
+    shown = shown.join(frame[["backend", "setting"]])
+    for column, (heading, digits) in NUMBERS.items():
+        values = frame.get(column, pd.Series(index=frame.index, dtype=object))
+        shown[heading] = [
+            number(value, digits) if digits or pd.isna(value) else value for value in values
+        ]
+    return markdown(shown)
+
+
+def growth_table(frame: pd.DataFrame) -> str:
+    """Forward / forward + backward milliseconds of one setting over the whole grid, Markdown."""
+    rows = frame[frame.setting == GROWTH].rename(columns={"gaussians": "N"})
+    rows["kind"] = rows.backend + ", C=" + rows.channels.astype(str)
+    rows["ms"] = [f"{number(a)} / {number(b)}" for a, b in zip(*map(rows.get, TIMES), strict=True)]
+    wide = rows.pivot_table(index=["N", "size"], columns="kind", values="ms", aggfunc="first")
+    wide = wide.fillna(NOTHING).reset_index()
+    wide["size"] = wide["size"].astype(str) + "²"
+    return markdown(wide)
+
+
+def summary(frame: pd.DataFrame, here: pd.DataFrame, where: Mapping[str, Any]) -> str:
+    """What the docs show: the plot, the rows of the reference scene, the growth."""
+    return "\n\n".join(
+        [
+            common.sentence(where) + ".",
+            "![time against error](pictures/raster_error.png)",
+            "Medians of interleaved runs:",
+            number_table(here),
+            f"`{GROWTH}`, milliseconds forward / forward + backward:",
+            growth_table(frame),
+        ]
+    )
+
+
+def error_plot(here: pd.DataFrame) -> bytes:
+    """Time against error, one line per backend and channels through its accuracy settings; PNG.
+
+    Left: forward time and the largest value error; right: forward + backward time and the worst
+    gradient error. Rows without errors, or without any error, are left out.
+    """
+    figure, (left, right) = common.panels(2, 10.4, 4.2)
+    here = here.reindex(columns=here.columns.union(["value_max", "gradient"]))
+    settings = list(here.setting[here.value_max.notna()].unique())
+    marks = {name: MARKERS[i % len(MARKERS)] for i, name in enumerate(settings)}
+    dashes = dict(zip(sorted(here.channels.unique()), DASHES * len(here), strict=False))
+    for axes, time, error in ((left, "forward_ms", "value_max"), (right, "both_ms", "gradient")):
+        shown = here[here[error] > 0].sort_values(error, ascending=False)  # the axis has no zero
+        for (backend, channels), line in shown.groupby(["backend", "channels"]):
+            colour, label = COLOURS.get(backend, PURPLE), f"{backend}, C={channels}"
+            axes.plot(line[time], line[error], dashes[channels], color=colour, label=label)
+            for _, row in line.iterrows():
+                axes.plot(row[time], row[error], marks[row.setting], color=colour, ms=7)
+        axes.set(xlabel=f"{TIMES[time]}, ms", xscale="log", yscale="log")
+        common.plain_ticks(axes.xaxis)
+    left.set_ylabel("largest error of a value")
+    right.set_ylabel("relative error of the worst gradient")
+    shapes = [Line2D([], [], color="black", ls="", marker=marks[name]) for name in settings]
+    right.legend(shapes, settings, fontsize=8, frameon=False)
+    if left.get_lines():
+        left.legend(fontsize=8, frameon=False)
+    return common.png(figure)

@@ -14,28 +14,20 @@ import pandas as pd
 import torch
 from omegaconf import DictConfig
 
-from gsgan.bench.common import Bench, check_whole, markdown, number, panels, png, sentence
-from gsgan.bench.painter import (
-    Painter,
-    Way,
-    painting_memory,
-    place,
-    spread,
-    without_denormals,
-)
+from gsgan.bench.common import Bench, check_whole, markdown, number, sentence
+from gsgan.bench.painter import Painter, Way, painting_memory, place, spread, without_denormals
 from gsgan.model.avatar import Avatar, unwatched
 from gsgan.scene import Frame
 from gsgan.splat import resolve_backend
 from gsgan.train.runs import Moved, build_avatar, build_data, load_avatar, load_config
-from gsgan.utils.errors import ConfigError
-from gsgan.utils.palette import BLUE
+from gsgan.utils.checks import one_of
 from gsgan.utils.timing import timed, wait
 
 TOTAL, REST = "end to end", "between stages"
 
 
 def run(config: DictConfig, folder: Path) -> None:
-    """Times an avatar; writes ``speed.md``, ``speed.json`` and ``speed.png``.
+    """Times an avatar; writes ``speed.md`` and ``speed.json``.
 
     Convention: one image at a time; poses, cameras and images stay on the device, so reading and
     showing are not in it.
@@ -49,10 +41,9 @@ def run(config: DictConfig, folder: Path) -> None:
         DataError: when the run or its data cannot be read.
     """
     check_whole(config, frames=1, warmup=0, poses=1, seed=0)
-    if not isinstance(config.channels_last, bool):
-        raise ConfigError(f"channels_last must be true or false, got {config.channels_last!r}")
+    one_of("channels_last", config.channels_last, (True, False))
     way = Way(precision=config.precision, backend=config.backend)
-    bench = Bench.start("speed", config, folder, config.block)
+    bench = Bench.start("speed", config, folder)
     avatar, frames, name, marks = load_subject(config, bench.device)
     painter = Painter(avatar, way)
     with without_denormals():
@@ -67,17 +58,18 @@ def run(config: DictConfig, folder: Path) -> None:
             )
         memory = painting_memory(painter, frames)
     settings = {"avatar": name, **settings_of(config, avatar, frames)}
-    page = text(times, memory, bench.where, settings, marks)
-    bench.console.print(page, markup=False, highlight=False)
-    spreads = {name: dict(row) for name, row in times.iterrows()}
-    total, rest = spreads.pop(TOTAL), spreads.pop(REST)
     record = {
         "settings": settings,
         "marks": marks,
-        "times_ms": {"total": total, "stages": spreads, "rest": rest},
+        "times_ms": {
+            "total": dict(times.loc[TOTAL]),
+            "stages": {stage: dict(row) for stage, row in times.drop([TOTAL, REST]).iterrows()},
+            "rest": dict(times.loc[REST]),
+        },
         "memory_mb": memory,
     }
-    bench.write("From skeleton to image", page, record, images={"speed.png": plot(times, settings)})
+    page = text(times, memory, bench.where, settings, marks)
+    bench.write("From skeleton to image", page, record)
 
 
 def load_subject(
@@ -128,16 +120,9 @@ def measure(
     *,
     count: int,
     warmup: int,
-    tick: Callable[[], None] = lambda: None,
+    tick: Callable[[], object] = lambda: None,
 ) -> pd.DataFrame:
-    """Paints ``count`` frames end to end and as many by stage, in turn.
-
-    Args:
-        painter: paints.
-        frames: gone through round and round.
-        count: of frames timed each way.
-        warmup: frames before the clock starts.
-        tick: called after each frame.
+    """Paints ``count`` frames end to end and as many by stage, in turn, after ``warmup`` frames.
 
     Returns:
         ``median p10 p90`` in milliseconds by stage, then ``between stages`` (of the frames timed by
@@ -145,22 +130,20 @@ def measure(
     """
     device = frames[0].skeleton.device
     samples: dict[str, list[float]] = {}
-    for i in range(warmup + count):
-        frame, clock = frames[(i - warmup) % len(frames)], StageClock(device)
-        if i < warmup:
-            painter(frame)
-            tick()
-            continue
+    for i in range(-warmup, count):
+        frame, clock = frames[i % len(frames)], StageClock(device)
         total = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
+        tick()
+        if i < 0:
+            continue
         painter.avatar.stage = clock
         try:
-            whole = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
+            staged = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
         finally:
             painter.avatar.stage = unwatched
-        rest = whole - sum(clock.frame.values())
+        rest = staged - sum(clock.frame.values())
         for name, took in {**clock.frame, REST: rest, TOTAL: total}.items():
             samples.setdefault(name, []).append(took)
-        tick()
     return pd.DataFrame({name: deciles(s) for name, s in samples.items()}).T
 
 
@@ -187,8 +170,7 @@ def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> 
         backend, _ = resolve_backend(config.backend, frames[0].skeleton.device, avatar.accuracy)
         found |= {"accuracy": avatar.accuracy.name, "backend": backend}
         found["channels of F"] = avatar.splat_channels
-        if avatar.accuracy.supersample > 1:
-            found["F drawn"] = f"{avatar.accuracy.supersample} times as large, then averaged"
+        found["supersampling of F"] = avatar.accuracy.supersample
         found["SH degree"] = avatar.splats.sh_degree
     placed = avatar.body_points or avatar.densify
     if placed is not None:
@@ -215,26 +197,3 @@ def text(
     lines.append(f"Peak memory on top of the avatar: {number(memory)} MB.")
     lines += ["\n".join(f"- {mark}" for mark in marks)] if marks else []
     return "\n\n".join(lines)
-
-
-def plot(times: pd.DataFrame, settings: dict[str, Any]) -> bytes:
-    """One bar per stage, with the deciles, as PNG bytes."""
-    rows = times.drop(TOTAL).clip(lower=0)[::-1]
-    figure, (axes,) = panels(1, 7.2, 0.9 + 0.32 * len(rows))
-    whiskers = [rows["median"] - rows.p10, rows.p90 - rows["median"]]
-    bars = axes.barh(
-        rows.index,
-        rows["median"],
-        xerr=np.maximum(whiskers, 0),
-        color=BLUE,
-        height=0.66,
-        error_kw={"lw": 1, "capsize": 2},
-    )
-    axes.bar_label(bars, [number(value) for value in rows["median"]], padding=4, fontsize=8)
-    total = number(times.loc[TOTAL, "median"])
-    title = f"{settings['avatar']}, {settings['picture']}: {total} ms end to end"
-    axes.set_title(title, fontsize=10, loc="left")
-    axes.set_xlabel("milliseconds, each stage by itself; whiskers from the 1st to the 9th decile")
-    axes.margins(x=0.12)
-    axes.grid(visible=False)
-    return png(figure)

@@ -1,79 +1,68 @@
-"""``python -m gsgan.bench trade-off``: quality against time, over settings and small trainings."""
+"""``python -m gsgan.bench trade-off``: quality against time, of trained avatars and settings."""
 
 from __future__ import annotations
 
-import hashlib
 import itertools
 import math
 import re
-import statistics
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from gsgan.bench.common import Bench, Store, check_whole, records, train
-from gsgan.bench.painter import (
-    Painter,
-    Way,
-    painting_memory,
-    place,
-    spread,
-    without_denormals,
-)
+from gsgan.bench import common
+from gsgan.bench.common import NOTHING, Bench, markdown, number
+from gsgan.bench.painter import Painter, Way, painting_memory, place, spread, without_denormals
 from gsgan.bench.speed import deciles
-from gsgan.bench.trade_off_report import QUALITIES, front, images, text
 from gsgan.metrics.image import edge_f1, psnr, ssim
 from gsgan.metrics.lpips import lpips
 from gsgan.scene import Frame
 from gsgan.splat import Accuracy
 from gsgan.train.curve import curve
 from gsgan.train.runs import CHECKPOINT, Moved, build_data, load_avatar, load_config
+from gsgan.utils.checks import above, one_of
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.palette import BLACK, COLOURS, GREY, MARKERS
 from gsgan.utils.timing import interleaved
 
 BASE = "base"
 SCORES = "metrics.json"  # what a finished run has, beside its checkpoint
-SETTINGS = ("accuracies", "precisions", "scales", "backends", "windows")
 # Of a multirun's overrides: a point is the mean over seeds; others do not change what is trained.
 SEED = "seed"
 IGNORED = re.compile(r"^(data\.(source\.)?workers|hydra\..*|trainer(\..*)?|grid_rows)$")
 # Of a run's data: how it is read and sampled, not what is in it.
 SAMPLING = ("seed", "steps_per_epoch", "workers", "cache_mb", "batch_size", "val_pictures")
-
-Score = Callable[[Tensor, Tensor], Tensor]
-
+# Metric: heading, digits, and 1 where more is better, -1 where less is.
+QUALITIES = {
+    "psnr": ("PSNR dB", 2, 1),
+    "ssim": ("SSIM", 4, 1),
+    "edge_f1": ("edge F1", 3, 1),
+    "lpips": ("LPIPS", 4, -1),
+}
+ORDER = (BLACK, *COLOURS[:-1], GREY)  # the base point's first
 
 AS_TRAINED = Way()
+Score = Callable[[Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
 class Point:
-    """An avatar, and the way it paints.
+    """An avatar, and the way it paints."""
 
-    Args:
-        factor: what is changed from the base point; ``base`` for the base point.
-        label: its value there, for people.
-        folder: of the avatar's run.
-        way: how it paints.
-        overrides: of the training command; empty for a run that exists already.
-    """
-
-    factor: str
-    label: str
-    folder: Path
+    factor: str  # what differs from other runs, or from the way it was trained
+    label: str  # its value
+    folder: Path  # of the run
     way: Way = AS_TRAINED
-    overrides: tuple[str, ...] = ()
 
 
 def run(config: DictConfig, folder: Path) -> None:
-    """Trains what is missing, measures every point, writes tables and plots.
+    """Measures every point, writes a table and a plot.
 
     Args:
         config: as conf/bench_trade_off.yaml.
@@ -82,99 +71,45 @@ def run(config: DictConfig, folder: Path) -> None:
     Raises:
         ConfigError: on a wrong value.
         DataError: when a run or its data cannot be read.
-        GsganError: when a training fails.
     """
-    check(config)
-    bench = Bench.start("trade_off", config, folder, "trade-off")
+    common.check_whole(config, repeats=1, pictures=1)
+    above("patience", config.patience)
+    one_of("split", config.split, ("novel_pose", "novel_view"))
+    one_of("quality", config.quality, QUALITIES)
+    bench = Bench.start("trade_off", config, folder)
     perceptual, _ = lpips(config.lpips.net, config.lpips.path)
-    runs = trainings(config, folder, bench)
+    runs = trained(config, bench)
     subject = standard_run(runs).folder
     accuracies = {str(name): instantiate(one) for name, one in config.accuracies.items()}
-    points = [*runs, *ways(subject, config.settings, accuracies)]  # now, not after training
-    for i, point in enumerate(runs):
-        if point.overrides:
-            bench.console.print(f"training {i + 1} of {len(runs)}: {point.folder.name}")
-            train(point.overrides, point.folder)
+    points = [*runs, *ways(subject, config.settings, accuracies)]
     painters, frames, marks = load(points, config, bench)
     found, samples = measure(points, painters, frames, perceptual, config, bench)
-    curves = {p.folder: c for p in runs if (c := curve(p.label, p.folder)) is not None}
-    seconds = {at: one.seconds[-1] for at, one in curves.items()}
+    seconds = {p.folder: c.seconds[-1] for p in runs if (c := curve(p.label, p.folder))}
     frame = make_rows(points, found, samples, seconds)
-    best = front(frame, config.quality)
-    models = {p.label for p in runs if p.factor in (BASE, "model")}  # not widths and counts
-    drawn = [c for c in curves.values() if len(models) < 2 or c.label in models]
     about = {"split": config.split, "pictures": len(frames), "subject": subject.name}
-    page = text(frame, config.quality, about, bench.where, marks, has_curves=bool(curves))
-    bench.console.print(page, markup=False, highlight=False)
-    second = "lpips" if perceptual is not None else config.second
-    plots = images(frame, config.quality, second, drawn)
-    captions = ("Quality against time per frame", "Quality against time of training")
-    links = [f"![{c}](pictures/{name})" for c, name in zip(captions, plots, strict=False)]
+    page = text(frame, config.quality, about, bench.where, marks)
     record = {
         **about,
         "marks": marks,
-        "rows": records(frame),
-        "front": [frame.label[i] for i in best],
-        "curves": [asdict(one) for one in drawn],
+        "rows": common.records(frame),
+        "front": [frame.label[i] for i in front(frame, config.quality)],
     }
-    docs = "\n\n".join([page, *links])
+    second = "edge_f1" if perceptual is None else "lpips"
+    plots = {"trade_off.png": plot(frame, [*dict.fromkeys((config.quality, second))])}
+    docs = f"{page}\n\n![Quality against time per frame](pictures/trade_off.png)"
     bench.write("Quality against time", page, record, frame, plots, docs=docs)
 
 
-def check(config: DictConfig) -> None:
-    """Refuses wrong values before anything takes time."""
-    if config.run is not None and config.runs is not None:
-        raise ConfigError("give run=<one run> or runs=<a multirun's folder>, not both")
-    if config.run is None and config.runs is None:
-        Moved(config.data_root, config.data_smpl).refuse_without_run()
-    check_whole(config, repeats=1, pictures=1)
-    if not isinstance(config.patience, (int, float)) or not config.patience > 0:
-        raise ConfigError(f"patience must be a number above 0, got {config.patience!r}")
-    for name, known in (
-        ("split", ("novel_pose", "novel_view")),
-        ("quality", tuple(QUALITIES)),
-        ("second", tuple(QUALITIES)),
-        ("channels_last", (True, False)),
-    ):
-        if config[name] not in known:
-            words = ", ".join(map(str, known))
-            raise ConfigError(f"{name} must be one of {words}; got {config[name]!r}")
-
-
-def trainings(config: DictConfig, folder: Path, bench: Bench) -> list[Point]:
-    """The runs to compare: those of ``runs``, the one of ``run``, or the sweep."""
+def trained(config: DictConfig, bench: Bench) -> list[Point]:
+    """The runs to compare: those of ``runs``, or the one of ``run``."""
+    if (config.run is None) == (config.runs is None):
+        raise ConfigError("give either run=<a trained run> or runs=<the folder of a multirun>")
     if config.runs is not None:
         finished, unfinished = runs_in(Path(config.runs).expanduser())
         for name in unfinished:
             bench.console.print(f"left out, not finished: {name}", markup=False, highlight=False)
         return finished
-    if config.run is not None:
-        run = Path(config.run).expanduser()
-        if not (run / CHECKPOINT).is_file():
-            raise DataError(f"run={run}: no {CHECKPOINT} in it; give a trained run's folder")
-        return [Point(BASE, "as trained", run)]
-    return sweep(list(config.base), OmegaConf.to_container(config.factors), folder / "runs")  # type: ignore[arg-type]
-
-
-def sweep(base: Sequence[str], factors: Mapping[str, Any], folder: Path) -> list[Point]:
-    """The base point, and each factor's values one at a time; a factor that is None is left out."""
-    last = "evaluate=false"  # the bench scores
-    found = [Point(BASE, BASE, folder / BASE, overrides=(*base, last))]
-    for name, choice in factors.items():
-        if choice is None:
-            continue
-        if not isinstance(choice, Mapping) or set(choice) - {"also"} != {"key", "values"}:
-            raise ConfigError(f"factors.{name} must have a key and values, got {choice!r}")
-        for value in choice["values"]:
-            own = (*choice.get("also", ()), f"{choice['key']}={value}")
-            at = folder / re.sub(r"[^\w.-]+", "_", f"{name}-{value}")
-            factor = name.replace("_", " ")
-            found.append(Point(factor, str(value), at, overrides=(*base, *own, last)))
-    folders = [point.folder.name for point in found]
-    twice = sorted({name for name in folders if folders.count(name) > 1})
-    if twice:
-        raise ConfigError(f"factors: {', '.join(twice)} would be trained twice")
-    return found
+    return [Point(BASE, "as trained", Path(config.run).expanduser())]
 
 
 def runs_in(folder: Path) -> tuple[list[Point], list[str]]:
@@ -197,11 +132,7 @@ def runs_in(folder: Path) -> tuple[list[Point], list[str]]:
 
 
 def _overrides(run: Path) -> dict[str, str]:
-    path = run / ".hydra" / "overrides.yaml"
-    try:
-        words = list(OmegaConf.load(path))
-    except Exception as error:  # OmegaConf and its YAML reader raise all sorts
-        raise DataError(f"{path}: not a run's overrides ({type(error).__name__})") from error
+    words = OmegaConf.load(run / ".hydra" / "overrides.yaml")
     pairs = (str(word).partition("=")[::2] for word in words)
     return {k.lstrip("+"): v for k, v in pairs if not IGNORED.match(k.lstrip("+"))}
 
@@ -216,13 +147,8 @@ def ways(
     folder: Path, settings: Mapping[str, Any], accuracies: Mapping[str, Accuracy]
 ) -> list[Point]:
     """One avatar in every other way that the settings name, one thing at a time."""
-    for name, known in (("accuracies", accuracies), ("windows", ("whole",))):
-        unknown = set(settings.get(name) or ()) - set(known)
-        if unknown:
-            raise ConfigError(f"settings.{name}: expected {', '.join(known)}; got {unknown}")
-    if set(settings) - set(SETTINGS):
-        got = ", ".join(sorted(map(str, set(settings) - set(SETTINGS))))
-        raise ConfigError(f"settings must be among {', '.join(SETTINGS)}; got {got}")
+    for name in settings.get("accuracies", ()):
+        one_of("settings.accuracies", name, accuracies)
     make: dict[str, Callable[[Any], tuple[str, str, Way]]] = {
         "accuracies": lambda name: ("accuracy", name, Way(accuracy=accuracies[name])),
         "precisions": lambda name: ("precision", name, Way(precision=name)),
@@ -230,13 +156,8 @@ def ways(
         "backends": lambda name: ("backend", name, Way(backend=name)),
         "windows": lambda _: ("window", "whole picture", Way(whole=True)),
     }
-    found = [make[name](value) for name in SETTINGS for value in settings.get(name) or ()]
+    found = [one(value) for name, one in make.items() for value in settings.get(name, ())]
     return [Point(factor, label, folder, way) for factor, label, way in found]
-
-
-def digest(run: Path) -> str:
-    """A name of a run's weights."""
-    return hashlib.sha256((run / CHECKPOINT).read_bytes()).hexdigest()[:16]
 
 
 def load(
@@ -247,24 +168,23 @@ def load(
     Raises:
         ConfigError: when the runs do not share their data, or the split has no frame.
     """
-    folders = list(dict.fromkeys(point.folder for point in points))
     moved = Moved(config.data_root, config.data_smpl)
-    configs = {folder: load_config(folder, moved) for folder in folders}
-    first = folders[0]
+    configs = {point.folder: load_config(point.folder, moved) for point in points}
+    first, standard = next(iter(configs.items()))
     for folder, stored in configs.items():
-        if _content(stored) != _content(configs[first]):
+        if _content(stored) != _content(standard):
             raise ConfigError(
                 f"{folder.name} was trained on other data, or at another size, than {first.name}: "
                 "their scores cannot stand side by side; leave one out"
             )
-    data = build_data(configs[first])
-    avatars, marks = {}, []
+    data = build_data(standard)
+    avatars, marks = {}, dict[str, None]()
     for folder, stored in configs.items():
         avatar, found = load_avatar(folder, stored, data)
-        avatars[folder] = place(avatar, bench.device, channels_last=config.channels_last)
-        marks += [mark for mark in found if mark not in marks]
+        avatars[folder] = place(avatar, bench.device, channels_last=True)
+        marks |= dict.fromkeys(found)
     frames = [frame.to(bench.device) for frame in spread(data, config.pictures, config.split)]
-    return [Painter(avatars[point.folder], point.way) for point in points], frames, marks
+    return [Painter(avatars[point.folder], point.way) for point in points], frames, list(marks)
 
 
 def _content(config: DictConfig) -> dict[Any, Any]:
@@ -283,11 +203,10 @@ def measure(
     config: DictConfig,
     bench: Bench,
 ) -> tuple[list[dict[str, Any]], list[list[float]]]:
-    """Of every point the scores, stored ones where there are any, and milliseconds per frame.
+    """Of every point the scores, and milliseconds per frame.
 
     The times are taken in one go at the end, all points in turn on the same frame.
     """
-    store = Store(bench.folder / "measurements.jsonl", bench.where, fresh=config.fresh)
     found = []
 
     def action(painter: Painter) -> Callable[[], object]:
@@ -298,11 +217,7 @@ def measure(
         task = progress.add_task("", total=(config.repeats + 2) * len(points))
         for point, painter in zip(points, painters, strict=True):
             progress.update(task, description=f"scoring {point.factor} {point.label}")
-            key = {"run": str(point.folder), "weights": digest(point.folder), **asdict(point.way)}
-            for name in ("split", "pictures", "data_root", "data_smpl", "channels_last"):
-                key[name] = config[name]
-            key["lpips"] = OmegaConf.to_container(config.lpips)
-            found.append(store.get(key, partial(quality, painter, frames, perceptual)))
+            found.append(quality(painter, frames, perceptual))
             progress.advance(task)
         progress.update(task, description="timing")
         samples = interleaved(
@@ -321,22 +236,17 @@ def quality(
     """Mean scores over images, those without a finite score left out and counted; peak memory.
 
     Returns:
-        ``{metric: value or None, "left_out": images, "memory_mb": value or None}``.
+        ``{metric: value or NaN, "left_out": scores, "memory_mb": value or None}``.
     """
     metrics: dict[str, Score] = {"psnr": psnr, "ssim": ssim, "edge_f1": edge_f1}
     metrics |= {} if perceptual is None else {"lpips": perceptual}
-    scores: dict[str, list[float]] = {name: [] for name in metrics}
+    rows = []
     for frame in frames:
         image = painter(frame).clamp(0, 1)
-        for name, metric in metrics.items():
-            scores[name] += metric(image, frame.image).double().flatten().tolist()
-    finite = {name: [v for v in values if math.isfinite(v)] for name, values in scores.items()}
+        rows.append({name: float(metric(image, frame.image)) for name, metric in metrics.items()})
+    scores = pd.DataFrame(rows).replace([math.inf, -math.inf], math.nan)
     memory = painting_memory(painter, frames) if isinstance(painter, Painter) else None
-    return {
-        **{name: statistics.fmean(v) if v else None for name, v in finite.items()},
-        "left_out": sum(len(scores[name]) - len(finite[name]) for name in metrics),
-        "memory_mb": memory,
-    }
+    return {**scores.mean(), "left_out": int(scores.isna().sum().sum()), "memory_mb": memory}
 
 
 def make_rows(
@@ -347,15 +257,9 @@ def make_rows(
 ) -> pd.DataFrame:
     """One row per factor and label, the mean over its seeds, in the points' order.
 
-    Args:
-        points: measured.
-        found: see ``quality``, of each.
-        samples: milliseconds of each.
-        seconds: of training, by run folder.
-
-    Returns:
-        ``factor label``, the metrics (NaN where a seed has none), ``left_out`` scores, ``ms p10
-        p90`` per frame, ``memory_mb`` at its peak, ``seconds`` of training, and ``seeds``.
+    Of ``quality`` and milliseconds of each point, and seconds of training by run folder:
+    ``factor label``, the metrics (NaN where a seed has none), ``left_out`` scores, ``ms p10 p90``
+    per frame, ``memory_mb`` at its peak, ``seconds``, and ``seeds``.
     """
     each = pd.DataFrame(found).reindex(columns=[*QUALITIES, "left_out", "memory_mb"])
     each["seconds"] = [seconds.get(point.folder) for point in points]
@@ -363,11 +267,96 @@ def make_rows(
     rows = []
     names = [[point.factor for point in points], [point.label for point in points]]
     for (factor, label), few in each.groupby(names, sort=False):
-        mean = few[[*QUALITIES, "seconds"]].mean(skipna=False)
-        ms = deciles([ms for own in few.ms for ms in own]).values()
-        row = {"factor": factor, "label": label, **mean[list(QUALITIES)]}
-        row["left_out"] = int(few.left_out.sum())
-        row |= dict(zip(("ms", "p10", "p90"), ms, strict=True))
-        row |= {"memory_mb": few.memory_mb.max(), "seconds": mean.seconds, "seeds": len(few)}
-        rows.append(row)
+        ms = deciles([ms for own in few.ms for ms in own])
+        row = {"factor": factor, "label": label, "ms": ms.pop("median"), **ms}
+        row |= few[[*QUALITIES, "seconds"]].mean(skipna=False)
+        row |= {"left_out": int(few.left_out.sum()), "memory_mb": few.memory_mb.max()}
+        rows.append({**row, "seeds": len(few)})
     return pd.DataFrame(rows)
+
+
+def front(frame: pd.DataFrame, metric: str) -> list[int]:
+    """The Pareto front: indices of the rows that no other beats, from the fastest up.
+
+    Convention: a row is beaten when another is at least as good in time and in the metric, and
+    better in one; of equal rows all stay; those without a score are left out.
+    """
+    ms = frame.ms.to_numpy()
+    score = frame[metric].to_numpy(dtype=float) * QUALITIES[metric][2]
+    found = []
+    for i in np.argsort(ms, kind="stable").tolist():
+        least = (ms <= ms[i]) & (score >= score[i])
+        beaten = least & ((ms < ms[i]) | (score > score[i]))
+        if np.isfinite(score[i]) and not beaten.any():
+            found.append(i)
+    return found
+
+
+def text(
+    frame: pd.DataFrame,
+    metric: str,
+    about: Mapping[str, Any],
+    where: Mapping[str, Any],
+    marks: Sequence[str],
+) -> str:
+    """The block of the page, less its plot: the machine, the table of ``make_rows``, the notes."""
+    notes = list(marks)
+    if frame.lpips.isna().all():
+        notes.append("LPIPS n/a: the backbone's weights are not available")
+    if frame.left_out.any():
+        notes.append(f"{frame.left_out.sum()} scores were not finite and are not in the means")
+    heading = (
+        f"{about['pictures']} images of {about['split']}; settings changed on {about['subject']}; "
+        f"one image at a time. Front: nothing is as fast and scores as much "
+        f"({QUALITIES[metric][0]})."
+    )
+    listed = "\n".join(f"- {note}" for note in notes)
+    return f"{common.sentence(where)}.\n\n{heading}\n\n{table(frame, metric)}\n\n{listed}".strip()
+
+
+def table(frame: pd.DataFrame, metric: str) -> str:
+    """The rows in Markdown."""
+    seeds = [f" ({n} seeds)" if n > 1 else "" for n in frame.seeds]
+    shown = pd.DataFrame({"changed": frame.factor, "to": frame.label + seeds})
+    for name, (heading, digits, _) in QUALITIES.items():
+        if frame[name].notna().any():
+            shown[heading] = [NOTHING if pd.isna(v) else f"{v:.{digits}f}" for v in frame[name]]
+    shown["ms per frame"] = frame.ms.map(number)
+    shown["10–90 %"] = frame.p10.map(number) + "–" + frame.p90.map(number)
+    shown["peak MB"] = frame.memory_mb.map(number)
+    shown["training min"] = (frame.seconds / 60).map(number)
+    best = front(frame, metric)
+    shown["front"] = ["yes" if i in best else "" for i in range(len(frame))]
+    return markdown(shown)
+
+
+def plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
+    """Metrics against milliseconds per frame, all points labelled, the front as a step line; PNG.
+
+    A metric without any score has no panel, unless none has one.
+    """
+    metrics = [m for m in metrics if frame[m].notna().any()] or metrics[:1]
+    figure, all_axes = common.panels(len(metrics), 6.4 * len(metrics), 5.6)
+    for axes, metric in zip(all_axes, metrics, strict=True):
+        heading, _, sign = QUALITIES[metric]
+        ahead = frame.iloc[front(frame, metric)]
+        label = "front: nothing beats these"
+        axes.step(ahead.ms, ahead[metric], "#999999", where="post", lw=1.2, zorder=1, label=label)
+        for i, (factor, own) in enumerate(frame.groupby("factor", sort=False)):
+            whiskers = [own.ms - own.p10, own.p90 - own.ms]
+            mark, colour = MARKERS[i % len(MARKERS)] if i else "*", ORDER[i % len(ORDER)]
+            axes.errorbar(
+                own.ms, own[metric], xerr=whiskers, fmt=mark, color=colour, label=factor, ms=8
+            )
+        axes.set(xscale="log", xlabel="milliseconds per frame (whiskers: deciles)")
+        axes.set_ylabel(f"{heading}, {'higher' if sign > 0 else 'lower'} is better")
+        common.plain_ticks(axes.xaxis)
+        axes.margins(x=0.16, y=0.1)
+        if sign < 0:
+            axes.invert_yaxis()
+        for i, (_, row) in enumerate(frame[frame[metric].notna()].sort_values("ms").iterrows()):
+            va, ha = (("bottom", "center"), ("top", "center"), ("center", "left"))[i % 3]
+            axes.text(row.ms, row[metric], f"\n   {row.label}   \n", ha=ha, va=va, fontsize=7.5)
+    shown = all_axes[0].get_legend_handles_labels()
+    figure.legend(*shown, loc="outside lower center", ncols=6, frameon=False)
+    return common.png(figure)

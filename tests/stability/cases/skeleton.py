@@ -10,13 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsgan.bench.cases.case import REFUSED, Case, Inputs, Tolerance
-from gsgan.bench.cases.crossings import CROSSINGS, Path, poses
-from gsgan.bench.cases.poses import DEGENERATE, noisy, rest
-from gsgan.bench.cases.raster import Size, pinhole, raster_case, rendered
 from gsgan.scene import Camera, Gaussians
 from gsgan.skeleton import Densify, bone_frames, draw_skeleton, omega, sanitise
 from gsgan.splat import Accuracy
+from stability.cases.case import REFUSED, Case, Inputs, Tolerance
+from stability.cases.crossings import CROSSINGS, Path, poses
+from stability.cases.poses import DEGENERATE, noisy, rest
+from stability.cases.raster import Size, pinhole, raster_case, rendered
 
 _case = partial(Case, "skeleton")
 

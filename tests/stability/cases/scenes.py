@@ -8,10 +8,10 @@ from typing import Any
 
 import torch
 
-from gsgan.bench.cases.case import FINITE_ONLY, REFUSED, WARNED, Case, Inputs, Tolerance
-from gsgan.bench.cases.raster import SIZE, Numbers, cloud, pinhole, raster_case, render
 from gsgan.scene import Camera
 from gsgan.skeleton import MEDIAPIPE33, recentre
+from stability.cases.case import FINITE_ONLY, REFUSED, WARNED, Case, Inputs, Tolerance
+from stability.cases.raster import SIZE, Numbers, cloud, pinhole, raster_case, render
 
 FAR = (1e4, -2e4, 3e4)  # metres: where the origin of a survey may be
 

@@ -16,9 +16,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gsgan.bench.cases.poses import rest
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.frames import MIN_LENGTH
+from stability.cases.poses import rest
 
 Path = Callable[[Tensor], Tensor]
 

@@ -13,8 +13,10 @@ from typing import Any
 
 import torch
 
-from gsgan.bench.cases.case import Case, Inputs, Outputs, Tolerance
-from gsgan.bench.cases.raster import (
+from gsgan.splat import Accuracy
+from gsgan.splat.project import rotations
+from stability.cases.case import Case, Inputs, Outputs, Tolerance
+from stability.cases.raster import (
     HIGH,
     ON_PIXEL,
     SIZE,
@@ -29,8 +31,6 @@ from gsgan.bench.cases.raster import (
     rotation,
     uncut,
 )
-from gsgan.splat import Accuracy
-from gsgan.splat.project import rotations
 
 NEEDLE, PANCAKE = (1.0, 1e-4, 1e-4), (1.0, 1.0, 1e-4)  # metres; two metres away
 AHEAD = (0.01, 0.004, 2.0)

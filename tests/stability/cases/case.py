@@ -120,7 +120,7 @@ def drawing_backends(
 
 def all_cases() -> tuple[Case, ...]:
     """Every hard case, by subject. Imports the modules only now: some load networks."""
-    modules = (import_module(f"gsgan.bench.cases.{name}") for name in MODULES)
+    modules = (import_module(f"stability.cases.{name}") for name in MODULES)
     return tuple(case for module in modules for case in module.cases())
 
 

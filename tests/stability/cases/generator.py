@@ -9,8 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gsgan.bench.cases.case import Case, Inputs, Outputs, Tolerance
 from gsgan.model.generator import Generator, Style
+from stability.cases.case import Case, Inputs, Outputs, Tolerance
 
 SIDE = 16  # pixels
 CHANNELS = {"F": 5, "S": 4, "p2d": 8}

@@ -10,8 +10,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsgan.bench.cases.case import REFUSED, Case, Inputs, Tolerance
-from gsgan.bench.cases.raster import Size, pinhole, raster_case, rendered
 from gsgan.body import (
     axis_angle_to_matrix,
     blend_transforms,
@@ -22,6 +20,8 @@ from gsgan.body import (
 from gsgan.model.body_points import moved_normals
 from gsgan.scene import Gaussians
 from gsgan.splat import Accuracy
+from stability.cases.case import REFUSED, Case, Inputs, Tolerance
+from stability.cases.raster import Size, pinhole, raster_case, rendered
 
 PARENTS = (-1, 0, 1)
 """Shoulder, elbow, wrist: an arm along x, 0.3 m each."""

@@ -8,13 +8,13 @@ from functools import lru_cache, partial
 import torch
 from torch import Tensor
 
-from gsgan.bench.cases.case import Case, Inputs, Outputs, Tolerance
 from gsgan.losses.adversarial import FORMS, discriminator_loss, feature_matching, generator_loss
 from gsgan.losses.perceptual import Perceptual
 from gsgan.losses.photometric import d_ssim, photometric
 from gsgan.metrics.image import psnr, ssim
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.segmentation import IGNORE, segmentation_loss
+from stability.cases.case import Case, Inputs, Outputs, Tolerance
 
 SIDE = 24  # pixels
 

@@ -16,9 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsgan.bench.cases.case import Case, Inputs, Outputs
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat import ACCURACY, Accuracy, rasterise
+from stability.cases.case import Case, Inputs, Outputs
 
 HIGH = ACCURACY["high"]
 

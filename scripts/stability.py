@@ -1,36 +1,63 @@
-"""``python -m gsgan.bench stability``: the float32 error of every hard case."""
+"""Compares every numerically hard case of the tests in float32 with float64.
+
+    python scripts/stability.py [--page docs/rasteriser.md] [--out folder] [--device cuda]
+
+Prints a table, writes ``stability.md``, ``.csv`` and ``.json`` into a folder, and fills the block
+``bench:stability`` of a page. Ends with an error when a case gets another status than expected.
+"""
 
 from __future__ import annotations
 
+import argparse
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from omegaconf import DictConfig
+from omegaconf import OmegaConf
 from rich.progress import track
 
-from gsgan.bench.cases.case import compare_all
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
+
+from stability.cases.case import compare_all
+
 from gsgan.bench.common import Bench, markdown, number, records, sentence
 from gsgan.utils.errors import GsganError
 
 
-def run(config: DictConfig, folder: Path) -> None:
-    """Runs every case, writes ``stability.md``, ``.csv`` and ``.json``.
+def main() -> None:
+    """Reads the command line."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--page", help="a page whose block bench:stability is rewritten")
+    parser.add_argument("--out", type=Path, default=Path("outputs/bench/stability"))
+    parser.add_argument("--device", default="auto", help="auto takes CUDA where there is one")
+    given = parser.parse_args()
+    try:
+        run(given.page, given.out, given.device)
+    except GsganError as error:
+        sys.exit(f"gsgan: {error}")
+
+
+def run(page: str | None, folder: Path, device: str = "auto") -> None:
+    """Compares every case, writes the table.
 
     Args:
-        config: as conf/bench_stability.yaml.
-        folder: where they go.
+        page: a Markdown page that gets the summary, if any.
+        folder: of the files.
+        device: ``auto`` or a torch device.
 
     Raises:
+        ConfigError: on an unusable device, or a page without the block.
         GsganError: when a case gets another status than expected, after all is written.
     """
-    bench = Bench.start("stability", config, folder, "stability")
+    config = OmegaConf.create({"device": device, "threads": None, "docs": page})
+    bench = Bench.start("stability", config, folder)
     rows = compare_all(bench.device)
     frame = pd.DataFrame(list(track(rows, "comparing", console=bench.console, transient=True)))
     bench.write(
         "Hard cases: float32 against float64",
-        f"{sentence(bench.where)}.\n\n{page(frame)}",
+        f"{sentence(bench.where)}.\n\n{table(frame)}",
         {"rows": records(frame)},
         frame,
         docs=summary(frame, bench.where),
@@ -46,7 +73,7 @@ def run(config: DictConfig, folder: Path) -> None:
         )
 
 
-def page(frame: pd.DataFrame) -> str:
+def table(frame: pd.DataFrame) -> str:
     """Every case on every backend, Markdown."""
     shown = frame.drop(columns="expected").rename(columns=lambda name: name.replace("_", " "))
     for name in ("value error", "gradient error"):
@@ -55,7 +82,7 @@ def page(frame: pd.DataFrame) -> str:
 
 
 def summary(frame: pd.DataFrame, where: Mapping[str, Any]) -> str:
-    """One line per case for the docs, the worst of its backends, a table per subject; Markdown."""
+    """One line per case, the worst of its backends, a table per subject; Markdown."""
     parts = [sentence(where) + "."]
     for subject, cases in frame.groupby("subject", sort=False):
         lines = [_by_case(name, rows) for name, rows in cases.groupby("case", sort=False)]
@@ -75,3 +102,7 @@ def _by_case(name: str, rows: pd.DataFrame) -> dict[str, str]:
         "status": ", ".join([first.status, *named]),
         "note": first.note,
     }
+
+
+if __name__ == "__main__":
+    main()

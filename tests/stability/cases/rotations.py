@@ -8,9 +8,9 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from gsgan.bench.cases.case import Case, Inputs, Outputs, Tolerance
-from gsgan.bench.cases.raster import rotation
 from gsgan.skeleton import rotation_from_6d, rotation_to_6d
+from stability.cases.case import Case, Inputs, Outputs, Tolerance
+from stability.cases.raster import rotation
 
 _case = partial(Case, "6D rotations")
 

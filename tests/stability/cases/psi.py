@@ -11,13 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsgan.bench.cases.case import FINITE_ONLY, Case, Inputs, Tolerance
-from gsgan.bench.cases.poses import noisy, rest
-from gsgan.bench.cases.raster import Numbers, Size, pinhole, raster_case, rendered
 from gsgan.model.deformation import Deformation, Residuals
 from gsgan.scene import Camera
 from gsgan.skeleton import MEDIAPIPE33, Densify
 from gsgan.splat import Accuracy
+from stability.cases.case import FINITE_ONLY, Case, Inputs, Tolerance
+from stability.cases.poses import noisy, rest
+from stability.cases.raster import Numbers, Size, pinhole, raster_case, rendered
 
 SH_DEGREE, FEATURES = 1, 2
 NAMES = tuple(field.name for field in fields(Residuals))
