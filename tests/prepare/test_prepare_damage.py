@@ -167,7 +167,7 @@ def test_damaged_results_are_made_again_and_a_full_disk_is_reported(tmp_path: Pa
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(np, "savez", full)
+    monkeypatch.setattr("gsgan.prepare.work.write_atomically", full)
     with pytest.raises(DataError, match=r"cannot be written \(No space left"):
         work.arrays("a", 2, lambda: {"x": np.arange(2)})
 

@@ -84,9 +84,9 @@ def test_repeated_values_of_gap_filling_are_removed():
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        (lambda text: "hello", "not a .trc file"),
+        (lambda text: "hello", "cannot be read as a .trc file"),
         (lambda text: text.replace("\tm\n", "\tfeet\n"), "Units is 'feet'"),
-        (lambda text: text.replace("1.58", "x.yz"), "holds no numbers"),
+        (lambda text: text.replace("1.58", "x.yz"), "cannot be read as a .trc file"),
         (lambda text: text.replace("Shoulder", "Sh").replace("Hip", "H"), "no shoulders and hips"),
     ],
 )

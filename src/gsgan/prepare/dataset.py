@@ -6,26 +6,48 @@ import contextlib
 import json
 import os
 import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import gsgan
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.joints import BODY, hand_names
-from gsgan.prepare.inputs import Inputs
-from gsgan.prepare.options import Options
-from gsgan.prepare.rig import Float, known
+from gsgan.prepare.options import Inputs, Options
+from gsgan.prepare.pictures import Written
+from gsgan.prepare.rig import Float, Ints, known
 from gsgan.prepare.solve import Solution
 from gsgan.prepare.work import write_json, write_npz, writing
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.errors import DataError
 
 GENERATOR = "gsgan.prepare"
-Frames = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Everything that the dataset is made from: ``frames [F]`` numbers, images by camera."""
+
+    options: Options
+    inputs: Inputs
+    frames: Ints
+    solution: Solution
+    written: Mapping[str, Written]
+
+    @property
+    def cameras(self) -> list[CameraEntry]:
+        """The cameras of the written images."""
+        refined = self.solution.rig.entries(self.inputs.cameras)
+        return [self.options.pictures.camera(camera) for camera in refined]
+
+    @property
+    def kept(self) -> set[int]:
+        """Frames with at least one image."""
+        return {frame for one in self.written.values() for frame in one.frames}
 
 
 def is_there(out: Path, key: str, overwrite: bool) -> bool:
@@ -57,9 +79,6 @@ def publish(root: Path, out: Path) -> None:
     Raises:
         DataError: when training could not read it, or it cannot be moved.
     """
-    with writing(root):
-        for part in root.rglob(".*.part"):  # of a run that was killed while it wrote a file
-            part.unlink()
     try:
         read_capture(root)
     except DataError as error:
@@ -78,27 +97,25 @@ def publish(root: Path, out: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def write_small_files(
-    root: Path, options: Options, inputs: Inputs, frames: Frames, solution: Solution, key: str
-) -> list[CameraEntry]:
-    """cameras.json, landmarks3d.npz, hands3d.npz, landmarks2d/, meta.json.
+def write_small_files(root: Path, outcome: Outcome, key: str) -> None:
+    """cameras.json, landmarks3d.npz, hands3d.npz, landmarks2d/, meta.json; ``key`` as `is_there`'s.
 
-    Args:
-        root: the dataset.
-        options: how images are written, and the world's up axis.
-        inputs: cameras and frame rate.
-        frames: ``[F]`` numbers.
-        solution: of these frames.
-        key: of the inputs and settings, see `is_there`.
-
-    Returns:
-        The cameras of the written images.
+    Lengths are in metres, pixels those of the written images.
     """
-    files, cameras = options.pictures, solution.rig.entries(inputs.cameras)
-    written = [files.camera(camera) for camera in cameras]
-    write_json(root / "cameras.json", {camera.name: _camera(camera) for camera in written})
+    solution, frames = outcome.solution, outcome.frames
+    cameras = {
+        camera.name: {
+            "K": camera.K.tolist(),
+            "R": camera.R.tolist(),
+            "t": camera.t.tolist(),
+            "dist": [0.0] * 5,
+            "size": [camera.size[1], camera.size[0]],
+        }
+        for camera in outcome.cameras
+    }
+    write_json(root / "cameras.json", cameras)
     p, conf = solution.p, solution.conf
-    error = solution.error[:, :, :BODY] * files.scale
+    error = solution.error[:, :, :BODY] * outcome.options.pictures.scale
     seen = np.isfinite(error)
     mean = np.where(seen, error, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
     write_npz(
@@ -119,8 +136,8 @@ def write_small_files(
             frame_id=frames,
             names=np.array(hand_names()),
         )
-    for c, camera in enumerate(cameras) if solution.seen.any() else ():
-        ratio = np.array(written[c].size[::-1]) / np.array(camera.size[::-1])
+    for c, camera in enumerate(outcome.cameras) if solution.seen.any() else ():
+        ratio = np.diag(camera.K)[:2] / np.diag(solution.rig.K[c])[:2]
         write_npz(
             root / "landmarks2d" / f"{camera.name}.npz",
             p=(solution.uv[c, :, :BODY] * ratio).astype(np.float32),
@@ -129,34 +146,20 @@ def write_small_files(
             undistorted=np.array(True),
         )
     meta = {
-        "fps": inputs.fps,
+        "fps": outcome.inputs.fps,
         "unit": "m",
-        "up_axis": options.up_axis or standing_axis(p),
+        "up_axis": outcome.options.up_axis or standing_axis(p),
         "skeleton": "mediapipe33",
         "pixel_centre": 0.5,
         "made_by": {"generator": GENERATOR, "version": gsgan.__version__, "key": key},
     }
     write_json(root / "meta.json", meta)
-    return written
-
-
-def _camera(camera: CameraEntry) -> dict[str, Any]:
-    return {
-        "K": camera.K.tolist(),
-        "R": camera.R.tolist(),
-        "t": camera.t.tolist(),
-        "dist": [0.0] * 5,
-        "size": [camera.size[1], camera.size[0]],
-    }
 
 
 def standing_axis(p: Float) -> str:
-    """The world axis along which a person stands, from ankles to nose: "z", "-y", ...
+    """The world axis along which a person ``p [F, J, 3]`` stands: "z", "-y", ...; unknown is "z".
 
-    Without any joint it is "z".
-
-    Args:
-        p: ``[F, J, 3]`` metres, NaN = missing.
+    It is the direction from ankles to nose; NaN = missing.
     """
     above = np.concatenate([p[:, 0] - (p[:, 27] + p[:, 28]) / 2, (p[:, 11] - p[:, 23])])
     above = above[known(above)]

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.files import frame_files, read_arrays, read_json
+from gsgan.data.files import frame_files, read_arrays, read_json, read_json_value
 from gsgan.data.joints import ALL, BODY, FROM_HANDS, HAND, LEFT, RIGHT, SETS
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.prepare.rig import Float, known
@@ -46,8 +45,7 @@ class Detections:
     people: NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class Points3D:
+class Points3D(NamedTuple):
     """3D joints that another tool triangulated.
 
     Args:
@@ -67,21 +65,16 @@ def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     Raises:
         DataError: when a camera has none, listing what is there.
     """
-    if not folder.is_dir():
-        raise DataError(
-            f"landmarks={folder} is not a folder; expected <camera>.npz or <camera>_json/ in it"
-        )
+    there = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
     found = {}
     for name in names:
-        places = [folder / f"{name}.npz", folder / f"{name}_json", folder / name]
-        existing = [p for p in places if p.exists()]
+        existing = [end for end in (f"{name}.npz", f"{name}_json", name) if end in there]
         if not existing:
-            there = ", ".join(sorted(p.name for p in folder.iterdir())[:20]) or "nothing"
             raise DataError(
                 f"{folder} has no landmarks of the camera {name}; expected {name}.npz, "
-                f"{name}_json/ or {name}/, found {there}"
+                f"{name}_json/ or {name}/, found {', '.join(there[:20]) or 'nothing'}"
             )
-        found[name] = existing[0]
+        found[name] = folder / existing[0]
     return found
 
 
@@ -102,11 +95,7 @@ def read_detections(path: Path) -> Detections:
 def gather(
     detections: Mapping[str, Detections], offsets: Mapping[str, int]
 ) -> tuple[NDArray[np.int64], Float, Float]:
-    """All cameras' detections by common frame numbers.
-
-    Args:
-        detections: by camera.
-        offsets: frames to add to a camera's numbers to get the common ones.
+    """All cameras' detections by common frame numbers, a camera's own plus its offset.
 
     Returns:
         ``frames [F]`` rising, those of any camera; ``px [C, F, 75, 2]`` NaN = not seen;
@@ -240,36 +229,29 @@ def without_frozen(p: Float, frames: int) -> tuple[Float, int]:
 def _read_trc(path: Path) -> Points3D:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        names, values, markers = (lines[i].split("\t") for i in (1, 2, 3))
+        markers = [name for name in markers[2:] if name]
+        count = 2 + 3 * len(markers)  # frame, time and the coordinates; an empty cell is missing
+        rows = [
+            [
+                float(cell) if cell.strip() else np.nan
+                for cell in (line.split("\t") + [""] * count)[:count]
+            ]
+            for line in lines[TRC_HEADER:]
+            if line.strip()
+        ]
+        unit = values[names.index("Units")].strip()
+    except (OSError, ValueError, IndexError) as error:
         raise DataError(f"{path} cannot be read as a .trc file ({error})") from None
-    if len(lines) <= TRC_HEADER or "Units" not in lines[1]:
-        raise DataError(f"{path} is not a .trc file; expected five lines of header, then frames")
-    unit = dict(zip(lines[1].split(), lines[2].split(), strict=False)).get("Units")
     if unit not in UNITS:
         raise DataError(f"{path}: Units is {unit!r}; expected one of {', '.join(UNITS)}")
-    markers = [name for name in lines[3].rstrip("\t").split("\t")[2:] if name]
-    rows = [
-        _numbers(path, line, 2 + 3 * len(markers)) for line in lines[TRC_HEADER:] if line.strip()
-    ]
-    table = np.array(rows).reshape(-1, 2 + 3 * len(markers))
+    table = np.array(rows).reshape(-1, count)
     read = table[:, 2:].reshape(len(table), len(markers), 3)[..., TRC_AXES] * UNITS[unit]
     p = np.full((len(table), BODY, 3), np.nan)
     for marker, name in enumerate(markers):
         if (joint := _joint(name)) is not None:
             p[:, joint] = read[:, marker]
     return Points3D(whole_frame_ids(table[:, 0], str(path)), p, np.ones(p.shape[:2]))
-
-
-def _numbers(path: Path, line: str, count: int) -> list[float]:
-    """Frame, time and the markers' coordinates; an empty cell is missing."""
-    cells = (line.split("\t") + [""] * count)[:count]
-    try:
-        numbers = [float(cell) if cell.strip() else np.nan for cell in cells]
-    except ValueError as error:
-        raise DataError(f"{path}: a frame holds no numbers ({error})") from None
-    if not np.isfinite(numbers[0]):
-        raise DataError(f"{path}: a line has no frame number")
-    return numbers
 
 
 def _joint(name: str) -> int | None:
@@ -292,20 +274,17 @@ def _read_people_folder(path: Path) -> Points3D:
 
 def _read_people(path: Path) -> Float:
     """``[33, 4]`` x, y, z, confidence of the person seen best; EasyMocap's zeros stay zeros."""
+    best, numbers = np.zeros((BODY, 4)), SETS[25][1]
     try:
-        people: Any = json.loads(path.read_text(encoding="utf-8"))
-        read = [np.array(person["keypoints3d"], np.float64) for person in people]
-    except (OSError, ArithmeticError, ValueError, TypeError, LookupError, RecursionError) as error:
+        for person in read_json_value(path):
+            joints = np.array(person["keypoints3d"], np.float64)[list(numbers.values())]
+            if joints.shape[1] == 3:
+                joints = np.c_[joints, np.ones(len(joints))]
+            if joints[:, 3].sum() > best[:, 3].sum():
+                best[list(numbers)] = joints
+    except (ArithmeticError, ValueError, TypeError, LookupError) as error:
         raise DataError(
-            f"{path} is not an EasyMocap keypoints3d file: expected a list of persons ({error})"
+            f"{path} is not an EasyMocap keypoints3d file: expected a list of persons with "
+            f"(25, 4) numbers each ({error})"
         ) from None
-    out, numbers = np.zeros((BODY, 4)), SETS[25][1]
-    for joints in read:
-        if joints.ndim != 2 or len(joints) < 25 or joints.shape[1] not in (3, 4):
-            raise DataError(f"{path}: keypoints3d has shape {joints.shape}; expected (25, 4)")
-        if joints.shape[1] == 3:
-            joints = np.c_[joints, np.ones(len(joints))]
-        body = joints[list(numbers.values())]
-        if body[:, 3].sum() > out[:, 3].sum():
-            out[list(numbers)] = body
-    return out
+    return best

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gsgan.prepare.options import MEDIAPIPE, MediaPipe, Options
 from gsgan.prepare.sources import Source
-from gsgan.prepare.work import Work, each_camera, writing
+from gsgan.prepare.work import Advance, Work, each_camera, writing
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root
 
@@ -24,9 +24,9 @@ READY = ".ready"  # written last: an environment without it is incomplete
 
 def environment_of(tool: MediaPipe) -> Path:
     """The environment's folder, which need not exist."""
-    if tool.folder is not None:
-        return Path(tool.folder).expanduser()
-    return cache_root() / "tools" / "mediapipe-0.10.21"
+    if tool.folder is None:
+        return cache_root() / "tools" / "mediapipe-0.10.21"
+    return Path(tool.folder).expanduser()
 
 
 def tool_key(tool: MediaPipe) -> list[object]:
@@ -58,7 +58,7 @@ def run_tool(
     if missing:
         python = ensure_environment(tool, options.setup, say)
 
-        def one(name: str, report: Callable[[int, int], None]) -> None:
+        def one(name: str, advance: Advance) -> None:
             slot = missing.index(name) % options.workers
             command = [str(python), str(SCRIPT), "--source", str(sources[name].path)]
             command += ["--out", str(results[name]), "--hands", str(int(hands))]
@@ -66,7 +66,7 @@ def run_tool(
             for option in ("threads", "confidence", "tracking", "margin"):
                 command += [f"--{option}", str(getattr(tool, option))]
             command += ["--masks", str(folders[name])] if masks else []
-            _detect(command, sources[name].path, report)
+            _detect(command, sources[name].path, advance)
 
         each_camera(one, "finding landmarks", missing, options.workers)
     found = {
@@ -74,14 +74,11 @@ def run_tool(
         for name, folder in folders.items()
     }
     if masks and (empty := [name for name, files in found.items() if not files]):
-        raise DataError(
-            f"MediaPipe found nobody in the images of {empty[0]}; remove that camera, or give "
-            "masks=<folder>"
-        )
+        raise DataError(f"MediaPipe found nobody in {empty[0]}; remove it, or give masks=<folder>")
     return results, found
 
 
-def _detect(command: list[str], source: Path, report: Callable[[int, int], None]) -> None:
+def _detect(command: list[str], source: Path, advance: Advance) -> None:
     with (
         tempfile.TemporaryFile("w+") as errors,
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
@@ -91,7 +88,7 @@ def _detect(command: list[str], source: Path, report: Callable[[int, int], None]
             for line in process.stdout:
                 done, _, count = line.partition(" ")
                 if done.isdigit() and count.strip().isdigit():
-                    report(int(done), int(count))
+                    advance(int(done), int(count))
         except BaseException:
             process.kill()
             raise
@@ -114,18 +111,14 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
         return python
     if not setup:
         raise ConfigError(
-            f"landmarks=mediapipe needs its own environment at {place}, which does not exist; add "
-            "setup=true to create it (some 400 MB are installed), or give landmarks=<folder> and "
-            "masks=<folder>"
+            f"landmarks=mediapipe needs its own environment at {place}: add setup=true to create "
+            "it (some 400 MB), or give landmarks=<folder> and masks=<folder>"
         )
-    base = _base_python(tool.python)
+    base = tool.python or _base_python()
     with writing(place):
         if place.exists():
             if any(place.iterdir()) and not (place / MARKER).is_file():
-                raise ConfigError(
-                    f"mediapipe.folder={place} holds something else than an environment that gsgan "
-                    "made; give a new or empty folder"
-                )
+                raise ConfigError(f"mediapipe.folder={place} holds something else; give a new one")
             shutil.rmtree(place)
         place.mkdir(parents=True)
         (place / MARKER).touch()
@@ -140,17 +133,14 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
     return python
 
 
-def _base_python(given: str | None) -> str:
-    if given is not None:
-        return given
+def _base_python() -> str:
     if sys.version_info[:2] <= NEWEST:
         return sys.executable
     for minor in (12, 11):
         if found := shutil.which(f"python3.{minor}"):
             return found
     raise ConfigError(
-        "MediaPipe 0.10.21 needs Python 3.11 or 3.12, and neither is on the PATH; install one and "
-        "set mediapipe.python=/path/to/python3.12"
+        "MediaPipe 0.10.21 needs Python 3.11 or 3.12; set mediapipe.python=/path/to/python3.12"
     )
 
 

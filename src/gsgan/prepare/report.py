@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,26 +17,23 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, PersonCrop, Window, cut, project, resize
 from gsgan.data.files import read_colour, read_grey
 from gsgan.data.joints import BODY
-from gsgan.prepare.inputs import Inputs
-from gsgan.prepare.options import Options
+from gsgan.prepare.dataset import Outcome
 from gsgan.prepare.pictures import sampled
-from gsgan.prepare.rig import FOCAL, Float, known
-from gsgan.prepare.solve import Solution, median, stage_medians
+from gsgan.prepare.rig import FOCAL, Float, Rig, camera_moves, known
+from gsgan.prepare.solve import median
 from gsgan.prepare.work import write_json, writing
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.files import write_atomically
 
 Bytes = NDArray[np.uint8]
-STAGES = {
-    "plain": "plain weighted triangulation (DLT)",
-    "robust": "robust triangulation",
-    "flips": "left and right corrected",
-    "refined": "camera poses refined",
-    "smoothed": "cleansed and smoothed: what is written",
-}
 BAR = (70, 70, 70)
 EMPTY = 60  # grey of a tile without image
 FAR = 10_000  # pixels: drawing stops there
+AGREEMENT = (
+    "Median reprojection error in pixels of the full-size image, over all detections, after plain "
+    "weighted triangulation (DLT), robust triangulation, correction of left and right, refinement "
+    "of the camera poses, and cleansing and smoothing, which is what is written."
+)
 LEGEND = (
     "Blue: the person's left, orange: the right, white: the middle. Lines: the 3D joints "
     "projected; large dots: detections, sides corrected. Green: the mask's outline and box; "
@@ -45,52 +41,30 @@ LEGEND = (
 )
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """The content of the report.
-
-    Args:
-        inputs: images and calibration.
-        cameras: of the written images.
-        frames: ``F`` common numbers.
-        written: frames with image and mask, by camera.
-        solution: of all frames.
-        turned: ``[C]`` degrees by which refinement turned the cameras.
-        moved_mm: ``[C]`` millimetres by which it moved them.
-        doubts: one sentence each.
-    """
-
-    inputs: Inputs
-    cameras: Sequence[CameraEntry]
-    frames: Sequence[int]
-    written: Mapping[str, list[int]]
-    solution: Solution
-    turned: Float
-    moved_mm: Float
-    doubts: Sequence[str]
-
-
-def write_report(root: Path, outcome: Outcome, options: Options, console: Console) -> None:
+def write_report(root: Path, outcome: Outcome, doubts: Sequence[str], console: Console) -> None:
     """Writes report.html and report.json into the dataset and prints the tables."""
-    kept = {frame for frames in outcome.written.values() for frame in frames}
-    dropped = [frame for frame in outcome.frames if frame not in kept]
-    numbers = _numbers(outcome, options, dropped)
-    notes = [*outcome.inputs.notes]
-    notes += [f"{len(outcome.frames)} frames at {numbers['fps']:g} per second"]
-    if dropped:
+    inputs, options, solution = outcome.inputs, outcome.options, outcome.solution
+    numbers = _numbers(outcome, doubts)
+    notes = [*inputs.notes, f"{len(outcome.frames)} frames at {inputs.fps:g} per second"]
+    if dropped := numbers["frames_dropped"]:
         shown = ", ".join(map(str, dropped[:20])) + (" ..." if len(dropped) > 20 else "")
         notes.append(f"{len(dropped)} frames dropped, without skeleton or mask: {shown}")
+    found, views = known(solution.p).mean(0), solution.views.mean(0)
+    joints = tuple(
+        (name, f"{found[j]:.0%}", _number(median(solution.error[..., j]), ".1f"), f"{views[j]:.1f}")
+        for j, name in enumerate(MEDIAPIPE33.names)
+    )
+    headers = "joint", "frames found", "error px", "cameras that agree"
+    limits = options.doubts.reprojection * solution.rig.focal / FOCAL
     sections = (
         Section(
             "How well joints and cameras agree",
-            ("Median reprojection error in pixels of the full-size image, over all detections.",),
-            tables=(_stage_table(outcome, options), _camera_table(numbers["cameras"])),
-            findings=tuple(Finding("warning", "capture", doubt) for doubt in outcome.doubts),
+            tables=(_camera_table(numbers, limits),),
+            findings=tuple(Finding("warning", "capture", doubt) for doubt in doubts),
+            aside=(AGREEMENT,),
         ),
-        Section(
-            "Overlays", aside=(LEGEND,), figures=_figures(root, outcome, options, sorted(kept))
-        ),
-        Section("Joints", tables=(_joint_table(outcome.solution),)),
+        Section("Overlays", aside=(LEGEND,), figures=_figures(root, outcome)),
+        Section("Joints", tables=(Table(headers, joints),)),
         Section("Notes", tuple(notes)),
     )
     out = str(options.folder("out"))
@@ -101,95 +75,78 @@ def write_report(root: Path, outcome: Outcome, options: Options, console: Consol
     print_report(report, console)
 
 
-def _numbers(outcome: Outcome, options: Options, dropped: list[int]) -> dict[str, Any]:
+def _numbers(outcome: Outcome, doubts: Sequence[str]) -> dict[str, Any]:
     """The content of report.json."""
-    solution, calibration = outcome.solution, outcome.inputs.calibration
-    stages = stage_medians(solution.stages)
+    inputs, solution = outcome.inputs, outcome.solution
+    turned, moved = camera_moves(Rig.of(inputs.cameras), solution.rig)
     by_camera = {
-        camera.name: {
-            "error_px": {stage: values[1][c] for stage, values in stages.items()},
-            "turned_degrees": float(outcome.turned[c]),
-            "moved_mm": float(outcome.moved_mm[c]),
+        name: {
+            "error_px": {stage: median(error[c]) for stage, error in solution.stages.items()},
+            "turned_degrees": float(turned[c]),
+            "moved_mm": float(moved[c]),
             "flipped_share": float(solution.flips[c].any(-1).mean()),
             "delay_frames": float(solution.delay[c]),
             "frames_with_person": int(np.isfinite(solution.error[c]).any(-1).sum()),
-            "frames_written": len(outcome.written[camera.name]),
+            "frames_written": len(outcome.written[name].frames),
         }
-        for c, camera in enumerate(outcome.cameras)
+        for c, name in enumerate(inputs.sources)
     }
-    found = known(solution.p[:, :BODY]).mean(0)
+    found, kept = known(solution.p[:, :BODY]).mean(0), outcome.kept
     return {
-        "error_px": {stage: values[0] for stage, values in stages.items()},
-        "detections_used": {stage: values[2] for stage, values in stages.items()},
+        "error_px": {stage: median(error) for stage, error in solution.stages.items()},
         "cameras": by_camera,
         "joints_found": dict(zip(MEDIAPIPE33.names, found.tolist(), strict=True)),
         "frames": len(outcome.frames),
-        "frames_dropped": dropped,
+        "frames_dropped": [frame for frame in outcome.frames.tolist() if frame not in kept],
         "joints_removed": solution.removed,
-        "fps": outcome.inputs.fps,
-        "calibration": {"file": calibration.path.name, "format": calibration.format},
-        "notes": list(outcome.inputs.notes),
-        "doubts": list(outcome.doubts),
-        "settings": options.record(),
+        "fps": inputs.fps,
+        "calibration": {"file": inputs.calibration.path.name, "format": inputs.calibration.format},
+        "notes": list(inputs.notes),
+        "doubts": list(doubts),
+        "settings": outcome.options.record(),
     }
 
 
-def _stage_table(outcome: Outcome, options: Options) -> Table:
-    limits = options.doubts.reprojection * outcome.solution.rig.focal / FOCAL
-    rows: list[tuple[str, ...]] = []
-    flagged: set[tuple[int, int]] = set()
-    for stage, (whole, each, used) in stage_medians(outcome.solution.stages).items():
-        if stage == "smoothed":
-            flagged = {(len(rows), c + 2) for c, error in enumerate(each) if error > limits[c]}
-        cells = ("-" if np.isnan(error) else f"{error:.2f}" for error in (whole, *each))
-        rows.append((STAGES[stage], *cells, f"{used:.1%}"))
-    headers = ("after", "all", *(camera.name for camera in outcome.cameras), "detections used")
-    return Table(headers, tuple(rows), frozenset(flagged), "Error in pixels")
-
-
-def _camera_table(cameras: Mapping[str, Mapping[str, Any]]) -> Table:
-    rows = tuple(
-        (
-            name,
-            f"{one['turned_degrees']:.2f}°",
-            f"{one['moved_mm']:.0f} mm",
-            f"{one['flipped_share']:.0%}",
-            "?" if np.isnan(one["delay_frames"]) else f"{one['delay_frames']:+.2f}",
-            str(one["frames_written"]),
-        )
-        for name, one in cameras.items()
-    )
-    headers = ("camera", "turned", "moved", "sides swapped", "frames late", "images")
-    return Table(headers, rows, title="Cameras, after refinement")
-
-
-def _joint_table(solution: Solution) -> Table:
-    found, views = known(solution.p).mean(0), solution.views.mean(0)
-    rows = []
-    for j, name in enumerate(MEDIAPIPE33.names):
-        error = median(solution.error[..., j])
-        px = "-" if np.isnan(error) else f"{error:.1f}"
-        rows.append((name, f"{found[j]:.0%}", px, f"{views[j]:.1f}"))
-    return Table(("joint", "frames found", "error px", "cameras that agree"), tuple(rows))
-
-
-def _figures(
-    root: Path, outcome: Outcome, options: Options, kept: Sequence[int]
-) -> tuple[Figure, ...]:
-    """Per camera, its tiles of some frames side by side."""
-    chosen = [kept[i] for i in sampled(len(kept), options.overlays.frames)]
-    figures = []
-    for c, camera in enumerate(outcome.cameras if chosen else ()):
-        ratio = np.array(camera.size[::-1]) / np.array(outcome.inputs.cameras[c].size[::-1])
-        tiles = []
-        for frame in chosen:
-            at = outcome.frames.index(frame)
-            p, uv = outcome.solution.p[at, :BODY], outcome.solution.uv[c, at, :BODY] * ratio
-            files = (
-                root / "images" / camera.name / f"{frame:06d}.{options.pictures.format}",
-                root / "masks" / camera.name / f"{frame:06d}.png",
+def _camera_table(numbers: Mapping[str, Any], limits: Float) -> Table:
+    """Errors by camera and stage, and what refinement, flips and clocks gave."""
+    rows, flagged = [], set()
+    stages = numbers["error_px"]
+    for c, (name, one) in enumerate(numbers["cameras"].items()):
+        errors = one["error_px"]
+        if errors["smoothed"] > limits[c]:
+            flagged.add((c, len(stages)))
+        rows.append(
+            (
+                name,
+                *(_number(error, ".2f") for error in errors.values()),
+                f"{one['turned_degrees']:.2f}°",
+                f"{one['moved_mm']:.0f} mm",
+                f"{one['flipped_share']:.0%}",
+                _number(one["delay_frames"], "+.2f"),
+                str(one["frames_written"]),
             )
-            tile = _tile(*files, camera, p, uv, options.overlays.size)
+        )
+    rows.append(("all", *(_number(error, ".2f") for error in stages.values()), *[""] * 5))
+    headers = "camera", *stages, "turned", "moved", "sides swapped", "frames late", "images"
+    return Table(headers, tuple(rows), frozenset(flagged), "Error in pixels, and refined cameras")
+
+
+def _number(value: float, form: str) -> str:
+    return "-" if np.isnan(value) else format(value, form)
+
+
+def _figures(root: Path, outcome: Outcome) -> tuple[Figure, ...]:
+    """Per camera, its tiles of some frames side by side."""
+    options, kept, figures = outcome.options, sorted(outcome.kept), []
+    chosen = [kept[i] for i in sampled(len(kept), options.overlays.frames)]
+    for c, camera in enumerate(outcome.cameras if chosen else ()):
+        ratio, tiles = np.diag(camera.K)[:2] / np.diag(outcome.solution.rig.K[c])[:2], []
+        for frame in chosen:
+            at = np.searchsorted(outcome.frames, frame)
+            p, uv = outcome.solution.p[at, :BODY], outcome.solution.uv[c, at, :BODY] * ratio
+            image = root / "images" / camera.name / f"{frame:06d}.{options.pictures.format}"
+            mask = root / "masks" / camera.name / f"{frame:06d}.png"
+            tile = _tile(image, mask, camera, p, uv, options.overlays.size)
             tiles.append(caption(tile, f"{camera.name}  frame {frame}", BAR))
         title = f"{camera.name}: frames {', '.join(map(str, chosen))}"
         figures.append(Figure(title, picture=encode(np.concatenate(tiles, axis=1))))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from rich.console import Console
 
 from gsgan.data.joints import BODY
 from gsgan.data.splits import parse_frames
-from gsgan.prepare.dataset import Frames, is_there, publish, write_small_files
+from gsgan.prepare.dataset import Outcome, is_there, publish, write_small_files
 from gsgan.prepare.doubts import (
     check_distance,
     doubts_about_detections,
@@ -22,18 +22,24 @@ from gsgan.prepare.doubts import (
     doubts_about_solution,
     doubts_about_sources,
 )
-from gsgan.prepare.inputs import Inputs, read_inputs, read_people
-from gsgan.prepare.landmarks import Detections, gather, read_points3d
-from gsgan.prepare.options import Options
-from gsgan.prepare.pictures import Written, write_pictures
-from gsgan.prepare.refine import camera_moves
-from gsgan.prepare.report import Outcome, write_report
-from gsgan.prepare.rig import Bool, Rig, known, undistort_points
+from gsgan.prepare.landmarks import (
+    Detections,
+    Points3D,
+    find_landmarks,
+    gather,
+    read_detections,
+    read_points3d,
+)
+from gsgan.prepare.mediapipe import run_tool, tool_key
+from gsgan.prepare.options import MEDIAPIPE, Inputs, Options, read_inputs
+from gsgan.prepare.pictures import Written, check_values, find_masks, write_pictures
+from gsgan.prepare.report import write_report
+from gsgan.prepare.rig import Bool, Ints, Rig, camera_moves, known, undistort_points
 from gsgan.prepare.solve import Solution, adopt, solve
-from gsgan.prepare.work import Work, digest, each_camera
+from gsgan.prepare.work import Advance, Work, digest, each_camera
 from gsgan.utils.errors import DataError
 
-STAGE_VERSION = 2  # incremented when the same settings begin to give another result
+STAGE_VERSION = 3  # incremented when the same settings begin to give another result
 
 
 def prepare(options: Options, console: Console) -> Path:
@@ -48,34 +54,34 @@ def prepare(options: Options, console: Console) -> Path:
     """
     out = options.folder("out")
     inputs = read_inputs(options)
-    key = digest([STAGE_VERSION, options.record(), inputs.fingerprint(options)])
+    key = digest([STAGE_VERSION, options.record(), _fingerprint(options, inputs)])
     if is_there(out, key, options.overwrite):
         console.print(f"{out} exists already, made from the same images and settings")
         return out
-    work = Work.beside(out)
-    detections, masks = read_people(options, inputs, work, console.print)
+    work = Work(out.parent / f".{out.name}.prepare")
+    detections, masks = _read_people(options, inputs, work, console)
     if options.landmarks3d is None:
         frames, solution = _solved(options, inputs, detections, work, console)
     else:
         frames, solution = _adopted(options, inputs)
-    root = work.place("dataset", [key, STAGE_VERSION])
+    root = work.place("dataset", key)
+    shutil.rmtree(root, ignore_errors=True)  # of a run that was killed
     written = _write_pictures(options, inputs, masks, frames, solution, root)
-    small = write_small_files(root, options, inputs, frames, solution, key)
-    turned, moved = camera_moves(Rig.of(inputs.cameras), solution.rig)
-    clocks, limits = (solution.delay, solution.gain), options.doubts
+    outcome = Outcome(options, inputs, frames, solution, written)
+    write_small_files(root, outcome, key)
+    moves, limits = camera_moves(Rig.of(inputs.cameras), solution.rig), options.doubts
+    clocks = solution.delay, solution.gain
     doubts = [
         *doubts_about_sources(inputs.sources, limits),
         *doubts_about_pictures(inputs.sources, written, limits),
         *doubts_about_detections(detections, limits),
-        *doubts_about_solution(solution, list(inputs.sources), turned, moved, *clocks, limits),
+        *doubts_about_solution(solution, list(inputs.sources), *moves, *clocks, limits),
     ]
-    frames_of = {name: one.frames for name, one in written.items()}
-    outcome = Outcome(inputs, small, frames.tolist(), frames_of, solution, turned, moved, doubts)
-    write_report(root, outcome, options, console)
+    write_report(root, outcome, doubts, console)
     publish(root, out)
     work.forget_others()
     if not options.keep_work:
-        work.remove()
+        shutil.rmtree(work.folder, ignore_errors=True)
     lines = (
         f"{out} is ready; look at {out / 'report.html'}, then",
         f"python -m gsgan.check data=capture data.root={out}",
@@ -87,18 +93,45 @@ def prepare(options: Options, console: Console) -> Path:
     return out
 
 
+def _fingerprint(options: Options, inputs: Inputs) -> list[object]:
+    """Everything that is read: images, calibration, landmark and mask files, the tool."""
+    parts: list[object] = [source.fingerprint() for source in inputs.sources.values()]
+    parts += [inputs.calibration.path.name, *(str(c) for c in inputs.cameras)]
+    for name in ("landmarks", "landmarks3d", "masks"):
+        if getattr(options, name) not in (None, MEDIAPIPE):
+            place = options.folder(name)
+            files = sorted(p for p in (place, *place.rglob("*")) if p.is_file())
+            parts += [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+    return [*parts, tool_key(options.mediapipe) if options.needs_tool else None]
+
+
+def _read_people(
+    options: Options, inputs: Inputs, work: Work, console: Console
+) -> tuple[dict[str, Detections], dict[str, dict[int, Path]]]:
+    """2D landmarks, none where 3D joints are given, and masks by the camera's own frame numbers."""
+    names, found = list(inputs.sources), dict[str, Path]()
+    masks: dict[str, dict[int, Path]] = {}
+    if options.needs_tool:
+        found, masks = run_tool(options, inputs.sources, work, console.print)
+    if options.masks != MEDIAPIPE:
+        masks = find_masks(options.folder("masks"), names)
+        for name, files in masks.items():
+            check_values(options.folder("masks") / name, files)
+    if options.landmarks3d is not None:
+        return {}, masks
+    if options.landmarks != MEDIAPIPE:
+        found = find_landmarks(options.folder("landmarks"), names)
+    return {name: read_detections(found[name]) for name in names}, masks
+
+
 def _solved(
     options: Options,
     inputs: Inputs,
     detections: Mapping[str, Detections],
     work: Work,
     console: Console,
-) -> tuple[Frames, Solution]:
-    """Triangulates 2D landmarks, or loads the result of an earlier run on the same ones.
-
-    Raises:
-        DataError: when no frame is left, or the cameras are implausibly near or far.
-    """
+) -> tuple[Ints, Solution]:
+    """Triangulates 2D landmarks, or loads the result of an earlier run on the same ones."""
     frames, px, conf = gather(detections, options.offsets or {})
     chosen = _chosen(options, frames)
     joints = slice(None if options.hands else BODY)
@@ -114,33 +147,24 @@ def _solved(
     key = [STAGE_VERSION, options.record()["solve"], lag, hashes]
 
     def make() -> dict[str, NDArray[Any]]:
-        with console.status("solving") as status:
-            return solve(rig, time, uv, conf, options.solve, lag, status.update).to_arrays()
+        with console.status("finding 3D joints and refining the cameras"):
+            return solve(rig, time, uv, conf, options.solve, lag).to_arrays()
 
-    return frames, Solution.from_arrays(work.arrays("solution", key, make), rig.K)
+    return frames, Solution.from_arrays(work.arrays("solution", key, make))
 
 
-def _adopted(options: Options, inputs: Inputs) -> tuple[Frames, Solution]:
-    """The joints of another tool.
-
-    Raises:
-        DataError: when they cannot be read, or the cameras are implausibly near or far.
-    """
+def _adopted(options: Options, inputs: Inputs) -> tuple[Ints, Solution]:
+    """The joints of another tool."""
     points = read_points3d(options.folder("landmarks3d"))
     chosen = _chosen(options, points.frame_id)
-    points = replace(
-        points,
-        frame_id=points.frame_id[chosen],
-        p=points.p[chosen],
-        conf=points.conf[chosen],
-    )
-    p, where = points.p.reshape(-1, 3), inputs.calibration.path
+    points = Points3D(points.frame_id[chosen], points.p[chosen], points.conf[chosen])
+    where, p = inputs.calibration.path, points.p.reshape(-1, 3)
     check_distance(inputs.cameras, p, options.doubts, where)
     rig, frozen = Rig.of(inputs.cameras), options.doubts.frozen_frames
     return points.frame_id, adopt(rig, points, inputs.fps, options.solve, frozen)
 
 
-def _chosen(options: Options, frames: Frames) -> Bool:
+def _chosen(options: Options, frames: Ints) -> Bool:
     """``[F]`` which frames ``options.frames`` selects."""
     chosen = np.ones(len(frames), bool)
     if options.frames is not None:
@@ -154,15 +178,11 @@ def _write_pictures(
     options: Options,
     inputs: Inputs,
     masks: Mapping[str, Mapping[int, Path]],
-    frames: Frames,
+    frames: Ints,
     solution: Solution,
     root: Path,
 ) -> dict[str, Written]:
-    """Writes the images of every frame that has a skeleton.
-
-    Raises:
-        DataError: when no frame has one, or an image or mask cannot be read or written.
-    """
+    """Writes the images of every frame that has a skeleton."""
     posed = set(frames[known(solution.p[:, :BODY]).any(1)].tolist())
     if not posed:
         raise DataError(
@@ -170,19 +190,19 @@ def _write_pictures(
             "3D; expected landmarks that two cameras see at the same frame number, not NaN and "
             "with confidence above 0"
         )
-    cameras = {c.name: c for c in solution.rig.entries(inputs.cameras)}
+    cameras = {camera.name: camera for camera in inputs.cameras}
 
-    def one(name: str, report: Callable[[int, int], None]) -> Written:
+    def one(name: str, advance: Advance) -> Written:
         return write_pictures(
             root,
             cameras[name],
             inputs.sources[name],
             masks[name],
             posed,
-            options.offset(name),
+            (options.offsets or {}).get(name, 0),
             options.pictures,
             options.mask_tidying,
-            report,
+            advance,
         )
 
     return each_camera(one, "writing images", list(cameras), options.workers)

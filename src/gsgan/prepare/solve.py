@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,14 +11,11 @@ from numpy.typing import NDArray
 
 from gsgan.data.joints import ALL, BODY, flip_groups
 from gsgan.prepare.cleanse import Cleansing, Smoothing, cleanse, smooth
-from gsgan.prepare.flips import FlipSearch, apply_flips, find_flips
 from gsgan.prepare.landmarks import Points3D, without_frozen
-from gsgan.prepare.refine import Refinement, refine_rig
-from gsgan.prepare.rig import FOCAL, Bool, Float, Rig, known
-from gsgan.prepare.triangulate import MIN_VIEWS, Points, Triangulation
+from gsgan.prepare.rig import FOCAL, MIN_VIEWS, Bool, Float, Refinement, Rig, known, refine_rig
+from gsgan.prepare.triangulate import FlipSearch, Points, Triangulation, apply_flips, find_flips
 
 ARRAYS = ("p", "conf", "views", "error", "uv", "seen", "flips", "delay", "gain")
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -64,36 +61,33 @@ class Solution:
     removed: dict[str, int]
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """All of it as plain arrays, except K."""
+        """All of it as plain arrays."""
         return {
             **{name: getattr(self, name) for name in ARRAYS},
-            "R": self.rig.R,
-            "t": self.rig.t,
-            "stage_names": np.array(list(self.stages)),
-            "stages": np.stack(list(self.stages.values())),
-            "reasons": np.array(list(self.removed)),
-            "removed": np.array(list(self.removed.values())),
+            **{f"rig {name}": value for name, value in vars(self.rig).items()},
+            **{f"stage {name}": value for name, value in self.stages.items()},
+            **{f"removed {name}": np.array(count) for name, count in self.removed.items()},
         }
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], K: Float) -> Solution:
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Solution:
         """The inverse of `to_arrays`."""
+
+        def group(start: str) -> dict[str, NDArray[Any]]:
+            return {
+                key.removeprefix(start): a for key, a in arrays.items() if key.startswith(start)
+            }
+
         return cls(
-            rig=Rig(K, arrays["R"], arrays["t"]),
-            stages=dict(zip(arrays["stage_names"].tolist(), arrays["stages"], strict=True)),
-            removed=dict(zip(arrays["reasons"].tolist(), arrays["removed"].tolist(), strict=True)),
+            rig=Rig(**group("rig ")),
+            stages=group("stage "),
+            removed={name: int(count) for name, count in group("removed ").items()},
             **{name: arrays[name] for name in ARRAYS},
         )
 
 
 def solve(
-    rig: Rig,
-    time: Float,
-    uv: Float,
-    conf: Float,
-    settings: Settings,
-    lag: int = 0,
-    say: Say = lambda _: None,
+    rig: Rig, time: Float, uv: Float, conf: Float, settings: Settings, lag: int = 0
 ) -> Solution:
     """All stages: plain, robust, flips, refined, smoothed.
 
@@ -104,7 +98,6 @@ def solve(
         conf: ``[C, F, J]`` 0 = not seen.
         settings: of every stage.
         lag: frames tried either way when clocks are compared; 0 skips it.
-        say: called with the name of each stage.
     """
     triangulation, given, pixels, full = settings.triangulation, rig, uv, conf
     groups = flip_groups(hands=uv.shape[2] == ALL)
@@ -112,37 +105,28 @@ def solve(
     start, conf = rig, np.where(conf > triangulation.min_confidence, conf, 0.0)
     flips = np.zeros((*conf.shape[:2], len(groups)), bool)
     sided, weight = uv, conf
-    stages = dict[str, Float]()
-
-    def record(stage: str, error: Float) -> None:
-        stages[stage] = error.reshape(conf.shape)[:, :, :BODY]
 
     def triangulate() -> Points:
         nonlocal flips, sided, weight
         if settings.flips.enabled:
-            say("looking for swapped sides")
             flips = find_flips(rig, uv, conf, groups, settings.flips, triangulation)
             sided, weight = (apply_flips(v, flips, groups) for v in (uv, conf))
         return triangulation.points(rig, _flat(sided), _flat(weight))
 
-    say("triangulating")
     plain = triangulation.plain(rig, _flat(uv), _flat(conf))
-    record("plain", rig.errors(plain, _flat(uv)))
-    record("robust", triangulation.points(rig, _flat(uv), _flat(conf)).error)
+    robust = triangulation.points(rig, _flat(uv), _flat(conf))
+    stages = {"plain": rig.errors(plain, _flat(uv)), "robust": robust.error}
     points = triangulate()
-    record("flips", points.error)
+    stages["flips"] = points.error
     for _ in range(settings.refinement.rounds):
-        say("refining the cameras")
         rig = _refined(start, rig, points, sided, weight, settings.refinement)
         points = triangulate()
-    record("refined", points.error)
+    stages["refined"] = points.error
     p, removed = cleanse(points.p.reshape(*conf.shape[1:], 3), settings.cleansing)
     trust = _mean_seen(points.weight.reshape(conf.shape), weight)
     p = smooth(p, trust, time, settings.smoothing.seconds)
     error = rig.errors(p.reshape(-1, 3), _flat(sided)).reshape(conf.shape)
-    error = np.where(weight > 0, error, np.nan)
-    record("smoothed", error)
-    say("comparing the clocks")
+    stages["smoothed"] = error = np.where(weight > 0, error, np.nan)
     seen = apply_flips(full, flips, groups)
     delay, gain = clock_errors(rig, sided[:, :, :BODY], seen[:, :, :BODY], triangulation, lag)
     to_pixels = (given.focal / FOCAL)[:, None, None]
@@ -157,7 +141,9 @@ def solve(
         flips=flips,
         delay=delay,
         gain=gain,
-        stages={name: one * to_pixels for name, one in stages.items()},
+        stages={
+            name: one.reshape(conf.shape)[:, :, :BODY] * to_pixels for name, one in stages.items()
+        },
         removed=removed,
     )
 
@@ -259,19 +245,6 @@ def _vertex(values: list[float]) -> float:
     if len(values) < 3 or not values[0] - 2 * values[1] + values[2] > 0:
         return 0.0
     return 0.5 * (values[0] - values[2]) / (values[0] - 2 * values[1] + values[2])
-
-
-def stage_medians(stages: dict[str, Float]) -> dict[str, tuple[float, list[float], float]]:
-    """By stage: median error in pixels over all, by camera, and the share of detections used."""
-    seen = max(1, *(int(np.isfinite(error).sum()) for error in stages.values()))
-    return {
-        name: (
-            median(error),
-            [median(one) for one in error],
-            float(np.isfinite(error).sum() / seen),
-        )
-        for name, error in stages.items()
-    }
 
 
 def median(values: Float) -> float:

@@ -70,18 +70,11 @@ class Source:
 def find_sources(folder: Path, rotate: bool = False) -> dict[str, Source]:
     """Every camera's images in a folder, or in videos/ or images/ inside it, in natural order.
 
-    Args:
-        folder: with one video or one subfolder of images per camera.
-        rotate: whether rotation metadata of videos is applied.
+    ``rotate`` applies the rotation metadata of videos.
 
     Raises:
         DataError: when there are none, or two videos have the same stem.
     """
-    if not folder.is_dir():
-        raise DataError(
-            f"source={folder} is not a folder; expected one with a video or a folder of images per "
-            "camera"
-        )
     for place in (*(folder / name for name in INSIDE), folder):
         if place.is_dir() and (sources := _sources_in(place, rotate)):
             return sources
@@ -94,14 +87,15 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Source]:
 def _sources_in(folder: Path, rotate: bool) -> dict[str, Source]:
     sources: dict[str, Source] = {}
     for path in sorted(folder.iterdir(), key=lambda p: natural_order(p.name)):
-        source = None
         if path.name.startswith("."):
             continue
-        if path.is_dir():
-            source = _picture_folder(folder, path)
+        if path.is_dir() and (files := frame_files(folder, path.name, PICTURE_SUFFIXES)):
+            paths = {number: folder / files[number] for number in sorted(files)}
+            size = read_header(next(iter(paths.values()))).size
+            source = Source(path.name, path, size, None, paths, len(paths))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             source = _video(path, rotate)
-        if source is None:
+        else:
             continue
         if source.name in sources:
             raise DataError(
@@ -110,15 +104,6 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Source]:
             )
         sources[source.name] = source
     return sources
-
-
-def _picture_folder(root: Path, path: Path) -> Source | None:
-    if not any(p.suffix.lower() in PICTURE_SUFFIXES for p in path.iterdir()):
-        return None
-    found = frame_files(root, path.name, PICTURE_SUFFIXES)
-    files = {number: root / found[number] for number in sorted(found)}
-    size = read_header(next(iter(files.values()))).size
-    return Source(path.name, path, size, None, files, len(files))
 
 
 def _video(path: Path, rotate: bool) -> Source:
@@ -144,11 +129,8 @@ def _open(path: Path, rotate: bool) -> cv2.VideoCapture:
 def _decoded(video: cv2.VideoCapture) -> Iterator[Bytes]:
     """The images of a video, which is closed at the end."""
     try:
-        while True:
-            ok, picture = video.read()
-            if not ok:
-                return
-            yield np.asarray(picture, np.uint8)
+        while (read := video.read())[0]:
+            yield np.asarray(read[1], np.uint8)
     finally:
         video.release()
 
@@ -161,35 +143,24 @@ def pair_cameras(
     Convention: as ``given``; else the same name, ignoring case; else the one camera whose name
     stands between separators in the source's name ("Miqus_5_21474": 21474). Never by position.
 
-    Args:
-        sources: names of videos or folders.
-        cameras: names in the calibration.
-        given: source name to camera name.
-
     Raises:
         DataError: when a source has no camera or two have the same, listing both sides.
     """
     both = f"videos: {', '.join(sources)}; calibration: {', '.join(cameras)}"
-    pairs = {str(source): str(camera) for source, camera in given.items()}
-    for source, camera in pairs.items():
+    named = {str(source): str(camera) for source, camera in given.items()}
+    for source, camera in named.items():
         if source not in sources or camera not in cameras:
             raise DataError(f"cameras={{{source}: {camera}}} names what is not there ({both})")
+    pairs = dict[str, str]()
     for source in sources:
-        if source not in pairs:
-            matching = _matching(source, cameras)
-            if len(matching) != 1:
-                raise DataError(
-                    f"no one camera of the calibration matches the video {source} ({both}); set "
-                    f"cameras={{{source}: <calibration name>, …}}"
-                )
-            pairs[source] = matching[0]
-    taken = list(pairs.values())
-    if twice := sorted({camera for camera in taken if taken.count(camera) > 1}):
-        raise DataError(
-            f"the camera {twice[0]} of the calibration matches more than one video ({both}); set "
-            "cameras={video: calibration name, …}"
-        )
-    return {source: pairs[source] for source in sources}
+        matching = [named[source]] if source in named else _matching(source, cameras)
+        if len(matching) != 1 or matching[0] in pairs.values():
+            problem = "no one camera of the calibration matches"
+            if len(matching) == 1:
+                problem = f"the camera {matching[0]} matches more than one video, among them"
+            raise DataError(f"{problem} {source} ({both}); set cameras={{video: calibration name}}")
+        pairs[source] = matching[0]
+    return pairs
 
 
 def _matching(source: str, cameras: Sequence[str]) -> list[str]:
@@ -205,18 +176,11 @@ def fit_size(
 ) -> tuple[CameraEntry, str | None]:
     """A camera with its source's name and image size, and a note when the sizes differ.
 
-    Convention: a few missing columns or rows were cut off at the right or bottom, where codecs cut,
-    so K stays.
-
-    Args:
-        camera: as calibrated; a size of (0, 0) is unknown.
-        name: of the source.
-        size: ``(H, W)`` of its images.
-        crop_px: most pixels that may be missing.
-        where: the calibration file.
+    Convention: up to ``crop_px`` missing columns or rows were cut off at the right or bottom, where
+    codecs cut, so K stays. ``size`` is ``(H, W)``; a calibrated size of (0, 0) is unknown.
 
     Raises:
-        DataError: when the sizes differ by more: the calibration is of another resolution.
+        DataError: when the sizes differ by more: the calibration ``where`` is of another size.
     """
     fitted = replace(camera, name=name, size=size)
     if camera.size in (size, (0, 0)):

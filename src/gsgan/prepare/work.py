@@ -5,13 +5,11 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,11 +21,8 @@ from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_atomically
 
 T = TypeVar("T")
+Advance = Callable[[int, int], None]  # takes the number of steps done and in total
 KEY_LENGTH = 12
-
-
-class Stopped(Exception):
-    """Another camera failed, or the user interrupted, so this one ends as well."""
 
 
 @contextmanager
@@ -62,9 +57,7 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return int(value) if isinstance(value, np.integer) else value
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def progress(console: Console, disable: bool = False) -> Progress:
@@ -76,34 +69,25 @@ def progress(console: Console, disable: bool = False) -> Progress:
 
 
 def each_camera(
-    task: Callable[[str, Callable[[int, int], None]], T],
-    what: str,
-    names: Sequence[str],
-    workers: int,
+    task: Callable[[str, Advance], T], what: str, names: Sequence[str], workers: int
 ) -> dict[str, T]:
-    """Runs a task per camera in threads, with one progress bar each on stderr.
+    """Runs ``task(camera, advance)`` per camera in threads, with one progress bar each on stderr.
 
     The first failure or an interrupt is raised; tasks that have not started are cancelled, and
-    running ones are stopped at their next report, as a thread cannot be ended from outside.
-
-    Args:
-        task: called with the camera's name and a function that takes the number of steps done and
-            in total.
-        what: title of the bars.
-        names: of the cameras.
-        workers: tasks at once.
+    running ones are stopped at their next ``advance``, as a thread cannot be ended from outside.
     """
     stop, console = threading.Event(), Console(stderr=True)
     bars = progress(console, disable=not console.is_terminal)
-    rows = {name: bars.add_task(f"{what}: {name}", total=None) for name in names}
 
     def run(name: str) -> T:
-        def report(done: int, count: int) -> None:
-            if stop.is_set():
-                raise Stopped
-            bars.update(rows[name], completed=done, total=count)
+        row = bars.add_task(f"{what}: {name}", total=None)
 
-        return task(name, report)
+        def advance(done: int, count: int) -> None:
+            if stop.is_set():
+                raise CancelledError
+            bars.update(row, completed=done, total=count)
+
+        return task(name, advance)
 
     with bars, ThreadPoolExecutor(workers) as pool:
         futures = {name: pool.submit(run, name) for name in names}
@@ -111,8 +95,7 @@ def each_camera(
             return {name: future.result() for name, future in futures.items()}
         except BaseException:
             stop.set()
-            for future in futures.values():
-                future.cancel()
+            pool.shutdown(cancel_futures=True)
             raise
 
 
@@ -122,33 +105,18 @@ def digest(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
 
 
-@dataclass(frozen=True)
 class Work:
-    """A folder ``.<name>.prepare`` beside the dataset, with the results of finished stages.
+    """A folder with the results of finished stages; it is created when missing.
 
-    Args:
-        folder: the working folder.
-        used: names of this run's results, by stage.
+    Raises:
+        DataError: when it cannot be created.
     """
 
-    folder: Path
-    used: dict[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def beside(cls, out: Path) -> Work:
-        """The working folder of a dataset; it is created when missing.
-
-        Raises:
-            DataError: when it cannot be created.
-        """
-        folder = out.parent / f".{out.name}.prepare"
-        try:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.used: dict[str, str] = {}  # names of this run's results, by stage
+        with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise DataError(
-                f"{folder} cannot be made ({error.strerror}); choose another out"
-            ) from None
-        return cls(folder)
 
     def place(self, stage: str, key: Any) -> Path:
         """Path of a stage's result; its name contains a digest of its inputs."""
@@ -166,28 +134,20 @@ class Work:
         path = self.place(stage, key).with_suffix(".npz")
         try:
             with np.load(path, allow_pickle=False) as archive:
-                return {name: archive[name] for name in archive.files}
+                return dict(archive)
         except Exception:  # missing or damaged: zip, zlib, numpy and tokenize have their own errors
             pass
         arrays = make()
-        part = path.with_name(f".{path.name}.part")
-        with writing(path):
-            with part.open("wb") as stream:
-                np.savez(stream, **arrays)
-            os.replace(part, path)
+        write_npz(path, **arrays)
         return {name: np.asarray(array) for name, array in arrays.items()}
 
     def forget_others(self) -> None:
         """Removes results with other keys of the stages that this run used."""
         for left in list(self.folder.iterdir()):
             stem = left.name.removesuffix(".npz")
-            if stem[: -KEY_LENGTH - 1] not in self.used or stem in self.used.values():
+            if self.used.get(stem[: -KEY_LENGTH - 1], stem) == stem:
                 continue
             if left.is_dir():
                 shutil.rmtree(left, ignore_errors=True)
             else:
                 left.unlink(missing_ok=True)
-
-    def remove(self) -> None:
-        """Removes the folder."""
-        shutil.rmtree(self.folder, ignore_errors=True)
