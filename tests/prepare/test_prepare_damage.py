@@ -20,14 +20,13 @@ from test_prepare_points3d import write_trc
 import gsgan.prepare.mediapipe as tool
 from gsgan.data.calibration import read_calibration
 from gsgan.data.joints import BODY
-from gsgan.prepare.dataset import publish
 from gsgan.prepare.doubts import Doubts, doubts_about_pictures
 from gsgan.prepare.landmarks import read_detections, read_points3d
 from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.pictures import MaskTidying, PictureFiles, Written, check_values, write_pictures
 from gsgan.prepare.rig import undistort_points
 from gsgan.prepare.sources import Source
-from gsgan.prepare.work import Work
+from gsgan.prepare.work import Work, publish
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 
@@ -197,7 +196,7 @@ def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(tmp_path: Path, m
         replace(start, end)
 
     monkeypatch.setattr(os, "replace", failing)
-    monkeypatch.setattr("gsgan.prepare.dataset.read_capture", lambda _: None)
+    monkeypatch.setattr("gsgan.prepare.work.read_capture", lambda _: None)
     with pytest.raises(DataError, match="cannot be written"):
         publish(new, out)
     assert (out / "out").is_file()

@@ -253,11 +253,11 @@ def _defaults(compose) -> dict:
 # ------------------------------------------------ the MediaPipe tool, without MediaPipe
 
 STUB = """
-import argparse, pathlib, numpy as np, shutil
-parser = argparse.ArgumentParser()
-for name in "source out masks hands rotate threads slot confidence tracking margin".split():
-    parser.add_argument("--" + name, default="")
-given = parser.parse_args()
+import json, pathlib, shutil, sys
+from types import SimpleNamespace
+given = SimpleNamespace(**json.loads(sys.argv[1]))
+names = "hands rotate threads slot confidence tracking margin"
+assert set(names.split()) < set(vars(given))
 name, root = pathlib.Path(given.source).stem, pathlib.Path({root!r})
 if name == {bad!r}:
     raise SystemExit("the stub refuses " + name)

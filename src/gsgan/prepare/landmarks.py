@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,7 @@ EASYMOCAP_KEYS = ("keypoints", "handl2d", "handr2d")
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TRC_HEADER = 5  # lines before the first frame; markers are named in the fourth
 TRC_AXES = [2, 0, 1]  # Pose2Sim writes (y, z, x) so that y is up: columns of x, y, z
+Points3D = tuple[NDArray[np.int64], Float, Float]  # see `read_points3d`
 SYNONYMS = {"bigtoe": "footindex"}  # joint names of other tools, without side
 
 
@@ -43,20 +44,6 @@ class Detections:
     px: Float
     conf: Float
     people: NDArray[np.int64]
-
-
-class Points3D(NamedTuple):
-    """3D joints that another tool triangulated.
-
-    Args:
-        frame_id: ``[F]`` rising.
-        p: ``[F, 33, 3]`` metres, in the calibration's world; NaN = missing.
-        conf: ``[F, 33]`` 0 = missing.
-    """
-
-    frame_id: NDArray[np.int64]
-    p: Float
-    conf: Float
 
 
 def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
@@ -148,16 +135,21 @@ def _read_frame(path: Path) -> tuple[Float, Float, int]:
         keys, people = EASYMOCAP_KEYS, content["annots"]
     else:
         raise DataError(f"{path} has neither 'people' (OpenPose) nor 'annots' (EasyMocap)")
-    read = [_person(path, person, keys) for person in people]
+    try:
+        read = [_person(person, keys) for person in people]
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        sets = ", ".join(f"{n} ({name})" for n, (name, _) in SETS.items())
+        raise DataError(
+            f"{path}: a person must hold '{keys[0]}' with x, y, confidence of {sets} joints "
+            f"({error})"
+        ) from None
     if not read:
         return np.full((ALL, 2), np.nan), np.zeros(ALL), 0
     px, conf = max(read, key=lambda one: float(one[1].sum()))  # the person seen best
     return px, conf, len(read)
 
 
-def _person(path: Path, person: Any, keys: tuple[str, ...]) -> tuple[Float, Float]:
-    if not isinstance(person, Mapping):
-        raise DataError(f"{path}: a person must be an object, found {type(person).__name__}")
+def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Float, Float]:
     px, conf = np.full((ALL, 2), np.nan), np.zeros(ALL)
 
     def put(joints: list[int], triples: Float) -> None:
@@ -165,15 +157,12 @@ def _person(path: Path, person: Any, keys: tuple[str, ...]) -> tuple[Float, Floa
         px[joints] = np.where(seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan)
         conf[joints] = np.where(seen, triples[:, 2], 0.0)
 
-    body = _triples(path, person, keys[0])
+    # OpenPose writes triples flat, EasyMocap in rows.
+    body, *hands = (np.array(person.get(k) or [], np.float64).reshape(-1, 3) for k in keys)
     if len(body):
-        if len(body) not in SETS:
-            sets = ", ".join(f"{n} ({name})" for n, (name, _) in SETS.items())
-            raise DataError(f"{path}: '{keys[0]}' holds {len(body)} joints; known are {sets}")
         numbers = SETS[len(body)][1]
         put(list(numbers), body[list(numbers.values())])
-    for key, part in zip(keys[1:], (LEFT, RIGHT), strict=True):
-        hand = _triples(path, person, key)
+    for hand, part in zip(hands, (LEFT, RIGHT), strict=True):
         if len(hand) == HAND:
             put(list(range(part.start, part.stop)), hand)
     for target, origin in FROM_HANDS.items():
@@ -182,39 +171,35 @@ def _person(path: Path, person: Any, keys: tuple[str, ...]) -> tuple[Float, Floa
     return px, conf
 
 
-def _triples(path: Path, person: Mapping[str, Any], key: str) -> Float:
-    """``[n, 3]`` x, y, confidence; OpenPose writes them flat, EasyMocap in rows."""
-    try:
-        return np.array(person.get(key) or [], np.float64).reshape(-1, 3)
-    except (TypeError, ValueError, OverflowError):
-        raise DataError(f"{path}: '{key}' must hold x, y, confidence for every joint") from None
-
-
 def read_points3d(path: Path) -> Points3D:
-    """3D joints from a .trc file or a folder of EasyMocap JSON files; exact zeros are missing.
+    """3D joints that another tool triangulated: a .trc file, or a folder of EasyMocap JSON files.
+
+    Returns:
+        ``frames [F]`` rising; ``p [F, 33, 3]`` metres, in the calibration's world, NaN = missing,
+        as exact zeros are; ``conf [F, 33]``, 0 = missing.
 
     Raises:
         DataError: when it is neither, damaged, or without shoulders and hips.
     """
-    points = _read_people_folder(path) if path.is_dir() else _read_trc(path)
-    order = np.argsort(points.frame_id)
-    p = np.where((points.p == 0).all(-1, keepdims=True), np.nan, points.p)[order]
-    conf = np.where(known(p), points.conf[order], 0.0)
+    if path.is_dir():
+        files = _json_files(path)
+        both = np.stack([_read_people(file) for file in files.values()])
+        frames, p, conf = np.array(list(files)), both[..., :3], both[..., 3]
+    else:
+        frames, p, conf = _read_trc(path)
+    order = np.argsort(frames)
+    p = np.where((p == 0).all(-1, keepdims=True), np.nan, p)[order]
+    conf = np.where(known(p), conf[order], 0.0)
     p = np.where((conf > 0)[..., None], p, np.nan)
     if not (conf[:, [11, 12, 23, 24]] > 0).any():
         raise DataError(f"{path} has no shoulders and hips; expected a whole body's joints")
-    return Points3D(points.frame_id[order], p, conf)
+    return frames[order], p, conf
 
 
 def without_frozen(p: Float, frames: int) -> tuple[Float, int]:
-    """Points without those that stay exactly the same: gaps that another tool filled.
+    """Points ``p [F, J, 3]`` without gaps that another tool filled, and how many were removed.
 
-    Args:
-        p: ``[F, J, 3]``, NaN = missing.
-        frames: runs of this length or more are removed except for their first frame.
-
-    Returns:
-        The points, and how many were removed.
+    Of a run of exactly equal points, ``frames`` long or longer, only the first stays.
     """
     same = np.zeros(p.shape[:2], bool)
     same[1:] = (np.diff(p, axis=0) == 0).all(-1)
@@ -229,8 +214,8 @@ def without_frozen(p: Float, frames: int) -> tuple[Float, int]:
 def _read_trc(path: Path) -> Points3D:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-        names, values, markers = (lines[i].split("\t") for i in (1, 2, 3))
-        markers = [name for name in markers[2:] if name]
+        names, values = lines[1].split(), lines[2].split()
+        markers = [name for name in lines[3].split("\t")[2:] if name]
         count = 2 + 3 * len(markers)  # frame, time and the coordinates; an empty cell is missing
         rows = [
             [
@@ -240,7 +225,7 @@ def _read_trc(path: Path) -> Points3D:
             for line in lines[TRC_HEADER:]
             if line.strip()
         ]
-        unit = values[names.index("Units")].strip()
+        unit = values[names.index("Units")]
     except (OSError, ValueError, IndexError) as error:
         raise DataError(f"{path} cannot be read as a .trc file ({error})") from None
     if unit not in UNITS:
@@ -251,7 +236,7 @@ def _read_trc(path: Path) -> Points3D:
     for marker, name in enumerate(markers):
         if (joint := _joint(name)) is not None:
             p[:, joint] = read[:, marker]
-    return Points3D(whole_frame_ids(table[:, 0], str(path)), p, np.ones(p.shape[:2]))
+    return whole_frame_ids(table[:, 0], str(path)), p, np.ones(p.shape[:2])
 
 
 def _joint(name: str) -> int | None:
@@ -264,12 +249,6 @@ def _joint(name: str) -> int | None:
     joint = ("left" if side[0][0] == "l" else "right") + SYNONYMS.get(part, part)
     plain = [name.replace("_", "") for name in MEDIAPIPE33.names]
     return plain.index(joint) if joint in plain else None
-
-
-def _read_people_folder(path: Path) -> Points3D:
-    files = _json_files(path)
-    both = np.stack([_read_people(file) for file in files.values()])
-    return Points3D(np.array(list(files)), both[..., :3], both[..., 3])
 
 
 def _read_people(path: Path) -> Float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,7 @@ from gsgan.utils.files import cache_root
 
 TOOL = Path(__file__).parent / "mediapipe_tool"
 SCRIPT, REQUIREMENTS = TOOL / "detect.py", TOOL / "requirements.txt"
+PLACES = ("folder", "python")  # options of the environment, not of the tool
 NEWEST = (3, 12)  # the pinned MediaPipe has no build for later Pythons
 MARKER = ".gsgan-mediapipe"  # written first: a folder with it was made here and may be replaced
 READY = ".ready"  # written last: an environment without it is incomplete
@@ -59,13 +61,16 @@ def run_tool(
         python = ensure_environment(tool, options.setup, say)
 
         def one(name: str, advance: Advance) -> None:
-            slot = missing.index(name) % options.workers
-            command = [str(python), str(SCRIPT), "--source", str(sources[name].path)]
-            command += ["--out", str(results[name]), "--hands", str(int(hands))]
-            command += ["--rotate", str(int(sources[name].rotate)), "--slot", str(slot)]
-            for option in ("threads", "confidence", "tracking", "margin"):
-                command += [f"--{option}", str(getattr(tool, option))]
-            command += ["--masks", str(folders[name])] if masks else []
+            given = {
+                "source": str(sources[name].path),
+                "out": str(results[name]),
+                "masks": str(folders[name]) if masks else "",
+                "hands": hands,
+                "rotate": sources[name].rotate,
+                "slot": missing.index(name) % options.workers,
+                **{key: value for key, value in vars(tool).items() if key not in PLACES},
+            }
+            command = [str(python), str(SCRIPT), json.dumps(given)]
             _detect(command, sources[name].path, advance)
 
         each_camera(one, "finding landmarks", missing, options.workers)
@@ -127,7 +132,7 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
     install = [str(python), "-m", "pip", "install", "--quiet", "--no-deps"]
     install += ["--disable-pip-version-check", "-r", str(REQUIREMENTS)]
     _run(install, "pip cannot install MediaPipe")
-    _run([str(python), str(SCRIPT), "--help"], "MediaPipe does not start")
+    _run([str(python), "-c", "import mediapipe"], "MediaPipe does not start")
     with writing(place):
         (place / READY).touch()
     return python

@@ -1,8 +1,9 @@
-"""The report of a preparation: errors after every stage, overlays, doubts."""
+"""What stands beside the images: cameras, landmarks, and the report of a preparation."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+import gsgan
 from gsgan.check.overlays import LEFT, MIDDLE, RIGHT, caption, draw, encode
 from gsgan.check.report import Figure, Finding, Report, Section, Table, page, print_report
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, PersonCrop, Window, cut, project, resize
+from gsgan.data.crop import NEAR, Crop, PersonCrop, cut, project, resize
 from gsgan.data.files import read_colour, read_grey
-from gsgan.data.joints import BODY
-from gsgan.prepare.dataset import Outcome
-from gsgan.prepare.pictures import sampled
-from gsgan.prepare.rig import FOCAL, Float, Rig, camera_moves, known
-from gsgan.prepare.solve import median
-from gsgan.prepare.work import write_json, writing
+from gsgan.data.joints import BODY, hand_names
+from gsgan.prepare.options import Inputs, Options
+from gsgan.prepare.pictures import Written, sampled
+from gsgan.prepare.rig import FOCAL, Float, Ints, Rig, camera_moves, known
+from gsgan.prepare.solve import Solution, median
+from gsgan.prepare.work import GENERATOR, write_json, write_npz, writing
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.files import write_atomically
 
@@ -39,6 +41,99 @@ LEGEND = (
     "projected; large dots: detections, sides corrected. Green: the mask's outline and box; "
     "yellow: the joints' box."
 )
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Everything that the dataset is made from: ``frames [F]`` numbers, images by camera."""
+
+    options: Options
+    inputs: Inputs
+    frames: Ints
+    solution: Solution
+    written: Mapping[str, Written]
+
+    @property
+    def cameras(self) -> list[CameraEntry]:
+        """The cameras of the written images."""
+        refined = self.solution.rig.entries(self.inputs.cameras)
+        return [self.options.pictures.camera(camera) for camera in refined]
+
+    @property
+    def kept(self) -> set[int]:
+        """Frames with at least one image."""
+        return {frame for one in self.written.values() for frame in one.frames}
+
+
+def write_small_files(root: Path, outcome: Outcome, key: str) -> None:
+    """cameras.json, landmarks3d.npz, hands3d.npz, landmarks2d/, meta.json; ``key`` as `is_there`'s.
+
+    Lengths are in metres, pixels those of the written images.
+    """
+    solution, frames = outcome.solution, outcome.frames
+    cameras = {
+        camera.name: {
+            "K": camera.K.tolist(),
+            "R": camera.R.tolist(),
+            "t": camera.t.tolist(),
+            "dist": [0.0] * 5,
+            "size": [camera.size[1], camera.size[0]],
+        }
+        for camera in outcome.cameras
+    }
+    write_json(root / "cameras.json", cameras)
+    p, conf = solution.p, solution.conf
+    error = solution.error[:, :, :BODY] * outcome.options.pictures.scale
+    seen = np.isfinite(error)
+    mean = np.where(seen, error, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
+    write_npz(
+        root / "landmarks3d.npz",
+        p=p[:, :BODY].astype(np.float32),
+        conf=conf[:, :BODY].astype(np.float32),
+        reproj_px=np.where(seen.any(0), mean, np.nan).astype(np.float32),
+        n_views=solution.views[:, :BODY].astype(np.int16),
+        frame_id=frames,
+        names=np.array(MEDIAPIPE33.names),
+        edges=np.array(MEDIAPIPE33.edges),
+    )
+    if p.shape[1] > BODY:
+        write_npz(
+            root / "hands3d.npz",
+            p=p[:, BODY:].astype(np.float32),
+            conf=conf[:, BODY:].astype(np.float32),
+            frame_id=frames,
+            names=np.array(hand_names()),
+        )
+    for c, camera in enumerate(outcome.cameras) if solution.seen.any() else ():
+        ratio = np.diag(camera.K)[:2] / np.diag(solution.rig.K[c])[:2]
+        write_npz(
+            root / "landmarks2d" / f"{camera.name}.npz",
+            p=(solution.uv[c, :, :BODY] * ratio).astype(np.float32),
+            conf=solution.seen[c, :, :BODY].astype(np.float32),
+            frame_id=frames,
+            undistorted=np.array(True),
+        )
+    meta = {
+        "fps": outcome.inputs.fps,
+        "unit": "m",
+        "up_axis": outcome.options.up_axis or standing_axis(p),
+        "skeleton": "mediapipe33",
+        "pixel_centre": 0.5,
+        "made_by": {"generator": GENERATOR, "version": gsgan.__version__, "key": key},
+    }
+    write_json(root / "meta.json", meta)
+
+
+def standing_axis(p: Float) -> str:
+    """The world axis along which a person ``p [F, J, 3]`` stands: "z", "-y", ...; unknown is "z".
+
+    It is the direction from ankles to nose; NaN = missing.
+    """
+    above = np.concatenate([p[:, 0] - (p[:, 27] + p[:, 28]) / 2, (p[:, 11] - p[:, 23])])
+    above = above[known(above)]
+    up = np.median(above, axis=0) if len(above) else np.array([0.0, 0.0, 1.0])
+    axis = int(np.abs(up).argmax())
+    return ("-" if up[axis] < 0 else "") + "xyz"[axis]
 
 
 def write_report(root: Path, outcome: Outcome, doubts: Sequence[str], console: Console) -> None:
@@ -175,6 +270,6 @@ def _tile(image: Path, mask: Path, camera: CameraEntry, p: Float, uv: Float, siz
     return picture
 
 
-def _placed(pixels: Float, window: Window, size: int) -> Float:
+def _placed(pixels: Float, window: Crop, size: int) -> Float:
     scaled = (pixels - [window.left, window.top]) * (size / window.size[0])
     return np.clip(scaled, -FAR, FAR)

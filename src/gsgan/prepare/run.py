@@ -14,7 +14,6 @@ from rich.console import Console
 
 from gsgan.data.joints import BODY
 from gsgan.data.splits import parse_frames
-from gsgan.prepare.dataset import Outcome, is_there, publish, write_small_files
 from gsgan.prepare.doubts import (
     check_distance,
     doubts_about_detections,
@@ -24,7 +23,6 @@ from gsgan.prepare.doubts import (
 )
 from gsgan.prepare.landmarks import (
     Detections,
-    Points3D,
     find_landmarks,
     gather,
     read_detections,
@@ -33,10 +31,10 @@ from gsgan.prepare.landmarks import (
 from gsgan.prepare.mediapipe import run_tool, tool_key
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options, read_inputs
 from gsgan.prepare.pictures import Written, check_values, find_masks, write_pictures
-from gsgan.prepare.report import write_report
+from gsgan.prepare.report import Outcome, write_report, write_small_files
 from gsgan.prepare.rig import Bool, Ints, Rig, camera_moves, known, undistort_points
 from gsgan.prepare.solve import Solution, adopt, solve
-from gsgan.prepare.work import Advance, Work, digest, each_camera
+from gsgan.prepare.work import Advance, Work, digest, each_camera, is_there, publish
 from gsgan.utils.errors import DataError
 
 STAGE_VERSION = 3  # incremented when the same settings begin to give another result
@@ -136,14 +134,13 @@ def _solved(
     chosen = _chosen(options, frames)
     joints = slice(None if options.hands else BODY)
     frames, px, conf = frames[chosen], px[:, chosen, joints], conf[:, chosen, joints]
-    time, rig = frames / inputs.fps, Rig.of(inputs.cameras)
+    time, rig, lag = frames / inputs.fps, Rig.of(inputs.cameras), options.doubts.lag
     uv = np.stack([undistort_points(c, p) for c, p in zip(inputs.cameras, px, strict=True)])
     flat = uv.reshape(len(rig), -1, 2), conf.reshape(len(rig), -1)
     rough = options.solve.triangulation.plain(rig, *flat)
     check_distance(inputs.cameras, rough, options.doubts, inputs.calibration.path)
-    arrays = (np.ascontiguousarray(a) for a in (rig.K, rig.R, rig.t, uv, conf, time))
+    arrays = (rig.K, rig.R, rig.t, uv, conf, time)
     hashes = [hashlib.sha256(array.tobytes()).hexdigest() for array in arrays]
-    lag = options.doubts.lag
     key = [STAGE_VERSION, options.record()["solve"], lag, hashes]
 
     def make() -> dict[str, NDArray[Any]]:
@@ -155,13 +152,13 @@ def _solved(
 
 def _adopted(options: Options, inputs: Inputs) -> tuple[Ints, Solution]:
     """The joints of another tool."""
-    points = read_points3d(options.folder("landmarks3d"))
-    chosen = _chosen(options, points.frame_id)
-    points = Points3D(points.frame_id[chosen], points.p[chosen], points.conf[chosen])
-    where, p = inputs.calibration.path, points.p.reshape(-1, 3)
-    check_distance(inputs.cameras, p, options.doubts, where)
-    rig, frozen = Rig.of(inputs.cameras), options.doubts.frozen_frames
-    return points.frame_id, adopt(rig, points, inputs.fps, options.solve, frozen)
+    frames, p, conf = read_points3d(options.folder("landmarks3d"))
+    chosen = _chosen(options, frames)
+    frames, p, conf = frames[chosen], p[chosen], conf[chosen]
+    where, limits = inputs.calibration.path, options.doubts
+    check_distance(inputs.cameras, p.reshape(-1, 3), limits, where)
+    rig, time = Rig.of(inputs.cameras), frames / inputs.fps
+    return frames, adopt(rig, time, p, conf, options.solve, limits.frozen_frames)
 
 
 def _chosen(options: Options, frames: Ints) -> Bool:
@@ -187,8 +184,7 @@ def _write_pictures(
     if not posed:
         raise DataError(
             f"{options.landmarks3d or options.landmarks}: no body joint of any frame came out in "
-            "3D; expected landmarks that two cameras see at the same frame number, not NaN and "
-            "with confidence above 0"
+            "3D; expected landmarks that two cameras see at the same frame number"
         )
     cameras = {camera.name: camera for camera in inputs.cameras}
 

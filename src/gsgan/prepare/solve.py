@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.joints import ALL, BODY, flip_groups
 from gsgan.prepare.cleanse import Cleansing, Smoothing, cleanse, smooth
-from gsgan.prepare.landmarks import Points3D, without_frozen
+from gsgan.prepare.landmarks import without_frozen
 from gsgan.prepare.rig import FOCAL, MIN_VIEWS, Bool, Float, Refinement, Rig, known, refine_rig
 from gsgan.prepare.triangulate import FlipSearch, Points, Triangulation, apply_flips, find_flips
 
@@ -148,25 +148,28 @@ def solve(
     )
 
 
-def adopt(rig: Rig, points: Points3D, fps: float, settings: Settings, frozen: int) -> Solution:
+def adopt(
+    rig: Rig, time: Float, p: Float, conf: Float, settings: Settings, frozen: int
+) -> Solution:
     """Another tool's joints, cleansed and smoothed; the cameras stay as calibrated.
 
     Args:
         rig: as calibrated.
-        points: the joints.
-        fps: frames per second.
+        time: ``[F]`` seconds.
+        p: ``[F, 33, 3]`` metres, NaN = missing.
+        conf: ``[F, 33]`` 0 = missing.
         settings: of cleansing and smoothing.
         frozen: runs of identical joints of this length are removed, see `without_frozen`.
     """
-    p, stuck = without_frozen(points.p, frozen)
+    p, stuck = without_frozen(p, frozen)
     p, removed = cleanse(p, settings.cleansing)
-    p = smooth(p, points.conf, points.frame_id / fps, settings.smoothing.seconds)
-    C, (F, J) = len(rig), points.conf.shape
+    p = smooth(p, conf, time, settings.smoothing.seconds)
+    C, (F, J) = len(rig), conf.shape
     unseen, unknown = np.full((C, F, J), np.nan), np.full(C, np.nan)
     return Solution(
         rig=rig,
         p=p,
-        conf=np.where(known(p), points.conf, 0.0),
+        conf=np.where(known(p), conf, 0.0),
         views=np.zeros((F, J), np.int64),
         error=unseen,
         uv=np.full((C, F, J, 2), np.nan),
@@ -211,8 +214,7 @@ def clock_errors(
 
     Args:
         rig: ``C`` cameras.
-        uv: ``[C, F, J, 2]`` undistorted pixels.
-        weight: ``[C, F, J]``.
+        uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
         triangulation: its settings.
         lag: frames tried either way.
 

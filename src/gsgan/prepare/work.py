@@ -1,15 +1,16 @@
-"""The working folder of a run, parallel work with progress bars, and safe writing of files."""
+"""The working folder of a run, parallel work with progress bars, safe writing of the dataset."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
+import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -17,15 +18,17 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from gsgan.data.formats.capture import read_capture
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_atomically
 
 T = TypeVar("T")
 Advance = Callable[[int, int], None]  # takes the number of steps done and in total
+GENERATOR = "gsgan.prepare"
 KEY_LENGTH = 12
 
 
-@contextmanager
+@contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
     """Turns a failure of the disk (full, read-only, not allowed) into a `DataError` with ``path``.
 
@@ -151,3 +154,45 @@ class Work:
                 shutil.rmtree(left, ignore_errors=True)
             else:
                 left.unlink(missing_ok=True)
+
+
+def is_there(out: Path, key: str, overwrite: bool) -> bool:
+    """Whether ``out`` holds the dataset with this key.
+
+    Raises:
+        DataError: when it holds something else and may not be overwritten.
+    """
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return False
+    made_by: Any = None
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        made_by = json.loads((out / "meta.json").read_text()).get("made_by")
+    if not isinstance(made_by, dict) or made_by.get("generator") != GENERATOR:
+        raise DataError(f"{out} holds something else; choose another out")
+    if made_by.get("key") != key and not overwrite:
+        raise DataError(f"{out} was made with other settings; add overwrite=true")
+    return bool(made_by.get("key") == key)
+
+
+def publish(root: Path, out: Path) -> None:
+    """Moves the finished dataset ``root`` to ``out`` in one step; if that fails, an old one stays.
+
+    Raises:
+        DataError: when training could not read it, or it cannot be moved.
+    """
+    try:
+        read_capture(root)
+    except DataError as error:
+        raise DataError(f"nothing was made, because training could not read it: {error}") from None
+    old = out.with_name(f".{out.name}.old")
+    with writing(out):
+        if out.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            os.replace(out, old)
+        try:
+            os.replace(root, out)
+        except OSError:
+            if old.exists():
+                os.replace(old, out)
+            raise
+    shutil.rmtree(old, ignore_errors=True)

@@ -1,7 +1,9 @@
 """Finds body and hand landmarks, and the person's mask, in one video or folder of images.
 
-Runs in its own environment (requirements.txt beside it); `gsgan.prepare.mediapipe` starts it.
-Prints a line ``<images done> <images in total>`` per image. Writes an npz:
+Runs in its own environment (requirements.txt beside it). `gsgan.prepare.mediapipe` starts it with a
+JSON object: source, out, masks (a folder, or empty), hands, rotate, threads (processors; 0 is all),
+slot (number among those that run at once), confidence and tracking (lowest), margin (of the mask's
+crop, share of the person's height). Prints a line ``<images done> <images in total>`` per image. Writes an npz:
 
     px (F,33,2), conf (F,33)     pixels of the image as stored, first pixel's centre at (0.5, 0.5)
     left, right (F,21,2)         the person's hands; NaN = not found
@@ -10,11 +12,13 @@ Prints a line ``<images done> <images in total>`` per image. Writes an npz:
 and masks/%06d.png, 0..255. Depth estimates are not written: they are relative, not metric.
 """
 
-import argparse
+import json
 import os
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 os.environ.setdefault("GLOG_minloglevel", "2")
@@ -28,7 +32,7 @@ JOINTS, HAND = 33, 21
 
 
 def main() -> None:
-    options = parse()
+    options = SimpleNamespace(**json.loads(sys.argv[1]))
     if options.threads and hasattr(os, "sched_setaffinity"):
         # MediaPipe has no option for the number of threads; the allowed processors bound it.
         allowed = sorted(os.sched_getaffinity(0))
@@ -64,21 +68,6 @@ def main() -> None:
     part.replace(out)
 
 
-def parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--source", required=True, help="a video, or a folder of images")
-    parser.add_argument("--out", required=True, help="npz to write")
-    parser.add_argument("--masks", default="", help="folder for masks; none are made without it")
-    parser.add_argument("--hands", type=int, default=1, help="1: find the hands too")
-    parser.add_argument("--rotate", type=int, default=0, help="1: apply rotation metadata")
-    parser.add_argument("--threads", type=int, default=0, help="processors to use; 0: all")
-    parser.add_argument("--slot", type=int, default=0, help="number among those that run at once")
-    parser.add_argument("--confidence", type=float, default=0.5, help="lowest, to find a person")
-    parser.add_argument("--tracking", type=float, default=0.5, help="lowest, to keep tracking")
-    parser.add_argument("--margin", type=float, default=0.15, help="of the mask's crop, share")
-    return parser.parse_args()
-
-
 def open_source(path: Path, rotate: int) -> tuple[int, Iterator[tuple[int, Any]]]:
     """Number of images (0: unknown), and an iterator of (frame number, BGR image)."""
     if path.is_dir():
@@ -111,7 +100,7 @@ def read_video(video: cv2.VideoCapture) -> Iterator[Any]:
 class Detector:
     """The detectors of one video: they track the person from image to image."""
 
-    def __init__(self, options: argparse.Namespace) -> None:
+    def __init__(self, options: SimpleNamespace) -> None:
         solutions = mp.solutions
         common = {
             "model_complexity": 1,  # its weights come with the package
