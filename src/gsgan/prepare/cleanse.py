@@ -45,14 +45,11 @@ class Smoothing:
 
 
 def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
-    """Points with the impossible ones set to NaN, and how many were removed for which reason.
+    """Points ``p [F, J, 3]`` with the impossible ones set to NaN; how many, by reason.
 
     Convention: of a bone with the wrong length the outer end is removed; of a hand with most palm
-    bones wrong, the whole hand. Medians are over all frames, so a person of any size fits.
-
-    Args:
-        p: ``[F, J, 3]`` metres, NaN = missing; J is 33 or 75.
-        settings: thresholds.
+    bones wrong, the whole hand. Medians are over all frames, so a person of any size fits. J is 33
+    or 75; metres.
     """
     p, seen = p.copy(), known(p)
     centre = np.full((len(p), 1, 3), np.nan)

@@ -26,24 +26,16 @@ UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TRC_HEADER = 5  # lines before the first frame; markers are named in the fourth
 TRC_AXES = [2, 0, 1]  # Pose2Sim writes (y, z, x) so that y is up: columns of x, y, z
 Points3D = tuple[NDArray[np.int64], Float, Float]  # see `read_points3d`
-SYNONYMS = {"bigtoe": "footindex"}  # joint names of other tools, without side
 
 
 @dataclass(frozen=True)
 class Detections:
-    """One camera's detections of the 75 joints (33 body, 21 left hand, 21 right hand).
+    """One camera's detections of the 75 joints (33 body, 21 left hand, 21 right hand)."""
 
-    Args:
-        frame_id: ``[F]`` rising.
-        px: ``[F, 75, 2]`` pixels of the image as stored, pixel centres at +0.5; NaN = not seen.
-        conf: ``[F, 75]`` in [0, 1], 0 = not seen.
-        people: ``[F]`` number of persons found.
-    """
-
-    frame_id: NDArray[np.int64]
-    px: Float
-    conf: Float
-    people: NDArray[np.int64]
+    frame_id: NDArray[np.int64]  # [F] rising
+    px: Float  # [F, 75, 2] pixels of the image as stored, pixel centres at +0.5; NaN = not seen
+    conf: Float  # [F, 75] in [0, 1], 0 = not seen
+    people: NDArray[np.int64]  # [F] number of persons found
 
 
 def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
@@ -241,14 +233,10 @@ def _read_trc(path: Path) -> Points3D:
 
 def _joint(name: str) -> int | None:
     """The MediaPipe joint of a marker: LShoulder, left_shoulder, Lknee, LBigToe, Nose."""
-    word = re.sub(r"[^a-z]", "", name.lower())
-    side = re.match(r"left|right|l(?!eft)|r(?!ight)", word)
-    if word == "nose" or side is None:
-        return 0 if word == "nose" else None
-    part = word[side.end() :]
-    joint = ("left" if side[0][0] == "l" else "right") + SYNONYMS.get(part, part)
+    word = re.sub(r"[^a-z]", "", name.lower()).replace("bigtoe", "footindex")
+    word = re.sub("^l(?!eft)", "left", re.sub("^r(?!ight)", "right", word))
     plain = [name.replace("_", "") for name in MEDIAPIPE33.names]
-    return plain.index(joint) if joint in plain else None
+    return plain.index(word) if word in plain else None
 
 
 def _read_people(path: Path) -> Float:

@@ -18,7 +18,6 @@ from gsgan.utils.files import cache_root
 
 TOOL = Path(__file__).parent / "mediapipe_tool"
 SCRIPT, REQUIREMENTS = TOOL / "detect.py", TOOL / "requirements.txt"
-PLACES = ("folder", "python")  # options of the environment, not of the tool
 NEWEST = (3, 12)  # the pinned MediaPipe has no build for later Pythons
 MARKER = ".gsgan-mediapipe"  # written first: a folder with it was made here and may be replaced
 READY = ".ready"  # written last: an environment without it is incomplete
@@ -40,10 +39,7 @@ def tool_key(tool: MediaPipe) -> list[object]:
 def run_tool(
     options: Options, sources: Mapping[str, Source], work: Work, say: Callable[[str], None]
 ) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
-    """Runs MediaPipe on every source without a stored result.
-
-    Returns:
-        By source: the npz of landmarks, and the masks by frame number.
+    """The npz of landmarks and the masks by frame number of each source; runs what is not stored.
 
     Raises:
         ConfigError: when the environment is missing and may not be created.
@@ -64,11 +60,11 @@ def run_tool(
             given = {
                 "source": str(sources[name].path),
                 "out": str(results[name]),
-                "masks": str(folders[name]) if masks else "",
+                "masks": str(folders[name]) * masks,
                 "hands": hands,
                 "rotate": sources[name].rotate,
                 "slot": missing.index(name) % options.workers,
-                **{key: value for key, value in vars(tool).items() if key not in PLACES},
+                **vars(tool),
             }
             command = [str(python), str(SCRIPT), json.dumps(given)]
             _detect(command, sources[name].path, advance)
@@ -106,9 +102,8 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
     """The environment's Python; a missing environment is created if ``setup`` allows it.
 
     Raises:
-        ConfigError: when it is missing and may not be created, its folder holds something else, or
-            no suitable Python is found.
-        DataError: when it cannot be created.
+        ConfigError: when it may not be created, its folder is in use, or no Python fits.
+        DataError: when creating it fails.
     """
     place = environment_of(tool)
     python = place / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
@@ -119,7 +114,10 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
             f"landmarks=mediapipe needs its own environment at {place}: add setup=true to create "
             "it (some 400 MB), or give landmarks=<folder> and masks=<folder>"
         )
-    base = tool.python or _base_python()
+    pythons = [tool.python, sys.executable if sys.version_info[:2] <= NEWEST else None]
+    base = next(filter(None, (*pythons, *map(shutil.which, ("python3.12", "python3.11")))), None)
+    if base is None:
+        raise ConfigError("MediaPipe needs Python 3.11 or 3.12: set mediapipe.python=<path>")
     with writing(place):
         if place.exists():
             if any(place.iterdir()) and not (place / MARKER).is_file():
@@ -138,17 +136,6 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
     return python
 
 
-def _base_python() -> str:
-    if sys.version_info[:2] <= NEWEST:
-        return sys.executable
-    for minor in (12, 11):
-        if found := shutil.which(f"python3.{minor}"):
-            return found
-    raise ConfigError(
-        "MediaPipe 0.10.21 needs Python 3.11 or 3.12; set mediapipe.python=/path/to/python3.12"
-    )
-
-
 def _run(command: list[str], what: str) -> None:
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -159,5 +146,4 @@ def _run(command: list[str], what: str) -> None:
 
 
 def _last_line(text: str) -> str:
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return lines[-1] if lines else "it ended without a message"
+    return (text.strip().splitlines() or ["it ended without a message"])[-1].strip()

@@ -123,20 +123,12 @@ class Options:
 
 @dataclass(frozen=True)
 class Inputs:
-    """Images and the cameras that took them.
-
-    Args:
-        sources: by name.
-        calibration: the file.
-        cameras: in the order of the sources, with their names and sizes.
-        notes: one sentence for each thing that was converted or left out.
-        fps: frames per second.
-    """
+    """Images and the cameras that took them."""
 
     sources: Mapping[str, Source]
     calibration: Calibration
-    cameras: tuple[CameraEntry, ...]
-    notes: tuple[str, ...]
+    cameras: tuple[CameraEntry, ...]  # in the order of the sources, with their names and sizes
+    notes: tuple[str, ...]  # one sentence for each thing that was converted or left out
     fps: float
 
 

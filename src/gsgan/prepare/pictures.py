@@ -64,17 +64,11 @@ class PictureFiles:
 
 @dataclass(frozen=True)
 class Written:
-    """The result of writing one camera's images.
+    """The result of writing one camera's images."""
 
-    Args:
-        frames: common numbers that exist now.
-        empty: number of empty masks among them.
-        decoded: images that the source gave before it ended; None when it was not read to its end.
-    """
-
-    frames: list[int]
-    empty: int
-    decoded: int | None
+    frames: list[int]  # common numbers that exist now
+    empty: int  # empty masks among them
+    decoded: int | None  # images of the source; None when it was not read to its end
 
 
 def sampled(count: int, most: int) -> list[int]:
@@ -104,19 +98,13 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
 
 
 def check_values(folder: Path, files: Mapping[int, Path]) -> None:
-    """Rejects 0 and 1, or part numbers, which would mean a nearly transparent person.
-
-    A single faint mask is legitimate (someone leaves the image), so several are read.
-
-    Raises:
-        DataError: when no pixel of them reaches `PERSON`, or one is damaged.
-    """
+    """Refuses part numbers, or 0 and 1, with a DataError; one faint mask alone is legitimate."""
     paths = [files[number] for number in sorted(files)]
     highest = max((int(read_grey(paths[i]).max()) for i in sampled(len(paths), PROBED)), default=0)
     if 0 < highest < PERSON:
         raise DataError(
             f"{folder} holds masks with values up to {highest}; small numbers are labels, expected "
-            "alpha from 0 to 255 (write the person as 255)"
+            "alpha from 0 to 255"
         )
 
 
@@ -149,19 +137,17 @@ def write_pictures(
     Args:
         root: the dataset.
         camera: as calibrated, lens included.
-        source: its images.
-        masks: by the source's own frame number, of the images as stored.
+        source, masks: its images, and mask files by the source's own frame number.
         frames: common frame numbers to write; those without a mask are skipped.
         offset: added to a source's number to get the common one.
-        files: formats and scale.
-        tidying: of the masks.
-        advance: called after each frame with the number of frames done and in total.
+        files, tidying: settings.
+        advance: called for each frame.
 
     Raises:
         DataError: when an image or mask is damaged or of the wrong size, or the disk is full.
     """
-    image_folder, mask_folder = root / "images" / camera.name, root / "masks" / camera.name
-    for folder in (image_folder, mask_folder):
+    images, alphas = root / "images" / camera.name, root / "masks" / camera.name
+    for folder in (images, alphas):
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
     window, size = Crop(0, 0, camera.size), files.camera(camera).size
@@ -178,22 +164,19 @@ def write_pictures(
         advance(len(written), len(frames))
         mask = tidy(read_grey(masks[number]), tidying)
         empty += not mask.any()
-        image_path = image_folder / f"{frame:06d}.{files.format}"
-        for pixels, path in ((picture, image_path), (mask, mask_folder / f"{frame:06d}.png")):
+        for pixels, folder, kind in ((picture, images, files.format), (mask, alphas, "png")):
             if pixels.shape[:2] != camera.size:
+                where = masks[number] if pixels is mask else source.path
                 raise DataError(
-                    f"{masks[number] if pixels is mask else source.path}: frame {number} is "
-                    f"{pixels.shape[1]}x{pixels.shape[0]} pixels, expected "
-                    f"{camera.size[1]}x{camera.size[0]}"
+                    f"{where}: frame {number} is {pixels.shape[1]}x{pixels.shape[0]} pixels, "
+                    f"expected {camera.size[1]}x{camera.size[0]}"
                 )
             straight = resize(take(pixels, window, mapping, exact=False), size, exact=False)
-            _write(path, straight, files.quality)
+            _write(folder / f"{frame:06d}.{kind}", straight, files.quality)
     return Written(written, empty, decoded)
 
 
 def _write(path: Path, pixels: Bytes, quality: int) -> None:
-    options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
-    if path.suffix == ".jpg":
-        options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+    options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION, cv2.IMWRITE_JPEG_QUALITY, quality]
     with writing(path):  # in place: a run that was killed here writes all of them again
         path.write_bytes(cv2.imencode(path.suffix, pixels, options)[1].tobytes())

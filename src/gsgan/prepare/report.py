@@ -29,7 +29,6 @@ from gsgan.utils.files import write_atomically
 
 Bytes = NDArray[np.uint8]
 BAR = (70, 70, 70)
-EMPTY = 60  # grey of a tile without image
 FAR = 10_000  # pixels: drawing stops there
 AGREEMENT = (
     "Median reprojection error in pixels of the full-size image, over all detections, after plain "
@@ -59,26 +58,13 @@ class Outcome:
         refined = self.solution.rig.entries(self.inputs.cameras)
         return [self.options.pictures.camera(camera) for camera in refined]
 
-    @property
-    def kept(self) -> set[int]:
-        """Frames with at least one image."""
-        return {frame for one in self.written.values() for frame in one.frames}
-
 
 def write_small_files(root: Path, outcome: Outcome, key: str) -> None:
-    """cameras.json, landmarks3d.npz, hands3d.npz, landmarks2d/, meta.json; ``key`` as `is_there`'s.
-
-    Lengths are in metres, pixels those of the written images.
-    """
+    """cameras.json, landmarks3d.npz, hands3d.npz, landmarks2d/, meta.json, in metres and pixels."""
     solution, frames = outcome.solution, outcome.frames
     cameras = {
-        camera.name: {
-            "K": camera.K.tolist(),
-            "R": camera.R.tolist(),
-            "t": camera.t.tolist(),
-            "dist": [0.0] * 5,
-            "size": [camera.size[1], camera.size[0]],
-        }
+        camera.name: {key: getattr(camera, key).tolist() for key in ("K", "R", "t")}
+        | {"dist": [0.0] * 5, "size": list(camera.size[::-1])}
         for camera in outcome.cameras
     }
     write_json(root / "cameras.json", cameras)
@@ -186,7 +172,8 @@ def _numbers(outcome: Outcome, doubts: Sequence[str]) -> dict[str, Any]:
         }
         for c, name in enumerate(inputs.sources)
     }
-    found, kept = known(solution.p[:, :BODY]).mean(0), outcome.kept
+    found = known(solution.p[:, :BODY]).mean(0)
+    kept = {frame for one in outcome.written.values() for frame in one.frames}
     return {
         "error_px": {stage: median(error) for stage, error in solution.stages.items()},
         "cameras": by_camera,
@@ -232,26 +219,24 @@ def _number(value: float, form: str) -> str:
 
 def _figures(root: Path, outcome: Outcome) -> tuple[Figure, ...]:
     """Per camera, its tiles of some frames side by side."""
-    options, kept, figures = outcome.options, sorted(outcome.kept), []
-    chosen = [kept[i] for i in sampled(len(kept), options.overlays.frames)]
-    for c, camera in enumerate(outcome.cameras if chosen else ()):
-        ratio, tiles = np.diag(camera.K)[:2] / np.diag(outcome.solution.rig.K[c])[:2], []
-        for frame in chosen:
+    options, figures = outcome.options, []
+    for c, camera in enumerate(outcome.cameras):
+        ratio = np.diag(camera.K)[:2] / np.diag(outcome.solution.rig.K[c])[:2]
+        frames, tiles = outcome.written[camera.name].frames, []
+        for frame in (frames[i] for i in sampled(len(frames), options.overlays.frames)):
             at = np.searchsorted(outcome.frames, frame)
             p, uv = outcome.solution.p[at, :BODY], outcome.solution.uv[c, at, :BODY] * ratio
             image = root / "images" / camera.name / f"{frame:06d}.{options.pictures.format}"
             mask = root / "masks" / camera.name / f"{frame:06d}.png"
             tile = _tile(image, mask, camera, p, uv, options.overlays.size)
             tiles.append(caption(tile, f"{camera.name}  frame {frame}", BAR))
-        title = f"{camera.name}: frames {', '.join(map(str, chosen))}"
-        figures.append(Figure(title, picture=encode(np.concatenate(tiles, axis=1))))
+        if tiles:
+            figures.append(Figure(camera.name, encode(np.concatenate(tiles, axis=1))))
     return tuple(figures)
 
 
 def _tile(image: Path, mask: Path, camera: CameraEntry, p: Float, uv: Float, size: int) -> Bytes:
     """Joints ``p [33, 3]``, detections ``uv [33, 2]`` and mask on the image around the person."""
-    if not image.is_file():
-        return np.full((size, size, 3), EMPTY, np.uint8)
     pixels, depth = project(camera, np.nan_to_num(p))
     drawn = known(p) & (depth > NEAR)
     window = PersonCrop().window(camera, np.nan_to_num(p), drawn)

@@ -148,11 +148,9 @@ def refine_rig(
     Cauchy's; K is fixed. Points with fewer than two views are left out.
 
     Args:
-        given: centre of the priors.
-        start: initial value, usually the same.
+        given, start: centre of the priors, and the initial value.
         p: ``[N, 3]`` metres, initial values, NaN where missing.
-        uv: ``[C, N, 2]`` undistorted pixels.
-        weight: ``[C, N]`` confidence, 0 where unseen.
+        uv, weight: ``[C, N, 2]`` undistorted pixels; their confidence, 0 where unseen.
         settings: scale, priors, steps.
     """
     weight = np.where(known(uv), weight, 0.0)

@@ -34,6 +34,7 @@ from gsgan.prepare.pictures import Written, check_values, find_masks, write_pict
 from gsgan.prepare.report import Outcome, write_report, write_small_files
 from gsgan.prepare.rig import Bool, Ints, Rig, camera_moves, known, undistort_points
 from gsgan.prepare.solve import Solution, adopt, solve
+from gsgan.prepare.sources import stamp
 from gsgan.prepare.work import Advance, Work, digest, each_camera, is_there, publish
 from gsgan.utils.errors import DataError
 
@@ -47,8 +48,7 @@ def prepare(options: Options, console: Console) -> Path:
         Its folder.
 
     Raises:
-        DataError: on anything wrong with the images, calibration, landmarks or masks.
-        ConfigError: on options that do not fit the data.
+        GsganError: on anything the user can correct.
     """
     out = options.folder("out")
     inputs = read_inputs(options)
@@ -67,8 +67,11 @@ def prepare(options: Options, console: Console) -> Path:
     written = _write_pictures(options, inputs, masks, frames, solution, root)
     outcome = Outcome(options, inputs, frames, solution, written)
     write_small_files(root, outcome, key)
-    moves, limits = camera_moves(Rig.of(inputs.cameras), solution.rig), options.doubts
-    clocks = solution.delay, solution.gain
+    moves, clocks = (
+        camera_moves(Rig.of(inputs.cameras), solution.rig),
+        (solution.delay, solution.gain),
+    )
+    limits = options.doubts
     doubts = [
         *doubts_about_sources(inputs.sources, limits),
         *doubts_about_pictures(inputs.sources, written, limits),
@@ -98,8 +101,7 @@ def _fingerprint(options: Options, inputs: Inputs) -> list[object]:
     for name in ("landmarks", "landmarks3d", "masks"):
         if getattr(options, name) not in (None, MEDIAPIPE):
             place = options.folder(name)
-            files = sorted(p for p in (place, *place.rglob("*")) if p.is_file())
-            parts += [(str(p), p.stat().st_size, p.stat().st_mtime_ns) for p in files]
+            parts += [stamp(p) for p in sorted((place, *place.rglob("*"))) if p.is_file()]
     return [*parts, tool_key(options.mediapipe) if options.needs_tool else None]
 
 
@@ -186,19 +188,10 @@ def _write_pictures(
             f"{options.landmarks3d or options.landmarks}: no body joint of any frame came out in "
             "3D; expected landmarks that two cameras see at the same frame number"
         )
-    cameras = {camera.name: camera for camera in inputs.cameras}
+    cameras, offsets = {camera.name: camera for camera in inputs.cameras}, options.offsets or {}
 
     def one(name: str, advance: Advance) -> Written:
-        return write_pictures(
-            root,
-            cameras[name],
-            inputs.sources[name],
-            masks[name],
-            posed,
-            (options.offsets or {}).get(name, 0),
-            options.pictures,
-            options.mask_tidying,
-            advance,
-        )
+        given = cameras[name], inputs.sources[name], masks[name], posed, offsets.get(name, 0)
+        return write_pictures(root, *given, options.pictures, options.mask_tidying, advance)
 
     return each_camera(one, "writing images", list(cameras), options.workers)

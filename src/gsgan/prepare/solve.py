@@ -12,7 +12,17 @@ from numpy.typing import NDArray
 from gsgan.data.joints import ALL, BODY, flip_groups
 from gsgan.prepare.cleanse import Cleansing, Smoothing, cleanse, smooth
 from gsgan.prepare.landmarks import without_frozen
-from gsgan.prepare.rig import FOCAL, MIN_VIEWS, Bool, Float, Refinement, Rig, known, refine_rig
+from gsgan.prepare.rig import (
+    FOCAL,
+    MIN_VIEWS,
+    Bool,
+    Float,
+    Ints,
+    Refinement,
+    Rig,
+    known,
+    refine_rig,
+)
 from gsgan.prepare.triangulate import FlipSearch, Points, Triangulation, apply_flips, find_flips
 
 ARRAYS = ("p", "conf", "views", "error", "uv", "seen", "flips", "delay", "gain")
@@ -31,34 +41,20 @@ class Settings:
 
 @dataclass(frozen=True)
 class Solution:
-    """Joints, cameras, and how well they agree.
+    """Joints, cameras, and how well they agree; NaN = missing or not seen."""
 
-    Args:
-        rig: refined.
-        p: ``[F, J, 3]`` metres, NaN = missing.
-        conf: ``[F, J]`` mean confidence of the cameras that see the joint, 0 where missing.
-        views: ``[F, J]`` cameras whose detection lies within the triangulation's ``scale``.
-        error: ``[C, F, J]`` final reprojection error, full-size undistorted pixels, NaN = not seen.
-        uv: ``[C, F, J, 2]`` undistorted detections with the sides corrected.
-        seen: ``[C, F, J]`` their confidence.
-        flips: ``[C, F, G]`` sides that were swapped.
-        delay, gain: ``[C]`` of each camera's clock, see `clock_errors`.
-        stages: name of each stage and its body errors ``[C, F, 33]``.
-        removed: number of joints removed, by reason.
-    """
-
-    rig: Rig
-    p: Float
-    conf: Float
-    views: NDArray[np.int64]
-    error: Float
-    uv: Float
-    seen: Float
-    flips: Bool
-    delay: Float
-    gain: Float
-    stages: dict[str, Float]
-    removed: dict[str, int]
+    rig: Rig  # refined
+    p: Float  # [F, J, 3] metres
+    conf: Float  # [F, J] mean confidence of the cameras that see the joint, 0 where missing
+    views: Ints  # [F, J] cameras whose detection lies within the triangulation's scale
+    error: Float  # [C, F, J] final reprojection error, full-size undistorted pixels
+    uv: Float  # [C, F, J, 2] undistorted detections with the sides corrected
+    seen: Float  # [C, F, J] their confidence
+    flips: Bool  # [C, F, G] sides that were swapped
+    delay: Float  # [C] of each camera's clock, see `clock_errors`
+    gain: Float  # [C] the same
+    stages: dict[str, Float]  # name of each stage and its body errors [C, F, 33]
+    removed: dict[str, int]  # number of joints removed, by reason
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """All of it as plain arrays."""

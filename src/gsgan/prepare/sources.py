@@ -24,34 +24,19 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Source:
-    """One camera's video or folder of images.
+    """One camera's video or folder of images."""
 
-    Args:
-        name: file stem or folder name.
-        path: of the video or folder.
-        size: ``(H, W)`` pixels as read.
-        fps: frames per second, None for images or when the video does not have it.
-        files: of a folder, by number; empty for a video.
-        count: images; for a video its header's value, which may be wrong.
-        turned: degrees of rotation in the video's metadata.
-        rotate: whether that rotation is applied.
-    """
-
-    name: str
-    path: Path
-    size: tuple[int, int]
-    fps: float | None
-    files: Mapping[int, Path]
-    count: int
-    turned: int = 0
-    rotate: bool = False
+    name: str  # file stem or folder name
+    path: Path  # of the video or folder
+    size: tuple[int, int]  # (H, W) pixels as read
+    fps: float | None  # None for images or when the video does not have it
+    files: Mapping[int, Path]  # of a folder, by number; empty for a video
+    count: int  # images; for a video its header's value, which may be wrong
+    turned: int = 0  # degrees of rotation in the video's metadata
+    rotate: bool = False  # whether that rotation is applied
 
     def pictures(self) -> Iterator[tuple[int, Bytes]]:
-        """(number, BGR image ``[H, W, 3]``), in order; a video's are numbered from 0.
-
-        Raises:
-            DataError: when an image is damaged or the video cannot be opened.
-        """
+        """(number, BGR image ``[H, W, 3]``), in order; a video's are numbered from 0."""
         if not self.files:
             yield from enumerate(_decoded(_open(self.path, self.rotate)))
         for number, path in self.files.items():
@@ -60,11 +45,12 @@ class Source:
     def fingerprint(self) -> list[str | int]:
         """Names, sizes and times of the files: changes when the images do."""
         paths = list(self.files.values()) if self.files else [self.path]
-        return [
-            part
-            for path in paths
-            for part in (path.name, path.stat().st_size, path.stat().st_mtime_ns)
-        ]
+        return [part for path in paths for part in stamp(path)]
+
+
+def stamp(path: Path) -> tuple[str, int, int]:
+    """Name, size and time of a file: changes when its content does."""
+    return path.name, path.stat().st_size, path.stat().st_mtime_ns
 
 
 def find_sources(folder: Path, rotate: bool = False) -> dict[str, Source]:

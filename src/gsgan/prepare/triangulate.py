@@ -25,17 +25,11 @@ Pairs = tuple[tuple[int, int], ...]
 
 @dataclass(frozen=True)
 class Points:
-    """Triangulated points.
+    """Triangulated points."""
 
-    Args:
-        p: ``[N, 3]`` metres, NaN where missing.
-        weight: ``[C, N]`` final weight of each detection, 0 where it was not used.
-        error: ``[C, N]`` reprojection error in undistorted pixels, NaN where nothing was seen.
-    """
-
-    p: Float
-    weight: Float
-    error: Float
+    p: Float  # [N, 3] metres, NaN where missing
+    weight: Float  # [C, N] final weight of each detection, 0 where it was not used
+    error: Float  # [C, N] reprojection error in undistorted pixels, NaN where nothing was seen
 
 
 @dataclass(frozen=True)
@@ -59,8 +53,8 @@ class Triangulation:
 
         Args:
             rig: ``C`` cameras.
-            uv: ``[C, N, 2]`` undistorted pixels; ignored where the weight is 0.
-            weight: ``[C, N]`` at least 0.
+            uv: ``[C, N, 2]`` undistorted pixels, NaN allowed where the weight is 0.
+            weight: ``[C, N]`` confidence, at least 0.
 
         Returns:
             ``[N, 3]`` metres, NaN where fewer than two cameras have a weight.
@@ -72,13 +66,8 @@ class Triangulation:
 
         Convention: the loss is Cauchy's, ``log(1 + (r/scale)²)`` of the reprojection error r, times
         the weight. A point is NaN with fewer than two weighted views, with rays too parallel
-        (``max_elongation``), or when its detections contradict each other (``max_error``).
-
-        Args:
-            rig: ``C`` cameras.
-            uv: ``[C, N, 2]`` undistorted pixels, NaN allowed where the weight is 0.
-            weight: ``[C, N]`` confidence, at least 0.
-            iterations: of reweighting.
+        (``max_elongation``), or when its detections contradict each other (``max_error``). Arguments
+        as for `plain`; ``iterations`` of reweighting.
         """
         starts = range(0, max(uv.shape[1], 1), CHUNK)
         chunks = [slice(start, start + CHUNK) for start in starts]
@@ -191,8 +180,7 @@ def find_flips(
 
     Args:
         rig: ``C`` cameras.
-        uv: ``[C, F, J, 2]`` undistorted pixels.
-        weight: ``[C, F, J]`` confidence.
+        uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
         groups: ``G`` tuples of (left, right) joints that swap together.
         search: thresholds.
         triangulation: scale and limits.

@@ -30,11 +30,7 @@ KEY_LENGTH = 12
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turns a failure of the disk (full, read-only, not allowed) into a `DataError` with ``path``.
-
-    Raises:
-        DataError: naming ``path``.
-    """
+    """Turns an `OSError` (disk full, read-only, not allowed) into a `DataError` with ``path``."""
     try:
         yield
     except OSError as error:
@@ -109,11 +105,7 @@ def digest(content: Any) -> str:
 
 
 class Work:
-    """A folder with the results of finished stages; it is created when missing.
-
-    Raises:
-        DataError: when it cannot be created.
-    """
+    """A folder with the results of finished stages; it is created when missing."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -129,11 +121,7 @@ class Work:
     def arrays(
         self, stage: str, key: Any, make: Callable[[], dict[str, Any]]
     ) -> dict[str, np.ndarray]:
-        """Arrays of an earlier run with the same key, or made and stored now.
-
-        Raises:
-            DataError: when they cannot be written.
-        """
+        """Arrays of an earlier run with the same key, or made and stored now."""
         path = self.place(stage, key).with_suffix(".npz")
         try:
             with np.load(path, allow_pickle=False) as archive:

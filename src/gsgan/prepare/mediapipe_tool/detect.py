@@ -3,7 +3,8 @@
 Runs in its own environment (requirements.txt beside it). `gsgan.prepare.mediapipe` starts it with a
 JSON object: source, out, masks (a folder, or empty), hands, rotate, threads (processors; 0 is all),
 slot (number among those that run at once), confidence and tracking (lowest), margin (of the mask's
-crop, share of the person's height). Prints a line ``<images done> <images in total>`` per image. Writes an npz:
+crop, share of the person's height). Prints a line ``<images done> <images in total>`` per image.
+Writes an npz:
 
     px (F,33,2), conf (F,33)     pixels of the image as stored, first pixel's centre at (0.5, 0.5)
     left, right (F,21,2)         the person's hands; NaN = not found
@@ -57,7 +58,6 @@ def main() -> None:
             if mask is not None:
                 cv2.imwrite(str(folder / f"{frame:06d}.png"), mask)
         print(done, max(done, count), flush=True)
-    detector.close()
     if not found:
         raise SystemExit(f"{options.source} holds no image that can be decoded")
     out = Path(options.out)
@@ -91,10 +91,8 @@ def read_picture(path: Path) -> Any:
 
 
 def read_video(video: cv2.VideoCapture) -> Iterator[Any]:
-    ok, picture = video.read()
-    while ok:
-        yield picture
-        ok, picture = video.read()
+    while (read := video.read())[0]:
+        yield read[1]
 
 
 class Detector:
@@ -114,10 +112,6 @@ class Detector:
         self.segmenter = solutions.pose.Pose(
             static_image_mode=True, enable_segmentation=True, **common
         )
-
-    def close(self) -> None:
-        self.body.close()
-        self.segmenter.close()
 
     def landmarks(self, picture: Any) -> dict[str, Any]:
         found = self.body.process(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
