@@ -199,7 +199,7 @@ def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(tmp_path: Path, m
     monkeypatch.setattr("gsgan.prepare.work.read_capture", lambda _: None)
     with pytest.raises(DataError, match="cannot be written"):
         publish(new, out)
-    assert (out / "out").is_file()
+    assert (tmp_path / ".out.old" / "out").is_file()
 
 
 @pytest.mark.parametrize(

@@ -92,8 +92,7 @@ def smooth(p: Float, weight: Float, time: Float, seconds: float) -> Float:
     time, which `scipy.signal.savgol_filter` does not have.)
 
     Args:
-        p: ``[F, J, 3]`` metres, NaN = missing.
-        weight: ``[F, J]`` at least 0.
+        p, weight: ``[F, J, 3]`` metres, NaN = missing, and ``[F, J]`` at least 0.
         time: ``[F]`` seconds, rising; it need not be even.
         seconds: standard deviation of the Gaussian neighbourhood.
     """

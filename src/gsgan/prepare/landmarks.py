@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.files import frame_files, read_arrays, read_json, read_json_value
 from gsgan.data.joints import ALL, BODY, FROM_HANDS, HAND, LEFT, RIGHT, SETS
 from gsgan.data.skeletons import whole_frame_ids
-from gsgan.prepare.rig import Float, known
+from gsgan.prepare.rig import Float, Ints, known
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import DataError
@@ -25,17 +24,17 @@ EASYMOCAP_KEYS = ("keypoints", "handl2d", "handr2d")
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TRC_HEADER = 5  # lines before the first frame; markers are named in the fourth
 TRC_AXES = [2, 0, 1]  # Pose2Sim writes (y, z, x) so that y is up: columns of x, y, z
-Points3D = tuple[NDArray[np.int64], Float, Float]  # see `read_points3d`
+Numbered = tuple[Ints, Float, Float]  # frame numbers, coordinates, confidence
 
 
 @dataclass(frozen=True)
 class Detections:
     """One camera's detections of the 75 joints (33 body, 21 left hand, 21 right hand)."""
 
-    frame_id: NDArray[np.int64]  # [F] rising
+    frame_id: Ints  # [F] rising
     px: Float  # [F, 75, 2] pixels of the image as stored, pixel centres at +0.5; NaN = not seen
     conf: Float  # [F, 75] in [0, 1], 0 = not seen
-    people: NDArray[np.int64]  # [F] number of persons found
+    people: Ints  # [F] number of persons found
 
 
 def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
@@ -63,17 +62,23 @@ def read_detections(path: Path) -> Detections:
     Raises:
         DataError: on a damaged file or an unknown set of joints.
     """
-    detections = _read_folder(path) if path.is_dir() else _read_npz(path)
-    order = np.argsort(detections.frame_id)
-    conf = np.where(known(detections.px), np.nan_to_num(detections.conf), 0.0)
+    if path.is_dir():
+        files = _json_files(path)
+        px, conf, people = map(np.array, zip(*map(_read_frame, files.values()), strict=True))
+        frames = np.array(list(files))
+    else:
+        frames, px, conf = _read_npz(path)
+        people = np.asarray((conf[:, :BODY] > 0).any(1), np.int64)
+    order = np.argsort(frames)
+    conf = np.where(known(px), np.nan_to_num(conf), 0.0)
     conf = np.clip(conf, 0.0, 1.0)[order]
-    px = np.where(conf[..., None] > 0, detections.px[order], np.nan)
-    return Detections(detections.frame_id[order], px, conf, detections.people[order])
+    px = np.where(conf[..., None] > 0, px[order], np.nan)
+    return Detections(frames[order], px, conf, people[order])
 
 
 def gather(
     detections: Mapping[str, Detections], offsets: Mapping[str, int]
-) -> tuple[NDArray[np.int64], Float, Float]:
+) -> tuple[Ints, Float, Float]:
     """All cameras' detections by common frame numbers, a camera's own plus its offset.
 
     Returns:
@@ -91,7 +96,7 @@ def gather(
     return frames, px, conf
 
 
-def _read_npz(path: Path) -> Detections:
+def _read_npz(path: Path) -> Numbered:
     arrays = read_arrays(path, ("px", "conf", "left", "right", "frame_id"))
     body = expect_array(arrays, "px", (None, BODY, 2), path).astype(np.float64)
     F = len(body)
@@ -102,8 +107,7 @@ def _read_npz(path: Path) -> Detections:
         if name in arrays:
             px[:, part] = expect_array(arrays, name, (F, HAND, 2), path)
             conf[:, part] = 1.0  # MediaPipe has no confidence per hand joint
-    people = np.asarray((conf[:, :BODY] > 0).any(1), np.int64)
-    return Detections(frame_id, px, conf, people)
+    return frame_id, px, conf
 
 
 def _json_files(path: Path) -> dict[int, Path]:
@@ -111,12 +115,6 @@ def _json_files(path: Path) -> dict[int, Path]:
     if not files:
         raise DataError(f"{path} holds no JSON files; expected one per frame, numbered")
     return {number: path.parent / files[number] for number in sorted(files)}
-
-
-def _read_folder(path: Path) -> Detections:
-    files = _json_files(path)
-    px, conf, people = zip(*map(_read_frame, files.values()), strict=True)
-    return Detections(np.array(list(files)), np.stack(px), np.stack(conf), np.array(people))
 
 
 def _read_frame(path: Path) -> tuple[Float, Float, int]:
@@ -163,7 +161,7 @@ def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Float, Fl
     return px, conf
 
 
-def read_points3d(path: Path) -> Points3D:
+def read_points3d(path: Path) -> Numbered:
     """3D joints that another tool triangulated: a .trc file, or a folder of EasyMocap JSON files.
 
     Returns:
@@ -203,7 +201,7 @@ def without_frozen(p: Float, frames: int) -> tuple[Float, int]:
     return np.where(frozen[..., None], np.nan, p), int(frozen.sum())
 
 
-def _read_trc(path: Path) -> Points3D:
+def _read_trc(path: Path) -> Numbered:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
         names, values = lines[1].split(), lines[2].split()

@@ -113,8 +113,6 @@ def tidy(mask: Bytes, settings: MaskTidying) -> Bytes:
     low, high = (255 * level for level in settings.levels)
     table = np.clip((np.arange(256) - low) / (high - low), 0, 1)
     mask = np.asarray(cv2.LUT(mask, np.round(255 * table).astype(np.uint8)), np.uint8)
-    if settings.least_blob == 0:
-        return mask
     _, labels, stats, _ = cv2.connectedComponentsWithStats((mask > 0).astype(np.uint8))
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0  # the background

@@ -31,9 +31,8 @@ Bytes = NDArray[np.uint8]
 BAR = (70, 70, 70)
 FAR = 10_000  # pixels: drawing stops there
 AGREEMENT = (
-    "Median reprojection error in pixels of the full-size image, over all detections, after plain "
-    "weighted triangulation (DLT), robust triangulation, correction of left and right, refinement "
-    "of the camera poses, and cleansing and smoothing, which is what is written."
+    "Median reprojection error in pixels of the full-size image after each stage: plain and robust "
+    "triangulation, sides corrected, cameras refined, and smoothed, which is what is written."
 )
 LEGEND = (
     "Blue: the person's left, orange: the right, white: the middle. Lines: the 3D joints "
@@ -72,10 +71,13 @@ def write_small_files(root: Path, outcome: Outcome, key: str) -> None:
     error = solution.error[:, :, :BODY] * outcome.options.pictures.scale
     seen = np.isfinite(error)
     mean = np.where(seen, error, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
+    body, hands = (
+        {"p": p[:, part].astype(np.float32), "conf": conf[:, part].astype(np.float32)}
+        for part in (slice(BODY), slice(BODY, None))
+    )
     write_npz(
         root / "landmarks3d.npz",
-        p=p[:, :BODY].astype(np.float32),
-        conf=conf[:, :BODY].astype(np.float32),
+        **body,
         reproj_px=np.where(seen.any(0), mean, np.nan).astype(np.float32),
         n_views=solution.views[:, :BODY].astype(np.int16),
         frame_id=frames,
@@ -83,13 +85,7 @@ def write_small_files(root: Path, outcome: Outcome, key: str) -> None:
         edges=np.array(MEDIAPIPE33.edges),
     )
     if p.shape[1] > BODY:
-        write_npz(
-            root / "hands3d.npz",
-            p=p[:, BODY:].astype(np.float32),
-            conf=conf[:, BODY:].astype(np.float32),
-            frame_id=frames,
-            names=np.array(hand_names()),
-        )
+        write_npz(root / "hands3d.npz", **hands, frame_id=frames, names=np.array(hand_names()))
     for c, camera in enumerate(outcome.cameras) if solution.seen.any() else ():
         ratio = np.diag(camera.K)[:2] / np.diag(solution.rig.K[c])[:2]
         write_npz(

@@ -33,17 +33,11 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Rig:
-    """``C`` cameras without lens distortion, float64.
+    """``C`` cameras without lens distortion, float64."""
 
-    Args:
-        K: ``[C, 3, 3]`` pixels, pixel centres at +0.5.
-        R: ``[C, 3, 3]`` world to camera.
-        t: ``[C, 3]`` metres.
-    """
-
-    K: Float
-    R: Float
-    t: Float
+    K: Float  # [C, 3, 3] pixels, pixel centres at +0.5
+    R: Float  # [C, 3, 3] world to camera
+    t: Float  # [C, 3] metres
 
     @classmethod
     def of(cls, cameras: Sequence[CameraEntry]) -> Rig:

@@ -14,20 +14,8 @@ from rich.console import Console
 
 from gsgan.data.joints import BODY
 from gsgan.data.splits import parse_frames
-from gsgan.prepare.doubts import (
-    check_distance,
-    doubts_about_detections,
-    doubts_about_pictures,
-    doubts_about_solution,
-    doubts_about_sources,
-)
-from gsgan.prepare.landmarks import (
-    Detections,
-    find_landmarks,
-    gather,
-    read_detections,
-    read_points3d,
-)
+from gsgan.prepare import doubts, landmarks
+from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.mediapipe import run_tool, tool_key
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options, read_inputs
 from gsgan.prepare.pictures import Written, check_values, find_masks, write_pictures
@@ -67,18 +55,15 @@ def prepare(options: Options, console: Console) -> Path:
     written = _write_pictures(options, inputs, masks, frames, solution, root)
     outcome = Outcome(options, inputs, frames, solution, written)
     write_small_files(root, outcome, key)
-    moves, clocks = (
-        camera_moves(Rig.of(inputs.cameras), solution.rig),
-        (solution.delay, solution.gain),
-    )
-    limits = options.doubts
-    doubts = [
-        *doubts_about_sources(inputs.sources, limits),
-        *doubts_about_pictures(inputs.sources, written, limits),
-        *doubts_about_detections(detections, limits),
-        *doubts_about_solution(solution, list(inputs.sources), *moves, *clocks, limits),
+    moves, limits = camera_moves(Rig.of(inputs.cameras), solution.rig), options.doubts
+    names, clocks = list(inputs.sources), (solution.delay, solution.gain)
+    found = [
+        *doubts.doubts_about_sources(inputs.sources, limits),
+        *doubts.doubts_about_pictures(inputs.sources, written, limits),
+        *doubts.doubts_about_detections(detections, limits),
+        *doubts.doubts_about_solution(solution, names, *moves, *clocks, limits),
     ]
-    write_report(root, outcome, doubts, console)
+    write_report(root, outcome, found, console)
     publish(root, out)
     work.forget_others()
     if not options.keep_work:
@@ -120,8 +105,8 @@ def _read_people(
     if options.landmarks3d is not None:
         return {}, masks
     if options.landmarks != MEDIAPIPE:
-        found = find_landmarks(options.folder("landmarks"), names)
-    return {name: read_detections(found[name]) for name in names}, masks
+        found = landmarks.find_landmarks(options.folder("landmarks"), names)
+    return {name: landmarks.read_detections(found[name]) for name in names}, masks
 
 
 def _solved(
@@ -132,7 +117,7 @@ def _solved(
     console: Console,
 ) -> tuple[Ints, Solution]:
     """Triangulates 2D landmarks, or loads the result of an earlier run on the same ones."""
-    frames, px, conf = gather(detections, options.offsets or {})
+    frames, px, conf = landmarks.gather(detections, options.offsets or {})
     chosen = _chosen(options, frames)
     joints = slice(None if options.hands else BODY)
     frames, px, conf = frames[chosen], px[:, chosen, joints], conf[:, chosen, joints]
@@ -140,7 +125,7 @@ def _solved(
     uv = np.stack([undistort_points(c, p) for c, p in zip(inputs.cameras, px, strict=True)])
     flat = uv.reshape(len(rig), -1, 2), conf.reshape(len(rig), -1)
     rough = options.solve.triangulation.plain(rig, *flat)
-    check_distance(inputs.cameras, rough, options.doubts, inputs.calibration.path)
+    doubts.check_distance(inputs.cameras, rough, options.doubts, inputs.calibration.path)
     arrays = (rig.K, rig.R, rig.t, uv, conf, time)
     hashes = [hashlib.sha256(array.tobytes()).hexdigest() for array in arrays]
     key = [STAGE_VERSION, options.record()["solve"], lag, hashes]
@@ -154,11 +139,11 @@ def _solved(
 
 def _adopted(options: Options, inputs: Inputs) -> tuple[Ints, Solution]:
     """The joints of another tool."""
-    frames, p, conf = read_points3d(options.folder("landmarks3d"))
+    frames, p, conf = landmarks.read_points3d(options.folder("landmarks3d"))
     chosen = _chosen(options, frames)
     frames, p, conf = frames[chosen], p[chosen], conf[chosen]
     where, limits = inputs.calibration.path, options.doubts
-    check_distance(inputs.cameras, p.reshape(-1, 3), limits, where)
+    doubts.check_distance(inputs.cameras, p.reshape(-1, 3), limits, where)
     rig, time = Rig.of(inputs.cameras), frames / inputs.fps
     return frames, adopt(rig, time, p, conf, options.solve, limits.frozen_frames)
 
@@ -186,7 +171,7 @@ def _write_pictures(
     if not posed:
         raise DataError(
             f"{options.landmarks3d or options.landmarks}: no body joint of any frame came out in "
-            "3D; expected landmarks that two cameras see at the same frame number"
+            "3D; two cameras must see it at the same frame number"
         )
     cameras, offsets = {camera.name: camera for camera in inputs.cameras}, options.offsets or {}
 

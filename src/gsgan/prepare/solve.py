@@ -149,13 +149,8 @@ def adopt(
 ) -> Solution:
     """Another tool's joints, cleansed and smoothed; the cameras stay as calibrated.
 
-    Args:
-        rig: as calibrated.
-        time: ``[F]`` seconds.
-        p: ``[F, 33, 3]`` metres, NaN = missing.
-        conf: ``[F, 33]`` 0 = missing.
-        settings: of cleansing and smoothing.
-        frozen: runs of identical joints of this length are removed, see `without_frozen`.
+    ``time [F]`` is in seconds, ``p [F, 33, 3]`` in metres with ``conf [F, 33]``; for ``frozen`` see
+    `without_frozen`.
     """
     p, stuck = without_frozen(p, frozen)
     p, removed = cleanse(p, settings.cleansing)
@@ -211,8 +206,7 @@ def clock_errors(
     Args:
         rig: ``C`` cameras.
         uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
-        triangulation: its settings.
-        lag: frames tried either way.
+        triangulation, lag: its settings, and the frames tried either way.
 
     Returns:
         ``delay [C]`` and ``gain [C]``, the share by which the median error falls.

@@ -44,7 +44,7 @@ class Source:
 
     def fingerprint(self) -> list[str | int]:
         """Names, sizes and times of the files: changes when the images do."""
-        paths = list(self.files.values()) if self.files else [self.path]
+        paths = self.files.values() or [self.path]
         return [part for path in paths for part in stamp(path)]
 
 
@@ -55,8 +55,6 @@ def stamp(path: Path) -> tuple[str, int, int]:
 
 def find_sources(folder: Path, rotate: bool = False) -> dict[str, Source]:
     """Every camera's images in a folder, or in videos/ or images/ inside it, in natural order.
-
-    ``rotate`` applies the rotation metadata of videos.
 
     Raises:
         DataError: when there are none, or two videos have the same stem.
@@ -84,10 +82,7 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Source]:
         else:
             continue
         if source.name in sources:
-            raise DataError(
-                f"{folder} holds {sources[source.name].path.name} and {path.name}, two sources of "
-                f"the camera {source.name}; remove one"
-            )
+            raise DataError(f"{folder} holds the camera {source.name} twice; remove {path.name}")
         sources[source.name] = source
     return sources
 

@@ -49,15 +49,12 @@ class Triangulation:
             above(f"triangulation.{name}", getattr(self, name))
 
     def plain(self, rig: Rig, uv: Float, weight: Float) -> Float:
-        """The weighted linear (DLT) solution, without outlier rejection.
+        """``[N, 3]`` the weighted linear (DLT) solution, NaN with fewer than two weighted views.
 
         Args:
             rig: ``C`` cameras.
             uv: ``[C, N, 2]`` undistorted pixels, NaN allowed where the weight is 0.
             weight: ``[C, N]`` confidence, at least 0.
-
-        Returns:
-            ``[N, 3]`` metres, NaN where fewer than two cameras have a weight.
         """
         return _solve(*_rows(rig, uv, weight), weight)[0]
 
@@ -66,8 +63,8 @@ class Triangulation:
 
         Convention: the loss is Cauchy's, ``log(1 + (r/scale)²)`` of the reprojection error r, times
         the weight. A point is NaN with fewer than two weighted views, with rays too parallel
-        (``max_elongation``), or when its detections contradict each other (``max_error``). Arguments
-        as for `plain`; ``iterations`` of reweighting.
+        (``max_elongation``), or when its detections contradict each other (``max_error``).
+        Arguments as for `plain`; ``iterations`` of reweighting.
         """
         starts = range(0, max(uv.shape[1], 1), CHUNK)
         chunks = [slice(start, start + CHUNK) for start in starts]
@@ -182,8 +179,7 @@ def find_flips(
         rig: ``C`` cameras.
         uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
         groups: ``G`` tuples of (left, right) joints that swap together.
-        search: thresholds.
-        triangulation: scale and limits.
+        search, triangulation: thresholds, scale and limits.
     """
     quick = replace(triangulation, max_error=np.inf)
     weight = np.where(weight > quick.min_confidence, weight, 0.0)

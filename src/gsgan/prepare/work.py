@@ -163,7 +163,7 @@ def is_there(out: Path, key: str, overwrite: bool) -> bool:
 
 
 def publish(root: Path, out: Path) -> None:
-    """Moves the finished dataset ``root`` to ``out`` in one step; if that fails, an old one stays.
+    """Moves the finished dataset ``root`` to ``out``; an old one is removed when that is done.
 
     Raises:
         DataError: when training could not read it, or it cannot be moved.
@@ -177,10 +177,5 @@ def publish(root: Path, out: Path) -> None:
         if out.exists():
             shutil.rmtree(old, ignore_errors=True)
             os.replace(out, old)
-        try:
-            os.replace(root, out)
-        except OSError:
-            if old.exists():
-                os.replace(old, out)
-            raise
+        os.replace(root, out)
     shutil.rmtree(old, ignore_errors=True)

@@ -8,7 +8,7 @@ Writes an npz:
 
     px (F,33,2), conf (F,33)     pixels of the image as stored, first pixel's centre at (0.5, 0.5)
     left, right (F,21,2)         the person's hands; NaN = not found
-    frame_id (F,), size (2,) [w, h]
+    frame_id (F,)
 
 and masks/%06d.png, 0..255. Depth estimates are not written: they are relative, not metric.
 """
@@ -46,17 +46,13 @@ def main() -> None:
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, list[Any]] = {}
-    size = (0, 0)
     detector = Detector(options)
     for done, (frame, picture) in enumerate(pictures, start=1):
-        size = picture.shape[1], picture.shape[0]
         landmarks = detector.landmarks(picture)
         for name, value in (*landmarks.items(), ("frame_id", frame)):
             found.setdefault(name, []).append(value)
-        if folder is not None:
-            mask = detector.mask(picture, landmarks["px"])
-            if mask is not None:
-                cv2.imwrite(str(folder / f"{frame:06d}.png"), mask)
+        if folder and (mask := detector.mask(picture, landmarks["px"])) is not None:
+            cv2.imwrite(str(folder / f"{frame:06d}.png"), mask)
         print(done, max(done, count), flush=True)
     if not found:
         raise SystemExit(f"{options.source} holds no image that can be decoded")
@@ -64,7 +60,7 @@ def main() -> None:
     part = out.with_name(f".{out.name}")
     with part.open("wb") as stream:
         arrays: dict[str, Any] = {name: np.array(values) for name, values in found.items()}
-        np.savez(stream, size=np.array(size), **arrays)
+        np.savez(stream, **arrays)
     part.replace(out)
 
 
