@@ -49,8 +49,8 @@ def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
         existing = [end for end in (f"{name}.npz", f"{name}_json", name) if end in there]
         if not existing:
             raise DataError(
-                f"{folder} has no landmarks of the camera {name}; expected {name}.npz, "
-                f"{name}_json/ or {name}/, found {', '.join(there[:20]) or 'nothing'}"
+                f"{folder} has no landmarks of the camera {name}, such as {name}.npz or "
+                f"{name}_json/, found {', '.join(there[:20]) or 'nothing'}"
             )
         found[name] = folder / existing[0]
     return found

@@ -25,9 +25,7 @@ READY = ".ready"  # written last: an environment without it is incomplete
 
 def environment_of(tool: MediaPipe) -> Path:
     """The environment's folder, which need not exist."""
-    if tool.folder is None:
-        return cache_root() / "tools" / "mediapipe-0.10.21"
-    return Path(tool.folder).expanduser()
+    return Path(tool.folder or cache_root() / "tools" / "mediapipe-0.10.21").expanduser()
 
 
 def tool_key(tool: MediaPipe) -> list[object]:

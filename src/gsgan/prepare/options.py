@@ -91,8 +91,9 @@ class Options:
         for name, what in (("source", "folder with the videos"), ("out", "folder to make")):
             if not getattr(self, name):
                 raise ConfigError(f"give {name}=<{what}>")
-        one_of("unit", self.unit, (None, *UNITS))
-        one_of("up_axis", self.up_axis, (None, *AXES))
+        for name, choices in (("unit", UNITS), ("up_axis", AXES)):
+            if getattr(self, name) is not None:
+                one_of(name, getattr(self, name), choices)
         if self.pixel_centre not in (0, 0.5):
             raise ConfigError(f"pixel_centre must be 0 or 0.5, got {self.pixel_centre!r}")
         if self.fps is not None:

@@ -34,9 +34,7 @@ class MaskTidying:
 
     def __post_init__(self) -> None:
         if len(self.levels) != 2 or not 0 <= self.levels[0] < self.levels[1] <= 1:
-            raise ConfigError(
-                f"mask_tidying.levels must be two rising numbers in 0..1, got {self.levels}"
-            )
+            raise ConfigError(f"mask_tidying.levels must rise within 0..1, got {self.levels}")
         between("mask_tidying.least_blob", self.least_blob, 0, 1)
 
 
@@ -175,6 +173,8 @@ def write_pictures(
 
 
 def _write(path: Path, pixels: Bytes, quality: int) -> None:
-    options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION, cv2.IMWRITE_JPEG_QUALITY, quality]
+    options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
+    if path.suffix == ".jpg":
+        options = [cv2.IMWRITE_JPEG_QUALITY, quality]
     with writing(path):  # in place: a run that was killed here writes all of them again
         path.write_bytes(cv2.imencode(path.suffix, pixels, options)[1].tobytes())

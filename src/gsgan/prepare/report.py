@@ -205,8 +205,9 @@ def _camera_table(numbers: Mapping[str, Any], limits: Float) -> Table:
             )
         )
     rows.append(("all", *(_number(error, ".2f") for error in stages.values()), *[""] * 5))
-    headers = "camera", *stages, "turned", "moved", "sides swapped", "frames late", "images"
-    return Table(headers, tuple(rows), frozenset(flagged), "Error in pixels, and refined cameras")
+    headers = "camera", *stages, "turned", "moved", "swapped", "late", "images"
+    title = "Error in pixels, refinement, share of sides swapped, frames that the clock is late"
+    return Table(headers, tuple(rows), frozenset(flagged), title)
 
 
 def _number(value: float, form: str) -> str:

@@ -114,17 +114,22 @@ def solve(
     stages = {"plain": rig.errors(plain, _flat(uv)), "robust": robust.error}
     points = triangulate()
     stages["flips"] = points.error
+    # Evenly spaced frames and the body's joints: hands are less certain.
+    F, J = conf.shape[1:]
+    at = np.unique(np.linspace(0, F - 1, min(F, settings.refinement.frames)).round().astype(int))
     for _ in range(settings.refinement.rounds):
-        rig = _refined(start, rig, points, sided, weight, settings.refinement)
+        p = points.p.reshape(F, J, 3)[at, :BODY].reshape(-1, 3)
+        detections = _flat(sided[:, at, :BODY]), _flat(weight[:, at, :BODY])
+        rig = refine_rig(start, rig, p, *detections, settings.refinement)
         points = triangulate()
     stages["refined"] = points.error
     p, removed = cleanse(points.p.reshape(*conf.shape[1:], 3), settings.cleansing)
-    trust = _mean_seen(points.weight.reshape(conf.shape), weight)
-    p = smooth(p, trust, time, settings.smoothing.seconds)
+    agreed = _mean_seen(points.weight.reshape(conf.shape), weight)
+    p = smooth(p, agreed, time, settings.smoothing.seconds)
     error = rig.errors(p.reshape(-1, 3), _flat(sided)).reshape(conf.shape)
     stages["smoothed"] = error = np.where(weight > 0, error, np.nan)
-    seen = apply_flips(full, flips, groups)
-    delay, gain = clock_errors(rig, sided[:, :, :BODY], seen[:, :, :BODY], triangulation, lag)
+    trust = apply_flips(full, flips, groups)
+    delay, gain = clock_errors(rig, sided[:, :, :BODY], trust[:, :, :BODY], triangulation, lag)
     to_pixels = (given.focal / FOCAL)[:, None, None]
     return Solution(
         rig=Rig(given.K, rig.R, rig.t),
@@ -133,7 +138,7 @@ def solve(
         views=(np.nan_to_num(error, nan=np.inf) <= triangulation.scale).sum(0),
         error=error * to_pixels,
         uv=apply_flips(pixels, flips, groups),
-        seen=seen,
+        seen=trust,
         flips=flips,
         delay=delay,
         gain=gain,
@@ -175,17 +180,6 @@ def adopt(
 
 def _flat(values: Float) -> Float:
     return values.reshape(values.shape[0], -1, *values.shape[3:])
-
-
-def _refined(
-    given: Rig, rig: Rig, points: Points, uv: Float, weight: Float, settings: Refinement
-) -> Rig:
-    """The rig refined on evenly spaced frames and the body's joints: hands are less certain."""
-    _, F, J = weight.shape
-    chosen = np.unique(np.linspace(0, F - 1, min(F, settings.frames)).round().astype(int))
-    p = points.p.reshape(F, J, 3)[chosen, :BODY].reshape(-1, 3)
-    uv, weight = (_flat(values[:, chosen, :BODY]) for values in (uv, weight))
-    return refine_rig(given, rig, p, uv, weight, settings)
 
 
 def _mean_seen(values: Float, weight: Float) -> Float:

@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from gsgan.data.formats.capture import read_capture
 from gsgan.utils.errors import DataError
@@ -61,10 +61,8 @@ def _plain(value: Any) -> Any:
 
 def progress(console: Console, disable: bool = False) -> Progress:
     """Progress bars that disappear when done: title, bar, count, remaining time."""
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    return Progress(
-        *columns, TimeRemainingColumn(), console=console, transient=True, disable=disable
-    )
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console, transient=True, disable=disable)
 
 
 def each_camera(
