@@ -20,14 +20,13 @@ from test_prepare_points3d import write_trc
 import gsgan.prepare.mediapipe as tool
 from gsgan.data.calibration import read_calibration
 from gsgan.data.joints import BODY
-from gsgan.prepare.dataset import publish
 from gsgan.prepare.doubts import Doubts, doubts_about_pictures
 from gsgan.prepare.landmarks import read_detections, read_points3d
 from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.pictures import MaskTidying, PictureFiles, Written, check_values, write_pictures
 from gsgan.prepare.rig import undistort_points
 from gsgan.prepare.sources import Source
-from gsgan.prepare.work import Work
+from gsgan.prepare.work import Work, publish
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 
@@ -167,7 +166,7 @@ def test_damaged_results_are_made_again_and_a_full_disk_is_reported(tmp_path: Pa
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(np, "savez", full)
+    monkeypatch.setattr("gsgan.prepare.work.write_atomically", full)
     with pytest.raises(DataError, match=r"cannot be written \(No space left"):
         work.arrays("a", 2, lambda: {"x": np.arange(2)})
 
@@ -197,10 +196,10 @@ def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(tmp_path: Path, m
         replace(start, end)
 
     monkeypatch.setattr(os, "replace", failing)
-    monkeypatch.setattr("gsgan.prepare.dataset.read_capture", lambda _: None)
+    monkeypatch.setattr("gsgan.prepare.work.read_capture", lambda _: None)
     with pytest.raises(DataError, match="cannot be written"):
         publish(new, out)
-    assert (out / "out").is_file()
+    assert (tmp_path / ".out.old" / "out").is_file()
 
 
 @pytest.mark.parametrize(

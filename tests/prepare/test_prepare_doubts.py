@@ -11,7 +11,6 @@ from capture_scenes import ring, seen
 from make import skeletons
 
 from gsgan.data.joints import ALL
-from gsgan.prepare.dataset import standing_axis
 from gsgan.prepare.doubts import (
     Doubts,
     doubts_about_detections,
@@ -21,6 +20,7 @@ from gsgan.prepare.doubts import (
 )
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.pictures import MaskTidying, find_masks, sampled, tidy
+from gsgan.prepare.report import standing_axis
 from gsgan.prepare.solve import Settings, Solution, solve
 from gsgan.prepare.sources import Source, find_sources
 from gsgan.utils.errors import ConfigError, DataError

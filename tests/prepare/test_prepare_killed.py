@@ -15,11 +15,11 @@ from capture_scenes import write_project
 from rich.console import Console
 
 from gsgan.data.formats.capture import read_capture
-from gsgan.prepare.flips import FlipSearch
 from gsgan.prepare.options import Options, Overlays
-from gsgan.prepare.refine import Refinement
+from gsgan.prepare.rig import Refinement
 from gsgan.prepare.run import prepare
 from gsgan.prepare.solve import Settings
+from gsgan.prepare.triangulate import FlipSearch
 from gsgan.prepare.work import each_camera
 
 LIMIT = 120  # seconds after which the child counts as hanging
@@ -49,22 +49,29 @@ def quiet() -> Console:
 def killed(run: Callable[[], object], stop: Callable[[Path, int], bool]) -> bool:
     """Whether a child that runs this was killed, at the first file for which ``stop`` says so.
 
-    It dies as the file, written under another name, is to take its place; ``stop`` gets that place
-    and how many files came before.
+    It dies as an image is to be written, or another file, written under another name, is to take
+    its place; ``stop`` gets that place and how many files came before.
     """
     child = os.fork()
     if child == 0:
         signal.alarm(LIMIT)
         cv2.setNumThreads(0)
-        replace, before = os.replace, list[Path]()
+        replace, write, before = os.replace, Path.write_bytes, list[Path]()
 
-        def dying(source, target) -> None:
-            if stop(Path(target), len(before)):
+        def step(target: Path) -> None:
+            if stop(target, len(before)):
                 os.kill(os.getpid(), signal.SIGKILL)
-            before.append(Path(target))
+            before.append(target)
+
+        def replacing(source, target) -> None:
+            step(Path(target))
             replace(source, target)
 
-        os.replace = dying
+        def writing(path: Path, data: bytes) -> int:
+            step(path)
+            return write(path, data)
+
+        os.replace, Path.write_bytes = replacing, writing
         try:
             run()
         finally:

@@ -92,10 +92,10 @@ def test_npz_of_the_tool(tmp_path: Path):
     [
         ("[]", "JSON object"),
         ('{"x": 1}', "neither 'people'"),
-        ('{"people": [3]}', "must be an object"),
+        ('{"people": [3]}', "a person must hold"),
         ('{"people": [{"pose_keypoints_2d": [1, 2]}]}', "x, y, confidence"),
         ('{"people": [{"pose_keypoints_2d": ["a", 1, 1]}]}', "x, y, confidence"),
-        ('{"people": [{"pose_keypoints_2d": [1, 2, 0.5]}]}', "1 joints; known are 17"),
+        ('{"people": [{"pose_keypoints_2d": [1, 2, 0.5]}]}', "of 17 .COCO., 25"),
     ],
 )
 def test_damaged_json_names_the_file(tmp_path: Path, content: str, what: str):

@@ -57,19 +57,19 @@ def test_trc_units_axes_and_names_are_converted(tmp_path: Path, unit: str):
     p[2, 15] = np.nan
     found = read_points3d(write_trc(tmp_path / "a.trc", p, unit))
     joints = list(MARKERS.values())
-    np.testing.assert_allclose(found.p[:, joints], p[:, joints], atol=1e-9)
+    np.testing.assert_allclose(found[1][:, joints], p[:, joints], atol=1e-9)
     unknown = sorted(set(range(33)) - set(joints))
-    assert np.isnan(found.p[:, unknown]).all()
-    assert (found.conf[:, unknown] == 0).all()
-    assert found.conf[2, 15] == 0
+    assert np.isnan(found[1][:, unknown]).all()
+    assert (found[2][:, unknown] == 0).all()
+    assert found[2][2, 15] == 0
 
 
 def test_zeros_of_gap_filling_are_missing(tmp_path: Path):
     p = skeletons(4)
     p[1, 16] = 0
     found = read_points3d(write_trc(tmp_path / "a.trc", p))
-    assert np.isnan(found.p[1, 16]).all()
-    assert found.conf[1, 16] == 0
+    assert np.isnan(found[1][1, 16]).all()
+    assert found[2][1, 16] == 0
 
 
 def test_repeated_values_of_gap_filling_are_removed():
@@ -84,9 +84,9 @@ def test_repeated_values_of_gap_filling_are_removed():
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        (lambda text: "hello", "not a .trc file"),
+        (lambda text: "hello", "cannot be read as a .trc file"),
         (lambda text: text.replace("\tm\n", "\tfeet\n"), "Units is 'feet'"),
-        (lambda text: text.replace("1.58", "x.yz"), "holds no numbers"),
+        (lambda text: text.replace("1.58", "x.yz"), "cannot be read as a .trc file"),
         (lambda text: text.replace("Shoulder", "Sh").replace("Hip", "H"), "no shoulders and hips"),
     ],
 )
@@ -107,9 +107,9 @@ def test_easymocap_zero_confidence_is_missing(tmp_path: Path):
         (tmp_path / f"{f:06d}.json").write_text(json.dumps(people))
     found = read_points3d(tmp_path)
     seen = sorted(set(numbers) - {16})
-    np.testing.assert_allclose(found.p[:, seen], truth[:, seen])
-    assert (found.conf[:, seen] == 0.8).all()
-    assert np.isnan(found.p[:, 16]).all()
+    np.testing.assert_allclose(found[1][:, seen], truth[:, seen])
+    assert (found[2][:, seen] == 0.8).all()
+    assert np.isnan(found[1][:, 16]).all()
 
 
 @pytest.mark.parametrize("text", ["{", "{}", "[3]", '[{"keypoints3d": [1, 2]}]', "[]"])

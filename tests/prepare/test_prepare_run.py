@@ -18,11 +18,11 @@ import gsgan.prepare.mediapipe as tool
 from gsgan.data.formats.capture import read_capture
 from gsgan.prepare import pictures
 from gsgan.prepare.__main__ import prepare as command
-from gsgan.prepare.flips import FlipSearch
 from gsgan.prepare.options import MediaPipe, Options, Overlays
-from gsgan.prepare.refine import Refinement
+from gsgan.prepare.rig import Refinement
 from gsgan.prepare.run import prepare
 from gsgan.prepare.solve import Settings
+from gsgan.prepare.triangulate import FlipSearch
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 CAMERAS, FRAMES, SIZE = 3, 6, (96, 80)
@@ -121,20 +121,20 @@ def test_other_folders_are_never_overwritten(project: Path):
 def test_a_killed_run_leaves_no_dataset_and_resumes(project: Path, monkeypatch):
     write, written = pictures._write, []
 
-    def dying(path, pixels, files):
+    def dying(path, pixels, quality):
         if len(written) == 10:
             raise KeyboardInterrupt
         written.append(path)
-        write(path, pixels, files)
+        write(path, pixels, quality)
 
     monkeypatch.setattr(pictures, "_write", dying)
     with pytest.raises(KeyboardInterrupt):
         prepare(options(project, workers=1), quiet())
     assert not (project.parent / "out").exists()
-    monkeypatch.setattr(pictures, "_write", lambda *a: (written.append(a[0]), write(*a)))
+    monkeypatch.setattr(pictures, "_write", write)
     monkeypatch.setattr("gsgan.prepare.run.solve", None)  # found again, not solved again
     out = prepare(options(project, workers=1), quiet())
-    assert len(written) == len(set(written)) == 2 * CAMERAS * FRAMES
+    assert len(list(out.glob("images/*/*"))) == CAMERAS * FRAMES
     assert len(read_capture(out).frames) == FRAMES
 
 
@@ -186,7 +186,7 @@ def no_detections(project: Path) -> None:
     [
         (lambda p: None, {"unit": "mm"}, r"cameras\.json: cameras stand 0\.003 m .* unit=mm"),
         (in_centimetres, {}, r"cameras\.json: cameras stand 3\d\d m .* unit=mm, cm or m"),
-        (lambda p: None, {"source": "nowhere"}, r"nowhere is not a folder"),
+        (lambda p: None, {"source": "nowhere"}, "nowhere holds no videos"),
         (lambda p: (p / "cameras.json").unlink(), {}, "holds no calibration"),
         (lambda p: (p / "pose" / "cam01.npz").unlink(), {}, "no landmarks of the camera cam01"),
         (lambda p: (p / "pose" / "cam01.npz").write_bytes(b"PK"), {}, r"cam01\.npz"),
@@ -253,11 +253,11 @@ def _defaults(compose) -> dict:
 # ------------------------------------------------ the MediaPipe tool, without MediaPipe
 
 STUB = """
-import argparse, pathlib, numpy as np, shutil
-parser = argparse.ArgumentParser()
-for name in "source out masks hands rotate threads slot confidence tracking margin".split():
-    parser.add_argument("--" + name, default="")
-given = parser.parse_args()
+import json, pathlib, shutil, sys
+from types import SimpleNamespace
+given = SimpleNamespace(**json.loads(sys.argv[1]))
+names = "hands rotate threads slot confidence tracking margin"
+assert set(names.split()) < set(vars(given))
 name, root = pathlib.Path(given.source).stem, pathlib.Path({root!r})
 if name == {bad!r}:
     raise SystemExit("the stub refuses " + name)

@@ -4,33 +4,29 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from gsgan.fit.moments import Moments, around
-from gsgan.fit.shape import RigidShape
-from gsgan.scene import Frame
-from gsgan.skeleton import Densify, limb_length_sum
-from gsgan.splat import Accuracy
+from gsgan.scene import Camera, Frame, Gaussians
+from gsgan.skeleton import Densify, bone_frames, limb_length_sum, sanitise
+from gsgan.splat import Accuracy, rasterise
+from gsgan.utils.checks import above, at_least, between, whole
 from gsgan.utils.errors import ConfigError
 
 BETAS = (0.9, 0.99)
 LENGTH_FLOOR = 1e-12  # square metres
 FINAL_RATE = 0.02  # of the learning rates, in the last sweep
-ABOVE_ZERO = {"least_mask", "sweeps", "cameras", "noise", "joint_rate", "shape_rate"}
+STATEFUL = ("shape", "moves", "shape_optimiser", "joint_optimiser")
+BOUND = 0.25  # metres: a Gaussian stays this close to its point
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Settings of the fit, see conf/fit/standard.yaml; docs/data.md has measurements.
-
-    Raises:
-        ConfigError: when a value is out of its range.
-    """
+    """Settings of the fit, see conf/fit/standard.yaml; docs/data.md has measurements."""
 
     densify: Densify
     accuracy: Accuracy
@@ -46,35 +42,68 @@ class Fit:
     hold: float = 0.4
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value, default = getattr(self, field.name), field.default
-            if not isinstance(default, int | float):
-                if value is None:
-                    raise ConfigError(
-                        f"fit.{field.name} cannot be null; conf/fit/standard.yaml has it"
-                    )
-                continue
-            kind = int if isinstance(default, int) else (int, float)
-            fits = isinstance(value, kind) and not isinstance(value, bool) and value >= 0
-            if not fits or (field.name in ABOVE_ZERO and value == 0):
-                what = "a whole number" if kind is int else "a number"
-                least = "above 0" if field.name in ABOVE_ZERO else "of at least 0"
-                raise ConfigError(f"fit.{field.name} must be {what} {least}, got {value!r}")
-        if self.hold > 1:
-            raise ConfigError(f"fit.hold is a share of the sweeps, at most 1; got {self.hold!r}")
+        for name in ("densify", "accuracy"):
+            if getattr(self, name) is None:
+                raise ConfigError(f"fit.{name} cannot be null; conf/fit/standard.yaml has it")
+        for name, least in (("shape_steps", 0), ("sweeps", 1), ("cameras", 1)):
+            whole(f"fit.{name}", getattr(self, name), least)
+        for name in ("least_mask", "noise", "joint_rate", "shape_rate"):
+            above(f"fit.{name}", getattr(self, name))
+        for name in ("prior", "bones"):
+            at_least(f"fit.{name}", getattr(self, name), 0)
+        between("fit.hold", self.hold, 0, 1)
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """How well the shape fills the masks.
-
-    Args:
-        iou: intersection over union of alpha and mask above 0.5, mean over images.
-        share: wrong alpha as a share of the mask, mean over frames.
-    """
+class Agreement(NamedTuple):
+    """Mean intersection over union of alpha and mask, and wrong alpha as a share of the mask."""
 
     iou: float
     share: float
+
+
+class RigidShape(nn.Module):
+    """Gaussians on Alg. 1's points, with residuals that do not depend on the pose.
+
+    Such a shape cannot absorb noise in the landmarks: where it does not fill the masks, the joints
+    are in the wrong place.
+
+    Args:
+        densify: skeleton to points.
+        limb_sum: metres, the subject's summed limb lengths.
+        accuracy: the rasteriser's settings.
+    """
+
+    def __init__(self, densify: Densify, limb_sum: float, accuracy: Accuracy) -> None:
+        super().__init__()
+        self.densify, self.limb_sum, self.accuracy = densify, limb_sum, accuracy
+        self.offsets = nn.Parameter(torch.zeros(densify.n_points, 3))
+        self.log_scales = nn.Parameter(torch.zeros(densify.n_points, 3))
+        self.logits = nn.Parameter(torch.zeros(densify.n_points))  # an opacity of 0.5
+
+    def forward(self, skeleton: Tensor, visibility: Tensor, camera: Camera) -> Tensor:
+        """Alpha ``[B, 1, H, W]`` of the person.
+
+        Args:
+            skeleton: ``[B, J, 3]`` metres, world; differentiable.
+            visibility: ``[B, J]`` in [0, 1]; parts whose joints are 0 are left out.
+            camera: B cameras.
+        """
+        p, valid = sanitise(skeleton, visibility, self.densify.template, self.limb_sum)
+        points = self.densify(p, valid, bone_frames(p, valid, self.densify.template))
+        offsets = BOUND * torch.tanh(self.offsets / BOUND)
+        means = points.means + (points.frames @ offsets.unsqueeze(-1)).squeeze(-1)
+        scales = points.scales.unsqueeze(-1) * self.log_scales.clamp(-3, 3).exp()
+        axes = points.frames * scales.unsqueeze(-2)
+        opacities = self.logits.clamp(-8, 8).sigmoid() * points.valid.to(means.dtype)
+        person = Gaussians(
+            means=means,
+            quats=None,
+            scales=None,
+            covariances=axes @ axes.mT,
+            opacities=opacities,
+            features=means.new_ones(*means.shape[:2], 1),
+        )
+        return rasterise(person, camera, settings=self.accuracy).alpha
 
 
 class Fitter:
@@ -113,11 +142,6 @@ class Fitter:
         self.ends = limbs[:, 0], limbs[:, 1]
         self.shaped, self.swept = 0, 0
 
-    @property
-    def done(self) -> bool:
-        """Whether all sweeps are done."""
-        return self.swept >= self.settings.sweeps
-
     @torch.no_grad()
     def joints(self) -> Tensor:
         """``[F, J, 3]`` metres: the current skeletons."""
@@ -134,15 +158,13 @@ class Fitter:
         self.shaped += 1
         return share.item()
 
-    def sweep(self, advance: Callable[[], None] = lambda: None) -> float:
+    def sweep(self) -> float:
         """One step on every frame, in random order. Returns the mean share."""
         settings, chance = self.settings, random.Random(f"{self.seed} sweep {self.swept}")
         self._set_rates()
         known = self.seen[:, self.ends[0]] & self.seen[:, self.ends[1]]
         lengths = torch.where(known, self._lengths(self.joints()), torch.nan)
-        usual = lengths.nanmedian(dim=0).values.nan_to_num(
-            0.0
-        )  # limbs that were never seen are not used
+        usual = lengths.nanmedian(dim=0).values.nan_to_num(0.0)  # limbs never seen are not used
         order = list(range(len(self.start)))
         chance.shuffle(order)
         total = 0.0
@@ -159,7 +181,6 @@ class Fitter:
             self.shape_optimiser.step()
             self.joint_optimiser.step()
             total += share.item()
-            advance()
         self.swept += 1
         return total / len(order)
 
@@ -170,7 +191,7 @@ class Fitter:
         for i, skeleton in enumerate(skeletons):
             wrong = area = 0.0
             for frame in self._windows(i):
-                alpha = self._alpha(i, skeleton, frame)
+                alpha = self.alpha(i, skeleton, frame)
                 sure = True if frame.unsure is None else frame.unsure < 0.5
                 person, mask = (alpha > 0.5) & sure, (frame.mask > 0.5) & sure
                 either = (person | mask).sum().item()
@@ -180,27 +201,16 @@ class Fitter:
                 area += frame.mask.sum().item()
             if area:
                 shares.append(wrong / area)
-        return Agreement(_mean(ious), _mean(shares))
-
-    def outline(self, i: int, skeleton: Tensor, frame: Frame) -> Tensor:
-        """Alpha ``[1, 1, H, W]`` of the shape in a whole image of the i-th frame."""
-        with torch.no_grad():
-            return self._alpha(i, skeleton, frame)
+        return Agreement(*(torch.tensor(values).mean().item() for values in (ious, shares)))
 
     def state_dict(self) -> dict[str, Any]:
         """The state from which a later process can resume."""
-        return {
-            "shape": self.shape.state_dict(),
-            "moves": self.moves.state_dict(),
-            "shape_optimiser": self.shape_optimiser.state_dict(),
-            "joint_optimiser": self.joint_optimiser.state_dict(),
-            "shaped": self.shaped,
-            "swept": self.swept,
-        }
+        parts = {name: getattr(self, name).state_dict() for name in STATEFUL}
+        return {**parts, "shaped": self.shaped, "swept": self.swept}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores a state."""
-        for name in ("shape", "moves", "shape_optimiser", "joint_optimiser"):
+        for name in STATEFUL:
             getattr(self, name).load_state_dict(state[name])
         self.shaped, self.swept = state["shaped"], state["swept"]
 
@@ -214,11 +224,12 @@ class Fitter:
         if len(frames) > self.settings.cameras:
             frames = chance.sample(frames, self.settings.cameras)
         skeleton = self.start[i] + move
-        wrong = [_wrong(self._alpha(i, skeleton, frame), frame).sum() for frame in frames]
+        wrong = [_wrong(self.alpha(i, skeleton, frame), frame).sum() for frame in frames]
         area = torch.stack([frame.mask.sum() for frame in frames]).sum()
         return torch.stack(wrong).sum() / area.clamp_min(1.0)
 
-    def _alpha(self, i: int, skeleton: Tensor, frame: Frame) -> Tensor:
+    def alpha(self, i: int, skeleton: Tensor, frame: Frame) -> Tensor:
+        """``[1, 1, H, W]`` of the shape in an image of the i-th frame."""
         return self.shape(skeleton[None], self.visibility[i][None], frame.camera)
 
     def _windows(self, i: int) -> list[Frame]:
@@ -243,7 +254,3 @@ def _wrong(alpha: Tensor, frame: Frame) -> Tensor:
     """How far alpha is from the mask; 0 where the image is unknown."""
     off = (alpha - frame.mask).abs()
     return off if frame.unsure is None else off * (1 - frame.unsure)
-
-
-def _mean(values: Sequence[float]) -> float:
-    return sum(values) / len(values) if values else math.nan

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -30,19 +30,12 @@ class Moments:
         data: the capture.
         device: of the images.
         least_mask: least share of the usual mask area.
-        advance: called after each image is read.
 
     Raises:
         DataError: when no image is left.
     """
 
-    def __init__(
-        self,
-        data: GsganData,
-        device: torch.device,
-        least_mask: float = 0.1,
-        advance: Callable[[], None] = lambda: None,
-    ) -> None:
+    def __init__(self, data: GsganData, device: torch.device, least_mask: float = 0.1) -> None:
         layout, cameras = data.layout, data.splits.train_cameras
         items = [
             (camera, frame)
@@ -54,7 +47,7 @@ class Moments:
         self.dataset = CaptureDataset(layout, items, data.size, data.crop, cache, data.lens)
         self.cameras, self.device = cameras, device
         self._unseen: dict[int, Tensor] = {}
-        places = self._usable(least_mask, advance)
+        places = self._usable(least_mask)
         if not places:
             raise DataError(f"{layout.root}: the masks of {', '.join(cameras)} hold no person")
         self.left_out = len(items) - len(places)
@@ -78,7 +71,7 @@ class Moments:
             frame = replace(frame, unsure=unsure)
         return frame.to(self.device)
 
-    def _usable(self, least: float, advance: Callable[[], None]) -> list[int]:
+    def _usable(self, least: float) -> list[int]:
         """Positions of the images whose masks hold enough of the person; also finds borders.
 
         Areas are of the compared part, in square metres at the person: a mask shrinks with the
@@ -95,7 +88,6 @@ class Moments:
             depth = seen.camera.to_camera(seen.skeleton)[0, :, 2].median()
             pixel = (depth / seen.camera.K[0, 0, 0]).square()
             areas.append(float(mask.sum() * pixel))
-            advance()
         known = [area for area in areas if area > 0]
         usual = float(np.quantile(known, USUAL)) if known else np.inf
         return [place for place, area in enumerate(areas) if area >= least * usual]

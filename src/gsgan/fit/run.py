@@ -5,32 +5,41 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
+from torch import Tensor
 
 from gsgan import __version__
+from gsgan.check.overlays import caption
 from gsgan.data.datamodule import GsganData
 from gsgan.data.files import read_arrays
 from gsgan.data.formats.capture import LANDMARKS, CaptureReader, landmarks_path
-from gsgan.fit.fitter import Agreement, Fit, Fitter
+from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.moments import Moments
-from gsgan.fit.picture import fit_picture
+from gsgan.prepare.pictures import sampled
 from gsgan.prepare.work import progress, write_npz, writing
+from gsgan.scene import Frame
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
 from gsgan.utils.devices import pick_device
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
 
 SMALL_FILES = ("cameras.json", "meta.json")
+TILE = 300  # pixels
+GREEN, ORANGE, BLUE = (60, 200, 60), (255, 140, 0), (60, 140, 255)
+BAR = (70, 70, 70)
+LEGEND = "green: mask   orange: the shape before   blue: after"
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 
 
@@ -50,57 +59,38 @@ def run_fit(config: DictConfig) -> Path:
     settings: Fit = instantiate(config.fit)
     data: GsganData = instantiate(config.data, _convert_="all")
     if not isinstance(data.reader, CaptureReader):
-        raise ConfigError(
-            "gsgan.fit moves the landmarks of a capture in the bring-your-own layout "
-            "(data=capture); other formats are not supported"
-        )
+        raise ConfigError("gsgan.fit supports captures in the bring-your-own layout: data=capture")
     layout = data.layout
     source = landmarks_path(layout.root, data.reader.landmarks)
     if out.resolve() in {source.resolve(), (layout.root / LANDMARKS).resolve()}:
         raise ConfigError(f"out={config.out} holds the landmarks themselves; give another name")
     original = read_arrays(source, ("p", "conf", "frame_id", "fitted_to"))
     device = pick_device(config.device)
-    with progress(console) as bars:
-        task = bars.add_task("masks", total=None)
-        moments = Moments(data, device, settings.least_mask, lambda: bars.advance(task))
-    notes = []
+    with console.status("reading masks"):
+        moments = Moments(data, device, settings.least_mask)
     if moments.left_out:
-        notes.append(f"{moments.left_out} images with empty masks, or nearly so, are left out")
+        console.print(f"{moments.left_out} images with empty masks, or nearly so, are left out")
     if layout.poses is not None:
-        notes.append(
-            "the capture's body pose stays as it is; where G sits on the body (body_points), "
-            "moved landmarks do not move it: effects.body_points=off trains on them"
-        )
-    _print(console, notes)
+        console.print("the capture's body pose stays: effects.body_points=off trains without it")
     partial, key = _partial(out), _key(config, source, moments)
-    fitter = _resumed(settings, moments, config.seed, partial, key, console)
-    _work(fitter, partial, key, console)
+    fitter = _fitted(settings, moments, config.seed, partial, key, console)
     joints = fitter.joints()
-    before, after = (fitter.agreement(s) for s in (moments.skeletons, joints))
-    moved = (joints - moments.skeletons).norm(dim=-1)
-    write_npz(out, **_arrays(original, METRES[layout.meta.unit], moments, joints, moved))
+    write_npz(out, **_arrays(original, METRES[layout.meta.unit], moments, joints))
     picture = fit_picture(fitter, layout.camera_names, joints, config.shown)
     with writing(out):
         write_atomically(out.with_suffix(".png"), picture)
     partial.unlink(missing_ok=True)
-    _print(console, _summary(config, out, moments, before, after, moved[fitter.seen]))
+    lines = _summary(config, out, fitter, joints)
+    console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     return out
-
-
-def _print(console: Console, lines: list[str]) -> None:
-    for line in lines:
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _out(config: DictConfig) -> Path:
     if not config.out:
-        raise ConfigError(
-            "out is not set: give the file to write, e.g. out=/path/to/capture/landmarks3d_fit.npz"
-        )
+        raise ConfigError("out is not set: give out=/path/to/capture/landmarks3d_fit.npz")
     if not str(config.out).endswith(".npz"):
         raise ConfigError(f"out={config.out} must end in .npz")
-    if not isinstance(config.shown, int) or config.shown < 1:
-        raise ConfigError(f"shown must be a whole number of at least 1, got {config.shown!r}")
+    whole("shown", config.shown, 1)
     out = Path(str(config.out)).expanduser()
     attempt = out.with_name(f".{out.name}.try")
     with writing(out):  # before an hour's work, not after
@@ -121,9 +111,8 @@ def _partial(out: Path) -> Path:
 def _key(config: DictConfig, source: Path, moments: Moments) -> str:
     """Digest of everything that a stopped fit must share with this one to be resumed."""
     layout = moments.dataset.layout
-    whole = OmegaConf.to_container(config, resolve=True)
-    assert isinstance(whole, dict)
-    content: list[Any] = [__version__, {name: whole[name] for name in ("data", "fit", "seed")}]
+    parts = [OmegaConf.to_container(part, resolve=True) for part in (config.data, config.fit)]
+    content: list[Any] = [__version__, config.seed, parts]
     for item in moments.dataset.items:
         files = [path.stat() for _, path in layout.mask_files(*item)]
         content.append([*item, *((file.st_size, file.st_mtime_ns) for file in files)])
@@ -132,49 +121,39 @@ def _key(config: DictConfig, source: Path, moments: Moments) -> str:
     return hashlib.sha256(b"".join([text, *small])).hexdigest()
 
 
-def _resumed(
+def _fitted(
     settings: Fit, moments: Moments, seed: int, partial: Path, key: str, console: Console
 ) -> Fitter:
-    """The fit as a stopped process left it, or a new one."""
+    """The fit after all steps that a stopped process left; the state is saved after each sweep."""
     fitter = Fitter(settings, moments, seed)
-    if not partial.is_file():
-        return fitter
-    try:
-        state = torch.load(partial, map_location=moments.device, weights_only=True)
-        if state["key"] == key:
+    if partial.is_file():
+        try:
+            state = torch.load(partial, map_location=moments.device, weights_only=True)
+            if state["key"] != key:
+                raise ValueError
             fitter.load_state_dict(state["fitter"])
             console.print(f"resuming after {fitter.swept} of {settings.sweeps} sweeps")
-            return fitter
-    except Exception:  # damaged: torch.load and load_state_dict raise many kinds
-        pass
-    console.print("an earlier fit had other settings or data: starting again")
-    return Fitter(settings, moments, seed)
-
-
-def _work(fitter: Fitter, partial: Path, key: str, console: Console) -> None:
-    """All remaining steps; the state is saved after each sweep."""
-    settings, frames = fitter.settings, len(fitter.start)
+        except Exception:  # of another fit, or damaged: torch raises many kinds
+            console.print("an earlier fit had other settings or data: starting again")
+            fitter = Fitter(settings, moments, seed)
     with progress(console) as bars:
         task = bars.add_task("shape", total=settings.shape_steps, completed=fitter.shaped)
         while fitter.shaped < settings.shape_steps:
             fitter.shape_step()
             bars.advance(task)
-        task = bars.add_task("joints", total=settings.sweeps * frames)
-        bars.update(task, completed=fitter.swept * frames)
-        while not fitter.done:
-            fitter.sweep(lambda: bars.advance(task))
+        task = bars.add_task("joints", total=settings.sweeps, completed=fitter.swept)
+        while fitter.swept < settings.sweeps:
+            fitter.sweep()
+            bars.advance(task)
             stream = io.BytesIO()
             torch.save({"key": key, "fitter": fitter.state_dict()}, stream)
             with writing(partial):
                 write_atomically(partial, stream.getvalue())
+    return fitter
 
 
 def _arrays(
-    original: Mapping[str, NDArray[Any]],
-    unit: float,
-    moments: Moments,
-    joints: torch.Tensor,
-    moved: torch.Tensor,
+    original: Mapping[str, NDArray[Any]], unit: float, moments: Moments, joints: Tensor
 ) -> dict[str, Any]:
     """The landmarks' file with moved joints; those not seen or without image keep their place."""
     p = original["p"].astype(np.float64)
@@ -184,6 +163,7 @@ def _arrays(
     i, joint = np.nonzero(seen)
     row = np.array([row_of[frame] for frame in moments.frames])[i]
     p[row, joint] = joints.cpu().numpy().astype(np.float64)[i, joint] / unit
+    moved = (joints - moments.skeletons).norm(dim=-1)
     distance[row, joint] = moved.cpu().numpy()[i, joint]
     earlier = original.get("fitted_to", np.array([], str)).tolist()
     return {
@@ -195,14 +175,10 @@ def _arrays(
     }
 
 
-def _summary(
-    config: DictConfig,
-    out: Path,
-    moments: Moments,
-    before: Agreement,
-    after: Agreement,
-    moved: torch.Tensor,
-) -> list[str]:
+def _summary(config: DictConfig, out: Path, fitter: Fitter, joints: Tensor) -> list[str]:
+    moments = fitter.moments
+    before, after = (fitter.agreement(s) for s in (moments.skeletons, joints))
+    moved = (joints - moments.skeletons).norm(dim=-1)[fitter.seen]
     median, far = (float(moved.quantile(q)) for q in (0.5, 0.95)) if moved.numel() else (0.0, 0.0)
     lines = [
         f"{len(moments.frames)} frames, masks of {', '.join(moments.cameras)}: overlap (IoU) with "
@@ -211,10 +187,7 @@ def _summary(
         f"joints moved {1000 * median:.0f} mm in the median, 95 % by less than {1000 * far:.0f} mm",
     ]
     if median > config.fit.noise:
-        lines.append(
-            "that is more than landmarks' noise (fit.noise): calibration or masks may be wrong; "
-            "run gsgan.check"
-        )
+        lines.append("that is more than fit.noise: calibration or masks may be wrong")
     root, name = moments.dataset.layout.root, out.resolve()
     if name.is_relative_to(root.resolve()):  # then the folder can be moved as a whole
         name = name.relative_to(root.resolve())
@@ -223,3 +196,56 @@ def _summary(
         f"{out} is ready; look at {out.with_suffix('.png')}, then, with this command's data keys,",
         f"python -m gsgan.train data=capture data.root={root} data.reader.landmarks={name}",
     ]
+
+
+@torch.no_grad()
+def fit_picture(fitter: Fitter, names: Sequence[str], joints: Tensor, shown: int) -> bytes:
+    """A PNG: evenly spaced frames as rows, cameras as columns.
+
+    Args:
+        fitter: after the fit.
+        names: of all cameras, in the order of `camera_index`.
+        joints: ``[F, J, 3]`` the fitted skeletons.
+        shown: rows, at most.
+    """
+    moments = fitter.moments
+    rows = {
+        i: {int(frame.camera_index): frame for frame in moments.pictures(i)}
+        for i in sampled(len(moments.frames), shown)
+    }
+    columns = sorted(set().union(*rows.values()))
+    lines = []
+    for i, row in rows.items():
+        tiles = [
+            caption(
+                _tile(fitter, i, row.get(camera), joints[i]),
+                f"{names[camera]}  frame {moments.frames[i]}",
+                BAR,
+            )
+            for camera in columns
+        ]
+        lines.append(np.concatenate(tiles, axis=1))
+    sheet = caption(np.concatenate(lines), LEGEND, BAR)
+    return cv2.imencode(".png", sheet[..., ::-1])[1].tobytes()
+
+
+def _tile(fitter: Fitter, i: int, frame: Frame | None, after: Tensor) -> NDArray[np.uint8]:
+    tile = np.zeros((TILE, TILE, 3), np.uint8)
+    if frame is None:
+        return tile
+    image = (_large(frame.image[0].permute(1, 2, 0)).clip(0, 1) * 255).astype(np.uint8)
+    tile[: image.shape[0], : image.shape[1]] = image
+    before, fitted = (fitter.alpha(i, p, frame) for p in (fitter.start[i], after))
+    for alpha, colour in ((frame.mask, GREEN), (before, ORANGE), (fitted, BLUE)):
+        inside = (_large(alpha[0, 0]) > 0.5).astype(np.uint8)
+        lines = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
+        cv2.drawContours(tile, lines, -1, colour, 1, cv2.LINE_AA)
+    return tile
+
+
+def _large(values: Tensor) -> NDArray[np.float32]:
+    """Values ``[H, W, ...]`` resized so that the longer side has `TILE` pixels."""
+    array = values.detach().to("cpu", torch.float32).numpy()
+    scale = TILE / max(array.shape[:2])
+    size = [max(1, round(scale * side)) for side in array.shape[1::-1]]
+    return cv2.resize(array, size, interpolation=cv2.INTER_LINEAR).astype(np.float32, copy=False)

@@ -8,11 +8,7 @@ from gsgan.utils.config import entry
 
 
 def prepare(config: DictConfig) -> None:
-    """Makes the dataset ``config.out`` from the videos and calibration in ``config.source``.
-
-    Raises:
-        GsganError: on anything the user can correct.
-    """
+    """Makes the dataset ``config.out`` from the videos and calibration in ``config.source``."""
     from hydra.utils import instantiate
 
     from gsgan.prepare.options import Options

@@ -8,7 +8,7 @@ import numpy as np
 
 from gsgan.data.joints import ALL, BODY, HAND, PALM
 from gsgan.prepare.rig import Bool, Float, known
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.checks import above, at_least
 
 Bones = tuple[tuple[int, int], ...]
 # Bones of constant length, as (inner, outer) joint: the outer one is removed when it differs.
@@ -23,49 +23,39 @@ REACH = 3  # standard deviations at which the smoothing kernel ends
 
 @dataclass(frozen=True)
 class Cleansing:
-    """What counts as impossible, see conf/prepare.yaml.
-
-    Raises:
-        ConfigError: when a value is out of its range.
-    """
+    """What counts as impossible, see conf/prepare.yaml."""
 
     max_reach: float = 1.5
     bone: float = 0.3
     hand_bone: float = 0.3
 
     def __post_init__(self) -> None:
-        for name in ("max_reach", "bone", "hand_bone"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(f"cleansing.{name} must be above 0, got {getattr(self, name)!r}")
+        for name, value in vars(self).items():
+            above(f"cleansing.{name}", value)
 
 
 @dataclass(frozen=True)
 class Smoothing:
-    """How trajectories are smoothed, see conf/prepare.yaml.
-
-    Raises:
-        ConfigError: when a value is out of its range.
-    """
+    """How trajectories are smoothed, see conf/prepare.yaml."""
 
     seconds: float = 0.02
 
     def __post_init__(self) -> None:
-        if not self.seconds >= 0:
-            raise ConfigError(f"smoothing.seconds must be at least 0, got {self.seconds!r}")
+        at_least("smoothing.seconds", self.seconds, 0)
 
 
 def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
-    """Points with the impossible ones set to NaN, and how many were removed for which reason.
+    """Points ``p [F, J, 3]`` with the impossible ones set to NaN; how many, by reason.
 
     Convention: of a bone with the wrong length the outer end is removed; of a hand with most palm
-    bones wrong, the whole hand. Medians are over all frames, so a person of any size fits.
-
-    Args:
-        p: ``[F, J, 3]`` metres, NaN = missing; J is 33 or 75.
-        settings: thresholds.
+    bones wrong, the whole hand. Medians are over all frames, so a person of any size fits. J is 33
+    or 75; metres.
     """
-    p = p.copy()
-    far = _far(p, settings.max_reach)
+    p, seen = p.copy(), known(p)
+    centre = np.full((len(p), 1, 3), np.nan)
+    rows = seen.any(1)
+    centre[rows, 0] = np.nanmedian(p[rows], axis=1)
+    far = seen & (np.linalg.norm(p - centre, axis=-1) > settings.max_reach)
     p[far] = np.nan
     wrong = np.zeros(far.shape, bool)
     for (_, joint), bad in zip(BODY_BONES, _off(p, BODY_BONES, settings.bone).T, strict=True):
@@ -77,14 +67,6 @@ def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
     wrong &= known(p)
     p[wrong] = np.nan
     return p, {"too far away": int(far.sum()), "bone length": int(wrong.sum())}
-
-
-def _far(p: Float, reach: float) -> Bool:
-    seen = known(p)
-    centre = np.full((len(p), 1, 3), np.nan)
-    rows = seen.any(1)
-    centre[rows, 0] = np.nanmedian(p[rows], axis=1)
-    return seen & (np.linalg.norm(p - centre, axis=-1) > reach)
 
 
 def bone_lengths(p: Float, bones: Bones) -> Float:
@@ -110,8 +92,7 @@ def smooth(p: Float, weight: Float, time: Float, seconds: float) -> Float:
     time, which `scipy.signal.savgol_filter` does not have.)
 
     Args:
-        p: ``[F, J, 3]`` metres, NaN = missing.
-        weight: ``[F, J]`` at least 0.
+        p, weight: ``[F, J, 3]`` metres, NaN = missing, and ``[F, J]`` at least 0.
         time: ``[F]`` seconds, rising; it need not be even.
         seconds: standard deviation of the Gaussian neighbourhood.
     """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -10,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gsgan.data.files import frame_files, read_arrays, read_json
+from gsgan.data.files import frame_files, read_arrays, read_json, read_json_value
 from gsgan.data.joints import ALL, BODY, FROM_HANDS, HAND, LEFT, RIGHT, SETS
 from gsgan.data.skeletons import whole_frame_ids
-from gsgan.prepare.rig import Float, known
+from gsgan.prepare.rig import Float, Ints, known
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import DataError
@@ -26,39 +24,17 @@ EASYMOCAP_KEYS = ("keypoints", "handl2d", "handr2d")
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TRC_HEADER = 5  # lines before the first frame; markers are named in the fourth
 TRC_AXES = [2, 0, 1]  # Pose2Sim writes (y, z, x) so that y is up: columns of x, y, z
-SYNONYMS = {"bigtoe": "footindex"}  # joint names of other tools, without side
+Numbered = tuple[Ints, Float, Float]  # frame numbers, coordinates, confidence
 
 
 @dataclass(frozen=True)
 class Detections:
-    """One camera's detections of the 75 joints (33 body, 21 left hand, 21 right hand).
+    """One camera's detections of the 75 joints (33 body, 21 left hand, 21 right hand)."""
 
-    Args:
-        frame_id: ``[F]`` rising.
-        px: ``[F, 75, 2]`` pixels of the image as stored, pixel centres at +0.5; NaN = not seen.
-        conf: ``[F, 75]`` in [0, 1], 0 = not seen.
-        people: ``[F]`` number of persons found.
-    """
-
-    frame_id: NDArray[np.int64]
-    px: Float
-    conf: Float
-    people: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class Points3D:
-    """3D joints that another tool triangulated.
-
-    Args:
-        frame_id: ``[F]`` rising.
-        p: ``[F, 33, 3]`` metres, in the calibration's world; NaN = missing.
-        conf: ``[F, 33]`` 0 = missing.
-    """
-
-    frame_id: NDArray[np.int64]
-    p: Float
-    conf: Float
+    frame_id: Ints  # [F] rising
+    px: Float  # [F, 75, 2] pixels of the image as stored, pixel centres at +0.5; NaN = not seen
+    conf: Float  # [F, 75] in [0, 1], 0 = not seen
+    people: Ints  # [F] number of persons found
 
 
 def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
@@ -67,21 +43,16 @@ def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     Raises:
         DataError: when a camera has none, listing what is there.
     """
-    if not folder.is_dir():
-        raise DataError(
-            f"landmarks={folder} is not a folder; expected <camera>.npz or <camera>_json/ in it"
-        )
+    there = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
     found = {}
     for name in names:
-        places = [folder / f"{name}.npz", folder / f"{name}_json", folder / name]
-        existing = [p for p in places if p.exists()]
+        existing = [end for end in (f"{name}.npz", f"{name}_json", name) if end in there]
         if not existing:
-            there = ", ".join(sorted(p.name for p in folder.iterdir())[:20]) or "nothing"
             raise DataError(
-                f"{folder} has no landmarks of the camera {name}; expected {name}.npz, "
-                f"{name}_json/ or {name}/, found {there}"
+                f"{folder} has no landmarks of the camera {name}, such as {name}.npz or "
+                f"{name}_json/, found {', '.join(there[:20]) or 'nothing'}"
             )
-        found[name] = existing[0]
+        found[name] = folder / existing[0]
     return found
 
 
@@ -91,22 +62,24 @@ def read_detections(path: Path) -> Detections:
     Raises:
         DataError: on a damaged file or an unknown set of joints.
     """
-    detections = _read_folder(path) if path.is_dir() else _read_npz(path)
-    order = np.argsort(detections.frame_id)
-    conf = np.where(known(detections.px), np.nan_to_num(detections.conf), 0.0)
+    if path.is_dir():
+        files = _json_files(path)
+        px, conf, people = map(np.array, zip(*map(_read_frame, files.values()), strict=True))
+        frames = np.array(list(files))
+    else:
+        frames, px, conf = _read_npz(path)
+        people = np.asarray((conf[:, :BODY] > 0).any(1), np.int64)
+    order = np.argsort(frames)
+    conf = np.where(known(px), np.nan_to_num(conf), 0.0)
     conf = np.clip(conf, 0.0, 1.0)[order]
-    px = np.where(conf[..., None] > 0, detections.px[order], np.nan)
-    return Detections(detections.frame_id[order], px, conf, detections.people[order])
+    px = np.where(conf[..., None] > 0, px[order], np.nan)
+    return Detections(frames[order], px, conf, people[order])
 
 
 def gather(
     detections: Mapping[str, Detections], offsets: Mapping[str, int]
-) -> tuple[NDArray[np.int64], Float, Float]:
-    """All cameras' detections by common frame numbers.
-
-    Args:
-        detections: by camera.
-        offsets: frames to add to a camera's numbers to get the common ones.
+) -> tuple[Ints, Float, Float]:
+    """All cameras' detections by common frame numbers, a camera's own plus its offset.
 
     Returns:
         ``frames [F]`` rising, those of any camera; ``px [C, F, 75, 2]`` NaN = not seen;
@@ -123,7 +96,7 @@ def gather(
     return frames, px, conf
 
 
-def _read_npz(path: Path) -> Detections:
+def _read_npz(path: Path) -> Numbered:
     arrays = read_arrays(path, ("px", "conf", "left", "right", "frame_id"))
     body = expect_array(arrays, "px", (None, BODY, 2), path).astype(np.float64)
     F = len(body)
@@ -134,8 +107,7 @@ def _read_npz(path: Path) -> Detections:
         if name in arrays:
             px[:, part] = expect_array(arrays, name, (F, HAND, 2), path)
             conf[:, part] = 1.0  # MediaPipe has no confidence per hand joint
-    people = np.asarray((conf[:, :BODY] > 0).any(1), np.int64)
-    return Detections(frame_id, px, conf, people)
+    return frame_id, px, conf
 
 
 def _json_files(path: Path) -> dict[int, Path]:
@@ -143,12 +115,6 @@ def _json_files(path: Path) -> dict[int, Path]:
     if not files:
         raise DataError(f"{path} holds no JSON files; expected one per frame, numbered")
     return {number: path.parent / files[number] for number in sorted(files)}
-
-
-def _read_folder(path: Path) -> Detections:
-    files = _json_files(path)
-    px, conf, people = zip(*map(_read_frame, files.values()), strict=True)
-    return Detections(np.array(list(files)), np.stack(px), np.stack(conf), np.array(people))
 
 
 def _read_frame(path: Path) -> tuple[Float, Float, int]:
@@ -159,16 +125,21 @@ def _read_frame(path: Path) -> tuple[Float, Float, int]:
         keys, people = EASYMOCAP_KEYS, content["annots"]
     else:
         raise DataError(f"{path} has neither 'people' (OpenPose) nor 'annots' (EasyMocap)")
-    read = [_person(path, person, keys) for person in people]
+    try:
+        read = [_person(person, keys) for person in people]
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        sets = ", ".join(f"{n} ({name})" for n, (name, _) in SETS.items())
+        raise DataError(
+            f"{path}: a person must hold '{keys[0]}' with x, y, confidence of {sets} joints "
+            f"({error})"
+        ) from None
     if not read:
         return np.full((ALL, 2), np.nan), np.zeros(ALL), 0
     px, conf = max(read, key=lambda one: float(one[1].sum()))  # the person seen best
     return px, conf, len(read)
 
 
-def _person(path: Path, person: Any, keys: tuple[str, ...]) -> tuple[Float, Float]:
-    if not isinstance(person, Mapping):
-        raise DataError(f"{path}: a person must be an object, found {type(person).__name__}")
+def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Float, Float]:
     px, conf = np.full((ALL, 2), np.nan), np.zeros(ALL)
 
     def put(joints: list[int], triples: Float) -> None:
@@ -176,15 +147,12 @@ def _person(path: Path, person: Any, keys: tuple[str, ...]) -> tuple[Float, Floa
         px[joints] = np.where(seen[:, None], triples[:, :2] + PIXEL_CENTRE, np.nan)
         conf[joints] = np.where(seen, triples[:, 2], 0.0)
 
-    body = _triples(path, person, keys[0])
+    # OpenPose writes triples flat, EasyMocap in rows.
+    body, *hands = (np.array(person.get(k) or [], np.float64).reshape(-1, 3) for k in keys)
     if len(body):
-        if len(body) not in SETS:
-            sets = ", ".join(f"{n} ({name})" for n, (name, _) in SETS.items())
-            raise DataError(f"{path}: '{keys[0]}' holds {len(body)} joints; known are {sets}")
         numbers = SETS[len(body)][1]
         put(list(numbers), body[list(numbers.values())])
-    for key, part in zip(keys[1:], (LEFT, RIGHT), strict=True):
-        hand = _triples(path, person, key)
+    for hand, part in zip(hands, (LEFT, RIGHT), strict=True):
         if len(hand) == HAND:
             put(list(range(part.start, part.stop)), hand)
     for target, origin in FROM_HANDS.items():
@@ -193,39 +161,35 @@ def _person(path: Path, person: Any, keys: tuple[str, ...]) -> tuple[Float, Floa
     return px, conf
 
 
-def _triples(path: Path, person: Mapping[str, Any], key: str) -> Float:
-    """``[n, 3]`` x, y, confidence; OpenPose writes them flat, EasyMocap in rows."""
-    try:
-        return np.array(person.get(key) or [], np.float64).reshape(-1, 3)
-    except (TypeError, ValueError, OverflowError):
-        raise DataError(f"{path}: '{key}' must hold x, y, confidence for every joint") from None
+def read_points3d(path: Path) -> Numbered:
+    """3D joints that another tool triangulated: a .trc file, or a folder of EasyMocap JSON files.
 
-
-def read_points3d(path: Path) -> Points3D:
-    """3D joints from a .trc file or a folder of EasyMocap JSON files; exact zeros are missing.
+    Returns:
+        ``frames [F]`` rising; ``p [F, 33, 3]`` metres, in the calibration's world, NaN = missing,
+        as exact zeros are; ``conf [F, 33]``, 0 = missing.
 
     Raises:
         DataError: when it is neither, damaged, or without shoulders and hips.
     """
-    points = _read_people_folder(path) if path.is_dir() else _read_trc(path)
-    order = np.argsort(points.frame_id)
-    p = np.where((points.p == 0).all(-1, keepdims=True), np.nan, points.p)[order]
-    conf = np.where(known(p), points.conf[order], 0.0)
+    if path.is_dir():
+        files = _json_files(path)
+        both = np.stack([_read_people(file) for file in files.values()])
+        frames, p, conf = np.array(list(files)), both[..., :3], both[..., 3]
+    else:
+        frames, p, conf = _read_trc(path)
+    order = np.argsort(frames)
+    p = np.where((p == 0).all(-1, keepdims=True), np.nan, p)[order]
+    conf = np.where(known(p), conf[order], 0.0)
     p = np.where((conf > 0)[..., None], p, np.nan)
     if not (conf[:, [11, 12, 23, 24]] > 0).any():
         raise DataError(f"{path} has no shoulders and hips; expected a whole body's joints")
-    return Points3D(points.frame_id[order], p, conf)
+    return frames[order], p, conf
 
 
 def without_frozen(p: Float, frames: int) -> tuple[Float, int]:
-    """Points without those that stay exactly the same: gaps that another tool filled.
+    """Points ``p [F, J, 3]`` without gaps that another tool filled, and how many were removed.
 
-    Args:
-        p: ``[F, J, 3]``, NaN = missing.
-        frames: runs of this length or more are removed except for their first frame.
-
-    Returns:
-        The points, and how many were removed.
+    Of a run of exactly equal points, ``frames`` long or longer, only the first stays.
     """
     same = np.zeros(p.shape[:2], bool)
     same[1:] = (np.diff(p, axis=0) == 0).all(-1)
@@ -237,75 +201,55 @@ def without_frozen(p: Float, frames: int) -> tuple[Float, int]:
     return np.where(frozen[..., None], np.nan, p), int(frozen.sum())
 
 
-def _read_trc(path: Path) -> Points3D:
+def _read_trc(path: Path) -> Numbered:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        names, values = lines[1].split(), lines[2].split()
+        markers = [name for name in lines[3].split("\t")[2:] if name]
+        count = 2 + 3 * len(markers)  # frame, time and the coordinates; an empty cell is missing
+        rows = [
+            [
+                float(cell) if cell.strip() else np.nan
+                for cell in (line.split("\t") + [""] * count)[:count]
+            ]
+            for line in lines[TRC_HEADER:]
+            if line.strip()
+        ]
+        unit = values[names.index("Units")]
+    except (OSError, ValueError, IndexError) as error:
         raise DataError(f"{path} cannot be read as a .trc file ({error})") from None
-    if len(lines) <= TRC_HEADER or "Units" not in lines[1]:
-        raise DataError(f"{path} is not a .trc file; expected five lines of header, then frames")
-    unit = dict(zip(lines[1].split(), lines[2].split(), strict=False)).get("Units")
     if unit not in UNITS:
         raise DataError(f"{path}: Units is {unit!r}; expected one of {', '.join(UNITS)}")
-    markers = [name for name in lines[3].rstrip("\t").split("\t")[2:] if name]
-    rows = [
-        _numbers(path, line, 2 + 3 * len(markers)) for line in lines[TRC_HEADER:] if line.strip()
-    ]
-    table = np.array(rows).reshape(-1, 2 + 3 * len(markers))
+    table = np.array(rows).reshape(-1, count)
     read = table[:, 2:].reshape(len(table), len(markers), 3)[..., TRC_AXES] * UNITS[unit]
     p = np.full((len(table), BODY, 3), np.nan)
     for marker, name in enumerate(markers):
         if (joint := _joint(name)) is not None:
             p[:, joint] = read[:, marker]
-    return Points3D(whole_frame_ids(table[:, 0], str(path)), p, np.ones(p.shape[:2]))
-
-
-def _numbers(path: Path, line: str, count: int) -> list[float]:
-    """Frame, time and the markers' coordinates; an empty cell is missing."""
-    cells = (line.split("\t") + [""] * count)[:count]
-    try:
-        numbers = [float(cell) if cell.strip() else np.nan for cell in cells]
-    except ValueError as error:
-        raise DataError(f"{path}: a frame holds no numbers ({error})") from None
-    if not np.isfinite(numbers[0]):
-        raise DataError(f"{path}: a line has no frame number")
-    return numbers
+    return whole_frame_ids(table[:, 0], str(path)), p, np.ones(p.shape[:2])
 
 
 def _joint(name: str) -> int | None:
     """The MediaPipe joint of a marker: LShoulder, left_shoulder, Lknee, LBigToe, Nose."""
-    word = re.sub(r"[^a-z]", "", name.lower())
-    side = re.match(r"left|right|l(?!eft)|r(?!ight)", word)
-    if word == "nose" or side is None:
-        return 0 if word == "nose" else None
-    part = word[side.end() :]
-    joint = ("left" if side[0][0] == "l" else "right") + SYNONYMS.get(part, part)
+    word = re.sub(r"[^a-z]", "", name.lower()).replace("bigtoe", "footindex")
+    word = re.sub("^l(?!eft)", "left", re.sub("^r(?!ight)", "right", word))
     plain = [name.replace("_", "") for name in MEDIAPIPE33.names]
-    return plain.index(joint) if joint in plain else None
-
-
-def _read_people_folder(path: Path) -> Points3D:
-    files = _json_files(path)
-    both = np.stack([_read_people(file) for file in files.values()])
-    return Points3D(np.array(list(files)), both[..., :3], both[..., 3])
+    return plain.index(word) if word in plain else None
 
 
 def _read_people(path: Path) -> Float:
     """``[33, 4]`` x, y, z, confidence of the person seen best; EasyMocap's zeros stay zeros."""
+    best, numbers = np.zeros((BODY, 4)), SETS[25][1]
     try:
-        people: Any = json.loads(path.read_text(encoding="utf-8"))
-        read = [np.array(person["keypoints3d"], np.float64) for person in people]
-    except (OSError, ArithmeticError, ValueError, TypeError, LookupError, RecursionError) as error:
+        for person in read_json_value(path):
+            joints = np.array(person["keypoints3d"], np.float64)[list(numbers.values())]
+            if joints.shape[1] == 3:
+                joints = np.c_[joints, np.ones(len(joints))]
+            if joints[:, 3].sum() > best[:, 3].sum():
+                best[list(numbers)] = joints
+    except (ArithmeticError, ValueError, TypeError, LookupError) as error:
         raise DataError(
-            f"{path} is not an EasyMocap keypoints3d file: expected a list of persons ({error})"
+            f"{path} is not an EasyMocap keypoints3d file: expected a list of persons with "
+            f"(25, 4) numbers each ({error})"
         ) from None
-    out, numbers = np.zeros((BODY, 4)), SETS[25][1]
-    for joints in read:
-        if joints.ndim != 2 or len(joints) < 25 or joints.shape[1] not in (3, 4):
-            raise DataError(f"{path}: keypoints3d has shape {joints.shape}; expected (25, 4)")
-        if joints.shape[1] == 3:
-            joints = np.c_[joints, np.ones(len(joints))]
-        body = joints[list(numbers.values())]
-        if body[:, 3].sum() > out[:, 3].sum():
-            out[list(numbers)] = body
-    return out
+    return best

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 
 from gsgan.prepare.options import MEDIAPIPE, MediaPipe, Options
 from gsgan.prepare.sources import Source
-from gsgan.prepare.work import Work, each_camera, writing
+from gsgan.prepare.work import Advance, Work, each_camera, writing
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root
 
@@ -24,9 +25,7 @@ READY = ".ready"  # written last: an environment without it is incomplete
 
 def environment_of(tool: MediaPipe) -> Path:
     """The environment's folder, which need not exist."""
-    if tool.folder is not None:
-        return Path(tool.folder).expanduser()
-    return cache_root() / "tools" / "mediapipe-0.10.21"
+    return Path(tool.folder or cache_root() / "tools" / "mediapipe-0.10.21").expanduser()
 
 
 def tool_key(tool: MediaPipe) -> list[object]:
@@ -38,10 +37,7 @@ def tool_key(tool: MediaPipe) -> list[object]:
 def run_tool(
     options: Options, sources: Mapping[str, Source], work: Work, say: Callable[[str], None]
 ) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
-    """Runs MediaPipe on every source without a stored result.
-
-    Returns:
-        By source: the npz of landmarks, and the masks by frame number.
+    """The npz of landmarks and the masks by frame number of each source; runs what is not stored.
 
     Raises:
         ConfigError: when the environment is missing and may not be created.
@@ -58,15 +54,18 @@ def run_tool(
     if missing:
         python = ensure_environment(tool, options.setup, say)
 
-        def one(name: str, report: Callable[[int, int], None]) -> None:
-            slot = missing.index(name) % options.workers
-            command = [str(python), str(SCRIPT), "--source", str(sources[name].path)]
-            command += ["--out", str(results[name]), "--hands", str(int(hands))]
-            command += ["--rotate", str(int(sources[name].rotate)), "--slot", str(slot)]
-            for option in ("threads", "confidence", "tracking", "margin"):
-                command += [f"--{option}", str(getattr(tool, option))]
-            command += ["--masks", str(folders[name])] if masks else []
-            _detect(command, sources[name].path, report)
+        def one(name: str, advance: Advance) -> None:
+            given = {
+                "source": str(sources[name].path),
+                "out": str(results[name]),
+                "masks": str(folders[name]) * masks,
+                "hands": hands,
+                "rotate": sources[name].rotate,
+                "slot": missing.index(name) % options.workers,
+                **vars(tool),
+            }
+            command = [str(python), str(SCRIPT), json.dumps(given)]
+            _detect(command, sources[name].path, advance)
 
         each_camera(one, "finding landmarks", missing, options.workers)
     found = {
@@ -74,14 +73,11 @@ def run_tool(
         for name, folder in folders.items()
     }
     if masks and (empty := [name for name, files in found.items() if not files]):
-        raise DataError(
-            f"MediaPipe found nobody in the images of {empty[0]}; remove that camera, or give "
-            "masks=<folder>"
-        )
+        raise DataError(f"MediaPipe found nobody in {empty[0]}; remove it, or give masks=<folder>")
     return results, found
 
 
-def _detect(command: list[str], source: Path, report: Callable[[int, int], None]) -> None:
+def _detect(command: list[str], source: Path, advance: Advance) -> None:
     with (
         tempfile.TemporaryFile("w+") as errors,
         subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True) as process,
@@ -91,7 +87,7 @@ def _detect(command: list[str], source: Path, report: Callable[[int, int], None]
             for line in process.stdout:
                 done, _, count = line.partition(" ")
                 if done.isdigit() and count.strip().isdigit():
-                    report(int(done), int(count))
+                    advance(int(done), int(count))
         except BaseException:
             process.kill()
             raise
@@ -104,9 +100,8 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
     """The environment's Python; a missing environment is created if ``setup`` allows it.
 
     Raises:
-        ConfigError: when it is missing and may not be created, its folder holds something else, or
-            no suitable Python is found.
-        DataError: when it cannot be created.
+        ConfigError: when it may not be created, its folder is in use, or no Python fits.
+        DataError: when creating it fails.
     """
     place = environment_of(tool)
     python = place / ("Scripts/python.exe" if sys.platform == "win32" else "bin/python")
@@ -114,18 +109,17 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
         return python
     if not setup:
         raise ConfigError(
-            f"landmarks=mediapipe needs its own environment at {place}, which does not exist; add "
-            "setup=true to create it (some 400 MB are installed), or give landmarks=<folder> and "
-            "masks=<folder>"
+            f"landmarks=mediapipe needs its own environment at {place}: add setup=true to create "
+            "it (some 400 MB), or give landmarks=<folder> and masks=<folder>"
         )
-    base = _base_python(tool.python)
+    pythons = [tool.python, sys.executable if sys.version_info[:2] <= NEWEST else None]
+    base = next(filter(None, (*pythons, *map(shutil.which, ("python3.12", "python3.11")))), None)
+    if base is None:
+        raise ConfigError("MediaPipe needs Python 3.11 or 3.12: set mediapipe.python=<path>")
     with writing(place):
         if place.exists():
             if any(place.iterdir()) and not (place / MARKER).is_file():
-                raise ConfigError(
-                    f"mediapipe.folder={place} holds something else than an environment that gsgan "
-                    "made; give a new or empty folder"
-                )
+                raise ConfigError(f"mediapipe.folder={place} holds something else; give a new one")
             shutil.rmtree(place)
         place.mkdir(parents=True)
         (place / MARKER).touch()
@@ -134,24 +128,10 @@ def ensure_environment(tool: MediaPipe, setup: bool, say: Callable[[str], None])
     install = [str(python), "-m", "pip", "install", "--quiet", "--no-deps"]
     install += ["--disable-pip-version-check", "-r", str(REQUIREMENTS)]
     _run(install, "pip cannot install MediaPipe")
-    _run([str(python), str(SCRIPT), "--help"], "MediaPipe does not start")
+    _run([str(python), "-c", "import mediapipe"], "MediaPipe does not start")
     with writing(place):
         (place / READY).touch()
     return python
-
-
-def _base_python(given: str | None) -> str:
-    if given is not None:
-        return given
-    if sys.version_info[:2] <= NEWEST:
-        return sys.executable
-    for minor in (12, 11):
-        if found := shutil.which(f"python3.{minor}"):
-            return found
-    raise ConfigError(
-        "MediaPipe 0.10.21 needs Python 3.11 or 3.12, and neither is on the PATH; install one and "
-        "set mediapipe.python=/path/to/python3.12"
-    )
 
 
 def _run(command: list[str], what: str) -> None:
@@ -164,5 +144,4 @@ def _run(command: list[str], what: str) -> None:
 
 
 def _last_line(text: str) -> str:
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    return lines[-1] if lines else "it ended without a message"
+    return (text.strip().splitlines() or ["it ended without a message"])[-1].strip()

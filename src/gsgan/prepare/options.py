@@ -1,4 +1,4 @@
-"""The options of `gsgan.prepare`, as conf/prepare.yaml lists them."""
+"""The options of `gsgan.prepare`, and the images and cameras that they name."""
 
 from __future__ import annotations
 
@@ -7,12 +7,16 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from gsgan.data.files import LARGEST_FRAME
+from gsgan.data.calibration import Calibration, find_calibration, read_calibration
+from gsgan.data.cameras import CameraEntry
 from gsgan.prepare.doubts import Doubts
 from gsgan.prepare.landmarks import UNITS
 from gsgan.prepare.pictures import MaskTidying, PictureFiles
+from gsgan.prepare.rig import MIN_VIEWS
 from gsgan.prepare.solve import Settings
-from gsgan.utils.errors import ConfigError
+from gsgan.prepare.sources import Source, find_sources, fit_size, pair_cameras
+from gsgan.utils.checks import above, at_least, between, one_of, whole
+from gsgan.utils.errors import ConfigError, DataError
 
 MEDIAPIPE = "mediapipe"
 AXES = ("x", "y", "z", "-x", "-y", "-z")
@@ -21,11 +25,7 @@ FREE = ("out", "setup", "workers", "overwrite", "keep_work")  # do not change th
 
 @dataclass(frozen=True)
 class MediaPipe:
-    """The landmark tool and its environment, see conf/prepare.yaml.
-
-    Raises:
-        ConfigError: when a value is out of its range.
-    """
+    """The landmark tool and its environment, see conf/prepare.yaml."""
 
     folder: str | None = None
     python: str | None = None
@@ -35,30 +35,21 @@ class MediaPipe:
     margin: float = 0.15
 
     def __post_init__(self) -> None:
-        if not (0 <= self.confidence <= 1 and 0 <= self.tracking <= 1 and self.margin >= 0):
-            raise ConfigError(
-                "mediapipe.confidence and .tracking must be 0 to 1 and .margin at least 0, got "
-                f"{self.confidence!r}, {self.tracking!r} and {self.margin!r}"
-            )
+        between("mediapipe.confidence", self.confidence, 0, 1)
+        between("mediapipe.tracking", self.tracking, 0, 1)
+        at_least("mediapipe.margin", self.margin, 0)
 
 
 @dataclass(frozen=True)
 class Overlays:
-    """Images in the report, see conf/prepare.yaml.
-
-    Raises:
-        ConfigError: when a value is out of its range.
-    """
+    """Images in the report, see conf/prepare.yaml."""
 
     frames: int = 4
     size: int = 420
 
     def __post_init__(self) -> None:
-        if not (self.frames >= 0 and self.size > 0):
-            raise ConfigError(
-                "overlays.frames must be at least 0 and overlays.size above 0, got "
-                f"{self.frames!r} and {self.size!r}"
-            )
+        whole("overlays.frames", self.frames, 0)
+        whole("overlays.size", self.size, 1)
 
 
 @dataclass(frozen=True)
@@ -100,44 +91,27 @@ class Options:
         for name, what in (("source", "folder with the videos"), ("out", "folder to make")):
             if not getattr(self, name):
                 raise ConfigError(f"give {name}=<{what}>")
-        for name, allowed in (
-            ("unit", tuple(UNITS)),
-            ("up_axis", AXES),
-            ("pixel_centre", (0, 0.5)),
-        ):
-            value = getattr(self, name)
-            if value is not None and value not in allowed:
-                listed = ", ".join(map(str, allowed))
-                raise ConfigError(f"{name} must be one of {listed}, got {value!r}")
-        if self.fps is not None and not (isinstance(self.fps, int | float) and self.fps > 0):
-            raise ConfigError(f"fps must be a number above 0, got {self.fps!r}")
-        if not isinstance(self.workers, int) or self.workers < 1:
-            raise ConfigError(f"workers must be a whole number, at least 1, got {self.workers!r}")
+        for name, choices in (("unit", UNITS), ("up_axis", AXES)):
+            if getattr(self, name) is not None:
+                one_of(name, getattr(self, name), choices)
+        if self.pixel_centre not in (0, 0.5):
+            raise ConfigError(f"pixel_centre must be 0 or 0.5, got {self.pixel_centre!r}")
+        if self.fps is not None:
+            above("fps", self.fps)
+        whole("workers", self.workers, 1)
         for name in ("cameras", "offsets"):
             given = getattr(self, name)
             if given is not None and not isinstance(given, Mapping):
                 raise ConfigError(f"{name} must be {{video name: value}}, got {given!r}")
         for camera, frames in (self.offsets or {}).items():
-            if not isinstance(frames, int) or abs(frames) > LARGEST_FRAME:
-                raise ConfigError(
-                    f"offsets: {camera} must have whole frames up to {LARGEST_FRAME}, got "
-                    f"{frames!r}"
-                )
-
-    def offset(self, camera: str) -> int:
-        """Frames to add to a camera's own numbers."""
-        return int((self.offsets or {}).get(camera, 0))
+            if not isinstance(frames, int):
+                raise ConfigError(f"offsets: {camera} must be a whole number, got {frames!r}")
 
     @property
     def needs_tool(self) -> bool:
         """Whether the MediaPipe tool has to run."""
         landmarks = self.landmarks if self.landmarks3d is None else None
         return MEDIAPIPE in (landmarks, self.masks)
-
-    @property
-    def unit_scale(self) -> float | None:
-        """Metres per unit of the calibration, None for the format's own."""
-        return None if self.unit is None else UNITS[self.unit]
 
     def record(self) -> dict[str, Any]:
         """The settings that the dataset depends on, as plain values."""
@@ -146,3 +120,48 @@ class Options:
     def folder(self, name: str) -> Path:
         """A key that holds a path."""
         return Path(str(getattr(self, name))).expanduser().absolute()
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Images and the cameras that took them."""
+
+    sources: Mapping[str, Source]
+    calibration: Calibration
+    cameras: tuple[CameraEntry, ...]  # in the order of the sources, with their names and sizes
+    notes: tuple[str, ...]  # one sentence for each thing that was converted or left out
+    fps: float
+
+
+def read_inputs(options: Options) -> Inputs:
+    """Finds and pairs images and calibration.
+
+    Raises:
+        DataError: on what is missing, damaged, or cannot be paired.
+        ConfigError: when an offset names no video, or the frame rate is unknown.
+    """
+    folder = options.folder("source")
+    sources = find_sources(folder, options.apply_rotation)
+    if len(sources) < MIN_VIEWS:
+        raise DataError(f"{folder} holds only the camera {next(iter(sources))}; 3D needs two")
+    if unknown := sorted(set(options.offsets or {}) - set(sources)):
+        raise ConfigError(f"offsets name {unknown[0]}, but the videos are {', '.join(sources)}")
+    path = folder if options.calibration is None else options.folder("calibration")
+    if path.is_dir():
+        path = find_calibration(path)
+    scale = None if options.unit is None else UNITS[options.unit]  # None: the format's own
+    calibration = read_calibration(path, scale, options.pixel_centre)
+    notes, cameras = list(calibration.notes), []
+    pairs = pair_cameras(list(sources), list(calibration.cameras), options.cameras or {})
+    for name, source in sources.items():
+        camera = calibration.cameras[pairs[name]]
+        fitted, note = fit_size(camera, name, source.size, options.crop_px, path)
+        cameras.append(fitted)
+        notes += [] if note is None else [note]
+    if unused := sorted(set(calibration.cameras) - set(pairs.values())):
+        notes.append(f"calibrated without a video, left out: {', '.join(unused)}")
+    rates = sorted(source.fps for source in sources.values() if source.fps)
+    if options.fps is None and not rates:
+        raise ConfigError("images have no frame rate; give fps=<frames per second>")
+    fps = float(options.fps or rates[len(rates) // 2])
+    return Inputs(sources, calibration, tuple(cameras), tuple(notes), fps)

@@ -1,4 +1,4 @@
-"""The report of a preparation: errors after every stage, overlays, doubts."""
+"""What stands beside the images: cameras, landmarks, and the report of a preparation."""
 
 from __future__ import annotations
 
@@ -12,32 +12,28 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
+import gsgan
 from gsgan.check.overlays import LEFT, MIDDLE, RIGHT, caption, draw, encode
 from gsgan.check.report import Figure, Finding, Report, Section, Table, page, print_report
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, PersonCrop, Window, cut, project, resize
+from gsgan.data.crop import NEAR, Crop, PersonCrop, cut, project, resize
 from gsgan.data.files import read_colour, read_grey
-from gsgan.data.joints import BODY
-from gsgan.prepare.inputs import Inputs
-from gsgan.prepare.options import Options
-from gsgan.prepare.pictures import sampled
-from gsgan.prepare.rig import FOCAL, Float, known
-from gsgan.prepare.solve import Solution, median, stage_medians
-from gsgan.prepare.work import write_json, writing
+from gsgan.data.joints import BODY, hand_names
+from gsgan.prepare.options import Inputs, Options
+from gsgan.prepare.pictures import Written, sampled
+from gsgan.prepare.rig import FOCAL, Float, Ints, Rig, camera_moves, known
+from gsgan.prepare.solve import Solution, median
+from gsgan.prepare.work import GENERATOR, write_json, write_npz, writing
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.files import write_atomically
 
 Bytes = NDArray[np.uint8]
-STAGES = {
-    "plain": "plain weighted triangulation (DLT)",
-    "robust": "robust triangulation",
-    "flips": "left and right corrected",
-    "refined": "camera poses refined",
-    "smoothed": "cleansed and smoothed: what is written",
-}
 BAR = (70, 70, 70)
-EMPTY = 60  # grey of a tile without image
 FAR = 10_000  # pixels: drawing stops there
+AGREEMENT = (
+    "Median reprojection error in pixels of the full-size image after each stage: plain and robust "
+    "triangulation, sides corrected, cameras refined, and smoothed, which is what is written."
+)
 LEGEND = (
     "Blue: the person's left, orange: the right, white: the middle. Lines: the 3D joints "
     "projected; large dots: detections, sides corrected. Green: the mask's outline and box; "
@@ -47,50 +43,105 @@ LEGEND = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """The content of the report.
+    """Everything that the dataset is made from: ``frames [F]`` numbers, images by camera."""
 
-    Args:
-        inputs: images and calibration.
-        cameras: of the written images.
-        frames: ``F`` common numbers.
-        written: frames with image and mask, by camera.
-        solution: of all frames.
-        turned: ``[C]`` degrees by which refinement turned the cameras.
-        moved_mm: ``[C]`` millimetres by which it moved them.
-        doubts: one sentence each.
-    """
-
+    options: Options
     inputs: Inputs
-    cameras: Sequence[CameraEntry]
-    frames: Sequence[int]
-    written: Mapping[str, list[int]]
+    frames: Ints
     solution: Solution
-    turned: Float
-    moved_mm: Float
-    doubts: Sequence[str]
+    written: Mapping[str, Written]
+
+    @property
+    def cameras(self) -> list[CameraEntry]:
+        """The cameras of the written images."""
+        refined = self.solution.rig.entries(self.inputs.cameras)
+        return [self.options.pictures.camera(camera) for camera in refined]
 
 
-def write_report(root: Path, outcome: Outcome, options: Options, console: Console) -> None:
+def write_small_files(root: Path, outcome: Outcome, key: str) -> None:
+    """cameras.json, landmarks3d.npz, hands3d.npz, landmarks2d/, meta.json, in metres and pixels."""
+    solution, frames = outcome.solution, outcome.frames
+    cameras = {
+        camera.name: {key: getattr(camera, key).tolist() for key in ("K", "R", "t")}
+        | {"dist": [0.0] * 5, "size": list(camera.size[::-1])}
+        for camera in outcome.cameras
+    }
+    write_json(root / "cameras.json", cameras)
+    p, conf = solution.p, solution.conf
+    error = solution.error[:, :, :BODY] * outcome.options.pictures.scale
+    seen = np.isfinite(error)
+    mean = np.where(seen, error, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
+    body, hands = (
+        {"p": p[:, part].astype(np.float32), "conf": conf[:, part].astype(np.float32)}
+        for part in (slice(BODY), slice(BODY, None))
+    )
+    write_npz(
+        root / "landmarks3d.npz",
+        **body,
+        reproj_px=np.where(seen.any(0), mean, np.nan).astype(np.float32),
+        n_views=solution.views[:, :BODY].astype(np.int16),
+        frame_id=frames,
+        names=np.array(MEDIAPIPE33.names),
+        edges=np.array(MEDIAPIPE33.edges),
+    )
+    if p.shape[1] > BODY:
+        write_npz(root / "hands3d.npz", **hands, frame_id=frames, names=np.array(hand_names()))
+    for c, camera in enumerate(outcome.cameras) if solution.seen.any() else ():
+        ratio = np.diag(camera.K)[:2] / np.diag(solution.rig.K[c])[:2]
+        write_npz(
+            root / "landmarks2d" / f"{camera.name}.npz",
+            p=(solution.uv[c, :, :BODY] * ratio).astype(np.float32),
+            conf=solution.seen[c, :, :BODY].astype(np.float32),
+            frame_id=frames,
+            undistorted=np.array(True),
+        )
+    meta = {
+        "fps": outcome.inputs.fps,
+        "unit": "m",
+        "up_axis": outcome.options.up_axis or standing_axis(p),
+        "skeleton": "mediapipe33",
+        "pixel_centre": 0.5,
+        "made_by": {"generator": GENERATOR, "version": gsgan.__version__, "key": key},
+    }
+    write_json(root / "meta.json", meta)
+
+
+def standing_axis(p: Float) -> str:
+    """The world axis along which a person ``p [F, J, 3]`` stands: "z", "-y", ...; unknown is "z".
+
+    It is the direction from ankles to nose; NaN = missing.
+    """
+    above = np.concatenate([p[:, 0] - (p[:, 27] + p[:, 28]) / 2, (p[:, 11] - p[:, 23])])
+    above = above[known(above)]
+    up = np.median(above, axis=0) if len(above) else np.array([0.0, 0.0, 1.0])
+    axis = int(np.abs(up).argmax())
+    return ("-" if up[axis] < 0 else "") + "xyz"[axis]
+
+
+def write_report(root: Path, outcome: Outcome, doubts: Sequence[str], console: Console) -> None:
     """Writes report.html and report.json into the dataset and prints the tables."""
-    kept = {frame for frames in outcome.written.values() for frame in frames}
-    dropped = [frame for frame in outcome.frames if frame not in kept]
-    numbers = _numbers(outcome, options, dropped)
-    notes = [*outcome.inputs.notes]
-    notes += [f"{len(outcome.frames)} frames at {numbers['fps']:g} per second"]
-    if dropped:
+    inputs, options, solution = outcome.inputs, outcome.options, outcome.solution
+    numbers = _numbers(outcome, doubts)
+    notes = [*inputs.notes, f"{len(outcome.frames)} frames at {inputs.fps:g} per second"]
+    if dropped := numbers["frames_dropped"]:
         shown = ", ".join(map(str, dropped[:20])) + (" ..." if len(dropped) > 20 else "")
         notes.append(f"{len(dropped)} frames dropped, without skeleton or mask: {shown}")
+    found, views = known(solution.p).mean(0), solution.views.mean(0)
+    joints = tuple(
+        (name, f"{found[j]:.0%}", _number(median(solution.error[..., j]), ".1f"), f"{views[j]:.1f}")
+        for j, name in enumerate(MEDIAPIPE33.names)
+    )
+    headers = "joint", "frames found", "error px", "cameras that agree"
+    limits = options.doubts.reprojection * solution.rig.focal / FOCAL
     sections = (
         Section(
             "How well joints and cameras agree",
-            ("Median reprojection error in pixels of the full-size image, over all detections.",),
-            tables=(_stage_table(outcome, options), _camera_table(numbers["cameras"])),
-            findings=tuple(Finding("warning", "capture", doubt) for doubt in outcome.doubts),
+            tables=(_camera_table(numbers, limits),),
+            findings=tuple(Finding("warning", "capture", doubt) for doubt in doubts),
+            aside=(AGREEMENT,),
         ),
-        Section(
-            "Overlays", aside=(LEGEND,), figures=_figures(root, outcome, options, sorted(kept))
-        ),
-        Section("Joints", tables=(_joint_table(outcome.solution),)),
+        Section("Overlays", aside=(LEGEND,), figures=_figures(root, outcome)),
+        Section("Joints", tables=(Table(headers, joints),)),
         Section("Notes", tuple(notes)),
     )
     out = str(options.folder("out"))
@@ -101,105 +152,88 @@ def write_report(root: Path, outcome: Outcome, options: Options, console: Consol
     print_report(report, console)
 
 
-def _numbers(outcome: Outcome, options: Options, dropped: list[int]) -> dict[str, Any]:
+def _numbers(outcome: Outcome, doubts: Sequence[str]) -> dict[str, Any]:
     """The content of report.json."""
-    solution, calibration = outcome.solution, outcome.inputs.calibration
-    stages = stage_medians(solution.stages)
+    inputs, solution = outcome.inputs, outcome.solution
+    turned, moved = camera_moves(Rig.of(inputs.cameras), solution.rig)
     by_camera = {
-        camera.name: {
-            "error_px": {stage: values[1][c] for stage, values in stages.items()},
-            "turned_degrees": float(outcome.turned[c]),
-            "moved_mm": float(outcome.moved_mm[c]),
+        name: {
+            "error_px": {stage: median(error[c]) for stage, error in solution.stages.items()},
+            "turned_degrees": float(turned[c]),
+            "moved_mm": float(moved[c]),
             "flipped_share": float(solution.flips[c].any(-1).mean()),
             "delay_frames": float(solution.delay[c]),
             "frames_with_person": int(np.isfinite(solution.error[c]).any(-1).sum()),
-            "frames_written": len(outcome.written[camera.name]),
+            "frames_written": len(outcome.written[name].frames),
         }
-        for c, camera in enumerate(outcome.cameras)
+        for c, name in enumerate(inputs.sources)
     }
     found = known(solution.p[:, :BODY]).mean(0)
+    kept = {frame for one in outcome.written.values() for frame in one.frames}
     return {
-        "error_px": {stage: values[0] for stage, values in stages.items()},
-        "detections_used": {stage: values[2] for stage, values in stages.items()},
+        "error_px": {stage: median(error) for stage, error in solution.stages.items()},
         "cameras": by_camera,
         "joints_found": dict(zip(MEDIAPIPE33.names, found.tolist(), strict=True)),
         "frames": len(outcome.frames),
-        "frames_dropped": dropped,
+        "frames_dropped": [frame for frame in outcome.frames.tolist() if frame not in kept],
         "joints_removed": solution.removed,
-        "fps": outcome.inputs.fps,
-        "calibration": {"file": calibration.path.name, "format": calibration.format},
-        "notes": list(outcome.inputs.notes),
-        "doubts": list(outcome.doubts),
-        "settings": options.record(),
+        "fps": inputs.fps,
+        "calibration": {"file": inputs.calibration.path.name, "format": inputs.calibration.format},
+        "notes": list(inputs.notes),
+        "doubts": list(doubts),
+        "settings": outcome.options.record(),
     }
 
 
-def _stage_table(outcome: Outcome, options: Options) -> Table:
-    limits = options.doubts.reprojection * outcome.solution.rig.focal / FOCAL
-    rows: list[tuple[str, ...]] = []
-    flagged: set[tuple[int, int]] = set()
-    for stage, (whole, each, used) in stage_medians(outcome.solution.stages).items():
-        if stage == "smoothed":
-            flagged = {(len(rows), c + 2) for c, error in enumerate(each) if error > limits[c]}
-        cells = ("-" if np.isnan(error) else f"{error:.2f}" for error in (whole, *each))
-        rows.append((STAGES[stage], *cells, f"{used:.1%}"))
-    headers = ("after", "all", *(camera.name for camera in outcome.cameras), "detections used")
-    return Table(headers, tuple(rows), frozenset(flagged), "Error in pixels")
-
-
-def _camera_table(cameras: Mapping[str, Mapping[str, Any]]) -> Table:
-    rows = tuple(
-        (
-            name,
-            f"{one['turned_degrees']:.2f}°",
-            f"{one['moved_mm']:.0f} mm",
-            f"{one['flipped_share']:.0%}",
-            "?" if np.isnan(one["delay_frames"]) else f"{one['delay_frames']:+.2f}",
-            str(one["frames_written"]),
-        )
-        for name, one in cameras.items()
-    )
-    headers = ("camera", "turned", "moved", "sides swapped", "frames late", "images")
-    return Table(headers, rows, title="Cameras, after refinement")
-
-
-def _joint_table(solution: Solution) -> Table:
-    found, views = known(solution.p).mean(0), solution.views.mean(0)
-    rows = []
-    for j, name in enumerate(MEDIAPIPE33.names):
-        error = median(solution.error[..., j])
-        px = "-" if np.isnan(error) else f"{error:.1f}"
-        rows.append((name, f"{found[j]:.0%}", px, f"{views[j]:.1f}"))
-    return Table(("joint", "frames found", "error px", "cameras that agree"), tuple(rows))
-
-
-def _figures(
-    root: Path, outcome: Outcome, options: Options, kept: Sequence[int]
-) -> tuple[Figure, ...]:
-    """Per camera, its tiles of some frames side by side."""
-    chosen = [kept[i] for i in sampled(len(kept), options.overlays.frames)]
-    figures = []
-    for c, camera in enumerate(outcome.cameras if chosen else ()):
-        ratio = np.array(camera.size[::-1]) / np.array(outcome.inputs.cameras[c].size[::-1])
-        tiles = []
-        for frame in chosen:
-            at = outcome.frames.index(frame)
-            p, uv = outcome.solution.p[at, :BODY], outcome.solution.uv[c, at, :BODY] * ratio
-            files = (
-                root / "images" / camera.name / f"{frame:06d}.{options.pictures.format}",
-                root / "masks" / camera.name / f"{frame:06d}.png",
+def _camera_table(numbers: Mapping[str, Any], limits: Float) -> Table:
+    """Errors by camera and stage, and what refinement, flips and clocks gave."""
+    rows, flagged = [], set()
+    stages = numbers["error_px"]
+    for c, (name, one) in enumerate(numbers["cameras"].items()):
+        errors = one["error_px"]
+        if errors["smoothed"] > limits[c]:
+            flagged.add((c, len(stages)))
+        rows.append(
+            (
+                name,
+                *(_number(error, ".2f") for error in errors.values()),
+                f"{one['turned_degrees']:.2f}°",
+                f"{one['moved_mm']:.0f} mm",
+                f"{one['flipped_share']:.0%}",
+                _number(one["delay_frames"], "+.2f"),
+                str(one["frames_written"]),
             )
-            tile = _tile(*files, camera, p, uv, options.overlays.size)
+        )
+    rows.append(("all", *(_number(error, ".2f") for error in stages.values()), *[""] * 5))
+    headers = "camera", *stages, "turned", "moved", "swapped", "late", "images"
+    title = "Error in pixels, refinement, share of sides swapped, frames that the clock is late"
+    return Table(headers, tuple(rows), frozenset(flagged), title)
+
+
+def _number(value: float, form: str) -> str:
+    return "-" if np.isnan(value) else format(value, form)
+
+
+def _figures(root: Path, outcome: Outcome) -> tuple[Figure, ...]:
+    """Per camera, its tiles of some frames side by side."""
+    options, figures = outcome.options, []
+    for c, camera in enumerate(outcome.cameras):
+        ratio = np.diag(camera.K)[:2] / np.diag(outcome.solution.rig.K[c])[:2]
+        frames, tiles = outcome.written[camera.name].frames, []
+        for frame in (frames[i] for i in sampled(len(frames), options.overlays.frames)):
+            at = np.searchsorted(outcome.frames, frame)
+            p, uv = outcome.solution.p[at, :BODY], outcome.solution.uv[c, at, :BODY] * ratio
+            image = root / "images" / camera.name / f"{frame:06d}.{options.pictures.format}"
+            mask = root / "masks" / camera.name / f"{frame:06d}.png"
+            tile = _tile(image, mask, camera, p, uv, options.overlays.size)
             tiles.append(caption(tile, f"{camera.name}  frame {frame}", BAR))
-        title = f"{camera.name}: frames {', '.join(map(str, chosen))}"
-        figures.append(Figure(title, picture=encode(np.concatenate(tiles, axis=1))))
+        if tiles:
+            figures.append(Figure(camera.name, encode(np.concatenate(tiles, axis=1))))
     return tuple(figures)
 
 
 def _tile(image: Path, mask: Path, camera: CameraEntry, p: Float, uv: Float, size: int) -> Bytes:
     """Joints ``p [33, 3]``, detections ``uv [33, 2]`` and mask on the image around the person."""
-    if not image.is_file():
-        return np.full((size, size, 3), EMPTY, np.uint8)
     pixels, depth = project(camera, np.nan_to_num(p))
     drawn = known(p) & (depth > NEAR)
     window = PersonCrop().window(camera, np.nan_to_num(p), drawn)
@@ -218,6 +252,6 @@ def _tile(image: Path, mask: Path, camera: CameraEntry, p: Float, uv: Float, siz
     return picture
 
 
-def _placed(pixels: Float, window: Window, size: int) -> Float:
+def _placed(pixels: Float, window: Crop, size: int) -> Float:
     scaled = (pixels - [window.left, window.top]) * (size / window.size[0])
     return np.clip(scaled, -FAR, FAR)

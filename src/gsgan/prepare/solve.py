@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,14 +11,21 @@ from numpy.typing import NDArray
 
 from gsgan.data.joints import ALL, BODY, flip_groups
 from gsgan.prepare.cleanse import Cleansing, Smoothing, cleanse, smooth
-from gsgan.prepare.flips import FlipSearch, apply_flips, find_flips
-from gsgan.prepare.landmarks import Points3D, without_frozen
-from gsgan.prepare.refine import Refinement, refine_rig
-from gsgan.prepare.rig import FOCAL, Bool, Float, Rig, known
-from gsgan.prepare.triangulate import MIN_VIEWS, Points, Triangulation
+from gsgan.prepare.landmarks import without_frozen
+from gsgan.prepare.rig import (
+    FOCAL,
+    MIN_VIEWS,
+    Bool,
+    Float,
+    Ints,
+    Refinement,
+    Rig,
+    known,
+    refine_rig,
+)
+from gsgan.prepare.triangulate import FlipSearch, Points, Triangulation, apply_flips, find_flips
 
 ARRAYS = ("p", "conf", "views", "error", "uv", "seen", "flips", "delay", "gain")
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -34,66 +41,49 @@ class Settings:
 
 @dataclass(frozen=True)
 class Solution:
-    """Joints, cameras, and how well they agree.
+    """Joints, cameras, and how well they agree; NaN = missing or not seen."""
 
-    Args:
-        rig: refined.
-        p: ``[F, J, 3]`` metres, NaN = missing.
-        conf: ``[F, J]`` mean confidence of the cameras that see the joint, 0 where missing.
-        views: ``[F, J]`` cameras whose detection lies within the triangulation's ``scale``.
-        error: ``[C, F, J]`` final reprojection error, full-size undistorted pixels, NaN = not seen.
-        uv: ``[C, F, J, 2]`` undistorted detections with the sides corrected.
-        seen: ``[C, F, J]`` their confidence.
-        flips: ``[C, F, G]`` sides that were swapped.
-        delay, gain: ``[C]`` of each camera's clock, see `clock_errors`.
-        stages: name of each stage and its body errors ``[C, F, 33]``.
-        removed: number of joints removed, by reason.
-    """
-
-    rig: Rig
-    p: Float
-    conf: Float
-    views: NDArray[np.int64]
-    error: Float
-    uv: Float
-    seen: Float
-    flips: Bool
-    delay: Float
-    gain: Float
-    stages: dict[str, Float]
-    removed: dict[str, int]
+    rig: Rig  # refined
+    p: Float  # [F, J, 3] metres
+    conf: Float  # [F, J] mean confidence of the cameras that see the joint, 0 where missing
+    views: Ints  # [F, J] cameras whose detection lies within the triangulation's scale
+    error: Float  # [C, F, J] final reprojection error, full-size undistorted pixels
+    uv: Float  # [C, F, J, 2] undistorted detections with the sides corrected
+    seen: Float  # [C, F, J] their confidence
+    flips: Bool  # [C, F, G] sides that were swapped
+    delay: Float  # [C] of each camera's clock, see `clock_errors`
+    gain: Float  # [C] the same
+    stages: dict[str, Float]  # name of each stage and its body errors [C, F, 33]
+    removed: dict[str, int]  # number of joints removed, by reason
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """All of it as plain arrays, except K."""
+        """All of it as plain arrays."""
         return {
             **{name: getattr(self, name) for name in ARRAYS},
-            "R": self.rig.R,
-            "t": self.rig.t,
-            "stage_names": np.array(list(self.stages)),
-            "stages": np.stack(list(self.stages.values())),
-            "reasons": np.array(list(self.removed)),
-            "removed": np.array(list(self.removed.values())),
+            **{f"rig {name}": value for name, value in vars(self.rig).items()},
+            **{f"stage {name}": value for name, value in self.stages.items()},
+            **{f"removed {name}": np.array(count) for name, count in self.removed.items()},
         }
 
     @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]], K: Float) -> Solution:
+    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Solution:
         """The inverse of `to_arrays`."""
+
+        def group(start: str) -> dict[str, NDArray[Any]]:
+            return {
+                key.removeprefix(start): a for key, a in arrays.items() if key.startswith(start)
+            }
+
         return cls(
-            rig=Rig(K, arrays["R"], arrays["t"]),
-            stages=dict(zip(arrays["stage_names"].tolist(), arrays["stages"], strict=True)),
-            removed=dict(zip(arrays["reasons"].tolist(), arrays["removed"].tolist(), strict=True)),
+            rig=Rig(**group("rig ")),
+            stages=group("stage "),
+            removed={name: int(count) for name, count in group("removed ").items()},
             **{name: arrays[name] for name in ARRAYS},
         )
 
 
 def solve(
-    rig: Rig,
-    time: Float,
-    uv: Float,
-    conf: Float,
-    settings: Settings,
-    lag: int = 0,
-    say: Say = lambda _: None,
+    rig: Rig, time: Float, uv: Float, conf: Float, settings: Settings, lag: int = 0
 ) -> Solution:
     """All stages: plain, robust, flips, refined, smoothed.
 
@@ -104,7 +94,6 @@ def solve(
         conf: ``[C, F, J]`` 0 = not seen.
         settings: of every stage.
         lag: frames tried either way when clocks are compared; 0 skips it.
-        say: called with the name of each stage.
     """
     triangulation, given, pixels, full = settings.triangulation, rig, uv, conf
     groups = flip_groups(hands=uv.shape[2] == ALL)
@@ -112,39 +101,35 @@ def solve(
     start, conf = rig, np.where(conf > triangulation.min_confidence, conf, 0.0)
     flips = np.zeros((*conf.shape[:2], len(groups)), bool)
     sided, weight = uv, conf
-    stages = dict[str, Float]()
-
-    def record(stage: str, error: Float) -> None:
-        stages[stage] = error.reshape(conf.shape)[:, :, :BODY]
 
     def triangulate() -> Points:
         nonlocal flips, sided, weight
         if settings.flips.enabled:
-            say("looking for swapped sides")
             flips = find_flips(rig, uv, conf, groups, settings.flips, triangulation)
             sided, weight = (apply_flips(v, flips, groups) for v in (uv, conf))
         return triangulation.points(rig, _flat(sided), _flat(weight))
 
-    say("triangulating")
     plain = triangulation.plain(rig, _flat(uv), _flat(conf))
-    record("plain", rig.errors(plain, _flat(uv)))
-    record("robust", triangulation.points(rig, _flat(uv), _flat(conf)).error)
+    robust = triangulation.points(rig, _flat(uv), _flat(conf))
+    stages = {"plain": rig.errors(plain, _flat(uv)), "robust": robust.error}
     points = triangulate()
-    record("flips", points.error)
+    stages["flips"] = points.error
+    # Evenly spaced frames and the body's joints: hands are less certain.
+    F, J = conf.shape[1:]
+    at = np.unique(np.linspace(0, F - 1, min(F, settings.refinement.frames)).round().astype(int))
     for _ in range(settings.refinement.rounds):
-        say("refining the cameras")
-        rig = _refined(start, rig, points, sided, weight, settings.refinement)
+        p = points.p.reshape(F, J, 3)[at, :BODY].reshape(-1, 3)
+        detections = _flat(sided[:, at, :BODY]), _flat(weight[:, at, :BODY])
+        rig = refine_rig(start, rig, p, *detections, settings.refinement)
         points = triangulate()
-    record("refined", points.error)
+    stages["refined"] = points.error
     p, removed = cleanse(points.p.reshape(*conf.shape[1:], 3), settings.cleansing)
-    trust = _mean_seen(points.weight.reshape(conf.shape), weight)
-    p = smooth(p, trust, time, settings.smoothing.seconds)
+    agreed = _mean_seen(points.weight.reshape(conf.shape), weight)
+    p = smooth(p, agreed, time, settings.smoothing.seconds)
     error = rig.errors(p.reshape(-1, 3), _flat(sided)).reshape(conf.shape)
-    error = np.where(weight > 0, error, np.nan)
-    record("smoothed", error)
-    say("comparing the clocks")
-    seen = apply_flips(full, flips, groups)
-    delay, gain = clock_errors(rig, sided[:, :, :BODY], seen[:, :, :BODY], triangulation, lag)
+    stages["smoothed"] = error = np.where(weight > 0, error, np.nan)
+    trust = apply_flips(full, flips, groups)
+    delay, gain = clock_errors(rig, sided[:, :, :BODY], trust[:, :, :BODY], triangulation, lag)
     to_pixels = (given.focal / FOCAL)[:, None, None]
     return Solution(
         rig=Rig(given.K, rig.R, rig.t),
@@ -153,34 +138,34 @@ def solve(
         views=(np.nan_to_num(error, nan=np.inf) <= triangulation.scale).sum(0),
         error=error * to_pixels,
         uv=apply_flips(pixels, flips, groups),
-        seen=seen,
+        seen=trust,
         flips=flips,
         delay=delay,
         gain=gain,
-        stages={name: one * to_pixels for name, one in stages.items()},
+        stages={
+            name: one.reshape(conf.shape)[:, :, :BODY] * to_pixels for name, one in stages.items()
+        },
         removed=removed,
     )
 
 
-def adopt(rig: Rig, points: Points3D, fps: float, settings: Settings, frozen: int) -> Solution:
+def adopt(
+    rig: Rig, time: Float, p: Float, conf: Float, settings: Settings, frozen: int
+) -> Solution:
     """Another tool's joints, cleansed and smoothed; the cameras stay as calibrated.
 
-    Args:
-        rig: as calibrated.
-        points: the joints.
-        fps: frames per second.
-        settings: of cleansing and smoothing.
-        frozen: runs of identical joints of this length are removed, see `without_frozen`.
+    ``time [F]`` is in seconds, ``p [F, 33, 3]`` in metres with ``conf [F, 33]``; for ``frozen`` see
+    `without_frozen`.
     """
-    p, stuck = without_frozen(points.p, frozen)
+    p, stuck = without_frozen(p, frozen)
     p, removed = cleanse(p, settings.cleansing)
-    p = smooth(p, points.conf, points.frame_id / fps, settings.smoothing.seconds)
-    C, (F, J) = len(rig), points.conf.shape
+    p = smooth(p, conf, time, settings.smoothing.seconds)
+    C, (F, J) = len(rig), conf.shape
     unseen, unknown = np.full((C, F, J), np.nan), np.full(C, np.nan)
     return Solution(
         rig=rig,
         p=p,
-        conf=np.where(known(p), points.conf, 0.0),
+        conf=np.where(known(p), conf, 0.0),
         views=np.zeros((F, J), np.int64),
         error=unseen,
         uv=np.full((C, F, J, 2), np.nan),
@@ -195,17 +180,6 @@ def adopt(rig: Rig, points: Points3D, fps: float, settings: Settings, frozen: in
 
 def _flat(values: Float) -> Float:
     return values.reshape(values.shape[0], -1, *values.shape[3:])
-
-
-def _refined(
-    given: Rig, rig: Rig, points: Points, uv: Float, weight: Float, settings: Refinement
-) -> Rig:
-    """The rig refined on evenly spaced frames and the body's joints: hands are less certain."""
-    _, F, J = weight.shape
-    chosen = np.unique(np.linspace(0, F - 1, min(F, settings.frames)).round().astype(int))
-    p = points.p.reshape(F, J, 3)[chosen, :BODY].reshape(-1, 3)
-    uv, weight = (_flat(values[:, chosen, :BODY]) for values in (uv, weight))
-    return refine_rig(given, rig, p, uv, weight, settings)
 
 
 def _mean_seen(values: Float, weight: Float) -> Float:
@@ -225,10 +199,8 @@ def clock_errors(
 
     Args:
         rig: ``C`` cameras.
-        uv: ``[C, F, J, 2]`` undistorted pixels.
-        weight: ``[C, F, J]``.
-        triangulation: its settings.
-        lag: frames tried either way.
+        uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
+        triangulation, lag: its settings, and the frames tried either way.
 
     Returns:
         ``delay [C]`` and ``gain [C]``, the share by which the median error falls.
@@ -259,19 +231,6 @@ def _vertex(values: list[float]) -> float:
     if len(values) < 3 or not values[0] - 2 * values[1] + values[2] > 0:
         return 0.0
     return 0.5 * (values[0] - values[2]) / (values[0] - 2 * values[1] + values[2])
-
-
-def stage_medians(stages: dict[str, Float]) -> dict[str, tuple[float, list[float], float]]:
-    """By stage: median error in pixels over all, by camera, and the share of detections used."""
-    seen = max(1, *(int(np.isfinite(error).sum()) for error in stages.values()))
-    return {
-        name: (
-            median(error),
-            [median(one) for one in error],
-            float(np.isfinite(error).sum() / seen),
-        )
-        for name, error in stages.items()
-    }
 
 
 def median(values: Float) -> float:

@@ -24,34 +24,19 @@ Bytes = NDArray[np.uint8]
 
 @dataclass(frozen=True)
 class Source:
-    """One camera's video or folder of images.
+    """One camera's video or folder of images."""
 
-    Args:
-        name: file stem or folder name.
-        path: of the video or folder.
-        size: ``(H, W)`` pixels as read.
-        fps: frames per second, None for images or when the video does not have it.
-        files: of a folder, by number; empty for a video.
-        count: images; for a video its header's value, which may be wrong.
-        turned: degrees of rotation in the video's metadata.
-        rotate: whether that rotation is applied.
-    """
-
-    name: str
-    path: Path
-    size: tuple[int, int]
-    fps: float | None
-    files: Mapping[int, Path]
-    count: int
-    turned: int = 0
-    rotate: bool = False
+    name: str  # file stem or folder name
+    path: Path  # of the video or folder
+    size: tuple[int, int]  # (H, W) pixels as read
+    fps: float | None  # None for images or when the video does not have it
+    files: Mapping[int, Path]  # of a folder, by number; empty for a video
+    count: int  # images; for a video its header's value, which may be wrong
+    turned: int = 0  # degrees of rotation in the video's metadata
+    rotate: bool = False  # whether that rotation is applied
 
     def pictures(self) -> Iterator[tuple[int, Bytes]]:
-        """(number, BGR image ``[H, W, 3]``), in order; a video's are numbered from 0.
-
-        Raises:
-            DataError: when an image is damaged or the video cannot be opened.
-        """
+        """(number, BGR image ``[H, W, 3]``), in order; a video's are numbered from 0."""
         if not self.files:
             yield from enumerate(_decoded(_open(self.path, self.rotate)))
         for number, path in self.files.items():
@@ -59,29 +44,21 @@ class Source:
 
     def fingerprint(self) -> list[str | int]:
         """Names, sizes and times of the files: changes when the images do."""
-        paths = list(self.files.values()) if self.files else [self.path]
-        return [
-            part
-            for path in paths
-            for part in (path.name, path.stat().st_size, path.stat().st_mtime_ns)
-        ]
+        paths = self.files.values() or [self.path]
+        return [part for path in paths for part in stamp(path)]
+
+
+def stamp(path: Path) -> tuple[str, int, int]:
+    """Name, size and time of a file: changes when its content does."""
+    return path.name, path.stat().st_size, path.stat().st_mtime_ns
 
 
 def find_sources(folder: Path, rotate: bool = False) -> dict[str, Source]:
     """Every camera's images in a folder, or in videos/ or images/ inside it, in natural order.
 
-    Args:
-        folder: with one video or one subfolder of images per camera.
-        rotate: whether rotation metadata of videos is applied.
-
     Raises:
         DataError: when there are none, or two videos have the same stem.
     """
-    if not folder.is_dir():
-        raise DataError(
-            f"source={folder} is not a folder; expected one with a video or a folder of images per "
-            "camera"
-        )
     for place in (*(folder / name for name in INSIDE), folder):
         if place.is_dir() and (sources := _sources_in(place, rotate)):
             return sources
@@ -94,31 +71,20 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Source]:
 def _sources_in(folder: Path, rotate: bool) -> dict[str, Source]:
     sources: dict[str, Source] = {}
     for path in sorted(folder.iterdir(), key=lambda p: natural_order(p.name)):
-        source = None
         if path.name.startswith("."):
             continue
-        if path.is_dir():
-            source = _picture_folder(folder, path)
+        if path.is_dir() and (files := frame_files(folder, path.name, PICTURE_SUFFIXES)):
+            paths = {number: folder / files[number] for number in sorted(files)}
+            size = read_header(next(iter(paths.values()))).size
+            source = Source(path.name, path, size, None, paths, len(paths))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             source = _video(path, rotate)
-        if source is None:
+        else:
             continue
         if source.name in sources:
-            raise DataError(
-                f"{folder} holds {sources[source.name].path.name} and {path.name}, two sources of "
-                f"the camera {source.name}; remove one"
-            )
+            raise DataError(f"{folder} holds the camera {source.name} twice; remove {path.name}")
         sources[source.name] = source
     return sources
-
-
-def _picture_folder(root: Path, path: Path) -> Source | None:
-    if not any(p.suffix.lower() in PICTURE_SUFFIXES for p in path.iterdir()):
-        return None
-    found = frame_files(root, path.name, PICTURE_SUFFIXES)
-    files = {number: root / found[number] for number in sorted(found)}
-    size = read_header(next(iter(files.values()))).size
-    return Source(path.name, path, size, None, files, len(files))
 
 
 def _video(path: Path, rotate: bool) -> Source:
@@ -144,11 +110,8 @@ def _open(path: Path, rotate: bool) -> cv2.VideoCapture:
 def _decoded(video: cv2.VideoCapture) -> Iterator[Bytes]:
     """The images of a video, which is closed at the end."""
     try:
-        while True:
-            ok, picture = video.read()
-            if not ok:
-                return
-            yield np.asarray(picture, np.uint8)
+        while (read := video.read())[0]:
+            yield np.asarray(read[1], np.uint8)
     finally:
         video.release()
 
@@ -161,35 +124,24 @@ def pair_cameras(
     Convention: as ``given``; else the same name, ignoring case; else the one camera whose name
     stands between separators in the source's name ("Miqus_5_21474": 21474). Never by position.
 
-    Args:
-        sources: names of videos or folders.
-        cameras: names in the calibration.
-        given: source name to camera name.
-
     Raises:
         DataError: when a source has no camera or two have the same, listing both sides.
     """
     both = f"videos: {', '.join(sources)}; calibration: {', '.join(cameras)}"
-    pairs = {str(source): str(camera) for source, camera in given.items()}
-    for source, camera in pairs.items():
+    named = {str(source): str(camera) for source, camera in given.items()}
+    for source, camera in named.items():
         if source not in sources or camera not in cameras:
             raise DataError(f"cameras={{{source}: {camera}}} names what is not there ({both})")
+    pairs = dict[str, str]()
     for source in sources:
-        if source not in pairs:
-            matching = _matching(source, cameras)
-            if len(matching) != 1:
-                raise DataError(
-                    f"no one camera of the calibration matches the video {source} ({both}); set "
-                    f"cameras={{{source}: <calibration name>, …}}"
-                )
-            pairs[source] = matching[0]
-    taken = list(pairs.values())
-    if twice := sorted({camera for camera in taken if taken.count(camera) > 1}):
-        raise DataError(
-            f"the camera {twice[0]} of the calibration matches more than one video ({both}); set "
-            "cameras={video: calibration name, …}"
-        )
-    return {source: pairs[source] for source in sources}
+        matching = [named[source]] if source in named else _matching(source, cameras)
+        if len(matching) != 1 or matching[0] in pairs.values():
+            problem = "no one camera of the calibration matches"
+            if len(matching) == 1:
+                problem = f"the camera {matching[0]} matches more than one video, among them"
+            raise DataError(f"{problem} {source} ({both}); set cameras={{video: calibration name}}")
+        pairs[source] = matching[0]
+    return pairs
 
 
 def _matching(source: str, cameras: Sequence[str]) -> list[str]:
@@ -205,18 +157,11 @@ def fit_size(
 ) -> tuple[CameraEntry, str | None]:
     """A camera with its source's name and image size, and a note when the sizes differ.
 
-    Convention: a few missing columns or rows were cut off at the right or bottom, where codecs cut,
-    so K stays.
-
-    Args:
-        camera: as calibrated; a size of (0, 0) is unknown.
-        name: of the source.
-        size: ``(H, W)`` of its images.
-        crop_px: most pixels that may be missing.
-        where: the calibration file.
+    Convention: up to ``crop_px`` missing columns or rows were cut off at the right or bottom, where
+    codecs cut, so K stays. ``size`` is ``(H, W)``; a calibrated size of (0, 0) is unknown.
 
     Raises:
-        DataError: when the sizes differ by more: the calibration is of another resolution.
+        DataError: when the sizes differ by more: the calibration ``where`` is of another size.
     """
     fitted = replace(camera, name=name, size=size)
     if camera.size in (size, (0, 0)):

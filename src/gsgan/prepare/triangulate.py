@@ -1,37 +1,35 @@
-"""Triangulation from several cameras: linear, and robust against wrong detections."""
+"""Triangulation from several cameras, robust against wrong detections and swapped sides."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gsgan.data.crop import NEAR
-from gsgan.prepare.rig import Bool, Float, Rig, known
-from gsgan.utils.errors import ConfigError
+from gsgan.prepare.rig import MIN_VIEWS, Bool, Float, Rig, known
+from gsgan.utils.checks import above, at_least
 
-MIN_VIEWS = 2
 FAR = 1e6  # pixels: stands for an infinite error
 FLAT = 1e-15  # determinant over trace³: below it the equations are singular in float64
-POSITIVE = ("scale", "iterations", "max_pairs", "max_elongation", "max_error", "chunk")
+ITERATIONS, QUICK_ITERATIONS = 10, 3  # of reweighting; the search for swapped sides needs fewer
+CHUNK = 100_000  # points processed at once: bounds the memory, changes nothing else
+MAX_PAIRS = 60  # of cameras, tried as a start; of more, a spread-out part
 PROGRESSION = 7919  # a prime: spreads the chosen camera pairs when there are too many
+
+Pairs = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
 class Points:
-    """Triangulated points.
+    """Triangulated points."""
 
-    Args:
-        p: ``[N, 3]`` metres, NaN where missing.
-        weight: ``[C, N]`` final weight of each detection, 0 where it was not used.
-        error: ``[C, N]`` reprojection error in undistorted pixels, NaN where nothing was seen.
-    """
-
-    p: Float
-    weight: Float
-    error: Float
+    p: Float  # [N, 3] metres, NaN where missing
+    weight: Float  # [C, N] final weight of each detection, 0 where it was not used
+    error: Float  # [C, N] reprojection error in undistorted pixels, NaN where nothing was seen
 
 
 @dataclass(frozen=True)
@@ -39,71 +37,51 @@ class Triangulation:
     """Settings of the triangulation, see conf/prepare.yaml.
 
     Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
-
-    Raises:
-        ConfigError: when a value is out of its range.
     """
 
     min_confidence: float = 0.1
     scale: float = 3.5
-    iterations: int = 10
-    max_pairs: int = 60
     max_elongation: float = 20.0
     max_error: float = 35.0
-    chunk: int = 100_000
 
     def __post_init__(self) -> None:
-        for name in POSITIVE:
-            if not getattr(self, name) > 0:
-                raise ConfigError(
-                    f"triangulation.{name} must be above 0, got {getattr(self, name)!r}"
-                )
+        for name in ("scale", "max_elongation", "max_error"):
+            above(f"triangulation.{name}", getattr(self, name))
 
     def plain(self, rig: Rig, uv: Float, weight: Float) -> Float:
-        """The weighted linear (DLT) solution, without outlier rejection.
-
-        Args:
-            rig: ``C`` cameras.
-            uv: ``[C, N, 2]`` undistorted pixels; ignored where the weight is 0.
-            weight: ``[C, N]`` at least 0.
-
-        Returns:
-            ``[N, 3]`` metres, NaN where fewer than two cameras have a weight.
-        """
-        parts = self._chunks(uv, weight)
-        return np.concatenate([_solve(*_rows(rig, u, w), w)[0] for u, w in parts])
-
-    def points(self, rig: Rig, uv: Float, weight: Float) -> Points:
-        """Points that most detections agree on, by reweighting from the best pair of cameras.
-
-        Convention: the loss is Cauchy's, ``log(1 + (r/scale)²)`` of the reprojection error r, times
-        the weight. A point is NaN with fewer than two weighted views, with rays too parallel
-        (``max_elongation``), or when its detections contradict each other (``max_error``).
+        """``[N, 3]`` the weighted linear (DLT) solution, NaN with fewer than two weighted views.
 
         Args:
             rig: ``C`` cameras.
             uv: ``[C, N, 2]`` undistorted pixels, NaN allowed where the weight is 0.
             weight: ``[C, N]`` confidence, at least 0.
         """
-        parts = [_robust(rig, *part, self) for part in self._chunks(uv, weight)]
+        return _solve(*_rows(rig, uv, weight), weight)[0]
+
+    def points(self, rig: Rig, uv: Float, weight: Float, iterations: int = ITERATIONS) -> Points:
+        """Points that most detections agree on, by reweighting from the best pair of cameras.
+
+        Convention: the loss is Cauchy's, ``log(1 + (r/scale)²)`` of the reprojection error r, times
+        the weight. A point is NaN with fewer than two weighted views, with rays too parallel
+        (``max_elongation``), or when its detections contradict each other (``max_error``).
+        Arguments as for `plain`; ``iterations`` of reweighting.
+        """
+        starts = range(0, max(uv.shape[1], 1), CHUNK)
+        chunks = [slice(start, start + CHUNK) for start in starts]
+        parts = [_robust(rig, uv[:, at], weight[:, at], self, iterations) for at in chunks]
         return Points(
             p=np.concatenate([part.p for part in parts]),
             weight=np.concatenate([part.weight for part in parts], axis=1),
             error=np.concatenate([part.error for part in parts], axis=1),
         )
 
-    def _chunks(self, uv: Float, weight: Float) -> Iterator[tuple[Float, Float]]:
-        for start in range(0, max(uv.shape[1], 1), self.chunk):
-            part = slice(start, start + self.chunk)
-            yield uv[:, part], weight[:, part]
 
-
-def _robust(rig: Rig, uv: Float, weight: Float, settings: Triangulation) -> Points:
+def _robust(rig: Rig, uv: Float, weight: Float, settings: Triangulation, iterations: int) -> Points:
     weight = np.where(known(uv) & (weight > settings.min_confidence), weight, 0.0)
     a, b = _rows(rig, uv, weight)
-    p, reweighted = _best_pair(rig, uv, weight, a, b, settings), weight
+    p, reweighted = _best_pair(rig, uv, weight, a, b, settings.scale), weight
     information = np.zeros((p.shape[0], 3, 3))
-    for _ in range(settings.iterations):
+    for _ in range(iterations):
         loss = 1 / (1 + (rig.errors(p, uv) / settings.scale) ** 2)
         reweighted = weight * np.nan_to_num(loss, nan=0.0)
         depth = np.maximum(rig.project(p)[1], NEAR)
@@ -119,7 +97,7 @@ def _robust(rig: Rig, uv: Float, weight: Float, settings: Triangulation) -> Poin
     return Points(p, np.where(missing, 0.0, reweighted), np.where(missing, np.nan, error))
 
 
-def robust_cost(error: Float, weight: Float, scale: float) -> Float:
+def _robust_cost(error: Float, weight: Float, scale: float) -> Float:
     """``[N]`` weighted Cauchy loss over the cameras, of ``error`` and ``weight [C, N]``.
 
     Detections with weight 0 cost nothing; a point that was not found costs as one far away.
@@ -149,18 +127,16 @@ def _solve(a: Float, b: Float, weight: Float) -> tuple[Float, Float]:
     return np.where(enough[:, None], p, np.nan), information
 
 
-def _best_pair(
-    rig: Rig, uv: Float, weight: Float, a: Float, b: Float, settings: Triangulation
-) -> Float:
+def _best_pair(rig: Rig, uv: Float, weight: Float, a: Float, b: Float, scale: float) -> Float:
     """``[N, 3]`` of all pairs' points and the linear one, that with the smallest robust cost."""
     best = _solve(a, b, weight)[0]
-    cost = robust_cost(rig.errors(best, uv), weight, settings.scale)
+    cost = _robust_cost(rig.errors(best, uv), weight, scale)
     pairs = list(combinations(range(len(rig)), 2))
-    if len(pairs) > settings.max_pairs:
-        pairs = [pairs[k * PROGRESSION % len(pairs)] for k in range(settings.max_pairs)]
+    if len(pairs) > MAX_PAIRS:
+        pairs = [pairs[k * PROGRESSION % len(pairs)] for k in range(MAX_PAIRS)]
     for pair in map(list, pairs):
         p = _solve(a[pair], b[pair], weight[pair])[0]
-        new = robust_cost(rig.errors(p, uv), weight, settings.scale)
+        new = _robust_cost(rig.errors(p, uv), weight, scale)
         better = (new < cost) & np.isfinite(p).all(-1)
         best, cost = np.where(better[:, None], p, best), np.where(better, new, cost)
     return best
@@ -171,3 +147,104 @@ def _median(error: Float, used: Bool) -> Float:
     masked = np.where(used, np.nan_to_num(error, nan=np.nan, posinf=FAR), np.nan)
     masked[:, np.isnan(masked).all(0)] = 0.0
     return np.asarray(np.nanmedian(masked, axis=0))
+
+
+@dataclass(frozen=True)
+class FlipSearch:
+    """How swapped sides are found, see conf/prepare.yaml."""
+
+    enabled: bool = True
+    gain: float = 0.15
+
+    def __post_init__(self) -> None:
+        at_least("flips.gain", self.gain, 0)
+
+
+def find_flips(
+    rig: Rig,
+    uv: Float,
+    weight: Float,
+    groups: Sequence[Pairs],
+    search: FlipSearch,
+    triangulation: Triangulation,
+) -> Bool:
+    """``[C, F, G]`` which camera swapped which group of joints in which frame.
+
+    Detectors confuse left and right, mostly when a person is seen from behind. Per frame, one
+    camera at a time is changed as long as the triangulated points fit better. That does not
+    determine whether all cameras swapped or none; the smaller motion from frame to frame and, over
+    the whole sequence, the majority of the detections do.
+
+    Args:
+        rig: ``C`` cameras.
+        uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
+        groups: ``G`` tuples of (left, right) joints that swap together.
+        search, triangulation: thresholds, scale and limits.
+    """
+    quick = replace(triangulation, max_error=np.inf)
+    weight = np.where(weight > quick.min_confidence, weight, 0.0)
+    found = [_group_flips(rig, uv, weight, pairs, search.gain, quick) for pairs in groups]
+    return np.stack(found, axis=-1)
+
+
+def apply_flips(values: Float, flips: Bool, groups: Sequence[Pairs]) -> Float:
+    """Values ``[C, F, J, ...]`` with left and right exchanged where ``flips [C, F, G]``."""
+    out = values.copy()
+    for g, pairs in enumerate(groups):
+        at = flips[..., g].reshape(*flips.shape[:2], *[1] * (values.ndim - 2))
+        left, right = (list(side) for side in zip(*pairs, strict=True))
+        for a, b in ((left, right), (right, left)):
+            out[:, :, a] = np.where(at, values[:, :, b], values[:, :, a])
+    return out
+
+
+def _group_flips(
+    rig: Rig, uv: Float, weight: Float, pairs: Pairs, gain: float, quick: Triangulation
+) -> Bool:
+    """``[C, F]`` for one group."""
+    joints = [j for pair in pairs for j in pair]  # pairs are then adjacent: j and j ^ 1
+    local = [tuple((2 * i, 2 * i + 1) for i in range(len(pairs)))]
+    uv, weight = uv[:, :, joints], weight[:, :, joints]
+    C, F, J = weight.shape
+    everywhere = np.arange(F)
+
+    def points(flips: Bool, frames: NDArray[np.int64]) -> tuple[Float, Float]:
+        """``p [F, J, 3]`` and the cost ``[F]`` of some frames with these flips ``[C, F]``."""
+        sided, trust = (apply_flips(v[:, frames], flips[..., None], local) for v in (uv, weight))
+        trust = trust.reshape(C, -1)
+        found = quick.points(rig, sided.reshape(C, -1, 2), trust, QUICK_ITERATIONS)
+        seen = np.where(np.isfinite(found.error), trust, 0.0)
+        cost = _robust_cost(found.error, seen, quick.scale)
+        return found.p.reshape(-1, J, 3), cost.reshape(-1, J).sum(-1)
+
+    flips, price = np.zeros((C, F), bool), gain * weight.sum(-1)
+    cost, active = points(flips, everywhere)[1], everywhere
+    for _ in range(C):
+        toggles = np.eye(C, dtype=bool)[:, :, None]
+        trials = np.stack([points(flips[:, active] ^ one, active)[1] for one in toggles])
+        saved = cost[active] - trials - price[:, active]
+        best, better = saved.argmax(0), saved.max(0) > 0
+        active, best = active[better], best[better]
+        if not len(active):
+            break
+        flips[best, active] ^= True
+        cost[active] = trials[best, better.nonzero()[0]]
+    flips = flips ^ _exchanged(points(flips, everywhere)[0])
+    votes = weight.sum(-1)
+    return ~flips if (votes * flips).sum() > votes.sum() / 2 else flips
+
+
+def _exchanged(p: Float) -> Bool:
+    """``[F]`` frames whose sides ``p [F, J, 3]`` are exchanged against the first frame's."""
+    state = np.zeros(len(p), bool)
+    last, before = p[0], known(p[0])
+    swap = [j ^ 1 for j in range(p.shape[1])]
+    for f in range(1, len(p)):
+        now = known(p[f])
+        both = before & now & before[swap] & now[swap]
+        straight = np.linalg.norm(p[f] - last, axis=-1)[both].sum()
+        crossed = np.linalg.norm(p[f][swap] - last, axis=-1)[both].sum()
+        state[f] = crossed < straight if both.any() else state[f - 1]
+        settled, seen = (p[f][swap], now[swap]) if state[f] else (p[f], now)
+        last, before = np.where(seen[:, None], settled, last), before | seen
+    return state

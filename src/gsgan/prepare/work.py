@@ -1,7 +1,8 @@
-"""The working folder of a run, parallel work with progress bars, and safe writing of files."""
+"""The working folder of a run, parallel work with progress bars, safe writing of the dataset."""
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
@@ -9,34 +10,27 @@ import os
 import shutil
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
+from gsgan.data.formats.capture import read_capture
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_atomically
 
 T = TypeVar("T")
+Advance = Callable[[int, int], None]  # takes the number of steps done and in total
+GENERATOR = "gsgan.prepare"
 KEY_LENGTH = 12
 
 
-class Stopped(Exception):
-    """Another camera failed, or the user interrupted, so this one ends as well."""
-
-
-@contextmanager
+@contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Turns a failure of the disk (full, read-only, not allowed) into a `DataError` with ``path``.
-
-    Raises:
-        DataError: naming ``path``.
-    """
+    """Turns an `OSError` (disk full, read-only, not allowed) into a `DataError` with ``path``."""
     try:
         yield
     except OSError as error:
@@ -62,48 +56,35 @@ def _plain(value: Any) -> Any:
         return {str(key): _plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return int(value) if isinstance(value, np.integer) else value
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def progress(console: Console, disable: bool = False) -> Progress:
     """Progress bars that disappear when done: title, bar, count, remaining time."""
-    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
-    return Progress(
-        *columns, TimeRemainingColumn(), console=console, transient=True, disable=disable
-    )
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    return Progress(*columns, console=console, transient=True, disable=disable)
 
 
 def each_camera(
-    task: Callable[[str, Callable[[int, int], None]], T],
-    what: str,
-    names: Sequence[str],
-    workers: int,
+    task: Callable[[str, Advance], T], what: str, names: Sequence[str], workers: int
 ) -> dict[str, T]:
-    """Runs a task per camera in threads, with one progress bar each on stderr.
+    """Runs ``task(camera, advance)`` per camera in threads, with one progress bar each on stderr.
 
     The first failure or an interrupt is raised; tasks that have not started are cancelled, and
-    running ones are stopped at their next report, as a thread cannot be ended from outside.
-
-    Args:
-        task: called with the camera's name and a function that takes the number of steps done and
-            in total.
-        what: title of the bars.
-        names: of the cameras.
-        workers: tasks at once.
+    running ones are stopped at their next ``advance``, as a thread cannot be ended from outside.
     """
     stop, console = threading.Event(), Console(stderr=True)
     bars = progress(console, disable=not console.is_terminal)
-    rows = {name: bars.add_task(f"{what}: {name}", total=None) for name in names}
 
     def run(name: str) -> T:
-        def report(done: int, count: int) -> None:
-            if stop.is_set():
-                raise Stopped
-            bars.update(rows[name], completed=done, total=count)
+        row = bars.add_task(f"{what}: {name}", total=None)
 
-        return task(name, report)
+        def advance(done: int, count: int) -> None:
+            if stop.is_set():
+                raise CancelledError
+            bars.update(row, completed=done, total=count)
+
+        return task(name, advance)
 
     with bars, ThreadPoolExecutor(workers) as pool:
         futures = {name: pool.submit(run, name) for name in names}
@@ -111,8 +92,7 @@ def each_camera(
             return {name: future.result() for name, future in futures.items()}
         except BaseException:
             stop.set()
-            for future in futures.values():
-                future.cancel()
+            pool.shutdown(cancel_futures=True)
             raise
 
 
@@ -122,33 +102,14 @@ def digest(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
 
 
-@dataclass(frozen=True)
 class Work:
-    """A folder ``.<name>.prepare`` beside the dataset, with the results of finished stages.
+    """A folder with the results of finished stages; it is created when missing."""
 
-    Args:
-        folder: the working folder.
-        used: names of this run's results, by stage.
-    """
-
-    folder: Path
-    used: dict[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def beside(cls, out: Path) -> Work:
-        """The working folder of a dataset; it is created when missing.
-
-        Raises:
-            DataError: when it cannot be created.
-        """
-        folder = out.parent / f".{out.name}.prepare"
-        try:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.used: dict[str, str] = {}  # names of this run's results, by stage
+        with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise DataError(
-                f"{folder} cannot be made ({error.strerror}); choose another out"
-            ) from None
-        return cls(folder)
 
     def place(self, stage: str, key: Any) -> Path:
         """Path of a stage's result; its name contains a digest of its inputs."""
@@ -158,36 +119,61 @@ class Work:
     def arrays(
         self, stage: str, key: Any, make: Callable[[], dict[str, Any]]
     ) -> dict[str, np.ndarray]:
-        """Arrays of an earlier run with the same key, or made and stored now.
-
-        Raises:
-            DataError: when they cannot be written.
-        """
+        """Arrays of an earlier run with the same key, or made and stored now."""
         path = self.place(stage, key).with_suffix(".npz")
         try:
             with np.load(path, allow_pickle=False) as archive:
-                return {name: archive[name] for name in archive.files}
+                return dict(archive)
         except Exception:  # missing or damaged: zip, zlib, numpy and tokenize have their own errors
             pass
         arrays = make()
-        part = path.with_name(f".{path.name}.part")
-        with writing(path):
-            with part.open("wb") as stream:
-                np.savez(stream, **arrays)
-            os.replace(part, path)
+        write_npz(path, **arrays)
         return {name: np.asarray(array) for name, array in arrays.items()}
 
     def forget_others(self) -> None:
         """Removes results with other keys of the stages that this run used."""
         for left in list(self.folder.iterdir()):
             stem = left.name.removesuffix(".npz")
-            if stem[: -KEY_LENGTH - 1] not in self.used or stem in self.used.values():
+            if self.used.get(stem[: -KEY_LENGTH - 1], stem) == stem:
                 continue
             if left.is_dir():
                 shutil.rmtree(left, ignore_errors=True)
             else:
                 left.unlink(missing_ok=True)
 
-    def remove(self) -> None:
-        """Removes the folder."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+
+def is_there(out: Path, key: str, overwrite: bool) -> bool:
+    """Whether ``out`` holds the dataset with this key.
+
+    Raises:
+        DataError: when it holds something else and may not be overwritten.
+    """
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return False
+    made_by: Any = None
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        made_by = json.loads((out / "meta.json").read_text()).get("made_by")
+    if not isinstance(made_by, dict) or made_by.get("generator") != GENERATOR:
+        raise DataError(f"{out} holds something else; choose another out")
+    if made_by.get("key") != key and not overwrite:
+        raise DataError(f"{out} was made with other settings; add overwrite=true")
+    return bool(made_by.get("key") == key)
+
+
+def publish(root: Path, out: Path) -> None:
+    """Moves the finished dataset ``root`` to ``out``; an old one is removed when that is done.
+
+    Raises:
+        DataError: when training could not read it, or it cannot be moved.
+    """
+    try:
+        read_capture(root)
+    except DataError as error:
+        raise DataError(f"nothing was made, because training could not read it: {error}") from None
+    old = out.with_name(f".{out.name}.old")
+    with writing(out):
+        if out.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            os.replace(out, old)
+        os.replace(root, out)
+    shutil.rmtree(old, ignore_errors=True)

@@ -1,20 +1,25 @@
 """Finds body and hand landmarks, and the person's mask, in one video or folder of images.
 
-Runs in its own environment (requirements.txt beside it); `gsgan.prepare.mediapipe` starts it.
-Prints a line ``<images done> <images in total>`` per image. Writes an npz:
+Runs in its own environment (requirements.txt beside it). `gsgan.prepare.mediapipe` starts it with a
+JSON object: source, out, masks (a folder, or empty), hands, rotate, threads (processors; 0 is all),
+slot (number among those that run at once), confidence and tracking (lowest), margin (of the mask's
+crop, share of the person's height). Prints a line ``<images done> <images in total>`` per image.
+Writes an npz:
 
     px (F,33,2), conf (F,33)     pixels of the image as stored, first pixel's centre at (0.5, 0.5)
     left, right (F,21,2)         the person's hands; NaN = not found
-    frame_id (F,), size (2,) [w, h]
+    frame_id (F,)
 
 and masks/%06d.png, 0..255. Depth estimates are not written: they are relative, not metric.
 """
 
-import argparse
+import json
 import os
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 os.environ.setdefault("GLOG_minloglevel", "2")
@@ -28,7 +33,7 @@ JOINTS, HAND = 33, 21
 
 
 def main() -> None:
-    options = parse()
+    options = SimpleNamespace(**json.loads(sys.argv[1]))
     if options.threads and hasattr(os, "sched_setaffinity"):
         # MediaPipe has no option for the number of threads; the allowed processors bound it.
         allowed = sorted(os.sched_getaffinity(0))
@@ -41,42 +46,22 @@ def main() -> None:
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, list[Any]] = {}
-    size = (0, 0)
     detector = Detector(options)
     for done, (frame, picture) in enumerate(pictures, start=1):
-        size = picture.shape[1], picture.shape[0]
         landmarks = detector.landmarks(picture)
         for name, value in (*landmarks.items(), ("frame_id", frame)):
             found.setdefault(name, []).append(value)
-        if folder is not None:
-            mask = detector.mask(picture, landmarks["px"])
-            if mask is not None:
-                cv2.imwrite(str(folder / f"{frame:06d}.png"), mask)
+        if folder and (mask := detector.mask(picture, landmarks["px"])) is not None:
+            cv2.imwrite(str(folder / f"{frame:06d}.png"), mask)
         print(done, max(done, count), flush=True)
-    detector.close()
     if not found:
         raise SystemExit(f"{options.source} holds no image that can be decoded")
     out = Path(options.out)
     part = out.with_name(f".{out.name}")
     with part.open("wb") as stream:
         arrays: dict[str, Any] = {name: np.array(values) for name, values in found.items()}
-        np.savez(stream, size=np.array(size), **arrays)
+        np.savez(stream, **arrays)
     part.replace(out)
-
-
-def parse() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--source", required=True, help="a video, or a folder of images")
-    parser.add_argument("--out", required=True, help="npz to write")
-    parser.add_argument("--masks", default="", help="folder for masks; none are made without it")
-    parser.add_argument("--hands", type=int, default=1, help="1: find the hands too")
-    parser.add_argument("--rotate", type=int, default=0, help="1: apply rotation metadata")
-    parser.add_argument("--threads", type=int, default=0, help="processors to use; 0: all")
-    parser.add_argument("--slot", type=int, default=0, help="number among those that run at once")
-    parser.add_argument("--confidence", type=float, default=0.5, help="lowest, to find a person")
-    parser.add_argument("--tracking", type=float, default=0.5, help="lowest, to keep tracking")
-    parser.add_argument("--margin", type=float, default=0.15, help="of the mask's crop, share")
-    return parser.parse_args()
 
 
 def open_source(path: Path, rotate: int) -> tuple[int, Iterator[tuple[int, Any]]]:
@@ -102,16 +87,14 @@ def read_picture(path: Path) -> Any:
 
 
 def read_video(video: cv2.VideoCapture) -> Iterator[Any]:
-    ok, picture = video.read()
-    while ok:
-        yield picture
-        ok, picture = video.read()
+    while (read := video.read())[0]:
+        yield read[1]
 
 
 class Detector:
     """The detectors of one video: they track the person from image to image."""
 
-    def __init__(self, options: argparse.Namespace) -> None:
+    def __init__(self, options: SimpleNamespace) -> None:
         solutions = mp.solutions
         common = {
             "model_complexity": 1,  # its weights come with the package
@@ -125,10 +108,6 @@ class Detector:
         self.segmenter = solutions.pose.Pose(
             static_image_mode=True, enable_segmentation=True, **common
         )
-
-    def close(self) -> None:
-        self.body.close()
-        self.segmenter.close()
 
     def landmarks(self, picture: Any) -> dict[str, Any]:
         found = self.body.process(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
