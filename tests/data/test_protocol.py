@@ -238,7 +238,8 @@ def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> Non
 
     from rich.console import Console
 
-    from gsgan.evaluate.run import Selection, evaluate_run
+    from gsgan.evaluate.facts import Method
+    from gsgan.evaluate.run import evaluate_run
     from gsgan.train.runs import build_avatar, build_data
 
     config = compose(
@@ -258,7 +259,7 @@ def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> Non
         data=data,
         avatar=avatar,
         marks=[],
-        selection=Selection(pictures=0),
+        method=Method("gsgan"),
     )
     written = json.loads((tmp_path / "metrics.json").read_text())
     assert written == json.loads(json.dumps(results))

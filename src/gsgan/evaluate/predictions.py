@@ -2,65 +2,26 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from glob import glob
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from gsgan.data.files import check_picture, read_header, read_with_alpha
+from gsgan.data.files import check_picture, read_with_alpha
 from gsgan.data.splits import Item
-from gsgan.evaluate.prepare import Prediction
-from gsgan.evaluate.split import FULL
+from gsgan.evaluate.prepare import FULL, Prediction
 from gsgan.scene import Frame
 from gsgan.utils.errors import ConfigError, DataError
 
+NO_PARTS = "predictions are pictures, not a segmentation"
 FIELDS = ("split", "camera", "camera_index", "frame")
 FIELD = re.compile(r"\{(.*?)\}")
-SHOWN = 5  # names in a message
 WRONG_BACKGROUND = 0.5  # share of the background's pixels that have the other background's colour
 CLOSE = 0.05  # of the range: below it a pixel counts as black, within it of 1 as white
-
-
-@dataclass(frozen=True)
-class Pattern:
-    """How prediction files are named.
-
-    Args:
-        text: relative to the folder, with "{camera}" (name) or "{camera_index}" (index into the
-            dataset's cameras, from 0), "{frame}" (number, any zero-padding), optionally "{split}".
-
-    Raises:
-        ConfigError: when a field is unknown, missing or given twice.
-    """
-
-    text: str
-
-    def __post_init__(self) -> None:
-        found = FIELD.findall(self.text)
-        unknown = [name for name in found if name not in FIELDS]
-        if unknown:
-            raise ConfigError(
-                f"predictions_pattern has the field {{{unknown[0]}}}; it may have "
-                + ", ".join(f"{{{name}}}" for name in FIELDS)
-            )
-        cameras = found.count("camera") + found.count("camera_index")
-        if found.count("frame") != 1 or cameras != 1 or found.count("split") > 1:
-            raise ConfigError(
-                f"predictions_pattern={self.text} must have {{frame}} once, {{camera}} or "
-                "{camera_index} once, and {split} at most once"
-            )
-
-    def name(self, split: str, item: Item, cameras: Sequence[str]) -> str:
-        """The file name of an item, its frame number padded to six digits."""
-        camera, frame = item
-        index = str(cameras.index(camera))
-        values = dict(zip(FIELDS, (split, camera, index, f"{frame:06d}"), strict=True))
-        return FIELD.sub(lambda field: values[field[1]], self.text)
 
 
 @dataclass(frozen=True)
@@ -70,52 +31,28 @@ class PredictionFolder:
     Args:
         root: the folder.
         files: relative paths by camera and frame.
-        extra: files that match no expected image.
         background: of opaque images, "black" or "white".
     """
 
     root: Path
     files: Mapping[Item, str]
-    extra: tuple[str, ...]
     background: str
-
-    def check(self, item: Item, size: tuple[int, int]) -> None:
-        """Checks the header of an item's file.
-
-        Args:
-            item: camera and frame.
-            size: ``(H, W)`` of the ground truth as scored.
-
-        Raises:
-            DataError: when the file has another size, or is not an 8-bit RGB image.
-        """
-        path = self.root / self.files[item]
-        found = read_header(path).size
-        if found != size:
-            raise DataError(
-                f"{path} (camera {item[0]}, frame {item[1]}) is {found[1]}x{found[0]} pixels "
-                f"(width x height), but the ground truth as scored is {size[1]}x{size[0]}; "
-                "predictions are scored at the size given by data.size, data.crop and the "
-                "protocol, and are never resized"
-            )
-        check_picture(path, "image", size, "the ground truth")
 
     def predict(self, frame: Frame, item: Item) -> Prediction:
         """The image of an item.
 
         Raises:
-            DataError: when it is damaged, not 8-bit RGB, of another size than the ground truth as
-                scored, or on another background than ``background``.
+            DataError: when it is damaged, not 8-bit RGB, or on another background than
+                ``background``.
         """
-        self.check(item, frame.camera.size)
         path = self.root / self.files[item]
         rgb, alpha = read_with_alpha(path)
-        image = _unit(rgb).permute(2, 0, 1)[None].to(frame.image)
+        image = (torch.from_numpy(rgb).float() / 255).permute(2, 0, 1)[None].to(frame.image)
         if alpha is not None:
-            cover = _unit(alpha)[None, None].to(frame.image)
-            return Prediction({FULL: image * cover}, {FULL: cover})
+            cover = (torch.from_numpy(alpha).float() / 255)[None, None].to(frame.image)
+            return Prediction({FULL: image * cover}, {FULL: cover}, no_parts=NO_PARTS)
         self._check_background(path, image, frame.mask)
-        return Prediction({FULL: image}, {}, self.background)
+        return Prediction({FULL: image}, {}, self.background, no_parts=NO_PARTS)
 
     def _check_background(self, path: Path, image: Tensor, mask: Tensor) -> None:
         behind = image.permute(0, 2, 3, 1)[mask[:, 0] == 0]
@@ -130,78 +67,65 @@ class PredictionFolder:
             )
 
 
-def _unit(pixels: np.ndarray) -> Tensor:
-    return torch.from_numpy(pixels).float() / 255
-
-
 def read_folder(
     root: Path,
-    pattern: Pattern,
-    expected: Mapping[str, Sequence[Item]],
+    pattern: str,
+    expected: Mapping[str, Mapping[Item, tuple[int, int]]],
     cameras: Sequence[str],
     background: str,
 ) -> PredictionFolder:
-    """Finds the file of every expected image without opening it.
+    """Finds the file of every expected image and checks its header; other files are ignored.
 
     Args:
         root: the folder.
-        pattern: of the names.
-        expected: items by split.
+        pattern: of the names, relative to the folder, with "{camera}" (name) or "{camera_index}"
+            (index into ``cameras``), "{frame}" (number, any zero-padding), optionally "{split}".
+        expected: by split, camera and frame: ``(H, W)`` of the ground truth as scored.
         cameras: of the dataset, in its order.
         background: of opaque images.
 
     Raises:
-        DataError: when the folder does not exist, or an image is missing or there twice.
+        ConfigError: when a field of the pattern is unknown or missing.
+        DataError: when the folder does not exist, or an image is missing, is there twice,
+            or has another size or more than 8 bits per channel.
     """
-    if not root.is_dir():
-        what = "is a file, not a folder" if root.exists() else "does not exist"
-        raise DataError(f"predictions={root} {what}; expected the folder of a method's images")
-    files: dict[str, list[str]] = {}
-    names = _files(root)
-    for name in names:
-        files.setdefault(_unpadded(name), []).append(name)
-    expected_as = {
-        item: pattern.name(split, item, cameras)
-        for split, items in expected.items()
-        for item in items
-    }
-    found = {item: files.get(_unpadded(name), []) for item, name in expected_as.items()}
-    for (camera, frame), several in found.items():
-        if len(several) > 1:
-            raise DataError(
-                f"{root} holds camera {camera}, frame {frame} twice, as {several[0]} and "
-                f"{several[1]}; keep one of them"
-            )
-    missing = [item for item, hits in found.items() if not hits]
-    if missing:
-        camera, frame = missing[0]
-        message = (
-            f"{root} lacks {len(missing)} of {len(found)} images; the first is camera {camera}, "
-            f"frame {frame}, expected as {expected_as[missing[0]]} "
-            f"(predictions_pattern={pattern.text})"
+    fields = set(FIELD.findall(pattern))
+    if not ("frame" in fields <= set(FIELDS) and fields & {"camera", "camera_index"}):
+        raise ConfigError(
+            f"predictions_pattern={pattern} must have {{frame}} and {{camera}} or "
+            "{camera_index}, may have {split}, and no other field"
         )
-        if len(missing) == len(found):
-            message += f"; the folder contains {some(names) or 'nothing'}"
-        raise DataError(message)
-    used = {item: hits[0] for item, hits in found.items()}
-    taken = set(used.values())
-    extra = tuple(name for name in names if name not in taken)
-    return PredictionFolder(root, used, extra, background)
+    if not root.is_dir():
+        raise DataError(f"predictions={root} is not a folder; give that of a method's images")
+    stored: dict[str, list[str]] = {}
+    for name in sorted(glob("**", root_dir=root, recursive=True)):
+        stored.setdefault(_unpadded(name), []).append(name)
+    files, missing = {}, []
+    for split, sizes in expected.items():
+        for (camera, frame), size in sizes.items():
+            what = f"camera {camera}, frame {frame}"
+            values = (split, camera, str(cameras.index(camera)), f"{frame:06d}")
+            name = _filled(pattern, dict(zip(FIELDS, values, strict=True)))
+            found = stored.get(_unpadded(name), [])
+            if not found:
+                missing.append(f"{what}, expected as {name}")
+                continue
+            if len(found) > 1:
+                raise DataError(
+                    f"{root} holds {what} twice, as {found[0]} and {found[1]}; keep one of them"
+                )
+            files[camera, frame] = found[0]
+            check_picture(root / found[0], "image", size, f"the ground truth of {what}, as scored,")
+    if missing:
+        raise DataError(
+            f"{root} lacks {len(missing)} of {len(missing) + len(files)} images; the first is "
+            f"{missing[0]} (predictions_pattern={pattern})"
+        )
+    return PredictionFolder(root, files, background)
 
 
-def some(names: Sequence[str]) -> str:
-    """The first names, for a message."""
-    return ", ".join(names[:SHOWN]) + (" …" if len(names) > SHOWN else "")
-
-
-def _files(root: Path) -> list[str]:
-    """All files below a folder except hidden ones, relative and sorted."""
-    found = []
-    for folder, subfolders, names in os.walk(root, followlinks=True):
-        subfolders[:] = [s for s in subfolders if not s.startswith(".")]
-        relative = Path(folder).relative_to(root)
-        found += [(relative / name).as_posix() for name in names if not name.startswith(".")]
-    return sorted(found)
+def _filled(pattern: str, values: Mapping[str, str]) -> str:
+    return FIELD.sub(lambda field: values[field[1]], pattern)
 
 
 def _unpadded(name: str) -> str:

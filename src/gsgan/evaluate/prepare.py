@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 VERTEX_MARGIN = 0.05  # metres round the body's vertices, as in published scoring scripts
 JOINT_MARGIN = 0.2  # metres round joints, which lie inside the flesh; as in `PersonCrop`
+FULL, SPLAT, FLOOR = "full", "splat", "floor"  # the floor is the all-background image
 HIDDEN_OUTLINE = (
     "pictures without alpha are put on the protocol's background by the truth's mask, which hides "
     "what they paint outside it"
@@ -45,6 +46,7 @@ class Prediction:
         segmentation: ``[B, classes, H, W]``, or None.
         labels: ``[B, H, W]`` ground truth in the classes of the segmentation; None where those are
             the frame's labels.
+        no_parts: the reason given where there is no segmentation.
     """
 
     images: dict[str, Tensor]
@@ -52,6 +54,7 @@ class Prediction:
     background: str = "black"
     segmentation: Tensor | None = None
     labels: Tensor | None = None
+    no_parts: str = "the model has no segmentation"
 
 
 class BodyBoxes:
@@ -134,10 +137,6 @@ class Preparation:
         """Whether an opaque image must be moved to this background by the ground truth's mask."""
         opaque = any(prediction.alphas.get(name) is None for name in prediction.images)
         return opaque and prediction.background != self.measures.background
-
-    def floor(self, frame: Frame) -> Tensor:
-        """``[B, 3, H, W]`` the all-background image."""
-        return torch.full_like(frame.image, self.background)
 
     def box(self, frame: Frame) -> Tensor | None:
         """``[B, 1, H, W]`` the body's projected box, or None where it is not needed."""
