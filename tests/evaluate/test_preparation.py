@@ -9,7 +9,7 @@ import torch
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.measures import Measures
-from gsgan.evaluate.prepare import (
+from gsgan.evaluate.predictions import (
     FULL,
     JOINT_MARGIN,
     VERTEX_MARGIN,

@@ -11,7 +11,7 @@ import torch
 from torchmetrics.classification import MulticlassJaccardIndex
 
 from gsgan.data.measures import Measures
-from gsgan.evaluate.prepare import FLOOR, FULL, SPLAT, Prediction, Preparation
+from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparation
 from gsgan.evaluate.scores import (
     Scorer,
     confusion,

@@ -42,7 +42,13 @@ class Method:
     seed: int | None = None
     iterations: int | None = None
     train_seconds: float | None = None
-    trained_by: tuple[str, ...] | None = None
+    trained_by: list[str] | None = None
+
+
+def trained(folder: Path, **training: Any) -> Method:
+    """The method of a run folder, with the fields of ``training``."""
+    chosen = choices(folder)
+    return Method("gsgan", model=chosen.get("model"), data=chosen.get("data"), **training)
 
 
 def facts(method: Method, data: GsganData, device: torch.device) -> dict[str, Any]:
@@ -115,18 +121,15 @@ def choices(folder: Path) -> dict[str, Any]:
     return {} if found is None else {str(key): value for key, value in found.items()}
 
 
-def provenance(facts: dict[str, Any]) -> dict[str, str]:
-    """What every row of a table carries: protocol, data, number of seeds, commit."""
-    data = facts["data"]
-    return {
-        "protocol": facts["protocol"] or "none",
-        "data": f"{data['name'] or 'unknown'} ({data['root']}, {data['fingerprint']})",
-        "seeds": "none said" if facts["seed"] is None else f"1 ({facts['seed']})",
-        "commit": (facts["commit"] or "unknown") + (", changed since" if facts["dirty"] else ""),
-    }
-
-
 def caption(facts: dict[str, Any]) -> str:
-    """One line under a table: the method and its provenance."""
-    method = facts["method"] if facts["model"] is None else f"{facts['method']} {facts['model']}"
-    return " · ".join([method, *(f"{key} {value}" for key, value in provenance(facts).items())])
+    """One line under a table: method, protocol, data, number of seeds, commit."""
+    data, seed = facts["data"], facts["seed"]
+    return " · ".join(
+        [
+            facts["method"] if facts["model"] is None else f"{facts['method']} {facts['model']}",
+            f"protocol {facts['protocol'] or 'none'}",
+            f"data {data['name'] or 'unknown'} ({data['root']}, {data['fingerprint']})",
+            "seed unknown" if seed is None else f"seed {seed}",
+            f"commit {facts['commit'] or 'unknown'}" + (", changed since" * bool(facts["dirty"])),
+        ]
+    )

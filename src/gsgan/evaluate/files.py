@@ -13,7 +13,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from gsgan.evaluate.facts import SAME, caption, provenance
+from gsgan.evaluate.facts import SAME, caption
 from gsgan.evaluate.scores import METRICS
 from gsgan.utils import pages
 from gsgan.utils.files import write_atomically
@@ -82,15 +82,10 @@ def read_rows(path: Path) -> pd.DataFrame:
 
 
 def joined(now: Scored, folder: Path, splits: Iterable[str]) -> tuple[Scored, list[str]]:
-    """Adds the earlier scores of other splits where they were made in the same way.
-
-    Args:
-        now: the new scores.
-        folder: of the earlier ones.
-        splits: in the order of the table.
+    """Adds the scores that ``folder`` has of other splits if they were made in the same way.
 
     Returns:
-        All scores, and the names of earlier splits that had to be dropped.
+        All scores in the order of ``splits``, and the earlier splits that had to be dropped.
     """
     if not (folder / METRICS_FILE).is_file():
         return now, []
@@ -128,13 +123,7 @@ def _way(facts: dict[str, Any], scores: dict[str, Any]) -> list[Any]:
 def rows(
     results: Results, metrics: tuple[str, ...] = METRICS, *, cameras: bool = False
 ) -> Iterator[list[str]]:
-    """One formatted row per split and variant; what is None shows as ``n/a``.
-
-    Args:
-        results: as in metrics.json.
-        metrics: columns.
-        cameras: add a row per camera below each variant.
-    """
+    """One formatted row per split and variant, and per camera if ``cameras``; None is ``n/a``."""
 
     def formatted(values: dict[str, Any]) -> list[str]:
         return ["n/a" if (v := values[m]) is None else f"{v:.{COLUMNS[m][1]}f}" for m in metrics]
@@ -189,12 +178,10 @@ def print_table(results: Results, facts: dict[str, Any], console: Console) -> No
 
 
 def markdown(results: Results, facts: dict[str, Any]) -> str:
-    """The table in Markdown with every metric, and again by camera; rows carry the provenance."""
-    source = provenance(facts)
-    header = ["split", "picture", "images", *(COLUMNS[m][0] for m in METRICS), *source]
+    """The table in Markdown with its caption and every metric, and again by camera."""
+    header = ["split", "picture", "images", *(COLUMNS[m][0] for m in METRICS)]
     by_split, by_camera = (
-        pages.markdown(header, [[*row, *source.values()] for row in rows(results, cameras=each)])
-        for each in (False, True)
+        pages.markdown(header, list(rows(results, cameras=each))) for each in (False, True)
     )
     listed = "\n".join(f"- {note}" for note in notes(results))
     parts = (f"# {TITLE}", caption(facts), by_split, listed, "## By camera", by_camera)

@@ -16,7 +16,7 @@ from rich.progress import track
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.measures import Measures
-from gsgan.evaluate.facts import Method, choices, facts
+from gsgan.evaluate.facts import Method, facts, trained
 from gsgan.evaluate.files import (
     FACTS_FILE,
     HEADER,
@@ -27,12 +27,17 @@ from gsgan.evaluate.files import (
     write_scored,
 )
 from gsgan.evaluate.pictures import write_grid
-from gsgan.evaluate.predictions import read_folder
-from gsgan.evaluate.prepare import FLOOR, FULL, HIDDEN_OUTLINE, BodyBoxes, Preparation
+from gsgan.evaluate.predictions import (
+    FLOOR,
+    FULL,
+    HIDDEN_OUTLINE,
+    BodyBoxes,
+    Preparation,
+    read_folder,
+)
 from gsgan.evaluate.scores import Predict, Scorer, SplitScores, empty, painter, score_split
 from gsgan.metrics.lpips import lpips
 from gsgan.metrics.regions import BACKGROUNDS
-from gsgan.model.avatar import Avatar
 from gsgan.train.runs import (
     CHECKPOINT,
     Moved,
@@ -46,10 +51,6 @@ from gsgan.utils.devices import pick_device
 from gsgan.utils.errors import ConfigError
 
 SPLITS = ("novel_view", "novel_pose")
-NOT_WITH = {  # keys that apply to the other kind of input only
-    "run": ("data", "protocol", "out", "method"),
-    "predictions": ("data_root", "data_smpl"),
-}
 
 
 def evaluate_config(config: DictConfig) -> Results:
@@ -64,8 +65,10 @@ def evaluate_config(config: DictConfig) -> Results:
             "give either run=<the folder that gsgan.train printed>, or predictions=<folder of "
             "images> with data= and data.root="
         )
-    kind = "run" if config.run is not None else "predictions"
-    for key in NOT_WITH[kind]:
+    kind, others = "run", ["data", "protocol", "out", "method"]
+    if config.run is None:
+        kind, others = "predictions", ["data_root", "data_smpl"]
+    for key in others:
         if config.get(key) is not None:
             raise ConfigError(f"{key}= cannot be given with {kind}=; leave it out")
     for key in ("background", "predictions_background"):
@@ -73,16 +76,12 @@ def evaluate_config(config: DictConfig) -> Results:
             raise ConfigError(f"{key} must be black, white or null; got {config[key]!r}")
     if not config.splits or not set(config.splits) <= set(SPLITS):
         raise ConfigError(f"splits must be a list of {' and '.join(SPLITS)}; got {config.splits}")
-    score = evaluate_folder if kind == "run" else evaluate_predictions
+    score = evaluate_predictions if config.run is None else evaluate_folder
     return score(config, make_console(), pick_device(config.device))
 
 
 def evaluate_folder(config: DictConfig, console: Console, device: torch.device) -> Results:
-    """Loads the avatar of ``config.run`` and scores it.
-
-    Raises:
-        DataError: when the folder, its checkpoint or its data cannot be used.
-    """
+    """Loads the avatar of ``config.run`` and scores it."""
     folder = Path(config.run).expanduser()
     stored = load_config(folder, Moved.said(config))
     data = build_data(stored)
@@ -92,32 +91,21 @@ def evaluate_folder(config: DictConfig, console: Console, device: torch.device) 
     if config.background not in (None, _measures(data).background):  # others' scores stay
         out = folder / f"on_{config.background}"
         console.print(f"scores on {config.background} go into {out}", soft_wrap=True)
-    method = Method(
-        "gsgan",
+    method = trained(
+        folder,
         seed=stored.seed,
         iterations=state["step"],
         train_seconds=state.get("train_seconds"),
-        trained_by=tuple(state["code"]) if "code" in state else None,
+        trained_by=state.get("code"),
     )
-    return evaluate_run(
-        folder,
-        config,
-        console,
-        data=data,
-        avatar=avatar.to(device),
-        marks=marks,
-        method=method,
-        out=out,
+    predict = painter(avatar.to(device))
+    return evaluate_method(
+        out, config, console, data, predict, method=method, device=device, marks=marks
     )
 
 
 def evaluate_predictions(config: DictConfig, console: Console, device: torch.device) -> Results:
-    """Scores the folder ``config.predictions`` on the config's data.
-
-    Raises:
-        ConfigError: on a value that cannot be used.
-        DataError: when the folder or an image in it cannot be used.
-    """
+    """Scores the folder ``config.predictions`` on the config's data."""
     if config.get("data") is None:
         raise ConfigError("data is not set: give that of the predictions with data= and data.root=")
     root = Path(config.predictions).expanduser()
@@ -150,51 +138,12 @@ def _out(config: DictConfig, root: Path, method: str) -> Path:
         raise ConfigError(
             f"out={out} is inside the predictions, a file or a run folder; choose another folder"
         )
-    if (out / FACTS_FILE).is_file():
-        found = json.loads((out / FACTS_FILE).read_text())["method"]
-        if found != method:
-            raise ConfigError(
-                f"out={out} holds scores of {found}, not of {method}; choose another folder"
-            )
+    held = out / FACTS_FILE
+    if held.is_file() and (found := json.loads(held.read_text())["method"]) != method:
+        raise ConfigError(
+            f"out={out} holds scores of {found}, not of {method}; choose another folder"
+        )
     return out
-
-
-def evaluate_run(
-    folder: Path,
-    config: DictConfig,
-    console: Console,
-    *,
-    data: GsganData,
-    avatar: Avatar,
-    marks: list[str],
-    method: Method,
-    out: Path | None = None,
-) -> Results:
-    """Scores an avatar on held-out cameras and poses and writes the results into the run folder.
-
-    Args:
-        folder: the run folder; the names of model and data are read from it.
-        config, console: see `evaluate_method`.
-        data: of the run.
-        avatar: in eval mode.
-        marks: notes that the tables must carry.
-        method: of the training.
-        out: another folder for the results.
-
-    Returns:
-        As in metrics.json.
-    """
-    chosen = choices(folder)
-    return evaluate_method(
-        out or folder,
-        config,
-        console,
-        data,
-        painter(avatar),
-        method=replace(method, model=chosen.get("model"), data=chosen.get("data")),
-        device=next(avatar.parameters()).device,
-        marks=marks,
-    )
 
 
 def evaluate_method(
@@ -216,10 +165,12 @@ def evaluate_method(
         config: for ``lpips``, and, if set, ``background``, ``splits`` and ``pictures``.
         console: prints progress and the table.
         data: with the splits.
-        predict: the method.
-        method: for facts.json.
+        predict, method: the method, and what facts.json states about it.
         device: of the frames.
         marks: notes that the tables must carry.
+
+    Returns:
+        As in metrics.json.
 
     Raises:
         GsganError: when a prediction cannot be scored.

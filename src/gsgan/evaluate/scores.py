@@ -14,7 +14,7 @@ from torchmetrics.functional.classification import multiclass_confusion_matrix
 from gsgan.data.measures import Measures
 from gsgan.data.splits import Item
 from gsgan.evaluate.pictures import grid_rows
-from gsgan.evaluate.prepare import FLOOR, FULL, SPLAT, Prediction, Preparation
+from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparation
 from gsgan.metrics.image import (
     Score,
     edge_scores,
@@ -57,7 +57,7 @@ def image_scores(
     """The scores of one image, clamped to [0, 1].
 
     Args:
-        image, target: ``[1, 3, H, W]``, prepared (`gsgan.evaluate.prepare`).
+        image, target: ``[1, 3, H, W]``, prepared (`gsgan.evaluate.predictions.Preparation`).
         mask: ``[1, 1, H, W]`` of the person; required for the metrics of the person alone.
         box: ``[1, 1, H, W]`` bool, the body's projected box; required where the measures use it.
         measures: regions and ranges; None takes the defaults.
@@ -113,10 +113,6 @@ def means(rows: Sequence[Mapping[str, Any]], lpips_reason: str = "") -> dict[str
     """``{metric: mean or None, metric_left_out: number, metric_reason: why None}`` of images.
 
     Scores that are not finite are left out of the mean.
-
-    Args:
-        rows: from `image_scores`.
-        lpips_reason: why there is no LPIPS.
     """
     result: dict[str, Any] = {}
     for metric in IMAGE_METRICS:
@@ -209,7 +205,13 @@ def painter(avatar: Avatar) -> Predict:
         parts, labels = painting.segmentation, frame.labels
         if avatar.segmentation is not None and parts is not None and labels is not None:
             parts, labels = avatar.segmentation.to_score(parts, labels)
-        return Prediction(images, alphas, segmentation=parts, labels=labels)
+        return Prediction(
+            images,
+            alphas,
+            segmentation=parts,
+            labels=labels,
+            no_parts="the model has no segmentation",
+        )
 
     return predict
 
