@@ -17,7 +17,7 @@ from gsgan.evaluate.predictions import (
     Prediction,
     Preparation,
 )
-from gsgan.metrics.body_box import box_corners, box_mask
+from gsgan.metrics.regions import box_corners, box_mask
 
 
 @pytest.fixture(scope="module")

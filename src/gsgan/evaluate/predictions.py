@@ -16,9 +16,10 @@ from gsgan.body import SkinnedBody, open_body
 from gsgan.data.files import check_picture, read_with_alpha
 from gsgan.data.measures import Measures
 from gsgan.data.splits import Item
-from gsgan.metrics.body_box import box_corners, box_mask
 from gsgan.metrics.regions import (
     BACKGROUNDS,
+    box_corners,
+    box_mask,
     cleared,
     eight_bits,
     hard_outline,
