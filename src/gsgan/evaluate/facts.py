@@ -18,7 +18,6 @@ from gsgan import __version__
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-FINGERPRINT = 12  # hexadecimal digits
 DIRTY = "+changes"
 # Scores that differ in one of these do not share a table.
 SAME = ("method", "model", "protocol", "seed", "iterations", "version", "commit", "dirty")
@@ -109,7 +108,7 @@ def fingerprint(data: GsganData) -> str:
     if layout.landmarks.fitted_to:  # other skeletons are other inputs, and crop other windows
         content["landmarks"] = layout.landmarks.digest(layout.frames)
     plain = json.dumps(content, sort_keys=True).encode()
-    return hashlib.sha256(plain).hexdigest()[:FINGERPRINT]
+    return hashlib.sha256(plain).hexdigest()[:12]
 
 
 def choices(folder: Path) -> dict[str, Any]:

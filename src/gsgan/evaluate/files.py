@@ -95,14 +95,11 @@ def joined(now: Scored, folder: Path, splits: Iterable[str]) -> tuple[Scored, li
         others = [split for split in results if split not in now.results]
         rows = read_rows(folder / SCORES_FILE)
         facts = json.loads((folder / FACTS_FILE).read_text())
-        fits = all(
-            _way(facts, results[other]["full"]) == _way(now.facts, scored["full"])
-            for other in others
-            for scored in now.results.values()
-        )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        fits = False  # damaged, or of a version without facts
-    if not fits:
+        ways = [_way(facts, results[split]["full"]) for split in others]
+        ways += [_way(now.facts, scored["full"]) for scored in now.results.values()]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # damaged, or too old
+        return now, others
+    if any(way != ways[-1] for way in ways):
         return now, others
     results |= now.results
     rows = pd.concat([rows[rows["split"].isin(others)], now.rows])

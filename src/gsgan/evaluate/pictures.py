@@ -60,7 +60,7 @@ def grid_rows(frame: Frame, painting: Painting) -> list[dict[str, Tensor]]:
     return [{name: column[i] for name, column in shown.items()} for i in range(len(frame))]
 
 
-def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) -> Path:
+def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) -> None:
     """Writes rows of images ``[3, H, W]`` as one PNG with a caption over each column.
 
     Smaller images are padded with black to the largest.
@@ -87,4 +87,3 @@ def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) 
     if not ok:
         raise OSError(f"{path}: the image could not be encoded as PNG")
     write_atomically(path, data.tobytes())
-    return path

@@ -97,10 +97,8 @@ class BodyBoxes:
 
     def masks(self, frame: Frame) -> Tensor:
         """``[B, 1, H, W]`` bool: the pixels that see it."""
-        boxes = [
-            box_mask(self.corners(frame, i), frame.camera[i : i + 1]) for i in range(len(frame))
-        ]
-        return torch.stack(boxes)
+        cameras = (frame.camera[i : i + 1] for i in range(len(frame)))
+        return torch.stack([box_mask(self.corners(frame, i), c) for i, c in enumerate(cameras)])
 
 
 @dataclass(frozen=True)
@@ -189,11 +187,9 @@ class PredictionFolder:
 
     def _check_background(self, path: Path, image: Tensor, mask: Tensor) -> None:
         behind = image.permute(0, 2, 3, 1)[mask[:, 0] == 0]
-        if len(behind) == 0:
-            return
         black, white = (behind < CLOSE).all(-1), (behind > 1 - CLOSE).all(-1)
         other, name = (white, "white") if self.background == "black" else (black, "black")
-        if float(other.float().mean()) > WRONG_BACKGROUND:
+        if float(other.float().mean()) > WRONG_BACKGROUND:  # NaN without background
             raise DataError(
                 f"{path} has a {name} background, expected {self.background}; set "
                 f"predictions_background={name}, or give images with alpha"

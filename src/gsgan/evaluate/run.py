@@ -90,7 +90,6 @@ def evaluate_folder(config: DictConfig, console: Console, device: torch.device) 
     out = folder
     if config.background not in (None, _measures(data).background):  # others' scores stay
         out = folder / f"on_{config.background}"
-        console.print(f"scores on {config.background} go into {out}", soft_wrap=True)
     method = trained(
         folder,
         seed=stored.seed,
@@ -122,11 +121,7 @@ def evaluate_predictions(config: DictConfig, console: Console, device: torch.dev
     )
     chosen = HydraConfig.get().runtime.choices if HydraConfig.initialized() else {}
     method = Method(name, data=chosen.get("data"))
-    results = evaluate_method(
-        out, config, console, data, folder.predict, method=method, device=device
-    )
-    console.print(f"scores: {out}", markup=False, highlight=False, soft_wrap=True)
-    return results
+    return evaluate_method(out, config, console, data, folder.predict, method=method, device=device)
 
 
 def _out(config: DictConfig, root: Path, method: str) -> Path:
@@ -185,9 +180,6 @@ def evaluate_method(
         frames = ((dataset.items[i], dataset[i].to(device)) for i in order)
         shown = {round((i + 0.5) * count / rows - 0.5) for i in range(rows)}
         scores[split] = score_split(frames, predict, scorer, shown)
-    for split, found in scores.items():
-        if found.grid:
-            write_grid(found.grid, folder / "pictures" / f"{split}.png")
     record = scorer.protocol
     if record is not None and any(found.hidden_outline for found in scores.values()):
         record = record | {"departures": [*record["departures"], HIDDEN_OUTLINE]}
@@ -196,6 +188,8 @@ def evaluate_method(
     for split, found in scores.items():
         reason = data.reasons.get(split, "no frames")
         held = found.variants or {name: empty(reason, scorer) for name in variants}
+        if found.grid:
+            write_grid(found.grid, folder / "pictures" / f"{split}.png")
         results[split] = {name: values | {"protocol": record} for name, values in held.items()}
     table = (
         {"split": split, "variant": variant, **row}
@@ -210,6 +204,7 @@ def evaluate_method(
         console.print(f"earlier scores of {names} were made in another way and are left out")
     write_scored(whole, folder)
     print_table(whole.results, whole.facts, console)
+    console.print(f"scores: {folder}", markup=False, highlight=False, soft_wrap=True)
     return whole.results
 
 
@@ -247,8 +242,7 @@ def _measures(data: GsganData) -> Measures:
 def lpips_name(net: str, measures: Measures) -> str:
     """The name of an LPIPS: backbone, input range, and order of channels and region where those are
     not the defaults."""
-    backbone = {"vgg": "VGG", "alex": "Alex"}[net]
     low, high = measures.lpips_range
     order = "" if measures.lpips_channels == "rgb" else " BGR"
     region = "" if measures.lpips_region == "full" else " mask crop 512"
-    return f"LPIPS-{backbone} [{low:g},{high:g}]{order}{region}"
+    return f"LPIPS-{'VGG' if net == 'vgg' else 'Alex'} [{low:g},{high:g}]{order}{region}"

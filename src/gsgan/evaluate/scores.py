@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -68,11 +69,8 @@ def image_scores(
     """
     measures, image = measures or Measures(), image.clamp(0, 1)
     pooling, background = measures.psnr_pooling, BACKGROUNDS[measures.background]
-
-    def similarity(a: Tensor, b: Tensor) -> Tensor:
-        score = ssim_uniform if measures.ssim_window == "uniform" else ssim
-        return score(a, b, value_range=measures.ssim_range)
-
+    window = ssim_uniform if measures.ssim_window == "uniform" else ssim
+    similarity = partial(window, value_range=measures.ssim_range)
     scores: dict[str, Any] = {"high_frequencies": high_frequencies(image, target)}
     if measures.region == "body_box":
         assert box is not None
