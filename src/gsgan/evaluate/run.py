@@ -83,7 +83,7 @@ def evaluate_config(config: DictConfig) -> Results:
 def evaluate_folder(config: DictConfig, console: Console, device: torch.device) -> Results:
     """Loads the avatar of ``config.run`` and scores it."""
     folder = Path(config.run).expanduser()
-    stored = load_config(folder, Moved.said(config))
+    stored = load_config(folder, Moved.from_config(config))
     data = build_data(stored)
     avatar, marks = load_avatar(folder, stored, data)
     state = read_checkpoint(folder / CHECKPOINT)["gsgan"]

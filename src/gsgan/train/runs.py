@@ -54,8 +54,6 @@ class Moved:
         """From ``data_root`` and ``data_smpl`` of a command's config."""
         return cls(config.data_root, config.data_smpl)
 
-    said = from_config  # former name
-
     def refuse_without_run(self) -> None:
         """Refuses the keys where no run is given.
 
