@@ -29,9 +29,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from gsgan.utils import pages
 from gsgan.utils.console import make_console
-from gsgan.utils.devices import pick_device
 from gsgan.utils.errors import ConfigError, GsganError
 from gsgan.utils.files import write_atomically
+from gsgan.utils.tensors import pick_device
 
 NOTHING = "–"  # what was not measured
 PACKAGES = ("gsgan", "torch", "gsplat")

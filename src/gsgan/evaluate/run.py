@@ -47,8 +47,8 @@ from gsgan.train.runs import (
     read_checkpoint,
 )
 from gsgan.utils.console import make_console
-from gsgan.utils.devices import pick_device
 from gsgan.utils.errors import ConfigError
+from gsgan.utils.tensors import pick_device
 
 SPLITS = ("novel_view", "novel_pose")
 

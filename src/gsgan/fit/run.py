@@ -26,9 +26,9 @@ from gsgan.fit.picture import fit_picture
 from gsgan.prepare.work import progress, write_npz, writing
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.console import make_console
-from gsgan.utils.devices import pick_device
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
+from gsgan.utils.tensors import pick_device
 
 SMALL_FILES = ("cameras.json", "meta.json")
 METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}

@@ -15,8 +15,8 @@ from omegaconf import DictConfig, OmegaConf
 import gsgan.model.assemble as assemble
 from gsgan.effects import Effects
 from gsgan.model.avatar import Avatar
-from gsgan.utils.devices import pick_device
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.tensors import pick_device
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData, SceneInfo

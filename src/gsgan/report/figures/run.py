@@ -24,9 +24,9 @@ from gsgan.report.figures.subjects import Subject, open_subjects
 from gsgan.report.figures.training import training
 from gsgan.train.runs import Moved, load_config
 from gsgan.utils.console import make_console
-from gsgan.utils.devices import pick_device
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically
+from gsgan.utils.tensors import pick_device
 
 RECORD, CAPTIONS = "figures.json", "captions.md"
 METADATA: dict[str, dict[str, Any]] = {  # no dates: the same figure gives the same bytes
