@@ -79,7 +79,7 @@ def test_nothing_has_moved_where_there_is_no_run(inside):
 
 
 def test_evaluate_refuses_what_is_no_run(run, tmp_path, inside):
-    refused(inside("evaluate"), "run is not set")
+    refused(inside("evaluate"), "give either run=")
     refused(inside("evaluate", f"run={tmp_path}"), "not a run folder")
     refused(inside("evaluate", f"run={run}", "device=abacus"), "device=abacus")
     refused(inside("evaluate", f"run={run}", "splits=[training]"), "splits", "novel_pose")

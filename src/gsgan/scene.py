@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from gsgan.utils.constants import constant
 from gsgan.utils.records import TensorRecord, cat
+from gsgan.utils.tensors import constant
 
 __all__ = [
     "BodyPose",

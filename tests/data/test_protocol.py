@@ -236,9 +236,12 @@ def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> Non
     """metrics.json and the table name the protocol, what it asked for, and what differs from it."""
     import io
 
+    import torch
     from rich.console import Console
 
-    from gsgan.evaluate.run import Selection, evaluate_run
+    from gsgan.evaluate.facts import Method
+    from gsgan.evaluate.run import evaluate_method
+    from gsgan.evaluate.scores import painter
     from gsgan.train.runs import build_avatar, build_data
 
     config = compose(
@@ -251,14 +254,14 @@ def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> Non
     data = build_data(config)
     avatar = build_avatar(config, data).eval()
     text = io.StringIO()
-    results = evaluate_run(
+    results = evaluate_method(
         tmp_path,
         config,
         Console(file=text, width=200),
-        data=data,
-        avatar=avatar,
-        marks=[],
-        selection=Selection(pictures=0),
+        data,
+        painter(avatar),
+        method=Method("gsgan"),
+        device=torch.device("cpu"),
     )
     written = json.loads((tmp_path / "metrics.json").read_text())
     assert written == json.loads(json.dumps(results))

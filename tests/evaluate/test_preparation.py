@@ -9,9 +9,15 @@ import torch
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.measures import Measures
-from gsgan.evaluate.prepare import JOINT_MARGIN, VERTEX_MARGIN, BodyBoxes, Prediction, Preparation
-from gsgan.evaluate.split import FULL
-from gsgan.metrics.body_box import box_corners, box_mask
+from gsgan.evaluate.predictions import (
+    FULL,
+    JOINT_MARGIN,
+    VERTEX_MARGIN,
+    BodyBoxes,
+    Prediction,
+    Preparation,
+)
+from gsgan.metrics.regions import box_corners, box_mask
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,7 @@ import pandas as pd
 import pytest
 
 from gsgan.evaluate.files import HEADER, Scored, joined, read_rows, write_scored
-from gsgan.evaluate.scores import METRICS
-from gsgan.evaluate.split import no_scores
+from gsgan.evaluate.scores import METRICS, no_scores
 
 
 def variant(protocol: str | None = None) -> dict:
@@ -39,7 +38,7 @@ def scored(
 
 def test_the_csv_keeps_every_digit(tmp_path):
     path = tmp_path / "scores.csv"
-    write_scored(scored("novel_pose"), tmp_path, "t")
+    write_scored(scored("novel_pose"), tmp_path)
     with path.open() as stream:
         (line,) = csv.DictReader(stream)
     assert tuple(line) == HEADER
@@ -52,7 +51,7 @@ def test_the_csv_keeps_every_digit(tmp_path):
 
 
 def test_scoring_one_split_keeps_the_others(tmp_path):
-    write_scored(scored("novel_pose"), tmp_path, "t")
+    write_scored(scored("novel_pose"), tmp_path)
     whole, dropped = joined(scored("novel_view"), tmp_path, ("novel_view", "novel_pose"))
     assert list(whole.results) == list(whole.rows["split"]) == ["novel_view", "novel_pose"]
     assert dropped == []
@@ -60,14 +59,14 @@ def test_scoring_one_split_keeps_the_others(tmp_path):
 
 @pytest.mark.parametrize("other", [{"seed": 1}, {"protocol": "zju"}, {"commit": "abc"}])
 def test_scores_of_another_way_are_not_mixed_in(tmp_path, other):
-    write_scored(scored("novel_pose", **other), tmp_path, "t")
+    write_scored(scored("novel_pose", **other), tmp_path)
     whole, dropped = joined(scored("novel_view"), tmp_path, ("novel_view", "novel_pose"))
     assert list(whole.results) == ["novel_view"]
     assert dropped == ["novel_pose"]
 
 
 def test_damaged_earlier_scores_are_left_out(tmp_path):
-    write_scored(scored("novel_pose"), tmp_path, "t")
+    write_scored(scored("novel_pose"), tmp_path)
     (tmp_path / "scores.csv").write_text("split,psnr\n")
     whole, dropped = joined(scored("novel_view"), tmp_path, ("novel_view", "novel_pose"))
     assert list(whole.results) == ["novel_view"]
@@ -81,5 +80,5 @@ def test_nothing_that_json_does_not_have_is_written(tmp_path):
     broken = scored("novel_pose")
     broken.results["novel_pose"]["full"]["psnr"] = math.nan
     with pytest.raises(ValueError, match="JSON"):
-        write_scored(broken, tmp_path, "t")
+        write_scored(broken, tmp_path)
     assert not (tmp_path / "metrics.json").exists()

@@ -11,9 +11,17 @@ import torch
 from torchmetrics.classification import MulticlassJaccardIndex
 
 from gsgan.data.measures import Measures
-from gsgan.evaluate.prepare import Prediction, Preparation
-from gsgan.evaluate.scores import confusion, image_scores, mean, means, miou
-from gsgan.evaluate.split import FLOOR, FULL, SPLAT, Scorer, empty_split, painter, score_split
+from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparation
+from gsgan.evaluate.scores import (
+    Scorer,
+    confusion,
+    empty,
+    image_scores,
+    means,
+    miou,
+    painter,
+    score_split,
+)
 from gsgan.metrics.image import psnr, ssim, ssim_uniform
 from gsgan.model.painting import Painting
 from gsgan.scene import Camera, Frame
@@ -48,8 +56,10 @@ def scorer(measures: Measures | None = None) -> Scorer:
 
 def test_equal_images_are_kept_out_of_the_mean():
     rows = [{"psnr": score} for score in (math.inf, 30.0, 20.0, math.nan)]
-    assert mean(rows, "psnr") == (25.0, 2)
-    assert mean(rows, "lpips") == (None, 0)
+    found = means(rows)
+    assert (found["psnr"], found["psnr_left_out"]) == (25.0, 2)
+    assert found["lpips"] is None
+    assert "lpips_left_out" not in found
 
 
 def test_image_scores_name_a_reason_for_every_none():
@@ -179,7 +189,7 @@ def test_every_split_has_every_metric_or_a_reason():
     found = score_split([(("a", 0), f)], lambda f, _: Prediction({FULL: f.image}, {}), scorer())
     for values in (
         *found.variants.values(),
-        *empty_split("none held out", scorer()).variants.values(),
+        empty("none held out", scorer()),
     ):
         for metric in (
             "psnr",

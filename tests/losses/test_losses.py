@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from gsgan.losses.adversarial import discriminator_loss, feature_matching, generator_loss
-from gsgan.losses.perceptual import Perceptual
+from gsgan.losses.perceptual import FILES, Perceptual, find_weights, load_weights
 from gsgan.losses.photometric import d_ssim, photometric
-from gsgan.losses.weights import FILES, find_weights, load_weights
 from gsgan.utils.errors import ConfigError, DataError
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from gsgan.metrics.body_box import box_corners, box_mask, inside_hull, pixel_centres
+from gsgan.metrics.regions import box_corners, box_mask, inside_hull, pixel_centres
 from gsgan.scene import Camera, distort
 
 

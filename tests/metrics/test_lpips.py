@@ -11,7 +11,7 @@ from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 from gsgan.data.measures import Measures
 from gsgan.evaluate.run import lpips_name
 from gsgan.evaluate.scores import image_scores
-from gsgan.losses.weights import FILES
+from gsgan.losses.perceptual import FILES
 from gsgan.metrics.lpips import lpips
 from gsgan.metrics.regions import mask_crop
 from gsgan.utils.errors import ConfigError

@@ -32,9 +32,9 @@ from gsgan.splat import buffers
 from gsgan.utils import pages
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
-from gsgan.utils.devices import pick_device
 from gsgan.utils.errors import GsganError
 from gsgan.utils.files import write_atomically
+from gsgan.utils.tensors import pick_device
 
 NOTHING = "–"  # what was not measured
 

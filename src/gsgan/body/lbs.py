@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from gsgan.utils.constants import constant
+from gsgan.utils.tensors import constant
 
 
 def axis_angle_to_matrix(axis_angle: Tensor, small: float = 1e-6) -> Tensor:

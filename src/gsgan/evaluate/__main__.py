@@ -9,7 +9,7 @@ from gsgan.utils.config import entry
 
 def evaluate(config: DictConfig) -> None:
     """Scores the run folder ``config.run`` or the images in ``config.predictions``."""
-    from gsgan.evaluate.command import evaluate_config
+    from gsgan.evaluate.run import evaluate_config
 
     evaluate_config(config)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.metadata
 import json
 import subprocess
 from dataclasses import asdict, dataclass
@@ -14,26 +13,26 @@ from typing import TYPE_CHECKING, Any
 import torch
 from omegaconf import OmegaConf
 
+from gsgan import __version__
+
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-FINGERPRINT = 12  # hexadecimal digits
 DIRTY = "+changes"
+# Scores that differ in one of these do not share a table.
 SAME = ("method", "model", "protocol", "seed", "iterations", "version", "commit", "dirty")
 
 
 @dataclass(frozen=True)
 class Method:
-    """What is scored.
+    """What is scored; None for what is unknown.
 
     Args:
         name: of the method.
-        model: choice of the model group, or None.
-        data: choice of the data group, or None.
-        seed: of the training, or None.
-        iterations: of the training, or None.
-        train_seconds: wall clock over all parts of a resumed run, or None.
-        trained_by: commits that trained it, one per part of a resumed run; None if unknown.
+        model, data: choices of these config groups.
+        seed, iterations: of the training.
+        train_seconds: wall clock over all parts of a resumed run.
+        trained_by: commits that trained it, one per part of a resumed run.
     """
 
     name: str
@@ -42,33 +41,32 @@ class Method:
     seed: int | None = None
     iterations: int | None = None
     train_seconds: float | None = None
-    trained_by: tuple[str, ...] | None = None
+    trained_by: list[str] | None = None
+
+
+def trained(folder: Path, **training: Any) -> Method:
+    """The method of a run folder, with the fields of ``training``."""
+    chosen = choices(folder)
+    return Method("gsgan", model=chosen.get("model"), data=chosen.get("data"), **training)
 
 
 def facts(method: Method, data: GsganData, device: torch.device) -> dict[str, Any]:
     """The content of facts.json."""
-    try:
-        version = importlib.metadata.version("gsgan")
-    except importlib.metadata.PackageNotFoundError:
-        version = None
-    commit, dirty = commit_of()
+    commit, dirty = _commit()
+    trained = asdict(method)
     return {
-        "version": version,
+        "version": __version__,
         "commit": commit,
         "dirty": dirty,
         "date": datetime.now().astimezone().isoformat(timespec="seconds"),
-        "method": method.name,
-        "model": method.model,
+        "method": trained.pop("name"),
         "data": {
-            "name": method.data,
+            "name": trained.pop("data"),
             "root": Path(data.layout.root).resolve().name,
             "fingerprint": fingerprint(data),
         },
         "protocol": None if data.protocol is None else data.protocol.name,
-        "seed": method.seed,
-        "iterations": method.iterations,
-        "train_seconds": method.train_seconds,
-        "trained_by": None if method.trained_by is None else list(method.trained_by),
+        **trained,
         "device": str(device),
         "torch": torch.__version__,
     }
@@ -76,16 +74,15 @@ def facts(method: Method, data: GsganData, device: torch.device) -> dict[str, An
 
 def training_code() -> list[str]:
     """The commit that a checkpoint records; empty if unknown."""
-    commit, dirty = commit_of()
+    commit, dirty = _commit()
     return [] if commit is None else [commit + (DIRTY if dirty else "")]
 
 
-def commit_of(folder: Path | None = None) -> tuple[str | None, bool | None]:
-    """``git describe`` of the checkout that holds a folder (None: this package), and whether
-    tracked files differ from it; (None, None) outside a checkout or without git."""
-    folder = folder or Path(__file__).resolve().parent
-    root = next((f for f in folder.parents if (f / ".git").exists()), None)
-    if root is None or not (root / "src" / "gsgan").is_dir():
+def _commit() -> tuple[str | None, bool | None]:
+    """``git describe`` of this checkout, and whether tracked files differ from it; (None, None)
+    outside a checkout or without git."""
+    root = Path(__file__).resolve().parents[3]
+    if not (root / ".git").exists():
         return None, None
     options = ("--always", "--tags", "--abbrev=12", f"--dirty={DIRTY}")
     command = ["git", "-C", str(root), "describe", *options]
@@ -111,7 +108,7 @@ def fingerprint(data: GsganData) -> str:
     if layout.landmarks.fitted_to:  # other skeletons are other inputs, and crop other windows
         content["landmarks"] = layout.landmarks.digest(layout.frames)
     plain = json.dumps(content, sort_keys=True).encode()
-    return hashlib.sha256(plain).hexdigest()[:FINGERPRINT]
+    return hashlib.sha256(plain).hexdigest()[:12]
 
 
 def choices(folder: Path) -> dict[str, Any]:
@@ -123,24 +120,15 @@ def choices(folder: Path) -> dict[str, Any]:
     return {} if found is None else {str(key): value for key, value in found.items()}
 
 
-def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    """Whether two sets of scores may share a table: same method, training, data and code."""
-    prints = (a["data"]["fingerprint"], b["data"]["fingerprint"])
-    return prints[0] == prints[1] and all(a[key] == b[key] for key in SAME)
-
-
-def provenance(facts: dict[str, Any]) -> dict[str, str]:
-    """What every row of a table carries: protocol, data, number of seeds, commit."""
-    data = facts["data"]
-    return {
-        "protocol": facts["protocol"] or "none",
-        "data": f"{data['name'] or 'unknown'} ({data['root']}, {data['fingerprint']})",
-        "seeds": "none said" if facts["seed"] is None else f"1 ({facts['seed']})",
-        "commit": (facts["commit"] or "unknown") + (", changed since" if facts["dirty"] else ""),
-    }
-
-
 def caption(facts: dict[str, Any]) -> str:
-    """One line under a table: the method and its provenance."""
-    method = facts["method"] if facts["model"] is None else f"{facts['method']} {facts['model']}"
-    return " · ".join([method, *(f"{key} {value}" for key, value in provenance(facts).items())])
+    """One line under a table: method, protocol, data, number of seeds, commit."""
+    data, seed = facts["data"], facts["seed"]
+    return " · ".join(
+        [
+            facts["method"] if facts["model"] is None else f"{facts['method']} {facts['model']}",
+            f"protocol {facts['protocol'] or 'none'}",
+            f"data {data['name'] or 'unknown'} ({data['root']}, {data['fingerprint']})",
+            "seed unknown" if seed is None else f"seed {seed}",
+            f"commit {facts['commit'] or 'unknown'}" + (", changed since" * bool(facts["dirty"])),
+        ]
+    )

@@ -1,18 +1,21 @@
-"""The files of an evaluation: metrics.json, scores.csv, facts.json, metrics.md."""
+"""The results of an evaluation: metrics.json, scores.csv, facts.json and tables of the scores."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
+from rich import box
+from rich.console import Console
+from rich.table import Table
 
-from gsgan.evaluate.facts import same
+from gsgan.evaluate.facts import SAME, caption
 from gsgan.evaluate.scores import METRICS
-from gsgan.evaluate.tables import Results, markdown
+from gsgan.utils import pages
 from gsgan.utils.files import write_atomically
 
 METRICS_FILE, SCORES_FILE, FACTS_FILE, TABLE_FILE = NAMES = (
@@ -20,6 +23,27 @@ METRICS_FILE, SCORES_FILE, FACTS_FILE, TABLE_FILE = NAMES = (
 )
 PLACE = {"split": str, "variant": str, "camera": str, "frame": int}
 HEADER = (*PLACE, *METRICS)
+Results = dict[str, dict[str, dict[str, Any]]]
+TITLE = "Held-out cameras (novel_view) and poses (novel_pose)"
+COLUMNS = {  # heading and number of decimals
+    "psnr": ("PSNR ↑", 2),
+    "psnr_person": ("in box ↑", 2),
+    "ssim": ("SSIM ↑", 4),
+    "ssim_person": ("SSIM in box ↑", 4),
+    "lpips": ("LPIPS ↓", 4),
+    "lpips_person": ("LPIPS in box ↓", 4),
+    "edge_f1": ("edge F1 ↑", 3),
+    "edge_f1_person": ("edge F1 in box ↑", 3),
+    "edge_ratio": ("edges →1", 2),
+    "edge_ratio_person": ("edges in box →1", 2),
+    "high_frequencies": ("detail →1", 2),
+    "miou": ("mIoU ↑", 3),
+    "miou_with_background": ("with background ↑", 3),
+}
+IN_TERMINAL = (  # narrow; metrics.md has all metrics
+    *("psnr", "psnr_person", "ssim", "lpips", "edge_f1", "edge_ratio", "high_frequencies", "miou"),
+)
+VARIANTS = {"full": "picture", "splat": "Step I's colour", "floor": "floor: background"}
 
 
 @dataclass(frozen=True)
@@ -37,61 +61,45 @@ class Scored:
     facts: dict[str, Any]
 
 
-def write_scored(scored: Scored, folder: Path, title: str) -> None:
+def write_scored(scored: Scored, folder: Path) -> None:
     """Writes the four files, each whole or not at all; metrics.json last: if it is new, all are."""
     facts = json.dumps(scored.facts, indent=2, allow_nan=False)
     table = scored.rows.to_csv(columns=list(HEADER), index=False, lineterminator="\n")
     write_atomically(folder / SCORES_FILE, table)
-    write_atomically(folder / TABLE_FILE, markdown(scored.results, scored.facts, title))
+    write_atomically(folder / TABLE_FILE, markdown(scored.results, scored.facts))
     write_atomically(folder / FACTS_FILE, facts)
     results = json.dumps(scored.results, indent=2, allow_nan=False)
     write_atomically(folder / METRICS_FILE, results)
 
 
 def read_rows(path: Path) -> pd.DataFrame:
-    """Reads scores.csv.
-
-    Raises:
-        ValueError: when it is another table.
-        OSError: when it cannot be read.
-    """
+    """Reads scores.csv; a KeyError when a column is missing."""
     empty: dict[str, list[str]] = {metric: [""] for metric in METRICS}
     table = pd.read_csv(
         path, dtype=PLACE, keep_default_na=False, na_values=empty, float_precision="round_trip"
     )
-    if tuple(table.columns) != HEADER:
-        raise ValueError(f"{path}: other columns")
-    return table
+    return table[list(HEADER)]
 
 
 def joined(now: Scored, folder: Path, splits: Iterable[str]) -> tuple[Scored, list[str]]:
-    """Adds the earlier scores of other splits where they were made in the same way.
-
-    Args:
-        now: the new scores.
-        folder: of the earlier ones.
-        splits: in the order of the table.
+    """Adds the scores that ``folder`` has of other splits if they were made in the same way.
 
     Returns:
-        All scores, and the names of earlier splits that had to be dropped.
+        All scores in the order of ``splits``, and the earlier splits that had to be dropped.
     """
-    path = folder / METRICS_FILE
-    if not path.is_file():
+    if not (folder / METRICS_FILE).is_file():
         return now, []
     others: list[str] = []
     try:
-        results: Results = json.loads(path.read_text())
+        results: Results = json.loads((folder / METRICS_FILE).read_text())
         others = [split for split in results if split not in now.results]
-        facts = json.loads((folder / FACTS_FILE).read_text())
         rows = read_rows(folder / SCORES_FILE)
-        fits = same(facts, now.facts) and all(
-            _way(results[split]["full"]) == _way(scored["full"])
-            for split in others
-            for scored in now.results.values()
-        )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        fits = False  # damaged, or of a version without facts
-    if not fits:
+        facts = json.loads((folder / FACTS_FILE).read_text())
+        ways = [_way(facts, results[split]["full"]) for split in others]
+        ways += [_way(now.facts, scored["full"]) for scored in now.results.values()]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # damaged, or too old
+        return now, others
+    if any(way != ways[-1] for way in ways):
         return now, others
     results |= now.results
     rows = pd.concat([rows[rows["split"].isin(others)], now.rows])
@@ -100,6 +108,78 @@ def joined(now: Scored, folder: Path, splits: Iterable[str]) -> tuple[Scored, li
     return Scored({split: results[split] for split in order}, rows, now.facts), []
 
 
-def _way(scores: dict[str, Any]) -> tuple[Any, ...]:
-    """How a variant was scored."""
-    return scores["marks"], scores.get("protocol"), scores["lpips_name"]
+def _way(facts: dict[str, Any], scores: dict[str, Any]) -> list[Any]:
+    """How a split was scored; splits of one table share it."""
+    way = [facts["data"]["fingerprint"], *(facts[key] for key in SAME)]
+    return way + [scores.get(key) for key in ("marks", "protocol", "lpips_name")]
+
+
+# -- tables
+
+
+def rows(
+    results: Results, metrics: tuple[str, ...] = METRICS, *, cameras: bool = False
+) -> Iterator[list[str]]:
+    """One formatted row per split and variant, and per camera if ``cameras``; None is ``n/a``."""
+
+    def formatted(values: dict[str, Any]) -> list[str]:
+        return ["n/a" if (v := values[m]) is None else f"{v:.{COLUMNS[m][1]}f}" for m in metrics]
+
+    for split, variants in results.items():
+        for variant, scores in variants.items():
+            yield [split, VARIANTS[variant], str(scores["images"]), *formatted(scores)]
+            for camera, means in scores["cameras"].items() if cameras else ():
+                yield [split, f"  {camera}", "", *formatted(means)]
+
+
+def notes(results: Results) -> list[str]:
+    """Every reason and mark behind the table, once each."""
+    found: dict[str, None] = {}
+    for split, variants in results.items():
+        scores = variants["full"]
+        if name := scores.get("lpips_name"):
+            found[f"LPIPS is {name}"] = None
+        for mark in scores["marks"]:
+            found[f"marked: {mark}"] = None
+        if protocol := scores.get("protocol"):
+            note = f"; {protocol['note']}" if protocol.get("note") else ""
+            found[f"protocol: {protocol['name']} ({protocol['source']}){note}"] = None
+            for departure in protocol["departures"]:
+                found[f"departs from {protocol['name']}: {departure}"] = None
+        if not scores["images"]:
+            found[f"{split}: {scores['psnr_reason']}"] = None
+            continue
+        for metric in METRICS:
+            repeats = metric in ("miou_with_background", "lpips_person")  # miou's, lpips' reason
+            if not repeats and scores[metric] is None:
+                found[f"{metric} n/a: {scores[f'{metric}_reason']}"] = None
+    return list(found)
+
+
+def print_table(results: Results, facts: dict[str, Any], console: Console) -> None:
+    """Prints the table, its caption and its notes."""
+    table = Table(title=TITLE, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column("picture", no_wrap=True)
+    for metric in IN_TERMINAL:
+        table.add_column(COLUMNS[metric][0], justify="right", no_wrap=True)
+    previous = None
+    for split, variant, images, *scores in rows(results, IN_TERMINAL):
+        if split != previous:  # a column for the split would not fit a narrow terminal
+            table.add_section()
+            table.add_row(f"[bold]{split}[/bold], {images} images")
+            previous = split
+        table.add_row(variant, *scores)
+    console.print(table)
+    for line in (caption(facts), *notes(results)):
+        console.print(f"  {line}", markup=False, highlight=False)
+
+
+def markdown(results: Results, facts: dict[str, Any]) -> str:
+    """The table in Markdown with its caption and every metric, and again by camera."""
+    header = ["split", "picture", "images", *(COLUMNS[m][0] for m in METRICS)]
+    by_split, by_camera = (
+        pages.markdown(header, list(rows(results, cameras=each))) for each in (False, True)
+    )
+    listed = "\n".join(f"- {note}" for note in notes(results))
+    parts = (f"# {TITLE}", caption(facts), by_split, listed, "## By camera", by_camera)
+    return "\n\n".join(filter(None, parts)) + "\n"

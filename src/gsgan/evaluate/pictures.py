@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gsgan.model.avatar import Painting
 from gsgan.scene import Frame
@@ -59,26 +60,30 @@ def grid_rows(frame: Frame, painting: Painting) -> list[dict[str, Tensor]]:
     return [{name: column[i] for name, column in shown.items()} for i in range(len(frame))]
 
 
-def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) -> Path:
+def write_grid(rows: Sequence[dict[str, Tensor]], path: Path, least: int = 160) -> None:
     """Writes rows of images ``[3, H, W]`` as one PNG with a caption over each column.
 
+    Smaller images are padded with black to the largest.
+
     Args:
-        rows: at least one row, each with the same captions; all images of one size.
+        rows: at least one row, each with the same captions.
         path: of the PNG.
         least: pixels; smaller images are enlarged by a whole factor to at least this width.
     """
-    captions = list(rows[0])
-    scale = max(1, -(-least // rows[0][captions[0]].shape[-1]))
-    body = torch.cat([torch.cat(list(row.values()), dim=-1) for row in rows], dim=-2)
-    body = body.clamp(0, 1).repeat_interleave(scale, -1).repeat_interleave(scale, -2)
+    images = [list(row.values()) for row in rows]
+    height, width = (max(x.shape[d] for row in images for x in row) for d in (-2, -1))
+    padded = [
+        [pad(x, (0, width - x.shape[-1], 0, height - x.shape[-2])) for x in row] for row in images
+    ]
+    body = torch.cat([torch.cat(row, dim=-1) for row in padded], dim=-2).clamp(0, 1)
+    scale = max(1, -(-least // width))
+    body = body.repeat_interleave(scale, -1).repeat_interleave(scale, -2)
     pixels = (body * 255).round().byte().permute(1, 2, 0).numpy()
     header = np.full((CAPTION_HEIGHT, pixels.shape[1], 3), 255, np.uint8)
-    step = pixels.shape[1] // len(captions)
-    for i, caption in enumerate(captions):
-        at = (i * step + 4, CAPTION_HEIGHT - 7)
+    for i, caption in enumerate(rows[0]):
+        at = (i * scale * width + 4, CAPTION_HEIGHT - 7)
         cv2.putText(header, caption, at, cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
     ok, data = cv2.imencode(".png", np.concatenate([header, pixels])[..., ::-1])
     if not ok:
         raise OSError(f"{path}: the image could not be encoded as PNG")
     write_atomically(path, data.tobytes())
-    return path

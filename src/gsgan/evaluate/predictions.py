@@ -1,66 +1,158 @@
-"""Any method's predictions: a folder of images, each matched with its camera and frame."""
+"""Predictions of any method: read from a folder, and prepared as a protocol scores them."""
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from glob import glob
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from gsgan.data.files import check_picture, read_header, read_with_alpha
+from gsgan.body import SkinnedBody, open_body
+from gsgan.data.files import check_picture, read_with_alpha
+from gsgan.data.measures import Measures
 from gsgan.data.splits import Item
-from gsgan.evaluate.prepare import Prediction
-from gsgan.evaluate.split import FULL
+from gsgan.metrics.regions import (
+    BACKGROUNDS,
+    box_corners,
+    box_mask,
+    cleared,
+    eight_bits,
+    hard_outline,
+    moved_background,
+    on_background,
+)
 from gsgan.scene import Frame
 from gsgan.utils.errors import ConfigError, DataError
 
+if TYPE_CHECKING:
+    from gsgan.data.datamodule import GsganData
+
+VERTEX_MARGIN = 0.05  # metres round the body's vertices, as in published scoring scripts
+JOINT_MARGIN = 0.2  # metres round joints, which lie inside the flesh; as in `PersonCrop`
+FULL, SPLAT, FLOOR = "full", "splat", "floor"  # the floor is the all-background image
+HIDDEN_OUTLINE = (
+    "pictures without alpha are put on the protocol's background by the truth's mask, which hides "
+    "what they paint outside it"
+)
 FIELDS = ("split", "camera", "camera_index", "frame")
 FIELD = re.compile(r"\{(.*?)\}")
-SHOWN = 5  # names in a message
 WRONG_BACKGROUND = 0.5  # share of the background's pixels that have the other background's colour
 CLOSE = 0.05  # of the range: below it a pixel counts as black, within it of 1 as white
 
 
 @dataclass(frozen=True)
-class Pattern:
-    """How prediction files are named.
+class Prediction:
+    """What a method predicts for one frame.
 
     Args:
-        text: relative to the folder, with "{camera}" (name) or "{camera_index}" (index into the
-            dataset's cameras, from 0), "{frame}" (number, any zero-padding), optionally "{split}".
-
-    Raises:
-        ConfigError: when a field is unknown, missing or given twice.
+        images: by variant, ``[B, 3, H, W]``.
+        alphas: by variant, ``[B, 1, H, W]`` of images on black, premultiplied; None or absent for
+            opaque images.
+        background: of opaque images, "black" or "white".
+        segmentation: ``[B, classes, H, W]``, or None.
+        labels: ``[B, H, W]`` ground truth in the classes of the segmentation; None where those are
+            the frame's labels.
+        no_parts: the reason given where there is no segmentation.
     """
 
-    text: str
+    images: dict[str, Tensor]
+    alphas: Mapping[str, Tensor | None]
+    background: str = "black"
+    segmentation: Tensor | None = None
+    labels: Tensor | None = None
+    no_parts: str = "predictions are pictures, not a segmentation"
 
-    def __post_init__(self) -> None:
-        found = FIELD.findall(self.text)
-        unknown = [name for name in found if name not in FIELDS]
-        if unknown:
-            raise ConfigError(
-                f"predictions_pattern has the field {{{unknown[0]}}}; it may have "
-                + ", ".join(f"{{{name}}}" for name in FIELDS)
-            )
-        cameras = found.count("camera") + found.count("camera_index")
-        if found.count("frame") != 1 or cameras != 1 or found.count("split") > 1:
-            raise ConfigError(
-                f"predictions_pattern={self.text} must have {{frame}} once, {{camera}} or "
-                "{camera_index} once, and {split} at most once"
-            )
 
-    def name(self, split: str, item: Item, cameras: Sequence[str]) -> str:
-        """The file name of an item, its frame number padded to six digits."""
-        camera, frame = item
-        index = str(cameras.index(camera))
-        values = dict(zip(FIELDS, (split, camera, index, f"{frame:06d}"), strict=True))
-        return FIELD.sub(lambda field: values[field[1]], self.text)
+class BodyBoxes:
+    """The body's projected 3D box: round its vertices, or, without a mesh, round its joints with a
+    larger margin."""
+
+    def __init__(self, data: GsganData) -> None:
+        found = data.layout.meta.body
+        self.body: SkinnedBody | None = None
+        if data.layout.poses is not None and found is not None:
+            self.body = open_body(found.kind, found.file, found.betas)
+
+    @property
+    def departures(self) -> list[str]:
+        """What tables must state when there is no mesh."""
+        if self.body is not None:
+            return []
+        return [
+            f"the body's box is {100 * JOINT_MARGIN:g} cm round the joints, asked for: "
+            f"{100 * VERTEX_MARGIN:g} cm round the vertices, of which this data has none"
+        ]
+
+    def corners(self, frame: Frame, index: int) -> Tensor:
+        """``[8, 3]`` metres: the box of one item of a frame."""
+        if self.body is not None and frame.body is not None:
+            vertices = self.body.to(frame.skeleton.device).posed_vertices(frame.body)
+            return box_corners(vertices[index], VERTEX_MARGIN)
+        return box_corners(frame.skeleton[index][frame.visibility[index] > 0], JOINT_MARGIN)
+
+    def masks(self, frame: Frame) -> Tensor:
+        """``[B, 1, H, W]`` bool: the pixels that see it."""
+        cameras = (frame.camera[i : i + 1] for i in range(len(frame)))
+        return torch.stack([box_mask(self.corners(frame, i), c) for i, c in enumerate(cameras)])
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """What a protocol does to images before they are scored.
+
+    Args:
+        measures: of the protocol.
+        boxes: where the measures need the body's box, else None.
+    """
+
+    measures: Measures
+    boxes: BodyBoxes | None
+
+    @property
+    def background(self) -> float:
+        """Its grey value."""
+        return BACKGROUNDS[self.measures.background]
+
+    def target(self, frame: Frame) -> Tensor:
+        """``[B, 3, H, W]`` the ground truth, which the data has on black."""
+        image, mask = frame.image, frame.mask
+        if self.measures.truth_outline == "hard":
+            image, mask = hard_outline(image, mask), (mask >= 0.5).to(mask)
+        return on_background(image, mask, self.background)
+
+    def image(
+        self, prediction: Prediction, variant: str, frame: Frame, box: Tensor | None
+    ) -> Tensor:
+        """``[B, 3, H, W]`` a prediction on the protocol's background: by its own alpha, or, where
+        it is opaque and on the other background, by the ground truth's mask."""
+        image = prediction.images[variant].clamp(0, 1)
+        alpha = prediction.alphas.get(variant)
+        if alpha is not None:
+            image = on_background(image, alpha.clamp(0, 1), self.background).clamp(0, 1)
+        elif prediction.background != self.measures.background:
+            old = BACKGROUNDS[prediction.background]
+            image = moved_background(image, frame.mask, old, self.background)
+        image = eight_bits(image, self.measures.eight_bits)
+        if box is not None and self.measures.region == "body_box_cleared":
+            image = cleared(image, box, self.background)
+        return image
+
+    def hides_outline(self, prediction: Prediction) -> bool:
+        """Whether an opaque image must be moved to this background by the ground truth's mask."""
+        opaque = any(prediction.alphas.get(name) is None for name in prediction.images)
+        return opaque and prediction.background != self.measures.background
+
+    def box(self, frame: Frame) -> Tensor | None:
+        """``[B, 1, H, W]`` the body's projected box, or None where it is not needed."""
+        return None if self.boxes is None else self.boxes.masks(frame)
+
+
+# -- a folder of images
 
 
 @dataclass(frozen=True)
@@ -70,138 +162,99 @@ class PredictionFolder:
     Args:
         root: the folder.
         files: relative paths by camera and frame.
-        extra: files that match no expected image.
         background: of opaque images, "black" or "white".
     """
 
     root: Path
     files: Mapping[Item, str]
-    extra: tuple[str, ...]
     background: str
-
-    def check(self, item: Item, size: tuple[int, int]) -> None:
-        """Checks the header of an item's file.
-
-        Args:
-            item: camera and frame.
-            size: ``(H, W)`` of the ground truth as scored.
-
-        Raises:
-            DataError: when the file has another size, or is not an 8-bit RGB image.
-        """
-        path = self.root / self.files[item]
-        found = read_header(path).size
-        if found != size:
-            raise DataError(
-                f"{path} (camera {item[0]}, frame {item[1]}) is {found[1]}x{found[0]} pixels "
-                f"(width x height), but the ground truth as scored is {size[1]}x{size[0]}; "
-                "predictions are scored at the size given by data.size, data.crop and the "
-                "protocol, and are never resized"
-            )
-        check_picture(path, "image", size, "the ground truth")
 
     def predict(self, frame: Frame, item: Item) -> Prediction:
         """The image of an item.
 
         Raises:
-            DataError: when it is damaged, not 8-bit RGB, of another size than the ground truth as
-                scored, or on another background than ``background``.
+            DataError: when it is damaged, not 8-bit RGB, or on another background than
+                ``background``.
         """
-        self.check(item, frame.camera.size)
         path = self.root / self.files[item]
         rgb, alpha = read_with_alpha(path)
-        image = _unit(rgb).permute(2, 0, 1)[None].to(frame.image)
+        image = (torch.from_numpy(rgb).float() / 255).permute(2, 0, 1)[None].to(frame.image)
         if alpha is not None:
-            cover = _unit(alpha)[None, None].to(frame.image)
+            cover = (torch.from_numpy(alpha).float() / 255)[None, None].to(frame.image)
             return Prediction({FULL: image * cover}, {FULL: cover})
         self._check_background(path, image, frame.mask)
         return Prediction({FULL: image}, {}, self.background)
 
     def _check_background(self, path: Path, image: Tensor, mask: Tensor) -> None:
         behind = image.permute(0, 2, 3, 1)[mask[:, 0] == 0]
-        if len(behind) == 0:
-            return
         black, white = (behind < CLOSE).all(-1), (behind > 1 - CLOSE).all(-1)
         other, name = (white, "white") if self.background == "black" else (black, "black")
-        if float(other.float().mean()) > WRONG_BACKGROUND:
+        if float(other.float().mean()) > WRONG_BACKGROUND:  # NaN without background
             raise DataError(
                 f"{path} has a {name} background, expected {self.background}; set "
                 f"predictions_background={name}, or give images with alpha"
             )
 
 
-def _unit(pixels: np.ndarray) -> Tensor:
-    return torch.from_numpy(pixels).float() / 255
-
-
 def read_folder(
     root: Path,
-    pattern: Pattern,
-    expected: Mapping[str, Sequence[Item]],
+    pattern: str,
+    expected: Mapping[str, Mapping[Item, tuple[int, int]]],
     cameras: Sequence[str],
     background: str,
 ) -> PredictionFolder:
-    """Finds the file of every expected image without opening it.
+    """Finds the file of every expected image and checks its header; other files are ignored.
 
     Args:
         root: the folder.
-        pattern: of the names.
-        expected: items by split.
+        pattern: of the names, relative to the folder, with "{camera}" (name) or "{camera_index}"
+            (index into ``cameras``), "{frame}" (number, any zero-padding), optionally "{split}".
+        expected: by split, camera and frame: ``(H, W)`` of the ground truth as scored.
         cameras: of the dataset, in its order.
         background: of opaque images.
 
     Raises:
-        DataError: when the folder does not exist, or an image is missing or there twice.
+        ConfigError: when a field of the pattern is unknown or missing.
+        DataError: when the folder does not exist, or an image is missing, is there twice,
+            or has another size or more than 8 bits per channel.
     """
-    if not root.is_dir():
-        what = "is a file, not a folder" if root.exists() else "does not exist"
-        raise DataError(f"predictions={root} {what}; expected the folder of a method's images")
-    files: dict[str, list[str]] = {}
-    names = _files(root)
-    for name in names:
-        files.setdefault(_unpadded(name), []).append(name)
-    expected_as = {
-        item: pattern.name(split, item, cameras)
-        for split, items in expected.items()
-        for item in items
-    }
-    found = {item: files.get(_unpadded(name), []) for item, name in expected_as.items()}
-    for (camera, frame), several in found.items():
-        if len(several) > 1:
-            raise DataError(
-                f"{root} holds camera {camera}, frame {frame} twice, as {several[0]} and "
-                f"{several[1]}; keep one of them"
-            )
-    missing = [item for item, hits in found.items() if not hits]
-    if missing:
-        camera, frame = missing[0]
-        message = (
-            f"{root} lacks {len(missing)} of {len(found)} images; the first is camera {camera}, "
-            f"frame {frame}, expected as {expected_as[missing[0]]} "
-            f"(predictions_pattern={pattern.text})"
+    fields = set(FIELD.findall(pattern))
+    if not ("frame" in fields <= set(FIELDS) and fields & {"camera", "camera_index"}):
+        raise ConfigError(
+            f"predictions_pattern={pattern} must have {{frame}} and {{camera}} or "
+            "{camera_index}, may have {split}, and no other field"
         )
-        if len(missing) == len(found):
-            message += f"; the folder contains {some(names) or 'nothing'}"
-        raise DataError(message)
-    used = {item: hits[0] for item, hits in found.items()}
-    taken = set(used.values())
-    extra = tuple(name for name in names if name not in taken)
-    return PredictionFolder(root, used, extra, background)
+    if not root.is_dir():
+        raise DataError(f"predictions={root} is not a folder; give that of a method's images")
+    stored: dict[str, list[str]] = {}
+    for name in sorted(glob("**", root_dir=root, recursive=True)):
+        stored.setdefault(_unpadded(name), []).append(name)
+    files, missing = {}, []
+    for split, sizes in expected.items():
+        for (camera, frame), size in sizes.items():
+            what = f"camera {camera}, frame {frame}"
+            values = (split, camera, str(cameras.index(camera)), f"{frame:06d}")
+            name = _filled(pattern, dict(zip(FIELDS, values, strict=True)))
+            found = stored.get(_unpadded(name), [])
+            if not found:
+                missing.append(f"{what}, expected as {name}")
+                continue
+            if len(found) > 1:
+                raise DataError(
+                    f"{root} holds {what} twice, as {found[0]} and {found[1]}; keep one of them"
+                )
+            files[camera, frame] = found[0]
+            check_picture(root / found[0], "image", size, f"the ground truth of {what}, as scored,")
+    if missing:
+        raise DataError(
+            f"{root} lacks {len(missing)} of {len(missing) + len(files)} images; the first is "
+            f"{missing[0]} (predictions_pattern={pattern})"
+        )
+    return PredictionFolder(root, files, background)
 
 
-def some(names: Sequence[str]) -> str:
-    """The first names, for a message."""
-    return ", ".join(names[:SHOWN]) + (" …" if len(names) > SHOWN else "")
-
-
-def _files(root: Path) -> list[str]:
-    """All files below a folder except hidden ones, relative and sorted."""
-    found = []
-    for folder, subfolders, names in os.walk(root, followlinks=True):
-        subfolders[:] = [s for s in subfolders if not s.startswith(".")]
-        relative = Path(folder).relative_to(root)
-        found += [(relative / name).as_posix() for name in names if not name.startswith(".")]
-    return sorted(found)
+def _filled(pattern: str, values: Mapping[str, str]) -> str:
+    return FIELD.sub(lambda field: values[field[1]], pattern)
 
 
 def _unpadded(name: str) -> str:

@@ -1,9 +1,11 @@
-"""Scores of one image or segmentation, and means of many."""
+"""Scores of images and segmentations, and of a split: each frame predicted, prepared, scored."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -11,6 +13,9 @@ from torch import Tensor
 from torchmetrics.functional.classification import multiclass_confusion_matrix
 
 from gsgan.data.measures import Measures
+from gsgan.data.splits import Item
+from gsgan.evaluate.pictures import grid_rows
+from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparation
 from gsgan.metrics.image import (
     Score,
     edge_scores,
@@ -24,7 +29,11 @@ from gsgan.metrics.image import (
     ssim_uniform,
 )
 from gsgan.metrics.regions import BACKGROUNDS, cleared, mask_crop, rectangle
+from gsgan.model.avatar import Avatar
+from gsgan.model.painting import Painting
 from gsgan.model.segmentation import IGNORE
+from gsgan.scene import Frame
+from gsgan.utils.errors import GsganError
 
 IMAGE_METRICS = (
     *("psnr", "psnr_person", "ssim", "ssim_person", "lpips", "lpips_person"),
@@ -33,6 +42,8 @@ IMAGE_METRICS = (
 PART_METRICS = ("miou", "miou_with_background")
 METRICS = (*IMAGE_METRICS, *PART_METRICS)
 LPIPS_LEAST = 64  # pixels: AlexNet's last map is empty below
+Predict = Callable[[Frame, Item], Prediction]
+Row = dict[str, Any]  # "camera", "frame", and a score by metric
 
 
 def image_scores(
@@ -47,7 +58,7 @@ def image_scores(
     """The scores of one image, clamped to [0, 1].
 
     Args:
-        image, target: ``[1, 3, H, W]``, prepared (`gsgan.evaluate.prepare`).
+        image, target: ``[1, 3, H, W]``, prepared (`gsgan.evaluate.predictions.Preparation`).
         mask: ``[1, 1, H, W]`` of the person; required for the metrics of the person alone.
         box: ``[1, 1, H, W]`` bool, the body's projected box; required where the measures use it.
         measures: regions and ranges; None takes the defaults.
@@ -58,11 +69,8 @@ def image_scores(
     """
     measures, image = measures or Measures(), image.clamp(0, 1)
     pooling, background = measures.psnr_pooling, BACKGROUNDS[measures.background]
-
-    def similarity(a: Tensor, b: Tensor) -> Tensor:
-        score = ssim_uniform if measures.ssim_window == "uniform" else ssim
-        return score(a, b, value_range=measures.ssim_range)
-
+    window = ssim_uniform if measures.ssim_window == "uniform" else ssim
+    similarity = partial(window, value_range=measures.ssim_range)
     scores: dict[str, Any] = {"high_frequencies": high_frequencies(image, target)}
     if measures.region == "body_box":
         assert box is not None
@@ -99,27 +107,19 @@ def _inside(box: Tensor, score: Score, a: Tensor, b: Tensor, least: int = 1) -> 
     return math.nan if part is None else score(*(x[:, :, part[0], part[1]] for x in (a, b)))
 
 
-def mean(rows: Iterable[Mapping[str, Any]], metric: str) -> tuple[float | None, int]:
-    """The mean of the finite scores, None without one, and the number of scores left out."""
-    scores = [row[metric] for row in rows if metric in row]
-    finite = [score for score in scores if math.isfinite(score)]
-    return (sum(finite) / len(finite) if finite else None), len(scores) - len(finite)
-
-
-def means(rows: Iterable[Mapping[str, Any]], lpips_reason: str = "") -> dict[str, Any]:
+def means(rows: Sequence[Mapping[str, Any]], lpips_reason: str = "") -> dict[str, Any]:
     """``{metric: mean or None, metric_left_out: number, metric_reason: why None}`` of images.
 
-    Args:
-        rows: from `image_scores`.
-        lpips_reason: why there is no LPIPS.
+    Scores that are not finite are left out of the mean.
     """
-    rows = list(rows)
     result: dict[str, Any] = {}
     for metric in IMAGE_METRICS:
-        result[metric], left_out = mean(rows, metric)
-        if left_out:
+        scores = [row[metric] for row in rows if metric in row]
+        finite = [score for score in scores if math.isfinite(score)]
+        result[metric] = sum(finite) / len(finite) if finite else None
+        if left_out := len(scores) - len(finite):
             result[f"{metric}_left_out"] = left_out
-        if result[metric] is None:
+        if not finite:
             no_score = "no picture had a finite score" if left_out else "no picture"
             missing = lpips_reason if metric.startswith("lpips") else ""
             result[f"{metric}_reason"] = missing or no_score
@@ -147,3 +147,165 @@ def miou(matrix: Tensor) -> dict[str, float | None]:
         "miou": float(iou[1:][present[1:]].mean()) if present[1:].any() else None,
         "miou_with_background": float(iou[present].mean()) if present.any() else None,
     }
+
+
+# -- a split
+
+
+@dataclass(frozen=True)
+class Scorer:
+    """How images are scored.
+
+    Args:
+        prepare: what is done to them first.
+        lpips, lpips_reason: from `gsgan.metrics.lpips.lpips`.
+        lpips_name: backbone, range and region of LPIPS.
+        marks: notes that every table must carry.
+        protocol: its record with every departure, or None.
+    """
+
+    prepare: Preparation
+    lpips: Score | None
+    lpips_reason: str
+    lpips_name: str
+    marks: list[str] = field(default_factory=list)
+    protocol: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class SplitScores:
+    """Scores of a split.
+
+    Args:
+        variants: ``{variant: {metric: value}}`` as in metrics.json; empty without frames.
+        rows: one per variant and image.
+        hidden_outline: a ground-truth mask stood in for the alpha of a prediction.
+        grid: rows of images to show, from `gsgan.evaluate.pictures.grid_rows`.
+    """
+
+    variants: dict[str, dict[str, Any]]
+    rows: dict[str, list[Row]]
+    hidden_outline: bool = False
+    grid: list[dict[str, Tensor]] = field(default_factory=list)
+
+
+def painter(avatar: Avatar) -> Predict:
+    """The predictions of an avatar in eval mode: I_pred as ``full``, Step I's colour as ``splat``,
+    each with its own alpha."""
+
+    def predict(frame: Frame, item: Item) -> Prediction:
+        with torch.no_grad():
+            painting = avatar.paint(frame)
+        assert painting.image is not None
+        images, alphas = {FULL: painting.image}, {FULL: painting.alpha}
+        if painting.colour is not None:
+            images[SPLAT], alphas[SPLAT] = painting.colour, painting.splat_alpha
+        parts, labels = painting.segmentation, frame.labels
+        if avatar.segmentation is not None and parts is not None and labels is not None:
+            parts, labels = avatar.segmentation.to_score(parts, labels)
+        return Prediction(
+            images,
+            alphas,
+            segmentation=parts,
+            labels=labels,
+            no_parts="the model has no segmentation",
+        )
+
+    return predict
+
+
+def score_split(
+    items: Iterable[tuple[Item, Frame]],
+    predict: Predict,
+    scorer: Scorer,
+    shown: Collection[int] = (),
+) -> SplitScores:
+    """Scores every frame of a split.
+
+    Args:
+        items: (camera and frame number, frame) pairs, on the device that predicts.
+        predict: the method.
+        scorer: how to score.
+        shown: numbers of the frames that go into the grid, counted from 0.
+
+    Raises:
+        GsganError: when a prediction is not finite, naming camera and frame.
+    """
+    prepare, hidden, no_parts = scorer.prepare, False, ""
+    rows: dict[str, list[Row]] = {}
+    grid: list[dict[str, Tensor]] = []
+    matrices: dict[str, Tensor] = {}  # by camera
+    for i, ((camera, number), frame) in enumerate(items):
+        target, box = prepare.target(frame), prepare.box(frame)
+        prediction = predict(frame, (camera, number))
+        hidden = hidden or prepare.hides_outline(prediction)
+        images = {}
+        for name, image in prediction.images.items():
+            if bad := int((~torch.isfinite(image)).sum()):
+                raise GsganError(
+                    f"camera {camera}, frame {number}: {bad} values of the predicted image are not "
+                    "finite; it cannot be scored"
+                )
+            images[name] = prepare.image(prediction, name, frame, box)
+        parts = prediction.segmentation
+        if i in shown:
+            painting = Painting(images[FULL], corrected=images.get(SPLAT), segmentation=parts)
+            grid += grid_rows(replace(frame, image=target), painting)
+        images[FLOOR] = torch.full_like(frame.image, prepare.background)
+        for name, image in images.items():
+            own = image_scores(
+                image, target, frame.mask, box, measures=prepare.measures, lpips=scorer.lpips
+            )
+            rows.setdefault(name, []).append({"camera": camera, "frame": number, **own})
+        if parts is None or frame.labels is None:
+            no_parts = "the data has no part labels" if parts is not None else prediction.no_parts
+            continue
+        labels = frame.labels if prediction.labels is None else prediction.labels
+        matrix = confusion(parts, labels)
+        matrices[camera] = matrices.get(camera, torch.zeros_like(matrix)) + matrix
+        rows[FULL][-1] |= miou(matrix)
+    reasons = {
+        FULL: no_parts,
+        SPLAT: "Step I's colour is not a segmentation",
+        FLOOR: "an all-background picture is not a segmentation",
+    }
+    variants = {
+        name: _variant(own, matrices if name == FULL else {}, reasons[name], scorer)
+        for name, own in rows.items()
+    }
+    return SplitScores(variants, rows, hidden, grid)
+
+
+def _variant(
+    rows: Sequence[Row], matrices: dict[str, Tensor], no_parts: str, scorer: Scorer
+) -> dict[str, Any]:
+    """One variant as in metrics.json."""
+    result = means(rows, scorer.lpips_reason)
+    if matrices:
+        parts = miou(torch.stack(list(matrices.values())).sum(0))
+        result |= parts
+        result |= {f"{m}_reason": "the truth holds no part" for m in parts if parts[m] is None}
+    else:
+        result |= no_scores(PART_METRICS, no_parts)
+    cameras = {}
+    for camera in dict.fromkeys(row["camera"] for row in rows):
+        found = means([row for row in rows if row["camera"] == camera])
+        if camera in matrices:
+            found |= miou(matrices[camera])
+        cameras[camera] = {metric: found.get(metric) for metric in METRICS}
+    return result | {"cameras": cameras} | _common(scorer, len(rows))
+
+
+def empty(reason: str, scorer: Scorer) -> dict[str, Any]:
+    """A variant of a split without frames: every metric None, with the reason."""
+    return no_scores(METRICS, reason) | {"cameras": {}} | _common(scorer, 0)
+
+
+def _common(scorer: Scorer, images: int) -> dict[str, Any]:
+    name = scorer.lpips_name if scorer.lpips is not None else None
+    return {"images": images, "marks": list(scorer.marks), "lpips_name": name}
+
+
+def no_scores(metrics: Iterable[str], reason: str) -> dict[str, Any]:
+    """Each metric None, with the reason."""
+    return {k: v for metric in metrics for k, v in ((metric, None), (f"{metric}_reason", reason))}

@@ -31,9 +31,9 @@ from gsgan.scene import Frame
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
-from gsgan.utils.devices import pick_device
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
+from gsgan.utils.tensors import pick_device
 
 SMALL_FILES = ("cameras.json", "meta.json")
 TILE = 300  # pixels

@@ -22,18 +22,13 @@ _FORMS: dict[str, tuple[Term, Term]] = {
     "relativistic": (lambda r, f: softplus(f - r), lambda r, f: softplus(r - f)),
 }
 FORMS = tuple(_FORMS)
-COMPARING = ("relativistic",)
-"""Forms whose generator loss depends on the real image."""
+COMPARING = ("relativistic",)  # forms whose generator loss depends on the real image
 
 
-def _form(name: str) -> tuple[Term, Term]:
-    if name not in _FORMS:
-        raise ConfigError(f"training.step_two.gan must be one of {', '.join(_FORMS)}; got {name!r}")
-    return _FORMS[name]
-
-
-def _mean_over_scales(term: Term, real: Maps, fake: Maps) -> Tensor:
-    scales = zip(real, fake, strict=True)
+def _loss(form: str, which: int, real: Maps, fake: Maps) -> Tensor:
+    if form not in _FORMS:
+        raise ConfigError(f"training.step_two.gan must be one of {', '.join(FORMS)}; got {form!r}")
+    term, scales = _FORMS[form][which], zip(real, fake, strict=True)
     return torch.stack([term(r[-1].float(), f[-1].float()).mean() for r, f in scales]).sum()
 
 
@@ -50,13 +45,13 @@ def discriminator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor
     Raises:
         ConfigError: on an unknown form.
     """
-    return _mean_over_scales(_form(form)[0], real, fake)
+    return _loss(form, 0, real, fake)
 
 
 def generator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor:
     """The generator's loss, same conventions; only `COMPARING` forms use ``real``, for others pass
     ``fake`` twice."""
-    return _mean_over_scales(_form(form)[1], real, fake)
+    return _loss(form, 1, real, fake)
 
 
 def feature_matching(real: Maps, fake: Maps) -> Tensor:

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.losses.weights import find_weights, how_to_get, load_weights
 from gsgan.utils.errors import ConfigError, DataError
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
+FILES = {"vgg16": "vgg16-397923af.pth", "alexnet": "alexnet-owt-7be5be79.pth"}
 VGG_TAPS = (3, 8, 15, 22)  # relu1_2, relu2_2, relu3_3, relu4_3 in torchvision's vgg16.features
 
 
@@ -44,12 +44,7 @@ class Perceptual(nn.Module):
     calls: Tensor
 
     def __init__(
-        self,
-        weights: str = "auto",
-        path: str | None = None,
-        *,
-        warmup: int = 50,
-        width: int = 16,
+        self, weights: str = "auto", path: str | None = None, *, warmup: int = 50, width: int = 16
     ) -> None:
         super().__init__()
         if weights not in ("vgg16", "auto", "random"):
@@ -58,9 +53,7 @@ class Perceptual(nn.Module):
         if weights == "vgg16" and found is None:
             raise DataError(f"VGG-16's weights were not found: {how_to_get('vgg16')}")
         self.stages = _vgg_stages(found) if found else _random_stages(width)
-        self.mark: str | None = None
-        if not found:
-            self.mark = "perceptual loss: fixed random network, not VGG-16"
+        self.mark = None if found else "perceptual loss: fixed random network, not VGG-16"
         self.requires_grad_(False)
         # Fixed weights, restored from a file or a seed, are not stored in checkpoints.
         self.stages.register_state_dict_post_hook(_leave_out)
@@ -130,3 +123,49 @@ def _random_stages(width: int) -> nn.ModuleList:
             conv.bias.zero_()  # type: ignore[union-attr]
         stages.append(nn.Sequential(conv, nn.LeakyReLU(0.2)))
     return nn.ModuleList(stages)
+
+
+# -- pretrained torchvision weights; nothing is downloaded
+
+
+def find_weights(name: str, path: str | Path | None = None) -> Path | None:
+    """The weight file of torchvision's ``vgg16`` or ``alexnet``, or None if there is none.
+
+    Args:
+        name: of the network.
+        path: the file or its folder; None looks in the torch cache.
+
+    Raises:
+        DataError: when a path was given and the file does not exist.
+    """
+    if path is None:
+        cached = Path(torch.hub.get_dir()) / "checkpoints" / FILES[name]
+        return cached if cached.is_file() else None
+    given = Path(path).expanduser()
+    found = given / FILES[name] if given.is_dir() else given
+    if not found.is_file():
+        raise DataError(f"{found}: no such file; expected torchvision's {name} weights there")
+    return found
+
+
+def how_to_get(name: str) -> str:
+    """How to install the weights, as a clause of a message."""
+    return (
+        f"put torchvision's {FILES[name]} into $TORCH_HOME/hub/checkpoints "
+        "(~/.cache/torch/hub/checkpoints unless set) or give its path"
+    )
+
+
+def load_weights(path: Path) -> dict[str, torch.Tensor]:
+    """Reads a state dict without unrestricted pickle.
+
+    Raises:
+        DataError: when the file is not a plain state dict.
+    """
+    try:
+        return dict(torch.load(path, map_location="cpu", weights_only=True))
+    except Exception as error:
+        raise DataError(
+            f"{path}: not a readable torchvision weight file ({type(error).__name__}); "
+            "download it again"
+        ) from error

@@ -6,7 +6,7 @@ import torch
 from kornia.filters import filter2d_separable, get_gaussian_kernel1d
 from torch import Tensor
 
-from gsgan.utils.precision import full_precision
+from gsgan.utils.tensors import full_precision
 
 
 def d_ssim(image: Tensor, target: Tensor) -> Tensor:

@@ -7,7 +7,6 @@ Convention: images ``[B, 3, H, W]``, RGB in [0, 1]; every function returns one s
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Literal
 
 import cv2
 import numpy as np
@@ -23,9 +22,7 @@ LEAST_SIDE = 6  # pixels: smaller images cannot be reflected by half of SSIM's w
 UNIFORM_WINDOW = 7  # pixels, scikit-image's default
 
 
-def psnr(
-    image: Tensor, target: Tensor, *, pooling: Literal["picture", "channels"] = "picture"
-) -> Tensor:
+def psnr(image: Tensor, target: Tensor, pooling: str = "picture") -> Tensor:
     """Peak signal-to-noise ratio in dB; infinite for equal images (leave those out of means).
 
     Args:
@@ -38,16 +35,10 @@ def psnr(
     return (-10 * error.log10()).mean(dim=1)
 
 
-def psnr_where(
-    image: Tensor,
-    target: Tensor,
-    where: Tensor,
-    *,
-    pooling: Literal["picture", "channels"] = "picture",
-) -> Tensor:
+def psnr_where(image: Tensor, target: Tensor, where: Tensor, pooling: str = "picture") -> Tensor:
     """PSNR of the pixels ``where [B, 1, H, W]`` in dB; NaN without any."""
     scores = [
-        psnr(a[None, :, m, None], b[None, :, m, None], pooling=pooling)[0]
+        psnr(a[None, :, m, None], b[None, :, m, None], pooling)[0]
         for a, b, m in zip(image, target, where[:, 0], strict=True)
     ]
     return torch.stack(scores)
@@ -56,15 +47,11 @@ def psnr_where(
 def person_box(mask: Tensor) -> Tensor:
     """``[B, 1, H, W]`` bool: the smallest box round the mask's pixels of at least one half."""
     person = mask >= 0.5
-    return _reached(person, -1) & _reached(person, -2)
-
-
-def _reached(person: Tensor, along: int) -> Tensor:
-    """Rows (``along`` -1) or columns (-2) from the first to the last with the person."""
-    held = person.any(dim=along, keepdim=True).long()
-    across = -3 - along
-    before, after = held.cumsum(across), held.flip(across).cumsum(across).flip(across)
-    return (before > 0) & (after > 0)
+    box = torch.ones_like(person)
+    for along, across in ((-1, -2), (-2, -1)):  # rows, columns from the first to the last
+        held = person.any(dim=along, keepdim=True).long()
+        box &= (held.cumsum(across) > 0) & (held.flip(across).cumsum(across).flip(across) > 0)
+    return box
 
 
 def psnr_person(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
@@ -169,36 +156,27 @@ def edge_scores(
     Returns:
         Two float64 ``[B]``; NaN where the ground truth has no edge.
     """
-    f1, ratio = [], []
-    for i, (a, b) in enumerate(zip(image, target, strict=True)):
-        edges, truth = canny(a, low, high), canny(b, low, high)
-        inside = None if where is None else where[i, 0].cpu().numpy()
-        f1.append(_edge_f1(edges, truth, tolerance, inside))
-        if inside is not None:
+    scores, kernel = [], np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
+    for i, pair in enumerate(zip(image, target, strict=True)):
+        edges, truth = (canny(x, low, high) for x in pair)
+        near = [cv2.dilate(x.astype(np.uint8), kernel) > 0 for x in (edges, truth)]
+        if where is not None:
+            inside = where[i, 0].cpu().numpy()
             edges, truth = edges & inside, truth & inside
-        ratio.append(float(edges.sum() / truth.sum()) if truth.any() else float("nan"))
-    return torch.tensor(f1, dtype=torch.float64), torch.tensor(ratio, dtype=torch.float64)
+        count, expected = edges.sum(), truth.sum()
+        if not expected:
+            scores.append((np.nan, np.nan))
+            continue
+        precision = (edges & near[1]).sum() / max(count, 1)
+        recall = (truth & near[0]).sum() / expected
+        total = precision + recall
+        scores.append((2 * precision * recall / total if total else 0.0, count / expected))
+    f1, ratio = torch.tensor(scores, dtype=torch.float64).unbind(1)
+    return f1, ratio
 
 
 def canny(image: Tensor, low: float = 100.0, high: float = 200.0) -> np.ndarray:
-    """``[H, W]`` bool: Canny edges of one image ``[3, H, W]``, found on 8-bit grey."""
+    """``[H, W]`` bool: Canny edges of one image ``[3, H, W]``, found on 8-bit grey with these
+    hysteresis thresholds."""
     rgb = (image.detach().cpu().clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
     return cv2.Canny(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), low, high) > 0
-
-
-def _edge_f1(
-    edges: np.ndarray, truth: np.ndarray, tolerance: int, inside: np.ndarray | None = None
-) -> float:
-    kernel = np.ones((2 * tolerance + 1, 2 * tolerance + 1), np.uint8)
-    near_truth = cv2.dilate(truth.astype(np.uint8), kernel) > 0
-    near_edges = cv2.dilate(edges.astype(np.uint8), kernel) > 0
-    if inside is not None:
-        edges, truth = edges & inside, truth & inside
-    if not truth.any():
-        return float("nan")
-    if not edges.any():
-        return 0.0
-    precision = (edges & near_truth).sum() / edges.sum()
-    recall = (truth & near_edges).sum() / truth.sum()
-    total = precision + recall
-    return float(2 * precision * recall / total) if total else 0.0

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import shutil
 import tempfile
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from gsgan.losses.weights import FILES, find_weights, how_to_get, load_weights
+from gsgan.losses.perceptual import FILES, find_weights, how_to_get, load_weights
 from gsgan.metrics.image import Score
 from gsgan.utils.errors import ConfigError
 
@@ -70,11 +69,7 @@ def _build_lpips(net: str, weights: Path, scale: bool) -> torch.nn.Module:
     with tempfile.TemporaryDirectory() as folder:
         cache = Path(folder) / "checkpoints"
         cache.mkdir()
-        target = cache / FILES[_BACKBONES[net]]
-        try:
-            target.symlink_to(weights.resolve())
-        except OSError:  # no links on this file system
-            shutil.copyfile(weights, target)
+        (cache / FILES[_BACKBONES[net]]).symlink_to(weights.resolve())
         torch.hub.set_dir(folder)
         try:
             return LearnedPerceptualImagePatchSimilarity(net, normalize=scale).eval()  # type: ignore[arg-type]

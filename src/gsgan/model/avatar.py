@@ -33,7 +33,7 @@ from gsgan.skeleton import (
 from gsgan.splat import Accuracy, rasterise
 from gsgan.splat.checks import checks_for
 from gsgan.utils.errors import GsganError
-from gsgan.utils.precision import full_precision
+from gsgan.utils.tensors import full_precision
 
 LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in an image 512 high
 SKELETON_CHANNELS = len(MEDIAPIPE33.draw_groups)

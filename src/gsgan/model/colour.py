@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from gsgan.utils.precision import full_precision
+from gsgan.utils.tensors import full_precision
 
 
 class ColourCorrection(nn.Module):

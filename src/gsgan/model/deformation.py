@@ -15,7 +15,7 @@ from gsgan.model.encoding import encoded_size, positional_encoding
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
-from gsgan.utils.constants import constant
+from gsgan.utils.tensors import constant
 
 QUAT_FLOOR = 1e-12  # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
 

@@ -17,7 +17,7 @@ from gsgan.scene import BodyPose, Camera, Frame, Gaussians, Raster
 from gsgan.splat import accuracy as named_accuracy
 from gsgan.splat import rasterise
 from gsgan.splat.checks import checks_for
-from gsgan.utils.precision import full_precision
+from gsgan.utils.tensors import full_precision
 
 __all__ = ["IGNORE", "Segmentation", "segmentation_loss", "silhouette_loss"]
 

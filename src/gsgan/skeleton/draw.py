@@ -12,7 +12,7 @@ from torch import Tensor
 from gsgan.scene import Camera
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
 from gsgan.skeleton.tensors import check_skeleton
-from gsgan.utils.constants import constant
+from gsgan.utils.tensors import constant
 
 MIN_SEGMENT_PX = 1e-2
 """Pixels: a shorter segment is drawn as a point, with a finite slope."""

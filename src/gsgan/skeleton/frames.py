@@ -19,7 +19,7 @@ from torch import Tensor
 from gsgan.skeleton.rotation6d import across, rotation_from_6d, rotation_to_6d, unit
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, N_HUBS, SkeletonTemplate
 from gsgan.skeleton.tensors import FOLDED, Constants, Level, check_skeleton, constants
-from gsgan.utils.constants import constant
+from gsgan.utils.tensors import constant
 
 Twist = Literal["none", "hinge"]
 

@@ -12,7 +12,7 @@ from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
 from gsgan.scene import RIM, Camera, Gaussians, distort, fold_radius
-from gsgan.utils.constants import constant
+from gsgan.utils.tensors import constant
 
 ITERATIONS = 20  # of Newton's method: a usable lens takes 4, points near its fold more
 FOUND = 1e-9  # of x/z, in float64: largest error of a point that counts as found

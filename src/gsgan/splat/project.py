@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat.settings import Accuracy
-from gsgan.utils.constants import constant, filled
+from gsgan.utils.tensors import constant, filled
 
 # exp(-745.2) is the smallest positive double: beyond this a Gaussian is exactly 0.
 EXP_UNDERFLOW = 746.0

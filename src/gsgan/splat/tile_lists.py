@@ -10,7 +10,7 @@ from torch.nn import functional
 
 from gsgan.splat.project import Projected
 from gsgan.splat.settings import Accuracy
-from gsgan.utils.constants import filled
+from gsgan.utils.tensors import filled
 
 # Bound of the rounding error of q where tiles are listed, in units of the last place.
 ROUNDING = 64

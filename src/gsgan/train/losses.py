@@ -16,7 +16,7 @@ from gsgan.model.avatar import Painting
 from gsgan.model.discriminator import Discriminator
 from gsgan.scene import Frame
 from gsgan.utils.errors import ConfigError
-from gsgan.utils.precision import full_precision
+from gsgan.utils.tensors import full_precision
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from gsgan.data.datamodule import GsganData
 from gsgan.effects.table import effects_table
-from gsgan.evaluate.facts import Method, training_code
+from gsgan.evaluate.facts import trained, training_code
 from gsgan.evaluate.files import NAMES
-from gsgan.evaluate.run import evaluate_run
+from gsgan.evaluate.run import evaluate_method
+from gsgan.evaluate.scores import painter
 from gsgan.metrics.lpips import check_lpips
 from gsgan.model.avatar import Avatar
 from gsgan.splat import resolve_backend
@@ -95,20 +96,22 @@ def run_training(config: DictConfig) -> None:
     report_progress(console, folder, module)
     if config.evaluate:
         module.to(trainer.strategy.root_device)  # Lightning leaves it on the CPU
-        evaluate_run(
+        method = trained(
+            folder,
+            seed=config.seed,
+            iterations=module.step,
+            train_seconds=module.train_seconds,
+            trained_by=module.code,
+        )
+        evaluate_method(
             folder,
             config,
             console,
-            data=data,
-            avatar=module.shown.eval(),
+            data,
+            painter(module.shown.eval()),
+            method=method,
+            device=trainer.strategy.root_device,
             marks=module.marks,
-            method=Method(
-                "gsgan",
-                seed=config.seed,
-                iterations=module.step,
-                train_seconds=module.train_seconds,
-                trained_by=tuple(module.code),
-            ),
         )
     console.print(f"run folder: {folder}", soft_wrap=True)
 

@@ -15,8 +15,8 @@ from omegaconf import DictConfig, OmegaConf
 import gsgan.model.assemble as assemble
 from gsgan.effects import Effects
 from gsgan.model.avatar import Avatar
-from gsgan.utils.devices import pick_device
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.tensors import pick_device
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData, SceneInfo
@@ -53,8 +53,6 @@ class Moved:
     def from_config(cls, config: DictConfig) -> Moved:
         """From ``data_root`` and ``data_smpl`` of a command's config."""
         return cls(config.data_root, config.data_smpl)
-
-    said = from_config  # former name
 
     def refuse_without_run(self) -> None:
         """Refuses the keys where no run is given.

@@ -23,9 +23,9 @@ from gsgan.report.figures.subjects import Shot, Subject, choose_items, make_shot
 from gsgan.train.runs import Moved, load_config
 from gsgan.utils.checks import one_of, whole
 from gsgan.utils.console import make_console
-from gsgan.utils.devices import pick_device
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically
+from gsgan.utils.tensors import pick_device
 
 RECORD, CAPTIONS = "figures.json", "captions.md"
 METADATA: dict[str, dict[str, Any]] = {  # no dates: the same figure gives the same bytes
