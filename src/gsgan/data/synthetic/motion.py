@@ -33,12 +33,7 @@ def motion(frames: int, seed: int = 0) -> tuple[Tensor, Tensor, list[str]]:
 
     Returns:
         ``theta [F, 56, 3]`` axis-angle, ``transl [F, 3]`` metres, and the passage of each frame.
-
-    Raises:
-        ValueError: when ``frames`` is less than 1.
     """
-    if frames < 1:
-        raise ValueError(f"motion: frames must be at least 1, got {frames}")
     theta, transl = solve(controls_at(frame_times(frames), seed), free_body())
     return theta.float(), transl.float(), passage_names(frames)
 
@@ -114,8 +109,7 @@ def two_bone(
     Args:
         target: ``[F, 3]`` metres from the first joint; limited to ``reach`` times the full length.
         pole: ``[F, 3]`` direction in which the middle joint bends.
-        upper: length of the first bone, metres.
-        lower: length of the second bone, metres.
+        upper, lower: lengths of the bones, metres.
         reach: largest share of the full length; below 1, so that the bend has a direction.
 
     Returns:
