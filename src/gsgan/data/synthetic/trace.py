@@ -119,7 +119,7 @@ def undistort(points: Array, dist: Array, iterations: int = 200) -> Array:
 
 @dataclass(frozen=True)
 class Tint:
-    """One camera's colours ``A c + b`` on sRGB, like its internal processing: ``A [3,3], b [3]``."""
+    """One camera's colours, ``A c + b`` on sRGB in [0, 1]: ``A [3, 3]``, ``b [3]``."""
 
     A: Array
     b: Array
