@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,38 +17,27 @@ from torch import Tensor
 TAU = 2 * math.pi
 
 
-@dataclass(frozen=True)
 class Controls:
-    """Targets of the body at F moments; pairs are left, right."""
+    """Targets of the body at F moments, standing with the arms down; pairs are left, right."""
 
-    pelvis: Tensor  # [F, 3] metres from the rest position
-    root: Tensor  # [F, 3] axis-angle of the whole body
-    spine: Tensor  # [F, 3] axis-angle, distributed over the spine
-    head: Tensor  # [F, 3] axis-angle, distributed over neck and head
-    wrist: Tensor  # [F, 2, 3] metres from the shoulder, chest axes, mirrored
-    elbow: Tensor  # [F, 2, 3] direction in which the elbow points, chest axes, mirrored
-    palm: Tensor  # [F, 2] forearm twist, radians, positive turns the palm up
-    flex: Tensor  # [F, 2] wrist flexion towards the palm, radians
-    curl: Tensor  # [F, 2, 5] finger flexion in [0, 1], thumb first
-    ankle: Tensor  # [F, 2, 3] metres: mirrored x and y in the world, z above the standing height
-    pitch: Tensor  # [F, 2] radians, positive lifts the heel
+    def __init__(self, frames: int) -> None:
+        def still(*value: object) -> Tensor:
+            rest = torch.tensor(value, dtype=torch.float64)
+            return rest.expand(frames, *rest.shape).clone()
 
-
-def neutral(frames: int) -> Controls:
-    """Standing, arms down."""
-
-    def still(*values: float, shape: tuple[int, ...]) -> Tensor:
-        return torch.tensor(values, dtype=torch.float64).expand(frames, *shape).clone()
-
-    return Controls(
-        pelvis=still(0, 0, -0.015, shape=(3,)),
-        **{name: still(0, shape=(3,)) for name in ("root", "spine", "head")},
-        wrist=still(0.13, -0.04, -0.5, shape=(2, 3)),
-        elbow=still(0.5, 1.0, -0.2, shape=(2, 3)),
-        **{name: still(0, shape=(2,)) for name in ("palm", "flex", "pitch")},
-        curl=still(0.25, shape=(2, 5)),
-        ankle=still(0.125, 0, 0, shape=(2, 3)),
-    )
+        self.pelvis = still(0, 0, -0.015)  # [F, 3] metres from the rest position
+        self.root = still(0, 0, 0)  # [F, 3] axis-angle of the whole body
+        self.spine = still(0, 0, 0)  # [F, 3] axis-angle, distributed over the spine
+        self.head = still(0, 0, 0)  # [F, 3] axis-angle, distributed over neck and head
+        # [F, 2, 3], mirrored, chest axes: metres from the shoulder; where the elbow points
+        self.wrist = still(*[(0.13, -0.04, -0.5)] * 2)
+        self.elbow = still(*[(0.5, 1.0, -0.2)] * 2)
+        self.palm = still(0, 0)  # [F, 2] forearm twist, radians, positive turns the palm up
+        self.flex = still(0, 0)  # [F, 2] wrist flexion towards the palm, radians
+        self.curl = still(*[[0.25] * 5] * 2)  # [F, 2, 5] finger flexion in [0, 1], thumb first
+        # [F, 2, 3] metres: mirrored x and y in the world, z above the standing height
+        self.ankle = still(*[(0.125, 0, 0)] * 2)
+        self.pitch = still(0, 0)  # [F, 2] radians, positive lifts the heel
 
 
 @dataclass(frozen=True)
@@ -259,7 +248,7 @@ def _passage_index(times: Tensor) -> Tensor:
 
 def controls_at(times: Tensor, seed: int) -> Controls:
     """Targets at times ``[F]``, seconds: every passage starts and ends standing."""
-    index, base = _passage_index(times), neutral(len(times))
+    index, base = _passage_index(times), Controls(len(times))
     generator = torch.Generator().manual_seed(seed)
     start = 0.0
     for i, (_, passage, seconds) in enumerate(PASSAGES):
@@ -268,11 +257,10 @@ def controls_at(times: Tensor, seed: int) -> Controls:
         here = (index == i).nonzero().squeeze(1)
         s = (times[here] - start) / seconds
         start += seconds
-        moved = neutral(len(here))
+        moved = Controls(len(here))
         passage(moved, s, style)
         share = smoothstep(s / 0.15) * smoothstep((1 - s) / 0.15)
-        for field in fields(Controls):
-            rest, goal = getattr(base, field.name), getattr(moved, field.name)
+        for rest, goal in zip(vars(base).values(), vars(moved).values(), strict=True):
             w = share.view(-1, *[1] * (goal.ndim - 1))
             rest[here] = rest[here] + w * (goal - rest[here])
     return base

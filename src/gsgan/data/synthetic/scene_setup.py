@@ -139,18 +139,9 @@ def dataset_key(settings: Settings) -> str:
 class Scene:
     """A whole synthetic scene, ready to be traced.
 
-    Args:
-        settings: everything follows from them.
-
-    Attributes:
-        person: the constant part, in numpy.
-        views: camera name to camera, training cameras first.
-        tints: camera name to tint, for the tinted cameras. Held-out cameras stay neutral: nothing
-            in the training data could reveal their tint.
-        theta, transl: ``[F, 56, 3]`` and ``[F, 3]`` float32.
-        passages: passage of each frame.
-        train_cameras, test_cameras: names.
-        train_frames, test_frames: frame ids.
+    ``theta [F, 56, 3]`` and ``transl [F, 3]`` are float32; ``views`` and ``tints`` are by camera
+    name, training cameras first. Held-out cameras have no tint: nothing in the training data could
+    reveal it.
 
     Raises:
         ConfigError: when a lens cannot be inverted up to the images' corners.
