@@ -28,16 +28,16 @@ VERSION = 1
 
 RADIUS = 2.8  # metres from the middle of the scene to the cameras
 MARGIN = 0.02  # share of the image kept free at each edge, over all frames and cameras
-# Lower bounds of the whole-number parameters.
-AT_LEAST = {"size": 8, "train_cameras": 1, "frames": 1, "rays_per_pixel": 1} | dict.fromkeys(
-    ("test_cameras", "test_frames", "seed", "identity"), 0
-)
-# Whether an effect's parameter is a list, and the range of its numbers.
-EFFECTS = {
-    "lens": (True, -math.inf, math.inf),
-    "tint": (False, 0, 0.3),
-    "gloss": (False, 0, 1),
-    "test_scale": (True, 0.25, 4),
+WHOLE, NUMBER, LIST = "a whole number", "a number", "a list of numbers"
+# Kind and range of each parameter; those that are not whole numbers may be None.
+RANGES = {
+    "size": (WHOLE, 8, math.inf),
+    **dict.fromkeys(("train_cameras", "frames", "rays_per_pixel"), (WHOLE, 1, math.inf)),
+    **dict.fromkeys(("test_cameras", "test_frames", "seed", "identity"), (WHOLE, 0, math.inf)),
+    "lens": (LIST, -math.inf, math.inf),
+    "tint": (NUMBER, 0, 0.3),
+    "gloss": (NUMBER, 0, 1),
+    "test_scale": (LIST, 0.25, 4),
 }
 # (joint that bends, joint towards which its folds run)
 FOLDS = (
@@ -75,18 +75,24 @@ class Settings:
     test_scale: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        for name, least in AT_LEAST.items():
-            value = getattr(self, name)
-            whole = isinstance(value, int) and not isinstance(value, bool)
+        for name, (kind, low, high) in RANGES.items():
+            raw = getattr(self, name)
+            if raw is None and kind != WHOLE:
+                continue
+            try:
+                values = np.array(raw, dtype=float)
+            except (TypeError, ValueError):
+                values = np.array(math.nan)
+            good = np.isfinite(values) & (values >= low) & (values <= high)
+            typed = not isinstance(raw, bool) and (kind != WHOLE or isinstance(raw, int))
             _require(
-                whole and value >= least,
-                f"{name} must be a whole number of at least {least}, got {value!r}",
+                typed and values.ndim == (kind == LIST) and bool(good.all()),
+                f"{name} must be {kind} in [{low:g}, {high:g}], got {raw!r}",
             )
-        for name, (listed, low, high) in EFFECTS.items():
-            if getattr(self, name) is not None:
-                numbers = _numbers(name, getattr(self, name), listed, low, high)
-                stored = numbers if listed else numbers[0]
-                object.__setattr__(self, name, stored if any(numbers) else None)
+            if kind != WHOLE:
+                numbers = values.tolist()
+                stored = tuple(numbers) if kind == LIST else numbers
+                object.__setattr__(self, name, stored if values.any() else None)
         _require(
             self.test_frames < self.frames,
             f"test_frames must be less than frames = {self.frames}, got {self.test_frames}",
@@ -110,22 +116,6 @@ class Settings:
 def _require(holds: bool, message: str) -> None:
     if not holds:
         raise ConfigError(f"synthetic data: {message}")
-
-
-def _numbers(name: str, raw: object, listed: bool, low: float, high: float) -> tuple[float, ...]:
-    """The finite numbers in [low, high] of a parameter."""
-    try:
-        values = np.array(raw, dtype=float)
-    except (TypeError, ValueError):
-        values = np.array(math.nan)
-    _require(
-        values.ndim == listed
-        and not isinstance(raw, bool)
-        and bool((np.isfinite(values) & (values >= low) & (values <= high)).all()),
-        f"{name} must be {'a list of numbers' if listed else 'a number'} in [{low:g}, {high:g}], "
-        f"got {raw!r}",
-    )
-    return tuple(np.atleast_1d(values).tolist())
 
 
 def dataset_key(settings: Settings) -> str:

@@ -201,16 +201,13 @@ def _write_skeletons(root: Path, scene: Scene) -> None:
     body = free_body()
     pose, ids = BodyPose(scene.theta, scene.transl), np.arange(len(scene.theta))
     p = body.posed_landmarks(pose).float().numpy()
+    cameras = scene.settings.train_cameras + scene.settings.test_cameras
     np.savez(
         root / "landmarks3d.npz",
         p=p,
         conf=np.ones(p.shape[:2], dtype=np.float32),
         reproj_px=np.zeros(p.shape[:2], dtype=np.float32),
-        n_views=np.full(
-            p.shape[:2],
-            scene.settings.train_cameras + scene.settings.test_cameras,
-            dtype=np.int64,
-        ),
+        n_views=np.full(p.shape[:2], cameras),
         frame_id=ids,
         names=np.array(body.landmark_names),
     )
