@@ -168,7 +168,8 @@ def _leg(solver: _Solver, c: Controls, i: int, side: str) -> None:
 
 def _arm(solver: _Solver, c: Controls, i: int, side: str) -> None:
     lift = 0.5 * smoothstep((c.wrist[:, i, 2] + 0.15) / 0.6)
-    raised = torch.stack([0 * lift, lift / 2 * (-1 if side == "L" else 1), 0 * lift], -1)
+    sign = 1 if side == "L" else -1  # a mirrored axis-angle has the opposite y and z
+    raised = torch.stack([0 * lift, -lift / 2 * sign, 0 * lift * sign], -1)
     solver.turn(f"clavicle.{side}", raised)
     solver.turn(f"shoulder01.{side}", raised)
     R_chest, _ = solver.world("spine01")
