@@ -22,7 +22,7 @@ OUTPUT = Path(__file__).parents[1] / "src" / "gsgan" / "skeleton" / "templates.n
 
 
 def make_templates() -> dict[str, np.ndarray]:
-    """Points and normals of the unit shapes, float32; see gsgan.skeleton.sampling."""
+    """Points and normals of the unit shapes, float32; see gsgan.skeleton.densify."""
     return {
         **_named("cylinder", *_cylinder(LIMB_POINTS, seed=100)),
         **_named("sphere", *_sphere(FACE_POINTS, seed=0)),

@@ -407,7 +407,7 @@ def test_synthetic_config_reads_what_the_generator_would_make(capture: Path) -> 
     assert data.source.func.__name__ == "ensure_synthetic"
     given = dict(data.source.keywords)
     assert given.pop("workers") == 2
-    assert Settings.from_parameters(given) == Settings(size=48, frames=12, test_frames=3)
+    assert Settings(**given) == Settings(size=48, frames=12, test_frames=3)
     made = instantiate(conf("synthetic", f"root={capture}"))
     assert made.dataset("train")[0].image.shape[-2:] == (128, 128)
 

@@ -14,11 +14,10 @@ import pytest
 import torch
 
 from gsgan.body.free import free_body
-from gsgan.data.synthetic import ensure_synthetic, make
-from gsgan.data.synthetic.motion import (
-    motion,
-)
-from gsgan.data.synthetic.scene_setup import Settings, build_scene, dataset_key
+from gsgan.data.synthetic import ensure_synthetic, scenes
+from gsgan.data.synthetic.motion import motion
+from gsgan.data.synthetic.scene_setup import Scene, Settings, dataset_key
+from gsgan.data.synthetic.trace import PosedPerson
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root
 
@@ -128,7 +127,7 @@ def test_landmarks_project_into_the_mask(dataset):
 
 
 def test_the_default_person_has_not_changed_by_a_bit():
-    scene = build_scene(Settings(**{**TINY, "size": 24}))
+    scene = Scene(Settings(**{**TINY, "size": 24}))
     person, digest = scene.posed(1), hashlib.sha256()
     for view in scene.views.values():
         for pixels in person.render(view, 1):
@@ -138,7 +137,7 @@ def test_the_default_person_has_not_changed_by_a_bit():
 
 
 def test_left_and_right_labels_lie_on_left_and_right_landmarks():
-    scene = build_scene(Settings(**{**TINY, "size": 96, "frames": 8}))
+    scene = Scene(Settings(**{**TINY, "size": 96, "frames": 8}))
     names, hits = free_body().label_names, 0
     for frame in range(0, 8, 2):
         p = free_body().posed_landmarks(scene.pose(frame))[0].double().numpy()
@@ -153,7 +152,7 @@ def test_left_and_right_labels_lie_on_left_and_right_landmarks():
 
 
 def test_person_is_in_view_and_fills_it():
-    scene = build_scene(Settings(frames=24, test_frames=6))
+    scene = Scene(Settings(frames=24, test_frames=6))
     top, bottom = [], []
     for frame in range(24):
         vertices = scene.vertices(frame)
@@ -167,7 +166,7 @@ def test_person_is_in_view_and_fills_it():
 
 
 def test_test_cameras_are_between_training_cameras():
-    scene = build_scene(Settings(frames=2, test_frames=1))
+    scene = Scene(Settings(frames=2, test_frames=1))
     angle = {
         name: math.atan2(view.centre[0], -view.centre[1]) for name, view in scene.views.items()
     }
@@ -202,46 +201,45 @@ def test_another_seed_gives_another_motion():
 
 
 def test_a_ready_dataset_is_used_again(dataset, monkeypatch):
-    monkeypatch.setattr(make, "_write", lambda *_: pytest.fail("made twice"))
+    monkeypatch.setattr(scenes, "_write", lambda *_: pytest.fail("made twice"))
     assert tiny(dataset.parents[2]) == dataset
 
 
-def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
-    def stop(*_):
-        raise KeyboardInterrupt
+def test_an_interrupted_dataset_is_continued(dataset, tmp_path, monkeypatch):
+    render, left = PosedPerson.render, 2
 
-    monkeypatch.setattr(make, "_write_skeletons", stop)
-    with pytest.raises(KeyboardInterrupt):
-        tiny(tmp_path, frames=1, test_frames=0)
-    assert [p.suffix for p in folder(tmp_path).iterdir()] == [".lock"]
+    def stops(self, view, rays):
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise KeyboardInterrupt
+        return render(self, view, rays)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PosedPerson, "render", stops)
+        with pytest.raises(KeyboardInterrupt):
+            tiny(tmp_path)
+    root = folder(tmp_path) / dataset_key(Settings(**TINY))
+    assert len(images(root, "labels")) == 2
+    assert not (root / "meta.json").exists()
+    first = root / "images" / "cam00" / "000000.png"
+    written = first.stat().st_mtime_ns
+    assert tiny(tmp_path) == root
+    assert first.stat().st_mtime_ns == written
+    assert fingerprint(root) == fingerprint(dataset)
 
 
-def test_failing_worker_is_reported_and_leaves_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(make.sys, "executable", "false")
+def test_failing_worker_is_reported(tmp_path, monkeypatch):
+    monkeypatch.setattr(scenes.sys, "executable", "false")
     with pytest.raises(DataError, match="workers=1"):
         tiny(tmp_path, workers=2)
-    assert [p.suffix for p in folder(tmp_path).iterdir()] == [".lock"]
-
-
-def test_leftovers_of_a_killed_process_are_cleared(tmp_path, monkeypatch):
-    name = dataset_key(Settings(**TINY))
-    (folder(tmp_path) / f".{name}.part-abc" / "images").mkdir(parents=True)
-    monkeypatch.setattr(make, "_write", lambda part, *_: (part / "meta.json").write_text("{}"))
-    tiny(tmp_path)
-    assert sorted(p.name for p in folder(tmp_path).iterdir()) == [f".{name}.lock", name]
+    assert not list(tmp_path.rglob("meta.json"))
 
 
 def test_unwritable_folder_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(DataError, match="GSGAN_CACHE"):
         tiny(tmp_path / "file")
-
-
-def test_an_incomplete_folder_is_not_taken_for_a_dataset(tmp_path, monkeypatch):
-    (folder(tmp_path) / dataset_key(Settings(**TINY)) / "images").mkdir(parents=True)
-    monkeypatch.setattr(make, "_write", lambda part, *_: (part / "meta.json").write_text("{}"))
-    with pytest.raises(DataError, match="cannot be written"):
-        tiny(tmp_path)
 
 
 @pytest.mark.slow
@@ -305,13 +303,11 @@ def test_key_depends_on_every_parameter():
         ({"lens": "strong"}, "lens must be"),
         ({"lens": -0.2}, "lens must be"),
         ({"lens": [0.1, float("nan"), 0, 0]}, "lens must be"),
-        ({"tint": -0.1}, r"tint must be in \[0, 0.3\]"),
+        ({"tint": -0.1}, r"tint must be a number in \[0, 0.3\]"),
         ({"tint": True}, "tint must be"),
-        ({"gloss": 2}, r"gloss must be in \[0, 1\]"),
+        ({"gloss": 2}, r"gloss must be a number in \[0, 1\]"),
         ({"gloss": float("nan")}, "gloss must be"),
-        ({"test_scale": [1]}, "other than 1"),
-        ({"test_scale": [9]}, "test_scale must list"),
-        ({"test_scale": [2, 2.0]}, "twice"),
+        ({"test_scale": [9]}, "test_scale must be"),
         ({"test_scale": 2}, "test_scale must be"),
         ({"test_scale": [2], "test_cameras": 0}, "set test_cameras"),
     ],

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from skeleton_poses import DEGENERATE, REST, assert_rotation, camera, noisy, rest, rotation
 from torch import Tensor
 
-from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames, recentre, sampling
+from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames, recentre
+from gsgan.skeleton.densify import even_box, even_cylinder, even_sphere, shipped
 from gsgan.skeleton.template import HEAD
 from gsgan.utils.errors import ConfigError
 
@@ -277,15 +278,15 @@ def test_even_samplers_cover_evenly() -> None:
     def emptiest(points: np.ndarray) -> float:
         return float(np.linalg.norm(probe[:, None] - points[None], axis=-1).min(1).max())
 
-    assert emptiest(sampling.even_sphere(500)[0]) < 0.55 * emptiest(random)
+    assert emptiest(even_sphere(500)[0]) < 0.55 * emptiest(random)
 
 
 @pytest.mark.parametrize("n", [1, 7, 500])
 def test_even_samplers_return_the_requested_number(n: int) -> None:
     for points, normals in (
-        sampling.even_cylinder(n),
-        sampling.even_sphere(n),
-        sampling.even_box(n, (1.0, 2.0, 0.5)),
+        even_cylinder(n),
+        even_sphere(n),
+        even_box(n, (1.0, 2.0, 0.5)),
     ):
         assert points.shape == normals.shape == (n, 3)
         np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
@@ -302,7 +303,7 @@ def test_shipped_templates_can_be_made_again() -> None:
     spec.loader.exec_module(module)
     made = module.make_templates()
     for shape, n in (("cylinder", 200), ("sphere", 500), ("box", 500), ("box_fit", 500)):
-        points, normals = sampling.shipped(shape, n)
+        points, normals = shipped(shape, n)
         np.testing.assert_allclose(points, made[shape], atol=1e-6)
         np.testing.assert_allclose(normals, made[f"{shape}_normals"], atol=1e-6)
 

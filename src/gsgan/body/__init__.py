@@ -3,7 +3,7 @@
 Body models of the SMPL family are in `gsgan.body.smpl`.
 """
 
-from gsgan.body.free import Body, free_body, read_body
+from gsgan.body.free import Body, free_body, open_body, read_body
 from gsgan.body.lbs import (
     axis_angle_to_matrix,
     blend_transforms,
@@ -12,7 +12,6 @@ from gsgan.body.lbs import (
     skin,
 )
 from gsgan.body.skinned import SkinnedBody
-from gsgan.body.source import open_body
 
 __all__ = [
     "Body",

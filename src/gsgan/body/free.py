@@ -1,4 +1,4 @@
-"""The free body: a clothed person under a free licence.
+"""The free body, a clothed person under a free licence; and the body of a dataset's poses.
 
 Convention: metres; Z up, the person faces -Y, the person's left is +X; rest pose with the arms away
 from the trunk. The asset in this package is made by scripts/bake_free_body.py.
@@ -7,9 +7,9 @@ from the trunk. The asset in this package is made by scripts/bake_free_body.py.
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -26,27 +26,18 @@ from gsgan.utils.errors import DataError
 class Body(SkinnedBody):
     """The free body: a skinned body with materials and landmarks, unbatched.
 
-    Args:
-        face_labels: ``[F]`` int64 part of each face, see ``label_names``; 0 is the background.
-            A vertex has the part of most of its faces.
-        face_surface: ``[F]`` int64 material of each face, see ``surface_names``.
-        surface_names: skin, hair, eye and the garments.
-        landmarks: ``[33, 3]`` rest positions of the MediaPipe pose landmarks.
-        landmark_bone: ``[33]`` int64, the joint that each landmark moves with.
-        landmark_names: 33 names.
-        hand_landmarks: ``[42, 3]``, MediaPipe's 21 of the left hand, then the right hand's.
-        hand_bone: ``[42]`` int64.
-        hand_names: 42 names.
+    A vertex has the part of most of its faces. Hand landmarks are MediaPipe's 21 of the left hand,
+    then the right hand's.
     """
 
-    face_labels: Tensor
-    face_surface: Tensor
-    surface_names: tuple[str, ...]
-    landmarks: Tensor
-    landmark_bone: Tensor
+    face_labels: Tensor  # [F] int64 part of each face, see label_names; 0 is the background
+    face_surface: Tensor  # [F] int64 material of each face, see surface_names
+    surface_names: tuple[str, ...]  # skin, hair, eye and the garments
+    landmarks: Tensor  # [33, 3] rest positions of the MediaPipe pose landmarks, metres
+    landmark_bone: Tensor  # [33] int64, the joint that each landmark moves with
     landmark_names: tuple[str, ...]
-    hand_landmarks: Tensor
-    hand_bone: Tensor
+    hand_landmarks: Tensor  # [42, 3] metres
+    hand_bone: Tensor  # [42] int64
     hand_names: tuple[str, ...]
 
     def posed_landmarks(self, pose: BodyPose) -> Tensor:
@@ -69,7 +60,7 @@ def majority_vertex_labels(faces: Tensor, face_labels: Tensor, vertices: int) ->
 
 def free_body_path() -> Path:
     """Path of the baked asset."""
-    return Path(str(resources.files("gsgan.body") / "assets" / "free_body.npz"))
+    return Path(__file__).with_name("assets") / "free_body.npz"
 
 
 @lru_cache(maxsize=1)
@@ -93,16 +84,11 @@ def read_body(path: Path) -> Body:
     try:
         with np.load(path, allow_pickle=False) as archive:
             return _body(dict(archive))
-    except FileNotFoundError:
+    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise DataError(
-            f"{path} is missing: reinstall gsgan, or bake it with scripts/bake_free_body.py"
-        ) from None
-    except KeyError as error:
-        raise DataError(
-            f"{path} has no array {error}: bake it again with scripts/bake_free_body.py"
-        ) from None
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise DataError(f"{path} cannot be read as a body ({error}): reinstall gsgan") from error
+            f"{path} is missing or cannot be read as a body ({error}): reinstall gsgan, or bake it "
+            "with scripts/bake_free_body.py"
+        ) from error
 
 
 def _body(arrays: dict[str, np.ndarray]) -> Body:
@@ -129,3 +115,45 @@ def _body(arrays: dict[str, np.ndarray]) -> Body:
         vertex_labels=majority_vertex_labels(faces, face_labels, len(arrays["vertices"])),
         **fields,
     )
+
+
+def open_body(
+    kind: str | None,
+    file: str | None = None,
+    betas: Sequence[float] = (),
+    label_names: Sequence[str] = (),
+) -> SkinnedBody | None:
+    """The body with its part labels, or None when no mesh of it is available.
+
+    A model file gets the set of parts with the names of the images' labels (the free body's,
+    CIHP's, or one part per joint), by default the free body's. Clothes on a model file are a guess,
+    and their names may differ from the images' labels: see `SkinnedBody.shares_labels`.
+
+    Args:
+        kind: "free", "smpl", "smplx", or another name from the data.
+        file: the user's model file; not needed for the free body.
+        betas: shape coefficients of the person.
+        label_names: the parts in the data's label images, background first; empty when unknown.
+
+    Raises:
+        DataError: when the file cannot be read or is of another body.
+    """
+    if kind == "free":
+        return free_body()
+    if kind is None or file is None:
+        return None
+    from gsgan.body.smpl import read_smpl
+    from gsgan.body.smpl_names import fitting_parts
+
+    model = read_smpl(file)
+    if model.kind != kind:
+        raise DataError(
+            f"{file} is a model of kind {model.kind} ({len(model.parents)} joints), but the data's "
+            f"poses are of {kind}; give that model's file"
+        )
+    if len(betas) > model.shapedirs.shape[-1]:
+        raise DataError(
+            f"{file} has {model.shapedirs.shape[-1]} shape coefficients, the data gives "
+            f"{len(betas)}; give the model file that the data was fitted with"
+        )
+    return model.as_body(betas, fitting_parts(tuple(label_names), model.joint_names))

@@ -17,15 +17,8 @@ from gsgan.utils.tensors import constant
 def axis_angle_to_matrix(axis_angle: Tensor, small: float = 1e-6) -> Tensor:
     """Rotation matrices ``[..., 3, 3]`` of axis-angle vectors ``[..., 3]`` in radians.
 
-    Rodrigues' formula, with its Taylor series near zero: values and gradients are finite at zero
-    rotation.
-
-    Args:
-        axis_angle: ``[..., 3]`` unit axis times angle, radians.
-        small: squared radians below which the Taylor series replaces the quotients.
-
-    Returns:
-        ``[..., 3, 3]`` rotations, det +1.
+    Rodrigues' formula, and below ``small`` squared radians its Taylor series: values and gradients
+    are finite at zero rotation.
     """
     squared = (axis_angle * axis_angle).sum(-1)[..., None, None]
     is_small = squared < small
@@ -46,10 +39,7 @@ def _cross_matrix(v: Tensor) -> Tensor:
 
 
 def kinematic_levels(parents: Sequence[int]) -> list[list[int]]:
-    """The joints grouped by depth, roots first: a level depends on earlier levels only.
-
-    Args:
-        parents: parent of each joint, -1 for a root, each parent before its children.
+    """The joints grouped by depth, roots (parent -1) first: a level depends on earlier ones only.
 
     Raises:
         ValueError: when a parent does not come before its child.
@@ -133,13 +123,10 @@ def _accumulate(
 
 
 def check_weights(bone_weight: Tensor) -> None:
-    """Checks skinning weights; called once, where weights are stored.
+    """Checks skinning weights ``[V, n]``, once, where they are stored.
 
     Not in :func:`blend_transforms`: reading values makes the host wait for the device, which costs
     too much per frame.
-
-    Args:
-        bone_weight: ``[V, n]``.
 
     Raises:
         ValueError: when a vertex has no weight, a negative one, or one that is not finite.

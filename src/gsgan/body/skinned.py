@@ -24,34 +24,23 @@ class SkinnedBody:
     """A skinned body with part labels, unbatched.
 
     Convention: metres; the axes depend on the body (the free body has Z up, SMPL's have Y up); the
-    root rotates about its own joint.
-
-    Args:
-        vertices: ``[V, 3]`` rest positions, metres.
-        faces: ``[F, 3]`` int64, counter-clockwise seen from outside.
-        bone_index: ``[V, n]`` int64.
-        bone_weight: ``[V, n]``, rows sum to 1.
-        joints: ``[J, 3]`` rest positions, metres.
-        parents: parent of each joint, -1 for the root.
-        joint_names: names of the joints.
-        vertex_labels: ``[V]`` int64 part of each vertex, see ``label_names``.
-        label_names: name of each part, background first.
-        label_source: source of a vertex's part: "own", the body's definition; "guess", its joint,
-            where the true part depends on the clothes; "vote", the data's label images.
+    root rotates about its own joint. ``label_source`` is the source of a vertex's part: "own", the
+    body's definition; "guess", its joint, where the true part depends on the clothes; "vote", the
+    data's label images.
 
     Raises:
         ValueError: when a vertex has no skinning weight, or one that is negative or not finite.
     """
 
-    vertices: Tensor
-    faces: Tensor
-    bone_index: Tensor
-    bone_weight: Tensor
-    joints: Tensor
-    parents: tuple[int, ...]
+    vertices: Tensor  # [V, 3] rest positions, metres
+    faces: Tensor  # [F, 3] int64, counter-clockwise seen from outside
+    bone_index: Tensor  # [V, n] int64
+    bone_weight: Tensor  # [V, n], rows sum to 1
+    joints: Tensor  # [J, 3] rest positions, metres
+    parents: tuple[int, ...]  # of each joint, -1 for the root
     joint_names: tuple[str, ...]
-    vertex_labels: Tensor
-    label_names: tuple[str, ...]
+    vertex_labels: Tensor  # [V] int64 part of each vertex, see label_names
+    label_names: tuple[str, ...]  # of each part, background first
     label_source: Literal["own", "guess", "vote"] = "own"
 
     def __post_init__(self) -> None:
@@ -95,11 +84,6 @@ class SkinnedBody:
         Raises:
             ValueError: when ``pose.theta`` has another number of joints than the body.
         """
-        if pose.theta.ndim != 3 or pose.theta.shape[1:] != (len(self.parents), 3):
-            raise ValueError(
-                f"{type(self).__name__}.transforms: pose.theta must have shape "
-                f"[B, {len(self.parents)}, 3], got {list(pose.theta.shape)}"
-            )
         rotations = axis_angle_to_matrix(pose.theta)
         return forward_kinematics(
             self.joints.to(rotations), self.parents, rotations, pose.transl.to(rotations)
@@ -127,14 +111,7 @@ def carry(transforms: Tensor, points: Tensor, bones: Tensor) -> Tensor:
 
 
 def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
-    """``[V, 3]`` outward unit normals, faces weighted by their area.
-
-    A vertex without a face of positive area gets zeros.
-
-    Args:
-        vertices: ``[V, 3]``.
-        faces: ``[F, 3]`` int64, counter-clockwise seen from outside.
-    """
+    """``[V, 3]`` outward unit normals, faces weighted by their area; zero where there is none."""
     a, b, c = vertices[faces].unbind(1)
     face = torch.linalg.cross(b - a, c - a)
     summed = torch.zeros_like(vertices)

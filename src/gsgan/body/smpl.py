@@ -37,30 +37,19 @@ KINDS = {24: "smpl", 55: "smplx"}
 class SkinnedModel:
     """A body model with shape and pose blend shapes, in float64 on the CPU.
 
-    Args:
-        kind: "smpl" (24 joints), "smplx" (55) or "generic".
-        v_template: ``[V, 3]`` metres, the mean shape.
-        shapedirs: ``[V, 3, S]``.
-        expression_dirs: ``[V, 3, E]``; E is 0 but for SMPL-X.
-        posedirs: ``[V, 3, 9 (J - 1)]``, per row-major entry of each joint's ``R - 1``.
-        J_regressor: ``[J, V]``.
-        weights: ``[V, J]``, rows sum to 1.
-        parents: parent of each joint, -1 for the root.
-        faces: ``[F, 3]`` int64.
-
     Raises:
         ValueError: when a vertex has no skinning weight, or one that is negative or not finite.
     """
 
-    kind: str
-    v_template: Tensor
-    shapedirs: Tensor
-    expression_dirs: Tensor
-    posedirs: Tensor
-    J_regressor: Tensor
-    weights: Tensor
-    parents: tuple[int, ...]
-    faces: Tensor
+    kind: str  # "smpl" (24 joints), "smplx" (55) or "generic"
+    v_template: Tensor  # [V, 3] metres, the mean shape
+    shapedirs: Tensor  # [V, 3, S]
+    expression_dirs: Tensor  # [V, 3, E]; E is 0 but for SMPL-X
+    posedirs: Tensor  # [V, 3, 9 (J - 1)], per row-major entry of each joint's R - 1
+    J_regressor: Tensor  # [J, V]
+    weights: Tensor  # [V, J], rows sum to 1
+    parents: tuple[int, ...]  # of each joint, -1 for the root
+    faces: Tensor  # [F, 3] int64
 
     def __post_init__(self) -> None:
         check_weights(self.weights)
@@ -134,7 +123,7 @@ class SkinnedModel:
         if pose_blend:
             eye = torch.eye(3, dtype=rotations.dtype)
             feature = (rotations[:, 1:] - eye).flatten(1)
-            vertices = vertices + _directed(self.posedirs, feature)
+            vertices = _add("theta", vertices, self.posedirs, feature)
         return skin(vertices, *blend_transforms(transforms, *self.bones)), _moved(transforms, rest)
 
     def posed_joints(
@@ -198,13 +187,8 @@ class SkinnedModel:
         return moved, rotations, rest
 
 
-def _directed(directions: Tensor, coefficients: Tensor) -> Tensor:
-    """``[B, N, 3]``: directions ``[N, 3, n]`` times coefficients ``[B, n]``."""
-    return (directions @ coefficients.mT).permute(2, 0, 1)
-
-
 def _add(name: str, base: Tensor, directions: Tensor, coefficients: Tensor | None) -> Tensor:
-    """``base`` plus directions times coefficients; missing coefficients are 0."""
+    """``base [N, 3]`` plus directions ``[N, 3, n]`` times coefficients ``[B, n]`` or fewer."""
     if coefficients is None:
         return base
     most = directions.shape[-1]
@@ -214,7 +198,7 @@ def _add(name: str, base: Tensor, directions: Tensor, coefficients: Tensor | Non
             f"got {list(coefficients.shape)}"
         )
     given = coefficients.to(base)
-    return base + _directed(directions[..., : given.shape[1]], given)
+    return base + (directions[..., : given.shape[1]] @ given.mT).permute(2, 0, 1)
 
 
 def _moved(transforms: Tensor, joints: Tensor) -> Tensor:

@@ -18,9 +18,6 @@ from gsgan.utils.pickles import read_npz, read_pickle
 
 KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 SMPLX_JOINT_COUNT = 55
-# SMPL-X concatenates shape and expression coefficients: 300 + 100, or 10 + 10.
-SMPLX_SHAPES, SMPLX_ALL = 300, 400
-SMPLX_FEW_SHAPES, SMPLX_FEW_ALL = 10, 20
 WEIGHT_TOLERANCE = 1e-3  # of the sum of a vertex's weights, and of negative weights
 
 Floats = NDArray[np.float64]
@@ -64,10 +61,7 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], tuple[int, ...]]:
 def _raw(path: Path) -> dict[str, Any]:
     content = read_npz(path, KEYS) if zipfile.is_zipfile(path) else read_pickle(path)
     if not isinstance(content, dict):
-        raise DataError(
-            f"{path} holds a {type(content).__name__}; expected an SMPL model, a dict with "
-            f"{', '.join(KEYS)}"
-        )
+        raise DataError(f"{path} holds a {type(content).__name__}; expected an SMPL model, a dict")
     missing = [key for key in KEYS if not isinstance(content.get(key), np.ndarray)]
     if missing:
         raise DataError(
@@ -78,12 +72,13 @@ def _raw(path: Path) -> dict[str, Any]:
 
 
 def _shape_count(joints: int, directions: int) -> int:
-    """Number of a file's directions that are body shape; the rest are expression."""
-    if joints != SMPLX_JOINT_COUNT:
-        return directions
-    if directions >= SMPLX_ALL:
-        return SMPLX_SHAPES
-    return SMPLX_FEW_SHAPES if directions == SMPLX_FEW_ALL else directions
+    """Number of a file's directions that are body shape; the rest are expression.
+
+    SMPL-X concatenates them: 300 + 100, or 10 + 10.
+    """
+    if joints == SMPLX_JOINT_COUNT and directions >= 400:
+        return 300
+    return 10 if joints == SMPLX_JOINT_COUNT and directions == 20 else directions
 
 
 def _parents(table: NDArray[Any], path: Path) -> tuple[int, ...]:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.resources import files
 from itertools import combinations
 from typing import Literal, get_args
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from gsgan.skeleton import sampling
 from gsgan.skeleton.frames import MIN_LENGTH, BoneFrames, bone_frames
 from gsgan.skeleton.template import HEAD, MEDIAPIPE33, SkeletonTemplate
 from gsgan.skeleton.tensors import Swing, check_skeleton, constants
@@ -19,31 +20,27 @@ from gsgan.utils.errors import ConfigError
 Torso = Literal["fit", "cube"]
 Sampler = Literal["even", "trimesh"]
 Limbs = Literal["paper22", "all26"]
+Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+GOLDEN = (5**0.5 - 1) / 2
+PLASTIC = 1.32471795724474602596  # root of x³ = x + 1, the two-dimensional golden ratio
 
 
 @dataclass(frozen=True)
 class Points:
-    """The points of a body in a batch of poses.
+    """The points of a body in a batch of poses; P parts: limbs, then face, then torso.
 
-    Args:
-        means: ``[B, N, 3]`` metres, world frame.
-        rotations: ``[B, P, 3, 3]`` frames of the parts: limbs, then face, then torso. On a skinned
-            body (`gsgan.model.body_points`) each point is a part, and its frame may shear.
-        origins: ``[B, P, 3]`` metres, world frame: origin of each part's frame.
-        scales: ``[B, N]`` metres, initial standard deviation, isotropic.
-        valid: ``[B, N]`` bool, False on parts whose joints are unseen.
-        part_id: ``[N]`` int64 into the parts.
-        normals: ``[B, N, 3]`` outward, world frame, unit length; on a skinned body shorter, down to
-            zero, where the skin is flat.
+    On a skinned body (`gsgan.model.body_points`) each point is a part, whose frame may shear, and
+    normals are shorter than 1, down to zero, where the skin is flat.
     """
 
-    means: Tensor
-    rotations: Tensor
-    origins: Tensor
-    scales: Tensor
-    valid: Tensor
-    part_id: Tensor
-    normals: Tensor
+    means: Tensor  # [B, N, 3] metres, world frame
+    rotations: Tensor  # [B, P, 3, 3] frames of the parts
+    origins: Tensor  # [B, P, 3] metres, world frame: origin of each part's frame
+    scales: Tensor  # [B, N] metres, initial standard deviation, isotropic
+    valid: Tensor  # [B, N] bool, False on parts whose joints are unseen
+    part_id: Tensor  # [N] int64 into the parts
+    normals: Tensor  # [B, N, 3] outward, world frame, unit length
 
     @property
     def frames(self) -> Tensor:
@@ -120,7 +117,14 @@ class Densify(nn.Module):
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
-        _check_options(torso=torso, sampler=sampler, limbs=limbs)
+        for name, value, known in (
+            ("torso", torso, Torso),
+            ("sampler", sampler, Sampler),
+            ("limbs", limbs, Limbs),
+        ):
+            if value not in get_args(known):
+                expected = ", ".join(get_args(known))
+                raise ConfigError(f"Densify: {name} must be one of {expected}, got {value!r}")
         counts = (points_per_limb, face_points, torso_points)
         if min(counts) < 1:
             raise ConfigError(f"Densify: every part must have at least one point, got {counts}")
@@ -144,7 +148,17 @@ class Densify(nn.Module):
     def _make_buffers(self, sampler: str, dtype: torch.dtype) -> None:
         t, (n_limb, n_face, n_torso) = self.template, self.counts
         torso_rest = t.rest_torso
-        cylinder, sphere, box = _unit_shapes(sampler, self.counts, torso_rest, self.torso)
+        if sampler == "trimesh":
+            fit = "box" if self.torso == "cube" else "box_fit"
+            cylinder, sphere = (
+                shipped("cylinder", n_limb),
+                shipped("sphere", n_face),
+            )
+            box = shipped(fit, n_torso)
+        else:
+            extents = (1.0, 1.0, 1.0) if self.torso == "cube" else torso_rest
+            cylinder, sphere = even_cylinder(n_limb), even_sphere(n_face)
+            box = even_box(n_torso, extents)
         along = _limb_axes(t)
         limb_points = (cylinder[0] * [self.radius_ratio, self.radius_ratio, 1.0]) @ along.mT.numpy()
         limb_normals = cylinder[1] @ along.mT.numpy()
@@ -263,15 +277,6 @@ class Densify(nn.Module):
         return torch.stack([face, torso], dim=1)
 
 
-def _check_options(**options: str) -> None:
-    known = {"torso": Torso, "sampler": Sampler, "limbs": Limbs}
-    for name, value in options.items():
-        if value not in get_args(known[name]):
-            raise ConfigError(
-                f"Densify: {name} must be one of {', '.join(get_args(known[name]))}, got {value!r}"
-            )
-
-
 def _limb_axes(template: SkeletonTemplate) -> Tensor:
     """``[L, 3, 3]`` float64: constant rotations from z to the limbs' rest directions."""
     up = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
@@ -279,25 +284,63 @@ def _limb_axes(template: SkeletonTemplate) -> Tensor:
     return Swing.of(up).to(rest.unsqueeze(1)).squeeze(1)
 
 
-def _unit_shapes(
-    sampler: str,
-    counts: tuple[int, int, int],
-    torso_rest: tuple[float, float, float],
-    torso: str,
-) -> tuple[sampling.Samples, sampling.Samples, sampling.Samples]:
-    n_limb, n_face, n_torso = counts
-    if sampler == "trimesh":
-        try:
-            return (
-                sampling.shipped("cylinder", n_limb),
-                sampling.shipped("sphere", n_face),
-                sampling.shipped("box" if torso == "cube" else "box_fit", n_torso),
-            )
-        except ValueError as error:
-            raise ConfigError(f"Densify: {error}") from None
-    extents = (1.0, 1.0, 1.0) if torso == "cube" else torso_rest
-    return (
-        sampling.even_cylinder(n_limb),
-        sampling.even_sphere(n_face),
-        sampling.even_box(n_torso, extents),
-    )
+# Samples on unit shapes, in the shape's own frame: float64 ``points [n, 3]`` and outward unit
+# ``normals [n, 3]``. The cylinder has radius 1 and height 1 from z = 0 up, lateral face only (caps
+# would be inside the neighbouring limb); the sphere has radius 1; the box has edges of 1 around the
+# origin.
+
+
+def even_cylinder(n: int) -> Samples:
+    """``n`` points on the unit cylinder: evenly spaced in height, a golden angle apart."""
+    k = np.arange(n)
+    turn = 2 * np.pi * np.modf(k * GOLDEN)[0]
+    normals = np.stack([np.cos(turn), np.sin(turn), np.zeros(n)], axis=-1)
+    return normals + np.outer((k + 0.5) / n, [0.0, 0.0, 1.0]), normals
+
+
+def even_sphere(n: int) -> Samples:
+    """``n`` points of the Fibonacci lattice on the unit sphere."""
+    k = np.arange(n)
+    z = 1 - (2 * k + 1) / n
+    turn = 2 * np.pi * np.modf(k * GOLDEN)[0]
+    ring = np.sqrt(1 - z * z)
+    points = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=-1)
+    return points, points.copy()
+
+
+def even_box(n: int, extents: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Samples:
+    """``n`` points on the unit box, per face in proportion to its area when scaled to ``extents``.
+
+    Faces are filled by the R2 sequence (Roberts 2018), a two-dimensional golden ratio.
+    """
+    x, y, z = extents
+    areas = np.array([y * z, y * z, z * x, z * x, x * y, x * y])
+    counts = np.diff(np.round(np.cumsum(np.append(0.0, areas)) / areas.sum() * n).astype(int))
+    points, normals = [], []
+    for face, count in enumerate(counts):
+        axis, sign = face // 2, 1.0 - 2.0 * (face % 2)
+        k = np.arange(count)[:, None] + 1
+        flat = np.modf(0.5 + k / PLASTIC ** np.array([1, 2]))[0] - 0.5
+        points.append(np.insert(flat, axis, 0.5 * sign, axis=1))
+        normals.append(np.tile(np.eye(3)[axis] * sign, (count, 1)))
+    return np.concatenate(points), np.concatenate(normals)
+
+
+def shipped(shape: str, n: int) -> Samples:
+    """The stored random samples of a shape: cylinder, sphere, box, or box_fit.
+
+    ``templates.npz`` was sampled once with trimesh (scripts/make_skeleton_templates.py), so that
+    results do not depend on the trimesh version.
+
+    Raises:
+        ConfigError: when the file holds another number of points than ``n``.
+    """
+    with (files("gsgan.skeleton") / "templates.npz").open("rb") as file:
+        stored = np.load(file, allow_pickle=False)
+        points, normals = stored[shape].astype(np.float64), stored[f"{shape}_normals"]
+    if len(points) != n:
+        raise ConfigError(
+            f"Densify: sampler 'trimesh' has {len(points)} {shape} points, {n} were requested; "
+            "use sampler 'even' for other numbers"
+        )
+    return points, normals.astype(np.float64)

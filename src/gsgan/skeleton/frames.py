@@ -33,20 +33,13 @@ class BoneFrames:
 
     Convention: rotations map the frame's axes to the world; at the rest directions every limb
     frame equals its hub's.
-
-    Args:
-        hubs: ``[B, 3, 3, 3]`` pelvis, chest, head; columns are left, up, front.
-        limbs: ``[B, L, 3, 3]`` limb frames.
-        local: ``[B, L, 3, 3]`` the same relative to the parent's frame.
-        lengths: ``[B, L]`` metres, ``sqrt(|bone|² + min_length²)``.
-        torso: ``[B, 3, 3]`` the frame of the trunk's box.
     """
 
-    hubs: Tensor
-    limbs: Tensor
-    local: Tensor
-    lengths: Tensor
-    torso: Tensor
+    hubs: Tensor  # [B, 3, 3, 3] pelvis, chest, head; columns are left, up, front
+    limbs: Tensor  # [B, L, 3, 3]
+    local: Tensor  # [B, L, 3, 3] the same relative to the parent's frame
+    lengths: Tensor  # [B, L] metres, sqrt(|bone|² + min_length²)
+    torso: Tensor  # [B, 3, 3] the frame of the trunk's box
 
 
 def root_of(p: Tensor, template: SkeletonTemplate = MEDIAPIPE33) -> Tensor:

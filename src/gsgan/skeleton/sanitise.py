@@ -125,11 +125,10 @@ def _refuse_without_trunk(valid: Tensor, template: SkeletonTemplate, least: int)
     trunk = valid[:, list(template.torso)]
     bad = (trunk.sum(-1) < least).nonzero().flatten().tolist()
     if bad:
-        lost = "; ".join(
-            f"item {b}: "
-            + ", ".join(template.names[j] for j in template.torso if not bool(valid[b, j]))
-            for b in bad
+        names = (
+            ", ".join(template.names[j] for j in template.torso if not valid[b, j]) for b in bad
         )
+        lost = "; ".join(f"item {b}: {missing}" for b, missing in zip(bad, names, strict=True))
         raise ValueError(
             f"sanitise: p needs {least} of the four shoulders and hips, but in {len(bad)} of "
             f"{len(valid)} skeletons too many are NaN or invisible ({lost}); leave these frames out"
@@ -140,7 +139,10 @@ def _filled(
     p: Tensor, valid: Tensor, template: SkeletonTemplate, body_height: Tensor | float | None
 ) -> Tensor:
     c = constants(template, p.device, p.dtype)
-    root = _seen_trunk_joint(p, valid, template)
+    # the origin of the completion: a seen hip or shoulder
+    order = torch.tensor([*template.hips, *template.shoulders], device=p.device)
+    first = order[valid[:, order].to(torch.uint8).argmax(-1)]
+    root = p.gather(1, first[:, None, None].expand(-1, 1, 3)).detach()
     q = torch.where(valid.unsqueeze(-1), p, 0.0)
     q = torch.where(valid.unsqueeze(-1), q - root, 0.0)
     if body_height is None:
@@ -173,29 +175,15 @@ def _put(q: Tensor, valid: Tensor, joints: Tensor, where_to: Tensor) -> Tensor:
     return q.index_copy(1, joints, new)
 
 
-def _seen_trunk_joint(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Tensor:
-    """``[B, 1, 3]``: a seen shoulder or hip, the origin of the completion."""
-    order = torch.tensor([*template.hips, *template.shoulders], device=p.device)
-    first = order[valid[:, order].to(torch.uint8).argmax(-1)]
-    return p.gather(1, first[:, None, None].expand(-1, 1, 3)).detach()
-
-
 def _complete_trunk(q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: Tensor) -> Tensor:
     """One missing corner: its partner plus the other line, scaled by the rest skeleton's ratio."""
     (l_sh, r_sh), (l_hip, r_hip) = template.shoulders, template.hips
     ratio = (rest[l_sh] - rest[r_sh]).norm() / (rest[l_hip] - rest[r_hip]).norm()
     hips, shoulders = q[:, l_hip] - q[:, r_hip], q[:, l_sh] - q[:, r_sh]
     corners = torch.tensor(template.torso, device=q.device)
-    where_to = torch.stack(
-        [
-            q[:, r_sh] + hips * ratio,
-            q[:, l_sh] - hips * ratio,
-            q[:, r_hip] + shoulders / ratio,
-            q[:, l_hip] - shoulders / ratio,
-        ],
-        dim=1,
-    )
-    return _put(q, valid, corners, where_to)
+    upper = (q[:, r_sh] + hips * ratio, q[:, l_sh] - hips * ratio)
+    lower = (q[:, r_hip] + shoulders / ratio, q[:, l_hip] - shoulders / ratio)
+    return _put(q, valid, corners, torch.stack([*upper, *lower], dim=1))
 
 
 def _complete_face(

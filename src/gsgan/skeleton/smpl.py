@@ -22,19 +22,12 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Table:
-    """The source of each landmark in one kind of body; later entries override earlier ones.
+    """The source of each landmark in one kind of body; later entries override earlier ones."""
 
-    Args:
-        counts: number of joints, number of vertices.
-        joints: landmark to (joint, confidence).
-        vertices: landmark to (vertex, confidence).
-        midpoints: landmark to (joint, vertex), approximately halfway between which it lies.
-    """
-
-    counts: tuple[int, int]
-    joints: dict[str, tuple[int, float]]
-    vertices: dict[str, tuple[int, float]]
-    midpoints: dict[str, tuple[int, int]]
+    counts: tuple[int, int]  # number of joints, number of vertices
+    joints: dict[str, tuple[int, float]]  # landmark to (joint, confidence)
+    vertices: dict[str, tuple[int, float]]  # landmark to (vertex, confidence)
+    midpoints: dict[str, tuple[int, int]]  # landmark to (joint, vertex), about halfway between
 
 
 def _sides(names: dict[str, tuple[int, int]], confidence: float) -> dict[str, tuple[int, float]]:
@@ -52,17 +45,9 @@ def _eyes(left: int, right: int) -> dict[str, tuple[int, float]]:
     return _sides({"eye": (left, right)}, SAME) | _sides(corners, NEAR)
 
 
-_LIMBS = _sides(
-    {
-        "shoulder": (16, 17),
-        "elbow": (18, 19),
-        "wrist": (20, 21),
-        "hip": (1, 2),
-        "knee": (4, 5),
-        "ankle": (7, 8),
-    },
-    SAME,
-) | _sides({"foot_index": (10, 11)}, NEAR)
+_ARMS = {"shoulder": (16, 17), "elbow": (18, 19), "wrist": (20, 21)}
+_LEGS = {"hip": (1, 2), "knee": (4, 5), "ankle": (7, 8)}
+_LIMBS = _sides(_ARMS | _LEGS, SAME) | _sides({"foot_index": (10, 11)}, NEAR)
 
 TABLES = {
     "smpl": Table(
@@ -71,10 +56,8 @@ TABLES = {
         vertices={
             "nose": (332, SAME),
             **_eyes(2800, 6260),
-            **_sides(
-                {"ear": (583, 4071), "heel": (3387, 6787), "foot_index": (3216, 6617)},
-                SAME,
-            ),
+            **_sides({"ear": (583, 4071), "heel": (3387, 6787)}, SAME),
+            **_sides({"foot_index": (3216, 6617)}, SAME),
         },
         # MediaPipe's three hand points are knuckles: about halfway to the finger tip
         midpoints={
@@ -94,10 +77,7 @@ TABLES = {
         vertices={
             "nose": (9120, SAME),
             **_eyes(9448, 9929),
-            **_sides(
-                {"ear": (6, 616), "heel": (8846, 8635), "foot_index": (5770, 8463)},
-                SAME,
-            ),
+            **_sides({"ear": (6, 616), "heel": (8846, 8635), "foot_index": (5770, 8463)}, SAME),
         },
         midpoints={},
     ),

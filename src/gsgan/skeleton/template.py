@@ -22,48 +22,33 @@ N_HUBS = 3
 class SkeletonTemplate:
     """Joints, bones and rest shape of one kind of skeleton.
 
-    Compared and hashed by identity, so that it can be the key of cached tensors.
-
-    Args:
-        names: of the ``J`` joints.
-        edges: the connections that the landmark detector draws.
-        limbs: (parent joint, child joint) of the bones with a cylinder.
-        limb_parents: per limb, the frame that its own is relative to: 0 pelvis, 1 chest, 2 head,
-            ``3 + l`` limb ``l``.
-        rest_directions: per limb, unit, in its parent's frame. Not the rest pose: chosen so that
-            the opposite direction, where the swing is undefined, is out of reach.
-        hinges: (upper limb, lower limb) pairs that bend about one axis.
-        hinge_axes: per hinge, unit, in the upper limb's frame, across its rest direction.
-        rest_positions: ``J`` points of an A-pose on the ground y = 0.
-        stature: metres, sole to crown of the rest pose.
-        shoulders, hips, ears, eyes: (left, right) joints that define the hub frames.
-        nose: joint at the front of the head.
-        face: joints inside the head's sphere.
-        mirror: per joint, its counterpart on the other side (itself on the midline).
-        draw_groups: (name, segments) of the channels of the drawn skeleton.
-        gnn_edges: the edges connected to one component, for message passing.
+    Compared and hashed by identity, so that it can be the key of cached tensors. Left joints come
+    before right ones.
 
     Source: method notes, sections 1, 5 and 6; the paper names MediaPipe Pose and Algorithm 1.
     """
 
-    names: tuple[str, ...]
-    edges: tuple[Edge, ...]
-    limbs: tuple[Edge, ...]
+    names: tuple[str, ...]  # of the J joints
+    edges: tuple[Edge, ...]  # the connections that the landmark detector draws
+    limbs: tuple[Edge, ...]  # (parent joint, child joint) of the bones with a cylinder
+    # per limb, the frame that its own is relative to: 0 pelvis, 1 chest, 2 head, 3 + l limb l
     limb_parents: tuple[int, ...]
+    # per limb, unit, in its parent's frame; not the rest pose: chosen so that the opposite
+    # direction, where the swing is undefined, is out of reach
     rest_directions: tuple[Vector, ...]
-    hinges: tuple[Edge, ...]
-    hinge_axes: tuple[Vector, ...]
-    rest_positions: tuple[Vector, ...]
-    stature: float
+    hinges: tuple[Edge, ...]  # (upper limb, lower limb) pairs that bend about one axis
+    hinge_axes: tuple[Vector, ...]  # unit, in the upper limb's frame, across its rest direction
+    rest_positions: tuple[Vector, ...]  # J points of an A-pose on the ground y = 0
+    stature: float  # metres, sole to crown of the rest pose
     shoulders: Edge
     hips: Edge
     ears: Edge
     eyes: Edge
     nose: int
-    face: tuple[int, ...]
-    mirror: tuple[int, ...]
-    draw_groups: tuple[tuple[str, tuple[Edge, ...]], ...]
-    gnn_edges: tuple[Edge, ...]
+    face: tuple[int, ...]  # joints inside the head's sphere
+    mirror: tuple[int, ...]  # per joint, its counterpart (itself on the midline)
+    draw_groups: tuple[tuple[str, tuple[Edge, ...]], ...]  # (name, segments) of drawn channels
+    gnn_edges: tuple[Edge, ...]  # the edges connected to one component, for message passing
 
     @property
     def torso(self) -> tuple[int, int, int, int]:

@@ -133,7 +133,9 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
         )
 
     left, right = t.eyes
-    eye_frame = _two_axes(rest[left] - rest[right], rest[t.nose] - (rest[left] + rest[right]) / 2)
+    across_eyes = unit(rest[left] - rest[right])
+    front = unit(across(across_eyes, rest[t.nose] - (rest[left] + rest[right]) / 2))
+    eye_frame = torch.stack([across_eyes, torch.linalg.cross(front, across_eyes), front], dim=-1)
     turned = [j for j in t.face if j != t.nose]
     from_ears = rest[turned] - rest[list(t.ears)].mean(0)
     n_turned, incoming = len(turned), t.incoming
@@ -146,7 +148,7 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
         ends=index([b for _, b in t.limbs]),
         levels=tuple(levels),
         limb_order=index([sorted_limbs.index(limb) for limb in range(len(t.limbs))]),
-        head_from_eyes=cast(head_columns(*eye_frame).mT.contiguous()),
+        head_from_eyes=cast(eye_frame.mT.contiguous()),
         head_points=index([*t.ears, *t.eyes, t.nose]),
         torso=index(t.torso),
         face_turned=index(turned),
@@ -154,17 +156,6 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
         omega_order=index([place[joint] for joint in range(len(t.names))]),
         axes=cast(eye),
     )
-
-
-def _two_axes(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Unit first axis, unit part of the second orthogonal to it, and the cross product 2 x 1."""
-    e1 = unit(first)
-    e2 = unit(across(e1, second))
-    return e1, e2, torch.linalg.cross(e2, e1)
-
-
-def head_columns(left: Tensor, front: Tensor, up: Tensor) -> Tensor:
-    return torch.stack([left, up, front], dim=-1)
 
 
 def check_skeleton(

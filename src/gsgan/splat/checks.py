@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 
 import torch
@@ -80,7 +81,8 @@ def _check_types(gaussians: Gaussians, camera: Camera) -> None:
 
 def _check_camera(camera: Camera, tolerance: float) -> None:
     """K is a pinhole's, R a rotation; one transfer to the host for all checks."""
-    K, R, t = (x.detach().double() if x.device.type != "mps" else x.detach() for x in _KRt(camera))
+    wide = torch.float64 if camera.K.device.type != "mps" else camera.K.dtype
+    K, R, t = (x.detach().to(wide) for x in (camera.K, camera.R, camera.t))
     identity = torch.eye(3, dtype=R.dtype, device=R.device)
     rows = [
         (K[:, 0, 0], K[:, 1, 1]),
@@ -91,7 +93,8 @@ def _check_camera(camera: Camera, tolerance: float) -> None:
     host = torch.stack([torch.stack(row) for row in rows]).tolist()  # [4, 2, B]
     for i in range(len(camera)):
         (fx, fy), (last_row, k10), (off, det), (total, _) = ((a[i], b[i]) for a, b in host)
-        _require_finite(total, i)
+        if not math.isfinite(total):
+            raise ValueError(f"rasterise: Camera.K, R and t of item {i} must be finite")
         if not (fx > 0 and fy > 0):
             raise ValueError(
                 f"rasterise: Camera.K of item {i} must have fx, fy > 0, got {fx}, {fy}"
@@ -113,17 +116,8 @@ def _check_camera(camera: Camera, tolerance: float) -> None:
             )
 
 
-def _KRt(camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    return camera.K, camera.R, camera.t
-
-
-def _require_finite(total: float, item: int) -> None:
-    if total != total or total in (float("inf"), float("-inf")):
-        raise ValueError(f"rasterise: Camera.K, R and t of item {item} must be finite")
-
-
 def _check_gaussians(gaussians: Gaussians, on_invalid: str) -> Tensor | None:
-    """None when all are valid; else, for ``drop``, ``[B, N]`` bool, True where valid."""
+    """The second half of :func:`check`, with its result."""
     if gaussians.means.shape[1] == 0 or len(gaussians) == 0 or _all_valid(gaussians):
         return None
     B, N = gaussians.means.shape[:2]

@@ -20,7 +20,6 @@ import importlib
 import importlib.util
 import math
 from functools import lru_cache
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -91,10 +90,9 @@ def unsuited(gaussians: Gaussians, camera: Camera) -> str:
 
 
 def _stop_loss(cap: float) -> float:
-    """The largest share of light that a stopped pixel may lack.
+    """The largest share of light that a stopped pixel may lack, with alphas up to ``cap``.
 
-    A layer of alpha ``a`` stops the pixel where ``T (1 - a) <= transmittance_min``, which loses all
-    of ``T``: with alphas up to ``cap`` that is the returned share.
+    A layer of alpha ``a`` stops the pixel where ``T (1 - a) <= transmittance_min``: it loses ``T``.
     """
     stop = float(COMPILED_IN["transmittance_min"])
     return 1.0 if cap >= 1 else min(1.0, stop / (1 - cap))
@@ -129,7 +127,7 @@ def draw(
         gaussians = without(gaussians, ~keep)
     (H, W), C = camera.size, gaussians.features.shape[-1]
     means, viewmats = _seen_from_the_camera(gaussians.means, camera)
-    colours, alphas, _ = _rasterization()(
+    colours, alphas, _ = importlib.import_module("gsplat").rasterization(
         means=means,
         **_shapes(gaussians),
         opacities=gaussians.opacities.float(),
@@ -151,10 +149,6 @@ def draw(
     image = colours.squeeze(1).movedim(-1, 1)
     depth = image[:, C : C + 1] if want_depth else None
     return image[:, :C], alphas.squeeze(1).movedim(-1, 1), depth
-
-
-def _rasterization() -> Any:
-    return importlib.import_module("gsplat").rasterization
 
 
 def _shapes(gaussians: Gaussians) -> dict[str, Tensor | None]:
@@ -215,15 +209,11 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
             alpha = draw(gaussians, camera, _PROBE, None, want_depth=True)[1]
         return float(alpha), ""
     except Exception as error:  # no compiler, unknown GPU, other version: torch is used
-        return None, f"gsplat is installed but cannot draw here ({_one_line(error)})."
+        line = ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]])
+        return None, f"gsplat is installed but cannot draw here ({line})."
 
 
 _PROBE = Accuracy("probe", 1 / 255, 1e-4, "opacity", "float32")
-
-
-def _one_line(error: Exception) -> str:
-    text = str(error).strip()
-    return f"{type(error).__name__}: {text.splitlines()[0]}" if text else type(error).__name__
 
 
 def _equal(a: float | str, b: float | str) -> bool:

@@ -8,10 +8,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor
 
 from gsgan.scene import RIM, Camera, Gaussians, distort, fold_radius
+from gsgan.splat.project import rotations
 from gsgan.utils.tensors import constant
 
 ITERATIONS = 20  # of Newton's method: a usable lens takes 4, points near its fold more
@@ -54,8 +54,7 @@ def _covariances(gaussians: Gaussians) -> Tensor:
     if gaussians.covariances is not None:
         return gaussians.covariances
     assert gaussians.quats is not None and gaussians.scales is not None  # noqa: PT018
-    quats = torch.nn.functional.normalize(gaussians.quats, dim=-1, eps=1e-6)
-    axes = quaternion_to_rotation_matrix(quats) * gaussians.scales.unsqueeze(-2)
+    axes = rotations(gaussians.quats) * gaussians.scales.unsqueeze(-2)
     return axes @ axes.mT
 
 
@@ -94,16 +93,14 @@ def bend(x_cam: Tensor, dist: Tensor, near: float) -> tuple[Tensor, Tensor, Tens
 def undistort(points: Tensor, dist: Tensor, iterations: int = ITERATIONS) -> tuple[Tensor, Tensor]:
     """The inverse of `distort`, by Newton's method, computed in float64.
 
-    Convention: beyond the fold of a lens there is no such point, or one that only the polynomial
-    shows: then the second result is False and the first one finite.
-
     Args:
-        points: ``[B, M, 2]`` as the lenses show them.
-        dist: ``[B, 5]``.
+        points: ``[B, M, 2]`` as the lenses ``dist [B, 5]`` show them.
+        dist: coefficients.
         iterations: at most.
 
     Returns:
-        Points ``[B, M, 2]`` of the z = 1 plane, and whether each was found ``[B, M]``.
+        Points ``[B, M, 2]`` of the z = 1 plane, finite, and whether each was found ``[B, M]``:
+        beyond the fold of a lens there is none, or one that only the polynomial shows.
     """
     target, lens = points.double(), dist.double()
     x = target

@@ -6,7 +6,6 @@ When it cannot be built, ``available()`` is False and ``why_not()`` has the reas
 from __future__ import annotations
 
 import ctypes
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -94,26 +93,9 @@ def composite(
         projected.depths,
         projected.extents,
         projected.visible,
-        _Options(
-            size,
-            (settings.alpha_min, settings.transmittance_min, settings.alpha_max),
-            settings.extent == "sigma",
-            want_depth,
-            torch.is_grad_enabled(),
-        ),
+        *(size, settings, want_depth, torch.is_grad_enabled()),
     )
     return features, alpha, depth
-
-
-@dataclass(frozen=True)
-class _Options:
-    """The arguments that are not tensors."""
-
-    size: tuple[int, int]
-    cutoffs: tuple[float, float, float]
-    box: bool
-    want_depth: bool
-    grad_enabled: bool
 
 
 def _check(projected: Projected, size: tuple[int, int]) -> None:
@@ -171,24 +153,27 @@ class _Composite(torch.autograd.Function):
         depths: Tensor,
         extents: Tensor,
         visible: Tensor,
-        options: _Options,
+        size: tuple[int, int],
+        settings: Accuracy,
+        want_depth: bool,
+        grad_enabled: bool,
     ) -> tuple[Tensor, Tensor, Tensor | None]:
         tensors = [means, factors, opacities, features, depths, extents]
         inputs = [x.detach().contiguous() for x in tensors]
         shown = visible.contiguous()
-        (B, _, C), (H, W) = features.shape, options.size
+        B, _, C = features.shape
         dtype = features.dtype
-        channels = [C, 1, 1] if options.want_depth else [C, 1]
-        outputs = [zeros((B, c, H, W), dtype) for c in channels]
-        job = _job(options, inputs, shown)
-        job.keep = options.grad_enabled and any(ctx.needs_input_grad)
+        channels = [C, 1, 1] if want_depth else [C, 1]
+        outputs = [zeros((B, c, *size), dtype) for c in channels]
+        job = _job(size, settings, inputs, shown)
+        job.keep = grad_enabled and any(ctx.needs_input_grad)
         point(job, _OUTPUTS, outputs)
         plan = _Plan(dtype)
         run = build.function("forward", dtype)
         _raise_for(run(ctypes.byref(job), ctypes.byref(plan.pointer)), job)
         if job.keep:
             ctx.save_for_backward(*tensors, visible)
-            ctx.plan, ctx.options = plan, options
+            ctx.plan, ctx.size, ctx.settings = plan, size, settings
             ctx.set_materialize_grads(False)
         features_out, alpha, *rest = outputs
         return features_out, alpha, rest[0] if rest else None
@@ -199,7 +184,7 @@ class _Composite(torch.autograd.Function):
         *tensors, visible = ctx.saved_tensors
         inputs = [x.detach().contiguous() for x in tensors]
         shown = visible.contiguous()
-        job = _job(ctx.options, inputs, shown)
+        job = _job(ctx.size, ctx.settings, inputs, shown)
         incoming = [None if g is None else g.contiguous() for g in grads]
         point(job, _GRADS_OUT, incoming)
         with_depth = incoming[2] is not None
@@ -217,10 +202,10 @@ class _Composite(torch.autograd.Function):
         return (*needed, *[None] * (len(ctx.needs_input_grad) - len(needed)))
 
 
-def _job(options: _Options, inputs: list[Tensor], visible: Tensor) -> _Job:
+def _job(size: tuple[int, int], settings: Accuracy, inputs: list[Tensor], visible: Tensor) -> _Job:
     threads = max(1, torch.get_num_threads())
-    sizes = (*inputs[3].shape, *options.size, threads, 0, options.box, SLOT_BYTES)
-    job = _Job(*sizes, *options.cutoffs)
+    sizes = (*inputs[3].shape, *size, threads, 0, settings.extent == "sigma", SLOT_BYTES)
+    job = _Job(*sizes, settings.alpha_min, settings.transmittance_min, settings.alpha_max)
     point(job, (*_INPUTS, "visible"), [*inputs, visible])
     return job
 

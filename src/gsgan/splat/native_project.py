@@ -49,24 +49,14 @@ class _Job(ctypes.Structure):
 def project(
     gaussians: Gaussians, camera: Camera, settings: Accuracy, keep: Tensor | None = None
 ) -> Projected:
-    """Projects Gaussians onto the image, on the CPU; see ``gsgan.splat.project.project``.
+    """``gsgan.splat.project.project`` on the CPU, with the same arguments.
 
-    Convention: differentiable once, in the same inputs. The result is bit-identical for any number
-    of threads.
-
-    Args:
-        gaussians: N Gaussians per batch item.
-        camera: one camera per batch item.
-        settings: cut-offs, see ``Accuracy``.
-        keep: ``[B, N]`` bool; the others become invisible, whatever their values.
-
-    Returns:
-        The ellipses; invisible ones get exactly zero gradients.
+    Convention: differentiable once. The result is bit-identical for any number of threads.
 
     Raises:
         RuntimeError: when the kernel is not available.
 
-    Source: paper Sec. 3.1; Zwicker et al., EWA splatting; gradients derived in kernels/ewa.h.
+    Source: gradients derived in kernels/ewa.h.
     """
     dtype = torch.promote_types(gaussians.means.dtype, settings.torch_dtype)
     K, R, t = (x.to(torch.float64) for x in (camera.K, camera.R, camera.t))

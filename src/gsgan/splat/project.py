@@ -30,27 +30,19 @@ class Projected:
     has it: backends round them relative to a tile, and can order layers of equal float32 depth; the
     rest has the dtype of the arithmetic. Entries of invisible Gaussians are finite and arbitrary.
 
-    Args:
-        means: ``[B, N, 2]`` pixels.
-        factors: ``[B, N, 3]`` (p, k, r), a triangular factor of the inverse 2D covariance:
-            ``q = (p (dx + k dy))² + (r dy)²`` and ``alpha = min(alpha_max, o exp(-q / 2))``.
-            A sum of squares: written out as ``a dx² + 2 b dx dy + c dy²`` the terms of a needle
-            cancel, and rounding a, b, c to float32 moves its edge.
-        opacities: ``[B, N]``, including anti-aliasing.
-        features: ``[B, N, C]``.
-        depths: ``[B, N]`` metres along the viewing axis.
-        extents: ``[B, N, 2]`` pixels, half-width and half-height of the footprint; 0 where not
-            visible; no gradient.
-        visible: ``[B, N]`` bool.
+    ``factors`` (p, k, r) are a triangular factor of the inverse 2D covariance:
+    ``q = (p (dx + k dy))² + (r dy)²`` and ``alpha = min(alpha_max, o exp(-q / 2))``. A sum of
+    squares: written out as ``a dx² + 2 b dx dy + c dy²`` the terms of a needle cancel, and rounding
+    a, b, c to float32 moves its edge.
     """
 
-    means: Tensor
-    factors: Tensor
-    opacities: Tensor
-    features: Tensor
-    depths: Tensor
-    extents: Tensor
-    visible: Tensor
+    means: Tensor  # [B, N, 2] pixels
+    factors: Tensor  # [B, N, 3]
+    opacities: Tensor  # [B, N], including anti-aliasing
+    features: Tensor  # [B, N, C]
+    depths: Tensor  # [B, N] metres along the viewing axis
+    extents: Tensor  # [B, N, 2] pixels, half-sizes of the footprint, 0 if invisible; no gradient
+    visible: Tensor  # [B, N] bool
 
 
 def project(
@@ -116,16 +108,10 @@ def project(
 
 
 def rotations(quats: Tensor) -> Tensor:
-    """Rotation matrices of quaternions of any length.
+    """Rotation matrices ``[..., 3, 3]`` of quaternions ``[..., 4]`` of any length.
 
     Convention: w x y z. Quaternions whose largest component is below 1e-20 (zero ones too) give
     the identity and no gradient.
-
-    Args:
-        quats: ``[..., 4]``.
-
-    Returns:
-        ``[..., 3, 3]``.
     """
     return torch.stack(_rotation_entries(quats, -1), dim=-1).unflatten(-1, (3, 3))
 
@@ -202,16 +188,11 @@ def field_of_view(K: Tensor, size: tuple[int, int], widen: float) -> tuple[Tenso
     """
     H, W = size
     corners = filled(((0, W, 0, W), (0, 0, H, H)), K) - K[:, :2, 2:]
-    ratios = _inverse(K[:, :2, :2]) @ corners
+    # not linalg.inv: the host would wait for its check of the result
+    ratios = torch.linalg.inv_ex(K[:, :2, :2]).inverse @ corners
     low, high = ratios.amin(-1, keepdim=True), ratios.amax(-1, keepdim=True)
     middle, half = (low + high) / 2, (high - low) / 2
     return middle - widen * half, middle + widen * half
-
-
-def _inverse(matrix: Tensor) -> Tensor:
-    """``torch.linalg.inv`` without its check of the result, for which the host would wait."""
-    inverse: Tensor = torch.linalg.inv_ex(matrix).inverse
-    return inverse
 
 
 def _footprint(

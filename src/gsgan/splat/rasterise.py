@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
-from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from gsgan.scene import Camera, Gaussians, Raster
-from gsgan.splat import checks, gsplat_backend, reference, tiles
+from gsgan.splat import checks, gsplat_backend, native, native_project, reference, tiles
 from gsgan.splat.lens import as_pinhole_sees
-from gsgan.splat.project import Projected, project
+from gsgan.splat.project import project
 from gsgan.splat.settings import Accuracy, accuracy
 
 BACKENDS = ("auto", "reference", "torch", "native", "gsplat")
@@ -66,7 +63,7 @@ def rasterise(
         gaussians, camera = as_pinhole_sees(gaussians, camera, settings.near)
     name, reason = resolve_backend(backend, gaussians.means.device, settings)
     if name == "gsplat" and (why_not := gsplat_backend.unsuited(gaussians, camera)):
-        name, reason = _torch_instead_of_gsplat(why_not)
+        name, reason = "torch", f"Drawing with the torch backend: {why_not}"
     if reason:
         _warn_once(reason)
     out = gaussians.means.dtype
@@ -104,30 +101,15 @@ def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tupl
     if name == "auto" and settings.is_dense:
         return "reference", ""
     if name == "gsplat" or (name == "auto" and device.type == gsplat_backend.DEVICE):
-        why_not = gsplat_backend.why_not(settings, device)
-        if why_not:
-            return _torch_instead_of_gsplat(why_not)
+        if why_not := gsplat_backend.why_not(settings, device):
+            return "torch", f"Drawing with the torch backend: {why_not}"
         return "gsplat", gsplat_backend.given_up(settings, device)
     if device.type != "cpu":
         message = f"The native backend runs on CPU only; drawing with torch on {device}."
         return "torch", message if name == "native" else ""
-    why_not = _why_native_is_missing()
-    if why_not:
+    if why_not := native.why_not():
         return "torch", f"Drawing with the torch backend, which is slower: {why_not}"
     return "native", ""
-
-
-def _torch_instead_of_gsplat(why_not: str) -> tuple[str, str]:
-    return "torch", f"Drawing with the torch backend: {why_not}"
-
-
-def _why_native_is_missing() -> str:
-    """The reason, or empty when the native backend can be used."""
-    try:
-        native = importlib.import_module("gsgan.splat.native")
-        return "" if native.available() else native.why_not()
-    except ImportError as error:
-        return f"the native backend cannot be imported ({error})."
 
 
 def _draw(
@@ -141,18 +123,12 @@ def _draw(
     """Features, alpha and depth by one backend."""
     if name == "gsplat":
         return gsplat_backend.draw(gaussians, camera, settings, keep, depth)
-    projector, composite = _backend(name)
-    projected = projector(gaussians, camera, settings, keep)
-    return composite(projected, camera.size, settings, depth)
-
-
-def _backend(name: str) -> tuple[Callable[..., Projected], Callable[..., Any]]:
-    """The projection and the compositing of a backend."""
     if name == "native":
-        native_project = importlib.import_module("gsgan.splat.native_project")
-        native = importlib.import_module("gsgan.splat.native")
-        return native_project.project, native.composite
-    return project, {"reference": reference.composite, "torch": tiles.composite}[name]
+        projected = native_project.project(gaussians, camera, settings, keep)
+        return native.composite(projected, camera.size, settings, depth)
+    projected = project(gaussians, camera, settings, keep)
+    composite = reference.composite if name == "reference" else tiles.composite
+    return composite(projected, camera.size, settings, depth)
 
 
 def _warn_once(message: str) -> None:

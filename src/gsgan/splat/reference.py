@@ -44,21 +44,14 @@ def composite(
 
 
 def error_bound(projected: Projected, size: tuple[int, int], settings: Accuracy) -> Tensor:
-    """Bound, per pixel, of the error that a setting's cut-offs cause.
+    """Bound ``[B, 1, H, W]`` of the error that a setting's cut-offs cause.
 
-    Convention: for features in [0, 1]; without the rounding of the arithmetic.
+    Convention: for features in [0, 1]; without the rounding of the arithmetic. ``projected``
+    without cut-offs.
 
     Removing a layer changes a pixel by at most its own weight, so skipped layers cost at most the
     sum of their weights; capping an alpha costs at most the weight that the cap removes; a stopped
     pixel lacks less than ``transmittance_min``.
-
-    Args:
-        projected: the ellipses, projected without cut-offs.
-        size: (H, W) pixels.
-        settings: the cut-offs.
-
-    Returns:
-        ``[B, 1, H, W]``.
     """
     front_to_back = _sorted(projected)
     chunks = []

@@ -19,25 +19,9 @@ class Accuracy:
     in front of it that were not skipped) is below ``transmittance_min`` is skipped, and so is
     everything behind it.
 
-    Args:
-        name: of the setting in configs and tables.
-        alpha_min: in [0, 1); 0 keeps every contribution.
-        transmittance_min: in [0, 1); 0 never stops a pixel.
-        extent: ``all`` (wherever a float64 ``exp`` is not 0), ``opacity`` (the box of the ellipse
-            ``alpha >= alpha_min``: skips nothing that alpha_min does not) or ``sigma`` (a box of
-            ``radius_sigmas`` standard deviations).
-        dtype: ``float32`` or ``float64``: the lowest precision of the arithmetic; inputs of a
-            higher precision raise it.
-        radius_sigmas: half-width of the ``sigma`` box, in standard deviations, > 0.
-        near: metres, > 0; Gaussians whose mean is nearer are not drawn.
-        alpha_max: in (0, 1]; upper bound of alphas. 1 is for float64: close to it the gradient of
-            hidden layers is lost in float32 rounding.
-        low_pass: square pixels, > 0, added to the diagonal of every 2D covariance.
-        fov_clamp: x/z and y/z are clamped to this many half fields of view (from the middle of
-            the image) where the Jacobian of the projection is formed, >= 1.
-        antialias: multiply opacities by sqrt(det before / det after) of the low-pass.
-        supersample: >= 1: draw this many times larger in each direction, then average. The low-pass
-            is in pixels of the larger image.
+    ``extent`` is ``all`` (wherever a float64 ``exp`` is not 0), ``opacity`` (the box of the ellipse
+    ``alpha >= alpha_min``: skips nothing that alpha_min does not) or ``sigma`` (a box of
+    ``radius_sigmas`` standard deviations). Inputs of a higher precision raise that of ``dtype``.
 
     Raises:
         ValueError: on a value outside its range, naming it.
@@ -46,18 +30,20 @@ class Accuracy:
     cut-off, 1/255 and 0.3 square pixels are the values of 3D Gaussian splatting.
     """
 
-    name: str
-    alpha_min: float
-    transmittance_min: float
+    name: str  # in configs and tables
+    alpha_min: float  # in [0, 1); 0 keeps every contribution
+    transmittance_min: float  # in [0, 1); 0 never stops a pixel
     extent: str
-    dtype: str
+    dtype: str  # float32 or float64, of the arithmetic
     radius_sigmas: float = 3.0
-    near: float = 0.01
+    near: float = 0.01  # metres; Gaussians whose mean is nearer are not drawn
+    # near 1 the gradient of hidden layers is lost in float32 rounding: 1 is for float64
     alpha_max: float = 0.999
-    low_pass: float = 0.3
+    low_pass: float = 0.3  # square pixels, added to the diagonal of every 2D covariance
+    # half fields of view, to which x/z and y/z are clamped in the projection's Jacobian, >= 1
     fov_clamp: float = 1.3
-    antialias: bool = False
-    supersample: int = 1
+    antialias: bool = False  # multiply opacities by sqrt(det before / det after) of the low-pass
+    supersample: int = 1  # draw this many times larger, low-pass included, then average
 
     def __post_init__(self) -> None:
         self._require("alpha_min", 0 <= self.alpha_min < 1, "in [0, 1)")

@@ -58,16 +58,10 @@ class TileLists:
 def tile_lists(
     projected: Projected, size: tuple[int, int], settings: Accuracy, tiling: Tiling
 ) -> TileLists:
-    """Lists the ellipses of each tile.
+    """Lists the ellipses of each tile of an image of ``size`` (H, W) pixels.
 
     The host waits twice for the device: for the number of pairs of ellipse and tile, and for the
     lists' lengths.
-
-    Args:
-        projected: the ellipses.
-        size: (H, W) pixels.
-        settings: alpha_min, and whether the extent is ``sigma``.
-        tiling: the size of a tile.
     """
     (H, W), side = size, tiling.tile
     grid = (-(-H // side), -(-W // side))
@@ -88,9 +82,6 @@ def tile_lists(
     counts, deepest = counts.sort(descending=True, stable=True)
     depths = counts.tolist()
     listed = len(depths) - depths.count(0)
-    box = None
-    if settings.extent == "sigma":
-        box = with_empty_row(projected.extents)
     return TileLists(
         size=size,
         grid=grid,
@@ -99,7 +90,7 @@ def tile_lists(
         starts=starts[deepest[:listed]],
         counts=counts[:listed],
         depths=depths[:listed],
-        box=box,
+        box=with_empty_row(projected.extents) if settings.extent == "sigma" else None,
     )
 
 

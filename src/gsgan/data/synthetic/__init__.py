@@ -1,5 +1,5 @@
 """The default person: a clothed figure, ray-traced from a ring of cameras on first use."""
 
-from gsgan.data.synthetic.make import ensure_synthetic
+from gsgan.data.synthetic.scenes import ensure_synthetic
 
 __all__ = ["ensure_synthetic"]

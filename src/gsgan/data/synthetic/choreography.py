@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -17,56 +17,27 @@ from torch import Tensor
 TAU = 2 * math.pi
 
 
-@dataclass(frozen=True)
 class Controls:
-    """Targets of the body at F moments; pairs are left, right.
+    """Targets of the body at F moments, standing with the arms down; pairs are left, right."""
 
-    Args:
-        pelvis: ``[F, 3]`` metres from the rest position.
-        root: ``[F, 3]`` axis-angle of the whole body.
-        spine: ``[F, 3]`` axis-angle, distributed over the spine.
-        head: ``[F, 3]`` axis-angle, distributed over neck and head.
-        wrist: ``[F, 2, 3]`` metres from the shoulder, chest axes, mirrored.
-        elbow: ``[F, 2, 3]`` direction in which the elbow points, chest axes, mirrored.
-        palm: ``[F, 2]`` forearm twist, radians, positive turns the palm up.
-        flex: ``[F, 2]`` wrist flexion towards the palm, radians.
-        curl: ``[F, 2, 5]`` finger flexion in [0, 1], thumb first.
-        ankle: ``[F, 2, 3]`` metres: mirrored x and y in the world, z above the standing height.
-        pitch: ``[F, 2]`` radians, positive lifts the heel.
-    """
+    def __init__(self, frames: int) -> None:
+        def still(*value: object) -> Tensor:
+            rest = torch.tensor(value, dtype=torch.float64)
+            return rest.expand(frames, *rest.shape).clone()
 
-    pelvis: Tensor
-    root: Tensor
-    spine: Tensor
-    head: Tensor
-    wrist: Tensor
-    elbow: Tensor
-    palm: Tensor
-    flex: Tensor
-    curl: Tensor
-    ankle: Tensor
-    pitch: Tensor
-
-
-def neutral(frames: int) -> Controls:
-    """Standing, arms down."""
-
-    def still(*values: float, shape: tuple[int, ...]) -> Tensor:
-        return torch.tensor(values, dtype=torch.float64).expand(frames, *shape).clone()
-
-    return Controls(
-        pelvis=still(0, 0, -0.015, shape=(3,)),
-        root=still(0, shape=(3,)),
-        spine=still(0, shape=(3,)),
-        head=still(0, shape=(3,)),
-        wrist=still(0.13, -0.04, -0.5, shape=(2, 3)),
-        elbow=still(0.5, 1.0, -0.2, shape=(2, 3)),
-        palm=still(0, shape=(2,)),
-        flex=still(0, shape=(2,)),
-        curl=still(0.25, shape=(2, 5)),
-        ankle=still(0.125, 0, 0, shape=(2, 3)),
-        pitch=still(0, shape=(2,)),
-    )
+        self.pelvis = still(0, 0, -0.015)  # [F, 3] metres from the rest position
+        self.root = still(0, 0, 0)  # [F, 3] axis-angle of the whole body
+        self.spine = still(0, 0, 0)  # [F, 3] axis-angle, distributed over the spine
+        self.head = still(0, 0, 0)  # [F, 3] axis-angle, distributed over neck and head
+        # [F, 2, 3], mirrored, chest axes: metres from the shoulder; where the elbow points
+        self.wrist = still(*[(0.13, -0.04, -0.5)] * 2)
+        self.elbow = still(*[(0.5, 1.0, -0.2)] * 2)
+        self.palm = still(0, 0)  # [F, 2] forearm twist, radians, positive turns the palm up
+        self.flex = still(0, 0)  # [F, 2] wrist flexion towards the palm, radians
+        self.curl = still(*[[0.25] * 5] * 2)  # [F, 2, 5] finger flexion in [0, 1], thumb first
+        # [F, 2, 3] metres: mirrored x and y in the world, z above the standing height
+        self.ankle = still(*[(0.125, 0, 0)] * 2)
+        self.pitch = still(0, 0)  # [F, 2] radians, positive lifts the heel
 
 
 @dataclass(frozen=True)
@@ -78,17 +49,13 @@ class Style:
     lead: int
 
 
-Passage = Callable[[Controls, Tensor, Style], None]
-"""Writes into neutral controls, given times in [0, 1] through the passage."""
+# Passages write into neutral controls, given times in [0, 1] through the passage.
 
 
 def walk(c: Controls, s: Tensor, style: Style) -> None:
     """Walking on the spot, the trunk turning slowly left and right."""
-    _step(c, TAU * 2 * s + style.phase, style.amplitude)
+    phase, amplitude = TAU * 2 * s + style.phase, style.amplitude
     c.root[:, 2] += 0.7 * torch.sin(TAU * s)
-
-
-def _step(c: Controls, phase: Tensor, amplitude: float) -> None:
     for i, shift in enumerate((0.0, math.pi)):
         a = phase + shift
         lift = torch.sin(a).clamp_min(0) ** 2
@@ -137,8 +104,8 @@ def _wave_arm(c: Controls, side: int, phase: Tensor, amplitude: float) -> None:
 
 def squat(c: Controls, s: Tensor, style: Style) -> None:
     """Two squats, arms reaching forwards for balance."""
-    _squat_legs(c, 0.5 - 0.5 * torch.cos(TAU * 2 * s), style.amplitude)
     depth = 0.5 - 0.5 * torch.cos(TAU * 2 * s)
+    _squat_legs(c, depth, style.amplitude)
     for i in range(2):
         c.wrist[:, i, 0] = 0.10 - 0.04 * depth
         c.wrist[:, i, 1] = -0.04 - 0.44 * depth
@@ -250,7 +217,7 @@ def _wander(s: Tensor, cycles: float, phase: float) -> Tensor:
 
 COMBINATION = "squat_and_wave"
 # name, passage, seconds
-PASSAGES: tuple[tuple[str, Passage, float], ...] = (
+PASSAGES: tuple[tuple[str, Callable[[Controls, Tensor, Style], None], float], ...] = (
     ("walk", walk, 4.0),
     ("arm_swings", arm_swings, 2.5),
     ("wave", wave, 2.5),
@@ -281,7 +248,7 @@ def _passage_index(times: Tensor) -> Tensor:
 
 def controls_at(times: Tensor, seed: int) -> Controls:
     """Targets at times ``[F]``, seconds: every passage starts and ends standing."""
-    index, base = _passage_index(times), neutral(len(times))
+    index, base = _passage_index(times), Controls(len(times))
     generator = torch.Generator().manual_seed(seed)
     start = 0.0
     for i, (_, passage, seconds) in enumerate(PASSAGES):
@@ -290,11 +257,10 @@ def controls_at(times: Tensor, seed: int) -> Controls:
         here = (index == i).nonzero().squeeze(1)
         s = (times[here] - start) / seconds
         start += seconds
-        moved = neutral(len(here))
+        moved = Controls(len(here))
         passage(moved, s, style)
         share = smoothstep(s / 0.15) * smoothstep((1 - s) / 0.15)
-        for field in fields(Controls):
-            rest, goal = getattr(base, field.name), getattr(moved, field.name)
+        for rest, goal in zip(vars(base).values(), vars(moved).values(), strict=True):
             w = share.view(-1, *[1] * (goal.ndim - 1))
             rest[here] = rest[here] + w * (goal - rest[here])
     return base
@@ -314,19 +280,9 @@ def held_out(frames: int, test_frames: int, block: int = 3) -> list[int]:
 
     Args:
         frames: number of all frames.
-        test_frames: number of frames to hold out, less than ``frames``.
-        block: frames per block.
-
-    Raises:
-        ValueError: when ``test_frames`` is not in [0, frames), or ``block`` is less than 1.
+        test_frames: number of frames to hold out, in [0, frames).
+        block: frames per block, at least 1.
     """
-    if block < 1:
-        raise ValueError(f"held_out: block must be at least 1, got {block}")
-    if not 0 <= test_frames < frames:
-        raise ValueError(
-            f"held_out: test_frames must be at least 0 and less than frames = {frames}, "
-            f"got {test_frames}"
-        )
     names = passage_names(frames)
     chosen = [i for i, name in enumerate(names) if name == COMBINATION][:test_frames]
     others: dict[str, list[int]] = {}

@@ -39,39 +39,22 @@ STREAM = 54  # chosen for the look of identity 0, the default person
 
 @dataclass(frozen=True)
 class Identity:
-    """Colours and patterns of one person; periods and sizes in metres.
-
-    Args:
-        skin, hair, eye: sRGB.
-        shirt: main, second and badge colour.
-        shirt_pattern: one of ``SHIRT_PATTERNS``.
-        shirt_period: metres.
-        badge: one of ``BADGES``, on the chest.
-        trousers: main and line colour.
-        trouser_pattern: one of ``TROUSER_PATTERNS``.
-        shoe: upper, sole and lace colour.
-    """
+    """Colours and patterns of one person."""
 
     skin: Colour
     hair: Colour
     eye: Colour
-    shirt: tuple[Colour, Colour, Colour]
+    shirt: tuple[Colour, Colour, Colour]  # main, second, badge
     shirt_pattern: str
-    shirt_period: float
-    badge: str
-    trousers: tuple[Colour, Colour]
+    shirt_period: float  # metres
+    badge: str  # on the chest
+    trousers: tuple[Colour, Colour]  # main, lines
     trouser_pattern: str
-    shoe: tuple[Colour, Colour, Colour]
+    shoe: tuple[Colour, Colour, Colour]  # upper, sole, laces
 
 
 def make_identity(seed: int) -> Identity:
-    """The identity of a seed; every non-negative integer gives a different one.
-
-    Raises:
-        ValueError: when the seed is negative.
-    """
-    if seed < 0:
-        raise ValueError(f"make_identity: seed must not be negative, got {seed}")
+    """The identity of a seed; every non-negative integer gives a different one."""
     rng = np.random.default_rng([STREAM, seed])
     tone = int(rng.integers(len(SKINS)))
     hair = HAIRS[int(rng.integers(len(HAIRS)))] if tone < 3 else HAIRS[int(rng.integers(2))]
@@ -97,25 +80,14 @@ def _hsv(hue: float, saturation: float, value: float) -> Colour:
     return colorsys.hsv_to_rgb(hue % 1.0, saturation, value)
 
 
-@dataclass(frozen=True)
 class Marks:
-    """Rest-pose anchor points of the patterns, metres: see :func:`marks_of`."""
+    """Anchor points of the patterns from rest landmarks ``[33, 3]``, metres; left, then right."""
 
-    eyes: Array
-    mouth: Array
-    chest: Array
-    hips: Array
-    wrists: Array
-    elbows: Array
-    shoulders: Array
-
-
-def marks_of(landmarks: Array) -> Marks:
-    """The anchor points of a body from its rest landmarks ``[33, 3]``; pairs are left, right."""
-    p = np.asarray(landmarks, dtype=np.float64)
-    shoulders, hips = p[[11, 12]], p[[23, 24]]
-    chest = 0.74 * shoulders.mean(axis=0) + 0.26 * hips.mean(axis=0)
-    return Marks(p[[2, 5]], p[[9, 10]], chest, hips, p[[15, 16]], p[[13, 14]], shoulders)
+    def __init__(self, p: Array) -> None:
+        self.eyes, self.mouth = p[[2, 5]], p[[9, 10]]
+        self.shoulders, self.elbows, self.wrists = p[[11, 12]], p[[13, 14]], p[[15, 16]]
+        self.hips = p[[23, 24]]
+        self.chest = 0.74 * self.shoulders.mean(axis=0) + 0.26 * self.hips.mean(axis=0)
 
 
 def albedo(identity: Identity, marks: Marks, points: Array, surface: Ints) -> Array:
@@ -124,11 +96,9 @@ def albedo(identity: Identity, marks: Marks, points: Array, surface: Ints) -> Ar
     Surfaces are numbered skin, hair, eye, shirt, trousers, shoe, as in the free body's asset.
     """
     out = np.zeros((len(points), 3))
-    painters = (_skin, _hair, _eye, _shirt, _trousers, _shoe)
-    for number, paint in enumerate(painters):
+    for number, paint in enumerate((_skin, _hair, _eye, _shirt, _trousers, _shoe)):
         here = surface == number
-        if here.any():
-            out[here] = paint(identity, marks, points[here])
+        out[here] = paint(identity, marks, points[here])
     return out
 
 

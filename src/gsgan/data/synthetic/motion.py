@@ -33,20 +33,9 @@ def motion(frames: int, seed: int = 0) -> tuple[Tensor, Tensor, list[str]]:
 
     Returns:
         ``theta [F, 56, 3]`` axis-angle, ``transl [F, 3]`` metres, and the passage of each frame.
-
-    Raises:
-        ValueError: when ``frames`` is less than 1.
     """
-    if frames < 1:
-        raise ValueError(f"motion: frames must be at least 1, got {frames}")
-    theta, transl = solve(controls_at(frame_times(frames), seed), free_body())
-    return theta.float(), transl.float(), passage_names(frames)
-
-
-def solve(c: Controls, body: Body) -> tuple[Tensor, Tensor]:
-    """Joint rotations ``[F, J, 3]`` and translation ``[F, 3]``, float64, of the controls."""
-    body = body.to(torch.float64)
-    solver = _Solver(body, c.pelvis)
+    c = controls_at(frame_times(frames), seed)
+    solver = _Solver(free_body().to(torch.float64), c.pelvis)
     solver.turn("root", c.root)
     for name in SPINE:
         solver.turn(name, c.spine / len(SPINE))
@@ -56,7 +45,7 @@ def solve(c: Controls, body: Body) -> tuple[Tensor, Tensor]:
         _leg(solver, c, i, side)
         _arm(solver, c, i, side)
         _hand(solver, c, i, side)
-    return solver.theta, c.pelvis
+    return solver.theta.float(), c.pelvis.float(), passage_names(frames)
 
 
 class _Solver:
@@ -112,14 +101,10 @@ def two_bone(
     """Directions of two bones from the origin to a target, by the law of cosines.
 
     Args:
-        target: ``[F, 3]`` metres from the first joint; limited to ``reach`` times the full length.
+        target: ``[F, 3]`` metres from the first joint.
         pole: ``[F, 3]`` direction in which the middle joint bends.
-        upper: length of the first bone, metres.
-        lower: length of the second bone, metres.
-        reach: largest share of the full length; below 1, so that the bend has a direction.
-
-    Returns:
-        The two unit vectors ``[F, 3]``.
+        upper, lower: lengths of the bones, metres.
+        reach: bound of the target's distance in full lengths; below 1, so that it bends.
     """
     nearest = abs(upper - lower) + 0.05 * min(upper, lower)
     d = target.norm(dim=-1, keepdim=True).clamp(nearest, reach * (upper + lower))
@@ -183,7 +168,8 @@ def _leg(solver: _Solver, c: Controls, i: int, side: str) -> None:
 
 def _arm(solver: _Solver, c: Controls, i: int, side: str) -> None:
     lift = 0.5 * smoothstep((c.wrist[:, i, 2] + 0.15) / 0.6)
-    raised = _mirror_angle(torch.stack([0 * lift, -lift / 2, 0 * lift], -1), side)
+    sign = 1 if side == "L" else -1  # a mirrored axis-angle has the opposite y and z
+    raised = torch.stack([0 * lift, -lift / 2 * sign, 0 * lift * sign], -1)
     solver.turn(f"clavicle.{side}", raised)
     solver.turn(f"shoulder01.{side}", raised)
     R_chest, _ = solver.world("spine01")
@@ -192,11 +178,6 @@ def _arm(solver: _Solver, c: Controls, i: int, side: str) -> None:
     pole = (R_chest @ _mirror(c.elbow[:, i], side)[..., None]).squeeze(-1)
     names = (f"upperarm01.{side}", f"upperarm02.{side}", f"lowerarm01.{side}", f"wrist.{side}")
     solver.limb(names, target, pole)
-
-
-def _mirror_angle(v: Tensor, side: str) -> Tensor:
-    """An axis-angle of the left side, mirrored for the right one: y and z change sign."""
-    return v * v.new_tensor([1.0, 1.0, 1.0] if side == "L" else [1.0, -1.0, -1.0])
 
 
 def _hand(solver: _Solver, c: Controls, i: int, side: str) -> None:

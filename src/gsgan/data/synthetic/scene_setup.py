@@ -7,21 +7,17 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import asdict, dataclass, fields, replace
-from typing import Any
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from gsgan.body.free import Body, free_body
 from gsgan.data.cameras import DISTORTION_LENGTHS
 from gsgan.data.synthetic.choreography import held_out
-from gsgan.data.synthetic.identity import make_identity, marks_of
-from gsgan.data.synthetic.lens import LensView, undistort
+from gsgan.data.synthetic.identity import Marks, make_identity
 from gsgan.data.synthetic.motion import motion
-from gsgan.data.synthetic.tint import Tint, make_tints
-from gsgan.data.synthetic.trace import Light, Person, PosedPerson, View
+from gsgan.data.synthetic.trace import Light, Person, PosedPerson, View, make_tints, undistort
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import ConfigError
 
@@ -32,18 +28,16 @@ VERSION = 1
 
 RADIUS = 2.8  # metres from the middle of the scene to the cameras
 MARGIN = 0.02  # share of the image kept free at each edge, over all frames and cameras
-MAX_TINT = 0.3
-SCALES = (0.25, 4.0)  # range of test_scale
-# Lower bounds of the whole-number parameters.
-AT_LEAST = {
-    "size": 8,
-    "train_cameras": 1,
-    "test_cameras": 0,
-    "frames": 1,
-    "test_frames": 0,
-    "rays_per_pixel": 1,
-    "seed": 0,
-    "identity": 0,
+WHOLE, NUMBER, LIST = "a whole number", "a number", "a list of numbers"
+# Kind and range of each parameter; those that are not whole numbers may be None.
+RANGES = {
+    "size": (WHOLE, 8, math.inf),
+    **dict.fromkeys(("train_cameras", "frames", "rays_per_pixel"), (WHOLE, 1, math.inf)),
+    **dict.fromkeys(("test_cameras", "test_frames", "seed", "identity"), (WHOLE, 0, math.inf)),
+    "lens": (LIST, -math.inf, math.inf),
+    "tint": (NUMBER, 0, 0.3),
+    "gloss": (NUMBER, 0, 1),
+    "test_scale": (LIST, 0.25, 4),
 }
 # (joint that bends, joint towards which its folds run)
 FOLDS = (
@@ -59,21 +53,9 @@ FOLDS = (
 
 @dataclass(frozen=True)
 class Settings:
-    """The parameters of a synthetic dataset; together with `VERSION` they determine every byte.
+    """The parameters of a synthetic dataset, as in conf/data/synthetic.yaml.
 
-    Args:
-        size: width and height of the images, pixels.
-        train_cameras: on a ring around the person, evenly spaced.
-        test_cameras: in the gaps between them.
-        frames: moments of the choreography.
-        test_frames: of these, held out (see :func:`gsgan.data.synthetic.choreography.held_out`).
-        rays_per_pixel: anti-aliasing; docs/data.md has the cost of few rays.
-        seed: of the motion and the tints.
-        identity: of the clothes and colours.
-        lens: distortion of every camera, OpenCV order k1 k2 p1 p2 k3 …; None or zeros: pinholes.
-        tint: how much the training cameras differ in colour: largest change of a channel's gain.
-        gloss: peak of the highlight on shirt, trousers and shoes, as a share of the sun's strength.
-        test_scale: each test camera gets further copies with its focal length times these.
+    Together with `VERSION` they determine every byte. Effects without effect are stored as None.
 
     Raises:
         ConfigError: naming the parameter that is out of range.
@@ -93,13 +75,24 @@ class Settings:
     test_scale: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        for name, least in AT_LEAST.items():
-            value = getattr(self, name)
-            whole = isinstance(value, int) and not isinstance(value, bool)
+        for name, (kind, low, high) in RANGES.items():
+            raw = getattr(self, name)
+            if raw is None and kind != WHOLE:
+                continue
+            try:
+                values = np.array(raw, dtype=float)
+            except (TypeError, ValueError):
+                values = np.array(math.nan)
+            good = np.isfinite(values) & (values >= low) & (values <= high)
+            typed = not isinstance(raw, bool) and (kind != WHOLE or isinstance(raw, int))
             _require(
-                whole and value >= least,
-                f"{name} must be a whole number of at least {least}, got {value!r}",
+                typed and values.ndim == (kind == LIST) and bool(good.all()),
+                f"{name} must be {kind} in [{low:g}, {high:g}], got {raw!r}",
             )
+            if kind != WHOLE:
+                numbers = values.tolist()
+                stored = tuple(numbers) if kind == LIST else numbers
+                object.__setattr__(self, name, stored if values.any() else None)
         _require(
             self.test_frames < self.frames,
             f"test_frames must be less than frames = {self.frames}, got {self.test_frames}",
@@ -109,79 +102,20 @@ class Settings:
             f"test_cameras stand between training cameras, so there can be at most "
             f"{self.train_cameras}, got {self.test_cameras}",
         )
-        self._check_lens()
-        self._check_share("tint", MAX_TINT)
-        self._check_share("gloss", 1.0)
-        self._check_test_scale()
-
-    def _check_lens(self) -> None:
-        if self.lens is None:
-            return
-        count = " or ".join(map(str, DISTORTION_LENGTHS))
-        lens = _numbers("lens", self.lens, f"{count} lens coefficients (k1 k2 p1 p2 k3 …)")
         _require(
-            len(lens) in DISTORTION_LENGTHS,
-            f"lens must list {count} lens coefficients, got {len(lens)}",
-        )
-        object.__setattr__(self, "lens", lens if any(lens) else None)
-
-    def _check_share(self, name: str, most: float) -> None:
-        if getattr(self, name) is None:
-            return
-        (value,) = _numbers(name, [getattr(self, name)], "a number")
-        _require(0 <= value <= most, f"{name} must be in [0, {most:g}], got {value:g}")
-        object.__setattr__(self, name, value or None)
-
-    def _check_test_scale(self) -> None:
-        if self.test_scale is None:
-            return
-        scales = _numbers("test_scale", self.test_scale, "a list of relative focal lengths")
-        low, high = SCALES
-        for scale in scales:
-            _require(
-                low <= scale <= high and scale != 1,
-                f"test_scale must list numbers in [{low:g}, {high:g}] other than 1, got {scale:g}",
-            )
-        _require(
-            len({f"{scale:g}" for scale in scales}) == len(scales),
-            "test_scale lists a number twice",
+            self.lens is None or len(self.lens) in DISTORTION_LENGTHS,
+            f"lens must list {' or '.join(map(str, DISTORTION_LENGTHS))} coefficients "
+            "(k1 k2 p1 p2 k3 …)",
         )
         _require(
-            not scales or self.test_cameras > 0,
+            self.test_scale is None or self.test_cameras > 0,
             "test_scale adds copies of the test cameras, but there are none; set test_cameras",
         )
-        object.__setattr__(self, "test_scale", scales or None)
-
-    @classmethod
-    def from_parameters(cls, parameters: dict[str, Any]) -> Settings:
-        """Settings from keyword arguments.
-
-        Raises:
-            ConfigError: when a name is unknown.
-        """
-        known = [field.name for field in fields(cls)]
-        unknown = sorted(set(parameters) - set(known))
-        if unknown:
-            raise ConfigError(
-                f"synthetic data: unknown parameter {unknown[0]!r}; known are {', '.join(known)}"
-            )
-        return cls(**parameters)
 
 
 def _require(holds: bool, message: str) -> None:
     if not holds:
         raise ConfigError(f"synthetic data: {message}")
-
-
-def _numbers(name: str, raw: Any, expected: str) -> tuple[float, ...]:
-    listed = not isinstance(raw, str) and hasattr(raw, "__iter__")
-    values = list(raw) if listed else []
-    good = [isinstance(v, (int, float)) and not isinstance(v, bool) for v in values]
-    _require(
-        listed and all(good) and all(math.isfinite(v) for v in values),
-        f"{name} must be {expected}, all finite, got {raw!r}",
-    )
-    return tuple(float(v) for v in values)
 
 
 def dataset_key(settings: Settings) -> str:
@@ -192,34 +126,36 @@ def dataset_key(settings: Settings) -> str:
     return "-".join([f"person{settings.identity}-{settings.size}-{digest}", *effects])
 
 
-@dataclass(frozen=True)
 class Scene:
     """A whole synthetic scene, ready to be traced.
 
-    Args:
-        person: the constant part, in numpy.
-        light: sun and sky.
-        views: camera name to camera, training cameras first.
-        tints: camera name to tint, for the tinted cameras. Held-out cameras stay neutral: nothing
-            in the training data could reveal their tint.
-        theta: ``[F, 56, 3]`` float32.
-        transl: ``[F, 3]`` float32.
-        passages: passage of each frame.
-        train_cameras, test_cameras: names.
-        train_frames, test_frames: frame ids.
+    ``theta [F, 56, 3]`` and ``transl [F, 3]`` are float32; ``views`` and ``tints`` are by camera
+    name, training cameras first. Held-out cameras have no tint: nothing in the training data could
+    reveal it.
+
+    Raises:
+        ConfigError: when a lens cannot be inverted up to the images' corners.
     """
 
-    person: Person
-    light: Light
-    views: dict[str, View]
-    tints: dict[str, Tint]
-    theta: torch.Tensor
-    transl: torch.Tensor
-    passages: list[str]
-    train_cameras: list[str]
-    test_cameras: list[str]
-    train_frames: list[int]
-    test_frames: list[int]
+    def __init__(self, settings: Settings) -> None:
+        body = free_body()
+        self.settings, self.light = settings, Light(gloss=settings.gloss or 0.0)
+        self.person = make_person(body, settings.identity)
+        self.theta, self.transl, self.passages = motion(settings.frames, settings.seed)
+        self.test_frames = held_out(settings.frames, settings.test_frames)
+        self.train_frames = [i for i in range(settings.frames) if i not in self.test_frames]
+        names = [f"cam{i:02d}" for i in range(settings.train_cameras + settings.test_cameras)]
+        self.train_cameras = names[: settings.train_cameras]
+        self.views = dict(zip(names, ring(settings, extent(body, settings.seed)), strict=True))
+        for name in names[settings.train_cameras :]:
+            for scale in settings.test_scale or ():
+                self.views[f"{name}_x{scale:g}"] = zoomed(self.views[name], scale)
+        self.test_cameras = list(self.views)[settings.train_cameras :]
+        if settings.lens is not None:
+            dist = np.array(settings.lens)
+            self.views = {name: through_lens(v, dist) for name, v in self.views.items()}
+        tints = make_tints(settings.tint or 0.0, settings.train_cameras, settings.seed)
+        self.tints = dict(zip(self.train_cameras, tints, strict=True)) if settings.tint else {}
 
     def pose(self, frame: int) -> BodyPose:
         """The body pose of one frame, with a batch size of 1."""
@@ -240,36 +176,6 @@ class Scene:
         return PosedPerson(self.person, self.vertices(frame), self.flexion(frame), self.light)
 
 
-def build_scene(settings: Settings) -> Scene:
-    """Everything of the scene but the images."""
-    body = free_body()
-    theta, transl, passages = motion(settings.frames, settings.seed)
-    test_frames = held_out(settings.frames, settings.test_frames)
-    names = [f"cam{i:02d}" for i in range(settings.train_cameras + settings.test_cameras)]
-    train, test = names[: settings.train_cameras], names[settings.train_cameras :]
-    views = dict(zip(names, ring(settings, extent(body, settings.seed)), strict=True))
-    for name in list(test):
-        for scale in settings.test_scale or ():
-            views[f"{name}_x{scale:g}"] = zoomed(views[name], scale)
-            test.append(f"{name}_x{scale:g}")
-    if settings.lens is not None:
-        views = {n: through_lens(v, np.array(settings.lens)) for n, v in views.items()}
-    tints = make_tints(settings.tint, len(train), settings.seed) if settings.tint else []
-    return Scene(
-        person=make_person(body, settings.identity),
-        light=Light(gloss=settings.gloss or 0.0),
-        views=views,
-        tints=dict(zip(train, tints, strict=False)),
-        theta=theta,
-        transl=transl,
-        passages=passages,
-        train_cameras=train,
-        test_cameras=test,
-        train_frames=[i for i in range(settings.frames) if i not in test_frames],
-        test_frames=test_frames,
-    )
-
-
 def make_person(body: Body, identity: int) -> Person:
     """The free body in numpy, dressed as an identity."""
     joint = {n: body.joints[i].double().numpy() for i, n in enumerate(body.joint_names)}
@@ -282,7 +188,7 @@ def make_person(body: Body, identity: int) -> Person:
         fold_centre=np.array([joint[start] for start, _ in FOLDS]),
         fold_axis=axis / np.linalg.norm(axis, axis=1, keepdims=True),
         identity=make_identity(identity),
-        marks=marks_of(body.landmarks.double().numpy()),
+        marks=Marks(body.landmarks.double().numpy()),
     )
 
 
@@ -342,13 +248,9 @@ def zoomed(view: View, scale: float) -> View:
     return replace(view, K=K)
 
 
-def through_lens(view: View, dist: Array) -> LensView:
-    """The same camera with a lens.
-
-    Raises:
-        ConfigError: when the distortion cannot be inverted up to the image's corners.
-    """
+def through_lens(view: View, dist: Array) -> View:
+    """The same camera with a lens, which is checked up to the image's corners."""
     H, W = view.size
     corners = np.array([[x, y, 1.0] for x in (0, W / 2, W) for y in (0, H / 2, H)])
     undistort((corners @ np.linalg.inv(view.K).T)[:, :2], dist)
-    return LensView(view.K, view.R, view.t, view.size, dist)
+    return replace(view, dist=dist)

@@ -1,5 +1,249 @@
+"""Writes the synthetic dataset, once, into a cache folder.
+
+The layout is that of a capture: cameras.json, images/{cam}/%06d.png, masks/, labels/,
+landmarks3d.npz, hands3d.npz, body_pose.npz, meta.json. Every image is written whole, and meta.json
+last: a dataset whose making was interrupted is not taken for complete, and continued. Tints are
+written nowhere: a model has to estimate them.
+
+Workers are separate programs rather than children of multiprocessing, which would import the
+user's main script again, and fail where it is a notebook or lacks a ``__main__`` guard.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import gsgan
+from gsgan.body.free import free_body
+from gsgan.data.synthetic.choreography import DURATION
+from gsgan.data.synthetic.scene_setup import Scene, Settings, dataset_key
+from gsgan.data.synthetic.trace import View
+from gsgan.scene import BodyPose
+from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.files import cache_root, write_atomically
+
+KINDS = ("images", "masks", "labels")
+POLL_SECONDS = 0.05
+WORKER = "from gsgan.data.synthetic.scenes import trace_share; trace_share()"
+
+
+def ensure_synthetic(
+    *, cache: Path | None = None, workers: int = 2, progress: bool = True, **parameters: Any
+) -> Path:
+    """The synthetic dataset with these parameters: found in the cache, or made there.
+
+    Two processes may request the same dataset at once: the second waits, then finds it.
+
+    Args:
+        cache: cache folder, :func:`gsgan.utils.files.cache_root` by default.
+        workers: processes that trace; 1 traces in this one. Does not change the result.
+        progress: whether to draw a progress bar.
+        parameters: of :class:`gsgan.data.synthetic.scene_setup.Settings`.
+
+    Returns:
+        The dataset's folder.
+
+    Raises:
+        ConfigError: on an unknown parameter or one out of range.
+        DataError: when the folder cannot be written.
+    """
+    known = [field.name for field in fields(Settings)]
+    if unknown := sorted(set(parameters) - set(known)):
+        raise ConfigError(
+            f"synthetic data: unknown parameter {unknown[0]!r}; known are {', '.join(known)}"
+        )
+    settings = Settings(**parameters)
+    root = (cache or cache_root()) / "data" / "synthetic" / dataset_key(settings)
+    if not _is_complete(root):
+        try:
+            root.mkdir(parents=True, exist_ok=True)
+            with _locked(root.with_name(f".{root.name}.lock")):
+                if not _is_complete(root):  # else made while this process waited
+                    _write(root, settings, workers, progress)
+        except OSError as error:
+            raise DataError(
+                f"{root} cannot be written ({error}): make room, or set GSGAN_CACHE to a folder "
+                f"that you may write to"
+            ) from error
+    return root
+
+
+ensure_scene = ensure_synthetic
 """The name under which config files request the synthetic person."""
 
-from gsgan.data.synthetic.make import ensure_synthetic as ensure_scene
 
-__all__ = ["ensure_scene"]
+def _is_complete(root: Path) -> bool:
+    return (root / "meta.json").is_file()
+
+
+@contextlib.contextmanager
+def _locked(lock: Path) -> Iterator[None]:
+    """Holds a lock that the system releases when the process dies."""
+    with lock.open("w") as file:
+        # not on Windows and some network file systems: two processes then write the same files
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _write(root: Path, settings: Settings, workers: int, progress: bool) -> None:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    scene = Scene(settings)
+    with Progress(console=Console(stderr=True), disable=not progress, transient=True) as bar:
+        count = f"{settings.frames} frames, {len(scene.views)} cameras"
+        task = bar.add_task(f"tracing the synthetic person ({count})", total=settings.frames)
+        if workers <= 1 or settings.frames == 1:
+            for frame in range(settings.frames):
+                trace_frames(root, scene, [frame])
+                bar.advance(task)
+        else:
+            last = root / "labels" / list(scene.views)[-1]
+            for _ in _trace_in_processes(root, settings, min(workers, settings.frames)):
+                bar.update(task, completed=len(list(last.glob("*.png"))))
+    _write_skeletons(root, scene)
+    cameras = {name: _calibration(view) for name, view in scene.views.items()}
+    write_atomically(root / "cameras.json", json.dumps(cameras, indent=1) + "\n")
+    write_atomically(root / "meta.json", json.dumps(_meta(scene), indent=1) + "\n")
+
+
+def _trace_in_processes(root: Path, settings: Settings, workers: int) -> Iterator[None]:
+    """Divides the frames among processes; yields from time to time until all are done.
+
+    Raises:
+        DataError: with a failed worker's last line of output.
+    """
+    environment = dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    environment["PYTHONPATH"] = os.pathsep.join(p or os.getcwd() for p in sys.path)
+    command = [sys.executable, "-c", WORKER, str(root), json.dumps(asdict(settings))]
+    with tempfile.TemporaryFile("w+") as errors, contextlib.ExitStack() as stack:
+        running = []
+        for first in range(workers):
+            process = subprocess.Popen(
+                [*command, str(first), str(workers)], stderr=errors, env=environment
+            )
+            stack.callback(process.wait)
+            stack.callback(process.kill)
+            running.append(process)
+        while None in (codes := [process.poll() for process in running]) and not any(codes):
+            yield
+            time.sleep(POLL_SECONDS)
+        if any(codes):
+            errors.seek(0)
+            lines = [line.strip() for line in errors if line.strip()]
+            raise DataError(
+                f"a process tracing the synthetic person failed: "
+                f"{lines[-1] if lines else 'it was killed'}; workers=1 traces in this process"
+            )
+
+
+def trace_share() -> None:
+    """A worker's program: frames ``first, first + step, …``; argv: root, settings, first, step."""
+    import torch
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    root, parameters, first, step = sys.argv[1:]
+    settings = Settings(**json.loads(parameters))
+    trace_frames(Path(root), Scene(settings), range(int(first), settings.frames, int(step)))
+
+
+def trace_frames(root: Path, scene: Scene, frames: Iterable[int]) -> None:
+    """Writes images, masks and labels of the frames for all cameras, where they do not exist."""
+    for frame in frames:
+        person = None
+        for name, view in scene.views.items():
+            paths = [root / kind / name / f"{frame:06d}.png" for kind in KINDS]
+            if all(path.is_file() for path in paths):
+                continue
+            person = person or scene.posed(frame)
+            image, alpha, labels = person.render(view, scene.settings.rays_per_pixel)
+            if name in scene.tints:
+                image = scene.tints[name](image, alpha)
+            pixels = (_bytes(image[..., ::-1]), _bytes(alpha), labels.astype(np.uint8))
+            for path, content in zip(paths, pixels, strict=True):
+                encoded = cv2.imencode(".png", np.ascontiguousarray(content))[1]
+                write_atomically(path, encoded.tobytes())
+
+
+def _bytes(x: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return np.floor(255 * np.clip(x, 0, 1) + 0.5).astype(np.uint8)
+
+
+def _calibration(view: View) -> dict[str, Any]:
+    return {
+        "K": view.K.tolist(),
+        "R": view.R.tolist(),
+        "t": view.t.tolist(),
+        "dist": [0.0] * 5 if view.dist is None else view.dist.tolist(),
+        "size": [view.size[1], view.size[0]],
+    }
+
+
+def _write_skeletons(root: Path, scene: Scene) -> None:
+    body = free_body()
+    pose, ids = BodyPose(scene.theta, scene.transl), np.arange(len(scene.theta))
+    p = body.posed_landmarks(pose).float().numpy()
+    cameras = scene.settings.train_cameras + scene.settings.test_cameras
+    np.savez(
+        root / "landmarks3d.npz",
+        p=p,
+        conf=np.ones(p.shape[:2], dtype=np.float32),
+        reproj_px=np.zeros(p.shape[:2], dtype=np.float32),
+        n_views=np.full(p.shape[:2], cameras),
+        frame_id=ids,
+        names=np.array(body.landmark_names),
+    )
+    np.savez(
+        root / "hands3d.npz",
+        p=body.posed_hands(pose).float().numpy(),
+        frame_id=ids,
+        names=np.array(body.hand_names),
+    )
+    np.savez(
+        root / "body_pose.npz",
+        theta=scene.theta.numpy(),
+        transl=scene.transl.numpy(),
+        frame_id=ids,
+        joint_names=np.array(body.joint_names),
+        passage=np.array(scene.passages),
+    )
+
+
+def _meta(scene: Scene) -> dict[str, Any]:
+    chosen = {name: value for name, value in asdict(scene.settings).items() if value is not None}
+    splits = ("train_cameras", "test_cameras", "train_frames", "test_frames")
+    return {
+        "fps": scene.settings.frames / DURATION,
+        "unit": "m",
+        "up_axis": "z",
+        "skeleton": "mediapipe33",
+        "pixel_centre": 0.5,
+        "background": "black",  # images are premultiplied: blending them again darkens edges
+        "body": "free",
+        "label_names": list(free_body().label_names),
+        "splits": {name: getattr(scene, name) for name in splits},
+        "made_by": {
+            "generator": "gsgan.data.synthetic",
+            "version": gsgan.__version__,
+            "key": dataset_key(scene.settings),
+            **chosen,
+        },
+    }

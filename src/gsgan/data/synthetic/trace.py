@@ -2,8 +2,8 @@
 
 An independent renderer: splatting takes no part in making the training data.
 
-Convention: metres, world frame; OpenCV cameras, pixel centres at +0.5; images are RGB, sRGB in
-[0, 1], premultiplied on black.
+Convention: metres, world frame; OpenCV cameras and lenses, pixel centres at +0.5; images are RGB,
+sRGB in [0, 1], premultiplied on black.
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gsgan.data.crop import distort
 from gsgan.data.synthetic.identity import Identity, Marks, albedo
+from gsgan.utils.errors import ConfigError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -21,69 +23,51 @@ Ints = NDArray[np.int64]
 GAMMA = 2.2
 SHIRT, TROUSERS, SHOE = 3, 4, 5  # materials of the free body's asset
 SHININESS = 12.0  # exponent of the highlight's lobe: falls to half within about 19 degrees
+EXACT = 1e-10  # residual of x/z up to which an undistorted point counts as found
+FURTHEST = 10.0  # bound of x/z in the search
+TINT_STREAM = 77
+CROSSTALK = 0.25  # leak from channel to channel, as a share of the tint
+OFFSET = 0.25  # largest offset of a channel, as a share of the tint
 
 
 @dataclass(frozen=True)
 class Light:
-    """A sun and a sky, and how clothes reflect them.
+    """A sun and a sky, and how clothes reflect them."""
 
-    Args:
-        direction: towards the sun, any length.
-        sun: strength of the sun.
-        sky: ambient strength from above.
-        ground: ambient strength from below.
-        shadow_offset: metres along the normal at which shadow rays start; less gives speckles.
-        fold: share of the light that a fold at full flexion removes or adds.
-        fold_period: metres from one fold to the next.
-        fold_reach: metres over which a joint's folds fade.
-        gloss: peak of the sun's highlight (Blinn-Phong) on shirt, trousers and shoes, as a share
-            of ``sun``; 0: matt.
-    """
-
-    direction: tuple[float, float, float] = (0.5, -0.75, 0.9)
-    sun: float = 0.85
-    sky: float = 0.62
-    ground: float = 0.36
-    shadow_offset: float = 2e-3
-    fold: float = 0.38
-    fold_period: float = 0.045
-    fold_reach: float = 0.12
-    gloss: float = 0.0
+    direction: tuple[float, float, float] = (0.5, -0.75, 0.9)  # towards the sun, any length
+    sun: float = 0.85  # strength
+    sky: float = 0.62  # ambient strength from above
+    ground: float = 0.36  # ambient strength from below
+    shadow_offset: float = 2e-3  # metres along the normal to shadow rays; less gives speckles
+    fold: float = 0.38  # share of the light that a fold at full flexion removes or adds
+    fold_period: float = 0.045  # metres from one fold to the next
+    fold_reach: float = 0.12  # metres over which a joint's folds fade
+    gloss: float = 0.0  # highlight (Blinn-Phong) of shirt, trousers and shoes, as a share of sun
 
 
 @dataclass(frozen=True)
 class Person:
-    """The part of the person that is constant over frames, in numpy.
+    """The part of the person that is constant over frames."""
 
-    Args:
-        vertices: ``[V, 3]`` rest positions.
-        faces: ``[F, 3]``.
-        labels: ``[F]`` part of each face.
-        surface: ``[F]`` material of each face.
-        fold_centre: ``[K, 3]`` rest positions of the joints that crease clothes.
-        fold_axis: ``[K, 3]`` unit directions across their folds.
-        identity: colours and patterns.
-        marks: anchor points of the patterns.
-    """
-
-    vertices: Array
-    faces: Ints
-    labels: Ints
-    surface: Ints
-    fold_centre: Array
-    fold_axis: Array
+    vertices: Array  # [V, 3] rest positions
+    faces: Ints  # [F, 3]
+    labels: Ints  # [F] part of each face
+    surface: Ints  # [F] material of each face
+    fold_centre: Array  # [K, 3] rest positions of the joints that crease clothes
+    fold_axis: Array  # [K, 3] unit directions across their folds
     identity: Identity
     marks: Marks
 
 
 @dataclass(frozen=True)
 class View:
-    """One pinhole camera: ``K [3,3]``, ``R [3,3]``, ``t [3]``, ``size`` (H, W)."""
+    """A camera: ``K [3, 3]``, ``R [3, 3]``, ``t [3]``, ``size`` (H, W), lens ``dist`` or None."""
 
     K: Array
     R: Array
     t: Array
     size: tuple[int, int]
+    dist: Array | None = None  # [4, 5 or 8] OpenCV's coefficients
 
     @property
     def centre(self) -> Array:
@@ -91,12 +75,82 @@ class View:
 
     def project(self, points: Array) -> Array:
         """``[N, 2]`` pixels of world points ``[N, 3]``, all in front of the camera."""
-        x = (points @ self.R.T + self.t) @ self.K.T
+        x = points @ self.R.T + self.t
+        if self.dist is not None:
+            shown = distort(x[:, :2] / x[:, 2:], self.dist)
+            return shown @ self.K[:2, :2].T + self.K[:2, 2]
+        x = x @ self.K.T
         return x[:, :2] / x[:, 2:]
 
     def bend(self, directions: Array) -> Array:
-        """The world rays ``[N, 3]`` seen where a pinhole sees ``directions``: the same rays."""
-        return directions
+        """The unit world rays ``[N, 3]`` seen where a pinhole sees the unit ``directions``.
+
+        Raises:
+            ConfigError: when the distortion cannot be inverted there.
+        """
+        if self.dist is None:
+            return directions
+        rays = directions @ self.R.T
+        straight = undistort(rays[:, :2] / rays[:, 2:], self.dist)
+        return _unit(np.concatenate([straight, np.ones((len(rays), 1))], axis=1) @ self.R)
+
+
+def undistort(points: Array, dist: Array, iterations: int = 200) -> Array:
+    """The inverse of `gsgan.data.crop.distort` on ``[N, 2]``, exact to `EXACT`, by fixed point.
+
+    Raises:
+        ConfigError: when a point has no inverse: the distortion folds back.
+    """
+    found = points
+    for _ in range(iterations):
+        error = points - distort(found, dist)
+        if not np.abs(error).max(initial=0) >= EXACT:
+            break
+        found = np.clip(found + error, -FURTHEST, FURTHEST)
+    lost = ~(np.abs(points - distort(found, dist)) < EXACT).all(axis=1)
+    if lost.any():
+        x, y = points[lost][0]
+        raise ConfigError(
+            f"synthetic data: lens {dist.tolist()} folds back near x/z = {x:.2f}, y/z = {y:.2f}, "
+            "within the image; give weaker coefficients"
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class Tint:
+    """One camera's colours, ``A c + b`` on sRGB in [0, 1]: ``A [3, 3]``, ``b [3]``."""
+
+    A: Array
+    b: Array
+
+    def __call__(self, image: Array, alpha: Array) -> Array:
+        """Tints a premultiplied image ``[H, W, 3]`` with alpha ``[H, W]``."""
+        share = alpha[..., None]
+        return np.clip(image @ self.A.T + share * self.b, 0, share)
+
+
+def make_tints(strength: float, cameras: int, seed: int) -> list[Tint]:
+    """Random tints of the training cameras, ``strength`` the largest change of a channel's gain.
+
+    Their mean is the identity, so a single camera has none.
+    """
+    rng = np.random.default_rng([TINT_STREAM, seed])
+    gain, leak, offset = (rng.uniform(-1, 1, (cameras, n)) for n in (3, 9, 3))
+    leak = leak.reshape(-1, 3, 3) * (1 - np.eye(3))
+    # a leak is subtracted from the channel itself, so that grey stays grey but for the gains
+    leak -= leak.sum(axis=2, keepdims=True) * np.eye(3)
+    change = _centred(gain)[:, :, None] * np.eye(3) + CROSSTALK * _centred(leak)
+    shift = OFFSET * _centred(offset)
+    return [
+        Tint(np.eye(3) + strength * a, strength * b) for a, b in zip(change, shift, strict=True)
+    ]
+
+
+def _centred(x: Array) -> Array:
+    """Shifted to mean 0 over the cameras, then scaled to within [-1, 1]."""
+    x = x - x.mean(axis=0)
+    return x / max(1.0, float(np.abs(x).max(initial=0)))
 
 
 class Tracer:
@@ -122,14 +176,7 @@ class Tracer:
 
 
 class PosedPerson:
-    """The person in one pose, ready to be rendered.
-
-    Args:
-        person: the constant part.
-        vertices: ``[V, 3]`` posed positions.
-        flexion: ``[K]`` radians by which each fold joint is bent.
-        light: see :class:`Light`.
-    """
+    """The person with ``vertices [V, 3]`` posed and fold joints bent by ``flexion [K]`` radians."""
 
     def __init__(self, person: Person, vertices: Array, flexion: Array, light: Light) -> None:
         self.person, self.vertices, self.flexion, self.light = person, vertices, flexion, light
@@ -185,7 +232,9 @@ class PosedPerson:
         normal *= np.where((normal * directions).sum(axis=1) > 0, -1.0, 1.0)[:, None]
         sun = np.asarray(light.direction) / np.linalg.norm(light.direction)
         facing = np.maximum(normal @ sun, 0)
-        lit = self._lit(here + light.shadow_offset * normal, sun, facing > 0)
+        lit = facing > 0
+        start = here[lit] + light.shadow_offset * normal[lit]
+        lit[lit] = self.tracer.first(start, np.broadcast_to(sun, start.shape))[0] < 0
         up = 0.5 + 0.5 * normal[:, 2]
         irradiance = light.sun * (facing * lit) + light.ground + (light.sky - light.ground) * up
         irradiance *= self._folds(rest, surface)
@@ -198,15 +247,6 @@ class PosedPerson:
             linear = colour[shiny] ** GAMMA + (light.gloss * light.sun * lit[shiny] * lobe)[:, None]
             colour[shiny] = np.clip(linear, 0, 1) ** (1 / GAMMA)
         return colour
-
-    def _lit(self, points: Array, sun: Array, ask: NDArray[np.bool_]) -> Array:
-        """1 where the sun is visible, 0 in shadow and where ``ask`` is False."""
-        lit = np.zeros(len(points))
-        if ask.any():
-            count = int(ask.sum())
-            face, _ = self.tracer.first(points[ask], np.broadcast_to(sun, (count, 3)))
-            lit[ask] = face < 0
-        return lit
 
     def _folds(self, rest: Array, surface: Ints) -> Array:
         """Factor on the light: creases of the clothes that deepen as a joint bends."""
@@ -228,14 +268,9 @@ class PosedPerson:
 def vertex_normals(triangles: Array, faces: Ints, vertices: int) -> Array:
     """``[V, 3]`` unit normals, faces weighted by their area."""
     face = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    out = np.stack(
-        [
-            np.bincount(faces.ravel(), np.repeat(face[:, axis], 3), minlength=vertices)
-            for axis in range(3)
-        ],
-        axis=1,
-    )
-    return _unit(out.astype(np.float64), 1e-20)
+    out = np.zeros((vertices, 3))
+    np.add.at(out, faces.ravel(), np.repeat(face, 3, axis=0))
+    return _unit(out, 1e-20)
 
 
 def _unit(x: Array, least: float = 1e-12) -> Array:
