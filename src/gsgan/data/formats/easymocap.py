@@ -27,7 +27,6 @@ from gsgan.data.formats.common import (
     IMAGES,
     FolderReader,
     body_model,
-    no_joints,
     picture_size,
     up_axis,
 )
@@ -57,18 +56,7 @@ HANDS_TO_33 = {landmark: BODY_25 + joint - BODY for landmark, joint in FROM_HAND
 
 @dataclass(frozen=True, kw_only=True)
 class EasymocapReader(FolderReader):
-    """Reads a folder of EasyMocap.
-
-    Args:
-        skeleton: "smpl" (fits), "keypoints3d", or "auto" for the first that exists and can be
-            used: fits need ``data.smpl``.
-        person: EasyMocap's id of the person whose skeleton, and whose masks where their names
-            hold an id, are read.
-        masks: folder of the masks, relative to the root.
-        mask_rule: how masks are decoded, one of `gsgan.data.pixels.MASK_RULES`.
-        threshold: for the rule of that name, and for "nonzero" where masks are JPEGs.
-        fps: frames per second, or None.
-    """
+    """Reads a folder of EasyMocap; conf/data/easymocap.yaml explains the settings."""
 
     skeleton: str = "auto"
     person: int = 0
@@ -105,12 +93,10 @@ class EasymocapReader(FolderReader):
         people = read_people(root, place, frames, self.person, notes)
         motion = body = None
         if kind == "smpl":
-            given = body_model(smpl, "smpl")
-            if given is None:
-                raise no_joints(root, f"SMPL parameters ({place}/)", "SMPL (SMPL_NEUTRAL.pkl)")
-            motion = zju_motion(people, given[1], notes)
-            body = BodyModel("smpl", str(given[0]), tuple(motion.betas[0].tolist()))
-            ids, (p, conf) = motion.ids, landmarks_of(given[1], motion)
+            file, model = body_model(root / place, smpl, "smpl")
+            motion = zju_motion(people, model, notes)
+            body = BodyModel("smpl", str(file), tuple(motion.betas[0].tolist()))
+            ids, (p, conf) = motion.ids, landmarks_of(model, motion)
         else:
             ids, p, conf = read_keypoints(people)
         return Found(
