@@ -16,7 +16,6 @@ from gsgan.utils.errors import DataError
 Float = NDArray[np.float64]
 
 DISTORTION_LENGTHS = (4, 5, 8)
-EXPECTED = "K, R, t, dist and size"
 
 
 @dataclass(frozen=True)

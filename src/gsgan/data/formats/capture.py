@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from gsgan.data.calibration.cameras_json import (
+from gsgan.data.calibration.find import (
     METRES,
     Conventions,
     choose,
