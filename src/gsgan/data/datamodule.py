@@ -20,11 +20,10 @@ from torch.utils.data import DataLoader, Dataset, Subset
 
 from gsgan.data.checks import Checks
 from gsgan.data.crop import PersonCrop
-from gsgan.data.dataset import CaptureDataset, Lens, PictureCache
+from gsgan.data.dataset import CaptureDataset, Lens, PictureCache, StepSampler, pass_order
 from gsgan.data.formats.capture import CaptureReader
 from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
-from gsgan.data.sampler import StepSampler, pass_order
 from gsgan.data.scene_info import SceneInfo, count_labels, scene_info
 from gsgan.data.skeletons import complete_skeletons
 from gsgan.data.splits import SPLITS, Splits, make_splits, protocol_splits
@@ -56,24 +55,17 @@ def _quiet_worker(_: int) -> None:
 class GsganData(LightningDataModule):
     """A dataset in any format that has a reader, from a folder or made by ``source``.
 
+    conf/data/*.yaml explain the settings.
+
     Args:
         root: the folder; or None when ``source`` makes it.
-        reader: of the dataset's format (`gsgan.data.formats`); None is the bring-your-own layout.
-        smpl: the user's SMPL or SMPL-X model file, for datasets whose poses need one.
-        protocol: the splits of a publication; None takes those of the dataset or the keys below.
         source: called without arguments, makes the dataset if needed and returns its folder.
-        size: side of the square images in pixels; None keeps their size.
-        crop: "person" or a `PersonCrop` cuts round the person; None keeps the full image.
-        batch_size: items per batch.
+        reader: of the dataset's format (`gsgan.data.formats`); None is the bring-your-own layout.
+        protocol: the splits of a publication; None takes those of the dataset or the keys below.
         train_cameras, test_cameras, train_frames, test_frames, test_share: see `make_splits`.
-        val_pictures: held-out images rendered during training.
-        steps_per_epoch: batches per epoch; None is one pass over the training items.
         workers: loading processes; 0 loads in this one; None is 0 without a GPU, else up to
             `MOST_WORKERS`, one per processor that each GPU has.
-        seed: of the order of training items.
         cache_mb: bound on decoded images kept in memory, over all loading processes.
-        info_samples: images per camera for the mean foreground colour.
-        min_joints: a frame with fewer usable joints is dropped.
         distortion: ``auto`` and ``undistort`` undistort images on reading; ``off`` treats them as
             a pinhole's; ``project`` keeps the distortion, with the lens in ``camera.dist``.
         wanted: description of the root, for the message when it is not set.
@@ -119,7 +111,9 @@ class GsganData(LightningDataModule):
         self.smpl = smpl
         self.protocol = protocol
         self.size = size
-        self.crop = _crop(crop)
+        if not (crop in (None, "person") or isinstance(crop, PersonCrop)):
+            raise ConfigError(f"data.crop must be null or person, got {crop!r}")
+        self.crop = PersonCrop() if isinstance(crop, str) else crop
         self.batch_size = whole("data.batch_size", batch_size, 1)
         self.split_keys = {
             "train_cameras": train_cameras,
@@ -137,7 +131,7 @@ class GsganData(LightningDataModule):
         self.cache_mb = at_least("data.cache_mb", cache_mb, 0)
         self.info_samples = whole("data.info_samples", info_samples, 1)
         self.checks = replace(Checks(), min_joints=whole("data.min_joints", min_joints, 1))
-        self.lens = _lens(distortion)
+        self.lens = LENSES[one_of("effects.distortion", distortion, LENSES)]
         self._datasets: dict[str, CaptureDataset] | None = None
         self._layout: Layout | None = None
         self._splits: Splits | None = None
@@ -157,7 +151,13 @@ class GsganData(LightningDataModule):
             return
         self._layout = layout = self.reader(self._folder(), self.checks, self.smpl)
         self._splits = splits = self._split(layout)
-        _refuse_leak(layout, splits)
+        held_out = set(splits.test_cameras) - set(splits.train_cameras)
+        if leaks := [camera for camera in layout.landmarks.fitted_to if camera in held_out]:
+            raise ConfigError(
+                f"{layout.landmarks.source} was fitted to the masks of {leaks[0]}, which is held "
+                "out here; run gsgan.fit with the same data.train_cameras, data.test_cameras or "
+                "protocol"
+            )
         for note in (*layout.notes, *splits.notes):
             log.warning("%s: %s", layout.root, note)
         # every process has its own, and training and validation start their own workers
@@ -328,26 +328,3 @@ def default_workers() -> int:
     mine = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
     processors = mine or os.cpu_count() or 1
     return max(0, min(MOST_WORKERS, processors // gpus - 1))
-
-
-def _refuse_leak(layout: Layout, splits: Splits) -> None:
-    held_out = [c for c in splits.test_cameras if c not in splits.train_cameras]
-    seen = [camera for camera in held_out if camera in layout.landmarks.fitted_to]
-    if seen:
-        raise ConfigError(
-            f"{layout.landmarks.source} was fitted to the masks of {seen[0]}, which is held out "
-            "here; run gsgan.fit with the same data.train_cameras, data.test_cameras or protocol"
-        )
-
-
-def _crop(crop: PersonCrop | str | None) -> PersonCrop | None:
-    if crop == "person":
-        return PersonCrop()
-    if crop is None or isinstance(crop, PersonCrop):
-        return crop
-    raise ConfigError(f"data.crop must be null or person, got {crop!r}")
-
-
-def _lens(distortion: str) -> Lens:
-    """The treatment of lens distortion on reading."""
-    return LENSES[one_of("effects.distortion", distortion, LENSES)]

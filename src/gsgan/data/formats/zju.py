@@ -233,7 +233,8 @@ def read_annots(root: Path) -> Annots:
     if len({len(entries) for entries in lists}) != 1 or not lists[0]:
         found = ", ".join(f"{len(n)} {key}" for key, n in zip("KRTD", lists, strict=True))
         raise DataError(f"{path}: cams must hold one K, R, T and D per camera, found {found}")
-    return Annots(path, *lists, _folders(path, content.get("ims"), len(lists[0])))
+    K, R, T, D = lists
+    return Annots(path, K, R, T, D, _folders(path, content.get("ims"), len(K)))
 
 
 def _entries(value: Any) -> list[Any]:
