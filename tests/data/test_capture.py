@@ -17,7 +17,7 @@ from make import edit_json, ring_camera, skeletons, write_landmarks, write_tiny_
 from PIL import Image
 
 from gsgan.data.checks import Checks, spans
-from gsgan.data.crop import PersonCrop, Window, cut, square_window, undistort_map
+from gsgan.data.crop import Crop, PersonCrop, cut, square_window, undistort_map
 from gsgan.data.dataset import CaptureDataset, Picture, PictureCache
 from gsgan.data.files import cut_off, last_number, read_header
 from gsgan.data.formats.capture import LOOKED_AT, read_capture
@@ -141,7 +141,7 @@ def test_distortion_matters_in_that_test(tmp_path: Path) -> None:
 
 def test_lens_folding_back_shows_nothing(tmp_path: Path) -> None:
     K, dist = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), np.array([-0.3, *[0.0] * 7])
-    mapping = undistort_map(K, dist, Window(0, -150, (100, 400)))
+    mapping = undistort_map(K, dist, Crop(0, -150, (100, 400)))
     # r (1 - 0.3 r²) rises up to r = 1.054: column 250 is at r = 2
     assert (mapping[50, -1] < -1000).all()
     assert np.allclose(mapping[50, 200], 49.5 + np.array([0.5, 0.5]), atol=0.01)
@@ -176,9 +176,9 @@ def test_crop_is_square_and_has_the_margin_in_metres(tmp_path: Path) -> None:
     joints[0, 2] = 1.5
     window = PersonCrop(0.3).window(view, joints, usable)
     # focal 480 at 3 m is 160 px a metre: from 0.3 m below the low joint to 0.3 above the high one
-    assert window == Window(200 - 144, 200 - 96, (192, 192))
+    assert window == Crop(200 - 144, 200 - 96, (192, 192))
     usable[0] = False
-    assert PersonCrop(0.3).window(view, joints, usable) == Window(152, 152, (96, 96))
+    assert PersonCrop(0.3).window(view, joints, usable) == Crop(152, 152, (96, 96))
 
 
 def test_crop_beyond_the_border_is_black_and_follows_only_what_is_in_view(tmp_path: Path) -> None:
@@ -192,14 +192,14 @@ def test_crop_beyond_the_border_is_black_and_follows_only_what_is_in_view(tmp_pa
     piece = cut(np.full((400, 400, 3), 9, np.uint8), window)
     assert (piece[:, : -window.left] == 0).all()
     assert (piece[:, -window.left :] == 9).all()
-    assert (cut(np.ones((4, 4), np.uint8), Window(50, 50, (3, 2))) == np.zeros((3, 2))).all()
+    assert (cut(np.ones((4, 4), np.uint8), Crop(50, 50, (3, 2))) == np.zeros((3, 2))).all()
 
 
 def test_crop_without_joints_in_front_is_the_whole_picture(tmp_path: Path) -> None:
     layout = read_capture(write_tiny_capture(tmp_path))
     behind = np.tile([0.0, -50.0, 0.9], (33, 1))
     window = PersonCrop().window(layout.cameras["cam00"], behind, np.ones(33, bool))
-    assert window == square_window((24, 32)) == Window(-4, 0, (32, 32))
+    assert window == square_window((24, 32)) == Crop(-4, 0, (32, 32))
 
 
 def test_full_frames_of_uneven_cameras_share_one_size(tmp_path: Path) -> None:

@@ -50,9 +50,6 @@ class Crop:
     size: tuple[int, int]
 
 
-Window = Crop  # former name
-
-
 def project(view: View, points: Float) -> tuple[Float, Float]:
     """Pixels ``[..., 2]`` (centres at +0.5) and depths ``[...]`` of world points ``[..., 3]``.
 

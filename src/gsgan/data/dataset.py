@@ -18,7 +18,7 @@ from torch.utils.data.distributed import DistributedSampler
 from gsgan.data import crop as cropping
 from gsgan.data import pixels
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import PersonCrop, Window
+from gsgan.data.crop import Crop, PersonCrop
 from gsgan.data.files import read_colour
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL
@@ -151,10 +151,10 @@ class CaptureDataset(Dataset[Frame]):
         taken = cropping.resize(taken, self._target(window), exact=True)
         return None if taken.all() else _unit(taken)[None, None]
 
-    def _target(self, window: Window) -> tuple[int, int]:
+    def _target(self, window: Crop) -> tuple[int, int]:
         return window.size if self.size is None else (self.size, self.size)
 
-    def window(self, item: Item) -> Window:
+    def window(self, item: Item) -> Crop:
         """Which part of the (undistorted) image an item shows."""
         camera = self.layout.cameras[item[0]]
         if self.crop is not None:
@@ -165,7 +165,7 @@ class CaptureDataset(Dataset[Frame]):
             )
         if self.size is not None:
             return cropping.square_window(camera.size)
-        return Window(0, 0, camera.size)
+        return Crop(0, 0, camera.size)
 
     def camera(self, item: Item) -> Camera:
         """The camera of the item's image: window and scale are in its K."""
@@ -182,7 +182,7 @@ class CaptureDataset(Dataset[Frame]):
         """Whether the camera's images keep their distortion, with ``camera.dist`` set."""
         return self.lens == "raw" and camera.distorted and not camera.dist[5:].any()
 
-    def _mapping(self, camera: CameraEntry, window: Window) -> NDArray[np.float32] | None:
+    def _mapping(self, camera: CameraEntry, window: Crop) -> NDArray[np.float32] | None:
         """Where the window's pixels lie in the stored image; None for a pinhole."""
         if not camera.distorted or self.lens == "ignore" or self._raw(camera):
             return None

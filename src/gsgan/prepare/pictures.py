@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import Window, resize, take, undistort_map
+from gsgan.data.crop import Crop, resize, take, undistort_map
 from gsgan.data.files import frame_files, last_number, read_grey
 from gsgan.prepare.sources import PICTURE_SUFFIXES, Source
 from gsgan.prepare.work import writing
@@ -183,7 +183,7 @@ def write_pictures(
     for folder in (image_folder, mask_folder):
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-    window = Window(0, 0, camera.size)
+    window = Crop(0, 0, camera.size)
     mapping = undistort_map(camera.K, camera.dist, window) if camera.distorted else None
     size, written, empty, decoded, done = files.size(camera.size), list[int](), 0, 0, 0
     last = max(frames, default=-1)

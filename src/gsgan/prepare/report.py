@@ -15,7 +15,7 @@ from rich.console import Console
 from gsgan.check.overlays import LEFT, MIDDLE, RIGHT, caption, draw, encode
 from gsgan.check.report import Figure, Finding, Report, Section, Table, page, print_report
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, PersonCrop, Window, cut, project, resize
+from gsgan.data.crop import NEAR, Crop, PersonCrop, cut, project, resize
 from gsgan.data.files import read_colour, read_grey
 from gsgan.data.joints import BODY
 from gsgan.prepare.inputs import Inputs
@@ -218,6 +218,6 @@ def _tile(image: Path, mask: Path, camera: CameraEntry, p: Float, uv: Float, siz
     return picture
 
 
-def _placed(pixels: Float, window: Window, size: int) -> Float:
+def _placed(pixels: Float, window: Crop, size: int) -> Float:
     scaled = (pixels - [window.left, window.top]) * (size / window.size[0])
     return np.clip(scaled, -FAR, FAR)
