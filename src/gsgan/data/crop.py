@@ -17,7 +17,6 @@ from gsgan.utils.errors import ConfigError
 
 Float = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
-Pixels = NDArray[np.float32]
 
 NEAR = 1e-2  # metres: points nearer than this are not seen
 
@@ -104,7 +103,7 @@ class PersonCrop:
         height, width = view.size
         pixels, depth = project(view, joints)
         if dist is not None:
-            pixels = _through_lens(view.K, dist, pixels)
+            pixels = _through_lens(view.K, dist, *pixels.T)
         taken = usable & (depth > NEAR)
         if not taken.any():
             return square_window(view.size)
@@ -151,31 +150,20 @@ def undistort_map(K: Float, dist: Float, crop: Crop) -> NDArray[np.float32]:
         crop: of the undistorted image.
     """
     if K[0, 1] == 0:  # OpenCV's own is ten times as fast, but ignores skew
-        u, v = _opencv_map(K, dist, crop)
+        stored = K.copy()
+        stored[:2, 2] -= 0.5  # to OpenCV's pixel centres
+        seen = stored.copy()
+        seen[:2, 2] -= (crop.left, crop.top)
+        size = crop.size[::-1]
+        maps = cv2.initUndistortRectifyMap(stored, dist, np.eye(3), seen, size, cv2.CV_32FC1)
+        pixels = np.stack(maps, axis=-1)
     else:
-        u, v = _skewed_map(K, dist, crop)
+        pixels = (_through_lens(K, dist, *_grid(crop)) - 0.5).astype(np.float32)
     limit = fold_radius(K, dist, crop)
     if limit is not None:
-        x, y = _rays(K, crop)
-        beyond = x * x + y * y > limit**2
-        u[beyond], v[beyond] = -1e4, -1e4
-    return np.stack([u, v], axis=-1)
-
-
-def _opencv_map(K: Float, dist: Float, crop: Crop) -> tuple[Pixels, Pixels]:
-    h, w = crop.size
-    stored = K.copy()
-    stored[:2, 2] -= 0.5  # to OpenCV's pixel centres
-    seen = stored.copy()
-    seen[:2, 2] -= (crop.left, crop.top)
-    u, v = cv2.initUndistortRectifyMap(stored, dist, np.eye(3), seen, (w, h), cv2.CV_32FC1)
-    return np.asarray(u, np.float32), np.asarray(v, np.float32)
-
-
-def _skewed_map(K: Float, dist: Float, crop: Crop) -> tuple[Pixels, Pixels]:
-    shown = distort(np.stack(_rays(K, crop), axis=-1), dist)
-    pixels = shown @ K[:2, :2].T + K[:2, 2] - 0.5
-    return pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
+        x, y = _unproject(K, *_grid(crop))
+        pixels[x * x + y * y > limit**2] = -1e4
+    return np.asarray(pixels, np.float32)
 
 
 def distort(points: Float, dist: Float) -> Float:
@@ -193,9 +181,9 @@ def distort(points: Float, dist: Float) -> Float:
     return np.asarray(shown, np.float64).reshape(points.shape)
 
 
-def _through_lens(K: Float, dist: Float, pixels: Float) -> Float:
-    """``[M, 2]`` where the lens shows what a pinhole shows at pixels ``[M, 2]``."""
-    shown = distort(np.stack(_unproject(K, pixels[:, 0], pixels[:, 1]), axis=-1), dist)
+def _through_lens(K: Float, dist: Float, u: Float, v: Float) -> Float:
+    """``[..., 2]`` pixels where the lens shows what a pinhole shows at pixels u, v ``[...]``."""
+    shown = distort(np.stack(_unproject(K, u, v), axis=-1), dist)
     return shown @ K[:2, :2].T + K[:2, 2]
 
 
@@ -205,11 +193,11 @@ def _unproject(K: Float, u: Float, v: Float) -> tuple[Float, Float]:
     return (u - K[0, 2] - K[0, 1] * y) / K[0, 0], y
 
 
-def _rays(K: Float, crop: Crop) -> tuple[Float, Float]:
-    """``[h, w]`` each: x/z and y/z of the crop's pixels."""
+def _grid(crop: Crop) -> tuple[Float, Float]:
+    """``[h, w]`` each: u and v of the crop's pixels, centres at +0.5."""
     h, w = crop.size
     v, u = np.mgrid[crop.top : crop.top + h, crop.left : crop.left + w] + 0.5
-    return _unproject(K, u, v)
+    return u, v
 
 
 def fold_radius(K: Float, dist: Float, crop: Crop, samples: int = 256) -> float | None:

@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -132,10 +133,6 @@ class GsganData(LightningDataModule):
         self.info_samples = whole("data.info_samples", info_samples, 1)
         self.checks = replace(Checks(), min_joints=whole("data.min_joints", min_joints, 1))
         self.lens = LENSES[one_of("effects.distortion", distortion, LENSES)]
-        self._datasets: dict[str, CaptureDataset] | None = None
-        self._layout: Layout | None = None
-        self._splits: Splits | None = None
-        self._info: SceneInfo | None = None
 
     def prepare_data(self) -> None:
         """Makes the dataset if it has a ``source``; one process per machine."""
@@ -147,48 +144,65 @@ class GsganData(LightningDataModule):
         Raises:
             DataError: see the reader and `make_splits`.
         """
-        if self._datasets is not None:
-            return
-        self._layout = layout = self.reader(self._folder(), self.checks, self.smpl)
-        self._splits = splits = self._split(layout)
-        held_out = set(splits.test_cameras) - set(splits.train_cameras)
-        if leaks := [camera for camera in layout.landmarks.fitted_to if camera in held_out]:
+        if "_datasets" not in self.__dict__:
+            for note in (*self.layout.notes, *self.splits.notes):
+                log.warning("%s: %s", self.layout.root, note)
+            assert self._datasets
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The capture, read on first use."""
+        return self.reader(self._folder(), self.checks, self.smpl)
+
+    @cached_property
+    def splits(self) -> Splits:
+        """The training and held-out items."""
+        if self.protocol is None:
+            splits = make_splits(self.layout, **self.split_keys)
+        else:
+            given = [k for k, v in self.split_keys.items() if k != "test_share" and v is not None]
+            if given:
+                raise ConfigError(
+                    f"data.{given[0]} is set, but protocol {self.protocol.name} sets the splits; "
+                    "leave one of them out"
+                )
+            splits = protocol_splits(self.layout, self.protocol)
+        marks, held_out = (
+            self.layout.landmarks,
+            set(splits.test_cameras) - set(splits.train_cameras),
+        )
+        if leaks := [camera for camera in marks.fitted_to if camera in held_out]:
             raise ConfigError(
-                f"{layout.landmarks.source} was fitted to the masks of {leaks[0]}, which is held "
-                "out here; run gsgan.fit with the same data.train_cameras, data.test_cameras or "
-                "protocol"
+                f"{marks.source} was fitted to the masks of {leaks[0]}, which is held out here; run "
+                "gsgan.fit with the same data.train_cameras, data.test_cameras or protocol"
             )
-        for note in (*layout.notes, *splits.notes):
-            log.warning("%s: %s", layout.root, note)
+        return splits
+
+    @cached_property
+    def _datasets(self) -> dict[str, CaptureDataset]:
+        layout, splits = self.layout, self.splits
+        sizes = {camera.size for camera in layout.cameras.values()}
+        if self.size is None and self.batch_size > 1 and (self.crop or len(sizes) > 1):
+            raise ConfigError(
+                "data.size is not set and images differ in size, so batches of "
+                f"{self.batch_size} cannot be made; set data.size (e.g. 512) or data.batch_size=1"
+            )
         # every process has its own, and training and validation start their own workers
-        limit = int(self.cache_mb * 2**20) // (2 * self.workers + 1)
-        cache = PictureCache(limit)
+        cache = PictureCache(int(self.cache_mb * 2**20) // (2 * self.workers + 1))
         trained = sorted({frame for _, frame in splits.items["train"]})
         skeletons = complete_skeletons(layout.landmarks, layout.frames, trained)
-        self._datasets = {
+        return {
             name: CaptureDataset(
                 layout, splits.items[name], self.size, self.crop, cache, self.lens, skeletons
             )
             for name in SPLITS
         }
-        self._check_one_size()
 
     def _folder(self) -> str | Path:
         if self.root is not None:
             return self.root
         assert self.source is not None  # checked in __init__
         return self.source()
-
-    def _split(self, layout: Layout) -> Splits:
-        if self.protocol is None:
-            return make_splits(layout, **self.split_keys)
-        given = [k for k, v in self.split_keys.items() if k != "test_share" and v is not None]
-        if given:
-            raise ConfigError(
-                f"data.{given[0]} is set, but protocol {self.protocol.name} sets the splits; leave "
-                "one of them out"
-            )
-        return protocol_splits(layout, self.protocol)
 
     def protocol_record(self, lpips_net: str) -> dict[str, Any] | None:
         """The record beside every score: the protocol and where this run departs from it.
@@ -205,41 +219,16 @@ class GsganData(LightningDataModule):
         departures = self.protocol.departures(lpips_net=lpips_net, scale=scale, padded=padded)
         return self.protocol.record() | {"departures": list(departures)}
 
-    def _check_one_size(self) -> None:
-        sizes = {camera.size: name for name, camera in self.layout.cameras.items()}
-        if self.size is None and self.batch_size > 1 and (self.crop or len(sizes) > 1):
-            raise ConfigError(
-                "data.size is not set and images differ in size, so batches of "
-                f"{self.batch_size} cannot be made; set data.size (e.g. 512) or data.batch_size=1"
-            )
-
-    @property
-    def layout(self) -> Layout:
-        """The capture, read on first use."""
-        self.setup()
-        assert self._layout is not None
-        return self._layout
-
-    @property
-    def splits(self) -> Splits:
-        """The training and held-out items."""
-        self.setup()
-        assert self._splits is not None
-        return self._splits
-
     @property
     def reasons(self) -> dict[str, str]:
         """Why a split is empty, for those that are."""
         return self.splits.reasons
 
-    @property
+    @cached_property
     def info(self) -> SceneInfo:
         """Facts about the scene from the training split, computed on first use."""
-        if self._info is None:
-            train = self.dataset("train")
-            held_out = [self.dataset(name) for name in SPLITS[1:]]
-            self._info = scene_info(self.layout, self.splits, train, self.info_samples, held_out)
-        return self._info
+        train, *held_out = (self.dataset(name) for name in SPLITS)
+        return scene_info(self.layout, self.splits, train, self.info_samples, held_out)
 
     @property
     def eval_names(self) -> tuple[str, ...]:
@@ -255,7 +244,6 @@ class GsganData(LightningDataModule):
         if split not in SPLITS:
             raise ValueError(f"dataset: split must be one of {', '.join(SPLITS)}, got {split!r}")
         self.setup()
-        assert self._datasets is not None
         return self._datasets[split]
 
     def labelled(self, split: str) -> Subset[Frame]:
@@ -266,7 +254,13 @@ class GsganData(LightningDataModule):
     def train_dataloader(self) -> DataLoader[Frame]:
         """Batches of `Frame` in `StepSampler` order."""
         dataset = self.dataset("train")
-        replicas, rank, epoch = self._place()
+        replicas, rank, epoch = 1, 0, 0
+        if (trainer := self.trainer) is not None:
+            replicas, rank, epoch = (
+                trainer.world_size,
+                trainer.global_rank,
+                trainer.current_epoch,
+            )
         per_pass = math.ceil(len(dataset) / (self.batch_size * replicas))
         steps = self.steps_per_epoch or per_pass
         sampler = StepSampler(len(dataset), self.batch_size, steps, self.seed, replicas, rank)
@@ -299,12 +293,6 @@ class GsganData(LightningDataModule):
     ) -> Frame:
         """The batch on the device; Lightning's own walk cannot rebuild frozen records."""
         return batch.to(device)
-
-    def _place(self) -> tuple[int, int, int]:
-        """Number of processes, rank of this one, epoch: 1, 0, 0 without a trainer."""
-        if self.trainer is None:
-            return 1, 0, 0
-        return self.trainer.world_size, self.trainer.global_rank, self.trainer.current_epoch
 
     def _loader(
         self, dataset: Dataset[Frame], sampler: StepSampler | None = None

@@ -45,7 +45,6 @@ SKELETONS = {"smpl": "smpl24 -> mediapipe33", "keypoints3d": "body25 -> mediapip
 RESULTS = ("{kind}", "output/{kind}", "output-{kind}/{kind}")
 PEOPLE = 1000  # bound on the person's number in a mask's name
 PEOPLE_KEYS = ("annots", "people")
-ID_KEYS = ("id", "personID")
 
 BODY_25 = 25
 WITH_HANDS = BODY_25 + 2 * HAND
@@ -255,7 +254,7 @@ def _people(path: Path) -> dict[int, Mapping[str, Any]]:
         raise DataError(f"{path} must hold a list of people, each an object with 'id'")
     found: dict[int, Mapping[str, Any]] = {}
     for entry in content:
-        number = next((entry[key] for key in ID_KEYS if key in entry), None)
+        number = entry.get("id")
         if isinstance(number, bool) or not isinstance(number, int) or number in found:
             raise DataError(
                 f"{path}: each person needs a whole 'id' that no other has, found {number}"
