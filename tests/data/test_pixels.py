@@ -58,7 +58,9 @@ def test_masks_are_joined_by_their_maximum_and_must_agree_in_size(
     mixed = read_mask([("grey", grey), ("threshold", other)], RULES)
     assert np.array_equal(mixed, np.maximum(VALUES, [[0, 0, 0], [255, 255, 255]]))
     cv2.imwrite(str(other), VALUES.T)
-    with pytest.raises(DataError, match=r"other.png and .*grey.png, masks of one image, differ in size"):
+    with pytest.raises(
+        DataError, match=r"other.png and .*grey.png, masks of one image, differ in size"
+    ):
         read_mask([("grey", grey), ("grey", other)], RULES)
 
 

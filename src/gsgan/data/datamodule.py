@@ -167,14 +167,12 @@ class GsganData(LightningDataModule):
                     "leave one of them out"
                 )
             splits = protocol_splits(self.layout, self.protocol)
-        marks, held_out = (
-            self.layout.landmarks,
-            set(splits.test_cameras) - set(splits.train_cameras),
-        )
+        marks = self.layout.landmarks
+        held_out = set(splits.test_cameras) - set(splits.train_cameras)
         if leaks := [camera for camera in marks.fitted_to if camera in held_out]:
             raise ConfigError(
-                f"{marks.source} was fitted to the masks of {leaks[0]}, which is held out here; run "
-                "gsgan.fit with the same data.train_cameras, data.test_cameras or protocol"
+                f"{marks.source} was fitted to the masks of {leaks[0]}, which is held out here; "
+                "run gsgan.fit with the same data.train_cameras, data.test_cameras or protocol"
             )
         return splits
 
@@ -255,12 +253,8 @@ class GsganData(LightningDataModule):
         """Batches of `Frame` in `StepSampler` order."""
         dataset = self.dataset("train")
         replicas, rank, epoch = 1, 0, 0
-        if (trainer := self.trainer) is not None:
-            replicas, rank, epoch = (
-                trainer.world_size,
-                trainer.global_rank,
-                trainer.current_epoch,
-            )
+        if (on := self.trainer) is not None:
+            replicas, rank, epoch = on.world_size, on.global_rank, on.current_epoch
         per_pass = math.ceil(len(dataset) / (self.batch_size * replicas))
         steps = self.steps_per_epoch or per_pass
         sampler = StepSampler(len(dataset), self.batch_size, steps, self.seed, replicas, rank)

@@ -229,10 +229,8 @@ class CaptureDataset(Dataset[Frame]):
         path, camera = self.layout.label_path(*item), self.layout.cameras[item[0]]
         if path is None:
             return np.full(camera.size, IGNORE_LABEL, np.uint8)
-        meta = self.layout.meta
-        labels = pixels.read_labels(
-            path, self.layout.pixels, meta.label_names, meta.labels_named_by
-        )
+        meta, rules = self.layout.meta, self.layout.pixels
+        labels = pixels.read_labels(path, rules, meta.label_names, meta.labels_named_by)
         self._check_size(path, labels, camera)
         return labels
 

@@ -105,20 +105,12 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """``[H, W]`` uint8, a colour file converted.
-
-    Raises:
-        DataError: when the file is missing, damaged or cut off.
-    """
+    """``[H, W]`` uint8, a colour file converted; errors as `read_colour`."""
     return _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def read_stored(path: Path) -> NDArray[np.uint8]:
-    """``[H, W]`` or ``[H, W, 3]`` uint8 as stored; an alpha channel is left out.
-
-    Raises:
-        DataError: when the file is missing, damaged, cut off or not 8-bit.
-    """
+    """``[H, W]`` or ``[H, W, 3]`` 8-bit values as stored, without alpha; errors as `read_colour`."""
     image = _decode_8_bit(path)
     return image[..., :3] if image.ndim == 3 else image
 

@@ -133,13 +133,7 @@ def read_labels(
 
 
 def with_ignored_border(labels: Bytes, mask: Bytes, band: int) -> Bytes:
-    """Labels with "ignore" along the outline of a mask of the same size.
-
-    Args:
-        labels: ``[H, W]``.
-        mask: ``[H, W]`` 0..255.
-        band: side of the square that dilates and erodes the mask; 0 changes nothing.
-    """
+    """Labels ``[H, W]`` with "ignore" on the `outline` of the mask ``[H, W]``."""
     if band == 0:
         return labels
     return np.where(outline(mask, band), np.uint8(IGNORE_LABEL), labels)
@@ -160,9 +154,6 @@ def read_unsure(files: Sequence[tuple[str, Path]], mask: Bytes, rules: PixelRule
         files: (rule, path) of the masks, decoded again when the rules use alphas.
         mask: ``[H, W]`` 0..255, the result of `read_mask`.
         rules: of the dataset.
-
-    Raises:
-        DataError: when a file is missing or damaged.
     """
     if rules.unsure_band == 0 and rules.unsure_alpha is None:
         return None

@@ -57,11 +57,7 @@ class Protocol:
             )
 
     def frames(self, side: Literal["train", "test"]) -> Any:
-        """The frames of one side, for the subject where they differ by subject.
-
-        Raises:
-            ConfigError: when they do, and the subject is not set or unknown.
-        """
+        """The frames of one side; where they differ by subject, the subject must be set."""
         frames = self.train_frames if side == "train" else self.test_frames
         if not isinstance(frames, Mapping):
             return frames

@@ -242,10 +242,7 @@ def _shared_surface(
     samples: int,
     mesh: SkinnedBody | None,
 ) -> SurfaceColours | None:
-    """Colours compared in frames of all training cameras, on the mesh or else the visual hull.
-
-    None with a single camera.
-    """
+    """Colours compared in frames of all training cameras; None with a single camera."""
     index = {item: i for i, item in enumerate(dataset.items)}
     shared = sorted({f for _, f in dataset.items if all((c, f) in index for c in cameras)})
     if len(cameras) < 2 or not shared:

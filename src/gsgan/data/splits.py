@@ -60,10 +60,8 @@ def make_splits(
 
     Args:
         layout: the capture.
-        train_cameras: names, or None.
-        test_cameras: names, or None.
-        train_frames: numbers and "a-b" ranges (both ends included), or None.
-        test_frames: the same.
+        train_cameras, test_cameras: names, or None.
+        train_frames, test_frames: numbers and "a-b" ranges (both ends included), or None.
         test_share: in [0, 1), the share of frames held out by default.
 
     Raises:
@@ -194,11 +192,7 @@ def _complete(
 
 
 def camera_name(layout: Layout, camera: str | int, protocol: str) -> str:
-    """The name of a camera given by name or by its index in `Layout.camera_names`.
-
-    Raises:
-        DataError: when there is no such camera, listing the existing ones.
-    """
+    """The name of a camera given by name or by its index in `Layout.camera_names`."""
     names = layout.camera_names
     if isinstance(camera, int) and 0 <= camera < len(names):
         return names[camera]

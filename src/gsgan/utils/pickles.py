@@ -210,8 +210,7 @@ def _as_data_error(path: Path, what: str) -> Iterator[None]:
     except Exception as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         reason = " ".join(reason.split())[:160] or type(error).__name__
-        message = f"{path} is not a valid {what} ({reason}); copy or export it again"
-        raise DataError(message) from None
+        raise DataError(f"{path} is not a valid {what} ({reason}); export it again") from None
 
 
 def read_pickle(path: Path) -> Any:
@@ -227,11 +226,7 @@ def read_pickle(path: Path) -> Any:
 
 
 def read_npy(path: Path) -> Any:
-    """The content of a .npy file: a plain array, or the object of a 0-d array of objects.
-
-    Raises:
-        DataError: when the file is missing, damaged, or names a class that is not allowed.
-    """
+    """The content of a .npy file, or the object of a 0-d array of objects; errors as above."""
     with _as_data_error(path, ".npy file"), path.open("rb") as stream:
         return _read_array(stream)
 

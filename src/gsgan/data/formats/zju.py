@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar, NamedTuple
 
@@ -26,8 +26,7 @@ from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, frame_of, last_number, natural_order
 from gsgan.data.formats.common import IMAGES, FolderReader, body_model, picture_size, up_axis
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed, zju_motion
-from gsgan.data.formats.trust import highest_label, spread
-from gsgan.data.layout import BodyModel, Found, Layout, Meta
+from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
 from gsgan.utils.checks import one_of
@@ -43,6 +42,7 @@ MILLIMETRES = 1e-3
 NAMED_FRAME = re.compile(r"\)_(\d+)")  # CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592
 CAMERA_FOLDER = re.compile(r"(Camera[_ ]?\(?B?\d+\)?|\d{1,3})")
 MASKS = {"mask_cihp": "label", "mask": "nonzero"}
+# Files may hold stray numbers beyond CIHP's.
 CIHP_TABLE = tuple(i if i < len(CIHP) else IGNORE_LABEL for i in range(256))
 FITS = {"refit": "new_params", "refined": "smpl_params", "first": "params"}
 UNBLENDED = "first"  # the fit whose body is posed without pose blend shapes
@@ -67,14 +67,6 @@ class ZjuReader(FolderReader):
     def __post_init__(self) -> None:
         one_of("data.reader.masks", self.masks, ("both", *MASKS))
         one_of("data.reader.fit", self.fit, ("auto", *FITS))
-
-    def __call__(self, root: str | Path, checks: Checks, smpl: str | None = None) -> Layout:
-        """Reads and checks everything except most images' pixels; see `FolderReader`.
-
-        Raises:
-            DataError: for whatever is missing, damaged or contradictory, naming the file.
-        """
-        return self._without_wrong_labels(super().__call__(root, checks, smpl))
 
     def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
         """The subject's files, each checked by itself.
@@ -175,22 +167,6 @@ class ZjuReader(FolderReader):
                     for frame, path in files.items():
                         masks[name][frame] = (*masks[name].get(frame, ()), mask_file(rule, path))
         return masks, labels if any(labels.values()) else {}
-
-    def _without_wrong_labels(self, layout: Layout) -> Layout:
-        """The same without labels if a few of them hold more parts than CIHP names."""
-        if not layout.labels:
-            return layout
-        camera, files = next((c, files) for c, files in layout.labels.items() if files)
-        some = [files[f] for f in spread(sorted(files), self.trust.watched_masks)]
-        highest = highest_label(layout.root, some)
-        if highest < len(CIHP):
-            return layout
-        note = (
-            f"mask_cihp of camera {camera} holds the label {highest}, but CIHP has 0 to "
-            f"{len(CIHP) - 1}: these files are used as masks only"
-        )
-        meta = replace(layout.meta, label_names=None)
-        return replace(layout, notes=(*layout.notes, note), labels={}, meta=meta)
 
 
 class Annots(NamedTuple):
