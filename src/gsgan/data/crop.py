@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.checks import above
 
 Float = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -74,18 +74,14 @@ class PersonCrop:
     """A square crop round the projected joints.
 
     Args:
-        margin: metres kept round every joint for flesh, hair and cloth: landmarks lie inside the
-            body, and the crown is about 0.2 m above the ears.
-
-    Raises:
-        ConfigError: when the margin is not positive.
+        margin: metres kept round every joint for flesh, hair and cloth, above 0: landmarks lie
+            inside the body, and the crown is about 0.2 m above the ears.
     """
 
     margin: float = 0.2
 
     def __post_init__(self) -> None:
-        if not self.margin > 0:
-            raise ConfigError(f"data.crop.margin must be above 0 metres, got {self.margin}")
+        above("data.crop.margin", self.margin)
 
     def window(
         self, view: View, joints: Float, usable: NDArray[np.bool_], dist: Float | None = None
@@ -221,7 +217,6 @@ def take(picture: Bytes, crop: Crop, mapping: NDArray[np.float32] | None, exact:
 
     Args:
         picture: ``[H, W]`` or ``[H, W, C]``.
-        crop: what to take.
         mapping: `undistort_map` of the same crop, or None for a pinhole camera.
         exact: take the nearest value (labels) instead of interpolating.
     """

@@ -246,8 +246,9 @@ class GsganData(LightningDataModule):
 
     def labelled(self, split: str) -> Subset[Frame]:
         """The items of a split whose images have part labels; may be empty."""
-        dataset, labels = self.dataset(split), self.layout.label_path
-        return Subset(dataset, [i for i, item in enumerate(dataset.items) if labels(*item)])
+        dataset = self.dataset(split)
+        chosen = [i for i, item in enumerate(dataset.items) if self.layout.label_path(*item)]
+        return Subset(dataset, chosen)
 
     def train_dataloader(self) -> DataLoader[Frame]:
         """Batches of `Frame` in `StepSampler` order."""
@@ -263,10 +264,9 @@ class GsganData(LightningDataModule):
 
     @property
     def watched(self) -> tuple[str, list[int]]:
-        """Pictures watched while training, a split and places in it: evenly spaced over held-out
-        poses.
+        """The split and indices of the images rendered while training, evenly spaced.
 
-        Without held-out poses they come from held-out cameras; without those, from training.
+        Of held-out poses, without those of held-out cameras, without those of the training split.
         """
         name = next((n for n in ("novel_pose", "novel_view") if self.splits.items[n]), "train")
         most = len(self.dataset(name))

@@ -110,7 +110,7 @@ def read_grey(path: Path) -> NDArray[np.uint8]:
 
 
 def read_stored(path: Path) -> NDArray[np.uint8]:
-    """``[H, W]`` or ``[H, W, 3]`` 8-bit values as stored, without alpha; errors as `read_colour`."""
+    """``[H, W]`` or ``[H, W, 3]`` 8-bit, as stored, without alpha; errors as `read_colour`."""
     image = _decode_8_bit(path)
     return image[..., :3] if image.ndim == 3 else image
 

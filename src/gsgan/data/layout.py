@@ -55,11 +55,10 @@ class Meta:
 
     Args:
         unit: of the lengths in its files: m, cm or mm.
-        fps: frames per second, or None if unknown.
+        fps: frames per second.
         up_axis: of the world, e.g. "z" or "-y".
         skeleton: name of the landmark set.
         skeleton_source: origin of the landmarks, e.g. "smpl24 -> mediapipe33".
-        body: the skinned body that the poses move, or None.
         label_names: names of the part numbers, background first, or None.
         labels_named_by: the source of those names, for messages.
         splits: train_cameras, test_cameras, train_frames, test_frames of the dataset itself,

@@ -220,10 +220,7 @@ def _read_people(
     if lacking := [frame for frame in there if frame not in found]:
         notes.append(f"{folder} lacks person {person} at frames {spans(lacking)}")
     if crowded:
-        notes.append(
-            f"{folder} has more people than person {person} at frames {spans(crowded)}; masks must "
-            "be of that person alone"
-        )
+        notes.append(f"{folder} has more people than person {person} at frames {spans(crowded)}")
     return found
 
 
@@ -234,15 +231,13 @@ def _people(path: Path) -> dict[int, Mapping[str, Any]]:
         content = next((content[key] for key in PEOPLE_KEYS if key in content), None)
     if not isinstance(content, list) or not all(isinstance(p, Mapping) for p in content):
         raise DataError(f"{path} must hold a list of people, each an object with 'id'")
-    found: dict[int, Mapping[str, Any]] = {}
-    for entry in content:
-        number = entry.get("id")
-        if isinstance(number, bool) or not isinstance(number, int) or number in found:
+    numbers = [entry.get("id") for entry in content]
+    for i, number in enumerate(numbers):
+        if type(number) is not int or number in numbers[:i]:
             raise DataError(
                 f"{path}: each person needs a whole 'id' that no other has, found {number}"
             )
-        found[number] = entry
-    return found
+    return dict(zip(numbers, content, strict=True))
 
 
 def _read_keypoints(

@@ -170,13 +170,9 @@ class ZjuReader(FolderReader):
 
 
 class Annots(NamedTuple):
-    """The raw content of annots.npy.
+    """annots.npy: its path, one K, R, T and D per camera, and the cameras' image folders.
 
-    Args:
-        path: the file.
-        K, R, T, D: one entry per camera.
-        folders: the image folder of each camera relative to the root; None where the file lists
-            no images.
+    Folders are relative to the root; None where the file lists no images.
     """
 
     path: Path
