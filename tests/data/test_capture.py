@@ -779,7 +779,7 @@ def test_bad_sizes(tmp_path: Path, size: object) -> None:
 
 
 def test_bad_margin() -> None:
-    with pytest.raises(ConfigError, match=r"data.crop.margin must be above 0"):
+    with pytest.raises(ConfigError, match=r"data.crop.margin must be a number above 0"):
         PersonCrop(0)
 
 

@@ -106,7 +106,7 @@ def test_protocols_that_do_not_fit(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"scale": 0}, "protocol.scale must be in"),
+        ({"scale": 0}, "protocol.scale must be a number"),
         ({"train_cameras": None}, "both null; name one of them"),
     ],
 )
