@@ -64,8 +64,6 @@ FORMATS = (
     Format("zju_original", zju.write_original, _zju),
     Format("zju_313", _odd, _zju),
     Format("zju_refined", zju.write_refined, _zju),
-    Format("zju_humannerf", zju.write_humannerf, _zju),
-    Format("zju_arah", zju.write_arah, _zju),
     Format("thuman4", _thuman4, lambda root, _: Thuman4Reader()(root, Checks(), str(smplx_once()))),
     Format(
         "avatarrex",

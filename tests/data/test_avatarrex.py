@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from make import edit_json
 from writers.avatarrex import SERIALS, write_avatarrex
 from writers.common import write_picture
 from writers.smplx_rig import SmplxSubject
@@ -85,11 +84,6 @@ def test_a_camera_without_a_folder_or_without_calibration(root: Path, smplx_file
     shutil.rmtree(root / "22000000")
     shutil.rmtree(root / SERIALS[2])
     refused(root, smplx_file, "lists 3 cameras, but 2", f"{SERIALS[2]} lacks one")
-
-
-def test_a_transposed_size(root: Path, smplx_file: Path) -> None:
-    edit_json(root / "calibration_full.json", lambda c: c[SERIALS[0]].update(imgSize=[44, 52]))
-    refused(root, smplx_file, SERIALS[0], "transposed")
 
 
 def test_a_mask_of_another_size(root: Path, smplx_file: Path) -> None:

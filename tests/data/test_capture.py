@@ -17,7 +17,7 @@ from make import edit_json, ring_camera, skeletons, write_landmarks, write_tiny_
 from PIL import Image
 
 from gsgan.data.checks import Checks, spans
-from gsgan.data.crop import PersonCrop, Window, cut, square_window, undistort_map
+from gsgan.data.crop import Crop, PersonCrop, cut, square_window, undistort_map
 from gsgan.data.dataset import CaptureDataset, Picture, PictureCache
 from gsgan.data.files import cut_off, last_number, read_header
 from gsgan.data.formats.capture import LOOKED_AT, read_capture
@@ -141,7 +141,7 @@ def test_distortion_matters_in_that_test(tmp_path: Path) -> None:
 
 def test_lens_folding_back_shows_nothing(tmp_path: Path) -> None:
     K, dist = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), np.array([-0.3, *[0.0] * 7])
-    mapping = undistort_map(K, dist, Window(0, -150, (100, 400)))
+    mapping = undistort_map(K, dist, Crop(0, -150, (100, 400)))
     # r (1 - 0.3 r²) rises up to r = 1.054: column 250 is at r = 2
     assert (mapping[50, -1] < -1000).all()
     assert np.allclose(mapping[50, 200], 49.5 + np.array([0.5, 0.5]), atol=0.01)
@@ -176,9 +176,9 @@ def test_crop_is_square_and_has_the_margin_in_metres(tmp_path: Path) -> None:
     joints[0, 2] = 1.5
     window = PersonCrop(0.3).window(view, joints, usable)
     # focal 480 at 3 m is 160 px a metre: from 0.3 m below the low joint to 0.3 above the high one
-    assert window == Window(200 - 144, 200 - 96, (192, 192))
+    assert window == Crop(200 - 144, 200 - 96, (192, 192))
     usable[0] = False
-    assert PersonCrop(0.3).window(view, joints, usable) == Window(152, 152, (96, 96))
+    assert PersonCrop(0.3).window(view, joints, usable) == Crop(152, 152, (96, 96))
 
 
 def test_crop_beyond_the_border_is_black_and_follows_only_what_is_in_view(tmp_path: Path) -> None:
@@ -192,14 +192,14 @@ def test_crop_beyond_the_border_is_black_and_follows_only_what_is_in_view(tmp_pa
     piece = cut(np.full((400, 400, 3), 9, np.uint8), window)
     assert (piece[:, : -window.left] == 0).all()
     assert (piece[:, -window.left :] == 9).all()
-    assert (cut(np.ones((4, 4), np.uint8), Window(50, 50, (3, 2))) == np.zeros((3, 2))).all()
+    assert (cut(np.ones((4, 4), np.uint8), Crop(50, 50, (3, 2))) == np.zeros((3, 2))).all()
 
 
 def test_crop_without_joints_in_front_is_the_whole_picture(tmp_path: Path) -> None:
     layout = read_capture(write_tiny_capture(tmp_path))
     behind = np.tile([0.0, -50.0, 0.9], (33, 1))
     window = PersonCrop().window(layout.cameras["cam00"], behind, np.ones(33, bool))
-    assert window == square_window((24, 32)) == Window(-4, 0, (32, 32))
+    assert window == square_window((24, 32)) == Crop(-4, 0, (32, 32))
 
 
 def test_full_frames_of_uneven_cameras_share_one_size(tmp_path: Path) -> None:
@@ -542,7 +542,7 @@ BAD_INDEX = {
     ),
     "no images": (remove("images"), "images does not exist"),
     "zero frames": (empty("images/cam00"), "images/cam00 holds no frames"),
-    "K missing": (without("K"), "camera cam01: 'K' is missing"),
+    "K missing": (without("K"), "camera cam01: expected an object with K, R, t"),
     "K shape": (camera(K=[1, 2, 3]), r"'K' must hold finite numbers of shape \(3, 3\)"),
     "K ragged": (camera(K=[[1], [2, 3]]), r"'K' must hold finite numbers of shape \(3, 3\)"),
     "K focal": (
@@ -551,7 +551,7 @@ BAD_INDEX = {
     ),
     "K transposed": (camera(K=[[30, 0, 0], [0, 30, 0], [16, 12, 1]]), "K must be .*found"),
     "R sheared": (camera(R=STRETCHED.tolist()), "cam01: R is not a rotation.*differs .* by 0.21"),
-    "R mirrored": (camera(R=np.diag([1, 1, -1]).tolist()), r"R mirrors \(determinant -1\)"),
+    "R mirrored": (camera(R=np.diag([1, 1, -1]).tolist()), "R mirrors"),
     "R NaN": (camera(R=np.full((3, 3), np.nan).tolist()), "'R' must hold finite numbers"),
     "t length": (camera(t=[1, 2]), r"'t' must hold finite numbers of shape \(3,\)"),
     "dist length": (camera(dist=[0.1, 0.2, 0.3]), "dist must hold 4, 5 or 8 finite numbers"),
@@ -617,7 +617,7 @@ BAD_INDEX = {
     ),
     "frame of a date": (
         write("images/cam00/20240131120000123456.png", b""),
-        "20240131120000123456.png is named by a date or time stamp .*frames 0, 1, 2 … equally",
+        "20240131120000123456.png has no frame number up to .*frames 0, 1, 2 … equally",
     ),
     "theta shape": (poses(theta=np.zeros((4, 168))), r"'theta' must have shape \(any, any, 3\)"),
     "transl shape": (poses(transl=np.zeros((3, 3))), r"'transl' must have shape \(4, 3\)"),
@@ -660,7 +660,7 @@ BAD_INDEX = {
     "frame without number": (write("images/cam00/first.png", b""), "has no frame number"),
     "labels colour": (
         write("labels/cam00/000001.png", png(32, 24, 8, 2, bytes(96))),
-        "labels/cam00/000001.png has 3 channels; expected one channel",
+        "labels/cam00/000001.png is a palette PNG or has colours; expected 8-bit grey",
     ),
 }
 
@@ -779,7 +779,7 @@ def test_bad_sizes(tmp_path: Path, size: object) -> None:
 
 
 def test_bad_margin() -> None:
-    with pytest.raises(ConfigError, match=r"data.crop.margin must be above 0"):
+    with pytest.raises(ConfigError, match=r"data.crop.margin must be a number above 0"):
         PersonCrop(0)
 
 

@@ -159,9 +159,9 @@ def test_which_skeleton_is_taken(root: Path, smpl_file: Path) -> None:
 
     assert source() == "body25 -> mediapipe33"
     assert source(smpl_file, skeleton="keypoints3d") == "body25 -> mediapipe33"
-    refused(root, "SMPL parameters (smpl/) but no joints", "data.smpl=", skeleton="smpl")
+    refused(root, "smpl holds SMPL parameters but no joints", "data.smpl=", skeleton="smpl")
     shutil.rmtree(root / "keypoints3d")
-    refused(root, "SMPL parameters (smpl/) but no joints")
+    refused(root, "smpl holds SMPL parameters but no joints")
     assert source(smpl_file) == "smpl24 -> mediapipe33"
     shutil.rmtree(root / "smpl")
     refused(root, "has no skeletons; expected keypoints3d/ or smpl/")

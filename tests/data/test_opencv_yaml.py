@@ -32,7 +32,6 @@ def test_opencvs_files_are_read_as_opencv_reads_them(tmp_path: Path) -> None:
     for key, matrix in matrices().items():
         storage.write(key, matrix)
     storage.write("H_1", 1920)
-    storage.write("share", 0.125)
     storage.writeComment("by hand")
     storage.startWriteStruct("names", cv2.FILE_NODE_SEQ)
     for name in NAMES:
@@ -41,10 +40,11 @@ def test_opencvs_files_are_read_as_opencv_reads_them(tmp_path: Path) -> None:
     storage.release()
     found, again = read_storage(tmp_path / "rig.yml"), cv2.FileStorage(path, cv2.FILE_STORAGE_READ)
     for key in matrices():
-        np.testing.assert_array_equal(found.matrix(key), again.getNode(key).mat())
-    assert found.strings("names") == NAMES
-    assert (found.number("H_1"), found.number("share")) == (1920, 0.125)
-    assert found.matrix("absent") is found.number("absent") is found.strings("absent") is None
+        np.testing.assert_array_equal(found.get(key, np.ndarray), again.getNode(key).mat())
+    assert found.get("names", list) == NAMES
+    assert found.pixels("H_1") == 1920
+    assert found.get("absent", list) is None
+    assert found.pixels("absent") == 0
 
 
 @pytest.mark.parametrize("lines", ["\n", "\r\n"])
@@ -53,11 +53,10 @@ def test_heads_and_ends_of_line(tmp_path: Path, head: str, lines: str) -> None:
     text = head + 'names:\n- "1"\n- 002\n' + MATRIX + "...\n"
     (tmp_path / "a.yml").write_bytes(text.replace("\n", lines).encode())
     found = read_storage(tmp_path / "a.yml")
-    assert found.strings("names") == ["1", "002"]  # unquoted numbers stay the names they are
-    np.testing.assert_array_equal(found.matrix("M"), [[1], [-0.0025]])
+    assert found.get("names", list) == ["1", "002"]  # unquoted numbers stay the names they are
+    np.testing.assert_array_equal(found.get("M", np.ndarray), [[1], [-0.0025]])
 
 
-NO_MATRIX = "rows x cols numbers in line 3"
 NO_MATRIX = "rows x cols numbers in line 3"
 DAMAGE = {
     "cut in a list": (HEAD + MATRIX[:-12], "it may be cut off"),
@@ -88,7 +87,7 @@ def test_damage_is_one_sentence(tmp_path: Path, name: str) -> None:
     path = tmp_path / "a.yml"
     path.write_text(text)
     with pytest.raises(DataError) as failure:
-        read_storage(path).matrix("M")
+        read_storage(path).get("M", np.ndarray)
     assert str(path) in str(failure.value)
     assert message in str(failure.value)
     assert "\n" not in str(failure.value)
@@ -99,9 +98,9 @@ def test_values_of_another_kind_are_refused(tmp_path: Path) -> None:
     path.write_text(HEAD + "names: cam1\nH: tall\n")
     found = read_storage(path)
     with pytest.raises(DataError, match="'names' must be a list of names"):
-        found.strings("names")
-    with pytest.raises(DataError, match="'H' must be a number"):
-        found.number("H")
+        found.get("names", list)
+    with pytest.raises(DataError, match="'H' must be a number of pixels"):
+        found.pixels("H")
 
 
 def test_size_is_bounded_and_other_bytes_are_refused(tmp_path: Path) -> None:

@@ -82,13 +82,13 @@ def test_new_poses_seen_by_a_camera_that_trains(layout: Layout) -> None:
         (
             {"train_cameras": [21]},
             DataError,
-            "protocol one requests the camera of index 21, but there are 4, 0 to 3: cam00, cam01",
+            "protocol one requests camera 21; the capture has 4: cam00, cam01",
         ),
-        ({"train_cameras": [-1]}, DataError, "camera of index -1"),
+        ({"train_cameras": [-1]}, DataError, "requests camera -1"),
         (
             {"test_cameras": ["cam9"]},
             DataError,
-            "requests camera cam9; the capture has cam00, cam01",
+            "requests camera cam9; the capture has 4: cam00",
         ),
         ({"test_cameras": [0]}, ConfigError, "frame 0 of camera cam00 is in both splits"),
         ({"train_frames": "50-60"}, DataError, "nothing to train on with cameras cam00"),
@@ -106,7 +106,7 @@ def test_protocols_that_do_not_fit(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"scale": 0}, "protocol.scale must be in"),
+        ({"scale": 0}, "protocol.scale must be a number"),
         ({"train_cameras": None}, "both null; name one of them"),
     ],
 )

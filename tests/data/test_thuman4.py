@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -21,8 +20,7 @@ from gsgan.data.checks import Checks
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import read_colour
 from gsgan.data.formats.smpl_motion import Motion, posed
-from gsgan.data.formats.smplx_params import read_motion
-from gsgan.data.formats.smplx_rig import read_missing
+from gsgan.data.formats.smplx_rig import read_missing, read_motion
 from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Layout
@@ -275,14 +273,6 @@ def test_a_mask_of_another_size(root: Path, smplx_file: Path) -> None:
     refused(root, smplx_file, "masks/cam02/00000000.jpg is 26x22", "52x44")
 
 
-def test_a_mask_that_is_a_picture(root: Path, smplx_file: Path) -> None:
-    shutil.copy(root / "images/cam01/00000000.jpg", root / "masks/cam01/00000000.jpg")
-    refused(root, smplx_file, "masks/cam01/00000000.jpg is a colour image", "8-bit grey")
-    grey = cv2.imread(str(root / "masks/cam02/00000000.jpg"))  # three equal channels will do
-    write_picture(root / "masks/cam01/00000000.jpg", grey)
-    read(root, smplx_file, trust=NO_LOOK)
-
-
 def test_masks_that_are_missing(root: Path, smplx_file: Path) -> None:
     (root / "masks/cam01/00000002.jpg").unlink()
     assert any("1 of 12 images have no mask" in n for n in read(
@@ -295,7 +285,7 @@ def test_masks_that_are_missing(root: Path, smplx_file: Path) -> None:
 
 def test_parameters_of_smpl(root: Path, smplx_file: Path) -> None:
     edit_params(root, lambda arrays: arrays.update(body_pose=np.zeros((4, 69))))
-    refused(root, smplx_file, "smpl_params.npz", "69", "those of SMPL", "63 (21 joints)")
+    refused(root, smplx_file, "smpl_params.npz", "(4, 63)", "69 are those of SMPL")
 
 
 def test_cameras_and_folders_are_the_same_ones(root: Path, smplx_file: Path) -> None:
@@ -308,9 +298,7 @@ def test_cameras_and_folders_are_the_same_ones(root: Path, smplx_file: Path) -> 
 
 def test_a_transposed_size(root: Path, smplx_file: Path) -> None:
     edit_camera(root, "cam01", imgSize=[44, 52])
-    refused(root, smplx_file, "camera cam01: imgSize [44, 52] is transposed", "52x44", "[width,")
-    edit_camera(root, "cam01", imgSize=[104, 88])
-    refused(root, smplx_file, "images/cam01/00000000.jpg is 52x44", "104x88")
+    refused(root, smplx_file, "images/cam01/00000000.jpg is 52x44", "44x52")
 
 
 @pytest.mark.parametrize(
@@ -374,7 +362,10 @@ def test_another_subjects_parameters_do_not_meet_the_masks(root: Path, smplx_fil
     [
         (lambda a: a.pop("transl"), "has no array transl"),
         (lambda a: a.update(left_hand_pose=np.zeros((4, 12))), "look like PCA coefficients"),
-        (lambda a: a.update(jaw_pose=np.zeros((3, 3))), "'jaw_pose' has 3 rows and 'transl' 4"),
+        (
+            lambda a: a.update(jaw_pose=np.zeros((3, 3))),
+            "'jaw_pose' must hold numbers",
+        ),
         (
             lambda a: a.update(transl=np.zeros(12)),
             "must hold numbers of shape (frames, 3)",

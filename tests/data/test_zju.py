@@ -25,8 +25,7 @@ from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import frame_files, natural_order
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
 from gsgan.data.formats.trust import Trust, box_iou, mask_box
-from gsgan.data.formats.zju import ZjuReader, layout_of
-from gsgan.data.formats.zju_annots import camera_folders, frame_number, read_annots
+from gsgan.data.formats.zju import ZjuReader, camera_folders, frame_number, read_annots
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_labels, read_mask
 from gsgan.scene import Frame
@@ -200,7 +199,7 @@ def test_the_refit_goes_before_the_first_fit_which_has_no_pose_blend_shapes(
 ) -> None:
     first = make_subject(smpl_file, pose_blend=False)
     assert np.abs(first.vertices - subject.vertices).max() > 1e-4
-    root = writers.write_original(tmp_path / "s", first, params="params", vertices="vertices")
+    root = writers.write_original(tmp_path / "s", first, params="params")
     check_skeletons(read(root, smpl_file), first)
     check_poses(read(root, smpl_file), first, blend=False)
     moved = replace(subject, Th=subject.Th + 0.01, vertices=subject.vertices + 0.01)
@@ -259,44 +258,6 @@ def test_the_refined_release(
     check_pictures(layout, subject)
     assert not layout.labels
     assert any("rebuilt" in note for note in layout.notes) == (listed == "none")
-
-
-def test_the_humannerf_cache_needs_no_model_file(subject: Subject, tmp_path: Path) -> None:
-    layout = read(writers.write_humannerf(tmp_path / "377", subject, camera=1), None)
-    one = replace(
-        subject,
-        cameras=subject.cameras[1:2],
-        images=[row[1:2] for row in subject.images],
-        labels=[row[1:2] for row in subject.labels],
-    )
-    check_cameras(layout, one)
-    check_skeletons(layout, one, vertices=False)
-    check_poses(layout, one)
-    check_pictures(layout, one)
-    assert layout.meta.skeleton_source == "smpl24 joints only -> mediapipe33"
-    assert layout.meta.body is None
-
-
-@pytest.mark.parametrize("with_model", [False, True])
-def test_the_arah_cache(
-    subject: Subject, smpl_file: Path, tmp_path: Path, with_model: bool
-) -> None:
-    root = writers.write_arah(tmp_path / "377", subject)
-    layout = read(root, smpl_file if with_model else None)
-    check_cameras(layout, subject)
-    check_skeletons(layout, subject, vertices=with_model)
-    check_poses(layout, subject)
-    check_pictures(layout, subject)
-    assert (layout.meta.body is not None) == with_model
-
-
-def test_layouts_are_told_apart_by_their_files_not_by_their_names(
-    subject: Subject, tmp_path: Path
-) -> None:
-    arah = writers.write_arah(tmp_path / "zju_mocap_refine" / "my_377", subject)
-    assert layout_of(arah) == "arah"
-    refined = writers.write_refined(tmp_path / "CoreView_377_humannerf", subject)
-    assert layout_of(refined) == "annots"
 
 
 def test_landmarks_from_few_vertices_are_those_of_all(subject: Subject) -> None:
@@ -367,24 +328,14 @@ def test_a_mask_of_odd_area_is_noted_and_can_be_left_out(original: Path, smpl_fi
     assert not any("off the usual" in note for note in without.notes)
 
 
-def test_labels_beyond_cihp_serve_as_masks_only(original: Path, smpl_file: Path) -> None:
+def test_labels_beyond_cihp_are_ignored(original: Path, smpl_file: Path) -> None:
     path = original / "mask_cihp/Camera_B1/000003.png"
     labels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     labels[labels == 5] = 109
     write_picture(path, labels)
-    layout = read(original, smpl_file)
-    assert not layout.labels
-    assert layout.meta.label_names is None
-    assert any("holds the label 109, but CIHP has 0 to 19" in note for note in layout.notes)
-    blind = read(original, smpl_file, trust=Trust(watched_masks=0))
-    found = frame_of(blind, 0, 3).labels
+    found = frame_of(read(original, smpl_file), 0, 3).labels
     assert found is not None
     assert set(found.unique().tolist()) <= {*range(20), 255}
-
-
-def test_palette_colours_are_noted_and_not_used(original: Path, smpl_file: Path) -> None:
-    (original / "schp").mkdir()
-    assert any("schp/" in note for note in read(original, smpl_file).notes)
 
 
 def test_shapes_that_change_are_noted(original: Path, subject: Subject, smpl_file: Path) -> None:
@@ -451,19 +402,9 @@ def cut(name: str, keep: float) -> Callable[[Path], None]:
     return damage
 
 
-def moved_vertices(root: Path) -> None:
-    for path in (root / "new_vertices").iterdir():
-        np.save(path, np.load(path) + np.float32(0.05))
-
-
 def moved_body(root: Path) -> None:
-    """Parameters and vertices of another take: they agree, but not with the pictures."""
-    moved_vertices(root)
-    for path in (root / "new_vertices").iterdir():
-        np.save(path, np.load(path) + np.float32([0.55, 0.75, -0.05]))
+    """Parameters of another take."""
     every_param(lambda c: c.update(Th=c["Th"] + [[0.6, 0.8, 0.0]]))(root)
-    for path in (root / "new_vertices").iterdir():
-        np.save(path, np.load(path) - np.float32([0, 0, 0]))
 
 
 class Evil:
@@ -493,11 +434,11 @@ def swapped_lists(root: Path) -> None:
 
 GREY = np.zeros((40, 40), np.uint8)
 BAD = {
-    "no annots": (remove("annots.npy"), "is not a ZJU-MoCap subject: it has neither annots.npy"),
+    "no annots": (remove("annots.npy"), "is not a ZJU-MoCap subject: it has no annots.npy"),
     "annots cut": (cut("annots.npy", 0.5), "annots.npy is not a valid .npy file"),
     "annots of code": (evil, r"annots.npy asks for (posix|nt|os)\.system"),
     "no cams": (annots(lambda c: c.pop("cams") and None), "annots.npy has no 'cams'"),
-    "no D": (annots(lambda c: c["cams"].pop("D") and None), "cams has no list 'D'"),
+    "no D": (annots(lambda c: c["cams"].pop("D") and None), "found 3 K, 3 R, 3 T, 0 D"),
     "K of fewer cameras": (
         annots(lambda c: c["cams"].update(K=c["cams"]["K"][:2])),
         "cams must hold one K, R, T and D per camera, found 2 K, 3 R",
@@ -528,7 +469,7 @@ BAD = {
     ),
     "Th in millimetres": (
         every_param(lambda c: c.update(Th=c["Th"] * 1000)),
-        "new_params and .*new_vertices do not belong together",
+        r"cameras stand .* expected 0.5-20 m; T in .*millimetres",
     ),
     "R sheared": (cams("R", shear), r"camera Camera_B2 \(index 1\): R is not a rotation"),
     "R mirrored": (cams("R", lambda R: R * [[1], [1], [-1]]), "Camera_B2 .*R mirrors"),
@@ -560,15 +501,6 @@ BAD = {
         "2.npy has no 'Rh'",
     ),
     "parameters cut": (cut("new_params/1.npy", 0.7), "1.npy is not a valid .npy file"),
-    "vertices of another fit": (
-        moved_vertices,
-        "new_params and .*new_vertices do not belong together: .* 8.7 cm off",
-    ),
-    "vertices cut": (cut("new_vertices/0.npy", 0.7), "0.npy is not a valid .npy file"),
-    "vertices of another body": (
-        lambda root: np.save(root / "new_vertices/0.npy", np.zeros((778, 3))),
-        r"must hold vertices of shape \(6890, 3\), found \(778, 3\)",
-    ),
     "pictures of another release": (
         moved_body,
         "the projected body and the masks do not meet .*check that cameras, SMPL parameters",
@@ -612,8 +544,8 @@ def test_damage_is_refused_in_one_sentence(original: Path, smpl_file: Path, name
     assert not Path("/tmp/never").exists()
 
 
-def test_joints_need_a_model_file_or_a_cache(written: Path) -> None:
-    with pytest.raises(DataError, match=r"parameters and vertices but no joints.*data.smpl=/path"):
+def test_joints_need_a_model_file(written: Path) -> None:
+    with pytest.raises(DataError, match=r"SMPL parameters but no joints.*data.smpl=/path"):
         read(written, None)
 
 
@@ -644,82 +576,11 @@ def test_settings_that_cannot_be(
         read(written, smpl_file, **settings)
 
 
-def moving(path: Path) -> None:
-    cameras = pickle.loads(path.read_bytes())
-    cameras["frame_000002"]["extrinsics"] = cameras["frame_000002"]["extrinsics"] + np.eye(4)
-    path.write_bytes(pickle.dumps(cameras))
-
-
-def turned_twice(path: Path) -> None:
-    infos = pickle.loads(path.read_bytes())
-    infos["frame_000002"]["poses"] = infos["frame_000002"]["poses"] + 0.1
-    path.write_bytes(pickle.dumps(infos))
-
-
-CACHE_DAMAGE: dict[str, tuple[str, Callable[[Path], Any], str]] = {
-    "moving camera": (
-        "humannerf",
-        lambda root: moving(root / "cameras.pkl"),
-        "cameras.pkl, frame 2: the camera moves",
-    ),
-    "root turned twice": (
-        "humannerf",
-        lambda root: turned_twice(root / "mesh_infos.pkl"),
-        "mesh_infos.pkl, frame 2: the first 3 numbers of 'poses' must be 0, found up to 0.1",
-    ),
-    "cameras cut": ("humannerf", cut("cameras.pkl", 0.5), "cameras.pkl is not a valid pickle"),
-    "cameras a list": (
-        "humannerf",
-        lambda root: (root / "cameras.pkl").write_bytes(pickle.dumps([1])),
-        "cameras.pkl must hold a dict",
-    ),
-    "infos unnumbered": (
-        "humannerf",
-        lambda root: (root / "mesh_infos.pkl").write_bytes(pickle.dumps({"a": 1})),
-        "every key must be a frame's name with its number, found a",
-    ),
-    "infos without joints": (
-        "humannerf",
-        lambda root: (root / "mesh_infos.pkl").write_bytes(
-            pickle.dumps({"frame_000000": {"poses": np.zeros(72), "Rh": [0] * 3, "Th": [0] * 3}})
-        ),
-        "mesh_infos.pkl, frame 0 has no 'joints'",
-    ),
-    "evil cache": (
-        "humannerf",
-        lambda root: (root / "mesh_infos.pkl").write_bytes(pickle.dumps(Evil())),
-        r"mesh_infos.pkl asks for .*system",
-    ),
-    "no pictures": ("humannerf", remove("images"), "images holds no images"),
-    "no names": (
-        "arah",
-        lambda root: (root / "cam_params.json").write_text("{}"),
-        "cam_params.json has no list 'all_cam_names'",
-    ),
-    "camera without pictures": ("arah", remove("2"), "2 holds no images, but cam_params.json"),
-    "no models": (
-        "arah",
-        lambda root: [p.unlink() for p in (root / "models").iterdir()],
-        "holds no",
-    ),
-    "object npz": (
-        "arah",
-        lambda root: np.savez(root / "models/000001.npz", betas=np.array([Evil()], object)),
-        "000001.npz (asks for|has no|is not a valid)",
-    ),
-}
-
-
-@pytest.mark.parametrize("name", CACHE_DAMAGE)
-def test_damaged_caches(subject: Subject, tmp_path: Path, name: str) -> None:
-    kind, damage, message = CACHE_DAMAGE[name]
-    write = {"humannerf": writers.write_humannerf, "arah": writers.write_arah}[kind]
-    root = write(tmp_path / "377", subject)
-    read(root, None)
-    damage(root)
-    with pytest.raises(DataError, match=message) as caught:
-        read(root, None)
-    assert "\n" not in str(caught.value)
+@pytest.mark.parametrize("name", ["mesh_infos.pkl", "cam_params.json"])
+def test_caches_of_other_projects_are_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    with pytest.raises(DataError, match=r"HumanNeRF or ARAH prepared.* give the original"):
+        read(tmp_path, None)
 
 
 def test_a_size_that_the_headers_did_not_show_is_found_on_decoding(
@@ -729,13 +590,6 @@ def test_a_size_that_the_headers_did_not_show_is_found_on_decoding(
     write_picture(original / "Camera_B1/000001.jpg", np.zeros((20, 20, 3), np.uint8))
     with pytest.raises(DataError, match=r"000001.jpg is 20x20 pixels .* Camera_B1 has 40x40"):
         frame_of(layout, 0, 1)
-
-
-def test_a_person_far_off_is_a_matter_of_units(original: Path, smpl_file: Path) -> None:
-    shutil.rmtree(original / "new_vertices")
-    every_param(lambda c: c.update(Th=c["Th"] * 1000 + [[0, 90.0, 0]]))(original)
-    with pytest.raises(DataError, match=r"cameras stand .* expected 0.5-20 m; T in .*millimetres"):
-        read(original, smpl_file)
 
 
 def test_boxes() -> None:

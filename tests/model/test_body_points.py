@@ -203,7 +203,7 @@ def test_a_run_from_before_body_points_and_low_pass_loads_as_it_was_trained(tiny
     checkpoint = stored(module, tmp_path)
     del checkpoint["gsgan"]["effects"]["body_points"]
     torch.save(checkpoint, tmp_path / CHECKPOINT)
-    data._info = replace(data.info, body_inside=1.0)  # what would call for points on the body now
+    data.info = replace(data.info, body_inside=1.0)  # what would call for points on the body now
     avatar, _ = load_avatar(tmp_path, config, data)
     assert avatar.body_points is None
     assert avatar.accuracy.low_pass == avatar.segmentation.accuracy.low_pass == 0.3

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gsgan.check.views import Subject, View
 from gsgan.data import crop as cropping
 from gsgan.data import pixels as reading
-from gsgan.data.crop import NEAR, Window
+from gsgan.data.crop import NEAR, Crop
 from gsgan.data.files import read_colour
 from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float
 from gsgan.skeleton.template import SkeletonTemplate
@@ -84,7 +84,7 @@ def tile(subject: Subject, view: View, height: int) -> Bytes:
     return draw(image, mask, at, drawn, view.beyond, subject.template)
 
 
-def person_window(view: View, joints: Float, size: tuple[int, int]) -> Window:
+def person_window(view: View, joints: Float, size: tuple[int, int]) -> Crop:
     """The window about mask and joints ``[M, 2]``, of the tiles' aspect."""
     points = [np.clip(joints, 0, np.array(size[::-1]))]
     rows, columns = np.nonzero(view.mask)
@@ -99,7 +99,7 @@ def person_window(view: View, joints: Float, size: tuple[int, int]) -> Window:
     height = max(span[1], span[0] / ASPECT)
     width = height * ASPECT
     left, top = (low + high) / 2 - (width / 2, height / 2)
-    return Window(int(np.floor(top)), int(np.floor(left)), (round(height), round(width)))
+    return Crop(int(np.floor(top)), int(np.floor(left)), (round(height), round(width)))
 
 
 def draw(

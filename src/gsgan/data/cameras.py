@@ -16,7 +16,6 @@ from gsgan.utils.errors import DataError
 Float = NDArray[np.float64]
 
 DISTORTION_LENGTHS = (4, 5, 8)
-EXPECTED = "K, R, t, dist and size"
 
 
 @dataclass(frozen=True)
@@ -92,17 +91,7 @@ def make_camera(
     Raises:
         DataError: naming the camera and the problem.
     """
-    K = _intrinsics(where, K)
-    K[:2, 2] += 0.5 - pixel_centre
-    R = numbers(where, R, "R", (3, 3))
-    check_rotation(where, R, rotation_tolerance)
-    return CameraEntry(
-        name, K, R, numbers(where, t, "t", (3,)) * scale, distortion(where, dist), size
-    )
-
-
-def _intrinsics(where: str, raw: Any) -> Float:
-    K = numbers(where, raw, "K", (3, 3))
+    K = numbers(where, K, "K", (3, 3))
     if K[0, 0] <= 0 or K[1, 1] <= 0:
         raise DataError(
             f"{where}: the focal lengths in K must be above 0, found {K[0, 0]:g} and {K[1, 1]:g}"
@@ -111,7 +100,17 @@ def _intrinsics(where: str, raw: Any) -> Float:
         raise DataError(
             f"{where}: K must be [[fx, s, cx], [0, fy, cy], [0, 0, 1]], found {K.tolist()}"
         )
-    return K
+    K[:2, 2] += 0.5 - pixel_centre
+    R = numbers(where, R, "R", (3, 3))
+    error = np.abs(R @ R.T - np.eye(3)).max()
+    if error > rotation_tolerance:
+        raise DataError(
+            f"{where}: R is not a rotation, R Rᵀ differs from the identity by {error:.3g} "
+            f"(allowed {rotation_tolerance:g})"
+        )
+    if np.linalg.det(R) < 0:
+        raise DataError(f"{where}: R mirrors; expected a rotation, world to OpenCV camera axes")
+    return CameraEntry(name, K, R, numbers(where, t, "t", (3,)) * scale, _lens(where, dist), size)
 
 
 def numbers(where: str, raw: Any, key: str, shape: tuple[int, ...]) -> Float:
@@ -139,30 +138,8 @@ def _short(raw: Any, limit: int = 120) -> str:
     return text if len(text) <= limit else text[:limit] + "…"
 
 
-def check_rotation(where: str, R: Float, tolerance: float) -> None:
-    """Refuses a matrix that is not a rotation.
-
-    Raises:
-        DataError: on a sheared or mirrored matrix.
-    """
-    error = np.abs(R @ R.T - np.eye(3)).max()
-    if error > tolerance:
-        raise DataError(
-            f"{where}: R is not a rotation, R Rᵀ differs from the identity by {error:.3g} "
-            f"(allowed {tolerance:g})"
-        )
-    if np.linalg.det(R) < 0:
-        raise DataError(
-            f"{where}: R mirrors (determinant -1); expected a rotation, world to OpenCV camera axes"
-        )
-
-
-def distortion(where: str, raw: Any) -> Float:
-    """``[8]`` OpenCV lens coefficients, zero-padded; None and an empty list mean none.
-
-    Raises:
-        DataError: on another count, or numbers that are not finite.
-    """
+def _lens(where: str, raw: Any) -> Float:
+    """``[8]`` OpenCV lens coefficients, zero-padded; None and an empty list mean none."""
     padded = np.zeros(8)
     if raw is None or (isinstance(raw, (list, tuple)) and not raw):
         return padded

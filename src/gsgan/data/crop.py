@@ -13,11 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.checks import above
 
 Float = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
-Pixels = NDArray[np.float32]
 
 NEAR = 1e-2  # metres: points nearer than this are not seen
 
@@ -50,9 +49,6 @@ class Crop:
     size: tuple[int, int]
 
 
-Window = Crop  # former name
-
-
 def project(view: View, points: Float) -> tuple[Float, Float]:
     """Pixels ``[..., 2]`` (centres at +0.5) and depths ``[...]`` of world points ``[..., 3]``.
 
@@ -78,18 +74,14 @@ class PersonCrop:
     """A square crop round the projected joints.
 
     Args:
-        margin: metres kept round every joint for flesh, hair and cloth: landmarks lie inside the
-            body, and the crown is about 0.2 m above the ears.
-
-    Raises:
-        ConfigError: when the margin is not positive.
+        margin: metres kept round every joint for flesh, hair and cloth, above 0: landmarks lie
+            inside the body, and the crown is about 0.2 m above the ears.
     """
 
     margin: float = 0.2
 
     def __post_init__(self) -> None:
-        if not self.margin > 0:
-            raise ConfigError(f"data.crop.margin must be above 0 metres, got {self.margin}")
+        above("data.crop.margin", self.margin)
 
     def window(
         self, view: View, joints: Float, usable: NDArray[np.bool_], dist: Float | None = None
@@ -107,7 +99,7 @@ class PersonCrop:
         height, width = view.size
         pixels, depth = project(view, joints)
         if dist is not None:
-            pixels = _through_lens(view.K, dist, pixels)
+            pixels = _through_lens(view.K, dist, *pixels.T)
         taken = usable & (depth > NEAR)
         if not taken.any():
             return square_window(view.size)
@@ -154,31 +146,20 @@ def undistort_map(K: Float, dist: Float, crop: Crop) -> NDArray[np.float32]:
         crop: of the undistorted image.
     """
     if K[0, 1] == 0:  # OpenCV's own is ten times as fast, but ignores skew
-        u, v = _opencv_map(K, dist, crop)
+        stored = K.copy()
+        stored[:2, 2] -= 0.5  # to OpenCV's pixel centres
+        seen = stored.copy()
+        seen[:2, 2] -= (crop.left, crop.top)
+        size = crop.size[::-1]
+        maps = cv2.initUndistortRectifyMap(stored, dist, np.eye(3), seen, size, cv2.CV_32FC1)
+        pixels = np.stack(maps, axis=-1)
     else:
-        u, v = _skewed_map(K, dist, crop)
+        pixels = (_through_lens(K, dist, *_grid(crop)) - 0.5).astype(np.float32)
     limit = fold_radius(K, dist, crop)
     if limit is not None:
-        x, y = _rays(K, crop)
-        beyond = x * x + y * y > limit**2
-        u[beyond], v[beyond] = -1e4, -1e4
-    return np.stack([u, v], axis=-1)
-
-
-def _opencv_map(K: Float, dist: Float, crop: Crop) -> tuple[Pixels, Pixels]:
-    h, w = crop.size
-    stored = K.copy()
-    stored[:2, 2] -= 0.5  # to OpenCV's pixel centres
-    seen = stored.copy()
-    seen[:2, 2] -= (crop.left, crop.top)
-    u, v = cv2.initUndistortRectifyMap(stored, dist, np.eye(3), seen, (w, h), cv2.CV_32FC1)
-    return np.asarray(u, np.float32), np.asarray(v, np.float32)
-
-
-def _skewed_map(K: Float, dist: Float, crop: Crop) -> tuple[Pixels, Pixels]:
-    shown = distort(np.stack(_rays(K, crop), axis=-1), dist)
-    pixels = shown @ K[:2, :2].T + K[:2, 2] - 0.5
-    return pixels[..., 0].astype(np.float32), pixels[..., 1].astype(np.float32)
+        x, y = _unproject(K, *_grid(crop))
+        pixels[x * x + y * y > limit**2] = -1e4
+    return np.asarray(pixels, np.float32)
 
 
 def distort(points: Float, dist: Float) -> Float:
@@ -196,9 +177,9 @@ def distort(points: Float, dist: Float) -> Float:
     return np.asarray(shown, np.float64).reshape(points.shape)
 
 
-def _through_lens(K: Float, dist: Float, pixels: Float) -> Float:
-    """``[M, 2]`` where the lens shows what a pinhole shows at pixels ``[M, 2]``."""
-    shown = distort(np.stack(_unproject(K, pixels[:, 0], pixels[:, 1]), axis=-1), dist)
+def _through_lens(K: Float, dist: Float, u: Float, v: Float) -> Float:
+    """``[..., 2]`` pixels where the lens shows what a pinhole shows at pixels u, v ``[...]``."""
+    shown = distort(np.stack(_unproject(K, u, v), axis=-1), dist)
     return shown @ K[:2, :2].T + K[:2, 2]
 
 
@@ -208,11 +189,11 @@ def _unproject(K: Float, u: Float, v: Float) -> tuple[Float, Float]:
     return (u - K[0, 2] - K[0, 1] * y) / K[0, 0], y
 
 
-def _rays(K: Float, crop: Crop) -> tuple[Float, Float]:
-    """``[h, w]`` each: x/z and y/z of the crop's pixels."""
+def _grid(crop: Crop) -> tuple[Float, Float]:
+    """``[h, w]`` each: u and v of the crop's pixels, centres at +0.5."""
     h, w = crop.size
     v, u = np.mgrid[crop.top : crop.top + h, crop.left : crop.left + w] + 0.5
-    return _unproject(K, u, v)
+    return u, v
 
 
 def fold_radius(K: Float, dist: Float, crop: Crop, samples: int = 256) -> float | None:
@@ -236,7 +217,6 @@ def take(picture: Bytes, crop: Crop, mapping: NDArray[np.float32] | None, exact:
 
     Args:
         picture: ``[H, W]`` or ``[H, W, C]``.
-        crop: what to take.
         mapping: `undistort_map` of the same crop, or None for a pinhole camera.
         exact: take the nearest value (labels) instead of interpolating.
     """

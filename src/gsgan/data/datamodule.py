@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +21,10 @@ from torch.utils.data import DataLoader, Dataset, Subset
 
 from gsgan.data.checks import Checks
 from gsgan.data.crop import PersonCrop
-from gsgan.data.dataset import CaptureDataset, Lens, PictureCache
+from gsgan.data.dataset import CaptureDataset, Lens, PictureCache, StepSampler, pass_order
 from gsgan.data.formats.capture import CaptureReader
 from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
-from gsgan.data.sampler import StepSampler, pass_order
 from gsgan.data.scene_info import SceneInfo, count_labels, scene_info
 from gsgan.data.skeletons import complete_skeletons
 from gsgan.data.splits import SPLITS, Splits, make_splits, protocol_splits
@@ -56,24 +56,17 @@ def _quiet_worker(_: int) -> None:
 class GsganData(LightningDataModule):
     """A dataset in any format that has a reader, from a folder or made by ``source``.
 
+    conf/data/*.yaml explain the settings.
+
     Args:
         root: the folder; or None when ``source`` makes it.
-        reader: of the dataset's format (`gsgan.data.formats`); None is the bring-your-own layout.
-        smpl: the user's SMPL or SMPL-X model file, for datasets whose poses need one.
-        protocol: the splits of a publication; None takes those of the dataset or the keys below.
         source: called without arguments, makes the dataset if needed and returns its folder.
-        size: side of the square images in pixels; None keeps their size.
-        crop: "person" or a `PersonCrop` cuts round the person; None keeps the full image.
-        batch_size: items per batch.
+        reader: of the dataset's format (`gsgan.data.formats`); None is the bring-your-own layout.
+        protocol: the splits of a publication; None takes those of the dataset or the keys below.
         train_cameras, test_cameras, train_frames, test_frames, test_share: see `make_splits`.
-        val_pictures: held-out images rendered during training.
-        steps_per_epoch: batches per epoch; None is one pass over the training items.
         workers: loading processes; 0 loads in this one; None is 0 without a GPU, else up to
             `MOST_WORKERS`, one per processor that each GPU has.
-        seed: of the order of training items.
         cache_mb: bound on decoded images kept in memory, over all loading processes.
-        info_samples: images per camera for the mean foreground colour.
-        min_joints: a frame with fewer usable joints is dropped.
         distortion: ``auto`` and ``undistort`` undistort images on reading; ``off`` treats them as
             a pinhole's; ``project`` keeps the distortion, with the lens in ``camera.dist``.
         wanted: description of the root, for the message when it is not set.
@@ -119,7 +112,9 @@ class GsganData(LightningDataModule):
         self.smpl = smpl
         self.protocol = protocol
         self.size = size
-        self.crop = _crop(crop)
+        if not (crop in (None, "person") or isinstance(crop, PersonCrop)):
+            raise ConfigError(f"data.crop must be null or person, got {crop!r}")
+        self.crop = PersonCrop() if isinstance(crop, str) else crop
         self.batch_size = whole("data.batch_size", batch_size, 1)
         self.split_keys = {
             "train_cameras": train_cameras,
@@ -137,11 +132,7 @@ class GsganData(LightningDataModule):
         self.cache_mb = at_least("data.cache_mb", cache_mb, 0)
         self.info_samples = whole("data.info_samples", info_samples, 1)
         self.checks = replace(Checks(), min_joints=whole("data.min_joints", min_joints, 1))
-        self.lens = _lens(distortion)
-        self._datasets: dict[str, CaptureDataset] | None = None
-        self._layout: Layout | None = None
-        self._splits: Splits | None = None
-        self._info: SceneInfo | None = None
+        self.lens = LENSES[one_of("effects.distortion", distortion, LENSES)]
 
     def prepare_data(self) -> None:
         """Makes the dataset if it has a ``source``; one process per machine."""
@@ -153,42 +144,63 @@ class GsganData(LightningDataModule):
         Raises:
             DataError: see the reader and `make_splits`.
         """
-        if self._datasets is not None:
-            return
-        self._layout = layout = self.reader(self._folder(), self.checks, self.smpl)
-        self._splits = splits = self._split(layout)
-        _refuse_leak(layout, splits)
-        for note in (*layout.notes, *splits.notes):
-            log.warning("%s: %s", layout.root, note)
+        if "_datasets" not in self.__dict__:
+            for note in (*self.layout.notes, *self.splits.notes):
+                log.warning("%s: %s", self.layout.root, note)
+            assert self._datasets
+
+    @cached_property
+    def layout(self) -> Layout:
+        """The capture, read on first use."""
+        return self.reader(self._folder(), self.checks, self.smpl)
+
+    @cached_property
+    def splits(self) -> Splits:
+        """The training and held-out items."""
+        if self.protocol is None:
+            splits = make_splits(self.layout, **self.split_keys)
+        else:
+            given = [k for k, v in self.split_keys.items() if k != "test_share" and v is not None]
+            if given:
+                raise ConfigError(
+                    f"data.{given[0]} is set, but protocol {self.protocol.name} sets the splits; "
+                    "leave one of them out"
+                )
+            splits = protocol_splits(self.layout, self.protocol)
+        marks = self.layout.landmarks
+        held_out = set(splits.test_cameras) - set(splits.train_cameras)
+        if leaks := [camera for camera in marks.fitted_to if camera in held_out]:
+            raise ConfigError(
+                f"{marks.source} was fitted to the masks of {leaks[0]}, which is held out here; "
+                "run gsgan.fit with the same data.train_cameras, data.test_cameras or protocol"
+            )
+        return splits
+
+    @cached_property
+    def _datasets(self) -> dict[str, CaptureDataset]:
+        layout, splits = self.layout, self.splits
+        sizes = {camera.size for camera in layout.cameras.values()}
+        if self.size is None and self.batch_size > 1 and (self.crop or len(sizes) > 1):
+            raise ConfigError(
+                "data.size is not set and images differ in size, so batches of "
+                f"{self.batch_size} cannot be made; set data.size (e.g. 512) or data.batch_size=1"
+            )
         # every process has its own, and training and validation start their own workers
-        limit = int(self.cache_mb * 2**20) // (2 * self.workers + 1)
-        cache = PictureCache(limit)
+        cache = PictureCache(int(self.cache_mb * 2**20) // (2 * self.workers + 1))
         trained = sorted({frame for _, frame in splits.items["train"]})
         skeletons = complete_skeletons(layout.landmarks, layout.frames, trained)
-        self._datasets = {
+        return {
             name: CaptureDataset(
                 layout, splits.items[name], self.size, self.crop, cache, self.lens, skeletons
             )
             for name in SPLITS
         }
-        self._check_one_size()
 
     def _folder(self) -> str | Path:
         if self.root is not None:
             return self.root
         assert self.source is not None  # checked in __init__
         return self.source()
-
-    def _split(self, layout: Layout) -> Splits:
-        if self.protocol is None:
-            return make_splits(layout, **self.split_keys)
-        given = [k for k, v in self.split_keys.items() if k != "test_share" and v is not None]
-        if given:
-            raise ConfigError(
-                f"data.{given[0]} is set, but protocol {self.protocol.name} sets the splits; leave "
-                "one of them out"
-            )
-        return protocol_splits(layout, self.protocol)
 
     def protocol_record(self, lpips_net: str) -> dict[str, Any] | None:
         """The record beside every score: the protocol and where this run departs from it.
@@ -205,41 +217,16 @@ class GsganData(LightningDataModule):
         departures = self.protocol.departures(lpips_net=lpips_net, scale=scale, padded=padded)
         return self.protocol.record() | {"departures": list(departures)}
 
-    def _check_one_size(self) -> None:
-        sizes = {camera.size: name for name, camera in self.layout.cameras.items()}
-        if self.size is None and self.batch_size > 1 and (self.crop or len(sizes) > 1):
-            raise ConfigError(
-                "data.size is not set and images differ in size, so batches of "
-                f"{self.batch_size} cannot be made; set data.size (e.g. 512) or data.batch_size=1"
-            )
-
-    @property
-    def layout(self) -> Layout:
-        """The capture, read on first use."""
-        self.setup()
-        assert self._layout is not None
-        return self._layout
-
-    @property
-    def splits(self) -> Splits:
-        """The training and held-out items."""
-        self.setup()
-        assert self._splits is not None
-        return self._splits
-
     @property
     def reasons(self) -> dict[str, str]:
         """Why a split is empty, for those that are."""
         return self.splits.reasons
 
-    @property
+    @cached_property
     def info(self) -> SceneInfo:
         """Facts about the scene from the training split, computed on first use."""
-        if self._info is None:
-            train = self.dataset("train")
-            held_out = [self.dataset(name) for name in SPLITS[1:]]
-            self._info = scene_info(self.layout, self.splits, train, self.info_samples, held_out)
-        return self._info
+        train, *held_out = (self.dataset(name) for name in SPLITS)
+        return scene_info(self.layout, self.splits, train, self.info_samples, held_out)
 
     @property
     def eval_names(self) -> tuple[str, ...]:
@@ -255,18 +242,20 @@ class GsganData(LightningDataModule):
         if split not in SPLITS:
             raise ValueError(f"dataset: split must be one of {', '.join(SPLITS)}, got {split!r}")
         self.setup()
-        assert self._datasets is not None
         return self._datasets[split]
 
     def labelled(self, split: str) -> Subset[Frame]:
         """The items of a split whose images have part labels; may be empty."""
-        dataset, labels = self.dataset(split), self.layout.label_path
-        return Subset(dataset, [i for i, item in enumerate(dataset.items) if labels(*item)])
+        dataset = self.dataset(split)
+        chosen = [i for i, item in enumerate(dataset.items) if self.layout.label_path(*item)]
+        return Subset(dataset, chosen)
 
     def train_dataloader(self) -> DataLoader[Frame]:
         """Batches of `Frame` in `StepSampler` order."""
         dataset = self.dataset("train")
-        replicas, rank, epoch = self._place()
+        replicas, rank, epoch = 1, 0, 0
+        if (on := self.trainer) is not None:
+            replicas, rank, epoch = on.world_size, on.global_rank, on.current_epoch
         per_pass = math.ceil(len(dataset) / (self.batch_size * replicas))
         steps = self.steps_per_epoch or per_pass
         sampler = StepSampler(len(dataset), self.batch_size, steps, self.seed, replicas, rank)
@@ -275,10 +264,9 @@ class GsganData(LightningDataModule):
 
     @property
     def watched(self) -> tuple[str, list[int]]:
-        """Pictures watched while training, a split and places in it: evenly spaced over held-out
-        poses.
+        """The split and indices of the images rendered while training, evenly spaced.
 
-        Without held-out poses they come from held-out cameras; without those, from training.
+        Of held-out poses, without those of held-out cameras, without those of the training split.
         """
         name = next((n for n in ("novel_pose", "novel_view") if self.splits.items[n]), "train")
         most = len(self.dataset(name))
@@ -299,12 +287,6 @@ class GsganData(LightningDataModule):
     ) -> Frame:
         """The batch on the device; Lightning's own walk cannot rebuild frozen records."""
         return batch.to(device)
-
-    def _place(self) -> tuple[int, int, int]:
-        """Number of processes, rank of this one, epoch: 1, 0, 0 without a trainer."""
-        if self.trainer is None:
-            return 1, 0, 0
-        return self.trainer.world_size, self.trainer.global_rank, self.trainer.current_epoch
 
     def _loader(
         self, dataset: Dataset[Frame], sampler: StepSampler | None = None
@@ -328,26 +310,3 @@ def default_workers() -> int:
     mine = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None
     processors = mine or os.cpu_count() or 1
     return max(0, min(MOST_WORKERS, processors // gpus - 1))
-
-
-def _refuse_leak(layout: Layout, splits: Splits) -> None:
-    held_out = [c for c in splits.test_cameras if c not in splits.train_cameras]
-    seen = [camera for camera in held_out if camera in layout.landmarks.fitted_to]
-    if seen:
-        raise ConfigError(
-            f"{layout.landmarks.source} was fitted to the masks of {seen[0]}, which is held out "
-            "here; run gsgan.fit with the same data.train_cameras, data.test_cameras or protocol"
-        )
-
-
-def _crop(crop: PersonCrop | str | None) -> PersonCrop | None:
-    if crop == "person":
-        return PersonCrop()
-    if crop is None or isinstance(crop, PersonCrop):
-        return crop
-    raise ConfigError(f"data.crop must be null or person, got {crop!r}")
-
-
-def _lens(distortion: str) -> Lens:
-    """The treatment of lens distortion on reading."""
-    return LENSES[one_of("effects.distortion", distortion, LENSES)]

@@ -1,8 +1,8 @@
-"""A capture as a torch dataset of `Frame`, one camera and one moment per item."""
+"""A capture as a torch dataset of `Frame`, one camera and one moment per item; their order."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,11 +13,12 @@ from cachetools import LRUCache
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
+from torch.utils.data.distributed import DistributedSampler
 
 from gsgan.data import crop as cropping
 from gsgan.data import pixels
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import PersonCrop, Window
+from gsgan.data.crop import Crop, PersonCrop
 from gsgan.data.files import read_colour
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL
@@ -46,12 +47,6 @@ class Picture:
     labels: Bytes | None
     unsure: Bytes | None = None
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes held."""
-        parts = (self.image, self.mask, self.labels, self.unsure)
-        return sum(part.nbytes for part in parts if part is not None)
-
 
 class PictureCache(LRUCache[Item, Picture]):
     """The most recently used images.
@@ -65,8 +60,9 @@ class PictureCache(LRUCache[Item, Picture]):
 
     @staticmethod
     def getsizeof(value: Picture) -> int:
-        """Bytes of an image."""
-        return value.nbytes
+        """Bytes held."""
+        parts = (value.image, value.mask, value.labels, value.unsure)
+        return sum(part.nbytes for part in parts if part is not None)
 
 
 class CaptureDataset(Dataset[Frame]):
@@ -124,8 +120,12 @@ class CaptureDataset(Dataset[Frame]):
         decoded = self.cache.get(item)
         if decoded is None:
             decoded = self._load(item)
-            if decoded.nbytes <= self.cache.maxsize:
+            if self.cache.getsizeof(decoded) <= self.cache.maxsize:
                 self.cache[item] = decoded
+        labels, poses = decoded.labels, self.layout.poses
+        body = None
+        if poses is not None:
+            body = BodyPose(_float(poses.theta[frame]), _float(poses.transl[frame]))
         return Frame(
             image=_unit(decoded.image)[None],
             mask=_unit(decoded.mask)[None, None],
@@ -134,8 +134,8 @@ class CaptureDataset(Dataset[Frame]):
             visibility=_float(self.layout.landmarks.visibility[frame]),
             frame_id=torch.tensor([frame]),
             camera_index=torch.tensor([self._indices[name]]),
-            body=self._body(frame),
-            labels=_labels(decoded.labels),
+            body=body,
+            labels=None if labels is None else torch.from_numpy(labels).to(torch.int64)[None],
             unsure=None if decoded.unsure is None else _unit(decoded.unsure)[None, None],
         )
 
@@ -151,11 +151,10 @@ class CaptureDataset(Dataset[Frame]):
         taken = cropping.resize(taken, self._target(window), exact=True)
         return None if taken.all() else _unit(taken)[None, None]
 
-    def _target(self, window: Window) -> tuple[int, int]:
-        """``(H, W)`` of the images."""
+    def _target(self, window: Crop) -> tuple[int, int]:
         return window.size if self.size is None else (self.size, self.size)
 
-    def window(self, item: Item) -> Window:
+    def window(self, item: Item) -> Crop:
         """Which part of the (undistorted) image an item shows."""
         camera = self.layout.cameras[item[0]]
         if self.crop is not None:
@@ -166,13 +165,14 @@ class CaptureDataset(Dataset[Frame]):
             )
         if self.size is not None:
             return cropping.square_window(camera.size)
-        return Window(0, 0, camera.size)
+        return Crop(0, 0, camera.size)
 
     def camera(self, item: Item) -> Camera:
         """The camera of the item's image: window and scale are in its K."""
-        window = self.window(item)
-        entry = self.layout.cameras[item[0]]
-        camera = _camera(entry, self._raw(entry))
+        window, entry = self.window(item), self.layout.cameras[item[0]]
+        K, R, t = (torch.from_numpy(a)[None] for a in (entry.K, entry.R, entry.t))
+        lens = torch.from_numpy(entry.dist[None, :5]) if self._raw(entry) else None
+        camera = Camera(K, R, t, entry.size, lens)
         camera = camera.crop(window.top, window.left, window.size)
         if self.size is not None:
             camera = camera.resize((self.size, self.size))
@@ -182,7 +182,7 @@ class CaptureDataset(Dataset[Frame]):
         """Whether the camera's images keep their distortion, with ``camera.dist`` set."""
         return self.lens == "raw" and camera.distorted and not camera.dist[5:].any()
 
-    def _mapping(self, camera: CameraEntry, window: Window) -> NDArray[np.float32] | None:
+    def _mapping(self, camera: CameraEntry, window: Crop) -> NDArray[np.float32] | None:
         """Where the window's pixels lie in the stored image; None for a pinhole."""
         if not camera.distorted or self.lens == "ignore" or self._raw(camera):
             return None
@@ -229,23 +229,10 @@ class CaptureDataset(Dataset[Frame]):
         path, camera = self.layout.label_path(*item), self.layout.cameras[item[0]]
         if path is None:
             return np.full(camera.size, IGNORE_LABEL, np.uint8)
-        meta = self.layout.meta
-        labels = pixels.read_labels(
-            path, self.layout.pixels, meta.label_names, meta.labels_named_by
-        )
+        meta, rules = self.layout.meta, self.layout.pixels
+        labels = pixels.read_labels(path, rules, meta.label_names, meta.labels_named_by)
         self._check_size(path, labels, camera)
         return labels
-
-    def _body(self, frame: int) -> BodyPose | None:
-        poses = self.layout.poses
-        if poses is None:
-            return None
-        return BodyPose(theta=_float(poses.theta[frame]), transl=_float(poses.transl[frame]))
-
-
-def _camera(entry: CameraEntry, raw: bool) -> Camera:
-    K, R, t = (torch.from_numpy(a)[None] for a in (entry.K, entry.R, entry.t))
-    return Camera(K, R, t, entry.size, torch.from_numpy(entry.dist[None, :5]) if raw else None)
 
 
 def _unit(pixels: Bytes) -> Tensor:
@@ -256,5 +243,55 @@ def _float(array: NDArray[np.float64]) -> Tensor:
     return torch.from_numpy(array).to(torch.float32)[None]
 
 
-def _labels(labels: Bytes | None) -> Tensor | None:
-    return None if labels is None else torch.from_numpy(labels).to(torch.int64)[None]
+class StepSampler(DistributedSampler[int]):
+    """Draws the items of every global step from (seed, step) alone.
+
+    An epoch is ``steps`` batches. Draws run through shuffled passes over all items, each item once
+    per pass, across epoch borders; so a resumed run sees the order of an unbroken one. It is a
+    `DistributedSampler` because Lightning would wrap and reshuffle anything else on several
+    processes; the processes share the draws of a step between them.
+
+    Args:
+        items: number of items.
+        batch_size: items per batch and process.
+        steps: batches per epoch.
+        seed: of the shuffles.
+        replicas: number of processes.
+        rank: of this process.
+    """
+
+    def __init__(
+        self, items: int, batch_size: int, steps: int, seed: int, replicas: int = 1, rank: int = 0
+    ) -> None:
+        super().__init__(_Count(items), num_replicas=replicas, rank=rank, shuffle=True, seed=seed)
+        self.items, self.batch_size, self.steps = items, batch_size, steps
+
+    def __len__(self) -> int:
+        return self.steps * self.batch_size
+
+    def __iter__(self) -> Iterator[int]:
+        order, shuffled = torch.empty(0), -1
+        for step in range(self.epoch * self.steps, (self.epoch + 1) * self.steps):
+            first = (step * self.num_replicas + self.rank) * self.batch_size
+            for draw in range(first, first + self.batch_size):
+                if draw // self.items != shuffled:
+                    shuffled = draw // self.items
+                    order = pass_order(self.items, self.seed, shuffled)
+                yield int(order[draw % self.items])
+
+
+class _Count(Dataset[int]):
+    """A length; `DistributedSampler` asks its dataset for nothing else."""
+
+    def __init__(self, length: int) -> None:
+        self.length = length
+
+    def __len__(self) -> int:
+        return self.length
+
+
+def pass_order(items: int, seed: int, number: int) -> torch.Tensor:
+    """``[items]`` the order of a shuffled pass, a pure function of its arguments."""
+    mixed = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]
+    generator = torch.Generator().manual_seed(int(mixed) >> 1)
+    return torch.randperm(items, generator=generator)

@@ -1,7 +1,7 @@
 """Files of a dataset: image headers, images, JSON, arrays.
 
-Every function turns problems with a file into one `DataError` that names the file, the expected
-and the actual content. Nothing here unpickles.
+Every function turns problems with a file into one `DataError` that names the file. Nothing here
+unpickles.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from PIL import Image, UnidentifiedImageError
 from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_npz
 
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE, JPEG_END, JPEG_SCAN = b"\xff\xd8", b"\xff\xd9", b"\xff\xda"
 LARGEST_FRAME = 10**9  # frame numbers beyond it are dates or damage
 
@@ -82,23 +81,17 @@ def check_picture(path: Path, kind: str, size: tuple[int, int], expected_by: str
     header = read_header(path)
     if header.size != size:
         raise DataError(
-            f"{path} is {_wh(header.size)} pixels (width x height), but {expected_by} has "
-            f"{_wh(size)}; scale one of them so that they agree"
+            f"{path} is {header.size[1]}x{header.size[0]} pixels (width x height), but "
+            f"{expected_by} has {size[1]}x{size[0]}; scale one of them so that they agree"
         )
     if header.depth > 8 or (kind == "labels" and header.depth != 8):
         raise DataError(f"{path} has {header.depth} bits a channel; expected 8 (save it as 8-bit)")
     if header.jpeg and header.channels == 4:
         raise DataError(f"{path} is a CMYK JPEG; expected RGB or grey (convert it to RGB)")
-    if header.palette and kind != "image":
-        raise DataError(f"{path} is a palette PNG; expected 8-bit grey values for a {kind} file")
-    if kind == "labels" and header.channels != 1:
+    if (header.palette and kind != "image") or (kind == "labels" and header.channels != 1):
         raise DataError(
-            f"{path} has {header.channels} channels; expected one channel of part numbers"
+            f"{path} is a palette PNG or has colours; expected 8-bit grey values for a {kind} file"
         )
-
-
-def _wh(size: tuple[int, int]) -> str:
-    return f"{size[1]}x{size[0]}"
 
 
 def read_colour(path: Path) -> NDArray[np.uint8]:
@@ -112,20 +105,12 @@ def read_colour(path: Path) -> NDArray[np.uint8]:
 
 
 def read_grey(path: Path) -> NDArray[np.uint8]:
-    """``[H, W]`` uint8, a colour file converted.
-
-    Raises:
-        DataError: when the file is missing, damaged or cut off.
-    """
+    """``[H, W]`` uint8, a colour file converted; errors as `read_colour`."""
     return _decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def read_stored(path: Path) -> NDArray[np.uint8]:
-    """``[H, W]`` or ``[H, W, 3]`` uint8 as stored; an alpha channel is left out.
-
-    Raises:
-        DataError: when the file is missing, damaged, cut off or not 8-bit.
-    """
+    """``[H, W]`` or ``[H, W, 3]`` 8-bit, as stored, without alpha; errors as `read_colour`."""
     image = _decode_8_bit(path)
     return image[..., :3] if image.ndim == 3 else image
 
@@ -191,11 +176,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_json_value(path: Path) -> Any:
-    """The content of a JSON file, of any type.
-
-    Raises:
-        DataError: when the file is missing or is not JSON.
-    """
+    """The content of a JSON file, of any type; errors as `read_json`."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -241,7 +222,10 @@ def frame_files(
             continue
         frame = (number or last_number)(stem)
         if frame is None:
-            raise unnumbered(place / name)
+            raise DataError(
+                f"{place / name} has no frame number up to {LARGEST_FRAME} in its name; number the "
+                f"frames 0, 1, 2 … equally in all cameras, e.g. 000012{suffix}"
+            )
         if frame in found:
             raise DataError(
                 f"{place} holds frame {frame} twice, as {found[frame].rpartition('/')[2]} and "
@@ -249,18 +233,6 @@ def frame_files(
             )
         found[frame] = f"{folder}/{name}"
     return found
-
-
-def unnumbered(path: Path) -> DataError:
-    """The error for a file whose name holds no frame number, or one too large to be one."""
-    digits = re.findall(r"[0-9]+", path.stem)
-    if digits and frame_of(digits[-1]) is None:
-        return DataError(
-            f"{path} is named by a date or time stamp ({digits[-1][:24]}), not by a frame number "
-            f"up to {LARGEST_FRAME}; stamps differ between cameras: number the frames 0, 1, 2 … "
-            "equally in all of them"
-        )
-    return DataError(f"{path} has no frame number in its name; expected e.g. 000012{path.suffix}")
 
 
 def last_number(stem: str) -> int | None:

@@ -55,11 +55,10 @@ class Meta:
 
     Args:
         unit: of the lengths in its files: m, cm or mm.
-        fps: frames per second, or None if unknown.
+        fps: frames per second.
         up_axis: of the world, e.g. "z" or "-y".
         skeleton: name of the landmark set.
         skeleton_source: origin of the landmarks, e.g. "smpl24 -> mediapipe33".
-        body: the skinned body that the poses move, or None.
         label_names: names of the part numbers, background first, or None.
         labels_named_by: the source of those names, for messages.
         splits: train_cameras, test_cameras, train_frames, test_frames of the dataset itself,
@@ -81,6 +80,21 @@ class Meta:
 
 @dataclass(frozen=True, kw_only=True)
 class _Contents:
+    """Paths are relative to the root.
+
+    Args:
+        root: the dataset's folder.
+        meta: about the whole.
+        cameras: by name, in the order of `camera_index`.
+        images: by camera and frame.
+        masks: by camera and frame, one or more per image.
+        labels: by camera and frame; empty without labels.
+        landmarks: by frame.
+        poses: by frame, or None.
+        pixels: how to decode the files.
+        notes: one sentence for each conversion or omission.
+    """
+
     root: Path
     meta: Meta
     cameras: Mapping[str, CameraEntry]
@@ -98,20 +112,10 @@ class Found(_Contents):
     """The files that a reader found; they are not yet checked against each other.
 
     Args:
-        root: the dataset's folder; all paths are relative to it.
-        meta: about the whole.
-        cameras: by name, in the order of `camera_index`.
-        images: by camera and frame.
-        masks: by camera and frame, one or more per image; images may lack theirs.
         mask_folder: where the masks of ``{camera}`` are expected, for messages.
-        labels: by camera and frame; empty without labels.
-        landmarks: by frame.
-        poses: by frame, or None.
-        pixels: how to decode the files.
         calibration: the file that holds the cameras, for messages.
         unit_hint: what to check when distances are implausible.
         points: points on the body's surface, compared with the masks; None compares the joints.
-        notes: one sentence for each conversion or omission so far.
     """
 
     mask_folder: str = "mask/{camera}"
@@ -125,17 +129,7 @@ class Layout(_Contents):
     """A capture on disk, validated and indexed; no image is decoded.
 
     Args:
-        root: the folder.
-        meta: about the whole.
-        cameras: by name, in the order of `camera_index`.
         frames: usable frame numbers, rising.
-        images: paths relative to the root by camera and frame, usable ones only.
-        masks: the same for masks, one or more per image.
-        labels: the same for part labels; empty without labels.
-        landmarks: by frame.
-        poses: by frame, or None.
-        pixels: how to decode the files.
-        notes: one sentence for each conversion or omission.
     """
 
     frames: tuple[int, ...]
@@ -190,7 +184,14 @@ def assemble(found: Found, checks: Checks) -> Layout:
     folders = {name: root / found.mask_folder.format(camera=name) for name in cameras}
     images = drop_unmasked(images, found.masks, folders, checks, notes)
     masks = {c: {f: found.masks[c][f] for f in files} for c, files in images.items()}
-    labels = _labels_of(images, found.labels, notes)
+    labels = {
+        c: {f: p for f, p in found.labels.get(c, {}).items() if f in files}
+        for c, files in images.items()
+    }
+    labelled, count = (sum(len(files) for files in x.values()) for x in (labels, images))
+    labels = labels if labelled else {}
+    if 0 < labelled < count:
+        notes.append(f"{count - labelled} of {count} images have no labels, they count as 'ignore'")
     check_pictures(root, cameras, images, masks, labels, checks.header_stride, calibration)
     return Layout(
         root=root,
@@ -205,12 +206,3 @@ def assemble(found: Found, checks: Checks) -> Layout:
         pixels=found.pixels,
         notes=tuple(notes),
     )
-
-
-def _labels_of(images: Index, found: Index, notes: list[str]) -> Index:
-    labels = {c: {f: p for f, p in found.get(c, {}).items() if f in images[c]} for c in images}
-    count = sum(len(files) for files in images.values())
-    missing = count - sum(len(files) for files in labels.values())
-    if 0 < missing < count:
-        notes.append(f"{missing} of {count} images have no labels, they count as 'ignore'")
-    return labels if missing < count else {}

@@ -24,7 +24,6 @@ IGNORE_LABEL = 255
 MASK_RULES = ("grey", "nonzero", "threshold", "label")
 """grey: alpha 0..255. nonzero: any channel above 0 is the person. threshold: at least
 `PixelRules.threshold` is. label: part numbers, all but 0 are."""
-JPEG_SUFFIXES = (".jpg", ".jpeg")
 
 
 class MaskFile(NamedTuple):
@@ -41,7 +40,7 @@ class MaskFile(NamedTuple):
 
 def mask_file(rule: str, path: str) -> MaskFile:
     """A mask by its rule; a JPEG's "nonzero" is "threshold", as compression rings round edges."""
-    jpeg = path.lower().endswith(JPEG_SUFFIXES)
+    jpeg = path.lower().endswith((".jpg", ".jpeg"))
     return MaskFile("threshold" if jpeg and rule == "nonzero" else rule, path)
 
 
@@ -69,12 +68,6 @@ class PixelRules:
     unsure_band: int = 0
     unsure_alpha: tuple[int, int] | None = None
 
-    def __post_init__(self) -> None:
-        if self.label_table is not None and len(self.label_table) != 256:
-            raise ValueError(
-                f"PixelRules: label_table must have 256 entries, got {len(self.label_table)}"
-            )
-
 
 def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
     """``[H, W]`` 0..255: the masks of one image, each by its rule, joined by their maximum.
@@ -90,11 +83,7 @@ def read_mask(files: Sequence[tuple[str, Path]], rules: PixelRules) -> Bytes:
     for rule, path in files[1:]:
         mask = _one_mask(rule, path, rules)
         if mask.shape != joined.shape:
-            raise DataError(
-                f"{path} is {mask.shape[1]}x{mask.shape[0]} pixels (width x height), but "
-                f"{files[0][1]} is {joined.shape[1]}x{joined.shape[0]}; both are masks of one "
-                "image and must agree"
-            )
+            raise DataError(f"{path} and {files[0][1]}, masks of one image, differ in size")
         joined = np.maximum(joined, mask)
     return joined
 
@@ -108,17 +97,11 @@ def _one_mask(rule: str, path: Path, rules: PixelRules) -> Bytes:
             )
         return mask
     if rule == "threshold":
-        return _at_least(read_grey(path), rules.threshold)
-    if rule in ("nonzero", "label"):
-        stored = read_stored(path)
-        if stored.ndim == 3:
-            stored = stored[..., 0] | stored[..., 1] | stored[..., 2]
-        return _at_least(stored, 1)
-    raise ValueError(f"read_mask: rule must be one of {', '.join(MASK_RULES)}, got {rule!r}")
-
-
-def _at_least(values: Bytes, least: int) -> Bytes:
-    """255 where a value is ``least`` or more, else 0."""
+        values, least = read_grey(path), rules.threshold
+    else:
+        values, least = read_stored(path), 1
+        if values.ndim == 3:
+            values = values[..., 0] | values[..., 1] | values[..., 2]
     return np.asarray(cv2.threshold(values, least - 1, 255, cv2.THRESH_BINARY)[1], np.uint8)
 
 
@@ -150,13 +133,7 @@ def read_labels(
 
 
 def with_ignored_border(labels: Bytes, mask: Bytes, band: int) -> Bytes:
-    """Labels with "ignore" along the outline of a mask of the same size.
-
-    Args:
-        labels: ``[H, W]``.
-        mask: ``[H, W]`` 0..255.
-        band: side of the square that dilates and erodes the mask; 0 changes nothing.
-    """
+    """Labels ``[H, W]`` with "ignore" on the `outline` of the mask ``[H, W]``."""
     if band == 0:
         return labels
     return np.where(outline(mask, band), np.uint8(IGNORE_LABEL), labels)
@@ -177,9 +154,6 @@ def read_unsure(files: Sequence[tuple[str, Path]], mask: Bytes, rules: PixelRule
         files: (rule, path) of the masks, decoded again when the rules use alphas.
         mask: ``[H, W]`` 0..255, the result of `read_mask`.
         rules: of the dataset.
-
-    Raises:
-        DataError: when a file is missing or damaged.
     """
     if rules.unsure_band == 0 and rules.unsure_alpha is None:
         return None

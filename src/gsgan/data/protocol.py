@@ -11,6 +11,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from gsgan.data.measures import Measures
+from gsgan.utils.checks import above, between
 from gsgan.utils.errors import ConfigError
 
 
@@ -49,19 +50,14 @@ class Protocol:
     subject: str | int | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < self.scale <= 1:
-            raise ConfigError(f"protocol.scale must be in (0, 1], got {self.scale!r}")
+        between("protocol.scale", above("protocol.scale", self.scale), 0, 1)
         if self.train_cameras is None and self.test_cameras is None:
             raise ConfigError(
                 "protocol.train_cameras and protocol.test_cameras are both null; name one of them"
             )
 
     def frames(self, side: Literal["train", "test"]) -> Any:
-        """The frames of one side, for the subject where they differ by subject.
-
-        Raises:
-            ConfigError: when they do, and the subject is not set or unknown.
-        """
+        """The frames of one side; where they differ by subject, the subject must be set."""
         frames = self.train_frames if side == "train" else self.test_frames
         if not isinstance(frames, Mapping):
             return frames

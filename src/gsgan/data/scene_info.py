@@ -111,14 +111,18 @@ def scene_info(
     frames = sorted({frame for _, frame in splits.items["train"]})
     p, valid = layout.landmarks.joints(frames)
     middles = torch.stack([q[v].mean(0) for q, v in zip(p, valid, strict=True)])
-    cameras = {camera for camera, _ in splits.items["train"]}
+    cameras = {camera for camera, _ in dataset.items}
     tested = {camera for data in held_out for camera, _ in data.items} - cameras
     body = layout.meta.body
-    centre = _triple(middles.median(0).values)
-    foreground, darkest = foreground_colours(dataset, samples)
+    centre = middles.median(0).values
+    foreground, darkest = _foreground(dataset, samples)
     entries = {name: entry for name, entry in layout.cameras.items() if name in cameras}
     scales = [_scales(data, samples) for data in held_out if data.items]
-    mesh = _mesh(layout)
+    mesh, inside = _mesh(layout), None
+    if mesh is not None:
+        chosen = _evenly(range(len(dataset.items)), 2 * samples)
+        shares = [body_inside(dataset[i], mesh) for i in chosen]
+        inside = float(np.mean([share for share in shares if share is not None] or [0.0]))
     return SceneInfo(
         camera_names=layout.camera_names,
         n_train_cameras=len(cameras),
@@ -131,7 +135,7 @@ def scene_info(
         label_names=layout.meta.label_names or (),
         foreground=foreground,
         body_height=body_height(p, valid),
-        centre=centre,
+        centre=(float(centre[0]), float(centre[1]), float(centre[2])),
         up_axis=layout.meta.up_axis,
         fps=layout.meta.fps,
         frames=len(frames),
@@ -141,18 +145,13 @@ def scene_info(
         train_cameras=tuple(entries),
         held_out_distortion=any(layout.cameras[name].distorted for name in tested),
         has_rational_lens=any((layout.cameras[n].dist[5:] != 0).any() for n in cameras | tested),
-        spread=_spread(list(entries.values()), np.array(centre)),
+        spread=_spread(list(entries.values()), centre.numpy()),
         scale_train=_scales(dataset, samples),
         scale_test=(min(s[0] for s in scales), max(s[1] for s in scales)) if scales else None,
         surface=_shared_surface(layout, dataset, tuple(entries), samples, mesh),
         darkest=darkest,
-        body_inside=_body_inside(dataset, samples, mesh),
+        body_inside=inside,
     )
-
-
-def _triple(values: torch.Tensor) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z
 
 
 def count_labels(layout: Layout, items: tuple[Item, ...]) -> int:
@@ -172,18 +171,10 @@ def count_labels(layout: Layout, items: tuple[Item, ...]) -> int:
     return highest + 1
 
 
-def foreground_colours(
+def _foreground(
     dataset: CaptureDataset, samples: int
 ) -> tuple[dict[str, tuple[float, float, float]], float]:
-    """Colours of the person in [0, 1].
-
-    Args:
-        dataset: of the images.
-        samples: images per camera, evenly spaced over its frames.
-
-    Returns:
-        Mean RGB, mask-weighted, by camera name; and the brightness of the darkest percent.
-    """
+    """Mean RGB in [0, 1] by camera, mask-weighted, and the brightness of the darkest percent."""
     colours, brightness = {}, []
     for camera, indices in _by_camera(dataset).items():
         total, weight = torch.zeros(3, dtype=torch.float64), 0.0
@@ -192,7 +183,8 @@ def foreground_colours(
             total += frame.image.double().sum((0, 2, 3))
             weight += float(frame.mask.double().sum())
             brightness.append(frame.image.amax(1, keepdim=True)[frame.mask > SOLID])
-        colours[camera] = _triple(total / max(weight, 1.0))
+        red, green, blue = (total / max(weight, 1.0)).tolist()
+        colours[camera] = red, green, blue
     solid = torch.cat(brightness).numpy()
     return colours, float(np.percentile(solid, 1)) if solid.size else 0.0
 
@@ -243,14 +235,6 @@ def _mesh(layout: Layout) -> SkinnedBody | None:
     return None
 
 
-def _body_inside(dataset: CaptureDataset, samples: int, mesh: SkinnedBody | None) -> float | None:
-    if mesh is None or not dataset.items:
-        return None
-    chosen = _evenly(range(len(dataset.items)), 2 * samples)
-    shares = [body_inside(dataset[i], mesh) for i in chosen]
-    return float(np.mean([share for share in shares if share is not None] or [0.0]))
-
-
 def _shared_surface(
     layout: Layout,
     dataset: CaptureDataset,
@@ -258,10 +242,7 @@ def _shared_surface(
     samples: int,
     mesh: SkinnedBody | None,
 ) -> SurfaceColours | None:
-    """Colours compared in frames of all training cameras, on the mesh or else the visual hull.
-
-    None with a single camera.
-    """
+    """Colours compared in frames of all training cameras; None with a single camera."""
     index = {item: i for i, item in enumerate(dataset.items)}
     shared = sorted({f for _, f in dataset.items if all((c, f) in index for c in cameras)})
     if len(cameras) < 2 or not shared:

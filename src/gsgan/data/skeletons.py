@@ -84,7 +84,12 @@ def make_landmarks(
         source: file or folder, for messages.
     """
     visibility = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0).clip(0, 1)
-    far = _far_joints(p, visibility > 0, max_reach)
+    valid = visibility > 0
+    centre, some = np.zeros((len(p), 1, 3)), valid.any(-1)
+    centre[some, 0] = np.nanmedian(np.where(valid[some, :, None], p[some], np.nan), axis=1)
+    with np.errstate(over="ignore"):  # absurdly far is far
+        distance = np.linalg.norm(np.nan_to_num(p, posinf=0, neginf=0) - centre, axis=-1)
+    far = valid & (distance > max_reach)
     if far.any():
         visibility[far] = 0
         notes.append(
@@ -119,15 +124,6 @@ def whole_frame_ids(raw: NDArray[Any], where: str) -> NDArray[np.int64]:
     if len(values) != len(ids):
         raise DataError(f"{where}: frame_id {values[counts > 1][0]} appears more than once")
     return ids
-
-
-def _far_joints(p: Float, valid: Bool, reach: float) -> Bool:
-    centre = np.zeros((len(p), 1, 3))
-    some = valid.any(-1)
-    centre[some, 0] = np.nanmedian(np.where(valid[some, :, None], p[some], np.nan), axis=1)
-    with np.errstate(over="ignore"):  # absurdly far is far
-        distance = np.linalg.norm(np.nan_to_num(p, posinf=0, neginf=0) - centre, axis=-1)
-    return valid & (distance > reach)
 
 
 def fill_missing(p: Float, valid: Bool, ids: NDArray[np.int64]) -> Float:

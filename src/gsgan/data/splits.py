@@ -60,10 +60,8 @@ def make_splits(
 
     Args:
         layout: the capture.
-        train_cameras: names, or None.
-        test_cameras: names, or None.
-        train_frames: numbers and "a-b" ranges (both ends included), or None.
-        test_frames: the same.
+        train_cameras, test_cameras: names, or None.
+        train_frames, test_frames: numbers and "a-b" ranges (both ends included), or None.
         test_share: in [0, 1), the share of frames held out by default.
 
     Raises:
@@ -101,13 +99,11 @@ def make_splits(
         "novel_view": _items(layout, cameras[1], train),
         "novel_pose": _items(layout, cameras[0], test),
     }
-    _require_training(layout, items, cameras[0], train)
-    reasons = {}
-    if not items["novel_view"]:
-        reasons["novel_view"] = "no camera is held out (data.test_cameras)"
-    if not items["novel_pose"]:
-        reasons["novel_pose"] = "no frame is held out (data.test_frames)"
-    return Splits(*cameras, train, test, items, reasons, notes)
+    reasons = {
+        "novel_view": "no camera is held out (data.test_cameras)",
+        "novel_pose": "no frame is held out (data.test_frames)",
+    }
+    return _splits(layout, cameras, (train, test), items, reasons, notes)
 
 
 def _usable(
@@ -123,15 +119,23 @@ def _usable(
     return train, test, (note,)
 
 
-def _require_training(
-    layout: Layout, items: dict[str, tuple[Item, ...]], cameras: Sequence[str], train: Sequence[int]
-) -> None:
+def _splits(
+    layout: Layout,
+    cameras: tuple[tuple[str, ...], tuple[str, ...]],
+    frames: tuple[tuple[int, ...], tuple[int, ...]],
+    items: dict[str, tuple[Item, ...]],
+    reasons: dict[str, str],
+    notes: tuple[str, ...],
+) -> Splits:
+    """The splits, with the reasons of those that are empty; training must not be."""
     if not items["train"]:
         raise DataError(
-            f"{layout.root}: nothing to train on with cameras {', '.join(cameras) or 'none'} "
-            f"and {len(train)} train frames; the capture has cameras "
+            f"{layout.root}: nothing to train on with cameras {', '.join(cameras[0]) or 'none'} "
+            f"and {len(frames[0])} train frames; the capture has cameras "
             f"{', '.join(layout.camera_names)} and frames {spans(list(layout.frames))}"
         )
+    reasons = {name: why for name, why in reasons.items() if not items[name]}
+    return Splits(*cameras, *frames, items, reasons, notes)
 
 
 def _items(layout: Layout, cameras: Sequence[str], frames: Sequence[int]) -> tuple[Item, ...]:
@@ -152,7 +156,11 @@ def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:
         DataError: when a camera does not exist, or nothing is left to train on.
         ConfigError: when an image is in both splits, or a value is malformed.
     """
-    train_cameras, test_cameras = _protocol_cameras(layout, protocol)
+    sides = (
+        None if side is None else tuple(camera_name(layout, c, protocol.name) for c in side)
+        for side in (protocol.train_cameras, protocol.test_cameras)
+    )
+    train_cameras, test_cameras = _complete(layout.camera_names, *sides)
     frames = [parse_frames(protocol.frames(side), f"protocol.{side}_frames") for side in SIDES]
     train, test, notes = _usable(layout, frames, f"of protocol {protocol.name}")
     trained = set(train)
@@ -167,21 +175,9 @@ def protocol_splits(layout: Layout, protocol: Protocol) -> Splits:
         "novel_view": _items(layout, test_cameras, [f for f in test if f in trained]),
         "novel_pose": _items(layout, test_cameras, [f for f in test if f not in trained]),
     }
-    _require_training(layout, items, train_cameras, train)
-    why = f"protocol {protocol.name} has none"
-    reasons = {name: why for name in SPLITS[1:] if not items[name]}
-    return Splits(train_cameras, test_cameras, train, test, items, reasons, notes)
-
-
-def _protocol_cameras(
-    layout: Layout, protocol: Protocol
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Both sides by name."""
-    train, test = (
-        None if side is None else tuple(camera_name(layout, c, protocol.name) for c in side)
-        for side in (protocol.train_cameras, protocol.test_cameras)
-    )
-    return _complete(layout.camera_names, train, test)
+    reasons = dict.fromkeys(SPLITS[1:], f"protocol {protocol.name} has none")
+    cameras = train_cameras, test_cameras
+    return _splits(layout, cameras, (train, test), items, reasons, notes)
 
 
 def _complete(
@@ -196,25 +192,16 @@ def _complete(
 
 
 def camera_name(layout: Layout, camera: str | int, protocol: str) -> str:
-    """The name of a camera given by name or by its index in `Layout.camera_names`.
-
-    Raises:
-        DataError: when there is no such camera, listing the existing ones.
-    """
+    """The name of a camera given by name or by its index in `Layout.camera_names`."""
     names = layout.camera_names
-    listed = ", ".join(names)
-    if isinstance(camera, int):
-        if not 0 <= camera < len(names):
-            raise DataError(
-                f"{layout.root}: protocol {protocol} requests the camera of index {camera}, but "
-                f"there are {len(names)}, 0 to {len(names) - 1}: {listed}"
-            )
+    if isinstance(camera, int) and 0 <= camera < len(names):
         return names[camera]
-    if camera not in layout.cameras:
-        raise DataError(
-            f"{layout.root}: protocol {protocol} requests camera {camera}; the capture has {listed}"
-        )
-    return camera
+    if camera in layout.cameras:
+        return str(camera)
+    raise DataError(
+        f"{layout.root}: protocol {protocol} requests camera {camera}; the capture has "
+        f"{len(names)}: {', '.join(names)}"
+    )
 
 
 def _pair(

@@ -19,54 +19,34 @@ def is_number(value: Any) -> bool:
 
 
 def between(name: str, value: Any, least: float, most: float) -> Any:
-    """A number from ``least`` to ``most``, both included.
-
-    Raises:
-        ConfigError: on anything else.
-    """
+    """A number from ``least`` to ``most``, both included."""
     good = is_number(value) and least <= value <= most
     _require(good, name, f"a number from {least} to {most}", value)
     return value
 
 
 def at_least(name: str, value: Any, least: float) -> Any:
-    """A number of at least ``least``; NaN is not.
-
-    Raises:
-        ConfigError: on anything else.
-    """
+    """A number of at least ``least``; NaN is not."""
     good = is_number(value) and value >= least
     _require(good, name, f"a number of at least {least}", value)
     return value
 
 
 def above(name: str, value: Any, bound: float = 0) -> Any:
-    """A number above ``bound``.
-
-    Raises:
-        ConfigError: on anything else.
-    """
+    """A number above ``bound``."""
     _require(is_number(value) and value > bound, name, f"a number above {bound}", value)
     return value
 
 
 def whole(name: str, value: Any, least: int) -> int:
-    """A whole number of at least ``least``.
-
-    Raises:
-        ConfigError: on anything else.
-    """
+    """A whole number of at least ``least``."""
     good = isinstance(value, int) and not isinstance(value, bool) and value >= least
     _require(good, name, f"a whole number of at least {least}", value)
     return int(value)
 
 
 def one_of(name: str, value: Any, choices: Iterable[Any]) -> Any:
-    """One of the choices.
-
-    Raises:
-        ConfigError: on anything else.
-    """
+    """One of the choices."""
     choices = tuple(choices)
     known = any(type(value) is type(choice) and value == choice for choice in choices)
     _require(known, name, f"one of {', '.join(map(str, choices))}", value)

@@ -1,8 +1,7 @@
-"""Reads pickled data without running it: SMPL files, ``annots.npy``, caches of other projects.
+"""Reads pickled data, such as SMPL files and ``annots.npy``, without running it.
 
 A pickle is a program. `_Unpickler` lets it build dicts, lists, numbers, text and numpy arrays, and
-name the few classes in `ALLOWED`, which are replaced by the stand-ins below; any other name is
-refused before it is used.
+name the classes in `ALLOWED`, which are replaced by the stand-ins below; any other name is refused.
 """
 
 from __future__ import annotations
@@ -31,16 +30,6 @@ class _Refused(pickle.UnpicklingError):
     """The pickle names something that is not in `ALLOWED`."""
 
 
-class _Unpickler(pickle._Unpickler):
-    """In Python: a damaged file makes the one in C reserve as much memory as a number names."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        known = RENAMED.get(module, module), name
-        if known not in ALLOWED:
-            raise _Refused(f"{module}.{name}")
-        return ALLOWED[known]
-
-
 def _expect(condition: bool, otherwise: str) -> None:
     if not condition:
         raise pickle.UnpicklingError(otherwise)
@@ -55,35 +44,12 @@ class _DType:
         self.value = np.dtype(name)
 
     def __setstate__(self, state: Any) -> None:
-        order, *record = state[1:5]
-        _expect(record == [None] * 3, "it holds record arrays")
-        if order in ("<", ">"):
-            self.value = self.value.newbyteorder(order)
-
-
-class _Array(np.ndarray):
-    """An array that is being read; numpy itself does not check all of its state."""
-
-    def __setstate__(self, state: Any) -> None:
-        shape, dtype, fortran, content = state[-4:]
-        if dtype.value.hasobject:
-            _expect(isinstance(content, list), "an array of objects has no list of them")
-            count = len(content)
-        else:
-            content = _bytes(content)
-            count = len(content) / dtype.value.itemsize
-        fits = min(shape, default=0) >= 0 and math.prod(shape) == count
-        _expect(fits, "the shape of an array does not fit its content")
-        super().__setstate__((1, shape, dtype.value, bool(fortran), content))  # type: ignore[arg-type]
+        if state[1] in ("<", ">"):
+            self.value = self.value.newbyteorder(state[1])
 
 
 def _bytes(content: Any) -> bytes:
     return content.encode("latin1") if isinstance(content, str) else bytes(content)  # str: Python 2
-
-
-def _reconstruct(kind: Any, *_shape_and_code: Any) -> _Array:
-    _expect(kind is NDARRAY, "it builds an array of an unknown class")
-    return np.empty(0).view(_Array)
 
 
 def _from_buffer(content: Any, dtype: _DType, shape: Any, order: Any) -> NDArray[Any]:
@@ -96,10 +62,14 @@ def _scalar(dtype: _DType, content: Any) -> Any:
     return np.frombuffer(_bytes(content), dtype.value)[0]
 
 
-def _encode(text: str, encoding: str) -> bytes:
+def _encode(text: str, _encoding: str) -> bytes:
     """How Python 3 writes bytes for Python 2."""
-    _expect(encoding == "latin1", f"it encodes text as {encoding}")
     return text.encode("latin1")
+
+
+def _reconstruct(kind: Any, *_shape_and_code: Any) -> _Array:
+    _expect(kind is NDARRAY, "it builds an array of an unknown class")
+    return _Array()
 
 
 def _reconstructor(kind: Any, base: Any, _state: Any) -> Any:
@@ -110,7 +80,7 @@ def _reconstructor(kind: Any, base: Any, _state: Any) -> Any:
 
 
 class _StandIn:
-    """Keeps the state of an object whose class is not loaded."""
+    """Keeps the state of an object that is not built while reading: here chumpy's array."""
 
     def __init__(self, *_arguments: Any) -> None:
         self.state: dict[str, Any] = {}
@@ -120,7 +90,24 @@ class _StandIn:
 
     def array(self) -> NDArray[Any]:
         """The array that the object stands for."""
-        return _numbers(self.state["x"])  # chumpy.ch.Ch
+        return _numbers(self.state["x"])
+
+
+class _Array(_StandIn):
+    """``numpy.ndarray``, which does not check all of its state itself."""
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = dict(zip(("shape", "dtype", "fortran", "content"), state[-4:], strict=True))
+
+    def array(self) -> NDArray[Any]:
+        shape, dtype, fortran, content = self.state.values()
+        order: Any = "F" if fortran else "C"
+        if not dtype.value.hasobject:
+            return _from_buffer(_bytes(content), dtype, shape, order)
+        _expect(isinstance(content, list), "an array of objects has no list of them")
+        flat = np.empty(len(content), object)
+        flat[:] = content
+        return flat.reshape(shape, order=order)
 
 
 class _Select(_StandIn):
@@ -128,8 +115,7 @@ class _Select(_StandIn):
 
     def array(self) -> NDArray[Any]:
         chosen = _numbers(self.state["a"]).ravel()[_numbers(self.state["idxs"])]
-        shape = self.state.get("preferred_shape")
-        return chosen if shape is None else chosen.reshape(shape)
+        return chosen.reshape(self.state.get("preferred_shape") or chosen.shape)
 
 
 class _Sparse(_StandIn):
@@ -138,7 +124,7 @@ class _Sparse(_StandIn):
     def array(self) -> NDArray[Any]:
         import scipy.sparse  # takes long, and few files need it
 
-        shape = self.state["_shape"] if "_shape" in self.state else self.state["shape"]
+        shape = self.state["_shape" if "_shape" in self.state else "shape"]
         _expect(math.prod(shape) * 8 <= LARGEST_ARRAY, f"a sparse matrix of shape {shape}")
         parts = [_numbers(self.state[key]) for key in ("data", "indices", "indptr")]
         matrix = scipy.sparse.csc_matrix(tuple(parts), shape)
@@ -175,13 +161,43 @@ RENAMED = {
 }
 
 
+class _Unpickler(pickle._Unpickler):
+    """In Python: a damaged file makes the one in C reserve as much memory as a number names."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        known = RENAMED.get(module, module), name
+        if known not in ALLOWED:
+            raise _Refused(f"{module}.{name}")
+        return ALLOWED[known]
+
+
+def _load(data: bytes) -> Any:
+    return _plain(_Unpickler(io.BytesIO(data), encoding="latin1").load(), {})
+
+
+def _plain(value: Any, done: dict[int, tuple[Any, Any]]) -> Any:
+    """The same with arrays in place of stand-ins; ``done`` holds (value, result) by identity."""
+    if not isinstance(value, _StandIn | dict | list | tuple):
+        return value
+    if id(value) in done:
+        return done[id(value)][1]
+    result = value.array() if isinstance(value, _StandIn) else value
+    done[id(value)] = value, result
+    if isinstance(result, tuple):
+        result = tuple(_plain(entry, done) for entry in result)
+        done[id(value)] = value, result
+    elif isinstance(result, dict | list) or result.dtype.hasobject:
+        flat = result.reshape(-1) if isinstance(result, np.ndarray) else result
+        for key in list(flat) if isinstance(flat, dict) else range(len(flat)):
+            flat[key] = _plain(flat[key], done)
+    return result
+
+
 @contextmanager
 def _as_data_error(path: Path, what: str) -> Iterator[None]:
     """Turns whatever goes wrong inside into one sentence that names the file."""
     try:
         yield
-    except DataError:
-        raise
     except FileNotFoundError:
         raise DataError(f"{path} does not exist") from None
     except OSError as error:
@@ -194,19 +210,13 @@ def _as_data_error(path: Path, what: str) -> Iterator[None]:
     except Exception as error:
         reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
         reason = " ".join(reason.split())[:160] or type(error).__name__
-        raise DataError(
-            f"{path} is not a valid {what} ({reason}); copy or export it again"
-        ) from None
+        raise DataError(f"{path} is not a valid {what} ({reason}); export it again") from None
 
 
 def read_pickle(path: Path) -> Any:
     """The content of a .pkl file, with sparse matrices and chumpy's values as plain arrays.
 
-    Convention: text and bytes of Python 2 are read as latin1; arrays inside tuples may be of a
-    subclass of ndarray.
-
-    Args:
-        path: a pickle of any protocol.
+    Convention: text and bytes of Python 2 are read as latin1.
 
     Raises:
         DataError: when the file is missing, damaged, or names a class that is not allowed.
@@ -215,32 +225,8 @@ def read_pickle(path: Path) -> Any:
         return _load(path.read_bytes())
 
 
-def _load(data: bytes) -> Any:
-    return _plain(_Unpickler(io.BytesIO(data), encoding="latin1").load(), set())
-
-
-def _plain(value: Any, seen: set[int]) -> Any:
-    """The same with plain arrays in place of stand-ins, in dicts, lists and arrays of objects."""
-    if isinstance(value, _StandIn):
-        value = value.array()
-    if isinstance(value, _Array):
-        value = value.view(np.ndarray)
-    objects = isinstance(value, np.ndarray) and value.dtype.hasobject
-    if id(value) in seen or not (objects or isinstance(value, dict | list)):
-        return value
-    seen.add(id(value))
-    flat = value.reshape(-1) if objects else value
-    for key in list(flat) if isinstance(flat, dict) else range(len(flat)):
-        flat[key] = _plain(flat[key], seen)
-    return value
-
-
 def read_npy(path: Path) -> Any:
-    """The content of a .npy file: a plain array, or the object of a 0-d array of objects.
-
-    Raises:
-        DataError: when the file is missing, damaged, or names a class that is not allowed.
-    """
+    """The content of a .npy file, or the object of a 0-d array of objects; errors as above."""
     with _as_data_error(path, ".npy file"), path.open("rb") as stream:
         return _read_array(stream)
 

@@ -1,25 +1,74 @@
-"""Finds the calibration file in a capture folder, and its format."""
+"""Finds a calibration file and reads it, by its content; cameras.json and meta.json's conventions.
+
+cameras.json is the bring-your-own layout's calibration:
+``{camera: {K 3x3, R 3x3, t 3, dist 0/4/5/8, size [w, h]}}``
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
-from gsgan.data.calibration.cameras_json import read_cameras_json
 from gsgan.data.calibration.opencv_yaml import read_opencv_yaml
-from gsgan.data.calibration.qualisys import read_qualisys
-from gsgan.data.calibration.toml_tables import read_toml
-from gsgan.data.cameras import CameraEntry
+from gsgan.data.calibration.text import read_qualisys, read_toml
+from gsgan.data.cameras import CameraEntry, make_camera, numbers
+from gsgan.data.checks import Checks
+from gsgan.data.files import read_json
 from gsgan.utils.errors import DataError
 
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+EXPECTED = "K, R, t, dist and size"
 HEAD = 65536  # bytes that are enough to recognise the format
 PATTERNS = ("cameras.json", "intri.yml", "intri.yaml", "*.qca.txt", "*.qca", "*.toml")
 KNOWN = (
     "OpenCV YAML (intri.yml beside extri.yml), TOML of Pose2Sim or aniposelib, Qualisys .qca.txt, "
     "or cameras.json"
 )
+
+
+@dataclass(frozen=True)
+class Conventions:
+    """How the numbers of a capture are stored.
+
+    Args:
+        scale: metres in one unit of the files.
+        pixel_centre: 0.5, or 0 when K counts from the centre of the first pixel.
+        composed: the images are already composed on black (``"background": "black"``).
+    """
+
+    scale: float = 1.0
+    pixel_centre: float = 0.5
+    composed: bool = False
+
+
+def read_conventions(path: Path, content: Mapping[str, Any]) -> Conventions:
+    """The conventions in the content of meta.json.
+
+    Raises:
+        DataError: on a missing unit or an unknown value.
+    """
+    return Conventions(
+        scale=METRES[choose(path, content, "unit", None, tuple(METRES))],
+        pixel_centre=choose(path, content, "pixel_centre", 0.5, (0, 0.5)),
+        composed=choose(path, content, "background", "scene", ("scene", "black")) == "black",
+    )
+
+
+def choose(
+    path: Path, content: Mapping[str, Any], key: str, default: Any, allowed: tuple[Any, ...]
+) -> Any:
+    """The value of a key, one of those allowed.
+
+    Raises:
+        DataError: when it is another.
+    """
+    value = content.get(key, default)
+    if isinstance(value, (list, dict)) or value not in allowed:
+        names = ", ".join(map(str, allowed))
+        raise DataError(f"{path}: '{key}' is {value!r}; expected one of {names}")
+    return value
 
 
 @dataclass(frozen=True)
@@ -39,14 +88,59 @@ class Calibration:
     notes: tuple[str, ...] = ()
 
 
-class Reader(Protocol):
-    """Reads one format: path, metres in a unit (None: the format's own), K's pixel centre."""
+def read_cameras_json(
+    path: Path, scale: float | None, pixel_centre: float
+) -> tuple[dict[str, CameraEntry], list[str]]:
+    """Cameras by name; a meta.json beside the file gives its unit and pixel centre, else 0.5.
 
-    def __call__(
-        self, path: Path, scale: float | None, pixel_centre: float
-    ) -> tuple[dict[str, CameraEntry], list[str]]: ...
+    Raises:
+        DataError: naming the camera and the problem.
+    """
+    meta = path.with_name("meta.json")
+    found = read_conventions(meta, read_json(meta)) if meta.is_file() else Conventions()
+    if scale is not None:
+        found = replace(found, scale=scale)
+    return read_cameras(path, read_json(path), found, Checks()), []
 
 
+def read_cameras(
+    path: Path, content: Mapping[str, Any], conventions: Conventions, checks: Checks
+) -> dict[str, CameraEntry]:
+    """The cameras of cameras.json by name, in metres, pixel centres moved to +0.5.
+
+    Raises:
+        DataError: naming the camera and the problem.
+    """
+    if not content:
+        raise DataError(f"{path} lists no camera")
+    cameras = {}
+    for name, entry in content.items():
+        where = f"{path}, camera {name}"
+        keys = ("K", "R", "t", "size")
+        if not isinstance(entry, dict) or any(key not in entry for key in keys):
+            raise DataError(f"{where}: expected an object with {EXPECTED}")
+        width, height = numbers(where, entry["size"], "size", (2,))
+        if width < 1 or height < 1 or width % 1 or height % 1:
+            raise DataError(
+                f"{where}: size must be [width, height] in pixels, found {entry['size']}"
+            )
+        cameras[name] = make_camera(
+            where,
+            name,
+            K=entry["K"],
+            R=entry["R"],
+            t=entry["t"],
+            dist=entry.get("dist"),
+            size=(int(height), int(width)),
+            scale=conventions.scale,
+            pixel_centre=conventions.pixel_centre,
+            rotation_tolerance=checks.rotation_tolerance,
+        )
+    return cameras
+
+
+Reader = Callable[[Path, float | None, float], tuple[dict[str, CameraEntry], list[str]]]
+"""Cameras and notes by path, metres in a unit (None: the format's own), and K's pixel centre."""
 FORMATS: dict[str, tuple[Callable[[str], bool], Reader]] = {
     "OpenCV YAML": (lambda head: head.lstrip().startswith("%YAML"), read_opencv_yaml),
     "Qualisys": (lambda head: "<calibration" in head and "<camera" in head, read_qualisys),
@@ -91,12 +185,10 @@ def find_calibration(folder: Path) -> Path:
     Raises:
         DataError: when there is none, or more than one.
     """
-    places = [
-        folder,
-        *sorted(p for p in folder.glob("*") if p.is_dir() and "calib" in p.name.lower()),
-    ]
+    places = [folder, *(p for p in folder.glob("*") if p.is_dir() and "calib" in p.name.lower())]
     found = sorted({p for place in places for pattern in PATTERNS for p in place.glob(pattern)})
-    found = [p for p in found if p.suffix != ".toml" or "matrix" in _text(p)]  # not a config file
+    # other .toml files are configs
+    found = [p for p in found if p.suffix != ".toml" or b"matrix" in p.read_bytes()]
     if not found:
         raise DataError(f"{folder} holds no calibration; give calibration=<file>: {KNOWN}")
     if len(found) > 1:
@@ -105,10 +197,3 @@ def find_calibration(folder: Path) -> Path:
             f"{folder} holds more than one calibration ({names}); give calibration=<file>"
         )
     return found[0]
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(errors="replace")
-    except OSError:
-        return ""

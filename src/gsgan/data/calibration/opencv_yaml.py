@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
 from gsgan.utils.errors import DataError
 
+T = TypeVar("T")
+
 MAX_BYTES = 2**20  # of a file: some 1000 cameras
 MAX_LENS = 8  # coefficients that are supported
 SAME_ROTATION = 1e-3  # largest entry in which Rot_ and R_ of one camera may differ
 TYPES = re.compile("1?[ucwsifd]")  # of one channel
-SINGLE = "1?f"
+KINDS = {list: "a list of names", str: "a number", np.ndarray: "an !!opencv-matrix"}
 
 
 class _Loader(yaml.BaseLoader):
@@ -44,10 +46,10 @@ def _matrix(loader: _Loader, node: yaml.MappingNode) -> NDArray[np.float64]:
     if not fits:
         problem = "a matrix must have rows, cols, a type of one channel and rows x cols numbers"
         raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
-    with np.errstate(over="ignore"):  # infinite values are refused later
-        single = re.fullmatch(SINGLE, kind)
-        rounded = values.astype(np.float32 if single else np.float64)
-    return rounded.astype(np.float64).reshape(rows, cols)
+    if kind.endswith("f"):
+        with np.errstate(over="ignore"):  # infinite values are refused later
+            values = values.astype(np.float32).astype(np.float64)
+    return values.reshape(rows, cols)
 
 
 _Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
@@ -59,42 +61,35 @@ def _float(text: str) -> float:
 
 @dataclass(frozen=True)
 class Storage:
-    """The top level of a file.
-
-    Args:
-        path: the file, for messages.
-        values: by key: text, lists of text, and matrices.
-    """
+    """The top level of a file: text, lists of text, and matrices, by key."""
 
     path: Path
     values: dict[str, Any]
 
-    def strings(self, key: str) -> list[str] | None:
-        """A list of names, quoted or not; None without the key, `DataError` on anything else."""
-        names: list[str] | None = self._get(key, list, "a list of names")
-        return None if names is None else [str(name) for name in names]
+    def get(self, key: str, kind: type[T]) -> T | None:
+        """A value of a kind: str, list or np.ndarray ``[rows, cols]``; None without the key.
 
-    def number(self, key: str) -> float | None:
-        """One number, infinite and NaN too; None without the key, `DataError` on anything else."""
-        text = self._get(key, str, "a number")
-        try:
-            return None if text is None else _float(text)
-        except ValueError:
-            raise self._wrong(key, "a number") from None
-
-    def matrix(self, key: str) -> NDArray[np.float64] | None:
-        """``[rows, cols]``; None without the key, `DataError` on anything else."""
-        matrix: NDArray[np.float64] | None = self._get(key, np.ndarray, "an !!opencv-matrix")
-        return matrix
-
-    def _get(self, key: str, kind: type, expected: str) -> Any:
+        Raises:
+            DataError: when it is of another kind.
+        """
         value = self.values.get(key)
         if value is not None and not isinstance(value, kind):
-            raise self._wrong(key, expected)
+            raise DataError(f"{self.path}: '{key}' must be {KINDS[kind]}; export it again")
         return value
 
-    def _wrong(self, key: str, expected: str) -> DataError:
-        return DataError(f"{self.path}: '{key}' must be {expected}; export it again")
+    def pixels(self, key: str) -> int:
+        """A number of pixels; 0 without the key.
+
+        Raises:
+            DataError: when it is not a whole number.
+        """
+        text = self.get(key, str) or "0"
+        try:
+            if (value := _float(text)) % 1 == 0:
+                return max(0, int(value))
+        except ValueError:
+            pass
+        raise DataError(f"{self.path}: '{key}' must be a number of pixels, found {text}")
 
 
 def read_storage(path: Path) -> Storage:
@@ -136,85 +131,64 @@ def read_opencv_yaml(
     Raises:
         DataError: when one file or one camera's half is missing, or they contradict each other.
     """
-    intri_path, extri_path = _both(path)
-    intri, extri = read_storage(intri_path), read_storage(extri_path)
-    names, notes = _names(intri), list[str]()
+    intri, extri = (read_storage(_sibling(path, name)) for name in ("intri", "extri"))
+    listed = intri.get("names", list) or [k[2:] for k in intri.values if k.startswith("K_")]
+    names, notes = (name for name in dict.fromkeys(map(str, listed)) if name != "none"), list[str]()
     cameras = {}
     for name in names:
-        where, K = f"{intri_path}, camera {name}", intri.matrix(f"K_{name}")
+        where, K = f"{intri.path}, camera {name}", intri.get(f"K_{name}", np.ndarray)
+        rotation, t = _rotation(extri, name), extri.get(f"T_{name}", np.ndarray)
         if K is None:
+            raise DataError(f"{where} lacks K_{name}; export it again")
+        if rotation is None or t is None:
             raise DataError(
-                f"{intri_path} lists the camera {name} but lacks K_{name}; export it again"
-            )
-        rotation, T = _rotation(extri, extri_path, name), extri.matrix(f"T_{name}")
-        if rotation is None or T is None:
-            raise DataError(
-                f"{extri_path} lacks Rot_{name} (or R_{name}) and T_{name}, but {intri_path} "
+                f"{extri.path} lacks Rot_{name} (or R_{name}) and T_{name}, but {intri.path} "
                 f"lists the camera {name}; calibrate it, or take it out of both"
             )
-        given = (intri.matrix(f"{key}_{name}") for key in ("dist", "D"))
-        dist = next((matrix for matrix in given if matrix is not None), None)
+        dist = intri.get(f"dist_{name}", np.ndarray)
+        dist = intri.get(f"D_{name}", np.ndarray) if dist is None else dist
         if dist is None:
-            notes.append(f"{intri_path} gives no lens distortion for {name}: taken as none")
+            notes.append(f"{intri.path} gives no lens distortion for {name}: taken as none")
+        elif not dist.reshape(-1)[MAX_LENS:].any():  # thin prisms and tilts are refused later
+            dist = dist.reshape(-1)[:MAX_LENS]
         cameras[name] = make_camera(
             where,
             name,
             K=K,
             R=rotation,
-            t=T,
-            dist=None if dist is None else _lens(dist),
-            size=(_pixels(intri, where, f"H_{name}"), _pixels(intri, where, f"W_{name}")),
+            t=t,
+            dist=dist,
+            size=(intri.pixels(f"H_{name}"), intri.pixels(f"W_{name}")),
             scale=scale or 1.0,
             pixel_centre=pixel_centre,
         )
     return cameras, notes
 
 
-def _both(path: Path) -> tuple[Path, Path]:
-    pair = []
-    for own, other in (("intri", "extri"), ("extri", "intri")):
-        if own in path.name.lower():
-            pair = [path, path.with_name(path.name.replace(own, other))]
-            pair = pair if own == "intri" else pair[::-1]
-    if not pair:
+def _sibling(path: Path, name: str) -> Path:
+    """The file of the pair that is called ``name``, intri or extri."""
+    file = path.with_name(re.sub("intri|extri", name, path.name))
+    if name not in file.name:
         raise DataError(f"{path}: expected OpenCV YAML named intri.yml beside extri.yml")
-    for file in pair:
-        if not file.is_file():
-            raise DataError(f"{file} does not exist; intri.yml and extri.yml belong together")
-    return pair[0], pair[1]
+    if not file.is_file():
+        raise DataError(f"{file} does not exist; intri.yml and extri.yml belong together")
+    return file
 
 
-def _names(intri: Storage) -> list[str]:
-    listed = intri.strings("names") or [key[2:] for key in intri.values if key.startswith("K_")]
-    return [name for name in dict.fromkeys(listed) if name and name != "none"]
-
-
-def _lens(dist: np.ndarray) -> list[float]:
-    """Without trailing zeros: thin prisms and tilts (12 or 14 coefficients) are refused later."""
-    values: list[float] = dist.reshape(-1).tolist()
-    return values if any(values[MAX_LENS:]) else values[:MAX_LENS]
-
-
-def _pixels(intri: Storage, where: str, key: str) -> int:
-    value = intri.number(key)
-    if value is None:
-        return 0
-    if not np.isfinite(value) or value != int(value):
-        raise DataError(f"{where}: '{key}' must be a number of pixels, found {value}")
-    return max(0, int(value))
-
-
-def _rotation(extri: Storage, path: Path, name: str) -> np.ndarray | None:
-    matrix, vector = extri.matrix(f"Rot_{name}"), extri.matrix(f"R_{name}")
+def _rotation(extri: Storage, name: str) -> NDArray[np.float64] | None:
+    """By Rot_ or R_, which must agree where both are there."""
+    where = f"{extri.path}, camera {name}"
+    matrix, vector = (extri.get(f"{key}_{name}", np.ndarray) for key in ("Rot", "R"))
     if vector is None:
         return matrix
-    turned = cv2.Rodrigues(numbers(f"{path}, camera {name}", vector, f"R_{name}", (3,)))[0]
+    turned = cv2.Rodrigues(numbers(where, vector, f"R_{name}", (3,)))[0]
     if matrix is None:
-        return turned
-    matrix = numbers(f"{path}, camera {name}", matrix, f"Rot_{name}", (3, 3))
-    if np.abs(matrix - turned).max() > SAME_ROTATION:
+        return np.asarray(turned, np.float64)
+    matrix = numbers(where, matrix, f"Rot_{name}", (3, 3))
+    difference = np.abs(matrix - turned).max()
+    if difference > SAME_ROTATION:
         raise DataError(
-            f"{path}, camera {name}: Rot_{name} and R_{name} are different rotations (by "
-            f"{np.abs(matrix - turned).max():.3g}); keep the right one"
+            f"{where}: Rot_{name} and R_{name} are different rotations (by {difference:.3g}); keep "
+            "the right one"
         )
     return matrix

@@ -12,18 +12,16 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from gsgan.data.formats.smplx_rig import Places, SmplxRigReader
+from gsgan.data.formats.smplx_rig import SmplxRigReader
 
 
 class AvatarrexReader(SmplxRigReader):
     """Reads a subject of AvatarReX; settings as `SmplxRigReader`."""
 
     contents: ClassVar[str] = "calibration_full.json, smpl_params.npz and a folder for each camera"
-    places: ClassVar[Places] = Places(
-        layout="AvatarReX",
-        calibration="calibration_full.json",
-        images="{camera}",
-        masks="{camera}/mask/pha",
-        cameras="*/mask",
-        lists_missing=False,
-    )
+    layout: ClassVar[str] = "AvatarReX"
+    calibration: ClassVar[str] = "calibration_full.json"
+    images: ClassVar[str] = "{camera}"
+    masks: ClassVar[str] = "{camera}/mask/pha"
+    lists_missing: ClassVar[bool] = False
+    camera_folders: ClassVar[str] = "*/mask"

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from gsgan.data.calibration.cameras_json import (
+from gsgan.data.calibration.find import (
     METRES,
     Conventions,
     choose,
@@ -47,15 +47,29 @@ LOOKED_AT = Trust(min_box_iou=0.0)
 
 @dataclass(frozen=True)
 class CaptureReader:
-    """Reads a capture in the bring-your-own layout; for the arguments see `read_capture`."""
+    """Reads a capture in the bring-your-own layout; conf/data/capture.yaml explains the settings.
+
+    ``landmarks`` is the skeletons' file, in the folder unless its path is absolute.
+    """
 
     landmarks: str | None = None
     drop_frames: Any = None
     trust: Trust = LOOKED_AT
 
     def __call__(self, root: str | Path, checks: Checks, smpl: str | None = None) -> Layout:
-        """See `read_capture`."""
-        return read_capture(root, checks, smpl, self.trust, self.drop_frames, self.landmarks)
+        """Reads and checks everything except most images' pixels.
+
+        Args:
+            root: the folder that holds cameras.json.
+            checks: thresholds.
+            smpl: the user's model file, for poses of an SMPL or SMPL-X body.
+
+        Raises:
+            DataError: for whatever is missing, damaged or contradictory, naming the file.
+        """
+        found = _find(dataset_folder(root, "cameras.json, images/ and masks/"), checks, smpl, self)
+        hint = "check that cameras, landmarks and masks belong together"
+        return finish(found, checks, self.trust, hint, self.drop_frames)
 
 
 def read_capture(
@@ -66,40 +80,29 @@ def read_capture(
     drop_frames: Any = None,
     landmarks: str | None = None,
 ) -> Layout:
-    """Reads a capture in the bring-your-own layout and checks all but most images' pixels.
+    """The capture in a folder, see `CaptureReader`; ``checks`` are `Checks()` when None."""
+    return CaptureReader(landmarks, drop_frames, trust)(root, checks or Checks(), smpl)
 
-    Args:
-        root: the folder that holds cameras.json.
-        checks: thresholds, `Checks()` when None.
-        smpl: the user's model file, for poses of an SMPL or SMPL-X body.
-        trust: which images are compared with the landmarks.
-        drop_frames: frames to leave out, e.g. "360-370", or None.
-        landmarks: the skeletons' file, in the folder unless its path is absolute; None is
-            landmarks3d.npz.
 
-    Raises:
-        DataError: for whatever is missing, damaged or contradictory, naming the file.
-    """
-    checks = checks or Checks()
-    root = dataset_folder(root, "cameras.json, images/ and masks/")
+def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -> Found:
     notes: list[str] = []
     cameras_json = read_json(root / "cameras.json")
-    meta_json = read_json(root / "meta.json")
-    meta = read_meta(root / "meta.json", meta_json, smpl)
-    conventions = read_conventions(root / "meta.json", meta_json)
+    meta_path = root / "meta.json"
+    meta_json = read_json(meta_path)
+    meta = _read_meta(meta_path, meta_json, smpl)
+    conventions = read_conventions(meta_path, meta_json)
     if conventions.scale != 1.0:
         notes.append(f"lengths converted from {meta.unit} to metres")
     cameras = read_cameras(root / "cameras.json", cameras_json, conventions, checks)
     images = _index_images(root, cameras)
-    joints_file = landmarks_path(root, landmarks)
+    joints_file = landmarks_path(root, reader.landmarks)
     if joints_file != root / LANDMARKS:
-        notes.append(f"skeletons come from {landmarks}, not from {LANDMARKS}")
-    skeletons = read_landmarks(joints_file, meta, conventions, checks, notes)
+        notes.append(f"skeletons come from {reader.landmarks}, not from {LANDMARKS}")
+    skeletons = _read_landmarks(joints_file, meta, conventions, checks, notes)
     poses = None
     if (root / "body_pose.npz").exists():
-        poses = read_poses(root / "body_pose.npz", meta, conventions)
-        meta = _with_shape(meta, root / "body_pose.npz")
-    found = Found(
+        poses, meta = _read_poses(root / "body_pose.npz", meta, conventions)
+    return Found(
         root=root,
         meta=meta,
         cameras=cameras,
@@ -116,8 +119,6 @@ def read_capture(
         ),
         notes=tuple(notes),
     )
-    hint = "check that cameras, landmarks and masks belong together"
-    return finish(found, checks, trust, hint, drop_frames)
 
 
 def landmarks_path(root: Path, name: str | None) -> Path:
@@ -138,12 +139,8 @@ def landmarks_path(root: Path, name: str | None) -> Path:
     return path
 
 
-def read_meta(path: Path, content: Mapping[str, Any], smpl: str | None = None) -> Meta:
-    """Facts about the capture from the content of meta.json, where only ``unit`` is required.
-
-    Raises:
-        DataError: on a missing unit or an unknown value.
-    """
+def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta:
+    """Facts about the capture from the content of meta.json, where only ``unit`` is required."""
     fps, names, body = (content.get(key) for key in ("fps", "label_names", "body"))
     if fps is not None and not (is_number(fps) and fps > 0):
         raise DataError(f"{path}: 'fps' is {fps!r}; expected a number above 0")
@@ -163,17 +160,6 @@ def read_meta(path: Path, content: Mapping[str, Any], smpl: str | None = None) -
         label_names=None if names is None else tuple(map(str, names)),
         splits=splits,
     )
-
-
-def _with_shape(meta: Meta, path: Path) -> Meta:
-    """The body with the shape that body_pose.npz gives, the mean shape where it gives none."""
-    arrays = read_arrays(path, ("betas",))
-    if meta.body is None or not arrays:
-        return meta
-    betas = expect_array(arrays, "betas", (None,), path).astype(np.float64)
-    if not np.isfinite(betas).all():
-        raise DataError(f"{path}: 'betas' must hold finite numbers")
-    return replace(meta, body=replace(meta.body, betas=tuple(betas.tolist())))
 
 
 def _index_images(root: Path, cameras: Mapping[str, CameraEntry]) -> dict[str, dict[int, str]]:
@@ -197,14 +183,10 @@ def _index_images(root: Path, cameras: Mapping[str, CameraEntry]) -> dict[str, d
     return images
 
 
-def read_landmarks(
+def _read_landmarks(
     path: Path, meta: Meta, conventions: Conventions, checks: Checks, notes: list[str]
 ) -> Landmarks:
-    """Skeletons of every frame, see `make_landmarks`.
-
-    Raises:
-        DataError: on wrong arrays.
-    """
+    """Skeletons of every frame."""
     joints = SKELETONS[meta.skeleton]
     arrays = read_arrays(path, ("p", "conf", "frame_id", "fitted_to"))
     p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64) * conventions.scale
@@ -219,13 +201,9 @@ def read_landmarks(
     return replace(found, fitted_to=tuple(cameras.tolist()))
 
 
-def read_poses(path: Path, meta: Meta, conventions: Conventions) -> Poses:
-    """Body poses; frames whose numbers are not finite are left out.
-
-    Raises:
-        DataError: on wrong arrays.
-    """
-    arrays = read_arrays(path, ("theta", "transl", "frame_id"))
+def _read_poses(path: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
+    """Poses of frames whose numbers are finite, and ``meta`` with the file's body shape."""
+    arrays = read_arrays(path, ("theta", "transl", "frame_id", "betas"))
     bones = None if meta.body is None else BODY_BONES[meta.body.kind]
     theta = expect_array(arrays, "theta", (None, bones, 3), path).astype(np.float64)
     transl = expect_array(arrays, "transl", (len(theta), 3), path).astype(np.float64)
@@ -233,4 +211,10 @@ def read_poses(path: Path, meta: Meta, conventions: Conventions) -> Poses:
     ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(theta),), path), str(path))
     finite = np.isfinite(theta).all((1, 2)) & np.isfinite(transl).all(1)
     rows = {int(ids[i]): int(i) for i in np.flatnonzero(finite)}
-    return Poses({f: theta[i] for f, i in rows.items()}, {f: transl[i] for f, i in rows.items()})
+    poses = Poses({f: theta[i] for f, i in rows.items()}, {f: transl[i] for f, i in rows.items()})
+    if meta.body is None or "betas" not in arrays:
+        return poses, meta
+    betas = expect_array(arrays, "betas", (None,), path).astype(np.float64)
+    if not np.isfinite(betas).all():
+        raise DataError(f"{path}: 'betas' must hold finite numbers")
+    return poses, replace(meta, body=replace(meta.body, betas=tuple(betas.tolist())))

@@ -13,28 +13,23 @@ from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.checks import Checks
 from gsgan.data.files import read_header
-from gsgan.data.formats.smpl_motion import require_kind
 from gsgan.data.formats.trust import Trust, check_meeting, watch_masks
 from gsgan.data.layout import Found, Layout, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile, mask_file
 from gsgan.data.splits import parse_frames
+from gsgan.skeleton.smpl import TABLES
 from gsgan.utils.errors import ConfigError, DataError
 
 IMAGES = (".jpg", ".jpeg", ".png")
 AXES = ("x", "y", "z")
+MODELS = {"smpl": ("SMPL", "SMPL_NEUTRAL.pkl"), "smplx": ("SMPL-X", "SMPLX_NEUTRAL.npz")}
 
 
 @dataclass(frozen=True, kw_only=True)
 class FolderReader:
     """Reads a published dataset's folder; a subclass finds its files and sets the defaults.
 
-    Args:
-        drop_frames: frames to leave out, e.g. "360-370", or None.
-        distance: metres, see `Checks`.
-        max_missing_masks: share of images without a mask that may be left out.
-        header_stride: see `Checks`.
-        pixel_centre: where K puts the centre of the first pixel: 0 as OpenCV calibrates.
-        trust: which images are compared with the body.
+    conf/data/*.yaml explain the settings.
     """
 
     drop_frames: Any = None
@@ -68,7 +63,7 @@ class FolderReader:
             header_stride=self.header_stride,
         )
         found = self.find(folder, checks, smpl)
-        return finish(found, checks, self.trust_of(found), self.hint, self.drop_frames)
+        return finish(found, checks, self.trust, self.hint, self.drop_frames)
 
     def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
         """The dataset's files, each checked by itself.
@@ -77,10 +72,6 @@ class FolderReader:
             DataError: for whatever is missing or damaged, naming the file.
         """
         raise NotImplementedError
-
-    def trust_of(self, found: Found) -> Trust:
-        """Which images are compared with the body."""
-        return self.trust
 
 
 def finish(
@@ -99,65 +90,55 @@ def finish(
         DataError: for whatever is missing or contradictory, naming the file.
         ConfigError: when ``drop_frames`` is malformed or leaves no frame.
     """
-    layout = assemble(without_frames(found, drop_frames), checks)
+    if drop_frames is not None:
+        gone = set(parse_frames(drop_frames, "data.reader.drop_frames"))
+        images = {
+            name: {f: path for f, path in files.items() if f not in gone}
+            for name, files in found.images.items()
+        }
+        if not any(images.values()):
+            raise ConfigError(f"data.reader.drop_frames={drop_frames} leaves no frame")
+        found = replace(found, images=images)
+    layout = assemble(found, checks)
     doubts = check_meeting(layout, found.points or layout.landmarks.seen, trust, hint)
     return replace(layout, notes=(*layout.notes, *doubts, *watch_masks(layout, trust)))
 
 
-def without_frames(found: Found, dropped: Any) -> Found:
-    """The same without the images of some frames, such as "360-370"; None keeps all.
-
-    Raises:
-        ConfigError: when none is left, or the value is malformed.
-    """
-    if dropped is None:
-        return found
-    gone = set(parse_frames(dropped, "data.reader.drop_frames"))
-    images = {
-        name: {f: path for f, path in files.items() if f not in gone}
-        for name, files in found.images.items()
-    }
-    if not any(images.values()):
-        raise ConfigError(f"data.reader.drop_frames={dropped} leaves no frame")
-    return replace(found, images=images)
-
-
-def no_joints(root: Path, has: str, model: str, otherwise: str = "") -> DataError:
-    """The error for a dataset whose skeleton needs a body model that was not given.
+def body_model(root: Path, smpl: str | None, kind: str) -> tuple[Path, SkinnedModel]:
+    """The user's body model file and the model in it.
 
     Args:
-        root: the dataset.
-        has: its content instead of joints, e.g. "SMPL parameters and vertices".
-        model: the required model, e.g. "SMPL (SMPL_NEUTRAL.pkl)".
-        otherwise: another way out, as the end of a sentence.
-    """
-    return DataError(
-        f"{root} holds {has} but no joints, and joints need the regressor of the body model: give "
-        f"data.smpl=/path/to/your {model} file, which has its own licence and is not part of this "
-        f"project{otherwise}"
-    )
-
-
-def body_model(smpl: str | None, kind: str) -> tuple[Path, SkinnedModel] | None:
-    """The user's body model file and the model in it, None without a file.
-
-    Args:
+        root: the dataset, for messages.
         smpl: the file.
         kind: "smpl" or "smplx", which it must be.
 
     Raises:
         ConfigError: when the file does not exist.
-        DataError: when it is damaged, or of another kind.
+        DataError: when none is given, or it is damaged or of another kind.
     """
+    name, example = MODELS[kind]
     if smpl is None:
-        return None
+        raise DataError(
+            f"{root} holds {name} parameters but no joints, and joints need the body model: give "
+            f"data.smpl=/path/to/your {name} file ({example}), which has its own licence and is "
+            "not part of this project"
+        )
     path = Path(smpl).expanduser()
     if not path.is_file():
         raise ConfigError(
             f"data.smpl={smpl} does not exist; expected an SMPL or SMPL-X .pkl or .npz"
         )
-    model = read_smpl(path)
-    require_kind(model, kind, path)
+    model, counts = read_smpl(path), TABLES[kind].counts
+    if model.kind != kind:
+        raise DataError(
+            f"{path} is a model of {len(model.parents)} joints; this dataset's parameters are of "
+            f"{name} ({counts[0]} joints)"
+        )
+    if len(model.v_template) != counts[1]:
+        raise DataError(
+            f"{path} has {len(model.v_template)} vertices; expected the {counts[1]} of {name}, "
+            "whose numbers the landmarks use: get the model from its own site"
+        )
     return path, model
 
 

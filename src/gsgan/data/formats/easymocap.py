@@ -27,7 +27,6 @@ from gsgan.data.formats.common import (
     IMAGES,
     FolderReader,
     body_model,
-    no_joints,
     picture_size,
     up_axis,
 )
@@ -46,7 +45,6 @@ SKELETONS = {"smpl": "smpl24 -> mediapipe33", "keypoints3d": "body25 -> mediapip
 RESULTS = ("{kind}", "output/{kind}", "output-{kind}/{kind}")
 PEOPLE = 1000  # bound on the person's number in a mask's name
 PEOPLE_KEYS = ("annots", "people")
-ID_KEYS = ("id", "personID")
 
 BODY_25 = 25
 WITH_HANDS = BODY_25 + 2 * HAND
@@ -57,18 +55,7 @@ HANDS_TO_33 = {landmark: BODY_25 + joint - BODY for landmark, joint in FROM_HAND
 
 @dataclass(frozen=True, kw_only=True)
 class EasymocapReader(FolderReader):
-    """Reads a folder of EasyMocap.
-
-    Args:
-        skeleton: "smpl" (fits), "keypoints3d", or "auto" for the first that exists and can be
-            used: fits need ``data.smpl``.
-        person: EasyMocap's id of the person whose skeleton, and whose masks where their names
-            hold an id, are read.
-        masks: folder of the masks, relative to the root.
-        mask_rule: how masks are decoded, one of `gsgan.data.pixels.MASK_RULES`.
-        threshold: for the rule of that name, and for "nonzero" where masks are JPEGs.
-        fps: frames per second, or None.
-    """
+    """Reads a folder of EasyMocap; conf/data/easymocap.yaml explains the settings."""
 
     skeleton: str = "auto"
     person: int = 0
@@ -95,24 +82,22 @@ class EasymocapReader(FolderReader):
             DataError: for whatever is missing or damaged, naming the file.
         """
         notes: list[str] = []
-        names = camera_folders(root, self.contents)
+        names = _camera_folders(root, self.contents)
         images = {name: frame_files(root, f"images/{name}", IMAGES) for name in names}
         if empty := [name for name, files in images.items() if not files]:
             raise DataError(f"{root / 'images' / empty[0]} holds no images; expected 000000.jpg")
         cameras = self._cameras(root, images, notes)
         frames = {f for files in images.values() for f in files}
         kind, place = self._source(root, smpl)
-        people = read_people(root, place, frames, self.person, notes)
+        people = _read_people(root, place, frames, self.person, notes)
         motion = body = None
         if kind == "smpl":
-            given = body_model(smpl, "smpl")
-            if given is None:
-                raise no_joints(root, f"SMPL parameters ({place}/)", "SMPL (SMPL_NEUTRAL.pkl)")
-            motion = zju_motion(people, given[1], notes)
-            body = BodyModel("smpl", str(given[0]), tuple(motion.betas[0].tolist()))
-            ids, (p, conf) = motion.ids, landmarks_of(given[1], motion)
+            file, model = body_model(root / place, smpl, "smpl")
+            motion = zju_motion(people, model, notes)
+            body = BodyModel("smpl", str(file), tuple(motion.betas[0].tolist()))
+            ids, (p, conf) = motion.ids, landmarks_of(model, motion)
         else:
-            ids, p, conf = read_keypoints(people)
+            ids, p, conf = _read_keypoints(people)
         return Found(
             root=root,
             meta=Meta(
@@ -136,20 +121,17 @@ class EasymocapReader(FolderReader):
 
     def _source(self, root: Path, smpl: str | None) -> tuple[str, str]:
         """The kind of skeletons to use, and their folder."""
-        places = {}
-        for kind in SKELETONS if self.skeleton == "auto" else (self.skeleton,):
-            folders = [pattern.format(kind=kind) for pattern in RESULTS]
-            if there := [folder for folder in folders if (root / folder).is_dir()]:
-                places[kind] = there[0]
+        kinds = SKELETONS if self.skeleton == "auto" else (self.skeleton,)
+        places = [(k, pattern.format(kind=k)) for k in kinds for pattern in RESULTS]
+        places = [(kind, place) for kind, place in places if (root / place).is_dir()]
         if not places:
             names = "keypoints3d/ or smpl/" if self.skeleton == "auto" else f"{self.skeleton}/"
             raise DataError(
                 f"{root} has no skeletons; expected {names} in it, or in output/: run EasyMocap's "
                 "reconstruction first"
             )
-        usable = [kind for kind in places if kind != "smpl" or smpl is not None]
-        kind = (usable or list(places))[0]
-        return kind, places[kind]
+        usable = [(kind, place) for kind, place in places if kind != "smpl" or smpl is not None]
+        return (usable or places)[0]
 
     def _cameras(
         self, root: Path, images: Mapping[str, Mapping[int, str]], notes: list[str]
@@ -192,21 +174,17 @@ class EasymocapReader(FolderReader):
         return found
 
 
-def camera_folders(root: Path, contents: str) -> list[str]:
-    """Names of the cameras that have a folder of images, in natural order.
-
-    Raises:
-        DataError: when there is none.
-    """
+def _camera_folders(root: Path, contents: str) -> list[str]:
+    """Names of the cameras that have a folder of images, in natural order."""
     for name in ("intri.yml", "extri.yml"):
         if not (root / name).is_file():
             raise DataError(f"{root / name} does not exist; a folder of EasyMocap holds {contents}")
     place = root / "images"
     names = [p.name for p in place.glob("*") if p.is_dir() and not p.name.startswith(".")]
     if not names:
-        hint = "extract the frames of videos/" if (root / "videos").is_dir() else "copy it whole"
         raise DataError(
-            f"{place} holds no folder of a camera; a folder of EasyMocap holds {contents}: {hint}"
+            f"{place} holds no folder of a camera; a folder of EasyMocap holds {contents}: extract "
+            "the frames of videos/"
         )
     return sorted(names, key=natural_order)
 
@@ -219,21 +197,10 @@ def _frame_and_person(stem: str) -> int | None:
     return int(match[1]) * PEOPLE + (int(match[2]) + 1 if match[2] else 0)
 
 
-def read_people(
+def _read_people(
     root: Path, folder: str, frames: Collection[int], person: int, notes: list[str]
 ) -> dict[int, tuple[str, Mapping[str, Any]]]:
-    """One person's entry, with the file's name for messages, by frame.
-
-    Args:
-        root: the dataset.
-        folder: of the JSON files, relative to it.
-        frames: that have images.
-        person: the requested ``id``.
-        notes: gains the frames that lack the person, or hold others too.
-
-    Raises:
-        DataError: on a damaged file, or when the person is in none.
-    """
+    """The person's entry, with the file's name for messages, by frame that has images."""
     files = frame_files(root, folder, (".json",))
     found, seen, crowded = {}, set[int](), list[int]()
     there = sorted(set(frames) & set(files))
@@ -253,10 +220,7 @@ def read_people(
     if lacking := [frame for frame in there if frame not in found]:
         notes.append(f"{folder} lacks person {person} at frames {spans(lacking)}")
     if crowded:
-        notes.append(
-            f"{folder} has more people than person {person} at frames {spans(crowded)}; masks must "
-            "be of that person alone"
-        )
+        notes.append(f"{folder} has more people than person {person} at frames {spans(crowded)}")
     return found
 
 
@@ -267,18 +231,16 @@ def _people(path: Path) -> dict[int, Mapping[str, Any]]:
         content = next((content[key] for key in PEOPLE_KEYS if key in content), None)
     if not isinstance(content, list) or not all(isinstance(p, Mapping) for p in content):
         raise DataError(f"{path} must hold a list of people, each an object with 'id'")
-    found: dict[int, Mapping[str, Any]] = {}
-    for entry in content:
-        number = next((entry[key] for key in ID_KEYS if key in entry), None)
-        if isinstance(number, bool) or not isinstance(number, int) or number in found:
+    numbers = [entry.get("id") for entry in content]
+    for i, number in enumerate(numbers):
+        if type(number) is not int or number in numbers[:i]:
             raise DataError(
                 f"{path}: each person needs a whole 'id' that no other has, found {number}"
             )
-        found[number] = entry
-    return found
+    return dict(zip(numbers, content, strict=True))
 
 
-def read_keypoints(
+def _read_keypoints(
     people: Mapping[int, tuple[str, Mapping[str, Any]]],
 ) -> tuple[NDArray[np.int64], Float, Float]:
     """MediaPipe's 33 landmarks from BODY_25, with hands where they are there.
@@ -288,9 +250,6 @@ def read_keypoints(
 
     Returns:
         ``ids [F]`` rising, ``p [F, 33, 3]`` metres and ``conf [F, 33]``.
-
-    Raises:
-        DataError: on another number of joints.
     """
     p, conf = np.full((len(people), BODY, 3), np.nan), np.zeros((len(people), BODY))
     for row, (where, entry) in enumerate(people.values()):

@@ -17,11 +17,10 @@ from gsgan.utils.arrays import as_floats
 from gsgan.utils.errors import DataError
 
 Float = NDArray[np.float64]
-MODEL_NAMES = {"smpl": "SMPL", "smplx": "SMPL-X"}
 CHUNK = 32  # frames posed at once: bounds memory, nothing else
 SHAPE_TOLERANCE = 1e-4  # spread of a shape coefficient over frames that is not worth a note
 ROOT_TOLERANCE = 1e-6  # radians in poses[:3] that count as none
-ZJU_POSES, ZJU_SHAPES = (72, 69), 10  # 69: without the root, which Rh turns
+ZJU_SIZES = {"poses": (72, 69), "shapes": (10,), "Rh": (3,), "Th": (3,)}  # 69: no root
 
 
 @dataclass(frozen=True)
@@ -59,36 +58,6 @@ class Motion:
         )
 
 
-def one_shape(betas: Float, notes: list[str]) -> Float:
-    """``[S]`` the subject's shape: the median of ``betas [F, S]``, with a note when they differ."""
-    spread = float(np.ptp(betas, axis=0).max(initial=0))
-    if spread > SHAPE_TOLERANCE:
-        notes.append(
-            f"the body's shape changes between frames (by up to {spread:.2g} in a coefficient); "
-            "its median is used"
-        )
-    return np.asarray(np.median(betas, axis=0), np.float64)
-
-
-def require_kind(model: SkinnedModel, kind: str, path: object) -> None:
-    """Refuses SMPL in place of SMPL-X, the reverse, and meshes of another topology.
-
-    Raises:
-        DataError: naming the file and what it holds.
-    """
-    if model.kind != kind:
-        raise DataError(
-            f"{path} is a model of {len(model.parents)} joints; this dataset's parameters are of "
-            f"{MODEL_NAMES[kind]} ({TABLES[kind].counts[0]} joints)"
-        )
-    count, found = TABLES[kind].counts[1], len(model.v_template)
-    if found != count:
-        raise DataError(
-            f"{path} has {found} vertices; expected the {count} of {MODEL_NAMES[kind]}, "
-            "whose numbers the landmarks use: get the model from its own site"
-        )
-
-
 def posed(model: SkinnedModel, motion: Motion, pose_blend: bool = True) -> tuple[Float, Float]:
     """Vertices ``[F, V, 3]`` and joints ``[F, J, 3]``, metres, world; for few frames at a time."""
     face = None if motion.expression is None else torch.from_numpy(motion.expression)
@@ -109,7 +78,10 @@ def landmarks_of(
 
     Only the vertices that landmarks lie on are posed: about 0.1 ms per frame instead of 10.
     """
-    small, vertices = _only(model, landmark_vertices(model.kind))
+    table = TABLES[model.kind]
+    own = {vertex for vertex, _ in table.vertices.values()}
+    vertices = sorted(own | {vertex for _, vertex in table.midpoints.values()})
+    small = _only(model, vertices)
     p, conf = [], []
     for first in range(0, len(motion.ids), CHUNK):
         found, joints = posed(small, motion.rows(slice(first, first + CHUNK)), pose_blend)
@@ -122,62 +94,24 @@ def landmarks_of(
     return np.stack(p), np.stack(conf)
 
 
-def landmark_vertices(kind: str) -> list[int]:
-    """The vertices that landmarks lie on, rising."""
-    table = TABLES[kind]
-    own = {vertex for vertex, _ in table.vertices.values()}
-    return sorted(own | {vertex for _, vertex in table.midpoints.values()})
-
-
-def _only(model: SkinnedModel, vertices: list[int]) -> tuple[SkinnedModel, list[int]]:
+def _only(model: SkinnedModel, vertices: list[int]) -> SkinnedModel:
     """The same skeleton with few vertices; each joint becomes a vertex too, that regresses it."""
-    J = len(model.parents)
+    eye = torch.eye(len(model.parents), dtype=torch.float64)
 
     def with_joints(values: torch.Tensor) -> torch.Tensor:
         at_joints = (model.J_regressor @ values.flatten(1)).unflatten(1, values.shape[1:])
         return torch.cat([values[vertices], at_joints])
 
-    still = model.posedirs.new_zeros((J, *model.posedirs.shape[1:]))
-    pick = torch.cat([model.J_regressor.new_zeros(J, len(vertices)), _eye(J)], dim=1)
-    small = replace(
+    still = model.posedirs.new_zeros((len(eye), *model.posedirs.shape[1:]))
+    return replace(
         model,
         v_template=with_joints(model.v_template),
         shapedirs=with_joints(model.shapedirs),
         expression_dirs=with_joints(model.expression_dirs),
         posedirs=torch.cat([model.posedirs[vertices], still]),
-        J_regressor=pick,
-        weights=torch.cat([model.weights[vertices], _eye(J)]),
+        J_regressor=torch.cat([eye.new_zeros(len(eye), len(vertices)), eye], dim=1),
+        weights=torch.cat([model.weights[vertices], eye]),
     )
-    return small, vertices
-
-
-def _eye(n: int) -> torch.Tensor:
-    return torch.eye(n, dtype=torch.float64)
-
-
-def parameter(content: Any, key: str, sizes: tuple[int, ...], where: str) -> Float:
-    """One frame's parameter as finite numbers, flat.
-
-    Args:
-        content: of the file.
-        key: of the parameter.
-        sizes: allowed lengths.
-        where: the file, for messages.
-
-    Raises:
-        DataError: when it is missing, of another length, or not finite.
-    """
-    expected = " or ".join(map(str, sizes))
-    if not isinstance(content, Mapping) or key not in content:
-        held = ", ".join(map(str, content)) if isinstance(content, Mapping) else "something else"
-        raise DataError(f"{where} has no '{key}'; expected {expected} numbers, found {held[:120]}")
-    values = as_floats(content[key]).reshape(-1)
-    if len(values) not in sizes:
-        found = getattr(content[key], "shape", type(content[key]).__name__)
-        raise DataError(f"{where}: '{key}' must hold {expected} numbers, found {found}")
-    if not np.isfinite(values).all():
-        raise DataError(f"{where}: '{key}' must hold finite numbers, found NaN or infinity")
-    return values
 
 
 def zju_motion(
@@ -199,29 +133,39 @@ def zju_motion(
     """
     rows = []
     for where, content in entries.values():
-        poses = parameter(content, "poses", ZJU_POSES, where)
-        poses = np.concatenate([np.zeros(ZJU_POSES[0] - len(poses)), poses])
-        refuse_root(poses, where)
-        sizes = {"shapes": ZJU_SHAPES, "Rh": 3, "Th": 3}
-        rows.append([poses, *(parameter(content, key, (n,), where) for key, n in sizes.items())])
+        row = [_parameter(content, key, sizes, where) for key, sizes in ZJU_SIZES.items()]
+        row[0] = np.concatenate([np.zeros(ZJU_SIZES["poses"][0] - len(row[0])), row[0]])
+        turn = float(np.abs(row[0][:3]).max())
+        if turn > ROOT_TOLERANCE:
+            raise DataError(
+                f"{where}: the first 3 numbers of 'poses' must be 0, found up to {turn:.3g}; "
+                "the root's rotation belongs in Rh"
+            )
+        rows.append(row)
     poses, shapes, Rh, Th = (np.stack(column) for column in zip(*rows, strict=True))
-    shape = one_shape(shapes, notes)[: model.shapedirs.shape[-1]]
+    spread = float(np.ptp(shapes, axis=0).max(initial=0))
+    if spread > SHAPE_TOLERANCE:
+        notes.append(
+            f"the body's shape changes between frames (by up to {spread:.2g} in a coefficient); "
+            "its median is used"
+        )
+    shape = np.median(shapes, axis=0)[: model.shapedirs.shape[-1]]
     J0 = model.rest_joints(torch.from_numpy(shape[None]))[0, 0].numpy()
-    theta = poses.reshape(len(rows), -1, 3).copy()
+    theta = poses.reshape(len(rows), -1, 3)
     theta[:, 0], transl = from_zju(Rh, Th, J0)
     ids = np.array(list(entries), np.int64)
     return Motion(ids, theta, transl, np.repeat(shape[None], len(ids), axis=0))
 
 
-def refuse_root(poses: Float, where: str) -> None:
-    """Refuses a pose ``[72]`` that turns the root, which Rh does in ZJU-MoCap's convention.
-
-    Raises:
-        DataError: naming the file.
-    """
-    turn = float(np.abs(poses[:3]).max())
-    if turn > ROOT_TOLERANCE:
-        raise DataError(
-            f"{where}: the first 3 numbers of 'poses' must be 0, found up to {turn:.3g}; "
-            "the root's rotation belongs in Rh"
-        )
+def _parameter(content: Any, key: str, sizes: tuple[int, ...], where: str) -> Float:
+    """One frame's parameter as finite numbers, flat; its length is one of ``sizes``."""
+    expected = " or ".join(map(str, sizes))
+    if not isinstance(content, Mapping) or key not in content:
+        raise DataError(f"{where} has no '{key}'; expected {expected} numbers")
+    values = as_floats(content[key]).reshape(-1)
+    if len(values) not in sizes:
+        found = getattr(content[key], "shape", type(content[key]).__name__)
+        raise DataError(f"{where}: '{key}' must hold {expected} numbers, found {found}")
+    if not np.isfinite(values).all():
+        raise DataError(f"{where}: '{key}' must hold finite numbers, found NaN or infinity")
+    return values

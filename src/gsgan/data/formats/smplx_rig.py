@@ -1,77 +1,64 @@
 """One person before a rig of cameras: a JSON of cameras, images, matting alphas, SMPL-X fits.
 
-The shared reader of THuman4.0 and AvatarReX; `Places` holds their differences.
+The shared reader of THuman4.0 and AvatarReX. Convention of the fits, one npz: metres, axis-angle;
+row i is frame i; the first row of betas is the subject's; hands are full rotations away from the
+flat hand (``use_pca=False, flat_hand_mean=True`` in smplx's terms).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from gsgan.body.smpl import SkinnedModel
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
-from gsgan.data.checks import Checks
-from gsgan.data.files import frame_files, last_number, read_header, read_json, read_stored
+from gsgan.data.checks import Checks, spans
+from gsgan.data.files import frame_files, last_number, read_json
 from gsgan.data.formats.common import (
     IMAGES,
     FolderReader,
     body_model,
-    no_joints,
     one_mask_each,
     picture_size,
     up_axis,
 )
-from gsgan.data.formats.smpl_motion import landmarks_of, posed
-from gsgan.data.formats.smplx_params import read_motion
+from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import make_landmarks
+from gsgan.utils.arrays import as_floats
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.pickles import read_npz
 
 Files = dict[str, dict[int, str]]
 """Paths relative to the root, by camera and frame."""
+Float = NDArray[np.float64]
 
 PARAMETERS = "smpl_params.npz"
 MISSING = "missing_img_files.txt"
-GREY_SPREAD = 24  # by which the channels of a grey image may differ once a colour JPEG holds it
-
-
-@dataclass(frozen=True)
-class Places:
-    """The files of a release.
-
-    Args:
-        layout: its name.
-        calibration: file of the cameras.
-        images, masks: folder of a camera's files, with ``{camera}``.
-        cameras: pattern whose ``*`` is the name of a camera that has files.
-        lists_missing: the release always has a missing_img_files.txt.
-    """
-
-    layout: str
-    calibration: str
-    images: str
-    masks: str
-    cameras: str
-    lists_missing: bool
+POSES = {  # in the order of SMPL-X's joints: numbers per frame of each
+    "global_orient": 3,
+    "body_pose": 63,
+    "jaw_pose": 3,
+    "leye_pose": 3,
+    "reye_pose": 3,
+    "left_hand_pose": 45,
+    "right_hand_pose": 45,
+}
+NEEDED = ("global_orient", "body_pose", "transl", "betas")
+HANDS = ("left_hand_pose", "right_hand_pose")
+SMPL_BODY = 69
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmplxRigReader(FolderReader):
-    """Reads one subject.
-
-    Args:
-        threshold: an alpha of at least this is the person; JPEG makes alphas noisy.
-        ignore_band: pixels, side of the square that widens the mask's outline into a band that is
-            left out of the loss; 0 leaves out nothing.
-        ignore_alpha: pixels of an alpha strictly between these two are left out too, or None.
-        undistort: apply the calibration's ``distCoeff``; the released images are rectified.
-        fps: frames per second.
-    """
+    """Reads one subject; conf/data/thuman4.yaml explains the settings."""
 
     threshold: int = 128
     ignore_band: int = 0
@@ -79,7 +66,17 @@ class SmplxRigReader(FolderReader):
     undistort: bool = False
     fps: float | None = 30.0
 
-    places: ClassVar[Places]
+    layout: ClassVar[str]
+    """Name of the release."""
+    calibration: ClassVar[str]
+    """File of the cameras."""
+    images: ClassVar[str]
+    masks: ClassVar[str]
+    """Folder of a camera's files, with ``{camera}``."""
+    camera_folders: ClassVar[str]
+    """Pattern whose ``*`` is the name of a camera that has files."""
+    lists_missing: ClassVar[bool]
+    """The release always has a missing_img_files.txt."""
     hint: ClassVar[str] = (
         f"check that calibration, {PARAMETERS} and masks are of one subject, and that data.smpl is "
         "the neutral SMPL-X"
@@ -100,24 +97,19 @@ class SmplxRigReader(FolderReader):
         Raises:
             DataError: for whatever is missing or damaged, naming the file.
         """
-        places, alpha, notes = self.places, self.ignore_alpha, list[str]()
-        for name in (places.calibration, PARAMETERS):
+        alpha, notes = self.ignore_alpha, list[str]()
+        for name in (self.calibration, PARAMETERS):
             if not (root / name).is_file():
                 raise DataError(
-                    f"{root / name} does not exist; a folder of {places.layout} holds "
-                    f"{self.contents}"
+                    f"{root / name} does not exist; a folder of {self.layout} holds {self.contents}"
                 )
-        given = body_model(smpl, "smplx")
-        if given is None:
-            raise no_joints(root, "SMPL-X parameters", "SMPL-X (SMPLX_NEUTRAL.npz)")
-        file, model = given
-        path = root / places.calibration
+        file, model = body_model(root, smpl, "smplx")
+        path = root / self.calibration
         entries = read_json(path)
-        check_cameras(root, path, entries, places.cameras)
-        images = index(root, entries, places.images, "images")
-        masks = index(root, entries, places.masks, "masks")
-        check_grey(root, masks)
-        leave_out(images, root / MISSING, places.lists_missing, notes)
+        self._check_folders(root, path, entries)
+        images = _index(root, entries, self.images, "images")
+        masks = _index(root, entries, self.masks, "masks")
+        _leave_out(images, root / MISSING, self.lists_missing, notes)
         cameras = self._cameras(root, path, entries, images, checks, notes)
         frames = {f for files in images.values() for f in files}
         motion = read_motion(root / PARAMETERS, frames, model, notes)
@@ -130,12 +122,12 @@ class SmplxRigReader(FolderReader):
                 up_axis=up_axis(cameras.values()),
                 skeleton_source="smplx -> mediapipe33",
                 body=BodyModel("smplx", str(file), tuple(motion.betas[0].tolist())),
-                layout=places.layout,
+                layout=self.layout,
             ),
             cameras=cameras,
             images=images,
             masks=one_mask_each(masks, "threshold"),
-            mask_folder=places.masks,
+            mask_folder=self.masks,
             landmarks=make_landmarks(motion.ids, p, conf, checks.max_reach, notes, PARAMETERS),
             poses=motion.poses(PARAMETERS),
             pixels=PixelRules(
@@ -148,6 +140,20 @@ class SmplxRigReader(FolderReader):
             points=lambda frame: posed(model, motion.rows([row[frame]]))[0][0],
             notes=tuple(notes),
         )
+
+    def _check_folders(self, root: Path, path: Path, entries: Mapping[str, Any]) -> None:
+        """Cameras and folders are the same ones."""
+        at = PurePosixPath(self.camera_folders).parts.index("*")
+        found = root.glob(self.camera_folders)
+        folders = {p.relative_to(root).parts[at] for p in found if p.is_dir()}
+        counts = (
+            f"{path} lists {len(entries)} cameras, but {len(folders)} have a folder "
+            f"({root / self.camera_folders})"
+        )
+        if lacking := [name for name in entries if name not in folders]:
+            raise DataError(f"{counts}: {', '.join(lacking[:5])} lacks one; copy it")
+        if unknown := sorted(folders - set(entries)):
+            raise DataError(f"{counts}: {', '.join(unknown[:5])} is not calibrated")
 
     def _cameras(
         self,
@@ -162,6 +168,13 @@ class SmplxRigReader(FolderReader):
         cameras = {}
         for name, entry in entries.items():
             where = f"{path}, camera {name}"
+            if not isinstance(entry, dict) or any(key not in entry for key in "KRT"):
+                held = ", ".join(entry) if isinstance(entry, dict) else type(entry).__name__
+                raise DataError(f"{where}: expected K, R, T and imgSize, found {held}")
+            size = picture_size(root, images[name])
+            if "imgSize" in entry:
+                w, h = (int(x) for x in numbers(where, entry["imgSize"], "imgSize", (2,)))
+                size = h, w
             cameras[name] = make_camera(
                 where,
                 name,
@@ -169,7 +182,7 @@ class SmplxRigReader(FolderReader):
                 R=numbers(where, entry["R"], "R", (9,)).reshape(3, 3),
                 t=entry["T"],
                 dist=entry.get("distCoeff"),
-                size=camera_size(where, entry, root, images[name]),
+                size=size,
                 pixel_centre=self.pixel_centre,
                 rotation_tolerance=checks.rotation_tolerance,
             )
@@ -184,62 +197,8 @@ class SmplxRigReader(FolderReader):
         return cameras
 
 
-def camera_size(
-    where: str, entry: Mapping[str, Any], root: Path, files: Mapping[int, str]
-) -> tuple[int, int]:
-    """``(H, W)`` by ``imgSize [width, height]``, else of the first image.
-
-    Raises:
-        DataError: when it is not a size, or is written height first.
-    """
-    height, width = picture_size(root, files)
-    if "imgSize" not in entry:
-        return height, width
-    w, h = (int(x) for x in numbers(where, entry["imgSize"], "imgSize", (2,)))
-    if (w, h) == (height, width) and w != h:
-        raise DataError(
-            f"{where}: imgSize {[w, h]} is transposed, {root / next(iter(files.values()))} is "
-            f"{width}x{height} pixels (width x height); write [width, height]"
-        )
-    return h, w
-
-
-def check_cameras(root: Path, path: Path, entries: Mapping[str, Any], pattern: str) -> None:
-    """Checks that cameras and folders are the same ones, and that each camera has K, R and T.
-
-    Args:
-        root: the dataset.
-        path: its calibration.
-        entries: of the calibration, by camera.
-        pattern: see `Places.cameras`.
-
-    Raises:
-        DataError: listing the cameras without a folder, or the folders without a camera.
-    """
-    at = PurePosixPath(pattern).parts.index("*")
-    folders = {p.relative_to(root).parts[at] for p in root.glob(pattern) if p.is_dir()}
-    counts = (
-        f"{path} lists {len(entries)} cameras, but {len(folders)} have a folder ({root / pattern})"
-    )
-    if lacking := [name for name in entries if name not in folders]:
-        raise DataError(
-            f"{counts}: {', '.join(lacking[:5])} lacks one; copy it, or take the camera out of the "
-            "calibration"
-        )
-    if unknown := sorted(folders - set(entries)):
-        raise DataError(f"{counts}: {', '.join(unknown[:5])} is not calibrated")
-    for name, entry in entries.items():
-        if not isinstance(entry, dict) or any(key not in entry for key in "KRT"):
-            held = ", ".join(entry) if isinstance(entry, dict) else type(entry).__name__
-            raise DataError(f"{path}, camera {name}: expected K, R, T and imgSize, found {held}")
-
-
-def index(root: Path, cameras: Mapping[str, Any], place: str, kind: str) -> Files:
-    """Files by camera and frame.
-
-    Raises:
-        DataError: when a camera has none.
-    """
+def _index(root: Path, cameras: Mapping[str, Any], place: str, kind: str) -> Files:
+    """Files by camera and frame; each camera has some."""
     found = {}
     for name in cameras:
         folder = place.format(camera=name)
@@ -249,27 +208,8 @@ def index(root: Path, cameras: Mapping[str, Any], place: str, kind: str) -> File
     return found
 
 
-def check_grey(root: Path, masks: Files) -> None:
-    """Checks that the first mask of each camera is grey.
-
-    Raises:
-        DataError: when it has colours: masks and images may be swapped.
-    """
-    for files in masks.values():
-        path = root / next(iter(files.values()))
-        if read_header(path).channels < 3:
-            continue
-        stored = read_stored(path)
-        if stored.ndim == 3 and np.ptp(stored.astype(np.int16), axis=2).max() > GREY_SPREAD:
-            raise DataError(f"{path} is a colour image; expected a mask of 8-bit grey alphas")
-
-
-def leave_out(images: Files, path: Path, expected: bool, notes: list[str]) -> None:
-    """Removes the images that a missing_img_files.txt names from the index.
-
-    Raises:
-        DataError: when the list cannot be read, or nothing is left of a camera.
-    """
+def _leave_out(images: Files, path: Path, expected: bool, notes: list[str]) -> None:
+    """Removes the images that a missing_img_files.txt names from the index."""
     if not path.is_file():
         if expected:
             notes.append(f"{path} does not exist: every image in the folders is used")
@@ -305,3 +245,90 @@ def read_missing(path: Path, cameras: Mapping[str, Any]) -> set[tuple[str, int]]
             )
         found.add((camera, frame))
     return found
+
+
+def read_motion(
+    path: Path, frames: Collection[int], model: SkinnedModel, notes: list[str]
+) -> Motion:
+    """The parameters of the frames that have any, in the model's own convention.
+
+    Args:
+        path: smpl_params.npz.
+        frames: that have images.
+        model: SMPL-X.
+        notes: gains a sentence for each omission.
+
+    Raises:
+        DataError: on a damaged file, a missing or misshapen array, or one of SMPL.
+    """
+    arrays = read_npz(path, (*POSES, "transl", "betas", "expression"))
+    if missing := [key for key in NEEDED if key not in arrays]:
+        raise DataError(f"{path} has no array {', '.join(missing)}; expected SMPL-X parameters")
+    transl = _rows(arrays, "transl", 3, path)
+    count = len(transl)
+    theta = np.concatenate(
+        [
+            _rows(arrays, key, width, path, count) if key in arrays else np.zeros((count, width))
+            for key, width in POSES.items()
+        ],
+        axis=1,
+    )
+    if absent := [key for key in HANDS if key not in arrays]:
+        notes.append(f"{path} has no {' and '.join(absent)}: taken as flat hands")
+    betas = _coefficients(arrays, "betas", model.shapedirs.shape[-1], path)[0]
+    if not np.isfinite(betas).all():
+        raise DataError(f"{path}: 'betas' must hold finite numbers, found NaN or infinity")
+    face = np.zeros((count, 0))
+    if "expression" in arrays:
+        face = _coefficients(arrays, "expression", model.expression_dirs.shape[-1], path, count)
+    finite = np.isfinite(np.concatenate([theta, transl, face], axis=1)).all(1)
+    there = [f for f in sorted(frames) if f < count]
+    ids = np.array([f for f in there if finite[f]], np.int64)
+    if not len(ids):
+        raise DataError(
+            f"{path} has {count} rows, but no finite one of a frame that has images; expected row "
+            "i to be frame i"
+        )
+    if lost := [f for f in there if not finite[f]]:
+        notes.append(f"{path}: NaN or infinity at frames {spans(lost)}")
+    return Motion(
+        ids=ids,
+        theta=theta.reshape(count, -1, 3)[ids],
+        transl=transl[ids],
+        betas=np.repeat(betas[None], len(ids), axis=0),
+        expression=face[ids],
+    )
+
+
+def _rows(
+    arrays: dict[str, Any], key: str, width: int | None, path: Path, count: int | None = None
+) -> Float:
+    """``[N, width]`` of an array ``[N, ...]``; N is ``count`` where that is given."""
+    values = as_floats(arrays[key])
+    values = (
+        values.reshape(len(values), -1) if values.ndim > 1 and values.size else np.zeros((0, 0))
+    )
+    found = values.shape[1]
+    if values.size and width in (None, found) and count in (None, len(values)):
+        return values
+    hint = ""
+    if key == "body_pose" and found == SMPL_BODY:
+        hint = "; 69 are those of SMPL: fit SMPL-X to the sequence, or use its own smpl_params.npz"
+    elif key in HANDS and 0 < found < POSES[key]:
+        hint = "; fewer look like PCA coefficients (expected use_pca=False)"
+    shape = getattr(arrays[key], "shape", type(arrays[key]).__name__)
+    expected = f"({count or 'frames'}, {width or 'any'})"
+    raise DataError(f"{path}: '{key}' must hold numbers of shape {expected}, found {shape}{hint}")
+
+
+def _coefficients(
+    arrays: dict[str, Any], key: str, most: int, path: Path, count: int | None = None
+) -> Float:
+    """``[N, n]``, n at most the model's number; further ones must be 0."""
+    values = _rows(arrays, key, None, path, count)
+    if np.any(values[:, most:] != 0):
+        raise DataError(
+            f"{path}: '{key}' has {values.shape[1]} coefficients, the model file {most}; give the "
+            "SMPL-X file with all of them as data.smpl"
+        )
+    return values[:, :most]

@@ -12,18 +12,16 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from gsgan.data.formats.smplx_rig import Places, SmplxRigReader
+from gsgan.data.formats.smplx_rig import SmplxRigReader
 
 
 class Thuman4Reader(SmplxRigReader):
     """Reads a subject of THuman4.0; settings as `SmplxRigReader`."""
 
     contents: ClassVar[str] = "calibration.json, smpl_params.npz, images/ and masks/"
-    places: ClassVar[Places] = Places(
-        layout="THuman4.0",
-        calibration="calibration.json",
-        images="images/{camera}",
-        masks="masks/{camera}",
-        cameras="images/*",
-        lists_missing=True,
-    )
+    layout: ClassVar[str] = "THuman4.0"
+    calibration: ClassVar[str] = "calibration.json"
+    images: ClassVar[str] = "images/{camera}"
+    masks: ClassVar[str] = "masks/{camera}"
+    lists_missing: ClassVar[bool] = True
+    camera_folders: ClassVar[str] = "images/*"

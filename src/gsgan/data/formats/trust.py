@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.checks import spans
 from gsgan.data.crop import NEAR, project
-from gsgan.data.files import read_grey
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
 from gsgan.utils.errors import DataError
@@ -344,8 +343,3 @@ def watch_masks(layout: Layout, trust: Trust) -> list[str]:
         for case, at in cases.items()
         if at.any()
     ]
-
-
-def highest_label(root: Path, files: list[str]) -> int:
-    """The highest value in some label images, 0 without any."""
-    return max((int(read_grey(root / path).max()) for path in files), default=0)

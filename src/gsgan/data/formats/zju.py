@@ -1,11 +1,9 @@
-"""Reader of ZJU-MoCap in each of its layouts, recognised by their files.
+"""Reader of ZJU-MoCap.
 
 ::
 
     original   annots.npy  Camera_B1/000000.jpg  mask/ mask_cihp/  new_params/ or params/
     refined    annots.npy  images/00/000000.jpg  mask/00/          smpl_params/
-    HumanNeRF  cameras.pkl  mesh_infos.pkl  images/frame_000000.png  masks/
-    ARAH       cam_params.json  1/000000.{jpg,png}  models/000000.npz
 
 Subjects 313 and 315 of the original release have 21 cameras (``Camera (1)``, no 20 and 21), long
 file names, frames that count from 1 and nested lists in annots.npy.
@@ -13,57 +11,54 @@ file names, frames that count from 1 and nested lists in annots.npy.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import ClassVar
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.body.smpl import SkinnedModel
 from gsgan.body.smpl_names import CIHP
+from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.data.checks import Checks
-from gsgan.data.files import frame_files
-from gsgan.data.formats import zju_annots, zju_caches
-from gsgan.data.formats.common import FolderReader, body_model, no_joints, up_axis
-from gsgan.data.formats.smpl_motion import landmarks_of, posed
-from gsgan.data.formats.trust import Trust, highest_label, spread
-from gsgan.data.layout import BodyModel, Found, Layout, Meta
-from gsgan.data.pixels import MaskFile, PixelRules, mask_file
+from gsgan.data.files import frame_files, frame_of, last_number, natural_order
+from gsgan.data.formats.common import IMAGES, FolderReader, body_model, picture_size, up_axis
+from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed, zju_motion
+from gsgan.data.layout import BodyModel, Found, Meta
+from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import DataError
+from gsgan.utils.pickles import read_npy
 
-Float = NDArray[np.float64]
+Files = dict[str, dict[int, str]]
+"""Paths relative to the root, by camera and frame."""
 
+ANNOTS = ("annots.npy", "annots_new.npy")
+CACHES = ("mesh_infos.pkl", "cam_params.json")  # of HumanNeRF and of ARAH
+MILLIMETRES = 1e-3
+NAMED_FRAME = re.compile(r"\)_(\d+)")  # CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592
+CAMERA_FOLDER = re.compile(r"(Camera[_ ]?\(?B?\d+\)?|\d{1,3})")
 MASKS = {"mask_cihp": "label", "mask": "nonzero"}
+# Files may hold stray numbers beyond CIHP's.
+CIHP_TABLE = tuple(i if i < len(CIHP) else IGNORE_LABEL for i in range(256))
+FITS = {"refit": "new_params", "refined": "smpl_params", "first": "params"}
+UNBLENDED = "first"  # the fit whose body is posed without pose blend shapes
 
 
 @dataclass(frozen=True, kw_only=True)
 class ZjuReader(FolderReader):
-    """Reads a ZJU-MoCap subject.
-
-    Args:
-        masks: "both" joins mask_cihp and mask where both exist, or only one of them by name.
-        fit: "refit" (new_params), "refined" (smpl_params), "first" (params), or "auto" for the
-            first of these that exists.
-        ignore_band: pixels, side of the square that widens the mask's outline into a band of
-            ignored labels; 0 ignores none.
-        translation: metres, least and greatest median length of the cameras' T.
-        max_vertex_error: metres, mean distance allowed between stored and posed vertices.
-    """
+    """Reads a ZJU-MoCap subject; conf/data/zju_mocap.yaml explains the settings."""
 
     masks: str = "both"
     fit: str = "auto"
     ignore_band: int = 5
     translation: tuple[float, float] = (0.05, 20.0)
     max_missing_masks: float = 0.5
-    max_vertex_error: float = 0.01
 
-    contents: ClassVar[str] = (
-        "a ZJU-MoCap subject (annots.npy and camera folders, or a HumanNeRF or ARAH cache of it)"
-    )
+    contents: ClassVar[str] = "a ZJU-MoCap subject (annots.npy and camera folders)"
     hint: ClassVar[str] = (
         "check that cameras, SMPL parameters and masks come from one release (the refined my_* "
         "ones do not fit CoreView images)"
@@ -71,65 +66,25 @@ class ZjuReader(FolderReader):
 
     def __post_init__(self) -> None:
         one_of("data.reader.masks", self.masks, ("both", *MASKS))
-        one_of("data.reader.fit", self.fit, ("auto", *zju_annots.FITS))
-
-    def __call__(self, root: str | Path, checks: Checks, smpl: str | None = None) -> Layout:
-        """Reads and checks everything except most images' pixels; see `FolderReader`.
-
-        Raises:
-            DataError: for whatever is missing, damaged or contradictory, naming the file.
-        """
-        return self._without_wrong_labels(super().__call__(root, checks, smpl))
+        one_of("data.reader.fit", self.fit, ("auto", *FITS))
 
     def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
-        """The subject's files, each checked by itself; caches that hold joints need no model.
+        """The subject's files, each checked by itself.
 
         Raises:
             DataError: for whatever is missing or damaged, naming the file.
         """
-        path, model = body_model(smpl, "smpl") or (None, None)
-        kind = layout_of(root)
-        if kind == "annots":
-            return self._annots(root, checks, model, path)
-        cache = zju_caches.humannerf if kind == "humannerf" else zju_caches.arah
-        found = cache(root, checks, model, path, self.pixel_centre)
-        return replace(found, pixels=replace(found.pixels, ignore_band=self.ignore_band))
-
-    def trust_of(self, found: Found) -> Trust:
-        """For joints, which lie inside the body, without the overlap of body and mask boxes."""
-        return self.trust if found.points is not None else replace(self.trust, min_box_iou=0.0)
-
-    def _annots(
-        self, root: Path, checks: Checks, model: SkinnedModel | None, smpl: Path | None
-    ) -> Found:
-        """The original or the refined release."""
-        if model is None:
-            raise no_joints(
-                root,
-                "SMPL parameters and vertices",
-                "SMPL (SMPL_NEUTRAL.pkl)",
-                ", or use a HumanNeRF or ARAH cache of the subject, which has joints",
-            )
+        annots = read_annots(root)
+        file, model = body_model(root, smpl, "smpl")
         notes = ["lengths of the cameras converted from mm to metres"]
-        annots = zju_annots.read_annots(root)
-        folders = zju_annots.camera_folders(root, annots, notes)
-        images = zju_annots.index_images(root, folders, notes)
-        cameras = zju_annots.annots_cameras(
-            root,
-            annots,
-            images,
-            self.pixel_centre,
-            checks.rotation_tolerance,
-            (self.translation[0], self.translation[1]),
-        )
-        frames = sorted({f for files in images.values() for f in files})
-        fit = zju_annots.choose_fit(root, self.fit)
-        motion = zju_annots.read_motion(root, fit, frames, model, notes)
-        blend = zju_annots.check_vertices(
-            root, fit, motion, model, self.trust.frames, self.max_vertex_error
-        )
-        masks, labels = self._masks(root, folders, notes)
-        p, conf = landmarks_of(model, motion, blend)
+        folders = camera_folders(root, annots, notes)
+        images = _index_images(root, folders, notes)
+        cameras = self._cameras(root, annots, images, checks)
+        fit, params = self._fit(root)
+        frames = {f for files in images.values() for f in files}
+        motion = _read_motion(root, params, frames, model, notes)
+        masks, labels = self._masks(root, folders)
+        p, conf = landmarks_of(model, motion, fit != UNBLENDED)
         row = {int(f): i for i, f in enumerate(motion.ids)}
         return Found(
             root=root,
@@ -137,7 +92,7 @@ class ZjuReader(FolderReader):
                 unit="mm",
                 up_axis=up_axis(cameras.values()),
                 skeleton_source="smpl24 -> mediapipe33",
-                body=BodyModel("smpl", str(smpl), tuple(motion.betas[0].tolist())),
+                body=BodyModel("smpl", str(file), tuple(motion.betas[0].tolist())),
                 label_names=CIHP if labels else None,
                 labels_named_by="CIHP",
                 layout="ZJU-MoCap",
@@ -146,75 +101,211 @@ class ZjuReader(FolderReader):
             images=images,
             masks=masks,
             labels=labels,
-            landmarks=make_landmarks(
-                motion.ids, p, conf, checks.max_reach, notes, source=f"{fit.params}/"
-            ),
-            poses=motion.poses(f"{fit.params}/"),
+            landmarks=make_landmarks(motion.ids, p, conf, checks.max_reach, notes, f"{params}/"),
+            poses=motion.poses(f"{params}/"),
             pixels=PixelRules(
-                mask_sampling="nearest",
-                label_table=zju_caches.CIHP_TABLE,
-                ignore_band=self.ignore_band,
+                mask_sampling="nearest", label_table=CIHP_TABLE, ignore_band=self.ignore_band
             ),
             calibration=annots.path,
-            unit_hint=(
-                f"T in {annots.path} must be in millimetres, Th in {root / fit.params} in metres"
-            ),
-            points=lambda frame: posed(model, motion.rows([row[frame]]), blend)[0][0],
+            unit_hint=f"T in {annots.path} must be in millimetres, Th in {root / params} in metres",
+            points=lambda frame: posed(model, motion.rows([row[frame]]), fit != UNBLENDED)[0][0],
             notes=tuple(notes),
         )
 
+    def _cameras(
+        self, root: Path, annots: Annots, images: Files, checks: Checks
+    ) -> dict[str, CameraEntry]:
+        """By name, in the order of annots.npy."""
+        some = next(files for files in images.values() if files)
+        cameras = {}
+        for i, (name, files) in enumerate(images.items()):
+            cameras[name] = make_camera(
+                f"{annots.path}, camera {name} (index {i})",
+                name,
+                K=annots.K[i],
+                R=annots.R[i],
+                t=annots.T[i],
+                dist=annots.D[i],
+                size=picture_size(root, files or some),
+                scale=MILLIMETRES,
+                pixel_centre=self.pixel_centre,
+                rotation_tolerance=checks.rotation_tolerance,
+            )
+        length = float(np.median([np.linalg.norm(camera.t) for camera in cameras.values()]))
+        low, high = self.translation
+        if not low <= length <= high:
+            raise DataError(
+                f"{annots.path}: T is {length:.3g} m long (median, taken as millimetres), expected "
+                f"{low:g}-{high:g} m; this file's T is not in millimetres"
+            )
+        return cameras
+
+    def _fit(self, root: Path) -> tuple[str, str]:
+        """Name and folder of the requested fit, or with "auto" of the first that exists."""
+        fits = FITS if self.fit == "auto" else {self.fit: FITS[self.fit]}
+        for name, folder in fits.items():
+            if (root / folder).is_dir():
+                return name, folder
+        looked = ", ".join(f"{folder}/" for folder in fits.values())
+        raise DataError(f"{root} has no SMPL parameters; expected one of the folders {looked}")
+
     def _masks(
-        self, root: Path, folders: Mapping[str, str], notes: list[str]
-    ) -> tuple[dict[str, dict[int, tuple[MaskFile, ...]]], dict[str, dict[int, str]]]:
+        self, root: Path, folders: Mapping[str, str]
+    ) -> tuple[dict[str, dict[int, tuple[MaskFile, ...]]], Files]:
         """Masks and part labels by camera and frame."""
         masks: dict[str, dict[int, tuple[MaskFile, ...]]] = {name: {} for name in folders}
-        labels: dict[str, dict[int, str]] = {name: {} for name in folders}
+        labels: Files = {name: {} for name in folders}
         for kind, rule in MASKS.items():
             for name, folder in folders.items():
                 # mask/Camera_B1, or mask/images/00 as some copies have it
                 places = (f"{kind}/{name}", f"{kind}/{folder}")
                 place = next((p for p in places if (root / p).is_dir()), places[0])
-                files = frame_files(root, place, (".png", ".jpg"), zju_annots.frame_number)
+                files = frame_files(root, place, (".png", ".jpg"), frame_number)
                 if kind == "mask_cihp":
                     labels[name] = {f: path for f, path in files.items() if path.endswith(".png")}
                 if self.masks in ("both", kind):
                     for frame, path in files.items():
                         masks[name][frame] = (*masks[name].get(frame, ()), mask_file(rule, path))
-        if (root / "schp").is_dir():
-            notes.append("schp/ holds colours in place of part numbers and is not used")
         return masks, labels if any(labels.values()) else {}
 
-    def _without_wrong_labels(self, layout: Layout) -> Layout:
-        """The same without labels if a few of them hold more parts than CIHP names."""
-        if not layout.labels:
-            return layout
-        camera, files = next((c, files) for c, files in layout.labels.items() if files)
-        some = [files[f] for f in spread(sorted(files), self.trust.watched_masks)]
-        highest = highest_label(layout.root, some)
-        if highest < len(CIHP):
-            return layout
-        note = (
-            f"mask_cihp of camera {camera} holds the label {highest}, but CIHP has 0 to "
-            f"{len(CIHP) - 1}: these files are used as masks only"
-        )
-        meta = replace(layout.meta, label_names=None)
-        return replace(layout, notes=(*layout.notes, note), labels={}, meta=meta)
+
+class Annots(NamedTuple):
+    """annots.npy: its path, one K, R, T and D per camera, and the cameras' image folders.
+
+    Folders are relative to the root; None where the file lists no images.
+    """
+
+    path: Path
+    K: Sequence[Any]
+    R: Sequence[Any]
+    T: Sequence[Any]
+    D: Sequence[Any]
+    folders: tuple[str, ...] | None
 
 
-def layout_of(root: Path) -> str:
-    """The layout of a folder: "annots" (original or refined), "humannerf" or "arah".
+def read_annots(root: Path) -> Annots:
+    """The first of `ANNOTS` that exists.
 
     Raises:
-        DataError: when it is none of them, naming the expected files.
+        DataError: when there is none, it is damaged, or its cameras are not complete.
     """
-    if any((root / name).is_file() for name in zju_annots.ANNOTS):
-        return "annots"
-    if (root / "cameras.pkl").is_file() and (root / "mesh_infos.pkl").is_file():
-        return "humannerf"
-    if (root / "cam_params.json").is_file() and (root / "models").is_dir():
-        return "arah"
-    raise DataError(
-        f"{root} is not a ZJU-MoCap subject: it has neither annots.npy (original and refined "
-        "release) nor cameras.pkl and mesh_infos.pkl (HumanNeRF) nor cam_params.json and models/ "
-        "(ARAH)"
-    )
+    path = next((root / name for name in ANNOTS if (root / name).exists()), None)
+    if path is None:
+        if any((root / name).exists() for name in CACHES):
+            raise DataError(
+                f"{root} is a copy of a ZJU-MoCap subject that HumanNeRF or ARAH prepared, which "
+                "is not supported; give the original ZJU-MoCap folder, which has annots.npy"
+            )
+        raise DataError(f"{root} is not a ZJU-MoCap subject: it has no annots.npy")
+    content = read_npy(path)
+    cams = content.get("cams") if isinstance(content, dict) else None
+    if not isinstance(cams, dict):
+        raise DataError(f"{path} has no 'cams'; expected a dict with cams and ims")
+    lists = [_entries(cams.get(key)) for key in "KRTD"]
+    if len({len(entries) for entries in lists}) != 1 or not lists[0]:
+        found = ", ".join(f"{len(n)} {key}" for key, n in zip("KRTD", lists, strict=True))
+        raise DataError(f"{path}: cams must hold one K, R, T and D per camera, found {found}")
+    K, R, T, D = lists
+    return Annots(path, K, R, T, D, _folders(path, content.get("ims"), len(K)))
+
+
+def _entries(value: Any) -> list[Any]:
+    """The entries of a list or array, none for anything else."""
+    array = isinstance(value, np.ndarray) and value.ndim > 0
+    return list(value) if array or isinstance(value, (list, tuple)) else []
+
+
+def _folders(path: Path, ims: Any, cameras: int) -> tuple[str, ...] | None:
+    """The folder of each camera, the same in every frame, or None without a list of images."""
+    first: tuple[str, ...] | None = None
+    for number, entry in enumerate(_entries(ims)):
+        names = _entries(entry.get("ims")) if isinstance(entry, Mapping) else []
+        folders = tuple(str(PurePosixPath(str(name).replace("\\", "/")).parent) for name in names)
+        if len(folders) != cameras:
+            raise DataError(
+                f"{path}: ims[{number}] lists {len(folders)} images, but cams has {cameras} "
+                f"cameras; the images' folders are {', '.join(folders[:30])}"
+            )
+        first = first or folders
+        if folders != first:
+            other = next(i for i in range(cameras) if folders[i] != first[i])
+            raise DataError(
+                f"{path}: ims[{number}] has {folders[other]} where ims[0] has {first[other]}; "
+                "images must be listed in the order of the cameras"
+            )
+    if first is not None and len(set(first)) != len(first):
+        raise DataError(f"{path}: two cameras share the image folder {first[0]}")
+    return first
+
+
+def camera_folders(root: Path, annots: Annots, notes: list[str]) -> dict[str, str]:
+    """Image folder by camera name, in the order of annots.npy.
+
+    A camera's name is its folder's name. Folders come from the list of images; where that is
+    empty, from the existing folders, which must be as many as the cameras.
+
+    Raises:
+        DataError: when cameras and folders cannot be matched, listing both.
+    """
+    if annots.folders is not None:
+        places = [_place(root, folder) for folder in annots.folders]
+        return {PurePosixPath(place).name: place for place in places}
+    base = "images/" if (root / "images").is_dir() else ""
+    names = [p.name for p in (root / base).iterdir() if p.is_dir()]
+    names = sorted((n for n in names if CAMERA_FOLDER.fullmatch(n)), key=natural_order)
+    if len(names) != len(annots.K):
+        raise DataError(
+            f"{annots.path} has {len(annots.K)} cameras and lists no images, but there are "
+            f"{len(names)} image folders ({', '.join(names) or 'none'}); get the "
+            "annots.npy that lists them"
+        )
+    notes.append(f"{annots.path.name} lists no images; the index is rebuilt from the folders")
+    return {name: base + name for name in names}
+
+
+def _place(root: Path, folder: str) -> str:
+    """The place of a folder that annots.npy names; copies are often rearranged."""
+    parts = PurePosixPath(folder).parts
+    if not parts or ".." in parts or PurePosixPath(folder).is_absolute():
+        raise DataError(f"{root}: annots lists images in {folder!r}, which is not a folder in it")
+    places = (folder, parts[-1], f"images/{parts[-1]}")
+    return next((place for place in places if (root / place).is_dir()), folder)
+
+
+def frame_number(stem: str) -> int | None:
+    """The frame number in an image's name, 313's and 315's long names included."""
+    named = NAMED_FRAME.search(stem)
+    return frame_of(named[1]) if named else last_number(stem)
+
+
+def _index_images(root: Path, folders: Mapping[str, str], notes: list[str]) -> Files:
+    """The images of each camera by frame number."""
+    images = {
+        name: frame_files(root, folder, IMAGES, frame_number) for name, folder in folders.items()
+    }
+    empty = [name for name, files in images.items() if not files]
+    if len(empty) == len(images):
+        raise DataError(
+            f"{root}: no camera folder holds images; expected e.g. "
+            f"{next(iter(folders.values()))}/000000.jpg"
+        )
+    if empty:
+        notes.append(
+            f"{len(empty)} of {len(images)} cameras have no images here: {', '.join(empty)}"
+        )
+    return images
+
+
+def _read_motion(
+    root: Path, folder: str, frames: Iterable[int], model: SkinnedModel, notes: list[str]
+) -> Motion:
+    """The parameters of the frames that have any, in the model's own convention."""
+    files = frame_files(root, folder, (".npy",))
+    ids = sorted(set(frames) & set(files))
+    if not ids:
+        raise DataError(
+            f"{root / folder} has no parameters of any frame that has images; it holds "
+            f"{len(files)} files ({', '.join(list(files.values())[:3]) or 'none'})"
+        )
+    entries = {i: (str(root / files[i]), read_npy(root / files[i])) for i in ids}
+    return zju_motion(entries, model, notes)

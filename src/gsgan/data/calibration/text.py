@@ -1,21 +1,76 @@
-"""Qualisys Track Manager's calibration, .qca.txt, which is XML."""
+"""TOML of Pose2Sim and aniposelib, and Qualisys Track Manager's .qca.txt, which is XML."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import tomllib
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
+import cv2
 import numpy as np
 
-from gsgan.data.cameras import CameraEntry, make_camera
+from gsgan.data.cameras import CameraEntry, make_camera, numbers
 from gsgan.data.files import natural_order
 from gsgan.utils.errors import DataError
 
+NO_CAMERAS = ("metadata", "capture_volume", "charuco", "checkerboard")
+KEYS = ("size", "matrix", "distortions", "rotation", "translation")
 SUBPIXELS = 64  # parts of a pixel in which focal lengths and centres are written
 MILLIMETRE = 1e-3
 VIDEO_MODELS = ("video", "hybrid", "none")  # the others see markers only
 OPENCV_AXES = np.diag([1.0, -1.0, -1.0])  # Qualisys cameras look along -z, y up
+
+
+def read_toml(
+    path: Path, scale: float | None, pixel_centre: float
+) -> tuple[dict[str, CameraEntry], list[str]]:
+    """Cameras by name: size [w, h], matrix, distortions, rotation (Rodrigues), translation.
+
+    Convention: world to camera; metres as Pose2Sim writes them. aniposelib keeps the unit of its
+    calibration board, often mm, without naming it: give it with ``unit``.
+
+    Raises:
+        DataError: when a table lacks a key, is a fisheye's, or holds something else.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError, RecursionError) as error:
+        raise DataError(f"{path} is not readable as TOML: {error}") from None
+    cameras: dict[str, CameraEntry] = {}
+    for table, entry in content.items():
+        if table in NO_CAMERAS or not isinstance(entry, dict):
+            continue
+        camera = _toml_camera(path, table, entry, scale or 1.0, pixel_centre)
+        if camera.name in cameras:
+            raise DataError(f"{path} names two cameras {camera.name}; give each its own name")
+        cameras[camera.name] = camera
+    return cameras, []
+
+
+def _toml_camera(
+    path: Path, table: str, entry: dict[str, Any], scale: float, pixel_centre: float
+) -> CameraEntry:
+    where = f"{path}, [{table}]"
+    if missing := [key for key in KEYS if key not in entry]:
+        raise DataError(f"{where} lacks '{missing[0]}'; expected {', '.join(KEYS)}")
+    if entry.get("fisheye"):
+        raise DataError(
+            f"{where} is a fisheye camera, which is not supported; undistort its video and "
+            "calibrate it without distortion"
+        )
+    width, height = numbers(where, entry["size"], "size", (2,))
+    return make_camera(
+        where,
+        str(entry.get("name", table)),
+        K=entry["matrix"],
+        R=cv2.Rodrigues(numbers(where, entry["rotation"], "rotation", (3,)))[0],
+        t=entry["translation"],
+        dist=entry["distortions"],
+        size=(int(height), int(width)),
+        scale=scale,
+        pixel_centre=pixel_centre,
+    )
 
 
 def read_qualisys(
@@ -43,7 +98,7 @@ def read_qualisys(
             continue
         if serial in found:
             raise DataError(f"{path} holds the camera {serial} twice; take one of them out")
-        found[serial] = _camera(path, serial, node, scale or MILLIMETRE, pixel_centre)
+        found[serial] = _qualisys_camera(path, serial, node, scale or MILLIMETRE, pixel_centre)
         if node.get("viewrotation", "0") != "0":
             notes.append(
                 f"{path}: camera {serial} is turned by {node.get('viewrotation')} degrees; its "
@@ -52,19 +107,15 @@ def read_qualisys(
     return {name: found[name] for name in sorted(found, key=natural_order)}, notes
 
 
-def _camera(
+def _qualisys_camera(
     path: Path, serial: str, node: ElementTree.Element, scale: float, pixel_centre: float
 ) -> CameraEntry:
     where = f"{path}, camera {serial}"
-
-    def part(tag: str) -> Mapping[str, str]:
-        child = node.find(tag)
-        if child is None:
-            raise DataError(f"{where}: <{tag}> is missing; export the calibration again")
-        return child.attrib
-
-    intrinsic, transform, window = part("intrinsic"), part("transform"), part("fov_video")
+    parts = {child.tag: child.attrib for child in node}
     try:
+        intrinsic, transform, window = (
+            parts[tag] for tag in ("intrinsic", "transform", "fov_video")
+        )
         f_u, f_v, c_u, c_v = (
             float(intrinsic[f"{kind}{axis}"]) / SUBPIXELS
             for kind in ("focalLength", "centerPoint")
@@ -80,7 +131,7 @@ def _camera(
             int(float(window[side])) for side in ("left", "top", "right", "bottom")
         )
     except (KeyError, ValueError, OverflowError) as error:
-        raise DataError(f"{where}: a number is missing or unreadable ({error})") from None
+        raise DataError(f"{where}: a value is missing or unreadable ({error})") from None
     R = OPENCV_AXES @ r
     return make_camera(
         where,
