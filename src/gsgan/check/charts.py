@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,6 +14,8 @@ from gsgan.check.views import Subject
 from gsgan.data.formats.trust import Float
 from gsgan.utils.palette import BLACK, COLOURS, GREY, VERMILLION
 
+Chart = tuple[Mapping[str, Mapping[int, float]], float | None]
+"""Lines, and a limit that is drawn dashed."""
 NAMES = 12  # cameras that are named seen from the side, where they crowd
 LEGEND = 8  # lines that are named beside a chart; all are drawn
 
@@ -56,38 +57,28 @@ def _panel(axes: Axes, subject: Subject, plane: Float, named: bool) -> None:
     axes.grid(alpha=0.3)
 
 
-@dataclass(frozen=True)
-class Series:
-    """One chart: values over frames.
+def series_chart(charts: Mapping[str, Chart], doubtful: frozenset[int]) -> bytes:
+    """Charts above each other, with a tick at the bottom for each doubtful frame.
 
     Args:
-        title: the quantity and its unit.
-        lines: (frame numbers, values) by name; NaN interrupts a line.
-        limit: drawn as a dashed line.
+        charts: by title; values by frame number by line, NaN interrupts a line.
+        doubtful: frame numbers.
     """
-
-    title: str
-    lines: Mapping[str, tuple[Sequence[int], Sequence[float]]]
-    limit: float | None = None
-
-
-def series_chart(charts: Sequence[Series], doubtful: frozenset[int]) -> bytes:
-    """Charts above each other, with a tick at the bottom for each doubtful frame."""
     figure = Figure((10, 1.7 * len(charts)), layout="tight")
-    for axes, chart in zip(
-        np.ravel(figure.subplots(len(charts), sharex=True)), charts, strict=True
-    ):
-        for i, (name, (frames, values)) in enumerate(chart.lines.items()):
+    every = np.ravel(figure.subplots(len(charts), sharex=True))
+    for axes, (title, (lines, limit)) in zip(every, charts.items(), strict=True):
+        for i, (name, line) in enumerate(lines.items()):
+            frames, values = np.array(sorted(line.items()), float).T
             known = np.where(np.isfinite(values), values, np.nan)
-            label = name if i < LEGEND and len(chart.lines) > 1 else None
+            label = name if i < LEGEND and len(lines) > 1 else None
             axes.plot(frames, known, ".-", ms=3, lw=1, c=COLOURS[i % len(COLOURS)], label=label)
-        if chart.limit is not None:
-            axes.axhline(chart.limit, color=VERMILLION, linestyle="--", linewidth=1)
+        if limit is not None:
+            axes.axhline(limit, color=VERMILLION, linestyle="--", linewidth=1)
         foot = axes.get_xaxis_transform()
         axes.plot(sorted(doubtful), [0] * len(doubtful), "|", color=VERMILLION, transform=foot)
-        axes.set_title(chart.title, loc="left", fontsize="medium")
+        axes.set_title(title, loc="left", fontsize="medium")
         axes.grid(alpha=0.3)
-        if len(chart.lines) > 1:
+        if len(lines) > 1:
             axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small")
     return _svg(figure)
 

@@ -7,14 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from gsgan.check.motion import nanmedian
 from gsgan.check.report import Finding, Table
 from gsgan.check.settings import Limits
-from gsgan.check.views import Subject
+from gsgan.check.views import Subject, nanmedian
 from gsgan.data.formats.trust import Float, far_cameras
 from gsgan.skeleton.sanitise import limb_length_sum
 
-WIDE = 45.0  # degrees between neighbouring views from which a held-out camera is hard
 IMPOSSIBLE = (0.4, 3.0)  # metres of person outside which units are wrong
 
 
@@ -23,12 +21,10 @@ class Rig:
     """The geometry of a capture.
 
     Args:
-        distances: metres from the person, by camera.
+        distances, heights: metres from the person, and above the feet, by camera.
         gaps: degrees between neighbouring views about the up axis, once round.
-        heights: metres above the feet, by camera.
         stature: metres, median over frames, estimated from limb lengths.
-        up: ``[3]`` unit, direction of the trunk, median over frames.
-        lean: degrees between that and the up axis of the dataset.
+        up, lean: ``[3]`` unit, direction of the trunk, median over frames; degrees from the up axis.
         far: a message for each camera that is far too near or far.
     """
 
@@ -110,7 +106,6 @@ def units_table(subject: Subject, rig: Rig) -> Table:
     """Units and sizes in words."""
     meta, distances = subject.layout.meta, rig.distances.values()
     span = np.ptp(subject.p[:, list(subject.template.hips)].mean(1), axis=0)
-    hard = " (evaluate on novel poses: a held-out camera is hard)" if max(rig.gaps) > WIDE else ""
     near, far = min(distances), max(distances)
     rows = (
         ("unit of the files", meta.unit),
@@ -119,34 +114,30 @@ def units_table(subject: Subject, rig: Rig) -> Table:
         ("person's path", f"{np.linalg.norm(span):.2f} m across"),
         ("up axis", f"{meta.up_axis}; the trunk leans {rig.lean:.0f}° from it"),
         ("frames per second", "not given" if meta.fps is None else f"{meta.fps:g}"),
-        ("between neighbouring views", f"{min(rig.gaps):.0f}° to {max(rig.gaps):.0f}°{hard}"),
+        ("between neighbouring views", f"{min(rig.gaps):.0f}° to {max(rig.gaps):.0f}°"),
     )
     return Table(("what", "how much"), rows)
 
 
 def lens_table(subject: Subject, rig: Rig) -> Table:
     """Size, lens and place, one row per camera."""
-    rows, flagged = [], set()
-    for i, (name, camera) in enumerate(subject.cameras.items()):
+    rows = []
+    for name, camera in subject.cameras.items():
         (height, width), K = camera.size, camera.K
         terms = [f"{c:.3g}" for c in np.trim_zeros(camera.dist, "b")]
-        rows.append(
-            (
-                name,
-                f"{width}×{height}",
-                f"{K[0, 0]:.0f}, {K[1, 1]:.0f}",
-                f"{2 * np.degrees(np.arctan(width / 2 / K[0, 0])):.0f}°",
-                f"{K[0, 2] / width:.2f}, {K[1, 2] / height:.2f}",
-                " ".join(terms) or "none",
-                f"{rig.distances[name]:.2f}",
-                f"{rig.heights[name]:.2f}",
-                str(len(subject.pairs[name])),
-            )
-        )
-        if name in rig.far:
-            flagged.add((i, 6))
+        rows.append((
+            name,
+            f"{width}×{height}",
+            f"{K[0, 0]:.0f}, {K[1, 1]:.0f}",
+            f"{K[0, 2] / width:.2f}, {K[1, 2] / height:.2f}",
+            " ".join(terms) or "none",
+            f"{rig.distances[name]:.2f}",
+            f"{rig.heights[name]:.2f}",
+            str(len(subject.pairs[name])),
+        ))  # fmt: skip
     headers = (
-        "camera", "pixels", "focal fx, fy", "view", "centre (share)", "distortion", "distance m",
+        "camera", "pixels", "focal fx, fy", "centre (share)", "distortion", "distance m",
         "height m", "images",
     )  # fmt: skip
-    return Table(headers, tuple(rows), frozenset(flagged), "Lenses and places")
+    flagged = frozenset((i, 5) for i, row in enumerate(rows) if row[0] in rig.far)
+    return Table(headers, tuple(rows), flagged, "Lenses and places")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Callable
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, Any
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from rich.progress import track
+from rich.console import Console
 
-from gsgan.check.contents import unreadable
-from gsgan.check.report import Report, page, print_report
+from gsgan.check.report import Finding, Report, Section, Table, page, print_report
 from gsgan.check.sections import Measured, sections
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.views import Results, measure, sampled_items, subject_of, suspicious_items
+from gsgan.check.views import measure, sampled_items, subject_of, suspicious_items
 from gsgan.effects import EffectSettings
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
@@ -28,15 +27,15 @@ from gsgan.utils.files import write_atomically
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-Progress = Callable[[Results, int], Results]
+LISTED_FOLDERS = 60  # of a dataset that cannot be read
 
 
 def check_data(
     data: GsganData,
     sampling: Sampling,
     limits: Limits,
-    progress: Progress | None = None,
     effects: EffectSettings | None = None,
+    console: Console | None = None,
 ) -> Report:
     """Checks a dataset.
 
@@ -44,8 +43,8 @@ def check_data(
         data: it need not have been read yet.
         sampling: how much is checked.
         limits: thresholds.
-        progress: wraps the results of the pass over the images, given their number.
         effects: settings of the effects as for training; None: the defaults.
+        console: shows the progress.
 
     Returns:
         The report; of a dataset that cannot be read it has the reader's message.
@@ -56,15 +55,36 @@ def check_data(
     try:
         subject = subject_of(data)
     except DataError as error:
-        return _failed(data.root, error)
+        return unreadable(data.root, error)
     items = (*sampled_items(subject, sampling.pictures), *suspicious_items(subject, sampling))
-    views, broken = measure(subject, tuple(dict.fromkeys(items)), sampling, progress)
+    views, broken = measure(subject, tuple(dict.fromkeys(items)), sampling, console)
     measured = Measured(data, subject, views, broken, sampling, limits, effects or EffectSettings())
     return Report(str(subject.layout.root), sections(measured), measured.numbers())
 
 
-def _failed(root: str | None, error: DataError) -> Report:
-    return Report(str(root), (unreadable(root, error),), {"readable": False})
+def unreadable(root: str | None, error: DataError) -> Report:
+    """Why the reader refuses a dataset, and the files of its folder."""
+    folder = None if root is None else Path(root).expanduser()
+    section = Section(
+        "The dataset cannot be read",
+        text=("Nothing further could be checked. Correct this, then check again.",),
+        tables=(inventory(folder),) if folder is not None and folder.is_dir() else (),
+        findings=(Finding("error", "reading", str(error)),),
+    )
+    return Report(str(root), (section,), {"readable": False})
+
+
+def inventory(root: Path) -> Table:
+    """The files of a folder and of two levels of folders below it, counted by suffix."""
+    rows = []
+    for folder in [root, *sorted((*root.glob("*/"), *root.glob("*/*/")))][:LISTED_FOLDERS]:
+        try:
+            kinds = Counter(p.suffix.lower() or p.name for p in folder.iterdir() if p.is_file())
+            text = ", ".join(f"{n} × {kind}" for kind, n in sorted(kinds.items())) or "no files"
+        except OSError as error:
+            text = f"cannot be read: {error.strerror}"
+        rows.append((str(folder.relative_to(root)), text))
+    return Table(("folder", "files"), tuple(rows), title="Files of the folder")
 
 
 def run_check(config: DictConfig) -> Report:
@@ -79,17 +99,13 @@ def run_check(config: DictConfig) -> Report:
     logging.getLogger("gsgan.data").setLevel(logging.ERROR)
     console = make_console()
     sampling, limits = instantiate(config.sampling), instantiate(config.limits)
-
-    def shown(results: Results, count: int) -> Results:
-        return track(results, "checking images", count, console=console, transient=True)
-
+    effects = instantiate(config.effects)
     try:
-        data = instantiate(config.data)
-        report = check_data(data, sampling, limits, shown, instantiate(config.effects))
+        report = check_data(instantiate(config.data), sampling, limits, effects, console)
     except InstantiationException as error:
         if not isinstance(error.__cause__, DataError):
             raise
-        report = _failed(config.data.get("root"), error.__cause__)
+        report = unreadable(config.data.get("root"), error.__cause__)
     path = Path(config.report).expanduser()
     numbers = json.dumps(plain(report), indent=1, allow_nan=False) + "\n"
     try:
@@ -109,7 +125,7 @@ def plain(report: Report) -> dict[str, Any]:
         "errors": report.errors,
         "warnings": report.warnings,
         "findings": [asdict(finding) for finding in report.findings],
-        **{key: _known(value) for key, value in report.numbers.items()},
+        **_known(report.numbers),
     }
 
 

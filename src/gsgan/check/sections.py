@@ -10,12 +10,11 @@ import numpy as np
 
 from gsgan.check import agreement, charts, overlays, rig
 from gsgan.check.calibration import calibration_findings, score_cameras
-from gsgan.check.contents import broken_images, contents
-from gsgan.check.frames import doubts, frame_findings, motion_of
+from gsgan.check.frames import doubts, frame_findings, motion_of, shortened
 from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.reprojection import read_reprojection, reprojection_findings
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.views import Broken, Subject, View, grouped
+from gsgan.check.views import Subject, View, grouped
 from gsgan.data.formats.trust import spread
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.table import HEADERS, rows
@@ -24,6 +23,7 @@ from gsgan.utils.errors import DataError
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
+LISTED_BROKEN = 6
 TABLE_FRAMES = 40  # doubtful frames listed
 AGREEMENT = (
     "Joints are compared with masks, undistorted. Overlap is that of the mask with the silhouette "
@@ -44,7 +44,7 @@ class Measured:
         data: the data module.
         subject: its arrays.
         views: of the sampled images.
-        broken: images that could not be read.
+        broken: messages of images that could not be read.
         sampling, limits, effects: settings.
     """
 
@@ -53,14 +53,17 @@ class Measured:
         data: GsganData,
         subject: Subject,
         views: Sequence[View],
-        broken: Sequence[Broken],
+        broken: Sequence[str],
         sampling: Sampling,
         limits: Limits,
         effects: EffectSettings,
     ) -> None:
         self.data, self.subject, self.views = data, subject, views
         self.sampling, self.limits, self.effects = sampling, limits, effects
-        self.files = broken_images(list(broken))
+        texts = list(broken[:LISTED_BROKEN])
+        if len(broken) > LISTED_BROKEN:
+            texts.append(f"{len(broken)} sampled images cannot be read")
+        self.files = [Finding("error", "files", text) for text in texts]
         self.rig = rig.rig_of(subject)
         self.cameras = score_cameras(subject, views, limits, sampling)
         self.wrong = frozenset(self.rig.far) | {s.name for s in self.cameras if s.wrong(limits)}
@@ -152,12 +155,66 @@ def sections(m: Measured) -> tuple[Section, ...]:
     )
 
 
+def contents(data: GsganData, subject: Subject) -> Section:
+    """Counts, splits and missing images of a dataset that could be read."""
+    layout, splits, names = data.layout, data.splits, subject.template.names
+    frames = [int(f) for f in subject.frames]
+    images = sum(len(files) for files in subject.pairs.values())
+    labels = sum(len(files) for files in layout.labels.values())
+    unseen = [n for n, seen in zip(names, subject.visible.sum(0), strict=True) if not seen]
+    skeleton = (
+        f"{len(names)} joints, {layout.meta.skeleton_source}; {subject.visible.mean():.1%} seen"
+        + f"; never seen: {', '.join(unseen)}" * bool(unseen)
+    )
+    rows = [
+        ("layout", layout.meta.layout),
+        ("cameras", f"{len(subject.cameras)}: {', '.join(subject.cameras)}"),
+        ("frames", f"{len(frames)}: {shortened(frames)}"),
+        ("images", f"{images} of {len(frames) * len(subject.cameras)} (all with a mask)"),
+        ("part labels", f"{labels} images" if labels else "none"),
+        ("body poses", "none" if layout.poses is None else f"{len(layout.poses.theta)} frames"),
+        ("skeleton", skeleton),
+        *((f"split {name}", _split(data, name)) for name in splits.items),
+    ]
+    if data.protocol is not None:
+        rows.append(("protocol", data.protocol.name))
+    return Section(
+        "Contents",
+        text=tuple(f"Note of the reader: {note}." for note in (*layout.notes, *splits.notes)),
+        tables=(Table(("what", "how much"), tuple(rows)),),
+        findings=tuple(missing_images(subject)),
+    )
+
+
+def _split(data: GsganData, name: str) -> str:
+    items = data.splits.items[name]
+    if not items:
+        return f"empty: {data.splits.reasons.get(name, '')}"
+    cameras, frames = {camera for camera, _ in items}, {frame for _, frame in items}
+    count, views = counted(len(items), "image"), counted(len(cameras), "camera")
+    return f"{count}: {views}, frames {shortened(sorted(frames))}"
+
+
+def missing_images(subject: Subject) -> list[Finding]:
+    """The frames that some cameras lack."""
+    every = [int(f) for f in subject.frames]
+    texts = []
+    for name, files in subject.pairs.items():
+        if lacking := sorted(set(every) - set(files)):
+            count = f"{len(lacking)} of the {len(every)} frames"
+            texts.append(f"camera {name} lacks {count}: {shortened(lacking)}")
+    if holes := sorted(set(range(every[0], every[-1] + 1, subject.step)) - set(every)):
+        text = f"no camera has a usable image of {len(holes)} frames in between"
+        texts.append(f"{text}: {shortened(holes)}")
+    return [Finding("warning", "files", text) for text in texts]
+
+
 def _agreement(m: Measured) -> Section:
     found, min_inside = m.reprojection, m.subject.trust.min_inside
     text: tuple[str, ...] = ()
     if found is not None and not np.isnan(found.median):
         px = f"{found.median:.1f} pixels (median) from their 2D detections"
-        text = (f"Joints lie {px}: {found.source}.",)
+        text = (f"Joints lie {px}.",)
     cells, flagged = [], set()
     for i, s in enumerate(m.cameras):
         filled = None if m.hull is None else m.hull.filled.get(s.name)
@@ -230,30 +287,24 @@ def _frames(m: Measured) -> Section:
     )
 
 
-def _series(m: Measured) -> list[charts.Series]:
-    frames = [int(f) for f in m.subject.frames]
-    by_camera = {
-        name: ([view.frame for view in own], own)
-        for name, own in (
-            (n, sorted(v, key=lambda v: v.frame)) for n, v in grouped(m.views).items()
-        )
+def _series(m: Measured) -> dict[str, charts.Chart]:
+    rows, views = m.subject.rows, grouped(m.views)
+    inside = {name: {v.frame: v.inside for v in own} for name, own in views.items()}
+    fullness = {name: {v.frame: v.fullness for v in own} for name, own in views.items()}
+    jump = np.nan_to_num(m.motion.jump).max(1)
+    jumps = {frame: float(jump[row]) for frame, row in rows.items()}
+    seen = {frame: float(m.motion.seen[row]) for frame, row in rows.items()}
+    series: dict[str, charts.Chart] = {
+        "share of joints inside the mask": (inside, 1 - m.limits.frame_outside),
+        "area of the mask over that of the estimated silhouette": (fullness, None),
+        "largest jump of a joint, m": ({"": jumps}, m.limits.joint_jump),
+        "share of joints seen": ({"": seen}, m.limits.seen_share),
     }
-    inside = {n: (at, [view.inside for view in own]) for n, (at, own) in by_camera.items()}
-    fullness = {n: (at, [view.fullness for view in own]) for n, (at, own) in by_camera.items()}
-    jump = np.nan_to_num(m.motion.jump).max(1).tolist()
-    series = [
-        charts.Series("share of joints inside the mask", inside, 1 - m.limits.frame_outside),
-        charts.Series("area of the mask over that of the estimated silhouette", fullness),
-        charts.Series("largest jump of a joint, m", {"": (frames, jump)}, m.limits.joint_jump),
-        charts.Series(
-            "share of joints seen", {"": (frames, m.motion.seen.tolist())}, m.limits.seen_share
-        ),
-    ]
     if m.reprojection is not None:
-        worst = np.nan_to_num(m.reprojection.pixels).max(1).tolist()
+        worst = np.nan_to_num(m.reprojection.pixels).max(1)
+        line = {frame: float(worst[row]) for frame, row in rows.items()}
         limit = m.limits.reprojection_joint * m.reprojection.focal
-        title = "farthest joint from its 2D detections, pixels"
-        series.append(charts.Series(title, {"": (frames, worst)}, limit))
+        series["farthest joint from its 2D detections, pixels"] = ({"": line}, limit)
     return series
 
 

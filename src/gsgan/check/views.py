@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
 
 from gsgan.check.settings import Sampling
 from gsgan.check.silhouette import body_silhouette, box, overlap
@@ -49,8 +52,7 @@ class Subject:
     """One dataset.
 
     Args:
-        layout: the reader's index, for paths and images.
-        trust: the reader's thresholds.
+        layout, trust: the reader's index and thresholds.
         frames: ``[F]`` rising frame numbers.
         pairs: frame numbers that exist, by camera.
         p: ``[F, J, 3]`` metres, finite.
@@ -123,10 +125,8 @@ class View:
         reach: ``[4]`` metres by which the mask's box exceeds the silhouette's: left, top, right,
             bottom; NaN when one of them is empty.
         lagged: ``[2 lag + 1]`` mean metres outside with the skeleton of an earlier or later frame.
-        colour: ``[3]`` summed RGB of the person.
-        weight: summed mask.
-        mask: ``[h, w]`` small mask.
-        to_small: ``[3, 3]`` maps pixels of the whole image to the small mask.
+        colour, weight: ``[3]`` summed RGB of the person, summed mask.
+        mask, to_small: ``[h, w]`` small mask; ``[3, 3]`` maps pixels of the whole image to it.
     """
 
     camera: str
@@ -163,24 +163,19 @@ class View:
         return 1 - np.count_nonzero(self.beyond) / known if known else np.nan
 
 
-@dataclass(frozen=True)
-class Broken:
-    """An image that could not be read, and the reader's message."""
-
-    camera: str
-    frame: int
-    message: str
-
-
-Results = Iterable[View | Broken]
-
-
 def grouped(views: Sequence[View]) -> dict[str, list[View]]:
     """The views by camera."""
-    found: dict[str, list[View]] = {}
-    for view in views:
-        found.setdefault(view.camera, []).append(view)
-    return found
+    return {
+        name: [v for v in views if v.camera == name]
+        for name in dict.fromkeys(v.camera for v in views)
+    }
+
+
+def nanmedian(values: Float) -> Float:
+    """Median over the first axis, NaN where nothing is known, without a warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.nanmedian(values, axis=0))
 
 
 def sampled_items(subject: Subject, pictures: int) -> tuple[Item, ...]:
@@ -202,19 +197,17 @@ def suspicious_items(subject: Subject, sampling: Sampling) -> tuple[Item, ...]:
     """
     cut, odd, layout = list[Item](), list[Item](), subject.layout
     images = sum(len(files) for files in subject.pairs.values())
-    every = max(1, -(-2 * images // TAILS))  # an image and its mask each
+    every = 1 + 2 * images // TAILS  # an image and its mask each
     for name, files in subject.pairs.items():
         items = [(name, frame) for frame in files[::every]]
         masks = [[path for _, path in layout.mask_files(*item)] for item in items]
-        cut += [
-            item
-            for item, paths in zip(items, masks, strict=True)
-            if not all(map(complete, [layout.image_path(*item), *paths]))
-        ]
-        sizes = np.array([p[0].stat().st_size if p[0].is_file() else 0 for p in masks], float)
-        ratio = np.maximum(sizes, 1) / max(float(np.median(sizes)), 1)
-        far = np.maximum(ratio, 1 / ratio) > sampling.size_ratio
-        odd += [item for item, is_far in zip(items, far, strict=True) if is_far]
+        sizes = np.array([p[0].stat().st_size if p[0].is_file() else 1 for p in masks], float)
+        usual = max(float(np.median(sizes)), 1)
+        for item, paths, size in zip(items, masks, sizes.clip(1), strict=True):
+            if not all(map(complete, [layout.image_path(*item), *paths])):
+                cut.append(item)
+            if max(size / usual, usual / size) > sampling.size_ratio:
+                odd.append(item)
     return (*cut[: sampling.pictures], *spread(odd, sampling.pictures))
 
 
@@ -232,33 +225,21 @@ def complete(path: Path) -> bool:
 
 
 def measure(
-    subject: Subject,
-    items: Sequence[Item],
-    sampling: Sampling,
-    progress: Callable[[Results, int], Results] | None = None,
-) -> tuple[list[View], list[Broken]]:
-    """Decodes and measures images.
+    subject: Subject, items: Sequence[Item], sampling: Sampling, console: Console | None = None
+) -> tuple[list[View], list[str]]:
+    """Decodes and measures images; the messages of those that cannot be read."""
 
-    Args:
-        subject: the dataset.
-        items: which images.
-        sampling: sizes and threads.
-        progress: wraps the results as they come, given their number.
-    """
-
-    def one(item: Item) -> View | Broken:
+    def one(item: Item) -> View | str:
         try:
             return _view(subject, item, sampling)
         except DataError as error:
-            return Broken(*item, str(error))
+            return str(error)
 
-    def every() -> Iterator[View | Broken]:
-        with ThreadPoolExecutor(sampling.workers) as pool:
-            yield from pool.map(one, items)
-
-    results = list(every() if progress is None else progress(every(), len(items)))
+    hidden = {"console": console, "disable": console is None, "transient": True}
+    with ThreadPoolExecutor(sampling.workers) as pool:
+        results = list(track(pool.map(one, items), "checking images", len(items), **hidden))
     views = [result for result in results if isinstance(result, View)]
-    return views, [result for result in results if isinstance(result, Broken)]
+    return views, [result for result in results if isinstance(result, str)]
 
 
 def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
