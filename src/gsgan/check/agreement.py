@@ -8,7 +8,6 @@ away what the others show.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -31,45 +30,31 @@ CHANNELS = ("red", "green", "blue")
 DARK = 0.05  # darker means give no ratio
 
 
-@dataclass(frozen=True)
-class HullScore:
-    """How well the masks agree.
+def score_hulls(
+    subject: Subject, views: Sequence[View], moments: int
+) -> dict[str, tuple[float, float]]:
+    """How well the masks agree, by camera; empty when fewer than three cameras see one moment.
 
-    Args:
-        filled: share of the mask that the hull fills, by camera.
-        without: mean share in the other cameras when this one does not carve, by camera.
-    """
-
-    filled: dict[str, float]
-    without: dict[str, float]
-
-
-def score_hulls(subject: Subject, views: Sequence[View], moments: int) -> HullScore | None:
-    """Means over at most ``moments`` frames that most cameras saw, evenly spaced.
-
-    None when fewer than three cameras saw one together.
+    Means over at most ``moments`` frames that most cameras saw, evenly spaced: the share of the
+    camera's mask that the hull fills, and the share in the others when this one does not carve.
     """
     by_frame: dict[int, list[View]] = {}
     for view in views:
         by_frame.setdefault(view.frame, []).append(view)
     most = max((len(seen) for seen in by_frame.values()), default=0)
     if most < LEAST_CAMERAS:
-        return None
+        return {}
     full = sorted(frame for frame, seen in by_frame.items() if len(seen) == most)
-    filled: dict[str, list[float]] = {}
-    without: dict[str, list[float]] = {}
+    found: dict[str, list[Float]] = {}
     for frame in spread(full, moments):
         for view, *shares in zip(by_frame[frame], *_shares(subject, by_frame[frame]), strict=True):
-            filled.setdefault(view.camera, []).append(shares[0])
-            without.setdefault(view.camera, []).append(shares[1])
-    return HullScore(
-        {name: float(np.mean(values)) for name, values in filled.items()},
-        {name: float(np.mean(values)) for name, values in without.items()},
-    )
+            found.setdefault(view.camera, []).append(np.array(shares))
+    means = {name: np.mean(shares, axis=0) for name, shares in found.items()}
+    return {name: (float(filled), float(without)) for name, (filled, without) in means.items()}
 
 
 def _shares(subject: Subject, views: Sequence[View]) -> tuple[Float, Float]:
-    """Of one moment, ``[C]`` each: the values of `HullScore`."""
+    """Of one moment, ``[C]`` each: the two shares of `score_hulls`."""
     joints = subject.p[subject.rows[views[0].frame]]
     joints = joints[subject.visible[subject.rows[views[0].frame]]]
     low, high = joints.min(0) - AIR, joints.max(0) + AIR
@@ -79,26 +64,24 @@ def _shares(subject: Subject, views: Sequence[View]) -> tuple[Float, Float]:
     inside = np.stack([inside for inside, _ in seen])
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3)
     masks = [view.mask & _covered(subject, view, corners) for view in views]
-    grown = [_grown(subject, view) for view in views]
 
-    def filled(kept: Bool) -> Float:
-        """Share of each mask that the kept voxels cover; NaN when empty."""
+    def filled(kept: Bool) -> Float:  # share of each mask that voxels cover; NaN when empty
         shares = np.full(len(views), np.nan)
         for i, mask in enumerate(masks):
             if mask.any():
                 canvas = np.zeros(mask.shape, np.uint8)
-                at = seen[i][1][kept]
-                at = at[at[:, 0] >= 0]
-                canvas[at[:, 1], at[:, 0]] = 1
-                covered = cv2.dilate(canvas, np.ones((grown[i], grown[i]), np.uint8)) > 0
+                column, row = seen[i][1][kept].T
+                canvas[row[row >= 0], column[row >= 0]] = 1
+                side = _grown(subject, views[i])
+                covered = cv2.dilate(canvas, np.ones((side, side), np.uint8)) > 0
                 shares[i] = np.count_nonzero(covered & mask) / np.count_nonzero(mask)
         return shares
 
-    spared = []
-    for i in range(len(views)):
-        others = np.asarray(np.delete(inside, i, axis=0).all(0))
-        spared.append(float(np.nanmean(np.delete(filled(others), i))))
-    return filled(np.asarray(inside.all(0))), np.array(spared)
+    spared = [
+        float(np.nanmean(np.delete(filled(np.all(np.delete(inside, i, 0), 0)), i)))
+        for i in range(len(views))
+    ]
+    return filled(np.all(inside, 0)), np.array(spared)
 
 
 def _project(subject: Subject, view: View, voxels: Float) -> tuple[Bool, NDArray[np.int64]]:
@@ -130,12 +113,13 @@ def _grown(subject: Subject, view: View) -> int:
     return thickness(1 + np.sqrt(2) * VOXEL * camera.K[0, 0] / depth, camera.size)
 
 
-def hull_findings(score: HullScore | None, limits: Limits) -> list[Finding]:
+def hull_findings(score: Mapping[str, tuple[float, float]], limits: Limits) -> list[Finding]:
     """Names the camera whose masks or calibration do not fit the others'."""
-    if score is None or all(share >= limits.hull_warning for share in score.filled.values()):
+    filled = {name: share for name, (share, _) in score.items()}
+    if all(share >= limits.hull_warning for share in filled.values()):
         return []
-    mean = float(np.nanmean(list(score.filled.values())))
-    name, without = max(score.without.items(), key=lambda item: item[1])
+    mean = float(np.nanmean(list(filled.values())))
+    name, (_, without) = max(score.items(), key=lambda item: item[1][1])
     text = f"the masks do not agree: together they fill {mean:.0%} of themselves"
     if without - mean > GAIN:
         text += (
@@ -143,8 +127,7 @@ def hull_findings(score: HullScore | None, limits: Limits) -> list[Finding]:
             "the other cameras"
         )
     else:
-        least = min(score.filled, key=lambda name: score.filled[name])
-        text += f" (least: {least}); see the overlays"
+        text += f" (least: {min(filled, key=lambda name: filled[name])}); see the overlays"
     return [Finding("warning", "masks", text)]
 
 
@@ -174,12 +157,7 @@ def colour_findings(
     """Names the cameras whose colours differ.
 
     Cameras that agree on shared surface are not named: only the side that they see differs.
-
-    Args:
-        colours: of `mean_colours`.
-        info: of the training split, for the difference on shared surface; None: unknown.
-        effects: the difference from which training corrects colours.
-        limits: how much mean colours may differ.
+    ``info`` of the training split has that difference; None: unknown.
     """
     surface = None if info is None else info.surface
     agree = surface is not None and surface.difference < effects.colour_difference
@@ -187,31 +165,28 @@ def colour_findings(
     named = [name for name in differing(colours, limits) if name not in same]
     if not named or len(colours) < 2:
         return []
+    ratios = {name: zip(CHANNELS, colours[name][1], strict=True) for name in named}
     text = "; ".join(
-        f"{name} "
-        + ", ".join(f"{n} {v:.2f}" for n, v in zip(CHANNELS, colours[name][1], strict=True))
-        for name in named
+        f"{name} {', '.join(f'{channel} {value:.2f}' for channel, value in pairs)}"
+        for name, pairs in ratios.items()
     )
-    why = "; seeing another side of the person does this as well"
+    why = "seeing another side of the person does this as well"
     if surface is not None and not agree:
-        why = f"; on shared surface training cameras differ by {surface.difference:.3f}"
-    return [
-        Finding(
-            "warning", "colour",
-            "cameras differ in exposure or white balance (times the median camera's mean colour "
-            f"of the person): {text}{why}. The table of effects shows whether training corrects "
-            "it; effects.colour_correction=on always does",
-        )
-    ]  # fmt: skip
+        why = f"on shared surface training cameras differ by {surface.difference:.3f}"
+    text = (
+        "cameras differ in exposure or white balance (times the median camera's mean colour of "
+        f"the person): {text}; {why}. The table of effects shows whether training corrects it; "
+        "effects.colour_correction=on always does"
+    )
+    return [Finding("warning", "colour", text)]
 
 
 def colour_table(colours: Mapping[str, tuple[Float, Float]], limits: Limits) -> Table:
     """One row per camera."""
-    rows = tuple((name, *map(_triple, values)) for name, values in colours.items())
+    rows = tuple(
+        (name, *(" ".join(f"{v:.2f}" for v in values) for values in pair))
+        for name, pair in colours.items()
+    )
     named = differing(colours, limits)
     flagged = frozenset((i, 2) for i, row in enumerate(rows) if row[0] in named)
     return Table(("camera", "mean RGB of the person", "to the median camera"), rows, flagged)
-
-
-def _triple(values: Float) -> str:
-    return " ".join(f"{v:.2f}" for v in values)

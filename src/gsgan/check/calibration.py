@@ -53,8 +53,7 @@ class CameraScore:
     """How well one camera's calibration fits its masks.
 
     Args:
-        name: the camera.
-        inside: mean share of joints inside the mask.
+        name, inside: the camera; mean share of joints inside the mask.
         overlap: mean overlap of mask and estimated silhouette.
         fullness: median area of the mask over that of the estimated silhouette.
         rivals: other calibrations, best first.
@@ -117,25 +116,25 @@ def score_cameras(
     """Scores every camera of which an image could be read."""
     by_camera = grouped(views)
     count = min(TRIED, max(1, sampling.trials // (2 * len(by_camera) ** 2 or 1)))
-    return [_score(subject, name, own, limits, count) for name, own in by_camera.items()]
-
-
-def _score(
-    subject: Subject, name: str, views: Sequence[View], limits: Limits, count: int
-) -> CameraScore:
-    chosen, own = spread(views, count), subject.cameras[name]
-
-    def fit(camera: CameraEntry) -> float:
-        return float(np.mean([overlap(v.mask, _body(subject, v, camera)) for v in chosen]))
-
-    others = calibrations(own, subject.cameras)
-    rivals = sorted((Rival(*what, fit(c)) for what, c in others.items()), key=lambda r: -r.overlap)
-    inside = known_mean([view.inside for view in views if view.mask.any()])
-    fullness = float(np.median([view.fullness for view in views]))
-    shifts = _shift(subject, own, chosen)
-    return CameraScore(
-        name, inside, fit(own), fullness, tuple(rivals), *shifts, *_lag(views, limits)
-    )
+    scores = []
+    for name, own in by_camera.items():
+        chosen, camera = spread(own, count), subject.cameras[name]
+        rivals = [
+            Rival(*what, _fit(subject, chosen, other))
+            for what, other in calibrations(camera, subject.cameras).items()
+        ]
+        scores.append(
+            CameraScore(
+                name,
+                known_mean([view.inside for view in own if view.mask.any()]),
+                _fit(subject, chosen, camera),
+                float(np.median([view.fullness for view in own])),
+                tuple(sorted(rivals, key=lambda rival: -rival.overlap)),
+                *_shift(subject, camera, chosen),
+                *_lag(own, limits),
+            )
+        )
+    return scores
 
 
 def calibrations(
@@ -149,10 +148,10 @@ def calibrations(
         (INVERSE, ""): replace(own, R=own.R.T, t=-own.R.T @ own.t),
         (MIRRORED, ""): replace(own, K=mirror),
     }
-    for name, camera in cameras.items():
+    for name, other in cameras.items():
         if name != own.name:
-            found[(EXTRINSICS, name)] = replace(own, R=camera.R, t=camera.t)
-            found[(WHOLE, name)] = camera
+            found[EXTRINSICS, name] = replace(own, R=other.R, t=other.t)
+            found[WHOLE, name] = other
     return found
 
 
@@ -160,6 +159,10 @@ def _body(subject: Subject, view: View, camera: CameraEntry) -> Bool:
     row = subject.rows[view.frame]
     small = view.small(camera)
     return body_silhouette(small, subject.p[row], subject.visible[row], subject.template)
+
+
+def _fit(subject: Subject, views: Sequence[View], camera: CameraEntry) -> float:
+    return float(np.mean([overlap(v.mask, _body(subject, v, camera)) for v in views]))
 
 
 def _shift(
@@ -219,9 +222,8 @@ def calibration_findings(
     if big := [s for s in scores if s.oversized(limits) and s.name not in named]:
         sizes = listed(f"{s.name} {s.fullness:.1f}" for s in big)
         text = (
-            f"masks are far larger than the body that skeleton and camera suggest (times its "
-            f"area: {sizes}): a focal length that is too short, K of smaller images, a skeleton "
-            "in another unit, or masks of more than the person"
+            f"masks are far larger than the body (times its area: {sizes}): a focal length that is "
+            "too short, K of smaller images, a skeleton in another unit, or masks of more"
         )
         found.append(Finding("error", TOPIC, text))
         named |= {s.name for s in big}
@@ -233,9 +235,9 @@ def calibration_findings(
             what = "R and t" if ours.kind == EXTRINSICS else "calibration"
             text = (
                 f"cameras {one.name} and {other.name} look exchanged: the {what} of the other "
-                f"would fit the masks of each better (overlap {ours.overlap:.2f} and "
-                f"{theirs.overlap:.2f}) than its own ({one.overlap:.2f} and {other.overlap:.2f}); "
-                "exchange them in the calibration, or rename the folders"
+                f"would fit the masks better (overlap {ours.overlap:.2f} and {theirs.overlap:.2f}, "
+                f"its own {one.overlap:.2f} and {other.overlap:.2f}); exchange them in the "
+                "calibration, or rename the folders"
             )
             found.append(Finding("error", TOPIC, text))
             named |= {one.name, other.name}
@@ -243,12 +245,11 @@ def calibration_findings(
         return [finding]
     for score in scores:
         if score.lag and (score not in beaten or score.name in named):
+            when = "later" if score.lag > 0 else "earlier"
             text = (
                 f"camera {score.name}: its images fit the skeleton {abs(score.lag)} frame(s) "
-                f"{'later' if score.lag > 0 else 'earlier'} better (joints "
-                f"{100 * score.lag_outside:.1f} cm outside the masks instead of "
-                f"{100 * score.outside:.1f}); its clock or its numbering is off: "
-                f"add {score.lag:+d}"
+                f"{when} better (joints {100 * score.lag_outside:.1f} cm outside the masks instead "
+                f"of {100 * score.outside:.1f}); its clock or numbering is off: add {score.lag:+d}"
             )
             found.append(Finding("error", "synchronisation", text))
         elif score.name not in named:
@@ -259,10 +260,8 @@ def calibration_findings(
 
 def _rival_of(score: CameraScore, other: CameraScore, limits: Limits) -> Rival | None:
     """The other camera's calibration, where it fits the masks about as well as the best."""
-    for rival in score.rivals:
-        if rival.other == other.name and rival.overlap > score.rival_overlap - limits.better_fit:
-            return rival
-    return None
+    least = score.rival_overlap - limits.better_fit
+    return next((r for r in score.rivals if r.other == other.name and r.overlap > least), None)
 
 
 def _of_all(scores: Sequence[CameraScore], limits: Limits) -> Finding | None:
@@ -321,19 +320,13 @@ def _of_one(
 
 
 def small_errors(scores: Sequence[CameraScore], limits: Limits) -> list[Finding]:
-    """Calibrations that are nearly right: joints lie just outside the masks.
-
-    Args:
-        scores: of the cameras that no other finding names.
-        limits: thresholds.
-    """
+    """Cameras, of those without other findings, whose joints lie just outside the masks."""
     metres = {s.name: s.outside for s in scores if np.isfinite(s.outside)}
     middle = float(np.median(list(metres.values()) or [0]))
     if middle > limits.outside_all:
         text = (
             f"in most cameras joints lie {100 * middle:.1f} cm outside the masks on average (good "
-            "captures: 0.1): a focal length or unit that is slightly off in all of them, masks "
-            "that are too tight, or noisy landmarks"
+            "captures: 0.1): focal lengths or unit slightly off, tight masks, or noisy landmarks"
         )
         return [Finding("warning", TOPIC, text)]
     found = []
@@ -343,8 +336,7 @@ def small_errors(scores: Sequence[CameraScore], limits: Limits) -> list[Finding]
         if own > max(limits.outside, OUTSIDE_RATIO * others):
             text = (
                 f"camera {name}: joints lie {100 * own:.1f} cm outside its masks on average, "
-                f"{100 * others:.1f} in the other cameras; its R, t or focal length is slightly "
-                "off (some degrees, centimetres or per cent), or its masks are worse"
+                f"{100 * others:.1f} in the other cameras; its R, t or focal length is slightly off"
             )
             found.append(Finding("warning", TOPIC, text))
     return found

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Sequence, Set
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from gsgan.check.frames import Motion
 from gsgan.check.rig import axis_name, ground_axes
-from gsgan.check.views import Subject
+from gsgan.check.settings import Limits
+from gsgan.check.views import Subject, View, grouped
 from gsgan.data.formats.trust import Float
 from gsgan.utils.palette import BLACK, COLOURS, GREY, VERMILLION
 
-Chart = tuple[Mapping[str, Mapping[int, float]], float | None]
-"""Lines, and a limit that is drawn dashed."""
 NAMES = 12  # cameras that are named seen from the side, where they crowd
-LEGEND = 8  # lines that are named beside a chart; all are drawn
+LEGEND = 8  # cameras that are named beside the charts; all are drawn
 
 
 def rig_drawing(subject: Subject) -> bytes:
@@ -57,29 +57,35 @@ def _panel(axes: Axes, subject: Subject, plane: Float, named: bool) -> None:
     axes.grid(alpha=0.3)
 
 
-def series_chart(charts: Mapping[str, Chart], doubtful: frozenset[int]) -> bytes:
-    """Charts above each other, with a tick at the bottom for each doubtful frame.
-
-    Args:
-        charts: by title; values by frame number by line, NaN interrupts a line.
-        doubtful: frame numbers.
-    """
-    figure = Figure((10, 1.7 * len(charts)), layout="tight")
-    every = np.ravel(figure.subplots(len(charts), sharex=True))
-    for axes, (title, (lines, limit)) in zip(every, charts.items(), strict=True):
-        for i, (name, line) in enumerate(lines.items()):
-            frames, values = np.array(sorted(line.items()), float).T
-            known = np.where(np.isfinite(values), values, np.nan)
-            label = name if i < LEGEND and len(lines) > 1 else None
-            axes.plot(frames, known, ".-", ms=3, lw=1, c=COLOURS[i % len(COLOURS)], label=label)
+def series_chart(
+    subject: Subject, views: Sequence[View], motion: Motion, limits: Limits, doubtful: Set[int]
+) -> bytes:
+    """Four charts over the frames, with a tick at the bottom for each doubtful frame."""
+    figure = Figure((10, 6.8), layout="tight")
+    inside, area, jump, seen = every = figure.subplots(4, sharex=True)
+    for i, (name, own) in enumerate(grouped(views).items()):
+        own = sorted(own, key=lambda view: view.frame)
+        frames, colour = [view.frame for view in own], COLOURS[i % len(COLOURS)]
+        label = name if i < LEGEND else None
+        inside.plot(frames, [view.inside for view in own], ".-", c=colour, label=label)
+        area.plot(frames, [view.fullness for view in own], ".-", c=colour)
+    jump.plot(subject.frames, np.nan_to_num(motion.jump).max(1), ".-")
+    seen.plot(subject.frames, motion.seen, ".-")
+    charts: dict[str, float | None] = {
+        "share of joints inside the mask": 1 - limits.frame_outside,
+        "area of the mask over that of the estimated silhouette": None,
+        "largest jump of a joint, m": limits.joint_jump,
+        "share of joints seen": limits.seen_share,
+    }
+    for axes, (title, limit) in zip(every, charts.items(), strict=True):
         if limit is not None:
             axes.axhline(limit, color=VERMILLION, linestyle="--", linewidth=1)
         foot = axes.get_xaxis_transform()
         axes.plot(sorted(doubtful), [0] * len(doubtful), "|", color=VERMILLION, transform=foot)
         axes.set_title(title, loc="left", fontsize="medium")
         axes.grid(alpha=0.3)
-        if len(lines) > 1:
-            axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small")
+    if views:
+        inside.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small")
     return _svg(figure)
 
 

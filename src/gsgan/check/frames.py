@@ -6,30 +6,27 @@ measured (too few neighbours, joints not visible) is not flagged.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from gsgan.check.report import Finding, listed
-from gsgan.check.reprojection import Reprojection
 from gsgan.check.settings import Limits
 from gsgan.check.views import Subject, View, grouped, nanmedian
 from gsgan.data.checks import spans
 from gsgan.data.formats.trust import Bool, Float
 from gsgan.skeleton.template import SkeletonTemplate
 
-SIDES = ("left", "top", "right", "bottom")
 KINDS = {
     "outside": "joints lie outside the mask",
-    "mask": "the mask is not of the body's size or place",
+    "mask": "the mask is not of the body's size",
     "jump": "joints jump",
     "limb": "limbs change their length",
     "frozen": "joints stand exactly still, as gap filling leaves them",
     "exchanged": "left and right are exchanged",
     "backwards": "nose or toes point backwards",
     "unseen": "few joints were seen",
-    "detections": "joints lie far from their 2D detections",
 }
 JUMP_RATIO = 4.0  # a jump exceeds the upper quartile of all by this: low frame rates pass
 LIMB_METRES = 0.06  # that a limb must be off as well: noise moves the ends of short bones
@@ -41,53 +38,6 @@ SWAP_METRES = 0.06  # and this much nearer: crossing feet come close
 
 
 @dataclass(frozen=True)
-class Motion:
-    """What the skeleton does over time, ``F`` frames.
-
-    Args:
-        jump, jumps: ``[F, J]`` metres from the midpoint of the neighbours in time; too large ones.
-        change, limbs: ``[F, L]`` share by which a limb differs from its median length; too large
-            ones.
-        frozen: ``[F, J]``.
-        exchanged: ``[F]`` by body part.
-        facing: ``[F]`` below 0 where the front points backwards.
-        seen: ``[F]`` share of the joints that any frame has.
-    """
-
-    jump: Float
-    jumps: Bool
-    change: Float
-    limbs: Bool
-    frozen: Bool
-    exchanged: dict[str, Bool]
-    facing: Float
-    seen: Float
-
-
-def motion_of(subject: Subject, limits: Limits) -> Motion:
-    """Measures the skeletons of all frames; no image is needed."""
-    p, visible, template = subject.p, subject.visible, subject.template
-    jump = jump_distance(p, visible)
-    gap = np.diff(subject.frames) != subject.step
-    jump[1:][gap] = jump[:-1][gap] = np.nan  # neighbours in the list, not in time
-    usual = float(np.quantile(np.nan_to_num(jump), 0.75))
-    lengths = limb_lengths(p, visible, template)
-    change = length_change(lengths)
-    still = frozen(p, visible, int(limits.frozen_frames))
-    whole = np.asarray((still | ~visible).all(1) & still.any(1))
-    return Motion(
-        jump=jump,
-        jumps=jumped(jump, limits.joint_jump) & (np.nan_to_num(jump) > JUMP_RATIO * usual),
-        change=change,
-        limbs=(change > limits.limb_share) & (change * nanmedian(lengths) > LIMB_METRES),
-        frozen=still & (measured_joints(change, template, RIGID) | whole[:, None]),
-        exchanged={n: swapped(p, visible, pairs) for n, pairs in body_parts(template).items()},
-        facing=facing(p, visible, template),
-        seen=visible.sum(1) / max(int(visible.any(0).sum()), 1),
-    )
-
-
-@dataclass(frozen=True)
 class Doubt:
     """A frame number and one reason to doubt it: a key of `KINDS`, and a text with numbers."""
 
@@ -96,29 +46,72 @@ class Doubt:
     text: str
 
 
+@dataclass(frozen=True)
+class Motion:
+    """What the skeleton does over time, ``F`` frames.
+
+    Args:
+        jump: ``[F, J]`` metres from the midpoint of the neighbours in time.
+        facing: ``[F]`` below 0 where the front points backwards.
+        seen: ``[F]`` share of the joints that any frame has.
+        doubts: by kind.
+    """
+
+    jump: Float
+    facing: Float
+    seen: Float
+    doubts: tuple[Doubt, ...]
+
+
+def motion_of(subject: Subject, limits: Limits) -> Motion:
+    """Measures the skeletons of all frames; no image is needed."""
+    p, visible, template = subject.p, subject.visible, subject.template
+    names, found = template.names, list[Doubt]()
+
+    def doubt(kind: str, what: str, flags: Bool, text: Callable[[int, int], str]) -> None:
+        """Adds the frames in which any of the flags ``[F, N]`` holds."""
+        for row in np.flatnonzero(flags.any(1)).tolist():
+            texts = listed([text(row, i) for i in np.flatnonzero(flags[row]).tolist()], 3)
+            found.append(Doubt(int(subject.frames[row]), kind, f"{what}{texts}"))
+
+    jump = jump_distance(p, visible)
+    gap = np.diff(subject.frames) != subject.step
+    jump[1:][gap] = jump[:-1][gap] = np.nan  # neighbours in the list, not in time
+    usual = float(np.quantile(np.nan_to_num(jump), 0.75))
+    jumps = jumped(jump, limits.joint_jump) & (np.nan_to_num(jump) > JUMP_RATIO * usual)
+    doubt("jump", "jumps: ", jumps, lambda row, j: f"{names[j]} {jump[row, j]:.2f} m")
+    lengths = limb_lengths(p, visible, template)
+    change = length_change(lengths)
+    bones = [f"{names[a]} to {names[b]}" for a, b in template.limbs]
+    odd = (change > limits.limb_share) & (change * nanmedian(lengths) > LIMB_METRES)
+    doubt("limb", "length off its median: ", odd, lambda f, i: f"{bones[i]} {change[f, i]:.0%}")
+    still = frozen(p, visible, int(limits.frozen_frames))
+    whole = np.asarray((still | ~visible).all(1) & still.any(1))
+    still &= measured_joints(change, template, RIGID) | whole[:, None]
+    doubt("frozen", "frozen: ", still, lambda _, j: names[j])
+    parts = body_parts(template)
+    exchanged = np.stack([swapped(p, visible, pairs) for pairs in parts.values()], 1)
+    doubt("exchanged", "left and right exchanged: ", exchanged, lambda _, i: list(parts)[i])
+    front = facing(p, visible, template)
+    doubt("backwards", "", front[:, None] < 0, lambda *_: "nose or toes point backwards")
+    seen = visible.sum(1) / max(int(visible.any(0).sum()), 1)
+    few = seen[:, None] < limits.seen_share
+    doubt("unseen", "", few, lambda row, _: f"{seen[row]:.0%} of the joints seen")
+    return Motion(jump, front, seen, tuple(found))
+
+
 def doubts(
     subject: Subject,
     views: Sequence[View],
     motion: Motion,
-    reprojection: Reprojection | None,
     limits: Limits,
-    unfit: frozenset[str] = frozenset(),
+    unfit: Collection[str] = (),
 ) -> list[Doubt]:
     """Every reason to doubt a frame, in order of frames.
 
-    Args:
-        subject: the dataset.
-        views: of the sampled images.
-        motion: of `motion_of`.
-        reprojection: or None.
-        limits: thresholds.
-        unfit: cameras whose masks do not fit as a whole: they are not used for single frames.
+    Masks of ``unfit`` cameras, which do not fit as a whole, are not used for single frames.
     """
-    found = [
-        Doubt(number, *doubt)
-        for row, number in enumerate(map(int, subject.frames))
-        for doubt in _of_skeleton(subject, motion, reprojection, row, limits)
-    ]
+    found = list(motion.doubts)
     for name, own in grouped(views).items():
         if name not in unfit:
             full = [view.fullness for view in own if view.mask.any()]
@@ -129,41 +122,6 @@ def doubts(
                 for kind, text in _of_view(view, usual, limits)
             ]
     return sorted(found, key=lambda doubt: doubt.frame)
-
-
-def _of_skeleton(
-    subject: Subject, motion: Motion, reprojection: Reprojection | None, row: int, limits: Limits
-) -> Iterable[tuple[str, str]]:
-    names, limbs = subject.template.names, subject.template.limbs
-    if motion.jumps[row].any():
-        far = np.flatnonzero(motion.jumps[row])
-        yield (
-            "jump",
-            f"jumps: {listed([f'{names[j]} {motion.jump[row, j]:.2f} m' for j in far], 2)}",
-        )
-    if motion.limbs[row].any():
-        off = [
-            f"{names[limbs[i][0]]} to {names[limbs[i][1]]} {motion.change[row, i]:.0%}"
-            for i in np.flatnonzero(motion.limbs[row])
-        ]
-        yield "limb", f"length off its median: {listed(off, 2)}"
-    if motion.frozen[row].any():
-        still = [names[j] for j in np.flatnonzero(motion.frozen[row])]
-        yield "frozen", f"frozen: {listed(still, 2)}"
-    if parts := [name for name, exchanged in motion.exchanged.items() if exchanged[row]]:
-        yield "exchanged", f"left and right exchanged: {listed(parts)}"
-    if motion.facing[row] < 0:
-        yield "backwards", "nose or toes point backwards"
-    if motion.seen[row] < limits.seen_share:
-        yield "unseen", f"{motion.seen[row]:.0%} of the joints seen"
-    if reprojection is None or np.isnan(reprojection.pixels[row]).all():
-        return
-    pixels, focal = reprojection.pixels[row], reprojection.focal
-    worst, median = int(np.nanargmax(pixels)), float(np.nanmedian(pixels))
-    if pixels[worst] > limits.reprojection_joint * focal:
-        yield "detections", f"{names[worst]} {pixels[worst]:.0f} px from its detections"
-    elif median > limits.reprojection_frame * focal:
-        yield "detections", f"joints {median:.0f} px from their detections"
 
 
 def _of_view(view: View, usual: float, limits: Limits) -> Iterable[tuple[str, str]]:
@@ -178,11 +136,6 @@ def _of_view(view: View, usual: float, limits: Limits) -> Iterable[tuple[str, st
     change = view.fullness / usual - 1 if usual else 0.0
     if abs(change) > limits.area_jump:
         yield "mask", f"mask area {change:+.0%} off the usual for the pose"
-    side = int(np.nan_to_num(np.abs(view.reach)).argmax())
-    if abs(view.reach[side]) > limits.box_reach:
-        way = "beyond" if view.reach[side] > 0 else "short of"
-        metres = abs(view.reach[side])
-        yield "mask", f"mask ends {metres:.2f} m {way} the body ({SIDES[side]})"
 
 
 def frame_findings(

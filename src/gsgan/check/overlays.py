@@ -41,13 +41,10 @@ def strip(
     doubtful: frozenset[int] = frozenset(),
     named: bool = False,
 ) -> bytes:
-    """A row of tiles as a JPEG.
+    """A row of at least one tile as a JPEG; ``doubtful`` frames have a red caption.
 
     Args:
-        subject: the dataset.
-        views: at least one.
         height: pixels of a tile without its caption.
-        doubtful: frames with a red caption.
         named: write the camera into the caption as well.
     """
     tiles = []
@@ -103,12 +100,7 @@ def person_window(view: View, joints: Float, size: tuple[int, int]) -> Window:
 
 
 def draw(
-    image: Bytes,
-    mask: Bytes,
-    joints: Float,
-    drawn: Bool,
-    outside: Bool,
-    template: SkeletonTemplate,
+    image: Bytes, mask: Bytes, joints: Float, drawn: Bool, outside: Bool, template: SkeletonTemplate
 ) -> Bytes:
     """The image ``[H, W, 3]`` with mask outline, boxes, bones and joints ``[J, 2]`` on it."""
     canvas = image.copy()

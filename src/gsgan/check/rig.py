@@ -22,14 +22,12 @@ class Rig:
 
     Args:
         distances, heights: metres from the person, and above the feet, by camera.
-        gaps: degrees between neighbouring views about the up axis, once round.
         stature: metres, median over frames, estimated from limb lengths.
-        up, lean: ``[3]`` unit, direction of the trunk, median over frames; degrees from the up axis.
+        up, lean: ``[3]`` direction of the trunk, median over frames; degrees from the up axis.
         far: a message for each camera that is far too near or far.
     """
 
     distances: dict[str, float]
-    gaps: Float
     heights: dict[str, float]
     stature: float
     up: Float
@@ -38,7 +36,7 @@ class Rig:
 
     @property
     def distance(self) -> float:
-        """Metres: the median camera's."""
+        """Metres, of the median camera."""
         return float(np.median(list(self.distances.values())))
 
 
@@ -55,13 +53,9 @@ def rig_of(subject: Subject) -> Rig:
     cosine = axis @ up / max(float(np.linalg.norm(axis)), 1e-9)
     feet = float(np.quantile((subject.p @ up)[subject.visible], 0.01))
     centre = np.median(subject.p[subject.visible], axis=0)
-    ways = {name: camera.centre - centre for name, camera in subject.cameras.items()}
-    first, second = ground_axes(up)
-    angles = np.sort([np.degrees(np.arctan2(d @ second, d @ first)) % 360 for d in ways.values()])
-    distances = {name: float(np.linalg.norm(way)) for name, way in ways.items()}
+    distances = {n: float(np.linalg.norm(c.centre - centre)) for n, c in subject.cameras.items()}
     return Rig(
         distances=distances,
-        gaps=np.diff(np.append(angles, angles[0] + 360)),
         heights={n: float(c.centre @ up) - feet for n, c in subject.cameras.items()},
         stature=float(sums.nanmedian()) / template.limb_length_sum * template.stature,
         up=axis,
@@ -114,7 +108,6 @@ def units_table(subject: Subject, rig: Rig) -> Table:
         ("person's path", f"{np.linalg.norm(span):.2f} m across"),
         ("up axis", f"{meta.up_axis}; the trunk leans {rig.lean:.0f}° from it"),
         ("frames per second", "not given" if meta.fps is None else f"{meta.fps:g}"),
-        ("between neighbouring views", f"{min(rig.gaps):.0f}° to {max(rig.gaps):.0f}°"),
     )
     return Table(("what", "how much"), rows)
 

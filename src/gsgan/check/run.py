@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import math
 from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
@@ -18,7 +17,6 @@ from rich.console import Console
 from gsgan.check.report import Finding, Report, Section, Table, page, print_report
 from gsgan.check.sections import Measured, sections
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.views import measure, sampled_items, subject_of, suspicious_items
 from gsgan.effects import EffectSettings
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
@@ -53,13 +51,10 @@ def check_data(
         ConfigError: when the data's config is wrong.
     """
     try:
-        subject = subject_of(data)
+        measured = Measured(data, sampling, limits, effects or EffectSettings(), console)
     except DataError as error:
         return unreadable(data.root, error)
-    items = (*sampled_items(subject, sampling.pictures), *suspicious_items(subject, sampling))
-    views, broken = measure(subject, tuple(dict.fromkeys(items)), sampling, console)
-    measured = Measured(data, subject, views, broken, sampling, limits, effects or EffectSettings())
-    return Report(str(subject.layout.root), sections(measured), measured.numbers())
+    return Report(str(measured.subject.layout.root), sections(measured), measured.numbers())
 
 
 def unreadable(root: str | None, error: DataError) -> Report:
@@ -119,20 +114,13 @@ def run_check(config: DictConfig) -> Report:
 
 
 def plain(report: Report) -> dict[str, Any]:
-    """The report's findings and numbers for the JSON file; null stands for unknown."""
-    return {
+    """The report's findings and numbers for the JSON file; null stands for NaN and infinity."""
+    content = {
         "root": report.root,
         "errors": report.errors,
         "warnings": report.warnings,
         "findings": [asdict(finding) for finding in report.findings],
-        **_known(report.numbers),
+        **report.numbers,
     }
-
-
-def _known(value: Any) -> Any:
-    """A value without NaN and infinity, which JSON lacks."""
-    if isinstance(value, dict):
-        return {key: _known(held) for key, held in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_known(held) for held in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    found: dict[str, Any] = json.loads(json.dumps(content), parse_constant=lambda _: None)
+    return found

@@ -1,20 +1,26 @@
-"""The sections of the report, from what was measured."""
+"""All measurements of a dataset, and the sections of the report made from them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
+from rich.console import Console
 
 from gsgan.check import agreement, charts, overlays, rig
 from gsgan.check.calibration import calibration_findings, score_cameras
 from gsgan.check.frames import doubts, frame_findings, motion_of, shortened
 from gsgan.check.report import Figure, Finding, Section, Table, counted
-from gsgan.check.reprojection import read_reprojection, reprojection_findings
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.views import Subject, View, grouped
+from gsgan.check.views import (
+    Subject,
+    grouped,
+    measure,
+    sampled_items,
+    subject_of,
+    suspicious_items,
+)
 from gsgan.data.formats.trust import spread
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.table import HEADERS, rows
@@ -40,50 +46,38 @@ SERIES = "Over the frames; red ticks at the bottom: doubtful frames; dashed: the
 class Measured:
     """All measurements of a dataset, shared by the sections.
 
-    Args:
-        data: the data module.
-        subject: its arrays.
-        views: of the sampled images.
-        broken: messages of images that could not be read.
-        sampling, limits, effects: settings.
+    Raises:
+        DataError: when the dataset cannot be read.
     """
 
     def __init__(
         self,
         data: GsganData,
-        subject: Subject,
-        views: Sequence[View],
-        broken: Sequence[str],
         sampling: Sampling,
         limits: Limits,
         effects: EffectSettings,
+        console: Console | None,
     ) -> None:
-        self.data, self.subject, self.views = data, subject, views
-        self.sampling, self.limits, self.effects = sampling, limits, effects
-        texts = list(broken[:LISTED_BROKEN])
+        self.data, self.sampling, self.limits, self.effects = data, sampling, limits, effects
+        self.subject = subject = subject_of(data)
+        items = (*sampled_items(subject, sampling.pictures), *suspicious_items(subject, sampling))
+        self.views, broken = measure(subject, tuple(dict.fromkeys(items)), sampling, console)
         if len(broken) > LISTED_BROKEN:
-            texts.append(f"{len(broken)} sampled images cannot be read")
-        self.files = [Finding("error", "files", text) for text in texts]
+            broken[LISTED_BROKEN:] = [f"{len(broken)} sampled images cannot be read"]
         self.rig = rig.rig_of(subject)
-        self.cameras = score_cameras(subject, views, limits, sampling)
-        self.wrong = frozenset(self.rig.far) | {s.name for s in self.cameras if s.wrong(limits)}
-        self.unfit = self.wrong | {s.name for s in self.cameras if s.unfit(limits)}
-        self.hull = agreement.score_hulls(subject, views, sampling.hull_frames)
-        self.colours = agreement.mean_colours(views)
+        self.cameras = score_cameras(subject, self.views, limits, sampling)
+        self.wrong = {*self.rig.far, *(s.name for s in self.cameras if s.wrong(limits))}
+        self.unfit = {*self.wrong, *(s.name for s in self.cameras if s.unfit(limits))}
+        self.hull = agreement.score_hulls(subject, self.views, sampling.hull_frames)
+        self.colours = agreement.mean_colours(self.views)
         self.motion = motion_of(subject, limits)
-        try:
-            self.reprojection = read_reprojection(subject)
-        except DataError as error:
-            self.reprojection = None
-            self.files.append(Finding("error", "files", str(error)))
+        self.files = [Finding("error", "files", text) for text in broken]
         self.info, self.no_info = None, ""
         try:
             self.info = data.info
         except DataError as error:  # named among the findings
             self.no_info = str(error)
-        self.doubts = doubts(
-            subject, views, self.motion, self.reprojection, limits, frozenset(self.unfit)
-        )
+        self.doubts = doubts(subject, self.views, self.motion, limits, self.unfit)
         self.doubtful = frozenset(doubt.frame for doubt in self.doubts)
 
     @property
@@ -96,76 +90,65 @@ class Measured:
 
     def numbers(self) -> dict[str, object]:
         """The scores, for the JSON file."""
-        found = self.reprojection
         return {
             "readable": True,
             "cameras": {
                 s.name: asdict(s) | {"rivals": asdict(s)["rivals"][:3]} for s in self.cameras
             },
-            "hull": None if self.hull is None else self.hull.filled,
+            "hull": {name: filled for name, (filled, _) in self.hull.items()} or None,
             "colours": {
                 name: {"mean": mean.tolist(), "to_median": ratio.tolist()}
                 for name, (mean, ratio) in self.colours.items()
             },
             "camera_distance": self.rig.distance,
             "stature": self.rig.stature,
-            "reprojection_px": None if found is None else found.median,
             "doubtful_frames": {str(frame): text for frame, text in self.reasons.items()},
             "settings": {
-                "sampling": asdict(self.sampling),
-                "limits": asdict(self.limits),
-                "trust": asdict(self.subject.trust),
+                key: asdict(value)
+                for key, value in (
+                    ("sampling", self.sampling),
+                    ("limits", self.limits),
+                    ("trust", self.subject.trust),
+                )
             },
         }
 
 
 def sections(m: Measured) -> tuple[Section, ...]:
     """Every section, in reading order."""
-    files = (Section("Files", findings=tuple(m.files)),) if m.files else ()
+    rig_text = (
+        "The cameras with their viewing directions (dotted), the person and their path (grey)."
+    )
     units = Section(
         "Units and cameras",
         tables=(rig.units_table(m.subject, m.rig), rig.lens_table(m.subject, m.rig)),
-        figures=(
-            Figure(
-                "The cameras with their viewing directions (dotted), the person and the person's "
-                "path (grey).",
-                charts.rig_drawing(m.subject),
-            ),
-        ),
+        figures=(Figure(rig_text, charts.rig_drawing(m.subject)),),
         findings=tuple(rig.rig_findings(m.subject, m.rig, m.limits)),
     )
     colour = Section(
         "Colours of the cameras",
         aside=(COLOURS,),
         tables=(agreement.colour_table(m.colours, m.limits),),
-        # masks that do not fit show other things than the person
-        findings=()
-        if m.wrong
-        else tuple(agreement.colour_findings(m.colours, m.info, m.effects, m.limits)),
+        findings=tuple(agreement.colour_findings(m.colours, m.info, m.effects, m.limits))
+        if not m.wrong  # masks that do not fit show other things than the person
+        else (),
     )
-    return (
-        contents(m.data, m.subject),
-        *files,
-        units,
-        _agreement(m),
-        _overlays(m),
-        _frames(m),
-        colour,
-        _effects(m),
-    )
+    return (_contents(m), units, _agreement(m), _overlays(m), _frames(m), colour, _effects(m))
 
 
-def contents(data: GsganData, subject: Subject) -> Section:
-    """Counts, splits and missing images of a dataset that could be read."""
-    layout, splits, names = data.layout, data.splits, subject.template.names
+def _contents(m: Measured) -> Section:
+    """Counts, splits, missing and damaged images."""
+    data, subject, names = m.data, m.subject, m.subject.template.names
+    layout, splits = data.layout, data.splits
     frames = [int(f) for f in subject.frames]
     images = sum(len(files) for files in subject.pairs.values())
     labels = sum(len(files) for files in layout.labels.values())
     unseen = [n for n, seen in zip(names, subject.visible.sum(0), strict=True) if not seen]
     skeleton = (
         f"{len(names)} joints, {layout.meta.skeleton_source}; {subject.visible.mean():.1%} seen"
-        + f"; never seen: {', '.join(unseen)}" * bool(unseen)
     )
+    if unseen:
+        skeleton += f"; never seen: {', '.join(unseen)}"
     rows = [
         ("layout", layout.meta.layout),
         ("cameras", f"{len(subject.cameras)}: {', '.join(subject.cameras)}"),
@@ -182,7 +165,7 @@ def contents(data: GsganData, subject: Subject) -> Section:
         "Contents",
         text=tuple(f"Note of the reader: {note}." for note in (*layout.notes, *splits.notes)),
         tables=(Table(("what", "how much"), tuple(rows)),),
-        findings=tuple(missing_images(subject)),
+        findings=(*m.files, *_missing_images(subject)),
     )
 
 
@@ -195,7 +178,7 @@ def _split(data: GsganData, name: str) -> str:
     return f"{count}: {views}, frames {shortened(sorted(frames))}"
 
 
-def missing_images(subject: Subject) -> list[Finding]:
+def _missing_images(subject: Subject) -> list[Finding]:
     """The frames that some cameras lack."""
     every = [int(f) for f in subject.frames]
     texts = []
@@ -210,42 +193,34 @@ def missing_images(subject: Subject) -> list[Finding]:
 
 
 def _agreement(m: Measured) -> Section:
-    found, min_inside = m.reprojection, m.subject.trust.min_inside
-    text: tuple[str, ...] = ()
-    if found is not None and not np.isnan(found.median):
-        px = f"{found.median:.1f} pixels (median) from their 2D detections"
-        text = (f"Joints lie {px}.",)
+    min_inside = m.subject.trust.min_inside
     cells, flagged = [], set()
     for i, s in enumerate(m.cameras):
-        filled = None if m.hull is None else m.hull.filled.get(s.name)
-        pixels = None if found is None else found.by_camera.get(s.name)
+        filled, _ = m.hull.get(s.name, (None, None))
         columns = (
             (s.name, False),
             (f"{s.inside:.1%}", not s.inside >= min_inside),
             ("–" if np.isnan(s.outside) else f"{100 * s.outside:.1f}", False),
             (f"{s.overlap:.2f}", False),
             (f"{s.rival_overlap:.2f}", s.beaten(m.limits)),
-            (f"{s.shift[0]:+.0f}, {s.shift[1]:+.0f}", s.shifted(m.limits)),
+            (s.shift_text, s.shifted(m.limits)),
             (f"{s.lag:+d}" if s.lag else "0", s.lag != 0),
             ("–", False) if filled is None else (f"{filled:.1%}", filled < m.limits.hull_warning),
-            ("–" if pixels is None else f"{pixels:.1f}", False),
         )
         cells.append(tuple(text for text, _ in columns))
         flagged |= {(i, column) for column, (_, bad) in enumerate(columns) if bad}
     headers = (
         "camera", "joints inside mask", "outside by cm", "overlap", "best other", "shift px",
-        "lag", "hull fills", "2D px",
+        "lag", "hull fills",
     )  # fmt: skip
     title = "Do skeleton, masks and cameras agree?"
     return Section(
         "Skeleton, masks and cameras",
-        text=text,
         aside=(AGREEMENT,),
         tables=(Table(headers, tuple(cells), frozenset(flagged), title),),
         findings=(
             *calibration_findings(m.cameras, m.limits, min_inside, m.rig.far),
             *(() if m.unfit else agreement.hull_findings(m.hull, m.limits)),
-            *reprojection_findings(found, m.limits),
         ),
     )
 
@@ -269,7 +244,8 @@ def _frames(m: Measured) -> Section:
     )
     if len(table) > TABLE_FRAMES:
         text += f" The first {TABLE_FRAMES} are listed; the JSON file has all."
-    figures = [Figure(SERIES, charts.series_chart(_series(m), m.doubtful))]
+    chart = charts.series_chart(m.subject, m.views, m.motion, m.limits, m.doubtful)
+    figures = [Figure(SERIES, chart)]
     worst = sorted(
         (view for view in m.views if view.frame in m.doubtful),
         key=lambda view: np.nan_to_num(view.inside),
@@ -285,27 +261,6 @@ def _frames(m: Measured) -> Section:
         figures=tuple(figures),
         findings=tuple(frame_findings(m.subject, m.doubts, m.motion, m.limits)),
     )
-
-
-def _series(m: Measured) -> dict[str, charts.Chart]:
-    rows, views = m.subject.rows, grouped(m.views)
-    inside = {name: {v.frame: v.inside for v in own} for name, own in views.items()}
-    fullness = {name: {v.frame: v.fullness for v in own} for name, own in views.items()}
-    jump = np.nan_to_num(m.motion.jump).max(1)
-    jumps = {frame: float(jump[row]) for frame, row in rows.items()}
-    seen = {frame: float(m.motion.seen[row]) for frame, row in rows.items()}
-    series: dict[str, charts.Chart] = {
-        "share of joints inside the mask": (inside, 1 - m.limits.frame_outside),
-        "area of the mask over that of the estimated silhouette": (fullness, None),
-        "largest jump of a joint, m": ({"": jumps}, m.limits.joint_jump),
-        "share of joints seen": ({"": seen}, m.limits.seen_share),
-    }
-    if m.reprojection is not None:
-        worst = np.nan_to_num(m.reprojection.pixels).max(1)
-        line = {frame: float(worst[row]) for frame, row in rows.items()}
-        limit = m.limits.reprojection_joint * m.reprojection.focal
-        series["farthest joint from its 2D detections, pixels"] = ({"": line}, limit)
-    return series
 
 
 def _effects(m: Measured) -> Section:

@@ -53,14 +53,11 @@ class Limits:
     height_warning_high: float = 2.1
     lean: float = 50.0
     frame_outside: float = 0.3
-    box_reach: float = 0.4
     area_jump: float = 0.35
     joint_jump: float = 0.2
     limb_share: float = 0.3
     frozen_frames: int = 5
     seen_share: float = 0.7
-    reprojection_frame: float = 0.02
-    reprojection_joint: float = 0.05
     colour_ratio: float = 1.15
     distrust: float = 0.5
 

@@ -15,7 +15,6 @@ from gsgan.skeleton.template import SkeletonTemplate
 
 FLESH = 0.07  # metres of body about every bone: between an arm and a thigh
 HEAD_RADIUS = 0.12  # metres about the middle of the face: half of a head's height
-BOX_TAIL = 0.5  # per cent of a mask's pixels left out on each side of its box: specks
 
 
 def body_silhouette(
@@ -23,11 +22,7 @@ def body_silhouette(
 ) -> Bool:
     """``[H, W]`` silhouette estimated from a skeleton: thick bones, a filled trunk, a round head.
 
-    Args:
-        camera: whose ``size`` the silhouette gets; distortion is left out.
-        p: ``[J, 3]`` metres; joints behind the camera are left out.
-        visible: ``[J]``.
-        template: bones, trunk and face.
+    Joints ``p [J, 3]`` (metres) behind the camera are left out, and so is lens distortion.
     """
     size = camera.size
     pixels, depth = project(camera, p)
@@ -61,16 +56,6 @@ def overlap(a: Bool, b: Bool) -> float:
     """Intersection over union; 0 when both are empty."""
     union = np.count_nonzero(a | b)
     return np.count_nonzero(a & b) / union if union else 0.0
-
-
-def box(mask: Bool) -> Float:
-    """``[4]`` left, top, right, bottom in pixels, NaN when empty; specks are left out."""
-    rows, columns = np.nonzero(mask)
-    if len(rows) == 0:
-        return np.full(4, np.nan)
-    left, right = np.percentile(columns, (BOX_TAIL, 100 - BOX_TAIL))
-    top, bottom = np.percentile(rows, (BOX_TAIL, 100 - BOX_TAIL))
-    return np.array([left, top, right + 1, bottom + 1])
 
 
 def best_shift(mask: Bool, body: Bool) -> tuple[int, int]:

@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import track
+from rich.progress import Progress
 
 from gsgan.check.settings import Sampling
-from gsgan.check.silhouette import body_silhouette, box, overlap
+from gsgan.check.silhouette import body_silhouette
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import project
 from gsgan.data.dataset import CaptureDataset
@@ -118,12 +118,9 @@ class View:
 
     Args:
         camera, frame: of the image.
-        outside: ``[J]`` metres by which joints lie outside the mask, NaN where unknown.
-        tolerance: metres that they may.
-        overlap: of the mask and the estimated silhouette, intersection over union.
+        outside, tolerance: ``[J]`` metres by which joints lie outside the mask, NaN where unknown;
+            metres that they may.
         fullness: area of the mask over that of the estimated silhouette.
-        reach: ``[4]`` metres by which the mask's box exceeds the silhouette's: left, top, right,
-            bottom; NaN when one of them is empty.
         lagged: ``[2 lag + 1]`` mean metres outside with the skeleton of an earlier or later frame.
         colour, weight: ``[3]`` summed RGB of the person, summed mask.
         mask, to_small: ``[h, w]`` small mask; ``[3, 3]`` maps pixels of the whole image to it.
@@ -133,9 +130,7 @@ class View:
     frame: int
     outside: Float
     tolerance: float
-    overlap: float
     fullness: float
-    reach: Float
     lagged: Float
     colour: Float
     weight: float
@@ -154,13 +149,12 @@ class View:
     @property
     def beyond(self) -> Bool:
         """``[J]`` joints outside the mask by more than the tolerance."""
-        return self.known & (np.nan_to_num(self.outside, posinf=np.inf) > self.tolerance)
+        return np.asarray(self.outside > self.tolerance)
 
     @property
     def inside(self) -> float:
         """Share of the known joints inside the mask, within the tolerance; NaN of none."""
-        known = np.count_nonzero(self.known)
-        return 1 - np.count_nonzero(self.beyond) / known if known else np.nan
+        return 1 - self.beyond.sum() / self.known.sum() if self.known.any() else np.nan
 
 
 def grouped(views: Sequence[View]) -> dict[str, list[View]]:
@@ -235,9 +229,9 @@ def measure(
         except DataError as error:
             return str(error)
 
-    hidden = {"console": console, "disable": console is None, "transient": True}
-    with ThreadPoolExecutor(sampling.workers) as pool:
-        results = list(track(pool.map(one, items), "checking images", len(items), **hidden))
+    bar = Progress(transient=True, console=console, disable=console is None)
+    with ThreadPoolExecutor(sampling.workers) as pool, bar:
+        results = list(bar.track(pool.map(one, items), len(items), description="checking images"))
     views = [result for result in results if isinstance(result, View)]
     return views, [result for result in results if isinstance(result, str)]
 
@@ -270,9 +264,7 @@ def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
         frame=number,
         outside=outside(row),
         tolerance=max(subject.trust.joint_tolerance, TOLERANCE * metre),
-        overlap=overlap(mask, body),
         fullness=float(mask.sum() / max(1, int(body.sum()))),
-        reach=(box(mask) - box(body)) * np.array([-1, -1, 1, 1]) * metre,
         lagged=lagged,
         colour=frame.image.double().sum((0, 2, 3)).numpy(),
         weight=float(soft.sum(dtype=np.float64)),
