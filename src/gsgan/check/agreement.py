@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from gsgan.check.report import Finding, Table
 from gsgan.check.settings import Limits
-from gsgan.check.silhouette import thickness
-from gsgan.check.views import Subject, View, grouped
+from gsgan.check.views import Subject, View, grouped, thickness
 from gsgan.data.crop import NEAR, project
 from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float, spread
 from gsgan.data.scene_info import SceneInfo

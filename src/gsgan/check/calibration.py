@@ -10,8 +10,7 @@ import numpy as np
 
 from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.silhouette import best_shift, body_silhouette, moved, overlap
-from gsgan.check.views import Subject, View, grouped
+from gsgan.check.views import Subject, View, best_shift, body_silhouette, grouped, moved, overlap
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import project
 from gsgan.data.formats.trust import Bool, spread

@@ -10,13 +10,16 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import binary_opening
 
 from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits
 from gsgan.check.views import Subject, View, grouped, nanmedian
 from gsgan.data.checks import spans
+from gsgan.data.files import read_arrays
 from gsgan.data.formats.trust import Bool, Float
 from gsgan.skeleton.template import SkeletonTemplate
+from gsgan.utils.arrays import expect_array
 
 KINDS = {
     "outside": "joints lie outside the mask",
@@ -27,6 +30,7 @@ KINDS = {
     "exchanged": "left and right are exchanged",
     "backwards": "nose or toes point backwards",
     "unseen": "few joints were seen",
+    "detections": "joints lie far from their 2D detections",
 }
 JUMP_RATIO = 4.0  # a jump exceeds the upper quartile of all by this: low frame rates pass
 LIMB_METRES = 0.06  # that a limb must be off as well: noise moves the ends of short bones
@@ -54,12 +58,14 @@ class Motion:
         jump: ``[F, J]`` metres from the midpoint of the neighbours in time.
         facing: ``[F]`` below 0 where the front points backwards.
         seen: ``[F]`` share of the joints that any frame has.
+        reprojection: ``[F, J]`` of `reprojection_errors`.
         doubts: by kind.
     """
 
     jump: Float
     facing: Float
     seen: Float
+    reprojection: Float
     doubts: tuple[Doubt, ...]
 
 
@@ -97,7 +103,37 @@ def motion_of(subject: Subject, limits: Limits) -> Motion:
     seen = visible.sum(1) / max(int(visible.any(0).sum()), 1)
     few = seen[:, None] < limits.seen_share
     doubt("unseen", "", few, lambda row, _: f"{seen[row]:.0%} of the joints seen")
-    return Motion(jump, front, seen, tuple(found))
+    pixels = reprojection_errors(subject)
+    focal = float(np.median([camera.K[0, 0] for camera in subject.cameras.values()]))
+    off = pixels > limits.reprojection_joint * focal
+    away = "px from 2D detections"
+    doubt("detections", "", off, lambda row, j: f"{names[j]} {pixels[row, j]:.0f} {away}")
+    median = nanmedian(pixels.T)
+    many = (median > limits.reprojection_frame * focal) & ~off.any(1)
+    doubt("detections", "", many[:, None], lambda row, _: f"joints {median[row]:.0f} {away}")
+    return Motion(jump, front, seen, pixels, tuple(found))
+
+
+def reprojection_errors(subject: Subject) -> Float:
+    """``[F, J]`` pixels between projected joints and 2D detections, NaN where unknown.
+
+    They are ``reproj_px`` of landmarks3d.npz, the mean over cameras, as `gsgan.prepare` writes it.
+
+    Raises:
+        DataError: when it has another shape than the joints.
+    """
+    result = np.full(subject.visible.shape, np.nan)
+    path = subject.layout.root / "landmarks3d.npz"
+    if subject.layout.landmarks.fitted_to or not path.is_file():
+        return result  # the errors are those of other joints
+    arrays = read_arrays(path, ("reproj_px", "frame_id"))
+    if "reproj_px" in arrays:
+        ids = expect_array(arrays, "frame_id", (None,), path)
+        stored = expect_array(arrays, "reproj_px", (len(ids), subject.p.shape[1]), path)
+        for number, row in zip(ids, stored, strict=True):
+            if int(number) in subject.rows:
+                result[subject.rows[int(number)]] = row
+    return np.where(subject.visible & np.isfinite(result), result, np.nan)
 
 
 def doubts(
@@ -229,18 +265,10 @@ def frozen(p: Float, visible: Bool, least: int) -> Bool:
     same = np.zeros(visible.shape, bool)
     same[1:] = np.linalg.norm(p[1:] - p[:-1], axis=-1) < STILL
     same[1:] &= visible[1:] & visible[:-1]
-    held = np.zeros_like(same)
-    for joint in range(p.shape[1]):
-        for first, last in runs(same[:, joint]):
-            if last - first + 2 >= least:  # a run of n equal steps joins n + 1 frames
-                held[first - 1 : last + 1, joint] = True
-    return held
-
-
-def runs(flags: Bool) -> list[tuple[int, int]]:
-    """First and last index of every run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return [(int(a), int(b) - 1) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    # an opening keeps runs of equal steps; a run of n joins n + 1 frames
+    held = binary_opening(same, np.ones((max(1, least - 1), 1)))
+    held[:-1] |= held[1:].copy()
+    return np.asarray(held)
 
 
 def body_parts(template: SkeletonTemplate) -> dict[str, tuple[tuple[int, int], ...]]:

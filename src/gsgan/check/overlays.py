@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import cv2
 import numpy as np
@@ -38,7 +38,7 @@ def strip(
     subject: Subject,
     views: Sequence[View],
     height: int,
-    doubtful: frozenset[int] = frozenset(),
+    doubtful: Collection[int] = (),
     named: bool = False,
 ) -> bytes:
     """A row of at least one tile as a JPEG; ``doubtful`` frames have a red caption.

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from gsgan.check.report import Finding, Table
 from gsgan.check.settings import Limits
 from gsgan.check.views import Subject, nanmedian
 from gsgan.data.formats.trust import Float, far_cameras
 from gsgan.skeleton.sanitise import limb_length_sum
+from gsgan.utils.palette import BLACK, COLOURS, GREY
 
+NAMES = 12  # cameras that are named seen from the side, where they crowd
 IMPOSSIBLE = (0.4, 3.0)  # metres of person outside which units are wrong
 
 
@@ -99,13 +104,11 @@ def rig_findings(subject: Subject, rig: Rig, limits: Limits) -> list[Finding]:
 def units_table(subject: Subject, rig: Rig) -> Table:
     """Units and sizes in words."""
     meta, distances = subject.layout.meta, rig.distances.values()
-    span = np.ptp(subject.p[:, list(subject.template.hips)].mean(1), axis=0)
     near, far = min(distances), max(distances)
     rows = (
         ("unit of the files", meta.unit),
         ("camera to person", f"{rig.distance:.2f} m (median; {near:.2f} to {far:.2f})"),
         ("person's height", f"{rig.stature:.2f} m, from limb lengths"),
-        ("person's path", f"{np.linalg.norm(span):.2f} m across"),
         ("up axis", f"{meta.up_axis}; the trunk leans {rig.lean:.0f}° from it"),
         ("frames per second", "not given" if meta.fps is None else f"{meta.fps:g}"),
     )
@@ -134,3 +137,47 @@ def lens_table(subject: Subject, rig: Rig) -> Table:
     )  # fmt: skip
     flagged = frozenset((i, 5) for i, row in enumerate(rows) if row[0] in rig.far)
     return Table(headers, tuple(rows), flagged, "Lenses and places")
+
+
+def rig_drawing(subject: Subject) -> bytes:
+    """Cameras, viewing directions and the person's path, from above and from the side."""
+    figure = Figure((9, 4.5), layout="tight")
+    first, second = ground_axes(subject.up)
+    titles = {"seen from above": second, "seen from the side": subject.up}
+    for axes, (title, up) in zip(figure.subplots(1, 2), titles.items(), strict=True):
+        named = up is second or len(subject.cameras) <= NAMES
+        _panel(axes, subject, np.stack([first, up]), named)
+        axes.set(title=title, xlabel=f"{axis_name(first)} (m)", ylabel=f"{axis_name(up)} (m)")
+    return svg(figure)
+
+
+def _panel(axes: Axes, subject: Subject, plane: Float, named: bool) -> None:
+    """Draws onto the plane ``[2, 3]``: right, up."""
+    axes.plot(*plane @ subject.p[:, list(subject.template.hips)].mean(1).T, color=GREY)
+    row = len(subject.frames) // 2
+    for edge in map(list, subject.template.edges):
+        if subject.visible[row, edge].all():
+            axes.plot(*plane @ subject.p[row, edge].T, color=BLACK, linewidth=1)
+    centres = np.stack([camera.centre for camera in subject.cameras.values()])
+    reach = 0.1 * max(1.0, float(np.ptp(centres, axis=0).max()))  # metres
+    for i, (name, camera) in enumerate(subject.cameras.items()):
+        colour, (height, width) = COLOURS[i % len(COLOURS)], camera.size
+        corners = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]], float)
+        ends = camera.centre + reach * corners @ np.linalg.inv(camera.K).T @ camera.R
+        for line in (ends[[0, 1, 2, 3, 0]], *(np.stack([camera.centre, end]) for end in ends)):
+            axes.plot(*plane @ line.T, color=colour, linewidth=0.8)
+        aim = np.stack([camera.centre, camera.centre + 2.2 * reach * camera.R[2]])
+        axes.plot(*plane @ aim.T, color=colour, linewidth=0.8, linestyle=":")
+        if named:
+            axes.annotate(
+                name, tuple(plane @ camera.centre), (4, 4), textcoords="offset points", color=colour
+            )
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(alpha=0.3)
+
+
+def svg(figure: Figure) -> bytes:
+    """The encoded plot."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="svg")
+    return stream.getvalue()

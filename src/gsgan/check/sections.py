@@ -6,9 +6,10 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.figure import Figure as Plot
 from rich.console import Console
 
-from gsgan.check import agreement, charts, overlays, rig
+from gsgan.check import agreement, overlays, rig
 from gsgan.check.calibration import calibration_findings, score_cameras
 from gsgan.check.frames import doubts, frame_findings, motion_of, shortened
 from gsgan.check.report import Figure, Finding, Section, Table, counted
@@ -17,6 +18,7 @@ from gsgan.check.views import (
     Subject,
     grouped,
     measure,
+    nanmedian,
     sampled_items,
     subject_of,
     suspicious_items,
@@ -25,11 +27,13 @@ from gsgan.data.formats.trust import spread
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.table import HEADERS, rows
 from gsgan.utils.errors import DataError
+from gsgan.utils.palette import COLOURS, VERMILLION
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
 LISTED_BROKEN = 6
+LEGEND = 8  # cameras that are named beside the charts; all are drawn
 TABLE_FRAMES = 40  # doubtful frames listed
 AGREEMENT = (
     "Joints are compared with masks, undistorted. Overlap is that of the mask with the silhouette "
@@ -38,7 +42,7 @@ AGREEMENT = (
     "'Hull fills' is the share of the mask that is left when all masks together carve space: it "
     "does not need the skeleton."
 )
-COLOURS = "Mean colour of the person; the side that a camera sees changes it as well as exposure."
+MEANS = "Mean colour of the person; the side that a camera sees changes it as well as exposure."
 EFFECTS = "What is off is neither built nor computed; effects.<name>= forces one (docs/effects.md)."
 SERIES = "Over the frames; red ticks at the bottom: doubtful frames; dashed: the limit."
 
@@ -78,15 +82,9 @@ class Measured:
         except DataError as error:  # named among the findings
             self.no_info = str(error)
         self.doubts = doubts(subject, self.views, self.motion, limits, self.unfit)
-        self.doubtful = frozenset(doubt.frame for doubt in self.doubts)
-
-    @property
-    def reasons(self) -> dict[int, list[str]]:
-        """Reasons by doubtful frame."""
-        found: dict[int, list[str]] = {}
+        self.reasons: dict[int, list[str]] = {}
         for doubt in self.doubts:
-            found.setdefault(doubt.frame, []).append(doubt.text)
-        return found
+            self.reasons.setdefault(doubt.frame, []).append(doubt.text)
 
     def numbers(self) -> dict[str, object]:
         """The scores, for the JSON file."""
@@ -102,6 +100,7 @@ class Measured:
             },
             "camera_distance": self.rig.distance,
             "stature": self.rig.stature,
+            "reprojection_px": float(nanmedian(self.motion.reprojection.ravel())),
             "doubtful_frames": {str(frame): text for frame, text in self.reasons.items()},
             "settings": {
                 key: asdict(value)
@@ -122,12 +121,12 @@ def sections(m: Measured) -> tuple[Section, ...]:
     units = Section(
         "Units and cameras",
         tables=(rig.units_table(m.subject, m.rig), rig.lens_table(m.subject, m.rig)),
-        figures=(Figure(rig_text, charts.rig_drawing(m.subject)),),
+        figures=(Figure(rig_text, rig.rig_drawing(m.subject)),),
         findings=tuple(rig.rig_findings(m.subject, m.rig, m.limits)),
     )
     colour = Section(
         "Colours of the cameras",
-        aside=(COLOURS,),
+        aside=(MEANS,),
         tables=(agreement.colour_table(m.colours, m.limits),),
         findings=tuple(agreement.colour_findings(m.colours, m.info, m.effects, m.limits))
         if not m.wrong  # masks that do not fit show other things than the person
@@ -229,7 +228,7 @@ def _overlays(m: Measured) -> Section:
     figures = [
         Figure(
             f"camera {name}",
-            overlays.strip(m.subject, spread(own, m.sampling.shown), m.sampling.tile, m.doubtful),
+            overlays.strip(m.subject, spread(own, m.sampling.shown), m.sampling.tile, m.reasons),
         )
         for name, own in grouped(m.views).items()
     ]
@@ -244,14 +243,13 @@ def _frames(m: Measured) -> Section:
     )
     if len(table) > TABLE_FRAMES:
         text += f" The first {TABLE_FRAMES} are listed; the JSON file has all."
-    chart = charts.series_chart(m.subject, m.views, m.motion, m.limits, m.doubtful)
-    figures = [Figure(SERIES, chart)]
+    figures = [Figure(SERIES, _series(m))]
     worst = sorted(
-        (view for view in m.views if view.frame in m.doubtful),
+        (view for view in m.views if view.frame in m.reasons),
         key=lambda view: np.nan_to_num(view.inside),
     )[: m.sampling.shown]
     if worst:
-        tiles = overlays.strip(m.subject, worst, m.sampling.tile, m.doubtful, named=True)
+        tiles = overlays.strip(m.subject, worst, m.sampling.tile, m.reasons, named=True)
         title = "Doubtful frames with most joints outside the mask"
         figures.insert(0, Figure(title, tiles))
     return Section(
@@ -261,6 +259,36 @@ def _frames(m: Measured) -> Section:
         figures=tuple(figures),
         findings=tuple(frame_findings(m.subject, m.doubts, m.motion, m.limits)),
     )
+
+
+def _series(m: Measured) -> bytes:
+    """Four charts over the frames, with a tick at the bottom for each doubtful frame."""
+    figure = Plot((10, 6.8), layout="tight")
+    inside, area, jump, seen = every = figure.subplots(4, sharex=True)
+    for i, (name, own) in enumerate(grouped(m.views).items()):
+        own = sorted(own, key=lambda view: view.frame)
+        frames, colour = [view.frame for view in own], COLOURS[i % len(COLOURS)]
+        label = name if i < LEGEND else None
+        inside.plot(frames, [view.inside for view in own], ".-", c=colour, label=label)
+        area.plot(frames, [view.fullness for view in own], ".-", c=colour)
+    jump.plot(m.subject.frames, np.nan_to_num(m.motion.jump).max(1), ".-")
+    seen.plot(m.subject.frames, m.motion.seen, ".-")
+    charts: dict[str, float | None] = {
+        "share of joints inside the mask": 1 - m.limits.frame_outside,
+        "area of the mask over that of the estimated silhouette": None,
+        "largest jump of a joint, m": m.limits.joint_jump,
+        "share of joints seen": m.limits.seen_share,
+    }
+    for axes, (title, limit) in zip(every, charts.items(), strict=True):
+        if limit is not None:
+            axes.axhline(limit, color=VERMILLION, linestyle="--", linewidth=1)
+        foot = axes.get_xaxis_transform()
+        axes.plot(sorted(m.reasons), [0] * len(m.reasons), "|", color=VERMILLION, transform=foot)
+        axes.set_title(title, loc="left", fontsize="medium")
+        axes.grid(alpha=0.3)
+    if m.views:
+        inside.legend(loc="center left", bbox_to_anchor=(1, 0.5), fontsize="small")
+    return rig.svg(figure)
 
 
 def _effects(m: Measured) -> Section:

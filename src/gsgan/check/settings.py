@@ -58,6 +58,8 @@ class Limits:
     limb_share: float = 0.3
     frozen_frames: int = 5
     seen_share: float = 0.7
+    reprojection_frame: float = 0.02
+    reprojection_joint: float = 0.05
     colour_ratio: float = 1.15
     distrust: float = 0.5
 

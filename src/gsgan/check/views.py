@@ -1,4 +1,7 @@
-"""The dataset as arrays, and the one pass over sampled images: all that needs decoding."""
+"""The dataset as arrays, and the one pass over sampled images: all that needs decoding.
+
+A silhouette estimated from the skeleton is what masks are compared with; pixel centres at +0.5.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +21,11 @@ from rich.console import Console
 from rich.progress import Progress
 
 from gsgan.check.settings import Sampling
-from gsgan.check.silhouette import body_silhouette
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import project
+from gsgan.data.crop import NEAR, project
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.trust import (
+    FAR_PIXELS,
     TOLERANCE,
     Bool,
     Float,
@@ -45,6 +48,8 @@ SMALL = 128  # pixels, longest side of the masks that calibrations are tried on 
 TAILS = 20000  # files whose end is read
 TAIL = 64  # bytes: some writers append a few after the end mark
 END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}  # by first bytes
+FLESH = 0.07  # metres of body about every bone: between an arm and a thigh
+HEAD_RADIUS = 0.12  # metres about the middle of the face: half of a head's height
 
 
 @dataclass(frozen=True)
@@ -271,3 +276,60 @@ def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
         mask=cv2.resize(soft, small, interpolation=cv2.INTER_AREA) > 0.5,
         to_small=to_small,
     )
+
+
+def body_silhouette(
+    camera: CameraEntry, p: Float, visible: Bool, template: SkeletonTemplate
+) -> Bool:
+    """``[H, W]`` silhouette estimated from a skeleton: thick bones, a filled trunk, a round head.
+
+    Joints ``p [J, 3]`` (metres) behind the camera are left out, and so is lens distortion.
+    """
+    size = camera.size
+    pixels, depth = project(camera, p)
+    canvas = np.zeros(size, np.uint8)
+    drawn = visible & (depth > NEAR)
+    at = np.round(np.clip(np.nan_to_num(pixels), -FAR_PIXELS, FAR_PIXELS) - 0.5).astype(np.int32)
+    metre = abs(camera.K[0, 0]) / np.maximum(depth, NEAR)  # pixels
+    trunk = template.torso
+    edges = [*template.limbs, *zip(trunk, (trunk[1], trunk[3], trunk[0], trunk[2]), strict=True)]
+    for a, b in edges:
+        if drawn[a] and drawn[b]:
+            width = thickness(2 * FLESH * min(metre[a], metre[b]), size)
+            cv2.line(canvas, at[a].tolist(), at[b].tolist(), 1, width)
+    corners = [j for j in trunk if drawn[j]]
+    if len(corners) > 2:
+        cv2.fillConvexPoly(canvas, cv2.convexHull(at[corners]), 1)
+    face = [j for j in template.face if drawn[j]]
+    if face:
+        middle = at[face].mean(0).round().astype(int)
+        radius = thickness(HEAD_RADIUS * float(metre[face].mean()), size)
+        cv2.circle(canvas, middle.tolist(), radius, 1, -1)
+    return canvas > 0
+
+
+def thickness(pixels: float, size: tuple[int, int]) -> int:
+    """A whole line width that OpenCV can draw: at least 1, at most the image."""
+    return int(np.clip(round(float(pixels)), 1, min(255, max(size))))
+
+
+def overlap(a: Bool, b: Bool) -> float:
+    """Intersection over union; 0 when both are empty."""
+    union = np.count_nonzero(a | b)
+    return np.count_nonzero(a & b) / union if union else 0.0
+
+
+def best_shift(mask: Bool, body: Bool) -> tuple[int, int]:
+    """Whole pixels ``(dx, dy)`` by which the mask lies beside the body: largest correlation."""
+    height, width = mask.shape
+    shape = (2 * height, 2 * width)  # padded: a shift must not wrap around
+    spectrum = np.fft.rfft2(mask, shape) * np.conj(np.fft.rfft2(body, shape))
+    common = np.fft.irfft2(spectrum, shape)
+    dy, dx = np.unravel_index(int(np.argmax(common)), shape)
+    return int((dx + width) % (2 * width) - width), int((dy + height) % (2 * height) - height)
+
+
+def moved(mask: Bool, dx: int, dy: int) -> Bool:
+    """A mask moved by whole pixels, empty where nothing was."""
+    shift = np.array([[1, 0, dx], [0, 1, dy]], np.float64)
+    return cv2.warpAffine(mask.astype(np.uint8), shift, mask.shape[::-1], flags=0) > 0
