@@ -54,24 +54,22 @@ def score_hulls(
 
 def _shares(subject: Subject, views: Sequence[View]) -> tuple[Float, Float]:
     """Of one moment, ``[C]`` each: the two shares of `score_hulls`."""
-    joints = subject.p[subject.rows[views[0].frame]]
-    joints = joints[subject.visible[subject.rows[views[0].frame]]]
+    row = subject.rows[views[0].frame]
+    joints = subject.p[row][subject.visible[row]]
     low, high = joints.min(0) - AIR, joints.max(0) + AIR
     axes = [np.arange(a, b, VOXEL) + VOXEL / 2 for a, b in zip(low, high, strict=True)]
     voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    seen = [_project(subject, view, voxels) for view in views]
-    inside = np.stack([inside for inside, _ in seen])
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3)
-    masks = [view.mask & _covered(subject, view, corners) for view in views]
+    seen = [_carve(subject, view, voxels, corners) for view in views]
+    inside = np.stack([kept for kept, *_ in seen])
 
     def filled(kept: Bool) -> Float:  # share of each mask that voxels cover; NaN when empty
         shares = np.full(len(views), np.nan)
-        for i, mask in enumerate(masks):
+        for i, (_, pixels, mask, side) in enumerate(seen):
             if mask.any():
                 canvas = np.zeros(mask.shape, np.uint8)
-                column, row = seen[i][1][kept].T
+                column, row = pixels[kept].T
                 canvas[row[row >= 0], column[row >= 0]] = 1
-                side = _grown(subject, views[i])
                 covered = cv2.dilate(canvas, np.ones((side, side), np.uint8)) > 0
                 shares[i] = np.count_nonzero(covered & mask) / np.count_nonzero(mask)
         return shares
@@ -83,33 +81,33 @@ def _shares(subject: Subject, views: Sequence[View]) -> tuple[Float, Float]:
     return filled(np.all(inside, 0)), np.array(spared)
 
 
-def _project(subject: Subject, view: View, voxels: Float) -> tuple[Bool, NDArray[np.int64]]:
-    """Which voxels lie in the mask or outside the image; pixels, -1 outside the image."""
+def _carve(
+    subject: Subject, view: View, voxels: Float, corners: Float
+) -> tuple[Bool, NDArray[np.int64], Bool, int]:
+    """What one image keeps of the voxels ``[V, 3]`` in the box with these corners.
+
+    Returns:
+        ``[V]`` whether they lie in the mask or outside the image; their pixels, -1 outside the
+        image; the mask where the image shows the box; pixels that a voxel covers.
+    """
     entry = subject.cameras[view.camera]
+    small = view.small(entry)
     raw, depth = project(entry, voxels)
     height, width = entry.size
     seen = (depth > NEAR) & (raw >= 0).all(1) & (raw[:, 0] < width) & (raw[:, 1] < height)
     limit = np.array(view.mask.shape[::-1]) - 1
-    pixels = np.floor(project(view.small(entry), voxels)[0]).clip(0, limit).astype(np.int64)
+    pixels = np.floor(project(small, voxels)[0]).clip(0, limit).astype(np.int64)
     inside = view.mask[pixels[:, 1], pixels[:, 0]] | ~seen
-    return inside, np.where(seen[:, None], pixels, -1)
-
-
-def _covered(subject: Subject, view: View, corners: Float) -> Bool:
-    """``[h, w]`` where the image shows the carved box; everywhere when the camera is in it."""
-    pixels, depth = project(view.small(subject.cameras[view.camera]), corners)
-    if (depth < NEAR).any():
-        return np.ones(view.mask.shape, bool)
-    at = np.clip(pixels, -FAR_PIXELS, FAR_PIXELS).round().astype(np.int32)
-    canvas = cv2.fillConvexPoly(np.zeros(view.mask.shape, np.uint8), cv2.convexHull(at), 1)
-    return np.asarray(canvas > 0)
-
-
-def _grown(subject: Subject, view: View) -> int:
-    """Pixels that a voxel at the person covers, corner to corner, plus one."""
-    camera = view.small(subject.cameras[view.camera])
-    depth = max(NEAR, float(project(camera, subject.p[subject.rows[view.frame]])[1].mean()))
-    return thickness(1 + np.sqrt(2) * VOXEL * camera.K[0, 0] / depth, camera.size)
+    at, depth = project(small, corners)
+    mask = view.mask
+    if (depth >= NEAR).all():  # else the camera is in the box
+        at = np.clip(at, -FAR_PIXELS, FAR_PIXELS).round().astype(np.int32)
+        shown = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), cv2.convexHull(at), 1)
+        mask = mask & (shown > 0)
+    # corner to corner, at the person, plus one
+    metres = max(NEAR, float(project(small, subject.p[subject.rows[view.frame]])[1].mean()))
+    side = thickness(1 + np.sqrt(2) * VOXEL * small.K[0, 0] / metres, small.size)
+    return inside, np.where(seen[:, None], pixels, -1), mask, side
 
 
 def hull_findings(score: Mapping[str, tuple[float, float]], limits: Limits) -> list[Finding]:

@@ -16,13 +16,11 @@ from gsgan.data.crop import project
 from gsgan.data.formats.trust import Bool, spread
 
 TOPIC = "calibration"
-INVERSE = "R and t the other way round"
 MIRRORED = "mirrored images"
 EXTRINSICS = "R and t of"
 WHOLE = "the whole calibration of"
 ADVICE = {
     MIRRORED: "mirror its images and masks back",
-    INVERSE: "invert its R and t: x_cam = R x + t is expected",
     EXTRINSICS: "check its R, t and folder name",
     WHOLE: "check its calibration and folder name",
 }
@@ -81,14 +79,9 @@ class CameraScore:
         """Pixels right, down."""
         return f"{self.shift[0]:+.0f}, {self.shift[1]:+.0f}"
 
-    @property
-    def rival_overlap(self) -> float:
-        """Of the best rival."""
-        return self.rivals[0].overlap
-
     def beaten(self, limits: Limits) -> bool:
         """Whether another calibration fits the masks better, and well."""
-        return self.rival_overlap > max(self.overlap + limits.better_fit, CREDIBLE_OVERLAP)
+        return self.rivals[0].overlap > max(self.overlap + limits.better_fit, CREDIBLE_OVERLAP)
 
     def shifted(self, limits: Limits) -> bool:
         """Whether the masks lie beside the skeleton, by more than bodies and skeletons differ."""
@@ -143,10 +136,7 @@ def calibrations(
     mirror = own.K.copy()
     mirror[0] = -mirror[0]
     mirror[0, 2] += own.size[1]
-    found = {
-        (INVERSE, ""): replace(own, R=own.R.T, t=-own.R.T @ own.t),
-        (MIRRORED, ""): replace(own, K=mirror),
-    }
+    found = {(MIRRORED, ""): replace(own, K=mirror)}
     for name, other in cameras.items():
         if name != own.name:
             found[EXTRINSICS, name] = replace(own, R=other.R, t=other.t)
@@ -209,14 +199,7 @@ def known_mean(values: Iterable[float]) -> float:
 def calibration_findings(
     scores: Sequence[CameraScore], limits: Limits, min_inside: float, named: Iterable[str] = ()
 ) -> list[Finding]:
-    """Which camera is wrong, and the usual causes.
-
-    Args:
-        scores: of all cameras.
-        limits: thresholds.
-        min_inside: share of joints inside the masks below which a camera is named.
-        named: cameras that another finding names already.
-    """
+    """Which camera is wrong, and the usual causes; other findings name ``named`` already."""
     found, named = list[Finding](), set(named)
     if big := [s for s in scores if s.oversized(limits) and s.name not in named]:
         sizes = listed(f"{s.name} {s.fullness:.1f}" for s in big)
@@ -259,7 +242,7 @@ def calibration_findings(
 
 def _rival_of(score: CameraScore, other: CameraScore, limits: Limits) -> Rival | None:
     """The other camera's calibration, where it fits the masks about as well as the best."""
-    least = score.rival_overlap - limits.better_fit
+    least = score.rivals[0].overlap - limits.better_fit
     return next((r for r in score.rivals if r.other == other.name and r.overlap > least), None)
 
 

@@ -22,15 +22,13 @@ Colour = tuple[int, int, int]
 ASPECT = 0.75  # width to height of a tile: a standing person
 MARGIN = 0.08  # of the box about person and skeleton, on each side
 LEFT, RIGHT, MIDDLE = (60, 150, 255), (255, 140, 40), (240, 240, 240)  # RGB, the person's sides
-OUTLINE, MASK_BOX, BODY_BOX = (70, 255, 90), (40, 140, 60), (210, 190, 60)
-OUTSIDE, NEUTRAL = (255, 40, 60), (70, 70, 70)
+OUTLINE, OUTSIDE, NEUTRAL = (70, 255, 90), (255, 40, 60), (70, 70, 70)
 BAR = 18  # pixels of the caption above a tile
 GAP = 4  # pixels between tiles
 QUALITY = 88  # of the JPEG
 LEGEND = (
-    "Green: the mask's outline and box. Yellow: the skeleton's box. Blue: the person's left, "
-    "orange: the right, white: the middle; red rings: joints outside the mask. Images are cropped "
-    "to the person and undistorted."
+    "Green: the mask's outline. Blue: the person's left, orange: the right, white: the middle; "
+    "red rings: joints outside the mask. Images are cropped to the person and undistorted."
 )
 
 
@@ -41,11 +39,9 @@ def strip(
     doubtful: Collection[int] = (),
     named: bool = False,
 ) -> bytes:
-    """A row of at least one tile as a JPEG; ``doubtful`` frames have a red caption.
+    """A row of at least one tile as a JPEG; captions of ``doubtful`` frames are red.
 
-    Args:
-        height: pixels of a tile without its caption.
-        named: write the camera into the caption as well.
+    Tiles have ``height`` pixels below the caption, which has the camera as well when ``named``.
     """
     tiles = []
     for view in views:
@@ -102,17 +98,11 @@ def person_window(view: View, joints: Float, size: tuple[int, int]) -> Window:
 def draw(
     image: Bytes, mask: Bytes, joints: Float, drawn: Bool, outside: Bool, template: SkeletonTemplate
 ) -> Bytes:
-    """The image ``[H, W, 3]`` with mask outline, boxes, bones and joints ``[J, 2]`` on it."""
+    """The image ``[H, W, 3]`` with mask outline, bones and joints ``[J, 2]`` on it."""
     canvas = image.copy()
     person = (mask > 127).astype(np.uint8)
     contours = cv2.findContours(person, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     at = np.round(joints - 0.5).astype(np.int32)
-    if person.any():
-        x, y, w, h = cv2.boundingRect(person)
-        cv2.rectangle(canvas, (x, y), (x + w - 1, y + h - 1), MASK_BOX, 1)
-    if drawn.any():
-        low, high = at[drawn].min(0), at[drawn].max(0)
-        cv2.rectangle(canvas, low.tolist(), high.tolist(), BODY_BOX, 1)
     cv2.drawContours(canvas, contours, -1, OUTLINE, 1, cv2.LINE_AA)
     for a, b in template.edges:
         if drawn[a] and drawn[b]:

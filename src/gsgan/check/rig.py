@@ -26,14 +26,13 @@ class Rig:
     """The geometry of a capture.
 
     Args:
-        distances, heights: metres from the person, and above the feet, by camera.
+        distances: metres from the person, by camera.
         stature: metres, median over frames, estimated from limb lengths.
         up, lean: ``[3]`` direction of the trunk, median over frames; degrees from the up axis.
         far: a message for each camera that is far too near or far.
     """
 
     distances: dict[str, float]
-    heights: dict[str, float]
     stature: float
     up: Float
     lean: float
@@ -56,12 +55,10 @@ def rig_of(subject: Subject) -> Rig:
     lengths = np.linalg.norm(trunk, axis=-1, keepdims=True)
     axis = nanmedian(trunk / np.where(lengths > 0, lengths, np.nan)) if len(trunk) else up
     cosine = axis @ up / max(float(np.linalg.norm(axis)), 1e-9)
-    feet = float(np.quantile((subject.p @ up)[subject.visible], 0.01))
     centre = np.median(subject.p[subject.visible], axis=0)
     distances = {n: float(np.linalg.norm(c.centre - centre)) for n, c in subject.cameras.items()}
     return Rig(
         distances=distances,
-        heights={n: float(c.centre @ up) - feet for n, c in subject.cameras.items()},
         stature=float(sums.nanmedian()) / template.limb_length_sum * template.stature,
         up=axis,
         lean=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
@@ -128,12 +125,10 @@ def lens_table(subject: Subject, rig: Rig) -> Table:
             f"{K[0, 2] / width:.2f}, {K[1, 2] / height:.2f}",
             " ".join(terms) or "none",
             f"{rig.distances[name]:.2f}",
-            f"{rig.heights[name]:.2f}",
             str(len(subject.pairs[name])),
         ))  # fmt: skip
     headers = (
-        "camera", "pixels", "focal fx, fy", "centre (share)", "distortion", "distance m",
-        "height m", "images",
+        "camera", "pixels", "focal fx, fy", "centre (share)", "distortion", "distance m", "images",
     )  # fmt: skip
     flagged = frozenset((i, 5) for i, row in enumerate(rows) if row[0] in rig.far)
     return Table(headers, tuple(rows), flagged, "Lenses and places")

@@ -73,11 +73,8 @@ def inventory(root: Path) -> Table:
     """The files of a folder and of two levels of folders below it, counted by suffix."""
     rows = []
     for folder in [root, *sorted((*root.glob("*/"), *root.glob("*/*/")))][:LISTED_FOLDERS]:
-        try:
-            kinds = Counter(p.suffix.lower() or p.name for p in folder.iterdir() if p.is_file())
-            text = ", ".join(f"{n} × {kind}" for kind, n in sorted(kinds.items())) or "no files"
-        except OSError as error:
-            text = f"cannot be read: {error.strerror}"
+        kinds = Counter(p.suffix.lower() or p.name for p in folder.iterdir() if p.is_file())
+        text = ", ".join(f"{n} × {kind}" for kind, n in sorted(kinds.items())) or "no files"
         rows.append((str(folder.relative_to(root)), text))
     return Table(("folder", "files"), tuple(rows), title="Files of the folder")
 

@@ -38,7 +38,7 @@ TABLE_FRAMES = 40  # doubtful frames listed
 AGREEMENT = (
     "Joints are compared with masks, undistorted. Overlap is that of the mask with the silhouette "
     "estimated from the skeleton (about 0.7 in a good capture); 'best other' is what the "
-    "calibration of another camera, mirrored images, or R and t the other way round would reach. "
+    "calibration of another camera or mirrored images would reach. "
     "'Hull fills' is the share of the mask that is left when all masks together carve space: it "
     "does not need the skeleton."
 )
@@ -103,12 +103,9 @@ class Measured:
             "reprojection_px": float(nanmedian(self.motion.reprojection.ravel())),
             "doubtful_frames": {str(frame): text for frame, text in self.reasons.items()},
             "settings": {
-                key: asdict(value)
-                for key, value in (
-                    ("sampling", self.sampling),
-                    ("limits", self.limits),
-                    ("trust", self.subject.trust),
-                )
+                "sampling": asdict(self.sampling),
+                "limits": asdict(self.limits),
+                "trust": asdict(self.subject.trust),
             },
         }
 
@@ -185,9 +182,6 @@ def _missing_images(subject: Subject) -> list[Finding]:
         if lacking := sorted(set(every) - set(files)):
             count = f"{len(lacking)} of the {len(every)} frames"
             texts.append(f"camera {name} lacks {count}: {shortened(lacking)}")
-    if holes := sorted(set(range(every[0], every[-1] + 1, subject.step)) - set(every)):
-        text = f"no camera has a usable image of {len(holes)} frames in between"
-        texts.append(f"{text}: {shortened(holes)}")
     return [Finding("warning", "files", text) for text in texts]
 
 
@@ -201,7 +195,7 @@ def _agreement(m: Measured) -> Section:
             (f"{s.inside:.1%}", not s.inside >= min_inside),
             ("–" if np.isnan(s.outside) else f"{100 * s.outside:.1f}", False),
             (f"{s.overlap:.2f}", False),
-            (f"{s.rival_overlap:.2f}", s.beaten(m.limits)),
+            (f"{s.rivals[0].overlap:.2f}", s.beaten(m.limits)),
             (s.shift_text, s.shifted(m.limits)),
             (f"{s.lag:+d}" if s.lag else "0", s.lag != 0),
             ("–", False) if filled is None else (f"{filled:.1%}", filled < m.limits.hull_warning),

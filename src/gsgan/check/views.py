@@ -42,7 +42,6 @@ from gsgan.utils.errors import DataError
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 FAR = 0.3  # metres: distances of joints from the mask are clipped to this before they are averaged
 SMALL = 128  # pixels, longest side of the masks that calibrations are tried on and hulls carved by
 TAILS = 20000  # files whose end is read
@@ -113,7 +112,7 @@ def subject_of(data: GsganData) -> Subject:
         pairs={name: tuple(sorted(layout.images[name])) for name in layout.camera_names},
         p=np.stack([layout.landmarks.p[int(f)] for f in frames]),
         visible=np.stack([layout.landmarks.visibility[int(f)] for f in frames]) > 0,
-        up=np.array(UP[axis[-1]]) * (-1.0 if axis.startswith("-") else 1.0),
+        up=np.eye(3)["xyz".index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0),
     )
 
 

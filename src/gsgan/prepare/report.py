@@ -40,8 +40,7 @@ EMPTY = 60  # grey of a tile without image
 FAR = 10_000  # pixels: drawing stops there
 LEGEND = (
     "Blue: the person's left, orange: the right, white: the middle. Lines: the 3D joints "
-    "projected; large dots: detections, sides corrected. Green: the mask's outline and box; "
-    "yellow: the joints' box."
+    "projected; large dots: detections, sides corrected. Green: the mask's outline."
 )
 
 
