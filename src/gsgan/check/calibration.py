@@ -250,17 +250,17 @@ def _of_all(scores: Sequence[CameraScore], limits: Limits) -> Finding | None:
     """One finding when every camera is wrong."""
     wrong = [s for s in scores if s.wrong(limits)]
     if all(s.shifted(limits) for s in scores):
+        shifts = listed(f"{s.name} {s.shift_text}" for s in scores)
         text = (
-            "in every camera the masks lie beside the skeleton, by pixels right, down: "
-            f"{listed(f'{s.name} {s.shift_text}' for s in scores)}; the skeleton is moved or of "
-            "another size, or images were cropped and K did not follow"
+            f"in every camera the masks lie beside the skeleton, by pixels right, down: {shifts}; "
+            "the skeleton is moved or of another size, or K does not follow a crop"
         )
         return Finding("error" if wrong else "warning", TOPIC, text)
     if len(wrong) == len(scores) and not any(s.beaten(limits) for s in scores):
+        shares = listed(f"{s.name} {s.inside:.0%}" for s in scores)
         text = (
-            "in every camera joints lie outside the masks (inside: "
-            f"{listed(f'{s.name} {s.inside:.0%}' for s in scores)}): the skeleton's axes, unit or "
-            "frame numbers do not fit the cameras, or the masks belong to other images"
+            f"in every camera joints lie outside the masks (inside: {shares}): axes, unit or frame "
+            "numbers of the skeleton are wrong, or the masks belong to other images"
         )
         return Finding("error", TOPIC, text)
     return None

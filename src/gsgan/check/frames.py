@@ -145,7 +145,7 @@ def doubts(
 ) -> list[Doubt]:
     """Every reason to doubt a frame, in order of frames.
 
-    Masks of ``unfit`` cameras, which do not fit as a whole, are not used for single frames.
+    Masks of ``unfit`` cameras are not used: they do not fit in any frame.
     """
     found = list(motion.doubts)
     for name, own in grouped(views).items():

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gsgan.check.report import Finding, Table
@@ -17,7 +16,6 @@ from gsgan.data.formats.trust import Float, far_cameras
 from gsgan.skeleton.sanitise import limb_length_sum
 from gsgan.utils.palette import BLACK, COLOURS, GREY
 
-NAMES = 12  # cameras that are named seen from the side, where they crowd
 IMPOSSIBLE = (0.4, 3.0)  # metres of person outside which units are wrong
 
 
@@ -84,16 +82,11 @@ def rig_findings(subject: Subject, rig: Rig, limits: Limits) -> list[Finding]:
     found = [Finding("error", "units", text) for text in rig.far.values()]
     possible = IMPOSSIBLE[0] <= rig.stature <= IMPOSSIBLE[1]
     if not limits.height_warning_low <= rig.stature <= limits.height_warning_high:
-        text = (
-            f"limb lengths suggest a person of {rig.stature:.3g} m; check the unit of the skeleton "
-            "and the order of its joints"
-        )
+        text = f"limb lengths suggest a person of {rig.stature:.3g} m; check unit and joint order"
         found.append(Finding("warning" if possible else "error", "units", text))
     if rig.lean > limits.lean:
-        text = (
-            f"the person's trunk points along {axis_name(rig.up)}, {rig.lean:.0f} degrees from "
-            f"the up axis {subject.layout.meta.up_axis}; check up_axis"
-        )
+        way, axis = axis_name(rig.up), subject.layout.meta.up_axis
+        text = f"the trunk points along {way}, {rig.lean:.0f} degrees from the up axis {axis}"
         found.append(Finding("warning", "units", text))
     return found
 
@@ -117,13 +110,12 @@ def lens_table(subject: Subject, rig: Rig) -> Table:
     rows = []
     for name, camera in subject.cameras.items():
         (height, width), K = camera.size, camera.K
-        terms = [f"{c:.3g}" for c in np.trim_zeros(camera.dist, "b")]
         rows.append((
             name,
             f"{width}×{height}",
             f"{K[0, 0]:.0f}, {K[1, 1]:.0f}",
             f"{K[0, 2] / width:.2f}, {K[1, 2] / height:.2f}",
-            " ".join(terms) or "none",
+            " ".join(f"{c:.3g}" for c in np.trim_zeros(camera.dist, "b")) or "none",
             f"{rig.distances[name]:.2f}",
             str(len(subject.pairs[name])),
         ))  # fmt: skip
@@ -138,37 +130,25 @@ def rig_drawing(subject: Subject) -> bytes:
     """Cameras, viewing directions and the person's path, from above and from the side."""
     figure = Figure((9, 4.5), layout="tight")
     first, second = ground_axes(subject.up)
+    row, hips = len(subject.frames) // 2, subject.p[:, list(subject.template.hips)].mean(1)
+    centres = np.stack([camera.centre for camera in subject.cameras.values()])
+    reach = 0.25 * max(1.0, float(np.ptp(centres, axis=0).max()))  # metres
     titles = {"seen from above": second, "seen from the side": subject.up}
     for axes, (title, up) in zip(figure.subplots(1, 2), titles.items(), strict=True):
-        named = up is second or len(subject.cameras) <= NAMES
-        _panel(axes, subject, np.stack([first, up]), named)
+        plane = np.stack([first, up])
+        axes.plot(*plane @ hips.T, color=GREY)
+        for edge in map(list, subject.template.edges):
+            if subject.visible[row, edge].all():
+                axes.plot(*plane @ subject.p[row, edge].T, color=BLACK, linewidth=1)
+        for i, (name, camera) in enumerate(subject.cameras.items()):
+            colour = COLOURS[i % len(COLOURS)]
+            line = plane @ np.stack([camera.centre, camera.centre + reach * camera.R[2]], 1)
+            axes.plot(*line, color=colour, linestyle=":", marker="o", markevery=[0])
+            axes.annotate(name, tuple(line[:, 0]), (4, 4), textcoords="offset points", color=colour)
         axes.set(title=title, xlabel=f"{axis_name(first)} (m)", ylabel=f"{axis_name(up)} (m)")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.grid(alpha=0.3)
     return svg(figure)
-
-
-def _panel(axes: Axes, subject: Subject, plane: Float, named: bool) -> None:
-    """Draws onto the plane ``[2, 3]``: right, up."""
-    axes.plot(*plane @ subject.p[:, list(subject.template.hips)].mean(1).T, color=GREY)
-    row = len(subject.frames) // 2
-    for edge in map(list, subject.template.edges):
-        if subject.visible[row, edge].all():
-            axes.plot(*plane @ subject.p[row, edge].T, color=BLACK, linewidth=1)
-    centres = np.stack([camera.centre for camera in subject.cameras.values()])
-    reach = 0.1 * max(1.0, float(np.ptp(centres, axis=0).max()))  # metres
-    for i, (name, camera) in enumerate(subject.cameras.items()):
-        colour, (height, width) = COLOURS[i % len(COLOURS)], camera.size
-        corners = np.array([[0, 0, 1], [width, 0, 1], [width, height, 1], [0, height, 1]], float)
-        ends = camera.centre + reach * corners @ np.linalg.inv(camera.K).T @ camera.R
-        for line in (ends[[0, 1, 2, 3, 0]], *(np.stack([camera.centre, end]) for end in ends)):
-            axes.plot(*plane @ line.T, color=colour, linewidth=0.8)
-        aim = np.stack([camera.centre, camera.centre + 2.2 * reach * camera.R[2]])
-        axes.plot(*plane @ aim.T, color=colour, linewidth=0.8, linestyle=":")
-        if named:
-            axes.annotate(
-                name, tuple(plane @ camera.centre), (4, 4), textcoords="offset points", color=colour
-            )
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(alpha=0.3)
 
 
 def svg(figure: Figure) -> bytes:

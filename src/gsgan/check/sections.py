@@ -9,20 +9,11 @@ import numpy as np
 from matplotlib.figure import Figure as Plot
 from rich.console import Console
 
-from gsgan.check import agreement, overlays, rig
+from gsgan.check import agreement, overlays, rig, views
 from gsgan.check.calibration import calibration_findings, score_cameras
 from gsgan.check.frames import doubts, frame_findings, motion_of, shortened
 from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.views import (
-    Subject,
-    grouped,
-    measure,
-    nanmedian,
-    sampled_items,
-    subject_of,
-    suspicious_items,
-)
 from gsgan.data.formats.trust import spread
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.table import HEADERS, rows
@@ -63,9 +54,10 @@ class Measured:
         console: Console | None,
     ) -> None:
         self.data, self.sampling, self.limits, self.effects = data, sampling, limits, effects
-        self.subject = subject = subject_of(data)
-        items = (*sampled_items(subject, sampling.pictures), *suspicious_items(subject, sampling))
-        self.views, broken = measure(subject, tuple(dict.fromkeys(items)), sampling, console)
+        self.subject = subject = views.subject_of(data)
+        items = views.sampled_items(subject, sampling.pictures)
+        items += views.suspicious_items(subject, sampling)
+        self.views, broken = views.measure(subject, items, sampling, console)
         if len(broken) > LISTED_BROKEN:
             broken[LISTED_BROKEN:] = [f"{len(broken)} sampled images cannot be read"]
         self.rig = rig.rig_of(subject)
@@ -100,7 +92,7 @@ class Measured:
             },
             "camera_distance": self.rig.distance,
             "stature": self.rig.stature,
-            "reprojection_px": float(nanmedian(self.motion.reprojection.ravel())),
+            "reprojection_px": float(views.nanmedian(self.motion.reprojection.ravel())),
             "doubtful_frames": {str(frame): text for frame, text in self.reasons.items()},
             "settings": {
                 "sampling": asdict(self.sampling),
@@ -112,9 +104,7 @@ class Measured:
 
 def sections(m: Measured) -> tuple[Section, ...]:
     """Every section, in reading order."""
-    rig_text = (
-        "The cameras with their viewing directions (dotted), the person and their path (grey)."
-    )
+    rig_text = "The cameras, their viewing directions (dotted), the person and the path (grey)."
     units = Section(
         "Units and cameras",
         tables=(rig.units_table(m.subject, m.rig), rig.lens_table(m.subject, m.rig)),
@@ -170,11 +160,11 @@ def _split(data: GsganData, name: str) -> str:
     if not items:
         return f"empty: {data.splits.reasons.get(name, '')}"
     cameras, frames = {camera for camera, _ in items}, {frame for _, frame in items}
-    count, views = counted(len(items), "image"), counted(len(cameras), "camera")
-    return f"{count}: {views}, frames {shortened(sorted(frames))}"
+    count = f"{counted(len(items), 'image')}: {counted(len(cameras), 'camera')}"
+    return f"{count}, frames {shortened(sorted(frames))}"
 
 
-def _missing_images(subject: Subject) -> list[Finding]:
+def _missing_images(subject: views.Subject) -> list[Finding]:
     """The frames that some cameras lack."""
     every = [int(f) for f in subject.frames]
     texts = []
@@ -224,7 +214,7 @@ def _overlays(m: Measured) -> Section:
             f"camera {name}",
             overlays.strip(m.subject, spread(own, m.sampling.shown), m.sampling.tile, m.reasons),
         )
-        for name, own in grouped(m.views).items()
+        for name, own in views.grouped(m.views).items()
     ]
     return Section("Overlays", aside=(overlays.LEGEND,), figures=tuple(figures))
 
@@ -259,7 +249,7 @@ def _series(m: Measured) -> bytes:
     """Four charts over the frames, with a tick at the bottom for each doubtful frame."""
     figure = Plot((10, 6.8), layout="tight")
     inside, area, jump, seen = every = figure.subplots(4, sharex=True)
-    for i, (name, own) in enumerate(grouped(m.views).items()):
+    for i, (name, own) in enumerate(views.grouped(m.views).items()):
         own = sorted(own, key=lambda view: view.frame)
         frames, colour = [view.frame for view in own], COLOURS[i % len(COLOURS)]
         label = name if i < LEGEND else None

@@ -225,7 +225,7 @@ def complete(path: Path) -> bool:
 def measure(
     subject: Subject, items: Sequence[Item], sampling: Sampling, console: Console | None = None
 ) -> tuple[list[View], list[str]]:
-    """Decodes and measures images; the messages of those that cannot be read."""
+    """Decodes and measures images, each once; the messages of those that cannot be read."""
 
     def one(item: Item) -> View | str:
         try:
@@ -235,7 +235,9 @@ def measure(
 
     bar = Progress(transient=True, console=console, disable=console is None)
     with ThreadPoolExecutor(sampling.workers) as pool, bar:
-        results = list(bar.track(pool.map(one, items), len(items), description="checking images"))
+        unique = tuple(dict.fromkeys(items))
+        found = bar.track(pool.map(one, unique), len(unique), description="checking images")
+        results = list(found)
     views = [result for result in results if isinstance(result, View)]
     return views, [result for result in results if isinstance(result, str)]
 

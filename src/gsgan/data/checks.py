@@ -191,30 +191,23 @@ def drop_unmasked(
     Raises:
         DataError: when more are missing than allowed, naming one in the ``expected`` folders.
     """
-    lacking = {c: [f for f in files if not masks[c].get(f)] for c, files in images.items()}
-    count = sum(len(files) for files in images.values())
-    missing = sum(len(frames) for frames in lacking.values())
-    if missing == 0:
+    lost = [(c, f) for c, files in images.items() for f in files if not masks[c].get(f)]
+    if not lost:
         return images
-    camera = next(c for c, frames in lacking.items() if frames)
-    frame = lacking[camera][0]
-    path = (expected[camera] / Path(images[camera][frame]).name).with_suffix(".png")
-    first = f"{len(lacking[camera])} of the {len(images[camera])} of camera {camera} are missing"
-    if checks.max_missing_masks == 0:
-        raise DataError(f"{path} does not exist; every image needs a mask, and {first}")
-    share = missing / count
-    if share > checks.max_missing_masks:
+    (camera, frame), count = lost[0], sum(len(files) for files in images.values())
+    if len(lost) > checks.max_missing_masks * count:
+        path = (expected[camera] / Path(images[camera][frame]).name).with_suffix(".png")
+        here = sum(c == camera for c, _ in lost)
         raise DataError(
-            f"{path} does not exist, and {share:.0%} of all {count} images have no mask ({first}); "
-            f"at most {checks.max_missing_masks:.0%} may be left out (max_missing_masks)"
+            f"{path} does not exist; every image needs a mask, and {here} of the "
+            f"{len(images[camera])} of camera {camera} are missing: {len(lost) / count:.0%} of all "
+            f"{count} images have no mask, allowed are {checks.max_missing_masks:.0%}"
         )
     notes.append(
-        f"{missing} of {count} images have no mask and are left out "
+        f"{len(lost)} of {count} images have no mask and are left out "
         f"(first: camera {camera}, frame {frame})"
     )
-    return {
-        c: {f: path for f, path in files.items() if masks[c].get(f)} for c, files in images.items()
-    }
+    return {c: {f: p for f, p in files.items() if masks[c].get(f)} for c, files in images.items()}
 
 
 def check_pictures(

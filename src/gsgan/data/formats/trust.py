@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.checks import spans
 from gsgan.data.crop import NEAR, project
-from gsgan.data.files import read_grey
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
 from gsgan.utils.errors import DataError
@@ -146,24 +145,21 @@ def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
 def _notes(root: Path, compared: Sequence[Meeting], trust: Trust, hint: str) -> list[str]:
     """One note on joints outside masks, one on masks beyond joints, where there are any."""
     notes = []
-    inside = _means(compared, "inside")
+    inside, beyond = _means(compared, "inside"), _means(compared, "beyond")
     outside = {name for name, share in inside.items() if share < trust.min_inside}
     if outside:
-        shares, others = _listed(inside, outside)
-        text = f"joints lie outside the masks (inside: {shares}{others})"
+        text = f"joints lie outside the masks (inside: {_listed(inside, outside)})"
         if min(inside.values()) < trust.least_inside:
             raise DataError(f"{root}: {text}; {hint}: python -m gsgan.check finds the wrong camera")
         notes.append(
             f"{text}: python -m gsgan.check finds whether calibration, skeleton or masks are wrong"
         )
-    beyond = _means(compared, "beyond")
     wide = {n for n, share in beyond.items() if share > trust.max_beyond and n not in outside}
     if wide:
-        shares, others = _listed(beyond, wide)
         notes.append(
-            f"masks reach more than {trust.joint_reach:g} m beyond all joints ({shares} of the "
-            f"mask{others}): focal lengths are too short, masks show more than the person, or the "
-            "skeleton lacks limbs: python -m gsgan.check reports more"
+            f"masks reach more than {trust.joint_reach:g} m beyond all joints (share: "
+            f"{_listed(beyond, wide)}): focal lengths are too short, masks show more than the "
+            "person, or the skeleton lacks limbs: python -m gsgan.check reports more"
         )
     return notes
 
@@ -177,11 +173,11 @@ def _means(compared: Sequence[Meeting], field: str) -> dict[str, float]:
     return {name: float(np.mean(some)) for name, some in kept.items()}
 
 
-def _listed(means: Mapping[str, float], named: set[str]) -> tuple[str, str]:
-    """The shares of the named cameras, and the mean of the others as a clause."""
+def _listed(means: Mapping[str, float], named: set[str]) -> str:
+    """The shares of the named cameras, and the mean of the others."""
     text = ", ".join(f"{name} {share:.0%}" for name, share in means.items() if name in named)
     rest = [share for name, share in means.items() if name not in named]
-    return text, f"; {np.mean(rest):.0%} in the other cameras" if rest else ""
+    return f"{text}; {np.mean(rest):.0%} in the other cameras" if rest else text
 
 
 def mask_distance(mask: Bool) -> Float:
@@ -258,11 +254,9 @@ def box_of(points: Float, camera: CameraEntry) -> Box | None:
     pixels = camera.stored_pixels(points[depth > NEAR])
     if len(pixels) == 0:
         return None
-    height, width = camera.size
-    (left, top), (right, bottom) = (
-        np.clip(edge, 0, (width, height)) for edge in (pixels.min(0), pixels.max(0))
-    )
-    return float(left), float(top), float(right), float(bottom)
+    edges = np.clip([pixels.min(0), pixels.max(0)], 0, camera.size[::-1])
+    (left, top), (right, bottom) = edges.tolist()
+    return left, top, right, bottom
 
 
 def mask_box(mask: Bytes) -> Box | None:
@@ -307,8 +301,3 @@ def watch_masks(layout: Layout, trust: Trust) -> list[str]:
         for case, at in (("mask is empty", ~filled), (off, odd))
         if at.any()
     ]
-
-
-def highest_label(root: Path, files: list[str]) -> int:
-    """The highest value in some label images, 0 without any."""
-    return max((int(read_grey(root / path).max()) for path in files), default=0)

@@ -24,11 +24,11 @@ from numpy.typing import NDArray
 from gsgan.body.smpl import SkinnedModel
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.checks import Checks
-from gsgan.data.files import frame_files
+from gsgan.data.files import frame_files, read_grey
 from gsgan.data.formats import zju_annots, zju_caches
 from gsgan.data.formats.common import FolderReader, body_model, no_joints, up_axis
 from gsgan.data.formats.smpl_motion import landmarks_of, posed
-from gsgan.data.formats.trust import Trust, highest_label, spread
+from gsgan.data.formats.trust import Trust, spread
 from gsgan.data.layout import BodyModel, Found, Layout, Meta
 from gsgan.data.pixels import MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
@@ -190,7 +190,7 @@ class ZjuReader(FolderReader):
             return layout
         camera, files = next((c, files) for c, files in layout.labels.items() if files)
         some = [files[f] for f in spread(sorted(files), self.trust.watched_masks)]
-        highest = highest_label(layout.root, some)
+        highest = max((int(read_grey(layout.root / path).max()) for path in some), default=0)
         if highest < len(CIHP):
             return layout
         note = (
