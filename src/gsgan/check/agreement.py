@@ -119,12 +119,7 @@ def hull_findings(score: Mapping[str, tuple[float, float]], limits: Limits) -> l
     name, (_, without) = max(score.items(), key=lambda item: item[1][1])
     text = f"the masks do not agree: together they fill {mean:.0%} of themselves"
     if without - mean > GAIN:
-        text += (
-            f", and {without:.0%} without camera {name}; its masks or its calibration do not fit "
-            "the other cameras"
-        )
-    else:
-        text += f" (least: {min(filled, key=lambda name: filled[name])}); see the overlays"
+        text += f", and {without:.0%} without camera {name}: its masks or calibration do not fit"
     return [Finding("warning", "masks", text)]
 
 

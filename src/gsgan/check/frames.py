@@ -149,29 +149,24 @@ def doubts(
     """
     found = list(motion.doubts)
     for name, own in grouped(views).items():
-        if name not in unfit:
-            full = [view.fullness for view in own if view.mask.any()]
-            usual = float(np.median(full)) if full else 0.0
-            found += [
-                Doubt(view.frame, kind, f"{name}: {text}")
-                for view in own
-                for kind, text in _of_view(view, usual, limits)
-            ]
+        full = [view.fullness for view in own if view.mask.any()]
+        usual = float(np.median(full)) if full else 0.0
+        for view in own if name not in unfit else ():
+            found += [Doubt(view.frame, *doubt) for doubt in _of_view(view, usual, limits)]
     return sorted(found, key=lambda doubt: doubt.frame)
 
 
 def _of_view(view: View, usual: float, limits: Limits) -> Iterable[tuple[str, str]]:
-    if not view.mask.any():
-        yield "mask", "the mask is empty"
-        return
     known, out = int(view.known.sum()), int(view.beyond.sum())
+    if not view.mask.any():
+        yield "mask", f"{view.camera}: the mask is empty"
+        return
     if known and out / known > limits.frame_outside:
-        yield "outside", f"{out} of {known} joints outside the mask"
-    if known < limits.seen_share * len(view.known):
-        return  # the estimated silhouette is too incomplete to compare the mask with
+        yield "outside", f"{view.camera}: {out} of {known} joints outside the mask"
     change = view.fullness / usual - 1 if usual else 0.0
-    if abs(change) > limits.area_jump:
-        yield "mask", f"mask area {change:+.0%} off the usual for the pose"
+    # else the estimated silhouette is too incomplete to compare the mask with
+    if known >= limits.seen_share * len(view.known) and abs(change) > limits.area_jump:
+        yield "mask", f"{view.camera}: mask area {change:+.0%} off the usual for the pose"
 
 
 def frame_findings(

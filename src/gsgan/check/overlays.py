@@ -17,7 +17,6 @@ from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float
 from gsgan.skeleton.template import SkeletonTemplate
 
 Bytes = NDArray[np.uint8]
-Colour = tuple[int, int, int]
 
 ASPECT = 0.75  # width to height of a tile: a standing person
 MARGIN = 0.08  # of the box about person and skeleton, on each side
@@ -116,14 +115,14 @@ def draw(
     return canvas
 
 
-def _side(template: SkeletonTemplate, a: int, b: int) -> Colour:
+def _side(template: SkeletonTemplate, a: int, b: int) -> tuple[int, int, int]:
     for side, colour in (("left", LEFT), ("right", RIGHT)):
         if side in template.names[a] and side in template.names[b]:
             return colour
     return MIDDLE
 
 
-def caption(image: Bytes, text: str, colour: Colour) -> Bytes:
+def caption(image: Bytes, text: str, colour: tuple[int, int, int]) -> Bytes:
     """The image under a bar of the colour with white text."""
     bar = np.full((BAR, image.shape[1], 3), colour, np.uint8)
     cv2.putText(
@@ -134,7 +133,4 @@ def caption(image: Bytes, text: str, colour: Colour) -> Bytes:
 
 def encode(image: Bytes) -> bytes:
     """A JPEG of an RGB image."""
-    ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    if not ok:
-        raise OSError("an image of the report could not be encoded as JPEG")
-    return data.tobytes()
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()

@@ -12,7 +12,6 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-Level = Literal["error", "warning"]
 STYLES = {"error": "bold red", "warning": "yellow"}
 
 PAGE = """<!DOCTYPE html>
@@ -59,7 +58,7 @@ class Finding:
     An error makes the command fail; a warning is only listed.
     """
 
-    level: Level
+    level: Literal["error", "warning"]
     topic: str
     sentence: str
 

@@ -57,10 +57,8 @@ class Subject:
 
     Args:
         layout, trust: the reader's index and thresholds.
-        frames: ``[F]`` rising frame numbers.
-        pairs: frame numbers that exist, by camera.
-        p: ``[F, J, 3]`` metres, finite.
-        visible: ``[F, J]``.
+        frames, pairs: ``[F]`` rising frame numbers; those that exist, by camera.
+        p, visible: ``[F, J, 3]`` metres, finite; ``[F, J]``.
         up: ``[3]`` unit, the world's up axis.
         template: names of the joints and bones.
     """

@@ -102,8 +102,7 @@ def surface_colours(
 def body_inside(frame: Frame, body: SkinnedBody) -> float | None:
     """Share of the posed body's vertices in the image that lie inside the mask, within 3 cm.
 
-    Returns:
-        None where the image shows none of them, or its mask is empty.
+    None where the image shows none of them, or its mask is empty.
     """
     with torch.no_grad():
         pixels, inside, depth = _place(frame, _skin(body, frame))

@@ -142,9 +142,6 @@ def doubts_about_solution(
         if scatter > limits.bone:
             bone = f"{joint_names()[a]} to {joint_names()[b]}"
             found.append(f"the length from {bone} scatters by {scatter:.0%} about {usual:.2f} m")
-    if removed := {why: count for why, count in solution.removed.items() if count}:
-        text = ", ".join(f"{count} {why}" for why, count in removed.items())
-        found.append(f"joints removed as impossible: {text}")
     return found
 
 

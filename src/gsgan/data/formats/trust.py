@@ -58,11 +58,11 @@ class Meeting:
     """One image's mask against what its camera should see.
 
     Args:
-        camera, frame, mask: of the image; the (first) file of its mask.
-        empty: the mask has no foreground.
+        camera, frame, mask, empty: of the image; the (first) file of its mask, and whether that
+            has no foreground.
         iou: overlap of the boxes of mask and projected body; NaN when one of them is empty.
-        inside: share of the visible joints inside the mask; NaN of none.
-        beyond: share of the mask far from every visible joint; NaN of none.
+        inside, beyond: share of the visible joints inside the mask, and of the mask far from every
+            visible joint; NaN of none.
     """
 
     camera: str
@@ -86,7 +86,7 @@ def check_meeting(
         hint: what to check when they do not fit.
 
     Returns:
-        Notes on the cameras whose joints lie outside their masks, or masks far from their joints.
+        Notes on cameras whose joints lie outside their masks, or masks far from their joints.
 
     Raises:
         DataError: naming the camera that is furthest off, or the first empty mask.
@@ -261,10 +261,8 @@ def box_of(points: Float, camera: CameraEntry) -> Box | None:
 
 def mask_box(mask: Bytes) -> Box | None:
     """The box of a mask's person, None when it is empty."""
-    rows, columns = (np.flatnonzero((mask > 127).any(axis)) for axis in (1, 0))
-    if len(rows) == 0:
-        return None
-    return float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
+    left, top, width, height = cv2.boundingRect((mask > 127).astype(np.uint8))
+    return (left, top, left + width, top + height) if width else None
 
 
 def box_iou(a: Box, b: Box) -> float:
