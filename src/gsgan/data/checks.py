@@ -62,6 +62,8 @@ def drop_frames(
             f"{root} ({landmarks.source}) has no usable frame: "
             + "; ".join(f"{len(ids)} {reason}" for reason, ids in dropped.items())
         )
+    if unseen := len(set(landmarks.p) - set(frames)):
+        notes.append(f"{unseen} frames in {landmarks.source} have no image and are not used")
     uneven = [f"{name} {len(files)}" for name, files in images.items() if len(files) < len(frames)]
     if uneven:
         notes.append(
