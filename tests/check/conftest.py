@@ -37,14 +37,15 @@ def copy(good: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def check(monkeypatch: pytest.MonkeyPatch):
     """Checks a folder: ``check(root, pictures=48, joint_jump=0.1, trust={"min_inside": 0.7})``."""
-    from gsgan.check import charts
+    from gsgan.check import rig, sections
     from gsgan.check.run import check_data
     from gsgan.data.datamodule import GsganData
     from gsgan.data.formats.capture import CaptureReader
     from gsgan.data.formats.trust import Trust
 
-    for name in ("rig_drawing", "series_chart"):  # tests of the command draw them
-        monkeypatch.setattr(charts, name, lambda *_: b"<?")
+    # tests of the command draw them
+    monkeypatch.setattr(rig, "rig_drawing", lambda _: b"<?")
+    monkeypatch.setattr(sections, "_series", lambda _: b"<?")
 
     def run(root: Path, pictures: int = 48, trust: dict | None = None, **limits: float) -> Report:
         sampling = Sampling(

@@ -124,7 +124,7 @@ def test_settings_that_make_no_sense_are_one_sentence(good, command):
 def test_strict_must_be_true_or_false(good, command):
     code, output, page = command(f"data.root={good}", "strict=maybe")
     assert code == 1
-    assert "strict must be true or false, got 'maybe'" in output
+    assert "strict must be one of True, False, got 'maybe'" in output
     assert page == ""
 
 

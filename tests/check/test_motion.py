@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from make import skeletons
 
-from gsgan.check.motion import (
+from gsgan.check.frames import (
     body_parts,
     facing,
     frozen,
@@ -15,7 +15,6 @@ from gsgan.check.motion import (
     length_change,
     limb_lengths,
     measured_joints,
-    runs,
     swapped,
 )
 from gsgan.skeleton.template import MEDIAPIPE33
@@ -83,11 +82,6 @@ def test_only_joints_with_bones_that_change_are_measured(seen):
     measured = measured_joints(change, MEDIAPIPE33, share=0.05)
     assert measured[[13, 15]].all()
     assert not measured[23:].any()
-
-
-def test_runs():
-    assert runs(np.array([1, 1, 0, 1, 0, 0, 1], bool)) == [(0, 1), (3, 3), (6, 6)]
-    assert runs(np.zeros(3, bool)) == []
 
 
 @pytest.mark.parametrize("part", ["face", "arms", "legs"])

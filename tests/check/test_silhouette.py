@@ -5,13 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsgan.check.silhouette import (
-    best_shift,
-    body_silhouette,
-    box,
-    moved,
-    overlap,
-)
+from gsgan.check.views import best_shift, body_silhouette, moved, overlap
 from gsgan.data.cameras import CameraEntry
 from gsgan.skeleton.template import MEDIAPIPE33
 
@@ -22,18 +16,10 @@ def square(size=(40, 60), rows=slice(10, 20), columns=slice(20, 40)):
     return mask
 
 
-def test_overlap_and_box():
+def test_overlap():
     a, b = square(), square(columns=slice(30, 50))
     assert overlap(a, b) == pytest.approx(1 / 3)
     assert overlap(a & ~a, b & ~b) == 0
-    assert box(a) == pytest.approx([20, 10, 40, 20], abs=0.5)
-    assert np.isnan(box(a & ~a)).all()
-
-
-def test_box_leaves_specks_out():
-    mask = square(size=(100, 100), rows=slice(20, 80), columns=slice(30, 60))
-    mask[2, 97] = True
-    assert box(mask) == pytest.approx([30, 20, 60, 80], abs=1)
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (7, 0), (-6, 4), (15, -9)])

@@ -108,7 +108,7 @@ def test_a_camera_whose_focal_length_alone_is_halved_is_named(root: Path) -> Non
     edit_json(root / "cameras.json", halve)
     trust = Trust(min_box_iou=0, min_inside=0, least_inside=0)  # where joints stay inside as well
     (note,) = read(root, trust).notes
-    assert re.match(r"masks reach .* beyond all joints \(cam02 \d\d% of .*; [0-3]% in the o", note)
+    assert re.match(r"masks reach .* beyond all joints \(share: cam02 \d\d%; [0-3]% in the o", note)
     assert read(root, replace(trust, max_beyond=1)).notes == ()
     (other,) = read(root, replace(trust, min_inside=0.9)).notes
     assert other.startswith("joints lie outside the masks (inside: cam02 ")

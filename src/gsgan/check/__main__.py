@@ -6,8 +6,8 @@ import sys
 
 from omegaconf import DictConfig
 
+from gsgan.utils.checks import one_of
 from gsgan.utils.config import FAILED, entry
-from gsgan.utils.errors import ConfigError
 
 
 def check(config: DictConfig) -> None:
@@ -20,8 +20,7 @@ def check(config: DictConfig) -> None:
     """
     from gsgan.check.run import run_check
 
-    if not isinstance(config.strict, bool):
-        raise ConfigError(f"strict must be true or false, got {config.strict!r}")
+    one_of("strict", config.strict, (True, False))
     report = run_check(config)
     if report.errors or (config.strict and report.warnings):
         sys.exit(FAILED)

@@ -8,7 +8,6 @@ away what the others show.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,8 +15,7 @@ from numpy.typing import NDArray
 
 from gsgan.check.report import Finding, Table
 from gsgan.check.settings import Limits
-from gsgan.check.silhouette import thickness
-from gsgan.check.views import Subject, View, grouped
+from gsgan.check.views import Subject, View, grouped, thickness
 from gsgan.data.crop import NEAR, project
 from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float, spread
 from gsgan.data.scene_info import SceneInfo
@@ -31,120 +29,97 @@ CHANNELS = ("red", "green", "blue")
 DARK = 0.05  # darker means give no ratio
 
 
-@dataclass(frozen=True)
-class HullScore:
-    """How well the masks agree.
+def score_hulls(
+    subject: Subject, views: Sequence[View], moments: int
+) -> dict[str, tuple[float, float]]:
+    """How well the masks agree, by camera; empty when fewer than three cameras see one moment.
 
-    Args:
-        filled: share of the mask that the hull fills, by camera.
-        without: mean share in the other cameras when this one does not carve, by camera.
-    """
-
-    filled: dict[str, float]
-    without: dict[str, float]
-
-
-def score_hulls(subject: Subject, views: Sequence[View], moments: int) -> HullScore | None:
-    """Means over at most ``moments`` frames that most cameras saw, evenly spaced.
-
-    None when fewer than three cameras saw one together.
+    Means over at most ``moments`` frames that most cameras saw, evenly spaced: the share of the
+    camera's mask that the hull fills, and the share in the others when this one does not carve.
     """
     by_frame: dict[int, list[View]] = {}
     for view in views:
         by_frame.setdefault(view.frame, []).append(view)
     most = max((len(seen) for seen in by_frame.values()), default=0)
     if most < LEAST_CAMERAS:
-        return None
+        return {}
     full = sorted(frame for frame, seen in by_frame.items() if len(seen) == most)
-    filled: dict[str, list[float]] = {}
-    without: dict[str, list[float]] = {}
+    found: dict[str, list[Float]] = {}
     for frame in spread(full, moments):
         for view, *shares in zip(by_frame[frame], *_shares(subject, by_frame[frame]), strict=True):
-            filled.setdefault(view.camera, []).append(shares[0])
-            without.setdefault(view.camera, []).append(shares[1])
-    return HullScore(
-        {name: float(np.mean(values)) for name, values in filled.items()},
-        {name: float(np.mean(values)) for name, values in without.items()},
-    )
+            found.setdefault(view.camera, []).append(np.array(shares))
+    means = {name: np.mean(shares, axis=0) for name, shares in found.items()}
+    return {name: (float(filled), float(without)) for name, (filled, without) in means.items()}
 
 
 def _shares(subject: Subject, views: Sequence[View]) -> tuple[Float, Float]:
-    """Of one moment, ``[C]`` each: the values of `HullScore`."""
-    joints = subject.p[subject.rows[views[0].frame]]
-    joints = joints[subject.visible[subject.rows[views[0].frame]]]
+    """Of one moment, ``[C]`` each: the two shares of `score_hulls`."""
+    row = subject.rows[views[0].frame]
+    joints = subject.p[row][subject.visible[row]]
     low, high = joints.min(0) - AIR, joints.max(0) + AIR
     axes = [np.arange(a, b, VOXEL) + VOXEL / 2 for a, b in zip(low, high, strict=True)]
     voxels = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-    seen = [_project(subject, view, voxels) for view in views]
-    inside = np.stack([inside for inside, _ in seen])
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), -1).reshape(-1, 3)
-    masks = [view.mask & _covered(subject, view, corners) for view in views]
-    grown = [_grown(subject, view) for view in views]
+    seen = [_carve(subject, view, voxels, corners) for view in views]
+    inside = np.stack([kept for kept, *_ in seen])
 
-    def filled(kept: Bool) -> Float:
-        """Share of each mask that the kept voxels cover; NaN when empty."""
+    def filled(kept: Bool) -> Float:  # share of each mask that voxels cover; NaN when empty
         shares = np.full(len(views), np.nan)
-        for i, mask in enumerate(masks):
+        for i, (_, pixels, mask, side) in enumerate(seen):
             if mask.any():
                 canvas = np.zeros(mask.shape, np.uint8)
-                at = seen[i][1][kept]
-                at = at[at[:, 0] >= 0]
-                canvas[at[:, 1], at[:, 0]] = 1
-                covered = cv2.dilate(canvas, np.ones((grown[i], grown[i]), np.uint8)) > 0
+                column, row = pixels[kept].T
+                canvas[row[row >= 0], column[row >= 0]] = 1
+                covered = cv2.dilate(canvas, np.ones((side, side), np.uint8)) > 0
                 shares[i] = np.count_nonzero(covered & mask) / np.count_nonzero(mask)
         return shares
 
-    spared = []
-    for i in range(len(views)):
-        others = np.asarray(np.delete(inside, i, axis=0).all(0))
-        spared.append(float(np.nanmean(np.delete(filled(others), i))))
-    return filled(np.asarray(inside.all(0))), np.array(spared)
+    spared = [
+        float(np.nanmean(np.delete(filled(np.all(np.delete(inside, i, 0), 0)), i)))
+        for i in range(len(views))
+    ]
+    return filled(np.all(inside, 0)), np.array(spared)
 
 
-def _project(subject: Subject, view: View, voxels: Float) -> tuple[Bool, NDArray[np.int64]]:
-    """Which voxels lie in the mask or outside the image; pixels, -1 outside the image."""
+def _carve(
+    subject: Subject, view: View, voxels: Float, corners: Float
+) -> tuple[Bool, NDArray[np.int64], Bool, int]:
+    """What one image keeps of the voxels ``[V, 3]`` in the box with these corners.
+
+    Returns:
+        ``[V]`` whether they lie in the mask or outside the image; their pixels, -1 outside the
+        image; the mask where the image shows the box; pixels that a voxel covers.
+    """
     entry = subject.cameras[view.camera]
+    small = view.small(entry)
     raw, depth = project(entry, voxels)
     height, width = entry.size
     seen = (depth > NEAR) & (raw >= 0).all(1) & (raw[:, 0] < width) & (raw[:, 1] < height)
     limit = np.array(view.mask.shape[::-1]) - 1
-    pixels = np.floor(project(view.small(entry), voxels)[0]).clip(0, limit).astype(np.int64)
+    pixels = np.floor(project(small, voxels)[0]).clip(0, limit).astype(np.int64)
     inside = view.mask[pixels[:, 1], pixels[:, 0]] | ~seen
-    return inside, np.where(seen[:, None], pixels, -1)
+    at, depth = project(small, corners)
+    mask = view.mask
+    if (depth >= NEAR).all():  # else the camera is in the box
+        at = np.clip(at, -FAR_PIXELS, FAR_PIXELS).round().astype(np.int32)
+        shown = cv2.fillConvexPoly(np.zeros(mask.shape, np.uint8), cv2.convexHull(at), 1)
+        mask = mask & (shown > 0)
+    # corner to corner, at the person, plus one
+    metres = max(NEAR, float(project(small, subject.p[subject.rows[view.frame]])[1].mean()))
+    side = thickness(1 + np.sqrt(2) * VOXEL * small.K[0, 0] / metres, small.size)
+    return inside, np.where(seen[:, None], pixels, -1), mask, side
 
 
-def _covered(subject: Subject, view: View, corners: Float) -> Bool:
-    """``[h, w]`` where the image shows the carved box; everywhere when the camera is in it."""
-    pixels, depth = project(view.small(subject.cameras[view.camera]), corners)
-    if (depth < NEAR).any():
-        return np.ones(view.mask.shape, bool)
-    at = np.clip(pixels, -FAR_PIXELS, FAR_PIXELS).round().astype(np.int32)
-    canvas = cv2.fillConvexPoly(np.zeros(view.mask.shape, np.uint8), cv2.convexHull(at), 1)
-    return np.asarray(canvas > 0)
-
-
-def _grown(subject: Subject, view: View) -> int:
-    """Pixels that a voxel at the person covers, corner to corner, plus one."""
-    camera = view.small(subject.cameras[view.camera])
-    depth = max(NEAR, float(project(camera, subject.p[subject.rows[view.frame]])[1].mean()))
-    return thickness(1 + np.sqrt(2) * VOXEL * camera.K[0, 0] / depth, camera.size)
-
-
-def hull_findings(score: HullScore | None, limits: Limits) -> list[Finding]:
+def hull_findings(score: Mapping[str, tuple[float, float]], limits: Limits) -> list[Finding]:
     """Names the camera whose masks or calibration do not fit the others'."""
-    if score is None or all(share >= limits.hull_warning for share in score.filled.values()):
+    filled = {name: share for name, (share, _) in score.items()}
+    if all(share >= limits.hull_warning for share in filled.values()):
         return []
-    mean = float(np.nanmean(list(score.filled.values())))
-    name, without = max(score.without.items(), key=lambda item: item[1])
+    mean = float(np.nanmean(list(filled.values())))
+    name, (_, without) = max(score.items(), key=lambda item: item[1][1])
     text = f"the masks do not agree: together they fill {mean:.0%} of themselves"
     if without - mean > GAIN:
-        text += (
-            f", and {without:.0%} without camera {name}; its masks or its calibration do not fit "
-            "the other cameras"
-        )
-    else:
-        least = min(score.filled, key=lambda name: score.filled[name])
-        text += f" (least: {least}); see the overlays"
+        text += f", and {without:.0%} without camera {name}: its masks or calibration do not fit"
     return [Finding("warning", "masks", text)]
 
 
@@ -174,12 +149,7 @@ def colour_findings(
     """Names the cameras whose colours differ.
 
     Cameras that agree on shared surface are not named: only the side that they see differs.
-
-    Args:
-        colours: of `mean_colours`.
-        info: of the training split, for the difference on shared surface; None: unknown.
-        effects: the difference from which training corrects colours.
-        limits: how much mean colours may differ.
+    ``info`` of the training split has that difference; None: unknown.
     """
     surface = None if info is None else info.surface
     agree = surface is not None and surface.difference < effects.colour_difference
@@ -187,31 +157,28 @@ def colour_findings(
     named = [name for name in differing(colours, limits) if name not in same]
     if not named or len(colours) < 2:
         return []
+    ratios = {name: zip(CHANNELS, colours[name][1], strict=True) for name in named}
     text = "; ".join(
-        f"{name} "
-        + ", ".join(f"{n} {v:.2f}" for n, v in zip(CHANNELS, colours[name][1], strict=True))
-        for name in named
+        f"{name} {', '.join(f'{channel} {value:.2f}' for channel, value in pairs)}"
+        for name, pairs in ratios.items()
     )
-    why = "; seeing another side of the person does this as well"
+    why = "seeing another side of the person does this as well"
     if surface is not None and not agree:
-        why = f"; on shared surface training cameras differ by {surface.difference:.3f}"
-    return [
-        Finding(
-            "warning", "colour",
-            "cameras differ in exposure or white balance (times the median camera's mean colour "
-            f"of the person): {text}{why}. The table of effects shows whether training corrects "
-            "it; effects.colour_correction=on always does",
-        )
-    ]  # fmt: skip
+        why = f"on shared surface training cameras differ by {surface.difference:.3f}"
+    text = (
+        "cameras differ in exposure or white balance (times the median camera's mean colour of "
+        f"the person): {text}; {why}. The table of effects shows whether training corrects it; "
+        "effects.colour_correction=on always does"
+    )
+    return [Finding("warning", "colour", text)]
 
 
 def colour_table(colours: Mapping[str, tuple[Float, Float]], limits: Limits) -> Table:
     """One row per camera."""
-    rows = tuple((name, *map(_triple, values)) for name, values in colours.items())
+    rows = tuple(
+        (name, *(" ".join(f"{v:.2f}" for v in values) for values in pair))
+        for name, pair in colours.items()
+    )
     named = differing(colours, limits)
     flagged = frozenset((i, 2) for i, row in enumerate(rows) if row[0] in named)
     return Table(("camera", "mean RGB of the person", "to the median camera"), rows, flagged)
-
-
-def _triple(values: Float) -> str:
-    return " ".join(f"{v:.2f}" for v in values)

@@ -8,22 +8,19 @@ from itertools import combinations
 
 import numpy as np
 
-from gsgan.check.report import Finding, Level, listed
+from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.silhouette import best_shift, body_silhouette, moved, overlap
-from gsgan.check.views import Subject, View, grouped
+from gsgan.check.views import Subject, View, best_shift, body_silhouette, grouped, moved, overlap
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import project
 from gsgan.data.formats.trust import Bool, spread
 
-OWN = "its own calibration"
-INVERSE = "R and t the other way round"
+TOPIC = "calibration"
 MIRRORED = "mirrored images"
 EXTRINSICS = "R and t of"
 WHOLE = "the whole calibration of"
 ADVICE = {
     MIRRORED: "mirror its images and masks back",
-    INVERSE: "invert its R and t: x_cam = R x + t is expected",
     EXTRINSICS: "check its R, t and folder name",
     WHOLE: "check its calibration and folder name",
 }
@@ -38,12 +35,9 @@ OUTSIDE_RATIO = 3.0  # times the other cameras' distance: noisy landmarks are of
 
 @dataclass(frozen=True)
 class Rival:
-    """Another calibration that a camera may have.
+    """Another calibration that a camera may have, and the mean overlap with it.
 
-    Args:
-        kind: one of `INVERSE`, `MIRRORED`, `EXTRINSICS`, `WHOLE`.
-        other: the camera whose calibration it takes, or empty.
-        overlap: mean overlap of mask and estimated silhouette with it.
+    ``kind`` is a key of `ADVICE`, ``other`` the camera whose calibration it takes, or empty.
     """
 
     kind: str
@@ -56,17 +50,16 @@ class CameraScore:
     """How well one camera's calibration fits its masks.
 
     Args:
-        name: the camera.
-        inside: mean share of joints inside the mask.
+        name, inside: the camera; mean share of joints inside the mask.
         overlap: mean overlap of mask and estimated silhouette.
         fullness: median area of the mask over that of the estimated silhouette.
         rivals: other calibrations, best first.
-        shift: ``(dx, dy)`` pixels of the whole image by which masks lie beside the skeleton.
-        shift_metres: its length at the person.
+        shift, shift_metres: ``(dx, dy)`` pixels of the whole image by which masks lie beside the
+            skeleton; its length at the person.
         shift_overlap: mean overlap once the masks are moved back.
         lag: frames by which the skeleton must be moved to fit best; 0 when nothing is gained.
-        outside: metres, mean distance of the joints from the mask.
-        lag_outside: the same after the lag.
+        outside, lag_outside: metres, mean distance of the joints from the mask, without and with
+            the lag.
     """
 
     name: str
@@ -82,13 +75,13 @@ class CameraScore:
     lag_outside: float
 
     @property
-    def rival_overlap(self) -> float:
-        """Of the best rival."""
-        return self.rivals[0].overlap
+    def shift_text(self) -> str:
+        """Pixels right, down."""
+        return f"{self.shift[0]:+.0f}, {self.shift[1]:+.0f}"
 
     def beaten(self, limits: Limits) -> bool:
         """Whether another calibration fits the masks better, and well."""
-        return self.rival_overlap > max(self.overlap + limits.better_fit, CREDIBLE_OVERLAP)
+        return self.rivals[0].overlap > max(self.overlap + limits.better_fit, CREDIBLE_OVERLAP)
 
     def shifted(self, limits: Limits) -> bool:
         """Whether the masks lie beside the skeleton, by more than bodies and skeletons differ."""
@@ -114,54 +107,40 @@ def score_cameras(
 ) -> list[CameraScore]:
     """Scores every camera of which an image could be read."""
     by_camera = grouped(views)
-    pairs = max(1, 2 * len(by_camera) ** 2)
-    count = min(TRIED, max(1, sampling.trials // pairs))
-    return [_score(subject, name, own, limits, count) for name, own in by_camera.items()]
-
-
-def _score(
-    subject: Subject, name: str, views: Sequence[View], limits: Limits, count: int
-) -> CameraScore:
-    chosen, own = spread(views, count), subject.cameras[name]
-    fits = {
-        what: float(np.mean([overlap(v.mask, _body(subject, v, entry)) for v in chosen]))
-        for what, entry in calibrations(own, subject.cameras).items()
-    }
-    here = fits.pop((OWN, ""))
-    rivals = sorted((Rival(*what, fit) for what, fit in fits.items()), key=lambda r: -r.overlap)
-    shift, metres, shifted = _shift(subject, own, chosen)
-    lag, outside, lagged = _lag(views, limits)
-    return CameraScore(
-        name=name,
-        inside=known_mean([view.inside for view in views if view.mask.any()]),
-        overlap=here,
-        fullness=float(np.median([view.fullness for view in views])),
-        rivals=tuple(rivals),
-        shift=shift,
-        shift_metres=metres,
-        shift_overlap=shifted,
-        lag=lag,
-        outside=outside,
-        lag_outside=lagged,
-    )
+    count = min(TRIED, max(1, sampling.trials // (2 * len(by_camera) ** 2 or 1)))
+    scores = []
+    for name, own in by_camera.items():
+        chosen, camera = spread(own, count), subject.cameras[name]
+        rivals = [
+            Rival(*what, _fit(subject, chosen, other))
+            for what, other in calibrations(camera, subject.cameras).items()
+        ]
+        scores.append(
+            CameraScore(
+                name,
+                known_mean([view.inside for view in own if view.mask.any()]),
+                _fit(subject, chosen, camera),
+                float(np.median([view.fullness for view in own])),
+                tuple(sorted(rivals, key=lambda rival: -rival.overlap)),
+                *_shift(subject, camera, chosen),
+                *_lag(own, limits),
+            )
+        )
+    return scores
 
 
 def calibrations(
     own: CameraEntry, cameras: Mapping[str, CameraEntry]
 ) -> dict[tuple[str, str], CameraEntry]:
-    """Calibrations that a camera may have, its own first, by (kind, other camera)."""
+    """Other calibrations that a camera may have, by (kind, other camera)."""
     mirror = own.K.copy()
     mirror[0] = -mirror[0]
     mirror[0, 2] += own.size[1]
-    found = {
-        (OWN, ""): own,
-        (INVERSE, ""): replace(own, R=own.R.T, t=-own.R.T @ own.t),
-        (MIRRORED, ""): replace(own, K=mirror),
-    }
-    for name, camera in cameras.items():
+    found = {(MIRRORED, ""): replace(own, K=mirror)}
+    for name, other in cameras.items():
         if name != own.name:
-            found[(EXTRINSICS, name)] = replace(own, R=camera.R, t=camera.t)
-            found[(WHOLE, name)] = camera
+            found[EXTRINSICS, name] = replace(own, R=other.R, t=other.t)
+            found[WHOLE, name] = other
     return found
 
 
@@ -169,6 +148,10 @@ def _body(subject: Subject, view: View, camera: CameraEntry) -> Bool:
     row = subject.rows[view.frame]
     small = view.small(camera)
     return body_silhouette(small, subject.p[row], subject.visible[row], subject.template)
+
+
+def _fit(subject: Subject, views: Sequence[View], camera: CameraEntry) -> float:
+    return float(np.mean([overlap(v.mask, _body(subject, v, camera)) for v in views]))
 
 
 def _shift(
@@ -216,165 +199,126 @@ def known_mean(values: Iterable[float]) -> float:
 def calibration_findings(
     scores: Sequence[CameraScore], limits: Limits, min_inside: float, named: Iterable[str] = ()
 ) -> list[Finding]:
-    """Which camera is wrong, and the usual causes.
-
-    Args:
-        scores: of all cameras.
-        limits: thresholds.
-        min_inside: share of joints inside the masks below which a camera is named.
-        named: cameras that another finding names already.
-    """
+    """Which camera is wrong, and the usual causes; other findings name ``named`` already."""
     found, named = list[Finding](), set(named)
     if big := [s for s in scores if s.oversized(limits) and s.name not in named]:
         sizes = listed(f"{s.name} {s.fullness:.1f}" for s in big)
-        found.append(_error(
-            f"masks are far larger than the body that skeleton and camera suggest (times its "
-            f"area: {sizes}): a focal length that is too short, K of smaller images, a skeleton "
-            "in another unit, or masks of more than the person"
-        ))  # fmt: skip
+        text = (
+            f"masks are far larger than the body (times its area: {sizes}): a focal length that is "
+            "too short, K of smaller images, a skeleton in another unit, or masks of more"
+        )
+        found.append(Finding("error", TOPIC, text))
         named |= {s.name for s in big}
         scores = [s for s in scores if s not in big]
     beaten = [s for s in scores if s.beaten(limits)]
     for one, other in combinations(beaten, 2):
         ours, theirs = _rival_of(one, other, limits), _rival_of(other, one, limits)
         if ours and theirs and not {one.name, other.name} & named:
-            found.append(_exchanged(one, other, ours, theirs))
+            what = "R and t" if ours.kind == EXTRINSICS else "calibration"
+            text = (
+                f"cameras {one.name} and {other.name} look exchanged: the {what} of the other "
+                f"would fit the masks better (overlap {ours.overlap:.2f} and {theirs.overlap:.2f}, "
+                f"its own {one.overlap:.2f} and {other.overlap:.2f}); exchange them in the "
+                "calibration, or rename the folders"
+            )
+            found.append(Finding("error", TOPIC, text))
             named |= {one.name, other.name}
-    if len(scores) > 1 and not big:
-        wrong = [s for s in scores if s.wrong(limits)]
-        if all(s.shifted(limits) for s in scores):
-            return [_all_beside(scores, "error" if wrong else "warning")]
-        if len(wrong) == len(scores) and not beaten:
-            return [_all_wrong(scores)]
+    if len(scores) > 1 and not big and (finding := _of_all(scores, limits)):
+        return [finding]
     for score in scores:
-        if score in beaten and score.name not in named:
-            found.append(_better_fit(score, scores, limits))
-        elif score.lag:
-            found.append(_out_of_step(score))
+        if score.lag and (score not in beaten or score.name in named):
+            when = "later" if score.lag > 0 else "earlier"
+            text = (
+                f"camera {score.name}: its images fit the skeleton {abs(score.lag)} frame(s) "
+                f"{when} better (joints {100 * score.lag_outside:.1f} cm outside the masks instead "
+                f"of {100 * score.outside:.1f}); its clock or numbering is off: add {score.lag:+d}"
+            )
+            found.append(Finding("error", "synchronisation", text))
         elif score.name not in named:
-            found += _unexplained(score, scores, limits, min_inside)
+            found += _of_one(score, scores, limits, min_inside)
     named |= {s.name for s in scores if s.unfit(limits)}
     return found + small_errors([s for s in scores if s.name not in named], limits)
 
 
-def _error(message: str, level: Level = "error") -> Finding:
-    return Finding(level, "calibration", message)
-
-
-def _seen(score: CameraScore, scores: Sequence[CameraScore]) -> str:
-    others = known_mean([s.inside for s in scores if s.name != score.name])
-    seen = f"{score.inside:.0%} of the joints lie inside its masks"
-    return f"{seen}, {others:.0%} in the other cameras" if len(scores) > 1 else seen
-
-
 def _rival_of(score: CameraScore, other: CameraScore, limits: Limits) -> Rival | None:
     """The other camera's calibration, where it fits the masks about as well as the best."""
-    for rival in score.rivals:
-        if rival.other == other.name and rival.overlap > score.rival_overlap - limits.better_fit:
-            return rival
+    least = score.rivals[0].overlap - limits.better_fit
+    return next((r for r in score.rivals if r.other == other.name and r.overlap > least), None)
+
+
+def _of_all(scores: Sequence[CameraScore], limits: Limits) -> Finding | None:
+    """One finding when every camera is wrong."""
+    wrong = [s for s in scores if s.wrong(limits)]
+    if all(s.shifted(limits) for s in scores):
+        shifts = listed(f"{s.name} {s.shift_text}" for s in scores)
+        text = (
+            f"in every camera the masks lie beside the skeleton, by pixels right, down: {shifts}; "
+            "the skeleton is moved or of another size, or K does not follow a crop"
+        )
+        return Finding("error" if wrong else "warning", TOPIC, text)
+    if len(wrong) == len(scores) and not any(s.beaten(limits) for s in scores):
+        shares = listed(f"{s.name} {s.inside:.0%}" for s in scores)
+        text = (
+            f"in every camera joints lie outside the masks (inside: {shares}): axes, unit or frame "
+            "numbers of the skeleton are wrong, or the masks belong to other images"
+        )
+        return Finding("error", TOPIC, text)
     return None
 
 
-def _exchanged(a: CameraScore, b: CameraScore, of_a: Rival, of_b: Rival) -> Finding:
-    what = "R and t" if of_a.kind == EXTRINSICS else "calibration"
-    return _error(
-        f"cameras {a.name} and {b.name} look exchanged: the {what} of the other would fit the "
-        f"masks of each better (overlap {of_a.overlap:.2f} and {of_b.overlap:.2f}) than its own "
-        f"({a.overlap:.2f} and {b.overlap:.2f}); exchange them in the calibration, or rename the "
-        "folders"
-    )
-
-
-def _better_fit(score: CameraScore, scores: Sequence[CameraScore], limits: Limits) -> Finding:
-    best = score.rivals[0]
-    close = [r for r in score.rivals if r.overlap > best.overlap - limits.better_fit]
-    what = dict.fromkeys(f"{r.kind} {r.other}".strip() for r in close)
-    kinds = {rival.kind for rival in close}
-    advice = [text for kind, text in ADVICE.items() if kind in kinds]
-    return _error(
-        f"camera {score.name}: {' or '.join(what)} would fit its masks better (overlap "
-        f"{best.overlap:.2f}) than its own calibration ({score.overlap:.2f}); "
-        f"{_seen(score, scores)}; {', or '.join(advice)}"
-    )
-
-
-def _unexplained(
+def _of_one(
     score: CameraScore, scores: Sequence[CameraScore], limits: Limits, min_inside: float
 ) -> list[Finding]:
-    level: Level = "error" if not score.inside >= limits.inside_error else "warning"
-    if np.isnan(score.inside):
+    """What is wrong with one camera, if anything."""
+    seen = f"{score.inside:.0%} of the joints lie inside its masks"
+    if len(scores) > 1:
+        others = known_mean([s.inside for s in scores if s is not score])
+        seen += f", {others:.0%} in the other cameras"
+    error = not score.inside >= limits.inside_error
+    if score.beaten(limits):
+        error, best = True, score.rivals[0]
+        close = [r for r in score.rivals if r.overlap > best.overlap - limits.better_fit]
+        what = dict.fromkeys(f"{r.kind} {r.other}".strip() for r in close)
+        advice = [ADVICE[kind] for kind in ADVICE if kind in {rival.kind for rival in close}]
+        text = (
+            f"{' or '.join(what)} would fit its masks better (overlap {best.overlap:.2f}) than "
+            f"its own calibration ({score.overlap:.2f}); {seen}; {', or '.join(advice)}"
+        )
+    elif np.isnan(score.inside):
         text = "its masks are empty, or no joint lies in its images; check both folders and K"
     elif score.shifted(limits):
         text = (
-            f"its masks lie {_pixels(score)} pixels (right, down) beside the skeleton; "
-            f"{_seen(score, scores)}. A crop or resize that K does not follow, or masks of other "
-            "images, do this"
+            f"its masks lie {score.shift_text} pixels (right, down) beside the skeleton; {seen}. "
+            "A crop or resize that K does not follow, or masks of other images, do this"
         )
     elif not score.inside >= min_inside:
         text = (
-            f"only {_seen(score, scores)}. One camera alone points to its extrinsics, to "
-            "exchanged folder names, to lens distortion left out, or to masks of other images; "
-            "see its overlays"
+            f"only {seen}. One camera alone points to its extrinsics, to exchanged folder names, "
+            "to lens distortion left out, or to masks of other images; see its overlays"
         )
     else:
         return []
-    return [_error(f"camera {score.name}: {text}", level)]
-
-
-def _pixels(score: CameraScore) -> str:
-    return f"{score.shift[0]:+.0f}, {score.shift[1]:+.0f}"
-
-
-def _all_beside(scores: Sequence[CameraScore], level: Level) -> Finding:
-    return _error(
-        "in every camera the masks lie beside the skeleton, by pixels right, down: "
-        f"{listed(f'{s.name} {_pixels(s)}' for s in scores)}; the skeleton is moved or of another "
-        "size, or images were cropped and K did not follow",
-        level,
-    )
-
-
-def _all_wrong(scores: Sequence[CameraScore]) -> Finding:
-    return _error(
-        "in every camera joints lie outside the masks (inside: "
-        f"{listed(f'{s.name} {s.inside:.0%}' for s in scores)}): the skeleton's axes, unit or "
-        "frame numbers do not fit the cameras, or the masks belong to other images"
-    )
-
-
-def _out_of_step(score: CameraScore) -> Finding:
-    when = "later" if score.lag > 0 else "earlier"
-    return Finding(
-        "error", "synchronisation",
-        f"camera {score.name}: its images fit the skeleton {abs(score.lag)} frame(s) {when} "
-        f"better (joints {100 * score.lag_outside:.1f} cm outside the masks instead of "
-        f"{100 * score.outside:.1f}); its clock or its numbering is off: add {score.lag:+d}",
-    )  # fmt: skip
+    return [Finding("error" if error else "warning", TOPIC, f"camera {score.name}: {text}")]
 
 
 def small_errors(scores: Sequence[CameraScore], limits: Limits) -> list[Finding]:
-    """Calibrations that are nearly right: joints lie just outside the masks.
-
-    Args:
-        scores: of the cameras that no other finding names.
-        limits: thresholds.
-    """
+    """Cameras, of those without other findings, whose joints lie just outside the masks."""
     metres = {s.name: s.outside for s in scores if np.isfinite(s.outside)}
     middle = float(np.median(list(metres.values()) or [0]))
     if middle > limits.outside_all:
-        return [_error(
+        text = (
             f"in most cameras joints lie {100 * middle:.1f} cm outside the masks on average (good "
-            "captures: 0.1): a focal length or unit that is slightly off in all of them, masks "
-            "that are too tight, or noisy landmarks", "warning",
-        )]  # fmt: skip
+            "captures: 0.1): focal lengths or unit slightly off, tight masks, or noisy landmarks"
+        )
+        return [Finding("warning", TOPIC, text)]
     found = []
     for name, own in metres.items():
         rest = [value for other, value in metres.items() if other != name]
         others = float(np.median(rest)) if rest else np.inf
         if own > max(limits.outside, OUTSIDE_RATIO * others):
-            found.append(_error(
+            text = (
                 f"camera {name}: joints lie {100 * own:.1f} cm outside its masks on average, "
-                f"{100 * others:.1f} in the other cameras; its R, t or focal length is slightly "
-                "off (some degrees, centimetres or per cent), or its masks are worse", "warning",
-            ))  # fmt: skip
+                f"{100 * others:.1f} in the other cameras; its R, t or focal length is slightly off"
+            )
+            found.append(Finding("warning", TOPIC, text))
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import cv2
 import numpy as np
@@ -17,20 +17,17 @@ from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float
 from gsgan.skeleton.template import SkeletonTemplate
 
 Bytes = NDArray[np.uint8]
-Colour = tuple[int, int, int]
 
 ASPECT = 0.75  # width to height of a tile: a standing person
 MARGIN = 0.08  # of the box about person and skeleton, on each side
 LEFT, RIGHT, MIDDLE = (60, 150, 255), (255, 140, 40), (240, 240, 240)  # RGB, the person's sides
-OUTLINE, MASK_BOX, BODY_BOX = (70, 255, 90), (40, 140, 60), (210, 190, 60)
-OUTSIDE, NEUTRAL = (255, 40, 60), (70, 70, 70)
+OUTLINE, OUTSIDE, NEUTRAL = (70, 255, 90), (255, 40, 60), (70, 70, 70)
 BAR = 18  # pixels of the caption above a tile
 GAP = 4  # pixels between tiles
 QUALITY = 88  # of the JPEG
 LEGEND = (
-    "Green: the mask's outline and box. Yellow: the skeleton's box. Blue: the person's left, "
-    "orange: the right, white: the middle; red rings: joints outside the mask. Images are cropped "
-    "to the person and undistorted."
+    "Green: the mask's outline. Blue: the person's left, orange: the right, white: the middle; "
+    "red rings: joints outside the mask. Images are cropped to the person and undistorted."
 )
 
 
@@ -38,17 +35,12 @@ def strip(
     subject: Subject,
     views: Sequence[View],
     height: int,
-    doubtful: frozenset[int] = frozenset(),
+    doubtful: Collection[int] = (),
     named: bool = False,
 ) -> bytes:
-    """A row of tiles as a JPEG.
+    """A row of at least one tile as a JPEG; captions of ``doubtful`` frames are red.
 
-    Args:
-        subject: the dataset.
-        views: at least one.
-        height: pixels of a tile without its caption.
-        doubtful: frames with a red caption.
-        named: write the camera into the caption as well.
+    Tiles have ``height`` pixels below the caption, which has the camera as well when ``named``.
     """
     tiles = []
     for view in views:
@@ -103,24 +95,13 @@ def person_window(view: View, joints: Float, size: tuple[int, int]) -> Crop:
 
 
 def draw(
-    image: Bytes,
-    mask: Bytes,
-    joints: Float,
-    drawn: Bool,
-    outside: Bool,
-    template: SkeletonTemplate,
+    image: Bytes, mask: Bytes, joints: Float, drawn: Bool, outside: Bool, template: SkeletonTemplate
 ) -> Bytes:
-    """The image ``[H, W, 3]`` with mask outline, boxes, bones and joints ``[J, 2]`` on it."""
+    """The image ``[H, W, 3]`` with mask outline, bones and joints ``[J, 2]`` on it."""
     canvas = image.copy()
     person = (mask > 127).astype(np.uint8)
     contours = cv2.findContours(person, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
     at = np.round(joints - 0.5).astype(np.int32)
-    if person.any():
-        x, y, w, h = cv2.boundingRect(person)
-        cv2.rectangle(canvas, (x, y), (x + w - 1, y + h - 1), MASK_BOX, 1)
-    if drawn.any():
-        low, high = at[drawn].min(0), at[drawn].max(0)
-        cv2.rectangle(canvas, low.tolist(), high.tolist(), BODY_BOX, 1)
     cv2.drawContours(canvas, contours, -1, OUTLINE, 1, cv2.LINE_AA)
     for a, b in template.edges:
         if drawn[a] and drawn[b]:
@@ -134,14 +115,14 @@ def draw(
     return canvas
 
 
-def _side(template: SkeletonTemplate, a: int, b: int) -> Colour:
+def _side(template: SkeletonTemplate, a: int, b: int) -> tuple[int, int, int]:
     for side, colour in (("left", LEFT), ("right", RIGHT)):
         if side in template.names[a] and side in template.names[b]:
             return colour
     return MIDDLE
 
 
-def caption(image: Bytes, text: str, colour: Colour) -> Bytes:
+def caption(image: Bytes, text: str, colour: tuple[int, int, int]) -> Bytes:
     """The image under a bar of the colour with white text."""
     bar = np.full((BAR, image.shape[1], 3), colour, np.uint8)
     cv2.putText(
@@ -152,7 +133,4 @@ def caption(image: Bytes, text: str, colour: Colour) -> Bytes:
 
 def encode(image: Bytes) -> bytes:
     """A JPEG of an RGB image."""
-    ok, data = cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    if not ok:
-        raise OSError("an image of the report could not be encoded as JPEG")
-    return data.tobytes()
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()

@@ -12,9 +12,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-Level = Literal["error", "warning"]
 STYLES = {"error": "bold red", "warning": "yellow"}
-KINDS = {b"\xff\xd8": "jpeg", b"\x89P": "png", b"<?": "svg+xml"}  # of a figure, by first bytes
 
 PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
@@ -55,29 +53,19 @@ img { max-width: 100%; border: 1px solid #ddd; } .wide { overflow-x: auto; }
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is wrong, or may be.
+    """Something that is wrong, or may be: what, where, and the usual cause.
 
-    Args:
-        level: an error makes the command fail; a warning is only listed.
-        topic: one or two words: "calibration", "colour".
-        sentence: what, where, and the usual cause.
+    An error makes the command fail; a warning is only listed.
     """
 
-    level: Level
+    level: Literal["error", "warning"]
     topic: str
     sentence: str
 
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text.
-
-    Args:
-        headers: of the columns.
-        rows: one cell per header each.
-        flagged: (row, column) of the cells that are out of bounds.
-        title: above the table; may be empty.
-    """
+    """Rows of text; ``flagged`` holds (row, column) of the cells that are out of bounds."""
 
     headers: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -87,12 +75,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """An image: an encoded JPEG, PNG or SVG.
-
-    Args:
-        caption: below it.
-        picture: the encoded bytes.
-    """
+    """An encoded image, JPEG or SVG, and the caption below it."""
 
     caption: str
     picture: bytes
@@ -100,20 +83,13 @@ class Figure:
     @property
     def source(self) -> str:
         """A data URL, for the page."""
-        kind = KINDS[self.picture[:2]]
+        kind = "svg+xml" if self.picture.startswith(b"<?") else "jpeg"
         return f"data:image/{kind};base64,{base64.b64encode(self.picture).decode()}"
 
 
 @dataclass(frozen=True)
 class Section:
-    """One part of a report.
-
-    Args:
-        title: a few words.
-        text: paragraphs.
-        tables, figures, findings: its content.
-        aside: explanations, which the terminal leaves out.
-    """
+    """One part of a report; ``aside`` are explanations, which the terminal leaves out."""
 
     title: str
     text: tuple[str, ...] = ()
@@ -125,14 +101,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Report:
-    """Everything that was found.
-
-    Args:
-        root: the dataset's folder.
-        sections: in reading order.
-        numbers: the scores by name, plain values for the JSON file.
-        title: of the page.
-    """
+    """Everything that was found in a folder; ``numbers`` are the scores, plain values for JSON."""
 
     root: str
     sections: tuple[Section, ...]
@@ -188,7 +157,13 @@ def print_report(report: Report, console: Console) -> None:
         if section.tables or section.text:
             console.rule(Text(section.title), align="left", style="dim")
         for table in section.tables:
-            console.print(_rich(table))
+            drawn = RichTable(title=table.title or None, title_justify="left", title_style="bold")
+            for header in table.headers:
+                drawn.add_column(header, overflow="fold")
+            for i, row in enumerate(table.rows):
+                styles = ["bold red" if (i, j) in table.flagged else "" for j in range(len(row))]
+                drawn.add_row(*map(Text, row, styles))
+            console.print(drawn)
         for line in section.text:
             console.print(Text(line))
     if report.findings:
@@ -198,13 +173,3 @@ def print_report(report: Report, console: Console) -> None:
         console.print(start.append(finding.sentence, "default not bold"))
     style = "bold red" if report.errors else "bold"
     console.print(Text(f"{report.title}: {report.verdict}", style))
-
-
-def _rich(table: Table) -> RichTable:
-    drawn = RichTable(title=table.title or None, title_justify="left", title_style="bold")
-    for header in table.headers:
-        drawn.add_column(header, overflow="fold")
-    for i, row in enumerate(table.rows):
-        styles = ["bold red" if (i, j) in table.flagged else "" for j in range(len(row))]
-        drawn.add_row(*(Text(cell, style) for cell, style in zip(row, styles, strict=True)))
-    return drawn

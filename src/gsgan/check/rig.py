@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import io
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure
 
-from gsgan.check.motion import nanmedian
 from gsgan.check.report import Finding, Table
 from gsgan.check.settings import Limits
-from gsgan.check.views import Subject
+from gsgan.check.views import Subject, nanmedian
 from gsgan.data.formats.trust import Float, far_cameras
 from gsgan.skeleton.sanitise import limb_length_sum
+from gsgan.utils.palette import BLACK, COLOURS, GREY
 
-WIDE = 45.0  # degrees between neighbouring views from which a held-out camera is hard
 IMPOSSIBLE = (0.4, 3.0)  # metres of person outside which units are wrong
 
 
@@ -24,17 +25,12 @@ class Rig:
 
     Args:
         distances: metres from the person, by camera.
-        gaps: degrees between neighbouring views about the up axis, once round.
-        heights: metres above the feet, by camera.
         stature: metres, median over frames, estimated from limb lengths.
-        up: ``[3]`` unit, direction of the trunk, median over frames.
-        lean: degrees between that and the up axis of the dataset.
+        up, lean: ``[3]`` direction of the trunk, median over frames; degrees from the up axis.
         far: a message for each camera that is far too near or far.
     """
 
     distances: dict[str, float]
-    gaps: Float
-    heights: dict[str, float]
     stature: float
     up: Float
     lean: float
@@ -42,7 +38,7 @@ class Rig:
 
     @property
     def distance(self) -> float:
-        """Metres: the median camera's."""
+        """Metres, of the median camera."""
         return float(np.median(list(self.distances.values())))
 
 
@@ -57,16 +53,10 @@ def rig_of(subject: Subject) -> Rig:
     lengths = np.linalg.norm(trunk, axis=-1, keepdims=True)
     axis = nanmedian(trunk / np.where(lengths > 0, lengths, np.nan)) if len(trunk) else up
     cosine = axis @ up / max(float(np.linalg.norm(axis)), 1e-9)
-    feet = float(np.quantile((subject.p @ up)[subject.visible], 0.01))
     centre = np.median(subject.p[subject.visible], axis=0)
-    ways = {name: camera.centre - centre for name, camera in subject.cameras.items()}
-    first, second = ground_axes(up)
-    angles = np.sort([np.degrees(np.arctan2(d @ second, d @ first)) % 360 for d in ways.values()])
-    distances = {name: float(np.linalg.norm(way)) for name, way in ways.items()}
+    distances = {n: float(np.linalg.norm(c.centre - centre)) for n, c in subject.cameras.items()}
     return Rig(
         distances=distances,
-        gaps=np.diff(np.append(angles, angles[0] + 360)),
-        heights={n: float(c.centre @ up) - feet for n, c in subject.cameras.items()},
         stature=float(sums.nanmedian()) / template.limb_length_sum * template.stature,
         up=axis,
         lean=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
@@ -92,16 +82,11 @@ def rig_findings(subject: Subject, rig: Rig, limits: Limits) -> list[Finding]:
     found = [Finding("error", "units", text) for text in rig.far.values()]
     possible = IMPOSSIBLE[0] <= rig.stature <= IMPOSSIBLE[1]
     if not limits.height_warning_low <= rig.stature <= limits.height_warning_high:
-        text = (
-            f"limb lengths suggest a person of {rig.stature:.3g} m; check the unit of the skeleton "
-            "and the order of its joints"
-        )
+        text = f"limb lengths suggest a person of {rig.stature:.3g} m; check unit and joint order"
         found.append(Finding("warning" if possible else "error", "units", text))
     if rig.lean > limits.lean:
-        text = (
-            f"the person's trunk points along {axis_name(rig.up)}, {rig.lean:.0f} degrees from "
-            f"the up axis {subject.layout.meta.up_axis}; check up_axis"
-        )
+        way, axis = axis_name(rig.up), subject.layout.meta.up_axis
+        text = f"the trunk points along {way}, {rig.lean:.0f} degrees from the up axis {axis}"
         found.append(Finding("warning", "units", text))
     return found
 
@@ -109,44 +94,65 @@ def rig_findings(subject: Subject, rig: Rig, limits: Limits) -> list[Finding]:
 def units_table(subject: Subject, rig: Rig) -> Table:
     """Units and sizes in words."""
     meta, distances = subject.layout.meta, rig.distances.values()
-    span = np.ptp(subject.p[:, list(subject.template.hips)].mean(1), axis=0)
-    hard = " (evaluate on novel poses: a held-out camera is hard)" if max(rig.gaps) > WIDE else ""
     near, far = min(distances), max(distances)
     rows = (
         ("unit of the files", meta.unit),
         ("camera to person", f"{rig.distance:.2f} m (median; {near:.2f} to {far:.2f})"),
         ("person's height", f"{rig.stature:.2f} m, from limb lengths"),
-        ("person's path", f"{np.linalg.norm(span):.2f} m across"),
         ("up axis", f"{meta.up_axis}; the trunk leans {rig.lean:.0f}° from it"),
         ("frames per second", "not given" if meta.fps is None else f"{meta.fps:g}"),
-        ("between neighbouring views", f"{min(rig.gaps):.0f}° to {max(rig.gaps):.0f}°{hard}"),
     )
     return Table(("what", "how much"), rows)
 
 
 def lens_table(subject: Subject, rig: Rig) -> Table:
     """Size, lens and place, one row per camera."""
-    rows, flagged = [], set()
-    for i, (name, camera) in enumerate(subject.cameras.items()):
+    rows = []
+    for name, camera in subject.cameras.items():
         (height, width), K = camera.size, camera.K
-        terms = [f"{c:.3g}" for c in np.trim_zeros(camera.dist, "b")]
-        rows.append(
-            (
-                name,
-                f"{width}×{height}",
-                f"{K[0, 0]:.0f}, {K[1, 1]:.0f}",
-                f"{2 * np.degrees(np.arctan(width / 2 / K[0, 0])):.0f}°",
-                f"{K[0, 2] / width:.2f}, {K[1, 2] / height:.2f}",
-                " ".join(terms) or "none",
-                f"{rig.distances[name]:.2f}",
-                f"{rig.heights[name]:.2f}",
-                str(len(subject.pairs[name])),
-            )
-        )
-        if name in rig.far:
-            flagged.add((i, 6))
+        rows.append((
+            name,
+            f"{width}×{height}",
+            f"{K[0, 0]:.0f}, {K[1, 1]:.0f}",
+            f"{K[0, 2] / width:.2f}, {K[1, 2] / height:.2f}",
+            " ".join(f"{c:.3g}" for c in np.trim_zeros(camera.dist, "b")) or "none",
+            f"{rig.distances[name]:.2f}",
+            str(len(subject.pairs[name])),
+        ))  # fmt: skip
     headers = (
-        "camera", "pixels", "focal fx, fy", "view", "centre (share)", "distortion", "distance m",
-        "height m", "images",
+        "camera", "pixels", "focal fx, fy", "centre (share)", "distortion", "distance m", "images",
     )  # fmt: skip
-    return Table(headers, tuple(rows), frozenset(flagged), "Lenses and places")
+    flagged = frozenset((i, 5) for i, row in enumerate(rows) if row[0] in rig.far)
+    return Table(headers, tuple(rows), flagged, "Lenses and places")
+
+
+def rig_drawing(subject: Subject) -> bytes:
+    """Cameras, viewing directions and the person's path, from above and from the side."""
+    figure = Figure((9, 4.5), layout="tight")
+    first, second = ground_axes(subject.up)
+    row, hips = len(subject.frames) // 2, subject.p[:, list(subject.template.hips)].mean(1)
+    centres = np.stack([camera.centre for camera in subject.cameras.values()])
+    reach = 0.25 * max(1.0, float(np.ptp(centres, axis=0).max()))  # metres
+    titles = {"seen from above": second, "seen from the side": subject.up}
+    for axes, (title, up) in zip(figure.subplots(1, 2), titles.items(), strict=True):
+        plane = np.stack([first, up])
+        axes.plot(*plane @ hips.T, color=GREY)
+        for edge in map(list, subject.template.edges):
+            if subject.visible[row, edge].all():
+                axes.plot(*plane @ subject.p[row, edge].T, color=BLACK, linewidth=1)
+        for i, (name, camera) in enumerate(subject.cameras.items()):
+            colour = COLOURS[i % len(COLOURS)]
+            line = plane @ np.stack([camera.centre, camera.centre + reach * camera.R[2]], 1)
+            axes.plot(*line, color=colour, linestyle=":", marker="o", markevery=[0])
+            axes.annotate(name, tuple(line[:, 0]), (4, 4), textcoords="offset points", color=colour)
+        axes.set(title=title, xlabel=f"{axis_name(first)} (m)", ylabel=f"{axis_name(up)} (m)")
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.grid(alpha=0.3)
+    return svg(figure)
+
+
+def svg(figure: Figure) -> bytes:
+    """The encoded plot."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="svg")
+    return stream.getvalue()

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-import math
-from collections.abc import Callable
+from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,13 +12,11 @@ from typing import TYPE_CHECKING, Any
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
-from rich.progress import track
+from rich.console import Console
 
-from gsgan.check.contents import unreadable
-from gsgan.check.report import Report, page, print_report
+from gsgan.check.report import Finding, Report, Section, Table, page, print_report
 from gsgan.check.sections import Measured, sections
 from gsgan.check.settings import Limits, Sampling
-from gsgan.check.views import Results, measure, sampled_items, subject_of, suspicious_items
 from gsgan.effects import EffectSettings
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
@@ -28,15 +25,15 @@ from gsgan.utils.files import write_atomically
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-Progress = Callable[[Results, int], Results]
+LISTED_FOLDERS = 60  # of a dataset that cannot be read
 
 
 def check_data(
     data: GsganData,
     sampling: Sampling,
     limits: Limits,
-    progress: Progress | None = None,
     effects: EffectSettings | None = None,
+    console: Console | None = None,
 ) -> Report:
     """Checks a dataset.
 
@@ -44,8 +41,8 @@ def check_data(
         data: it need not have been read yet.
         sampling: how much is checked.
         limits: thresholds.
-        progress: wraps the results of the pass over the images, given their number.
         effects: settings of the effects as for training; None: the defaults.
+        console: shows the progress.
 
     Returns:
         The report; of a dataset that cannot be read it has the reader's message.
@@ -54,17 +51,32 @@ def check_data(
         ConfigError: when the data's config is wrong.
     """
     try:
-        subject = subject_of(data)
+        measured = Measured(data, sampling, limits, effects or EffectSettings(), console)
     except DataError as error:
-        return _failed(data.root, error)
-    items = (*sampled_items(subject, sampling.pictures), *suspicious_items(subject, sampling))
-    views, broken = measure(subject, tuple(dict.fromkeys(items)), sampling, progress)
-    measured = Measured(data, subject, views, broken, sampling, limits, effects or EffectSettings())
-    return Report(str(subject.layout.root), sections(measured), measured.numbers())
+        return unreadable(data.root, error)
+    return Report(str(measured.subject.layout.root), sections(measured), measured.numbers())
 
 
-def _failed(root: str | None, error: DataError) -> Report:
-    return Report(str(root), (unreadable(root, error),), {"readable": False})
+def unreadable(root: str | None, error: DataError) -> Report:
+    """Why the reader refuses a dataset, and the files of its folder."""
+    folder = None if root is None else Path(root).expanduser()
+    section = Section(
+        "The dataset cannot be read",
+        text=("Nothing further could be checked. Correct this, then check again.",),
+        tables=(inventory(folder),) if folder is not None and folder.is_dir() else (),
+        findings=(Finding("error", "reading", str(error)),),
+    )
+    return Report(str(root), (section,), {"readable": False})
+
+
+def inventory(root: Path) -> Table:
+    """The files of a folder and of two levels of folders below it, counted by suffix."""
+    rows = []
+    for folder in [root, *sorted((*root.glob("*/"), *root.glob("*/*/")))][:LISTED_FOLDERS]:
+        kinds = Counter(p.suffix.lower() or p.name for p in folder.iterdir() if p.is_file())
+        text = ", ".join(f"{n} × {kind}" for kind, n in sorted(kinds.items())) or "no files"
+        rows.append((str(folder.relative_to(root)), text))
+    return Table(("folder", "files"), tuple(rows), title="Files of the folder")
 
 
 def run_check(config: DictConfig) -> Report:
@@ -79,17 +91,13 @@ def run_check(config: DictConfig) -> Report:
     logging.getLogger("gsgan.data").setLevel(logging.ERROR)
     console = make_console()
     sampling, limits = instantiate(config.sampling), instantiate(config.limits)
-
-    def shown(results: Results, count: int) -> Results:
-        return track(results, "checking images", count, console=console, transient=True)
-
+    effects = instantiate(config.effects)
     try:
-        data = instantiate(config.data)
-        report = check_data(data, sampling, limits, shown, instantiate(config.effects))
+        report = check_data(instantiate(config.data), sampling, limits, effects, console)
     except InstantiationException as error:
         if not isinstance(error.__cause__, DataError):
             raise
-        report = _failed(config.data.get("root"), error.__cause__)
+        report = unreadable(config.data.get("root"), error.__cause__)
     path = Path(config.report).expanduser()
     numbers = json.dumps(plain(report), indent=1, allow_nan=False) + "\n"
     try:
@@ -103,20 +111,13 @@ def run_check(config: DictConfig) -> Report:
 
 
 def plain(report: Report) -> dict[str, Any]:
-    """The report's findings and numbers for the JSON file; null stands for unknown."""
-    return {
+    """The report's findings and numbers for the JSON file; null stands for NaN and infinity."""
+    content = {
         "root": report.root,
         "errors": report.errors,
         "warnings": report.warnings,
         "findings": [asdict(finding) for finding in report.findings],
-        **{key: _known(value) for key, value in report.numbers.items()},
+        **report.numbers,
     }
-
-
-def _known(value: Any) -> Any:
-    """A value without NaN and infinity, which JSON lacks."""
-    if isinstance(value, dict):
-        return {key: _known(held) for key, held in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_known(held) for held in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    found: dict[str, Any] = json.loads(json.dumps(content), parse_constant=lambda _: None)
+    return found

@@ -1,9 +1,13 @@
-"""The dataset as arrays, and the one pass over sampled images: all that needs decoding."""
+"""The dataset as arrays, and the one pass over sampled images: all that needs decoding.
+
+A silhouette estimated from the skeleton is what masks are compared with; pixel centres at +0.5.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -13,13 +17,15 @@ from typing import TYPE_CHECKING, Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import Progress
 
 from gsgan.check.settings import Sampling
-from gsgan.check.silhouette import body_silhouette, box, overlap
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import project
+from gsgan.data.crop import NEAR, project
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.trust import (
+    FAR_PIXELS,
     TOLERANCE,
     Bool,
     Float,
@@ -36,12 +42,13 @@ from gsgan.utils.errors import DataError
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-UP = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 FAR = 0.3  # metres: distances of joints from the mask are clipped to this before they are averaged
 SMALL = 128  # pixels, longest side of the masks that calibrations are tried on and hulls carved by
 TAILS = 20000  # files whose end is read
 TAIL = 64  # bytes: some writers append a few after the end mark
 END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}  # by first bytes
+FLESH = 0.07  # metres of body about every bone: between an arm and a thigh
+HEAD_RADIUS = 0.12  # metres about the middle of the face: half of a head's height
 
 
 @dataclass(frozen=True)
@@ -49,12 +56,9 @@ class Subject:
     """One dataset.
 
     Args:
-        layout: the reader's index, for paths and images.
-        trust: the reader's thresholds.
-        frames: ``[F]`` rising frame numbers.
-        pairs: frame numbers that exist, by camera.
-        p: ``[F, J, 3]`` metres, finite.
-        visible: ``[F, J]``.
+        layout, trust: the reader's index and thresholds.
+        frames, pairs: ``[F]`` rising frame numbers; those that exist, by camera.
+        p, visible: ``[F, J, 3]`` metres, finite; ``[F, J]``.
         up: ``[3]`` unit, the world's up axis.
         template: names of the joints and bones.
     """
@@ -106,7 +110,7 @@ def subject_of(data: GsganData) -> Subject:
         pairs={name: tuple(sorted(layout.images[name])) for name in layout.camera_names},
         p=np.stack([layout.landmarks.p[int(f)] for f in frames]),
         visible=np.stack([layout.landmarks.visibility[int(f)] for f in frames]) > 0,
-        up=np.array(UP[axis[-1]]) * (-1.0 if axis.startswith("-") else 1.0),
+        up=np.eye(3)["xyz".index(axis[-1])] * (-1.0 if axis.startswith("-") else 1.0),
     )
 
 
@@ -116,26 +120,19 @@ class View:
 
     Args:
         camera, frame: of the image.
-        outside: ``[J]`` metres by which joints lie outside the mask, NaN where unknown.
-        tolerance: metres that they may.
-        overlap: of the mask and the estimated silhouette, intersection over union.
+        outside, tolerance: ``[J]`` metres by which joints lie outside the mask, NaN where unknown;
+            metres that they may.
         fullness: area of the mask over that of the estimated silhouette.
-        reach: ``[4]`` metres by which the mask's box exceeds the silhouette's: left, top, right,
-            bottom; NaN when one of them is empty.
         lagged: ``[2 lag + 1]`` mean metres outside with the skeleton of an earlier or later frame.
-        colour: ``[3]`` summed RGB of the person.
-        weight: summed mask.
-        mask: ``[h, w]`` small mask.
-        to_small: ``[3, 3]`` maps pixels of the whole image to the small mask.
+        colour, weight: ``[3]`` summed RGB of the person, summed mask.
+        mask, to_small: ``[h, w]`` small mask; ``[3, 3]`` maps pixels of the whole image to it.
     """
 
     camera: str
     frame: int
     outside: Float
     tolerance: float
-    overlap: float
     fullness: float
-    reach: Float
     lagged: Float
     colour: Float
     weight: float
@@ -154,33 +151,27 @@ class View:
     @property
     def beyond(self) -> Bool:
         """``[J]`` joints outside the mask by more than the tolerance."""
-        return self.known & (np.nan_to_num(self.outside, posinf=np.inf) > self.tolerance)
+        return np.asarray(self.outside > self.tolerance)
 
     @property
     def inside(self) -> float:
         """Share of the known joints inside the mask, within the tolerance; NaN of none."""
-        known = np.count_nonzero(self.known)
-        return 1 - np.count_nonzero(self.beyond) / known if known else np.nan
-
-
-@dataclass(frozen=True)
-class Broken:
-    """An image that could not be read, and the reader's message."""
-
-    camera: str
-    frame: int
-    message: str
-
-
-Results = Iterable[View | Broken]
+        return 1 - self.beyond.sum() / self.known.sum() if self.known.any() else np.nan
 
 
 def grouped(views: Sequence[View]) -> dict[str, list[View]]:
     """The views by camera."""
-    found: dict[str, list[View]] = {}
-    for view in views:
-        found.setdefault(view.camera, []).append(view)
-    return found
+    return {
+        name: [v for v in views if v.camera == name]
+        for name in dict.fromkeys(v.camera for v in views)
+    }
+
+
+def nanmedian(values: Float) -> Float:
+    """Median over the first axis, NaN where nothing is known, without a warning."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.asarray(np.nanmedian(values, axis=0))
 
 
 def sampled_items(subject: Subject, pictures: int) -> tuple[Item, ...]:
@@ -202,19 +193,17 @@ def suspicious_items(subject: Subject, sampling: Sampling) -> tuple[Item, ...]:
     """
     cut, odd, layout = list[Item](), list[Item](), subject.layout
     images = sum(len(files) for files in subject.pairs.values())
-    every = max(1, -(-2 * images // TAILS))  # an image and its mask each
+    every = 1 + 2 * images // TAILS  # an image and its mask each
     for name, files in subject.pairs.items():
         items = [(name, frame) for frame in files[::every]]
         masks = [[path for _, path in layout.mask_files(*item)] for item in items]
-        cut += [
-            item
-            for item, paths in zip(items, masks, strict=True)
-            if not all(map(complete, [layout.image_path(*item), *paths]))
-        ]
-        sizes = np.array([p[0].stat().st_size if p[0].is_file() else 0 for p in masks], float)
-        ratio = np.maximum(sizes, 1) / max(float(np.median(sizes)), 1)
-        far = np.maximum(ratio, 1 / ratio) > sampling.size_ratio
-        odd += [item for item, is_far in zip(items, far, strict=True) if is_far]
+        sizes = np.array([p[0].stat().st_size if p[0].is_file() else 1 for p in masks], float)
+        usual = max(float(np.median(sizes)), 1)
+        for item, paths, size in zip(items, masks, sizes.clip(1), strict=True):
+            if not all(map(complete, [layout.image_path(*item), *paths])):
+                cut.append(item)
+            if max(size / usual, usual / size) > sampling.size_ratio:
+                odd.append(item)
     return (*cut[: sampling.pictures], *spread(odd, sampling.pictures))
 
 
@@ -232,33 +221,23 @@ def complete(path: Path) -> bool:
 
 
 def measure(
-    subject: Subject,
-    items: Sequence[Item],
-    sampling: Sampling,
-    progress: Callable[[Results, int], Results] | None = None,
-) -> tuple[list[View], list[Broken]]:
-    """Decodes and measures images.
+    subject: Subject, items: Sequence[Item], sampling: Sampling, console: Console | None = None
+) -> tuple[list[View], list[str]]:
+    """Decodes and measures images, each once; the messages of those that cannot be read."""
 
-    Args:
-        subject: the dataset.
-        items: which images.
-        sampling: sizes and threads.
-        progress: wraps the results as they come, given their number.
-    """
-
-    def one(item: Item) -> View | Broken:
+    def one(item: Item) -> View | str:
         try:
             return _view(subject, item, sampling)
         except DataError as error:
-            return Broken(*item, str(error))
+            return str(error)
 
-    def every() -> Iterator[View | Broken]:
-        with ThreadPoolExecutor(sampling.workers) as pool:
-            yield from pool.map(one, items)
-
-    results = list(every() if progress is None else progress(every(), len(items)))
+    bar = Progress(transient=True, console=console, disable=console is None)
+    with ThreadPoolExecutor(sampling.workers) as pool, bar:
+        unique = tuple(dict.fromkeys(items))
+        found = bar.track(pool.map(one, unique), len(unique), description="checking images")
+        results = list(found)
     views = [result for result in results if isinstance(result, View)]
-    return views, [result for result in results if isinstance(result, Broken)]
+    return views, [result for result in results if isinstance(result, str)]
 
 
 def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
@@ -289,12 +268,67 @@ def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
         frame=number,
         outside=outside(row),
         tolerance=max(subject.trust.joint_tolerance, TOLERANCE * metre),
-        overlap=overlap(mask, body),
         fullness=float(mask.sum() / max(1, int(body.sum()))),
-        reach=(box(mask) - box(body)) * np.array([-1, -1, 1, 1]) * metre,
         lagged=lagged,
         colour=frame.image.double().sum((0, 2, 3)).numpy(),
         weight=float(soft.sum(dtype=np.float64)),
         mask=cv2.resize(soft, small, interpolation=cv2.INTER_AREA) > 0.5,
         to_small=to_small,
     )
+
+
+def body_silhouette(
+    camera: CameraEntry, p: Float, visible: Bool, template: SkeletonTemplate
+) -> Bool:
+    """``[H, W]`` silhouette estimated from a skeleton: thick bones, a filled trunk, a round head.
+
+    Joints ``p [J, 3]`` (metres) behind the camera are left out, and so is lens distortion.
+    """
+    size = camera.size
+    pixels, depth = project(camera, p)
+    canvas = np.zeros(size, np.uint8)
+    drawn = visible & (depth > NEAR)
+    at = np.round(np.clip(np.nan_to_num(pixels), -FAR_PIXELS, FAR_PIXELS) - 0.5).astype(np.int32)
+    metre = abs(camera.K[0, 0]) / np.maximum(depth, NEAR)  # pixels
+    trunk = template.torso
+    edges = [*template.limbs, *zip(trunk, (trunk[1], trunk[3], trunk[0], trunk[2]), strict=True)]
+    for a, b in edges:
+        if drawn[a] and drawn[b]:
+            width = thickness(2 * FLESH * min(metre[a], metre[b]), size)
+            cv2.line(canvas, at[a].tolist(), at[b].tolist(), 1, width)
+    corners = [j for j in trunk if drawn[j]]
+    if len(corners) > 2:
+        cv2.fillConvexPoly(canvas, cv2.convexHull(at[corners]), 1)
+    face = [j for j in template.face if drawn[j]]
+    if face:
+        middle = at[face].mean(0).round().astype(int)
+        radius = thickness(HEAD_RADIUS * float(metre[face].mean()), size)
+        cv2.circle(canvas, middle.tolist(), radius, 1, -1)
+    return canvas > 0
+
+
+def thickness(pixels: float, size: tuple[int, int]) -> int:
+    """A whole line width that OpenCV can draw: at least 1, at most the image."""
+    return int(np.clip(round(float(pixels)), 1, min(255, max(size))))
+
+
+def overlap(a: Bool, b: Bool) -> float:
+    """Intersection over union; 0 when both are empty."""
+    union = np.count_nonzero(a | b)
+    return np.count_nonzero(a & b) / union if union else 0.0
+
+
+def best_shift(mask: Bool, body: Bool) -> tuple[int, int]:
+    """Whole pixels ``(dx, dy)`` by which the mask lies beside the body: largest correlation."""
+    height, width = mask.shape
+    shape = (2 * height, 2 * width)  # padded: a shift must not wrap around
+    spectrum = np.fft.rfft2(mask, shape) * np.conj(np.fft.rfft2(body, shape))
+    common = np.fft.irfft2(spectrum, shape)
+    dy, dx = np.unravel_index(int(np.argmax(common)), shape)
+    return int((dx + width) % (2 * width) - width), int((dy + height) % (2 * height) - height)
+
+
+def moved(mask: Bool, dx: int, dy: int) -> Bool:
+    """A mask moved by whole pixels, empty where nothing was."""
+    shift = np.array([[1, 0, dx], [0, 1, dy]], np.float64)
+    return cv2.warpAffine(mask.astype(np.uint8), shift, mask.shape[::-1], flags=0) > 0

@@ -22,32 +22,18 @@ Index = Mapping[str, Mapping[int, str]]
 
 @dataclass(frozen=True)
 class Checks:
-    """What a dataset must satisfy; each threshold can be set.
+    """What a dataset must satisfy; each threshold can be set."""
 
-    Args:
-        min_joints: a frame with fewer usable joints is dropped.
-        min_hubs: the same for shoulders and hips, of which there are four.
-        min_joints_in_view: a camera that sees fewer joints of a frame does not use that frame.
-        max_reach: metres from the median joint; a joint further out counts as missing.
-        rotation_tolerance: largest entry of ``R Rᵀ - I`` allowed.
-        distance: metres, minimum and maximum median distance from the cameras to the person; units
-            are wrong outside them.
-        max_behind: share of joints behind a camera above which its pose is wrong.
-        max_missing_masks: share of images without a mask that may be left out; above it reading
-            stops.
-        header_stride: the header of every n-th image of a camera is checked when the dataset is
-            opened; 1 checks all, at about 0.1 ms per file. Sizes are checked again on decoding.
-    """
-
-    min_joints: int = 12
-    min_hubs: int = 3
-    min_joints_in_view: int = 4
-    max_reach: float = 3.0
-    rotation_tolerance: float = 1e-3
+    min_joints: int = 12  # a frame with fewer usable joints is dropped
+    min_hubs: int = 3  # the same for shoulders and hips, of which there are four
+    min_joints_in_view: int = 4  # a camera that sees fewer joints of a frame does not use it
+    max_reach: float = 3.0  # metres from the median joint; one further out counts as missing
+    rotation_tolerance: float = 1e-3  # largest entry of R Rᵀ - I
+    # metres, minimum and maximum median distance from the cameras to the person
     distance: tuple[float, float] = (0.3, 30.0)
-    max_behind: float = 0.05
-    max_missing_masks: float = 0.0
-    header_stride: int = 1
+    max_behind: float = 0.05  # share of joints behind a camera above which its pose is wrong
+    max_missing_masks: float = 0.0  # share of images left out for want of a mask
+    header_stride: int = 1  # of images whose header is read on opening, 0.1 ms each; 1 reads all
 
 
 def drop_frames(
@@ -102,13 +88,9 @@ def _unusable(frame: int, landmarks: Landmarks, poses: Poses | None, checks: Che
 
 def spans(ids: list[int]) -> str:
     """Numbers as ranges: [1, 2, 3, 7] is "1-3, 7"."""
-    ids = sorted(ids)
-    starts = [i for i in range(len(ids)) if i == 0 or ids[i] != ids[i - 1] + 1]
-    ends = [*(i - 1 for i in starts[1:]), len(ids) - 1]
-    parts = [
-        f"{ids[a]}" if a == b else f"{ids[a]}-{ids[b]}" for a, b in zip(starts, ends, strict=True)
-    ]
-    return ", ".join(parts)
+    numbers = np.array(sorted(ids), int)
+    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1) if len(numbers) else []
+    return ", ".join(f"{r[0]}" if len(r) == 1 else f"{r[0]}-{r[-1]}" for r in runs)
 
 
 def check_geometry(
@@ -122,12 +104,8 @@ def check_geometry(
 ) -> None:
     """Cameras must be at a plausible distance and face the person.
 
-    Args:
-        calibration: the file to name.
-        unit_hint: what to check when the distance is not plausible.
-
     Raises:
-        DataError: naming the camera.
+        DataError: naming the ``calibration`` file and camera, or the distance and ``unit_hint``.
     """
     frames = sorted({f for files in images.values() for f in files})
     joints = np.stack([landmarks.p[f] for f in frames])
@@ -150,17 +128,10 @@ def check_distance(
     limits: tuple[float, float],
     hint: str,
 ) -> None:
-    """The median distance from the cameras to the median joint must be plausible.
-
-    Args:
-        where: file or folder, for the message.
-        cameras: at least one.
-        joints: ``[N, 3]`` metres, visible ones.
-        limits: metres, minimum and maximum.
-        hint: what to check otherwise.
+    """The median distance from the cameras to the median of ``joints [N, 3]`` must be plausible.
 
     Raises:
-        DataError: when it is not; units are wrong then.
+        DataError: when it is outside the ``limits`` (metres); ``hint`` says what to check.
     """
     person = np.median(joints, axis=0)
     distance = float(np.median([np.linalg.norm(c.centre - person) for c in cameras]))
@@ -187,8 +158,7 @@ def drop_unseen(
     """
     kept: dict[str, Mapping[int, str]] = {}
     for name, files in images.items():
-        frames = list(files)
-        if not frames:
+        if not (frames := list(files)):
             kept[name] = {}
             continue
         seen = inside(cameras[name], np.stack([landmarks.p[f] for f in frames]))
@@ -196,9 +166,8 @@ def drop_unseen(
         enough = seen.sum(1) >= checks.min_joints_in_view
         if not enough.any():
             raise DataError(
-                f"{calibration}, camera {name}: no frame has "
-                f"{checks.min_joints_in_view} joints inside the image; check K, and that R and t "
-                "map world to camera (x_cam = R x + t)"
+                f"{calibration}, camera {name}: no frame has {checks.min_joints_in_view} joints "
+                "inside the image; check K, and that R and t map world to camera (x_cam = R x + t)"
             )
         if not enough.all():
             lost = [f for f, ok in zip(frames, enough, strict=True) if not ok]
@@ -217,44 +186,28 @@ def drop_unmasked(
     checks: Checks,
     notes: list[str],
 ) -> Index:
-    """The images that have a mask.
-
-    Args:
-        images: those kept so far.
-        masks: those found.
-        expected: the folder of each camera's masks.
-        checks: for the share that may be missing.
-        notes: a note on how many were left out is appended.
+    """The images that have a mask; a note says how many were left out.
 
     Raises:
-        DataError: when more are missing than allowed.
+        DataError: when more are missing than allowed, naming one in the ``expected`` folders.
     """
-    lacking = {c: [f for f in files if not masks[c].get(f)] for c, files in images.items()}
-    count = sum(len(files) for files in images.values())
-    missing = sum(len(frames) for frames in lacking.values())
-    if missing == 0:
+    lost = [(c, f) for c, files in images.items() for f in files if not masks[c].get(f)]
+    if not lost:
         return images
-    camera = next(c for c, frames in lacking.items() if frames)
-    frame = lacking[camera][0]
-    path = (expected[camera] / Path(images[camera][frame]).name).with_suffix(".png")
-    first = f"{len(lacking[camera])} of the {len(images[camera])} of camera {camera} are missing"
-    if checks.max_missing_masks == 0:
-        raise DataError(f"{path} does not exist; every image needs a mask, and {first}")
-    share = missing / count
-    if share > checks.max_missing_masks:
+    (camera, frame), count = lost[0], sum(len(files) for files in images.values())
+    if len(lost) > checks.max_missing_masks * count:
+        path = (expected[camera] / Path(images[camera][frame]).name).with_suffix(".png")
+        here = sum(c == camera for c, _ in lost)
         raise DataError(
-            f"{path} does not exist, and {share:.0%} of all {count} images have no mask "
-            f"({first}); at most {checks.max_missing_masks:.0%} may be left out: get the whole "
-            "masks, or raise max_missing_masks"
+            f"{path} does not exist; every image needs a mask, and {here} of the "
+            f"{len(images[camera])} of camera {camera} are missing: {len(lost) / count:.0%} of all "
+            f"{count} images have no mask, allowed are {checks.max_missing_masks:.0%}"
         )
     notes.append(
-        f"{missing} of {count} images have no mask and are left out "
+        f"{len(lost)} of {count} images have no mask and are left out "
         f"(first: camera {camera}, frame {frame})"
     )
-    gone = {c: set(frames) for c, frames in lacking.items()}
-    return {
-        c: {f: path for f, path in files.items() if f not in gone[c]} for c, files in images.items()
-    }
+    return {c: {f: p for f, p in files.items() if masks[c].get(f)} for c, files in images.items()}
 
 
 def check_pictures(

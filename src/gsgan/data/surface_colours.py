@@ -62,15 +62,18 @@ def surface_colours(
     """Compares cameras pairwise.
 
     Args:
-        moments: each with one frame per camera, the same cameras in the same order, images of any
-            size. Only one frame is held at a time, so sequences that read from disk need little
-            memory.
+        moments: each with one frame per camera, the same cameras in the same order. Only one frame
+            is held at a time, so sequences that read from disk need little memory.
         body: the mesh that the frames' poses move; None: the visual hull.
 
     Returns:
         None where no two cameras share enough, or images are too coarse.
     """
-    if not moments or max(_pixel(frame) for frame in moments[0]) > COARSEST:
+    if not moments or any(
+        float(f.camera.to_camera(f.skeleton)[..., 2].median()) / float(f.camera.K[0, 0, 0])
+        > COARSEST  # metres per pixel at the person
+        for f in moments[0]
+    ):
         return None
     found: dict[tuple[int, int], list[Float]] = {}
     with torch.no_grad():
@@ -99,8 +102,7 @@ def surface_colours(
 def body_inside(frame: Frame, body: SkinnedBody) -> float | None:
     """Share of the posed body's vertices in the image that lie inside the mask, within 3 cm.
 
-    Returns:
-        None where the image shows none of them, or its mask is empty.
+    None where the image shows none of them, or its mask is empty.
     """
     with torch.no_grad():
         pixels, inside, depth = _place(frame, _skin(body, frame))
@@ -111,12 +113,6 @@ def body_inside(frame: Frame, body: SkinnedBody) -> float | None:
     reach = np.ceil(SLACK * float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside])))
     distance = cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return float((distance[pixels[inside, 1], pixels[inside, 0]] <= reach).mean())
-
-
-def _pixel(frame: Frame) -> float:
-    """Metres per pixel at the person."""
-    depth = float(frame.camera.to_camera(frame.skeleton)[..., 2].median())
-    return depth / float(frame.camera.K[0, 0, 0])
 
 
 def _difference(pair: list[Float]) -> tuple[float, float]:
@@ -175,18 +171,15 @@ def _colours(frame: Frame, points: Float) -> Float:
     np.minimum.at(nearest, flat[inside], depth[inside])
     front = inside.copy()
     front[inside] = depth[inside] < nearest[flat[inside]] + 1.5 * VOXEL
-    soft, picture = _blurred(frame, max(0.5, BLUR * metre))
+    sigma = max(0.5, BLUR * metre)
+    side = 2 * int(2 * sigma) + 1
+    soft, image = (
+        np.asarray(cv2.GaussianBlur(x, (side, side), sigma), np.float32)
+        for x in (frame.mask[0, 0].numpy(), frame.image[0].permute(1, 2, 0).contiguous().numpy())
+    )
     rows, columns = pixels[front, 1], pixels[front, 0]
     weight = soft[rows, columns]
-    colours = picture[rows, columns] / np.maximum(weight, WHOLE)[:, None]
+    colours = image[rows, columns] / np.maximum(weight, WHOLE)[:, None]
     colours[weight < WHOLE] = np.nan
     result[front] = colours
     return result
-
-
-def _blurred(frame: Frame, sigma: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    mask = frame.mask[0, 0].numpy()
-    picture = np.ascontiguousarray(frame.image[0].permute(1, 2, 0).numpy())
-    side = 2 * int(2 * sigma) + 1
-    blur = [cv2.GaussianBlur(x, (side, side), sigma) for x in (mask, picture)]
-    return np.asarray(blur[0], np.float32), np.asarray(blur[1], np.float32)

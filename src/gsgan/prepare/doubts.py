@@ -22,26 +22,7 @@ from gsgan.utils.errors import DataError
 
 @dataclass(frozen=True)
 class Doubts:
-    """Thresholds above which something is reported.
-
-    Args:
-        reprojection: median error of one camera, in thousandths of the focal length.
-        camera_turn: degrees by which refinement turned a camera.
-        camera_move: metres by which refinement moved a camera.
-        flips: share of frames in which a camera's left and right were swapped.
-        frozen_frames: frames in a row in which a detection is identical to the last digit.
-        missing: share of frames in which a camera has no person or an empty mask, or a body joint
-            is missing.
-        undecoded: share of a video's frames that cannot be decoded; headers may be a few off.
-        people: share of frames with more than one person.
-        bone: scatter of a limb's length (median deviation from its median), as a share.
-        lag: frames tried either way when the clocks are compared; 0 skips it.
-        delay: frames by which a clock may be off.
-        delay_gain: share by which the error must fall for a delay to be reported.
-        fps: share by which frame rates may differ.
-        distance: metres, minimum and maximum median distance from the cameras to the person;
-            outside them units are wrong and nothing is written.
-    """
+    """Thresholds above which something is reported; conf/prepare.yaml explains every field."""
 
     reprojection: float = 6.0
     camera_turn: float = 3.0
@@ -66,9 +47,8 @@ def doubts_about_sources(sources: Mapping[str, Source], limits: Doubts) -> list[
     if rates and max(rates.values()) > (1 + limits.fps) * min(rates.values()):
         text = ", ".join(f"{name} {fps:g}" for name, fps in rates.items())
         found.append(f"frame rates differ ({text}): frames are paired by number all the same")
-    counts = {name: s.count for name, s in sources.items()}
-    if len(set(counts.values())) > 1:
-        text = ", ".join(f"{name} {count}" for name, count in counts.items())
+    if len({s.count for s in sources.values()}) > 1:
+        text = ", ".join(f"{name} {s.count}" for name, s in sources.items())
         found.append(f"cameras have different numbers of frames ({text}): was one cut or dropped?")
     found += [
         f"{name}: its metadata ask for a turn by {source.turned} degrees, which is not "
@@ -102,10 +82,8 @@ def doubts_about_detections(detections: Mapping[str, Detections], limits: Doubts
         if empty > limits.missing:
             found.append(f"{name}: no person in {empty:.0%} of the frames")
         if crowd > limits.people:
-            found.append(
-                f"{name}: more than one person in {crowd:.0%} of the frames; the one detected best "
-                "was taken, which need not be the same one"
-            )
+            best = "the one detected best was taken, which may change"
+            found.append(f"{name}: more than one person in {crowd:.0%} of the frames; {best}")
         runs = longest_runs(seen.px[:, :BODY])
         stuck = [joint_names()[j] for j in np.flatnonzero(runs >= limits.frozen_frames)]
         if len(stuck) > BODY // 2:
@@ -120,8 +98,7 @@ def doubts_about_detections(detections: Mapping[str, Detections], limits: Doubts
 def longest_runs(values: Float) -> np.ndarray:
     """``[J]`` the longest run of frames in which ``values [F, J, D]`` stay identical."""
     same = (np.diff(values, axis=0) == 0).all(-1)  # NaN is never the same
-    longest = np.zeros(values.shape[1], int)
-    current = np.zeros(values.shape[1], int)
+    longest = current = np.zeros(values.shape[1], int)
     for row in same:
         current = np.where(row, current + 1, 0)
         longest = np.maximum(longest, current)
@@ -165,27 +142,17 @@ def doubts_about_solution(
         if scatter > limits.bone:
             bone = f"{joint_names()[a]} to {joint_names()[b]}"
             found.append(f"the length from {bone} scatters by {scatter:.0%} about {usual:.2f} m")
-    if removed := {why: count for why, count in solution.removed.items() if count}:
-        text = ", ".join(f"{count} {why}" for why, count in removed.items())
-        found.append(f"joints removed as impossible: {text}")
     return found
 
 
 def check_distance(cameras: Sequence[CameraEntry], p: Float, limits: Doubts, where: Path) -> None:
-    """Refuses a capture whose cameras are implausibly near or far.
-
-    Args:
-        p: ``[N, 3]`` metres, NaN = missing.
-        where: the file to name.
+    """Refuses a capture whose cameras are implausibly near or far; NaN in ``p [N, 3]``: missing.
 
     Raises:
-        DataError: naming the distance found.
+        DataError: naming the file and the distance.
     """
     seen = p[known(p)]
     if not len(seen):
-        raise DataError(
-            f"{where}: no joint was seen by two cameras in any frame; do the cameras' frame "
-            "numbers belong together?"
-        )
+        raise DataError(f"{where}: no joint was seen by two cameras; do frame numbers agree?")
     hint = "is the calibration in another unit? Set unit=mm, cm or m"
     checks.check_distance(where, cameras, seen, limits.distance, hint)

@@ -36,8 +36,7 @@ AGREEMENT = (
 )
 LEGEND = (
     "Blue: the person's left, orange: the right, white: the middle. Lines: the 3D joints "
-    "projected; large dots: detections, sides corrected. Green: the mask's outline and box; "
-    "yellow: the joints' box."
+    "projected; large dots: detections, sides corrected. Green: the mask's outline."
 )
 
 

@@ -6,7 +6,7 @@ Readers apply them to a few images when a dataset is opened (`check_meeting`, `w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -38,21 +38,7 @@ FAR_PIXELS = 1e4  # drawing coordinates are clipped to this: OpenCV's are 16 bit
 class Trust:
     """How many images are compared when a dataset is opened, and the thresholds.
 
-    Args:
-        frames: compared with body and joints in every camera, evenly spaced; 0 for none. About
-            20 ms per image of 1024 x 1024.
-        min_box_iou: minimum overlap (IoU, median over those images) of the box of the projected
-            body with the box of the mask; below it reading stops.
-        least_inside: share of a camera's joints inside its masks below which reading stops.
-        min_inside: the same, below which a note (in `gsgan.check` a warning) names the camera.
-        far_camera: factor by which a camera may be farther than the median camera, or nearer;
-            beyond it reading stops: its ``t`` is in another unit.
-        joint_tolerance: metres that a joint may lie outside the mask and count as inside.
-        max_beyond: share of a camera's masks beyond all joints above which a note names it.
-        joint_reach: metres from the nearest joint at which a pixel of the mask is beyond them.
-        watched_masks: masks of the first camera compared, evenly spaced; 0 for none. About 6 ms
-            each at 1024 x 1024.
-        mask_jump: share of the median by which a mask's area may differ without a note.
+    conf/data/capture.yaml explains every field.
     """
 
     frames: int = 3
@@ -72,19 +58,18 @@ class Meeting:
     """One image's mask against what its camera should see.
 
     Args:
-        camera, frame: of the image.
-        mask: its (first) file.
-        empty: the mask has no foreground.
-        iou: overlap of the boxes of mask and projected body; None when one of them is empty.
-        inside: share of the visible joints inside the mask; NaN of none.
-        beyond: share of the mask far from every visible joint; NaN of none.
+        camera, frame, mask, empty: of the image; the (first) file of its mask, and whether that
+            has no foreground.
+        iou: overlap of the boxes of mask and projected body; NaN when one of them is empty.
+        inside, beyond: share of the visible joints inside the mask, and of the mask far from every
+            visible joint; NaN of none.
     """
 
     camera: str
     frame: int
     mask: Path
     empty: bool
-    iou: float | None
+    iou: float
     inside: float
     beyond: float
 
@@ -101,26 +86,26 @@ def check_meeting(
         hint: what to check when they do not fit.
 
     Returns:
-        Notes on the cameras whose joints lie outside their masks, or masks far from their joints.
+        Notes on cameras whose joints lie outside their masks, or masks far from their joints.
 
     Raises:
-        DataError: naming the camera and frame that is furthest off, cameras with hardly a joint
-            inside their masks or in another unit, or the first empty mask.
+        DataError: naming the camera that is furthest off, or the first empty mask.
     """
     compared = _meetings(layout, body, trust)
     if not compared:
         return []
-    _check_far(layout, compared[0].frame, trust)
+    person = np.median(layout.landmarks.seen(compared[0].frame), axis=0)
+    metres = {n: float(np.linalg.norm(c.centre - person)) for n, c in layout.cameras.items()}
+    if far := far_cameras(metres, trust.far_camera):
+        raise DataError(f"{layout.root}: {next(iter(far.values()))}")
     if all(one.empty for one in compared):
         raise DataError(
             f"{compared[0].mask} shows no person, nor does any of the {len(compared)} masks "
-            "compared; expected values above 0 where the person is: check how the masks were "
-            "written"
+            "compared; expected values above 0 where the person is"
         )
-    ious = [(one.iou, one) for one in compared if one.iou is not None]
-    median = float(np.median([iou for iou, _ in ious])) if ious else 1.0
-    if median < trust.min_box_iou:
-        _, worst = min(ious, key=lambda pair: pair[0])
+    known = [one for one in compared if np.isfinite(one.iou)]
+    if known and (median := float(np.median([one.iou for one in known]))) < trust.min_box_iou:
+        worst = min(known, key=lambda one: one.iou)
         raise DataError(
             f"{layout.root}: the projected body and the masks do not meet (their boxes overlap by "
             f"{median:.2f}, expected {trust.min_box_iou:g}; worst in camera {worst.camera}, frame "
@@ -138,7 +123,7 @@ def _meetings(layout: Layout, body: Callable[[int], Float], trust: Trust) -> lis
             camera = layout.cameras[name]
             mask = read_mask(layout.mask_files(name, frame), layout.pixels)
             expected, found_box = box_of(points, camera), mask_box(mask)
-            iou = box_iou(expected, found_box) if expected and found_box else None
+            iou = box_iou(expected, found_box) if expected and found_box else np.nan
             inside = inside_share(mask, camera, joints, trust.joint_tolerance)
             beyond = mask_beyond(mask, camera, joints, trust.joint_reach)
             path = layout.mask_path(name, frame)
@@ -146,20 +131,8 @@ def _meetings(layout: Layout, body: Callable[[int], Float], trust: Trust) -> lis
     return found
 
 
-def _check_far(layout: Layout, frame: int, trust: Trust) -> None:
-    person = np.median(layout.landmarks.seen(frame), axis=0)
-    metres = {n: float(np.linalg.norm(c.centre - person)) for n, c in layout.cameras.items()}
-    if far := far_cameras(metres, trust.far_camera):
-        raise DataError(f"{layout.root}: {next(iter(far.values()))}")
-
-
 def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
-    """A message for each camera that is ``factor`` times farther than the median one, or nearer.
-
-    Args:
-        metres: from the person, by camera.
-        factor: see `Trust.far_camera`.
-    """
+    """A message for each camera that is ``factor`` times farther than the median one, or nearer."""
     median = float(np.median(list(metres.values())))
     return {
         name: f"camera {name} stands {distance:.3g} m from the person, the median camera "
@@ -172,42 +145,39 @@ def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
 def _notes(root: Path, compared: Sequence[Meeting], trust: Trust, hint: str) -> list[str]:
     """One note on joints outside masks, one on masks beyond joints, where there are any."""
     notes = []
-    inside = _means((one.camera, one.inside) for one in compared)
+    inside, beyond = _means(compared, "inside"), _means(compared, "beyond")
     outside = {name for name, share in inside.items() if share < trust.min_inside}
     if outside:
-        shares, others = _listed(inside, outside)
-        text = f"joints lie outside the masks (inside: {shares}{others})"
+        text = f"joints lie outside the masks (inside: {_listed(inside, outside)})"
         if min(inside.values()) < trust.least_inside:
             raise DataError(f"{root}: {text}; {hint}: python -m gsgan.check finds the wrong camera")
         notes.append(
             f"{text}: python -m gsgan.check finds whether calibration, skeleton or masks are wrong"
         )
-    beyond = _means((one.camera, one.beyond) for one in compared)
     wide = {n for n, share in beyond.items() if share > trust.max_beyond and n not in outside}
     if wide:
-        shares, others = _listed(beyond, wide)
         notes.append(
-            f"masks reach more than {trust.joint_reach:g} m beyond all joints ({shares} of the "
-            f"mask{others}): focal lengths that are too short do this, masks of more than the "
-            "person, or a skeleton that lacks limbs: python -m gsgan.check reports more"
+            f"masks reach more than {trust.joint_reach:g} m beyond all joints (share: "
+            f"{_listed(beyond, wide)}): focal lengths are too short, masks show more than the "
+            "person, or the skeleton lacks limbs: python -m gsgan.check reports more"
         )
     return notes
 
 
-def _means(values: Iterable[tuple[str, float]]) -> dict[str, float]:
+def _means(compared: Sequence[Meeting], field: str) -> dict[str, float]:
     """The mean of each camera's finite values."""
     kept: dict[str, list[float]] = {}
-    for name, value in values:
-        if np.isfinite(value):
-            kept.setdefault(name, []).append(value)
+    for one in compared:
+        if np.isfinite(value := getattr(one, field)):
+            kept.setdefault(one.camera, []).append(value)
     return {name: float(np.mean(some)) for name, some in kept.items()}
 
 
-def _listed(means: Mapping[str, float], named: set[str]) -> tuple[str, str]:
-    """The shares of the named cameras, and the mean of the others as a clause."""
+def _listed(means: Mapping[str, float], named: set[str]) -> str:
+    """The shares of the named cameras, and the mean of the others."""
     text = ", ".join(f"{name} {share:.0%}" for name, share in means.items() if name in named)
     rest = [share for name, share in means.items() if name not in named]
-    return text, f"; {np.mean(rest):.0%} in the other cameras" if rest else ""
+    return f"{text}; {np.mean(rest):.0%} in the other cameras" if rest else text
 
 
 def mask_distance(mask: Bool) -> Float:
@@ -223,33 +193,27 @@ def joint_distance(
 ) -> Float:
     """``[J]`` metres by which joints lie outside the mask; NaN where unknown.
 
-    Unknown are joints that are not visible, behind the camera, or outside the image.
+    Unknown are joints that are not ``visible [J]``, behind the camera, or outside the image.
 
     Args:
         distance: ``[H, W]`` of `mask_distance`.
-        pixels: ``[J, 2]`` of the joints in that image.
-        depth: ``[J]`` metres.
-        visible: ``[J]``.
+        pixels, depth: ``[J, 2]`` and ``[J]`` (metres) of the joints in that image.
         focal: pixels, of that image.
     """
     known = np.where(np.isfinite(pixels), pixels, -1.0).clip(-1, FAR_PIXELS)
     column, row = np.floor(known.T).astype(int)
     height, width = distance.shape
-    usable = visible & (depth > NEAR) & (column >= 0) & (column < width) & (row >= 0)
-    usable &= row < height
+    usable = visible & (depth > NEAR)
+    usable &= (column >= 0) & (column < width) & (row >= 0) & (row < height)
     metres = np.full(len(pixels), np.nan)
     metres[usable] = distance[row[usable], column[usable]] * depth[usable] / focal
     return metres
 
 
 def inside_share(mask: Bytes, camera: CameraEntry, joints: Float, tolerance: float) -> float:
-    """Share of world points ``[N, 3]`` in view that lie inside a stored mask; NaN of none.
+    """Share of world points ``[N, 3]`` in view that lie inside a stored mask ``[H, W]``.
 
-    Args:
-        mask: ``[H, W]``; an empty one gives NaN.
-        camera: of the mask.
-        joints: metres.
-        tolerance: metres that they may lie outside.
+    They may lie ``tolerance`` metres outside; NaN of no points, or of an empty mask.
     """
     if not mask.any():
         return np.nan
@@ -290,19 +254,15 @@ def box_of(points: Float, camera: CameraEntry) -> Box | None:
     pixels = camera.stored_pixels(points[depth > NEAR])
     if len(pixels) == 0:
         return None
-    height, width = camera.size
-    (left, top), (right, bottom) = (
-        np.clip(edge, 0, (width, height)) for edge in (pixels.min(0), pixels.max(0))
-    )
-    return float(left), float(top), float(right), float(bottom)
+    edges = np.clip([pixels.min(0), pixels.max(0)], 0, camera.size[::-1])
+    (left, top), (right, bottom) = edges.tolist()
+    return left, top, right, bottom
 
 
 def mask_box(mask: Bytes) -> Box | None:
     """The box of a mask's person, None when it is empty."""
-    rows, columns = (np.flatnonzero((mask > 127).any(axis)) for axis in (1, 0))
-    if len(rows) == 0:
-        return None
-    return float(columns[0]), float(rows[0]), float(columns[-1] + 1), float(rows[-1] + 1)
+    left, top, width, height = cv2.boundingRect((mask > 127).astype(np.uint8))
+    return (left, top, left + width, top + height) if width else None
 
 
 def box_iou(a: Box, b: Box) -> float:
@@ -331,15 +291,11 @@ def watch_masks(layout: Layout, trust: Trust) -> list[str]:
     filled, areas = np.array([(mask.any(), np.count_nonzero(mask > 127)) for mask in masks]).T
     filled = filled > 0
     usual = float(np.median(areas[filled])) if filled.any() else 0.0
-    cases = {
-        "mask is empty": ~filled,
-        f"mask's area is more than {trust.mask_jump:.0%} off the usual": filled
-        & (np.abs(areas - usual) > trust.mask_jump * usual),
-    }
+    odd = filled & (np.abs(areas - usual) > trust.mask_jump * usual)
+    off = f"mask's area is more than {trust.mask_jump:.0%} off the usual"
     return [
         f"camera {camera}: the {case} at frames {spans(np.array(frames)[at].tolist())} of "
-        f"{len(frames)} compared; look at them, and leave bad ones out with "
-        "data.reader.drop_frames"
-        for case, at in cases.items()
+        f"{len(frames)} compared; leave bad ones out with data.reader.drop_frames"
+        for case, at in (("mask is empty", ~filled), (off, odd))
         if at.any()
     ]
