@@ -23,8 +23,8 @@ from gsgan.bench.trade_off import (
     ways,
 )
 from gsgan.bench.trade_off_report import front, images, table, text
+from gsgan.report.curve import Curve, curve
 from gsgan.splat import ACCURACY
-from gsgan.train.curve import Curve, curve
 from gsgan.utils.errors import ConfigError, DataError
 
 WHERE = {"device": "cpu", "hardware": "Abacus", "threads": 1, "date": "", "load": None}

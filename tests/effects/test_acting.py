@@ -9,7 +9,7 @@ import pytest
 import torch
 from operators import Calls
 
-from gsgan.model.colour import ColourCorrection
+from gsgan.model.painting import ColourCorrection
 from gsgan.train.runs import build_training, load_avatar, read_checkpoint
 from gsgan.utils.errors import ConfigError
 
@@ -128,11 +128,6 @@ def test_pictures_are_mapped_and_the_background_stays_black():
         ),
         (inputs[0], double.offsets.detach().requires_grad_()),
     )
-
-
-def test_one_camera_has_nothing_to_correct():
-    with pytest.raises(ValueError, match="at least two training cameras"):
-        ColourCorrection(["a"], ["a", "b"])
 
 
 def test_correction_acts_on_both_pictures_and_leaves_f_alone(build):
@@ -347,7 +342,7 @@ def test_decisions_are_stored_and_taken_up_again(capture, inside, tmp_path):
     from commands import arguments
 
     folder = tmp_path / "run"
-    words = ("effects.view_dependence=1", "effects.colour_correction=on", "effects.measure=1")
+    words = ("effects.view_dependence=1", "effects.colour_correction=on")
     result = inside("train", *arguments(capture, folder), *words, "evaluate=false")
     assert result.returncode == 0, result.stderr
     assert "colour correction" in result.stdout

@@ -188,7 +188,7 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
     stored(module, tmp_path)
     avatar, _ = load_avatar(tmp_path, config, data)
     assert getattr(avatar, part) is not None
-    for place in ("assemble", "parts"):
+    for place in ("assemble", "class_vote"):
         monkeypatch.setattr(f"gsgan.model.{place}.open_body", lambda *_: None)
     with pytest.raises(
         DataError, match=rf"{said},? .*cannot be built.* no model file; set data\.smpl"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from gsgan.model.body_points import SkinnedPoints
 from gsgan.model.painting import Painting
-from gsgan.model.skinned_points import SkinnedPoints
 from gsgan.scene import BodyPose, Frame, Gaussians
 from gsgan.train.runs import build_training
 

@@ -10,8 +10,13 @@ import torch
 
 from gsgan.body import free_body
 from gsgan.body.smpl_names import CIHP, CLOTHES, SMPLX_JOINTS
-from gsgan.model.classes import IGNORE, class_map
-from gsgan.model.segmentation import Segmentation, segmentation_loss, silhouette_loss
+from gsgan.model.segmentation import (
+    IGNORE,
+    Segmentation,
+    class_map,
+    segmentation_loss,
+    silhouette_loss,
+)
 from gsgan.scene import BodyPose, Camera
 from gsgan.train.runs import Moved, build_data, load_avatar, load_config
 from gsgan.utils.errors import ConfigError

@@ -120,5 +120,5 @@ def test_a_span_that_is_not_read_is_refused(make):
 
 
 def test_a_span_is_both_steps_or_the_first():
-    with pytest.raises(ConfigError, match="span must be both or step_one, got 'all'"):
+    with pytest.raises(ConfigError, match="span must be one of both, step_one, got 'all'"):
         Recipe(Rate(1e-3), span="all")

@@ -31,9 +31,9 @@ from gsgan.bench.speed import deciles
 from gsgan.bench.trade_off_report import QUALITIES, front, images, text
 from gsgan.metrics.image import edge_f1, psnr, ssim
 from gsgan.metrics.lpips import lpips
+from gsgan.report.curve import curve
 from gsgan.scene import Frame
 from gsgan.splat import Accuracy
-from gsgan.train.curve import curve
 from gsgan.train.runs import CHECKPOINT, Moved, build_data, load_avatar, load_config
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.timing import interleaved

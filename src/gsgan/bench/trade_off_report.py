@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from gsgan.bench.common import NOTHING, markdown, number, panels, plain_ticks, png, sentence
-from gsgan.train.curve import Curve
+from gsgan.report.curve import Curve
 from gsgan.utils.palette import BLACK, COLOURS, DASHES, GREY, MARKERS
 
 # Metric: heading, digits, and 1 where more is better, -1 where less is.

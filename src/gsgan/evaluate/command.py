@@ -70,7 +70,7 @@ def evaluate_folder(config: DictConfig) -> Results:
     check_background("background", config.background)
     device, console = pick_device(config.device), make_console()
     folder = Path(config.run).expanduser()
-    stored = load_config(folder, Moved.said(config))
+    stored = load_config(folder, Moved.from_config(config))
     data = build_data(stored)
     avatar, marks = load_avatar(folder, stored, data)
     state = read_checkpoint(folder / CHECKPOINT)["gsgan"]

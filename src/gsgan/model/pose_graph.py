@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.model.encoding import encoded_size, positional_encoding
+from gsgan.model.deformation import encoded_size, positional_encoding
 from gsgan.skeleton import MEDIAPIPE33, SkeletonTemplate
+from gsgan.utils.checks import one_of
 
 READOUT_START = 0.8  # initial standard deviation of g for joint channels of 1
 
@@ -57,9 +58,6 @@ class PoseGraph(nn.Module):
         readout: ``edge``, each number of g from the two joints of its edge (35 is the number of
             MediaPipe edges), or ``linear``, from all joints.
 
-    Raises:
-        ValueError: on another readout.
-
     Source: paper Sec. 3.5, which leaves open how joints become g.
     """
 
@@ -75,8 +73,7 @@ class PoseGraph(nn.Module):
         readout: str = "edge",
     ) -> None:
         super().__init__()
-        if readout not in ("edge", "linear"):
-            raise ValueError(f"PoseGraph: readout must be edge or linear, got {readout!r}")
+        one_of("model.pose_encoder.readout", readout, ("edge", "linear"))
         joints = len(template.names)
         mask = torch.eye(joints)
         for a, b in template.gnn_edges:

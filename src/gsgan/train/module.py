@@ -23,6 +23,7 @@ from gsgan.train.losses import StepOneLoss, StepTwoLoss, discriminate
 from gsgan.train.optimisers import MovingAverage, Recipe, clip, parameter_groups, set_rate
 from gsgan.train.rollback import Rollback, SkippedSteps
 from gsgan.train.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
+from gsgan.utils.checks import at_least
 from gsgan.utils.errors import ConfigError, GsganError
 
 PSNR_CAP = 100.0  # dB: one image equal to the ground truth would make the mean infinite
@@ -43,13 +44,9 @@ class AvatarTraining(LightningModule):
         pose_noise: standard deviation, body heights, of the noise on Ψ's pose code.
         seed: with the iteration it determines every random number drawn here, so a resumed run
             draws the same ones.
-        max_skipped: non-finite gradients within ``skip_window`` iterations that stop the run; fewer
-            are skipped.
-        skip_window: iterations.
-        log_every: iterations between logged values.
+        max_skipped, skip_window, log_every, average_every: see conf/training/long.yaml.
         average: decay of the moving average of the last step's weights, which is scored; None
             scores the weights themselves.
-        average_every: iterations between its updates.
         rollback: recovers from a collapse of the rendered person.
         extra_losses: further terms of Step II by name: modules of a painting and its frame.
         record: plain config values stored with every checkpoint.
@@ -95,9 +92,8 @@ class AvatarTraining(LightningModule):
         )
         self.recipes, self.step_one, self.step_two = recipes, step_one, step_two
         self.pose_noise, self.seed, self.log_every = pose_noise, seed, log_every
-        for name, every in {"log_every": log_every, "average_every": average_every}.items():
-            if every < 1:
-                raise ConfigError(f"training.{name} must be at least 1, got {every}")
+        at_least("training.log_every", log_every, 1)
+        at_least("training.average_every", average_every, 1)
         self.skipped = SkippedSteps(max_skipped, skip_window)
         self.record, self.scene = record or {}, scene
         self.rollback = rollback or Rollback()
@@ -110,8 +106,6 @@ class AvatarTraining(LightningModule):
         self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1) if reads else None
         self.step = 0  # iterations done: Lightning's global_step counts every optimiser's steps
         self.code: list[str] = []  # commits of the code, several where a run was resumed
-        self.start_psnr: float | None = None
-        self.last_psnr: float | None = None
         self.seconds_before: float | None = 0.0  # None: unknown, of an earlier part
         self._began: float | None = None
 
@@ -123,11 +117,7 @@ class AvatarTraining(LightningModule):
         return self.seconds_before + time.monotonic() - self._began
 
     def on_fit_start(self) -> None:
-        """Refuses float16: gradients would be clipped before unscaling.
-
-        Raises:
-            ConfigError: when ``trainer.precision`` is one of float16's.
-        """
+        """Refuses float16: gradients would be clipped before unscaling."""
         if self.trainer.precision in ("16-true", "16-mixed"):
             raise ConfigError(
                 f"trainer.precision={self.trainer.precision}: float16 loses this training's small "
@@ -153,9 +143,6 @@ class AvatarTraining(LightningModule):
         missing = sorted(set(groups) - set(self.recipes))
         if missing:
             raise ConfigError(f"training.recipes lacks {', '.join(missing)}")
-        for name in set(groups) - set(SPLATTING):
-            if self.recipes[name].span != "both":
-                raise ConfigError(f"training.recipes.{name}.span is read for psi and colour only")
         self._names = list(groups)
         return [self.recipes[name].build(groups[name]) for name in self._names]
 
@@ -364,9 +351,6 @@ class AvatarTraining(LightningModule):
     def on_validation_epoch_end(self) -> None:
         if self.train_seconds is not None:  # the time axis of every curve
             self.log("val/seconds", self.train_seconds, sync_dist=True)
-        self.last_psnr = float(self.trainer.callback_metrics["val/psnr"])
-        if self.start_psnr is None:
-            self.start_psnr = self.last_psnr
 
     def _log(self, name: str, value: Tensor) -> None:
         if self.step % self.log_every == 0 and self._trainer is not None:
@@ -377,7 +361,6 @@ class AvatarTraining(LightningModule):
             "step": self.step,
             "rollbacks": self.rollback.done,
             "averaged": self.average is not None and self.average.started,
-            "start_psnr": self.start_psnr,
             "train_seconds": self.train_seconds,
             "code": self.code,
             "marks": self.marks,
@@ -391,6 +374,5 @@ class AvatarTraining(LightningModule):
         self.avatar.effects.check_same(state.get("effects"))
         self.step = state["step"]
         self.rollback.done = state["rollbacks"]
-        self.start_psnr = state["start_psnr"]
         self.seconds_before = state.get("train_seconds")
         self.code = list(dict.fromkeys([*state.get("code", []), *self.code]))

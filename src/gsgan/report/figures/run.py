@@ -66,7 +66,7 @@ def make_figures(config: DictConfig) -> None:
         raise ConfigError("settings and shots are tables of values; leave them out, or set a key")
     settings: Settings = instantiate(config.settings)
     out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
-    moved = Moved.said(config)
+    moved = Moved.from_config(config)
     for folder in folders:
         load_config(folder, moved)  # refuses what is not a run folder before anything is written
     try:

@@ -7,10 +7,10 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from gsgan.report.curve import Curve, curve
 from gsgan.report.figures.layout import Drawing, Settings, Unavailable
 from gsgan.report.figures.shots import Shot
 from gsgan.report.figures.subjects import Subject
-from gsgan.train.curve import Curve, curve
 from gsgan.utils.errors import DataError
 from gsgan.utils.palette import COLOURS, MARKERS
 
