@@ -89,6 +89,8 @@ def test_a_config_of_an_older_gsgan_is_read_under_its_new_names(run, tmp_path):
     text = (run / CONFIG).read_text()
     old = text.replace("gsgan.model.assemble.assemble_avatar", "gsgan.model.avatar.Avatar")
     assert old != text
+    old = old.replace("\neffects:\n", "\neffects:\n  measure: 5\n")  # a former key
+    assert "measure" in old
     (tmp_path / CONFIG).write_text(old.replace("gsgan.train.", "gsgan.training."))
     assert load_config(tmp_path) == load_config(run)
 

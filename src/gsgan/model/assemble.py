@@ -40,12 +40,7 @@ def build_avatar(
     effects: Effects | None = None,
     labelled: bool | None = None,
 ) -> Avatar:
-    """The untrained avatar of a config, its weights from ``config.seed``; see `assemble_avatar`.
-
-    Raises:
-        ConfigError: when a value under ``model`` is not allowed.
-        DataError: when the data lacks what the model needs.
-    """
+    """The untrained avatar of a config, its weights from ``config.seed``; see `assemble_avatar`."""
     if config.model.get("densify") is not None and "_target_" not in config.model.densify:
         raise ConfigError(
             "experiment=paper changes parts that this model does not have; it goes with "
@@ -92,13 +87,11 @@ def assemble_avatar(
     does not change the start of the others.
 
     Args:
-        scene: facts about the training split: body height, body, labels.
-        densify: skeleton to points.
-        deformation: Ψ, given rest points, body height, number of joints and SH degree; goes with
-            densify.
+        scene: facts about the training split.
+        densify, deformation: skeleton to points; Ψ, given rest points, height, joints, SH degree.
         segmentation: S, given a body; None leaves it out (``wo_seg``).
-        pose_encoder: Ω (or the flat skeleton) to g; goes with generator.
-        generator: the UNet, given its channel counts; None makes Step I's colour the image.
+        pose_encoder, generator: Ω (or the flat skeleton) to g; the UNet, given its channel counts.
+            Without them Step I's colour is the image.
         accuracy: the rasteriser's settings for F.
         surface: in place of Ψ, any Gaussians that move with the body (``lbs_splat``), given the
             body, its height and the SH degree. Without either nothing is splatted and the UNet
@@ -109,8 +102,7 @@ def assemble_avatar(
         pictures: training frames with labels, for that vote.
         vertex_labels: ``[V]`` int64, the result of an earlier vote, which is then not repeated.
         labelled: whether S was trained on part labels; None: whether the data has some.
-        effects: decided when training began; None decides them here.
-        settings: for that decision; None: the defaults.
+        effects: decided when training began; None decides them here, by ``settings``.
         options: of `Avatar`: twist, window_margin, window_multiple, window_least.
 
     Raises:

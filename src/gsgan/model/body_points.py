@@ -13,6 +13,7 @@ from gsgan.body import SkinnedBody, axis_angle_to_matrix, blend_transforms, forw
 from gsgan.body.skinned import vertex_normals
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
+from gsgan.utils.checks import above, whole
 
 NORMAL_FLOOR = 1e-2  # below it rounding errors dominate where skinning is flat
 ROWS = 1024  # points compared with all others at a time
@@ -24,9 +25,6 @@ class SkinnedPoints(nn.Module):
     Args:
         body: vertices, weights and joints.
         count: vertices used, spread evenly over the surface; None for all.
-
-    Raises:
-        ValueError: on a count below 1.
 
     Source: paper Sec. 3.4.
     """
@@ -40,8 +38,8 @@ class SkinnedPoints(nn.Module):
 
     def __init__(self, body: SkinnedBody, count: int | None = None) -> None:
         super().__init__()
-        if count is not None and count < 1:
-            raise ValueError(f"SkinnedPoints: points must be at least 1, or null, got {count}")
+        if count is not None:
+            whole("points", count, 1)
         vertices = body.vertices.float()
         every = len(vertices)
         chosen = farthest_points(vertices, every if count is None else min(count, every))
@@ -113,9 +111,6 @@ class BodyPoints(nn.Module):
         points: vertices used, spread evenly over the surface; None for all.
         sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
 
-    Raises:
-        ValueError: on a number out of range.
-
     Source: ours; the paper's G is Alg. 1's (`gsgan.skeleton.Densify`).
     """
 
@@ -132,8 +127,7 @@ class BodyPoints(nn.Module):
         sigma: float = 0.7,
     ) -> None:
         super().__init__()
-        if sigma <= 0:
-            raise ValueError(f"BodyPoints: sigma must be positive, got {sigma}")
+        above("model.body_points.sigma", sigma)
         self.points, self.sigma = SkinnedPoints(body, points), sigma
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
         self.register_buffer("rest_points", rest, persistent=False)

@@ -6,15 +6,13 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import torch
-from rich.progress import track
 from torch import Tensor
 
 from gsgan.body import SkinnedBody, open_body
-from gsgan.model.body_points import neighbour_distance
+from gsgan.model.body_points import ROWS, neighbour_distance
 from gsgan.model.segmentation import IGNORE
 from gsgan.scene import Camera, Frame
 from gsgan.utils.checks import above, whole
-from gsgan.utils.console import make_console
 from gsgan.utils.errors import DataError
 
 if TYPE_CHECKING:
@@ -24,7 +22,6 @@ NEIGHBOUR = 4  # the neighbour whose distance measures the gaps between vertices
 CELLS = 2.0  # cells of the depth map across the median occluder's radius
 WIDEST = 8  # cells, largest occluder radius: one close to the camera would fill the map
 MOST_CELLS = 2048  # along a side of the depth map, however far the discs spread
-ROWS = 1024  # vertices compared with all others at a time
 
 
 class Pictures(Protocol):
@@ -43,13 +40,7 @@ def labelled_body(
     """The body, and a clause on where its labels come from, or why there is no body.
 
     The body's own labels are used where they are the data's, or the data has none; otherwise those
-    of a checkpoint, or of a vote.
-
-    Args:
-        scene: facts about the training split.
-        vote: settings of the vote.
-        pictures: training frames with labels, for the vote.
-        vertex_labels: ``[V]`` int64, the result of an earlier vote.
+    of a checkpoint (``vertex_labels [V]``), or of a vote over ``pictures``.
 
     Raises:
         DataError: when a vote is needed and not possible, or the labels do not fit the body.
@@ -130,12 +121,7 @@ class ClassVote:
         above("model.class_vote.depth_tolerance", self.depth_tolerance)
 
     def __call__(self, body: SkinnedBody, pictures: Pictures, n_labels: int) -> Votes:
-        """Votes.
-
-        Args:
-            body: vertices and weights; its labels are ignored.
-            pictures: frames of one item each, with labels and a body pose.
-            n_labels: labels of the data, background included.
+        """Votes over frames of one item each, for data of so many labels (background included).
 
         Raises:
             DataError: when an image file is damaged, or no vertex lies on a labelled pixel.
@@ -144,14 +130,7 @@ class ClassVote:
         chosen = [(2 * i + 1) * len(pictures) // (2 * count) for i in range(count)]
         reach = self.occluder_radius * neighbour_distance(body.vertices.float(), NEIGHBOUR)
         votes = torch.zeros(len(body.vertices), n_labels, dtype=torch.int64)
-        console = make_console()
-        for index in track(
-            chosen,
-            "voting on each vertex's part",
-            console=console,
-            transient=True,
-            disable=not console.is_terminal,
-        ):
+        for index in chosen:
             self._count(votes, body, reach, pictures[index])
         if not votes.any():
             raise DataError(

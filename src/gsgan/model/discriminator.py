@@ -19,9 +19,6 @@ class PatchDiscriminator(nn.Module):
         norm: ``instance``, or ``none``. Instance normalisation equalises the contrast of every
             channel, and so hides how sharp the image is (measured in docs/ablations.md).
 
-    Raises:
-        ConfigError: on an unknown norm.
-
     Source: ours, after pix2pixHD (Wang et al., 2018).
     """
 

@@ -52,11 +52,8 @@ class PoseGraph(nn.Module):
 
     Args:
         template: the skeleton's joints and edges.
-        width: channels of the hidden layers.
-        joint_channels: output channels per joint.
-        octaves: positional encoding of Ω.
-        readout: ``edge``, each number of g from the two joints of its edge (35 is the number of
-            MediaPipe edges), or ``linear``, from all joints.
+        width, joint_channels, octaves: hidden and output channels per joint, encoding of Ω.
+        readout: ``edge`` (each number of g from the two joints of its edge) or ``linear``.
 
     Source: paper Sec. 3.5, which leaves open how joints become g.
     """
@@ -109,11 +106,7 @@ class PoseGraph(nn.Module):
 
 
 class PoseLinear(nn.Module):
-    """The ablation ``wo_gcn``: g = W p + b on the flattened skeleton (paper Sec. 4, ablation).
-
-    Args:
-        template: the skeleton; g has one number per edge, as with the graph.
-    """
+    """The ablation ``wo_gcn``: g = W p + b on the flattened skeleton (paper Sec. 4, ablation)."""
 
     def __init__(self, template: SkeletonTemplate = MEDIAPIPE33) -> None:
         super().__init__()

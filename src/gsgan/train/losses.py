@@ -76,7 +76,7 @@ def discriminate(discriminator: Discriminator, image: Tensor, gan: str) -> list[
 
 @dataclass(frozen=True)
 class StepTwoLoss:
-    """Weights of the generator's loss (conf/training/long.yaml); a term of weight 0 is not computed.
+    """Weights of the generator's loss (conf/training/long.yaml); 0 computes no term.
 
     Source: paper Sec. 3.5 and Alg. 2, an unweighted sum of L_GAN, L_perc and L_feat; weights, the
         other terms and the anchor are ours.

@@ -66,12 +66,6 @@ def parameter_groups(
     return groups
 
 
-def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
-    """Sets every group's learning rate, its multiplier applied."""
-    for group in optimiser.param_groups:
-        group["lr"] = rate * group["multiplier"]
-
-
 def clip(optimiser: torch.optim.Optimizer, largest: float | None) -> Tensor:
     """Clips all gradients together and returns their norm before clipping."""
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
@@ -79,16 +73,11 @@ def clip(optimiser: torch.optim.Optimizer, largest: float | None) -> Tensor:
 
 
 class MovingAverage(nn.Module):
-    """An exponential moving average of a module's parameters.
+    """An exponential moving average of a module's parameters, updated ``every`` so many iterations.
 
     Convention: the average starts as a copy at the first update and forgets it quickly: the decay
     at update n is ``min(decay ** every, (1 + n) / (10 + n))``. Buffers are copied, not
     averaged.
-
-    Args:
-        module: to average.
-        decay: in [0, 1); how much of the average each iteration keeps.
-        every: iterations between updates.
 
     Source: ours; the usual average of a generator's weights.
     """

@@ -53,9 +53,13 @@ def run_training(config: DictConfig) -> None:
     seed_everything(config.seed, workers=True, verbose=False)
     resume = checkpoint_to_resume(folder, module.record, module.marks) if config.resume else None
     done = 0 if resume is None else int(read_checkpoint(resume)["gsgan"]["step"])
+    scores = folder / "metrics.json"
     if resume is None:
         remove_old_results(folder)
-    elif done >= module.schedule.total and (not config.evaluate or _scored(folder)):
+    elif done >= module.schedule.total and (
+        not config.evaluate
+        or (scores.is_file() and scores.stat().st_mtime >= resume.stat().st_mtime)
+    ):
         console.print(
             f"{folder}: trained and scored before; nothing to do (gsgan.evaluate scores it again)",
             soft_wrap=True,
@@ -123,12 +127,6 @@ def refuse_long_cpu_run(
             f"{hours:.0f} hours: size=small training=demo (without experiment= and protocol=) "
             "trains for minutes at 128², trainer=cpu starts this run anyway"
         )
-
-
-def _scored(folder: Path) -> bool:
-    """Whether the run's scores are newer than its checkpoint."""
-    scores = folder / "metrics.json"
-    return scores.is_file() and scores.stat().st_mtime >= (folder / CHECKPOINT).stat().st_mtime
 
 
 def remove_old_results(folder: Path) -> None:

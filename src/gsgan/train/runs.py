@@ -62,15 +62,10 @@ class Moved:
 
 
 def read_config(folder: Path) -> DictConfig:
-    """The config a run was started with, names of older versions replaced.
-
-    Raises:
-        DataError: when the folder is not a run folder, or its run is too old.
-    """
+    """The config a run was started with, names of older versions replaced."""
     if not (folder / CONFIG).is_file():
         raise DataError(
-            f"{folder}: not a run folder (no {CONFIG}); give run=<the folder that gsgan.train "
-            "printed>"
+            f"{folder}: not a run folder (no {CONFIG}); give the folder that gsgan.train printed"
         )
     config = OmegaConf.create(_with_new_names((folder / CONFIG).read_text()))
     assert isinstance(config, DictConfig)
@@ -155,11 +150,7 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint of gsgan, read without unrestricted pickle.
-
-    Raises:
-        DataError: when the file is damaged or is no checkpoint of gsgan.
-    """
+    """A checkpoint of gsgan, read without unrestricted pickle; a DataError when damaged."""
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
@@ -217,12 +208,7 @@ def load(run: str | Path, *, smpl: str | Path | None = None, device: str = "auto
 
 
 def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avatar, list[str]]:
-    """The trained avatar of a run folder, in eval mode, and the marks its tables must carry.
-
-    Raises:
-        DataError: when the checkpoint is missing, damaged, or of another model, or when the data
-            lacks what the model was built with.
-    """
+    """The trained avatar of a run folder, in eval mode, and the marks its tables must carry."""
     checkpoint = read_checkpoint(folder / CHECKPOINT)
     avatar = _trained(folder, config, checkpoint, data.info, data.labelled("train"))
     return avatar, list(checkpoint["gsgan"]["marks"])
@@ -303,12 +289,7 @@ def training_record(config: DictConfig, data: GsganData) -> dict[str, Any]:
 
 
 def checkpoint_to_resume(folder: Path, now: Mapping[str, Any], marks: list[str]) -> Path | None:
-    """The checkpoint of an earlier part of this run, or None.
-
-    Args:
-        folder: of the run.
-        now: the `training_record` of this part.
-        marks: the stand-ins this part uses.
+    """The checkpoint of an earlier part of this run, or None, given its `training_record` now.
 
     Raises:
         ConfigError: when the folder holds a run with other settings.

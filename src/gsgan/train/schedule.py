@@ -63,11 +63,6 @@ class Schedule:
         )
 
     @property
-    def epochs(self) -> int:
-        """Epochs of the whole run; the last may be shorter."""
-        return math.ceil(self.total / self.epoch)
-
-    @property
     def total(self) -> int:
         """Iterations of the whole run."""
         return self.segmentation + self.step_one + self.step_two
