@@ -40,7 +40,7 @@ def test_a_loaded_avatar_renders_what_evaluation_paints(run, scored, tmp_path):
     on_white = avatar.render(frame.skeleton, frame.camera, body=frame.body, background=1.0)
     expected = on_background(painting.image.clamp(0, 1), painting.alpha.clamp(0, 1), 1.0)
     assert torch.equal(on_white, expected.clamp(0, 1))
-    with pytest.raises(ValueError, match="expected 1 camera or 1 per skeleton, 3; got 2"):
+    with pytest.raises(ValueError, match="expected 1 or 3 cameras, got 2"):
         avatar.render(frame.skeleton.repeat(3, 1, 1), cat([frame.camera] * 2), body=frame.body)
 
 
@@ -89,6 +89,8 @@ def test_a_config_of_an_older_gsgan_is_read_under_its_new_names(run, tmp_path):
     text = (run / CONFIG).read_text()
     old = text.replace("gsgan.model.assemble.assemble_avatar", "gsgan.model.avatar.Avatar")
     assert old != text
+    old = old.replace("\neffects:\n", "\neffects:\n  measure: 5\n")  # a former key
+    assert "measure" in old
     (tmp_path / CONFIG).write_text(old.replace("gsgan.train.", "gsgan.training."))
     assert load_config(tmp_path) == load_config(run)
 

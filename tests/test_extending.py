@@ -14,8 +14,8 @@ from gsgan.data.files import frame_files
 from gsgan.data.formats.common import FolderReader, one_mask_each, picture_size
 from gsgan.data.layout import Found, Meta
 from gsgan.data.skeletons import make_landmarks
+from gsgan.model.body_points import SkinnedPoints
 from gsgan.model.painting import Painting
-from gsgan.model.skinned_points import SkinnedPoints
 from gsgan.scene import BodyPose, Frame, Gaussians
 from gsgan.train.runs import build_data, build_training
 

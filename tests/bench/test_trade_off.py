@@ -10,6 +10,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from commands import refused
+from gsgan.train.curve import Curve, curve
 
 from gsgan.bench.painter import Way
 from gsgan.bench.trade_off import (
@@ -25,7 +26,6 @@ from gsgan.bench.trade_off import (
     ways,
 )
 from gsgan.splat import ACCURACY
-from gsgan.train.curve import Curve, curve
 from gsgan.utils.errors import ConfigError, DataError
 
 WHERE = {"device": "cpu", "hardware": "Abacus", "threads": 1, "date": "", "load": None}

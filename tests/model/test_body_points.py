@@ -155,8 +155,8 @@ def test_points_go_where_the_avatar_goes(build):
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        ("size.body_points=0", "points must be at least 1, or null, got 0"),
-        ("model.body_points.sigma=-1", "sigma must be positive, got -1"),
+        ("size.body_points=0", "points must be a whole number of at least 1, got 0"),
+        ("model.body_points.sigma=-1", "sigma must be a number above 0, got -1"),
     ],
 )
 def test_numbers_out_of_range_are_refused_in_one_sentence(build, word, said):
@@ -188,7 +188,7 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
     stored(module, tmp_path)
     avatar, _ = load_avatar(tmp_path, config, data)
     assert getattr(avatar, part) is not None
-    for place in ("assemble", "parts"):
+    for place in ("assemble", "class_vote"):
         monkeypatch.setattr(f"gsgan.model.{place}.open_body", lambda *_: None)
     with pytest.raises(
         DataError, match=rf"{said},? .*cannot be built.* no model file; set data\.smpl"

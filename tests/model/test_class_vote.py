@@ -13,7 +13,8 @@ import torch
 
 from gsgan.body import SkinnedBody, free_body, open_body
 from gsgan.body.smpl_names import CIHP
-from gsgan.model.class_vote import ClassVote, neighbour_distance, seen
+from gsgan.model.body_points import neighbour_distance
+from gsgan.model.class_vote import ClassVote, seen
 from gsgan.scene import BodyPose, Camera, Frame
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -63,7 +64,7 @@ def test_a_plate_hides_what_lies_behind_it_and_nothing_beside_it():
     beside = torch.tensor([[0.7, 0.0, 2.3]])
     close = plate(2.01, half=0.1)  # within the tolerance
     points = torch.cat([front, behind, beside, close])
-    shown = seen(points, neighbour_distance(points), camera(), tolerance=0.03)
+    shown = seen(points, neighbour_distance(points, 4), camera(), tolerance=0.03)
     front_seen, behind_seen, beside_seen, close_seen = shown.split(
         [len(front), len(behind), 1, len(close)]
     )
@@ -75,7 +76,7 @@ def test_a_plate_hides_what_lies_behind_it_and_nothing_beside_it():
 
 def test_the_picture_size_does_not_matter():
     points = torch.cat([plate(2.0), plate(2.3, half=0.6)])
-    reach = neighbour_distance(points)
+    reach = neighbour_distance(points, 4)
     small = seen(points, reach, camera(), 0.03)
     large = seen(points, reach, camera().resize((1024, 1024)), 0.03)
     assert 0 < int(small.sum()) < len(points)
@@ -285,7 +286,7 @@ def test_votes_of_another_body_are_refused(foreign, tiny):
     from gsgan.train.runs import build_avatar, build_data
 
     config = tiny(f"data.root={foreign}")
-    with pytest.raises(DataError, match="labels of 7 vertices, which do not fit the free body"):
+    with pytest.raises(DataError, match="labels of 7 vertices do not fit this free body"):
         build_avatar(config, build_data(config), vertex_labels=torch.ones(7).long())
 
 

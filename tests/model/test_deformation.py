@@ -9,6 +9,7 @@ import torch
 
 from gsgan.model.deformation import Deformation, _unit_quat
 from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames
+from gsgan.utils.errors import ConfigError
 
 HEIGHT = 1.7
 
@@ -150,5 +151,5 @@ def test_noise_reaches_only_the_pose_code(densify):
 
 @pytest.mark.parametrize("options", [{"sh_degree": 4}, {"pose_frame": "sky"}, {"layers": 1}])
 def test_unknown_options_are_refused(densify, options):
-    with pytest.raises(ValueError, match=next(iter(options))):
+    with pytest.raises(ConfigError, match=next(iter(options))):
         small(densify, **options)

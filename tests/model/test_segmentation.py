@@ -4,14 +4,20 @@ from __future__ import annotations
 
 import math
 import shutil
+from functools import cache
 
 import pytest
 import torch
 
 from gsgan.body import free_body
 from gsgan.body.smpl_names import CIHP, CLOTHES, SMPLX_JOINTS
-from gsgan.model.classes import IGNORE, class_map
-from gsgan.model.segmentation import Segmentation, segmentation_loss, silhouette_loss
+from gsgan.model.segmentation import (
+    IGNORE,
+    Segmentation,
+    class_map,
+    segmentation_loss,
+    silhouette_loss,
+)
 from gsgan.scene import BodyPose, Camera
 from gsgan.train.runs import Moved, build_data, load_avatar, load_config
 from gsgan.utils.errors import ConfigError
@@ -44,7 +50,7 @@ def test_probabilities_sum_to_one_and_cover_the_body():
 
 def test_left_hand_is_on_the_picture_right():
     """The body faces the camera, so its left (+x) appears on the right."""
-    S = Segmentation(free_body(), points=4000)(rest_pose(), facing_camera())
+    S = Segmentation(free_body(), points=2000)(rest_pose(), facing_camera())
     names = free_body().label_names
     left = next(i for i, n in enumerate(names) if "left" in n and "hand" in n)
     right = next(i for i, n in enumerate(names) if "right" in n and "hand" in n)
@@ -69,9 +75,9 @@ def test_translation_moves_the_map():
 
 def test_a_few_steps_lower_the_loss():
     torch.manual_seed(0)
-    segmentation = Segmentation(free_body(), points=1000, scale=0.3)
+    segmentation = Segmentation(free_body(), points=400, scale=0.3)
     with torch.no_grad():
-        labels = Segmentation(free_body())(rest_pose(), facing_camera()).argmax(1)
+        labels = Segmentation(free_body(), points=1500)(rest_pose(), facing_camera()).argmax(1)
     optimiser = torch.optim.Adam(segmentation.parameters(), lr=2e-2)
     losses = []
     for _ in range(15):
@@ -97,12 +103,14 @@ def test_loss_is_finite_where_a_class_was_never_hit_and_ignores_255():
 
 
 def without_labels(**options) -> Segmentation:
-    return Segmentation(free_body(), points=1000, labelled=False, **options)
+    return Segmentation(free_body(), points=400, labelled=False, **options)
 
 
+@cache
 def body_mask() -> torch.Tensor:
     with torch.no_grad():
-        return (Segmentation(free_body()).raster(rest_pose(), facing_camera()).alpha > 0.5).float()
+        raster = Segmentation(free_body(), points=2000).raster(rest_pose(), facing_camera())
+    return (raster.alpha > 0.5).float()
 
 
 def fit_to(segmentation: Segmentation, mask: torch.Tensor, steps: int = 15) -> list[float]:
@@ -184,7 +192,7 @@ def test_stability_silhouette_loss_where_alpha_is_0_or_1(value, truth):
         assert bool((alpha.grad.sign() == (1 if value > truth else -1)).all())
 
 
-@pytest.mark.parametrize("common", [(0.0, -60.0), (0.0, 60.0), (-9.0, 0.0), (2.0, 60.0)])
+@pytest.mark.parametrize("common", [(0.0, -60.0), (2.0, 60.0)])
 def test_stability_common_numbers_of_an_empty_or_opaque_body_get_finite_gradients(common):
     segmentation = without_labels()
     with torch.no_grad():
@@ -276,8 +284,8 @@ def test_finger_joints_belong_to_their_hand():
     ("mode", "names", "words"),
     [
         ("hands", CIHP, "no left_hand and no right_hand"),
-        ("hand", CLOTHES, "mode must be body or hands; got 'hand'"),
-        ("none", CLOTHES, "mode must be body or hands; got 'none'"),
+        ("hand", CLOTHES, "mode must be one of body, hands, got 'hand'"),
+        ("none", CLOTHES, "mode must be one of body, hands, got 'none'"),
     ],
 )
 def test_modes_that_cannot_be_are_one_sentence(mode, names, words):

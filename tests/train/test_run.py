@@ -12,7 +12,7 @@ def test_starting_over_removes_an_earlier_runs_results_and_logs(tmp_path):
     (tmp_path / "metrics.json").write_text("{}")
     (tmp_path / "notes.txt").write_text("mine")
     remove_old_results(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+    assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["notes.txt"]
 
 
 def test_starting_over_leaves_what_is_not_a_runs_log(tmp_path):

@@ -122,8 +122,8 @@ def test_bugs_keep_their_traceback_and_mistakes_get_a_sentence():
     ("override", "named"),
     [
         ("effects.view_dependence=7", "effects.view_dependence must be one of"),
-        ("model.generator.output=tanh", "output must be linear or sigmoid"),
-        ("training.schedule.step_two=-1", "schedule.step_two must be 0 or more"),
+        ("model.generator.output=tanh", "output must be one of linear, sigmoid"),
+        ("training.schedule.step_two=-1", "schedule.step_two must be a number of at least 0"),
         ("+model.densify.colour=1", "unexpected keyword argument 'colour'"),
         ("+model.generator.colour=1", "unexpected keyword argument 'colour'"),
         ("training.perceptual.weights=resnet", "vgg16, auto or random"),

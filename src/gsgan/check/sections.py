@@ -280,5 +280,5 @@ def _effects(m: Measured) -> Section:
     title = "Effects that the scene calls for"
     if m.info is None:
         return Section(title, text=(f"Not decided: {m.no_info}",))
-    table = Table(HEADERS[:3], tuple(row[:3] for row in rows(decide(m.info, m.effects))))
+    table = Table(HEADERS, tuple(rows(decide(m.info, m.effects))))
     return Section(title, tables=(table,), aside=(EFFECTS,))

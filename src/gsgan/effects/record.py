@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from gsgan.utils.errors import ConfigError
@@ -64,11 +64,6 @@ class Effects:
     def degree(self) -> int:
         """Degree of the spherical harmonics."""
         return int(self.view_dependence.value)
-
-    def without(self, name: str, why: str) -> Effects:
-        """A copy with one effect off."""
-        off = Effect(0 if name == "view_dependence" else OFF, why)
-        return replace(self, **{name: off})  # type: ignore[arg-type]
 
     def plain(self) -> dict[str, Any]:
         """Plain values, as a checkpoint holds them."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from gsgan.utils.checks import at_least, one_of
 from gsgan.utils.errors import ConfigError
 
 AUTO = "auto"
@@ -17,39 +18,19 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "body_points": ON_OFF,
     "random_background": ON_OFF,
 }
-LEAST = {  # smallest value of each number
+LEAST = {  # smallest value of each threshold
     **dict.fromkeys(("view_residual", "colour_difference", "colour_share", "colour_errors"), 0),
-    **dict.fromkeys(("dark", "body_inside", "measure"), 0),
+    **dict.fromkeys(("dark", "body_inside"), 0),
     "scale_ratio": 1,
 }
 
 
 @dataclass(frozen=True)
 class EffectSettings:
-    """A requested value per effect, and thresholds (reasons: conf/effects/auto.yaml).
+    """A requested value per effect, and the thresholds of ``auto``; see conf/effects/auto.yaml.
 
     Convention: ``auto`` decides from the scene, ``off`` builds and computes nothing, any other
     value forces the effect. YAML's bare on and off arrive as true and false and are accepted.
-
-    Args:
-        view_dependence: ``auto``, ``off``, ``on`` (the degree that the cameras resolve), 0 to 3.
-        distortion: ``auto``, ``off`` (images are treated as a pinhole's), ``undistort`` or ``on``
-            (images are undistorted when read), ``project`` (images stay distorted: Gaussians and
-            joints follow the lens).
-        antialias, colour_correction, body_points, random_background: ``auto``, ``on``, ``off``.
-        only: names of effects: these are on and all others off, except that lenses follow
-            ``distortion``; None: no list.
-        impossible: what a forced effect that is not possible does: ``error``, or ``off``.
-        view_residual: colour difference in [0, 1].
-        view_spread: degrees.
-        degree_cameras: training cameras needed for degree 1, 2, 3.
-        colour_difference: of colours in [0, 1].
-        colour_share: share of the residual.
-        colour_errors: standard errors.
-        scale_ratio: ratio of pixels per metre.
-        dark: brightness in [0, 1].
-        body_inside: share in [0, 1].
-        measure: rounds in which a run times each effect before training; 0: none.
 
     Raises:
         ConfigError: on a value that is not allowed, naming it.
@@ -72,22 +53,18 @@ class EffectSettings:
     scale_ratio: float = 1.3
     dark: float = 0.25
     body_inside: float = 0.95
-    measure: int = 0
 
     def __post_init__(self) -> None:
         for name in CHOICES:
-            object.__setattr__(self, name, _choice(name, getattr(self, name)))
+            value = getattr(self, name)
+            if isinstance(value, bool):
+                value = "on" if value else "off"
+            object.__setattr__(self, name, one_of(f"effects.{name}", value, CHOICES[name]))
         if self.impossible is False:  # YAML's off
             object.__setattr__(self, "impossible", "off")
-        if self.impossible not in ("error", "off"):
-            raise ConfigError(f"effects.impossible must be error or off, got {self.impossible!r}")
+        one_of("effects.impossible", self.impossible, ("error", "off"))
         for name, least in LEAST.items():
-            value = getattr(self, name)
-            number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not number or not value >= least:
-                raise ConfigError(
-                    f"effects.{name} must be a number of at least {least}, got {value!r}"
-                )
+            at_least(f"effects.{name}", getattr(self, name), least)
         counts = list(self.degree_cameras)
         if len(counts) != 3 or counts != sorted(counts):
             raise ConfigError(f"effects.degree_cameras must be three rising numbers, got {counts}")
@@ -103,12 +80,3 @@ class EffectSettings:
         if name not in self.only:  # a lens belongs to the camera: it is not a choice
             return value if name == "distortion" else "off"
         return "on" if value in (AUTO, "off", 0) else value
-
-
-def _choice(name: str, value: str | int | bool) -> str | int:
-    if isinstance(value, bool):
-        value = "on" if value else "off"
-    if value not in CHOICES[name]:
-        choices = ", ".join(map(str, CHOICES[name]))
-        raise ConfigError(f"effects.{name} must be one of {choices}; got {value!r}")
-    return value

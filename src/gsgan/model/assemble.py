@@ -16,15 +16,15 @@ from gsgan.body import SkinnedBody, open_body
 from gsgan.effects import Effects, EffectSettings, ModelParts, decide
 from gsgan.model.avatar import SKELETON_CHANNELS, Avatar
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.class_vote import ClassVote, Pictures
-from gsgan.model.colour import ColourCorrection
+from gsgan.model.class_vote import ClassVote, Pictures, labelled_body
 from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
-from gsgan.model.parts import labelled_body
+from gsgan.model.painting import ColourCorrection
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
 from gsgan.skeleton import MEDIAPIPE33, Densify
 from gsgan.splat import BACKENDS, Accuracy
+from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -40,12 +40,7 @@ def build_avatar(
     effects: Effects | None = None,
     labelled: bool | None = None,
 ) -> Avatar:
-    """The untrained avatar of a config, its weights from ``config.seed``; see `assemble_avatar`.
-
-    Raises:
-        ConfigError: when a value under ``model`` is not allowed.
-        DataError: when the data lacks what the model needs.
-    """
+    """The untrained avatar of a config, its weights from ``config.seed``; see `assemble_avatar`."""
     if config.model.get("densify") is not None and "_target_" not in config.model.densify:
         raise ConfigError(
             "experiment=paper changes parts that this model does not have; it goes with "
@@ -85,34 +80,29 @@ def assemble_avatar(
     settings: EffectSettings | None = None,
     **options: Any,
 ) -> Avatar:
-    """Builds each part with its sizes and puts them together.
+    """Builds each part with its sizes and puts them together (keys: conf/model/full.yaml).
 
     Convention: parts whose sizes depend on the scene arrive as functions of those sizes
     (``_partial_`` in the config). Each group of parts draws from its own seed, so leaving one out
     does not change the start of the others.
 
     Args:
-        scene: facts about the training split: body height, body, labels.
-        densify: skeleton to points.
-        deformation: Ψ, given rest points, body height, number of joints and SH degree; goes with
-            densify.
+        scene: facts about the training split.
+        densify, deformation: skeleton to points; Ψ, given rest points, height, joints, SH degree.
+        segmentation: S, given a body; None leaves it out (``wo_seg``).
+        pose_encoder, generator: Ω (or the flat skeleton) to g; the UNet, given its channel counts.
+            Without them Step I's colour is the image.
+        accuracy: the rasteriser's settings for F.
         surface: in place of Ψ, any Gaussians that move with the body (``lbs_splat``), given the
             body, its height and the SH degree. Without either nothing is splatted and the UNet
             paints the drawn skeleton alone (``image_to_image``).
         body_points: in place of densify where that effect is on, given the body and its height.
-        segmentation: S, given a body; None leaves it out (``wo_seg``).
-        pose_encoder: Ω (or the flat skeleton) to g; goes with generator.
-        generator: the UNet, given its channel counts; None makes Step I's colour the image.
-        accuracy: the rasteriser's settings for F.
-        low_pass: square pixels, of the image as drawn, that F and S add to every ellipse.
-        supersample: F is drawn so many times larger each way and averaged.
-        backend: that rasterises F and S, see `gsgan.splat.rasterise`.
+        low_pass, supersample, backend: of F, and of S where it has them.
         class_vote: gives S's vertices their parts where the data's labels are not the body's own.
         pictures: training frames with labels, for that vote.
         vertex_labels: ``[V]`` int64, the result of an earlier vote, which is then not repeated.
         labelled: whether S was trained on part labels; None: whether the data has some.
-        effects: decided when training began; None decides them here.
-        settings: for that decision; None: the defaults.
+        effects: decided when training began; None decides them here, by ``settings``.
         options: of `Avatar`: twist, window_margin, window_multiple, window_least.
 
     Raises:
@@ -120,23 +110,20 @@ def assemble_avatar(
         DataError: when the data lacks the body that the model needs.
         ValueError: on parts that do not go together.
     """
-    _check_accuracy(accuracy)
-    if (
-        densify is not None
-        and densify.template is not MEDIAPIPE33
-        and options.get("twist", "none") != "none"
+    one_of("model.backend", backend, BACKENDS)
+    paper22 = densify is None or densify.template is MEDIAPIPE33
+    for wrong, message in (
+        (not paper22 and options.get("twist", "none") != "none", "twist=hinge needs limbs=paper22"),
+        ((deformation is None) != (densify is None), "densify and deformation go together"),
+        ((generator is None) != (pose_encoder is None), "generator and pose_encoder go together"),
+        (deformation and surface, "give a deformation or a surface, got both"),
+        (
+            not (deformation or surface or generator),
+            "nothing paints; give a deformation, a surface or a generator",
+        ),
     ):
-        raise ValueError("twist=hinge goes with densify.limbs=paper22 only")
-    if backend not in BACKENDS:
-        raise ValueError(f"backend must be one of {', '.join(BACKENDS)}, got {backend!r}")
-    if (deformation is None) != (densify is None):
-        raise ValueError("Avatar: densify and deformation go together; got only one of them")
-    if deformation is not None and surface is not None:
-        raise ValueError("Avatar: give a deformation or a surface, got both")
-    if deformation is None and surface is None and generator is None:
-        raise ValueError("Avatar: nothing paints; give a deformation, a surface or a generator")
-    if (generator is None) != (pose_encoder is None):
-        raise ValueError("Avatar: generator and pose_encoder go together; got only one of them")
+        if wrong:
+            raise ValueError(message)
     if effects is None:
         model = ModelParts(
             splats=densify is not None or surface is not None,
@@ -153,12 +140,13 @@ def assemble_avatar(
     torch.manual_seed(seed + 1)
     on_body = None
     if densify is not None and body_points is not None and effects.body_points.on:
-        on_body = body_points(body=_body_of(scene), body_height=body_height)
+        held = _body_of(scene, "effects.body_points=on")
+        on_body = body_points(body=held, body_height=body_height)
     psi = None
     if densify is not None and deformation is not None:
         rest, joints = (on_body or densify).rest_points, len(MEDIAPIPE33.names)
         psi = deformation(rest_points=rest, joints=joints, **sizes)
-    skin = None if surface is None else surface(body=_surface_body(scene), **sizes)
+    skin = None if surface is None else surface(body=_body_of(scene, "model.surface"), **sizes)
     splats: Deformation | SurfaceGaussians | None = psi or skin
     S, why = None, "the model leaves it out"
     if segmentation is not None:
@@ -200,11 +188,7 @@ def assemble_avatar(
 
 
 def effect_settings(config: DictConfig) -> EffectSettings:
-    """The effects group of a config; the defaults for runs older than that group.
-
-    Raises:
-        ConfigError: on a value that is not allowed.
-    """
+    """The effects group of a config; the defaults for runs older than that group."""
     if config.get("effects") is None:
         return EffectSettings()
     settings: EffectSettings = instantiate(config.effects)
@@ -220,34 +204,16 @@ def naming_group(group: str) -> Iterator[None]:
         raise ConfigError(f"{group}: {error}") from error
 
 
-def _check_accuracy(accuracy: Accuracy) -> None:
-    """Refuses accuracy values that would be overwritten by the model and the effects."""
-    for name, place in (
-        ("low_pass", "model.low_pass"),
-        ("supersample", "model.supersample"),
-        ("antialias", "effects.antialias"),
-    ):
-        if getattr(accuracy, name) != getattr(Accuracy, name):
-            raise ConfigError(f"accuracy.{name} is not read; set {place}")
-
-
-def _body_of(scene: SceneInfo) -> SkinnedBody:
-    body = open_body(scene.body, scene.body_file, scene.betas)
-    if body is None:
+def _body_of(scene: SceneInfo, part: str) -> SkinnedBody:
+    if not scene.has_body_pose:
         raise DataError(
-            f"effects.body_points=on cannot be built: the data's poses are of the body "
-            f"{scene.body!r}, of which there is no model file; set data.smpl"
+            f"{part} cannot be built: the data lacks a body pose for every frame; choose "
+            "model=splat_only or model=full"
         )
-    return body
-
-
-def _surface_body(scene: SceneInfo) -> SkinnedBody:
-    body = None
-    if scene.has_body_pose:
-        body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
+    body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
     if body is None:
         raise DataError(
-            "model.surface: Gaussians on the body need a body pose for every frame and the "
-            "body's mesh, and this data lacks one; choose model=splat_only or model=full"
+            f"{part} cannot be built: the data's poses are of the body {scene.body!r}, of which "
+            "there is no model file; set data.smpl"
         )
     return body

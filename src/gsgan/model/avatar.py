@@ -12,10 +12,9 @@ from torch import Tensor, nn
 
 from gsgan.effects import Effects
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
-from gsgan.model.painting import Painting
+from gsgan.model.painting import ColourCorrection, Painting
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians, Window, body_window, cat
@@ -23,7 +22,6 @@ from gsgan.skeleton import (
     MEDIAPIPE33,
     BoneFrames,
     Densify,
-    Points,
     bone_frames,
     draw_skeleton,
     omega,
@@ -62,10 +60,9 @@ class Avatar(nn.Module):
         pose_encoder, generator: None in ``splat_only``, where Step I's colour is the image.
         colour: per-camera colour correction, where that effect is on.
         backend: that rasterises F, see `gsgan.splat.rasterise`.
-        twist: how bone frames turn about their bones, ``none`` or ``hinge``.
-        window_margin: metres round the joints that are painted; None paints whole images.
-        window_multiple: the window's sides are multiples of so many pixels.
-        window_least: pixels, its shortest side (a discriminator needs as many).
+        twist: of bone frames, see `gsgan.skeleton.bone_frames`.
+        window_margin, window_multiple, window_least: of the painted window, pixels and metres; see
+            `gsgan.scene.body_window`. No margin paints whole images.
 
     Source: paper Fig. 3 and Sec. 3.
     """
@@ -119,8 +116,7 @@ class Avatar(nn.Module):
     @property
     def needs_body(self) -> bool:
         """Whether painting needs the pose of the skinned body beside the skeleton."""
-        parts = (self.body_points, self.surface, self.segmentation)
-        return any(part is not None for part in parts)
+        return any(part for part in (self.body_points, self.surface, self.segmentation))
 
     @torch.no_grad()
     def render(
@@ -164,9 +160,7 @@ class Avatar(nn.Module):
         if visibility is not None:
             seen = seen * visibility.reshape(-1, visibility.shape[-1]).to(p)
         if len(camera) not in (1, len(p)):
-            raise ValueError(
-                f"render: expected 1 camera or 1 per skeleton, {len(p)}; got {len(camera)}"
-            )
+            raise ValueError(f"render: expected 1 or {len(p)} cameras, got {len(camera)}")
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
         body = None if body is None else body.to(device)
         painting = self._paint(p, seen, cameras.to(device), body)
@@ -227,7 +221,6 @@ class Avatar(nn.Module):
             p2d = self.draw(p, valid, camera, picture_height) if paints else None
             pose = self.pose_inputs(p, valid, frames, camera) if paints else None
 
-        F = None if raster is None else raster.features
         image = alpha = None
         if self.generator is None and raster is not None:
             image, alpha = raster.features[:, :3], raster.alpha
@@ -235,9 +228,8 @@ class Avatar(nn.Module):
             with self.stage("pose encoder"):
                 g = self.pose_encoder(*pose)  # type: ignore[misc]
             with self.stage("UNet"):
-                if raster is None:  # image_to_image: the drawing stands in F's place
-                    inputs = (p2d, S, None, g)
-                else:
+                inputs = (p2d, S, None, g)  # image_to_image: the drawing stands in F's place
+                if raster is not None:
                     seen = (raster.features, raster.fine, raster.alpha)
                     if detach_features:
                         seen = tuple(None if x is None else x.detach() for x in seen)  # type: ignore[assignment]
@@ -246,7 +238,7 @@ class Avatar(nn.Module):
             image, alpha = painted[:, :3], painted[:, 3:]
         if raster is None:
             return Painting(image, alpha, segmentation=S)
-        painting = Painting(image, alpha, F, raster.alpha, S, gaussians)
+        painting = Painting(image, alpha, raster.features, raster.alpha, S, gaussians)
         return self.as_taken(painting, camera_index)
 
     def as_taken(self, painting: Painting, camera_index: Tensor | None) -> Painting:
@@ -279,18 +271,15 @@ class Avatar(nn.Module):
         if self.deformation is None:
             return None
         with self.stage("densify"):
-            points = self.place(p, valid, frames, body)
+            if self.body_points is not None:  # on the body's surface, where that effect is on
+                points = self.body_points(_given(body))
+            else:
+                assert self.densify is not None
+                points = self.densify(p, valid, frames)  # Alg. 1
         with self.stage("Ψ"):
             return self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
                 p, points, camera.centre, frames.hubs[:, 0], pose_noise
             )
-
-    def place(self, p: Tensor, valid: Tensor, frames: BoneFrames, body: BodyPose | None) -> Points:
-        """G: on the body's surface where that effect is on, else by Alg. 1."""
-        if self.body_points is not None:
-            return self.body_points(_given(body))
-        assert self.densify is not None
-        return self.densify(p, valid, frames)
 
     def paint(self, frame: Frame) -> Painting:
         """The whole image of a dataset's frame: its window painted, background around it."""
@@ -327,15 +316,10 @@ class Avatar(nn.Module):
     def _window(self, skeleton: Tensor, camera: Camera) -> Window | None:
         if self.window_margin is None:
             return None
+        sides = {"multiple": self.window_multiple, "least": self.window_least}
+        margin, near = self.window_margin, self.accuracy.near
         with self.stage("window"), full_precision(skeleton):
-            return body_window(
-                skeleton,
-                camera,
-                margin=self.window_margin,
-                multiple=self.window_multiple,
-                least=self.window_least,
-                near=self.accuracy.near,
-            )
+            return body_window(skeleton, camera, margin=margin, near=near, **sides)
 
     def segment(self, body: BodyPose | None, camera: Camera) -> Tensor | None:
         """S, without gradient: it is trained on its own and then frozen."""

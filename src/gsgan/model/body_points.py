@@ -1,17 +1,102 @@
-"""G on a skinned body: fixed points of its surface, for data with a body pose that fits."""
+"""Canonical points and Gaussians on a skinned body, moved by linear blend skinning (LBS)."""
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor, nn
+import math
 
-from gsgan.body import SkinnedBody
+import torch
+from kornia.geometry.conversions import quaternion_to_rotation_matrix
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gsgan.body import SkinnedBody, axis_angle_to_matrix, blend_transforms, forward_kinematics
 from gsgan.body.skinned import vertex_normals
-from gsgan.model.skinned_points import SkinnedPoints
-from gsgan.scene import BodyPose
+from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
+from gsgan.utils.checks import above, whole
 
 NORMAL_FLOOR = 1e-2  # below it rounding errors dominate where skinning is flat
+ROWS = 1024  # points compared with all others at a time
+
+
+class SkinnedPoints(nn.Module):
+    """Points spread evenly over a body's vertices, moved with a pose.
+
+    Args:
+        body: vertices, weights and joints.
+        count: vertices used, spread evenly over the surface; None for all.
+
+    Source: paper Sec. 3.4.
+    """
+
+    joints: Tensor
+    bone_index: Tensor
+    bone_weight: Tensor
+    means: Tensor
+    chosen: Tensor
+    spacing: Tensor
+
+    def __init__(self, body: SkinnedBody, count: int | None = None) -> None:
+        super().__init__()
+        if count is not None:
+            whole("points", count, 1)
+        vertices = body.vertices.float()
+        every = len(vertices)
+        chosen = farthest_points(vertices, every if count is None else min(count, every))
+        self.parents = body.parents
+        means = vertices[chosen]
+        for name, value in {
+            "joints": body.joints.float(),
+            "bone_index": body.bone_index[chosen],
+            "bone_weight": body.bone_weight[chosen].float(),
+            "means": means,
+            "chosen": chosen,
+            "spacing": neighbour_distance(means).clamp_min(1e-4),
+        }.items():
+            self.register_buffer(name, value, persistent=False)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def blend(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
+        """The affine map of each point: ``A [B, N, 3, 3]`` and ``t [B, N, 3]``.
+
+        A blends rotations and is none itself: transform shapes as covariances ``A Σ Aᵀ``.
+        """
+        bones = forward_kinematics(
+            self.joints, self.parents, axis_angle_to_matrix(pose.theta), pose.transl
+        )
+        return blend_transforms(bones, self.bone_index, self.bone_weight)
+
+
+class SkinnedGaussians(nn.Module):
+    """Learned shapes and opacities at a body's points: the base of S and of ``lbs_splat``.
+
+    Args:
+        body: vertices, weights and joints.
+        points: vertices used, spread evenly over the surface; None for all.
+        opacity: initial opacity.
+        scale: initial standard deviation, as a share of the distance to the nearest neighbour.
+    """
+
+    def __init__(self, body: SkinnedBody, points: int | None, opacity: float, scale: float) -> None:
+        super().__init__()
+        self.points = SkinnedPoints(body, points)
+        count = len(self.points)
+        self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1))
+        spacing = (scale * self.points.spacing).log()
+        self.log_scales = nn.Parameter(spacing.unsqueeze(-1).repeat(1, 3))
+        logit = math.log(opacity / (1 - opacity))
+        self.logit_opacities = nn.Parameter(torch.full((count,), logit))
+
+    def deformed(
+        self, A: Tensor, means: Tensor, log_scales: Tensor, logits: Tensor, features: Tensor
+    ) -> Gaussians:
+        """Gaussians at ``means [B, N, 3]``, their shapes transformed by ``A [B, N, 3, 3]``."""
+        rotation = quaternion_to_rotation_matrix(functional.normalize(self.quats, dim=-1, eps=1e-6))
+        axes = A @ (rotation * log_scales.exp().unsqueeze(-2))
+        opacities = torch.sigmoid(logits).expand(len(A), -1)
+        return Gaussians(means, None, None, opacities, features, covariances=axes @ axes.mT)
 
 
 class BodyPoints(nn.Module):
@@ -25,9 +110,6 @@ class BodyPoints(nn.Module):
         body_height: metres, the length scale of Ψ's input.
         points: vertices used, spread evenly over the surface; None for all.
         sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
-
-    Raises:
-        ValueError: on a number out of range.
 
     Source: ours; the paper's G is Alg. 1's (`gsgan.skeleton.Densify`).
     """
@@ -45,8 +127,7 @@ class BodyPoints(nn.Module):
         sigma: float = 0.7,
     ) -> None:
         super().__init__()
-        if sigma <= 0:
-            raise ValueError(f"BodyPoints: sigma must be positive, got {sigma}")
+        above("model.body_points.sigma", sigma)
         self.points, self.sigma = SkinnedPoints(body, points), sigma
         rest = (self.points.means - self.points.means.mean(dim=0)) / body_height
         self.register_buffer("rest_points", rest, persistent=False)
@@ -60,15 +141,11 @@ class BodyPoints(nn.Module):
         return len(self.points)
 
     def forward(self, pose: BodyPose) -> Points:
-        """G in pose; each point is its own part, its frame the linear part of its skinning.
-
-        Args:
-            pose: B poses of the body.
-        """
+        """G in pose; each point is its own part, its frame the linear part of its skinning."""
         A, t = self.points.blend(pose)
         scales = (self.sigma * self.points.spacing).expand(len(A), -1)
         return Points(
-            means=(A @ self.points.means.unsqueeze(-1)).squeeze(-1) + t,
+            means=transformed(A, t, self.points.means),
             rotations=A,
             origins=t,
             scales=scales,
@@ -76,6 +153,11 @@ class BodyPoints(nn.Module):
             part_id=self.part_id,
             normals=moved_normals(A, self.rest_normals),
         )
+
+
+def transformed(A: Tensor, t: Tensor, points: Tensor) -> Tensor:
+    """``[B, N, 3]``: ``A x + t`` of points ``[N, 3]``, each by its own map."""
+    return (A @ points.unsqueeze(-1)).squeeze(-1) + t
 
 
 def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
@@ -88,3 +170,30 @@ def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
     cofactors = [torch.linalg.cross(a, b) for a, b in ((y, z), (z, x), (x, y))]
     moved = (torch.stack(cofactors, dim=-1) @ normals.unsqueeze(-1)).squeeze(-1)
     return moved * torch.rsqrt(moved.square().sum(-1, keepdim=True) + NORMAL_FLOOR**2)
+
+
+def farthest_points(vertices: Tensor, count: int) -> Tensor:
+    """``[count]`` indices of vertices ``[V, 3]`` far from each other, the first one first.
+
+    Meshes are dense in faces and hands; a subset in list order would leave arms and legs thin.
+    A count of V keeps the mesh's own order.
+    """
+    if count == len(vertices):
+        return torch.arange(count)
+    chosen = torch.zeros(count, dtype=torch.long)
+    nearest = torch.full((len(vertices),), math.inf)
+    for i in range(1, count):
+        nearest = torch.minimum(nearest, (vertices - vertices[chosen[i - 1]]).square().sum(-1))
+        chosen[i] = nearest.argmax()
+    return chosen
+
+
+def neighbour_distance(points: Tensor, k: int = 1) -> Tensor:
+    """``[V]`` metres from each point to its k-th nearest other point, or the farthest there is."""
+    k, found = min(k, max(1, len(points) - 1)), []
+    for start in range(0, len(points), ROWS):
+        distance = torch.cdist(points[start : start + ROWS], points)
+        rows = torch.arange(len(distance))
+        distance[rows, rows + start] = math.inf
+        found.append(distance.topk(k, largest=False).values[:, -1])
+    return torch.cat(found)

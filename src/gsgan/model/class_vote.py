@@ -1,26 +1,27 @@
-"""The part label of each vertex: a majority vote over the data's label images."""
+"""The body that S splats, with a part label per vertex: the body's own, or voted by the images."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import torch
-from rich.progress import track
 from torch import Tensor
 
-from gsgan.body import SkinnedBody
-from gsgan.model.classes import IGNORE
+from gsgan.body import SkinnedBody, open_body
+from gsgan.model.body_points import ROWS, neighbour_distance
+from gsgan.model.segmentation import IGNORE
 from gsgan.scene import Camera, Frame
-from gsgan.utils.console import make_console
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.checks import above, whole
+from gsgan.utils.errors import DataError
+
+if TYPE_CHECKING:
+    from gsgan.data.scene_info import SceneInfo  # loads the data package
 
 NEIGHBOUR = 4  # the neighbour whose distance measures the gaps between vertices
 CELLS = 2.0  # cells of the depth map across the median occluder's radius
 WIDEST = 8  # cells, largest occluder radius: one close to the camera would fill the map
 MOST_CELLS = 2048  # along a side of the depth map, however far the discs spread
-ROWS = 1024  # vertices compared with all others at a time
 
 
 class Pictures(Protocol):
@@ -30,18 +31,68 @@ class Pictures(Protocol):
     def __getitem__(self, index: int, /) -> Frame: ...
 
 
-class Votes(NamedTuple):
-    """The result of a vote.
+def labelled_body(
+    scene: SceneInfo,
+    vote: ClassVote,
+    pictures: Pictures | None = None,
+    vertex_labels: Tensor | None = None,
+) -> tuple[SkinnedBody | None, str]:
+    """The body, and a clause on where its labels come from, or why there is no body.
 
-    Args:
-        labels: ``[V]`` int64, the data's label of each vertex, never 0.
-        decided: share of the vertices with a majority; the others took the nearest one's.
-        pictures: number of images used.
+    The body's own labels are used where they are the data's, or the data has none; otherwise those
+    of a checkpoint (``vertex_labels [V]``), or of a vote over ``pictures``.
+
+    Raises:
+        DataError: when a vote is needed and not possible, or the labels do not fit the body.
     """
+    if not scene.has_body_pose:
+        return None, "the data has no body pose"
+    body = open_body(scene.body, scene.body_file, scene.betas, scene.label_names)
+    if body is None:
+        return None, (
+            f"the data's poses are of the body {scene.body!r}, of which there is no model file"
+        )
+    if not scene.has_labels and vertex_labels is None:
+        guess = body.label_source == "guess"
+        return body, "parts by the body's joints" if guess else "parts are the body's own"
+    if scene.has_labels and body.shares_labels(scene.label_names):
+        if scene.n_labels > len(body.label_names):
+            raise DataError(
+                f"labels: the images have {scene.n_labels} parts, the {scene.body} body has only "
+                f"{', '.join(body.label_names)}; map them to these ids, or choose model=wo_seg"
+            )
+        return body, "the labels are the body's own, so there is no class vote"
+    numbered = ("background", *(f"part {i}" for i in range(1, scene.n_labels)))
+    names = scene.label_names or numbered
+    if vertex_labels is not None:
+        if not scene.has_labels:  # voted on where there were some
+            names = tuple(f"part {i}" for i in range(int(vertex_labels.max()) + 1))
+        if len(vertex_labels) != len(body.vertices) or int(vertex_labels.max()) >= len(names):
+            raise DataError(
+                f"the checkpoint's labels of {len(vertex_labels)} vertices do not fit this "
+                f"{scene.body} body or its data; give the model file and the data of the training"
+            )
+        return body.voted(vertex_labels, names), "parts voted when training began"
+    if pictures is None or len(pictures) == 0:
+        raise DataError(
+            f"labels: the images' parts are {', '.join(names)}, the {scene.body} body has others, "
+            "and there is no training image with labels to vote on them; choose model=wo_seg"
+        )
+    votes = vote(body, pictures, len(names))
+    body = body.voted(votes.labels, names)
+    missing = len(names) - 1 - len(votes.labels.unique())
+    return body, (
+        f"class vote over {votes.pictures} images: {votes.decided:.0%} of the vertices decided, "
+        f"{missing} of {len(names) - 1} parts on none"
+    )
 
-    labels: Tensor
-    decided: float
-    pictures: int
+
+class Votes(NamedTuple):
+    """The result of a vote."""
+
+    labels: Tensor  # [V] int64, the data's label of each vertex, never 0
+    decided: float  # share of the vertices with a majority; the others took the nearest one's
+    pictures: int  # number of images used
 
 
 @dataclass(frozen=True)
@@ -53,12 +104,9 @@ class ClassVote:
     empty. Vertices without a majority (never seen, or a tie) take the label of the nearest vertex
     with one, at rest. Nothing is random.
 
-    Args:
-        vote_frames: most images used, spread evenly over those that have labels.
-        occluder_radius: radius within which a vertex hides what is behind it, in distances to its
-            fourth neighbour: 1 closes the gaps of an even mesh.
-        depth_tolerance: metres behind the nearest surface that still count as seen: more than
-            neighbours differ on a slanted surface, less than a limb's thickness.
+    Settings: conf/model/full.yaml. An occluder radius of 1 closes the gaps of an even mesh. The
+    depth tolerance is more than neighbours differ on a slanted surface, less than a limb's
+    thickness.
 
     Source: paper Sec. 3.4 (one class a vertex); the vote is ours.
     """
@@ -68,29 +116,21 @@ class ClassVote:
     depth_tolerance: float = 0.03
 
     def __post_init__(self) -> None:
-        if self.vote_frames < 1 or self.occluder_radius <= 0 or self.depth_tolerance <= 0:
-            raise ConfigError(
-                "model.class_vote: vote_frames must be at least 1, occluder_radius and "
-                f"depth_tolerance above 0; got {self.vote_frames}, {self.occluder_radius} and "
-                f"{self.depth_tolerance}"
-            )
+        whole("model.class_vote.vote_frames", self.vote_frames, 1)
+        above("model.class_vote.occluder_radius", self.occluder_radius)
+        above("model.class_vote.depth_tolerance", self.depth_tolerance)
 
     def __call__(self, body: SkinnedBody, pictures: Pictures, n_labels: int) -> Votes:
-        """Votes.
-
-        Args:
-            body: vertices and weights; its labels are ignored.
-            pictures: frames of one item each, with labels and a body pose.
-            n_labels: labels of the data, background included.
+        """Votes over frames of one item each, for data of so many labels (background included).
 
         Raises:
             DataError: when an image file is damaged, or no vertex lies on a labelled pixel.
         """
         count = min(self.vote_frames, len(pictures))
         chosen = [(2 * i + 1) * len(pictures) // (2 * count) for i in range(count)]
-        reach = self.occluder_radius * neighbour_distance(body.vertices.float())
+        reach = self.occluder_radius * neighbour_distance(body.vertices.float(), NEIGHBOUR)
         votes = torch.zeros(len(body.vertices), n_labels, dtype=torch.int64)
-        for index in _shown(chosen):
+        for index in chosen:
             self._count(votes, body, reach, pictures[index])
         if not votes.any():
             raise DataError(
@@ -152,12 +192,10 @@ def seen(points: Tensor, reach: Tensor, camera: Camera, tolerance: float) -> Ten
 
 
 def _depth_map(at: Tensor, depth: Tensor, radius: Tensor) -> Tensor:
-    """``[h, w]`` smallest depth of the discs over each cell; all in cells but for the depth.
+    """``[h, w]`` smallest depth of the discs over each cell.
 
-    Args:
-        at: ``[V, 2]`` column and row of each disc's centre, at least `WIDEST`.
-        depth: ``[V]``.
-        radius: ``[V]`` at most `WIDEST`.
+    Centres ``at [V, 2]`` (column, row) and radii ``[V]`` are in cells; the former are at least
+    `WIDEST`, the latter at most.
     """
     width, height = (at.amax(0) + 1 + WIDEST).tolist()
     flat = torch.full((height * width,), torch.inf, dtype=depth.dtype, device=depth.device)
@@ -185,26 +223,3 @@ def _from_the_nearest(vertices: Tensor, labels: Tensor, decided: Tensor) -> Tens
         nearest = torch.cdist(vertices[rows], vertices[known]).argmin(dim=1)
         labels[rows] = labels[known[nearest]]
     return labels
-
-
-def neighbour_distance(vertices: Tensor) -> Tensor:
-    """``[V]`` metres from each vertex to its fourth neighbour, or the farthest there is."""
-    nearest = min(NEIGHBOUR, len(vertices) - 1) + 1  # itself included
-    return torch.cat(
-        [
-            torch.cdist(rows, vertices).topk(nearest, largest=False).values[:, -1]
-            for rows in vertices.split(ROWS)
-        ]
-    )
-
-
-def _shown(chosen: Sequence[int]) -> Iterable[int]:
-    """The numbers, with a progress bar on a terminal."""
-    console = make_console()
-    return track(
-        chosen,
-        "voting on each vertex's part",
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-    )

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from gsgan.model.bounded import bounded
-from gsgan.model.encoding import encoded_size, positional_encoding
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
+from gsgan.utils.checks import one_of, whole
 from gsgan.utils.tensors import constant
 
 QUAT_FLOOR = 1e-12  # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
@@ -22,18 +23,14 @@ QUAT_FLOOR = 1e-12  # inside the root that normalises a quaternion: q0 + δq ≈
 
 @dataclass(frozen=True)
 class Residuals:
-    """ΔG, raw: Ψ's output for each point, before bounds and activations.
+    """ΔG, raw: Ψ's output for each point, before bounds and activations."""
 
-    means ``[B,N,3]``, quats ``[B,N,4]``, scales ``[B,N,3]``, opacities ``[B,N]``,
-    sh ``[B,N,(d+1)²,3]``, features ``[B,N,F]``.
-    """
-
-    means: Tensor
-    quats: Tensor
-    scales: Tensor
-    opacities: Tensor
-    sh: Tensor
-    features: Tensor
+    means: Tensor  # [B, N, 3]
+    quats: Tensor  # [B, N, 4]
+    scales: Tensor  # [B, N, 3]
+    opacities: Tensor  # [B, N]
+    sh: Tensor  # [B, N, (d+1)², 3]
+    features: Tensor  # [B, N, F]
 
 
 class Deformation(nn.Module):
@@ -51,15 +48,8 @@ class Deformation(nn.Module):
         embedding: learned numbers per point.
         features: channels beside the three of colour.
         sh_degree: 0 (no view dependence) to 3.
-        rest_octaves, position_octaves: positional encodings of the rest and the posed point.
-        normals: each point's surface normal is an input: shading depends on it.
-        free_table: also learn one pose-independent residual per point.
-        pose_frame: ``world``, or ``pelvis``: the pose code in the pelvis frame, without the
-            subject's heading.
-        opacity: initial opacity of every point.
-        mean_bound: largest distance of a mean from its point, body heights; None: unbounded.
-        scale_min, scale_max: body heights, the range of every scale (`bounded`).
-        logit_bound: opacity logits are kept within ± this, where the sigmoid has a gradient.
+
+    The other settings are explained in conf/model/full.yaml.
 
     Source: paper Sec. 3.3; the table beside the MLP is ours.
     """
@@ -89,12 +79,9 @@ class Deformation(nn.Module):
         logit_bound: float = 8.0,
     ) -> None:
         super().__init__()
-        if not 0 <= sh_degree <= 3:
-            raise ValueError(f"Deformation: sh_degree must be 0, 1, 2 or 3, got {sh_degree}")
-        if pose_frame not in ("world", "pelvis"):
-            raise ValueError(f"Deformation: pose_frame must be world or pelvis, got {pose_frame!r}")
-        if layers < 2:
-            raise ValueError(f"Deformation: layers must be at least 2, got {layers}")
+        one_of("model.deformation: sh_degree", sh_degree, range(4))
+        one_of("model.deformation.pose_frame", pose_frame, ("world", "pelvis"))
+        whole("model.deformation: layers", layers, 2)
         points = rest_points.shape[0]
         self.body_height, self.features, self.sh_degree = float(body_height), features, sh_degree
         self.active_degree = sh_degree  # raised during training; higher degrees are not computed
@@ -120,13 +107,7 @@ class Deformation(nn.Module):
         return [(list(self.parameters()), 1.0)]
 
     def residuals(self, points: Points, pose: Tensor, root: Tensor) -> Residuals:
-        """ΔG of posed points.
-
-        Args:
-            points: densified skeleton.
-            pose: ``[B, 3 J]`` root-centred joints in body heights.
-            root: ``[B, 3]`` metres, the pelvis.
-        """
+        """ΔG of posed points, from the `pose_code` and the pelvis ``root`` ``[B, 3]`` (metres)."""
         position = (points.means - root[:, None]) / self.body_height
         x = self.from_point(torch.cat([self.rest_code, self.embedding], dim=-1))
         x = x + self.from_position(positional_encoding(position, self.position_octaves))
@@ -177,12 +158,7 @@ class Deformation(nn.Module):
         logit = math.log(self.opacity / (1 - self.opacity))
         logits = bounded(logit + residuals.opacities, -self.logit_bound, self.logit_bound)
         opacities = torch.sigmoid(logits)
-        view = means  # at degree 0 a colour has no direction
-        if residuals.sh.shape[-2] > 1:
-            view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
-            view = (frames.mT @ view.unsqueeze(-1)).squeeze(-1)
-            view = functional.normalize(view, dim=-1, eps=1e-6)  # frames of a skinned body shear
-        colour = functional.relu(sh_to_colour(residuals.sh, view))
+        colour = colour_from(eye, means, frames, residuals.sh)
         return Gaussians(
             means=means,
             quats=None,
@@ -226,3 +202,70 @@ def _unit_quat(residual: Tensor) -> Tensor:
     """(1, 0, 0, 0) + δq, w x y z, of length one; finite where the sum vanishes."""
     quat = residual + constant((1.0, 0.0, 0.0, 0.0), residual)
     return quat * torch.rsqrt(quat.square().sum(-1, keepdim=True) + QUAT_FLOOR)
+
+
+def colour_from(eye: Tensor, means: Tensor, frames: Tensor, sh: Tensor) -> Tensor:
+    """``[B, N, 3]`` colours of harmonics ``sh [B, N, (d+1)², 3]`` as seen from ``eye [B, 3]``.
+
+    Directions are turned back by ``frames [B, N, 3, 3]``, as in 3DGS-Avatar: an arm that turns
+    keeps its highlights.
+    """
+    view = means  # at degree 0 a colour has no direction
+    if sh.shape[-2] > 1:
+        view = functional.normalize(means - eye[:, None], dim=-1, eps=1e-6)
+        view = (frames.mT @ view.unsqueeze(-1)).squeeze(-1)
+        view = functional.normalize(view, dim=-1, eps=1e-6)  # frames of a skinned body shear
+    return functional.relu(sh_to_colour(sh, view))
+
+
+def positional_encoding(x: Tensor, octaves: int) -> Tensor:
+    """Coordinates with their sines and cosines at doubling frequencies.
+
+    Args:
+        x: ``[..., D]``, of order 1 (metres divided by the body height, not raw metres).
+        octaves: frequencies π, 2π, … 2^(octaves-1) π; 0 returns ``x``.
+
+    Returns:
+        ``[..., D * (1 + 2 * octaves)]``: x, then all sines, then all cosines.
+
+    Source: ours, as NeRF has it (Mildenhall et al., 2020).
+    """
+    if octaves == 0:
+        return x
+    frequencies = math.pi * 2.0 ** torch.arange(octaves, device=x.device, dtype=x.dtype)
+    angles = (x.unsqueeze(-1) * frequencies).flatten(-2)
+    return torch.cat([x, angles.sin(), angles.cos()], dim=-1)
+
+
+def encoded_size(dimensions: int, octaves: int) -> int:
+    """Size of the `positional_encoding` of ``dimensions`` coordinates."""
+    return dimensions * (1 + 2 * octaves)
+
+
+class _Bounded(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, low: float, high: float) -> Tensor:
+        ctx.save_for_backward(x)
+        ctx.bounds = low, high
+        return x.clamp(low, high)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+        (x,) = ctx.saved_tensors
+        low, high = ctx.bounds
+        outwards = ((x > high) & (grad < 0)) | ((x < low) & (grad > 0))
+        return grad.masked_fill(outwards, 0.0), None, None
+
+
+def bounded(x: Tensor, low: float, high: float) -> Tensor:
+    """``x`` clamped to [low, high], with a gradient that leads back.
+
+    Convention: beyond a bound the gradient is 0 where a step against it would lead further out, and
+    passes where it leads back in. A plain clamp has none there: a parameter that once crossed the
+    bound would never learn again.
+
+    Source: ours.
+    """
+    bounded_x: Tensor = _Bounded.apply(x, low, high)
+    return bounded_x

@@ -5,10 +5,9 @@ from __future__ import annotations
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.checks import one_of, whole
 
 SLOPE = 0.2
-NORMS = ("instance", "none")
 
 
 class PatchDiscriminator(nn.Module):
@@ -20,20 +19,13 @@ class PatchDiscriminator(nn.Module):
         norm: ``instance``, or ``none``. Instance normalisation equalises the contrast of every
             channel, and so hides how sharp the image is (measured in docs/ablations.md).
 
-    Raises:
-        ConfigError: on an unknown norm.
-
     Source: ours, after pix2pixHD (Wang et al., 2018).
     """
 
     def __init__(self, base: int = 64, layers: int = 4, norm: str = "instance") -> None:
         super().__init__()
-        if layers < 2:
-            raise ValueError(f"PatchDiscriminator: layers must be at least 2, got {layers}")
-        if norm not in NORMS:
-            raise ConfigError(
-                f"training.discriminator.norm must be one of {', '.join(NORMS)}; got {norm!r}"
-            )
+        whole("training.discriminator.layers", layers, 2)
+        one_of("training.discriminator.norm", norm, ("instance", "none"))
         normal = norm == "instance"
         widths = [base * min(2**i, 8) for i in range(layers)]
         blocks: list[nn.Module] = []
@@ -46,7 +38,12 @@ class PatchDiscriminator(nn.Module):
             previous = channels
         self.blocks = nn.ModuleList(blocks)
         self.logits = nn.Conv2d(previous, 1, 4, padding=2)
-        self.apply(_initialise if normal else _initialise_without_norm)
+        for conv in (module for module in self.modules() if isinstance(module, nn.Conv2d)):
+            if normal:
+                nn.init.normal_(conv.weight, 0.0, 0.02)
+            else:  # He et al. 2015: without normalisation the signal would vanish under 0.02
+                nn.init.kaiming_normal_(conv.weight, a=SLOPE, nonlinearity="leaky_relu")
+            nn.init.zeros_(conv.bias)  # type: ignore[arg-type]
 
     def forward(self, image: Tensor) -> list[Tensor]:
         """Feature maps, then the logits, of an image ``[B, 3, H, W]``."""
@@ -78,32 +75,15 @@ class Discriminator(nn.Module):
         """For each scale its feature maps with the logits last.
 
         Raises:
-            ValueError: when the coarsest map would have a single pixel, which instance
-                normalisation erases.
+            ValueError: when the coarsest map would have a single pixel, which normalisation erases.
         """
         if min(image.shape[-2:]) < 2 * self.stride:
             raise ValueError(
-                f"Discriminator: an image of {tuple(image.shape[-2:])} is too small for "
-                f"{len(self.judges)} scales: "
-                f"at least {2 * self.stride} pixels, or fewer layers"
+                f"Discriminator: an image of {tuple(image.shape[-2:])} is too small; give at least "
+                f"{2 * self.stride} pixels, or fewer scales or layers"
             )
         results = []
         for patches in self.judges:
             results.append(patches(image))
             image = functional.avg_pool2d(image, 3, stride=2, padding=1, count_include_pad=False)
         return results
-
-
-def _initialise(module: nn.Module) -> None:
-    if isinstance(module, nn.Conv2d):
-        nn.init.normal_(module.weight, 0.0, 0.02)
-        if module.bias is not None:
-            nn.init.zeros_(module.bias)
-
-
-def _initialise_without_norm(module: nn.Module) -> None:
-    """He et al. 2015: without normalisation the signal would vanish under weights of 0.02."""
-    if isinstance(module, nn.Conv2d):
-        nn.init.kaiming_normal_(module.weight, a=SLOPE, nonlinearity="leaky_relu")
-        if module.bias is not None:
-            nn.init.zeros_(module.bias)

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from gsgan.utils.checks import one_of
+
 NORM_FLOOR = 1e-6  # inside the root: an all-zero pixel (empty background) stays zero
 SLOPE = 0.2
 
@@ -92,14 +94,9 @@ class Generator(nn.Module):
             beside their average; 1 for none.
         base: channels at full resolution.
         multipliers: channels of each level in units of ``base``; each level halves the resolution.
-        style: how the decoder is scaled and shifted: ``film``, at every pixel by E_s(F) and g, or
-            ``pose``, by g alone, without E_s.
-        style_share: E_s's width as a share of E_c's.
-        rgb_skip: paint a correction of Step I's colour and alpha instead of the whole image; the
-            last layer then starts at zero, and training at Step I's image.
-        output: ``linear`` (clamped on output only: an all-black start can recover) or
-            ``sigmoid``.
-        feature_bound: F is clamped to ± this before it enters (half precision overflows).
+
+    The other settings are explained in conf/model/full.yaml. With ``rgb_skip`` the last layer
+    starts at zero, and training at Step I's image. An unclamped output can recover from black.
 
     Source: paper Sec. 3.5; sizes, style, the linear output and alpha are ours where it is silent.
     """
@@ -121,12 +118,10 @@ class Generator(nn.Module):
         feature_bound: float = 1e3,
     ) -> None:
         super().__init__()
-        if output not in ("linear", "sigmoid"):
-            raise ValueError(f"Generator: output must be linear or sigmoid, got {output!r}")
+        one_of("model.generator.output", output, ("linear", "sigmoid"))
+        one_of("model.generator.style", style, ("film", "pose"))
         if rgb_skip and output == "sigmoid":
             raise ValueError("Generator: rgb_skip adds to a colour, so output must be linear")
-        if style not in ("film", "pose"):
-            raise ValueError(f"Generator: style must be film or pose, got {style!r}")
         channels = [base * m for m in multipliers]
         mapped = style == "film"
         widths = [max(1, round(style_share * c)) if mapped else 0 for c in channels]
@@ -168,11 +163,13 @@ class Generator(nn.Module):
             alpha: ``[B, 1, H, W]`` of F; given where built with ``rgb_skip``.
 
         Raises:
-            ValueError: when ``fine`` is missing, not expected, or of another size, or alpha is
-                missing.
+            ValueError: when ``fine`` or alpha is missing, or ``fine`` is of another size.
         """
         height, width = F.shape[-2:]
-        self._check_fine(height, width, fine)
+        k, given = self.supersample, None if fine is None else tuple(fine.shape[-2:])
+        expected = None if k == 1 else (k * height, k * width)
+        if given != expected:
+            raise ValueError(f"Generator: fine must be {expected} pixels, got {given}")
         features = F.clamp(-self.feature_bound, self.feature_bound)
         if fine is not None:
             fine = functional.pixel_unshuffle(fine, self.supersample)
@@ -191,16 +188,6 @@ class Generator(nn.Module):
                 raise ValueError("Generator: built with rgb_skip=True, so alpha must be given")
             return torch.cat([F[:, :3], alpha], dim=1) + painted
         return torch.sigmoid(painted) if self.output == "sigmoid" else painted
-
-    def _check_fine(self, height: int, width: int, fine: Tensor | None) -> None:
-        k = self.supersample
-        expected = None if k == 1 else (k * height, k * width)
-        given = None if fine is None else tuple(fine.shape[-2:])
-        if expected != given:
-            raise ValueError(
-                f"Generator: built with supersample={k}, so fine must be {expected} pixels, "
-                f"got {given}"
-            )
 
     def _padded(self, x: Tensor) -> Tensor:
         """Zeros on the right and below, up to a multiple of the stride; channels last."""

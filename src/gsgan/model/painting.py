@@ -1,13 +1,15 @@
-"""The output of an avatar: the image and every map that led to it."""
+"""The output of an avatar, and the colour correction of its images per camera."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gsgan.scene import Gaussians, Window
+from gsgan.utils.tensors import full_precision
 
 
 @dataclass(frozen=True)
@@ -45,19 +47,59 @@ class Painting:
     def pasted(self, window: Window) -> Painting:
         """The same in the whole image, background outside the window."""
 
-        def paste(x: Tensor | None) -> Tensor | None:
-            return None if x is None else window.paste(x)
+        names = ("image", "alpha", "features", "splat_alpha", "segmentation", "corrected")
+        held = {name: value for name in names if (value := getattr(self, name)) is not None}
+        whole = {name: window.paste(value) for name, value in held.items()}
+        if self.segmentation is not None:
+            inside = window.paste(torch.ones_like(self.segmentation[:, :1]))
+            parts = whole["segmentation"]
+            whole["segmentation"] = torch.cat([parts[:, :1] + (1 - inside), parts[:, 1:]], dim=1)
+        return replace(self, **whole)  # type: ignore[arg-type]
 
-        parts = paste(self.segmentation)
-        if parts is not None:
-            inside = window.paste(torch.ones_like(self.segmentation[:, :1]))  # type: ignore[index]
-            parts = torch.cat([parts[:, :1] + (1 - inside), parts[:, 1:]], dim=1)
-        return replace(
-            self,
-            image=paste(self.image),
-            alpha=paste(self.alpha),
-            features=paste(self.features),
-            splat_alpha=paste(self.splat_alpha),
-            segmentation=parts,
-            corrected=paste(self.corrected),
-        )
+
+class ColourCorrection(nn.Module):
+    """An affine colour map per training camera, for exposure and white balance; held-out cameras
+    keep the image.
+
+    Convention: images are on black, so the constant term is weighted by alpha and the background
+    stays black. The mean of all maps is exactly the identity: otherwise the person could take on a
+    tint and every map its inverse, and held-out cameras would show that tint.
+
+    Args:
+        trained: names of the training cameras, the order of the parameters.
+        cameras: all names, in the order that `Frame.camera_index` counts.
+    """
+
+    rows: Tensor
+
+    def __init__(self, trained: Sequence[str], cameras: Sequence[str]) -> None:
+        super().__init__()
+        self.offsets = nn.Parameter(torch.zeros(len(trained), 3, 4))
+        rows = [trained.index(name) if name in trained else len(trained) for name in cameras]
+        # by name, not number: other data may order cameras differently
+        self.register_buffer("rows", torch.tensor(rows), persistent=False)
+
+    @property
+    def affine(self) -> Tensor:
+        """``[C, 3, 4]`` the maps ``[A | b]``, of mean ``[1 | 0]``."""
+        identity = torch.eye(3, 4, dtype=self.offsets.dtype, device=self.offsets.device)
+        return identity + self.offsets - self.offsets.mean(dim=0)
+
+    def of_cameras(self, camera_index: Tensor) -> Tensor:
+        """``[B, 3, 4]`` the maps of cameras ``[B]``; the identity for held-out ones."""
+        affine = self.affine
+        identity = torch.eye(3, 4, dtype=affine.dtype, device=affine.device)
+        return torch.cat([affine, identity[None]])[self.rows[camera_index]]
+
+    def forward(self, picture: Tensor, alpha: Tensor, camera_index: Tensor) -> Tensor:
+        """The image as these cameras record it, ``A c + b alpha``, in full precision.
+
+        Args:
+            picture: ``[B, 3, H, W]`` RGB on black.
+            alpha: ``[B, 1, H, W]``.
+            camera_index: ``[B]`` int64.
+        """
+        with full_precision(picture):
+            affine = self.of_cameras(camera_index).to(picture.dtype)
+            mixed = torch.einsum("bij,bjhw->bihw", affine[..., :3], picture)
+            return mixed + affine[..., 3, None, None] * alpha

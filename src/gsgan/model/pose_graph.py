@@ -8,8 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.model.encoding import encoded_size, positional_encoding
+from gsgan.model.deformation import encoded_size, positional_encoding
 from gsgan.skeleton import MEDIAPIPE33, SkeletonTemplate
+from gsgan.utils.checks import one_of
 
 READOUT_START = 0.8  # initial standard deviation of g for joint channels of 1
 
@@ -51,14 +52,8 @@ class PoseGraph(nn.Module):
 
     Args:
         template: the skeleton's joints and edges.
-        width: channels of the hidden layers.
-        joint_channels: output channels per joint.
-        octaves: positional encoding of Ω.
-        readout: ``edge``, each number of g from the two joints of its edge (35 is the number of
-            MediaPipe edges), or ``linear``, from all joints.
-
-    Raises:
-        ValueError: on another readout.
+        width, joint_channels, octaves: hidden and output channels per joint, encoding of Ω.
+        readout: ``edge`` (each number of g from the two joints of its edge) or ``linear``.
 
     Source: paper Sec. 3.5, which leaves open how joints become g.
     """
@@ -75,8 +70,7 @@ class PoseGraph(nn.Module):
         readout: str = "edge",
     ) -> None:
         super().__init__()
-        if readout not in ("edge", "linear"):
-            raise ValueError(f"PoseGraph: readout must be edge or linear, got {readout!r}")
+        one_of("model.pose_encoder.readout", readout, ("edge", "linear"))
         joints = len(template.names)
         mask = torch.eye(joints)
         for a, b in template.gnn_edges:
@@ -112,11 +106,7 @@ class PoseGraph(nn.Module):
 
 
 class PoseLinear(nn.Module):
-    """The ablation ``wo_gcn``: g = W p + b on the flattened skeleton (paper Sec. 4, ablation).
-
-    Args:
-        template: the skeleton; g has one number per edge, as with the graph.
-    """
+    """The ablation ``wo_gcn``: g = W p + b on the flattened skeleton (paper Sec. 4, ablation)."""
 
     def __init__(self, template: SkeletonTemplate = MEDIAPIPE33) -> None:
         super().__init__()

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor, nn
 from torch.nn import functional
 
 from gsgan.body import SkinnedBody
-from gsgan.model.classes import IGNORE, class_map
-from gsgan.model.skinned_points import SkinnedPoints
+from gsgan.body.smpl_names import group_of_part
+from gsgan.model.body_points import SkinnedGaussians, transformed
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians, Raster
 from gsgan.splat import accuracy as named_accuracy
 from gsgan.splat import rasterise
 from gsgan.splat.checks import checks_for
+from gsgan.utils.checks import one_of
+from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import full_precision
 
-__all__ = ["IGNORE", "Segmentation", "segmentation_loss", "silhouette_loss"]
+IGNORE = 255
+HANDS = ("left_hand", "right_hand")
+FACE = "face_neck"
 
 
-class Segmentation(nn.Module):
+class Segmentation(SkinnedGaussians):
     """Canonical Gaussians on a body's vertices, moved by LBS, rendered as class probabilities.
 
     Learned: quats, scales, opacities. Fixed: positions, skinning weights, the one-hot class of
@@ -32,11 +36,8 @@ class Segmentation(nn.Module):
 
     Args:
         body: vertices, weights, joints and part labels.
-        mode: the classes, ``body`` or ``hands``, see `gsgan.model.classes.class_map`.
-        hands_face: with ``hands``, the face as a third class.
-        points: vertices used, spread evenly over the surface; None for all.
-        opacity: initial opacity.
-        scale: initial standard deviation, as a share of the distance to the nearest neighbour.
+        mode, hands_face: the classes, see `class_map`.
+        points, opacity, scale: see `SkinnedGaussians`.
         accuracy: the rasteriser's settings.
         labelled: whether the data has part labels, from which every shape and opacity learns.
             Without them one factor on all scales and one on all opacities learn from the masks:
@@ -63,9 +64,8 @@ class Segmentation(nn.Module):
         accuracy: str = "standard",
         labelled: bool = True,
     ) -> None:
-        super().__init__()
+        super().__init__(body, points, opacity, scale)
         self.accuracy = named_accuracy(accuracy)
-        self.points = SkinnedPoints(body, points)
         self.map = class_map(body.label_names, body.vertex_labels, mode, hands_face)
         # Voted labels are saved, so that the vote is not repeated; the body's own are not.
         self.voted = body.label_source == "vote"
@@ -74,12 +74,6 @@ class Segmentation(nn.Module):
         self.register_buffer("one_hot", self._classes_of_points(), persistent=False)
         self.register_load_state_dict_post_hook(_classes_as_loaded)
         self.all_classed = bool((self.one_hot.sum(dim=1) > 0).all())
-        count = len(self.points)
-        self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1))
-        spacing = self.points.spacing
-        self.log_scales = nn.Parameter((scale * spacing).log().unsqueeze(-1).repeat(1, 3))
-        logit = math.log(opacity / (1 - opacity))
-        self.logit_opacities = nn.Parameter(torch.full((count,), logit))
         self.common: nn.Parameter | None = None
         if not labelled:
             self.requires_grad_(False)
@@ -116,21 +110,12 @@ class Segmentation(nn.Module):
     def gaussians(self, pose: BodyPose) -> Gaussians:
         """The body's Gaussians in pose: covariances A Σ Aᵀ, features = one-hot class."""
         A, t = self.points.blend(pose)
-        batch = A.shape[0]
-        rotation = quaternion_to_rotation_matrix(functional.normalize(self.quats, dim=-1, eps=1e-6))
         log_scales: Tensor = self.log_scales
         logits: Tensor = self.logit_opacities
         if self.common is not None:
             log_scales, logits = log_scales + self.common[0], logits + self.common[1]
-        axes = A @ (rotation * log_scales.exp().unsqueeze(-2))
-        return Gaussians(
-            means=(A @ self.points.means.unsqueeze(-1)).squeeze(-1) + t,
-            quats=None,
-            scales=None,
-            covariances=axes @ axes.mT,
-            opacities=torch.sigmoid(logits).expand(batch, -1),
-            features=self.one_hot.expand(batch, -1, -1),
-        )
+        means, features = transformed(A, t, self.points.means), self.one_hot.expand(len(A), -1, -1)
+        return self.deformed(A, means, log_scales, logits, features)
 
     def raster(self, pose: BodyPose, camera: Camera) -> Raster:
         """The splatted body: features are its classes, alpha its silhouette."""
@@ -205,3 +190,72 @@ def silhouette_loss(
     loss = -(mask * (alpha + floor).log() + (1 - mask) * (1 - alpha + floor).log())
     sure = torch.ones_like(loss) if unsure is None else (unsure <= 0).to(loss)
     return (loss * sure).sum() / sure.sum().clamp_min(1)
+
+
+@dataclass(frozen=True)
+class ClassMap:
+    """The classes of S, and the class of each of the data's labels.
+
+    Convention: class 0 is the background. Labels that no vertex has are numbered after the
+    channels: S cannot learn them, and scores count them as missed.
+    """
+
+    names: tuple[str, ...]  # of the channels, background first
+    absent: tuple[str, ...]  # of the labels without a vertex
+    table: tuple[int, ...]  # the class of each label
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def truth_classes(self) -> int:
+        """Classes of the ground truth, those without a channel included."""
+        return len(self.names) + len(self.absent)
+
+    def as_table(self) -> Tensor:
+        """``[256]`` int64: the class of each label; IGNORE for unnamed ones and 255."""
+        table = torch.full((256,), IGNORE)
+        table[: len(self.table)] = torch.tensor(self.table)
+        return table
+
+
+def class_map(
+    label_names: Sequence[str], vertex_labels: Tensor, mode: str = "body", face: bool = False
+) -> ClassMap:
+    """The classes of a mode.
+
+    Args:
+        label_names: of the data's labels, background first.
+        vertex_labels: ``[V]`` int64, the label of each vertex of the body.
+        mode: ``body``: every label that a vertex has. ``hands``: the left and the right hand; the
+            rest counts as background, and still occludes.
+        face: with ``hands``, the face (and neck, where the labels join them) as a third class.
+
+    Raises:
+        ConfigError: on another mode, or when no label names a requested hand or face.
+    """
+    one_of("model.segmentation.mode", mode, ("body", "hands"))
+    if mode == "hands":
+        return _hands(label_names, face)
+    present = set(vertex_labels.unique().tolist()) - {0}
+    kept = [0, *sorted(present)]
+    absent = [label for label in range(1, len(label_names)) if label not in present]
+    number = {label: i for i, label in enumerate([*kept, *absent])}
+    return ClassMap(
+        names=tuple(label_names[label] for label in kept),
+        absent=tuple(label_names[label] for label in absent),
+        table=tuple(number[label] for label in range(len(label_names))),
+    )
+
+
+def _hands(label_names: Sequence[str], face: bool) -> ClassMap:
+    requested = (*HANDS, FACE) if face else HANDS
+    groups = [group_of_part(name) for name in label_names]
+    lacking = [name for name in requested if name not in groups]
+    if lacking:
+        raise ConfigError(
+            f"model.segmentation.mode=hands needs labels for {', '.join(requested)}, but they name "
+            f"no {' and no '.join(lacking)} ({', '.join(label_names)}); choose mode=body"
+        )
+    table = tuple(1 + requested.index(g) if g in requested else 0 for g in groups)
+    return ClassMap(names=("background", *requested), absent=(), table=table)

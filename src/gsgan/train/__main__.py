@@ -8,11 +8,7 @@ from gsgan.utils.config import entry
 
 
 def train(config: DictConfig) -> None:
-    """Builds data, avatar and training from the config, fits, evaluates.
-
-    Raises:
-        GsganError: on input or settings that the user has to change.
-    """
+    """Builds data, avatar and training from the config, fits, evaluates."""
     from gsgan.train.run import run_training
 
     run_training(config)

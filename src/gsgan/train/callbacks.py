@@ -14,7 +14,6 @@ from rich.console import Console
 from torch import Tensor
 
 from gsgan.evaluate.pictures import grid_rows, write_grid
-from gsgan.model.avatar import Painting
 from gsgan.scene import Frame
 from gsgan.utils.files import write_atomically
 
@@ -27,12 +26,8 @@ def _training(module: LightningModule) -> AvatarTraining:
 
 
 class PictureGrid(Callback):
-    """Writes ground truth, Step I's colour, S, I_pred and error at each validation.
-
-    Args:
-        folder: of ``step_000000.png``.
-        rows: images per grid, spread over the validation frames.
-    """
+    """Writes ground truth, Step I's colour, S, I_pred and error at each validation, as
+    ``folder/step_000000.png`` with ``rows`` images spread over the validation frames."""
 
     def __init__(self, folder: Path, rows: int = 4) -> None:
         self.folder, self.rows = folder, rows
@@ -50,17 +45,9 @@ class PictureGrid(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        if (
-            trainer.is_global_zero
-            and isinstance(outputs, Painting)
-            and self._shows(trainer, batch_idx)
-        ):
+        stride = max(1, int(sum(trainer.num_val_batches)) // max(1, self.rows))
+        if trainer.is_global_zero and batch_idx % stride == 0 and len(self._collected) < self.rows:
             self._collected += grid_rows(batch, outputs)[:1]
-
-    def _shows(self, trainer: Trainer, batch_idx: int) -> bool:
-        total = int(sum(trainer.num_val_batches))
-        stride = max(1, total // max(1, self.rows))
-        return batch_idx % stride == 0 and len(self._collected) < self.rows
 
     def on_validation_epoch_end(self, trainer: Trainer, module: LightningModule) -> None:
         if self._collected:
@@ -97,15 +84,11 @@ class ProgressLines(Callback):
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
-    """Writes beside the old checkpoint and renames: a kill leaves the old one or the new one.
-
-    Lightning's own writer copies from the system's temporary folder, which a kill can cut off.
-    """
+    """Writes beside the old checkpoint and renames, so that a kill leaves one of them whole."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None
     ) -> None:
-        """Saves a checkpoint to a local path."""
         buffer = io.BytesIO()
         torch.save(checkpoint, buffer)
         write_atomically(Path(path), buffer.getvalue())

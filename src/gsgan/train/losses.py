@@ -15,7 +15,7 @@ from gsgan.losses.photometric import photometric, without_unsure
 from gsgan.model.avatar import Painting
 from gsgan.model.discriminator import Discriminator
 from gsgan.scene import Frame
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.checks import at_least, one_of
 from gsgan.utils.tensors import full_precision
 
 
@@ -25,10 +25,7 @@ class StepOneLoss:
 
     Args:
         l1, ssim: weights (paper: 0.8, 0.2).
-        feature_head: weight of the same loss on a linear readout of F; without it F's further
-            channels get no gradient in Step I. 0 builds no readout.
-        alpha: weight of L1 between the splats' alpha and the mask, where images are compared on
-            black; over a random colour the other terms supervise alpha.
+        feature_head, alpha: weights, see conf/training/long.yaml; 0 builds no readout of F.
 
     Source: paper Sec. 3.5 (λ = 0.2); readout and alpha are ours.
     """
@@ -44,32 +41,27 @@ class StepOneLoss:
         """The loss of a painting of ``frame`` over ``background [B, 3, 1, 1]``, None for black;
         ``head`` is the linear readout of F. In full precision, autocast or not."""
         with full_precision(frame.image):
-            return self._loss(painting, frame, background, head)
-
-    def _loss(
-        self, painting: Painting, frame: Frame, background: Tensor | None, head: nn.Conv2d | None
-    ) -> Tensor:
-        assert painting.features is not None and painting.splat_alpha is not None  # noqa: PT018
-        assert painting.colour is not None
-        target, behind = frame.image, frame.image.new_zeros(())
-        if background is not None:
-            target = frame.image + (1 - frame.mask) * background
-            behind = (1 - painting.splat_alpha) * background
-        pixels = {"l1": self.l1, "ssim": self.ssim}
-        loss = photometric(painting.colour + behind, target, unsure=frame.unsure, **pixels)
-        if head is not None:
-            # the bias weighted by alpha: the readout commutes with alpha blending
-            read = functional.conv2d(painting.features, head.weight)
-            read = read + painting.splat_alpha * head.bias.view(1, 3, 1, 1)  # type: ignore[union-attr]
-            loss = loss + self.feature_head * photometric(
-                read + behind, target, unsure=frame.unsure, **pixels
-            )
-        if background is None and self.alpha:
-            matte = photometric(
-                painting.splat_alpha, frame.mask, l1=1.0, ssim=0.0, unsure=frame.unsure
-            )
-            loss = loss + self.alpha * matte
-        return loss
+            assert painting.features is not None and painting.splat_alpha is not None  # noqa: PT018
+            assert painting.colour is not None
+            target, behind = frame.image, frame.image.new_zeros(())
+            if background is not None:
+                target = frame.image + (1 - frame.mask) * background
+                behind = (1 - painting.splat_alpha) * background
+            pixels = {"l1": self.l1, "ssim": self.ssim}
+            loss = photometric(painting.colour + behind, target, unsure=frame.unsure, **pixels)
+            if head is not None:
+                # the bias weighted by alpha: the readout commutes with alpha blending
+                read = functional.conv2d(painting.features, head.weight)
+                read = read + painting.splat_alpha * head.bias.view(1, 3, 1, 1)  # type: ignore[union-attr]
+                loss = loss + self.feature_head * photometric(
+                    read + behind, target, unsure=frame.unsure, **pixels
+                )
+            if background is None and self.alpha:
+                matte = photometric(
+                    painting.splat_alpha, frame.mask, l1=1.0, ssim=0.0, unsure=frame.unsure
+                )
+                loss = loss + self.alpha * matte
+            return loss
 
 
 def discriminate(discriminator: Discriminator, image: Tensor, gan: str) -> list[list[Tensor]]:
@@ -84,21 +76,7 @@ def discriminate(discriminator: Discriminator, image: Tensor, gan: str) -> list[
 
 @dataclass(frozen=True)
 class StepTwoLoss:
-    """Weights of the generator's loss; a term of weight 0 is not computed.
-
-    Args:
-        l1, l2, ssim: photometric terms on I_pred (the paper's footnote: l2 reconstruction).
-        alpha: weight of the same terms with both images on white, I_pred by its alpha, the ground
-            truth by its mask: supervises that alpha. (Comparing alpha with the mask directly scored
-            0.2 dB less on white and 0.15 dB less on black for the default person.)
-        perceptual: L_perc.
-        perceptual_every: compute L_perc only every so many iterations (its weight is multiplied
-            by as much); VGG is the costliest term on a CPU.
-        adversarial: L_GAN.
-        feature_matching: L_feat, between the discriminator's features.
-        gan: ``logistic``, ``hinge``, ``lsgan`` or ``relativistic``.
-        anchor: weight of L_Ψ, which keeps C an image while Ψ learns from the generator.
-        detach_features: keep the generator's gradient out of Ψ (ablation).
+    """Weights of the generator's loss (conf/training/long.yaml); 0 computes no term.
 
     Source: paper Sec. 3.5 and Alg. 2, an unweighted sum of L_GAN, L_perc and L_feat; weights, the
         other terms and the anchor are ours.
@@ -117,15 +95,8 @@ class StepTwoLoss:
     detach_features: bool = False
 
     def __post_init__(self) -> None:
-        if self.gan not in FORMS:
-            raise ConfigError(
-                f"training.step_two.gan must be one of {', '.join(FORMS)}; got {self.gan!r}"
-            )
-        if self.perceptual_every < 1:
-            raise ConfigError(
-                "training.step_two.perceptual_every must be at least 1, "
-                f"got {self.perceptual_every}"
-            )
+        one_of("training.step_two.gan", self.gan, FORMS)
+        at_least("training.step_two.perceptual_every", self.perceptual_every, 1)
 
     @property
     def adversarial_terms(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from typing import Any
 
 import gsgan.utils.compat  # noqa: F401  (must come before lightning)
@@ -20,9 +21,10 @@ from gsgan.model.avatar import Avatar, Painting
 from gsgan.model.discriminator import Discriminator
 from gsgan.scene import Frame
 from gsgan.train.losses import StepOneLoss, StepTwoLoss, discriminate
-from gsgan.train.optimisers import MovingAverage, Recipe, clip, parameter_groups, set_rate
+from gsgan.train.optimisers import MovingAverage, Recipe, clip, parameter_groups
 from gsgan.train.rollback import Rollback, SkippedSteps
 from gsgan.train.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
+from gsgan.utils.checks import at_least
 from gsgan.utils.errors import ConfigError, GsganError
 
 PSNR_CAP = 100.0  # dB: one image equal to the ground truth would make the mean infinite
@@ -40,16 +42,10 @@ class AvatarTraining(LightningModule):
         schedule: iterations of each phase, see `Schedule.fitted`.
         recipes: optimisers by name: segmentation, psi, colour, generator, discriminator.
         step_one, step_two: loss weights.
-        pose_noise: standard deviation, body heights, of the noise on Ψ's pose code.
         seed: with the iteration it determines every random number drawn here, so a resumed run
             draws the same ones.
-        max_skipped: non-finite gradients within ``skip_window`` iterations that stop the run; fewer
-            are skipped.
-        skip_window: iterations.
-        log_every: iterations between logged values.
-        average: decay of the moving average of the last step's weights, which is scored; None
-            scores the weights themselves.
-        average_every: iterations between its updates.
+        pose_noise, max_skipped, skip_window, log_every, average, average_every: see
+            conf/training/long.yaml.
         rollback: recovers from a collapse of the rendered person.
         extra_losses: further terms of Step II by name: modules of a painting and its frame.
         record: plain config values stored with every checkpoint.
@@ -95,9 +91,8 @@ class AvatarTraining(LightningModule):
         )
         self.recipes, self.step_one, self.step_two = recipes, step_one, step_two
         self.pose_noise, self.seed, self.log_every = pose_noise, seed, log_every
-        for name, every in {"log_every": log_every, "average_every": average_every}.items():
-            if every < 1:
-                raise ConfigError(f"training.{name} must be at least 1, got {every}")
+        at_least("training.log_every", log_every, 1)
+        at_least("training.average_every", average_every, 1)
         self.skipped = SkippedSteps(max_skipped, skip_window)
         self.record, self.scene = record or {}, scene
         self.rollback = rollback or Rollback()
@@ -110,8 +105,6 @@ class AvatarTraining(LightningModule):
         self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1) if reads else None
         self.step = 0  # iterations done: Lightning's global_step counts every optimiser's steps
         self.code: list[str] = []  # commits of the code, several where a run was resumed
-        self.start_psnr: float | None = None
-        self.last_psnr: float | None = None
         self.seconds_before: float | None = 0.0  # None: unknown, of an earlier part
         self._began: float | None = None
 
@@ -123,11 +116,7 @@ class AvatarTraining(LightningModule):
         return self.seconds_before + time.monotonic() - self._began
 
     def on_fit_start(self) -> None:
-        """Refuses float16: gradients would be clipped before unscaling.
-
-        Raises:
-            ConfigError: when ``trainer.precision`` is one of float16's.
-        """
+        """Refuses float16: gradients would be clipped before unscaling."""
         if self.trainer.precision in ("16-true", "16-mixed"):
             raise ConfigError(
                 f"trainer.precision={self.trainer.precision}: float16 loses this training's small "
@@ -159,26 +148,27 @@ class AvatarTraining(LightningModule):
         self._names = list(groups)
         return [self.recipes[name].build(groups[name]) for name in self._names]
 
-    def _optimiser(self, name: str) -> Any:
+    def _optimisers(self) -> dict[str, Any]:
         found = self.optimizers()
-        return (found if isinstance(found, list) else [found])[self._names.index(name)]
+        return dict(zip(self._names, found if isinstance(found, list) else [found], strict=True))
 
     def _descend(self, loss: Tensor, *names: str) -> None:
         """One backward pass and one step of each named optimiser; none if a gradient is not
         finite."""
-        optimisers = [self._optimiser(name) for name in names]
-        for optimiser in optimisers:
+        optimisers = {name: self._optimisers()[name] for name in names}
+        for optimiser in optimisers.values():
             optimiser.zero_grad(set_to_none=True)
         self.manual_backward(loss)
         norms = [
             clip(optimiser.optimizer, self.recipes[name].clip).to(loss.device)
-            for name, optimiser in zip(names, optimisers, strict=True)
+            for name, optimiser in optimisers.items()
         ]
         if not bool(torch.isfinite(torch.stack(norms)).all()):
             self.print(self.skipped.add(self.step, names))
             return
-        for name, optimiser in zip(names, optimisers, strict=True):
-            set_rate(optimiser, self._rate(name))
+        for name, optimiser in optimisers.items():
+            for group in optimiser.param_groups:
+                group["lr"] = self._rate(name) * group["multiplier"]
             optimiser.step()
 
     def _rate(self, name: str) -> float:
@@ -205,18 +195,15 @@ class AvatarTraining(LightningModule):
         frame = frame if window is None else window.frame(frame)
         phase = self.schedule.phase(self.step)
         if phase == SEGMENTATION:
-            self._train_segmentation(frame)
+            assert self.avatar.segmentation is not None
+            loss = self.avatar.segmentation.loss(frame)
+            self._descend(loss, "segmentation")
+            self._log("segmentation/nll", loss)
         elif phase == STEP_ONE:
             self._train_step_one(frame, height)
         else:
             self._train_step_two(frame, height)
         self.step += 1
-
-    def _train_segmentation(self, frame: Frame) -> None:
-        assert self.avatar.segmentation is not None
-        loss = self.avatar.segmentation.loss(frame)
-        self._descend(loss, "segmentation")
-        self._log("segmentation/nll", loss)
 
     def _train_step_one(self, frame: Frame, height: int) -> None:
         painting = self._paint(frame, height, paint=False)
@@ -276,29 +263,23 @@ class AvatarTraining(LightningModule):
 
     def on_train_epoch_end(self) -> None:
         """Restores the last good state when the person has vanished, before it is saved."""
-        share = self.rollback.share(self._mean_of_ranks)
+        # over all processes, so that they decide alike
+        share = self.rollback.share(partial(self.trainer.strategy.reduce, reduce_op="mean"))
         if share >= self.rollback.collapse:
             self.rollback.keep(self, share)
             return
-        found = self.optimizers()
-        optimisers = [o.optimizer for o in (found if isinstance(found, list) else [found])]
+        optimisers = [wrapped.optimizer for wrapped in self._optimisers().values()]
         what = f"the rendered person has vanished (alpha is {share:.1%} of the masks')"
         if not self.rollback.restore(self, optimisers):
             raise GsganError(
                 f"training stopped at iteration {self.step}: {what}, also after "
-                f"{self.rollback.done} returns to a good state; the last good checkpoint is kept; "
-                "start again with a lower training.recipes.psi.rate.peak"
+                f"{self.rollback.done} returns to a good state; start again with a lower "
+                "training.recipes.psi.rate.peak (the last good checkpoint is kept)"
             )
         self.print(
             f"iteration {self.step}: {what}; back to the last good state, Ψ's learning rate times "
-            f"{self.rollback.rate:g} from here ({self.rollback.done} of at most "
-            f"{self.rollback.most})"
+            f"{self.rollback.rate:g} ({self.rollback.done} of at most {self.rollback.most})"
         )
-
-    def _mean_of_ranks(self, value: Tensor) -> Tensor:
-        """Mean over all processes, so that they decide alike."""
-        mean: Tensor = self.trainer.strategy.reduce(value, reduce_op="mean")
-        return mean
 
     # -- losses
 
@@ -330,10 +311,9 @@ class AvatarTraining(LightningModule):
         return torch.Generator().manual_seed(state % (2**63))
 
     def _background(self, frame: Frame) -> Tensor | None:
-        shape = (len(frame), 3, 1, 1)
         if not self.random_background:
             return None
-        return torch.rand(shape, generator=self._random(0)).to(frame.image)
+        return torch.rand((len(frame), 3, 1, 1), generator=self._random(0)).to(frame.image)
 
     def _pose_noise(self, skeleton: Tensor) -> Tensor | None:
         if not self.pose_noise:
@@ -364,9 +344,6 @@ class AvatarTraining(LightningModule):
     def on_validation_epoch_end(self) -> None:
         if self.train_seconds is not None:  # the time axis of every curve
             self.log("val/seconds", self.train_seconds, sync_dist=True)
-        self.last_psnr = float(self.trainer.callback_metrics["val/psnr"])
-        if self.start_psnr is None:
-            self.start_psnr = self.last_psnr
 
     def _log(self, name: str, value: Tensor) -> None:
         if self.step % self.log_every == 0 and self._trainer is not None:
@@ -377,7 +354,6 @@ class AvatarTraining(LightningModule):
             "step": self.step,
             "rollbacks": self.rollback.done,
             "averaged": self.average is not None and self.average.started,
-            "start_psnr": self.start_psnr,
             "train_seconds": self.train_seconds,
             "code": self.code,
             "marks": self.marks,
@@ -391,6 +367,5 @@ class AvatarTraining(LightningModule):
         self.avatar.effects.check_same(state.get("effects"))
         self.step = state["step"]
         self.rollback.done = state["rollbacks"]
-        self.start_psnr = state["start_psnr"]
         self.seconds_before = state.get("train_seconds")
         self.code = list(dict.fromkeys([*state.get("code", []), *self.code]))

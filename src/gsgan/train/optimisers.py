@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
@@ -12,7 +12,7 @@ from torch.optim.swa_utils import AveragedModel
 
 from gsgan.model.avatar import Avatar
 from gsgan.train.schedule import Rate
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.checks import between, one_of
 
 
 @dataclass(frozen=True)
@@ -21,11 +21,10 @@ class Recipe:
 
     Args:
         rate: learning rate over the phases of the optimiser.
+        betas, eps: Adam's. A second beta of 0.99 keeps Ψ from a collapse (`Rollback`).
+        clip: largest gradient norm; None leaves gradients alone.
         span: of psi and colour: the rate's shares are of ``both`` steps, or of ``step_one``, after
             which the rate stays.
-        betas: Adam's. A second beta of 0.99 keeps Ψ from a collapse (`Rollback`).
-        eps: Adam's.
-        clip: largest gradient norm; None leaves gradients alone.
     """
 
     rate: Rate
@@ -35,8 +34,7 @@ class Recipe:
     span: Literal["both", "step_one"] = "both"
 
     def __post_init__(self) -> None:
-        if self.span not in ("both", "step_one"):
-            raise ConfigError(f"training.recipes: span must be both or step_one, got {self.span!r}")
+        one_of("training.recipes: span", self.span, ("both", "step_one"))
 
     def build(self, groups: Iterable[tuple[list[nn.Parameter], float]]) -> torch.optim.Adam:
         """Adam over groups of (parameters, rate multiplier)."""
@@ -68,43 +66,25 @@ def parameter_groups(
     return groups
 
 
-def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
-    """Sets every group's learning rate, its multiplier applied."""
-    for group in optimiser.param_groups:
-        group["lr"] = rate * group["multiplier"]
-
-
 def clip(optimiser: torch.optim.Optimizer, largest: float | None) -> Tensor:
     """Clips all gradients together and returns their norm before clipping."""
     parameters = [p for group in optimiser.param_groups for p in group["params"]]
     return nn.utils.clip_grad_norm_(parameters, float("inf") if largest is None else largest)
 
 
-Tensors = tuple[Tensor, ...] | list[Tensor]
-
-
 class MovingAverage(nn.Module):
-    """An exponential moving average of a module's parameters.
+    """An exponential moving average of a module's parameters, updated ``every`` so many iterations.
 
     Convention: the average starts as a copy at the first update and forgets it quickly: the decay
     at update n is ``min(decay ** every, (1 + n) / (10 + n))``. Buffers are copied, not
     averaged.
-
-    Args:
-        module: to average.
-        decay: in [0, 1); how much of the average each iteration keeps.
-        every: iterations between updates.
-
-    Raises:
-        ConfigError: on a decay out of range.
 
     Source: ours; the usual average of a generator's weights.
     """
 
     def __init__(self, module: nn.Module, decay: float, every: int = 1) -> None:
         super().__init__()
-        if not 0 <= decay < 1:
-            raise ConfigError(f"training.average must be null or in [0, 1), got {decay!r}")
+        between("training.average", decay, 0, 1)
         self.decay = decay**every
         self.copy = AveragedModel(module, multi_avg_fn=self._blend)
         self.copy.requires_grad_(False)
@@ -123,7 +103,7 @@ class MovingAverage(nn.Module):
         """Adds the module's present weights to the average."""
         self.copy.update_parameters(module)
 
-    def _blend(self, averaged: Tensors, current: Tensors, count: Tensor | int) -> None:
+    def _blend(self, averaged: Any, current: Any, count: Tensor | int) -> None:
         n = int(count)
         decay = min(self.decay, (1 + n) / (10 + n))
         with torch.no_grad():

@@ -16,7 +16,7 @@ IDLE = (
     *("model.backend", "model.window_multiple", "model.window_least", "model.class_vote"),
     *("training.seed", "training.log_every", "training.max_skipped", "training.skip_window"),
     *("training.rollback", "training.average_every", "training.perceptual.path"),
-    *("training.schedule.epoch", "effects.measure", "effects.impossible"),
+    *("training.schedule.epoch", "effects.impossible"),
 )
 
 

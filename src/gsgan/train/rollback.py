@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from gsgan.utils.errors import ConfigError, GsganError
+from gsgan.utils.checks import between, whole
+from gsgan.utils.errors import GsganError
 
 
 @dataclass
@@ -23,17 +24,7 @@ class Rollback:
     Convention: both are averaged over recent iterations, so that a fall within an epoch shows.
     Optimisers restart after a restoration: their momenta point into the collapse.
 
-    Args:
-        collapse: alpha below this share of the masks' is a collapse.
-        healthy: alpha of at least this share of the masks' marks a good state.
-        memory: share of the average that each iteration keeps.
-        most: restorations before the run is stopped.
-        slower: factor on Ψ's learning rate after each restoration.
-
-    Raises:
-        ConfigError: on values out of range.
-
-    Source: ours.
+    Settings: conf/training/long.yaml. Source: ours.
     """
 
     collapse: float = 0.05
@@ -47,16 +38,11 @@ class Rollback:
     _state: dict[str, Any] | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
-        if not 0 <= self.collapse < self.healthy <= 1:
-            raise ConfigError(
-                "training.rollback: 0 <= collapse < healthy <= 1 must hold, got "
-                f"{self.collapse!r} and {self.healthy!r}"
-            )
-        if self.most < 0 or not 0 < self.slower <= 1 or not 0 <= self.memory < 1:
-            raise ConfigError(
-                "training.rollback: most must be at least 0, slower in (0, 1] and memory in "
-                f"[0, 1), got {self.most!r}, {self.slower!r} and {self.memory!r}"
-            )
+        between("training.rollback.healthy", self.healthy, 0, 1)
+        between("training.rollback.collapse", self.collapse, 0, self.healthy)
+        between("training.rollback.memory", self.memory, 0, 1)
+        between("training.rollback.slower", self.slower, 0, 1)
+        whole("training.rollback.most", self.most, 0)
 
     @property
     def rate(self) -> float:
@@ -66,8 +52,7 @@ class Rollback:
     def share(self, over_ranks: Callable[[Tensor], Tensor] = lambda value: value) -> float:
         """Rendered alpha as a share of the masks'; infinite before the first iteration.
 
-        Args:
-            over_ranks: mean of a tensor over all processes, which must all call this.
+        ``over_ranks`` is the mean of a tensor over all processes, which must all call this.
         """
         if self.alpha is None or self.mask is None:
             return float("inf")
@@ -101,23 +86,14 @@ class Rollback:
 
 
 class SkippedSteps:
-    """Counts iterations with non-finite gradients and stops a run that has too many.
-
-    Args:
-        most: within the window, at which the run stops.
-        window: iterations.
-    """
+    """Counts iterations with non-finite gradients; ``most`` within ``window`` stop the run."""
 
     def __init__(self, most: int, window: int) -> None:
         self.most, self.window = most, window
         self.steps: deque[int] = deque()  # within the window
 
     def add(self, step: int, names: Sequence[str]) -> str:
-        """A message on the skipped step of these optimisers.
-
-        Raises:
-            GsganError: when there were too many.
-        """
+        """A message on the skipped step of these optimisers; a GsganError after too many."""
         if step not in self.steps:  # the discriminator's may follow the generator's
             self.steps.append(step)
         while self.steps[0] <= step - self.window:
@@ -126,8 +102,8 @@ class SkippedSteps:
         if len(self.steps) >= self.most:
             raise GsganError(
                 f"training stopped at iteration {step}: {count} had gradients that were not "
-                "finite; check the data, lower the learning rates (training.recipes.*.rate.peak), "
-                "or go on with a larger training.max_skipped"
+                "finite; check the data, lower training.recipes.*.rate.peak, or go on with a "
+                "larger training.max_skipped"
             )
         return (
             f"iteration {step}: a gradient of {', '.join(names)} was not finite; skipped "

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import os
-import re
 import time
 import warnings
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +17,6 @@ from lightning.pytorch.utilities import rank_zero_only
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
-from torch.utils.flop_counter import FlopCounterMode
 
 from gsgan.data.datamodule import GsganData
 from gsgan.effects.table import effects_table
@@ -30,27 +25,23 @@ from gsgan.evaluate.files import NAMES
 from gsgan.evaluate.run import evaluate_method
 from gsgan.evaluate.scores import painter
 from gsgan.metrics.lpips import check_lpips
-from gsgan.model.avatar import Avatar
 from gsgan.splat import resolve_backend
 from gsgan.train.callbacks import AtomicCheckpoints, PictureGrid, ProgressLines
 from gsgan.train.module import AvatarTraining
 from gsgan.train.runs import CHECKPOINT, build_training, checkpoint_to_resume, read_checkpoint
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
-from gsgan.utils.files import write_atomically
 
-PROGRESS = "progress.json"
 # A training iteration takes so many times as long as painting: arithmetic of the networks at 512²
 # with VGG-16 and the discriminator. With small ones at 128² it was 3.4.
 STEP_PER_PAINTING = 10
-LOGS = re.compile(r"logs(_\d+)?")  # of a run, and of its resumed parts
 
 
 def run_training(config: DictConfig) -> None:
     """Trains, evaluates and prints where the results are.
 
     Raises:
-        GsganError: see `gsgan.train.runs.checkpoint_to_resume` and the data module.
+        GsganError: on anything the user can fix.
     """
     console = make_console()
     console.quiet = getattr(rank_zero_only, "rank", 0) != 0
@@ -63,9 +54,13 @@ def run_training(config: DictConfig) -> None:
     seed_everything(config.seed, workers=True, verbose=False)
     resume = checkpoint_to_resume(folder, module.record, module.marks) if config.resume else None
     done = 0 if resume is None else int(read_checkpoint(resume)["gsgan"]["step"])
+    scores = folder / "metrics.json"
     if resume is None:
         remove_old_results(folder)
-    elif done >= module.schedule.total and (not config.evaluate or scored(folder)):
+    elif done >= module.schedule.total and (
+        not config.evaluate
+        or (scores.is_file() and scores.stat().st_mtime >= resume.stat().st_mtime)
+    ):
         console.print(
             f"{folder}: trained and scored before; nothing to do (gsgan.evaluate scores it again)",
             soft_wrap=True,
@@ -93,7 +88,6 @@ def run_training(config: DictConfig) -> None:
         raise
     if not trainer.is_global_zero:
         return
-    report_progress(console, folder, module)
     if config.evaluate:
         module.to(trainer.strategy.root_device)  # Lightning leaves it on the CPU
         method = trained(
@@ -119,11 +113,7 @@ def run_training(config: DictConfig) -> None:
 def refuse_long_cpu_run(
     config: DictConfig, data: GsganData, module: AvatarTraining, iterations: int
 ) -> None:
-    """Refuses a run that would take very long because ``trainer=auto`` found no GPU.
-
-    Raises:
-        ConfigError: with the estimated time, and what to do.
-    """
+    """Refuses a run that would take very long because ``trainer=auto`` found no GPU."""
     chosen = not OmegaConf.is_interpolation(config.trainer, "accelerator")
     if chosen or config.trainer.accelerator != "cpu":
         return
@@ -135,47 +125,23 @@ def refuse_long_cpu_run(
         seconds = time.perf_counter() - began
     hours = STEP_PER_PAINTING * seconds * iterations / 3600
     if hours > config.cpu_hours:
-        long = f"{hours / 24:.0f} days" if hours > 48 else f"{hours:.0f} hours"
-        small = "size=small training=demo"
-        if config.get("protocol") is not None:  # it fixes the size
-            small = f"{small} without experiment= and protocol="
         raise ConfigError(
-            f"no GPU is found, and on this CPU {iterations:,} iterations would take about {long} "
-            f"(an image takes {seconds:.2g} s to paint): {small} trains for minutes at 128², "
-            "trainer=cpu goes on all the same"
+            f"no GPU is found, and on this CPU {iterations:,} iterations would take about "
+            f"{hours:.0f} hours: size=small training=demo (without experiment= and protocol=) "
+            "trains for minutes at 128², trainer=cpu starts this run anyway"
         )
-
-
-def scored(folder: Path) -> bool:
-    """Whether the run's scores are newer than its checkpoint."""
-    checkpoint, scores = folder / CHECKPOINT, folder / "metrics.json"
-    return scores.is_file() and scores.stat().st_mtime >= checkpoint.stat().st_mtime
 
 
 def remove_old_results(folder: Path) -> None:
     """Removes the results of an earlier run from a folder that starts over."""
-    for name in (*NAMES, PROGRESS, CHECKPOINT):
+    for name in (*NAMES, CHECKPOINT):
         (folder / name).unlink(missing_ok=True)
     for scores in folder.glob("on_*/*"):  # on another background
         if scores.name in NAMES:
             scores.unlink()
-    for log in folder.glob("logs*/metrics.csv"):  # else its curve would be shown as the new run's
-        if LOGS.fullmatch(log.parent.name):
-            log.unlink(missing_ok=True)
-            with suppress(OSError):  # it holds more: not all of it is ours
-                log.parent.rmdir()
-
-
-def report_progress(console: Console, folder: Path, module: AvatarTraining) -> None:
-    """Held-out PSNR at the start and at the end, on the validation images."""
-    start, end = module.start_psnr, module.last_psnr
-    if start is None or end is None:
-        return
-    progress = {"start_psnr": start, "end_psnr": end, "iterations": module.step}
-    write_atomically(folder / PROGRESS, json.dumps(progress, indent=2))
-    console.print(
-        f"\nheld-out PSNR while training: {start:.2f} dB at the start, {end:.2f} at the end"
-    )
+    for logs in ("logs", "logs_[0-9]*"):  # else their curves would be shown as the new run's
+        for log in folder.glob(f"{logs}/metrics.csv"):
+            log.unlink()
 
 
 def build_trainer(
@@ -215,7 +181,8 @@ def describe(
 ) -> None:
     """Prints the data, the parts with their sizes, the effects and the stand-ins in use."""
     info, avatar = data.info, module.avatar
-    device = training_device(config.trainer.accelerator)
+    on_cpu = config.trainer.accelerator == "cpu" or not torch.cuda.is_available()
+    device = torch.device("cpu" if on_cpu else "cuda")  # where Lightning will put the model
     held_out = ", ".join(f"{len(data.dataset(name))} {name}" for name in data.eval_names)
     table = Table(title=f"gsgan: {folder}", show_header=False)
     table.add_row(
@@ -223,42 +190,7 @@ def describe(
         f"{len(data.dataset('train'))} training images: {info.n_train_cameras} cameras, "
         f"{info.frames} frames; held out: {held_out}",
     )
-    for name, part in parts(module).items():
-        table.add_row(name, f"{sum(p.numel() for p in part.parameters()):,} parameters")
-    if avatar.segmentation is None:
-        table.add_row("segmentation S", f"not built: {avatar.segmentation_why}")
-    else:
-        source = "part labels" if info.has_labels else "masks: the data has no part labels"
-        table.add_row("", f"{avatar.segmentation_why}; S learns from {source}")
-    if avatar.splats is not None:
-        table.add_row("rasteriser", resolve_backend(avatar.backend, device, avatar.accuracy)[0])
-    table.add_row("cost of an image", cost(avatar, data))
-    s = module.schedule
-    table.add_row(
-        "schedule", f"segmentation {s.segmentation}, Step I {s.step_one}, Step II {s.step_two}"
-    )
-    console.print(table)
-    for mark in module.marks:
-        console.print(f"stand-in in use: {mark}", highlight=False)
-    costs = None
-    if config.effects.measure:
-        from gsgan.train.effects_cost import effect_costs
-
-        costs = effect_costs(config, data, avatar, config.effects.measure, device)
-    console.print(effects_table(avatar.effects, costs))
-
-
-def training_device(accelerator: str) -> torch.device:
-    """Where Lightning will put the model of this process."""
-    if accelerator == "cpu" or not torch.cuda.is_available():
-        return torch.device("cpu")
-    return torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
-
-
-def parts(module: AvatarTraining) -> dict[str, torch.nn.Module]:
-    """The trained parts by name, those that are built."""
-    avatar = module.avatar
-    found = {
+    parts = {
         "Ψ": avatar.deformation,
         "surface": avatar.surface,
         "colour correction": avatar.colour,
@@ -267,20 +199,24 @@ def parts(module: AvatarTraining) -> dict[str, torch.nn.Module]:
         "discriminator": module.discriminator,
         "segmentation S": avatar.segmentation,
     }
-    return {name: part for name, part in found.items() if part is not None}
-
-
-def cost(avatar: Avatar, data: GsganData) -> str:
-    """Arithmetic of the networks for one training image, counted by running it once.
-
-    The rasterisers are left out: their cost depends on the settings (`python -m gsgan.bench`).
-    """
-    frame = data.dataset("train")[0].to(next(avatar.parameters()).device)
-    with torch.no_grad(), FlopCounterMode(display=False) as counter:
-        avatar.paint(frame)
-    window = avatar.window(frame)
-    height, width = frame.camera.size if window is None else window.size
-    return f"{counter.get_total_flops() / 1e9:.2f} GFLOP in the networks, {width} x {height} pixels"
+    for name, part in parts.items():
+        if part is not None:
+            table.add_row(name, f"{sum(p.numel() for p in part.parameters()):,} parameters")
+    if avatar.segmentation is None:
+        table.add_row("segmentation S", f"not built: {avatar.segmentation_why}")
+    else:
+        source = "part labels" if info.has_labels else "masks: the data has no part labels"
+        table.add_row("", f"{avatar.segmentation_why}; S learns from {source}")
+    if avatar.splats is not None:
+        table.add_row("rasteriser", resolve_backend(avatar.backend, device, avatar.accuracy)[0])
+    s = module.schedule
+    table.add_row(
+        "schedule", f"segmentation {s.segmentation}, Step I {s.step_one}, Step II {s.step_two}"
+    )
+    console.print(table)
+    for mark in module.marks:
+        console.print(f"stand-in in use: {mark}", highlight=False)
+    console.print(effects_table(avatar.effects))
 
 
 def _quiet_lightning() -> None:

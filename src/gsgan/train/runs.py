@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 import gsgan.model.assemble as assemble
 from gsgan.effects import Effects
 from gsgan.model.avatar import Avatar
+from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.tensors import pick_device
 
@@ -55,25 +56,16 @@ class Moved:
         return cls(config.data_root, config.data_smpl)
 
     def refuse_without_run(self) -> None:
-        """Refuses the keys where no run is given.
-
-        Raises:
-            ConfigError: when one of them is set.
-        """
+        """Refuses the keys where no run is given, with a ConfigError."""
         if self != Moved():
             raise ConfigError("data_root and data_smpl are of a trained run; give run= too")
 
 
 def read_config(folder: Path) -> DictConfig:
-    """The config a run was started with, names of older versions replaced.
-
-    Raises:
-        DataError: when the folder is not a run folder, or its run is too old.
-    """
+    """The config a run was started with, names of older versions replaced."""
     if not (folder / CONFIG).is_file():
         raise DataError(
-            f"{folder}: not a run folder (no {CONFIG}); give run=<the folder that gsgan.train "
-            "printed>"
+            f"{folder}: not a run folder (no {CONFIG}); give the folder that gsgan.train printed"
         )
     config = OmegaConf.create(_with_new_names((folder / CONFIG).read_text()))
     assert isinstance(config, DictConfig)
@@ -82,6 +74,8 @@ def read_config(folder: Path) -> DictConfig:
             f"{folder}: trained by an older gsgan, whose images had no alpha of their own; train "
             "again, or use the commit that its facts.json names"
         )
+    if config.get("effects") is not None:
+        config.effects.pop("measure", None)  # a key until 2026-11-22
     return config
 
 
@@ -92,20 +86,13 @@ def _with_new_names(text: str) -> str:
 
 
 def load_config(folder: Path, moved: Moved | None = None) -> DictConfig:
-    """`read_config` with absolute paths of dataset and body model file.
-
-    Raises:
-        ConfigError: when a model file is given for a run that read none.
-        DataError: when the folder is not a run folder, or a path does not exist.
-    """
+    """`read_config` with absolute paths of dataset and body model file, which must exist."""
     config, moved = read_config(folder), moved or Moved()
     if moved.smpl is not None and OmegaConf.select(config, "data.smpl") is None:
         # Skeletons from SMPL fits are others: the scores would be of another model.
         raise ConfigError(f"data_smpl: {folder} was trained without a body model file")
-    for key, what, now in (
-        ("root", "dataset", moved.root),
-        ("smpl", "body model file", moved.smpl),
-    ):
+    for key, what in (("root", "dataset"), ("smpl", "body model file")):
+        now = getattr(moved, key)
         stored = OmegaConf.select(config, f"data.{key}")
         place = _from_start(folder, stored) if now is None else now
         if place is None:
@@ -149,8 +136,7 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     Raises:
         GsganError: on a dataset or a value that cannot be used.
     """
-    if not isinstance(config.seed, int) or config.seed < 0:
-        raise ConfigError(f"seed must be a whole number of at least 0, got {config.seed!r}")
+    whole("seed", config.seed, 0)
     data = build_data(config)
     avatar = build_avatar(config, data)
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
@@ -164,20 +150,13 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """A checkpoint of gsgan, read without unrestricted pickle.
-
-    Raises:
-        DataError: when the file is damaged or is no checkpoint of gsgan.
-    """
+    """A checkpoint of gsgan, read without unrestricted pickle; a DataError when damaged."""
     try:
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError as error:
         raise DataError(f"{path}: no such file; the run has no checkpoint yet") from error
     except Exception as error:
-        raise DataError(
-            f"{path}: not a readable checkpoint ({type(error).__name__}); it may be cut off: "
-            "remove it to start over"
-        ) from error
+        raise DataError(f"{path}: not a readable checkpoint; remove it to start over") from error
     if not isinstance(checkpoint, dict) or "gsgan" not in checkpoint:
         raise DataError(f"{path}: not a checkpoint of gsgan (it has no 'gsgan' entry)")
     return checkpoint
@@ -229,12 +208,7 @@ def load(run: str | Path, *, smpl: str | Path | None = None, device: str = "auto
 
 
 def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avatar, list[str]]:
-    """The trained avatar of a run folder, in eval mode, and the marks its tables must carry.
-
-    Raises:
-        DataError: when the checkpoint is missing, damaged, or of another model, or when the data
-            lacks what the model was built with.
-    """
+    """The trained avatar of a run folder, in eval mode, and the marks its tables must carry."""
     checkpoint = read_checkpoint(folder / CHECKPOINT)
     avatar = _trained(folder, config, checkpoint, data.info, data.labelled("train"))
     return avatar, list(checkpoint["gsgan"]["marks"])
@@ -271,9 +245,8 @@ def _trained(
     try:
         avatar.load_state_dict(state)
     except RuntimeError as error:
-        path = folder / CHECKPOINT
         raise DataError(
-            f"{path}: its weights do not fit the config beside it ({folder / CONFIG})"
+            f"{folder / CHECKPOINT}: its weights do not fit the config {folder / CONFIG}"
         ) from error
     return avatar.eval()
 
@@ -316,16 +289,10 @@ def training_record(config: DictConfig, data: GsganData) -> dict[str, Any]:
 
 
 def checkpoint_to_resume(folder: Path, now: Mapping[str, Any], marks: list[str]) -> Path | None:
-    """The checkpoint of an earlier part of this run, or None.
-
-    Args:
-        folder: of the run.
-        now: the `training_record` of this part.
-        marks: the stand-ins this part uses.
+    """The checkpoint of an earlier part of this run, or None, given its `training_record` now.
 
     Raises:
         ConfigError: when the folder holds a run with other settings.
-        DataError: when its checkpoint cannot be read.
     """
     path = folder / CHECKPOINT
     if not path.is_file():
@@ -333,9 +300,9 @@ def checkpoint_to_resume(folder: Path, now: Mapping[str, Any], marks: list[str])
     state = read_checkpoint(path)["gsgan"]
     if state["marks"] != marks:
         raise ConfigError(
-            f"{folder} holds a run with other stand-ins "
-            f"({'; '.join(state['marks']) or 'none'}; now {'; '.join(marks) or 'none'}); set "
-            "training.perceptual.weights as it was, or resume=false to start over there"
+            f"{folder} holds a run with other stand-ins: {state['marks'] or 'none'}, now "
+            f"{marks or 'none'}; set training.perceptual.weights as it was, or resume=false to "
+            "start over there"
         )
     changed = sorted(set(_differences(_fixed(state["record"]), now)))
     if changed:

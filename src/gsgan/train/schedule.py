@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+from gsgan.utils.checks import above, at_least, between, one_of
 from gsgan.utils.errors import ConfigError
 
 SEGMENTATION, STEP_ONE, STEP_TWO = "segmentation", "step I", "step II"
@@ -13,18 +14,7 @@ FROM_MASKS = 800  # iterations of S, at most, where two numbers learn from masks
 
 @dataclass(frozen=True)
 class Schedule:
-    """Iterations of each phase, in the order segmentation, Step I, Step II.
-
-    Args:
-        segmentation: iterations of S alone (0 where S is not built).
-        step_one: iterations of Ψ alone.
-        step_two: iterations in which generator, discriminator and Ψ learn together.
-        discriminator_start: iterations into Step II before the GAN starts.
-        epoch: iterations between checkpoints; Lightning's epoch is this many sampled batches.
-        stretch: factor on Steps I and II, for variants whose iterations are cheaper, so that all
-            train equally long.
-        degree_every: iterations after which the degree of the spherical harmonics rises by one,
-            from 0; 0 uses all degrees at once.
+    """Iterations of each phase: segmentation, Step I, Step II (conf/training/long.yaml).
 
     Source: paper Alg. 2; of the numbers in conf/training only Step I's 10,000 are the paper's.
     """
@@ -38,18 +28,12 @@ class Schedule:
     degree_every: int = 0
 
     def __post_init__(self) -> None:
-        if self.stretch <= 0:
-            raise ConfigError(f"schedule.stretch must be above 0, got {self.stretch}")
-        for name in (
-            *("segmentation", "step_one", "step_two", "discriminator_start"),
-            "degree_every",
-        ):
-            if getattr(self, name) < 0:
-                raise ConfigError(f"schedule.{name} must be 0 or more, got {getattr(self, name)}")
-        if self.epoch < 1:
-            raise ConfigError(f"schedule.epoch must be 1 or more, got {self.epoch}")
+        above("training.schedule.stretch", self.stretch)
+        for name in ("segmentation", "step_one", "step_two", "discriminator_start", "degree_every"):
+            at_least(f"training.schedule.{name}", getattr(self, name), 0)
+        at_least("training.schedule.epoch", self.epoch, 1)
         if self.total == 0:
-            raise ConfigError("schedule: every phase has 0 iterations, so there is nothing to do")
+            raise ConfigError("training.schedule: every phase has 0 iterations; nothing to do")
 
     def fitted(
         self, *, segmentation: bool, from_masks: bool, splats: bool, generator: bool
@@ -57,12 +41,8 @@ class Schedule:
         """The schedule of a model with these parts, stretched.
 
         Without S its phase is left out; without a generator Step I gets Step II's iterations, and
-        without splats the other way round, so that every variant trains equally long.
-
-        Args:
-            segmentation: S is built.
-            from_masks: S learns from masks, not labels.
-            splats, generator: these are built.
+        without splats the other way round, so that every variant trains equally long. From masks
+        S learns two numbers, which needs fewer iterations.
         """
         one, two, start, degree = (
             round(n * self.stretch)
@@ -81,11 +61,6 @@ class Schedule:
             discriminator_start=start,
             degree_every=degree,
         )
-
-    @property
-    def epochs(self) -> int:
-        """Epochs of the whole run; the last may be shorter."""
-        return math.ceil(self.total / self.epoch)
 
     @property
     def total(self) -> int:
@@ -143,9 +118,6 @@ class Rate:
         final: rate at the end, as a share of the peak.
         warmup: iterations of linear warm-up.
         shape: of the descent, ``cosine``, ``linear`` or ``exponential``.
-
-    Raises:
-        ConfigError: on an unknown shape, or shares out of order.
     """
 
     peak: float
@@ -156,12 +128,8 @@ class Rate:
     shape: str = "cosine"
 
     def __post_init__(self) -> None:
-        if self.shape not in _SHAPES:
-            raise ConfigError(f"rate.shape must be one of {', '.join(_SHAPES)}; got {self.shape!r}")
-        if not 0 <= self.hold <= self.until <= 1:
-            raise ConfigError(
-                f"rate: 0 <= hold <= until <= 1 must hold, got hold={self.hold}, until={self.until}"
-            )
+        one_of("rate.shape", self.shape, _SHAPES)
+        between("rate.hold", self.hold, 0, between("rate.until", self.until, 0, 1))
 
     def at(self, step: int, start: int, end: int) -> float:
         """The rate at iteration ``step`` of the span [start, end)."""
