@@ -22,7 +22,7 @@ from gsgan.bench.painter import Painter, Way, painting_memory, place, spread, wi
 from gsgan.bench.speed import deciles
 from gsgan.metrics.image import edge_f1, psnr, ssim
 from gsgan.metrics.lpips import lpips
-from gsgan.report.curve import curve
+from gsgan.report.training_curve import curve
 from gsgan.scene import Frame
 from gsgan.splat import Accuracy
 from gsgan.train.runs import CHECKPOINT, Moved, build_data, load_avatar, load_config

@@ -30,7 +30,7 @@ from gsgan.report.figures.layout import (
     written,
 )
 from gsgan.report.figures.subjects import Numbers, Shot, Subject, finite, measure
-from gsgan.train.curve import curve
+from gsgan.report.training_curve import curve
 from gsgan.utils.errors import DataError
 from gsgan.utils.palette import BLACK, COLOURS, MARKERS, SKY, VERMILLION
 
