@@ -50,10 +50,7 @@ class Rollback:
         return self.slower**self.done
 
     def share(self, over_ranks: Callable[[Tensor], Tensor] = lambda value: value) -> float:
-        """Rendered alpha as a share of the masks'; infinite before the first iteration.
-
-        ``over_ranks`` is the mean of a tensor over all processes, which must all call this.
-        """
+        """Rendered alpha as a share of the masks', by means over all ranks; infinite at first."""
         if self.alpha is None or self.mask is None:
             return float("inf")
         alpha, mask = over_ranks(torch.stack([self.alpha, self.mask])).tolist()

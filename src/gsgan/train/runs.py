@@ -142,7 +142,9 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
     with assemble.naming_group("training"):
         return data, instantiate(config.training)(
-            avatar, record=training_record(config, data), scene=plain_scene(data.info)
+            avatar,
+            record=training_record(config, data),
+            scene=json.loads(json.dumps(asdict(data.info))),
         )
 
 
@@ -162,14 +164,8 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     return checkpoint
 
 
-def plain_scene(info: SceneInfo) -> dict[str, Any]:
-    """Facts about a scene as plain values, as a checkpoint holds them."""
-    plain: dict[str, Any] = json.loads(json.dumps(asdict(info)))
-    return plain
-
-
 def scene_of(plain: Mapping[str, Any]) -> SceneInfo:
-    """The inverse of `plain_scene`."""
+    """The facts about a scene that a checkpoint holds as plain values."""
     from gsgan.data.scene_info import SceneInfo
     from gsgan.data.surface_colours import SurfaceColours
 
