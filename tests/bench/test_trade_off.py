@@ -10,7 +10,6 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from commands import refused
-from gsgan.train.curve import Curve, curve
 
 from gsgan.bench.painter import Way
 from gsgan.bench.trade_off import (
@@ -25,6 +24,7 @@ from gsgan.bench.trade_off import (
     text,
     ways,
 )
+from gsgan.report.training_curve import Curve, curve
 from gsgan.splat import ACCURACY
 from gsgan.utils.errors import ConfigError, DataError
 
