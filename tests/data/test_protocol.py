@@ -19,7 +19,7 @@ from gsgan.data.splits import camera_name, make_splits, parse_frames, protocol_s
 from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, DataError
 
-NAMES = sorted(path.stem for path in (config_folder() / "protocol").glob("*.yaml"))
+NAMES = sorted({p.stem for p in (config_folder() / "protocol").glob("*.yaml")} - {"none"})
 ONE = Protocol("one", train_cameras=[0], test_cameras=None, train_frames="0-5", test_frames="0-9:4")
 
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from gsgan.data.crop import Window, distort, take, undistort_map
+from gsgan.data.crop import Crop, distort, take, undistort_map
 from gsgan.data.datamodule import GsganData
 from gsgan.data.synthetic.scene_setup import Scene, Settings, dataset_key
 from gsgan.data.synthetic.scenes import ensure_scene
@@ -123,7 +123,7 @@ def test_distorted_images_undistort_to_those_of_the_pinholes():
     image, alpha, _ = person.render(straight.views["cam00"], 9)
     view = bent.views["cam00"]
     raw, raw_alpha, _ = person.render(view, 9)
-    window = Window(0, 0, view.size)
+    window = Crop(0, 0, view.size)
     mapping = undistort_map(view.K, np.pad(view.dist, (0, 3)), window)
     undone, undone_alpha = (
         take((255 * x).astype(np.uint8), window, mapping, exact=False) / 255
