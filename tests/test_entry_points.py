@@ -78,6 +78,21 @@ def test_nothing_has_moved_where_there_is_no_run(inside):
     refused(inside("bench", "trade-off", "data_smpl=/x"), "give either run=")
 
 
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("config.yaml", "data: {"),
+        ("config.yaml", ""),
+        ("config.yaml", "[1]"),
+        ("hydra.yaml", "a: ["),
+    ],
+)
+def test_a_damaged_run_folder_is_one_sentence(file, text, run, tmp_path, inside):
+    copy = shutil.copytree(run, tmp_path / "copy")
+    (copy / ".hydra" / file).write_text(text)
+    refused(inside("evaluate", f"run={copy}", "splits=[novel_pose]"), f".hydra/{file}")
+
+
 def test_evaluate_refuses_what_is_no_run(run, tmp_path, inside):
     refused(inside("evaluate"), "give either run=")
     refused(inside("evaluate", f"run={tmp_path}"), "not a run folder")

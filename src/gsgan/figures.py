@@ -9,7 +9,7 @@ from gsgan.report.__main__ import main as report
 
 def main() -> None:
     """Names the new command, and does the work."""
-    print("gsgan.figures is now python -m gsgan.report run=<folder>, same keys", file=sys.stderr)
+    print("gsgan.figures is now python -m gsgan.report run=<folder>", file=sys.stderr)
     report()
 
 

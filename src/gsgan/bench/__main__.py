@@ -17,7 +17,7 @@ from gsgan.utils.config import FAILED, entry
 SUBJECTS = {
     "raster": "time against error of every backend and accuracy setting of the rasteriser",
     "speed": "milliseconds from skeleton to image, by stage",
-    "trade-off": "quality against time and memory, over settings and small trainings",
+    "trade-off": "quality against time and memory, over settings of a run or over many runs",
     "effects": "what each effect gains where it is called for, and costs (trains for an hour)",
 }
 REMOVED = {"stability": "the hard cases are tests: run `make stability` in a checkout"}

@@ -104,6 +104,9 @@ def trained(config: DictConfig, bench: Bench) -> list[Point]:
     """The runs to compare: those of ``runs``, or the one of ``run``."""
     if (config.run is None) == (config.runs is None):
         raise ConfigError("give either run=<a trained run> or runs=<the folder of a multirun>")
+    for key in ("run", "runs"):
+        if not isinstance(config[key], str | None):
+            raise ConfigError(f"{key} must be one folder, got {config[key]!r}")
     if config.runs is not None:
         finished, unfinished = runs_in(Path(config.runs).expanduser())
         for name in unfinished:
@@ -132,7 +135,8 @@ def runs_in(folder: Path) -> tuple[list[Point], list[str]]:
 
 
 def _overrides(run: Path) -> dict[str, str]:
-    words = OmegaConf.load(run / ".hydra" / "overrides.yaml")
+    path = run / ".hydra" / "overrides.yaml"
+    words = OmegaConf.load(path) if path.is_file() else OmegaConf.create([])
     pairs = (str(word).partition("=")[::2] for word in words)
     return {k.lstrip("+"): v for k, v in pairs if not IGNORED.match(k.lstrip("+"))}
 

@@ -14,6 +14,7 @@ import torch
 from omegaconf import OmegaConf
 
 from gsgan import __version__
+from gsgan.train.runs import hydra_record
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
@@ -113,10 +114,7 @@ def fingerprint(data: GsganData) -> str:
 
 def choices(folder: Path) -> dict[str, Any]:
     """The config groups' choices of a run folder as Hydra recorded them, or nothing."""
-    path = folder / ".hydra" / "hydra.yaml"
-    if not path.is_file():
-        return {}
-    found = OmegaConf.select(OmegaConf.load(path), "hydra.runtime.choices")
+    found = OmegaConf.select(hydra_record(folder), "hydra.runtime.choices")
     return {} if found is None else {str(key): value for key, value in found.items()}
 
 

@@ -134,7 +134,11 @@ def _out(config: DictConfig, root: Path, method: str) -> Path:
             f"out={out} is inside the predictions, a file or a run folder; choose another folder"
         )
     held = out / FACTS_FILE
-    if held.is_file() and (found := json.loads(held.read_text())["method"]) != method:
+    try:
+        found = json.loads(held.read_text())["method"] if held.is_file() else method
+    except (ValueError, KeyError, TypeError):
+        raise ConfigError(f"{held} is damaged; choose another folder with out=") from None
+    if found != method:
         raise ConfigError(
             f"out={out} holds scores of {found}, not of {method}; choose another folder"
         )

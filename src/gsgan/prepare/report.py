@@ -1,4 +1,4 @@
-"""What stands beside the images: cameras, landmarks, and the report of a preparation."""
+"""The other files of a prepared dataset: cameras, landmarks, and the report of a preparation."""
 
 from __future__ import annotations
 

@@ -208,9 +208,7 @@ def _read_config(folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:
     if not (folder / CONFIG).is_file():
         return None, {}
     try:
-        text = (folder / CONFIG).read_text()
-        # `_target_` of runs from before gsgan.training was called gsgan.train
-        config = OmegaConf.create(text.replace("gsgan.training.", "gsgan.train."))
+        config = OmegaConf.create((folder / CONFIG).read_text())
         if not isinstance(config, DictConfig):
             raise ValueError("not a config")
         return settings_of(config), choices(folder)

@@ -32,8 +32,8 @@ from gsgan.train.runs import CHECKPOINT, build_training, checkpoint_to_resume, r
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 
-# A training iteration takes so many times as long as painting: arithmetic of the networks at 512²
-# with VGG-16 and the discriminator. With small ones at 128² it was 3.4.
+# A training iteration takes this many times as long as rendering: arithmetic of the networks at
+# 512² with VGG-16 and the discriminator. With small ones at 128² it was 3.4.
 STEP_PER_PAINTING = 10
 
 

@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
+import yaml
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 import gsgan.model.assemble as assemble
 from gsgan.effects import Effects
@@ -32,8 +34,8 @@ FREE_KEYS = (
     *("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips", "cpu_hours"),
     *("data.root", "data.smpl", "data.workers", "data.cache_mb", "data.val_pictures"),
     *("data.source.workers", "training.max_skipped", "training.skip_window", "model.backend"),
-    "effects.measure",
 )
+REMOVED_KEYS = ("effects.measure", "data.reader.max_vertex_error")  # in the configs of older runs
 RENAMED = {  # in the configs of older runs
     "gsgan.training.": "gsgan.train.",
     "gsgan.model.avatar.Avatar": "gsgan.model.assemble.assemble_avatar",
@@ -67,15 +69,21 @@ def read_config(folder: Path) -> DictConfig:
         raise DataError(
             f"{folder}: not a run folder (no {CONFIG}); give the folder that gsgan.train printed"
         )
-    config = OmegaConf.create(_with_new_names((folder / CONFIG).read_text()))
-    assert isinstance(config, DictConfig)
+    try:
+        config = OmegaConf.create(_with_new_names((folder / CONFIG).read_text()))
+    except (UnicodeDecodeError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise DataError(f"{folder / CONFIG}: damaged ({str(error).splitlines()[0]})") from None
+    if not isinstance(config, DictConfig) or not {"data", "model"} <= config.keys():
+        raise DataError(f"{folder / CONFIG}: expected the config of a run with data and model")
     if OmegaConf.select(config, "effects.segmentation") is not None:  # until 2026-11-22
         raise DataError(
             f"{folder}: trained by an older gsgan, whose images had no alpha of their own; train "
             "again, or use the commit that its facts.json names"
         )
-    if config.get("effects") is not None:
-        config.effects.pop("measure", None)  # a key until 2026-11-22
+    for key in REMOVED_KEYS:
+        group, _, last = key.rpartition(".")
+        if (node := OmegaConf.select(config, group)) is not None:
+            node.pop(last, None)
     return config
 
 
@@ -109,8 +117,23 @@ def _from_start(folder: Path, place: str | None) -> str | None:
     """A path of a run's config; a relative one counts from where the run was started."""
     if place is None or Path(place).expanduser().is_absolute():
         return place
-    started = OmegaConf.load(folder / ".hydra" / "hydra.yaml").hydra.runtime.cwd
-    return str(Path(started) / place)
+    started = OmegaConf.select(hydra_record(folder), "hydra.runtime.cwd")
+    return place if started is None else str(Path(started) / place)
+
+
+def hydra_record(folder: Path) -> DictConfig:
+    """What Hydra recorded of a run's start; empty where that file is missing.
+
+    Raises:
+        DataError: when it is damaged.
+    """
+    path = folder / ".hydra" / "hydra.yaml"
+    try:
+        found = OmegaConf.load(path) if path.is_file() else OmegaConf.create()
+    except (UnicodeDecodeError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise DataError(f"{path}: damaged ({str(error).splitlines()[0]})") from None
+    assert isinstance(found, DictConfig)
+    return found
 
 
 # -- building
@@ -265,7 +288,7 @@ def record(config: DictConfig) -> dict[str, Any]:
 def _fixed(plain: dict[str, Any]) -> dict[str, Any]:
     """The values that must not change when a run is resumed, under their present names."""
     plain = json.loads(_with_new_names(json.dumps(plain)))
-    for key in FREE_KEYS:
+    for key in (*FREE_KEYS, *REMOVED_KEYS):
         *groups, last = key.split(".")
         node: Any = plain
         for group in groups:

@@ -1,1 +1,1 @@
-"""Files, console, errors, config, pickles: knows nothing of the method."""
+"""Files, console, errors, config, pickles: independent of the method."""

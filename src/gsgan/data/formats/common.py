@@ -66,7 +66,7 @@ class FolderReader:
         return finish(found, checks, self.trust, self.hint, self.drop_frames)
 
     def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
-        """The dataset's files, each checked by itself.
+        """The dataset's files, each checked separately.
 
         Raises:
             DataError: for whatever is missing or damaged, naming the file.

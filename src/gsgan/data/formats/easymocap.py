@@ -76,7 +76,7 @@ class EasymocapReader(FolderReader):
         one_of("data.reader.mask_rule", self.mask_rule, MASK_RULES)
 
     def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
-        """The dataset's files, each checked by itself.
+        """The dataset's files, each checked separately.
 
         Raises:
             DataError: for whatever is missing or damaged, naming the file.

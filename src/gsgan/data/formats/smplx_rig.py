@@ -92,7 +92,7 @@ class SmplxRigReader(FolderReader):
             )
 
     def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
-        """The subject's files, each checked by itself.
+        """The subject's files, each checked separately.
 
         Raises:
             DataError: for whatever is missing or damaged, naming the file.

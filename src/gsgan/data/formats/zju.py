@@ -69,7 +69,7 @@ class ZjuReader(FolderReader):
         one_of("data.reader.fit", self.fit, ("auto", *FITS))
 
     def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
-        """The subject's files, each checked by itself.
+        """The subject's files, each checked separately.
 
         Raises:
             DataError: for whatever is missing or damaged, naming the file.
