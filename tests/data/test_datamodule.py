@@ -1,4 +1,4 @@
-"""Splits, sampling order, loaders, what the scene is said to be like, and the config files."""
+"""Sampling order, loaders, and what the scene is said to be like."""
 
 from __future__ import annotations
 
@@ -13,118 +13,21 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import ten_frames
 import torch
 from make import skeletons, write_landmarks, write_tiny_capture
 
 from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order
 from gsgan.data.formats.capture import read_capture
-from gsgan.data.layout import Layout
-from gsgan.data.splits import make_splits, parse_frames, parse_names
 from gsgan.scene import Frame
 from gsgan.utils.config import one_sentence
-from gsgan.utils.errors import ConfigError, DataError, GsganError
+from gsgan.utils.errors import ConfigError, DataError
 
 # isort: split
 import lightning
-from hydra import compose, initialize_config_dir
-from hydra.errors import InstantiationException
-from hydra.utils import instantiate
-from omegaconf import OmegaConf
 from torch import nn
 
-CONF = Path(__file__).resolve().parents[2] / "conf"
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three cameras, ten frames, labels and poses."""
-    root = tmp_path_factory.mktemp("data") / "capture"
-    return write_tiny_capture(root, cameras=3, frames=10, labels=True, body_pose=True)
-
-
-@pytest.fixture(scope="module")
-def layout(capture: Path) -> Layout:
-    return read_capture(capture)
-
-
-# --- splits -------------------------------------------------------------------------------------
-
-
-def test_default_splits_hold_out_the_last_frames(layout: Layout) -> None:
-    splits = make_splits(layout)
-    assert splits.train_cameras == ("cam00", "cam01", "cam02")
-    assert splits.train_frames == tuple(range(8))
-    assert splits.test_frames == (8, 9)
-    assert len(splits.items["train"]) == 24
-    assert splits.items["novel_view"] == ()
-    assert splits.reasons == {"novel_view": "no camera is held out (data.test_cameras)"}
-    assert set(splits.items["novel_pose"]) == {(c, f) for c in layout.cameras for f in (8, 9)}
-    assert make_splits(layout, test_share=0).reasons["novel_pose"].startswith("no frame")
-
-
-def test_splits_of_the_config_with_ranges_and_the_rest(layout: Layout) -> None:
-    splits = make_splits(layout, test_cameras=["cam01"], train_frames=["0-2", 5])
-    assert splits.train_cameras == ("cam00", "cam02")
-    assert splits.test_frames == (3, 4, 6, 7, 8, 9)
-    assert set(splits.items["novel_view"]) == {("cam01", f) for f in (0, 1, 2, 5)}
-    assert {f for _, f in splits.items["novel_pose"]} == {3, 4, 6, 7, 8, 9}
-    assert splits.reasons == {}
-    assert make_splits(layout, train_cameras=["cam02"]).test_cameras == ("cam00", "cam01")
-    assert make_splits(layout, test_frames="4-5").train_frames == (0, 1, 2, 3, 6, 7, 8, 9)
-
-
-def test_splits_of_meta_json_give_way_to_the_config(tmp_path: Path) -> None:
-    held = {"test_cameras": ["cam01"], "train_frames": [0, 1], "test_frames": [2, 3]}
-    layout = read_capture(write_tiny_capture(tmp_path, splits=held))
-    splits = make_splits(layout)
-    assert (splits.train_cameras, splits.test_cameras) == (("cam00",), ("cam01",))
-    assert (splits.train_frames, splits.test_frames) == ((0, 1), (2, 3))
-    mine = make_splits(layout, test_cameras=[], test_frames=[0])
-    assert (mine.train_cameras, mine.test_cameras) == (("cam00", "cam01"), ())
-    assert (mine.train_frames, mine.test_frames) == ((1, 2, 3), (0,))
-
-
-def test_frames_that_are_not_there_are_noted(layout: Layout) -> None:
-    splits = make_splits(layout, train_frames="5-20", test_frames=[0, 99])
-    assert (splits.train_frames, splits.test_frames) == ((5, 6, 7, 8, 9), (0,))
-    assert splits.notes == ("12 frames of the splits are not usable or do not exist: 10-20, 99",)
-
-
-@pytest.mark.parametrize(
-    ("keys", "error", "message"),
-    [
-        ({"train_cameras": ["cam9"]}, DataError, "has no camera cam9; it has cam00, cam01, cam02"),
-        ({"test_cameras": "cam9"}, DataError, "has no camera cam9; it has cam00, cam01, cam02"),
-        ({"train_frames": "50-60"}, DataError, "nothing to train on .* 0 train frames; .* 0-9"),
-        ({"train_cameras": []}, DataError, "nothing to train on with cameras none"),
-        (
-            {"train_cameras": ["cam00"], "test_cameras": ["cam00"]},
-            ConfigError,
-            "data.train_cameras and data.test_cameras share cam00",
-        ),
-        ({"train_frames": "0-5", "test_frames": "5-9"}, ConfigError, "share 5"),
-        ({"train_frames": "5-0"}, ConfigError, "data.train_frames must be frame numbers .*'5-0'"),
-        ({"train_frames": "all"}, ConfigError, "data.train_frames must be frame numbers .*'all'"),
-        ({"test_frames": 0.5}, ConfigError, "data.test_frames must be frame numbers .* 0.5"),
-        ({"train_cameras": 1.5}, ConfigError, "data.train_cameras must be a list of camera names"),
-        ({"test_share": 1.0}, ConfigError, r"data.test_share must be in \[0, 1\)"),
-    ],
-)
-def test_splits_that_cannot_be(
-    layout: Layout, keys: dict[str, Any], error: type[GsganError], message: str
-) -> None:
-    with pytest.raises(error, match=message):
-        make_splits(layout, **keys)
-
-
-def test_frames_and_names_are_parsed() -> None:
-    assert parse_frames("3-5, 1,4", "x") == (1, 3, 4, 5)
-    assert parse_frames([2, "7", "0-1"], "x") == (0, 1, 2, 7)
-    assert parse_frames(6, "x") == (6,)
-    assert parse_frames(OmegaConf.create([3, "5-6"]), "x") == (3, 5, 6)
-    assert parse_names("a, b", "x") == ("a", "b")
-    assert parse_names(OmegaConf.create(["a", "a", 7]), "x") == ("a", "7")
-    assert parse_names(7, "x") == ("7",)
+capture = ten_frames.capture
 
 
 # --- order --------------------------------------------------------------------------------------
@@ -367,69 +270,6 @@ def test_batches_need_one_size(capture: Path) -> None:
     GsganData(str(capture), batch_size=2).setup()
     with pytest.raises(ConfigError, match=r"data.size is not set and images differ in size"):
         GsganData(str(capture), batch_size=2, crop="person").setup()
-
-
-# --- config files -------------------------------------------------------------------------------
-
-
-def conf(name: str, *overrides: str) -> Any:
-    """The data group as the entry points compose it, keys of the group itself overridden."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        chosen = [f"+data={name}", *(o if o[0] == "+" else f"data.{o}" for o in overrides)]
-        return compose(overrides=chosen).data
-
-
-@pytest.mark.parametrize("name", ["capture", "zju_mocap", "thuman4", "avatarrex", "easymocap"])
-def test_a_dataset_without_root_says_so(name: str) -> None:
-    with pytest.raises(InstantiationException) as caught:
-        instantiate(conf(name))
-    cause = caught.value.__cause__
-    assert isinstance(cause, ConfigError)
-    assert str(cause).startswith("data.root is not set: give the folder of a")
-
-
-def test_capture_config_builds_and_reads(capture: Path) -> None:
-    data = instantiate(conf("capture", f"root={capture}", "size=20", "train_frames=0-3"))
-    assert len(data.dataset("train")) == 12
-    assert data.dataset("train")[0].image.shape == (1, 3, 20, 20)
-    assert data.crop.margin == conf("capture").crop.margin
-    wide = instantiate(conf("capture", f"root={capture}", "crop.margin=0.5"))
-    assert wide.crop.margin == 0.5
-    assert instantiate(conf("capture", f"root={capture}", "crop=null")).crop is None
-    assert instantiate(conf("capture", f"root={capture}", "crop=person")).crop is not None
-
-
-def test_synthetic_config_reads_what_the_generator_would_make(capture: Path) -> None:
-    """The generator is not run here: its parameters are checked, its folder replaced."""
-    from gsgan.data.synthetic.scene_setup import Settings
-
-    data = instantiate(conf("synthetic", "size=48", "source.frames=12", "source.test_frames=3"))
-    assert data.source.func.__name__ == "ensure_synthetic"
-    given = dict(data.source.keywords)
-    assert given.pop("workers") == 2
-    assert Settings(**given) == Settings(size=48, frames=12, test_frames=3)
-    made = instantiate(conf("synthetic", f"root={capture}"))
-    assert made.dataset("train")[0].image.shape[-2:] == (128, 128)
-
-
-@pytest.mark.parametrize("name", ["capture", "synthetic"])
-def test_other_groups_set_size_seed_and_length_of_an_epoch(name: str) -> None:
-    alone = conf(name)
-    assert (alone.seed, alone.steps_per_epoch) == (0, None)
-    among = conf(name, "+seed=7", "+training={schedule: {epoch: 250}}")
-    assert (among.seed, among.steps_per_epoch) == (7, 250)
-    with_group = conf(name, "+size=tiny")
-    assert with_group.size == 32
-    assert conf(name, "size=77").size == 77
-    assert conf(name).size in (128, 256)
-    if name == "synthetic":
-        assert with_group.source.size == 32
-
-
-def test_a_wrong_root_says_so(tmp_path: Path) -> None:
-    data = instantiate(conf("capture", f"root={tmp_path / 'no'}"))
-    with pytest.raises(DataError, match=r"data.root=.*no does not exist"):
-        data.setup()
 
 
 # --- the real capture ---------------------------------------------------------------------------

@@ -14,9 +14,7 @@ from gsgan.losses.adversarial import FORMS, generator_loss
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.painting import Painting
 from gsgan.model.segmentation import silhouette_loss
-from gsgan.train.losses import StepOneLoss, StepTwoLoss, discriminate
-from gsgan.train.optimisers import MovingAverage
-from gsgan.train.runs import load_avatar
+from gsgan.train.losses import StepTwoLoss, discriminate
 from gsgan.utils.errors import ConfigError, GsganError
 
 
@@ -133,99 +131,6 @@ def test_randomness_follows_from_seed_and_step(make):
     assert not torch.equal(module._pose_noise(frame.skeleton), first[1])
     module.random_background = False
     assert module._background(frame) is None
-
-
-# --- alpha
-
-
-def leaves(*channels: int, size: int = 16) -> list[torch.Tensor]:
-    """Random pictures that take a gradient."""
-    generator = torch.Generator().manual_seed(0)
-    return [torch.rand(1, n, size, size, generator=generator).requires_grad_() for n in channels]
-
-
-def seen_person(size: int = 16) -> SimpleNamespace:
-    """A person in the middle, unsure at the right side."""
-    mask, unsure = torch.zeros(1, 1, size, size), torch.zeros(1, 1, size, size)
-    mask[..., 4:12, 4:12], unsure[..., 13:] = 1.0, 1.0
-    return SimpleNamespace(image=0.4 * mask.expand(1, 3, -1, -1), mask=mask, unsure=unsure)
-
-
-def test_step_two_compares_on_white_by_alpha_and_mask():
-    image, alpha = leaves(3, 1)
-    frame = seen_person()
-    weights = StepTwoLoss(l1=0.5, l2=3.0, ssim=0.0, alpha=2.0)
-
-    def terms(loss: StepTwoLoss) -> dict[str, torch.Tensor]:
-        painting = Painting(image, alpha)
-        return loss.terms(painting, frame, anchor=None, perceptual=None, discriminator=None, step=0)
-
-    found = terms(weights)
-    off = ((image + 1 - alpha) - (frame.image + 1 - frame.mask)).detach() * (frame.unsure == 0)
-    assert float(found["alpha"].detach()) == pytest.approx(
-        2 * float(0.5 * off.abs().mean() + 3 * off.square().mean()), rel=1e-5
-    )
-    (slope,) = torch.autograd.grad(found["alpha"], alpha)
-    expected = -2 * (0.5 * off.sign() + 6 * off).sum(1, keepdim=True) / off.numel()
-    torch.testing.assert_close(slope, expected)
-    assert torch.autograd.grad(found["photometric"], alpha, allow_unused=True) == (None,)
-    assert set(terms(replace(weights, alpha=0.0))) == {"photometric"}
-
-
-def test_the_generators_fourth_channel_learns_from_alpha_alone(make):
-    module, _, data = make("size.rgb_skip=false", "training.step_two.perceptual_every=1")
-    frame = data.dataset("train")[0]
-    last = module.avatar.generator.paint.weight
-    terms = module.step_two_terms(module.avatar.paint(frame), frame, adversarial=True)
-    assert {"alpha", "photometric", "anchor", "adversarial"} <= set(terms)
-    slopes = {
-        name: torch.autograd.grad(term, last, retain_graph=True, allow_unused=True)[0]
-        for name, term in terms.items()
-    }
-    assert bool(slopes["alpha"][3].any())
-    assert bool(slopes["alpha"][:3].any())  # the image on white is its colours, too
-    for name in terms.keys() - {"alpha", "anchor"}:
-        assert bool(slopes[name][:3].any()), name
-        assert not slopes[name][3].any(), name
-    assert slopes["anchor"] is None  # of what is splatted
-
-
-def test_on_black_step_one_compares_the_splats_alpha_with_the_mask():
-    features, alpha = leaves(5, 1)
-    frame, colour = seen_person(), torch.tensor([0.2, 0.9, 0.5]).view(1, 3, 1, 1)
-    painting = Painting(None, features=features, splat_alpha=alpha)
-    with_alpha, without = StepOneLoss(alpha=0.3), StepOneLoss(alpha=0.0)
-    on_black = with_alpha(painting, frame, None, None)
-    (slope,) = torch.autograd.grad(on_black, alpha)
-    off = (alpha - frame.mask).detach() * (frame.unsure == 0)
-    torch.testing.assert_close(slope, 0.3 * off.sign() / off.numel())
-    black = without(painting, frame, None, None)
-    assert torch.autograd.grad(black, alpha, allow_unused=True) == (None,)
-    assert float((on_black - black).detach()) == pytest.approx(0.3 * float(off.abs().mean()))
-    # a colour behind her teaches alpha by itself
-    over = with_alpha(painting, frame, colour, None)
-    assert torch.equal(over, without(painting, frame, colour, None))
-    assert bool(torch.autograd.grad(over, alpha)[0].any())
-
-
-@pytest.mark.parametrize("word", ["on", "off"])
-def test_step_one_teaches_the_splats_alpha_with_and_without_a_random_background(make, word):
-    """On black and without a weight, a black person could as well be transparent."""
-    module, _, data = make(f"effects.random_background={word}", "training.step_one.feature_head=0")
-    frame = data.dataset("train")[0]
-    painting = module.avatar.paint(frame)
-    alpha = painting.splat_alpha.detach().requires_grad_()
-    seen = replace(painting, splat_alpha=alpha)
-    (slope,) = torch.autograd.grad(module.step_one_loss(seen, frame), alpha)
-    missing = (alpha < 0.9) & (frame.mask == 1)
-    assert bool(missing.any())
-    if word == "off":
-        assert bool((slope[missing] < 0).all())
-        module.step_one = replace(module.step_one, alpha=0.0)
-        loss = module.step_one_loss(seen, frame)
-        assert torch.autograd.grad(loss, alpha, allow_unused=True) == (None,)
-    else:
-        assert bool(slope.any())
 
 
 # --- S without labels
@@ -353,70 +258,6 @@ def test_a_person_that_keeps_vanishing_stops_the_run_before_its_checkpoint(make,
     assert float(kept["avatar.deformation.table"][:, 10].min()) > -20
 
 
-def test_the_average_is_scored_and_comes_back_from_a_checkpoint(make, tmp_path, tiny):
-    module, trainer, data = make("training.average=0.9", "training.schedule.step_one=0")
-    frame = data.dataset("train")[0]
-    assert module.shown is module.avatar
-    trainer.fit(module, data)
-    assert module.shown is not module.avatar
-    averaged = dict(module.shown.named_parameters())
-    moving = {
-        name: value
-        for name, value in module.avatar.named_parameters()
-        if not torch.equal(value, averaged[name])
-    }
-    assert any(name.startswith("generator") for name in moving)
-    assert all(not p.requires_grad for p in averaged.values())
-    trainer.save_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=False)
-    config = tiny("training.average=0.9", "training.schedule.step_one=0")
-    loaded, _ = load_avatar(tmp_path / "run", config, data)
-    with torch.no_grad():
-        expected, found = module.shown.paint(frame).image, loaded.paint(frame).image
-    torch.testing.assert_close(found, expected)
-
-
-def test_the_average_follows_its_formula():
-    layer = torch.nn.Linear(1, 1)
-    average = MovingAverage(layer, 0.5)
-    values = []
-    for step in range(4):
-        torch.nn.init.constant_(layer.weight, float(step))
-        average.update(layer)
-        values.append(float(average.module.weight.detach()))
-    # a copy first; then decay min(0.5, (1 + n) / (10 + n)) with n = 1, 2, 3
-    expected = [0.0]
-    for n in (1, 2, 3):
-        decay = min(0.5, (1 + n) / (10 + n))
-        expected.append(decay * expected[-1] + (1 - decay) * n)
-    assert values == pytest.approx(expected)
-
-
-def test_an_average_of_every_fourth_iteration_forgets_as_fast():
-    layer = torch.nn.Linear(1, 1)
-    torch.nn.init.constant_(layer.weight, 1.0)
-    often, seldom = MovingAverage(layer, 0.99), MovingAverage(layer, 0.99, every=4)
-    for average, updates in ((often, 4000), (seldom, 1000)):  # past the quick start
-        for _ in range(updates):
-            average.update(layer)
-    torch.nn.init.constant_(layer.weight, 2.0)
-    for step in range(40):
-        often.update(layer)
-        if step % 4 == 0:
-            seldom.update(layer)
-    expected = 2 - 0.99**40
-    for average in (often, seldom):
-        assert float(average.module.weight.detach()) == pytest.approx(expected, abs=1e-5)
-
-
-def test_the_average_is_updated_when_the_config_says(make):
-    module, trainer, data = make("training.average_every=5", "training.schedule.step_one=0")
-    trainer.fit(module, data)
-    steps = range(module.schedule.total - module.schedule.step_two, module.schedule.total)
-    assert int(module.average.copy.n_averaged) == sum(step % 5 == 0 for step in steps)
-    with pytest.raises(ConfigError, match="average_every must be a number of at least 1"):
-        make("training.average_every=0")
-
-
 @pytest.mark.parametrize("model", ["lbs_splat", "image_to_image", "splat_only"])
 def test_baselines_train_with_the_same_schedule(make, model):
     module, trainer, data = make(f"model={model}", "training.schedule.stretch=1")
@@ -435,16 +276,6 @@ def test_a_stretched_schedule_starts_the_gan_at_the_same_share(make):
     for name in ("step_one", "step_two", "discriminator_start"):
         assert getattr(module.schedule, name) == round(2.5 * getattr(plain.schedule, name))
     assert module.schedule.segmentation == plain.schedule.segmentation
-
-
-def test_every_variant_is_scored_by_its_moving_average(make):
-    module, trainer, data = make("model=splat_only", "training.schedule.stretch=1")
-    trainer.fit(module, data)
-    assert module.average.started
-    assert module.shown is module.average.module
-    live = dict(module.avatar.named_parameters())
-    averaged = dict(module.shown.named_parameters())
-    assert any(not torch.equal(live[name], averaged[name]) for name in live)
 
 
 def test_every_phase_runs_under_bf16_autocast(make):

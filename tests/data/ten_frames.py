@@ -1,0 +1,15 @@
+"""The capture that the tests of splits, loaders and config files share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from make import write_tiny_capture
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three cameras, ten frames, labels and poses."""
+    root = tmp_path_factory.mktemp("data") / "capture"
+    return write_tiny_capture(root, cameras=3, frames=10, labels=True, body_pose=True)

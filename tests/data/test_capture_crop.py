@@ -1,0 +1,201 @@
+"""The reader: the person's window, its size, and what lenses do to it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from capture_frames import every_frame, items
+from make import edit_json, write_tiny_capture
+
+from gsgan.data.crop import Crop, PersonCrop, cut, square_window, undistort_map
+from gsgan.data.dataset import CaptureDataset
+from gsgan.data.formats.capture import read_capture
+from gsgan.data.formats.trust import Trust
+from gsgan.utils.errors import ConfigError
+
+LENS = (-0.25, 0.08, 0.002, -0.001, 0.01)
+RATIONAL = (0.1, 0.02, 0.001, 0.002, 0.01, 0.3, 0.05, 0.01)
+SPOT = np.array([0.9, -0.1, 1.7])  # metres, where `spot_capture` puts a white spot
+
+
+def spot_capture(root: Path, size: tuple[int, int], dist: tuple[float, ...] = ()) -> Path:
+    """One camera whose picture shows nothing but a soft white spot at `SPOT`."""
+    write_tiny_capture(root, cameras=1, frames=1, size=size, dist=dist or (0,) * 5)
+    camera = json.loads((root / "cameras.json").read_text())["cam00"]
+    x, y, z = np.array(camera["R"]) @ SPOT + camera["t"]
+    u, v = distort(x / z, y / z, np.array(camera["K"]), camera["dist"])
+    rows, columns = np.mgrid[0 : size[1], 0 : size[0]] + 0.5
+    spot = 255 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / (2 * 1.5**2))
+    cv2.imwrite(
+        str(root / "images/cam00/000000.png"),
+        np.repeat(spot.round().astype(np.uint8)[..., None], 3, -1),
+    )
+    cv2.imwrite(str(root / "masks/cam00/000000.png"), np.full(size[::-1], 255, np.uint8))
+    return root
+
+
+def distort(x: float, y: float, K: np.ndarray, dist: tuple[float, ...]) -> tuple[float, float]:
+    pixels = cv2.projectPoints(
+        np.array([[x, y, 1.0]]), np.zeros(3), np.zeros(3), K, np.array(dist, float)
+    )
+    return tuple(pixels[0].ravel())
+
+
+def centroid(image: torch.Tensor) -> torch.Tensor:
+    """(u, v) of the light in ``[3, H, W]``, pixel centres at +0.5."""
+    grey = image.mean(0)
+    grey = grey * (grey > 0.02)
+    v, u = (torch.arange(n) + 0.5 for n in grey.shape)
+    return torch.stack([(grey.sum(0) * u).sum(), (grey.sum(1) * v).sum()]) / grey.sum()
+
+
+@pytest.mark.parametrize("lens", [(), LENS, RATIONAL, LENS[:4]], ids=["none", "5", "8", "4"])
+@pytest.mark.parametrize("crop", [None, PersonCrop(0.8)], ids=["full", "person"])
+@pytest.mark.parametrize("size", [None, 60, 300])
+def test_a_point_in_space_stays_on_its_spot(
+    tmp_path: Path, lens: tuple[float, ...], crop: PersonCrop | None, size: int | None
+) -> None:
+    """K, R and t of the frame put a 3D point where the picture shows it, whatever was done."""
+    (frame,) = every_frame(spot_capture(tmp_path, (160, 120), lens), crop=crop, size=size)
+    expected, _ = frame.camera.project(torch.from_numpy(SPOT).float()[None, None])
+    assert frame.image.shape[-2:] == frame.camera.size
+    assert torch.allclose(centroid(frame.image[0]), expected[0, 0], atol=0.1)
+
+
+def test_distortion_matters_in_that_test(tmp_path: Path) -> None:
+    root = spot_capture(tmp_path, (160, 120), LENS)
+    edit_json(root / "cameras.json", lambda rig: rig["cam00"].update(dist=[0] * 5))
+    (frame,) = every_frame(root)
+    expected, _ = frame.camera.project(torch.from_numpy(SPOT).float()[None, None])
+    assert (centroid(frame.image[0]) - expected[0, 0]).norm() > 0.5
+
+
+def test_lens_folding_back_shows_nothing(tmp_path: Path) -> None:
+    K, dist = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), np.array([-0.3, *[0.0] * 7])
+    mapping = undistort_map(K, dist, Crop(0, -150, (100, 400)))
+    # r (1 - 0.3 r²) rises up to r = 1.054: column 250 is at r = 2
+    assert (mapping[50, -1] < -1000).all()
+    assert np.allclose(mapping[50, 200], 49.5 + np.array([0.5, 0.5]), atol=0.01)
+
+
+def test_labels_are_never_mixed(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path, labels=True, size=(64, 48), dist=LENS)
+    for path in (root / "labels").rglob("*.png"):
+        labels = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        cv2.imwrite(str(path), np.where(labels == 2, 200, labels).astype(np.uint8))
+    for frame in every_frame(root, size=40, crop=PersonCrop()):
+        assert frame.labels is not None
+        assert set(frame.labels.unique().tolist()) == {0, 1, 200}
+
+
+def test_the_crop_comes_from_skeleton_and_camera_alone(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path)
+    before = read_capture(root)
+    windows = [CaptureDataset(before, [i], crop=PersonCrop()).window(i) for i in items(before)]
+    for path in (root / "masks").rglob("*.png"):
+        cv2.imwrite(str(path), np.zeros((24, 32), np.uint8))
+    after = read_capture(root, trust=Trust(frames=0))
+    blind = CaptureDataset(after, items(after), size=16, crop=PersonCrop())
+    assert [blind.window(i) for i in items(after)] == windows
+    assert (blind[0].image == 0).all()
+
+
+def test_crop_is_square_and_has_the_margin_in_metres(tmp_path: Path) -> None:
+    layout = read_capture(write_tiny_capture(tmp_path, cameras=1, frames=1, size=(400, 400)))
+    view = layout.cameras["cam00"]
+    joints, usable = np.tile([0.0, 0.0, 0.9], (33, 1)), np.ones(33, bool)
+    joints[0, 2] = 1.5
+    window = PersonCrop(0.3).window(view, joints, usable)
+    # focal 480 at 3 m is 160 px a metre: from 0.3 m below the low joint to 0.3 above the high one
+    assert window == Crop(200 - 144, 200 - 96, (192, 192))
+    usable[0] = False
+    assert PersonCrop(0.3).window(view, joints, usable) == Crop(152, 152, (96, 96))
+
+
+def test_crop_beyond_the_border_is_black_and_follows_only_what_is_in_view(tmp_path: Path) -> None:
+    layout = read_capture(write_tiny_capture(tmp_path, cameras=1, frames=1, size=(400, 400)))
+    view = layout.cameras["cam00"]
+    joints, usable = np.tile([-1.2, 0.0, 0.9], (33, 1)), np.ones(33, bool)
+    joints[1] = [-9.0, 0.0, 0.9]  # far out to the left
+    window = PersonCrop(0.3).window(view, joints, usable)
+    assert window.size == (96, 96)
+    assert window.left < 0
+    piece = cut(np.full((400, 400, 3), 9, np.uint8), window)
+    assert (piece[:, : -window.left] == 0).all()
+    assert (piece[:, -window.left :] == 9).all()
+    assert (cut(np.ones((4, 4), np.uint8), Crop(50, 50, (3, 2))) == np.zeros((3, 2))).all()
+
+
+def test_crop_without_joints_in_front_is_the_whole_picture(tmp_path: Path) -> None:
+    layout = read_capture(write_tiny_capture(tmp_path))
+    behind = np.tile([0.0, -50.0, 0.9], (33, 1))
+    window = PersonCrop().window(layout.cameras["cam00"], behind, np.ones(33, bool))
+    assert window == square_window((24, 32)) == Crop(-4, 0, (32, 32))
+
+
+def test_full_frames_of_uneven_cameras_share_one_size(tmp_path: Path) -> None:
+    for frame in every_frame(write_tiny_capture(tmp_path), size=16):
+        assert frame.image.shape[-2:] == (16, 16)
+        assert torch.allclose(frame.camera.K[:, 0, 0], frame.camera.K[:, 1, 1])
+        assert (frame.mask[..., :2, :] == 0).all()  # 4 of 32 rows padded above, halved
+
+
+def test_a_skewed_K_is_kept_and_undistorted_with_its_skew(tmp_path: Path) -> None:
+    """A dot drawn where lens and skew put a point is found where the pinhole camera puts it."""
+    root = write_tiny_capture(tmp_path, size=(200, 160), cameras=1)
+    content = json.loads((root / "cameras.json").read_text())["cam00"]
+    K = np.array(content["K"])
+    K[0, 1] = 40
+    k1 = -0.15
+    edit_json(
+        root / "cameras.json",
+        lambda rig: rig["cam00"].update(K=K.tolist(), dist=[k1, 0, 0, 0, 0]),
+    )
+    x, y = 0.2, -0.3
+    bend = 1 + k1 * (x * x + y * y)
+    u, v = (K @ [x * bend, y * bend, 1])[:2]
+    rows, columns = np.mgrid[:160, :200] + 0.5
+    dot = 255 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / 8)
+    cv2.imwrite(str(root / "images/cam00/000000.png"), np.repeat(dot[..., None], 3, -1))
+    cv2.imwrite(str(root / "masks/cam00/000000.png"), np.full((160, 200), 255, np.uint8))
+    frame = CaptureDataset(read_capture(root), [("cam00", 0)])[0]
+    np.testing.assert_allclose(frame.camera.K[0], K, atol=1e-4)
+    weight = frame.image[0, 0].double().numpy()
+    found = np.array([(weight * columns).sum(), (weight * rows).sum()]) / weight.sum()
+    np.testing.assert_allclose(found, (K @ [x, y, 1])[:2], atol=0.15)
+
+
+@pytest.mark.parametrize("size", [0, -4, 1.5, "big"])
+def test_bad_sizes(tmp_path: Path, size: object) -> None:
+    layout = read_capture(write_tiny_capture(tmp_path))
+    with pytest.raises(ConfigError, match=r"data.size must be a whole number"):
+        CaptureDataset(layout, items(layout), size=size)  # type: ignore[arg-type]
+
+
+def test_bad_margin() -> None:
+    with pytest.raises(ConfigError, match=r"data.crop.margin must be a number above 0"):
+        PersonCrop(0)
+
+
+def test_real_joints_lie_on_the_person_in_the_crop(real_capture: Path) -> None:
+    layout = read_capture(real_capture)
+    chosen = [(c, f) for c in layout.cameras for f in range(0, 70, 10)]
+    dataset = CaptureDataset(layout, chosen, size=128, crop=PersonCrop())
+    hits, total = 0, 0
+    for i, item in enumerate(chosen):
+        frame = dataset[i]
+        pixels, depth = frame.camera.project(frame.skeleton)
+        assert (depth > 0.5).all()
+        assert ((pixels > 0) & (pixels < 128)).all()
+        u, v = pixels[0].long().unbind(-1)
+        near = torch.nn.functional.max_pool2d(frame.mask, 3, 1, 1)[0, 0]  # landmarks: ~11 mm noise
+        hits, total = hits + int((near[v, u] > 0.5).sum()), total + len(u)
+        mask = cv2.imread(str(layout.mask_path(*item)), cv2.IMREAD_GRAYSCALE)
+        kept = cut(mask, dataset.window(item)).sum() / mask.sum()
+        assert kept > 0.999, f"{item}: the crop cuts off {1 - kept:.2%} of the person"
+    assert hits / total > 0.9

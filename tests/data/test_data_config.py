@@ -1,0 +1,78 @@
+"""The config files of the data: what they build, and what they take from other groups."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ten_frames
+from hydra import compose, initialize_config_dir
+from hydra.errors import InstantiationException
+from hydra.utils import instantiate
+
+from gsgan.utils.errors import ConfigError, DataError
+
+capture = ten_frames.capture
+
+CONF = Path(__file__).resolve().parents[2] / "conf"
+
+
+def conf(name: str, *overrides: str) -> Any:
+    """The data group as the entry points compose it, keys of the group itself overridden."""
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        chosen = [f"+data={name}", *(o if o[0] == "+" else f"data.{o}" for o in overrides)]
+        return compose(overrides=chosen).data
+
+
+@pytest.mark.parametrize("name", ["capture", "zju_mocap", "thuman4", "avatarrex", "easymocap"])
+def test_a_dataset_without_root_says_so(name: str) -> None:
+    with pytest.raises(InstantiationException) as caught:
+        instantiate(conf(name))
+    cause = caught.value.__cause__
+    assert isinstance(cause, ConfigError)
+    assert str(cause).startswith("data.root is not set: give the folder of a")
+
+
+def test_capture_config_builds_and_reads(capture: Path) -> None:
+    data = instantiate(conf("capture", f"root={capture}", "size=20", "train_frames=0-3"))
+    assert len(data.dataset("train")) == 12
+    assert data.dataset("train")[0].image.shape == (1, 3, 20, 20)
+    assert data.crop.margin == conf("capture").crop.margin
+    wide = instantiate(conf("capture", f"root={capture}", "crop.margin=0.5"))
+    assert wide.crop.margin == 0.5
+    assert instantiate(conf("capture", f"root={capture}", "crop=null")).crop is None
+    assert instantiate(conf("capture", f"root={capture}", "crop=person")).crop is not None
+
+
+def test_synthetic_config_reads_what_the_generator_would_make(capture: Path) -> None:
+    """The generator is not run here: its parameters are checked, its folder replaced."""
+    from gsgan.data.synthetic.scene_setup import Settings
+
+    data = instantiate(conf("synthetic", "size=48", "source.frames=12", "source.test_frames=3"))
+    assert data.source.func.__name__ == "ensure_synthetic"
+    given = dict(data.source.keywords)
+    assert given.pop("workers") == 2
+    assert Settings(**given) == Settings(size=48, frames=12, test_frames=3)
+    made = instantiate(conf("synthetic", f"root={capture}"))
+    assert made.dataset("train")[0].image.shape[-2:] == (128, 128)
+
+
+@pytest.mark.parametrize("name", ["capture", "synthetic"])
+def test_other_groups_set_size_seed_and_length_of_an_epoch(name: str) -> None:
+    alone = conf(name)
+    assert (alone.seed, alone.steps_per_epoch) == (0, None)
+    among = conf(name, "+seed=7", "+training={schedule: {epoch: 250}}")
+    assert (among.seed, among.steps_per_epoch) == (7, 250)
+    with_group = conf(name, "+size=tiny")
+    assert with_group.size == 32
+    assert conf(name, "size=77").size == 77
+    assert conf(name).size in (128, 256)
+    if name == "synthetic":
+        assert with_group.source.size == 32
+
+
+def test_a_wrong_root_says_so(tmp_path: Path) -> None:
+    data = instantiate(conf("capture", f"root={tmp_path / 'no'}"))
+    with pytest.raises(DataError, match=r"data.root=.*no does not exist"):
+        data.setup()

@@ -1,0 +1,100 @@
+"""Which frames and cameras are trained on, and which are held out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ten_frames
+from make import write_tiny_capture
+from omegaconf import OmegaConf
+
+from gsgan.data.formats.capture import read_capture
+from gsgan.data.layout import Layout
+from gsgan.data.splits import make_splits, parse_frames, parse_names
+from gsgan.utils.errors import ConfigError, DataError, GsganError
+
+capture = ten_frames.capture
+
+
+@pytest.fixture(scope="module")
+def layout(capture: Path) -> Layout:
+    return read_capture(capture)
+
+
+def test_default_splits_hold_out_the_last_frames(layout: Layout) -> None:
+    splits = make_splits(layout)
+    assert splits.train_cameras == ("cam00", "cam01", "cam02")
+    assert splits.train_frames == tuple(range(8))
+    assert splits.test_frames == (8, 9)
+    assert len(splits.items["train"]) == 24
+    assert splits.items["novel_view"] == ()
+    assert splits.reasons == {"novel_view": "no camera is held out (data.test_cameras)"}
+    assert set(splits.items["novel_pose"]) == {(c, f) for c in layout.cameras for f in (8, 9)}
+    assert make_splits(layout, test_share=0).reasons["novel_pose"].startswith("no frame")
+
+
+def test_splits_of_the_config_with_ranges_and_the_rest(layout: Layout) -> None:
+    splits = make_splits(layout, test_cameras=["cam01"], train_frames=["0-2", 5])
+    assert splits.train_cameras == ("cam00", "cam02")
+    assert splits.test_frames == (3, 4, 6, 7, 8, 9)
+    assert set(splits.items["novel_view"]) == {("cam01", f) for f in (0, 1, 2, 5)}
+    assert {f for _, f in splits.items["novel_pose"]} == {3, 4, 6, 7, 8, 9}
+    assert splits.reasons == {}
+    assert make_splits(layout, train_cameras=["cam02"]).test_cameras == ("cam00", "cam01")
+    assert make_splits(layout, test_frames="4-5").train_frames == (0, 1, 2, 3, 6, 7, 8, 9)
+
+
+def test_splits_of_meta_json_give_way_to_the_config(tmp_path: Path) -> None:
+    held = {"test_cameras": ["cam01"], "train_frames": [0, 1], "test_frames": [2, 3]}
+    layout = read_capture(write_tiny_capture(tmp_path, splits=held))
+    splits = make_splits(layout)
+    assert (splits.train_cameras, splits.test_cameras) == (("cam00",), ("cam01",))
+    assert (splits.train_frames, splits.test_frames) == ((0, 1), (2, 3))
+    mine = make_splits(layout, test_cameras=[], test_frames=[0])
+    assert (mine.train_cameras, mine.test_cameras) == (("cam00", "cam01"), ())
+    assert (mine.train_frames, mine.test_frames) == ((1, 2, 3), (0,))
+
+
+def test_frames_that_are_not_there_are_noted(layout: Layout) -> None:
+    splits = make_splits(layout, train_frames="5-20", test_frames=[0, 99])
+    assert (splits.train_frames, splits.test_frames) == ((5, 6, 7, 8, 9), (0,))
+    assert splits.notes == ("12 frames of the splits are not usable or do not exist: 10-20, 99",)
+
+
+@pytest.mark.parametrize(
+    ("keys", "error", "message"),
+    [
+        ({"train_cameras": ["cam9"]}, DataError, "has no camera cam9; it has cam00, cam01, cam02"),
+        ({"test_cameras": "cam9"}, DataError, "has no camera cam9; it has cam00, cam01, cam02"),
+        ({"train_frames": "50-60"}, DataError, "nothing to train on .* 0 train frames; .* 0-9"),
+        ({"train_cameras": []}, DataError, "nothing to train on with cameras none"),
+        (
+            {"train_cameras": ["cam00"], "test_cameras": ["cam00"]},
+            ConfigError,
+            "data.train_cameras and data.test_cameras share cam00",
+        ),
+        ({"train_frames": "0-5", "test_frames": "5-9"}, ConfigError, "share 5"),
+        ({"train_frames": "5-0"}, ConfigError, "data.train_frames must be frame numbers .*'5-0'"),
+        ({"train_frames": "all"}, ConfigError, "data.train_frames must be frame numbers .*'all'"),
+        ({"test_frames": 0.5}, ConfigError, "data.test_frames must be frame numbers .* 0.5"),
+        ({"train_cameras": 1.5}, ConfigError, "data.train_cameras must be a list of camera names"),
+        ({"test_share": 1.0}, ConfigError, r"data.test_share must be in \[0, 1\)"),
+    ],
+)
+def test_splits_that_cannot_be(
+    layout: Layout, keys: dict[str, Any], error: type[GsganError], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        make_splits(layout, **keys)
+
+
+def test_frames_and_names_are_parsed() -> None:
+    assert parse_frames("3-5, 1,4", "x") == (1, 3, 4, 5)
+    assert parse_frames([2, "7", "0-1"], "x") == (0, 1, 2, 7)
+    assert parse_frames(6, "x") == (6,)
+    assert parse_frames(OmegaConf.create([3, "5-6"]), "x") == (3, 5, 6)
+    assert parse_names("a, b", "x") == ("a", "b")
+    assert parse_names(OmegaConf.create(["a", "a", 7]), "x") == ("a", "7")
+    assert parse_names(7, "x") == ("7",)

@@ -1,0 +1,45 @@
+"""People to fit to, and fits of them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fit_quick import QUICK
+from hydra import compose as compose_config
+from hydra import initialize_config_dir
+from make import write_tiny_capture
+
+import gsgan.utils.compat  # noqa: F401
+from gsgan.fit.run import run_fit
+from gsgan.utils.config import config_folder
+
+
+@pytest.fixture(scope="session")
+def people(tmp_path_factory) -> Path:
+    """Four cameras around a person, one held out, landmarks in centimetres; read only."""
+    splits = {"train_cameras": ["cam00", "cam01", "cam02"], "test_cameras": ["cam03"]}
+    root = tmp_path_factory.mktemp("people")
+    return write_tiny_capture(root, cameras=4, frames=4, size=(96, 96), unit="cm", splits=splits)
+
+
+@pytest.fixture(scope="session")
+def fitted(people, tmp_path_factory) -> Path:
+    """Landmarks of these people as a fit with the default settings of `QUICK` writes them."""
+    out = tmp_path_factory.mktemp("fitted") / "fit.npz"
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose_config("fit", [f"data.root={people}", f"out={out}", *QUICK])
+    return run_fit(config)
+
+
+@pytest.fixture
+def fit(compose, people, tmp_path):
+    """Fits and returns the written arrays: ``fit("fit.sweeps=1", root=…)``."""
+
+    def run(*overrides: str, root: Path = people, name: str = "fit.npz"):
+        out = tmp_path / name
+        run_fit(compose("fit", f"data.root={root}", f"out={out}", *QUICK, *overrides))
+        return dict(np.load(out))
+
+    return run
