@@ -7,8 +7,8 @@ import inspect
 import os
 import sys
 
-import commands
 import pytest
+from commands import gsgan
 
 from gsgan.bench import __main__ as bench
 from gsgan.utils.config import config_folder
@@ -60,17 +60,16 @@ def test_help_without_a_subject_lists_them(monkeypatch, capsys):
 
 
 def test_help_of_a_subject_is_hydras_from_another_directory(tmp_path):
-    done = commands.gsgan("bench", "raster", "--help", cwd=tmp_path)
+    done = gsgan("bench", "raster", "--help", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "repeats: 7" in done.stdout
     assert "hydra.run.dir" in done.stdout
 
 
-def test_an_unknown_key_is_one_sentence(tmp_path, monkeypatch):
+def test_an_unknown_key_is_one_sentence(tmp_path):
     # Without coverage: under a tracer, Hydra shows its developers' view of a mistake.
     plain = {k: v for k, v in os.environ.items() if not k.startswith("COVERAGE")}
-    monkeypatch.setattr(commands, "ENVIRONMENT", plain)
-    done = commands.gsgan("bench", "raster", "colour=1", cwd=tmp_path)
+    done = gsgan("bench", "raster", "colour=1", cwd=tmp_path, environment=plain)
     assert done.returncode != 0
     assert "colour" in done.stderr
     assert "Traceback" not in done.stderr
