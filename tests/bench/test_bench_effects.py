@@ -174,6 +174,7 @@ def small(compose, tmp_path, monkeypatch):
         yield config
 
 
+@pytest.mark.slow
 def test_runs_are_scored_timed_and_written(run, small, tmp_path, monkeypatch):
     """The same finished run stands in for the training without the effect and with it."""
 

@@ -46,6 +46,7 @@ def test_the_config_trains_with_segmentation_on_cihp_labels(
     assert torch.isfinite(painting.image).all()
 
 
+@pytest.mark.slow
 def test_a_run_is_scored_with_its_model_file_elsewhere(
     written: Path, smpl_file: Path, tmp_path: Path, inside
 ) -> None:

@@ -267,6 +267,7 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_
     assert torch.equal(S, again)
 
 
+@pytest.mark.slow
 def test_a_resumed_run_goes_by_the_votes_it_began_with(foreign, tiny):
     from gsgan.train.runs import build_avatar, build_data
 
