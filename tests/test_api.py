@@ -11,8 +11,8 @@ import torch
 
 import gsgan
 from gsgan.metrics.regions import on_background
+from gsgan.model.runs import CHECKPOINT, CONFIG, build_data, load_avatar, load_config
 from gsgan.scene import cat
-from gsgan.train.runs import CHECKPOINT, CONFIG, build_data, load_avatar, load_config
 from gsgan.utils.errors import DataError, GsganError
 
 

@@ -26,7 +26,7 @@ def given(capture: Path) -> list[str]:
 @pytest.fixture(scope="session")
 def painted(run: Path, capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The images of the tiny run as another method would leave them: 8-bit PNGs."""
-    from gsgan.train.runs import build_data, load_avatar, load_config
+    from gsgan.model.runs import build_data, load_avatar, load_config
 
     root = tmp_path_factory.mktemp("others") / "other"
     data = build_data(load_config(run))
@@ -147,7 +147,7 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
     """By the alpha that each of its pictures has; the table is marked."""
     from gsgan.metrics.image import psnr
     from gsgan.metrics.regions import on_background
-    from gsgan.train.runs import build_data, load_avatar, load_config
+    from gsgan.model.runs import build_data, load_avatar, load_config
 
     copy = shutil.copytree(run, tmp_path / "copy")
     result = inside("evaluate", f"run={copy}", "background=white", "pictures=1")
@@ -266,7 +266,7 @@ def test_seconds_of_a_resumed_training_add_up(tiny, monkeypatch):
     from types import SimpleNamespace
 
     from gsgan.train import module as training
-    from gsgan.train.runs import build_training
+    from gsgan.train.run import build_training
 
     clock = SimpleNamespace(now=100.0)
     monkeypatch.setattr(training.time, "monotonic", lambda: clock.now)

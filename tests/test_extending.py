@@ -16,8 +16,9 @@ from gsgan.data.layout import Found, Meta
 from gsgan.data.skeletons import make_landmarks
 from gsgan.model.body_points import SkinnedPoints
 from gsgan.model.painting import Painting
+from gsgan.model.runs import build_data
 from gsgan.scene import BodyPose, Frame, Gaussians
-from gsgan.train.runs import build_data, build_training
+from gsgan.train.run import build_training
 
 HERE = __name__
 

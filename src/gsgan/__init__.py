@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from gsgan.train.runs import load as load
+    from gsgan.model.runs import load as load
 
 __version__ = "0.1.0"
 __all__ = ["load"]
@@ -17,7 +17,7 @@ __all__ = ["load"]
 def __getattr__(name: str) -> Any:
     """Imports `load` when it is first used: it needs torch, and ``import gsgan`` must be light."""
     if name == "load":
-        from gsgan.train.runs import load
+        from gsgan.model.runs import load
 
         return load
     raise AttributeError(f"module 'gsgan' has no attribute {name!r}")

@@ -296,7 +296,7 @@ def body_window(
         p: ``[B, J, 3]`` metres, finite.
         camera: B cameras.
         margin: metres kept round every joint (hair, fingertips, clothes).
-        multiple: sides are rounded up to multiples of so many pixels, where the image has room.
+        multiple: sides are rounded up to multiples of this many pixels, where the image has room.
         least: pixels, the shortest side, where the image has room.
         near: metres; with a joint nearer than this the box is the whole image.
 

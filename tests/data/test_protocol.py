@@ -242,7 +242,7 @@ def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> Non
     from gsgan.evaluate.facts import Method
     from gsgan.evaluate.run import evaluate_method
     from gsgan.evaluate.scores import painter
-    from gsgan.train.runs import build_avatar, build_data
+    from gsgan.model.runs import build_avatar, build_data
 
     config = compose(
         "train",

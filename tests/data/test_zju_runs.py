@@ -19,7 +19,7 @@ written = zju_folders.written
 def test_the_config_trains_with_segmentation_on_cihp_labels(
     compose, written: Path, smpl_file: Path
 ) -> None:
-    from gsgan.train.runs import build_avatar, build_data
+    from gsgan.model.runs import build_avatar, build_data
 
     config = compose(
         "train",

@@ -11,7 +11,8 @@ import torch
 from operators import Calls
 
 from gsgan.model.painting import ColourCorrection
-from gsgan.train.runs import build_training, load_avatar, read_checkpoint
+from gsgan.model.runs import load_avatar, read_checkpoint
+from gsgan.train.run import build_training
 from gsgan.utils.errors import ConfigError
 
 NONE = "effects=none"
@@ -266,7 +267,7 @@ def test_a_trained_avatar_has_what_its_checkpoint_says_not_what_the_scene_says_n
 
     from omegaconf import OmegaConf
 
-    from gsgan.train.runs import CHECKPOINT, build_data, load_config
+    from gsgan.model.runs import CHECKPOINT, build_data, load_config
 
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)

@@ -16,7 +16,8 @@ from gsgan.data.formats.capture import CaptureReader
 from gsgan.evaluate.facts import fingerprint
 from gsgan.evaluate.run import make_scorer
 from gsgan.fit.run import run_fit
-from gsgan.train.runs import CHECKPOINT, checkpoint_to_resume, training_record
+from gsgan.model.runs import CHECKPOINT
+from gsgan.train.run import checkpoint_to_resume, training_record
 from gsgan.utils.errors import ConfigError, DataError
 
 

@@ -12,8 +12,9 @@ from gsgan.body.skinned import vertex_normals
 from gsgan.data.surface_colours import body_inside
 from gsgan.effects import EffectSettings, decide
 from gsgan.model.body_points import BodyPoints, moved_normals
+from gsgan.model.runs import CHECKPOINT, load_avatar
 from gsgan.scene import BodyPose, cat
-from gsgan.train.runs import CHECKPOINT, build_training, load_avatar
+from gsgan.train.run import build_training
 from gsgan.utils.errors import ConfigError, DataError
 
 ON = "effects.body_points=on"

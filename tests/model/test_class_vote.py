@@ -246,7 +246,8 @@ def test_labels_that_are_the_bodys_own_are_not_voted_on(build, monkeypatch):
 
 
 def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_path, monkeypatch):
-    from gsgan.train.runs import CHECKPOINT, build_training, load_avatar
+    from gsgan.model.runs import CHECKPOINT, load_avatar
+    from gsgan.train.run import build_training
 
     config = tiny(f"data.root={foreign}", FEW)
     data, module = build_training(config)
@@ -269,7 +270,7 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_
 
 @pytest.mark.slow
 def test_a_resumed_run_goes_by_the_votes_it_began_with(foreign, tiny):
-    from gsgan.train.runs import build_avatar, build_data
+    from gsgan.model.runs import build_avatar, build_data
 
     config = tiny(f"data.root={foreign}", FEW)
     avatar = build_avatar(config, build_data(config))
@@ -284,7 +285,7 @@ def test_a_resumed_run_goes_by_the_votes_it_began_with(foreign, tiny):
 
 
 def test_votes_of_another_body_are_refused(foreign, tiny):
-    from gsgan.train.runs import build_avatar, build_data
+    from gsgan.model.runs import build_avatar, build_data
 
     config = tiny(f"data.root={foreign}")
     with pytest.raises(DataError, match="labels of 7 vertices do not fit this free body"):
@@ -294,7 +295,7 @@ def test_votes_of_another_body_are_refused(foreign, tiny):
 def test_without_pictures_foreign_labels_are_refused(foreign, tiny):
     from hydra.utils import instantiate
 
-    from gsgan.train.runs import build_data
+    from gsgan.model.runs import build_data
 
     config = tiny(f"data.root={foreign}")
     with pytest.raises(DataError, match="no training image with labels"):

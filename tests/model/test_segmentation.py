@@ -11,6 +11,7 @@ import torch
 
 from gsgan.body import free_body
 from gsgan.body.smpl_names import CIHP, CLOTHES, SMPLX_JOINTS
+from gsgan.model.runs import Moved, build_data, load_avatar, load_config
 from gsgan.model.segmentation import (
     IGNORE,
     Segmentation,
@@ -19,7 +20,6 @@ from gsgan.model.segmentation import (
     silhouette_loss,
 )
 from gsgan.scene import BodyPose, Camera
-from gsgan.train.runs import Moved, build_data, load_avatar, load_config
 from gsgan.utils.errors import ConfigError
 
 SIZE = 32

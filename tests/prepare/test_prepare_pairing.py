@@ -29,7 +29,7 @@ def test_given_names_win_and_may_be_numbers():
         (["x"], ["a", "b"], {}, r"no one camera.*videos: x; calibration: a, b"),
         (["a_b"], ["a", "b"], {}, r"no one camera"),
         (["a", "A"], ["a"], {}, r"more than one video"),
-        (["a"], ["a"], {"z": "a"}, r"names what is not there"),
+        (["a"], ["a"], {"z": "a"}, r"names an unknown source or camera"),
     ],
 )
 def test_unpaired_names_list_both_sides(sources, cameras, given, what):

@@ -13,8 +13,8 @@ from commands import refused
 from omegaconf import OmegaConf
 
 from gsgan.metrics.image import edge_f1, psnr
+from gsgan.model.runs import build_data, load_avatar, load_config
 from gsgan.report.figures.run import FIGURES
-from gsgan.train.runs import build_data, load_avatar, load_config
 from gsgan.utils.errors import DataError
 
 FEW = ("shots.teaser=2", "shots.strip=2", "shots.errors=1", "shots.canny=1", "settings.dpi=60")

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from report_folders import protocol, report_of, row, table, texts, write_run, zju
 
+from gsgan.evaluate.paper import NAME
 from gsgan.report.paper import read_paper
 from gsgan.report.runs import Run
-from gsgan.train.paper import NAME
 from gsgan.utils.errors import ConfigError
 
 ABLATION = {"rows": [{"run": "full"}, {"run": "wo_seg"}], "paper": "ablation"}

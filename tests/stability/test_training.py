@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 
 from gsgan.scene import Frame, cat
 from gsgan.train.module import AvatarTraining
-from gsgan.train.runs import build_training
+from gsgan.train.run import build_training
 from gsgan.utils.errors import GsganError
 from stability.cases.poses import DEGENERATE
 

@@ -8,7 +8,7 @@ import pytest
 from lightning import Trainer
 
 from gsgan.train.module import AvatarTraining
-from gsgan.train.runs import build_training
+from gsgan.train.run import build_training
 
 
 @pytest.fixture

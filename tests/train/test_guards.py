@@ -42,7 +42,7 @@ def test_two_optimisers_of_one_iteration_count_once(make):
 
 
 def test_a_resumed_run_starts_counting_anew_and_may_change_the_limit(make, tiny):
-    from gsgan.train.runs import record
+    from gsgan.model.runs import record
 
     module = skipping(make, "training.max_skipped=20")
     for step in range(19):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
+from gsgan.model.runs import load_avatar
 from gsgan.train.optimisers import MovingAverage
-from gsgan.train.runs import load_avatar
 from gsgan.utils.errors import ConfigError
 
 

@@ -131,7 +131,7 @@ def test_bugs_keep_their_traceback_and_mistakes_get_a_sentence():
     ],
 )
 def test_unknown_values_become_one_sentence(tiny, override, named):
-    from gsgan.train.runs import build_training
+    from gsgan.train.run import build_training
 
     config = tiny(override)
     with pytest.raises(Exception) as caught:  # noqa: PT011 (the sentence is what is checked)

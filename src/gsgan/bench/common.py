@@ -177,7 +177,7 @@ def peak_memory(action: Callable[[], object], device: torch.device) -> float | N
     Convention: free memory is returned to the system first, and the system's record of the peak is
     reset (``VmHWM`` of Linux); on CUDA it is the allocator's peak. None where neither is known.
     """
-    action()  # what is built once is built
+    action()  # builds what is built once
     gc.collect()
     buffers.forget()
     if device.type == "cuda":

@@ -18,7 +18,7 @@ from gsgan.bench import common
 from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, sentence
 from gsgan.bench.painter import evenly
 from gsgan.effects import decide as decide_effects
-from gsgan.train.runs import build_data, load_avatar, load_config
+from gsgan.model.runs import build_data, load_avatar, load_config
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, GsganError
 from gsgan.utils.timing import interleaved, median

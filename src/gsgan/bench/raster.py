@@ -113,7 +113,7 @@ def check(config: DictConfig) -> None:
 def variants(
     config: DictConfig, settings: dict[str, Accuracy], n: int, device: torch.device
 ) -> list[Variant]:
-    """Every backend with every setting that it draws by itself, and that ``n`` Gaussians allow."""
+    """Every backend with every setting that it supports, and that ``n`` Gaussians allow."""
     return [
         (backend, name, setting)
         for backend in (TIMED if config.backends == "auto" else config.backends)

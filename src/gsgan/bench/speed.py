@@ -17,9 +17,9 @@ from omegaconf import DictConfig
 from gsgan.bench.common import Bench, check_whole, markdown, number, sentence
 from gsgan.bench.painter import Painter, Way, painting_memory, place, spread, without_denormals
 from gsgan.model.avatar import Avatar, unwatched
+from gsgan.model.runs import Moved, build_avatar, build_data, load_avatar, load_config
 from gsgan.scene import Frame
 from gsgan.splat import resolve_backend
-from gsgan.train.runs import Moved, build_avatar, build_data, load_avatar, load_config
 from gsgan.utils.checks import one_of
 from gsgan.utils.timing import timed, wait
 

@@ -22,10 +22,10 @@ from gsgan.bench.painter import Painter, Way, painting_memory, place, spread, wi
 from gsgan.bench.speed import deciles
 from gsgan.metrics.image import edge_f1, psnr, ssim
 from gsgan.metrics.lpips import lpips
+from gsgan.model.runs import CHECKPOINT, Moved, build_data, load_avatar, load_config
 from gsgan.report.training_curve import curve
 from gsgan.scene import Frame
 from gsgan.splat import Accuracy
-from gsgan.train.runs import CHECKPOINT, Moved, build_data, load_avatar, load_config
 from gsgan.utils.checks import above, one_of
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.palette import BLACK, COLOURS, GREY, MARKERS

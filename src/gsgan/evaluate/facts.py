@@ -14,7 +14,7 @@ import torch
 from omegaconf import OmegaConf
 
 from gsgan import __version__
-from gsgan.train.runs import hydra_record
+from gsgan.model.runs import hydra_record
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
@@ -26,7 +26,7 @@ SAME = ("method", "model", "protocol", "seed", "iterations", "version", "commit"
 
 @dataclass(frozen=True)
 class Method:
-    """What is scored; None for what is unknown.
+    """The method that is scored; None where unknown.
 
     Args:
         name: of the method.

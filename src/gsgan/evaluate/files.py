@@ -43,7 +43,7 @@ COLUMNS = {  # heading and number of decimals
 IN_TERMINAL = (  # narrow; metrics.md has all metrics
     *("psnr", "psnr_person", "ssim", "lpips", "edge_f1", "edge_ratio", "high_frequencies", "miou"),
 )
-VARIANTS = {"full": "picture", "splat": "Step I's colour", "floor": "floor: background"}
+VARIANTS = {"full": "final image", "splat": "Step I's colour", "floor": "floor: background"}
 
 
 @dataclass(frozen=True)
@@ -159,7 +159,7 @@ def notes(results: Results) -> list[str]:
 def print_table(results: Results, facts: dict[str, Any], console: Console) -> None:
     """Prints the table, its caption and its notes."""
     table = Table(title=TITLE, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("picture", no_wrap=True)
+    table.add_column("variant", no_wrap=True)
     for metric in IN_TERMINAL:
         table.add_column(COLUMNS[metric][0], justify="right", no_wrap=True)
     previous = None
@@ -176,7 +176,7 @@ def print_table(results: Results, facts: dict[str, Any], console: Console) -> No
 
 def markdown(results: Results, facts: dict[str, Any]) -> str:
     """The table in Markdown with its caption and every metric, and again by camera."""
-    header = ["split", "picture", "images", *(COLUMNS[m][0] for m in METRICS)]
+    header = ["split", "variant", "images", *(COLUMNS[m][0] for m in METRICS)]
     by_split, by_camera = (
         pages.markdown(header, list(rows(results, cameras=each))) for each in (False, True)
     )

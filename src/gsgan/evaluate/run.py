@@ -38,7 +38,7 @@ from gsgan.evaluate.predictions import (
 from gsgan.evaluate.scores import Predict, Scorer, SplitScores, empty, painter, score_split
 from gsgan.metrics.lpips import lpips
 from gsgan.metrics.regions import BACKGROUNDS
-from gsgan.train.runs import (
+from gsgan.model.runs import (
     CHECKPOINT,
     Moved,
     build_data,

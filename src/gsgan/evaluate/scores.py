@@ -157,7 +157,7 @@ class Scorer:
     """How images are scored.
 
     Args:
-        prepare: what is done to them first.
+        prepare: applied to them first.
         lpips, lpips_reason: from `gsgan.metrics.lpips.lpips`.
         lpips_name: backbone, range and region of LPIPS.
         marks: notes that every table must carry.

@@ -19,7 +19,7 @@ from gsgan.splat.lens import straight_pixels
 
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
 CUT_SLACK = 1e-3  # of 1/255: values that are 8-bit already must not drop by one
-NEAR = 1e-2  # metres; what is nearer of the body's box is cut off
+NEAR = 1e-2  # metres; nearer parts of the body's box are cut off
 PAIRS = torch.combinations(torch.arange(8))
 
 

@@ -121,7 +121,7 @@ class ClassVote:
         above("model.class_vote.depth_tolerance", self.depth_tolerance)
 
     def __call__(self, body: SkinnedBody, pictures: Pictures, n_labels: int) -> Votes:
-        """Votes over frames of one item each, for data of so many labels (background included).
+        """Votes over frames of one item each, for data with this many labels (background included).
 
         Raises:
             DataError: when an image file is damaged, or no vertex lies on a labelled pixel.

@@ -90,7 +90,7 @@ class Generator(nn.Module):
         segmentation_channels: channels of S; 0 leaves S out (``wo_seg``).
         skeleton_channels: channels of p₂D.
         pose_channels: length of g.
-        supersample: F is drawn so many times larger each way; its pixels then enter E_c as channels
+        supersample: F is rendered this many times larger each way; its pixels enter E_c as channels
             beside their average; 1 for none.
         base: channels at full resolution.
         multipliers: channels of each level in units of ``base``; each level halves the resolution.

@@ -41,7 +41,7 @@ def find_landmarks(folder: Path, names: Iterable[str]) -> dict[str, Path]:
     """Each camera's npz or folder of JSON files: <camera>.npz, <camera>/, <camera>_json/.
 
     Raises:
-        DataError: when a camera has none, listing what is there.
+        DataError: when a camera has none, listing those found.
     """
     there = sorted(p.name for p in folder.iterdir()) if folder.is_dir() else []
     found = {}

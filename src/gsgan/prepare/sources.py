@@ -131,7 +131,9 @@ def pair_cameras(
     named = {str(source): str(camera) for source, camera in given.items()}
     for source, camera in named.items():
         if source not in sources or camera not in cameras:
-            raise DataError(f"cameras={{{source}: {camera}}} names what is not there ({both})")
+            raise DataError(
+                f"cameras={{{source}: {camera}}} names an unknown source or camera ({both})"
+            )
     pairs = dict[str, str]()
     for source in sources:
         matching = [named[source]] if source in named else _matching(source, cameras)

@@ -1,1 +1,1 @@
-"""Scored runs gathered into tables: what is there, what may stand together, how it is shown."""
+"""Tables of scored runs and figures of one run."""

@@ -1,4 +1,4 @@
-"""The numbers that the paper prints: when they may stand beside runs, and as rows."""
+"""The numbers printed in the paper: when they are comparable with runs, and as rows."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PaperTable:
     note: str | None = None
 
     def why_apart(self, runs: Sequence[Run], split: str) -> str | None:
-        """Why the numbers may not stand beside these runs' scores; None where they may."""
+        """Why the numbers are not comparable with these runs' scores; None if they are."""
         if self.reason is not None:
             return self.reason
         for run in runs:
@@ -62,7 +62,7 @@ class PaperTable:
         return found
 
     def grid(self, why: str) -> Grid:
-        """All of it by itself: a row for each of its rows and subjects."""
+        """The whole printed table: a row for each of its rows and subjects."""
         cells = [(row["label"], s, v) for row in self.rows for s, v in row["values"].items()]
         shown = [m for m in METRICS if any(m in values for *_, values in cells)]
         rows = [self._row(f"{label}, {s}", [v.get(m) for m in shown]) for label, s, v in cells]

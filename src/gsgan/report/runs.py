@@ -16,8 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from gsgan.evaluate.facts import choices
+from gsgan.evaluate.paper import departures, settings_of
 from gsgan.report.spec import METRICS
-from gsgan.train.paper import departures, settings_of
 from gsgan.utils.errors import ConfigError, DataError
 
 METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"

@@ -14,6 +14,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
+from gsgan.evaluate.paper import NAME, clause
 from gsgan.report.paper import PaperTable, read_paper
 from gsgan.report.runs import DATA, Run, by_settings, check_same, find_runs, read_runs
 from gsgan.report.spec import (
@@ -41,7 +42,6 @@ from gsgan.report.write import (
     common,
     pages,
 )
-from gsgan.train.paper import NAME, clause
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.files import write_atomically
@@ -265,7 +265,7 @@ def _no_place(spec: TableSpec, run: Run) -> str | None:
 
 
 def _grids(parts: Sequence[Part], paper: PaperTable | None) -> list[Grid]:
-    """Those of every part, with the paper's numbers beside them where they may, else last."""
+    """The grids of all parts; the paper's rows are added where comparable, else as a last grid."""
     if paper is None:
         return [_grid(part, None) for part in parts]
     reasons = {part.split: paper.why_apart(part.runs, part.split) for part in parts}
@@ -277,7 +277,7 @@ def _grids(parts: Sequence[Part], paper: PaperTable | None) -> list[Grid]:
 
 
 def _grid(part: Part, paper: PaperTable | None) -> Grid:
-    """The scores, the numbers of the paper that may stand beside them, and the floor."""
+    """The scores, the comparable numbers of the paper, and the floor."""
     columns = part.columns
     printed = {}
     if paper is not None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import time
 import warnings
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +28,26 @@ from gsgan.evaluate.files import NAMES
 from gsgan.evaluate.run import evaluate_method
 from gsgan.evaluate.scores import painter
 from gsgan.metrics.lpips import check_lpips
+from gsgan.model.assemble import naming_group
+from gsgan.model.runs import (
+    CHECKPOINT,
+    as_resumed,
+    build_avatar,
+    build_data,
+    read_checkpoint,
+    record,
+)
 from gsgan.splat import resolve_backend
 from gsgan.train.callbacks import AtomicCheckpoints, PictureGrid, ProgressLines
 from gsgan.train.module import AvatarTraining
-from gsgan.train.runs import CHECKPOINT, build_training, checkpoint_to_resume, read_checkpoint
+from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 
 # A training iteration takes this many times as long as rendering: arithmetic of the networks at
 # 512² with VGG-16 and the discriminator. With small ones at 128² it was 3.4.
 STEP_PER_PAINTING = 10
+DISCRIMINATOR_SALT = 1000
 
 
 def run_training(config: DictConfig) -> None:
@@ -108,6 +121,67 @@ def run_training(config: DictConfig) -> None:
             marks=module.marks,
         )
     console.print(f"run folder: {folder}", soft_wrap=True)
+
+
+def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
+    """Data and training module of a config.
+
+    Raises:
+        GsganError: on a dataset or a value that cannot be used.
+    """
+    whole("seed", config.seed, 0)
+    data = build_data(config)
+    avatar = build_avatar(config, data)
+    torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
+    with naming_group("training"):
+        return data, instantiate(config.training)(
+            avatar,
+            record=training_record(config, data),
+            scene=json.loads(json.dumps(asdict(data.info))),
+        )
+
+
+def training_record(config: DictConfig, data: GsganData) -> dict[str, Any]:
+    """What two parts of one run must share: the settings, and the skeletons that `gsgan.fit` made,
+    whose file may be overwritten under the same name."""
+    held = record(config)
+    if data.layout.landmarks.fitted_to:
+        held["fitted landmarks"] = data.layout.landmarks.digest(data.layout.frames)
+    return held
+
+
+def checkpoint_to_resume(folder: Path, now: Mapping[str, Any], marks: list[str]) -> Path | None:
+    """The checkpoint of an earlier part of this run, or None, given its `training_record` now.
+
+    Raises:
+        ConfigError: when the folder holds a run with other settings.
+    """
+    path = folder / CHECKPOINT
+    if not path.is_file():
+        return None
+    state = read_checkpoint(path)["gsgan"]
+    if state["marks"] != marks:
+        raise ConfigError(
+            f"{folder} holds a run with other stand-ins: {state['marks'] or 'none'}, now "
+            f"{marks or 'none'}; set training.perceptual.weights as it was, or resume=false to "
+            "start over there"
+        )
+    changed = sorted(set(_differences(as_resumed(state["record"]), now)))
+    if changed:
+        shown = ", ".join(changed[:5]) + (" …" if len(changed) > 5 else "")
+        raise ConfigError(
+            f"{folder} holds a run with other settings ({shown}); choose another hydra.run.dir, "
+            "or resume=false to start over there"
+        )
+    return path
+
+
+def _differences(before: Any, now: Any, at: str = "") -> list[str]:
+    if isinstance(before, dict) and isinstance(now, dict):
+        keys = sorted(before.keys() | now.keys(), key=str)
+        pairs = [(k, before.get(k), now.get(k)) for k in keys]
+        return [d for k, a, b in pairs for d in _differences(a, b, f"{at}.{k}" if at else str(k))]
+    return [] if before == now else [at]
 
 
 def refuse_long_cpu_run(

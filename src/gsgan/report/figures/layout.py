@@ -171,7 +171,7 @@ class Sheet:
 
 
 def legend_foot(lines: int, settings: Settings) -> float:
-    """Inches that a legend of so many lines needs in the foot."""
+    """Inches that a legend of that many lines needs in the foot."""
     return lines * (settings.font - 1) * LINE + 0.05
 
 

@@ -1,4 +1,4 @@
-"""Figures of ``run``: draws what the runs can show, and says what is left out and why."""
+"""Figures of ``run``: draws those that the runs allow, and reports the others with the reason."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
 
+from gsgan.model.runs import Moved, load_config
 from gsgan.report.figures import images
 from gsgan.report.figures.body import densify, segmentation
 from gsgan.report.figures.layout import Drawing, Settings, Unavailable, style
 from gsgan.report.figures.subjects import Shot, Subject, choose_items, make_shots, open_subjects
-from gsgan.train.runs import Moved, load_config
 from gsgan.utils.checks import one_of, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
@@ -65,7 +65,7 @@ def make_figures(config: DictConfig) -> None:
     out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
     moved = Moved.from_config(config)
     for folder in folders:
-        load_config(folder, moved)  # refuses what is not a run folder before anything is written
+        load_config(folder, moved)  # refuses other folders before anything is written
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:

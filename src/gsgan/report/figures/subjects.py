@@ -14,12 +14,10 @@ from gsgan.data.checks import spans
 from gsgan.data.datamodule import GsganData
 from gsgan.data.splits import SPLITS, Item
 from gsgan.evaluate.facts import fingerprint
+from gsgan.evaluate.paper import NAME
 from gsgan.metrics.image import edge_scores, psnr
 from gsgan.model.avatar import Avatar, Painting
-from gsgan.report.runs import DATA, Run, check_same, read_run
-from gsgan.scene import Camera, Frame, Window, body_window, cat
-from gsgan.train.paper import NAME
-from gsgan.train.runs import (
+from gsgan.model.runs import (
     CHECKPOINT,
     Moved,
     build_data,
@@ -27,6 +25,8 @@ from gsgan.train.runs import (
     load_config,
     read_checkpoint,
 )
+from gsgan.report.runs import DATA, Run, check_same, read_run
+from gsgan.scene import Camera, Frame, Window, body_window, cat
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
 

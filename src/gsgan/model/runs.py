@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,16 +17,13 @@ from omegaconf.errors import OmegaConfBaseException
 import gsgan.model.assemble as assemble
 from gsgan.effects import Effects
 from gsgan.model.avatar import Avatar
-from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.tensors import pick_device
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData, SceneInfo
     from gsgan.model.class_vote import Pictures
-    from gsgan.train.module import AvatarTraining
 
-DISCRIMINATOR_SALT = 1000
 CHECKPOINT = Path("checkpoints") / "last.ckpt"
 CONFIG = Path(".hydra") / "config.yaml"
 # Keys that may differ between a run and its continuation: they do not change what it learns.
@@ -153,24 +150,6 @@ def build_avatar(config: DictConfig, data: GsganData, **stored: Any) -> Avatar:
     return assemble.build_avatar(config, data.info, data.labelled("train"), **stored)
 
 
-def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
-    """Data and training module of a config.
-
-    Raises:
-        GsganError: on a dataset or a value that cannot be used.
-    """
-    whole("seed", config.seed, 0)
-    data = build_data(config)
-    avatar = build_avatar(config, data)
-    torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
-    with assemble.naming_group("training"):
-        return data, instantiate(config.training)(
-            avatar,
-            record=training_record(config, data),
-            scene=json.loads(json.dumps(asdict(data.info))),
-        )
-
-
 # -- checkpoints
 
 
@@ -270,7 +249,7 @@ def _trained(
     return avatar.eval()
 
 
-# -- resuming
+# -- settings
 
 
 def record(config: DictConfig) -> dict[str, Any]:
@@ -282,10 +261,10 @@ def record(config: DictConfig) -> dict[str, Any]:
         for key in config
         if key not in FREE_KEYS
     }
-    return _fixed(plain)
+    return as_resumed(plain)
 
 
-def _fixed(plain: dict[str, Any]) -> dict[str, Any]:
+def as_resumed(plain: dict[str, Any]) -> dict[str, Any]:
     """The values that must not change when a run is resumed, under their present names."""
     plain = json.loads(_with_new_names(json.dumps(plain)))
     for key in (*FREE_KEYS, *REMOVED_KEYS):
@@ -296,46 +275,3 @@ def _fixed(plain: dict[str, Any]) -> dict[str, Any]:
         if isinstance(node, dict):
             node.pop(last, None)
     return plain
-
-
-def training_record(config: DictConfig, data: GsganData) -> dict[str, Any]:
-    """What two parts of one run must share: the settings, and the skeletons that `gsgan.fit` made,
-    whose file may be overwritten under the same name."""
-    held = record(config)
-    if data.layout.landmarks.fitted_to:
-        held["fitted landmarks"] = data.layout.landmarks.digest(data.layout.frames)
-    return held
-
-
-def checkpoint_to_resume(folder: Path, now: Mapping[str, Any], marks: list[str]) -> Path | None:
-    """The checkpoint of an earlier part of this run, or None, given its `training_record` now.
-
-    Raises:
-        ConfigError: when the folder holds a run with other settings.
-    """
-    path = folder / CHECKPOINT
-    if not path.is_file():
-        return None
-    state = read_checkpoint(path)["gsgan"]
-    if state["marks"] != marks:
-        raise ConfigError(
-            f"{folder} holds a run with other stand-ins: {state['marks'] or 'none'}, now "
-            f"{marks or 'none'}; set training.perceptual.weights as it was, or resume=false to "
-            "start over there"
-        )
-    changed = sorted(set(_differences(_fixed(state["record"]), now)))
-    if changed:
-        shown = ", ".join(changed[:5]) + (" …" if len(changed) > 5 else "")
-        raise ConfigError(
-            f"{folder} holds a run with other settings ({shown}); choose another hydra.run.dir, "
-            "or resume=false to start over there"
-        )
-    return path
-
-
-def _differences(before: Any, now: Any, at: str = "") -> list[str]:
-    if isinstance(before, dict) and isinstance(now, dict):
-        keys = sorted(before.keys() | now.keys(), key=str)
-        pairs = [(k, before.get(k), now.get(k)) for k in keys]
-        return [d for k, a, b in pairs for d in _differences(a, b, f"{at}.{k}" if at else str(k))]
-    return [] if before == now else [at]
