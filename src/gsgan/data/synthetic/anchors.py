@@ -1,0 +1,3 @@
+from gsgan.data.synthetic.character import Character
+def with_anchors(character: Character) -> Character:
+    return character
