@@ -138,17 +138,22 @@ def _label_of(name: str) -> int:
     return 0
 
 
+def texture_lab(c: Character, uv: Array, material: Ints) -> Array:
+    """``[N, 3]`` CIELAB colours of the materials ``[N]`` at texture coordinates ``[N, 2]``."""
+    colour = np.zeros((len(uv), 3))
+    for m, surface in enumerate(c.surfaces):
+        at = material == m
+        h, w = surface.colour.shape[:2]
+        x, y = np.minimum(uv[at] % 1 * (w, h), (w - 1, h - 1)).astype(int).T
+        colour[at] = surface.colour[y, x, :3] / 255
+    return rgb_to_lab(from_numpy(colour.T[None, :, :, None]))[0, :, :, 0].numpy().T
+
+
 def _lab(c: Character) -> Array:
     """``[F, 3]`` CIELAB colour of each face, lightness halved: the mean of four points."""
-    colour = np.zeros((len(c.faces), 3))
-    weights = np.vstack([np.full((1, 3), 1 / 3), 0.2 + 0.4 * np.eye(3)])
-    for m, surface in enumerate(c.surfaces):
-        at = c.material == m
-        h, w = surface.colour.shape[:2]
-        uv = np.einsum("pk,fkd->pfd", weights, c.uv[c.faces[at]]) % 1
-        x, y = (np.minimum(uv[..., 0] * w, w - 1), np.minimum(uv[..., 1] * h, h - 1))
-        colour[at] = surface.colour[y.astype(int), x.astype(int), :3].mean(0) / 255
-    lab = rgb_to_lab(from_numpy(colour.T[None, :, :, None]))[0, :, :, 0].numpy().T
+    points = np.vstack([np.full((1, 3), 1 / 3), 0.2 + 0.4 * np.eye(3)])
+    uv = np.einsum("pk,fkd->pfd", points, c.uv[c.faces])
+    lab = np.mean([texture_lab(c, at, c.material) for at in uv], 0)
     return lab * np.array([0.5, 1, 1])
 
 
