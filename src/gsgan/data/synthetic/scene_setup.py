@@ -17,7 +17,7 @@ from gsgan.data.cameras import DISTORTION_LENGTHS
 from gsgan.data.synthetic.choreography import held_out
 from gsgan.data.synthetic.identity import Marks, make_identity
 from gsgan.data.synthetic.motion import motion
-from gsgan.data.synthetic.trace import Light, Person, PosedPerson, View, make_tints, undistort
+from gsgan.data.synthetic.procedural import Light, Person, PosedPerson, View, make_tints, undistort
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import ConfigError
 
