@@ -320,8 +320,9 @@ def majority(part: Ints, classes: int) -> Ints:
 
 def _disc(count: int) -> Floats:
     """``[count, 2]`` points spread over the unit disc."""
+    # the R2 sequence: unrelated to the rays' positions in the pixel, and any share of it is spread
     i = np.arange(count)
-    radius, turn = np.sqrt((i + 0.5) / count), np.pi * (3 - 5**0.5) * i
+    radius, turn = np.sqrt(np.mod(0.5 + 0.7548776662466927 * i, 1)), 2 * np.pi * 0.5698402909980532 * i
     spread = np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=1)
     return spread.astype(np.float32)
 
