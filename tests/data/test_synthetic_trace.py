@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from gsgan.data.synthetic.identity import SHIRT_PATTERNS, Marks, albedo, make_identity
 
 from gsgan.body.free import free_body
-from gsgan.data.synthetic.identity import SHIRT_PATTERNS, Marks, albedo, make_identity
 from gsgan.data.synthetic.scene_setup import Scene, Settings
 from gsgan.data.synthetic.trace import (
     Light,

@@ -9,7 +9,7 @@ vectors have x pointing away from the middle of the body on both sides.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -298,9 +298,9 @@ ENDS = np.cumsum([seconds for _, _, seconds in PASSAGES])
 DURATION = float(ENDS[-1])
 
 
-def frame_times(frames: int) -> Array:
-    """``[F]`` seconds: even samples of the choreography, in the middle of each step."""
-    return (np.arange(frames) + 0.5) * DURATION / frames
+def frame_times(frames: int, duration: float = DURATION) -> Array:
+    """``[F]`` seconds: even samples of a motion, in the middle of each step."""
+    return (np.arange(frames) + 0.5) * duration / frames
 
 
 def passages_at(times: Array) -> tuple[str, ...]:
@@ -338,21 +338,20 @@ def smoothstep(x: Array) -> Array:
     return x * x * (3 - 2 * x)
 
 
-def held_out(frames: int, test_frames: int, block: int = 3) -> list[int]:
+def held_out(passages: Sequence[str], test_frames: int, block: int = 3) -> list[int]:
     """The held-out frames: the combination passage first, then blocks inside the others.
 
     Blocks lie in the middle of passages: their neighbours in time are training frames, the extreme
     of the movement is not. The combination is never in the training split.
 
     Args:
-        frames: number of all frames.
-        test_frames: number of frames to hold out, in [0, frames).
+        passages: the passage of each frame.
+        test_frames: number of frames to hold out, fewer than there are.
         block: frames per block, at least 1.
     """
-    names = passages_at(frame_times(frames))
-    chosen = [i for i, name in enumerate(names) if name == COMBINATION][:test_frames]
+    chosen = [i for i, name in enumerate(passages) if name == COMBINATION][:test_frames]
     others: dict[str, list[int]] = {}
-    for i, name in enumerate(names):
+    for i, name in enumerate(passages):
         if name != COMBINATION:
             others.setdefault(name, []).append(i)
     order = sorted(others.values(), key=len, reverse=True)
@@ -364,6 +363,6 @@ def held_out(frames: int, test_frames: int, block: int = 3) -> list[int]:
             begin = (len(free) - size + 1) // 2
             chosen += free[begin : begin + size]
         if len(chosen) == before:
-            left = [i for i in range(frames) if i not in chosen]
+            left = [i for i in range(len(passages)) if i not in chosen]
             chosen += left[: test_frames - len(chosen)]
     return sorted(chosen)

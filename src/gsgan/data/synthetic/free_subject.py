@@ -8,20 +8,29 @@ from __future__ import annotations
 import re
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from gsgan.body.free import free_body
 from gsgan.body.skinned import vertex_normals
-from gsgan.data.synthetic.character import Array, Character, Motion, Surface
+from gsgan.data.synthetic.character import Character, Motion, Surface
+from gsgan.scene import BodyPose
 
 # Mixamo's names of the free body's joints; other joints keep their names and follow their parents.
-TRUNK = {"root": "Hips", "spine05": "Spine", "spine02": "Spine1", "spine01": "Spine2"}
+TRUNK = {"root": "Hips", "spine05": "Spine", "spine03": "Spine1", "spine01": "Spine2"}
 TRUNK |= {"neck01": "Neck", "head": "Head"}
 LIMBS = {"clavicle": "Shoulder", "upperarm01": "Arm", "lowerarm01": "ForeArm", "wrist": "Hand"}
 LIMBS |= {"upperleg01": "UpLeg", "lowerleg01": "Leg", "foot": "Foot", "toe1-1": "ToeBase"}
 FINGERS = ("Thumb", "Index", "Middle", "Ring", "Pinky")
 # sRGB of skin, hair, eyes, shirt, trousers and shoes
-COLOURS = ((214, 160, 128), (70, 48, 34), (235, 235, 230), (52, 110, 168), (64, 66, 88), (150, 60, 48))
+COLOURS = (
+    (214, 160, 128),
+    (70, 48, 34),
+    (235, 235, 230),
+    (52, 110, 168),
+    (64, 66, 88),
+    (150, 60, 48),
+)
 
 
 def mixamo_name(joint: str) -> str:
@@ -41,8 +50,7 @@ def free_character() -> Character:
     """The free body with one colour per material."""
     body = free_body()
     faces, vertices = body.faces.numpy(), body.vertices.double().numpy()
-    anchors = np.concatenate([body.landmarks.double().numpy(), body.hand_landmarks.double().numpy()])
-    carriers = np.concatenate([body.landmark_bone.numpy(), body.hand_bone.numpy()])
+    none = np.zeros(0, dtype=np.int64)
     colours = np.full((len(COLOURS), 1, 1, 4), 255, np.uint8)
     colours[:, 0, 0, :3] = COLOURS
     surfaces = zip(body.surface_names, colours, strict=True)
@@ -62,17 +70,17 @@ def free_character() -> Character:
         bone_index=body.bone_index.numpy(),
         bone_weight=body.bone_weight.double().numpy(),
         shapes={},
-        anchor_names=(*body.landmark_names, *body.hand_names),
-        anchor_bone=carriers,
-        anchor_vertex=np.full(len(anchors), -1),
-        anchor_rest=anchors,
+        anchor_names=(),
+        anchor_joint=none,
+        anchor_vertex=none,
     )
 
 
-def body_pose(character: Character, motion: Motion) -> tuple[Array, Array]:
-    """``theta [F, J, 3]`` axis-angle and ``transl [F, 3]`` metres of the free body's motion."""
-    R, parents = motion.rotations, character.parents
-    above = np.where((parents >= 0)[:, None, None], R[:, parents], np.eye(3))
-    local = np.swapaxes(above, -1, -2) @ R
+def free_pose(motion: Motion) -> BodyPose:
+    """The free body's pose at every moment of the motion of `free_character`."""
+    body, R = free_body(), motion.rotations
+    parents = np.array(body.parents)
+    local = np.where((parents < 0)[:, None, None], R, np.swapaxes(R[:, parents], -1, -2) @ R)
     theta = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:2], 3)
-    return theta, motion.joints[:, 0] - character.joints[0]
+    transl = motion.joints[:, 0] - body.joints[0].double().numpy()
+    return BodyPose(torch.from_numpy(theta).float(), torch.from_numpy(transl).float())

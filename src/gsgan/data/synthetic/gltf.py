@@ -261,9 +261,7 @@ def _surface(glb: Glb, material: int) -> Surface:
         table = np.arange(256) / 255
         linear = np.where(table <= 0.04045, table / 12.92, ((table + 0.055) / 1.055) ** 2.4)
         scaled = np.clip(linear[:, None] * factor[:3], 0, 1)
-        curve = np.where(
-            scaled <= 0.0031308, scaled * 12.92, 1.055 * scaled ** (1 / 2.4) - 0.055
-        )
+        curve = np.where(scaled <= 0.0031308, scaled * 12.92, 1.055 * scaled ** (1 / 2.4) - 0.055)
         curve = np.c_[curve, np.clip(table * factor[3], 0, 1)]
         curve = np.rint(curve * 255).astype(np.uint8)
         colour = np.stack([curve[colour[..., k], k] for k in range(4)], -1)

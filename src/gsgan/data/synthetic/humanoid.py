@@ -81,8 +81,12 @@ def _sided(choices: str) -> dict[str, tuple[dict[str, float], ...]]:
             sums = []
             for choice in filled.split(","):
                 terms = [term.split("*") for term in choice.split("+")]
-                sums.append({term[-1].strip(): float((*term, 1)[0]) if len(term) > 1 else 1.0
-                             for term in terms})
+                sums.append(
+                    {
+                        term[-1].strip(): float((*term, 1)[0]) if len(term) > 1 else 1.0
+                        for term in terms
+                    }
+                )
             shapes[shape.strip() + f"_{side}" * bool(side)] = tuple(sums)
     return shapes
 

@@ -6,10 +6,7 @@ Convention: that of :mod:`gsgan.data.synthetic.retarget`.
 from __future__ import annotations
 
 import numpy as np
-import torch
-from torch import Tensor
 
-from gsgan.body.free import free_body
 from gsgan.data.synthetic import choreography
 from gsgan.data.synthetic.character import Array, Character, Motion
 from gsgan.data.synthetic.choreography import Controls, controls_at, passages_at, smoothstep
@@ -23,7 +20,6 @@ from gsgan.data.synthetic.retarget import (
     SPINE,
     Pose,
     Rig,
-    axis_angle,
     rotation,
 )
 
@@ -131,63 +127,3 @@ def _follow_feet(c: Controls, feet: list[tuple[Array, ...]]) -> None:
     c.wrist[:, 1, 1] -= ahead
     c.wrist[:, :, 2] += 0.03 * c.swing[:, None]
     c.spine[:, 2] += 0.3 * ahead
-
-
-def motion(frames: int, seed: int = 0) -> tuple[Tensor, Tensor, list[str]]:
-    """The choreography as poses of the free body.
-
-    Args:
-        frames: number of moments; more frames sample the same choreography more finely.
-        seed: of amplitudes, phases and leading hands.
-
-    Returns:
-        ``theta [F, 56, 3]`` axis-angle, ``transl [F, 3]`` metres, and the passage of each frame.
-    """
-    body = free_character()
-    m = Choreography(body, seed).at(choreography.frame_times(frames))
-    R, parents = m.rotations, body.parents
-    local = np.where((parents < 0)[:, None, None], R, np.swapaxes(R[:, parents], -1, -2) @ R)
-    transl = torch.from_numpy(m.joints[:, 0] - body.joints[0]).float()
-    return torch.from_numpy(axis_angle(local)).float(), transl, list(m.passages)
-
-
-# the free body's joints under Mixamo's names, sides and fingers apart
-FREE_BONES = {"root": "Hips", "spine05": "Spine", "spine03": "Spine1", "spine01": "Spine2"}
-FREE_BONES |= {"neck01": "Neck", "head": "Head", "clavicle": "Shoulder", "upperarm01": "Arm"}
-FREE_BONES |= {"lowerarm01": "ForeArm", "wrist": "Hand", "upperleg01": "UpLeg"}
-FREE_BONES |= {"lowerleg01": "Leg", "foot": "Foot", "toe1-1": "ToeBase"}
-FREE_BONES |= {
-    f"finger{i}-{k}": f"Hand{name}{k}" for i, name in enumerate(FINGERS, 1) for k in (1, 2)
-}
-
-
-def free_character() -> Character:
-    """The free body as a character without materials, parts and landmarks."""
-    body = free_body().to(torch.float64)
-
-    def bone(joint: str) -> str:
-        stem, _, side = joint.partition(".")
-        return {"L": "Left", "R": "Right"}.get(side, "") + FREE_BONES.get(stem, joint)
-
-    none = np.zeros(0, dtype=np.int64)
-    vertices, faces = body.vertices.numpy(), body.faces.numpy()
-    return Character(
-        name="free",
-        vertices=vertices,
-        normals=np.zeros_like(vertices),
-        uv=np.zeros((len(vertices), 2)),
-        faces=faces,
-        material=np.zeros(len(faces), dtype=np.int64),
-        labels=body.face_labels.numpy(),
-        label_names=tuple(body.label_names),
-        surfaces=(),
-        bones=tuple(bone(joint) for joint in body.joint_names),
-        parents=np.array(body.parents),
-        joints=body.joints.numpy(),
-        bone_index=body.bone_index.numpy(),
-        bone_weight=body.bone_weight.numpy(),
-        shapes={},
-        anchor_names=(),
-        anchor_joint=none,
-        anchor_vertex=none,
-    )

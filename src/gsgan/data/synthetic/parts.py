@@ -218,7 +218,9 @@ def _hair(c: Character, lab: Array, others: Array, near: np.ndarray, centre: Arr
     hair = like & np.isin(parts, np.unique(parts[crown & like]))
     # skin-coloured islands within the hair are hair
     rest = _components(pairs[(~hair)[pairs].all(1)], len(like))
-    touching = np.unique(rest[pairs[hair[pairs].sum(1) == 1]][~hair[pairs[hair[pairs].sum(1) == 1]]])
+    touching = np.unique(
+        rest[pairs[hair[pairs].sum(1) == 1]][~hair[pairs[hair[pairs].sum(1) == 1]]]
+    )
     sizes = np.bincount(rest[~hair], minlength=rest.max() + 1)
     small = touching[sizes[touching] < 0.1 * hair.sum()]
     return hair | (~hair & np.isin(rest, small) & near)

@@ -157,7 +157,9 @@ class Rig:
             sum(self.length("Left" + a, "Left" + b) for a, b in ((p[0], p[1]), (p[1], p[2])))
             for p in (LEG, ARM)
         )
-        self.chest = max((b for b in ("Hips", *SPINE) if b in self.index), key=self.index.__getitem__)
+        self.chest = max(
+            (b for b in ("Hips", *SPINE) if b in self.index), key=self.index.__getitem__
+        )
         self.fingers = {side: finger_hinges(self.joint, self.turns, side) for side in SIDES}
         main = character.bone_index[
             np.arange(len(character.vertices)), character.bone_weight.argmax(axis=1)

@@ -11,22 +11,33 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from gsgan.body.free import free_body
 from gsgan.data.cameras import DISTORTION_LENGTHS
-from gsgan.data.synthetic.avatars import AVATARS, avatar_path
-from gsgan.data.synthetic.bvh import BvhMotion
 from gsgan.data.synthetic.character import Character
-from gsgan.data.synthetic.choreography import Choreography, frame_times, held_out
-from gsgan.data.synthetic.free_subject import free_character
+from gsgan.data.synthetic.choreography import frame_times, held_out
+from gsgan.data.synthetic.free_subject import free_character, free_pose
 from gsgan.data.synthetic.gltf import read_character
-from gsgan.data.synthetic.secondary import Secondary
+from gsgan.data.synthetic.motion import Choreography
+from gsgan.data.synthetic.secondary import Moving, Secondary
 from gsgan.data.synthetic.tint import make_tints
 from gsgan.data.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles
 from gsgan.data.synthetic.view import View, undistort
 from gsgan.utils.errors import ConfigError
 
 Array = NDArray[np.float64]
+
+AVATARS = ("woman", "man")
+
+
+def avatar_path(n):
+    return (
+        Path("/work/shared/data/valid")
+        / {"woman": "Black_F_1_Casual.glb", "man": "White_M_1_Casual.glb"}[n]
+    )
+
 
 VERSION = 2
 """Of the generator. Raise it when any pixel changes: cached datasets are then made again."""
@@ -91,6 +102,19 @@ class Settings:
                 numbers = values.tolist()
                 stored = tuple(numbers) if kind == LIST else numbers
                 object.__setattr__(self, name, stored if values.any() else None)
+        named = (*AVATARS, FREE_BODY)
+        _require(
+            self.avatar in named or str(self.avatar).endswith(".glb"),
+            f"avatar must be {', '.join(named)} or the path of a rigged .glb, got {self.avatar!r}",
+        )
+        _require(
+            self.motion == CHOREOGRAPHY or str(self.motion).endswith(".bvh"),
+            f"motion must be {CHOREOGRAPHY} or the path of a .bvh, got {self.motion!r}",
+        )
+        _require(
+            isinstance(self.secondary, bool),
+            f"secondary must be true or false, got {self.secondary!r}",
+        )
         _require(
             self.test_frames < self.frames,
             f"test_frames must be less than frames = {self.frames}, got {self.test_frames}",
@@ -164,11 +188,7 @@ class Scene:
         self.settings, self.light = settings, Light(gloss=settings.gloss or 0.0)
         self.character = character = load_character(settings.avatar)
         self.appearance = Appearance(character)
-        self.source = (
-            Choreography(character, settings.seed)
-            if settings.motion == CHOREOGRAPHY
-            else BvhMotion(character, Path(settings.motion).expanduser())
-        )
+        self.source = Choreography(character, settings.seed)
         times = frame_times(settings.frames, self.source.duration)
         self.motion = self.source.at(times)
         self.secondary = Secondary(character, self.source) if settings.secondary else None
@@ -177,7 +197,7 @@ class Scene:
         self.train_frames = [i for i in range(settings.frames) if i not in self.test_frames]
         names = [f"cam{i:02d}" for i in range(settings.train_cameras + settings.test_cameras)]
         self.train_cameras = names[: settings.train_cameras]
-        self.views = dict(zip(names, ring(settings, self._extent()), strict=True))
+        self.views = dict(zip(names, ring(settings, extent(character, self.source)), strict=True))
         for name in names[settings.train_cameras :]:
             for scale in settings.test_scale or ():
                 self.views[f"{name}_x{scale:g}"] = zoomed(self.views[name], scale)
@@ -190,11 +210,10 @@ class Scene:
 
     def mesh(self, frame: int) -> tuple[Array, Array, Wrinkles | None]:
         """Vertices (metres) and unit normals ``[V, 3]`` of a frame, and the wrinkles of cloth."""
-        rotations, joints = self.motion.rotations[frame], self.motion.joints[frame]
-        shapes = {name: float(weights[frame]) for name, weights in self.motion.shapes.items()}
-        vertices, normals = self.character.skinned(rotations, joints, self.character.face(shapes))
+        vertices, normals = self._skinned(frame)
         if self.secondary is None:
             return vertices, normals, None
+        rotations = self.motion.rotations[frame]
         return self.secondary(float(self.times[frame]), rotations, vertices, normals)
 
     def posed(self, frame: int) -> PosedCharacter:
@@ -202,23 +221,50 @@ class Scene:
         vertices, normals, wrinkles = self.mesh(frame)
         return PosedCharacter(self.appearance, vertices, normals, self.light, wrinkles)
 
-    def landmarks(self) -> Array:
-        """``[F, L, 3]`` landmarks of all frames, metres, in the order of ``anchor_names``.
+    def landmarks(self) -> tuple[tuple[str, ...], Array]:
+        """Names and positions ``[F, L, 3]`` (metres) of the landmarks of all frames.
 
         They are where skinning puts them: sway and wrinkles do not move a skeleton.
         """
-        return np.stack([self.character.landmarks(*self._skinned(f)) for f in range(len(self.times))])
+        if self.settings.avatar == FREE_BODY:
+            body, pose = free_body(), free_pose(self.motion)
+            points = torch.cat([body.posed_landmarks(pose), body.posed_hands(pose)], dim=1)
+            return (*body.landmark_names, *body.hand_names), points.numpy()
+        frames = range(len(self.times))
+        points = [
+            self.character.landmarks(self._skinned(f)[0], self.motion.joints[f]) for f in frames
+        ]
+        return self.character.anchor_names, np.stack(points).astype(np.float32)
 
-    def _extent(self, samples: int = 160, stride: int = 24) -> Array:
-        """``[N, 3]`` points that the motion reaches, metres.
+    def _skinned(self, frame: int) -> tuple[Array, Array]:
+        character, motion = self.character, self.motion
+        offsets = sum(
+            (
+                motion.shapes[name][frame] * shape
+                for name, shape in character.shapes.items()
+                if name in motion.shapes
+            ),
+            np.zeros_like(character.vertices),
+        )
+        return character.skinned(motion.rotations[frame], motion.joints[frame], offsets)
 
-        Every ``stride``-th vertex at a fixed number of moments: cameras fitted to these points do
-        not depend on ``frames``.
-        """
-        motion = self.source.at(frame_times(samples, self.source.duration))
-        thinned = self.character.thinned(stride)
-        poses = zip(motion.rotations, motion.joints, strict=True)
-        return np.concatenate([thinned.skinned(R, joints)[0] for R, joints in poses])
+
+def extent(character: Character, source: Moving, samples: int = 160, stride: int = 24) -> Array:
+    """``[N, 3]`` points that a motion reaches, metres.
+
+    Every ``stride``-th vertex at a fixed number of moments: cameras fitted to these points do not
+    depend on ``frames``.
+    """
+    motion = source.at(frame_times(samples, source.duration))
+    thinned = replace(
+        character,
+        vertices=character.vertices[::stride],
+        normals=character.normals[::stride],
+        bone_index=character.bone_index[::stride],
+        bone_weight=character.bone_weight[::stride],
+    )
+    poses = zip(motion.rotations, motion.joints, strict=True)
+    return np.concatenate([thinned.skinned(R, joints)[0] for R, joints in poses])
 
 
 def ring(settings: Settings, points: Array) -> list[View]:

@@ -8,7 +8,7 @@ Convention: metres, world frame; images are RGB, sRGB in [0, 1], premultiplied o
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.synthetic.character import Character
 from gsgan.data.synthetic.textures import Textures
-from gsgan.data.synthetic.view import View, pixel_offsets, pixel_rays
+from gsgan.data.synthetic.view import View, pixel_rays
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -102,8 +102,9 @@ class Appearance:
         solid = self.cutoff[surface] <= 0
         k = np.flatnonzero(~solid)
         uv = _blend(bary[k], self.uv[self.faces[face[k]]])
-        solid[k] = self.textures(surface[k], uv, np.zeros(len(k), np.int64))[1] >= (
-            self.cutoff[surface[k]]
+        solid[k] = (
+            self.textures(surface[k], uv, np.zeros(len(k), np.int64))[1]
+            >= (self.cutoff[surface[k]])
         )
         return solid
 
@@ -322,7 +323,10 @@ def _disc(count: int) -> Floats:
     """``[count, 2]`` points spread over the unit disc."""
     # the R2 sequence: unrelated to the rays' positions in the pixel, and any share of it is spread
     i = np.arange(count)
-    radius, turn = np.sqrt(np.mod(0.5 + 0.7548776662466927 * i, 1)), 2 * np.pi * 0.5698402909980532 * i
+    radius, turn = (
+        np.sqrt(np.mod(0.5 + 0.7548776662466927 * i, 1)),
+        2 * np.pi * 0.5698402909980532 * i,
+    )
     spread = np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=1)
     return spread.astype(np.float32)
 
