@@ -185,6 +185,7 @@ def test_a_folder_with_another_run_is_not_overwritten(run, capture, inside):
     assert (run / "checkpoints" / "last.ckpt").read_bytes() == before
 
 
+@pytest.mark.slow
 def test_multirun_trains_and_scores_each_model(capture, tmp_path, inside):
     models = ["splat_only", "wo_feat"]
     result = inside(
@@ -276,6 +277,7 @@ def test_a_wrong_value_ends_in_one_sentence(capture, tmp_path, inside, argument,
     refused(inside("train", *arguments(capture, tmp_path / "run"), argument), *words)
 
 
+@pytest.mark.slow
 def test_two_processes_train_together_and_one_scores(capture, tmp_path):
     """trainer=ddp on two CPU processes (gloo)."""
     given = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]

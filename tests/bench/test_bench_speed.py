@@ -175,6 +175,7 @@ def test_the_table_adds_up():
     assert "- untrained weights" in page
 
 
+@pytest.mark.slow
 def test_the_command_times_a_run_and_fills_the_page(run, tmp_path, inside):
     page = tmp_path / "page.md"
     page.write_text("# Speed\n\n<!-- bench:speed -->\nold\n<!-- end -->\n")

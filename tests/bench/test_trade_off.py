@@ -176,6 +176,7 @@ def test_scores_are_means_of_finite_ones(build):
     assert "lpips" not in found
 
 
+@pytest.mark.slow
 def test_the_command_compares_a_multirun(run, tmp_path, inside):
     for name in ("one", "two"):
         shutil.copytree(run, tmp_path / "sweep" / name)

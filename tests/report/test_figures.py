@@ -34,6 +34,7 @@ def edit(run: Path, **values) -> None:
     OmegaConf.save(config, path)
 
 
+@pytest.mark.slow
 def test_every_figure_is_made_with_numbers_of_the_images_shown(run, twin, tmp_path, inside):
     out = tmp_path / "out"
     whole = "settings.margin=9"  # metres: the window is the image
