@@ -22,7 +22,7 @@ from gsgan.data.synthetic.humanoid import (
     vrm_shapes,
 )
 from gsgan.data.synthetic.parts import LABEL_NAMES, face_labels
-from gsgan.utils.errors import DataError
+from gsgan.utils.errors import ConfigError, DataError
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF is y up
 HEIGHTS = (1.2, 2.3)  # metres: heights that are taken as they are
@@ -30,6 +30,27 @@ UNITS = (1.0, 0.01, 0.001, 0.0254)  # metres per unit of a file, likeliest first
 TRIANGLES = 4
 DAMAGED = (ArithmeticError, AttributeError, AssertionError, LookupError, OSError, RuntimeError,
            TypeError, ValueError, struct.error)  # fmt: skip
+
+
+AVATARS = Path(__file__).with_name("avatars")
+
+
+def avatar_names() -> tuple[str, ...]:
+    """Names of the avatars that come with gsgan."""
+    return tuple(sorted(path.stem for path in AVATARS.glob("*.glb")))
+
+
+def avatar_path(name: str) -> Path:
+    """The file of an avatar that comes with gsgan.
+
+    Raises:
+        ConfigError: There is no such avatar.
+    """
+    if name not in avatar_names():
+        raise ConfigError(
+            f"no avatar {name!r}; expected {', '.join(avatar_names())} or the path of a .glb"
+        )
+    return AVATARS / f"{name}.glb"
 
 
 def read_character(path: Path) -> Character:
