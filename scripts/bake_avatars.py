@@ -184,9 +184,7 @@ def write(c: Character, source: Path, out: Path) -> None:
         data = original.image_bytes(texture)
         image = pygltflib.Image(bufferView=writer.view(data), mimeType="image/webp")
         doc.images.append(image)
-        doc.textures.append(
-            pygltflib.Texture(extensions={"EXT_texture_webp": {"source": texture}})
-        )
+        doc.textures.append(pygltflib.Texture(extensions={"EXT_texture_webp": {"source": texture}}))
     shader = pygltflib.PbrMetallicRoughness(
         baseColorTexture=pygltflib.TextureInfo(index=0), metallicFactor=0.0, roughnessFactor=0.5
     )

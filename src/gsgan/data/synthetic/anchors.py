@@ -23,7 +23,11 @@ BROW_POINTS = 5  # from the nose outwards
 FACE_NAMES = (
     *(f"mouth_outer_{k}" for k in range(LIP_POINTS)),
     *(f"{side}_brow_{k}" for side in ("left", "right") for k in range(BROW_POINTS)),
-    *(f"{side}_lid_{k}" for side in ("left", "right") for k in ("inner", "upper", "outer", "lower")),
+    *(
+        f"{side}_lid_{k}"
+        for side in ("left", "right")
+        for k in ("inner", "upper", "outer", "lower")
+    ),
 )
 STEP = 0.0005  # metres between the rays that look at the face
 
@@ -73,7 +77,11 @@ def _limb_anchors(c: Character, main: Ints, side: str) -> dict[str, tuple[int, i
                 outwards = c.joints[last] - c.joints[c.parents[last]]
                 found[name] = -1, int(tip[(c.vertices[tip] @ outwards).argmax()])
                 continue
-            share = (0.2 + 0.13 * k) if finger == "Thumb" else (0.5 + (0.15, 0.2, 0.17, 0.12)[f - 1] * k)
+            share = (
+                (0.2 + 0.13 * k)
+                if finger == "Thumb"
+                else (0.5 + (0.15, 0.2, 0.17, 0.12)[f - 1] * k)
+            )
             across = (0.35, 0.18, 0.05, -0.08, -0.2)[f]
             target = wrist + length * (share * along + across * ahead)
             found[name] = _nearest(c, hand, target, at[f"{side}Hand"])
@@ -85,7 +93,9 @@ def _limb_anchors(c: Character, main: Ints, side: str) -> dict[str, tuple[int, i
     on_foot = np.isin(main, _below(c, ankle))
     foot = np.flatnonzero(on_foot & shod if (on_foot & shod).any() else on_foot)
     toes = c.joints[at.get(f"{side}ToeBase", ankle)] - c.joints[ankle]
-    outwards = _unit(toes * [1, 1, 0]) if np.linalg.norm(toes[:2]) > 0.02 else np.array([0, -1.0, 0])
+    outwards = (
+        _unit(toes * [1, 1, 0]) if np.linalg.norm(toes[:2]) > 0.02 else np.array([0, -1.0, 0])
+    )
     x = c.vertices[foot]
     sole = x[:, 2] < x[:, 2].min() + 0.08
     ahead_of = np.where(sole, x @ outwards, np.nan)
@@ -145,9 +155,7 @@ class _Face:
         uv = np.einsum("nk,nki->ni", share, c.uv[corners])
         self.lab = texture_lab(c, uv, c.material[face]).reshape(*shape, 3)
         opened = c.shapes.get("mouth_open")
-        self.drop = (
-            None if opened is None else -(share * opened[corners, 2]).sum(1).reshape(shape)
-        )
+        self.drop = None if opened is None else -(share * opened[corners, 2]).sum(1).reshape(shape)
 
     def at(self, x: float, z: float) -> int:
         """The vertex seen at a place of the face; the nearest on its skin beside the map."""
@@ -205,18 +213,19 @@ class _Face:
 
     def _brow(self, side: str, sign: int, eye: Array) -> dict[str, int]:
         """The darkest height above the eye, near where a brow usually is."""
-        found = {}
-        for k, share in enumerate(np.linspace(-0.28, 0.42, BROW_POINTS)):
-            x = eye[0] + sign * share * self.d
-            usual = eye[2] + (0.25, 0.31, 0.34, 0.31, 0.24)[k] * self.d
-            column = np.abs(self.x - x).argmin()
+        x = eye[0] + sign * np.linspace(-0.28, 0.42, BROW_POINTS) * self.d
+        usual = eye[2] + np.array([0.25, 0.31, 0.34, 0.31, 0.24]) * self.d
+        height = usual.copy()
+        for k in range(BROW_POINTS):
+            column = np.abs(self.x - x[k]).argmin()
             strip = self.lab[:, max(column - 4, 0) : column + 5, 0].mean(1)
             smooth = np.convolve(strip, np.ones(7) / 7, "same")
-            away = (self.z - usual) / (0.14 * self.d)
+            away = (self.z - usual[k]) / (0.14 * self.d)
             free = (np.abs(away) < 1) & ~self.hair[:, column]
-            score = np.where(free, smooth + 8 * away**2, 1000 + np.abs(away))
-            found[f"{side}_brow_{k}"] = self.at(x, self.z[score.argmin()])
-        return found
+            height[k] = self.z[np.where(free, smooth + 8 * away**2, 1000 + np.abs(away)).argmin()]
+        middle, most = np.median(height - usual), 0.06 * self.d  # a brow has no jumps
+        height = usual + np.clip(height - usual, middle - most, middle + most)
+        return {f"{side}_brow_{k}": self.at(x[k], height[k]) for k in range(BROW_POINTS)}
 
     def _lips(self) -> list[tuple[float, float]]:
         """Points (x, z) round the lips, from the left corner over the upper lip."""

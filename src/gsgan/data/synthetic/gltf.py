@@ -87,6 +87,7 @@ class _Rig:
         if not skins:
             raise DataError(f"{glb.path}: no skin; expected a rigged character, export its bones")
         self.nodes = nodes
+        self._worlds: dict[int, Array] = {}
         self.above = {child: i for i, node in enumerate(nodes) for child in node.children or ()}
         named = humanoid_bones([node.name for node in nodes], glb.doc.extensions or {})
         used = {joint for skin in skins for joint in skin.joints} | named.keys()
@@ -119,10 +120,10 @@ class _Rig:
 
     def world(self, node: int) -> Array:
         """``[4, 4]`` from a node's axes to world axes, z up."""
-        matrix = Z_UP
-        for i in [*self.ancestors(node)[::-1], node]:
-            matrix = matrix @ _local(self.nodes[i])
-        return matrix
+        if node not in self._worlds:
+            above = self.world(self.above[node]) if node in self.above else Z_UP
+            self._worlds[node] = above @ _local(self.nodes[node])
+        return self._worlds[node]
 
     def _names(self, named: dict[int, str]) -> tuple[str, ...]:
         """Canonical names; other joints keep theirs, made unique."""
@@ -282,9 +283,7 @@ def _surface(glb: Glb, material: int) -> Surface:
         table = np.arange(256) / 255
         linear = np.where(table <= 0.04045, table / 12.92, ((table + 0.055) / 1.055) ** 2.4)
         scaled = np.clip(linear[:, None] * factor[:3], 0, 1)
-        curve = np.where(
-            scaled <= 0.0031308, scaled * 12.92, 1.055 * scaled ** (1 / 2.4) - 0.055
-        )
+        curve = np.where(scaled <= 0.0031308, scaled * 12.92, 1.055 * scaled ** (1 / 2.4) - 0.055)
         curve = np.c_[curve, np.clip(table * factor[3], 0, 1)]
         curve = np.rint(curve * 255).astype(np.uint8)
         colour = np.stack([curve[colour[..., k], k] for k in range(4)], -1)
