@@ -5,12 +5,11 @@ from __future__ import annotations
 import re
 from typing import cast
 
+import cv2
 import numpy as np
-from kornia.color import rgb_to_lab
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
-from torch import from_numpy
 
 from gsgan.data.synthetic.character import Array, Character, Ints
 
@@ -142,7 +141,8 @@ def texture_lab(c: Character, uv: Array, material: Ints) -> Array:
         h, w = surface.colour.shape[:2]
         x, y = np.minimum(uv[at] % 1 * (w, h), (w - 1, h - 1)).astype(int).T
         colour[at] = surface.colour[y, x, :3] / 255
-    return rgb_to_lab(from_numpy(colour.T[None, :, :, None]))[0, :, :, 0].numpy().T
+    lab = cv2.cvtColor(colour[:, None].astype(np.float32), cv2.COLOR_RGB2LAB)[:, 0]
+    return lab.astype(np.float64)
 
 
 def _lab(c: Character) -> Array:
