@@ -98,7 +98,7 @@ def plain_shape(name: str) -> str:
 SHAPES = _choices("""
     mouth_open: jawopen, mouthopen, vrm.aa, fclmtha
     mouth_round: kiss, mouthpucker, vrm.ou, fclmthu
-    mouth_wide: axe, mouthstretchleft+mouthstretchright, vrm.ih, fclmthi
+    mouth_wide: tdi, mouthstretchleft+mouthstretchright, vrm.ih, fclmthi
     lips_pressed: mpbup+mpbdown, mouthpressleft+mouthpressright, fclmthclose
     smile: {S}smileclose, mouthsmile{side}, 0.5*mouthsmile, 0.5*vrm.happy, 0.5*fclmthjoy
     frown: {S}mouthsad, mouthfrown{side}, 0.5*vrm.sad, 0.5*fclmthsorrow
