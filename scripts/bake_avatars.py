@@ -3,17 +3,19 @@
 Run it once with the glTF versions of the VALID avatar library at hand (LICENSE and ATTRIBUTION.md
 beside the result name the sources): `python scripts/bake_avatars.py FOLDER`. The result is
 deterministic. Teeth and tongue are decimated, shapes that gsgan does not use are dropped, vertices
-are quantised; the textures are copied as they are.
+are quantised, normal maps turned to glTF's convention; colours are copied as they are.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 from pathlib import Path
 
 import meshoptimizer
 import numpy as np
 import pygltflib
+from PIL import Image, ImageChops
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -137,6 +139,15 @@ def bones_of(c: Character, writer: Writer) -> tuple[np.ndarray, np.ndarray]:
     return number, joints[kept]
 
 
+def upwards(data: bytes) -> bytes:
+    """VALID's normal maps have y down; glTF's, up."""
+    red, green, blue = Image.open(io.BytesIO(data)).convert("RGB").split()
+    out = io.BytesIO()
+    flipped = Image.merge("RGB", (red, ImageChops.invert(green), blue))
+    flipped.save(out, "WEBP", quality=90, method=6)
+    return out.getvalue()
+
+
 def write(c: Character, source: Path, out: Path) -> None:
     writer, faces = Writer(), simpler_mouth(c)
     used, inverse = np.unique(faces, return_inverse=True)
@@ -182,6 +193,8 @@ def write(c: Character, source: Path, out: Path) -> None:
     original = Glb(source)
     for texture in range(2):
         data = original.image_bytes(texture)
+        if texture == 1:
+            data = upwards(data)
         image = pygltflib.Image(bufferView=writer.view(data), mimeType="image/webp")
         doc.images.append(image)
         doc.textures.append(pygltflib.Texture(extensions={"EXT_texture_webp": {"source": texture}}))

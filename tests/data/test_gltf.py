@@ -328,3 +328,11 @@ def test_compressed_files_without_the_decoder_name_the_extra(monkeypatch) -> Non
     monkeypatch.setitem(sys.modules, "meshoptimizer", None)
     with pytest.raises(DataError, match=re.escape("pip install 'gsgan[gltf]'")):
         read_character(source)
+
+
+def test_normal_maps_of_avatars_have_y_up(avatar) -> None:
+    """A bump's slopes are those of one surface: d(slope x)/dy = d(slope y)/dx, y up."""
+    x, y, z = np.moveaxis(avatar.surfaces[0].normal.astype(float) / 127.5 - 1, -1, 0)
+    down = np.gradient(x / np.maximum(z, 0.2), axis=0)
+    across = np.gradient(y / np.maximum(z, 0.2), axis=1)
+    assert np.corrcoef(down.ravel(), across.ravel())[0, 1] < -0.3
