@@ -18,6 +18,9 @@ JOINTS = {"shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand", "hip": "UpLeg"
           "pinky": "HandPinky1"}  # fmt: skip
 SEGMENTS = ("mcp", "pip", "dip", "tip")
 THUMB = ("cmc", "mcp", "ip", "tip")
+# Thumb to pinky: first joint, step to the next, offset to the thumb's side, in hand lengths.
+ABSENT_FINGERS = ((0.2, 0.13, 0.35), (0.5, 0.15, 0.18), (0.5, 0.17, 0.05), (0.5, 0.15, -0.08),
+                  (0.45, 0.13, -0.2))  # fmt: skip
 LIP_POINTS = 12  # round the outer edge: 0 left corner, 3 top, 6 right corner, 9 bottom
 BROW_POINTS = 5  # from the nose outwards
 FACE_NAMES = (
@@ -30,6 +33,7 @@ FACE_NAMES = (
     ),
 )
 STEP = 0.0005  # metres between the rays that look at the face
+Anchors = dict[str, tuple[int, int]]  # landmark → joint and vertex, one of them -1
 
 
 def with_anchors(c: Character) -> Character:
@@ -41,69 +45,70 @@ def with_anchors(c: Character) -> Character:
     proportions of a face. Ours.
     """
     main = c.bone_index[np.arange(len(c.vertices)), c.bone_weight.argmax(1)]
-    found: dict[str, tuple[int, int]] = {}  # (joint, vertex)
+    found: Anchors = {}
     for side in SIDES:
         found |= _limb_anchors(c, main, side)
     points = _Face(c, main).vertices()
     found |= {name: (-1, vertex) for name, vertex in points.items()}
     body = free_body()
     names = (*body.landmark_names, *body.hand_names, *FACE_NAMES)
-    # the wrists occur among the pose's and the hands' landmarks
     pairs = np.array([found[name] for name in names], dtype=np.int64)
     return replace(c, anchor_names=names, anchor_joint=pairs[:, 0], anchor_vertex=pairs[:, 1])
 
 
-def _limb_anchors(c: Character, main: Ints, side: str) -> dict[str, tuple[int, int]]:
+def _limb_anchors(c: Character, main: Ints, side: str) -> Anchors:
     """Joints of arm, hand and leg, and vertices of foot, finger tips and absent fingers."""
-    low, at = side.lower(), {bone: k for k, bone in enumerate(c.bones)}
-    found = {f"{low}_{name}": (at[side + bone], -1) for name, bone in JOINTS.items()
-             if side + bone in at}  # fmt: skip
+    low = side.lower()
+    found = {f"{low}_{name}": (c.bones.index(side + bone), -1) for name, bone in JOINTS.items()
+             if side + bone in c.bones}  # fmt: skip
+    hand = _hand(c, main, side)
+    for name, knuckle in (("thumb", "thumb_mcp"), ("index", "index_mcp"), ("pinky", "pinky_mcp")):
+        found.setdefault(f"{low}_{name}", hand[f"{low}_{knuckle}"])
+    return found | hand | _foot(c, main, side)
+
+
+def _hand(c: Character, main: Ints, side: str) -> Anchors:
+    """Joints of the fingers, tips without a bone, and places on the hand of absent fingers."""
+    found, at = {}, {bone: k for k, bone in enumerate(c.bones)}
     wrist = c.joints[at[f"{side}Hand"]]
     along = _unit(wrist - c.joints[at[f"{side}ForeArm"]])
-    ahead = _unit(np.array([0, -1.0, 0]) - along * along[1] * -1)  # the thumb's side in a T pose
+    ahead = _unit(np.array([0, -1.0, 0]) + along * along[1])  # the thumb's side in a T pose
     hand = np.flatnonzero(np.isin(main, _below(c, at[f"{side}Hand"])))
-    reach = (c.vertices[hand] - wrist) @ along
-    length = float(np.quantile(reach, 0.995)) if len(hand) else 0.18
-    for f, finger in enumerate(FINGERS):
-        parts = THUMB if finger == "Thumb" else SEGMENTS
-        for k, part in enumerate(parts):
-            bone, name = f"{side}Hand{finger}{k + 1}", f"{low}_{finger.lower()}_{part}"
-            if bone in at:
-                found[name] = at[bone], -1
-                continue
+    length = float(((c.vertices[hand] - wrist) @ along).max()) if len(hand) else 0.0
+    for finger, (first, step, across) in zip(FINGERS, ABSENT_FINGERS, strict=True):
+        for k, part in enumerate(THUMB if finger == "Thumb" else SEGMENTS):
+            bone, name = f"{side}Hand{finger}{k + 1}", f"{side.lower()}_{finger.lower()}_{part}"
             last = at.get(f"{side}Hand{finger}{k}", -1)
             tip = np.flatnonzero(main == last)
-            if part == "tip" and last >= 0 and len(tip):
+            if bone in at:
+                found[name] = at[bone], -1
+            elif last >= 0 and len(tip):
                 outwards = c.joints[last] - c.joints[c.parents[last]]
                 found[name] = -1, int(tip[(c.vertices[tip] @ outwards).argmax()])
-                continue
-            share = (
-                (0.2 + 0.13 * k)
-                if finger == "Thumb"
-                else (0.5 + (0.15, 0.2, 0.17, 0.12)[f - 1] * k)
-            )
-            across = (0.35, 0.18, 0.05, -0.08, -0.2)[f]
-            target = wrist + length * (share * along + across * ahead)
-            found[name] = _nearest(c, hand, target, at[f"{side}Hand"])
-    for name, finger in (("thumb", "thumb_mcp"), ("index", "index_mcp"), ("pinky", "pinky_mcp")):
-        found.setdefault(f"{low}_{name}", found[f"{low}_{finger}"])
-    ankle = at[f"{side}Foot"]
+            else:
+                target = wrist + length * ((first + step * k) * along + across * ahead)
+                found[name] = _nearest(c, hand, target, at[f"{side}Hand"])
+    return found
+
+
+def _foot(c: Character, main: Ints, side: str) -> Anchors:
+    """Heel and toe tip: the ends of the foot along its direction, near the ground."""
+    low, ankle = side.lower(), c.bones.index(f"{side}Foot")
+    ball = c.bones.index(f"{side}ToeBase") if f"{side}ToeBase" in c.bones else ankle
     shod = np.zeros(len(main), bool)
     shod[c.faces[c.labels == LABEL_NAMES.index(f"{low}_shoe")]] = True  # no hem of the trousers
     on_foot = np.isin(main, _below(c, ankle))
     foot = np.flatnonzero(on_foot & shod if (on_foot & shod).any() else on_foot)
-    toes = c.joints[at.get(f"{side}ToeBase", ankle)] - c.joints[ankle]
-    outwards = (
-        _unit(toes * [1, 1, 0]) if np.linalg.norm(toes[:2]) > 0.02 else np.array([0, -1.0, 0])
-    )
+    if len(foot) == 0:
+        return {f"{low}_heel": (ankle, -1), f"{low}_foot_index": (ball, -1)}
+    outwards = (c.joints[ball] - c.joints[ankle]) * [1, 1, 0] + [0, -0.01, 0]
+    outwards = _unit(outwards)
     x = c.vertices[foot]
-    sole = x[:, 2] < x[:, 2].min() + 0.08
-    ahead_of = np.where(sole, x @ outwards, np.nan)
-    heel = c.joints[ankle] + outwards * (np.nanmin(ahead_of) - c.joints[ankle] @ outwards)
+    ahead = np.where(x[:, 2] < x[:, 2].min() + 0.08, x @ outwards, np.nan)
+    heel = c.joints[ankle] + outwards * (np.nanmin(ahead) - c.joints[ankle] @ outwards)
     heel[2] = x[:, 2].min() + 0.025
-    found[f"{low}_heel"] = _nearest(c, foot, heel, ankle)
-    found[f"{low}_foot_index"] = -1, int(foot[np.nanargmax(ahead_of)])
-    return found
+    tip = int(foot[np.nanargmax(ahead)])
+    return {f"{low}_heel": _nearest(c, foot, heel, ankle), f"{low}_foot_index": (-1, tip)}
 
 
 class _Face:
@@ -126,7 +131,9 @@ class _Face:
     def _eye_centres(self) -> Array:
         c = self.c
         if {"LeftEye", "RightEye"} <= set(c.bones):
-            return c.joints[[c.bones.index(f"{side}Eye") for side in SIDES]]
+            eyes = c.joints[[c.bones.index(f"{side}Eye") for side in SIDES]]
+            if np.linalg.norm(eyes[0] - eyes[1]) > 0.03:  # some rigs put both at the head's joint
+                return eyes
         if {"blink_left", "blink_right"} <= c.shapes.keys():
             moved = [np.linalg.norm(c.shapes[f"blink_{s}"], axis=1) for s in ("left", "right")]
             return np.array([np.average(c.vertices, axis=0, weights=m**2) for m in moved])
@@ -176,6 +183,7 @@ class _Face:
             found |= self._eye(side, sign, eye)
             found |= self._brow(side, sign, eye)
             level = self.skin & (np.abs(below - 0.25) < 0.45)
+            level = level if level.any() else self.skin
             reach = np.where(level, sign * x[:, 0], -np.inf)
             ear = x[reach > reach.max() - 0.012].mean(0)
             far = np.linalg.norm(x - ear, axis=1)
@@ -213,18 +221,19 @@ class _Face:
 
     def _brow(self, side: str, sign: int, eye: Array) -> dict[str, int]:
         """The darkest height above the eye, near where a brow usually is."""
-        found = {}
-        for k, share in enumerate(np.linspace(-0.28, 0.42, BROW_POINTS)):
-            x = eye[0] + sign * share * self.d
-            usual = eye[2] + (0.25, 0.31, 0.34, 0.31, 0.24)[k] * self.d
-            column = np.abs(self.x - x).argmin()
+        x = eye[0] + sign * np.linspace(-0.28, 0.42, BROW_POINTS) * self.d
+        usual = eye[2] + np.array([0.25, 0.31, 0.34, 0.31, 0.24]) * self.d
+        height = usual.copy()
+        for k in range(BROW_POINTS):
+            column = np.abs(self.x - x[k]).argmin()
             strip = self.lab[:, max(column - 4, 0) : column + 5, 0].mean(1)
             smooth = np.convolve(strip, np.ones(7) / 7, "same")
-            away = (self.z - usual) / (0.14 * self.d)
+            away = (self.z - usual[k]) / (0.14 * self.d)
             free = (np.abs(away) < 1) & ~self.hair[:, column]
-            score = np.where(free, smooth + 8 * away**2, 1000 + np.abs(away))
-            found[f"{side}_brow_{k}"] = self.at(x, self.z[score.argmin()])
-        return found
+            height[k] = self.z[np.where(free, smooth + 8 * away**2, 1000 + np.abs(away)).argmin()]
+        middle, most = np.median(height - usual), 0.06 * self.d  # a brow has no jumps
+        height = usual + np.clip(height - usual, middle - most, middle + most)
+        return {f"{side}_brow_{k}": self.at(x[k], height[k]) for k in range(BROW_POINTS)}
 
     def _lips(self) -> list[tuple[float, float]]:
         """Points (x, z) round the lips, from the left corner over the upper lip."""

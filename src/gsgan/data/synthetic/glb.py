@@ -29,13 +29,10 @@ class Glb:
     """A .glb file; ``doc`` is pygltflib's document.
 
     Raises:
-        DataError: There is no such file, it is no complete .glb or is compressed in an
-            unsupported way.
+        DataError: It is no complete .glb or is compressed in an unsupported way.
     """
 
     def __init__(self, path: Path) -> None:
-        if not path.is_file():
-            raise DataError(f"{path}: no such file; expected a rigged character as .glb")
         data = path.read_bytes()
         if data[:4] != b"glTF":
             raise DataError(f"{path}: not a binary glTF file; export the character as .glb")
@@ -75,6 +72,12 @@ class Glb:
 
     def image(self, texture: int) -> Bytes:
         """``[h, w, 4]`` sRGB and coverage of a texture, at most 2048 pixels a side."""
+        image = Image.open(io.BytesIO(self.image_bytes(texture))).convert("RGBA")
+        image.thumbnail((LARGEST_IMAGE, LARGEST_IMAGE))
+        return np.asarray(image)
+
+    def image_bytes(self, texture: int) -> bytes:
+        """The encoded image of a texture."""
         entry = self.doc.textures[texture]
         source = (entry.extensions or {}).get("EXT_texture_webp", {}).get("source", entry.source)
         view = self.doc.images[source].bufferView
@@ -82,10 +85,7 @@ class Glb:
             raise DataError(
                 f"{self.path}: image {source} is a separate file; export with embedded images"
             )
-        data, _ = self._view(view)
-        image = Image.open(io.BytesIO(bytes(data))).convert("RGBA")
-        image.thumbnail((LARGEST_IMAGE, LARGEST_IMAGE))
-        return np.asarray(image)
+        return bytes(self._view(view)[0])
 
     def _rows(
         self, view: int, offset: int | None, count: int, kind: np.dtype[Any], width: int

@@ -22,7 +22,7 @@ from gsgan.data.synthetic.humanoid import (
     vrm_shapes,
 )
 from gsgan.data.synthetic.parts import LABEL_NAMES, face_labels
-from gsgan.utils.errors import DataError
+from gsgan.utils.errors import ConfigError, DataError
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF is y up
 HEIGHTS = (1.2, 2.3)  # metres: heights that are taken as they are
@@ -30,6 +30,27 @@ UNITS = (1.0, 0.01, 0.001, 0.0254)  # metres per unit of a file, likeliest first
 TRIANGLES = 4
 DAMAGED = (ArithmeticError, AttributeError, AssertionError, LookupError, OSError, RuntimeError,
            TypeError, ValueError, struct.error)  # fmt: skip
+
+
+AVATARS = Path(__file__).with_name("avatars")
+
+
+def avatar_names() -> tuple[str, ...]:
+    """Names of the avatars that come with gsgan."""
+    return tuple(sorted(path.stem for path in AVATARS.glob("*.glb")))
+
+
+def avatar_path(name: str) -> Path:
+    """The file of an avatar that comes with gsgan.
+
+    Raises:
+        ConfigError: There is no such avatar.
+    """
+    if name not in avatar_names():
+        raise ConfigError(
+            f"no avatar {name!r}; expected {', '.join(avatar_names())} or the path of a .glb"
+        )
+    return AVATARS / f"{name}.glb"
 
 
 def read_character(path: Path) -> Character:
@@ -66,6 +87,7 @@ class _Rig:
         if not skins:
             raise DataError(f"{glb.path}: no skin; expected a rigged character, export its bones")
         self.nodes = nodes
+        self._worlds: dict[int, Array] = {}
         self.above = {child: i for i, node in enumerate(nodes) for child in node.children or ()}
         named = humanoid_bones([node.name for node in nodes], glb.doc.extensions or {})
         used = {joint for skin in skins for joint in skin.joints} | named.keys()
@@ -98,10 +120,10 @@ class _Rig:
 
     def world(self, node: int) -> Array:
         """``[4, 4]`` from a node's axes to world axes, z up."""
-        matrix = Z_UP
-        for i in [*self.ancestors(node)[::-1], node]:
-            matrix = matrix @ _local(self.nodes[i])
-        return matrix
+        if node not in self._worlds:
+            above = self.world(self.above[node]) if node in self.above else Z_UP
+            self._worlds[node] = above @ _local(self.nodes[node])
+        return self._worlds[node]
 
     def _names(self, named: dict[int, str]) -> tuple[str, ...]:
         """Canonical names; other joints keep theirs, made unique."""

@@ -69,32 +69,36 @@ def humanoid_bones(names: Iterable[str | None], extensions: Mapping[str, Any]) -
     return {node: bone for bone, node in found.items()}
 
 
-# Canonical face shape → choices, best first, each a weighted sum of a file's shapes. Names are
-# compared in lower case without separators; those of VALID, ARKit, Ready Player Me, VRM, VRoid.
-def _sided(choices: str) -> dict[str, tuple[dict[str, float], ...]]:
-    """``"blink: {S}eyeclose, eyeblink{side}"``: one line per shape, + and weights allowed."""
+def _choices(table: str) -> dict[str, tuple[dict[str, float], ...]]:
+    """Canonical shape → choices, of lines ``shape: name, 0.5*name+name``.
+
+    ``{side}`` stands for left and right, ``{S}`` for l and r.
+    """
     shapes = {}
-    for line in choices.strip().splitlines():
-        shape, names = line.split(":")
+    for line in table.strip().splitlines():
+        shape, names = (part.strip() for part in line.split(":"))
         for side in ("left", "right") if "{" in names else ("",):
-            filled = names.format(S=side[:1], side=side)
-            sums = []
-            for choice in filled.split(","):
-                terms = [term.split("*") for term in choice.split("+")]
-                sums.append(
-                    {
-                        term[-1].strip(): float((*term, 1)[0]) if len(term) > 1 else 1.0
-                        for term in terms
-                    }
-                )
-            shapes[shape.strip() + f"_{side}" * bool(side)] = tuple(sums)
+            whole = f"{shape}_{side}" if side else shape
+            sums = [{plain_shape(whole): 1.0}]
+            for choice in names.format(S=side[:1], side=side).split(","):
+                terms = [term.strip().split("*") for term in choice.split("+")]
+                sums.append({term[-1]: float(term[0]) if term[1:] else 1.0 for term in terms})
+            shapes[whole] = tuple(sums)
     return shapes
 
 
-SHAPES = _sided("""
+def plain_shape(name: str) -> str:
+    """A shape's name in lower case without separators, prefix and VALID's suffix."""
+    name = re.sub(r"^.*(?=Fcl_)|^t_|_h$", "", name.split(".")[-1])
+    return re.sub(r"[ _-]", "", name).lower()
+
+
+# What a canonical shape is made of, best choice first: names as `plain_shape` writes them, of
+# gsgan's own avatars (always the first choice), VALID, ARKit, Ready Player Me, VRM and VRoid.
+SHAPES = _choices("""
     mouth_open: jawopen, mouthopen, vrm.aa, fclmtha
     mouth_round: kiss, mouthpucker, vrm.ou, fclmthu
-    mouth_wide: axe, mouthstretchleft+mouthstretchright, vrm.ih, fclmthi
+    mouth_wide: tdi, mouthstretchleft+mouthstretchright, vrm.ih, fclmthi
     lips_pressed: mpbup+mpbdown, mouthpressleft+mouthpressright, fclmthclose
     smile: {S}smileclose, mouthsmile{side}, 0.5*mouthsmile, 0.5*vrm.happy, 0.5*fclmthjoy
     frown: {S}mouthsad, mouthfrown{side}, 0.5*vrm.sad, 0.5*fclmthsorrow
@@ -108,12 +112,6 @@ SHAPES = _sided("""
 WANTED = {name for choices in SHAPES.values() for choice in choices for name in choice}
 VRM0_PRESETS = {"a": "aa", "i": "ih", "u": "ou", "joy": "happy", "sorrow": "sad"}
 VRM0_PRESETS |= {"blink_l": "blinkleft", "blink_r": "blinkright"}
-
-
-def plain_shape(name: str) -> str:
-    """A shape's name in a file as ``SHAPES`` writes it."""
-    name = re.sub(r"^t_|_h$", "", name.split(".")[-1])
-    return re.sub(r"[ _-]", "", name).lower()
 
 
 def canonical_shapes(found: Mapping[str, Array]) -> dict[str, Array]:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
+from typing import cast
 
+import cv2
 import numpy as np
-from kornia.color import rgb_to_lab
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
-from torch import from_numpy
 
 from gsgan.data.synthetic.character import Array, Character, Ints
 
@@ -62,48 +62,43 @@ def face_labels(character: Character, names: np.ndarray) -> Ints:
     c = character
     corner = c.faces[:, 0]
     bone = c.bone_index[corner, c.bone_weight[corner].argmax(1)]
-    cloth, skin, root = _bone_labels(c)
-    cloth, skin, root = cloth[bone], skin[bone], root[bone]
+    cloth, skin, root = (rows[bone] for rows in _bone_labels(c))
     lab = _lab(c)
     centre, area = _centres(c)
-    shoulders = c.joints[[c.bones.index(f"{side}Arm") for side in ("Left", "Right")], 2].min()
+    shoulders = c.joints[_numbers(c, ("LeftArm", "RightArm")), 2].min()
     low = (skin == FACE) & (root == "Spine") & (centre[:, 2] < shoulders - CHEST)
     skin = np.where(low, UPPER, skin)
 
     head = root == "Head"
-    front = head & _faces_front(c) & (np.abs(centre[:, 2] - _face_height(c)) < 0.05)
-    tone = np.median(lab[front if front.any() else head], 0) if head.any() else lab.mean(0)
-    bare = np.linalg.norm(lab - tone, axis=1) < SKIN_DISTANCE
-    bare = _voted(c, bare)
+    front = head & (c.normals[corner, 1] < -0.6) & (np.abs(centre[:, 2] - _cheeks(c)) < 0.05)
+    tone = np.median(lab[front] if front.any() else lab, 0)
+    bare = _voted(c, np.linalg.norm(lab - tone, axis=1) < SKIN_DISTANCE)
     labels = np.where(bare, skin, cloth)
-    upper, lower = (_tone(lab, ~bare & np.isin(bone, _numbers(c, names)))
-                    for names in (TRUNK, SHANKS))  # fmt: skip
-    if upper is not None and lower is not None:
-        if np.linalg.norm(upper - lower) > GARMENT_DISTANCE:
-            nearer = np.linalg.norm(lab - upper, axis=1) < np.linalg.norm(lab - lower, axis=1)
-            between = ~bare & np.isin(bone, _numbers(c, BETWEEN))
-            labels = np.where(between, np.where(_voted(c, nearer), UPPER, LOWER), labels)
+    upper, lower = (
+        _tone(lab, ~bare & np.isin(bone, _numbers(c, bones)), tone) for bones in (TRUNK, SHANKS)
+    )
+    if np.linalg.norm(upper - lower) > GARMENT_DISTANCE:
+        nearer = np.linalg.norm(lab - upper, axis=1) < np.linalg.norm(lab - lower, axis=1)
+        between = ~bare & np.isin(bone, _numbers(c, BETWEEN))
+        labels = np.where(between, np.where(_voted(c, nearer), UPPER, LOWER), labels)
 
     named = _named(c, names)
-    of_shoe = named == SHOES[0]
-    known = (named > 0) & ~of_shoe
-    labels = np.where(known, named, labels)
-    right = np.array([bone.startswith("Right") for bone in c.bones])[bone]
-    labels = np.where(of_shoe, np.where(right, *SHOES[::-1]), labels)
-    labels = np.where(named < 0, skin, labels)
+    right = np.array([name.startswith("Right") for name in c.bones])[bone]
+    shoes = np.where(right, *SHOES[::-1])
+    choices = [named == SHOES[0], named > 0, named < 0]
+    labels = np.select(choices, [shoes, named, skin], labels)
     if not (named == HAIR).any():
-        others = np.array([tone] if upper is None else [tone, upper])
-        hair = _hair(c, lab, others, (head | (root == "Neck")) & (named == 0), centre)
-        labels = np.where(hair, HAIR, labels)
-    return _whole_garments(c, labels, named == 0, area)
+        near = (head | (root == "Neck")) & (named == 0)
+        labels = np.where(_hair(c, lab, np.array([tone, upper]), near, centre), HAIR, labels)
+    return _whole_garments(c, labels, shoes, named == 0, area)
 
 
 def _numbers(c: Character, bones: tuple[str, ...]) -> list[int]:
     return [c.bones.index(bone) for bone in bones if bone in c.bones]
 
 
-def _tone(lab: Array, at: np.ndarray) -> Array | None:
-    return np.median(lab[at], 0) if at.any() else None
+def _tone(lab: Array, at: np.ndarray, default: Array) -> Array:
+    return cast(Array, np.median(lab[at], 0)) if at.any() else default
 
 
 def _bone_labels(c: Character) -> tuple[Ints, Ints, np.ndarray]:
@@ -117,8 +112,8 @@ def _bone_labels(c: Character) -> tuple[Ints, Ints, np.ndarray]:
             rows.append((cloth, skin, bone[len(side) :]))
         else:
             rows.append(rows[parent] if parent >= 0 else (LOWER, LOWER, "Hips"))
-    cloth, skin, root = zip(*rows, strict=True)
-    return np.array(cloth), np.array(skin), np.array(root)
+    labels = np.array([row[:2] for row in rows])
+    return labels[:, 0], labels[:, 1], np.array([row[2] for row in rows])
 
 
 def _named(c: Character, names: np.ndarray) -> Ints:
@@ -146,7 +141,8 @@ def texture_lab(c: Character, uv: Array, material: Ints) -> Array:
         h, w = surface.colour.shape[:2]
         x, y = np.minimum(uv[at] % 1 * (w, h), (w - 1, h - 1)).astype(int).T
         colour[at] = surface.colour[y, x, :3] / 255
-    return rgb_to_lab(from_numpy(colour.T[None, :, :, None]))[0, :, :, 0].numpy().T
+    lab = cv2.cvtColor(colour[:, None].astype(np.float32), cv2.COLOR_RGB2LAB)[:, 0]
+    return lab.astype(np.float64)
 
 
 def _lab(c: Character) -> Array:
@@ -163,12 +159,8 @@ def _centres(c: Character) -> tuple[Array, Array]:
     return corners.mean(1), np.linalg.norm(normal, axis=1) / 2
 
 
-def _faces_front(c: Character) -> np.ndarray:
-    return c.normals[c.faces[:, 0], 1] < -0.6
-
-
-def _face_height(c: Character) -> float:
-    """Height of the cheeks: a little above the head's joint."""
+def _cheeks(c: Character) -> float:
+    """Height of the cheeks, metres."""
     head = c.joints[c.bones.index("Head"), 2]
     return float(head + 0.35 * (c.vertices[:, 2].max() - head))
 
@@ -216,17 +208,16 @@ def _hair(c: Character, lab: Array, others: Array, near: np.ndarray, centre: Arr
     pairs = _neighbours(c)
     parts = _components(pairs[like[pairs].all(1)], len(like))
     hair = like & np.isin(parts, np.unique(parts[crown & like]))
-    # skin-coloured islands within the hair are hair
-    rest = _components(pairs[(~hair)[pairs].all(1)], len(like))
-    touching = np.unique(
-        rest[pairs[hair[pairs].sum(1) == 1]][~hair[pairs[hair[pairs].sum(1) == 1]]]
-    )
+    # small islands within the hair are hair: highlights, and shadows of strands
+    rest = _components(pairs[~hair[pairs].any(1)], len(like))
+    edge = pairs[hair[pairs].sum(1) == 1]
+    touching = np.unique(rest[edge[~hair[edge]]])
     sizes = np.bincount(rest[~hair], minlength=rest.max() + 1)
     small = touching[sizes[touching] < 0.1 * hair.sum()]
     return hair | (~hair & np.isin(rest, small) & near)
 
 
-def _whole_garments(c: Character, labels: Ints, free: np.ndarray, area: Array) -> Ints:
+def _whole_garments(c: Character, labels: Ints, shoes: Ints, free: np.ndarray, area: Array) -> Ints:
     """Each piece of cloth gets the label of most of its area."""
     edges = np.concatenate([c.faces[:, [0, 1]], c.faces[:, [1, 2]]])
     piece = _components(edges, len(c.vertices))[c.faces[:, 0]]
@@ -235,8 +226,6 @@ def _whole_garments(c: Character, labels: Ints, free: np.ndarray, area: Array) -
     total = np.zeros((piece.max() + 1, 3))
     np.add.at(total, (piece[cloth], kind[cloth]), area[cloth])
     share = total / np.maximum(total.sum(1, keepdims=True), 1e-12)
-    winner = np.where(share.max(1) > 0.65, share.argmax(1), -1)[piece]
-    right = c.vertices[c.faces[:, 0], 0] < 0
-    shoe = np.where(right, *SHOES[::-1])
+    winner = np.where(share.max(1) > 0.85, share.argmax(1), -1)[piece]
     changed = cloth & (winner >= 0) & (winner != kind)
-    return np.where(changed, np.choose(np.maximum(winner, 0), [UPPER, LOWER, shoe]), labels)
+    return np.where(changed, np.choose(np.maximum(winner, 0), [UPPER, LOWER, shoes]), labels)
