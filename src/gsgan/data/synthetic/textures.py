@@ -56,9 +56,10 @@ class Textures:
         level = np.clip(level, 0, self.levels[surface] - 1)
         start, size = self._start[surface, level], self._size[surface, level]
         at = (uv - np.floor(uv)) * size.astype(np.float32) - np.float32(0.5)
-        corner = np.floor(at).astype(np.int64)
+        corner = np.floor(at)
         share = at - corner
-        low, high = corner % size, (corner + 1) % size
+        low, high = corner.astype(np.int64), corner.astype(np.int64) + 1
+        low, high = np.where(low < 0, size - 1, low), np.where(high >= size, 0, high)
         top, bottom = start + low[:, 1] * size[:, 0], start + high[:, 1] * size[:, 0]
         x, y = share[:, :1], share[:, 1:]
         out = self._texels[top + low[:, 0]] * ((1 - x) * (1 - y))
