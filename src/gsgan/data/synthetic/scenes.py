@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 import gsgan
 from gsgan.body.free import free_body
 from gsgan.data.synthetic.choreography import DURATION
-from gsgan.data.synthetic.scene_setup import Scene, Settings, dataset_key
 from gsgan.data.synthetic.procedural import View
+from gsgan.data.synthetic.scene_setup import Scene, Settings, dataset_key
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root, write_atomically

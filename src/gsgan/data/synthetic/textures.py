@@ -6,6 +6,7 @@ Convention: v runs down, texel centres at +0.5, textures repeat; colours in line
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.synthetic.character import Surface
 
-Floats = NDArray[np.float32]
+Floats = NDArray[np.floating[Any]]  # float32
 Ints = NDArray[np.int64]
 
 LARGEST = 1024  # texels along a side, about 2 mm on a person; larger textures are reduced

@@ -8,7 +8,8 @@ Convention: metres, world frame; images are RGB, sRGB in [0, 1], premultiplied o
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,10 +17,10 @@ from numpy.typing import NDArray
 
 from gsgan.data.synthetic.character import Character
 from gsgan.data.synthetic.textures import Textures
-from gsgan.data.synthetic.view import View, pixel_offsets, pixel_rays
+from gsgan.data.synthetic.view import View, pixel_rays
 
 Array = NDArray[np.float64]
-Floats = NDArray[np.float32]
+Floats = NDArray[np.floating[Any]]  # float32: enough for light, and twice as fast
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Colour = tuple[float, float, float]
@@ -102,8 +103,9 @@ class Appearance:
         solid = self.cutoff[surface] <= 0
         k = np.flatnonzero(~solid)
         uv = _blend(bary[k], self.uv[self.faces[face[k]]])
-        solid[k] = self.textures(surface[k], uv, np.zeros(len(k), np.int64))[1] >= (
-            self.cutoff[surface[k]]
+        solid[k] = (
+            self.textures(surface[k], uv, np.zeros(len(k), np.int64))[1]
+            >= (self.cutoff[surface[k]])
         )
         return solid
 
@@ -119,7 +121,10 @@ class Tracer:
     """
 
     def __init__(
-        self, vertices: Array, faces: Ints, solid: Callable[[Ints, Floats], Bools] | None = None
+        self,
+        vertices: Array,
+        faces: NDArray[Any],
+        solid: Callable[[Ints, Floats], Bools] | None = None,
     ) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
@@ -279,12 +284,12 @@ class PosedCharacter:
         side = np.where(inside, np.float32(-1), np.float32(1))[:, None]
         normal, flat = normal * side, flat * side
         lifted = np.where(inside[:, None], point, lifted)
-        sun, sky, ground = (np.float32(c) for c in (light.sun, light.sky, light.ground))
+        sun, sky, ground = (np.array(c, np.float32) for c in (light.sun, light.sky, light.ground))
         up = 0.5 + 0.5 * normal[:, 2:]
         seen = np.where(inside, here[:, 7], here[:, 6])[:, None]
         out = colour * (seen * (ground + (sky - ground) * up))
-        towards = _unit(np.float32(light.direction)[None])
-        across = _unit(np.cross(towards, np.float32([[0, 0, 1], [1, 0, 0]])))[:1]
+        towards = _unit(np.array([light.direction], np.float32))
+        across = _unit(np.cross(towards, np.array([[0, 0, 1], [1, 0, 0]])))[:1]
         d = _unit(towards + disc[:, :1] * across + disc[:, 1:] * np.cross(towards, across))
         facing = _dot(normal, d)[:, 0]
         k = np.flatnonzero(facing > 0)
@@ -326,9 +331,10 @@ def majority(part: Ints, classes: int) -> Ints:
 
 def _disc(count: int) -> Floats:
     """``[count, 2]`` points spread over the unit disc."""
-    # the R2 sequence: unrelated to the rays' positions in the pixel, and any share of it is spread
+    # the R2 sequence, unrelated to the rays' positions in the pixel
     i = np.arange(count)
-    radius, turn = np.sqrt(np.mod(0.5 + 0.7548776662466927 * i, 1)), 2 * np.pi * 0.5698402909980532 * i
+    radius = np.sqrt(np.mod(0.5 + 0.7548776662466927 * i, 1))
+    turn = 2 * np.pi * 0.5698402909980532 * i
     spread = np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=1)
     return spread.astype(np.float32)
 
