@@ -289,7 +289,7 @@ class PosedCharacter:
         seen = np.where(inside, here[:, 7], here[:, 6])[:, None]
         out = colour * (seen * (ground + (sky - ground) * up))
         towards = _unit(np.array([light.direction], np.float32))
-        across = _unit(np.cross(towards, np.array([[0, 0, 1], [1, 0, 0]])))[:1]
+        across = _unit(np.cross(towards, np.eye(3, dtype=np.float32)[np.abs(towards).argmin()]))
         d = _unit(towards + disc[:, :1] * across + disc[:, 1:] * np.cross(towards, across))
         facing = _dot(normal, d)[:, 0]
         k = np.flatnonzero(facing > 0)
