@@ -26,14 +26,14 @@ Ints = NDArray[np.int64]
 LOOSE: tuple[tuple[str, tuple[str, ...], str | None, float, float, float], ...] = (
     ("upper_clothes", ("LeftArm", "LeftForeArm", "LeftHand"), "LeftArm", 0.05, 0.28, 1.0),
     ("upper_clothes", ("RightArm", "RightForeArm", "RightHand"), "RightArm", 0.05, 0.28, 1.0),
-    ("upper_clothes", ("Spine2", "Spine1", "Spine", "Hips"), "Neck", 0.20, 0.60, 0.8),
-    ("upper_clothes", ("LeftUpLeg", "RightUpLeg"), "Neck", 0.20, 0.60, 0.8),
+    ("upper_clothes", ("Spine2", "Spine1", "Spine", "Hips"), "Neck", 0.20, 0.60, 0.5),
+    ("upper_clothes", ("LeftUpLeg", "RightUpLeg"), "Neck", 0.20, 0.60, 0.5),
     ("lower_clothes", ("LeftUpLeg", "LeftLeg", "LeftFoot"), "LeftUpLeg", 0.15, 0.85, 0.6),
     ("lower_clothes", ("RightUpLeg", "RightLeg", "RightFoot"), "RightUpLeg", 0.15, 0.85, 0.6),
     ("lower_clothes", ("Hips",), "Hips", 0.15, 0.60, 1.0),
     ("hair", ("Head", "Neck", "Spine2", "Spine1"), None, 0.15, 0.45, 1.0),
 )
-FREQUENCY, DAMPING = 2.4, 0.35  # Hz of the springs, and their share of critical damping
+FREQUENCY, DAMPING = 2.8, 0.35  # Hz of the springs, and their share of critical damping
 RATE, LEAD = 60.0, 1.5  # samples per second of the springs, and seconds before the motion starts
 LIMIT = 0.04  # metres: a sway approaches it and never exceeds it
 HANG = 0.02  # metres by which cloth hangs off a horizontal bone
@@ -56,7 +56,7 @@ CREASES = (
     ("Spine2", "Hips", "Neck", 0.15),
 )
 WAVELENGTH = 0.055  # metres from one fold to the next
-SLOPE = 0.55  # of the deepest folds
+SLOPE = 0.7  # of the deepest folds
 FLANK = 0.05  # metres from a limb's axis at which folds are fully one-sided
 
 

@@ -6,6 +6,7 @@ Convention: v runs down, texel centres at +0.5, textures repeat; colours in line
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.synthetic.character import Surface
 
-Floats = NDArray[np.float32]
+Floats = NDArray[np.floating[Any]]  # float32
 Ints = NDArray[np.int64]
 
 LARGEST = 1024  # texels along a side, about 2 mm on a person; larger textures are reduced
@@ -56,9 +57,10 @@ class Textures:
         level = np.clip(level, 0, self.levels[surface] - 1)
         start, size = self._start[surface, level], self._size[surface, level]
         at = (uv - np.floor(uv)) * size.astype(np.float32) - np.float32(0.5)
-        corner = np.floor(at).astype(np.int64)
+        corner = np.floor(at)
         share = at - corner
-        low, high = corner % size, (corner + 1) % size
+        low, high = corner.astype(np.int64), corner.astype(np.int64) + 1
+        low, high = np.where(low < 0, size - 1, low), np.where(high >= size, 0, high)
         top, bottom = start + low[:, 1] * size[:, 0], start + high[:, 1] * size[:, 0]
         x, y = share[:, :1], share[:, 1:]
         out = self._texels[top + low[:, 0]] * ((1 - x) * (1 - y))
