@@ -19,7 +19,7 @@ from gsgan.data.cameras import DISTORTION_LENGTHS
 from gsgan.data.synthetic.character import Character
 from gsgan.data.synthetic.choreography import frame_times, held_out
 from gsgan.data.synthetic.free_subject import free_character, free_pose
-from gsgan.data.synthetic.gltf import read_character
+from gsgan.data.synthetic.gltf import avatar_names, avatar_path, read_character
 from gsgan.data.synthetic.motion import Choreography
 from gsgan.data.synthetic.secondary import Moving, Secondary
 from gsgan.data.synthetic.tint import make_tints
@@ -29,20 +29,11 @@ from gsgan.utils.errors import ConfigError
 
 Array = NDArray[np.float64]
 
-AVATARS = ("woman", "man")
-
-
-def avatar_path(n):
-    return (
-        Path("/work/shared/data/valid")
-        / {"woman": "Black_F_1_Casual.glb", "man": "White_M_1_Casual.glb"}[n]
-    )
-
-
 VERSION = 2
 """Of the generator. Raise it when any pixel changes: cached datasets are then made again."""
 
-FREE_BODY, CHOREOGRAPHY = "free_body", "choreography"
+AVATARS = avatar_names()
+DEFAULT, FREE_BODY, CHOREOGRAPHY = "polo", "free_body", "choreography"
 RADIUS = 2.8  # metres from the middle of the scene to the cameras
 MARGIN = 0.02  # share of the image kept free at each edge, over all frames and cameras
 WHOLE, NUMBER, LIST = "a whole number", "a number", "a list of numbers"
@@ -75,7 +66,7 @@ class Settings:
     test_frames: int = 21
     rays_per_pixel: int = 16
     seed: int = 0
-    avatar: str = AVATARS[0]
+    avatar: str = DEFAULT
     motion: str = CHOREOGRAPHY
     secondary: bool = True
     lens: tuple[float, ...] | None = None
