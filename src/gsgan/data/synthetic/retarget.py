@@ -26,7 +26,7 @@ FINGERS = ("Thumb", "Index", "Middle", "Ring", "Pinky")
 ARM, LEG = ("Arm", "ForeArm", "Hand"), ("UpLeg", "Leg", "Foot")
 REQUIRED = ("Hips", *(side + bone for side in SIDES for bone in LEG + ARM))
 FOREARM_TWIST = 0.55  # the forearm's share of the hand's twist: without twist bones, half each
-REACH = 0.99  # longest reach of a limb in full lengths: below 1, so that it always bends
+REACH = 0.998  # longest reach of a limb in full lengths: below 1, so that it always bends
 SOLE = 0.02  # metres above the floor up to which a vertex of the resting foot is its sole
 
 
@@ -157,7 +157,9 @@ class Rig:
             sum(self.length("Left" + a, "Left" + b) for a, b in ((p[0], p[1]), (p[1], p[2])))
             for p in (LEG, ARM)
         )
-        self.chest = max((b for b in ("Hips", *SPINE) if b in self.index), key=self.index.__getitem__)
+        self.chest = max(
+            (b for b in ("Hips", *SPINE) if b in self.index), key=self.index.__getitem__
+        )
         self.fingers = {side: finger_hinges(self.joint, self.turns, side) for side in SIDES}
         main = character.bone_index[
             np.arange(len(character.vertices)), character.bone_weight.argmax(axis=1)
