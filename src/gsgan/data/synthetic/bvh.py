@@ -33,6 +33,7 @@ from gsgan.data.synthetic.retarget import (
 )
 from gsgan.utils.errors import DataError
 
+HOVER = 0.06  # legs: feet this high above the lowest of a second stand on the floor; no jump
 ROOM = 0.6  # metres from the origin that a motion may reach before its drift is subtracted
 DRIFT_SECONDS = 0.5  # standard deviation of the smoothing that separates drift from sway
 # A foot stands where it is this low and slow, legs and legs per second.
@@ -95,9 +96,13 @@ def read_bvh(path: Path) -> Bvh:
 def _parse(words: list[str]) -> Bvh:
     if words[:1] != ["HIERARCHY"] or "MOTION" not in words:
         raise ValueError("HIERARCHY and MOTION are expected")
-    names, parents, offsets, channels = [], [], [], []
+    names: list[str] = []
+    parents: list[int] = []
+    offsets: list[Array] = []
+    channels: list[list[str]] = []
+    open_joints: list[int] = []
     split = words.index("MOTION")
-    open_joints, tree = [], iter(words[1:split])
+    tree = iter(words[1:split])
     for word in tree:
         if word in ("ROOT", "JOINT", "End"):
             names.append(next(tree) + " end" * (word == "End"))
@@ -116,7 +121,7 @@ def _parse(words: list[str]) -> Bvh:
     head, numbers = words[split + 1 : split + 6], words[split + 6 :]
     if head[0] != "Frames:" or head[2:4] != ["Frame", "Time:"]:
         raise ValueError("'Frames:' and 'Frame Time:' are expected after MOTION")
-    frames, frame_time, columns = int(head[1]), float(head[4]), sum(map(len, channels))
+    frames, frame_time, columns = int(head[1]), float(head[4]), sum(len(c) for c in channels)
     if frames < 1 or not frame_time > 0 or len(numbers) != frames * columns:
         raise ValueError(
             f"{frames} frames of {columns} numbers, {frame_time:g} s apart, are announced, "
@@ -189,8 +194,8 @@ class BvhMotion:
     The person faces -Y in the first frame. A motion within `ROOM` of the middle of its path stays
     as recorded. Of a longer one, only what is faster than the smoothed path is kept, so that the
     person stays near the origin and walks as on a treadmill: its feet slide backwards. Where a
-    foot rests in the remaining motion, it is held in place. Feet are put on the floor; a file
-    whose root does not move vertically has one foot on the floor at all times.
+    foot rests in the remaining motion, it is held in place. One foot is on the floor except in
+    jumps, which lose `HOVER`.
 
     Args:
         character: the subject. What its rig or the file lacks rests on its parent.
@@ -217,10 +222,9 @@ class BvhMotion:
         hips, leg = self._hips, self.rig.leg
         pose = self._pose(self._turns, hips)
         lows = [pose.lowest(side) for side in SIDES]
-        floor = np.minimum(*lows)
-        if np.ptp(hips[:, 2]) > 0.01 * leg:  # else the file has no heights: one foot stands
-            window = max(1, round(1 / step))
-            floor = gaussian_filter1d(minimum_filter1d(floor, window), window / 4)
+        lowest, window = np.minimum(*lows), max(1, round(1 / step))
+        floor = gaussian_filter1d(minimum_filter1d(lowest, window), window / 4)
+        floor = floor + np.minimum(lowest - floor, HOVER * leg)
         shift = np.column_stack([-self._drift(hips[:, :2], step), -floor])
         self._hips, self._ankles = hips + shift, []
         for side, low in zip(SIDES, lows, strict=True):
@@ -250,7 +254,7 @@ class BvhMotion:
 
     def at(self, times: Array) -> Motion:
         """The poses at times ``[F]``, seconds in [0, `duration`]."""
-        times = np.clip(times, 0, self._times[-1])
+        times = np.minimum(np.maximum(times, 0), self._times[-1])
 
         def between_frames(values: Array) -> Array:
             return np.stack([np.interp(times, self._times, x) for x in values.T], axis=1)
@@ -316,7 +320,8 @@ def _trunk(bvh: Bvh, known: dict[str, int], R: Array) -> dict[str, Array]:
     """Turns of spine, neck and collarbones, whatever their number, by their place in the tree."""
 
     def above(bone: str) -> list[int]:
-        line, j = [], bvh.parents[known[bone]]
+        j = bvh.parents[known[bone]]
+        line: list[int] = []
         while j >= 0:
             line, j = [j, *line], bvh.parents[j]
         return line

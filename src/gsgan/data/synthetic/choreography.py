@@ -9,7 +9,7 @@ vectors have x pointing away from the middle of the body on both sides.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -339,18 +339,17 @@ def smoothstep(x: Array) -> Array:
     return x * x * (3 - 2 * x)
 
 
-def held_out(frames: int, test_frames: int, block: int = 3) -> list[int]:
+def held_out(names: Sequence[str], test_frames: int, block: int = 3) -> list[int]:
     """The held-out frames: the combination passage first, then blocks inside the others.
 
     Blocks lie in the middle of passages: their neighbours in time are training frames, the extreme
     of the movement is not. The combination is never in the training split.
 
     Args:
-        frames: number of all frames.
-        test_frames: number of frames to hold out, in [0, frames).
+        names: the passage of each frame.
+        test_frames: number of frames to hold out, fewer than all.
         block: frames per block, at least 1.
     """
-    names = passages_at(frame_times(frames))
     chosen = [i for i, name in enumerate(names) if name == COMBINATION][:test_frames]
     others: dict[str, list[int]] = {}
     for i, name in enumerate(names):
@@ -365,6 +364,6 @@ def held_out(frames: int, test_frames: int, block: int = 3) -> list[int]:
             begin = (len(free) - size + 1) // 2
             chosen += free[begin : begin + size]
         if len(chosen) == before:
-            left = [i for i in range(frames) if i not in chosen]
+            left = [i for i in range(len(names)) if i not in chosen]
             chosen += left[: test_frames - len(chosen)]
     return sorted(chosen)

@@ -5,6 +5,8 @@ Convention: that of :mod:`gsgan.data.synthetic.retarget`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -126,7 +128,7 @@ def blinks(times: Array, duration: float, seed: int) -> dict[str, Array]:
     return {"blink_left": closed, "blink_right": closed}
 
 
-def _follow_feet(c: Controls, feet: list[tuple[Array, ...]]) -> None:
+def _follow_feet(c: Controls, feet: Sequence[tuple[Array, ...]]) -> None:
     """Shifts the body's weight to the standing foot, and swings the arms with the legs."""
     (left, *_, left_load), (right, *_, right_load) = feet
     c.pelvis[:, 0] += 0.03 * (right_load - left_load)

@@ -169,7 +169,7 @@ class Rig:
             for bone in (side + "Foot", side + "ToeBase"):
                 of_bone = np.isin(main, self._with_descendants(bone))
                 points = character.vertices[of_bone & (character.vertices[:, 2] < SOLE)]
-                self.soles[bone] = points[:: max(1, len(points) // 100)]
+                self.soles[bone] = points[:: max(1, len(points) // 300)]
 
     def length(self, start: str, end: str) -> float:
         """Distance between two joints of the rest pose, metres."""

@@ -142,7 +142,7 @@ class Scene:
         self.settings, self.light = settings, Light(gloss=settings.gloss or 0.0)
         self.person = make_person(body, settings.identity)
         self.theta, self.transl, self.passages = motion(settings.frames, settings.seed)
-        self.test_frames = held_out(settings.frames, settings.test_frames)
+        self.test_frames = held_out(self.passages, settings.test_frames)
         self.train_frames = [i for i in range(settings.frames) if i not in self.test_frames]
         names = [f"cam{i:02d}" for i in range(settings.train_cameras + settings.test_cameras)]
         self.train_cameras = names[: settings.train_cameras]
