@@ -210,7 +210,7 @@ class BvhMotion:
         self.rig, self.seed, self.name = Rig(character), seed, path.stem
         bvh = read_bvh(path)
         self.duration = len(bvh.root) * bvh.frame_time
-        self._times = np.arange(len(bvh.root)) * bvh.frame_time
+        self._times = np.arange(len(bvh.root), dtype=np.float64) * bvh.frame_time
         self._turns, middle, leg = _standard(bvh, path)
         joint = self.rig.joint
         offset = (joint["LeftUpLeg"] + joint["RightUpLeg"]) / 2 - joint["Hips"]
@@ -254,7 +254,7 @@ class BvhMotion:
 
     def at(self, times: Array) -> Motion:
         """The poses at times ``[F]``, seconds in [0, `duration`]."""
-        times = np.minimum(np.maximum(times, 0), self._times[-1])
+        times = times.clip(0, self._times[-1])
 
         def between_frames(values: Array) -> Array:
             return np.stack([np.interp(times, self._times, x) for x in values.T], axis=1)

@@ -199,7 +199,7 @@ def signing(c: Controls, s: Array, style: Style) -> None:
 def _sign_arms(c: Controls, s: Array, style: Style) -> None:
     for i, shift in enumerate((0.0, 2.1)):
         a = TAU * s + style.phase + shift
-        c.wrist[:, i, 0] = -0.02 + 0.11 * np.sin(2 * a)
+        c.wrist[:, i, 0] = 0.02 + 0.1 * np.sin(2 * a)
         c.wrist[:, i, 1] = -0.31 - 0.06 * style.amplitude * np.sin(3 * a + 1)
         c.wrist[:, i, 2] = -0.15 + 0.14 * style.amplitude * np.sin(3 * a)
         c.elbow[:, i] = (0.8, 0.3, -1.0)

@@ -112,7 +112,9 @@ class Choreography:
 
     def _face(self, c: Controls, times: Array) -> dict[str, Array]:
         shapes = blinks(times, self.duration, self.seed)
-        shapes["mouth_open"] = 0.7 * c.mouth.clip(0, 1)
+        mouth, vowel = c.mouth.clip(0, 1), 0.5 + 0.5 * np.sin(9 * times)
+        shapes |= {"mouth_open": 0.7 * mouth, "mouth_round": 0.5 * mouth * vowel}
+        shapes["mouth_wide"] = 0.5 * mouth * (1 - vowel)
         for side in ("left", "right"):
             shapes[f"smile_{side}"] = 0.8 * c.smile.clip(0, 1)
             shapes[f"brow_up_{side}"] = c.brows.clip(0, 1)
