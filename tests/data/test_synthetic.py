@@ -336,7 +336,7 @@ def test_key_depends_on_every_parameter():
         ({"test_scale": [9]}, "test_scale must be"),
         ({"test_scale": 2}, "test_scale must be"),
         ({"test_scale": [2], "test_cameras": 0}, "set test_cameras"),
-        ({"avatar": "nobody"}, "avatar must be blouse, polo, free_body or the path of a rigged .glb"),
+        ({"avatar": "nobody"}, "avatar must be blouse, polo, free_body or the path"),
         ({"motion": "waltz"}, "motion must be choreography or the path of a .bvh"),
         ({"secondary": "some"}, "secondary must be true or false"),
     ],

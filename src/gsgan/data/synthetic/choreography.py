@@ -30,7 +30,7 @@ class Controls:
             return np.repeat(np.array(value, dtype=float)[None], frames, axis=0)
 
         self.path = still(0, 0, 0)  # [F, 3] x, y of the body in the world and its heading, radians
-        self.pelvis = still(0, 0, -0.015)  # [F, 3] body axes, metres from the standing position
+        self.pelvis = still(0, 0, -0.004)  # [F, 3] body axes, metres from the standing position
         self.lean = still(0, 0, 0)  # [F, 3] body axes, axis-angle of the pelvis
         self.spine = still(0, 0, 0)  # [F, 3] axis-angle, distributed over the spine
         self.head = still(0, 0, 0)  # [F, 3] axis-angle, distributed over neck and head
@@ -63,10 +63,10 @@ class Style:
 def walk(c: Controls, s: Array, style: Style) -> None:
     """Walking round an oval, and back to the start after a full turn to the left."""
     a = TAU * _ease(s)
-    c.path[:, 0] = 0.3 * (1 - np.cos(a))
-    c.path[:, 1] = -0.5 * np.sin(a)
+    c.path[:, 0] = 0.2 * (1 - np.cos(a))
+    c.path[:, 1] = -0.3 * np.sin(a)
     cosine, sine = np.cos(a), np.sin(a)  # heading along the oval, without jumps of a full turn
-    c.path[:, 2] = a - np.arctan2(0.2 * sine * cosine, 0.5 * cosine**2 + 0.3 * sine**2)
+    c.path[:, 2] = a - np.arctan2(0.1 * sine * cosine, 0.3 * cosine**2 + 0.2 * sine**2)
     c.swing[:] = style.amplitude
     c.head[:, 2] = 0.25 * np.sin(a)
     c.smile[:] = 0.3
@@ -100,9 +100,9 @@ def wave(c: Controls, s: Array, style: Style) -> None:
     """One hand waves beside the head, the other is on the hip."""
     _wave_arm(c, style.lead, TAU * 3 * s + style.phase, style.amplitude)
     other = 1 - style.lead
-    c.wrist[:, other] = (0.05, -0.08, -0.38)
+    c.wrist[:, other] = (0.13, -0.04, -0.36)
     c.elbow[:, other] = (1.0, 0.6, 0.0)
-    c.curl[:, other] = 0.6
+    c.curl[:, other] = 0.8
     c.head[:, 2] = (0.3 if style.lead == 0 else -0.3) * np.sin(math.pi * s)
     c.smile[:] = 1
     c.brows[:] = 0.6
@@ -183,7 +183,7 @@ def reach(c: Controls, s: Array, style: Style) -> None:
     c.spine[:, 1] = -0.2 * sign * high
     c.spine[:, 2] = -0.5 * sign * low + 0.25 * sign * high
     c.lean[:, 0] = 0.2 * low
-    c.pelvis[:, 2] += -0.1 * low
+    c.pelvis[:, 1:] += low[:, None] * (0.1, -0.1)
     c.head[:, 0] = 0.15 * low - 0.35 * high
     c.head[:, 2] = sign * (0.4 * high - 0.15 * low)
     c.mouth[:] = 0.15 * high
@@ -199,14 +199,14 @@ def signing(c: Controls, s: Array, style: Style) -> None:
 def _sign_arms(c: Controls, s: Array, style: Style) -> None:
     for i, shift in enumerate((0.0, 2.1)):
         a = TAU * s + style.phase + shift
-        c.wrist[:, i, 0] = -0.02 + 0.11 * np.sin(2 * a)
+        c.wrist[:, i, 0] = 0.02 + 0.1 * np.sin(2 * a)
         c.wrist[:, i, 1] = -0.31 - 0.06 * style.amplitude * np.sin(3 * a + 1)
         c.wrist[:, i, 2] = -0.15 + 0.14 * style.amplitude * np.sin(3 * a)
         c.elbow[:, i] = (0.8, 0.3, -1.0)
         c.palm[:, i] = 0.1 + 0.7 * np.sin(2 * a + 0.5)
         c.flex[:, i] = 0.25 * np.sin(3 * a + 2)
         for finger in range(5):
-            c.curl[:, i, finger] = 0.45 + 0.45 * np.sin((3 + finger % 3) * a + 1.7 * finger)
+            c.curl[:, i, finger] = 0.45 + 0.45 * np.sin((2 + finger % 3) * a + 1.7 * finger)
     c.mouth[:] = 0.3 + 0.45 * _wander(s, 9, style.phase)
     c.smile[:] = 0.3 * _wander(s, 2, style.phase).clip(0)
     c.brows[:] = 0.9 * _wander(s, 3, style.phase + 1)
@@ -282,18 +282,19 @@ def _wander(s: Array, cycles: float, phase: float) -> Array:
 COMBINATION = "squat_and_wave"
 # name, passage, seconds
 PASSAGES: tuple[tuple[str, Callable[[Controls, Array, Style], None], float], ...] = (
-    ("walk", walk, 6.0),
+    ("walk", walk, 5.5),
     ("arm_swings", arm_swings, 2.0),
-    ("wave", wave, 2.0),
+    ("wave", wave, 2.5),
     ("squat", squat, 2.5),
-    ("overhead", overhead, 2.0),
-    ("twist", twist, 2.0),
+    ("overhead", overhead, 2.5),
+    ("twist", twist, 2.5),
     ("reach", reach, 2.5),
     ("signing", signing, 4.0),
     (COMBINATION, squat_and_wave, 3.0),
     ("dance", dance, 3.0),
-    ("freestyle", freestyle, 6.0),
+    ("freestyle", freestyle, 5.0),
 )
+BLEND = 0.6  # seconds from standing into a passage, and back
 ENDS = np.cumsum([seconds for _, _, seconds in PASSAGES])
 DURATION = float(ENDS[-1])
 
@@ -322,7 +323,7 @@ def controls_at(times: Array, seed: int) -> Controls:
         s = 1 - (ENDS[i] - times[here]) / seconds
         moved = Controls(len(here))
         passage(moved, s, style)
-        share = smoothstep(s / 0.15) * smoothstep((1 - s) / 0.15)
+        share = smoothstep(s * seconds / BLEND) * smoothstep((1 - s) * seconds / BLEND)
         for name, rest in vars(base).items():
             whole = passage is walk and name == "path"  # it starts and ends smoothly itself
             w = np.ones(len(here)) if whole else share
@@ -338,20 +339,20 @@ def smoothstep(x: Array) -> Array:
     return x * x * (3 - 2 * x)
 
 
-def held_out(passages: Sequence[str], test_frames: int, block: int = 3) -> list[int]:
+def held_out(names: Sequence[str], test_frames: int, block: int = 3) -> list[int]:
     """The held-out frames: the combination passage first, then blocks inside the others.
 
     Blocks lie in the middle of passages: their neighbours in time are training frames, the extreme
     of the movement is not. The combination is never in the training split.
 
     Args:
-        passages: the passage of each frame.
-        test_frames: number of frames to hold out, fewer than there are.
+        names: the passage of each frame.
+        test_frames: number of frames to hold out, fewer than all.
         block: frames per block, at least 1.
     """
-    chosen = [i for i, name in enumerate(passages) if name == COMBINATION][:test_frames]
+    chosen = [i for i, name in enumerate(names) if name == COMBINATION][:test_frames]
     others: dict[str, list[int]] = {}
-    for i, name in enumerate(passages):
+    for i, name in enumerate(names):
         if name != COMBINATION:
             others.setdefault(name, []).append(i)
     order = sorted(others.values(), key=len, reverse=True)
@@ -363,6 +364,6 @@ def held_out(passages: Sequence[str], test_frames: int, block: int = 3) -> list[
             begin = (len(free) - size + 1) // 2
             chosen += free[begin : begin + size]
         if len(chosen) == before:
-            left = [i for i in range(len(passages)) if i not in chosen]
+            left = [i for i in range(len(names)) if i not in chosen]
             chosen += left[: test_frames - len(chosen)]
     return sorted(chosen)

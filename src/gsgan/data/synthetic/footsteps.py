@@ -36,7 +36,7 @@ class Footsteps:
                 far = np.linalg.norm(move[:2])
                 steps = least > 0.03 or far > SHORTEST[0] or abs(move[2]) > SHORTEST[1]
                 shift.append(move * steps)
-                height.append(max(least, 0.04 + 0.2 * far) * steps)
+                height.append(max(least, 0.03 + 0.15 * far) * steps)
                 place = place + shift[-1]
             self.start.append(start)
             self.shift.append(np.array(shift))
@@ -52,7 +52,7 @@ class Footsteps:
         stride = np.linalg.norm(self.shift[foot][:, :2], axis=1)
         place = np.array([(1 - 2 * foot) * STANCE, 0, 0]) + smoothstep(t / SWING) @ self.shift[foot]
         height = _bump(t / SWING) @ self.height[foot]
-        pitch = _bump((t + 0.12) / 0.45) @ np.minimum(2 * stride, 0.6)
+        pitch = _bump((t + 0.12) / 0.45) @ np.minimum(1.6 * stride, 0.45)
         load = _bump((t + 0.15) / (SWING + 0.3)) @ (self.height[foot] > 0)
         return place, height, pitch, load
 

@@ -5,6 +5,8 @@ Convention: that of :mod:`gsgan.data.synthetic.retarget`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from gsgan.data.synthetic import choreography
@@ -105,19 +107,26 @@ class Choreography:
             pose.world[bone] = pose.rotation(pose.parent(bone)) @ rotation(flexed + curl * across)
 
     def _face(self, c: Controls, times: Array) -> dict[str, Array]:
-        random = np.random.default_rng([self.seed, 1])
-        blinks = np.cumsum(random.uniform(1.5, 4.5, int(self.duration / 1.5)))
-        closed = np.exp(-(((times[:, None] - blinks) / 0.08) ** 2)).sum(axis=1).clip(0, 1)
-        shapes = {"mouth_open": 0.7 * c.mouth.clip(0, 1)}
+        shapes = blinks(times, self.duration, self.seed)
+        mouth, vowel = c.mouth.clip(0, 1), 0.5 + 0.5 * np.sin(9 * times)
+        shapes |= {"mouth_open": 0.7 * mouth, "mouth_round": 0.5 * mouth * vowel}
+        shapes["mouth_wide"] = 0.5 * mouth * (1 - vowel)
         for side in ("left", "right"):
-            shapes[f"blink_{side}"] = closed
             shapes[f"smile_{side}"] = 0.8 * c.smile.clip(0, 1)
             shapes[f"brow_up_{side}"] = c.brows.clip(0, 1)
             shapes[f"brow_down_{side}"] = (-c.brows).clip(0, 1)
         return shapes
 
 
-def _follow_feet(c: Controls, feet: list[tuple[Array, ...]]) -> None:
+def blinks(times: Array, duration: float, seed: int) -> dict[str, Array]:
+    """Weights of the face shapes of both eyes at times ``[F]``: a blink every three seconds."""
+    random = np.random.default_rng([seed, 1])
+    moments = np.cumsum(random.uniform(1.5, 4.5, int(duration / 1.5) + 1))
+    closed = np.exp(-(((times[:, None] - moments) / 0.08) ** 2)).sum(axis=1).clip(0, 1)
+    return {"blink_left": closed, "blink_right": closed}
+
+
+def _follow_feet(c: Controls, feet: Sequence[tuple[Array, ...]]) -> None:
     """Shifts the body's weight to the standing foot, and swings the arms with the legs."""
     (left, *_, left_load), (right, *_, right_load) = feet
     c.pelvis[:, 0] += 0.03 * (right_load - left_load)

@@ -26,7 +26,7 @@ FINGERS = ("Thumb", "Index", "Middle", "Ring", "Pinky")
 ARM, LEG = ("Arm", "ForeArm", "Hand"), ("UpLeg", "Leg", "Foot")
 REQUIRED = ("Hips", *(side + bone for side in SIDES for bone in LEG + ARM))
 FOREARM_TWIST = 0.55  # the forearm's share of the hand's twist: without twist bones, half each
-REACH = 0.99  # longest reach of a limb in full lengths: below 1, so that it always bends
+REACH = 0.998  # longest reach of a limb in full lengths: below 1, so that it always bends
 SOLE = 0.02  # metres above the floor up to which a vertex of the resting foot is its sole
 
 
@@ -169,7 +169,7 @@ class Rig:
             for bone in (side + "Foot", side + "ToeBase"):
                 of_bone = np.isin(main, self._with_descendants(bone))
                 points = character.vertices[of_bone & (character.vertices[:, 2] < SOLE)]
-                self.soles[bone] = points[:: max(1, len(points) // 100)]
+                self.soles[bone] = points[:: max(1, len(points) // 300)]
 
     def length(self, start: str, end: str) -> float:
         """Distance between two joints of the rest pose, metres."""

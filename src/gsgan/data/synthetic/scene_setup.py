@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from gsgan.body.free import free_body
 from gsgan.data.cameras import DISTORTION_LENGTHS
+from gsgan.data.synthetic.bvh import BvhMotion
 from gsgan.data.synthetic.character import Character
 from gsgan.data.synthetic.choreography import frame_times, held_out
 from gsgan.data.synthetic.free_subject import free_character, free_pose
@@ -179,7 +180,11 @@ class Scene:
         self.settings, self.light = settings, Light(gloss=settings.gloss or 0.0)
         self.character = character = load_character(settings.avatar)
         self.appearance = Appearance(character)
-        self.source = Choreography(character, settings.seed)
+        self.source: Moving = (
+            Choreography(character, settings.seed)
+            if settings.motion == CHOREOGRAPHY
+            else BvhMotion(character, Path(settings.motion).expanduser(), settings.seed)
+        )
         times = frame_times(settings.frames, self.source.duration)
         self.motion = self.source.at(times)
         self.secondary = Secondary(character, self.source) if settings.secondary else None
