@@ -27,6 +27,7 @@ SCALE_RANGE = (1e-4, 0.06)  # body heights, the bounds of Ψ
 JITTER = 0.5  # how far a mean leaves its surface point, in the point's initial scales
 OPACITY_LOGIT = (0.5, 1.5)  # mean and standard deviation
 AZIMUTH, HEIGHT = 0.3, 1.35  # of the camera, radians and metres
+MARGIN = 1.2  # the camera sees this many times the body: Gaussians leave its surface
 
 
 def human_cloud(n: int, channels: int, seed: int = 0) -> Gaussians:
@@ -68,7 +69,8 @@ def ring_camera(size: int) -> Camera:
     """A camera before the free body at rest, ``size`` pixels square, float32, a batch of one."""
     points = free_body().vertices.double().numpy()
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    view = look_at(AZIMUTH, HEIGHT, middle, points, size)
+    around = middle + MARGIN * (points - middle)
+    view = look_at(AZIMUTH, HEIGHT, middle, around, size)
     K, R, t = (torch.as_tensor(x).unsqueeze(0) for x in (view.K, view.R, view.t))
     return Camera(K, R, t, view.size).to(torch.float32)
 

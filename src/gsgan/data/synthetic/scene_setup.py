@@ -225,12 +225,10 @@ class Scene:
         if self.settings.avatar == FREE_BODY:
             body, pose = free_body(), free_pose(self.motion)
             points = torch.cat([body.posed_landmarks(pose), body.posed_hands(pose)], dim=1)
-            return (*body.landmark_names, *body.hand_names), points.numpy()
-        frames = range(len(self.times))
-        points = [
-            self.character.landmarks(self._skinned(f)[0], self.motion.joints[f]) for f in frames
-        ]
-        return self.character.anchor_names, np.stack(points).astype(np.float32)
+            return (*body.landmark_names, *body.hand_names), points.double().numpy()
+        character, joints = self.character, self.motion.joints
+        posed = [character.landmarks(self._skinned(f)[0], p) for f, p in enumerate(joints)]
+        return character.anchor_names, np.stack(posed)
 
     def _skinned(self, frame: int) -> tuple[Array, Array]:
         character, motion = self.character, self.motion

@@ -36,6 +36,7 @@ from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root, write_atomically
 
 KINDS = ("images", "masks", "labels")
+BODY, HANDS = 33, 33 + 42  # landmarks up to the end of the pose's and of the hands'
 POLL_SECONDS = 0.05
 WORKER = "from gsgan.data.synthetic.scenes import trace_share; trace_share()"
 
@@ -197,20 +198,20 @@ def _calibration(view: View) -> dict[str, Any]:
 
 
 def _write_skeletons(root: Path, scene: Scene) -> None:
-    ids, names, p = np.arange(len(scene.times)), *scene.landmarks()
-    pose, hands, face = (slice(*pair) for pair in ((0, 33), (33, 75), (75, None)))
-    shape, cameras = p[:, pose].shape[:2], len(scene.views)
+    names, points = scene.landmarks()
+    p, ids = points.astype(np.float32), np.arange(len(points))
+    shape = (len(p), BODY)
     np.savez(
         root / "landmarks3d.npz",
-        p=p[:, pose],
+        p=p[:, :BODY],
         conf=np.ones(shape, dtype=np.float32),
         reproj_px=np.zeros(shape, dtype=np.float32),
-        n_views=np.full(shape, cameras),
+        n_views=np.full(shape, len(scene.views)),
         frame_id=ids,
-        names=np.array(names[pose]),
+        names=np.array(names[:BODY]),
         passage=np.array(scene.motion.passages),
     )
-    for name, part in (("hands3d", hands), ("face3d", face)):
+    for name, part in (("hands3d", slice(BODY, HANDS)), ("face3d", slice(HANDS, None))):
         if names[part]:
             np.savez(root / f"{name}.npz", p=p[:, part], frame_id=ids, names=np.array(names[part]))
     if scene.settings.avatar == FREE_BODY:
