@@ -17,7 +17,7 @@ from gsgan.body.free import free_body
 from gsgan.data.synthetic import ensure_synthetic, scenes
 from gsgan.data.synthetic.motion import motion
 from gsgan.data.synthetic.scene_setup import Scene, Settings, dataset_key
-from gsgan.data.synthetic.trace import PosedPerson
+from gsgan.data.synthetic.procedural import PosedPerson
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root
 

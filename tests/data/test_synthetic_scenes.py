@@ -12,7 +12,7 @@ from gsgan.data.crop import Crop, distort, take, undistort_map
 from gsgan.data.datamodule import GsganData
 from gsgan.data.synthetic.scene_setup import Scene, Settings, dataset_key
 from gsgan.data.synthetic.scenes import ensure_scene
-from gsgan.data.synthetic.trace import (
+from gsgan.data.synthetic.procedural import (
     SHIRT,
     SHOE,
     TROUSERS,
