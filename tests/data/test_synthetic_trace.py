@@ -230,6 +230,10 @@ def z_buffer(c, view, fine):
 @pytest.mark.parametrize("view", [from_front(128, 3.0, 160.0), from_front(160, 2.5, 180.0, 0.4)])
 def test_masks_and_labels_agree_with_a_z_buffer(view):
     c, fine = lumpy(), 6
+    _, centre, at_centre = posed(c).render(view, 1)
+    expected = z_buffer(c, view, 1)  # with the same samples: the same picture
+    assert ((centre > 0) & (expected > 0)).sum() >= 0.999 * ((centre > 0) | (expected > 0)).sum()
+    assert (at_centre == expected).mean() >= 0.9995
     _, alpha, labels = posed(c).render(view, 16)
     expected = z_buffer(c, view, fine)
     H, W = view.size

@@ -28,15 +28,15 @@ LOOSE: tuple[tuple[str, tuple[str, ...], str | None, float, float, float], ...] 
     ("upper_clothes", ("RightArm", "RightForeArm", "RightHand"), "RightArm", 0.05, 0.28, 1.0),
     ("upper_clothes", ("Spine2", "Spine1", "Spine", "Hips"), "Neck", 0.20, 0.60, 0.5),
     ("upper_clothes", ("LeftUpLeg", "RightUpLeg"), "Neck", 0.20, 0.60, 0.5),
-    ("lower_clothes", ("LeftUpLeg", "LeftLeg", "LeftFoot"), "LeftUpLeg", 0.15, 0.85, 0.6),
-    ("lower_clothes", ("RightUpLeg", "RightLeg", "RightFoot"), "RightUpLeg", 0.15, 0.85, 0.6),
+    ("lower_clothes", ("LeftUpLeg", "LeftLeg", "LeftFoot"), "LeftUpLeg", 0.15, 0.85, 0.8),
+    ("lower_clothes", ("RightUpLeg", "RightLeg", "RightFoot"), "RightUpLeg", 0.15, 0.85, 0.8),
     ("lower_clothes", ("Hips",), "Hips", 0.15, 0.60, 1.0),
     ("hair", ("Head", "Neck", "Spine2", "Spine1"), None, 0.15, 0.45, 1.0),
 )
-FREQUENCY, DAMPING = 2.8, 0.35  # Hz of the springs, and their share of critical damping
-RATE, LEAD = 60.0, 1.5  # samples per second of the springs, and seconds before the motion starts
+FREQUENCY, DAMPING = 2.4, 0.35  # Hz of the springs, and their share of critical damping
+RATE, LEAD = 60.0, 2.5  # samples per second of the springs, and seconds before the motion starts
 LIMIT = 0.04  # metres: a sway approaches it and never exceeds it
-HANG = 0.02  # metres by which cloth hangs off a horizontal bone
+HANG = 0.025  # metres by which cloth hangs off a horizontal bone
 INWARDS = 0.25  # share of a sway into the body that is kept
 SMOOTHING = 4  # rounds that spread looseness from vertex to vertex
 
@@ -56,7 +56,7 @@ CREASES = (
     ("Spine2", "Hips", "Neck", 0.15),
 )
 WAVELENGTH = 0.055  # metres from one fold to the next
-SLOPE = 0.7  # of the deepest folds
+SLOPE, STIFFNESS = 0.8, 1.5  # of the deepest folds, and how soon they appear
 FLANK = 0.05  # metres from a limb's axis at which folds are fully one-sided
 
 
@@ -133,7 +133,7 @@ class Secondary:
         return _unit(np.stack(sums, axis=1))
 
     def _share_of(self, label: str) -> Array:
-        """``[W]`` share of the faces round each vertex that have a label, spread smoothly."""
+        """``[W]`` 1 on a label, falling smoothly to 0 beyond its hem."""
         c, V = self.character, len(self._rest)
         if label not in c.label_names:
             return np.zeros(V)
@@ -146,7 +146,7 @@ class Secondary:
         total = near.sum(axis=1)
         for _ in range(SMOOTHING):
             share = (near @ share) / total
-        return share
+        return np.minimum(2 * share, 1)  # 1 up to the hem, where half of the faces are cloth's
 
     def _looseness(self) -> Array:
         """``[W]`` share of a sway that each vertex follows: 0 where tight, growing to the hems."""
@@ -190,7 +190,7 @@ class Secondary:
     def _crease(self) -> None:
         """What is constant of the wrinkles: each vertex belongs to the joint nearest to it."""
         c, x = self.character, self._rest
-        cloth = self._share_of("upper_clothes") + self._share_of("lower_clothes")
+        cloth = np.maximum(self._share_of("upper_clothes"), self._share_of("lower_clothes"))
         index = {name: i for i, name in enumerate(c.bones)}
         known = [k for k in CREASES if all(name in index for name in k[:3])]
         self._bends = np.array([[index[n] for n in k[:2]] for k in known]).reshape(-1, 2)
@@ -222,7 +222,8 @@ class Secondary:
             own, off = self._own, self._rest - c.joints[bone[self._own]]
             flexion = np.linalg.norm(inner, axis=1)
             side = np.clip((off * inner[own]).sum(axis=1) / FLANK, -flexion[own], flexion[own])
-            slope = SLOPE * self._near * (0.6 * flexion[own] + 0.4 * side)
+            deep = np.tanh(STIFFNESS * (0.6 * flexion[own] + 0.4 * side))
+            slope = SLOPE * self._near * deep
             R = np.reshape(self._skin @ rotations.reshape(len(rotations), 9), (-1, 3, 3))
             across = _unit(np.einsum("vij,vj->vi", R, self._axis[own]))
         fields = (self._phase[self._weld], slope[self._weld], across[self._weld])

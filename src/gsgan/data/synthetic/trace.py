@@ -41,8 +41,8 @@ class Light:
 
     direction: tuple[float, float, float] = (0.5, -0.75, 0.9)  # towards the sun, any length
     sun: Colour = (0.88, 0.83, 0.76)
-    sky: Colour = (0.52, 0.56, 0.62)  # from straight above
-    ground: Colour = (0.34, 0.31, 0.28)  # from straight below
+    sky: Colour = (0.58, 0.62, 0.68)  # from straight above
+    ground: Colour = (0.38, 0.35, 0.32)  # from straight below
     spread: float = 0.06  # tangent of half the sun's width: soft shadows
     shine: float = 0.04  # highlight (Blinn-Phong) of everything, as a share of the sun
     gloss: float = 0.0  # the same, added for clothes and shoes
