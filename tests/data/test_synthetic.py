@@ -318,6 +318,12 @@ def test_key_depends_on_every_parameter():
     assert base == dataset_key(Settings())
 
 
+@pytest.mark.parametrize("parameters", [{"avatar": "mine.glb"}, {"motion": "mine.bvh"}])
+def test_a_missing_file_is_named(parameters, tmp_path):
+    with pytest.raises(DataError, match=r"data.source.*mine.* does not exist"):
+        tiny(tmp_path, **parameters)
+
+
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [

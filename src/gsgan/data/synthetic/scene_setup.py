@@ -26,7 +26,7 @@ from gsgan.data.synthetic.secondary import Moving, Secondary
 from gsgan.data.synthetic.tint import make_tints
 from gsgan.data.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles
 from gsgan.data.synthetic.view import View, undistort
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.errors import ConfigError, DataError
 
 Array = NDArray[np.float64]
 
@@ -136,19 +136,21 @@ def dataset_key(settings: Settings) -> str:
     """Name of a dataset in the cache: its main parameters and a hash of all of them.
 
     Files count by their content, not by their path.
+
+    Raises:
+        DataError: when a file does not exist.
     """
     parameters = asdict(settings)
     for name in ("avatar", "motion"):
-        if _is_file(parameters[name]):
-            parameters[name] = hashlib.sha256(Path(parameters[name]).read_bytes()).hexdigest()
+        if parameters[name] not in (*AVATARS, FREE_BODY, CHOREOGRAPHY):
+            path = Path(parameters[name]).expanduser()
+            if not path.is_file():
+                raise DataError(f"data.source.{name}: {path} does not exist")
+            parameters[name] = hashlib.sha256(path.read_bytes()).hexdigest()
     content = repr((VERSION, sorted(parameters.items())))
     digest = hashlib.sha256(content.encode()).hexdigest()[:12]
     effects = [name for name in ("lens", "tint", "gloss", "test_scale") if getattr(settings, name)]
     return "-".join([f"{Path(settings.avatar).stem}-{settings.size}-{digest}", *effects])
-
-
-def _is_file(name: str) -> bool:
-    return name not in (*AVATARS, FREE_BODY, CHOREOGRAPHY)
 
 
 def load_character(avatar: str) -> Character:
