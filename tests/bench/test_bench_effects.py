@@ -91,9 +91,9 @@ def test_the_default_person_without_effects_is_trained_once(rows):
     found = rows()
     assert len(found) == 10
     names = [name for row in found for name in row.runs]
-    assert names.count("default-off") == 4
-    assert len(set(names)) == 13
-    assert [row.effect for row in found if not row.runs] == ["distortion"]
+    assert names.count("default-off") == 3
+    assert len(set(names)) == 14
+    assert [row.effect for row in found if not row.runs] == ["distortion", "body_points"]
     for row in found:
         if row.runs:
             off, on = row.runs.values()
