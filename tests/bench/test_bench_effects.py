@@ -89,11 +89,11 @@ def rows(compose):
 
 def test_the_default_person_without_effects_is_trained_once(rows):
     found = rows()
-    assert len(found) == 9
+    assert len(found) == 10
     names = [name for row in found for name in row.runs]
-    assert names.count("default-off") == 4
-    assert len(set(names)) == 13
-    assert [row.effect for row in found if not row.runs] == ["distortion"]
+    assert names.count("default-off") == 3
+    assert len(set(names)) == 14
+    assert [row.effect for row in found if not row.runs] == ["distortion", "body_points"]
     for row in found:
         if row.runs:
             off, on = row.runs.values()
@@ -112,7 +112,7 @@ def test_only_some_and_not_on_the_default_person(rows):
 
 def test_without_training_only_the_decisions_are_found(rows):
     found = rows("train=false")
-    assert len(found) == 9
+    assert len(found) == 10
     assert not any(row.runs for row in found)
 
 

@@ -14,15 +14,18 @@ import pytest
 import torch
 
 from gsgan.body.free import free_body
+from gsgan.data.datamodule import GsganData
 from gsgan.data.synthetic import ensure_synthetic, scenes
-from gsgan.data.synthetic.motion import motion
-from gsgan.data.synthetic.scene_setup import Scene, Settings, dataset_key
-from gsgan.data.synthetic.trace import PosedPerson
+from gsgan.data.synthetic.free_subject import free_pose
+from gsgan.data.synthetic.scene_setup import AVATARS, Scene, Settings, dataset_key
+from gsgan.data.synthetic.trace import PosedCharacter
+from gsgan.scene import BodyPose
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root
 
 torch.set_num_threads(1)
 TINY = {
+    "avatar": "free_body",  # without textures: made in a second
     "size": 32,
     "train_cameras": 1,
     "test_cameras": 1,
@@ -30,9 +33,6 @@ TINY = {
     "test_frames": 1,
     "rays_per_pixel": 1,
 }
-# sha256 of images, masks and labels in test_the_default_person_has_not_changed_by_a_bit; where it
-# has to change, raise `gsgan.data.synthetic.scene_setup.VERSION` too.
-DEFAULT = "3b2f48bdb2d3b0febe8b3760b4f0b1b0bb37fbb2a31d380df09f29849de8e8d6"
 
 
 def tiny(cache, **parameters):
@@ -126,36 +126,53 @@ def test_landmarks_project_into_the_mask(dataset):
     assert np.mean(inside) > 0.97
 
 
-def test_the_default_person_has_not_changed_by_a_bit():
-    scene = Scene(Settings(**{**TINY, "size": 24}))
-    person, digest = scene.posed(1), hashlib.sha256()
-    for view in scene.views.values():
-        for pixels in person.render(view, 1):
-            whole = pixels if pixels.dtype.kind == "i" else np.floor(255 * pixels + 0.5)
-            digest.update(whole.astype(np.uint8).tobytes())
-    assert digest.hexdigest() == DEFAULT
+@pytest.mark.parametrize("avatar", AVATARS)
+def test_the_baked_avatars_have_landmarks_labels_and_no_body_pose(avatar, tmp_path):
+    root = tiny(tmp_path, avatar=avatar)
+    assert not (root / "body_pose.npz").exists()
+    assert "body" not in json.loads((root / "meta.json").read_text())
+    hands, face = (np.load(root / f"{name}3d.npz") for name in ("hands", "face"))
+    assert hands["p"].shape == (3, 42, 3)
+    assert face["p"].shape == (3, len(face["names"]), 3)
+    assert not GsganData(root=str(root)).info.has_body_pose
+    for mask, labels in zip(images(root, "masks"), images(root, "labels"), strict=True):
+        assert ((labels > 0) == (mask >= 128)).mean() >= 0.995
+
+
+@pytest.mark.parametrize("avatar", AVATARS)
+def test_landmarks_of_the_baked_avatars_lie_on_their_parts(avatar):
+    """Both eyes and the mouth on the face, wrists on arms or hands, toes on shoes."""
+    scene = Scene(Settings(**TINY | {"avatar": avatar, "size": 160, "train_cameras": 2}))
+    names, points = scene.landmarks()
+    expected = {"left_eye": "face", "mouth_left": "face", "nose": "face", "left_thumb": "hand"}
+    expected |= {"right_index": "hand", "left_foot_index": "shoe", "right_heel": "shoe"}
+    labels = scene.posed(1).render(scene.views["cam00"], 4)[2]  # from before the person
+    for name, part in expected.items():
+        u, v = np.floor(scene.views["cam00"].project(points[1, [names.index(name)]])[0]).astype(int)
+        near = labels[v - 2 : v + 3, u - 2 : u + 3]
+        found = {scene.character.label_names[i] for i in np.unique(near)}
+        assert any(part in label for label in found), (name, found)
 
 
 def test_left_and_right_labels_lie_on_left_and_right_landmarks():
-    scene = Scene(Settings(**{**TINY, "size": 96, "frames": 8}))
+    scene = Scene(Settings(**TINY | {"size": 96, "frames": 8}))
     names, hits = free_body().label_names, 0
+    points = scene.landmarks()[1]
     for frame in range(0, 8, 2):
-        p = free_body().posed_landmarks(scene.pose(frame))[0].double().numpy()
         person = scene.posed(frame)
         for view in scene.views.values():
             labels = person.render(view, 1)[2]
             for landmark, side in ((27, "left"), (28, "right")):
-                u, v = np.floor(view.project(p[landmark : landmark + 1])[0]).astype(int)
-                name = names[labels[v, u]]
-                hits += name.startswith(side)
+                u, v = np.floor(view.project(points[frame, [landmark]])[0]).astype(int)
+                hits += names[labels[v, u]].startswith(side)
     assert hits >= 14  # of 16: one leg may hide the other
 
 
 def test_person_is_in_view_and_fills_it():
-    scene = Scene(Settings(frames=24, test_frames=6))
+    scene = Scene(Settings(avatar="free_body", frames=24, test_frames=6))
     top, bottom = [], []
     for frame in range(24):
-        vertices = scene.vertices(frame)
+        vertices = scene.mesh(frame)[0]
         for view in scene.views.values():
             pixels = view.project(vertices)
             assert pixels.min() > 0
@@ -166,7 +183,7 @@ def test_person_is_in_view_and_fills_it():
 
 
 def test_test_cameras_are_between_training_cameras():
-    scene = Scene(Settings(frames=2, test_frames=1))
+    scene = Scene(Settings(avatar="free_body", frames=2, test_frames=1))
     angle = {
         name: math.atan2(view.centre[0], -view.centre[1]) for name, view in scene.views.items()
     }
@@ -184,17 +201,25 @@ def test_bytes_do_not_depend_on_workers(dataset, tmp_path):
     assert fingerprint(again) == fingerprint(dataset)
 
 
-def test_another_identity_has_other_clothes_but_the_same_shape(dataset, tmp_path):
-    other = tiny(tmp_path, identity=1)
-    for a, b in zip(images(dataset, "labels"), images(other, "labels"), strict=True):
-        assert np.array_equal(a, b)
-    a, b = (np.stack(images(r, "images")).astype(float) for r in (dataset, other))
-    shown = np.stack(images(dataset, "masks")) > 0
-    assert np.abs(a - b)[shown].mean() > 10
-
-
 def test_another_seed_gives_another_motion():
-    assert (motion(20, 0)[0] - motion(20, 1)[0]).abs().max() > 0.1
+    one, two = (Scene(Settings(**TINY, seed=seed)).motion for seed in (0, 1))
+    assert np.abs(one.rotations - two.rotations).max() > 0.1
+
+
+def test_without_secondary_motion_the_mesh_is_skinned_and_landmarks_stay():
+    still, moving = (Scene(Settings(**TINY, secondary=on)) for on in (False, True))
+    vertices, _, wrinkles = still.mesh(1)
+    assert wrinkles is None
+    exact = free_body().posed_vertices(free_pose(still.motion))[1].numpy()
+    np.testing.assert_allclose(vertices, exact, atol=1e-5)
+    assert 0.002 < np.abs(moving.mesh(1)[0] - vertices).max() < 0.06
+    np.testing.assert_array_equal(still.landmarks()[1], moving.landmarks()[1])
+
+
+def test_the_free_bodys_pose_puts_its_landmarks_where_the_file_has_them(dataset):
+    pose, p = np.load(dataset / "body_pose.npz"), np.load(dataset / "landmarks3d.npz")["p"]
+    pose = BodyPose(torch.from_numpy(pose["theta"]), torch.from_numpy(pose["transl"]))
+    np.testing.assert_allclose(free_body().posed_landmarks(pose).numpy(), p, atol=1e-6)
 
 
 # ---------------------------------------------------------------- the cache
@@ -206,7 +231,7 @@ def test_a_ready_dataset_is_used_again(dataset, monkeypatch):
 
 
 def test_an_interrupted_dataset_is_continued(dataset, tmp_path, monkeypatch):
-    render, left = PosedPerson.render, 2
+    render, left = PosedCharacter.render, 2
 
     def stops(self, view, rays):
         nonlocal left
@@ -216,7 +241,7 @@ def test_an_interrupted_dataset_is_continued(dataset, tmp_path, monkeypatch):
         return render(self, view, rays)
 
     with monkeypatch.context() as patch:
-        patch.setattr(PosedPerson, "render", stops)
+        patch.setattr(PosedCharacter, "render", stops)
         with pytest.raises(KeyboardInterrupt):
             tiny(tmp_path)
     root = folder(tmp_path) / dataset_key(Settings(**TINY))
@@ -278,7 +303,8 @@ def test_key_depends_on_every_parameter():
         Settings(test_frames=14),
         Settings(rays_per_pixel=5),
         Settings(seed=1),
-        Settings(identity=1),
+        Settings(avatar="free_body"),
+        Settings(secondary=False),
         Settings(lens=(0.1, 0, 0, 0)),
         Settings(lens=(0.1, 0, 0, 0, 0)),
         Settings(tint=0.1),
@@ -290,6 +316,12 @@ def test_key_depends_on_every_parameter():
     assert len({base, *map(dataset_key, changed)}) == 1 + len(changed)
     assert dataset_key(changed[-1]).endswith("-tint-test_scale")
     assert base == dataset_key(Settings())
+
+
+@pytest.mark.parametrize("parameters", [{"avatar": "mine.glb"}, {"motion": "mine.bvh"}])
+def test_a_missing_file_is_named(parameters, tmp_path):
+    with pytest.raises(DataError, match=r"data.source.*mine.* does not exist"):
+        tiny(tmp_path, **parameters)
 
 
 @pytest.mark.parametrize(
@@ -310,6 +342,9 @@ def test_key_depends_on_every_parameter():
         ({"test_scale": [9]}, "test_scale must be"),
         ({"test_scale": 2}, "test_scale must be"),
         ({"test_scale": [2], "test_cameras": 0}, "set test_cameras"),
+        ({"avatar": "nobody"}, "avatar must be blouse, polo, free_body or the path"),
+        ({"motion": "waltz"}, "motion must be choreography or the path of a .bvh"),
+        ({"secondary": "some"}, "secondary must be true or false"),
     ],
 )
 def test_parameters_out_of_range_are_refused(parameters, message, tmp_path):

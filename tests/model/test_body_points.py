@@ -284,8 +284,8 @@ def synthetic_frame():
     from gsgan.data.synthetic.scenes import ensure_scene
 
     root = ensure_scene(
-        size=64, train_cameras=2, test_cameras=0, frames=2, test_frames=0, rays_per_pixel=1,
-        workers=1, progress=False,
+        avatar="free_body", size=64, train_cameras=2, test_cameras=0, frames=2, test_frames=0,
+        rays_per_pixel=1, workers=1, progress=False,
     )  # fmt: skip
     data = GsganData(root=root, size=64)
     return data.dataset("train")[0]

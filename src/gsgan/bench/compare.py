@@ -1,6 +1,6 @@
 """The scene of the raster bench, and errors of its image and gradients on patches of it.
 
-The scene is one person before a camera of the default ring; the truth is float64 without cut-offs.
+The scene is the free body at rest before one camera; the truth is float64 without cut-offs.
 With every Gaussian at every pixel, whole images are rarely affordable. On a patch the image is
 exactly the same: all is projected by the whole camera, then only the patch's pixels are blended.
 """
@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from gsgan.body.free import free_body
-from gsgan.data.synthetic import scene_setup
-from gsgan.data.synthetic.motion import motion
-from gsgan.scene import BodyPose, Camera, Gaussians, Raster
+from gsgan.data.synthetic.scene_setup import look_at
+from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.skeleton import MEDIAPIPE33, Densify
 from gsgan.splat import ACCURACY, Accuracy, Projected, project, reference
 
@@ -27,10 +26,12 @@ SCALE_SPREAD = 0.5  # standard deviation of the logarithm of each axis's scale
 SCALE_RANGE = (1e-4, 0.06)  # body heights, the bounds of Ψ
 JITTER = 0.5  # how far a mean leaves its surface point, in the point's initial scales
 OPACITY_LOGIT = (0.5, 1.5)  # mean and standard deviation
+AZIMUTH, HEIGHT = 0.3, 1.35  # of the camera, radians and metres
+MARGIN = 1.2  # the camera sees this many times the body: Gaussians leave its surface
 
 
 def human_cloud(n: int, channels: int, seed: int = 0) -> Gaussians:
-    """Gaussians as an avatar of the default person has them, ``n`` exactly.
+    """Gaussians as an avatar has them, ``n`` exactly.
 
     Convention: world frame, metres, float32, a batch of one; features in [0, 1]. The same
     arguments give the same numbers, and the same person whatever ``n`` is: more points are smaller.
@@ -50,7 +51,7 @@ def human_cloud(n: int, channels: int, seed: int = 0) -> Gaussians:
     def normal(*size: int) -> Tensor:
         return torch.randn(1, n, *size, generator=random, dtype=torch.float64)
 
-    points = _densify(n)(default_person())
+    points = _densify(n)(free_body().landmarks[None].double())
     sigma = points.scales.unsqueeze(-1)
     low, high = (bound * MEDIAPIPE33.stature for bound in SCALE_RANGE)
     scales = (sigma * torch.exp(SCALE_SPREAD * normal(3))).clamp(low, high)
@@ -65,22 +66,13 @@ def human_cloud(n: int, channels: int, seed: int = 0) -> Gaussians:
 
 
 def ring_camera(size: int) -> Camera:
-    """The first camera of the default ring, ``size`` pixels square, float32, a batch of one."""
-    settings = scene_setup.Settings(size=size)
-    view = scene_setup.ring(settings, scene_setup.extent(free_body(), settings.seed))[0]
+    """A camera before the free body at rest, ``size`` pixels square, float32, a batch of one."""
+    points = free_body().vertices.double().numpy()
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    around = middle + MARGIN * (points - middle)
+    view = look_at(AZIMUTH, HEIGHT, middle, around, size)
     K, R, t = (torch.as_tensor(x).unsqueeze(0) for x in (view.K, view.R, view.t))
     return Camera(K, R, t, view.size).to(torch.float32)
-
-
-def default_person() -> Tensor:
-    """``[1, 33, 3]`` float64 joints of the default person's first frame, metres, world frame."""
-    settings = scene_setup.Settings()
-    theta, transl, _ = motion(settings.frames, settings.seed)
-    return (
-        free_body()
-        .to(torch.float64)
-        .posed_landmarks(BodyPose(theta[:1].double(), transl[:1].double()))
-    )
 
 
 def _densify(n: int) -> Densify:

@@ -1,43 +1,51 @@
 """The choreography of the synthetic person as a smooth function of time, and its held-out frames.
 
-Convention: metres, Z up, the person faces -Y at the start and stands on z = 0. Passages describe
-where pelvis, wrists and ankles go. "Mirrored" vectors have x pointing away from the middle of the
-body on both sides.
+Convention: metres of a person whose legs (hip to ankle) measure `LEG` and arms (shoulder to wrist)
+`ARM`, Z up; the person faces -Y at the start and stands on z = 0. Passages describe where body,
+wrists and feet go; feet follow in steps, planned ahead, and stand still between them. "Mirrored"
+vectors have x pointing away from the middle of the body on both sides.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
 
 TAU = 2 * math.pi
+LEG, ARM = 0.91, 0.56  # metres, to which all lengths here refer
+STANCE = 0.1  # metres from the middle of the body to a standing foot
 
 
 class Controls:
     """Targets of the body at F moments, standing with the arms down; pairs are left, right."""
 
     def __init__(self, frames: int) -> None:
-        def still(*value: object) -> Tensor:
-            rest = torch.tensor(value, dtype=torch.float64)
-            return rest.expand(frames, *rest.shape).clone()
+        def still(*value: object) -> Array:
+            return np.repeat(np.array(value, dtype=float)[None], frames, axis=0)
 
-        self.pelvis = still(0, 0, -0.015)  # [F, 3] metres from the rest position
-        self.root = still(0, 0, 0)  # [F, 3] axis-angle of the whole body
+        self.path = still(0, 0, 0)  # [F, 3] x, y of the body in the world and its heading, radians
+        self.pelvis = still(0, 0, -0.004)  # [F, 3] body axes, metres from the standing position
+        self.lean = still(0, 0, 0)  # [F, 3] body axes, axis-angle of the pelvis
         self.spine = still(0, 0, 0)  # [F, 3] axis-angle, distributed over the spine
         self.head = still(0, 0, 0)  # [F, 3] axis-angle, distributed over neck and head
         # [F, 2, 3], mirrored, chest axes: metres from the shoulder; where the elbow points
-        self.wrist = still(*[(0.13, -0.04, -0.5)] * 2)
-        self.elbow = still(*[(0.5, 1.0, -0.2)] * 2)
-        self.palm = still(0, 0)  # [F, 2] forearm twist, radians, positive turns the palm up
+        self.wrist = still(*[(0.12, -0.05, -0.52)] * 2)
+        self.elbow = still(*[(0.35, 1.0, -0.2)] * 2)
+        self.palm = still(0, 0)  # [F, 2] forearm twist, radians from mid-way, positive: palm up
         self.flex = still(0, 0)  # [F, 2] wrist flexion towards the palm, radians
         self.curl = still(*[[0.25] * 5] * 2)  # [F, 2, 5] finger flexion in [0, 1], thumb first
-        # [F, 2, 3] metres: mirrored x and y in the world, z above the standing height
-        self.ankle = still(*[(0.125, 0, 0)] * 2)
-        self.pitch = still(0, 0)  # [F, 2] radians, positive lifts the heel
+        self.foot = still(*[(0, 0)] * 2)  # [F, 2, 2] mirrored, body axes, metres from standing
+        self.march = np.zeros(frames)  # [F] metres: least height of steps; 0: only where needed
+        self.swing = np.zeros(frames)  # [F] share of the arms' swing with the legs
+        self.mouth = np.zeros(frames)  # [F] opening, in [0, 1]
+        self.smile = np.zeros(frames)  # [F] in [0, 1]
+        self.brows = np.zeros(frames)  # [F] in [-1, 1], positive raises them
 
 
 @dataclass(frozen=True)
@@ -52,59 +60,67 @@ class Style:
 # Passages write into neutral controls, given times in [0, 1] through the passage.
 
 
-def walk(c: Controls, s: Tensor, style: Style) -> None:
-    """Walking on the spot, the trunk turning slowly left and right."""
-    phase, amplitude = TAU * 2 * s + style.phase, style.amplitude
-    c.root[:, 2] += 0.7 * torch.sin(TAU * s)
-    for i, shift in enumerate((0.0, math.pi)):
-        a = phase + shift
-        lift = torch.sin(a).clamp_min(0) ** 2
-        c.ankle[:, i, 1] += 0.24 * amplitude * torch.cos(a)
-        c.ankle[:, i, 2] += 0.16 * amplitude * lift
-        c.pitch[:, i] += 0.45 * lift * torch.cos(a)
-        c.ankle[:, i, 0] += -0.02
-        c.wrist[:, i, 1] += -0.10 - 0.24 * amplitude * torch.cos(a + math.pi)
-        c.wrist[:, i, 2] += 0.03 + 0.05 * torch.cos(a) ** 2
-    c.pelvis[:, 2] += -0.035 + 0.015 * torch.cos(2 * phase)
-    c.spine[:, 2] += 0.14 * amplitude * torch.cos(phase)
+def walk(c: Controls, s: Array, style: Style) -> None:
+    """Walking round an oval, and back to the start after a full turn to the left."""
+    a = TAU * _ease(s)
+    c.path[:, 0] = 0.2 * (1 - np.cos(a))
+    c.path[:, 1] = -0.3 * np.sin(a)
+    cosine, sine = np.cos(a), np.sin(a)  # heading along the oval, without jumps of a full turn
+    c.path[:, 2] = a - np.arctan2(0.1 * sine * cosine, 0.3 * cosine**2 + 0.2 * sine**2)
+    c.swing[:] = style.amplitude
+    c.head[:, 2] = 0.25 * np.sin(a)
+    c.smile[:] = 0.3
 
 
-def arm_swings(c: Controls, s: Tensor, style: Style) -> None:
+def _ease(s: Array, share: float = 0.12) -> Array:
+    """From 0 to 1 at constant speed, which starts and ends smoothly."""
+
+    def begin(x: Array) -> Array:
+        u = (x / share).clip(0, 1)
+        return share * (u**3 - u**4 / 2) + (x - share).clip(0)
+
+    return np.where(s < 0.5, begin(s), 1 - share - begin(1 - s)) / (1 - share)
+
+
+def arm_swings(c: Controls, s: Array, style: Style) -> None:
     """Straight arms swung forwards, sideways and back, out of step."""
     for i, shift in enumerate((0.0, 0.35)):
-        swing = 0.5 - 0.5 * torch.cos(TAU * (s - 0.2 * shift))
+        swing = 0.5 - 0.5 * np.cos(TAU * (s - 0.2 * shift))
         around = TAU * 1.5 * s + style.phase + shift * TAU
         angle = 1.55 * style.amplitude * swing
-        out = 0.5 + 0.5 * torch.sin(around)
+        out = 0.5 + 0.5 * np.sin(around)
         reach = 0.55
-        c.wrist[:, i, 0] = 0.10 + reach * torch.sin(angle) * out
-        c.wrist[:, i, 1] = -0.04 - reach * torch.sin(angle) * (1 - out)
-        c.wrist[:, i, 2] = -reach * torch.cos(angle)
-    c.spine[:, 0] += -0.12 * torch.sin(TAU * s)
+        c.wrist[:, i, 0] = 0.10 + reach * np.sin(angle) * out
+        c.wrist[:, i, 1] = -0.04 - reach * np.sin(angle) * (1 - out)
+        c.wrist[:, i, 2] = -reach * np.cos(angle)
+    c.spine[:, 0] = -0.12 * np.sin(TAU * s)
 
 
-def wave(c: Controls, s: Tensor, style: Style) -> None:
+def wave(c: Controls, s: Array, style: Style) -> None:
     """One hand waves beside the head, the other is on the hip."""
     _wave_arm(c, style.lead, TAU * 3 * s + style.phase, style.amplitude)
     other = 1 - style.lead
-    c.wrist[:, other] = c.wrist.new_tensor([0.05, -0.08, -0.38])
-    c.elbow[:, other] = c.elbow.new_tensor([1.0, 0.6, 0.0])
-    c.curl[:, other] += 0.35
-    c.head[:, 2] += (0.3 if style.lead == 0 else -0.3) * torch.sin(math.pi * s)
+    c.wrist[:, other] = (0.13, -0.04, -0.36)
+    c.elbow[:, other] = (1.0, 0.6, 0.0)
+    c.curl[:, other] = 0.8
+    c.head[:, 2] = (0.3 if style.lead == 0 else -0.3) * np.sin(math.pi * s)
+    c.smile[:] = 1
+    c.brows[:] = 0.6
+    c.mouth[:] = 0.25 * _wander(s, 3, style.phase).clip(0)
 
 
-def _wave_arm(c: Controls, side: int, phase: Tensor, amplitude: float) -> None:
-    c.wrist[:, side, 0] = 0.24 + 0.12 * amplitude * torch.sin(phase)
+def _wave_arm(c: Controls, side: int, phase: Array, amplitude: float) -> None:
+    c.wrist[:, side, 0] = 0.24 + 0.12 * amplitude * np.sin(phase)
     c.wrist[:, side, 1] = -0.16
     c.wrist[:, side, 2] = 0.26
-    c.elbow[:, side] = c.elbow.new_tensor([1.0, 0.4, -0.9])
-    c.palm[:, side] = 0.5
+    c.elbow[:, side] = (1.0, 0.4, -0.9)
+    c.palm[:, side] = -0.6
     c.curl[:, side] = 0.05
 
 
-def squat(c: Controls, s: Tensor, style: Style) -> None:
+def squat(c: Controls, s: Array, style: Style) -> None:
     """Two squats, arms reaching forwards for balance."""
-    depth = 0.5 - 0.5 * torch.cos(TAU * 2 * s)
+    depth = 0.5 - 0.5 * np.cos(TAU * 2 * s)
     _squat_legs(c, depth, style.amplitude)
     for i in range(2):
         c.wrist[:, i, 0] = 0.10 - 0.04 * depth
@@ -112,178 +128,228 @@ def squat(c: Controls, s: Tensor, style: Style) -> None:
         c.wrist[:, i, 2] = -0.5 + 0.44 * depth
 
 
-def _squat_legs(c: Controls, depth: Tensor, amplitude: float) -> None:
+def _squat_legs(c: Controls, depth: Array, amplitude: float) -> None:
     c.pelvis[:, 2] += -0.36 * amplitude * depth
     c.pelvis[:, 1] += 0.16 * amplitude * depth
-    c.root[:, 0] += 0.45 * amplitude * depth
+    c.lean[:, 0] += 0.45 * amplitude * depth
     c.spine[:, 0] += 0.15 * depth
     c.head[:, 0] += -0.35 * depth
-    c.ankle[:, :, 0] += 0.06
+    c.foot[:, :, 0] += 0.06
 
 
-def overhead(c: Controls, s: Tensor, style: Style) -> None:
+def overhead(c: Controls, s: Array, style: Style) -> None:
     """Both arms rise to above the head and circle there."""
-    rise = torch.sin(math.pi * s) ** 2
+    rise = np.sin(math.pi * s) ** 2
     for i, shift in enumerate((0.0, 1.3)):
         circle = TAU * 2 * s + style.phase + shift
         angle = rise * 2.75 * (0.92 + 0.08 * style.amplitude)
-        c.wrist[:, i, 0] = 0.10 + 0.42 * torch.sin(angle) + 0.05 * torch.cos(circle) * rise
-        c.wrist[:, i, 1] = -0.06 + 0.08 * torch.sin(circle) * rise
-        c.wrist[:, i, 2] = torch.where(angle.cos() > 0, -0.48, -0.36) * torch.cos(angle)
-        c.elbow[:, i] = c.elbow.new_tensor([1.0, 0.9, -0.1])
+        c.wrist[:, i, 0] = 0.10 + 0.42 * np.sin(angle) + 0.05 * np.cos(circle) * rise
+        c.wrist[:, i, 1] = -0.06 + 0.08 * np.sin(circle) * rise
+        c.wrist[:, i, 2] = np.where(np.cos(angle) > 0, -0.48, -0.36) * np.cos(angle)
+        c.elbow[:, i] = (1.0, 0.9, -0.1)
     c.curl[...] = (0.25 - 0.2 * rise)[:, None, None]
-    c.head[:, 0] += -0.2 * rise
+    c.head[:, 0] = -0.2 * rise
+    c.mouth[:] = 0.5 * rise
+    c.brows[:] = rise
 
 
-def twist(c: Controls, s: Tensor, style: Style) -> None:
+def twist(c: Controls, s: Array, style: Style) -> None:
     """The trunk turns and leans from side to side, bent arms held out."""
-    turn = torch.sin(TAU * 1.5 * s + 0.3 * style.phase)
-    c.spine[:, 2] += 0.75 * style.amplitude * turn
-    c.spine[:, 1] += 0.35 * torch.sin(TAU * s + style.phase)
-    c.head[:, 2] += -0.4 * turn
+    turn = np.sin(TAU * 1.5 * s + 0.3 * style.phase)
+    c.spine[:, 2] = 0.75 * style.amplitude * turn
+    c.spine[:, 1] = 0.35 * np.sin(TAU * s + style.phase)
+    c.head[:, 2] = -0.4 * turn
     for i, sign in enumerate((1.0, -1.0)):
         c.wrist[:, i, 0] = 0.22 + 0.06 * sign * turn
         c.wrist[:, i, 1] = -0.30
         c.wrist[:, i, 2] = -0.12 + 0.10 * sign * turn
-        c.elbow[:, i] = c.elbow.new_tensor([1.0, 0.5, -0.5])
+        c.elbow[:, i] = (1.0, 0.5, -0.5)
     c.curl[...] = 0.75
+    c.brows[:] = -0.7
 
 
-def signing(c: Controls, s: Tensor, style: Style) -> None:
+def reach(c: Controls, s: Array, style: Style) -> None:
+    """One hand reaches high to its side, then low across the body; the gaze follows."""
+    low = smoothstep((s - 0.35) / 0.3)
+    high, side = 1 - low, style.lead
+    sign = 1.0 if side == 0 else -1.0
+    c.wrist[:, side, 0] = 0.3 * high - 0.06 * low
+    c.wrist[:, side, 1] = -0.2 * high - 0.42 * low
+    c.wrist[:, side, 2] = 0.4 * high - 0.3 * low
+    c.elbow[:, side] = (1.0, 0.5, -0.6)
+    c.palm[:, side] = 0.5 * low - 0.5 * high
+    c.curl[:, side] = (0.15 + 0.6 * np.exp(-(((s - 0.4) / 0.1) ** 2)))[:, None]
+    c.spine[:, 0] = 0.45 * low - 0.1 * high
+    c.spine[:, 1] = -0.2 * sign * high
+    c.spine[:, 2] = -0.5 * sign * low + 0.25 * sign * high
+    c.lean[:, 0] = 0.2 * low
+    c.pelvis[:, 1:] += low[:, None] * (0.1, -0.1)
+    c.head[:, 0] = 0.15 * low - 0.35 * high
+    c.head[:, 2] = sign * (0.4 * high - 0.15 * low)
+    c.mouth[:] = 0.15 * high
+
+
+def signing(c: Controls, s: Array, style: Style) -> None:
     """Sign language in front of the chest, every finger with its own rhythm."""
     _sign_arms(c, s, style)
-    c.head[:, 2] += 0.2 * torch.sin(TAU * 1.5 * s)
-    c.head[:, 0] += 0.12 * torch.sin(TAU * 2.5 * s + 1)
+    c.head[:, 2] = 0.2 * np.sin(TAU * 1.5 * s)
+    c.head[:, 0] = 0.12 * np.sin(TAU * 2.5 * s + 1)
 
 
-def _sign_arms(c: Controls, s: Tensor, style: Style) -> None:
+def _sign_arms(c: Controls, s: Array, style: Style) -> None:
     for i, shift in enumerate((0.0, 2.1)):
         a = TAU * s + style.phase + shift
-        c.wrist[:, i, 0] = -0.02 + 0.11 * torch.sin(2 * a)
-        c.wrist[:, i, 1] = -0.31 - 0.06 * style.amplitude * torch.sin(3 * a + 1)
-        c.wrist[:, i, 2] = -0.15 + 0.14 * style.amplitude * torch.sin(3 * a)
-        c.elbow[:, i] = c.elbow.new_tensor([0.8, 0.3, -1.0])
-        c.palm[:, i] = 0.5 + 0.7 * torch.sin(2 * a + 0.5)
-        c.flex[:, i] = 0.25 * torch.sin(3 * a + 2)
+        c.wrist[:, i, 0] = 0.02 + 0.1 * np.sin(2 * a)
+        c.wrist[:, i, 1] = -0.31 - 0.06 * style.amplitude * np.sin(3 * a + 1)
+        c.wrist[:, i, 2] = -0.15 + 0.14 * style.amplitude * np.sin(3 * a)
+        c.elbow[:, i] = (0.8, 0.3, -1.0)
+        c.palm[:, i] = 0.1 + 0.7 * np.sin(2 * a + 0.5)
+        c.flex[:, i] = 0.25 * np.sin(3 * a + 2)
         for finger in range(5):
-            c.curl[:, i, finger] = 0.45 + 0.45 * torch.sin((3 + finger % 3) * a + 1.7 * finger)
+            c.curl[:, i, finger] = 0.45 + 0.45 * np.sin((2 + finger % 3) * a + 1.7 * finger)
+    c.mouth[:] = 0.3 + 0.45 * _wander(s, 9, style.phase)
+    c.smile[:] = 0.3 * _wander(s, 2, style.phase).clip(0)
+    c.brows[:] = 0.9 * _wander(s, 3, style.phase + 1)
 
 
-def squat_and_wave(c: Controls, s: Tensor, style: Style) -> None:
+def squat_and_wave(c: Controls, s: Array, style: Style) -> None:
     """The held-out combination: a half squat while one hand waves and the other signs."""
     _sign_arms(c, s, style)
-    _squat_legs(c, 0.65 * torch.sin(math.pi * s) ** 2, style.amplitude)
+    _squat_legs(c, 0.65 * np.sin(math.pi * s) ** 2, style.amplitude)
     _wave_arm(c, style.lead, TAU * 2 * s + style.phase, style.amplitude)
-    c.spine[:, 2] += 0.4 * torch.sin(TAU * s)
+    c.spine[:, 2] += 0.4 * np.sin(TAU * s)
 
 
-def freestyle(c: Controls, s: Tensor, style: Style) -> None:
+def dance(c: Controls, s: Array, style: Style) -> None:
+    """Steps from side to side with high knees, hips and arms in the same beat."""
+    beat = TAU * 3 * s
+    c.march[:] = 0.16 * style.amplitude
+    c.path[:, 0] = 0.12 * np.sin(TAU * s)
+    c.path[:, 2] = 0.4 * style.amplitude * np.sin(TAU * s)
+    c.pelvis[:, 2] += -0.05 + 0.02 * np.cos(2 * beat)
+    c.lean[:, 1] = 0.08 * np.sin(beat)
+    c.spine[:, 1] = -0.2 * np.sin(beat)
+    c.spine[:, 2] = 0.3 * np.sin(beat + 0.8)
+    for i, sign in enumerate((1.0, -1.0)):
+        c.wrist[:, i, 0] = 0.20 + 0.06 * sign * np.sin(beat)
+        c.wrist[:, i, 1] = -0.26 - 0.08 * sign * np.sin(beat)
+        c.wrist[:, i, 2] = -0.08 + 0.2 * np.sin(beat / 2 + sign + style.phase)
+        c.elbow[:, i] = (1.0, 0.6, -0.5)
+        c.palm[:, i] = 0.4 * np.sin(beat + sign)
+    c.curl[...] = 0.5
+    c.smile[:] = 0.9
+
+
+def freestyle(c: Controls, s: Array, style: Style) -> None:
     """Arms, trunk, legs and heading move independently: poses that no other passage has.
 
     A model trained on the other passages alone is worst on poses between them.
     """
     for i, shift in enumerate((0.0, 2.6)):
         a = style.phase + shift
-        rise = 1.25 + 1.1 * style.amplitude * _wander(s, 4.0, a)  # 0: down, half a turn: up
-        around = 0.75 + 0.7 * _wander(s, 5.3, a + 1)  # 0: in front, a quarter: sideways
-        reach = 0.42 + 0.09 * _wander(s, 6.1, a + 2)
-        c.wrist[:, i, 0] = 0.06 + reach * torch.sin(rise) * torch.sin(around)
-        c.wrist[:, i, 1] = -0.04 - reach * torch.sin(rise).clamp_min(0.1) * torch.cos(around)
-        c.wrist[:, i, 2] = -reach * torch.cos(rise)
-        c.elbow[:, i] = c.elbow.new_tensor([1.0, 0.6, -0.5])
-        c.palm[:, i] = 0.3 + 0.6 * _wander(s, 4.7, a + 3)
-        c.flex[:, i] = 0.25 * _wander(s, 5.9, a + 4)
+        rise = 1.25 + 1.1 * style.amplitude * _wander(s, 2.5, a)  # 0: down, half a turn: up
+        around = 0.75 + 0.7 * _wander(s, 3.2, a + 1)  # 0: in front, a quarter: sideways
+        reach = 0.42 + 0.09 * _wander(s, 3.7, a + 2)
+        c.wrist[:, i, 0] = 0.06 + reach * np.sin(rise) * np.sin(around)
+        c.wrist[:, i, 1] = -0.04 - reach * np.sin(rise).clip(0.1) * np.cos(around)
+        c.wrist[:, i, 2] = -reach * np.cos(rise)
+        c.elbow[:, i] = (1.0, 0.6, -0.5)
+        c.palm[:, i] = 0.6 * _wander(s, 2.8, a + 3)
+        c.flex[:, i] = 0.25 * _wander(s, 3.5, a + 4)
         for finger in range(5):
-            c.curl[:, i, finger] = 0.45 + 0.4 * _wander(s, 6.5, a + 5 + 0.9 * finger)
-        forth = _wander(s, 3.7, a + 2.2)
-        c.ankle[:, i, 0] += 0.03 + 0.04 * _wander(s, 3.1, a + 0.7)
-        c.ankle[:, i, 1] += 0.14 * forth
-        c.ankle[:, i, 2] += 0.10 * forth.clamp_min(0) ** 2
-    _squat_legs(c, 0.6 * (0.5 + 0.5 * _wander(s, 3.3, style.phase + 6)) ** 2, style.amplitude)
-    c.spine[:, 2] += 0.6 * _wander(s, 3.5, style.phase + 1.5)
-    c.spine[:, 1] += 0.3 * _wander(s, 4.3, style.phase + 2.5)
-    c.spine[:, 0] += 0.2 * _wander(s, 3.9, style.phase + 3.5)
-    c.head[:, 2] += -0.3 * _wander(s, 4.9, style.phase + 4.5)
-    c.head[:, 0] += 0.15 * _wander(s, 5.7, style.phase + 5.5)
-    c.root[:, 2] += 0.9 * _wander(s, 2.3, style.phase + 0.5)
+            c.curl[:, i, finger] = 0.45 + 0.4 * _wander(s, 4, a + 5 + 0.9 * finger)
+        c.foot[:, i, 0] = 0.04 + 0.04 * _wander(s, 1.9, a + 0.7)
+        c.foot[:, i, 1] = 0.18 * _wander(s, 2.2, a + 2.2)
+    _squat_legs(c, 0.6 * (0.5 + 0.5 * _wander(s, 2, style.phase + 6)) ** 2, style.amplitude)
+    c.spine[:, 2] += 0.6 * _wander(s, 2.1, style.phase + 1.5)
+    c.spine[:, 1] += 0.3 * _wander(s, 2.6, style.phase + 2.5)
+    c.spine[:, 0] += 0.2 * _wander(s, 2.3, style.phase + 3.5)
+    c.head[:, 2] += -0.3 * _wander(s, 2.9, style.phase + 4.5)
+    c.head[:, 0] += 0.15 * _wander(s, 3.4, style.phase + 5.5)
+    c.path[:, 2] = 0.9 * _wander(s, 1.4, style.phase + 0.5)
+    c.mouth[:] = 0.5 * _wander(s, 6, style.phase + 7)
+    c.smile[:] = 0.8 * _wander(s, 2, style.phase + 8)
+    c.brows[:] = 0.9 * _wander(s, 3, style.phase + 9)
 
 
-def _wander(s: Tensor, cycles: float, phase: float) -> Tensor:
+def _wander(s: Array, cycles: float, phase: float) -> Array:
     """Smooth, in [-1, 1], without period within a passage."""
     golden = (1 + math.sqrt(5)) / 2
     slow, fast = TAU * cycles * s + phase, TAU * cycles * golden * s + 2.4 * phase + 1
-    return 0.5 * (torch.sin(slow) + torch.sin(fast))
+    return 0.5 * (np.sin(slow) + np.sin(fast))
 
 
 COMBINATION = "squat_and_wave"
 # name, passage, seconds
-PASSAGES: tuple[tuple[str, Callable[[Controls, Tensor, Style], None], float], ...] = (
-    ("walk", walk, 4.0),
-    ("arm_swings", arm_swings, 2.5),
+PASSAGES: tuple[tuple[str, Callable[[Controls, Array, Style], None], float], ...] = (
+    ("walk", walk, 5.5),
+    ("arm_swings", arm_swings, 2.0),
     ("wave", wave, 2.5),
     ("squat", squat, 2.5),
     ("overhead", overhead, 2.5),
-    ("twist", twist, 3.0),
-    ("signing", signing, 5.0),
+    ("twist", twist, 2.5),
+    ("reach", reach, 2.5),
+    ("signing", signing, 4.0),
     (COMBINATION, squat_and_wave, 3.0),
-    ("freestyle", freestyle, 10.0),
+    ("dance", dance, 3.0),
+    ("freestyle", freestyle, 5.0),
 )
-DURATION = sum(seconds for _, _, seconds in PASSAGES)
+BLEND = 0.6  # seconds from standing into a passage, and back
+ENDS = np.cumsum([seconds for _, _, seconds in PASSAGES])
+DURATION = float(ENDS[-1])
 
 
-def frame_times(frames: int) -> Tensor:
-    """``[F]`` seconds: even samples of the choreography, in the middle of each step."""
-    return (torch.arange(frames, dtype=torch.float64) + 0.5) * DURATION / frames
+def frame_times(frames: int, duration: float = DURATION) -> Array:
+    """``[F]`` seconds: even samples of a motion, in the middle of each step."""
+    return (np.arange(frames) + 0.5) * duration / frames
 
 
-def passage_names(frames: int) -> list[str]:
-    """The passage of each frame."""
-    return [PASSAGES[int(i)][0] for i in _passage_index(frame_times(frames))]
+def passages_at(times: Array) -> tuple[str, ...]:
+    """The passage at each of the times ``[F]``, seconds."""
+    return tuple(PASSAGES[i][0] for i in _passage_index(times))
 
 
-def _passage_index(times: Tensor) -> Tensor:
-    ends = torch.tensor([p[2] for p in PASSAGES], dtype=torch.float64).cumsum(0)
-    return torch.searchsorted(ends, times, right=True).clamp_max(len(PASSAGES) - 1)
+def _passage_index(times: Array) -> NDArray[np.intp]:
+    return np.searchsorted(ENDS, times, side="right").clip(max=len(PASSAGES) - 1)
 
 
-def controls_at(times: Tensor, seed: int) -> Controls:
+def controls_at(times: Array, seed: int) -> Controls:
     """Targets at times ``[F]``, seconds: every passage starts and ends standing."""
-    index, base = _passage_index(times), Controls(len(times))
-    generator = torch.Generator().manual_seed(seed)
-    start = 0.0
+    index, base, random = _passage_index(times), Controls(len(times)), np.random.default_rng(seed)
     for i, (_, passage, seconds) in enumerate(PASSAGES):
-        draw = torch.rand(3, generator=generator, dtype=torch.float64)
-        style = Style(0.85 + 0.3 * float(draw[0]), TAU * float(draw[1]), int(draw[2] < 0.5))
-        here = (index == i).nonzero().squeeze(1)
-        s = (times[here] - start) / seconds
-        start += seconds
+        draw = random.random(3)
+        style = Style(0.85 + 0.3 * draw[0], TAU * draw[1], int(draw[2] < 0.5))
+        here = np.flatnonzero(index == i)
+        s = 1 - (ENDS[i] - times[here]) / seconds
         moved = Controls(len(here))
         passage(moved, s, style)
-        share = smoothstep(s / 0.15) * smoothstep((1 - s) / 0.15)
-        for rest, goal in zip(vars(base).values(), vars(moved).values(), strict=True):
-            w = share.view(-1, *[1] * (goal.ndim - 1))
-            rest[here] = rest[here] + w * (goal - rest[here])
+        share = smoothstep(s * seconds / BLEND) * smoothstep((1 - s) * seconds / BLEND)
+        for name, rest in vars(base).items():
+            whole = passage is walk and name == "path"  # it starts and ends smoothly itself
+            w = np.ones(len(here)) if whole else share
+            goal = getattr(moved, name)
+            rest[here] += w.reshape(-1, *[1] * (goal.ndim - 1)) * (goal - rest[here])
+    base.path[index > 0, 2] += TAU  # the walk's full turn
     return base
 
 
-def smoothstep(x: Tensor) -> Tensor:
+def smoothstep(x: Array) -> Array:
     """0 below 0, 1 above 1, a cubic between."""
-    x = x.clamp(0, 1)
+    x = np.clip(x, 0, 1)
     return x * x * (3 - 2 * x)
 
 
-def held_out(frames: int, test_frames: int, block: int = 3) -> list[int]:
+def held_out(names: Sequence[str], test_frames: int, block: int = 3) -> list[int]:
     """The held-out frames: the combination passage first, then blocks inside the others.
 
     Blocks lie in the middle of passages: their neighbours in time are training frames, the extreme
     of the movement is not. The combination is never in the training split.
 
     Args:
-        frames: number of all frames.
-        test_frames: number of frames to hold out, in [0, frames).
+        names: the passage of each frame.
+        test_frames: number of frames to hold out, fewer than all.
         block: frames per block, at least 1.
     """
-    names = passage_names(frames)
     chosen = [i for i, name in enumerate(names) if name == COMBINATION][:test_frames]
     others: dict[str, list[int]] = {}
     for i, name in enumerate(names):
@@ -298,6 +364,6 @@ def held_out(frames: int, test_frames: int, block: int = 3) -> list[int]:
             begin = (len(free) - size + 1) // 2
             chosen += free[begin : begin + size]
         if len(chosen) == before:
-            left = [i for i in range(frames) if i not in chosen]
+            left = [i for i in range(len(names)) if i not in chosen]
             chosen += left[: test_frames - len(chosen)]
     return sorted(chosen)

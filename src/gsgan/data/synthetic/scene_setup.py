@@ -1,4 +1,4 @@
-"""The synthetic scene in numbers: its parameters, cameras, person and motion.
+"""The synthetic scene in numbers: its parameters, cameras, character and motion.
 
 Everything here follows from :class:`Settings` alone: worker processes rebuild the scene from them.
 """
@@ -8,24 +8,33 @@ from __future__ import annotations
 import hashlib
 import math
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
-from gsgan.body.free import Body, free_body
+from gsgan.body.free import free_body
 from gsgan.data.cameras import DISTORTION_LENGTHS
-from gsgan.data.synthetic.choreography import held_out
-from gsgan.data.synthetic.identity import Marks, make_identity
-from gsgan.data.synthetic.motion import motion
-from gsgan.data.synthetic.trace import Light, Person, PosedPerson, View, make_tints, undistort
-from gsgan.scene import BodyPose
-from gsgan.utils.errors import ConfigError
+from gsgan.data.synthetic.bvh import BvhMotion
+from gsgan.data.synthetic.character import Character
+from gsgan.data.synthetic.choreography import frame_times, held_out
+from gsgan.data.synthetic.free_subject import free_character, free_pose
+from gsgan.data.synthetic.gltf import avatar_names, avatar_path, read_character
+from gsgan.data.synthetic.motion import Choreography
+from gsgan.data.synthetic.secondary import Moving, Secondary
+from gsgan.data.synthetic.tint import make_tints
+from gsgan.data.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles
+from gsgan.data.synthetic.view import View, undistort
+from gsgan.utils.errors import ConfigError, DataError
 
 Array = NDArray[np.float64]
 
-VERSION = 1
+VERSION = 2
 """Of the generator. Raise it when any pixel changes: cached datasets are then made again."""
 
+AVATARS = avatar_names()
+DEFAULT, FREE_BODY, CHOREOGRAPHY = "polo", "free_body", "choreography"
 RADIUS = 2.8  # metres from the middle of the scene to the cameras
 MARGIN = 0.02  # share of the image kept free at each edge, over all frames and cameras
 WHOLE, NUMBER, LIST = "a whole number", "a number", "a list of numbers"
@@ -33,22 +42,12 @@ WHOLE, NUMBER, LIST = "a whole number", "a number", "a list of numbers"
 RANGES = {
     "size": (WHOLE, 8, math.inf),
     **dict.fromkeys(("train_cameras", "frames", "rays_per_pixel"), (WHOLE, 1, math.inf)),
-    **dict.fromkeys(("test_cameras", "test_frames", "seed", "identity"), (WHOLE, 0, math.inf)),
+    **dict.fromkeys(("test_cameras", "test_frames", "seed"), (WHOLE, 0, math.inf)),
     "lens": (LIST, -math.inf, math.inf),
     "tint": (NUMBER, 0, 0.3),
     "gloss": (NUMBER, 0, 1),
     "test_scale": (LIST, 0.25, 4),
 }
-# (joint that bends, joint towards which its folds run)
-FOLDS = (
-    ("upperarm01.L", "lowerarm01.L"),
-    ("upperarm01.R", "lowerarm01.R"),
-    ("upperleg01.L", "lowerleg01.L"),
-    ("upperleg01.R", "lowerleg01.R"),
-    ("lowerleg01.L", "foot.L"),
-    ("lowerleg01.R", "foot.R"),
-    ("spine03", "spine01"),
-)
 
 
 @dataclass(frozen=True)
@@ -68,7 +67,9 @@ class Settings:
     test_frames: int = 21
     rays_per_pixel: int = 16
     seed: int = 0
-    identity: int = 0
+    avatar: str = DEFAULT
+    motion: str = CHOREOGRAPHY
+    secondary: bool = True
     lens: tuple[float, ...] | None = None
     tint: float | None = None
     gloss: float | None = None
@@ -93,6 +94,19 @@ class Settings:
                 numbers = values.tolist()
                 stored = tuple(numbers) if kind == LIST else numbers
                 object.__setattr__(self, name, stored if values.any() else None)
+        named = (*AVATARS, FREE_BODY)
+        _require(
+            self.avatar in named or str(self.avatar).endswith(".glb"),
+            f"avatar must be {', '.join(named)} or the path of a rigged .glb, got {self.avatar!r}",
+        )
+        _require(
+            self.motion == CHOREOGRAPHY or str(self.motion).endswith(".bvh"),
+            f"motion must be {CHOREOGRAPHY} or the path of a .bvh, got {self.motion!r}",
+        )
+        _require(
+            isinstance(self.secondary, bool),
+            f"secondary must be true or false, got {self.secondary!r}",
+        )
         _require(
             self.test_frames < self.frames,
             f"test_frames must be less than frames = {self.frames}, got {self.test_frames}",
@@ -119,34 +133,69 @@ def _require(holds: bool, message: str) -> None:
 
 
 def dataset_key(settings: Settings) -> str:
-    """Name of a dataset in the cache: its main parameters and a hash of all of them."""
-    content = repr((VERSION, sorted(asdict(settings).items())))
+    """Name of a dataset in the cache: its main parameters and a hash of all of them.
+
+    Files count by their content, not by their path.
+
+    Raises:
+        DataError: when a file does not exist.
+    """
+    parameters = asdict(settings)
+    for name in ("avatar", "motion"):
+        if parameters[name] not in (*AVATARS, FREE_BODY, CHOREOGRAPHY):
+            path = Path(parameters[name]).expanduser()
+            if not path.is_file():
+                raise DataError(f"data.source.{name}: {path} does not exist")
+            parameters[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    content = repr((VERSION, sorted(parameters.items())))
     digest = hashlib.sha256(content.encode()).hexdigest()[:12]
     effects = [name for name in ("lens", "tint", "gloss", "test_scale") if getattr(settings, name)]
-    return "-".join([f"person{settings.identity}-{settings.size}-{digest}", *effects])
+    return "-".join([f"{Path(settings.avatar).stem}-{settings.size}-{digest}", *effects])
+
+
+def load_character(avatar: str) -> Character:
+    """The character of ``data.source.avatar``.
+
+    Args:
+        avatar: a name in `AVATARS`, ``free_body``, or the path of a rigged .glb.
+
+    Raises:
+        DataError: when the file is missing, damaged or not a rigged person.
+    """
+    if avatar == FREE_BODY:
+        return free_character()
+    return read_character(avatar_path(avatar) if avatar in AVATARS else Path(avatar).expanduser())
 
 
 class Scene:
     """A whole synthetic scene, ready to be traced.
 
-    ``theta [F, 56, 3]`` and ``transl [F, 3]`` are float32; ``views`` and ``tints`` are by camera
-    name, training cameras first. Held-out cameras have no tint: nothing in the training data could
-    reveal it.
+    ``motion`` has one pose per frame; ``views`` and ``tints`` are by camera name, training cameras
+    first. Held-out cameras have no tint: nothing in the training data could reveal it.
 
     Raises:
         ConfigError: when a lens cannot be inverted up to the images' corners.
+        DataError: when the avatar's or the motion's file cannot be used.
     """
 
     def __init__(self, settings: Settings) -> None:
-        body = free_body()
         self.settings, self.light = settings, Light(gloss=settings.gloss or 0.0)
-        self.person = make_person(body, settings.identity)
-        self.theta, self.transl, self.passages = motion(settings.frames, settings.seed)
-        self.test_frames = held_out(settings.frames, settings.test_frames)
+        self.character = character = load_character(settings.avatar)
+        self.appearance = Appearance(character)
+        self.source: Moving = (
+            Choreography(character, settings.seed)
+            if settings.motion == CHOREOGRAPHY
+            else BvhMotion(character, Path(settings.motion).expanduser(), settings.seed)
+        )
+        times = frame_times(settings.frames, self.source.duration)
+        self.motion = self.source.at(times)
+        self.secondary = Secondary(character, self.source) if settings.secondary else None
+        self.times = times
+        self.test_frames = held_out(self.motion.passages, settings.test_frames)
         self.train_frames = [i for i in range(settings.frames) if i not in self.test_frames]
         names = [f"cam{i:02d}" for i in range(settings.train_cameras + settings.test_cameras)]
         self.train_cameras = names[: settings.train_cameras]
-        self.views = dict(zip(names, ring(settings, extent(body, settings.seed)), strict=True))
+        self.views = dict(zip(names, ring(settings, extent(character, self.source)), strict=True))
         for name in names[settings.train_cameras :]:
             for scale in settings.test_scale or ():
                 self.views[f"{name}_x{scale:g}"] = zoomed(self.views[name], scale)
@@ -157,55 +206,61 @@ class Scene:
         tints = make_tints(settings.tint or 0.0, settings.train_cameras, settings.seed)
         self.tints = dict(zip(self.train_cameras, tints, strict=True)) if settings.tint else {}
 
-    def pose(self, frame: int) -> BodyPose:
-        """The body pose of one frame, with a batch size of 1."""
-        return BodyPose(self.theta[frame : frame + 1], self.transl[frame : frame + 1])
+    def mesh(self, frame: int) -> tuple[Array, Array, Wrinkles | None]:
+        """Vertices (metres) and unit normals ``[V, 3]`` of a frame, and the wrinkles of cloth."""
+        vertices, normals = self._skinned(frame)
+        if self.secondary is None:
+            return vertices, normals, None
+        rotations = self.motion.rotations[frame]
+        return self.secondary(float(self.times[frame]), rotations, vertices, normals)
 
-    def vertices(self, frame: int) -> Array:
-        """``[V, 3]`` posed vertices, float64."""
-        return free_body().posed_vertices(self.pose(frame))[0].double().numpy()
+    def posed(self, frame: int) -> PosedCharacter:
+        """The character at one frame, ready to be rendered."""
+        vertices, normals, wrinkles = self.mesh(frame)
+        return PosedCharacter(self.appearance, vertices, normals, self.light, wrinkles)
 
-    def flexion(self, frame: int) -> Array:
-        """``[K]`` radians by which each joint of `FOLDS` is bent."""
-        names = free_body().joint_names
-        index = [names.index(joint) for joint, _ in FOLDS]
-        return self.theta[frame, index].double().norm(dim=-1).numpy()
+    def landmarks(self) -> tuple[tuple[str, ...], Array]:
+        """Names and positions ``[F, L, 3]`` (metres) of the landmarks of all frames.
 
-    def posed(self, frame: int) -> PosedPerson:
-        """The person at one frame, ready to be rendered."""
-        return PosedPerson(self.person, self.vertices(frame), self.flexion(frame), self.light)
+        They are where skinning puts them: sway and wrinkles do not move a skeleton.
+        """
+        if self.settings.avatar == FREE_BODY:
+            body, pose = free_body(), free_pose(self.motion)
+            points = torch.cat([body.posed_landmarks(pose), body.posed_hands(pose)], dim=1)
+            return (*body.landmark_names, *body.hand_names), points.double().numpy()
+        character, joints = self.character, self.motion.joints
+        posed = [character.landmarks(self._skinned(f)[0], p) for f, p in enumerate(joints)]
+        return character.anchor_names, np.stack(posed)
+
+    def _skinned(self, frame: int) -> tuple[Array, Array]:
+        character, motion = self.character, self.motion
+        offsets = sum(
+            (
+                motion.shapes[name][frame] * shape
+                for name, shape in character.shapes.items()
+                if name in motion.shapes
+            ),
+            np.zeros_like(character.vertices),
+        )
+        return character.skinned(motion.rotations[frame], motion.joints[frame], offsets)
 
 
-def make_person(body: Body, identity: int) -> Person:
-    """The free body in numpy, dressed as an identity."""
-    joint = {n: body.joints[i].double().numpy() for i, n in enumerate(body.joint_names)}
-    axis = np.array([joint[end] - joint[start] for start, end in FOLDS])
-    return Person(
-        vertices=body.vertices.double().numpy(),
-        faces=body.faces.numpy(),
-        labels=body.face_labels.numpy(),
-        surface=body.face_surface.numpy(),
-        fold_centre=np.array([joint[start] for start, _ in FOLDS]),
-        fold_axis=axis / np.linalg.norm(axis, axis=1, keepdims=True),
-        identity=make_identity(identity),
-        marks=Marks(body.landmarks.double().numpy()),
-    )
-
-
-def extent(body: Body, seed: int, samples: int = 160, stride: int = 24) -> Array:
-    """``[N, 3]`` points that the choreography reaches, metres.
+def extent(character: Character, source: Moving, samples: int = 160, stride: int = 24) -> Array:
+    """``[N, 3]`` points that a motion reaches, metres.
 
     Every ``stride``-th vertex at a fixed number of moments: cameras fitted to these points do not
     depend on ``frames``.
     """
-    theta, transl, _ = motion(samples, seed)
+    motion = source.at(frame_times(samples, source.duration))
     thinned = replace(
-        body,
-        vertices=body.vertices[::stride],
-        bone_index=body.bone_index[::stride],
-        bone_weight=body.bone_weight[::stride],
+        character,
+        vertices=character.vertices[::stride],
+        normals=character.normals[::stride],
+        bone_index=character.bone_index[::stride],
+        bone_weight=character.bone_weight[::stride],
     )
-    return thinned.posed_vertices(BodyPose(theta, transl)).reshape(-1, 3).double().numpy()
+    poses = zip(motion.rotations, motion.joints, strict=True)
+    return np.concatenate([thinned.skinned(R, joints)[0] for R, joints in poses])
 
 
 def ring(settings: Settings, points: Array) -> list[View]:

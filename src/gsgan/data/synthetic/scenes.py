@@ -1,7 +1,7 @@
 """Writes the synthetic dataset, once, into a cache folder.
 
 The layout is that of a capture: cameras.json, images/{cam}/%06d.png, masks/, labels/,
-landmarks3d.npz, hands3d.npz, body_pose.npz, meta.json. Every image is written whole, and meta.json
+landmarks3d.npz, hands3d.npz, face3d.npz, meta.json. Every image is written whole, and meta.json
 last: a dataset whose making was interrupted is not taken for complete, and continued. Tints are
 written nowhere: a model has to estimate them.
 
@@ -29,14 +29,14 @@ from numpy.typing import NDArray
 
 import gsgan
 from gsgan.body.free import free_body
-from gsgan.data.synthetic.choreography import DURATION
-from gsgan.data.synthetic.scene_setup import Scene, Settings, dataset_key
-from gsgan.data.synthetic.trace import View
-from gsgan.scene import BodyPose
+from gsgan.data.synthetic.free_subject import free_pose
+from gsgan.data.synthetic.scene_setup import FREE_BODY, Scene, Settings, dataset_key
+from gsgan.data.synthetic.view import View
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root, write_atomically
 
 KINDS = ("images", "masks", "labels")
+BODY, HANDS = 33, 33 + 42  # landmarks up to the end of the pose's and of the hands'
 POLL_SECONDS = 0.05
 WORKER = "from gsgan.data.synthetic.scenes import trace_share; trace_share()"
 
@@ -198,47 +198,45 @@ def _calibration(view: View) -> dict[str, Any]:
 
 
 def _write_skeletons(root: Path, scene: Scene) -> None:
-    body = free_body()
-    pose, ids = BodyPose(scene.theta, scene.transl), np.arange(len(scene.theta))
-    p = body.posed_landmarks(pose).float().numpy()
-    cameras = scene.settings.train_cameras + scene.settings.test_cameras
+    names, points = scene.landmarks()
+    p, ids = points.astype(np.float32), np.arange(len(points))
+    shape = (len(p), BODY)
     np.savez(
         root / "landmarks3d.npz",
-        p=p,
-        conf=np.ones(p.shape[:2], dtype=np.float32),
-        reproj_px=np.zeros(p.shape[:2], dtype=np.float32),
-        n_views=np.full(p.shape[:2], cameras),
+        p=p[:, :BODY],
+        conf=np.ones(shape, dtype=np.float32),
+        reproj_px=np.zeros(shape, dtype=np.float32),
+        n_views=np.full(shape, len(scene.views)),
         frame_id=ids,
-        names=np.array(body.landmark_names),
+        names=np.array(names[:BODY]),
+        passage=np.array(scene.motion.passages),
     )
-    np.savez(
-        root / "hands3d.npz",
-        p=body.posed_hands(pose).float().numpy(),
-        frame_id=ids,
-        names=np.array(body.hand_names),
-    )
-    np.savez(
-        root / "body_pose.npz",
-        theta=scene.theta.numpy(),
-        transl=scene.transl.numpy(),
-        frame_id=ids,
-        joint_names=np.array(body.joint_names),
-        passage=np.array(scene.passages),
-    )
+    for name, part in (("hands3d", slice(BODY, HANDS)), ("face3d", slice(HANDS, None))):
+        if names[part]:
+            np.savez(root / f"{name}.npz", p=p[:, part], frame_id=ids, names=np.array(names[part]))
+    if scene.settings.avatar == FREE_BODY:
+        pose = free_pose(scene.motion)
+        np.savez(
+            root / "body_pose.npz",
+            theta=pose.theta.numpy(),
+            transl=pose.transl.numpy(),
+            frame_id=ids,
+            joint_names=np.array(free_body().joint_names),
+        )
 
 
 def _meta(scene: Scene) -> dict[str, Any]:
     chosen = {name: value for name, value in asdict(scene.settings).items() if value is not None}
     splits = ("train_cameras", "test_cameras", "train_frames", "test_frames")
     return {
-        "fps": scene.settings.frames / DURATION,
+        "fps": scene.settings.frames / scene.source.duration,
         "unit": "m",
         "up_axis": "z",
         "skeleton": "mediapipe33",
         "pixel_centre": 0.5,
         "background": "black",  # images are premultiplied: blending them again darkens edges
-        "body": "free",
-        "label_names": list(free_body().label_names),
+        **({"body": "free"} if scene.settings.avatar == FREE_BODY else {}),
+        "label_names": list(scene.character.label_names),
         "splits": {name: getattr(scene, name) for name in splits},
         "made_by": {
             "generator": "gsgan.data.synthetic",

@@ -1,303 +1,357 @@
-"""Ray tracing of the posed person: image, alpha and part labels of one camera.
+"""Ray tracing of the posed character: image, alpha and part labels of one camera.
 
 An independent renderer: splatting takes no part in making the training data.
 
-Convention: metres, world frame; OpenCV cameras and lenses, pixel centres at +0.5; images are RGB,
-sRGB in [0, 1], premultiplied on black.
+Convention: metres, world frame; images are RGB, sRGB in [0, 1], premultiplied on black.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.crop import distort
-from gsgan.data.synthetic.identity import Identity, Marks, albedo
-from gsgan.utils.errors import ConfigError
+from gsgan.data.synthetic.character import Character
+from gsgan.data.synthetic.textures import Textures
+from gsgan.data.synthetic.view import View, pixel_rays
 
 Array = NDArray[np.float64]
+Floats = NDArray[np.floating[Any]]  # float32: enough for light, and twice as fast
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Colour = tuple[float, float, float]
 
-GAMMA = 2.2
-SHIRT, TROUSERS, SHOE = 3, 4, 5  # materials of the free body's asset
+BLOCK = 1 << 15  # rays traced at once: their arrays stay in the processor's cache
 SHININESS = 12.0  # exponent of the highlight's lobe: falls to half within about 19 degrees
-EXACT = 1e-10  # residual of x/z up to which an undistorted point counts as found
-FURTHEST = 10.0  # bound of x/z in the search
-TINT_STREAM = 77
-CROSSTALK = 0.25  # leak from channel to channel, as a share of the tint
-OFFSET = 0.25  # largest offset of a channel, as a share of the tint
+CLOTHES = ("upper_clothes", "lower_clothes", "left_shoe", "right_shoe")
+SKY_RAYS = 48  # directions in which each vertex looks for the sky
+SKY_OFFSET = 3e-3  # metres from the surface to sky rays
+SHADOW_OFFSET = 1e-3  # metres from the surface to shadow rays; less gives speckles
+LAYERS = 32  # cut-out surfaces that one ray passes at most
+SHOULDER = 0.5  # linear light from which the tone curve is compressed
 
 
 @dataclass(frozen=True)
 class Light:
-    """A sun and a sky, and how clothes reflect them."""
+    """A sun and a sky, in linear light."""
 
     direction: tuple[float, float, float] = (0.5, -0.75, 0.9)  # towards the sun, any length
-    sun: float = 0.85  # strength
-    sky: float = 0.62  # ambient strength from above
-    ground: float = 0.36  # ambient strength from below
-    shadow_offset: float = 2e-3  # metres along the normal to shadow rays; less gives speckles
-    fold: float = 0.38  # share of the light that a fold at full flexion removes or adds
-    fold_period: float = 0.045  # metres from one fold to the next
-    fold_reach: float = 0.12  # metres over which a joint's folds fade
-    gloss: float = 0.0  # highlight (Blinn-Phong) of shirt, trousers and shoes, as a share of sun
+    sun: Colour = (0.88, 0.83, 0.76)
+    sky: Colour = (0.58, 0.62, 0.68)  # from straight above
+    ground: Colour = (0.38, 0.35, 0.32)  # from straight below
+    spread: float = 0.06  # tangent of half the sun's width: soft shadows
+    shine: float = 0.04  # highlight (Blinn-Phong) of everything, as a share of the sun
+    gloss: float = 0.0  # the same, added for clothes and shoes
 
 
 @dataclass(frozen=True)
-class Person:
-    """The part of the person that is constant over frames."""
+class Wrinkles:
+    """Waves in the shading normals of one posed mesh, per vertex.
 
-    vertices: Array  # [V, 3] rest positions
-    faces: Ints  # [F, 3]
-    labels: Ints  # [F] part of each face
-    surface: Ints  # [F] material of each face
-    fold_centre: Array  # [K, 3] rest positions of the joints that crease clothes
-    fold_axis: Array  # [K, 3] unit directions across their folds
-    identity: Identity
-    marks: Marks
-
-
-@dataclass(frozen=True)
-class View:
-    """A camera: ``K [3, 3]``, ``R [3, 3]``, ``t [3]``, ``size`` (H, W), lens ``dist`` or None."""
-
-    K: Array
-    R: Array
-    t: Array
-    size: tuple[int, int]
-    dist: Array | None = None  # [4, 5 or 8] OpenCV's coefficients
-
-    @property
-    def centre(self) -> Array:
-        return -self.R.T @ self.t
-
-    def project(self, points: Array) -> Array:
-        """``[N, 2]`` pixels of world points ``[N, 3]``, all in front of the camera."""
-        x = points @ self.R.T + self.t
-        if self.dist is not None:
-            shown = distort(x[:, :2] / x[:, 2:], self.dist)
-            return shown @ self.K[:2, :2].T + self.K[:2, 2]
-        x = x @ self.K.T
-        return x[:, :2] / x[:, 2:]
-
-    def bend(self, directions: Array) -> Array:
-        """The unit world rays ``[N, 3]`` seen where a pinhole sees the unit ``directions``.
-
-        Raises:
-            ConfigError: when the distortion cannot be inverted there.
-        """
-        if self.dist is None:
-            return directions
-        rays = directions @ self.R.T
-        straight = undistort(rays[:, :2] / rays[:, 2:], self.dist)
-        return _unit(np.concatenate([straight, np.ones((len(rays), 1))], axis=1) @ self.R)
-
-
-def undistort(points: Array, dist: Array, iterations: int = 200) -> Array:
-    """The inverse of `gsgan.data.crop.distort` on ``[N, 2]``, exact to `EXACT`, by fixed point.
-
-    Raises:
-        ConfigError: when a point has no inverse: the distortion folds back.
+    A normal is tilted by ``slope * wave(phase)`` along ``across``: see `wave`.
     """
-    found = points
-    for _ in range(iterations):
-        error = points - distort(found, dist)
-        if not np.abs(error).max(initial=0) >= EXACT:
-            break
-        found = np.clip(found + error, -FURTHEST, FURTHEST)
-    lost = ~(np.abs(points - distort(found, dist)) < EXACT).all(axis=1)
-    if lost.any():
-        x, y = points[lost][0]
-        raise ConfigError(
-            f"synthetic data: lens {dist.tolist()} folds back near x/z = {x:.2f}, y/z = {y:.2f}, "
-            "within the image; give weaker coefficients"
+
+    phase: Floats  # [V] radians, linear within faces
+    slope: Floats  # [V] 0 where cloth is smooth
+    across: Floats  # [V, 3] unit, world: the direction from one fold to the next
+
+
+def wave(phase: Floats) -> Floats:
+    """The slope of folds in [-1, 1]: two waves without a common period."""
+    return np.float32(0.65) * np.cos(phase) + np.float32(0.35) * np.cos(1.618 * phase + 1)
+
+
+def encode(light: Array) -> Array:
+    """sRGB of linear light: exact up to `SHOULDER`, then rolled off, below 1 for any light."""
+    rest = 1 - SHOULDER
+    over = np.maximum(light - SHOULDER, 0)
+    light = np.where(over > 0, 1 - rest * np.exp(-over / rest), light)
+    curve = 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(light <= 0.0031308, 12.92 * light, curve)
+
+
+class Appearance:
+    """The part of a character's picture that is constant over frames."""
+
+    def __init__(self, character: Character) -> None:
+        self.character = character
+        self.faces = character.faces.astype(np.int32)
+        self.uv = character.uv.astype(np.float32)
+        self.textures = Textures(character.surfaces)
+        self.cutoff = np.array([s.cutoff for s in character.surfaces], np.float32)
+        self.bumpy = any(s.normal is not None for s in character.surfaces)
+        clothes = [name in CLOTHES for name in character.label_names]
+        self.glossy = np.array(clothes, np.float32)[character.labels]
+        corners, uv = character.vertices[self.faces], character.uv[self.faces]
+        self.du, self.dv = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+        twice_uv = self.du[:, 0] * self.dv[:, 1] - self.du[:, 1] * self.dv[:, 0]
+        self.mirrored = np.where(twice_uv < 0, -1, 1).astype(np.float32)
+        twice_area = np.linalg.norm(
+            np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1
         )
-    return found
+        texels = np.abs(twice_uv) * self.textures.size(character.material).prod(axis=1)
+        # log2 of texels per metre, along one side
+        self.density = 0.5 * np.log2(np.maximum(texels, 1e-9) / np.maximum(twice_area, 1e-12))
 
-
-@dataclass(frozen=True)
-class Tint:
-    """One camera's colours, ``A c + b`` on sRGB in [0, 1]: ``A [3, 3]``, ``b [3]``."""
-
-    A: Array
-    b: Array
-
-    def __call__(self, image: Array, alpha: Array) -> Array:
-        """Tints a premultiplied image ``[H, W, 3]`` with alpha ``[H, W]``."""
-        share = alpha[..., None]
-        return np.clip(image @ self.A.T + share * self.b, 0, share)
-
-
-def make_tints(strength: float, cameras: int, seed: int) -> list[Tint]:
-    """Random tints of the training cameras, ``strength`` the largest change of a channel's gain.
-
-    Their mean is the identity, so a single camera has none.
-    """
-    rng = np.random.default_rng([TINT_STREAM, seed])
-    gain, leak, offset = (rng.uniform(-1, 1, (cameras, n)) for n in (3, 9, 3))
-    leak = leak.reshape(-1, 3, 3) * (1 - np.eye(3))
-    # a leak is subtracted from the channel itself, so that grey stays grey but for the gains
-    leak -= leak.sum(axis=2, keepdims=True) * np.eye(3)
-    change = _centred(gain)[:, :, None] * np.eye(3) + CROSSTALK * _centred(leak)
-    shift = OFFSET * _centred(offset)
-    return [
-        Tint(np.eye(3) + strength * a, strength * b) for a, b in zip(change, shift, strict=True)
-    ]
-
-
-def _centred(x: Array) -> Array:
-    """Shifted to mean 0 over the cameras, then scaled to within [-1, 1]."""
-    x = x - x.mean(axis=0)
-    return x / max(1.0, float(np.abs(x).max(initial=0)))
+    def coverage(self, face: Ints, bary: Floats) -> Bools:
+        """Whether points of faces are on the surface, rather than cut out of it."""
+        surface = self.character.material[face]
+        solid = self.cutoff[surface] <= 0
+        k = np.flatnonzero(~solid)
+        uv = _blend(bary[k], self.uv[self.faces[face[k]]])
+        solid[k] = (
+            self.textures(surface[k], uv, np.zeros(len(k), np.int64))[1]
+            >= (self.cutoff[surface[k]])
+        )
+        return solid
 
 
 class Tracer:
-    """Finds the first of the triangles ``[F, 3, 3]`` along rays, with Embree."""
+    """Finds the first face of a mesh along rays, with Embree.
 
-    def __init__(self, triangles: Array) -> None:
+    Args:
+        vertices: ``[V, 3]``.
+        faces: ``[F, 3]``.
+        solid: tells for faces ``[N]`` and barycentric weights ``[N, 3]`` which points stop a ray;
+            None: all.
+    """
+
+    def __init__(
+        self,
+        vertices: Array,
+        faces: NDArray[Any],
+        solid: Callable[[Ints, Floats], Bools] | None = None,
+    ) -> None:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
-        self._scene = EmbreeScene()
-        self._mesh = TriangleMesh(self._scene, np.ascontiguousarray(triangles, dtype=np.float32))
+        self._scene, self._solid = EmbreeScene(), solid
+        self._mesh = TriangleMesh(self._scene, vertices.astype(np.float32), faces.astype(np.int32))
 
-    def first(self, origins: Array, directions: Array) -> tuple[Ints, Array]:
-        """Face index ``[N]``, -1 for a miss, and barycentric (u, v) ``[N, 2]``."""
-        # also for shadow rays: the query OCCLUDED returns wrong results
-        hit = self._scene.run(
-            np.ascontiguousarray(origins, dtype=np.float32),
-            np.ascontiguousarray(directions, dtype=np.float32),
-            query="INTERSECT",
-            output=1,
-        )
-        return hit["primID"].astype(np.int64), np.stack([hit["u"], hit["v"]], axis=1)
+    def first(self, origins: Floats, directions: Floats) -> tuple[Ints, Floats]:
+        """Face index ``[N]``, -1 for a miss, and barycentric weights ``[N, 3]``."""
+        face, bary, distance = self._run(origins, directions)
+        if self._solid is None:
+            return face, bary
+        travelled, going = np.zeros(len(face), np.float32), np.arange(len(face))
+        for _ in range(LAYERS):
+            going = going[face[going] >= 0]
+            going = going[~self._solid(face[going], bary[going])]
+            if not len(going):
+                break
+            travelled[going] += distance[going] + np.float32(1e-5)
+            start = origins[going] + travelled[going, None] * directions[going]
+            face[going], bary[going], distance[going] = self._run(start, directions[going])
+        return face, bary
+
+    def blocked(self, origins: Floats, directions: Floats) -> Bools:
+        """Whether each ray ``[N]`` meets the mesh."""
+        if self._solid is not None:
+            return self.first(origins, directions)[0] >= 0
+        hit: NDArray[np.int32] = self._scene.run(origins, directions, query="OCCLUDED")
+        return hit >= 0  # 0 for a hit, whatever the face, and -1 for a miss
+
+    def _run(self, origins: Floats, directions: Floats) -> tuple[Ints, Floats, Floats]:
+        hit = self._scene.run(origins, directions, query="INTERSECT", output=1)
+        u, v = hit["u"], hit["v"]
+        return hit["primID"].astype(np.int64), np.stack([1 - u - v, u, v], axis=1), hit["tfar"]
 
 
-class PosedPerson:
-    """The person with ``vertices [V, 3]`` posed and fold joints bent by ``flexion [K]`` radians."""
+class PosedCharacter:
+    """A character with ``vertices`` and unit ``normals [V, 3]`` posed, ready to be rendered.
 
-    def __init__(self, person: Person, vertices: Array, flexion: Array, light: Light) -> None:
-        self.person, self.vertices, self.flexion, self.light = person, vertices, flexion, light
-        triangles = vertices[person.faces]
-        self.normals = vertex_normals(triangles, person.faces, len(vertices))
-        self.tracer = Tracer(triangles)
+    Args:
+        appearance: of the character; shared by all frames.
+        vertices: ``[V, 3]`` metres.
+        normals: ``[V, 3]`` unit.
+        light: of the scene.
+        wrinkles: waves in the normals, None for smooth cloth.
+    """
+
+    def __init__(
+        self,
+        appearance: Appearance,
+        vertices: Array,
+        normals: Array,
+        light: Light,
+        wrinkles: Wrinkles | None = None,
+    ) -> None:
+        self.appearance, self.light, self.wrinkles = appearance, light, wrinkles
+        self.vertices, faces = vertices, appearance.faces
+        solid = appearance.coverage if (appearance.cutoff > 0).any() else None
+        self.tracer = Tracer(vertices, faces, solid)
+        X, N = vertices.astype(np.float32), normals.astype(np.float32)
+        a, b = X[faces[:, 1]] - X[faces[:, 0]], X[faces[:, 2]] - X[faces[:, 0]]
+        flat = _unit(np.cross(a, b))
+        outwards = (flat * N[faces].sum(axis=1)).sum(axis=1, keepdims=True)
+        self.flat = np.where(outwards < 0, -flat, flat)
+        along_u = a * appearance.dv[:, 1:] - b * appearance.du[:, 1:]
+        self.tangent = _unit(along_u * appearance.mirrored[:, None]).astype(np.float32)
+        sky = self._sky(X, N)
+        waves = [] if wrinkles is None else [wrinkles.phase, wrinkles.slope, wrinkles.across]
+        self.attributes = np.column_stack([X, N, sky, appearance.uv, *waves]).astype(np.float32)
 
     def render(self, view: View, rays: int) -> tuple[Array, Array, Ints]:
         """Image ``[H,W,3]``, alpha ``[H,W]`` and labels ``[H,W]`` seen by a camera.
 
-        Casts ``rays`` per pixel of the person's bounding box. A pixel's label is the one that most
-        of its rays hit; it is background unless at least half of them hit the person.
+        Casts ``rays`` per pixel that the person can touch. A pixel's label is the one that most of
+        its rays hit; it is background unless at least half of them hit the person. Its colour is
+        the mean light of the rays that hit, encoded as sRGB, times alpha.
         """
         H, W = view.size
         image, alpha = np.zeros((H, W, 3)), np.zeros((H, W))
         labels = np.zeros((H, W), dtype=np.int64)
-        left, top, right, bottom = self._box(view)
-        if right <= left or bottom <= top:
-            return image, alpha, labels
-        origin, directions = pixel_rays(view, (left, top, right, bottom), rays)
-        face, colour = self._shoot(origin, view.bend(directions))
-        shape = (bottom - top, right - left, rays)
-        window = (slice(top, bottom), slice(left, right))
-        image[window] = colour.reshape(*shape, 3).mean(axis=2)
-        alpha[window] = (face >= 0).reshape(shape).mean(axis=2)
-        part = np.where(face >= 0, self.person.labels[face], 0).reshape(shape)
-        labels[window] = majority(part, int(self.person.labels.max()) + 1)
+        touched = np.argwhere(self._touched(view))
+        step = max(1, BLOCK // rays)
+        for first in range(0, len(touched), step):
+            y, x = touched[first : first + step].T
+            origin, directions = pixel_rays(view, x, y, rays)
+            face, light = self._shoot(view, origin, view.bend(directions), rays)
+            hits = (face >= 0).reshape(-1, rays)
+            count = hits.sum(axis=1)
+            mean = light.reshape(-1, rays, 3).sum(axis=1) / np.maximum(count, 1)[:, None]
+            alpha[y, x] = count / rays
+            image[y, x] = encode(mean) * alpha[y, x, None]
+            part = np.where(hits, self.appearance.character.labels[face].reshape(-1, rays), 0)
+            labels[y, x] = majority(part, len(self.appearance.character.label_names))
         return image, alpha, labels
 
-    def _box(self, view: View, margin: int = 1) -> tuple[int, int, int, int]:
+    def _touched(self, view: View) -> Bools:
+        """Pixels ``[H, W]`` that the person may touch: faces' edges and what is between them."""
         H, W = view.size
-        pixels = view.project(self.vertices)
-        low, high = np.floor(pixels.min(axis=0)) - margin, np.ceil(pixels.max(axis=0)) + margin
-        left, top = np.clip(low, 0, [W, H]).astype(int)
-        right, bottom = np.clip(high, 0, [W, H]).astype(int)
-        return int(left), int(top), int(right), int(bottom)
+        if (self.vertices @ view.R[2] + view.t[2]).min() <= 0:  # partly behind the camera
+            return np.ones((H, W), dtype=bool)
+        pixels = np.clip(np.floor(view.project(self.vertices)), -9999, 9999).astype(np.int32)
+        edges = np.zeros((H, W), np.uint8)
+        inside = ((pixels >= 0) & (pixels < [W, H])).all(axis=1)
+        edges[pixels[inside, 1], pixels[inside, 0]] = 1
+        corners = pixels[self.appearance.faces]
+        a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+        size = np.maximum(np.maximum(a, b), c) - np.minimum(np.minimum(a, b), c)
+        long = (size > 1).any(axis=1)  # others are within a pixel of their corners
+        cv2.polylines(edges, list(corners[long]), True, 1)
+        touched: Bools = cv2.dilate(edges, np.ones((3, 3), np.uint8)) > 0
+        y, x = np.nonzero(~touched)
+        origin, directions = pixel_rays(view, x, y, 1)
+        directions = view.bend(directions).astype(np.float32)
+        start = np.broadcast_to(origin.astype(np.float32), directions.shape)
+        touched[y, x] = self.tracer.blocked(np.ascontiguousarray(start), directions)
+        return touched
 
-    def _shoot(self, origin: Array, directions: Array) -> tuple[Ints, Array]:
-        face, uv = self.tracer.first(np.broadcast_to(origin, directions.shape), directions)
-        hit = face >= 0
-        colour = np.zeros((len(face), 3))
-        colour[hit] = self._shade(face[hit], uv[hit], directions[hit])
-        return face, colour
+    def _shoot(
+        self, view: View, origin: Array, directions: Array, rays: int
+    ) -> tuple[Ints, Floats]:
+        """Face ``[N]`` and linear light ``[N, 3]`` of each ray."""
+        towards = directions.astype(np.float32)
+        start = np.tile(origin.astype(np.float32), (len(towards), 1))
+        face, bary = self.tracer.first(start, towards)
+        k = np.flatnonzero(face >= 0)
+        light = np.zeros((len(face), 3), np.float32)
+        # metres between neighbouring rays, at 1 m from the camera
+        spacing = 1 / (view.K[0, 0] * np.sqrt(rays))
+        disc = _disc(rays)[k % rays] * np.float32(self.light.spread)
+        light[k] = self._shade(start[k], towards[k], face[k], bary[k], disc, spacing)
+        return face, light
 
-    def _shade(self, face: Ints, uv: Array, directions: Array) -> Array:
-        """sRGB of surface points: Lambert sun, cast shadow, hemisphere ambient, folds, gloss."""
-        person, light = self.person, self.light
-        surface, corners = person.surface[face], person.faces[face]
-        weight = np.concatenate([1 - uv.sum(axis=1, keepdims=True), uv], axis=1)[:, :, None]
-        rest = (weight * person.vertices[corners]).sum(axis=1)
-        here = (weight * self.vertices[corners]).sum(axis=1)
-        normal = _unit((weight * self.normals[corners]).sum(axis=1))
-        normal *= np.where((normal * directions).sum(axis=1) > 0, -1.0, 1.0)[:, None]
-        sun = np.asarray(light.direction) / np.linalg.norm(light.direction)
-        facing = np.maximum(normal @ sun, 0)
-        lit = facing > 0
-        start = here[lit] + light.shadow_offset * normal[lit]
-        lit[lit] = self.tracer.first(start, np.broadcast_to(sun, start.shape))[0] < 0
-        up = 0.5 + 0.5 * normal[:, 2]
-        irradiance = light.sun * (facing * lit) + light.ground + (light.sky - light.ground) * up
-        irradiance *= self._folds(rest, surface)
-        paint = albedo(person.identity, person.marks, rest, surface) ** GAMMA
-        colour = np.clip(paint * irradiance[:, None], 0, 1) ** (1 / GAMMA)
-        if light.gloss > 0:
-            shiny = np.isin(surface, (SHIRT, TROUSERS, SHOE))
-            halfway = _unit(sun - directions[shiny])
-            lobe = np.maximum((normal[shiny] * halfway).sum(axis=1), 0) ** SHININESS
-            linear = colour[shiny] ** GAMMA + (light.gloss * light.sun * lit[shiny] * lobe)[:, None]
-            colour[shiny] = np.clip(linear, 0, 1) ** (1 / GAMMA)
-        return colour
+    def _shade(
+        self, eye: Floats, ray: Floats, face: Ints, bary: Floats, disc: Floats, spacing: float
+    ) -> Floats:
+        """Linear light of surface points: sun with cast shadow, sky and ground, highlight."""
+        looks, light = self.appearance, self.light
+        corners = self.attributes[looks.faces[face]]
+        here = _blend(bary, corners)
+        point, normal, uv = here[:, :3], _unit(here[:, 3:6]), here[:, 8:10]
+        # from the flat face to the smooth surface (Hanika 2021): no facets in shadows
+        depth = ((point[:, None] - corners[:, :, :3]) * corners[:, :, 3:6]).sum(axis=2)
+        lifted = point - _blend(bary * np.minimum(depth, 0), corners[:, :, 3:6])
+        level = looks.density[face] + np.log2(_norm(point - eye)[:, 0] * spacing)
+        surface = looks.character.material[face]
+        colour, _, bump = looks.textures(surface, uv, np.rint(level).astype(np.int64))
+        if looks.bumpy:
+            T = self.tangent[face]
+            T = _unit(T - _dot(T, normal) * normal)
+            down = np.cross(normal, T) * looks.mirrored[face, None]  # along +v
+            normal = _unit(bump[:, :1] * T - bump[:, 1:2] * down + bump[:, 2:] * normal)
+        if self.wrinkles is not None:
+            tilt = here[:, 11:12] * wave(here[:, 10:11])
+            normal = _unit(normal + tilt * here[:, 12:15])
+        flat = self.flat[face]
+        inside = _dot(flat, ray)[:, 0] > 0  # the back of cloth is lit on its own side
+        side = np.where(inside, np.float32(-1), np.float32(1))[:, None]
+        normal, flat = normal * side, flat * side
+        lifted = np.where(inside[:, None], point, lifted)
+        sun, sky, ground = (np.array(c, np.float32) for c in (light.sun, light.sky, light.ground))
+        up = 0.5 + 0.5 * normal[:, 2:]
+        seen = np.where(inside, here[:, 7], here[:, 6])[:, None]
+        out = colour * (seen * (ground + (sky - ground) * up))
+        towards = _unit(np.array([light.direction], np.float32))
+        across = _unit(np.cross(towards, np.eye(3, dtype=np.float32)[np.abs(towards).argmin()]))
+        d = _unit(towards + disc[:, :1] * across + disc[:, 1:] * np.cross(towards, across))
+        facing = _dot(normal, d)[:, 0]
+        k = np.flatnonzero(facing > 0)
+        start = lifted[k] + np.float32(SHADOW_OFFSET) * flat[k]
+        k = k[~self.tracer.blocked(start, d[k])]
+        shine = light.shine + light.gloss * looks.glossy[face[k], None]
+        lobe = np.maximum(_dot(normal[k], _unit(d[k] - ray[k])), 0) ** np.float32(SHININESS)
+        out[k] += (colour[k] + shine * lobe) * facing[k, None] * sun
+        return out
 
-    def _folds(self, rest: Array, surface: Ints) -> Array:
-        """Factor on the light: creases of the clothes that deepen as a joint bends."""
-        light, factor = self.light, np.ones(len(rest))
-        cloth = (surface == SHIRT) | (surface == TROUSERS)
-        p = rest[cloth]
-        crease = np.zeros(len(p))
-        for centre, axis, bend in zip(
-            self.person.fold_centre, self.person.fold_axis, self.flexion, strict=True
-        ):
-            off = p - centre
-            near = np.exp(-(off * off).sum(axis=1) / light.fold_reach**2)
-            wave = np.sin(2 * np.pi * (off @ axis) / light.fold_period + 9.0 * off[:, 0])
-            crease += np.tanh(bend) * near * wave
-        factor[cloth] = 1 + light.fold * np.clip(crease, -1, 1)
-        return factor
-
-
-def vertex_normals(triangles: Array, faces: Ints, vertices: int) -> Array:
-    """``[V, 3]`` unit normals, faces weighted by their area."""
-    face = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    out = np.zeros((vertices, 3))
-    np.add.at(out, faces.ravel(), np.repeat(face, 3, axis=0))
-    return _unit(out, 1e-20)
-
-
-def _unit(x: Array, least: float = 1e-12) -> Array:
-    return x / np.maximum(np.linalg.norm(x, axis=1, keepdims=True), least)
-
-
-def pixel_offsets(rays: int) -> Array:
-    """``[rays, 2]`` positions in a pixel, in [0, 1): the centre, then the R2 sequence."""
-    g = 1.32471795724474602596  # the plastic number: x³ = x + 1
-    step = np.array([1 / g, 1 / g**2])
-    return np.mod(0.5 + np.arange(rays)[:, None] * step, 1.0)
-
-
-def pixel_rays(view: View, box: tuple[int, int, int, int], rays: int) -> tuple[Array, Array]:
-    """Origin ``[3]`` and unit directions ``[h*w*rays, 3]`` of the pixels of a box."""
-    left, top, right, bottom = box
-    y, x = np.mgrid[top:bottom, left:right].astype(np.float64)
-    offset = pixel_offsets(rays)
-    x = (x[..., None] + offset[:, 0]).ravel()
-    y = (y[..., None] + offset[:, 1]).ravel()
-    pixel = np.stack([x, y, np.ones_like(x)], axis=1)
-    directions = pixel @ np.linalg.inv(view.K).T @ view.R
-    return view.centre, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    def _sky(self, X: Floats, N: Floats) -> Floats:
+        """``[V, 2]`` share of the sky's and ground's light that arrives, outside and inside."""
+        i = np.arange(SKY_RAYS) + 0.5  # a Fibonacci sphere, always the same: nothing flickers
+        z, turn = 1 - 2 * i / SKY_RAYS, np.pi * (1 + 5**0.5) * i
+        ring = np.sqrt(1 - z * z)
+        sphere = np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1).astype(np.float32)
+        sky, ground = np.mean(self.light.sky), np.mean(self.light.ground)
+        arrived, all_of_it = np.zeros((2, len(X), 2), np.float32)
+        rows = np.arange(len(X))
+        for d in sphere:
+            cosine = N @ d
+            inside = (cosine < 0).astype(np.int64)
+            weight = np.abs(cosine) * np.float32(ground + (sky - ground) * (0.5 + 0.5 * d[2]))
+            start = X + np.float32(SKY_OFFSET) * np.sign(cosine)[:, None] * N
+            free = ~self.tracer.blocked(start, np.tile(d, (len(X), 1)))
+            all_of_it[rows, inside] += weight
+            arrived[rows, inside] += weight * free
+        share: Floats = arrived / np.maximum(all_of_it, np.float32(1e-6))
+        return share
 
 
 def majority(part: Ints, classes: int) -> Ints:
-    """``[h, w]`` most frequent part of ``[h, w, rays]``; 0 where more than half the rays miss."""
-    votes = np.stack([(part == c).sum(axis=-1) for c in range(1, classes)], axis=-1)
-    solid = 2 * (part > 0).sum(axis=-1) >= part.shape[-1]
-    return np.where(solid, votes.argmax(axis=-1) + 1, 0)
+    """``[n]`` most frequent part of ``[n, rays]``; 0 where more than half the rays miss."""
+    slot = np.arange(len(part))[:, None] * classes + part
+    votes = np.bincount(slot.ravel(), minlength=len(part) * classes).reshape(-1, classes)
+    solid = 2 * votes[:, 0] <= part.shape[1]
+    return np.where(solid, votes[:, 1:].argmax(axis=1) + 1, 0)
+
+
+def _disc(count: int) -> Floats:
+    """``[count, 2]`` points spread over the unit disc."""
+    # the R2 sequence, unrelated to the rays' positions in the pixel
+    i = np.arange(count)
+    radius = np.sqrt(np.mod(0.5 + 0.7548776662466927 * i, 1))
+    turn = 2 * np.pi * 0.5698402909980532 * i
+    spread = np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=1)
+    return spread.astype(np.float32)
+
+
+def _blend(weight: Floats, corners: Floats) -> Floats:
+    """``[N, C]`` of barycentric weights ``[N, 3]`` and corners ``[N, 3, C]``."""
+    blended: Floats = np.einsum("nk,nkc->nc", weight, corners)
+    return blended
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    return np.einsum("nc,nc->n", a, b)[:, None]
+
+
+def _norm(x: Floats) -> Floats:
+    return np.sqrt(_dot(x, x))
+
+
+def _unit(x: Floats) -> Floats:
+    return x / np.maximum(_norm(x), np.float32(1e-12))

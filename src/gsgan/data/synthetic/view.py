@@ -1,0 +1,102 @@
+"""Cameras of the synthetic scene and the rays of their pixels.
+
+Convention: metres, world frame; OpenCV cameras and lenses, pixel centres at +0.5.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsgan.data.crop import distort
+from gsgan.utils.errors import ConfigError
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+EXACT = 1e-10  # residual of x/z up to which an undistorted point counts as found
+FURTHEST = 10.0  # bound of x/z in the search
+GOLDEN = (5**0.5 - 1) / 2
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera: ``K [3, 3]``, ``R [3, 3]``, ``t [3]``, ``size`` (H, W), lens ``dist`` or None."""
+
+    K: Array
+    R: Array
+    t: Array
+    size: tuple[int, int]
+    dist: Array | None = None  # [4, 5 or 8] OpenCV's coefficients
+
+    @property
+    def centre(self) -> Array:
+        return -self.R.T @ self.t
+
+    def project(self, points: Array) -> Array:
+        """``[N, 2]`` pixels of world points ``[N, 3]``, all in front of the camera."""
+        x = points @ self.R.T + self.t
+        if self.dist is not None:
+            shown = distort(x[:, :2] / x[:, 2:], self.dist)
+            return shown @ self.K[:2, :2].T + self.K[:2, 2]
+        x = x @ self.K.T
+        return x[:, :2] / x[:, 2:]
+
+    def bend(self, directions: Array) -> Array:
+        """The unit world rays ``[N, 3]`` seen where a pinhole sees the unit ``directions``.
+
+        Raises:
+            ConfigError: when the distortion cannot be inverted there.
+        """
+        if self.dist is None:
+            return directions
+        rays = directions @ self.R.T
+        straight = undistort(rays[:, :2] / rays[:, 2:], self.dist)
+        return _unit(np.concatenate([straight, np.ones((len(rays), 1))], axis=1) @ self.R)
+
+
+def undistort(points: Array, dist: Array, iterations: int = 200) -> Array:
+    """The inverse of `gsgan.data.crop.distort` on ``[N, 2]``, exact to `EXACT`, by fixed point.
+
+    Raises:
+        ConfigError: when a point has no inverse: the distortion folds back.
+    """
+    found = points
+    for _ in range(iterations):
+        error = points - distort(found, dist)
+        if not np.abs(error).max(initial=0) >= EXACT:
+            break
+        found = np.clip(found + error, -FURTHEST, FURTHEST)
+    lost = ~(np.abs(points - distort(found, dist)) < EXACT).all(axis=1)
+    if lost.any():
+        x, y = points[lost][0]
+        raise ConfigError(
+            f"synthetic data: lens {dist.tolist()} folds back near x/z = {x:.2f}, y/z = {y:.2f}, "
+            "within the image; give weaker coefficients"
+        )
+    return found
+
+
+def pixel_offsets(rays: int) -> Array:
+    """``[rays, 2]`` positions in a pixel, in [0, 1): the golden-ratio lattice about its centre.
+
+    At edges of any direction its error is half that of random or R2 points.
+    """
+    k = np.arange(rays) - (rays - 1) / 2
+    return np.mod(0.5 + np.stack([k / rays, k * GOLDEN], axis=1), 1.0)
+
+
+def pixel_rays(view: View, x: Ints, y: Ints, rays: int) -> tuple[Array, Array]:
+    """Origin ``[3]`` and unit directions ``[N*rays, 3]`` of a pinhole's pixels ``x, y [N]``."""
+    offset = pixel_offsets(rays)
+    across = (x[:, None] + offset[:, 0]).ravel()
+    down = (y[:, None] + offset[:, 1]).ravel()
+    pixel = np.stack([across, down, np.ones_like(across)], axis=1)
+    directions = pixel @ (np.linalg.inv(view.K).T @ view.R)
+    return view.centre, _unit(directions)
+
+
+def _unit(x: Array) -> Array:
+    return x / np.linalg.norm(x, axis=1, keepdims=True)
