@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from gsgan.model import compose
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
@@ -146,27 +147,38 @@ class Deformation(nn.Module):
             Gaussians with covariances, features = colour (3) then F's other channels.
         """
         frames = points.frames
-        offset = residuals.means
-        if self.mean_bound is not None:
-            offset = self.mean_bound * torch.tanh(offset)
-        offset = offset * self.body_height
-        means = points.means + (frames @ offset.unsqueeze(-1)).squeeze(-1)
-        low, high = (math.log(bound * self.body_height) for bound in self.scale_range)
-        scales = bounded(points.scales.log().unsqueeze(-1) + residuals.scales, low, high).exp()
-        axes = frames @ quaternion_to_rotation_matrix(_unit_quat(residuals.quats))
-        axes = axes * scales.unsqueeze(-2)
-        logit = math.log(self.opacity / (1 - self.opacity))
-        logits = bounded(logit + residuals.opacities, -self.logit_bound, self.logit_bound)
-        opacities = torch.sigmoid(logits)
+        means, covariances, opacities = self._geometry(points, frames, residuals)
         colour = colour_from(eye, means, frames, residuals.sh)
         return Gaussians(
             means=means,
             quats=None,
             scales=None,
-            covariances=axes @ axes.mT,
-            opacities=opacities * points.valid.to(opacities.dtype),
+            covariances=covariances,
+            opacities=opacities,
             features=torch.cat([colour, residuals.features], dim=-1),
         )
+
+    def _geometry(
+        self, points: Points, frames: Tensor, residuals: Residuals
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Means, covariances and opacities; on a CPU in one pass, of the same definition."""
+        bound, height = self.mean_bound, self.body_height
+        low, high = (math.log(limit * height) for limit in self.scale_range)
+        logit = math.log(self.opacity / (1 - self.opacity))
+        parts = (residuals.means, residuals.quats, residuals.scales)
+        raw = torch.cat([*parts, residuals.opacities.unsqueeze(-1)], dim=-1)
+        fixed = (points.means, frames, points.scales, points.valid)
+        if compose.compiled(raw, *fixed):
+            numbers = ((bound or 0.0) * height, height, low, high, logit, self.logit_bound)
+            return compose.geometry(raw, *fixed, numbers)
+        offset = residuals.means if bound is None else bound * torch.tanh(residuals.means)
+        means = points.means + (frames @ (offset * height).unsqueeze(-1)).squeeze(-1)
+        scales = bounded(points.scales.log().unsqueeze(-1) + residuals.scales, low, high).exp()
+        axes = frames @ quaternion_to_rotation_matrix(_unit_quat(residuals.quats))
+        axes = axes * scales.unsqueeze(-2)
+        logits = bounded(logit + residuals.opacities, -self.logit_bound, self.logit_bound)
+        opacities = torch.sigmoid(logits) * points.valid.to(logits.dtype)
+        return means, axes @ axes.mT, opacities
 
     def pose_code(self, p: Tensor, root: Tensor, pelvis: Tensor, noise: Tensor | None) -> Tensor:
         """``[B, 3 J]``: joints about the root, in body heights, noise added when given.
