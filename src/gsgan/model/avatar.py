@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from gsgan.effects import Effects
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.deformation import Deformation
+from gsgan.model.deformation import Deformation, bounded
 from gsgan.model.generator import Generator
 from gsgan.model.painting import ColourCorrection, Painting
 from gsgan.model.segmentation import Segmentation
@@ -209,6 +209,7 @@ class Avatar(nn.Module):
             gaussians = self.splat(p, valid, frames, camera, body, pose_noise)
             raster = None
             if gaussians is not None:
+                gaussians = self.bounded(gaussians)
                 with self.stage("F"):
                     raster = rasterise(
                         gaussians,
@@ -280,6 +281,13 @@ class Avatar(nn.Module):
             return self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
                 p, points, camera.centre, frames.hubs[:, 0], pose_noise
             )
+
+    def bounded(self, gaussians: Gaussians) -> Gaussians:
+        """Features clamped to what the generator takes: their blends are then in that range too."""
+        bound = getattr(self.generator, "feature_bound", None)
+        if bound is None:
+            return gaussians
+        return replace(gaussians, features=bounded(gaussians.features, -bound, bound))
 
     def paint(self, frame: Frame) -> Painting:
         """The whole image of a dataset's frame: its window painted, background around it."""

@@ -28,7 +28,11 @@ class Encoder(nn.Module):
 
     def forward(self, x: Tensor) -> list[Tensor]:
         """``[B, inputs, H, W]`` to levels ``[B, channels[l], H / 2^l, W / 2^l]``."""
-        levels = [_activate(self.stem(x))]
+        return self.levels(self.stem(x))
+
+    def levels(self, stem: Tensor) -> list[Tensor]:
+        """The same from the stem's output, before its activation."""
+        levels = [_activate(stem)]
         for down, refine in zip(self.down, self.refine, strict=True):
             levels.append(_activate(refine(_activate(down(levels[-1])))))
         return levels
@@ -52,14 +56,21 @@ class Style(nn.Module):
 
     def forward(self, h: Tensor, style: Tensor | None, g: Tensor) -> Tensor:
         """``h`` ``[B, C, h, w]`` styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]``."""
-        modulation = self.from_pose(g)[:, :, None, None]
+        rows = h.permute(0, 2, 3, 1)  # channels last in memory: channels of a pixel are a row
+        modulation = self.from_pose(g).unsqueeze(1)
         if self.from_map is not None:
-            modulation = self.from_map(style) + modulation
-        gamma, beta = modulation.chunk(2, dim=1)
-        # Squares in float32 at least: half precision loses them above 256 and below 2e-4.
-        wide = h.to(torch.promote_types(h.dtype, torch.float32))
-        wide = wide * torch.rsqrt(wide.square().mean(dim=1, keepdim=True) + NORM_FLOOR)
-        return wide.to(h.dtype) * (1 + gamma) + beta
+            assert style is not None
+            weight = self.from_map.weight.flatten(1).mT.expand(len(h), -1, -1)
+            styles = style.permute(0, 2, 3, 1).flatten(1, 2)
+            modulation = torch.baddbmm(modulation + self.from_map.bias, styles, weight)
+            modulation = modulation.unflatten(1, rows.shape[1:3])
+        else:
+            modulation = modulation.unsqueeze(1)
+        gamma, beta = modulation.chunk(2, dim=-1)
+        # In float32 at least: half precision loses squares above 256 and below 2e-4.
+        wide = rows.to(torch.promote_types(h.dtype, torch.float32))
+        unit = functional.rms_norm(wide, wide.shape[-1:], eps=NORM_FLOOR).to(h.dtype)
+        return torch.addcmul(beta + unit, unit, gamma).permute(0, 3, 1, 2)
 
 
 class DecoderLevel(nn.Module):
@@ -74,12 +85,10 @@ class DecoderLevel(nn.Module):
         self.styles = nn.ModuleList(Style(channels, style_channels, pose) for _ in range(2))
 
     def forward(self, h: Tensor, skip: Tensor, style: Tensor | None, g: Tensor) -> Tensor:
-        # Nearest + convolution: transposed convolutions leave a checkerboard.
-        h = functional.interpolate(self.reduce(h), scale_factor=2.0, mode="nearest")
-        h = torch.cat([h, skip], dim=1)
-        for conv, styled in zip(self.convs, self.styles, strict=True):
-            h = _activate(styled(conv(h), style, g))
-        return h
+        first, second = self.convs
+        h = join(self.reduce(h), skip, first.weight, first.bias)  # type: ignore[arg-type]
+        h = _activate(self.styles[0](h, style, g))
+        return _activate(self.styles[1](second(h), style, g))
 
 
 class Generator(nn.Module):
@@ -94,6 +103,8 @@ class Generator(nn.Module):
             beside their average; 1 for none.
         base: channels at full resolution.
         multipliers: channels of each level in units of ``base``; each level halves the resolution.
+        feature_bound: of the Gaussians' features, which `Avatar` clamps: that is cheaper than
+            clamping images of them.
 
     The other settings are explained in conf/model/full.yaml. With ``rgb_skip`` the last layer
     starts at zero, and training at Step I's image. An unclamped output can recover from black.
@@ -170,13 +181,10 @@ class Generator(nn.Module):
         expected = None if k == 1 else (k * height, k * width)
         if given != expected:
             raise ValueError(f"Generator: fine must be {expected} pixels, got {given}")
-        features = F.clamp(-self.feature_bound, self.feature_bound)
-        if fine is not None:
-            fine = functional.pixel_unshuffle(fine, self.supersample)
-            fine = fine.clamp(-self.feature_bound, self.feature_bound)
-        content = torch.cat([x for x in (features, S, p2d, fine) if x is not None], dim=1)
-        skips = self.content(self._padded(content))
-        styles = self.style(self._padded(features)) if self.style else [None] * len(skips)
+        features = self._padded(F)
+        others = [x for x in (S, p2d) if x is not None]
+        skips = self.content.levels(self._stem(features, others, fine))
+        styles = self.style(features) if self.style else [None] * len(skips)
         h = skips[-1]
         for conv, style in zip(self.mid, self.mid_style, strict=True):
             h = _activate(style(conv(h), styles[-1], g))
@@ -189,11 +197,56 @@ class Generator(nn.Module):
             return torch.cat([F[:, :3], alpha], dim=1) + painted
         return torch.sigmoid(painted) if self.output == "sigmoid" else painted
 
-    def _padded(self, x: Tensor) -> Tensor:
+    def _stem(self, features: Tensor, others: list[Tensor], fine: Tensor | None) -> Tensor:
+        """E_c's stem on F, S, p₂D, and F's fine pixels as channels, without forming these."""
+        stem, k, C = self.content.stem, self.supersample, features.shape[1]
+        if fine is None:
+            rest = [self._padded(x) for x in others]
+            return stem(torch.cat([features, *rest], dim=1))  # type: ignore[no-any-return]
+        kernel = fine_kernel(stem.weight, C, k)
+        h = functional.conv2d(self._padded(fine, k), kernel, stem.bias, stride=k, padding=k)
+        if others:
+            rest_kernel = stem.weight[:, C : stem.in_channels - C * k * k]
+            h = h + functional.conv2d(
+                self._padded(torch.cat(others, dim=1)), rest_kernel, padding=1
+            )
+        return h
+
+    def _padded(self, x: Tensor, times: int = 1) -> Tensor:
         """Zeros on the right and below, up to a multiple of the stride; channels last."""
-        height, width = x.shape[-2:]
-        padded = functional.pad(x, (0, -width % self.stride, 0, -height % self.stride))
-        return padded.contiguous(memory_format=torch.channels_last)
+        (height, width), stride = x.shape[-2:], times * self.stride
+        if height % stride or width % stride:
+            x = functional.pad(x, (0, -width % stride, 0, -height % stride))
+        return x.contiguous(memory_format=torch.channels_last)
+
+
+def fine_kernel(weight: Tensor, C: int, k: int) -> Tensor:
+    """``[O, C, 3 k, 3 k]``: the part of a stem's ``weight`` that sees F, as one kernel on F's fine
+    pixels, of which its first C channels see averages and its last C k² each one."""
+    fine = weight[:, -C * k * k :].unflatten(1, (C, k, k)).permute(0, 1, 4, 2, 5, 3)
+    mean = weight[:, :C, :, None, :, None] / (k * k)
+    return (fine + mean).flatten(4, 5).flatten(2, 3)
+
+
+def join(h: Tensor, skip: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """A 3×3 convolution of ``h``, upsampled to the nearest, and ``skip`` as further channels.
+
+    Two of three pixels under a kernel on an upsampled image are equal: a transposed convolution
+    whose kernel has their sums does 4/9 of the arithmetic. (It has no checkerboard: that comes from
+    kernels that are not such sums.)
+    """
+    upper, lower = weight[:, : h.shape[1]], weight[:, h.shape[1] :]
+    upsampled = functional.conv_transpose2d(h, upsampled_kernel(upper), stride=2, padding=1)
+    return upsampled + functional.conv2d(skip, lower, bias, padding=1)
+
+
+def upsampled_kernel(weight: Tensor) -> Tensor:
+    """``[I, O, 4, 4]`` of a transposed convolution of stride 2 and padding 1: the kernel
+    ``[O, I, 3, 3]`` after upsampling to the nearest."""
+    for dim in (2, 3):
+        first, middle, last = weight.unbind(dim)
+        weight = torch.stack([last, middle + last, first + middle, first], dim)
+    return weight.transpose(0, 1)
 
 
 def start_at_zero(layer: nn.Module) -> None:
@@ -203,4 +256,4 @@ def start_at_zero(layer: nn.Module) -> None:
 
 
 def _activate(x: Tensor) -> Tensor:
-    return functional.leaky_relu(x, SLOPE)
+    return functional.leaky_relu(x, SLOPE, inplace=True)  # of new tensors only

@@ -58,7 +58,7 @@ def pick_device(name: str) -> torch.device:
 
 
 def keep_freed_memory() -> None:
-    """Makes the process keep memory that it freed, for its next image, where the C library is glibc.
+    """Makes the process keep freed memory for its next image, where the C library is glibc.
 
     By default most of it goes back to the system, which maps and clears it anew for every image:
     16 thousand pages in an image of 256², a third of the time of painting it.
