@@ -137,7 +137,16 @@ def test_a_loss_term(tiny):
 
 
 def test_a_generator(build):
-    keys = ("base", "multipliers", "style", "style_share", "rgb_skip", "output", "feature_bound")
+    keys = (
+        "base",
+        "multipliers",
+        "style",
+        "style_share",
+        "rgb_skip",
+        "output",
+        "feature_bound",
+        "patch",
+    )
     _, avatar, frame = build(
         f"model.generator._target_={HERE}.OneLayer", *(f"~model.generator.{key}" for key in keys)
     )

@@ -224,3 +224,20 @@ def test_positional_encoding_values():
     expected = torch.tensor([0.25 * torch.pi, 0.5 * torch.pi, -0.5 * torch.pi, -torch.pi]).sin()
     torch.testing.assert_close(code[0, 2:6], expected)
     assert positional_encoding(x, 0) is x
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_generator_of_patches(times):
+    F, S, p2d, g = inputs(20, 12)
+    net = Generator(5, 4, 8, 35, times, base=4, patch=2)
+    fine = None if times == 1 else torch.rand(2, 5, 20 * times, 12 * times)
+    F = F if fine is None else functional.avg_pool2d(fine, times)
+    assert net(F, S, p2d, g, fine).shape == (2, 4, 20, 12)
+    assert len(net.up) == len(generator().up) - 1
+    given = [net._padded(x) for x in (F, S, p2d)]
+    if fine is not None:
+        given.append(functional.pixel_unshuffle(net._padded(fine, times), times))
+    plain = net.content.stem(torch.cat(given, dim=1))
+    torch.testing.assert_close(net._stem(given[0], [S, p2d], fine), plain, atol=1e-5, rtol=1e-5)
+    with pytest.raises(ConfigError, match="patch must be one of 1, 2, 4"):
+        generator(patch=3)

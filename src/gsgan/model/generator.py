@@ -16,23 +16,32 @@ SLOPE = 0.2
 
 
 class Encoder(nn.Module):
-    """A pyramid: 3×3 stem, then stride-2 levels; returns every level, finest first."""
+    """A pyramid: a stem, then stride-2 levels; returns every level, finest first.
 
-    def __init__(self, inputs: int, channels: Sequence[int]) -> None:
+    The stem is a 3×3 convolution; with ``patch`` > 1 one of patch × patch pixels, each of which is
+    a pixel of the finest level, and then a 3×3.
+    """
+
+    def __init__(self, inputs: int, channels: Sequence[int], patch: int = 1) -> None:
         super().__init__()
-        self.stem = nn.Conv2d(inputs, channels[0], 3, padding=1)
+        first, kernel = channels[0], {"kernel_size": 3, "padding": 1}
+        stem = kernel if patch == 1 else {"kernel_size": patch, "stride": patch}
+        self.stem = nn.Conv2d(inputs, first, **stem)  # type: ignore[arg-type]
+        self.after = nn.Conv2d(first, first, **kernel) if patch > 1 else None  # type: ignore[arg-type]
         self.down = nn.ModuleList(
             nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(channels)
         )
         self.refine = nn.ModuleList(nn.Conv2d(c, c, 3, padding=1) for c in channels[1:])
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """``[B, inputs, H, W]`` to levels ``[B, channels[l], H / 2^l, W / 2^l]``."""
+        """``[B, inputs, H, W]`` to levels ``[B, channels[l], h / 2^l, w / 2^l]``, h = H / patch."""
         return self.levels(self.stem(x))
 
     def levels(self, stem: Tensor) -> list[Tensor]:
         """The same from the stem's output, before its activation."""
         levels = [_activate(stem)]
+        if self.after is not None:
+            levels = [_activate(self.after(levels[0]))]
         for down, refine in zip(self.down, self.refine, strict=True):
             levels.append(_activate(refine(_activate(down(levels[-1])))))
         return levels
@@ -103,6 +112,8 @@ class Generator(nn.Module):
             beside their average; 1 for none.
         base: channels at full resolution.
         multipliers: channels of each level in units of ``base``; each level halves the resolution.
+        patch: power of 2: so many pixels each way are one pixel of the finest level, which paints
+            them as channels. The first levels of ``multipliers`` are then left out.
         feature_bound: of the Gaussians' features, which `Avatar` clamps: that is cheaper than
             clamping images of them.
 
@@ -122,6 +133,7 @@ class Generator(nn.Module):
         *,
         base: int = 32,
         multipliers: Sequence[int] = (1, 2, 4, 8, 8),
+        patch: int = 1,
         style: str = "film",
         style_share: float = 0.5,
         rgb_skip: bool = False,
@@ -133,24 +145,25 @@ class Generator(nn.Module):
         one_of("model.generator.style", style, ("film", "pose"))
         if rgb_skip and output == "sigmoid":
             raise ValueError("Generator: rgb_skip adds to a colour, so output must be linear")
-        channels = [base * m for m in multipliers]
+        one_of("model.generator.patch", patch, [2**i for i in range(len(multipliers))])
+        self.patch, self.stride = patch, 2 ** (len(multipliers) - 1)
+        channels = [base * m for m in multipliers][patch.bit_length() - 1 :]
         mapped = style == "film"
         widths = [max(1, round(style_share * c)) if mapped else 0 for c in channels]
         inputs = feature_channels + segmentation_channels + skeleton_channels
         self.supersample = supersample
         if supersample > 1:
             inputs += feature_channels * supersample**2
-        self.stride = 2 ** (len(channels) - 1)
         self.rgb_skip, self.output, self.feature_bound = rgb_skip, output, feature_bound
-        self.content = Encoder(inputs, channels)
-        self.style = Encoder(feature_channels, widths) if mapped else None
+        self.content = Encoder(inputs, channels, patch)
+        self.style = Encoder(feature_channels, widths, patch) if mapped else None
         self.mid = nn.ModuleList(nn.Conv2d(channels[-1], channels[-1], 3, padding=1) for _ in "ab")
         self.mid_style = nn.ModuleList(Style(channels[-1], widths[-1], pose_channels) for _ in "ab")
         self.up = nn.ModuleList(
             DecoderLevel(channels[i + 1], channels[i], widths[i], pose_channels)
             for i in reversed(range(len(channels) - 1))
         )
-        self.paint = nn.Conv2d(channels[0], 4, 3, padding=1)
+        self.paint = nn.Conv2d(channels[0], 4 * patch**2, 3, padding=1)
         if rgb_skip:
             start_at_zero(self.paint)
 
@@ -190,7 +203,7 @@ class Generator(nn.Module):
             h = _activate(style(conv(h), styles[-1], g))
         for i, level in enumerate(self.up):
             h = level(h, skips[-2 - i], styles[-2 - i], g)
-        painted = self.paint(h)[..., :height, :width]
+        painted = functional.pixel_shuffle(self.paint(h), self.patch)[..., :height, :width]
         if self.rgb_skip:
             if alpha is None:
                 raise ValueError("Generator: built with rgb_skip=True, so alpha must be given")
@@ -201,15 +214,15 @@ class Generator(nn.Module):
         """E_c's stem on F, S, p₂D, and F's fine pixels as channels, without forming these."""
         stem, k, C = self.content.stem, self.supersample, features.shape[1]
         if fine is None:
-            rest = [self._padded(x) for x in others]
-            return stem(torch.cat([features, *rest], dim=1))  # type: ignore[no-any-return]
-        kernel = fine_kernel(stem.weight, C, k)
-        h = functional.conv2d(self._padded(fine, k), kernel, stem.bias, stride=k, padding=k)
+            padded = [self._padded(x) for x in others]
+            return stem(torch.cat([features, *padded], dim=1))  # type: ignore[no-any-return]
+        stride, padding = self.patch, int(self.patch == 1)
+        kernel, rest_kernel = fine_kernel(stem.weight, C, k), stem.weight[:, C : -C * k * k]
+        fine = self._padded(fine, k)
+        h = functional.conv2d(fine, kernel, stem.bias, k * stride, k * padding)
         if others:
-            rest_kernel = stem.weight[:, C : stem.in_channels - C * k * k]
-            h = h + functional.conv2d(
-                self._padded(torch.cat(others, dim=1)), rest_kernel, padding=1
-            )
+            rest = self._padded(torch.cat(others, dim=1))
+            h = h + functional.conv2d(rest, rest_kernel, None, stride, padding)
         return h
 
     def _padded(self, x: Tensor, times: int = 1) -> Tensor:
@@ -221,7 +234,7 @@ class Generator(nn.Module):
 
 
 def fine_kernel(weight: Tensor, C: int, k: int) -> Tensor:
-    """``[O, C, 3 k, 3 k]``: the part of a stem's ``weight`` that sees F, as one kernel on F's fine
+    """``[O, C, n k, n k]``: the part of a stem's ``weight`` that sees F, as one kernel on F's fine
     pixels, of which its first C channels see averages and its last C k² each one."""
     fine = weight[:, -C * k * k :].unflatten(1, (C, k, k)).permute(0, 1, 4, 2, 5, 3)
     mean = weight[:, :C, :, None, :, None] / (k * k)
