@@ -133,6 +133,6 @@ def evenly(length: int, count: int) -> list[int]:
 
 
 def place(avatar: Avatar, device: torch.device, *, channels_last: bool) -> Avatar:
-    """The avatar on a device, in eval mode, its weights with channels last or not."""
+    """The frozen avatar on a device, its weights with channels last or not."""
     layout = torch.channels_last if channels_last else torch.contiguous_format
-    return avatar.to(device=device, memory_format=layout).eval()  # type: ignore[call-overload]
+    return avatar.freeze().to(device=device, memory_format=layout)  # type: ignore[call-overload]

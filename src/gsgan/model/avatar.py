@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -117,6 +117,17 @@ class Avatar(nn.Module):
     def needs_body(self) -> bool:
         """Whether painting needs the pose of the skinned body beside the skeleton."""
         return any(part for part in (self.body_points, self.surface, self.segmentation))
+
+    def freeze(self) -> Self:
+        """Ends training, and paints faster: what depends on weights alone is computed once.
+
+        Convention: images are the same up to rounding, and follow weights that are loaded later.
+        Weights get no gradient any more; skeleton and camera do.
+        """
+        self.eval().requires_grad_(False)
+        for part in self.modules():
+            part.derived = {}  # type: ignore[assignment]
+        return self.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
     @torch.no_grad()
     def render(

@@ -17,7 +17,7 @@ from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
 from gsgan.utils.checks import one_of, whole
-from gsgan.utils.tensors import constant
+from gsgan.utils.tensors import constant, derived
 
 QUAT_FLOOR = 1e-12  # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
 
@@ -110,18 +110,31 @@ class Deformation(nn.Module):
     def residuals(self, points: Points, pose: Tensor, root: Tensor) -> Residuals:
         """ΔG of posed points, from the `pose_code` and the pelvis ``root`` ``[B, 3]`` (metres)."""
         position = (points.means - root[:, None]) / self.body_height
-        x = self.from_point(torch.cat([self.rest_code, self.embedding], dim=-1))
-        x = x + self.from_position(positional_encoding(position, self.position_octaves))
+        encoding = positional_encoding(position, self.position_octaves)
+        weight, by_pose = self.from_position.weight, self.from_pose(pose)
         if self.from_normal is not None:
-            x = x + self.from_normal(points.normals)
-        x = functional.relu(x + self.from_pose(pose)[:, None])
+            encoding = torch.cat([encoding, points.normals], dim=-1)
+            weight = torch.cat([weight, self.from_normal.weight], dim=1)
+        start = self._from_identity() + by_pose.unsqueeze(1)
+        x = torch.baddbmm(start, encoding, weight.mT.expand(len(pose), -1, -1))
+        x = functional.relu(x, inplace=True)
         for layer in self.trunk:
-            x = functional.relu(layer(x))
+            x = functional.relu(layer(x), inplace=True)
         raw, parts = self._head(x)
         means, quats, scales, opacities, sh, features = raw.split(parts, dim=-1)
         return Residuals(
             means, quats, scales, opacities[..., 0], sh.unflatten(-1, (-1, 3)), features
         )
+
+    def _from_identity(self) -> Tensor:
+        """``[N, width]``: the part of the first layer that depends on the point alone."""
+        layer, own = self.from_point, self.embedding
+
+        def make() -> Tensor:
+            found: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
+            return found
+
+        return derived(self, "identity", make, layer.weight, layer.bias, own, self.rest_code)
 
     def _head(self, x: Tensor) -> tuple[Tensor, tuple[int, ...]]:
         """The raw residuals ``[B, N, ...]`` and the sizes of their parts, without the harmonics

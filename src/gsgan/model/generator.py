@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsgan.utils.checks import one_of
+from gsgan.utils.tensors import derived
 
 NORM_FLOOR = 1e-6  # inside the root: an all-zero pixel (empty background) stays zero
 SLOPE = 0.2
@@ -95,9 +96,22 @@ class DecoderLevel(nn.Module):
 
     def forward(self, h: Tensor, skip: Tensor, style: Tensor | None, g: Tensor) -> Tensor:
         first, second = self.convs
-        h = join(self.reduce(h), skip, first.weight, first.bias)  # type: ignore[arg-type]
+        h = self._join(self.reduce(h), skip, first.weight, first.bias)  # type: ignore[arg-type]
         h = _activate(self.styles[0](h, style, g))
         return _activate(self.styles[1](second(h), style, g))
+
+    def _join(self, h: Tensor, skip: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """A 3×3 convolution of ``h``, upsampled to the nearest, and ``skip`` as further channels.
+
+        Two of three pixels under a kernel on an upsampled image are equal: a transposed convolution
+        whose kernel has their sums does 4/9 of the arithmetic. (It has no checkerboard: that comes
+        from kernels that are not such sums.)
+        """
+        C = h.shape[1]
+        kernel = derived(self, "upper", lambda: upsampled_kernel(weight[:, :C]), weight)
+        lower = derived(self, "lower", lambda: channels_last(weight[:, C:]), weight)
+        upsampled = functional.conv_transpose2d(h, kernel, stride=2, padding=1)
+        return upsampled + functional.conv2d(skip, lower, bias, padding=1)
 
 
 class Generator(nn.Module):
@@ -217,12 +231,14 @@ class Generator(nn.Module):
             padded = [self._padded(x) for x in others]
             return stem(torch.cat([features, *padded], dim=1))  # type: ignore[no-any-return]
         stride, padding = self.patch, int(self.patch == 1)
-        kernel, rest_kernel = fine_kernel(stem.weight, C, k), stem.weight[:, C : -C * k * k]
+        weight = stem.weight
+        kernel = derived(self, "fine", lambda: fine_kernel(weight, C, k), weight)
+        rest = derived(self, "rest", lambda: channels_last(weight[:, C : -C * k * k]), weight)
         fine = self._padded(fine, k)
         h = functional.conv2d(fine, kernel, stem.bias, k * stride, k * padding)
         if others:
-            rest = self._padded(torch.cat(others, dim=1))
-            h = h + functional.conv2d(rest, rest_kernel, None, stride, padding)
+            given = self._padded(torch.cat(others, dim=1))
+            h = h + functional.conv2d(given, rest, None, stride, padding)
         return h
 
     def _padded(self, x: Tensor, times: int = 1) -> Tensor:
@@ -230,7 +246,7 @@ class Generator(nn.Module):
         (height, width), stride = x.shape[-2:], times * self.stride
         if height % stride or width % stride:
             x = functional.pad(x, (0, -width % stride, 0, -height % stride))
-        return x.contiguous(memory_format=torch.channels_last)
+        return channels_last(x)
 
 
 def fine_kernel(weight: Tensor, C: int, k: int) -> Tensor:
@@ -238,19 +254,7 @@ def fine_kernel(weight: Tensor, C: int, k: int) -> Tensor:
     pixels, of which its first C channels see averages and its last C k² each one."""
     fine = weight[:, -C * k * k :].unflatten(1, (C, k, k)).permute(0, 1, 4, 2, 5, 3)
     mean = weight[:, :C, :, None, :, None] / (k * k)
-    return (fine + mean).flatten(4, 5).flatten(2, 3)
-
-
-def join(h: Tensor, skip: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """A 3×3 convolution of ``h``, upsampled to the nearest, and ``skip`` as further channels.
-
-    Two of three pixels under a kernel on an upsampled image are equal: a transposed convolution
-    whose kernel has their sums does 4/9 of the arithmetic. (It has no checkerboard: that comes from
-    kernels that are not such sums.)
-    """
-    upper, lower = weight[:, : h.shape[1]], weight[:, h.shape[1] :]
-    upsampled = functional.conv_transpose2d(h, upsampled_kernel(upper), stride=2, padding=1)
-    return upsampled + functional.conv2d(skip, lower, bias, padding=1)
+    return channels_last((fine + mean).flatten(4, 5).flatten(2, 3))
 
 
 def upsampled_kernel(weight: Tensor) -> Tensor:
@@ -259,7 +263,12 @@ def upsampled_kernel(weight: Tensor) -> Tensor:
     for dim in (2, 3):
         first, middle, last = weight.unbind(dim)
         weight = torch.stack([last, middle + last, first + middle, first], dim)
-    return weight.transpose(0, 1)
+    return channels_last(weight.transpose(0, 1))
+
+
+def channels_last(x: Tensor) -> Tensor:
+    """The same, channels last in memory."""
+    return x.contiguous(memory_format=torch.channels_last)
 
 
 def start_at_zero(layer: nn.Module) -> None:

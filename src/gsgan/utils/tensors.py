@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gsgan.utils.errors import ConfigError
 
@@ -67,3 +68,17 @@ def keep_freed_memory() -> None:
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(M_TRIM_THRESHOLD, KEPT)
         mallopt(M_MMAP_THRESHOLD, LARGEST)
+
+
+def derived(module: nn.Module, name: str, make: Callable[[], Tensor], *weights: Tensor) -> Tensor:
+    """``make()``, a function of these weights alone. In a frozen module (one with a dictionary
+    ``derived``) it is kept until a weight changes or moves."""
+    kept: dict[str, tuple[Any, Tensor]] | None = getattr(module, "derived", None)
+    if kept is None:
+        return make()
+    state = [(x.data_ptr(), x._version, x.dtype) for x in weights]
+    found = kept.get(name)
+    if found is None or found[0] != state:
+        with torch.inference_mode(False), torch.no_grad():
+            found = kept[name] = state, make()
+    return found[1]
