@@ -174,7 +174,7 @@ class Avatar(nn.Module):
             raise ValueError(f"render: expected 1 or {len(p)} cameras, got {len(camera)}")
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
         body = None if body is None else body.to(device)
-        painting = self._paint(p, seen, cameras.to(device), body)
+        painting = self._paint(p, seen, cameras.to(device), body, maps=False)
         assert painting.image is not None and painting.alpha is not None  # noqa: PT018
         colour = p.new_tensor(background).expand(3).view(1, 3, 1, 1)
         image = painting.image.clamp(0, 1)
@@ -300,11 +300,11 @@ class Avatar(nn.Module):
             return gaussians
         return replace(gaussians, features=bounded(gaussians.features, -bound, bound))
 
-    def paint(self, frame: Frame) -> Painting:
-        """The whole image of a dataset's frame: its window painted, background around it."""
-        return self._paint(
-            frame.skeleton, frame.visibility, frame.camera, frame.body, frame.camera_index
-        )
+    def paint(self, frame: Frame, *, maps: bool = True) -> Painting:
+        """The whole image of a dataset's frame: its window painted, background around it; without
+        F, S and the Gaussians where ``maps`` is False."""
+        given = (frame.skeleton, frame.visibility, frame.camera, frame.body, frame.camera_index)
+        return self._paint(*given, maps=maps)
 
     def _paint(
         self,
@@ -313,6 +313,8 @@ class Avatar(nn.Module):
         camera: Camera,
         body: BodyPose | None,
         camera_index: Tensor | None = None,
+        *,
+        maps: bool = True,
     ) -> Painting:
         window = self._window(skeleton, camera)
         if window is None:
@@ -326,7 +328,7 @@ class Avatar(nn.Module):
             camera_index=camera_index,
         )
         with self.stage("paste"):
-            return painting.pasted(window)
+            return (painting if maps else painting.only_image()).pasted(window)
 
     def window(self, frame: Frame) -> Window | None:
         """The part of a frame's image that holds the person; None means all of it."""
