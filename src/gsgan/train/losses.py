@@ -102,39 +102,35 @@ class Judged:
             self.real = discriminate(discriminator, target.detach(), gan)
 
     def terms(self, adversarial: float, matching: float) -> dict[str, Tensor]:
-        """The generator's terms by name, weighted; a term of weight 0 is left out. The first one
-        carries the gradient of all."""
+        """The generator's terms by name, weighted; a term of weight 0 is left out."""
         terms = {}
         if adversarial:
             terms["adversarial"] = adversarial * generator_loss(self.real, self.fake, self.gan)
         if matching:
             terms["feature_matching"] = matching * feature_matching(self.real, self.fake)
-        if not terms or not self.image.requires_grad:
-            return {name: term.detach() for name, term in terms.items()}
-        total = torch.stack(list(terms.values())).sum()
-        (gradient,) = torch.autograd.grad(total, self.painted, retain_graph=True)
-        terms = {name: term.detach() for name, term in terms.items()}
-        first = next(iter(terms))
-        terms[first] = _WithGradient.apply(terms[first], self.image, gradient)
-        return terms
+        found = _Through.apply(self.image, (self.painted, list(terms.values())))
+        return dict(zip(terms, found, strict=True))
 
     def loss(self) -> Tensor:
         """The discriminator's loss."""
         return discriminator_loss(self.real, self.fake, self.gan)
 
 
-class _WithGradient(torch.autograd.Function):
-    """A value whose gradient with respect to an image is known."""
+class _Through(torch.autograd.Function):
+    """Terms of a copy of an image as terms of the image; parameters on the way get no gradient."""
 
     @staticmethod
-    def forward(ctx: Any, value: Tensor, image: Tensor, gradient: Tensor) -> Tensor:
-        ctx.save_for_backward(gradient)
-        return value.clone()
+    def forward(ctx: Any, image: Tensor, path: tuple[Tensor, list[Tensor]]) -> tuple[Tensor, ...]:
+        # in a tuple autograd does not see them: it would go that way as well
+        ctx.copy, ctx.terms = path
+        terms = ctx.terms
+        return tuple(term.detach().clone() for term in terms)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[None, Tensor, None]:  # type: ignore[override]
-        return None, grad * ctx.saved_tensors[0], None
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        (grad,) = torch.autograd.grad(ctx.terms, ctx.copy, grads, retain_graph=True)
+        return grad, None
 
 
 @dataclass(frozen=True)
