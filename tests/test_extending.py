@@ -131,7 +131,7 @@ def test_a_loss_term(tiny):
     data, module = build_training(tiny(f"training.extra_losses={losses}"))
     frame = data.dataset("train")[0]
     painting = module.avatar.paint(frame)
-    terms = module.step_two_terms(painting, frame, adversarial=False)
+    terms = module.step_two_terms(painting, frame, None)
     expected = 0.1 * painting.image.diff(dim=-1).abs().mean()
     assert float(terms["smooth"]) == float(expected) > 0
 

@@ -92,9 +92,7 @@ class _Geometry(torch.autograd.Function):
         return d_raw, *[None] * 5
 
 
-def _job(
-    raw: Tensor, fixed: list[Tensor], numbers: tuple[float, ...]
-) -> tuple[_Job, list[Tensor]]:
+def _job(raw: Tensor, fixed: list[Tensor], numbers: tuple[float, ...]) -> tuple[_Job, list[Tensor]]:
     """The job without its outputs, and the tensors it points to."""
     rows = raw.detach()
     if rows.stride(-1) != 1 or rows.stride(0) != rows.shape[1] * rows.stride(1):

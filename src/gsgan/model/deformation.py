@@ -110,23 +110,26 @@ class Deformation(nn.Module):
     def residuals(self, points: Points, pose: Tensor, root: Tensor) -> Residuals:
         """ΔG of posed points, from the `pose_code` and the pelvis ``root`` ``[B, 3]`` (metres)."""
         position = (points.means - root[:, None]) / self.body_height
-        encoding = positional_encoding(position, self.position_octaves)
-        weight, by_pose = self.from_position.weight, self.from_pose(pose)
-        if self.from_normal is not None:
-            encoding = torch.cat([encoding, points.normals], dim=-1)
-            weight = torch.cat([weight, self.from_normal.weight], dim=1)
-        start = self._from_identity() + by_pose.unsqueeze(1)
-        x = torch.baddbmm(start, encoding, weight.mT.expand(len(pose), -1, -1))
-        x = functional.relu(x, inplace=True)
-        for layer in self.trunk:
-            x = functional.relu(layer(x), inplace=True)
+        code = positional_encoding(position, self.position_octaves)
+        if torch.is_grad_enabled() and not (code.requires_grad or points.normals.requires_grad):
+            x = self._trained(code, points.normals, pose)
+        else:
+            weight = self.from_position.weight
+            if self.from_normal is not None:
+                code = torch.cat([code, points.normals], dim=-1)
+                weight = torch.cat([weight, self.from_normal.weight], dim=1)
+            start = self._point_part() + self.from_pose(pose).unsqueeze(1)
+            x = torch.baddbmm(start, code, weight.mT.expand(len(pose), -1, -1))
+            x = functional.relu(x, inplace=True)
+            for layer in self.trunk:
+                x = functional.relu(layer(x), inplace=True)
         raw, parts = self._head(x)
         means, quats, scales, opacities, sh, features = raw.split(parts, dim=-1)
         return Residuals(
             means, quats, scales, opacities[..., 0], sh.unflatten(-1, (-1, 3)), features
         )
 
-    def _from_identity(self) -> Tensor:
+    def _point_part(self) -> Tensor:
         """``[N, width]``: the part of the first layer that depends on the point alone."""
         layer, own = self.from_point, self.embedding
 
@@ -134,7 +137,24 @@ class Deformation(nn.Module):
             found: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
             return found
 
-        return derived(self, "identity", make, layer.weight, layer.bias, own, self.rest_code)
+        return derived(self, "point part", make, layer.weight, layer.bias, own, self.rest_code)
+
+    def _trained(self, code: Tensor, normals: Tensor, pose: Tensor) -> Tensor:
+        """The trunk's output, its layers as one operation, which computes no unused gradient."""
+        given, weights = [self.rest_code, code], [self.from_position.weight]
+        from_rest, from_embedding = self.from_point.weight.split(
+            [self.rest_code.shape[-1], self.embedding.shape[-1]], dim=-1
+        )
+        if self.from_normal is not None:
+            given.append(normals)
+            weights.append(self.from_normal.weight)
+        size = code.shape[:2]
+        known = torch.cat([x.expand(*size, -1) for x in given], dim=-1)
+        weight = torch.cat([from_rest, *weights, from_embedding], dim=-1)
+        bias = self.from_point.bias + self.from_pose(pose)
+        layers = [x for layer in self.trunk for x in (layer.weight, layer.bias)]
+        x: Tensor = _Trunk.apply(known, self.embedding.expand(*size, -1), weight, bias, *layers)
+        return x
 
     def _head(self, x: Tensor) -> tuple[Tensor, tuple[int, ...]]:
         """The raw residuals ``[B, N, ...]`` and the sizes of their parts, without the harmonics
@@ -265,6 +285,41 @@ def positional_encoding(x: Tensor, octaves: int) -> Tensor:
 def encoded_size(dimensions: int, octaves: int) -> int:
     """Size of the `positional_encoding` of ``dimensions`` coordinates."""
     return dimensions * (1 + 2 * octaves)
+
+
+class _Trunk(torch.autograd.Function):
+    """Linear layers with ReLU; no gradient of what is ``known``, the largest part of the input."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, known: Tensor, learned: Tensor, weight: Tensor, bias: Tensor, *layers: Tensor
+    ) -> Tensor:
+        B, N, _ = known.shape
+        inputs = torch.cat([known, learned], dim=-1).flatten(0, 1)
+        x = (inputs @ weight.mT).view(B, N, -1).add_(bias[:, None]).relu_().flatten(0, 1)
+        outputs = [x]
+        for w, b in zip(layers[::2], layers[1::2], strict=True):
+            outputs.append(torch.addmm(b, outputs[-1], w.mT).relu_())
+        ctx.save_for_backward(inputs, weight, *layers[::2], *outputs)
+        ctx.size = (B, N, learned.shape[-1])
+        return outputs[-1].view(B, N, -1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        inputs, weight, *rest = ctx.saved_tensors
+        B, N, learned = ctx.size
+        count = len(rest) // 2
+        weights, outputs = rest[:count], rest[count:]
+        through = torch.ops.aten.threshold_backward  # ReLU's gradient
+        g = through(grad.reshape(B * N, -1), outputs[-1], 0)
+        found: list[Tensor | None] = []
+        for w, x in zip(reversed(weights), reversed(outputs[:-1]), strict=True):
+            found = [g.mT @ x, g.sum(0), *found]
+            g = g @ w
+            through.grad_input(g, x, 0, grad_input=g)
+        d_learned = g @ weight[:, weight.shape[1] - learned :]
+        return None, d_learned.view(B, N, learned), g.mT @ inputs, g.view(B, N, -1).sum(1), *found
 
 
 class _Bounded(torch.autograd.Function):

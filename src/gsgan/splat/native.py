@@ -83,8 +83,9 @@ def composite(
     Returns:
         features ``[B, C, H, W]`` premultiplied, channels last where they are averaged; alpha
         ``[B, 1, H / times, W / times]``, depth ``[B, 1, H, W]`` or None, and averaged features
-        ``[B, C, H / times, W / times]`` or None. Differentiable once in means, factors, opacities, features, and in depths through the
-        depth output.
+        ``[B, C, H / times, W / times]`` or None.
+        Differentiable once in means, factors, opacities, features, and in depths through the depth
+        output.
 
     Raises:
         ValueError: on another device or dtype, on mixed ones, and on a visible Gaussian that is not
@@ -232,9 +233,7 @@ def _job(
     return job
 
 
-def point(
-    job: ctypes.Structure, names: tuple[str, ...], tensors: Sequence[Tensor | None]
-) -> None:
+def point(job: ctypes.Structure, names: tuple[str, ...], tensors: Sequence[Tensor | None]) -> None:
     """Sets fields of a job to tensors' addresses; the caller keeps the tensors alive."""
     for name, tensor in zip(names, tensors, strict=False):
         setattr(job, name, None if tensor is None else tensor.data_ptr())
