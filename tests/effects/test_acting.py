@@ -63,6 +63,7 @@ def test_all_off_is_the_plain_chain_operator_by_operator(build):
         frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
         points = avatar.densify(p, valid, frames)
         gaussians = avatar.deformation(p, points, camera.centre, frames.hubs[:, 0], None)
+        gaussians = avatar.bounded(gaussians)
         raster = rasterise(gaussians, camera, settings=avatar.accuracy)
         S = avatar.segmentation(frame.body, camera)
         p2d = avatar.draw(p, valid, camera, None)
