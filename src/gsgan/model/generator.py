@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from gsgan.model import styled
 from gsgan.utils.checks import one_of
 from gsgan.utils.tensors import derived
 
@@ -49,7 +50,7 @@ class Encoder(nn.Module):
 
 
 class Style(nn.Module):
-    """Per-pixel normalisation, then scale and shift from E_s's level and the pose code g.
+    """Per-pixel normalisation, scale and shift from E_s's level and the pose code g, activation.
 
     Normalising over channels at each pixel (not over the image) keeps colours independent of how
     much of the image is background. Both maps start at zero: the style starts as the identity.
@@ -65,7 +66,8 @@ class Style(nn.Module):
                 start_at_zero(layer)
 
     def forward(self, h: Tensor, style: Tensor | None, g: Tensor) -> Tensor:
-        """``h`` ``[B, C, h, w]`` styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]``."""
+        """``h`` ``[B, C, h, w]`` styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]``, then
+        activated."""
         rows = h.permute(0, 2, 3, 1)  # channels last in memory: channels of a pixel are a row
         modulation = self.from_pose(g).unsqueeze(1)
         if self.from_map is not None:
@@ -76,11 +78,14 @@ class Style(nn.Module):
             modulation = modulation.unflatten(1, rows.shape[1:3])
         else:
             modulation = modulation.unsqueeze(1)
+        if styled.compiled(rows, modulation):
+            made = styled.styled(rows, modulation, NORM_FLOOR, SLOPE)
+            return made.permute(0, 3, 1, 2)
         gamma, beta = modulation.chunk(2, dim=-1)
         # In float32 at least: half precision loses squares above 256 and below 2e-4.
         wide = rows.to(torch.promote_types(h.dtype, torch.float32))
         unit = functional.rms_norm(wide, wide.shape[-1:], eps=NORM_FLOOR).to(h.dtype)
-        return torch.addcmul(beta + unit, unit, gamma).permute(0, 3, 1, 2)
+        return _activate(torch.addcmul(beta + unit, unit, gamma)).permute(0, 3, 1, 2)
 
 
 class DecoderLevel(nn.Module):
@@ -97,8 +102,8 @@ class DecoderLevel(nn.Module):
     def forward(self, h: Tensor, skip: Tensor, style: Tensor | None, g: Tensor) -> Tensor:
         first, second = self.convs
         h = self._join(self.reduce(h), skip, first.weight, first.bias)  # type: ignore[arg-type]
-        h = _activate(self.styles[0](h, style, g))
-        return _activate(self.styles[1](second(h), style, g))
+        h = self.styles[0](h, style, g)
+        return self.styles[1](second(h), style, g)  # type: ignore[no-any-return]
 
     def _join(self, h: Tensor, skip: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """A 3×3 convolution of ``h``, upsampled to the nearest, and ``skip`` as further channels.
@@ -214,7 +219,7 @@ class Generator(nn.Module):
         styles = self.style(features) if self.style else [None] * len(skips)
         h = skips[-1]
         for conv, style in zip(self.mid, self.mid_style, strict=True):
-            h = _activate(style(conv(h), styles[-1], g))
+            h = style(conv(h), styles[-1], g)
         for i, level in enumerate(self.up):
             h = level(h, skips[-2 - i], styles[-2 - i], g)
         painted = functional.pixel_shuffle(self.paint(h), self.patch)[..., :height, :width]
