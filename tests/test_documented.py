@@ -27,6 +27,7 @@ SMALL_BENCH = {
         *("settings.accuracies=[draft]", "settings.scales=[0.5]", "settings.backends=[]"),
         *("settings.precisions=[]", "settings.windows=[]", "repeats=1", "pictures=1"),
     ],
+    "roofline": ["sizes=[tiny]", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
     "effects": [
         *("train=false", "only=[distortion]"),
         "base=['size=tiny','data.source.frames=3','data.source.test_frames=1']",

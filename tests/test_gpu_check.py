@@ -37,6 +37,7 @@ def test_without_cuda_it_ends_with_one_sentence(tmp_path):
     assert not (tmp_path / "gpu.md").exists()
 
 
+@pytest.mark.slow
 def test_each_step_runs_once_and_its_options_exist(tmp_path, compose):
     fake = tmp_path / "python"
     fake.write_text(FAKE)

@@ -178,6 +178,7 @@ def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside)
     refused(inside("report", *given), str(twin), "has no log of two validations", "logger=csv")
 
 
+@pytest.mark.slow
 def test_training_curves_are_of_the_same_watched_images(run, twin, tmp_path, inside):
     given = (f"run={run}", f"compare={twin}", f"out={tmp_path / 'out'}", "figures=training")
     assert inside("report", *given, "names=[ours,'_x $1 {']").returncode == 0
