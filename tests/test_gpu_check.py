@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 SCRIPT = Path(__file__).parents[1] / "scripts" / "gpu_check.sh"
 NO_CUDA = "gpu_check: torch finds no CUDA device on this machine, so nothing was checked.\n"
 FAKE = """#!/bin/bash
