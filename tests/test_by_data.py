@@ -29,6 +29,7 @@ def test_the_accelerator_is_the_one_that_is_there(compose, monkeypatch, there, t
     assert compose("train", "trainer=cpu").trainer.accelerator == "cpu"
 
 
+@pytest.mark.slow
 def test_a_long_run_without_a_gpu_is_refused_with_its_price_until_it_is_asked_for(
     inside, capture, tmp_path
 ):

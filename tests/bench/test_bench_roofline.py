@@ -57,6 +57,7 @@ def test_every_stage_has_its_work(build):
     assert table.limit["paste"] == "memory"
 
 
+@pytest.mark.slow
 def test_the_command_prints_a_table(capture, tmp_path, inside):
     few = ("sizes=[tiny]", "frames=1", "warmup=0", "poses=1", f"data.root={capture}", "device=cpu")
     done = inside("bench", "roofline", *few, "data.source=null", f"hydra.run.dir={tmp_path}")

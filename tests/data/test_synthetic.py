@@ -156,6 +156,7 @@ def test_landmarks_of_the_baked_avatars_lie_on_their_parts(avatar):
         assert any(part in label for label in found), (name, found)
 
 
+@pytest.mark.slow
 def test_left_and_right_labels_lie_on_left_and_right_landmarks():
     scene = Scene(Settings(**TINY | {"size": 96, "frames": 8}))
     names, hits = free_body().label_names, 0

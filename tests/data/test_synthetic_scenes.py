@@ -196,6 +196,7 @@ def test_held_out_cameras_are_neutral_and_no_file_contains_the_tints(scene):
 # ---------------------------------------------------------------- scale
 
 
+@pytest.mark.slow
 def test_scaled_test_cameras_see_the_person_at_their_scale(scene, stage):
     root = scene(test_scale=[0.5, 2])
     splits = json.loads((root / "meta.json").read_text())["splits"]
