@@ -243,6 +243,7 @@ def test_the_free_body_follows(free):
     np.testing.assert_allclose(posed[7].numpy(), vertices, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
 )

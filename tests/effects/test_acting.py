@@ -321,6 +321,7 @@ def test_all_means_all_that_this_model_can_have(build):
     assert torch.isfinite(avatar.paint(frame).image).all()
 
 
+@pytest.mark.slow
 def test_check_prints_the_same_decisions(capture, inside):
     result = inside("check", "data=capture", f"data.root={capture}", "report=out.html")
     assert "Effects that the scene calls for" in result.stdout
