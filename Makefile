@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help install train test test-slow stability lint format wheel clean
+.PHONY: help install train test test-slow stability gpu lint format wheel clean
 
 help: ## list the targets
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /  make \1\t/' | expand -t 18
@@ -32,6 +32,9 @@ test-slow: $(STAMP) ## run the tests that take minutes
 
 stability: $(STAMP) ## compare every hard case with float64 (ARGS="--page docs/rasteriser.md")
 	$(BIN)/python scripts/stability.py $(ARGS)
+
+gpu: $(STAMP) ## check everything that needs CUDA and write docs/gpu.md (at most 20 minutes, resumes)
+	PYTHON=$(BIN)/python scripts/gpu_check.sh
 
 lint: $(STAMP) ## ruff and mypy
 	$(BIN)/ruff check .

@@ -24,6 +24,7 @@ if any(map(shutil.which, build.COMPILERS)):
     assert native.available(), native.why_not()
 '
 "$work/venv/bin/python" -m gsgan.train experiment=demo training=smoke \
+  size=small data.source.frames=12 data.source.test_frames=4 \
   hydra.run.dir="$work/run"
 test -s "$work/run/metrics.json"
 "$work/venv/bin/python" -m gsgan.evaluate run="$work/run"

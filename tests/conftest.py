@@ -147,6 +147,8 @@ def inside(tmp_path, monkeypatch, capfd):
         monkeypatch.chdir(tmp_path)
         monkeypatch.setenv("COLUMNS", "120")
         monkeypatch.setattr(sys, "argv", [f"gsgan.{command}", *args])
+        # tests of memory in this process need it given back
+        monkeypatch.setattr("gsgan.utils.tensors.keep_freed_memory", lambda: None)
         capfd.readouterr()
         code = 0
         try:

@@ -13,10 +13,10 @@ DATA = sorted(path.stem for path in (config_folder() / "data").glob("*.yaml"))
 def test_large_captures_train_at_full_size_by_themselves(compose, data):
     config = compose("train", f"data={data}")
     large = data in ("thuman4", "zju_mocap", "avatarrex")
-    assert config.size.picture == (512 if large else 128)
-    assert config.training.schedule.step_two == (250_000 if large else 2600)
+    assert config.size.picture == (512 if large else 256 if data == "synthetic" else 128)
+    assert config.training.schedule.step_two == (250_000 if large else 3200)
     small = compose("train", f"data={data}", "size=small", "training=demo")
-    assert (small.size.picture, small.training.schedule.step_two) == (128, 2600)
+    assert (small.size.picture, small.training.schedule.step_two) == (128, 3200)
 
 
 @pytest.mark.parametrize(
@@ -29,6 +29,7 @@ def test_the_accelerator_is_the_one_that_is_there(compose, monkeypatch, there, t
     assert compose("train", "trainer=cpu").trainer.accelerator == "cpu"
 
 
+@pytest.mark.slow
 def test_a_long_run_without_a_gpu_is_refused_with_its_price_until_it_is_asked_for(
     inside, capture, tmp_path
 ):

@@ -131,13 +131,22 @@ def test_a_loss_term(tiny):
     data, module = build_training(tiny(f"training.extra_losses={losses}"))
     frame = data.dataset("train")[0]
     painting = module.avatar.paint(frame)
-    terms = module.step_two_terms(painting, frame, adversarial=False)
+    terms = module.step_two_terms(painting, frame, None)
     expected = 0.1 * painting.image.diff(dim=-1).abs().mean()
     assert float(terms["smooth"]) == float(expected) > 0
 
 
 def test_a_generator(build):
-    keys = ("base", "multipliers", "style", "style_share", "rgb_skip", "output", "feature_bound")
+    keys = (
+        "base",
+        "multipliers",
+        "style",
+        "style_share",
+        "rgb_skip",
+        "output",
+        "feature_bound",
+        "patch",
+    )
     _, avatar, frame = build(
         f"model.generator._target_={HERE}.OneLayer", *(f"~model.generator.{key}" for key in keys)
     )

@@ -39,8 +39,8 @@ def test_every_subject_has_code_and_a_config(subject):
 @pytest.mark.parametrize(
     ("arguments", "given"),
     [
-        ([], "(raster, speed, trade-off, effects); nothing was given"),
-        (["rays", "seed=1"], "(raster, speed, trade-off, effects); 'rays' is not one"),
+        ([], "(raster, speed, roofline, trade-off, effects); nothing was given"),
+        (["rays", "seed=1"], "(raster, speed, roofline, trade-off, effects); 'rays' is not one"),
         (["stability"], "the hard cases are tests: run `make stability`"),
     ],
 )

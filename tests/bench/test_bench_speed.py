@@ -89,6 +89,7 @@ def test_the_clock_adds_up_what_one_stage_takes_twice():
     assert clock.frame["F"] > once > 0
 
 
+@pytest.mark.slow
 def test_ways_of_painting_do_not_reach_each_other(small):
     _, avatar, frame = small
     plain, exact = Painter(avatar, Way()), Painter(avatar, Way(accuracy=accuracy("exact")))

@@ -136,6 +136,7 @@ def test_a_report_that_cannot_be_written_is_reported(good, command, tmp_path):
     assert "report=taken/check.html cannot be written" in " ".join(output.split())
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (REAL / "cameras.json").is_file(), reason=f"no real capture at {REAL}")
 def test_the_real_capture_has_what_is_known_of_it(command, tmp_path):
     code, output, _ = command(f"data.root={REAL}", "sampling.pictures=40", "sampling.shown=1")

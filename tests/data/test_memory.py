@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import tracemalloc
 from pathlib import Path
@@ -24,8 +25,10 @@ CACHE = 2 * MIB
 
 
 def resident() -> int:
-    """Bytes of this process that are in memory."""
+    """Bytes of this process that are in memory, without what was freed."""
     if STATM.exists():
+        if hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
+            libc.malloc_trim(0)
         return int(STATM.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     tracemalloc.start()
     return tracemalloc.get_traced_memory()[0]

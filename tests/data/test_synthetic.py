@@ -17,15 +17,17 @@ from gsgan.body.free import free_body
 from gsgan.data.datamodule import GsganData
 from gsgan.data.synthetic import ensure_synthetic, scenes
 from gsgan.data.synthetic.free_subject import free_pose
-from gsgan.data.synthetic.scene_setup import AVATARS, Scene, Settings, dataset_key
+from gsgan.data.synthetic.scene_setup import Scene, Settings, dataset_key
 from gsgan.data.synthetic.trace import PosedCharacter
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root
 
 torch.set_num_threads(1)
+EACH_AVATAR = ("polo", pytest.param("blouse", marks=pytest.mark.slow))
 TINY = {
     "avatar": "free_body",  # without textures: made in a second
+    "secondary": False,
     "size": 32,
     "train_cameras": 1,
     "test_cameras": 1,
@@ -126,7 +128,7 @@ def test_landmarks_project_into_the_mask(dataset):
     assert np.mean(inside) > 0.97
 
 
-@pytest.mark.parametrize("avatar", AVATARS)
+@pytest.mark.parametrize("avatar", EACH_AVATAR)
 def test_the_baked_avatars_have_landmarks_labels_and_no_body_pose(avatar, tmp_path):
     root = tiny(tmp_path, avatar=avatar)
     assert not (root / "body_pose.npz").exists()
@@ -139,7 +141,7 @@ def test_the_baked_avatars_have_landmarks_labels_and_no_body_pose(avatar, tmp_pa
         assert ((labels > 0) == (mask >= 128)).mean() >= 0.995
 
 
-@pytest.mark.parametrize("avatar", AVATARS)
+@pytest.mark.parametrize("avatar", EACH_AVATAR)
 def test_landmarks_of_the_baked_avatars_lie_on_their_parts(avatar):
     """Both eyes and the mouth on the face, wrists on arms or hands, toes on shoes."""
     scene = Scene(Settings(**TINY | {"avatar": avatar, "size": 160, "train_cameras": 2}))
@@ -154,6 +156,7 @@ def test_landmarks_of_the_baked_avatars_lie_on_their_parts(avatar):
         assert any(part in label for label in found), (name, found)
 
 
+@pytest.mark.slow
 def test_left_and_right_labels_lie_on_left_and_right_landmarks():
     scene = Scene(Settings(**TINY | {"size": 96, "frames": 8}))
     names, hits = free_body().label_names, 0
@@ -169,7 +172,7 @@ def test_left_and_right_labels_lie_on_left_and_right_landmarks():
 
 
 def test_person_is_in_view_and_fills_it():
-    scene = Scene(Settings(avatar="free_body", frames=24, test_frames=6))
+    scene = Scene(Settings(avatar="free_body", secondary=False, frames=24, test_frames=6))
     top, bottom = [], []
     for frame in range(24):
         vertices = scene.mesh(frame)[0]
@@ -183,7 +186,7 @@ def test_person_is_in_view_and_fills_it():
 
 
 def test_test_cameras_are_between_training_cameras():
-    scene = Scene(Settings(avatar="free_body", frames=2, test_frames=1))
+    scene = Scene(Settings(avatar="free_body", secondary=False, frames=2, test_frames=1))
     angle = {
         name: math.atan2(view.centre[0], -view.centre[1]) for name, view in scene.views.items()
     }
@@ -207,7 +210,7 @@ def test_another_seed_gives_another_motion():
 
 
 def test_without_secondary_motion_the_mesh_is_skinned_and_landmarks_stay():
-    still, moving = (Scene(Settings(**TINY, secondary=on)) for on in (False, True))
+    still, moving = (Scene(Settings(**TINY | {"secondary": on})) for on in (False, True))
     vertices, _, wrinkles = still.mesh(1)
     assert wrinkles is None
     exact = free_body().posed_vertices(free_pose(still.motion))[1].numpy()

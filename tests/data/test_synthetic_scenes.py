@@ -20,6 +20,7 @@ LENS = (-0.28, 0.09, 0.001, -0.0008, -0.01)
 # Three cameras: the tints of two would be each other's inverse, as their mean is none.
 TINY = {
     "avatar": "free_body",
+    "secondary": False,
     "size": 48,
     "train_cameras": 3,
     "test_cameras": 1,
@@ -102,6 +103,7 @@ def test_the_ray_of_a_points_pixel_hits_the_point(stage):
         assert off.max() < 1e-8
 
 
+@pytest.mark.slow
 def test_distorted_images_undistort_to_those_of_the_pinholes():
     """At a size at which textures are several pixels wide: undistorting averages neighbours."""
     lens = (-0.5, 0.15, 0.003, -0.002, -0.01)
@@ -194,6 +196,7 @@ def test_held_out_cameras_are_neutral_and_no_file_contains_the_tints(scene):
 # ---------------------------------------------------------------- scale
 
 
+@pytest.mark.slow
 def test_scaled_test_cameras_see_the_person_at_their_scale(scene, stage):
     root = scene(test_scale=[0.5, 2])
     splits = json.loads((root / "meta.json").read_text())["splits"]

@@ -63,6 +63,7 @@ def test_all_off_is_the_plain_chain_operator_by_operator(build):
         frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
         points = avatar.densify(p, valid, frames)
         gaussians = avatar.deformation(p, points, camera.centre, frames.hubs[:, 0], None)
+        gaussians = avatar.bounded(gaussians)
         raster = rasterise(gaussians, camera, settings=avatar.accuracy)
         S = avatar.segmentation(frame.body, camera)
         p2d = avatar.draw(p, valid, camera, None)
@@ -320,6 +321,7 @@ def test_all_means_all_that_this_model_can_have(build):
     assert torch.isfinite(avatar.paint(frame).image).all()
 
 
+@pytest.mark.slow
 def test_check_prints_the_same_decisions(capture, inside):
     result = inside("check", "data=capture", f"data.root={capture}", "report=out.html")
     assert "Effects that the scene calls for" in result.stdout

@@ -34,6 +34,7 @@ def with_landmarks(people: Path, to: Path, change) -> Path:
     return to
 
 
+@pytest.mark.slow
 def test_noise_in_the_landmarks_shrinks(fit, people, tmp_path):
     truth = np.load(people / "landmarks3d.npz")["p"]
     noise = 3 * np.random.default_rng(0).standard_normal(truth.shape)

@@ -138,3 +138,12 @@ def test_the_deformation_follows_the_pose(build):
     assert (
         float((avatar.paint(frame).image - avatar.paint(moved).image).abs().max().detach()) > 0.01
     )
+
+
+def test_stability_overflowing_features_are_bounded(build):
+    _, avatar, frame = build("model.generator.feature_bound=10.0", "size.rgb_skip=false")
+    with torch.no_grad():
+        avatar.deformation.table.fill_(1e30)
+        painting = avatar.paint(frame)
+    assert float(painting.gaussians.features.max()) == 10
+    assert torch.isfinite(painting.image).all()

@@ -195,6 +195,7 @@ def frames_of(folder, smpl):
     return CaptureDataset(layout, items), open_body("smpl", str(smpl), betas, CIHP)
 
 
+@pytest.mark.slow
 def test_the_vote_finds_clothes_that_joints_do_not_tell(zju, tmp_path):
     """0.971 of all vertices when written (the joints' guess: 0.195), hidden ones included."""
     folder, smpl, truth = zju

@@ -19,6 +19,8 @@ from gsgan.utils.errors import DataError
 
 FEW = ("shots.teaser=2", "shots.strip=2", "shots.errors=1", "shots.canny=1", "settings.dpi=60")
 
+pytestmark = pytest.mark.slow  # make test runs `report run=` as the README has it
+
 
 @pytest.fixture
 def twin(run, tmp_path) -> Path:
@@ -34,7 +36,6 @@ def edit(run: Path, **values) -> None:
     OmegaConf.save(config, path)
 
 
-@pytest.mark.slow
 def test_every_figure_is_made_with_numbers_of_the_images_shown(run, twin, tmp_path, inside):
     out = tmp_path / "out"
     whole = "settings.margin=9"  # metres: the window is the image
@@ -80,7 +81,6 @@ def expected(run: Path, found: dict) -> dict:
     return numbers
 
 
-@pytest.mark.slow
 def test_the_same_figure_has_the_same_bytes_and_earlier_ones_are_kept(run, tmp_path, inside):
     given = (f"run={run}", f"out={tmp_path / 'out'}", "formats=[png,pdf]", *FEW)
     assert inside("report", *given, "figures=canny").returncode == 0
@@ -151,7 +151,6 @@ def test_an_unfinished_run_is_marked_in_captions(twin, tmp_path, inside):
     assert message in (tmp_path / "out" / "captions.md").read_text()
 
 
-@pytest.mark.slow
 def test_training_curves_join_the_parts_of_a_resumed_run(twin, tmp_path, inside):
     for log in twin.glob("logs*"):
         shutil.rmtree(log)

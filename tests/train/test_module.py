@@ -10,11 +10,16 @@ import torch
 from lightning import Trainer
 from torch.utils.data import DataLoader
 
-from gsgan.losses.adversarial import FORMS, generator_loss
+from gsgan.losses.adversarial import (
+    FORMS,
+    discriminator_loss,
+    feature_matching,
+    generator_loss,
+)
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.painting import Painting
 from gsgan.model.segmentation import silhouette_loss
-from gsgan.train.losses import StepTwoLoss, discriminate
+from gsgan.train.losses import Judged, StepTwoLoss, discriminate
 from gsgan.utils.errors import ConfigError, GsganError
 
 
@@ -286,7 +291,8 @@ def test_every_phase_runs_under_bf16_autocast(make):
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert module.avatar.window(frame) is not None
         mixed = module.avatar.paint(frame)
-        terms = module.step_two_terms(mixed, frame, adversarial=True)
+        judged = module.step_two.judged(module.discriminator, mixed, frame)
+        terms = module.step_two_terms(mixed, frame, judged)
         torch.stack(list(terms.values())).sum().backward()
     assert torch.equal(plain.features, mixed.features)
     assert mixed.image.dtype == torch.float32
@@ -324,7 +330,12 @@ def test_a_comparing_gan_without_feature_matching_still_sees_the_real_picture():
     weights = StepTwoLoss(adversarial=2.0, feature_matching=0.0, gan="relativistic", alpha=0.0)
     painting = Painting(image, image[:, :1])
     terms = weights.terms(
-        painting, frame, anchor=None, perceptual=None, discriminator=critic, step=0
+        painting,
+        frame,
+        anchor=None,
+        perceptual=None,
+        judged=weights.judged(critic, painting, frame),
+        step=0,
     )
     expected = 2 * generator_loss(critic(frame.image), critic(image), "relativistic")
     assert float(terms["adversarial"]) == pytest.approx(float(expected), rel=1e-6)
@@ -343,3 +354,26 @@ def test_a_comparing_gan_runs_the_discriminator_in_full_precision():
 def test_wrong_gan_name_is_one_sentence(make):
     with pytest.raises(Exception, match="logistic, hinge, lsgan, relativistic"):
         make("training.step_two.gan=wasserstein")
+
+
+@pytest.mark.parametrize("gan", FORMS)
+def test_maps_shared_by_both_losses_give_the_gradients_of_two_passes(gan):
+    torch.manual_seed(0)
+    critic = Discriminator(scales=2, base=4, layers=2, norm="none").double()
+    image = torch.rand(1, 3, 16, 16, dtype=torch.float64, requires_grad=True)
+    target = torch.rand(1, 3, 16, 16, dtype=torch.float64)
+    judged = Judged(critic, image, target, gan)
+    terms = judged.terms(0.5, 2.0)
+    torch.stack(list(terms.values())).sum().backward()
+    assert all(p.grad is None for p in critic.parameters())
+    found, image.grad = image.grad, None
+    judged.loss().backward()
+    assert image.grad is None  # the discriminator's loss does not reach the generator
+    of_critic = [p.grad.clone() for p in critic.parameters()]
+
+    real, fake = critic(target), critic(image)
+    expected = 0.5 * generator_loss(real, fake, gan) + 2 * feature_matching(real, fake)
+    torch.testing.assert_close(sum(terms.values()), expected)
+    torch.testing.assert_close(found, torch.autograd.grad(expected, image)[0])
+    apart = discriminator_loss(critic(target), critic(image.detach()), gan)
+    torch.testing.assert_close(of_critic, list(torch.autograd.grad(apart, critic.parameters())))

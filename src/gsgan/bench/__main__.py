@@ -17,6 +17,7 @@ from gsgan.utils.config import FAILED, entry
 SUBJECTS = {
     "raster": "time against error of every backend and accuracy setting of the rasteriser",
     "speed": "milliseconds from skeleton to image, by stage",
+    "roofline": "the work of each stage of painting against the machine's peak",
     "trade-off": "quality against time and memory, over settings of a run or over many runs",
     "effects": "what each effect gains where it is called for, and costs (trains for an hour)",
 }

@@ -61,7 +61,7 @@ class Painter:
         kind = frame.skeleton.device.type
         mixed = torch.autocast(kind, dtype=dtype or torch.bfloat16, enabled=dtype is not None)
         with changed(self.avatar, way), mixed:
-            image = self.avatar.paint(frame).image
+            image = self.avatar.paint(frame, maps=False).image
         assert image is not None
         if way.scale == 1:
             return image
@@ -133,6 +133,6 @@ def evenly(length: int, count: int) -> list[int]:
 
 
 def place(avatar: Avatar, device: torch.device, *, channels_last: bool) -> Avatar:
-    """The avatar on a device, in eval mode, its weights with channels last or not."""
+    """The frozen avatar on a device, its weights with channels last or not."""
     layout = torch.channels_last if channels_last else torch.contiguous_format
-    return avatar.to(device=device, memory_format=layout).eval()  # type: ignore[call-overload]
+    return avatar.freeze().to(device=device, memory_format=layout)  # type: ignore[call-overload]

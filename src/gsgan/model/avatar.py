@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, Self
 
 import torch
 from torch import Tensor, nn
 
 from gsgan.effects import Effects
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.deformation import Deformation
+from gsgan.model.deformation import Deformation, bounded
 from gsgan.model.generator import Generator
 from gsgan.model.painting import ColourCorrection, Painting
 from gsgan.model.segmentation import Segmentation
@@ -118,6 +118,17 @@ class Avatar(nn.Module):
         """Whether painting needs the pose of the skinned body beside the skeleton."""
         return any(part for part in (self.body_points, self.surface, self.segmentation))
 
+    def freeze(self) -> Self:
+        """Ends training, and paints faster: what depends on weights alone is computed once.
+
+        Convention: images are the same up to rounding, and follow weights that are loaded later.
+        Weights get no gradient any more; skeleton and camera do.
+        """
+        self.eval().requires_grad_(False)
+        for part in self.modules():
+            part.derived = {}  # type: ignore[assignment]
+        return self.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
+
     @torch.no_grad()
     def render(
         self,
@@ -163,7 +174,7 @@ class Avatar(nn.Module):
             raise ValueError(f"render: expected 1 or {len(p)} cameras, got {len(camera)}")
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
         body = None if body is None else body.to(device)
-        painting = self._paint(p, seen, cameras.to(device), body)
+        painting = self._paint(p, seen, cameras.to(device), body, maps=False)
         assert painting.image is not None and painting.alpha is not None  # noqa: PT018
         colour = p.new_tensor(background).expand(3).view(1, 3, 1, 1)
         image = painting.image.clamp(0, 1)
@@ -209,6 +220,7 @@ class Avatar(nn.Module):
             gaussians = self.splat(p, valid, frames, camera, body, pose_noise)
             raster = None
             if gaussians is not None:
+                gaussians = self.bounded(gaussians)
                 with self.stage("F"):
                     raster = rasterise(
                         gaussians,
@@ -281,11 +293,18 @@ class Avatar(nn.Module):
                 p, points, camera.centre, frames.hubs[:, 0], pose_noise
             )
 
-    def paint(self, frame: Frame) -> Painting:
-        """The whole image of a dataset's frame: its window painted, background around it."""
-        return self._paint(
-            frame.skeleton, frame.visibility, frame.camera, frame.body, frame.camera_index
-        )
+    def bounded(self, gaussians: Gaussians) -> Gaussians:
+        """Features clamped to what the generator takes: their blends are then in that range too."""
+        bound = getattr(self.generator, "feature_bound", None)
+        if bound is None:
+            return gaussians
+        return replace(gaussians, features=bounded(gaussians.features, -bound, bound))
+
+    def paint(self, frame: Frame, *, maps: bool = True) -> Painting:
+        """The whole image of a dataset's frame: its window painted, background around it; without
+        F, S and the Gaussians where ``maps`` is False."""
+        given = (frame.skeleton, frame.visibility, frame.camera, frame.body, frame.camera_index)
+        return self._paint(*given, maps=maps)
 
     def _paint(
         self,
@@ -294,6 +313,8 @@ class Avatar(nn.Module):
         camera: Camera,
         body: BodyPose | None,
         camera_index: Tensor | None = None,
+        *,
+        maps: bool = True,
     ) -> Painting:
         window = self._window(skeleton, camera)
         if window is None:
@@ -307,7 +328,7 @@ class Avatar(nn.Module):
             camera_index=camera_index,
         )
         with self.stage("paste"):
-            return painting.pasted(window)
+            return (painting if maps else painting.only_image()).pasted(window)
 
     def window(self, frame: Frame) -> Window | None:
         """The part of a frame's image that holds the person; None means all of it."""

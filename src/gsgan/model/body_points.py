@@ -14,6 +14,7 @@ from gsgan.body.skinned import vertex_normals
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import Points
 from gsgan.utils.checks import above, whole
+from gsgan.utils.tensors import derived
 
 NORMAL_FLOOR = 1e-2  # below it rounding errors dominate where skinning is flat
 ROWS = 1024  # points compared with all others at a time
@@ -93,8 +94,12 @@ class SkinnedGaussians(nn.Module):
         self, A: Tensor, means: Tensor, log_scales: Tensor, logits: Tensor, features: Tensor
     ) -> Gaussians:
         """Gaussians at ``means [B, N, 3]``, their shapes transformed by ``A [B, N, 3, 3]``."""
-        rotation = quaternion_to_rotation_matrix(functional.normalize(self.quats, dim=-1, eps=1e-6))
-        axes = A @ (rotation * log_scales.exp().unsqueeze(-2))
+
+        def make() -> Tensor:
+            unit = functional.normalize(self.quats, dim=-1, eps=1e-6)
+            return quaternion_to_rotation_matrix(unit) * log_scales.exp().unsqueeze(-2)
+
+        axes = A @ derived(self, "axes", make, *self.parameters(recurse=False))
         opacities = torch.sigmoid(logits).expand(len(A), -1)
         return Gaussians(means, None, None, opacities, features, covariances=axes @ axes.mT)
 

@@ -12,11 +12,12 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from gsgan.model import compose
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
 from gsgan.utils.checks import one_of, whole
-from gsgan.utils.tensors import constant
+from gsgan.utils.tensors import constant, derived
 
 QUAT_FLOOR = 1e-12  # inside the root that normalises a quaternion: q0 + δq ≈ 0 stays finite
 
@@ -109,18 +110,51 @@ class Deformation(nn.Module):
     def residuals(self, points: Points, pose: Tensor, root: Tensor) -> Residuals:
         """ΔG of posed points, from the `pose_code` and the pelvis ``root`` ``[B, 3]`` (metres)."""
         position = (points.means - root[:, None]) / self.body_height
-        x = self.from_point(torch.cat([self.rest_code, self.embedding], dim=-1))
-        x = x + self.from_position(positional_encoding(position, self.position_octaves))
-        if self.from_normal is not None:
-            x = x + self.from_normal(points.normals)
-        x = functional.relu(x + self.from_pose(pose)[:, None])
-        for layer in self.trunk:
-            x = functional.relu(layer(x))
+        code = positional_encoding(position, self.position_octaves)
+        if torch.is_grad_enabled() and not (code.requires_grad or points.normals.requires_grad):
+            x = self._trained(code, points.normals, pose)
+        else:
+            weight = self.from_position.weight
+            if self.from_normal is not None:
+                code = torch.cat([code, points.normals], dim=-1)
+                weight = torch.cat([weight, self.from_normal.weight], dim=1)
+            start = self._point_part() + self.from_pose(pose).unsqueeze(1)
+            x = torch.baddbmm(start, code, weight.mT.expand(len(pose), -1, -1))
+            x = functional.relu(x, inplace=True)
+            for layer in self.trunk:
+                x = functional.relu(layer(x), inplace=True)
         raw, parts = self._head(x)
         means, quats, scales, opacities, sh, features = raw.split(parts, dim=-1)
         return Residuals(
             means, quats, scales, opacities[..., 0], sh.unflatten(-1, (-1, 3)), features
         )
+
+    def _point_part(self) -> Tensor:
+        """``[N, width]``: the part of the first layer that depends on the point alone."""
+        layer, own = self.from_point, self.embedding
+
+        def make() -> Tensor:
+            found: Tensor = layer(torch.cat([self.rest_code, own], dim=-1))
+            return found
+
+        return derived(self, "point part", make, layer.weight, layer.bias, own, self.rest_code)
+
+    def _trained(self, code: Tensor, normals: Tensor, pose: Tensor) -> Tensor:
+        """The trunk's output, its layers as one operation, which computes no unused gradient."""
+        given, weights = [self.rest_code, code], [self.from_position.weight]
+        from_rest, from_embedding = self.from_point.weight.split(
+            [self.rest_code.shape[-1], self.embedding.shape[-1]], dim=-1
+        )
+        if self.from_normal is not None:
+            given.append(normals)
+            weights.append(self.from_normal.weight)
+        size = code.shape[:2]
+        known = torch.cat([x.expand(*size, -1) for x in given], dim=-1)
+        weight = torch.cat([from_rest, *weights, from_embedding], dim=-1)
+        bias = self.from_point.bias + self.from_pose(pose)
+        layers = [x for layer in self.trunk for x in (layer.weight, layer.bias)]
+        x: Tensor = _Trunk.apply(known, self.embedding.expand(*size, -1), weight, bias, *layers)
+        return x
 
     def _head(self, x: Tensor) -> tuple[Tensor, tuple[int, ...]]:
         """The raw residuals ``[B, N, ...]`` and the sizes of their parts, without the harmonics
@@ -146,27 +180,38 @@ class Deformation(nn.Module):
             Gaussians with covariances, features = colour (3) then F's other channels.
         """
         frames = points.frames
-        offset = residuals.means
-        if self.mean_bound is not None:
-            offset = self.mean_bound * torch.tanh(offset)
-        offset = offset * self.body_height
-        means = points.means + (frames @ offset.unsqueeze(-1)).squeeze(-1)
-        low, high = (math.log(bound * self.body_height) for bound in self.scale_range)
-        scales = bounded(points.scales.log().unsqueeze(-1) + residuals.scales, low, high).exp()
-        axes = frames @ quaternion_to_rotation_matrix(_unit_quat(residuals.quats))
-        axes = axes * scales.unsqueeze(-2)
-        logit = math.log(self.opacity / (1 - self.opacity))
-        logits = bounded(logit + residuals.opacities, -self.logit_bound, self.logit_bound)
-        opacities = torch.sigmoid(logits)
+        means, covariances, opacities = self._geometry(points, frames, residuals)
         colour = colour_from(eye, means, frames, residuals.sh)
         return Gaussians(
             means=means,
             quats=None,
             scales=None,
-            covariances=axes @ axes.mT,
-            opacities=opacities * points.valid.to(opacities.dtype),
+            covariances=covariances,
+            opacities=opacities,
             features=torch.cat([colour, residuals.features], dim=-1),
         )
+
+    def _geometry(
+        self, points: Points, frames: Tensor, residuals: Residuals
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Means, covariances and opacities; on a CPU in one pass, of the same definition."""
+        bound, height = self.mean_bound, self.body_height
+        low, high = (math.log(limit * height) for limit in self.scale_range)
+        logit = math.log(self.opacity / (1 - self.opacity))
+        parts = (residuals.means, residuals.quats, residuals.scales)
+        raw = torch.cat([*parts, residuals.opacities.unsqueeze(-1)], dim=-1)
+        fixed = (points.means, frames, points.scales, points.valid)
+        if compose.compiled(raw, *fixed):
+            numbers = ((bound or 0.0) * height, height, low, high, logit, self.logit_bound)
+            return compose.geometry(raw, *fixed, numbers)
+        offset = residuals.means if bound is None else bound * torch.tanh(residuals.means)
+        means = points.means + (frames @ (offset * height).unsqueeze(-1)).squeeze(-1)
+        scales = bounded(points.scales.log().unsqueeze(-1) + residuals.scales, low, high).exp()
+        axes = frames @ quaternion_to_rotation_matrix(_unit_quat(residuals.quats))
+        axes = axes * scales.unsqueeze(-2)
+        logits = bounded(logit + residuals.opacities, -self.logit_bound, self.logit_bound)
+        opacities = torch.sigmoid(logits) * points.valid.to(logits.dtype)
+        return means, axes @ axes.mT, opacities
 
     def pose_code(self, p: Tensor, root: Tensor, pelvis: Tensor, noise: Tensor | None) -> Tensor:
         """``[B, 3 J]``: joints about the root, in body heights, noise added when given.
@@ -240,6 +285,41 @@ def positional_encoding(x: Tensor, octaves: int) -> Tensor:
 def encoded_size(dimensions: int, octaves: int) -> int:
     """Size of the `positional_encoding` of ``dimensions`` coordinates."""
     return dimensions * (1 + 2 * octaves)
+
+
+class _Trunk(torch.autograd.Function):
+    """Linear layers with ReLU; no gradient of what is ``known``, the largest part of the input."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, known: Tensor, learned: Tensor, weight: Tensor, bias: Tensor, *layers: Tensor
+    ) -> Tensor:
+        B, N, _ = known.shape
+        inputs = torch.cat([known, learned], dim=-1).flatten(0, 1)
+        x = (inputs @ weight.mT).view(B, N, -1).add_(bias[:, None]).relu_().flatten(0, 1)
+        outputs = [x]
+        for w, b in zip(layers[::2], layers[1::2], strict=True):
+            outputs.append(torch.addmm(b, outputs[-1], w.mT).relu_())
+        ctx.save_for_backward(inputs, weight, *layers[::2], *outputs)
+        ctx.size = (B, N, learned.shape[-1])
+        return outputs[-1].view(B, N, -1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        inputs, weight, *rest = ctx.saved_tensors
+        B, N, learned = ctx.size
+        count = len(rest) // 2
+        weights, outputs = rest[:count], rest[count:]
+        through = torch.ops.aten.threshold_backward  # ReLU's gradient
+        g = through(grad.reshape(B * N, -1), outputs[-1], 0)
+        found: list[Tensor | None] = []
+        for w, x in zip(reversed(weights), reversed(outputs[:-1]), strict=True):
+            found = [g.mT @ x, g.sum(0), *found]
+            g = g @ w
+            through.grad_input(g, x, 0, grad_input=g)
+        d_learned = g @ weight[:, weight.shape[1] - learned :]
+        return None, d_learned.view(B, N, learned), g.mT @ inputs, g.view(B, N, -1).sum(1), *found
 
 
 class _Bounded(torch.autograd.Function):

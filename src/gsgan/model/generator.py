@@ -9,33 +9,48 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from gsgan.model import styled
 from gsgan.utils.checks import one_of
+from gsgan.utils.tensors import derived
 
 NORM_FLOOR = 1e-6  # inside the root: an all-zero pixel (empty background) stays zero
 SLOPE = 0.2
 
 
 class Encoder(nn.Module):
-    """A pyramid: 3×3 stem, then stride-2 levels; returns every level, finest first."""
+    """A pyramid: a stem, then stride-2 levels; returns every level, finest first.
 
-    def __init__(self, inputs: int, channels: Sequence[int]) -> None:
+    The stem is a 3×3 convolution; with ``patch`` > 1 one of patch × patch pixels, each of which is
+    a pixel of the finest level, and then a 3×3.
+    """
+
+    def __init__(self, inputs: int, channels: Sequence[int], patch: int = 1) -> None:
         super().__init__()
-        self.stem = nn.Conv2d(inputs, channels[0], 3, padding=1)
+        first, kernel = channels[0], {"kernel_size": 3, "padding": 1}
+        stem = kernel if patch == 1 else {"kernel_size": patch, "stride": patch}
+        self.stem = nn.Conv2d(inputs, first, **stem)  # type: ignore[arg-type]
+        self.after = nn.Conv2d(first, first, **kernel) if patch > 1 else None  # type: ignore[arg-type]
         self.down = nn.ModuleList(
             nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(channels)
         )
         self.refine = nn.ModuleList(nn.Conv2d(c, c, 3, padding=1) for c in channels[1:])
 
     def forward(self, x: Tensor) -> list[Tensor]:
-        """``[B, inputs, H, W]`` to levels ``[B, channels[l], H / 2^l, W / 2^l]``."""
-        levels = [_activate(self.stem(x))]
+        """``[B, inputs, H, W]`` to levels ``[B, channels[l], h / 2^l, w / 2^l]``, h = H / patch."""
+        return self.levels(self.stem(x))
+
+    def levels(self, stem: Tensor) -> list[Tensor]:
+        """The same from the stem's output, before its activation."""
+        levels = [_activate(stem)]
+        if self.after is not None:
+            levels = [_activate(self.after(levels[0]))]
         for down, refine in zip(self.down, self.refine, strict=True):
             levels.append(_activate(refine(_activate(down(levels[-1])))))
         return levels
 
 
 class Style(nn.Module):
-    """Per-pixel normalisation, then scale and shift from E_s's level and the pose code g.
+    """Per-pixel normalisation, scale and shift from E_s's level and the pose code g, activation.
 
     Normalising over channels at each pixel (not over the image) keeps colours independent of how
     much of the image is background. Both maps start at zero: the style starts as the identity.
@@ -51,15 +66,26 @@ class Style(nn.Module):
                 start_at_zero(layer)
 
     def forward(self, h: Tensor, style: Tensor | None, g: Tensor) -> Tensor:
-        """``h`` ``[B, C, h, w]`` styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]``."""
-        modulation = self.from_pose(g)[:, :, None, None]
+        """``h`` ``[B, C, h, w]`` styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]``, then
+        activated."""
+        rows = h.permute(0, 2, 3, 1)  # channels last in memory: channels of a pixel are a row
+        modulation = self.from_pose(g).unsqueeze(1)
         if self.from_map is not None:
-            modulation = self.from_map(style) + modulation
-        gamma, beta = modulation.chunk(2, dim=1)
-        # Squares in float32 at least: half precision loses them above 256 and below 2e-4.
-        wide = h.to(torch.promote_types(h.dtype, torch.float32))
-        wide = wide * torch.rsqrt(wide.square().mean(dim=1, keepdim=True) + NORM_FLOOR)
-        return wide.to(h.dtype) * (1 + gamma) + beta
+            assert style is not None
+            weight = self.from_map.weight.flatten(1).mT.expand(len(h), -1, -1)
+            styles = style.permute(0, 2, 3, 1).flatten(1, 2)
+            modulation = torch.baddbmm(modulation + self.from_map.bias, styles, weight)
+            modulation = modulation.unflatten(1, rows.shape[1:3])
+        else:
+            modulation = modulation.unsqueeze(1)
+        if styled.compiled(rows, modulation):
+            made = styled.styled(rows, modulation, NORM_FLOOR, SLOPE)
+            return made.permute(0, 3, 1, 2)
+        gamma, beta = modulation.chunk(2, dim=-1)
+        # In float32 at least: half precision loses squares above 256 and below 2e-4.
+        wide = rows.to(torch.promote_types(h.dtype, torch.float32))
+        unit = functional.rms_norm(wide, wide.shape[-1:], eps=NORM_FLOOR).to(h.dtype)
+        return _activate(torch.addcmul(beta + unit, unit, gamma)).permute(0, 3, 1, 2)
 
 
 class DecoderLevel(nn.Module):
@@ -74,12 +100,23 @@ class DecoderLevel(nn.Module):
         self.styles = nn.ModuleList(Style(channels, style_channels, pose) for _ in range(2))
 
     def forward(self, h: Tensor, skip: Tensor, style: Tensor | None, g: Tensor) -> Tensor:
-        # Nearest + convolution: transposed convolutions leave a checkerboard.
-        h = functional.interpolate(self.reduce(h), scale_factor=2.0, mode="nearest")
-        h = torch.cat([h, skip], dim=1)
-        for conv, styled in zip(self.convs, self.styles, strict=True):
-            h = _activate(styled(conv(h), style, g))
-        return h
+        first, second = self.convs
+        h = self._join(self.reduce(h), skip, first.weight, first.bias)  # type: ignore[arg-type]
+        h = self.styles[0](h, style, g)
+        return self.styles[1](second(h), style, g)  # type: ignore[no-any-return]
+
+    def _join(self, h: Tensor, skip: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        """A 3×3 convolution of ``h``, upsampled to the nearest, and ``skip`` as further channels.
+
+        Two of three pixels under a kernel on an upsampled image are equal: a transposed convolution
+        whose kernel has their sums does 4/9 of the arithmetic. (It has no checkerboard: that comes
+        from kernels that are not such sums.)
+        """
+        C = h.shape[1]
+        kernel = derived(self, "upper", lambda: upsampled_kernel(weight[:, :C]), weight)
+        lower = derived(self, "lower", lambda: channels_last(weight[:, C:]), weight)
+        upsampled = functional.conv_transpose2d(h, kernel, stride=2, padding=1)
+        return upsampled + functional.conv2d(skip, lower, bias, padding=1)
 
 
 class Generator(nn.Module):
@@ -94,6 +131,10 @@ class Generator(nn.Module):
             beside their average; 1 for none.
         base: channels at full resolution.
         multipliers: channels of each level in units of ``base``; each level halves the resolution.
+        patch: power of 2: so many pixels each way are one pixel of the finest level, which paints
+            them as channels. The first levels of ``multipliers`` are then left out.
+        feature_bound: of the Gaussians' features, which `Avatar` clamps: that is cheaper than
+            clamping images of them.
 
     The other settings are explained in conf/model/full.yaml. With ``rgb_skip`` the last layer
     starts at zero, and training at Step I's image. An unclamped output can recover from black.
@@ -111,6 +152,7 @@ class Generator(nn.Module):
         *,
         base: int = 32,
         multipliers: Sequence[int] = (1, 2, 4, 8, 8),
+        patch: int = 1,
         style: str = "film",
         style_share: float = 0.5,
         rgb_skip: bool = False,
@@ -122,24 +164,25 @@ class Generator(nn.Module):
         one_of("model.generator.style", style, ("film", "pose"))
         if rgb_skip and output == "sigmoid":
             raise ValueError("Generator: rgb_skip adds to a colour, so output must be linear")
-        channels = [base * m for m in multipliers]
+        one_of("model.generator.patch", patch, [2**i for i in range(len(multipliers))])
+        self.patch, self.stride = patch, 2 ** (len(multipliers) - 1)
+        channels = [base * m for m in multipliers][patch.bit_length() - 1 :]
         mapped = style == "film"
         widths = [max(1, round(style_share * c)) if mapped else 0 for c in channels]
         inputs = feature_channels + segmentation_channels + skeleton_channels
         self.supersample = supersample
         if supersample > 1:
             inputs += feature_channels * supersample**2
-        self.stride = 2 ** (len(channels) - 1)
         self.rgb_skip, self.output, self.feature_bound = rgb_skip, output, feature_bound
-        self.content = Encoder(inputs, channels)
-        self.style = Encoder(feature_channels, widths) if mapped else None
+        self.content = Encoder(inputs, channels, patch)
+        self.style = Encoder(feature_channels, widths, patch) if mapped else None
         self.mid = nn.ModuleList(nn.Conv2d(channels[-1], channels[-1], 3, padding=1) for _ in "ab")
         self.mid_style = nn.ModuleList(Style(channels[-1], widths[-1], pose_channels) for _ in "ab")
         self.up = nn.ModuleList(
             DecoderLevel(channels[i + 1], channels[i], widths[i], pose_channels)
             for i in reversed(range(len(channels) - 1))
         )
-        self.paint = nn.Conv2d(channels[0], 4, 3, padding=1)
+        self.paint = nn.Conv2d(channels[0], 4 * patch**2, 3, padding=1)
         if rgb_skip:
             start_at_zero(self.paint)
 
@@ -170,30 +213,67 @@ class Generator(nn.Module):
         expected = None if k == 1 else (k * height, k * width)
         if given != expected:
             raise ValueError(f"Generator: fine must be {expected} pixels, got {given}")
-        features = F.clamp(-self.feature_bound, self.feature_bound)
-        if fine is not None:
-            fine = functional.pixel_unshuffle(fine, self.supersample)
-            fine = fine.clamp(-self.feature_bound, self.feature_bound)
-        content = torch.cat([x for x in (features, S, p2d, fine) if x is not None], dim=1)
-        skips = self.content(self._padded(content))
-        styles = self.style(self._padded(features)) if self.style else [None] * len(skips)
+        features = self._padded(F)
+        others = [x for x in (S, p2d) if x is not None]
+        skips = self.content.levels(self._stem(features, others, fine))
+        styles = self.style(features) if self.style else [None] * len(skips)
         h = skips[-1]
         for conv, style in zip(self.mid, self.mid_style, strict=True):
-            h = _activate(style(conv(h), styles[-1], g))
+            h = style(conv(h), styles[-1], g)
         for i, level in enumerate(self.up):
             h = level(h, skips[-2 - i], styles[-2 - i], g)
-        painted = self.paint(h)[..., :height, :width]
+        painted = functional.pixel_shuffle(self.paint(h), self.patch)[..., :height, :width]
         if self.rgb_skip:
             if alpha is None:
                 raise ValueError("Generator: built with rgb_skip=True, so alpha must be given")
             return torch.cat([F[:, :3], alpha], dim=1) + painted
         return torch.sigmoid(painted) if self.output == "sigmoid" else painted
 
-    def _padded(self, x: Tensor) -> Tensor:
+    def _stem(self, features: Tensor, others: list[Tensor], fine: Tensor | None) -> Tensor:
+        """E_c's stem on F, S, p₂D, and F's fine pixels as channels, without forming these."""
+        stem, k, C = self.content.stem, self.supersample, features.shape[1]
+        if fine is None:
+            padded = [self._padded(x) for x in others]
+            return stem(torch.cat([features, *padded], dim=1))  # type: ignore[no-any-return]
+        stride, padding = self.patch, int(self.patch == 1)
+        weight = stem.weight
+        kernel = derived(self, "fine", lambda: fine_kernel(weight, C, k), weight)
+        rest = derived(self, "rest", lambda: channels_last(weight[:, C : -C * k * k]), weight)
+        fine = self._padded(fine, k)
+        h = functional.conv2d(fine, kernel, stem.bias, k * stride, k * padding)
+        if others:
+            given = self._padded(torch.cat(others, dim=1))
+            h = h + functional.conv2d(given, rest, None, stride, padding)
+        return h
+
+    def _padded(self, x: Tensor, times: int = 1) -> Tensor:
         """Zeros on the right and below, up to a multiple of the stride; channels last."""
-        height, width = x.shape[-2:]
-        padded = functional.pad(x, (0, -width % self.stride, 0, -height % self.stride))
-        return padded.contiguous(memory_format=torch.channels_last)
+        (height, width), stride = x.shape[-2:], times * self.stride
+        if height % stride or width % stride:
+            x = functional.pad(x, (0, -width % stride, 0, -height % stride))
+        return channels_last(x)
+
+
+def fine_kernel(weight: Tensor, C: int, k: int) -> Tensor:
+    """``[O, C, n k, n k]``: the part of a stem's ``weight`` that sees F, as one kernel on F's fine
+    pixels, of which its first C channels see averages and its last C k² each one."""
+    fine = weight[:, -C * k * k :].unflatten(1, (C, k, k)).permute(0, 1, 4, 2, 5, 3)
+    mean = weight[:, :C, :, None, :, None] / (k * k)
+    return channels_last((fine + mean).flatten(4, 5).flatten(2, 3))
+
+
+def upsampled_kernel(weight: Tensor) -> Tensor:
+    """``[I, O, 4, 4]`` of a transposed convolution of stride 2 and padding 1: the kernel
+    ``[O, I, 3, 3]`` after upsampling to the nearest."""
+    for dim in (2, 3):
+        first, middle, last = weight.unbind(dim)
+        weight = torch.stack([last, middle + last, first + middle, first], dim)
+    return channels_last(weight.transpose(0, 1))
+
+
+def channels_last(x: Tensor) -> Tensor:
+    """The same, channels last in memory."""
+    return x.contiguous(memory_format=torch.channels_last)
 
 
 def start_at_zero(layer: nn.Module) -> None:
@@ -203,4 +283,4 @@ def start_at_zero(layer: nn.Module) -> None:
 
 
 def _activate(x: Tensor) -> Tensor:
-    return functional.leaky_relu(x, SLOPE)
+    return functional.leaky_relu(x, SLOPE, inplace=True)  # of new tensors only

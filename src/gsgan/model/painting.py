@@ -44,6 +44,10 @@ class Painting:
             return self.corrected
         return None if self.features is None else self.features[:, :3]
 
+    def only_image(self) -> Painting:
+        """Image and alpha without the maps that led to them."""
+        return Painting(self.image, self.alpha)
+
     def pasted(self, window: Window) -> Painting:
         """The same in the whole image, background outside the window."""
 

@@ -180,7 +180,7 @@ def scene_of(plain: Mapping[str, Any]) -> SceneInfo:
 
 
 def load(run: str | Path, *, smpl: str | Path | None = None, device: str = "auto") -> Avatar:
-    """The trained avatar of a run folder, ready for `Avatar.render`; the dataset is not needed.
+    """The trained, frozen avatar of a run folder, to `render`; the dataset is not needed.
 
     Args:
         run: the folder that ``gsgan.train`` printed.
@@ -206,7 +206,7 @@ def load(run: str | Path, *, smpl: str | Path | None = None, device: str = "auto
 
 
 def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avatar, list[str]]:
-    """The trained avatar of a run folder, in eval mode, and the marks its tables must carry."""
+    """The trained, frozen avatar of a run folder, and the marks its tables must carry."""
     checkpoint = read_checkpoint(folder / CHECKPOINT)
     avatar = _trained(folder, config, checkpoint, data.info, data.labelled("train"))
     return avatar, list(checkpoint["gsgan"]["marks"])
@@ -246,7 +246,7 @@ def _trained(
         raise DataError(
             f"{folder / CHECKPOINT}: its weights do not fit the config {folder / CONFIG}"
         ) from error
-    return avatar.eval()
+    return avatar.freeze()
 
 
 # -- settings

@@ -49,7 +49,10 @@ _NATIVE_FLAGS = (
 
 DTYPES = {torch.float32: "float32", torch.float64: "float64"}
 # Functions of the library, one per dtype; each takes a job and at most one more pointer.
-_FUNCTIONS = ("forward", "backward", "free", "project", "project_backward")
+_FUNCTIONS = (
+    *("forward", "backward", "free", "project", "project_backward"),
+    *("compose", "compose_backward", "photometric", "style", "style_backward"),
+)
 
 _LOCK = threading.Lock()
 

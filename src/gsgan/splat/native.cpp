@@ -17,8 +17,11 @@
 
 #include "kernels/backward.h"
 #include "kernels/bin.h"
+#include "kernels/compose.h"
 #include "kernels/forward.h"
+#include "kernels/photometric.h"
 #include "kernels/project.h"
+#include "kernels/style.h"
 
 #ifdef _OPENMP
 #include <omp.h>
@@ -120,5 +123,23 @@ int gsgan_project_backward_float32(const ProjectJob* job) {
 }
 int gsgan_project_backward_float64(const ProjectJob* job) {
   return gsgan::project_backward<double>(*job);
+}
+int gsgan_compose_float32(const ComposeJob* job) { return gsgan::compose<float>(*job); }
+int gsgan_compose_float64(const ComposeJob* job) { return gsgan::compose<double>(*job); }
+int gsgan_compose_backward_float32(const ComposeJob* job) {
+  return gsgan::compose_backward<float>(*job);
+}
+int gsgan_compose_backward_float64(const ComposeJob* job) {
+  return gsgan::compose_backward<double>(*job);
+}
+int gsgan_style_float32(const StyleJob* job) { return gsgan::style<float>(*job); }
+int gsgan_style_float64(const StyleJob* job) { return gsgan::style<double>(*job); }
+int gsgan_style_backward_float32(const StyleJob* job) { return gsgan::style_backward<float>(*job); }
+int gsgan_style_backward_float64(const StyleJob* job) {
+  return gsgan::style_backward<double>(*job);
+}
+int gsgan_photometric_float32(const PhotometricJob* job) { return gsgan::photometric<float>(*job); }
+int gsgan_photometric_float64(const PhotometricJob* job) {
+  return gsgan::photometric<double>(*job);
 }
 }

@@ -6,6 +6,7 @@ When it cannot be built, ``available()`` is False and ``why_not()`` has the reas
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -23,11 +24,12 @@ SLOT_BYTES = 1 << 28
 
 _OUT_OF_MEMORY, _NOT_FINITE = 1, 2
 
-_SIZES = ("B", "N", "C", "H", "W", "threads", "keep", "box", "slot_bytes")
+_SIZES = ("B", "N", "C", "H", "W", "threads", "keep", "box", "slot_bytes", "times")
 _INPUTS = ("means", "factors", "opacities", "features", "depths", "extents")
 _WIDE = ("means", "factors", "depths")  # always float64, see Projected
-_OUTPUTS = ("out_features", "out_alpha", "out_depth")
-_GRADS_OUT = ("g_features", "g_alpha", "g_depth")
+_OUTPUTS = ("out_features", "out_alpha", "out_depth", "out_average")
+_GRADS_OUT = ("g_features", "g_alpha", "g_depth", "g_average")
+AVERAGES = (1, 2, 4, 8)  # supersampling that is averaged here: divisors of a tile
 _GRADS_IN = ("d_means", "d_factors", "d_opacities", "d_features", "d_depths")
 
 
@@ -54,8 +56,12 @@ def why_not() -> str:
 
 
 def composite(
-    projected: Projected, size: tuple[int, int], settings: Accuracy, want_depth: bool
-) -> tuple[Tensor, Tensor, Tensor | None]:
+    projected: Projected,
+    size: tuple[int, int],
+    settings: Accuracy,
+    want_depth: bool,
+    times: int = 1,
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
     """Blends ellipses front to back on the CPU.
 
     Convention: pixel centres at +0.5; ``alpha = min(alpha_max, o exp(-q / 2))`` inside the extent,
@@ -71,11 +77,15 @@ def composite(
         settings: alpha_min, transmittance_min, alpha_max, and whether the extent is ``sigma``:
             only then ``projected.extents`` cut off pixels.
         want_depth: whether to blend depths too.
+        times: one of ``AVERAGES``: above 1 features and alpha are also averaged over so many pixels
+            each way.
 
     Returns:
-        features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``, depth ``[B, 1, H, W]`` or
-        None. Differentiable once in means, factors, opacities, features, and in depths through the
-        depth output.
+        features ``[B, C, H, W]`` premultiplied, channels last where they are averaged; alpha
+        ``[B, 1, H / times, W / times]``, depth ``[B, 1, H, W]`` or None, and averaged features
+        ``[B, C, H / times, W / times]`` or None.
+        Differentiable once in means, factors, opacities, features, and in depths through the depth
+        output.
 
     Raises:
         ValueError: on another device or dtype, on mixed ones, and on a visible Gaussian that is not
@@ -85,7 +95,7 @@ def composite(
     Source: paper Sec. 3.1; tiles after 3D Gaussian splatting, gradients derived in native.cpp.
     """
     _check(projected, size)
-    features, alpha, depth = _Composite.apply(
+    composed: tuple[Tensor, Tensor, Tensor | None, Tensor | None] = _Composite.apply(
         projected.means,
         projected.factors,
         projected.opacities,
@@ -93,9 +103,9 @@ def composite(
         projected.depths,
         projected.extents,
         projected.visible,
-        *(size, settings, want_depth, torch.is_grad_enabled()),
+        *(size, settings, want_depth, times, torch.is_grad_enabled()),
     )
-    return features, alpha, depth
+    return composed
 
 
 def _check(projected: Projected, size: tuple[int, int]) -> None:
@@ -156,16 +166,26 @@ class _Composite(torch.autograd.Function):
         size: tuple[int, int],
         settings: Accuracy,
         want_depth: bool,
+        times: int,
         grad_enabled: bool,
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
+    ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
         tensors = [means, factors, opacities, features, depths, extents]
         inputs = [x.detach().contiguous() for x in tensors]
         shown = visible.contiguous()
         B, _, C = features.shape
         dtype = features.dtype
-        channels = [C, 1, 1] if want_depth else [C, 1]
-        outputs = [zeros((B, c, *size), dtype) for c in channels]
-        job = _job(size, settings, inputs, shown)
+        coarse = (size[0] // times, size[1] // times)
+        if times == 1:
+            drawn = zeros((B, C, *size), dtype)
+        else:
+            drawn = zeros((B, *size, C), dtype).permute(0, 3, 1, 2)
+        outputs = [
+            drawn,
+            zeros((B, 1, *coarse), dtype),
+            zeros((B, 1, *size), dtype) if want_depth else None,
+            zeros((B, C, *coarse), dtype) if times > 1 else None,
+        ]
+        job = _job(size, settings, inputs, shown, times)
         job.keep = grad_enabled and any(ctx.needs_input_grad)
         point(job, _OUTPUTS, outputs)
         plan = _Plan(dtype)
@@ -173,10 +193,9 @@ class _Composite(torch.autograd.Function):
         _raise_for(run(ctypes.byref(job), ctypes.byref(plan.pointer)), job)
         if job.keep:
             ctx.save_for_backward(*tensors, visible)
-            ctx.plan, ctx.size, ctx.settings = plan, size, settings
+            ctx.plan, ctx.size, ctx.settings, ctx.times = plan, size, settings, times
             ctx.set_materialize_grads(False)
-        features_out, alpha, *rest = outputs
-        return features_out, alpha, rest[0] if rest else None
+        return tuple(outputs)  # type: ignore[return-value]
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -184,8 +203,10 @@ class _Composite(torch.autograd.Function):
         *tensors, visible = ctx.saved_tensors
         inputs = [x.detach().contiguous() for x in tensors]
         shown = visible.contiguous()
-        job = _job(ctx.size, ctx.settings, inputs, shown)
+        job = _job(ctx.size, ctx.settings, inputs, shown, ctx.times)
         incoming = [None if g is None else g.contiguous() for g in grads]
+        if ctx.times > 1 and grads[0] is not None:
+            incoming[0] = grads[0].contiguous(memory_format=torch.channels_last)
         point(job, _GRADS_OUT, incoming)
         with_depth = incoming[2] is not None
         outgoing: list[Tensor | None] = [
@@ -202,17 +223,17 @@ class _Composite(torch.autograd.Function):
         return (*needed, *[None] * (len(ctx.needs_input_grad) - len(needed)))
 
 
-def _job(size: tuple[int, int], settings: Accuracy, inputs: list[Tensor], visible: Tensor) -> _Job:
+def _job(
+    size: tuple[int, int], settings: Accuracy, inputs: list[Tensor], visible: Tensor, times: int
+) -> _Job:
     threads = max(1, torch.get_num_threads())
-    sizes = (*inputs[3].shape, *size, threads, 0, settings.extent == "sigma", SLOT_BYTES)
+    sizes = (*inputs[3].shape, *size, threads, 0, settings.extent == "sigma", SLOT_BYTES, times)
     job = _Job(*sizes, settings.alpha_min, settings.transmittance_min, settings.alpha_max)
     point(job, (*_INPUTS, "visible"), [*inputs, visible])
     return job
 
 
-def point(
-    job: ctypes.Structure, names: tuple[str, ...], tensors: list[Tensor] | list[Tensor | None]
-) -> None:
+def point(job: ctypes.Structure, names: tuple[str, ...], tensors: Sequence[Tensor | None]) -> None:
     """Sets fields of a job to tensors' addresses; the caller keeps the tensors alive."""
     for name, tensor in zip(names, tensors, strict=False):
         setattr(job, name, None if tensor is None else tensor.data_ptr())

@@ -72,11 +72,12 @@ def rasterise(
     if times > 1:
         drawn = camera.resize((camera.size[0] * times, camera.size[1] * times))
     with tiles.full_precision(gaussians.means.device):
-        features, alpha, z = _draw(name, gaussians, drawn, settings, keep, depth)
+        features, alpha, z, average = _draw(name, gaussians, drawn, settings, keep, depth)
         if times > 1:
             fine = features.to(out)
-            features, alpha = avg_pool2d(features, times), avg_pool2d(alpha, times)
-            z = None if z is None else avg_pool2d(z, times)
+            if average is None:
+                average, alpha = avg_pool2d(features, times), avg_pool2d(alpha, times)
+            features, z = average, None if z is None else avg_pool2d(z, times)
     return Raster(features.to(out), alpha.to(out), None if z is None else z.to(out), fine)
 
 
@@ -119,16 +120,18 @@ def _draw(
     settings: Accuracy,
     keep: Tensor | None,
     depth: bool,
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Features, alpha and depth by one backend."""
+) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
+    """Features, alpha and depth by one backend; where it averages what is supersampled, alpha is
+    averaged, and averaged features follow."""
     if name == "gsplat":
-        return gsplat_backend.draw(gaussians, camera, settings, keep, depth)
+        return *gsplat_backend.draw(gaussians, camera, settings, keep, depth), None
     if name == "native":
         projected = native_project.project(gaussians, camera, settings, keep)
-        return native.composite(projected, camera.size, settings, depth)
+        times = settings.supersample if settings.supersample in native.AVERAGES else 1
+        return native.composite(projected, camera.size, settings, depth, times)
     projected = project(gaussians, camera, settings, keep)
     composite = reference.composite if name == "reference" else tiles.composite
-    return composite(projected, camera.size, settings, depth)
+    return *composite(projected, camera.size, settings, depth), None
 
 
 def _warn_once(message: str) -> None:

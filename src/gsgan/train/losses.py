@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.losses.adversarial import COMPARING, FORMS, feature_matching, generator_loss
+from gsgan.losses.adversarial import (
+    COMPARING,
+    FORMS,
+    discriminator_loss,
+    feature_matching,
+    generator_loss,
+)
 from gsgan.losses.perceptual import Perceptual
 from gsgan.losses.photometric import photometric, without_unsure
 from gsgan.model.avatar import Painting
@@ -74,6 +81,58 @@ def discriminate(discriminator: Discriminator, image: Tensor, gan: str) -> list[
         return discriminator(image.to(dtype))  # type: ignore[no-any-return]
 
 
+class Judged:
+    """The discriminator's maps of a frame and of its painting, computed once for the generator's
+    loss and for the discriminator's.
+
+    Args:
+        discriminator: its parameters get no gradient through the generator's terms.
+        image, target: ``[B, 3, H, W]`` I_pred and the ground truth.
+        gan: see `discriminate`.
+    """
+
+    def __init__(
+        self, discriminator: Discriminator, image: Tensor, target: Tensor, gan: str
+    ) -> None:
+        self.image, self.gan = image, gan
+        # a leaf: the two losses must not reach each other's parameters
+        self.painted = image.detach().requires_grad_(image.requires_grad)
+        with torch.enable_grad():
+            self.fake = discriminate(discriminator, self.painted, gan)
+            self.real = discriminate(discriminator, target.detach(), gan)
+
+    def terms(self, adversarial: float, matching: float) -> dict[str, Tensor]:
+        """The generator's terms by name, weighted; a term of weight 0 is left out."""
+        terms = {}
+        if adversarial:
+            terms["adversarial"] = adversarial * generator_loss(self.real, self.fake, self.gan)
+        if matching:
+            terms["feature_matching"] = matching * feature_matching(self.real, self.fake)
+        found = _Through.apply(self.image, (self.painted, list(terms.values())))
+        return dict(zip(terms, found, strict=True))
+
+    def loss(self) -> Tensor:
+        """The discriminator's loss."""
+        return discriminator_loss(self.real, self.fake, self.gan)
+
+
+class _Through(torch.autograd.Function):
+    """Terms of a copy of an image as terms of the image; parameters on the way get no gradient."""
+
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, path: tuple[Tensor, list[Tensor]]) -> tuple[Tensor, ...]:
+        # in a tuple autograd does not see them: it would go that way as well
+        ctx.copy, ctx.terms = path
+        terms = ctx.terms
+        return tuple(term.detach().clone() for term in terms)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, None]:  # type: ignore[override]
+        (grad,) = torch.autograd.grad(ctx.terms, ctx.copy, grads, retain_graph=True)
+        return grad, None
+
+
 @dataclass(frozen=True)
 class StepTwoLoss:
     """Weights of the generator's loss (conf/training/long.yaml); 0 computes no term.
@@ -98,6 +157,12 @@ class StepTwoLoss:
         one_of("training.step_two.gan", self.gan, FORMS)
         at_least("training.step_two.perceptual_every", self.perceptual_every, 1)
 
+    def judged(self, discriminator: Discriminator, painting: Painting, frame: Frame) -> Judged:
+        """The discriminator's maps of a painting of ``frame``."""
+        assert painting.image is not None
+        target = without_unsure(frame.image, painting.image, frame.unsure)
+        return Judged(discriminator, painting.image, target, self.gan)
+
     @property
     def adversarial_terms(self) -> bool:
         """Whether any term needs the discriminator."""
@@ -110,7 +175,7 @@ class StepTwoLoss:
         *,
         anchor: Tensor | None,
         perceptual: Perceptual | None,
-        discriminator: Discriminator | None,
+        judged: Judged | None,
         step: int,
     ) -> dict[str, Tensor]:
         """The generator's losses, weighted, by name.
@@ -120,7 +185,7 @@ class StepTwoLoss:
             frame: the ground truth.
             anchor: L_Ψ of the same painting; None leaves it out.
             perceptual: L_perc; None leaves it out.
-            discriminator: None before the GAN starts.
+            judged: the discriminator's maps; None before the GAN starts.
             step: the iteration, for ``perceptual_every``.
         """
         image, alpha = painting.image, painting.alpha
@@ -136,20 +201,6 @@ class StepTwoLoss:
         if perceptual is not None and step % self.perceptual_every == 0:
             scale = self.perceptual * self.perceptual_every
             terms["perceptual"] = scale * perceptual(image, target)
-        if discriminator is not None:
-            terms |= self._adversarial(discriminator, image, target)
-        return terms
-
-    def _adversarial(
-        self, discriminator: Discriminator, image: Tensor, target: Tensor
-    ) -> dict[str, Tensor]:
-        terms = {}
-        real = fake = discriminate(discriminator, image, self.gan)
-        if self.feature_matching or self.gan in COMPARING:
-            with torch.no_grad():
-                real = discriminate(discriminator, target, self.gan)
-        if self.adversarial:
-            terms["adversarial"] = self.adversarial * generator_loss(real, fake, self.gan)
-        if self.feature_matching:
-            terms["feature_matching"] = self.feature_matching * feature_matching(real, fake)
+        if judged is not None:
+            terms |= judged.terms(self.adversarial, self.feature_matching)
         return terms

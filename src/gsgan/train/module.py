@@ -13,14 +13,12 @@ import torch
 from lightning import LightningModule
 from torch import Tensor, nn
 
-from gsgan.losses.adversarial import discriminator_loss
 from gsgan.losses.perceptual import Perceptual
-from gsgan.losses.photometric import without_unsure
 from gsgan.metrics.image import psnr
 from gsgan.model.avatar import Avatar, Painting
 from gsgan.model.discriminator import Discriminator
 from gsgan.scene import Frame
-from gsgan.train.losses import StepOneLoss, StepTwoLoss, discriminate
+from gsgan.train.losses import Judged, StepOneLoss, StepTwoLoss
 from gsgan.train.optimisers import MovingAverage, Recipe, clip, parameter_groups
 from gsgan.train.rollback import Rollback, SkippedSteps
 from gsgan.train.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
@@ -215,16 +213,18 @@ class AvatarTraining(LightningModule):
 
     def _train_step_two(self, frame: Frame, height: int) -> None:
         painting = self._paint(frame, height, paint=True)
-        adversarial = self.discriminator is not None and self.schedule.adversarial(self.step)
-        if self.discriminator is not None:
-            self.discriminator.requires_grad_(False)
-        terms = self.step_two_terms(painting, frame, adversarial)
+        judged = None
+        if self.discriminator is not None and self.schedule.adversarial(self.step):
+            judged = self.step_two.judged(self.discriminator, painting, frame)
+        terms = self.step_two_terms(painting, frame, judged)
         self._descend(torch.stack(list(terms.values())).sum(), *self._splatting(), "generator")
         self._update_average()
         for name, term in terms.items():
             self._log(f"step_two/{name}", term)
-        if adversarial:
-            self._train_discriminator(painting, frame)
+        if judged is not None:
+            loss = judged.loss()
+            self._descend(loss, "discriminator")
+            self._log("step_two/discriminator", loss)
 
     def _update_average(self) -> None:
         if self.average is not None and self.step % self.average_every == 0:
@@ -233,17 +233,6 @@ class AvatarTraining(LightningModule):
     def _splatting(self) -> tuple[str, ...]:
         """The optimisers of the parts that make Step I's image."""
         return tuple(name for name in SPLATTING if name in self._names)
-
-    def _train_discriminator(self, painting: Painting, frame: Frame) -> None:
-        assert self.discriminator is not None
-        assert painting.image is not None
-        self.discriminator.requires_grad_(True)
-        painted, gan = painting.image.detach(), self.step_two.gan
-        target = without_unsure(frame.image, painted, frame.unsure)
-        real, fake = (discriminate(self.discriminator, x, gan) for x in (target, painted))
-        loss = discriminator_loss(real, fake, gan)
-        self._descend(loss, "discriminator")
-        self._log("step_two/discriminator", loss)
 
     def _paint(self, frame: Frame, height: int, *, paint: bool) -> Painting:
         painting: Painting = self.avatar(
@@ -288,7 +277,7 @@ class AvatarTraining(LightningModule):
         return self.step_one(painting, frame, self._background(frame), self.feature_head)
 
     def step_two_terms(
-        self, painting: Painting, frame: Frame, adversarial: bool
+        self, painting: Painting, frame: Frame, judged: Judged | None
     ) -> dict[str, Tensor]:
         """The generator's losses, weighted, by name."""
         assert painting.image is not None
@@ -298,7 +287,7 @@ class AvatarTraining(LightningModule):
             frame,
             anchor=self.step_one_loss(painting, frame) if anchored else None,
             perceptual=self.perceptual,
-            discriminator=self.discriminator if adversarial else None,
+            judged=judged,
             step=self.step,
         )
         return terms | {name: loss(painting, frame) for name, loss in self.extra_losses.items()}

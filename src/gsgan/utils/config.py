@@ -77,7 +77,9 @@ def entry(name: str) -> Callable[[Callable[[DictConfig], None]], Callable[[], No
         @functools.wraps(task)
         def run(config: DictConfig) -> None:
             import gsgan.utils.compat  # noqa: F401  (before lightning and torchmetrics)
+            from gsgan.utils.tensors import keep_freed_memory
 
+            keep_freed_memory()
             try:
                 task(config)
             except KeyboardInterrupt:

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from gsgan.utils.errors import ConfigError
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
+KEPT = 1 << 30  # bytes of freed memory that the process keeps
+LARGEST = 1 << 25  # bytes; glibc takes larger blocks from the system in any case
 
 
 def constant(values: Any, like: Tensor) -> Tensor:
@@ -49,3 +56,29 @@ def pick_device(name: str) -> torch.device:
         return torch.empty(0, device=name).device
     except (RuntimeError, AssertionError) as error:
         raise ConfigError(f"device={name}: not usable here; try device=cpu") from error
+
+
+def keep_freed_memory() -> None:
+    """Makes the process keep freed memory for its next image, where the C library is glibc.
+
+    By default most of it goes back to the system, which maps and clears it anew for every image:
+    16 thousand pages in an image of 256², a third of the time of painting it.
+    """
+    with contextlib.suppress(OSError, AttributeError):  # another C library
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(M_TRIM_THRESHOLD, KEPT)
+        mallopt(M_MMAP_THRESHOLD, LARGEST)
+
+
+def derived(module: nn.Module, name: str, make: Callable[[], Tensor], *weights: Tensor) -> Tensor:
+    """``make()``, a function of these weights alone. In a frozen module (one with a dictionary
+    ``derived``) it is kept until a weight changes or moves."""
+    kept: dict[str, tuple[Any, Tensor]] | None = getattr(module, "derived", None)
+    if kept is None:
+        return make()
+    state = [(x.data_ptr(), x._version, x.dtype) for x in weights]
+    found = kept.get(name)
+    if found is None or found[0] != state:
+        with torch.inference_mode(False), torch.no_grad():
+            found = kept[name] = state, make()
+    return found[1]

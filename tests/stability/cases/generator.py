@@ -101,7 +101,10 @@ def _inputs(scale: float = 1.0, shift: float = 0.0, person: float = 1.0) -> Inpu
 
 def _painted(inputs: Inputs, biased: bool = True) -> Outputs:
     F, S, p2d, g, fine = (inputs[name] for name in ("F", "S", "p2d", "g", "fine"))
-    return {"image": _generator(F.dtype, F.device, biased)(F, S, p2d, g, fine)}
+    generator = _generator(F.dtype, F.device, biased)
+    bound = generator.feature_bound  # the avatar bounds what is splatted, see Avatar.bounded
+    F, fine = F.clamp(-bound, bound), fine.clamp(-bound, bound)
+    return {"image": generator(F, S, p2d, g, fine)}
 
 
 def _in_half_precision(inputs: Inputs, half: torch.dtype) -> Outputs:

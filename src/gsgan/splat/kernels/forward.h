@@ -70,7 +70,7 @@ void forward_tile(const Job& job, const Inputs<T>& in, Plan<T>& plan, int64_t in
   const Tile tile = tile_at(job, plan, index);
   const int64_t plane = job.H * job.W, channels = job.C + (job.out_depth != nullptr);
   T* features = static_cast<T*>(job.out_features) + tile.b * job.C * plane;
-  T* alpha = static_cast<T*>(job.out_alpha) + tile.b * plane;
+  T* alpha = static_cast<T*>(job.out_alpha) + tile.b * (plane / (job.times * job.times));
   T* depth = job.out_depth ? static_cast<T*>(job.out_depth) + tile.b * plane : nullptr;
   const Cutoffs<T> cut(job);
   start_transmittance(tile, s.transmittance.get());
@@ -87,11 +87,20 @@ void forward_tile(const Job& job, const Inputs<T>& in, Plan<T>& plan, int64_t in
       if (s.length[cell] && !forward_cell(cell, channels, cut, s)) alive &= ~(1u << cell);
   }
   plan.chunks_done[index] = chunk;
-  for (int64_t c = 0; c < job.C; ++c)
-    write_plane(features + c * plane, job.W, tile, s.image.get() + c * PIXELS);
-  if (depth) write_plane(depth, job.W, tile, s.image.get() + job.C * PIXELS);
   for (int k = 0; k < PIXELS; ++k) s.transmittance[k] = T(1) - s.transmittance[k];
-  write_plane(alpha, job.W, tile, s.transmittance.get());
+  if (depth) write_plane(depth, job.W, tile, s.image.get() + job.C * PIXELS);
+  if (job.times == 1) {
+    for (int64_t c = 0; c < job.C; ++c)
+      write_plane(features + c * plane, job.W, tile, s.image.get() + c * PIXELS);
+    write_plane(alpha, job.W, tile, s.transmittance.get());
+    return;
+  }
+  const int64_t coarse = plane / (job.times * job.times);
+  T* average = static_cast<T*>(job.out_average) + tile.b * job.C * coarse;
+  write_pixels(features, job.W, job.C, tile, s.image.get());
+  for (int64_t c = 0; c < job.C; ++c)
+    write_average(average + c * coarse, job.W, job.times, tile, s.image.get() + c * PIXELS);
+  write_average(alpha, job.W, job.times, tile, s.transmittance.get());
 }
 
 }  // namespace gsgan

@@ -17,14 +17,16 @@ struct Job {
   int64_t keep;        // whether a backward pass will follow
   int64_t box;         // whether pixels outside the extents are skipped, whatever their alpha
   int64_t slot_bytes;  // memory for per-entry gradients in the backward pass
+  int64_t times;       // pixels averaged each way; above 1 (a divisor of TILE) features and their
+                       // gradient are channels last, and alpha is averaged
   double alpha_min, transmittance_min, alpha_max;
   const double *means, *factors;
   const void *opacities, *features;
   const double* depths;  // in T, close ones could be equal
   const void* extents;
   const uint8_t* visible;
-  void *out_features, *out_alpha, *out_depth;  // zeros on entry
-  const void *g_features, *g_alpha, *g_depth;
+  void *out_features, *out_alpha, *out_depth, *out_average;  // zeros on entry
+  const void *g_features, *g_alpha, *g_depth, *g_average;
   double *d_means, *d_factors;
   void *d_opacities, *d_features;
   double* d_depths;

@@ -84,6 +84,52 @@ template <class T> void write_plane(T* plane, int64_t stride, const Tile& t, con
   }
 }
 
+// The same for `channels` planes whose channels are adjacent in the image.
+template <class T>
+void read_pixels(const T* image, int64_t stride, int64_t channels, const Tile& t, T* to) {
+  if (t.width < TILE || t.height < TILE) std::fill_n(to, channels * PIXELS, T(0));
+  for (int y = 0; y < t.height; ++y)
+    for (int x = 0; x < t.width; ++x) {
+      const T* pixel = image + ((t.y + y) * stride + t.x + x) * channels;
+      T* at = to + pixel_of(x, y);
+      for (int64_t c = 0; c < channels; ++c) at[c * PIXELS] = pixel[c];
+    }
+}
+
+template <class T>
+void write_pixels(T* image, int64_t stride, int64_t channels, const Tile& t, const T* from) {
+  for (int y = 0; y < t.height; ++y)
+    for (int x = 0; x < t.width; ++x) {
+      T* pixel = image + ((t.y + y) * stride + t.x + x) * channels;
+      const T* at = from + pixel_of(x, y);
+      for (int64_t c = 0; c < channels; ++c) pixel[c] = at[c * PIXELS];
+    }
+}
+
+// Adds the gradient of a plane's averages over times x times pixels to that of its pixels.
+template <class T>
+void add_spread(const T* plane, int64_t stride, int64_t times, const Tile& t, T* to) {
+  const T share = T(1) / T(times * times);
+  for (int y = 0; y < t.height; ++y) {
+    const T* row = plane + (t.y + y) / times * (stride / times) + t.x / times;
+    for (int x = 0; x < t.width; ++x) to[pixel_of(x, y)] += share * row[x / times];
+  }
+}
+
+template <class T>
+void write_average(T* plane, int64_t stride, int64_t times, const Tile& t, const T* from) {
+  const T share = T(1) / T(times * times);
+  for (int y = 0; y < t.height; y += times) {
+    T* row = plane + (t.y + y) / times * (stride / times) + t.x / times;
+    for (int x = 0; x < t.width; x += times) {
+      T sum = 0;
+      for (int i = 0; i < times; ++i)
+        for (int j = 0; j < times; ++j) sum += from[pixel_of(x + j, y + i)];
+      row[x / times] = share * sum;
+    }
+  }
+}
+
 // Which cells of its tile the ellipse {alpha >= alpha_min} and the extent can reach.
 template <class T> INLINE uint32_t reached_cells(const Place<T>& at, T ex, T ey, T level) {
   constexpr T HALF = T(0.5) * (TILE - 1);

@@ -1,0 +1,116 @@
+"""Compiled operations against the tensor operations that define them: values and gradients."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from gsgan.losses import photometric
+from gsgan.model import compose, styled
+from gsgan.model.deformation import Deformation, Residuals
+from gsgan.model.generator import Style
+from gsgan.skeleton.densify import Points
+from gsgan.splat import native
+
+pytestmark = pytest.mark.skipif(not native.available(), reason=native.why_not() or "available")
+CLOSE = {"rtol": 1e-10, "atol": 1e-13}
+
+
+def both(monkeypatch, module: object, name: str, run) -> tuple[list[Tensor], list[Tensor]]:
+    """What ``run`` returns with the compiled operation, and without."""
+    fast = run()
+    monkeypatch.setattr(module, name, lambda *_: False)
+    return fast, run()
+
+
+@pytest.mark.parametrize("shape", [(2, 3, 17, 30), (1, 1, 6, 7)])
+@pytest.mark.parametrize("near", [False, True])
+def test_photometric(monkeypatch, shape, near):
+    torch.manual_seed(0)
+    target = torch.rand(shape, dtype=torch.float64)
+    image = target + 1e-4 * torch.rand_like(target) if near else torch.rand_like(target)
+    image[..., 0, 0] = target[..., 0, 0]  # where L1 has no slope
+    image.requires_grad_()
+
+    def run():
+        loss = photometric.photometric(image, target, l1=0.8, l2=2.0, ssim=0.2)
+        return [loss.detach(), *torch.autograd.grad(loss, image)]
+
+    torch.testing.assert_close(*both(monkeypatch, photometric, "_compiled", run), **CLOSE)
+
+
+@pytest.mark.parametrize("bound", [0.25, None])
+def test_geometry(monkeypatch, bound):
+    torch.manual_seed(0)
+    B, N = 2, 50
+    wide = {"dtype": torch.float64}
+    psi = Deformation(torch.randn(N, 3), 1.7, width=8, layers=2, sh_degree=0, mean_bound=bound)
+    frames = torch.randn(B, N, 3, 3, **wide)  # skinned frames shear
+    points = Points(
+        torch.randn(B, N, 3, **wide),
+        frames,
+        frames[..., 0],
+        0.01 + torch.rand(B, N, **wide),
+        torch.rand(B, N) > 0.2,
+        torch.arange(N),
+        frames[..., 0],
+    )
+    quats = torch.randn(B, N, 4, **wide)
+    quats[0, 0] = torch.tensor([-1.0, 0, 0, 0])  # turns nothing
+    beyond = 4 * torch.randn(B, N, 3, **wide), 9 * torch.randn(B, N, **wide)  # the bounds
+    raw = [torch.randn(B, N, 3, **wide), quats, *beyond]
+    raw = [x.requires_grad_() for x in raw]
+    rest = torch.zeros(B, N, 1, 3, **wide), torch.zeros(B, N, 29, **wide)
+    weights = [torch.randn(*shape, **wide) for shape in ((B, N, 3), (B, N, 3, 3), (B, N))]
+
+    def run():
+        made = psi.compose(points, Residuals(*raw, *rest), torch.ones(B, 3, **wide))
+        found = [made.means, made.covariances, made.opacities]
+        loss = sum((x * w).sum() for x, w in zip(found, weights, strict=True))
+        return [x.detach() for x in found] + list(torch.autograd.grad(loss, raw))
+
+    torch.testing.assert_close(*both(monkeypatch, compose, "compiled", run), **CLOSE)
+
+
+@pytest.mark.parametrize("channels", [6, 16, 37])
+def test_style(monkeypatch, channels):
+    torch.manual_seed(0)
+    style = Style(channels, 4, 35).double()
+    for parameter in style.parameters():
+        torch.nn.init.normal_(parameter)
+    h = torch.randn(2, channels, 5, 7, dtype=torch.float64, requires_grad=True)
+    h.data[0, :, 0, 0] = 0  # an empty pixel
+    levels = torch.randn(2, 4, 5, 7, dtype=torch.float64, requires_grad=True)
+    g = torch.randn(2, 35, dtype=torch.float64)
+    weights = torch.randn(2, channels, 5, 7, dtype=torch.float64)
+
+    def run():
+        out = style(h, levels, g)
+        inputs = [h, levels, *style.parameters()]
+        return [out.detach(), *torch.autograd.grad((out * weights).sum(), inputs)]
+
+    torch.testing.assert_close(*both(monkeypatch, styled, "compiled", run), **CLOSE)
+
+
+@pytest.mark.parametrize(("batch", "embedding", "normals"), [(1, 4, True), (3, 0, False)])
+def test_psi_in_training_is_psi(batch, embedding, normals):
+    """Its layers as one operation, and one by one where an input needs a gradient."""
+    torch.manual_seed(0)
+    N, wide = 40, {"dtype": torch.float64}
+    psi = Deformation(
+        torch.randn(N, 3), 1.7, width=8, layers=3, embedding=embedding, normals=normals
+    ).double()
+    torch.nn.init.normal_(psi.head.weight)
+    places, facing = torch.randn(batch, N, 3, **wide), torch.randn(batch, N, 3, **wide)
+    points = Points(places, places, places, places, places, torch.arange(N), facing)
+    pose, root = torch.randn(batch, 99, **wide), torch.zeros(batch, 3, **wide)
+    found = []
+    for needed in (False, True):
+        facing.requires_grad_(needed)
+        psi.zero_grad()
+        made = psi.residuals(points, pose, root)
+        (made.features.square().sum() + made.means.sum()).backward()
+        slopes = [p.grad for p in psi.parameters() if p.grad is not None]
+        found.append([made.features.detach(), *slopes])
+    torch.testing.assert_close(*found, **CLOSE)

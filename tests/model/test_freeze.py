@@ -1,0 +1,66 @@
+"""A frozen avatar paints as the avatar in training does, and follows its weights."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+
+MODELS = [
+    *((model, "none") for model in ("full", "wo_gcn", "lbs_splat", "image_to_image")),
+    *((model, "all") for model in ("full", "wo_seg", "lbs_splat", "splat_only")),
+]
+
+
+def left_of_zero(avatar):
+    """Out of the zero starts, where much would be equal whatever it was computed from."""
+    torch.manual_seed(1)
+    with torch.no_grad():
+        for parameter in avatar.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter))
+    return avatar.eval()
+
+
+def psnr(a, b) -> float:
+    return float(-10 * (a.double() - b.double()).square().mean().clamp_min(1e-30).log10())
+
+
+@pytest.mark.parametrize(("model", "effects"), MODELS)
+def test_the_image_is_that_of_training(build, model, effects):
+    _, avatar, frame = build(f"model={model}", f"effects={effects}")
+    trained = left_of_zero(avatar).paint(frame)
+    frozen = copy.deepcopy(avatar).freeze()
+    for _ in range(2):  # computed, then kept
+        with torch.inference_mode():
+            painting = frozen.paint(frame)
+        assert psnr(painting.image, trained.image.detach()) > 90
+    assert not any(p.requires_grad for p in frozen.parameters())
+    assert trained.image.requires_grad
+
+
+def test_it_follows_the_weights(build):
+    _, avatar, frame = build("size.rgb_skip=false")
+    frozen = copy.deepcopy(left_of_zero(avatar)).freeze()
+    with torch.inference_mode():
+        before = frozen.paint(frame).image
+    with torch.no_grad():
+        for parameter in avatar.parameters():
+            parameter.mul_(1.1)
+    expected = avatar.paint(frame).image.detach()
+    assert psnr(before, expected) < 60
+    frozen.load_state_dict(avatar.state_dict())
+    with torch.inference_mode():
+        assert psnr(frozen.paint(frame).image, expected) > 90
+    again = copy.deepcopy(avatar).freeze()
+    assert torch.equal(again.paint(frame).image, frozen.paint(frame).image)
+
+
+def test_gradients_still_reach_the_skeleton(build):
+    _, avatar, frame = build()
+    frozen = left_of_zero(avatar).freeze()
+    with torch.inference_mode():
+        frozen.paint(frame)  # what is kept from here on can be used with gradients
+    p = frame.skeleton.clone().requires_grad_()
+    frozen(p, frame.visibility, frame.camera, frame.body).image.sum().backward()
+    assert float(p.grad.abs().max()) > 0

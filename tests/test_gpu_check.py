@@ -1,0 +1,68 @@
+"""scripts/gpu_check.sh without a GPU: what it says, and that its steps run once and compose."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SCRIPT = Path(__file__).parents[1] / "scripts" / "gpu_check.sh"
+NO_CUDA = "gpu_check: torch finds no CUDA device on this machine, so nothing was checked.\n"
+FAKE = """#!/bin/bash
+mkdir -p "$OUT" # a Python that finds one device and does nothing
+[[ $* == *device_count* ]] && echo 1
+[[ $* == *speed_1024* && ! -e $OUT/mended ]] && { touch "$OUT/mended"; exit 1; }
+echo "$@" >>"$OUT/calls"
+"""
+
+
+def check(folder: Path, python: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    named = {"PYTHON": python, "OUT": str(folder / "out"), "PAGE": str(folder / "gpu.md")}
+    return subprocess.run(
+        [str(SCRIPT)],
+        env={**os.environ, **named, **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_without_cuda_it_ends_with_one_sentence(tmp_path):
+    done = check(tmp_path, sys.executable, CUDA_VISIBLE_DEVICES="")
+    assert done.returncode == 1
+    assert done.stdout == NO_CUDA
+    assert not (tmp_path / "gpu.md").exists()
+
+
+@pytest.mark.slow
+def test_each_step_runs_once_and_its_options_exist(tmp_path, compose):
+    fake = tmp_path / "python"
+    fake.write_text(FAKE)
+    fake.chmod(0o755)
+    out = tmp_path / "out"
+    assert check(tmp_path, str(fake)).returncode == 1  # one step fails at first
+    assert "failed after" in (tmp_path / "gpu.md").read_text()
+    first = (out / "calls").read_text().splitlines()
+    assert check(tmp_path, str(fake)).returncode == 0
+    again = (out / "calls").read_text().splitlines()[len(first) :]
+    assert [line for line in again if "gsgan" in line and "speed_1024" not in line] == []
+    page = (tmp_path / "gpu.md").read_text()
+    assert "failed" not in page
+    commands = [shlex.split(path.read_text())[1:] for path in sorted(out.glob("*.command"))]
+    assert len(commands) == 8
+    for words in commands:
+        if words[1] == "pytest":
+            assert Path(words[-1]).exists()
+        elif words[1] == "gsgan.bench":
+            compose(f"bench_{words[2]}", *without_folder(words[3:]))
+        else:
+            compose("train", *without_folder(words[2:]))
+
+
+def without_folder(overrides: list[str]) -> list[str]:
+    return [x for x in overrides if not x.startswith("hydra.run.dir")]
