@@ -19,7 +19,7 @@ from gsgan.losses.adversarial import (
 from gsgan.model.discriminator import Discriminator
 from gsgan.model.painting import Painting
 from gsgan.model.segmentation import silhouette_loss
-from gsgan.train.losses import Judged, StepTwoLoss, discriminate
+from gsgan.train.losses import DiscriminatorMaps, StepTwoLoss, discriminate
 from gsgan.utils.errors import ConfigError, GsganError
 
 
@@ -291,8 +291,8 @@ def test_every_phase_runs_under_bf16_autocast(make):
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert module.avatar.window(frame) is not None
         mixed = module.avatar.paint(frame)
-        judged = module.step_two.judged(module.discriminator, mixed, frame)
-        terms = module.step_two_terms(mixed, frame, judged)
+        maps = module.step_two.discriminator_maps(module.discriminator, mixed, frame)
+        terms = module.step_two_terms(mixed, frame, maps)
         torch.stack(list(terms.values())).sum().backward()
     assert torch.equal(plain.features, mixed.features)
     assert mixed.image.dtype == torch.float32
@@ -334,7 +334,7 @@ def test_a_comparing_gan_without_feature_matching_still_sees_the_real_picture():
         frame,
         anchor=None,
         perceptual=None,
-        judged=weights.judged(critic, painting, frame),
+        maps=weights.discriminator_maps(critic, painting, frame),
         step=0,
     )
     expected = 2 * generator_loss(critic(frame.image), critic(image), "relativistic")
@@ -362,12 +362,12 @@ def test_maps_shared_by_both_losses_give_the_gradients_of_two_passes(gan):
     critic = Discriminator(scales=2, base=4, layers=2, norm="none").double()
     image = torch.rand(1, 3, 16, 16, dtype=torch.float64, requires_grad=True)
     target = torch.rand(1, 3, 16, 16, dtype=torch.float64)
-    judged = Judged(critic, image, target, gan)
-    terms = judged.terms(0.5, 2.0)
+    maps = DiscriminatorMaps(critic, image, target, gan)
+    terms = maps.terms(0.5, 2.0)
     torch.stack(list(terms.values())).sum().backward()
     assert all(p.grad is None for p in critic.parameters())
     found, image.grad = image.grad, None
-    judged.loss().backward()
+    maps.loss().backward()
     assert image.grad is None  # the discriminator's loss does not reach the generator
     of_critic = [p.grad.clone() for p in critic.parameters()]
 

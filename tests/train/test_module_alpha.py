@@ -32,7 +32,7 @@ def test_step_two_compares_on_white_by_alpha_and_mask():
 
     def terms(loss: StepTwoLoss) -> dict[str, torch.Tensor]:
         painting = Painting(image, alpha)
-        return loss.terms(painting, frame, anchor=None, perceptual=None, judged=None, step=0)
+        return loss.terms(painting, frame, anchor=None, perceptual=None, maps=None, step=0)
 
     found = terms(weights)
     off = ((image + 1 - alpha) - (frame.image + 1 - frame.mask)).detach() * (frame.unsure == 0)
@@ -51,8 +51,8 @@ def test_the_generators_fourth_channel_learns_from_alpha_alone(make):
     frame = data.dataset("train")[0]
     last = module.avatar.generator.paint.weight
     painting = module.avatar.paint(frame)
-    judged = module.step_two.judged(module.discriminator, painting, frame)
-    terms = module.step_two_terms(painting, frame, judged)
+    maps = module.step_two.discriminator_maps(module.discriminator, painting, frame)
+    terms = module.step_two_terms(painting, frame, maps)
     assert {"alpha", "photometric", "anchor", "adversarial"} <= set(terms)
     slopes = {
         name: torch.autograd.grad(term, last, retain_graph=True, allow_unused=True)[0]

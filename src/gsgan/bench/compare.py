@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from gsgan.body.free import free_body
-from gsgan.data.synthetic.scene_setup import look_at
+from gsgan.data.synthetic.view import look_at
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.skeleton import MEDIAPIPE33, Densify
 from gsgan.splat import ACCURACY, Accuracy, Projected, project, reference

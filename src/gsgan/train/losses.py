@@ -81,7 +81,7 @@ def discriminate(discriminator: Discriminator, image: Tensor, gan: str) -> list[
         return discriminator(image.to(dtype))  # type: ignore[no-any-return]
 
 
-class Judged:
+class DiscriminatorMaps:
     """The discriminator's maps of a frame and of its painting, computed once for the generator's
     loss and for the discriminator's.
 
@@ -157,11 +157,13 @@ class StepTwoLoss:
         one_of("training.step_two.gan", self.gan, FORMS)
         at_least("training.step_two.perceptual_every", self.perceptual_every, 1)
 
-    def judged(self, discriminator: Discriminator, painting: Painting, frame: Frame) -> Judged:
+    def discriminator_maps(
+        self, discriminator: Discriminator, painting: Painting, frame: Frame
+    ) -> DiscriminatorMaps:
         """The discriminator's maps of a painting of ``frame``."""
         assert painting.image is not None
         target = without_unsure(frame.image, painting.image, frame.unsure)
-        return Judged(discriminator, painting.image, target, self.gan)
+        return DiscriminatorMaps(discriminator, painting.image, target, self.gan)
 
     @property
     def adversarial_terms(self) -> bool:
@@ -175,7 +177,7 @@ class StepTwoLoss:
         *,
         anchor: Tensor | None,
         perceptual: Perceptual | None,
-        judged: Judged | None,
+        maps: DiscriminatorMaps | None,
         step: int,
     ) -> dict[str, Tensor]:
         """The generator's losses, weighted, by name.
@@ -185,7 +187,7 @@ class StepTwoLoss:
             frame: the ground truth.
             anchor: L_Ψ of the same painting; None leaves it out.
             perceptual: L_perc; None leaves it out.
-            judged: the discriminator's maps; None before the GAN starts.
+            maps: the discriminator's maps; None before the GAN starts.
             step: the iteration, for ``perceptual_every``.
         """
         image, alpha = painting.image, painting.alpha
@@ -201,6 +203,6 @@ class StepTwoLoss:
         if perceptual is not None and step % self.perceptual_every == 0:
             scale = self.perceptual * self.perceptual_every
             terms["perceptual"] = scale * perceptual(image, target)
-        if judged is not None:
-            terms |= judged.terms(self.adversarial, self.feature_matching)
+        if maps is not None:
+            terms |= maps.terms(self.adversarial, self.feature_matching)
         return terms

@@ -18,7 +18,7 @@ from gsgan.metrics.image import psnr
 from gsgan.model.avatar import Avatar, Painting
 from gsgan.model.discriminator import Discriminator
 from gsgan.scene import Frame
-from gsgan.train.losses import Judged, StepOneLoss, StepTwoLoss
+from gsgan.train.losses import DiscriminatorMaps, StepOneLoss, StepTwoLoss
 from gsgan.train.optimisers import MovingAverage, Recipe, clip, parameter_groups
 from gsgan.train.rollback import Rollback, SkippedSteps
 from gsgan.train.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
@@ -213,16 +213,16 @@ class AvatarTraining(LightningModule):
 
     def _train_step_two(self, frame: Frame, height: int) -> None:
         painting = self._paint(frame, height, paint=True)
-        judged = None
+        maps = None
         if self.discriminator is not None and self.schedule.adversarial(self.step):
-            judged = self.step_two.judged(self.discriminator, painting, frame)
-        terms = self.step_two_terms(painting, frame, judged)
+            maps = self.step_two.discriminator_maps(self.discriminator, painting, frame)
+        terms = self.step_two_terms(painting, frame, maps)
         self._descend(torch.stack(list(terms.values())).sum(), *self._splatting(), "generator")
         self._update_average()
         for name, term in terms.items():
             self._log(f"step_two/{name}", term)
-        if judged is not None:
-            loss = judged.loss()
+        if maps is not None:
+            loss = maps.loss()
             self._descend(loss, "discriminator")
             self._log("step_two/discriminator", loss)
 
@@ -277,7 +277,7 @@ class AvatarTraining(LightningModule):
         return self.step_one(painting, frame, self._background(frame), self.feature_head)
 
     def step_two_terms(
-        self, painting: Painting, frame: Frame, judged: Judged | None
+        self, painting: Painting, frame: Frame, maps: DiscriminatorMaps | None
     ) -> dict[str, Tensor]:
         """The generator's losses, weighted, by name."""
         assert painting.image is not None
@@ -287,7 +287,7 @@ class AvatarTraining(LightningModule):
             frame,
             anchor=self.step_one_loss(painting, frame) if anchored else None,
             perceptual=self.perceptual,
-            judged=judged,
+            maps=maps,
             step=self.step,
         )
         return terms | {name: loss(painting, frame) for name, loss in self.extra_losses.items()}

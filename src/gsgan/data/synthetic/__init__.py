@@ -1,4 +1,4 @@
-"""The default person: a clothed figure, ray-traced from a ring of cameras on first use."""
+"""The default person: a rigged character, ray-traced from a ring of cameras on first use."""
 
 from gsgan.data.synthetic.scenes import ensure_synthetic
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from embreex.mesh_construction import TriangleMesh
-from embreex.rtcore_scene import EmbreeScene
 
 from gsgan.body.free import free_body
-from gsgan.data.synthetic.character import Array, Character, Ints
+from gsgan.data.synthetic.character import Array, Character, Ints, unit
 from gsgan.data.synthetic.humanoid import FINGERS, SIDES
 from gsgan.data.synthetic.parts import LABEL_NAMES, texture_lab
+from gsgan.data.synthetic.trace import Tracer
 
 JOINTS = {"shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand", "hip": "UpLeg", "knee": "Leg",
           "ankle": "Foot", "thumb": "HandThumb2", "index": "HandIndex1",
@@ -44,7 +43,7 @@ def with_anchors(c: Character) -> Character:
     and lips, and the slit that the shape ``mouth_open`` opens; in their absence from the
     proportions of a face. Ours.
     """
-    main = c.bone_index[np.arange(len(c.vertices)), c.bone_weight.argmax(1)]
+    main = c.dominant_bones()
     found: Anchors = {}
     for side in SIDES:
         found |= _limb_anchors(c, main, side)
@@ -71,9 +70,9 @@ def _hand(c: Character, main: Ints, side: str) -> Anchors:
     """Joints of the fingers, tips without a bone, and places on the hand of absent fingers."""
     found, at = {}, {bone: k for k, bone in enumerate(c.bones)}
     wrist = c.joints[at[f"{side}Hand"]]
-    along = _unit(wrist - c.joints[at[f"{side}ForeArm"]])
-    ahead = _unit(np.array([0, -1.0, 0]) + along * along[1])  # the thumb's side in a T pose
-    hand = np.flatnonzero(np.isin(main, _below(c, at[f"{side}Hand"])))
+    along = unit(wrist - c.joints[at[f"{side}ForeArm"]])
+    ahead = unit(np.array([0, -1.0, 0]) + along * along[1])  # the thumb's side in a T pose
+    hand = np.flatnonzero(np.isin(main, c.with_descendants(at[f"{side}Hand"])))
     length = float(((c.vertices[hand] - wrist) @ along).max()) if len(hand) else 0.0
     for finger, (first, step, across) in zip(FINGERS, ABSENT_FINGERS, strict=True):
         for k, part in enumerate(THUMB if finger == "Thumb" else SEGMENTS):
@@ -97,12 +96,12 @@ def _foot(c: Character, main: Ints, side: str) -> Anchors:
     ball = c.bones.index(f"{side}ToeBase") if f"{side}ToeBase" in c.bones else ankle
     shod = np.zeros(len(main), bool)
     shod[c.faces[c.labels == LABEL_NAMES.index(f"{low}_shoe")]] = True  # no hem of the trousers
-    on_foot = np.isin(main, _below(c, ankle))
+    on_foot = np.isin(main, c.with_descendants(ankle))
     foot = np.flatnonzero(on_foot & shod if (on_foot & shod).any() else on_foot)
     if len(foot) == 0:
         return {f"{low}_heel": (ankle, -1), f"{low}_foot_index": (ball, -1)}
     outwards = (c.joints[ball] - c.joints[ankle]) * [1, 1, 0] + [0, -0.01, 0]
-    outwards = _unit(outwards)
+    outwards = unit(outwards)
     x = c.vertices[foot]
     ahead = np.where(x[:, 2] < x[:, 2].min() + 0.08, x @ outwards, np.nan)
     heel = c.joints[ankle] + outwards * (np.nanmin(ahead) - c.joints[ankle] @ outwards)
@@ -117,7 +116,7 @@ class _Face:
     def __init__(self, c: Character, main: Ints) -> None:
         self.c, self.main = c, main
         self.head = c.bones.index("Head")
-        on_head = np.isin(main, _below(c, self.head))
+        on_head = np.isin(main, c.with_descendants(self.head))
         self.skin = np.zeros(len(c.vertices), bool)
         self.skin[c.faces[c.labels == LABEL_NAMES.index("face_neck")]] = True
         self.skin &= on_head
@@ -148,12 +147,8 @@ class _Face:
         self.z = np.arange(0.9 * d, -1.9 * d, -STEP) + self.mid[2]
         grid = np.stack(np.meshgrid(self.x, self.z), -1).reshape(-1, 2)
         start = np.c_[grid[:, 0], np.full(len(grid), c.vertices[:, 1].min() - 1), grid[:, 1]]
-        scene = EmbreeScene()
-        TriangleMesh(scene, c.vertices.astype(np.float32), c.faces.astype(np.int32))
         ray = np.tile(np.array([0, 1, 0], np.float32), (len(grid), 1))
-        hit = scene.run(start.astype(np.float32), ray, output=1)
-        face = hit["primID"].astype(np.int64)
-        share = np.stack([1 - hit["u"] - hit["v"], hit["u"], hit["v"]], 1)
+        face, share = Tracer(c.vertices, c.faces).first(start.astype(np.float32), ray)
         corners = c.faces[face]
         nearest = np.take_along_axis(corners, share.argmax(1)[:, None], 1)[:, 0]
         shape = len(self.z), len(self.x)
@@ -199,7 +194,7 @@ class _Face:
             eye[0] - sign * 0.23 * d, eye[0] + sign * 0.23 * d, eye[2] + 0.08 * d,
             eye[2] - 0.07 * d)  # fmt: skip
         if bone in self.c.bones:
-            ball = _below(self.c, self.c.bones.index(bone))
+            ball = self.c.with_descendants(self.c.bones.index(bone))
             seen = np.isin(self.main[self.vertex], ball) & (self.vertex >= 0)
             if seen.any():
                 rows, columns = np.nonzero(seen)
@@ -258,21 +253,8 @@ class _Face:
         return points
 
 
-def _below(c: Character, bone: int) -> list[int]:
-    """A bone and all below it."""
-    found = [bone]
-    for k in range(bone + 1, len(c.bones)):
-        if c.parents[k] in found:
-            found.append(k)
-    return found
-
-
 def _nearest(c: Character, among: Ints, target: Array, joint: int) -> tuple[int, int]:
     """The nearest of some vertices as (-1, vertex), or a joint where there are none."""
     if len(among) == 0:
         return joint, -1
     return -1, int(among[np.linalg.norm(c.vertices[among] - target, axis=1).argmin()])
-
-
-def _unit(x: Array) -> Array:
-    return x / max(float(np.linalg.norm(x)), 1e-12)

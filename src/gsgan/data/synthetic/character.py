@@ -16,6 +16,11 @@ Ints = NDArray[np.int64]
 Bytes = NDArray[np.uint8]
 
 
+def unit(v: Array) -> Array:
+    """Vectors ``[..., 3]`` divided by their length."""
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
+
+
 @dataclass(frozen=True)
 class Surface:
     """A material: ``colour [h, w, 4]`` sRGB and coverage, ``normal [h, w, 3]`` map or None."""
@@ -66,7 +71,19 @@ class Character:
             local = np.einsum("vij,vj->vi", R, rest - self.joints[index]) + joints[index]
             vertices += weight[:, None] * local
             normals += weight[:, None] * np.einsum("vij,vj->vi", R, self.normals)
-        return vertices, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+        return vertices, unit(normals)
+
+    def dominant_bones(self) -> Ints:
+        """``[V]`` the bone of the largest weight of each vertex."""
+        return self.bone_index[np.arange(len(self.vertices)), self.bone_weight.argmax(axis=1)]
+
+    def with_descendants(self, bone: int) -> list[int]:
+        """A bone and all bones below it."""
+        found = [bone]
+        for j in range(bone + 1, len(self.bones)):
+            if self.parents[j] in found:
+                found.append(j)
+        return found
 
     def landmarks(self, vertices: Array, joints: Array) -> Array:
         """``[L, 3]`` landmarks of a posed mesh, in the order of ``anchor_names``."""

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from gsgan.body.free import free_body
 from gsgan.body.skinned import vertex_normals
 from gsgan.data.synthetic.character import Character, Motion, Surface
+from gsgan.data.synthetic.humanoid import FINGERS
 from gsgan.scene import BodyPose
 
 # Mixamo's names of the free body's joints; other joints keep their names and follow their parents.
@@ -21,7 +22,6 @@ TRUNK = {"root": "Hips", "spine05": "Spine", "spine03": "Spine1", "spine01": "Sp
 TRUNK |= {"neck01": "Neck", "head": "Head"}
 LIMBS = {"clavicle": "Shoulder", "upperarm01": "Arm", "lowerarm01": "ForeArm", "wrist": "Hand"}
 LIMBS |= {"upperleg01": "UpLeg", "lowerleg01": "Leg", "foot": "Foot", "toe1-1": "ToeBase"}
-FINGERS = ("Thumb", "Index", "Middle", "Ring", "Pinky")
 # sRGB of skin, hair, eyes, shirt, trousers and shoes
 COLOURS = (
     (214, 160, 128),

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
+from gsgan.body.skinned import vertex_normals
 from gsgan.data.synthetic.anchors import with_anchors
 from gsgan.data.synthetic.character import Array, Character, Ints, Surface
 from gsgan.data.synthetic.glb import Glb
@@ -22,6 +24,7 @@ from gsgan.data.synthetic.humanoid import (
     vrm_shapes,
 )
 from gsgan.data.synthetic.parts import LABEL_NAMES, face_labels
+from gsgan.data.synthetic.textures import linear, srgb
 from gsgan.utils.errors import ConfigError, DataError
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])  # glTF is y up
@@ -281,10 +284,8 @@ def _surface(glb: Glb, material: int) -> Surface:
     colour = glb.image(base["index"]) if base else np.full((1, 1, 4), 255, np.uint8)
     if (factor != 1).any():  # the factor scales linear light
         table = np.arange(256) / 255
-        linear = np.where(table <= 0.04045, table / 12.92, ((table + 0.055) / 1.055) ** 2.4)
-        scaled = np.clip(linear[:, None] * factor[:3], 0, 1)
-        curve = np.where(scaled <= 0.0031308, scaled * 12.92, 1.055 * scaled ** (1 / 2.4) - 0.055)
-        curve = np.c_[curve, np.clip(table * factor[3], 0, 1)]
+        scaled = np.clip(linear(table)[:, None] * factor[:3], 0, 1)
+        curve = np.c_[srgb(scaled), np.clip(table * factor[3], 0, 1)]
         curve = np.rint(curve * 255).astype(np.uint8)
         colour = np.stack([curve[colour[..., k], k] for k in range(4)], -1)
     opaque = (entry.alphaMode or "OPAQUE") == "OPAQUE"
@@ -317,10 +318,7 @@ def _standing(rig: _Rig, vertices: Array) -> tuple[Array, float, Array]:
 
 def _unit_normals(normals: Array, vertices: Array, faces: Ints) -> Array:
     """Unit normals; where there are none, those of the faces, weighted by area."""
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    made = np.zeros_like(vertices)
-    for corner in faces.T:
-        np.add.at(made, corner, np.cross(b - a, c - a))
+    made = vertex_normals(torch.from_numpy(vertices), torch.from_numpy(faces)).numpy()
     normals = np.where(np.abs(normals).sum(1, keepdims=True) > 0, normals, made)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.where(length > 0, normals / np.where(length > 0, length, 1), [0.0, 0, 1])

@@ -61,7 +61,7 @@ def face_labels(character: Character, names: np.ndarray) -> Ints:
     """
     c = character
     corner = c.faces[:, 0]
-    bone = c.bone_index[corner, c.bone_weight[corner].argmax(1)]
+    bone = c.dominant_bones()[corner]
     cloth, skin, root = (rows[bone] for rows in _bone_labels(c))
     lab = _lab(c)
     centre, area = _centres(c)

@@ -15,24 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from gsgan.data.synthetic.character import Character, Motion
+from gsgan.data.synthetic.character import Character, Motion, unit
+from gsgan.data.synthetic.humanoid import FINGERS, SIDES
 
 Array = NDArray[np.float64]
 
-SIDES = ("Left", "Right")
 SIGN = {"Left": 1.0, "Right": -1.0}
 SPINE = ("Spine", "Spine1", "Spine2")
-FINGERS = ("Thumb", "Index", "Middle", "Ring", "Pinky")
 ARM, LEG = ("Arm", "ForeArm", "Hand"), ("UpLeg", "Leg", "Foot")
 REQUIRED = ("Hips", *(side + bone for side in SIDES for bone in LEG + ARM))
 FOREARM_TWIST = 0.55  # the forearm's share of the hand's twist: without twist bones, half each
 REACH = 0.998  # longest reach of a limb in full lengths: below 1, so that it always bends
 SOLE = 0.02  # metres above the floor up to which a vertex of the resting foot is its sole
-
-
-def unit(v: Array) -> Array:
-    """Vectors ``[..., 3]`` divided by their length."""
-    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
 
 
 def rotation(axis_angle: Array) -> Array:
@@ -161,29 +155,22 @@ class Rig:
             (b for b in ("Hips", *SPINE) if b in self.index), key=self.index.__getitem__
         )
         self.fingers = {side: finger_hinges(self.joint, self.turns, side) for side in SIDES}
-        main = character.bone_index[
-            np.arange(len(character.vertices)), character.bone_weight.argmax(axis=1)
-        ]
+        main = character.dominant_bones()
         self.soles: dict[str, Array] = {}
         for side in SIDES:
-            for bone in (side + "Foot", side + "ToeBase"):
-                of_bone = np.isin(main, self._with_descendants(bone))
+            parts = [
+                character.with_descendants(self.index[bone]) if bone in self.index else []
+                for bone in (side + "Foot", side + "ToeBase")
+            ]
+            parts[0] = [j for j in parts[0] if j not in parts[1]]
+            for bone, part in zip((side + "Foot", side + "ToeBase"), parts, strict=True):
+                of_bone = np.isin(main, part)
                 points = character.vertices[of_bone & (character.vertices[:, 2] < SOLE)]
                 self.soles[bone] = points[:: max(1, len(points) // 300)]
 
     def length(self, start: str, end: str) -> float:
         """Distance between two joints of the rest pose, metres."""
         return float(np.linalg.norm(self.joint[end] - self.joint[start]))
-
-    def _with_descendants(self, bone: str) -> list[int]:
-        if bone not in self.index:
-            return []
-        found = [self.index[bone]]
-        for j, parent in enumerate(self.character.parents):
-            # a foot's toes are asked for by their own name
-            if parent in found and not self.character.bones[j].endswith("ToeBase"):
-                found.append(j)
-        return found
 
 
 class Pose:

@@ -25,7 +25,7 @@ from gsgan.data.synthetic.motion import Choreography
 from gsgan.data.synthetic.secondary import Moving, Secondary
 from gsgan.data.synthetic.tint import make_tints
 from gsgan.data.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles
-from gsgan.data.synthetic.view import View, undistort
+from gsgan.data.synthetic.view import View, look_at, through_lens, zoomed
 from gsgan.utils.errors import ConfigError, DataError
 
 Array = NDArray[np.float64]
@@ -35,8 +35,6 @@ VERSION = 2
 
 AVATARS = avatar_names()
 DEFAULT, FREE_BODY, CHOREOGRAPHY = "polo", "free_body", "choreography"
-RADIUS = 2.8  # metres from the middle of the scene to the cameras
-MARGIN = 0.02  # share of the image kept free at each edge, over all frames and cameras
 WHOLE, NUMBER, LIST = "a whole number", "a number", "a list of numbers"
 # Kind and range of each parameter; those that are not whole numbers may be None.
 RANGES = {
@@ -273,39 +271,3 @@ def ring(settings: Settings, points: Array) -> list[View]:
     gaps = [(i * n) // max(settings.test_cameras, 1) for i in range(settings.test_cameras)]
     test = [(0.3 + (i + 0.5) * step, (1.15, 1.55)[k % 2]) for k, i in enumerate(gaps)]
     return [look_at(a, h, middle, points, settings.size) for a, h in train + test]
-
-
-def look_at(azimuth: float, height: float, middle: Array, points: Array, size: int) -> View:
-    """A camera at an azimuth: 0 in front of the person, growing towards the person's left."""
-    offset = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0]) * RADIUS
-    centre = np.array([middle[0], middle[1], height]) + offset
-    forward = middle - centre
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
-    right /= np.linalg.norm(right)
-    R = np.stack([right, np.cross(forward, right), forward])
-    t = -R @ centre
-    x = points @ R.T + t
-    rays = x[:, :2] / x[:, 2:]
-    low, high = rays.min(axis=0), rays.max(axis=0)
-    focal = (1 - 2 * MARGIN) * size / (high - low).max()
-    principal = size / 2 - focal * (low + high) / 2
-    K = np.array([[focal, 0, principal[0]], [0, focal, principal[1]], [0, 0, 1]])
-    return View(K, R, t, (size, size))
-
-
-def zoomed(view: View, scale: float) -> View:
-    """The same camera with its focal length times ``scale``, zoomed about the image's centre."""
-    H, W = view.size
-    K = view.K.copy()
-    K[:2, :2] *= scale
-    K[:2, 2] = scale * (K[:2, 2] - [W / 2, H / 2]) + [W / 2, H / 2]
-    return replace(view, K=K)
-
-
-def through_lens(view: View, dist: Array) -> View:
-    """The same camera with a lens, which is checked up to the image's corners."""
-    H, W = view.size
-    corners = np.array([[x, y, 1.0] for x in (0, W / 2, W) for y in (0, H / 2, H)])
-    undistort((corners @ np.linalg.inv(view.K).T)[:, :2], dist)
-    return replace(view, dist=dist)

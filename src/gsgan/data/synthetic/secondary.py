@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import bilinear, lfilter
 from scipy.sparse import coo_array, csr_array
 
-from gsgan.data.synthetic.character import Character, Motion
+from gsgan.data.synthetic.character import Character, Motion, unit
 from gsgan.data.synthetic.trace import Wrinkles
 
 Array = NDArray[np.float64]
@@ -117,7 +117,7 @@ class Secondary:
         after[:, 2] = np.maximum(after[:, 2], np.minimum(before[:, 2], 0))  # not below the floor
         turned = self._face_normals(after) - self._face_normals(before)
         moved = vertices + (after - before)[self._weld]
-        return moved, _unit(normals + turned[self._weld]), self._wrinkles(rotations)
+        return moved, unit(normals + turned[self._weld]), self._wrinkles(rotations)
 
     def _welded(self, x: Array) -> Array:
         """Mean ``[W, 3]`` of the duplicates of each vertex."""
@@ -130,7 +130,7 @@ class Secondary:
         area = np.cross(b - a, c - a)
         corner = self._faces.ravel()
         sums = [np.bincount(corner, np.repeat(area[:, i], 3), len(vertices)) for i in range(3)]
-        return _unit(np.stack(sums, axis=1))
+        return unit(np.stack(sums, axis=1))
 
     def _share_of(self, label: str) -> Array:
         """``[W]`` 1 on a label, falling smoothly to 0 beyond its hem."""
@@ -179,7 +179,7 @@ class Secondary:
         middle = (hold.T @ self._rest) / np.maximum(total, 1e-9)[:, None]
         middle = np.where((total > 1e-9)[:, None], middle, c.joints)
         place = poses.joints + np.einsum("tjab,jb->tja", poses.rotations, middle - c.joints)
-        along = np.einsum("tjab,jb->tja", poses.rotations, _unit(middle - c.joints))
+        along = np.einsum("tjab,jb->tja", poses.rotations, unit(middle - c.joints))
         hang = -HANG * (np.array([0, 0, 1.0]) - along * along[..., 2:])
         w = 2 * np.pi * FREQUENCY
         spring = [1, 2 * DAMPING * w, w * w]
@@ -198,9 +198,9 @@ class Secondary:
         self._axis = np.zeros((len(known), 3))
         for k, (bone, _, end, reach) in enumerate(known):
             joint = c.joints[index[bone]]
-            axis = self._axis[k] = _unit(c.joints[index[end]] - joint)
+            axis = self._axis[k] = unit(c.joints[index[end]] - joint)
             off = x - joint
-            across = _unit(np.cross(axis, [0.36, 0.48, 0.8]))
+            across = unit(np.cross(axis, [0.36, 0.48, 0.8]))
             # folds run askew round the limb, and are neither straight nor evenly spaced
             warp = 1.1 * np.sin(off @ across / 0.03) + 0.9 * np.sin(off @ axis / 0.05 + 1)
             phase[k] = 2 * np.pi * (off @ (axis + 0.5 * across)) / WAVELENGTH + warp
@@ -225,7 +225,7 @@ class Secondary:
             deep = np.tanh(STIFFNESS * (0.6 * flexion[own] + 0.4 * side))
             slope = SLOPE * self._near * deep
             R = np.reshape(self._skin @ rotations.reshape(len(rotations), 9), (-1, 3, 3))
-            across = _unit(np.einsum("vij,vj->vi", R, self._axis[own]))
+            across = unit(np.einsum("vij,vj->vi", R, self._axis[own]))
         fields = (self._phase[self._weld], slope[self._weld], across[self._weld])
         return Wrinkles(*(x.astype(np.float32) for x in fields))
 
@@ -241,7 +241,3 @@ def _filtered(numerator: list[float], denominator: list[float], signal: Array) -
     gain = numerator[-1] / denominator[-1]
     out: Array = lfilter(b, a, padded, axis=0)[lead:] + gain * start
     return out
-
-
-def _unit(x: Array) -> Array:
-    return x / np.maximum(np.linalg.norm(x, axis=-1, keepdims=True), 1e-12)

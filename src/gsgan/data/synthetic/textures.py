@@ -27,6 +27,12 @@ def linear(srgb: Floats) -> Floats:
     return np.where(srgb <= 0.04045, srgb / np.float32(12.92), curve)
 
 
+def srgb(light: Floats) -> Floats:
+    """sRGB of linear light in [0, 1], the inverse of `linear`."""
+    curve = 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055
+    return np.where(light <= 0.0031308, 12.92 * light, curve)
+
+
 class Textures:
     """All surfaces with their mip levels in one array, so that one lookup serves all rays."""
 

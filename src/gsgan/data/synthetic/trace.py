@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.synthetic.character import Character
-from gsgan.data.synthetic.textures import Textures
+from gsgan.data.synthetic.textures import Textures, srgb
 from gsgan.data.synthetic.view import View, pixel_rays
 
 Array = NDArray[np.float64]
@@ -70,12 +70,11 @@ def encode(light: Array) -> Array:
     rest = 1 - SHOULDER
     over = np.maximum(light - SHOULDER, 0)
     light = np.where(over > 0, 1 - rest * np.exp(-over / rest), light)
-    curve = 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055
-    return np.where(light <= 0.0031308, 12.92 * light, curve)
+    return np.asarray(srgb(light), np.float64)
 
 
 class Appearance:
-    """The part of a character's picture that is constant over frames."""
+    """The part of a character's appearance that is constant over frames."""
 
     def __init__(self, character: Character) -> None:
         self.character = character

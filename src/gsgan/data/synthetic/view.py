@@ -5,17 +5,21 @@ Convention: metres, world frame; OpenCV cameras and lenses, pixel centres at +0.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.crop import distort
+from gsgan.data.synthetic.character import unit
 from gsgan.utils.errors import ConfigError
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+RADIUS = 2.8  # metres from the middle of the scene to the cameras
+MARGIN = 0.02  # share of the image kept free at each edge, over all frames and cameras
 EXACT = 1e-10  # residual of x/z up to which an undistorted point counts as found
 FURTHEST = 10.0  # bound of x/z in the search
 GOLDEN = (5**0.5 - 1) / 2
@@ -54,7 +58,7 @@ class View:
             return directions
         rays = directions @ self.R.T
         straight = undistort(rays[:, :2] / rays[:, 2:], self.dist)
-        return _unit(np.concatenate([straight, np.ones((len(rays), 1))], axis=1) @ self.R)
+        return unit(np.concatenate([straight, np.ones((len(rays), 1))], axis=1) @ self.R)
 
 
 def undistort(points: Array, dist: Array, iterations: int = 200) -> Array:
@@ -95,8 +99,40 @@ def pixel_rays(view: View, x: Ints, y: Ints, rays: int) -> tuple[Array, Array]:
     down = (y[:, None] + offset[:, 1]).ravel()
     pixel = np.stack([across, down, np.ones_like(across)], axis=1)
     directions = pixel @ (np.linalg.inv(view.K).T @ view.R)
-    return view.centre, _unit(directions)
+    return view.centre, unit(directions)
 
 
-def _unit(x: Array) -> Array:
-    return x / np.linalg.norm(x, axis=1, keepdims=True)
+def look_at(azimuth: float, height: float, middle: Array, points: Array, size: int) -> View:
+    """A camera at an azimuth: 0 in front of the person, growing towards the person's left."""
+    offset = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0]) * RADIUS
+    centre = np.array([middle[0], middle[1], height]) + offset
+    forward = middle - centre
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    R = np.stack([right, np.cross(forward, right), forward])
+    t = -R @ centre
+    x = points @ R.T + t
+    rays = x[:, :2] / x[:, 2:]
+    low, high = rays.min(axis=0), rays.max(axis=0)
+    focal = (1 - 2 * MARGIN) * size / (high - low).max()
+    principal = size / 2 - focal * (low + high) / 2
+    K = np.array([[focal, 0, principal[0]], [0, focal, principal[1]], [0, 0, 1]])
+    return View(K, R, t, (size, size))
+
+
+def zoomed(view: View, scale: float) -> View:
+    """The same camera with its focal length times ``scale``, zoomed about the image's centre."""
+    H, W = view.size
+    K = view.K.copy()
+    K[:2, :2] *= scale
+    K[:2, 2] = scale * (K[:2, 2] - [W / 2, H / 2]) + [W / 2, H / 2]
+    return replace(view, K=K)
+
+
+def through_lens(view: View, dist: Array) -> View:
+    """The same camera with a lens, which is checked up to the image's corners."""
+    H, W = view.size
+    corners = np.array([[x, y, 1.0] for x in (0, W / 2, W) for y in (0, H / 2, H)])
+    undistort((corners @ np.linalg.inv(view.K).T)[:, :2], dist)
+    return replace(view, dist=dist)
