@@ -44,7 +44,7 @@ def test_the_settings_are_those_of_the_accuracy_group_and_ones_own(config):
     assert settings(config()) == ACCURACY
     found = settings(config("+accuracy@settings.mine=high", "settings.mine.alpha_min=1e-4"))
     assert found["mine"].alpha_min == 1e-4
-    assert found["high"].alpha_min == 1e-6
+    assert found["high"].alpha_min == 4e-6
 
 
 def test_variants_are_each_backend_with_each_setting_it_draws(config):
@@ -78,7 +78,13 @@ def test_a_real_run_writes_all_files_and_ends_in_an_error_beyond_the_bound(confi
         raster.run(config("gaussians=[120]", "rounding=0", f"docs={page}"), out)
     assert "| 120 | 2 | 24² | torch | high |" in page.read_text()
     files = {path.name for path in out.iterdir()}
-    assert files == {"raster.md", "raster.csv", "raster.json", "raster_error.png"}
+    assert files == {
+        "raster.md",
+        "raster.csv",
+        "raster.json",
+        "raster_error.png",
+        "raster_growth.png",
+    }
     frame = pd.read_csv(out / "raster.csv")
     assert {"gradient_means", "worst_group", "bound"} <= set(frame)
     assert (tmp_path / "pictures" / "raster_error.png").is_file()
