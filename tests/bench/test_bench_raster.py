@@ -59,11 +59,12 @@ def test_variants_are_each_backend_with_each_setting_it_draws(config):
 def test_a_cell_times_and_compares_every_variant(config):
     found = variants(config(), ACCURACY, 120, CPU)
     cell = {"gaussians": 120, "channels": 2, "size": 24}
-    rows = pd.DataFrame(measure_cell(config(), cell, found, CPU))
+    rows = pd.DataFrame(measure_cell(config(), cell, found, CPU, {"GFLOP/s": 50.0, "GB/s": 10.0}))
     assert list(zip(rows.backend, rows.setting, strict=True)) == [v[:2] for v in found]
     assert (rows.forward_ms > 0).all()
     assert (rows.both_ms > 0).all()
     assert (rows.beyond < 1e-5).all()
+    assert (rows.over_least[rows.setting != "exact"] > 1).all()
     for _, own in rows.groupby("backend"):
         own = own.set_index("setting")
         falling = own.value_max[["draft", "standard", "high", "exact"]]
@@ -138,8 +139,9 @@ def frame():
 
 def test_tables_show_each_row_and_a_dash_for_what_is_missing(frame):
     lines = number_table(frame).splitlines()
-    assert "| 8000 | 3 | 512² | native | high | 9.00 | 18.0 | 1.0e-05 | 1.0e-06 | 2.0e-05 |" in (
-        "\n".join(lines)
+    assert (
+        "| 8000 | 3 | 512² | native | high | 9.00 | 18.0 | – | 1.0e-05 | 1.0e-06 | 2.0e-05 |"
+        in ("\n".join(lines))
     )
     assert len({line.count("|") for line in lines}) == 1
     assert "| 8000 | 3 | 128² | native | high | 2.25 | 4.50 | – |" in "\n".join(lines)
