@@ -92,14 +92,15 @@ def figure_of(p: Tensor, valid: Tensor, up: str) -> Figure:
     for (wrist, ends), sign in zip(HANDS.items(), (1.0, -1.0), strict=True):
         held = local(hand_frame(q, wrist), q[:, ends] - q[:, wrist, None])
         rest[list(ends)] = rest[wrist] + held @ np.diag([sign, 1.0, sign])
-    for ankle, ends in FEET.items():
-        low = q[:, ends, 2].max(axis=1)
+    for ankle, (heel, toe) in FEET.items():
+        foot = [heel, toe]
+        low = q[:, foot, 2].max(axis=1)
         stands = q[low <= np.percentile(low, STANDING)]
-        ahead = (stands[:, ends[1]] - stands[:, ends[0]]) * (1, 1, 0)
+        ahead = (stands[:, toe] - stands[:, heel]) * (1, 1, 0)
         back = -ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-9)
         above = np.broadcast_to([0.0, 0, 1], back.shape)
         axes = np.stack([np.cross(back, above), back, above], axis=-1)
-        rest[list(ends)] = rest[ankle] + local(axes, stands[:, ends] - stands[:, ankle, None])
+        rest[foot] = rest[ankle] + local(axes, stands[:, foot] - stands[:, ankle, None])
     ears = middle(q, EARS)
     neck = local(hubs[:, CHEST], (ears - middle(q, SHOULDERS))[:, None]) @ TO_STANDARD.T
     pitch = float(np.median(np.arcsin(np.clip(hubs[:, HEAD, 2, 2], -1, 1))))

@@ -83,7 +83,7 @@ class _Bone:
 
 
 def _turn(angles: Array, names: list[str]) -> Array:
-    """Rotations ``[..., 3, 3]`` by angles ``[..., n]`` about the named axes, the first one first."""
+    """Rotations ``[..., 3, 3]`` by angles ``[..., n]`` about the named axes, first to last."""
     R = np.broadcast_to(np.eye(3), (*angles.shape[:-1], 3, 3))
     for k, name in enumerate(names):
         if name[0] == "R":
@@ -94,7 +94,9 @@ def _turn(angles: Array, names: list[str]) -> Array:
 def _skeleton(path: Path) -> tuple[dict[str, _Bone], dict[str, str], float, float]:
     """Bones and parents by name, metres in a unit, radians in an angle."""
     section, bones, parents = "", {}, {}
-    units, root, bone = {"length": ["1"], "angle": ["deg"]}, {}, {}
+    units: dict[str, list[str]] = {"length": ["1"], "angle": ["deg"]}
+    root: dict[str, list[str]] = {}
+    bone: dict[str, list[str]] = {}
     raw: list[dict[str, list[str]]] = []
     for words in _lines(path):
         if words[0].startswith(":"):

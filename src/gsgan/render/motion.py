@@ -19,12 +19,13 @@ from gsgan.skeleton.sanitise import MIN_TRUNK_JOINTS
 from gsgan.utils.errors import DataError
 
 Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
 TRUNK = (*SHOULDERS, *HIPS)
 FPS = 30.0  # assumed where neither the file nor the user gives it
 OWN = 0.02  # largest relative difference of bone lengths at which a motion is the subject's own
 AXES = ("x", "y", "z", "-x", "-y", "-z")
-PARENT = {b: a for limb in (*MEDIAPIPE33.limbs,) for a, b in (limb,) if b not in TRUNK}
+PARENT = {b: a for a, b in MEDIAPIPE33.limbs if b not in TRUNK}
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class Motion:
         fps: frames per second, None where the file does not say.
         up: the axis that points up, or None: found from the skeleton.
         unit: of the file's lengths, in words.
+        file_up: the file's own axis, where ``up`` is that of converted landmarks.
         body: ``[F]`` poses of the subject's body that the landmarks come from, or None.
     """
 
@@ -47,6 +49,7 @@ class Motion:
     fps: float | None
     up: str | None
     unit: str
+    file_up: str | None = None
     body: BodyPose | None = None
 
     def __len__(self) -> int:
@@ -64,8 +67,10 @@ def checked(motion: Motion, least_visibility: float) -> Motion:
     """
     if not len(motion):
         raise DataError(f"{motion.path} holds no frame; expected a motion")
-    known = np.isfinite(motion.p).all(-1) & (motion.visibility >= least_visibility)
-    known[:, TRUNK] = np.isfinite(motion.p[:, TRUNK]).all(-1) & (motion.visibility[:, TRUNK] > 0)
+    known: Bool = np.isfinite(motion.p).all(-1) & (motion.visibility >= least_visibility)
+    known[:, list(TRUNK)] = np.isfinite(motion.p[:, list(TRUNK)]).all(-1) & (
+        motion.visibility[:, TRUNK] > 0
+    )
     if len(bad := np.flatnonzero(known[:, TRUNK].sum(1) < MIN_TRUNK_JOINTS)):
         raise DataError(
             f"{motion.path}: {len(bad)} of {len(motion)} frames, the first is {bad[0]}, lack "
@@ -101,7 +106,7 @@ def completed(motion: Motion, up: str) -> Float:
     never seen, or a face, rests on the trunk.
     """
     p = motion.p @ upright(up).T
-    known = np.isfinite(p).all(-1)
+    known: Bool = np.asarray(np.isfinite(p).all(-1))
     times = np.arange(len(p))
     for joint, parent in PARENT.items():
         offset, seen = p[:, joint] - p[:, parent], known[:, joint] & known[:, parent]
@@ -110,16 +115,22 @@ def completed(motion: Motion, up: str) -> Float:
             p[:, joint] = np.where(known[:, joint, None], p[:, joint], p[:, parent] + between)
             known[:, joint] = np.isfinite(p[:, joint]).all(-1)
     whole, _ = sanitise(torch.from_numpy(p), torch.from_numpy(known))
-    return whole.numpy()
+    return np.asarray(whole.numpy(), np.float64)
 
 
 def resampled(p: Float, fps: float, wanted: float) -> Float:
-    """Landmarks ``[F, 33, 3]`` at another rate, linearly between frames; the last may be dropped."""
+    """Landmarks ``[F, 33, 3]`` at another rate, linearly between frames."""
     if len(p) == 1 or fps == wanted:
         return p
-    count = int((len(p) - 1) * wanted / fps + 1e-6) + 1
-    times = np.arange(count) * fps / wanted
+    times = frame_times(len(p), fps, wanted)
     flat = p.reshape(len(p), -1)
     at = np.minimum(times.astype(int), len(p) - 2)
     share = (times - at)[:, None]
-    return ((1 - share) * flat[at] + share * flat[at + 1]).reshape(count, *p.shape[1:])
+    mixed = np.where(share > 0, (1 - share) * flat[at] + share * flat[at + 1], flat[at])
+    return np.asarray(mixed.reshape(len(times), *p.shape[1:]), np.float64)
+
+
+def frame_times(frames: int, fps: float, wanted: float) -> Float:
+    """Moments of a new rate, in frames of the old one, from the first frame to the last at most."""
+    count = int((frames - 1) * wanted / fps + 1e-6) + 1
+    return np.arange(count, dtype=np.float64) * fps / wanted

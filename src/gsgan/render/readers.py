@@ -129,15 +129,14 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Motion:
     if "conf" in arrays:
         conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
     scale = METRES.get(meta.get("unit", "m"), 1.0)
-    found = {"fps": fps or meta.get("fps"), "up": meta.get("up_axis"), "unit": "metres"}
-    return Motion(path, p * scale, np.nan_to_num(conf), **found)
+    rate, up = fps or meta.get("fps"), meta.get("up_axis")
+    return Motion(path, p * scale, np.nan_to_num(conf), rate, up, "metres")
 
 
 def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Motion:
     theta = expect_array(arrays, "theta", (None, None, 3), path)
-    transl = expect_array(
-        {"transl": arrays.get("transl", _nothing())}, "transl", (len(theta), 3), path
-    )
+    arrays = arrays | {k: arrays[name] for k, name in (("transl", "trans"),) if name in arrays}
+    transl = expect_array(arrays, "transl", (len(theta), 3), path)
     meta = _beside(path)
     fps, up = fps or meta.get("fps"), meta.get("up_axis")
     if theta.shape[1] != FREE_BONES:
@@ -146,11 +145,7 @@ def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: So
     body = BodyPose(*(torch.from_numpy(np.nan_to_num(x)).float() for x in (theta, transl)))
     p = free_body().posed_landmarks(body).double().numpy()
     p[~np.isfinite(theta).all((1, 2)) | ~np.isfinite(transl).all(1)] = np.nan
-    return Motion(path, p, np.ones(p.shape[:2]), fps, up or "z", "metres", body)
-
-
-def _nothing() -> Float:
-    return np.zeros(0)
+    return Motion(path, p, np.ones(p.shape[:2]), fps, up or "z", "metres", body=body)
 
 
 def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Motion:
@@ -169,8 +164,8 @@ def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source)
         poses = np.concatenate([np.asarray(root).reshape(len(poses), 3), poses], axis=1)
     if poses.shape[1] % 3 or poses.shape[1] < 3 * SMPL_BODY:
         raise DataError(
-            f"{path}: the poses have {poses.shape[1]} numbers a frame; expected 3 for each of 22 or "
-            "more SMPL joints"
+            f"{path}: the poses have {poses.shape[1]} numbers a frame; expected 3 for each of 22 "
+            "or more SMPL joints"
         )
     moves = _first(arrays, MOVE_KEYS)
     moves = np.zeros((len(poses), 3)) if moves is None else np.asarray(moves, np.float64)
@@ -304,8 +299,8 @@ def _rig(path: Path, bvh: Bvh, metres: float | None, source: Source) -> Motion:
     else:
         unit = f"units of {100 * metres:.3g} cm"
     p = rig_landmarks(standard, source.figure)
-    seen = np.isfinite(p).all(-1).astype(np.float64)
-    return Motion(path, p, seen, 1 / bvh.frame_time, "z", unit)
+    seen = np.asarray(np.isfinite(p).all(-1), np.float64)
+    return Motion(path, p, seen, 1 / bvh.frame_time, "z", unit, standard.up)
 
 
 # -- others' points
@@ -361,8 +356,9 @@ def read_pose(path: Path, source: Source) -> Motion:
         if point.lower() in MEDIAPIPE33.names:
             j = MEDIAPIPE33.names.index(point.lower())
             p[:, j], visibility[:, j] = data[:, 0, place][:, k], conf[:, 0, place][:, k]
-    return Motion(path, _to_metres(path, p, visibility, source.figure), visibility,
-                  _rate(path, pose.body.fps), None, f"{name.lower().replace('_', ' ')}")  # fmt: skip
+    unit = f"{name.lower().replace('_', ' ')}, scaled to the subject"
+    p = _to_metres(path, p, visibility, source.figure)
+    return Motion(path, p, visibility, _rate(path, pose.body.fps), None, unit)
 
 
 def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure) -> Float:

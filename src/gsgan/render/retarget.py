@@ -55,9 +55,9 @@ def on_figure(p: Float, figure: Figure) -> Float:
     for wrist, ends in HANDS.items():
         turn = hand_frame(p, wrist) @ hand_frame(rest, wrist).T
         q[:, ends] = q[:, wrist, None] + (rest[list(ends)] - rest[wrist]) @ turn.mT
-    for ankle, ends in FEET.items():
+    for ankle, feet in FEET.items():
         turn = _foot_frame(p, ankle) @ _foot_frame(rest, ankle).T
-        q[:, ends] = q[:, ankle, None] + (rest[list(ends)] - rest[ankle]) @ turn.mT
+        q[:, feet] = q[:, ankle, None] + (rest[list(feet)] - rest[ankle]) @ turn.mT
     neck = middle(rest, EARS) - middle(rest, SHOULDERS)
     ears = chest + unit(middle(p, EARS) - middle(p, SHOULDERS)) * np.linalg.norm(neck)
     turn = _head_frame(p) @ _head_frame(rest[None]).mT

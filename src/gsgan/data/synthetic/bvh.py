@@ -274,6 +274,7 @@ class StandardMotion:
     turns: dict[str, Array]  # [F, 3, 3]
     joints: dict[str, Array]  # [F, 3] positions, units of the file
     leg: float  # the legs' length at rest, units of the file
+    up: str  # the axis of the file that points up, e.g. "y"
 
 
 def standard_motion(bvh: Bvh, path: Path) -> StandardMotion:
@@ -311,7 +312,9 @@ def standard_motion(bvh: Bvh, path: Path) -> StandardMotion:
     posed = bvh.positions(bvh.rotations, bvh.root) @ (yaw @ axes).T
     hip, knee, ankle = (joint["Left" + bone] for bone in LEG)
     leg = float(np.linalg.norm(hip - knee) + np.linalg.norm(knee - ankle))
-    return StandardMotion(turns, {bone: posed[:, j] for bone, j in known.items()}, leg)
+    at = int(np.abs(up).argmax())
+    name = ("-" if up[at] < 0 else "") + "xyz"[at]
+    return StandardMotion(turns, {bone: posed[:, j] for bone, j in known.items()}, leg, name)
 
 
 def floor_under(lowest: Array, leg: float, step: float) -> Array:
