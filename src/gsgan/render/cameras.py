@@ -15,6 +15,7 @@ from gsgan.data.calibration.find import read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import PersonCrop, square_window
 from gsgan.data.figure import Figure, upright
+from gsgan.render.retarget import heading
 from gsgan.scene import Camera, cat
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.checks import above, between
@@ -52,7 +53,7 @@ class Orbit:
 
         Args:
             p: metres, world frame.
-            figure: of the subject: its up axis and the way it faces.
+            figure: of the subject.
             scene: gives the size of the person in training images.
             size: pixels of the square images.
             trained: pixels of the training images.
@@ -64,7 +65,7 @@ class Orbit:
         shown = sum(scene.scale_train) / 2 * size / trained  # pixels per metre
         distance = self.distance or focal / shown
         share = np.arange(len(p)) / max(len(p), 1)
-        azimuth = figure.facing + np.radians(self.start + 360 * self.turns * share)
+        azimuth = heading(p[0] @ to_world) + np.radians(self.start + 360 * self.turns * share)
         tilt = np.radians(self.elevation)
         away = np.stack(
             [

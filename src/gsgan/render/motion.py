@@ -24,6 +24,7 @@ Bool = NDArray[np.bool_]
 TRUNK = (*SHOULDERS, *HIPS)
 FPS = 30.0  # assumed where neither the file nor the user gives it
 OWN = 0.02  # largest relative difference of bone lengths at which a motion is the subject's own
+SELDOM = 0.2  # share of the frames below which what is seen of a joint is taken as a false guess
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 PARENT = {b: a for a, b in MEDIAPIPE33.limbs if b not in TRUNK}
 
@@ -102,18 +103,20 @@ def up_axis(motion: Motion) -> str:
 def completed(motion: Motion, up: str) -> Float:
     """``[F, 33, 3]`` every landmark in standard axes, Z up.
 
-    A limb that is not seen for a while moves evenly between the frames that show it; one that is
-    never seen, or a face, rests on the trunk.
+    A joint that is not seen for a while moves evenly between the frames that show it, relative to
+    the joint before it; one that is `SELDOM` seen rests on that joint.
     """
     p = motion.p @ upright(up).T
     known: Bool = np.asarray(np.isfinite(p).all(-1))
     times = np.arange(len(p))
     for joint, parent in PARENT.items():
         offset, seen = p[:, joint] - p[:, parent], known[:, joint] & known[:, parent]
-        if seen.any() and not seen.all():
+        if seen.mean() < SELDOM:
+            known[:, joint] = False
+        elif not seen.all():
             between = np.stack([np.interp(times, times[seen], x[seen]) for x in offset.T], axis=1)
-            p[:, joint] = np.where(known[:, joint, None], p[:, joint], p[:, parent] + between)
-            known[:, joint] = np.isfinite(p[:, joint]).all(-1)
+            p[:, joint] = np.where(seen[:, None], p[:, joint], p[:, parent] + between)
+            known[:, joint] = known[:, parent]
     whole, _ = sanitise(torch.from_numpy(p), torch.from_numpy(known))
     return np.asarray(whole.numpy(), np.float64)
 

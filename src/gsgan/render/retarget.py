@@ -26,6 +26,7 @@ from gsgan.data.figure import (
     part_frame,
 )
 from gsgan.data.synthetic.bvh import StandardMotion, drift, floor_under
+from gsgan.data.synthetic.retarget import rotation
 from gsgan.skeleton import bone_frames
 from gsgan.skeleton.template import HEAD, PELVIS
 
@@ -97,6 +98,12 @@ def rig_landmarks(standard: StandardMotion, figure: Figure) -> Float:
     return p
 
 
+def heading(p: Float) -> float:
+    """Radians about the up axis, 0 towards -Y: where the hips of ``[33, 3]`` face."""
+    front = bone_frames(torch.from_numpy(p[None])).hubs[0, PELVIS, :, 2]
+    return float(torch.atan2(front[0], -front[1]))
+
+
 def placed(
     p: Float, figure: Figure, centre: Float, fps: float, *, ground: bool, stay: bool
 ) -> Float:
@@ -112,12 +119,7 @@ def placed(
         ground: keeps a foot on the ground, jumps aside; else only the lowest foot of all frames is.
         stay: takes the way from a motion that leaves its place, as on a treadmill.
     """
-    front = bone_frames(torch.from_numpy(p[:1])).hubs[0, PELVIS, :, 2].numpy()
-    angle = figure.facing - np.arctan2(front[0], -front[1])
-    yaw = np.array(
-        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
-    )
-    q = p @ yaw.T
+    q = p @ rotation(np.array([0, 0, figure.facing - heading(p[0])])).T
     way = middle(q, HIPS)[:, :2]
     lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)
     floor = floor_under(lowest, figure.leg, 1 / fps) if ground else np.full(len(q), lowest.min())

@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
-from PIL import Image, ImageColor, ImageOps
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import track
 from torch import Tensor
 
 from gsgan.data.figure import Figure, upright
@@ -30,6 +29,7 @@ from gsgan.model.runs import (
     scene_of,
 )
 from gsgan.render import cameras as views
+from gsgan.render.images import Background, background, eight_bits
 from gsgan.render.motion import (
     FPS,
     checked,
@@ -160,10 +160,8 @@ def render_config(config: DictConfig) -> None:
     missing = [i for i, n in enumerate(drive.numbers) if not output.path(n).is_file()]
     if kept := len(drive.numbers) - len(missing):
         console.print(f"{kept} of {len(drive.numbers)} frames are there already")
-    columns = (TextColumn("rendering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as progress:
-        for i in progress.track(missing):
-            output.write(drive.numbers[i], _image(config, run, drive, cameras, index, i, paint_on))
+    for i in track(missing, "rendering", console=console, transient=True):
+        output.write(drive.numbers[i], _image(config, run, drive, cameras, index, i, paint_on))
     output.finish(drive.numbers)
     console.print(f"rendered: {output.out}", markup=False, highlight=False, soft_wrap=True)
 
@@ -260,11 +258,15 @@ def _from_file(config: DictConfig, run: Run, fps: float) -> Drive:
         visibility = np.repeat(np.array(figure.seen, np.float64)[None], len(p), axis=0)
     assumed = "" if config.motion_fps or motion.fps else " (assumed: give motion_fps)"
     text = (
-        f"{motion.path.name}: {len(motion)} frames at {rate:g} per second{assumed}, {motion.unit}, "
-        f"{(motion.file_up or up).upper()} up -> {len(p)} frames at {fps:g}, "
+        f"{motion.path.name}: {_frames(len(motion))} at {rate:.5g} per second{assumed}, "
+        f"{motion.unit}, {(motion.file_up or up).upper()} up -> {_frames(len(p))} at {fps:g}, "
         + ("bones as they are" if own else "on the subject's bones")
     )
     return Drive(p, visibility, body, list(range(len(p))), text)
+
+
+def _frames(count: int) -> str:
+    return "1 frame" if count == 1 else f"{count} frames"
 
 
 def _chosen(drive: Drive, config: DictConfig, fps: float) -> Drive:
@@ -308,40 +310,6 @@ def _cameras(config: DictConfig, run: Run, drive: Drive) -> tuple[Camera, Tensor
 
 # -- images
 
-Background = Tensor | None
-
-
-def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background]:
-    """The background ``[3, H, W]`` by image size; None keeps alpha.
-
-    Raises:
-        ConfigError: when it is no colour and no image, or a video should have alpha.
-    """
-    if name == "alpha":
-        if video:
-            raise ConfigError("background=alpha needs PNG files: H.264 has no alpha; give a folder")
-        return lambda size: None
-    path = Path(name).expanduser()
-    if path.is_file():
-        try:
-            with Image.open(path) as opened:
-                picture = opened.convert("RGB")
-        except OSError as error:
-            raise ConfigError(f"background={name} cannot be read as an image ({error})") from None
-        return lambda size: _unit(np.asarray(ImageOps.fit(picture, size[::-1])))
-    try:
-        colour = torch.tensor(ImageColor.getrgb(name)[:3]).float() / 255
-    except ValueError:
-        raise ConfigError(
-            f"background={name} is no colour and no file; give black, white, a colour's name, "
-            "#rrggbb, an image file, or alpha"
-        ) from None
-    return lambda size: colour[:, None, None].expand(3, *size)
-
-
-def _unit(image: NDArray[np.uint8]) -> Tensor:
-    return torch.from_numpy(image.copy()).permute(2, 0, 1).float() / 255
-
 
 def _image(
     config: DictConfig,
@@ -370,19 +338,7 @@ def _image(
         if frame.camera.size != camera.size:
             raise ConfigError("compare=truth shows images of the data's size; leave size out")
         held.insert(0, (frame.image[0], frame.mask[0]))
-    return np.concatenate([_eight_bits(*pair, paint_on(camera.size)) for pair in held], axis=1)
-
-
-def _eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> NDArray[np.uint8]:
-    """``[H, W, 3]`` an image ``[3, H, W]`` on black put on a background; without one, with alpha
-    ``[H, W, 4]``, not premultiplied."""
-    image, alpha = image.clamp(0, 1), alpha.clamp(0, 1)
-    if behind is None:
-        straight = torch.where(alpha > 0, image / alpha.clamp_min(1e-6), image).clamp(0, 1)
-        image = torch.cat([straight, alpha])
-    else:
-        image = (image + (1 - alpha) * behind).clamp(0, 1)
-    return (image * 255).round().byte().permute(1, 2, 0).numpy()
+    return np.concatenate([eight_bits(*pair, paint_on(camera.size)) for pair in held], axis=1)
 
 
 def _record(config: DictConfig, run: Run, drive: Drive, cameras: Camera) -> dict[str, Any]:
