@@ -44,7 +44,7 @@ def test_the_settings_are_those_of_the_accuracy_group_and_ones_own(config):
     assert settings(config()) == ACCURACY
     found = settings(config("+accuracy@settings.mine=high", "settings.mine.alpha_min=1e-4"))
     assert found["mine"].alpha_min == 1e-4
-    assert found["high"].alpha_min == 4e-6
+    assert found["high"].alpha_min == 1e-5
 
 
 def test_variants_are_each_backend_with_each_setting_it_draws(config):
