@@ -252,6 +252,8 @@ def growth_plot(frame: pd.DataFrame) -> bytes:
             label = f"{backend}, {value}²" if kind == "size" else f"{backend}, N={value}"
             axes.plot(line[x], line.both_ms, dash, color=COLOURS.get(backend, PURPLE), label=label)
         axes.set(xlabel=x, xscale="log", yscale="log")
+        for axis in (axes.xaxis, axes.yaxis):
+            common.plain_ticks(axis)
         if axes.get_lines():
             axes.legend(fontsize=7, frameon=False)
     panels[0].set_ylabel(f"{TIMES['both_ms']}, ms")
