@@ -44,7 +44,7 @@ def shaped_body(shape: BodyShape) -> Body:
     body = free_body()
     group = _group_of(body)
     axial = [list(GROUPS)[g] in AXIAL for g in group]
-    J, s = body.joints, shape.stretch.exp()
+    J, s = body.joints, shape.stretch
     S = []
     for j in range(len(J)):
         k = s[group[j]]
@@ -86,4 +86,4 @@ def fit_shape(skeletons: Tensor, visibility: Tensor) -> BodyShape:
     pick = torch.linspace(0, len(skeletons) - 1, min(len(skeletons), 24)).round().long().unique()
     stretch = torch.zeros(len(GROUPS), requires_grad=True)
     fit_poses(None, skeletons[pick], visibility[pick], stretch=stretch)
-    return BodyShape(torch.zeros(0), stretch.detach())
+    return BodyShape(torch.zeros(0), stretch.detach().exp())

@@ -59,7 +59,7 @@ def align(body: Body, p: Tensor) -> tuple[Tensor, Tensor]:
 def fit_poses(body, p, visibility, stretch=None, steps=500, rate=0.03):
     from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
-    first = shaped_body(BodyShape(torch.zeros(0), stretch.detach())) if body is None else body
+    first = shaped_body(BodyShape(torch.zeros(0), stretch.detach().exp())) if body is None else body
     R, t = align(first, p)
     theta = torch.zeros(len(p), len(first.parents), 3)
     theta[:, 0] = rotation_matrix_to_axis_angle(R)
@@ -72,7 +72,7 @@ def fit_poses(body, p, visibility, stretch=None, steps=500, rate=0.03):
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(opt, steps)
     k, w = stiffness(first), weights() * (visibility > 0)
     for _ in range(steps):
-        b = body if body is not None else shaped_body(BodyShape(torch.zeros(0), stretch))
+        b = body if body is not None else shaped_body(BodyShape(torch.zeros(0), stretch.exp()))
         d = b.posed_landmarks(BodyPose(theta, transl)) - p
         loss = (w * ((1 + d.square().sum(-1) / 0.02**2).sqrt() - 1)).sum()
         loss = loss + 0.02 * (k * theta.square()).sum()

@@ -39,6 +39,7 @@ from gsgan.utils.checks import is_number
 from gsgan.utils.errors import DataError
 
 LANDMARKS = "landmarks3d.npz"
+POSES, SHAPE = "body_pose.npz", "body_shape.npz"
 MASKS = (".png",)
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
 LOOKED_AT = Trust(min_box_iou=0.0)
