@@ -45,8 +45,8 @@ class Fit:
     noise: float = 0.02
     landmarks: float = 0.02
     prior: float = 0.005
-    angle_rate: float = 0.01
-    transl_rate: float = 0.003
+    angle_rate: float = 0.004
+    transl_rate: float = 0.0015
     surface_rate: float = 0.01
     hold: float = 0.4
 
