@@ -6,7 +6,6 @@ has one or more, applied in order. Axes are those of the rest pose, metres and r
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch

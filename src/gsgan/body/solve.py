@@ -5,8 +5,6 @@ Convention: metres, world frame, radians.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from kornia.geometry.conversions import (
     quaternion_to_axis_angle,
@@ -15,7 +13,7 @@ from kornia.geometry.conversions import (
 from torch import Tensor
 
 from gsgan.body.lbs import axis_angle_to_matrix
-from gsgan.body.rig import SIDES, Rig, build_rig
+from gsgan.body.rig import SIDES, build_rig
 from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, bone_frames, sanitise

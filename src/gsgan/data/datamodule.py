@@ -167,14 +167,23 @@ class GsganData(LightningDataModule):
                     "leave one of them out"
                 )
             splits = protocol_splits(self.layout, self.protocol)
-        marks = self.layout.landmarks
         held_out = set(splits.test_cameras) - set(splits.train_cameras)
-        if leaks := [camera for camera in marks.fitted_to if camera in held_out]:
+        poses = self.layout.poses
+        if leaks := [c for c in (poses.fitted_to if poses else ()) if c in held_out]:
             raise ConfigError(
-                f"{marks.source} was fitted to the masks of {leaks[0]}, which is held out here; "
-                "run gsgan.fit with the same data.train_cameras, data.test_cameras or protocol"
+                f"{self.layout.root}: body poses were fitted to the masks of {leaks[0]}, which is "
+                "held out here; run gsgan.fit with the same data.train_cameras, data.test_cameras "
+                "or protocol, and overwrite=true"
             )
         return splits
+
+    @property
+    def registered_held_out(self) -> tuple[int, ...]:
+        """Frames of held-out poses whose body `gsgan.fit` registered to their own masks."""
+        poses, items = self.layout.poses, self.splits.items
+        trained = {frame for _, frame in items["train"]}
+        frames = {frame for _, frame in items["novel_pose"]} - trained
+        return tuple(sorted(frames & (poses.registered if poses else frozenset())))
 
     @cached_property
     def _datasets(self) -> dict[str, CaptureDataset]:

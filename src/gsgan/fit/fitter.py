@@ -74,6 +74,9 @@ class Surface(nn.Module):
         accuracy: the rasteriser's settings.
     """
 
+    normals: Tensor
+    basis: Tensor
+
     def __init__(self, body: Body, points: int, accuracy: Accuracy) -> None:
         super().__init__()
         self.body, self.accuracy = body, accuracy
@@ -152,7 +155,9 @@ class Fitter:
         rows = torch.arange(len(self.start.theta)) if rows is None else rows
         rows = rows.to(self.start.theta.device)
         move = self.moves(rows).view(len(rows), -1, 3) * self.scale
-        return BodyPose(self.start.theta[rows] + move[:, :-1], self.start.transl[rows] + move[:, -1])
+        return BodyPose(
+            self.start.theta[rows] + move[:, :-1], self.start.transl[rows] + move[:, -1]
+        )
 
     def surface_step(self) -> None:
         """One step of the surface on one frame; poses stay."""

@@ -74,7 +74,9 @@ def fit_before_training(data: GsganData, device: str = "auto") -> None:
         DataError: when the masks hold no person, or the folder is read-only.
     """
     seen = replace_size(data)
-    fit_body(seen, Fit(replace(accuracy("standard"), low_pass=LOW_PASS)), device=pick_device(device))
+    fit_body(
+        seen, Fit(replace(accuracy("standard"), low_pass=LOW_PASS)), device=pick_device(device)
+    )
 
 
 def fit_body(
@@ -132,7 +134,7 @@ def fit_body(
         theta=theta.numpy(),
         transl=transl.numpy() / unit,
         frame_id=np.array(layout.frames),
-        registered=np.isin(layout.frames, moments.frames),
+        registered=np.array(moments.frames),
         fitted_to=np.array(moments.cameras),
     )
     (folder / STOPPED).unlink(missing_ok=True)
@@ -259,7 +261,9 @@ def _report(fitter: Fitter, found: BodyPose) -> dict[str, Any]:
 def _summary(report: dict[str, Any], folder: Path, moments: Moments) -> list[str]:
     before, after = report["solved"], report["registered"]
     joints = sorted(report["joints"].items(), key=lambda x: -np.nan_to_num(x[1]["registered"]))
-    frames = sorted(report["frames"].items(), key=lambda x: np.nan_to_num(x[1]["iou"]["registered"]))
+    frames = sorted(
+        report["frames"].items(), key=lambda x: np.nan_to_num(x[1]["iou"]["registered"])
+    )
     worst = ", ".join(f"{n} {x['registered']:.0f}" for n, x in joints[:WORST])
     least = ", ".join(f"{n} {x['iou']['registered']:.3f}" for n, x in frames[:WORST])
     return [

@@ -8,6 +8,7 @@
     labels/{camera}/%06d.png            optional part numbers, 255 = ignore
     landmarks3d.npz   p (F,33,3) NaN = missing, conf (F,33), frame_id (F,)
     body_pose.npz     optional theta (F,bones,3), transl (F,3), frame_id (F,); betas (S,) of SMPL
+    body_shape.npz    optional coefficients (K,), stretch (8,): of the free body, by gsgan.fit
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from gsgan.body.shape import STRETCHED
 from gsgan.data.calibration.find import (
     METRES,
     Conventions,
@@ -101,8 +103,8 @@ def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -
         notes.append(f"skeletons come from {reader.landmarks}, not from {LANDMARKS}")
     skeletons = _read_landmarks(joints_file, meta, conventions, checks, notes)
     poses = None
-    if (root / "body_pose.npz").exists():
-        poses, meta = _read_poses(root / "body_pose.npz", meta, conventions)
+    if (root / POSES).exists():
+        poses, meta = _read_poses(root, meta, conventions)
     return Found(
         root=root,
         meta=meta,
@@ -189,22 +191,21 @@ def _read_landmarks(
 ) -> Landmarks:
     """Skeletons of every frame."""
     joints = SKELETONS[meta.skeleton]
-    arrays = read_arrays(path, ("p", "conf", "frame_id", "fitted_to"))
+    arrays = read_arrays(path, ("p", "conf", "frame_id"))
     p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64) * conventions.scale
     ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(p),), path), str(path))
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:
         conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
-    found = make_landmarks(ids, p, conf, checks.max_reach, notes, path.name)
-    cameras = arrays.get("fitted_to", np.array([], str))
-    if cameras.ndim != 1 or cameras.dtype.kind != "U":
-        raise DataError(f"{path}: 'fitted_to' must list camera names; run gsgan.fit again")
-    return replace(found, fitted_to=tuple(cameras.tolist()))
+    return make_landmarks(ids, p, conf, checks.max_reach, notes, path.name)
 
 
-def _read_poses(path: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
-    """Poses of frames whose numbers are finite, and ``meta`` with the file's body shape."""
-    arrays = read_arrays(path, ("theta", "transl", "frame_id", "betas"))
+def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
+    """Poses of frames whose numbers are finite, and ``meta`` with the body and its shape."""
+    path, fitted = root / POSES, (root / SHAPE).exists()
+    arrays = read_arrays(path, ("theta", "transl", "frame_id", "betas", "registered", "fitted_to"))
+    if fitted:  # by gsgan.fit: the free body in the person's shape
+        meta = replace(meta, body=BodyModel("free", betas=_read_shape(root / SHAPE)))
     bones = None if meta.body is None else BODY_BONES[meta.body.kind]
     theta = expect_array(arrays, "theta", (None, bones, 3), path).astype(np.float64)
     transl = expect_array(arrays, "transl", (len(theta), 3), path).astype(np.float64)
@@ -212,10 +213,30 @@ def _read_poses(path: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
     ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(theta),), path), str(path))
     finite = np.isfinite(theta).all((1, 2)) & np.isfinite(transl).all(1)
     rows = {int(ids[i]): int(i) for i in np.flatnonzero(finite)}
-    poses = Poses({f: theta[i] for f, i in rows.items()}, {f: transl[i] for f, i in rows.items()})
+    registered: frozenset[int] = frozenset()
+    if "registered" in arrays:
+        found = expect_array(arrays, "registered", (None,), path)
+        registered = frozenset(whole_frame_ids(found, str(path)).tolist())
+    poses = Poses(
+        {f: theta[i] for f, i in rows.items()},
+        {f: transl[i] for f, i in rows.items()},
+        fitted=fitted,
+        registered=registered,
+        fitted_to=tuple(map(str, arrays.get("fitted_to", ()))),
+    )
     if meta.body is None or "betas" not in arrays:
         return poses, meta
     betas = expect_array(arrays, "betas", (None,), path).astype(np.float64)
     if not np.isfinite(betas).all():
         raise DataError(f"{path}: 'betas' must hold finite numbers")
     return poses, replace(meta, body=replace(meta.body, betas=tuple(betas.tolist())))
+
+
+def _read_shape(path: Path) -> tuple[float, ...]:
+    """Coefficients and stretches of the free body, see `gsgan.body.shape.BodyShape.plain`."""
+    arrays = read_arrays(path, ("coefficients", "stretch"))
+    parts = [
+        expect_array(arrays, "coefficients", (None,), path),
+        expect_array(arrays, "stretch", (len(STRETCHED),), path),
+    ]
+    return tuple(np.concatenate(parts).astype(np.float64).tolist())
