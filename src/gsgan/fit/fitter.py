@@ -1,4 +1,4 @@
-"""Registration to silhouettes: one surface for all frames, and a pose of the body for every frame."""
+"""Registration to silhouettes: one surface for all frames, a pose of the body for each."""
 
 from __future__ import annotations
 

@@ -28,6 +28,7 @@ from gsgan.evaluate.facts import trained, training_code
 from gsgan.evaluate.files import NAMES
 from gsgan.evaluate.run import evaluate_method
 from gsgan.evaluate.scores import painter
+from gsgan.fit.run import fit_before_training
 from gsgan.metrics.lpips import check_lpips
 from gsgan.model.assemble import naming_group
 from gsgan.model.avatar import Avatar
@@ -134,6 +135,9 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     """
     whole("seed", config.seed, 0)
     data = build_data(config)
+    if data.lacks_body:
+        fit_before_training(data)
+        data = build_data(config)
     avatar = build_avatar(config, data)
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
     with naming_group("training"):

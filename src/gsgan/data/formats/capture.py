@@ -50,12 +50,8 @@ LOOKED_AT = Trust(min_box_iou=0.0)
 
 @dataclass(frozen=True)
 class CaptureReader:
-    """Reads a capture in the bring-your-own layout; conf/data/capture.yaml explains the settings.
+    """Reads a capture in the bring-your-own layout; see conf/data/capture.yaml."""
 
-    ``landmarks`` is the skeletons' file, in the folder unless its path is absolute.
-    """
-
-    landmarks: str | None = None
     drop_frames: Any = None
     trust: Trust = LOOKED_AT
 
@@ -81,10 +77,9 @@ def read_capture(
     smpl: str | None = None,
     trust: Trust = LOOKED_AT,
     drop_frames: Any = None,
-    landmarks: str | None = None,
 ) -> Layout:
     """The capture in a folder, see `CaptureReader`; ``checks`` are `Checks()` when None."""
-    return CaptureReader(landmarks, drop_frames, trust)(root, checks or Checks(), smpl)
+    return CaptureReader(drop_frames, trust)(root, checks or Checks(), smpl)
 
 
 def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -> Found:
@@ -98,10 +93,7 @@ def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -
         notes.append(f"lengths converted from {meta.unit} to metres")
     cameras = read_cameras(root / "cameras.json", cameras_json, conventions, checks)
     images = _index_images(root, cameras)
-    joints_file = landmarks_path(root, reader.landmarks)
-    if joints_file != root / LANDMARKS:
-        notes.append(f"skeletons come from {reader.landmarks}, not from {LANDMARKS}")
-    skeletons = _read_landmarks(joints_file, meta, conventions, checks, notes)
+    skeletons = _read_landmarks(root / LANDMARKS, meta, conventions, checks, notes)
     poses = None
     if (root / POSES).exists():
         poses, meta = _read_poses(root, meta, conventions)
@@ -122,24 +114,6 @@ def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -
         ),
         notes=tuple(notes),
     )
-
-
-def landmarks_path(root: Path, name: str | None) -> Path:
-    """The skeletons' file: in the capture's folder unless its path is absolute.
-
-    Raises:
-        DataError: when it does not exist, or is not an npz file.
-    """
-    if name is None:
-        return root / LANDMARKS
-    if not isinstance(name, str) or not name.endswith(".npz"):
-        raise DataError(f"data.reader.landmarks must name an .npz file, got {name!r}")
-    path = root / Path(name).expanduser()
-    if not path.is_file():
-        raise DataError(
-            f"data.reader.landmarks={name}: {path} does not exist; gsgan.fit makes such files"
-        )
-    return path
 
 
 def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta:
