@@ -213,7 +213,7 @@ def shaped_body(shape: BodyShape) -> Body:
 
 
 def length_pairs() -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of landmarks ``[P]``, ``[P]`` and how far the logarithm of their distance may be off."""
+    """Pairs of landmarks ``[P]``, ``[P]``, and the spread of the logarithm of their distance."""
     index = MEDIAPIPE33.names.index
     names = {n: n for n in MEDIAPIPE33.names}
     sides = {
