@@ -22,15 +22,25 @@ from gsgan.utils.tensors import constant
 # Standard deviation of each number about the rest pose: wide where a joint turns freely, narrow
 # across hinges and where 33 landmarks do not see the turn.
 SPREAD = {
-    name: float(value)
-    for name, value in (
-        pair.split()
-        for pair in (
-            "spine 0.5, neck 0.5, collar 0.2, arm 1.5, arm_twist 0.7, elbow 1.5, elbow_side 0.1, "
-            "forearm_twist 0.6, wrist 0.4, thumb 0.3, thigh 1, thigh_twist 0.2, knee 1.5, "
-            "knee_side 0.05, shank_twist 0.05, foot 0.4, foot_y 0.12, foot_z 0.2, toe 0.2"
-        ).split(", ")
-    )
+    "spine": 0.5,
+    "neck": 0.5,
+    "collar": 0.2,
+    "arm": 1.5,
+    "arm_twist": 0.7,
+    "elbow": 1.5,
+    "elbow_side": 0.1,
+    "forearm_twist": 0.6,
+    "wrist": 0.4,
+    "thumb": 0.3,
+    "thigh": 1.0,
+    "thigh_twist": 0.2,
+    "knee": 1.5,
+    "knee_side": 0.05,
+    "shank_twist": 0.05,
+    "foot": 0.4,
+    "foot_y": 0.12,
+    "foot_z": 0.2,
+    "toe": 0.2,
 }
 LEAST = {"knee": -0.1, "elbow": -0.7}  # a hinge does not bend backwards; elbows are bent at rest
 BEYOND = 0.05  # standard deviation beyond it
@@ -138,7 +148,7 @@ class Solver(nn.Module):
         return BodyPose(theta, transl + shift[:, 0])
 
     def at_rest(self, visibility: Tensor) -> Tensor:
-        """``[B, joints]`` bool: joints that no seen landmark shows, which `solve` leaves at rest."""
+        """``[B, joints]`` bool: joints that no seen landmark shows: `solve` leaves them at rest."""
         shown = (
             ((visibility > 0) & self.known).to(self.prior) @ self.reaches.to(self.prior).mT
         ) > 0
