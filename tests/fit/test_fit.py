@@ -17,7 +17,8 @@ from hydra.utils import instantiate
 from make import write_tiny_capture
 
 import gsgan.utils.compat  # noqa: F401
-from gsgan.body.shape import fit_shape, shaped_body
+from gsgan.body.measure import fit_shape
+from gsgan.body.shape import BodyShape, shaped_body
 from gsgan.body.solve import Solver
 from gsgan.data.datamodule import GsganData
 from gsgan.evaluate.facts import fingerprint
@@ -71,7 +72,7 @@ def test_held_out_frames_are_solved_by_their_skeleton(fitted, fit, people):
     shape = {name: torch.from_numpy(x) for name, x in np.load(fitted / "body_shape.npz").items()}
     landmarks = data.layout.landmarks
     p = torch.from_numpy(np.stack([landmarks.p[f] for f in (3, 4)])).float()
-    solved = Solver(shaped_body(running.BodyShape(**shape))).solve(p, torch.ones(2, 33))
+    solved = Solver(shaped_body(BodyShape(**shape))).solve(p, torch.ones(2, 33))
     np.testing.assert_allclose(found["theta"][3:], solved.theta, atol=0.05)
     np.testing.assert_allclose(0.01 * found["transl"][3:], solved.transl, atol=1e-3)
     both = fit("fit.held_out=true")
@@ -87,7 +88,7 @@ def test_what_is_written_is_read(fitted, people, compose):
     assert poses.fitted
     np.testing.assert_allclose(frame.body.theta[0], stored["theta"][0], atol=1e-6)
     np.testing.assert_allclose(frame.body.transl[0], 0.01 * stored["transl"][0], atol=1e-6)
-    shape = running.BodyShape.from_plain(data.info.betas)
+    shape = BodyShape.of_flat(torch.tensor(data.info.betas))
     np.testing.assert_allclose(shape.stretch, np.load(fitted / "body_shape.npz")["stretch"])
     assert fingerprint(plain) != fingerprint(data)
     report = json.loads((fitted / "body_fit.json").read_text())

@@ -1,27 +1,30 @@
-"""The joints of a body as anatomy: which way each one turns, how far, and what it shares.
+"""The joints of a body as anatomy: which way each one turns, and what the turns share.
 
-Convention: a *turn* is a rotation ``exp(M q)`` at a joint, M linear in the body's numbers q; a joint
-has one or more, applied in order. Axes are those of the rest pose, metres and radians.
+Convention: radians; axes are those of the rest pose. A *turn* is a rotation ``exp(v)`` at a joint,
+its axis-angle v linear in the body's numbers; a joint has one or more, applied in order. A *number*
+is one degree of freedom: an angle about an axis, spread over the turns of a chain.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gsgan.body.shape import limb_axes
 from gsgan.body.skinned import MarkedBody
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.template import CHEST, PELVIS
 
-# Joints by role, in the free body | in SMPL's family, with the share of the chain's turn each takes.
-Chain = tuple[tuple[str, float], ...]
+Chain = tuple[tuple[str, float], ...]  # joints, and the share of a number that each one takes
+# By role. Twist turns less near the trunk than at the far end, in the forearm up to the wrist.
 FREE: dict[str, Chain] = {
     "spine": (("spine05", 1 / 3), ("spine03", 1 / 3), ("spine01", 1 / 3)),
     "neck": (("neck01", 0.5), ("head", 0.5)),
     "collar": (("clavicle.{}", 1.0),),
-    "upper_arm": (("upperarm01.{}", 0.8), ("upperarm02.{}", 0.2)),
+    "arm": (("upperarm01.{}", 0.8), ("upperarm02.{}", 0.2)),
     "forearm": (("lowerarm01.{}", 0.5), ("lowerarm02.{}", 0.1), ("wrist.{}", 0.4)),
     "hand": (("wrist.{}", 1.0),),
     "thumb": (("finger1-1.{}", 1.0),),
@@ -34,7 +37,7 @@ SMPL: dict[str, Chain] = {
     "spine": (("spine1", 1 / 3), ("spine2", 1 / 3), ("spine3", 1 / 3)),
     "neck": (("neck", 0.5), ("head", 0.5)),
     "collar": (("{}_collar", 1.0),),
-    "upper_arm": (("{}_shoulder", 1.0),),
+    "arm": (("{}_shoulder", 1.0),),
     "forearm": (("{}_elbow", 0.5), ("{}_wrist", 0.5)),
     "hand": (("{}_wrist", 1.0),),
     "thumb": (("{}_thumb1", 1.0),),
@@ -44,167 +47,211 @@ SMPL: dict[str, Chain] = {
     "toe": (("{}_foot", 1.0),),
 }
 SIDES = {"left": "L", "right": "R"}
-BENT = 0.15  # radians: from here on the rest pose's own bend shows where the elbow's hinge is
+BENT = 0.15  # sine: a rest pose's elbow that is bent more shows where its hinge is
+AT_JOINT = 1e-4  # metres
+XYZ = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Limb:
+    """An arm or a leg, for the first guess.
+
+    Args:
+        hub: the bone frame that it hangs on, `PELVIS` or `CHEST`.
+        points: landmarks of its first, middle and end joint.
+        numbers: of the swing's two axes, the twist, and the hinge.
+        axes: ``[4, 3]`` of those two axes, along the upper bone, and across it towards the hinge.
+        bend: at rest, radians.
+    """
+
+    hub: int
+    points: tuple[int, int, int]
+    numbers: tuple[int, int, int, int]
+    axes: Tensor
+    bend: float
 
 
 @dataclass(frozen=True)
 class Rig:
-    """A body's turns and numbers.
+    """T turns and D numbers of a body; one entry for every turn that a number moves.
 
     Args:
-        joint: ``[T]`` the body's joint of each turn, the root's first.
-        parent: ``[T]`` the turn before it on the way from the root; -1 for the root's.
-        M: ``[T, 3, D]`` what the numbers turn; the root's own six numbers come first.
-        names: of the D numbers.
+        names: of the numbers; the first six are the root's rotation and translation.
+        joint: ``[T]`` the joint of each turn, the root's first.
+        parent: ``[T]`` the turn before it on the way to the root, -1 for the root's.
+        entry_turn, entry_number: ``[E]``.
+        entry_axis: ``[E, 3]`` axis times share.
         carrier: ``[33]`` the turn that each landmark follows.
         reaches: ``[D, 33]`` bool, the landmarks that a number moves.
+        limbs: arms and legs.
     """
 
+    names: tuple[str, ...]
     joint: Tensor
     parent: Tensor
-    M: Tensor
-    names: tuple[str, ...]
+    entry_turn: Tensor
+    entry_number: Tensor
+    entry_axis: Tensor
     carrier: Tensor
     reaches: Tensor
+    limbs: tuple[Limb, ...]
 
-    def number(self, name: str) -> int:
-        return self.names.index(name)
+    def numbers(self, name: str) -> list[int]:
+        """The numbers about x, y and z of a name."""
+        return [self.names.index(f"{name}_{k}") for k in XYZ]
 
 
-@dataclass
-class _Builder:
-    body: MarkedBody
-    turns: list[tuple[int, dict[str, Tensor]]] = field(default_factory=list)
+class _Turns(list[tuple[int, dict[str, Tensor]]]):
+    """Turns in order: joint, and axis by number; shared numbers appear in several."""
 
-    def add(self, chain: Chain, side: str, **axes: Tensor) -> None:
-        """Turns about named axes ``[3]``, spread over a chain's joints; one turn per joint."""
-        for pattern, share in chain:
-            name = pattern.format(side)
-            if name in self.body.joint_names:
-                joint = self.body.joint_names.index(name)
-                self.turns.append((joint, {k: share * axis for k, axis in axes.items()}))
+    def __init__(self, body: MarkedBody, chains: dict[str, Chain], side: str = "") -> None:
+        self.body, self.chains, self.side = body, chains, side
+
+    def joint(self, role: str, k: int = 0) -> int | None:
+        name = self.chains[role][k][0].format(self.side)
+        return self.body.joint_names.index(name) if name in self.body.joint_names else None
+
+    def put(self, role: str, joints: slice = slice(None), **axes: Tensor) -> None:
+        """One turn for each of a chain's joints that the body has."""
+        for k, (_, share) in list(enumerate(self.chains[role]))[joints]:
+            if (joint := self.joint(role, k)) is not None:
+                self.append((joint, {name: share * axis for name, axis in axes.items()}))
 
 
 def build_rig(body: MarkedBody) -> Rig:
     """The rig of the free body or of a model of SMPL's family.
 
     Raises:
-        ValueError: when the joints are not named as in one of them.
+        ValueError: when the joints are named as in neither.
     """
-    free = "spine05" in body.joint_names
-    chains = FREE if free else SMPL
-    if chains["spine"][0][0] not in body.joint_names:
-        raise ValueError(f"build_rig: unknown joints {', '.join(body.joint_names[:4])} ...")
-    made = _Builder(body)
-    left, up, front = rest_axes(body)
-    along = limb_axes(body)
-    full = {"x": left, "y": up, "z": front}
-    eye = {
-        "x": torch.tensor([1.0, 0, 0]),
-        "y": torch.tensor([0, 1.0, 0]),
-        "z": torch.tensor([0, 0, 1.0]),
-    }
-    made.turns.append((0, {f"root_{k}": a.to(left) for k, a in eye.items()}))
-    made.add(chains["spine"], "", **{f"spine_{k}": a for k, a in full.items()})
-    made.add(chains["neck"], "", **{f"neck_{k}": a for k, a in full.items()})
+    chains = next((c for c in (FREE, SMPL) if c["spine"][0][0] in body.joint_names), None)
+    if chains is None:
+        raise ValueError(
+            f"build_rig: the joints must be the free body's, SMPL's or SMPL-X's, got "
+            f"{', '.join(body.joint_names[:3])} ..."
+        )
+    axes = dict(zip(XYZ, rest_axes(body), strict=True))
+    turns = _Turns(body, chains)
+    turns.append((0, {f"root_{k}": axis for k, axis in zip(XYZ, torch.eye(3), strict=True)}))
+    turns.put("spine", **{f"spine_{k}": axis for k, axis in axes.items()})
+    turns.put("neck", **{f"neck_{k}": axis for k, axis in axes.items()})
+    limbs: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
     for side, letter in SIDES.items():
-        s = letter if free else side
-        index = {
-            role: body.joint_names.index(chain[0][0].format(s))
-            for role, chain in chains.items()
-            if chain[0][0].format(s) in body.joint_names
-        }
-        upper, lower = along[index["upper_arm"]], along[index["forearm"]]
-        hinge = torch.linalg.cross(upper, lower)
-        if hinge.norm() < BENT:
-            hinge = torch.linalg.cross(lower, front)
-        hinge = hinge / hinge.norm()
-        e1 = hinge - (hinge @ upper) * upper
-        e1 = e1 / e1.norm()
-        made.add(chains["collar"], s, **{f"{side}_collar_y": up, f"{side}_collar_z": front})
-        made.add(
-            chains["upper_arm"][:1],
-            s,
-            **{f"{side}_arm_a": e1, f"{side}_arm_b": torch.linalg.cross(upper, e1)},
-        )
-        made.add(chains["upper_arm"], s, **{f"{side}_arm_twist": upper})
-        across = torch.linalg.cross(lower, hinge)
-        made.add(chains["forearm"][:1], s, **{f"{side}_elbow": hinge})
-        made.add(chains["forearm"][:1], s, **{f"{side}_elbow_side": across})
-        made.add(chains["forearm"], s, **{f"{side}_forearm_twist": lower})
-        made.add(chains["hand"], s, **{f"{side}_wrist_a": hinge, f"{side}_wrist_b": across})
-        made.add(chains["thumb"], s, **{f"{side}_thumb_{k}": a for k, a in full.items()})
-        thigh, shank = along[index["thigh"]], along[index["shank"]]
-        e1 = left - (left @ thigh) * thigh
-        e1 = e1 / e1.norm()
-        made.add(
-            chains["thigh"][:1],
-            s,
-            **{f"{side}_thigh_a": e1, f"{side}_thigh_b": torch.linalg.cross(thigh, e1)},
-        )
-        made.add(chains["thigh"], s, **{f"{side}_thigh_twist": thigh})
-        knee = left - (left @ shank) * shank
-        knee = knee / knee.norm()
-        made.add(chains["shank"], s, **{f"{side}_knee": knee})
-        made.add(
-            chains["shank"],
-            s,
-            **{f"{side}_knee_side": torch.linalg.cross(shank, knee), f"{side}_shank_twist": shank},
-        )
-        made.add(chains["foot"], s, **{f"{side}_foot_{k}": a for k, a in full.items()})
-        made.add(chains["toe"], s, **{f"{side}_toe": left})
-    return _finished(made)
+        of_side = _Turns(body, chains, letter if chains is FREE else side)
+        limbs |= _arm(of_side, side, axes) | _leg(of_side, side, axes)
+        turns += of_side
+    return _rig(body, turns, limbs)
+
+
+def _arm(turns: _Turns, side: str, axes: dict[str, Tensor]) -> dict[str, tuple[Tensor, ...]]:
+    along = limb_axes(turns.body)
+    upper, lower = (along[turns.joint(role)] for role in ("arm", "forearm"))
+    hinge = torch.linalg.cross(upper, lower)
+    if hinge.norm() < BENT:
+        hinge = torch.linalg.cross(lower, axes["z"])
+    hinge = normalize(hinge, dim=0)
+    flat, across = _across(hinge, upper), torch.linalg.cross(lower, hinge)
+    first, named = slice(0, 1), f"{side}_arm"
+    turns.put("collar", **{f"{side}_collar_{k}": axes[k] for k in "yz"})
+    turns.put("arm", first, **{f"{named}_a": flat, f"{named}_b": torch.linalg.cross(upper, flat)})
+    turns.put("arm", **{f"{named}_twist": upper})
+    turns.put("forearm", first, **{f"{side}_elbow": hinge})
+    turns.put("forearm", first, **{f"{side}_elbow_side": across})
+    turns.put("forearm", **{f"{side}_forearm_twist": lower})
+    turns.put("hand", **{f"{side}_wrist_a": hinge, f"{side}_wrist_b": across})
+    turns.put("thumb", **{f"{side}_thumb_{k}": axis for k, axis in axes.items()})
+    return {f"{side} arm shoulder elbow wrist": (upper, flat, lower)}
+
+
+def _leg(turns: _Turns, side: str, axes: dict[str, Tensor]) -> dict[str, tuple[Tensor, ...]]:
+    along = limb_axes(turns.body)
+    thigh, shank = (along[turns.joint(role)] for role in ("thigh", "shank"))
+    flat, knee = _across(axes["x"], thigh), _across(axes["x"], shank)
+    first, named = slice(0, 1), f"{side}_thigh"
+    turns.put("thigh", first, **{f"{named}_a": flat, f"{named}_b": torch.linalg.cross(thigh, flat)})
+    turns.put("thigh", **{f"{named}_twist": thigh})
+    turns.put("shank", **{f"{side}_knee": knee})
+    tilt = torch.linalg.cross(shank, knee)
+    turns.put("shank", **{f"{side}_knee_side": tilt, f"{side}_shank_twist": shank})
+    turns.put("foot", **{f"{side}_foot_{k}": axis for k, axis in axes.items()})
+    turns.put("toe", **{f"{side}_toe": axes["x"]})
+    return {f"{side} thigh hip knee ankle": (thigh, flat, shank)}
 
 
 def rest_axes(body: MarkedBody) -> tuple[Tensor, Tensor, Tensor]:
     """Unit left, up and front of the rest pose, from its hips and shoulders."""
-    at = dict(zip(MEDIAPIPE33.names, body.landmarks, strict=True))
-    left = at["left_hip"] - at["right_hip"]
-    left = left / left.norm()
-    up = at["left_shoulder"] + at["right_shoulder"] - at["left_hip"] - at["right_hip"]
-    up = up - (up @ left) * left
-    up = up / up.norm()
+    (l_sh, r_sh), (l_hip, r_hip) = (
+        body.landmarks[list(pair)] for pair in (MEDIAPIPE33.shoulders, MEDIAPIPE33.hips)
+    )
+    left = normalize(l_hip - r_hip, dim=0)
+    up = _across(l_sh + r_sh - l_hip - r_hip, left)
     return left, up, torch.linalg.cross(left, up)
 
 
-def _finished(made: _Builder) -> Rig:
-    body = made.body
-    # by depth and then in the order given, so that a turn follows those before it
-    depth = [0] * len(body.parents)
-    for j, parent in enumerate(body.parents):
-        depth[j] = 0 if parent < 0 else depth[parent] + 1
-    turns = sorted(made.turns, key=lambda turn: depth[turn[0]])
-    names = list(dict.fromkeys(name for _, axes in turns for name in axes))
-    names = [*names[:3], "transl_x", "transl_y", "transl_z", *names[3:]]
-    M = torch.zeros(len(turns), 3, len(names))
-    for i, (_, axes) in enumerate(turns):
-        for name, axis in axes.items():
-            M[i, :, names.index(name)] = axis
-    last = {joint: i for i, (joint, _) in enumerate(turns)}
+def _across(v: Tensor, along: Tensor) -> Tensor:
+    """The unit part of ``v [3]`` orthogonal to the unit ``along [3]``."""
+    return normalize(v - (v @ along) * along, dim=0)
+
+
+def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, tuple[Tensor, ...]]) -> Rig:
+    depth = [0]
+    for parent in body.parents[1:]:
+        depth.append(depth[parent] + 1)
+    ordered = sorted(turns, key=lambda turn: depth[turn[0]])  # stable: a joint's keep their order
+    found = list(dict.fromkeys(name for _, axes in ordered for name in axes))
+    names = (*found[:3], *(f"transl_{k}" for k in XYZ), *found[3:])
+    last = {joint: i for i, (joint, _) in enumerate(ordered)}
 
     def carrier(joint: int) -> int:
         while joint not in last:
             joint = body.parents[joint]
         return last[joint]
 
-    parents: list[int] = []
-    for i, (joint, _) in enumerate(turns):
-        same = [k for k in range(i) if turns[k][0] == joint]
-        parents.append(same[-1] if same else -1 if i == 0 else carrier(body.parents[joint]))
-    above = torch.eye(len(turns), dtype=torch.bool)
-    for i, parent in enumerate(parents[1:], start=1):
-        above[i] |= above[parent]
+    parents = [-1]
+    for i, (joint, _) in enumerate(ordered[1:], start=1):
+        same = ordered[i - 1][0] == joint
+        parents.append(i - 1 if same else carrier(body.parents[joint]))
+    entries = [
+        (i, names.index(n), axis) for i, (_, axes) in enumerate(ordered) for n, axis in axes.items()
+    ]
+    turn, number, axis = (list(column) for column in zip(*entries, strict=True))
+    joints = torch.tensor([joint for joint, _ in ordered])
     carriers = torch.tensor([carrier(int(j)) for j in body.landmark_bone])
-    # a landmark at the joint itself does not move with it
-    offset = body.landmarks[:, None] - body.joints[[j for j, _ in turns]]
-    moved = above[carriers] & ~(offset.norm(dim=-1) < 1e-4)
-    reaches = (moved.float() @ (M != 0).any(1).float() > 0).mT
-    reaches[:6] = True
+    # a landmark at a joint does not move with it
+    there = (body.landmarks[:, None] - body.joints[joints]).norm(dim=-1) < AT_JOINT
+    moved = (ancestors(torch.tensor(parents))[carriers] & ~there).mT  # [T, 33]
+    reaches = torch.zeros(len(names), len(carriers), dtype=torch.bool)
+    for i, d in zip(turn, number, strict=True):
+        reaches[d] |= moved[i]
     return Rig(
-        joint=torch.tensor([j for j, _ in turns]),
+        names=names,
+        joint=joints,
         parent=torch.tensor(parents),
-        M=M,
-        names=tuple(names),
+        entry_turn=torch.tensor(turn),
+        entry_number=torch.tensor(number),
+        entry_axis=torch.stack(axis),
         carrier=carriers,
         reaches=reaches,
+        limbs=tuple(_limb(names, *item) for item in limbs.items()),
     )
+
+
+def _limb(names: tuple[str, ...], words: str, axes: tuple[Tensor, Tensor, Tensor]) -> Limb:
+    side, limb, *joints = words.split()
+    along, flat, lower = axes
+    first, middle, end = (MEDIAPIPE33.names.index(f"{side}_{joint}") for joint in joints)
+    numbers = [f"{side}_{limb}_{k}" for k in ("a", "b", "twist")] + [f"{side}_{joints[1]}"]
+    a, b, twist, hinge = map(names.index, numbers)
+    bend = torch.atan2(torch.linalg.cross(along, lower).norm(), along @ lower)
+    frame = torch.stack([flat, torch.linalg.cross(along, flat), along, flat])
+    hub = CHEST if limb == "arm" else PELVIS
+    return Limb(hub, (first, middle, end), (a, b, twist, hinge), frame, float(bend))
+
+
+def ancestors(parent: Tensor) -> Tensor:
+    """``[T, T]`` bool: whether the turn of a row follows that of a column, itself included."""
+    above = torch.eye(len(parent), dtype=torch.bool)
+    for i, p in enumerate(parent.tolist()):
+        if p >= 0:
+            above[i] |= above[p]
+    return above

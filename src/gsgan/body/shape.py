@@ -35,17 +35,7 @@ GROUPS = {  # by the joint's name in the free body | in SMPL's family; the other
     "foot": r"(foot|toe).*|.*_(ankle|foot)",
     "head": r"head|jaw|.*_eye",
 }
-# Lengths that the shape is fitted to, as pairs of landmarks, and how far a person's may differ from
-# the body's in the fit: poses change the trunk's, and detectors put thumbs anywhere.
-RIGID = (
-    "shoulder elbow, elbow wrist, hip knee, knee ankle, ankle heel, ankle foot_index, "
-    "heel foot_index, wrist pinky, wrist index, pinky index, nose ear, nose eye, ear eye"
-)
-PAIRED = "hip, ear, eye, mouth"
-LOOSE = "shoulder hip, ear shoulder, wrist thumb"
-SURE, UNSURE = 0.01, 0.05
-STRETCH_SPREAD = 0.15  # of the logarithm of a stretch, against the coefficients' 1
-STEPS = 12
+LANDMARKS = (len(MEDIAPIPE33.names), 3)
 
 B = TypeVar("B", bound=MarkedBody)
 
@@ -57,27 +47,43 @@ class BodyShape:
     Args:
         coefficients: ``[K]`` of the shape space, in standard deviations; SMPL's betas.
         stretch: ``[8]`` factors by group, in the order of `STRETCHED`; 1 leaves it as it is.
+        offsets: ``[33, 3]`` metres at rest, from the body's landmarks to where this person's
+            skeletons have them: detectors and rigs define joints differently. None: nowhere else.
+
+    Raises:
+        ValueError: on wrong shapes.
     """
 
     coefficients: Tensor
     stretch: Tensor
+    offsets: Tensor | None = None
 
     def __post_init__(self) -> None:
-        if self.coefficients.ndim != 1 or self.stretch.shape != (len(STRETCHED),):
+        off = LANDMARKS if self.offsets is None else self.offsets.shape
+        if (self.coefficients.ndim, self.stretch.shape, off) != (1, (len(STRETCHED),), LANDMARKS):
             raise ValueError(
-                f"BodyShape: expected coefficients [K] and stretch [{len(STRETCHED)}], got "
-                f"{list(self.coefficients.shape)} and {list(self.stretch.shape)}"
+                f"BodyShape: expected coefficients [K], stretch [{len(STRETCHED)}] and offsets "
+                f"{list(LANDMARKS)}, got {list(self.coefficients.shape)}, "
+                f"{list(self.stretch.shape)} and {list(off)}"
             )
 
-    def plain(self) -> tuple[float, ...]:
-        """Coefficients, then stretches, for checkpoints."""
-        return tuple(torch.cat([self.coefficients, self.stretch]).tolist())
+    def flat(self) -> Tensor:
+        """``[K + 8 + 99]`` all numbers, to store; see `of_flat`."""
+        off = self.stretch.new_zeros(LANDMARKS) if self.offsets is None else self.offsets
+        return torch.cat([self.coefficients, self.stretch, off.flatten()])
 
     @classmethod
-    def from_plain(cls, values: Sequence[float]) -> BodyShape:
-        """The shape that `plain` gave."""
-        numbers = torch.tensor(values)
-        return cls(numbers[: -len(STRETCHED)], numbers[-len(STRETCHED) :])
+    def of_flat(cls, values: Tensor) -> BodyShape:
+        """The shape whose numbers `flat` gave.
+
+        Raises:
+            ValueError: when there are fewer numbers than stretches and offsets.
+        """
+        rest = len(STRETCHED) + LANDMARKS[0] * LANDMARKS[1]
+        if values.ndim != 1 or len(values) < rest:
+            raise ValueError(f"BodyShape: at least {rest} numbers, got {list(values.shape)}")
+        K = len(values) - rest
+        return cls(values[:K], values[K : K + len(STRETCHED)], values[-99:].view(LANDMARKS))
 
 
 @dataclass(frozen=True)
@@ -117,7 +123,10 @@ class ShapeSpace(Generic[B]):
             + directions[..., : len(given)].to(given) @ given
             for name, directions in self.directions.items()
         }
-        return _stretched(replace(self.body, **moved), shape.stretch)
+        body = _stretched(replace(self.body, **moved), shape.stretch)
+        if shape.offsets is None:
+            return body
+        return replace(body, landmarks=body.landmarks + shape.offsets)
 
 
 def group_of(joint: str) -> str:
@@ -220,98 +229,6 @@ def shaped_body(shape: BodyShape) -> Body:
     return free_space().shaped(shape)
 
 
-# -- fitting
-
-
-def length_pairs() -> tuple[Tensor, Tensor, Tensor]:
-    """Pairs of landmarks ``[P]``, ``[P]`` and how far the logarithm of their distance may be off."""
-    index = MEDIAPIPE33.names.index
-    names = {n: n for n in MEDIAPIPE33.names}
-    sides = {
-        side: {
-            n.replace("left_", "").replace("_left", ""): n.replace("left", side)
-            for n in names
-            if "left" in n
-        }
-        | {"nose": "nose"}
-        for side in ("left", "right")
-    }
-    rows = [
-        (index(sides[s][a]), index(sides[s][b]), spread)
-        for spread, pairs in ((SURE, RIGID), (UNSURE, LOOSE))
-        for a, b in (pair.split() for pair in pairs.split(", "))
-        for s in sides
-    ]
-    rows += [(index(sides["left"][n]), index(sides["right"][n]), SURE) for n in PAIRED.split(", ")]
-    rows.append((index("left_shoulder"), index("right_shoulder"), 2 * SURE))
-    a, b, spread = zip(*rows, strict=True)
-    return torch.tensor(a), torch.tensor(b), torch.tensor(spread, dtype=torch.float64)
-
-
-def fit_shape(
-    skeletons: Tensor, visibility: Tensor, space: ShapeSpace[MarkedBody] | None = None
-) -> BodyShape:
-    """The shape whose distances between landmarks are those of a person's skeletons.
-
-    Deterministic: Gauss-Newton steps on the logarithms of median lengths over the frames, with a
-    Gaussian prior on coefficients and stretches.
-
-    Args:
-        skeletons: ``[F, 33, 3]`` metres.
-        visibility: ``[F, 33]``; landmarks at 0, and those not finite, are not used.
-        space: None for the free body's.
-
-    Raises:
-        DataError: when no frame shows both ends of any limb.
-
-    Source: ours.
-    """
-    space = space or free_space()
-    a, b, spread = length_pairs()
-    p = skeletons.double()
-    seen = (visibility > 0) & p.isfinite().all(-1)
-    length = torch.where(seen[:, a] & seen[:, b], (p[:, a] - p[:, b]).norm(dim=-1), torch.nan)
-    target = length.nanmedian(dim=0).values.log()
-    reduced = _landmark_space(space)
-    own = reduced.body.landmarks
-    used = target.isfinite() & (own[a] - own[b]).isfinite().all(-1)
-    if not used.any():
-        raise DataError("fit_shape: no limb has both ends visible in any frame")
-    a, b, spread, target = a[used], b[used], spread[used], target[used]
-    K = space.coefficients
-
-    def residual(x: Tensor) -> Tensor:
-        at = reduced.shaped(BodyShape(x[:K], x[K:].exp())).landmarks
-        off = ((at[a] - at[b]).norm(dim=-1).log() - target) / spread
-        return torch.cat([off, x[:K], x[K:] / STRETCH_SPREAD])
-
-    x = torch.zeros(K + len(STRETCHED), dtype=torch.float64)
-    for _ in range(STEPS):
-        J = torch.func.jacfwd(residual)(x)
-        x = x - torch.linalg.solve(J.mT @ J, J.mT @ residual(x))
-    return BodyShape(x[:K].float(), x[K:].exp().float())
-
-
-def _landmark_space(space: ShapeSpace[MarkedBody]) -> ShapeSpace[MarkedBody]:
-    """The space in float64 with one vertex: lengths do not need the surface."""
-    body = space.body
-    small = MarkedBody(
-        vertices=body.vertices[:1],
-        faces=torch.zeros(0, 3, dtype=torch.int64),
-        bone_index=body.bone_index[:1],
-        bone_weight=body.bone_weight[:1],
-        joints=body.joints,
-        parents=body.parents,
-        joint_names=body.joint_names,
-        vertex_labels=body.vertex_labels[:1],
-        label_names=body.label_names,
-        landmarks=body.landmarks,
-        landmark_bone=body.landmark_bone,
-    ).to(torch.float64)
-    kept = {"vertices": slice(0, 1), "joints": slice(None), "landmarks": slice(None)}
-    return ShapeSpace(small, {n: space.directions[n][s].double() for n, s in kept.items()})
-
-
 def open_body(
     kind: str | None,
     file: str | None = None,
@@ -327,15 +244,15 @@ def open_body(
     Args:
         kind: "free", "smpl", "smplx", or another name from the data.
         file: the user's model file; not needed for the free body.
-        betas: shape coefficients of the person; of the free body its `BodyShape` as one list, or
-            nothing for the body as it is.
+        betas: shape coefficients of the person; of the free body, the numbers of `BodyShape.flat`
+            or nothing for the body as it is.
         label_names: the parts in the data's label images, background first; empty when unknown.
 
     Raises:
         DataError: when the file cannot be read or is of another body.
     """
     if kind == "free":
-        return shaped_body(BodyShape.from_plain(betas)) if betas else free_body()
+        return shaped_body(BodyShape.of_flat(torch.tensor(betas))) if betas else free_body()
     if kind is None or file is None:
         return None
     model = read_smpl(file)

@@ -1,359 +1,345 @@
-"""From a skeleton to the pose of a body: `Solver`.
+"""From a skeleton to the pose of a body.
 
 Convention: metres, world frame, radians.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
-from kornia.geometry.conversions import (
-    quaternion_to_axis_angle,
-    rotation_matrix_to_quaternion,
-)
-from torch import Tensor
+from kornia.geometry.conversions import quaternion_to_axis_angle, rotation_matrix_to_quaternion
+from torch import Tensor, nn
+from torch.nn.functional import normalize
 
 from gsgan.body.lbs import axis_angle_to_matrix
-from gsgan.body.rig import SIDES, build_rig
+from gsgan.body.rig import Rig, ancestors, build_rig
 from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, bone_frames, sanitise
 from gsgan.utils.tensors import constant
 
-# Standard deviations of a pose's numbers about their means, radians: wide along a joint's own
-# range, narrow where it hardly turns.
+# Standard deviation of each number about the rest pose: wide where a joint turns freely, narrow
+# across hinges and where 33 landmarks do not see the turn.
 SPREAD = {
     "spine": 0.5,
     "neck": 0.5,
-    "collar": 0.25,
+    "collar": 0.2,
     "arm": 1.5,
-    "arm_twist": 0.5,
+    "arm_twist": 0.7,
     "elbow": 1.5,
-    "elbow_side": 0.05,
+    "elbow_side": 0.1,
     "forearm_twist": 0.6,
     "wrist": 0.4,
     "thumb": 0.3,
     "thigh": 1.0,
-    "thigh_twist": 0.25,
+    "thigh_twist": 0.2,
     "knee": 1.5,
     "knee_side": 0.05,
     "shank_twist": 0.05,
-    "foot_x": 0.5,
-    "foot_y": 0.06,
+    "foot": 0.4,
+    "foot_y": 0.12,
     "foot_z": 0.2,
     "toe": 0.2,
 }
-MEAN: dict[str, float] = {}
-# Metres: how far landmarks may be off. Detectors place face and palm less well.
-NOISE, FACE, PALM = 0.004, 0.008, 0.007
-ROBUST = 5.0  # residuals of more than this many standard deviations count linearly
-STEPS = 8
-LIMITS = {"knee": -0.1, "elbow": -0.7}
-LIMIT_SPREAD = 0.05
-CENTRED = ("root", "transl")
+LEAST = {"knee": -0.1, "elbow": -0.7}  # a hinge does not bend backwards; elbows are bent at rest
+BEYOND = 0.05  # standard deviation beyond it
+# Metres, standard deviation of a landmark: detectors place face and palm less well.
+NOISE, FACE_NOISE, PALM_NOISE = 0.004, 0.008, 0.007
+PALM = slice(17, 23)
+ROBUST = 5.0  # standard deviations: landmarks further off pull no more than that
+STEPS, CONVERGED = 10, 1e-3  # of the cost
+DAMPING, EASIER, HARDER = 1e-3, 0.2, 20.0
+FLOOR = 1e-3  # on the diagonal: the root has no prior
+CHUNK = 64  # frames at a time: their matrices fit a processor's cache
+STRAIGHT, SHARP = 0.1, 0.4  # radians: below a bend says nothing of the twist, above all
+# A pair's line this much against the left of toes and nose (a cosine) has its sides swapped.
+OPPOSED = -0.3
+PAIRS = {"hips": (23, 24), "shoulders": (11, 12), "ears": (7, 8), "eyes": (2, 5)}
+TOES, HEELS, NOSE = (31, 32), (29, 30), 0
 
 
-class Solver:
-    """Poses of one body from skeletons: deterministic, batched, differentiable.
+class Linear(NamedTuple):
+    """Residuals at some numbers, and their derivatives."""
 
-    A first guess from the frames of trunk and head and the directions of limbs; then Gauss-Newton
-    steps on the distances to the landmarks, with a prior on the turns of joints, which stands in
-    for what 33 landmarks do not see: knees and elbows are hinges, ankles hardly turn, twist spreads
-    along limbs. One more step carries the gradients, by the implicit function theorem.
+    residual: Tensor  # [B, 33, 3] metres
+    by_number: Tensor  # [B, D, 33, 3]
+
+
+class Solver(nn.Module):
+    """The pose of one body in which its landmarks are nearest to a skeleton's.
+
+    A first guess from the frames of trunk and head and the directions of limbs; then
+    Levenberg-Marquardt steps on the distances to the landmarks and a prior on the turns, which
+    decides what 33 landmarks do not show: knees and elbows are hinges, ankles hardly turn, twist
+    spreads along limbs. One more step carries gradients, by the implicit function theorem.
+    Deterministic; the result of a frame does not depend on the others.
 
     Args:
-        body: of the subject's shape; gradients reach its joints and landmarks.
+        body: of the subject's shape.
 
     Raises:
-        ValueError: when the body's joints are neither the free body's nor SMPL's.
+        ValueError: when the joints are neither the free body's nor those of SMPL's family.
 
     Source: ours.
     """
 
-    def __init__(self, body: MarkedBody) -> None:
-        self.body = body
-        with torch.no_grad():
-            self.rig = build_rig(body)
-            self._prepare()
+    joints: Tensor
+    landmarks: Tensor
+    precision: Tensor
+    prior: Tensor
+    least: Tensor
+    matrix: Tensor
+    follows: Tensor
+    jumps: Tensor
+    rest_hubs: Tensor
 
-    def _prepare(self) -> None:
-        rig, body = self.rig, self.body
-        self.known = body.landmarks.isfinite().all(-1)
-        sigma = torch.full((33,), NOISE)
-        sigma[list(MEDIAPIPE33.face)] = FACE
-        sigma[17:23] = PALM
-        self.precision = self.known / sigma.square()
-        D = len(rig.names)
-        spread, mean, low = (
-            torch.full((D,), torch.inf),
-            torch.zeros(D),
-            torch.full((D,), -torch.inf),
-        )
-        for i, name in enumerate(rig.names):
-            key = name.removeprefix("left_").removeprefix("right_")
-            if key.split("_")[0] in CENTRED:
-                continue
-            spread[i] = SPREAD[key] if key in SPREAD else SPREAD[key.split("_")[0]]
-            mean[i] = MEAN.get(key, 0.0)
-            low[i] = LIMITS.get(key, -torch.inf)
-        self.prior, self.mean, self.low = spread.square().reciprocal(), mean, low
-        # ancestors at distance 1, 2, 4, ...; one row more than turns holds the identity
-        jump = torch.cat(
-            [
-                torch.where(rig.parent < 0, len(rig.parent), rig.parent),
-                torch.tensor([len(rig.parent)]),
-            ]
-        )
-        self.jumps = []
-        while (jump != len(rig.parent)).any():
-            self.jumps.append(jump)
-            jump = jump[jump]
-        self.above = torch.zeros(len(rig.parent), len(rig.parent))
-        for i, parent in enumerate(rig.parent.tolist()):
-            self.above[i, i] = 1
-            if parent >= 0:
-                self.above[i] += self.above[parent]
-        rest = torch.where(self.known[:, None], body.landmarks, torch.nan)
-        filled, seen = sanitise(rest.unsqueeze(0))
-        self.rest_hubs = bone_frames(filled, seen).hubs
-        self.rest_points = filled[0]
-        self.parent_row = torch.where(rig.parent < 0, len(rig.parent), rig.parent)
+    def __init__(self, body: MarkedBody) -> None:
+        super().__init__()
+        self.parents = len(body.parents)
+        with torch.no_grad():
+            rig = self.rig = build_rig(body)
+            known = body.landmarks.isfinite().all(-1)
+            rest, _ = sanitise(torch.where(known[:, None], body.landmarks, torch.nan)[None])
+            matrix = body.joints.new_zeros(len(rig.names), len(rig.joint), 3)
+            matrix[rig.entry_number, rig.entry_turn] = rig.entry_axis.to(matrix)
+            spread, least = _spreads(rig)
+            held = {
+                "precision": known / _noise().square(),
+                "prior": spread.square().reciprocal(),
+                "least": least,
+                "matrix": matrix.flatten(1),
+                "follows": ancestors(rig.parent)[rig.carrier].mT[rig.entry_turn, :, None],
+                "jumps": _jumps(rig.parent),
+                "before": torch.where(rig.parent < 0, len(rig.parent), rig.parent),
+                "rest_hubs": bone_frames(rest).hubs[0],
+                "rest_hips": rest[0, MEDIAPIPE33.hips].mean(0),
+                "known": known,
+                **{k: v for k, v in vars(rig).items() if isinstance(v, Tensor)},
+            }
+        # the body's own tensors keep their graph: gradients reach its shape
+        held |= {"joints": body.joints, "landmarks": body.landmarks.nan_to_num()}
+        for name, value in held.items():
+            value = value.to(body.joints) if value.is_floating_point() else value
+            self.register_buffer(name, value, persistent=False)
 
     def solve(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
-        """The pose in which the body's landmarks are nearest to the skeleton's.
+        """The pose of each skeleton; differentiable in the skeleton and in the body.
+
+        Convention: joints that no seen landmark shows stay at rest, see `at_rest`.
 
         Args:
             skeleton: ``[B, 33, 3]`` metres, world.
-            visibility: ``[B, 33]`` in [0, 1]; landmarks at 0, and those not finite, are not used.
+            visibility: ``[B, 33]`` in [0, 1], a landmark's weight; those not finite count as 0.
 
         Raises:
-            ValueError: on a wrong shape; with too few shoulders and hips (see
-                `gsgan.skeleton.sanitise`); where left and right are swapped.
+            ValueError: on a wrong shape; with too few shoulders and hips (`sanitise`); where left
+                and right are swapped.
         """
         p, valid = sanitise(skeleton, visibility)
-        weight = self.precision.to(p) * valid * visibility.to(p)
-        with torch.no_grad():
-            shift = p[:, MEDIAPIPE33.hips, :].mean(1)
-            near = p.detach() - shift[:, None]
-            mean = self._mean(valid)
-            q, R0 = self._guess(near)
-            q, R0 = self._descend(q, R0, near, weight.detach(), mean)
-        near = p - shift[:, None]
-        q = self._last_step(q, R0, near, weight.detach(), mean)
-        return self._pose(q, R0, shift)
+        refuse_swapped(p.detach(), valid)
+        shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
+        weight = (self.precision * valid * visibility.clamp(0, 1)).to(p)
+        solved = [
+            self._solve(near, w)
+            for near, w in zip((p - shift).split(CHUNK), weight.detach().split(CHUNK), strict=True)
+        ]
+        theta, transl = (torch.cat(parts) for parts in zip(*solved, strict=True))
+        return BodyPose(theta, transl + shift[:, 0])
 
-    def _mean(self, valid: Tensor) -> Tensor:
-        """``[B, D]``: the prior's mean, rest where no landmark sees a number."""
-        seen = (valid & self.known).float() @ self.rig.reaches.float().mT > 0
-        return torch.where(seen, self.mean, 0.0)
+    def at_rest(self, visibility: Tensor) -> Tensor:
+        """``[B, joints]`` bool: joints that no seen landmark shows: `solve` leaves them at rest."""
+        shown = (
+            ((visibility > 0) & self.known).to(self.prior) @ self.reaches.to(self.prior).mT
+        ) > 0
+        shown[:, :6] = True
+        moved = torch.zeros(len(visibility), self.parents, device=visibility.device)
+        joints = self.joint[self.entry_turn].expand(len(visibility), -1)
+        return moved.scatter_add(1, joints, shown[:, self.entry_number].float()) == 0
+
+    def _solve(self, p: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        with torch.no_grad():
+            q, root = self.descend(*self.guess(p.detach()), p.detach(), weight)
+        q = self._last_step(q, root, p, weight)
+        turns = self.rotations(q, root).unbind(1)
+        whole: dict[int, Tensor] = {}
+        for joint, R in zip(self.rig.joint.tolist(), turns, strict=True):
+            whole[joint] = whole[joint] @ R if joint in whole else R
+        theta = p.new_zeros(len(p), self.parents, 3)
+        theta[:, list(whole)] = log_of(torch.stack(list(whole.values()), dim=1))
+        return theta, q[:, 3:6]
 
     # -- the first guess
 
-    def _guess(self, p: Tensor) -> tuple[Tensor, Tensor]:
-        """Numbers ``[B, D]`` and the root's rotation ``[B, 3, 3]``."""
-        rig, body = self.rig, self.body
+    def guess(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        """Numbers ``[B, D]`` and the root's rotation ``[B, 3, 3]`` of finite joints."""
         hubs = bone_frames(p).hubs @ self.rest_hubs.mT
-        R0, chest, head = hubs.unbind(1)
-        q = p.new_zeros(len(p), len(rig.names))
-
-        def put(name: str, value: Tensor) -> None:
-            if name in rig.names:
-                q[:, rig.number(name)] = value
-
-        def put_three(name: str, R: Tensor) -> None:
-            v = _log(R)
-            for k in "xyz":
-                i = rig.number(f"{name}_{k}")
-                axis = torch.nn.functional.normalize(rig.M[:, :, i].sum(0), dim=0)
-                q[:, i] = v @ axis
-
-        put_three("spine", R0.mT @ chest)
-        put_three("neck", chest.mT @ head)
-        names = MEDIAPIPE33.names
-        for side in SIDES:
-            for parent, (a, b, c), limb, hinge in (
-                (chest, ("shoulder", "elbow", "wrist"), "arm", "elbow"),
-                (R0, ("hip", "knee", "ankle"), "thigh", "knee"),
-            ):
-                ia, ib, ic = (names.index(f"{side}_{n}") for n in (a, b, c))
-                e1, e2, e3 = (
-                    torch.nn.functional.normalize(
-                        rig.M[:, :, rig.number(f"{side}_{limb}_{k}")].sum(0), dim=0
-                    )
-                    for k in ("a", "b", "twist")
-                )
-                axis = torch.nn.functional.normalize(
-                    rig.M[:, :, rig.number(f"{side}_{hinge}")].sum(0), dim=0
-                )
-                rest_u, rest_l = (
-                    self.rest_points[j] - self.rest_points[i] for i, j in ((ia, ib), (ib, ic))
-                )
-                u, l = (p[:, j] - p[:, i] for i, j in ((ia, ib), (ib, ic)))
-                u, l = (torch.einsum("bji,bj->bi", parent, x) for x in (u, l))
-                v = _swing(rest_u, u)
-                put(f"{side}_{limb}_a", v @ e1)
-                put(f"{side}_{limb}_b", v @ e2)
-                S = axis_angle_to_matrix(v)
-                l = torch.einsum("bji,bj->bi", S, l)
-                n = torch.linalg.cross(e3.expand_as(l), l)
-                bend = torch.atan2(n.norm(dim=-1), l @ e3)
-                h = axis - (axis @ e3) * e3
-                h = h / h.norm()
-                twist = torch.atan2(n @ torch.linalg.cross(e3, h), n @ h)
-                sharp = ((bend - 0.1) / 0.3).clamp(0, 1)
-                put(f"{side}_{limb}_twist", twist * sharp)
-                rest_bend = torch.atan2(torch.linalg.cross(e3, rest_l).norm(), e3 @ rest_l)
-                put(f"{side}_{hinge}", bend - rest_bend)
-        root = body.joints[0].detach()
-        middle = self.rest_points[list(MEDIAPIPE33.hips)].mean(0)
-        at = p[:, MEDIAPIPE33.hips, :].mean(1)
-        # transl so that the hips' middle fits
-        q[:, 3:6] = at - root - torch.einsum("bij,j->bi", R0, middle - root)
-        return q, R0
+        pelvis, chest, head = hubs.unbind(1)
+        q = p.new_zeros(len(p), len(self.prior))
+        for name, R in (("spine", pelvis.mT @ chest), ("neck", chest.mT @ head)):
+            numbers = self.rig.numbers(name)
+            q[:, numbers] = (
+                log_of(R) @ normalize(self.matrix[numbers].unflatten(1, (-1, 3)).sum(1)).mT
+            )
+        for limb in self.rig.limbs:
+            first, middle, end = (p[:, i] for i in limb.points)
+            bones = torch.stack([middle - first, end - middle], dim=1) @ hubs[:, limb.hub]
+            upper, lower = normalize(bones, dim=-1, eps=1e-6).unbind(1)
+            axes = limb.axes.to(p)
+            along, flat = axes[2], axes[3]
+            swing = _swing(along.expand_as(upper), upper)
+            lower = (lower.unsqueeze(1) @ axis_angle_to_matrix(swing)).squeeze(1)
+            normal = torch.linalg.cross(along.expand_as(lower), lower)
+            bend = torch.atan2(normal.norm(dim=-1), lower @ along)
+            twist = torch.atan2(normal @ torch.linalg.cross(along, flat), normal @ flat)
+            twist = twist * ((bend - STRAIGHT) / (SHARP - STRAIGHT)).clamp(0, 1)
+            found = [*(swing @ axes[:2].mT).unbind(1), twist, bend - limb.bend]
+            q[:, limb.numbers] = torch.stack(found, dim=1)
+        hips = p[:, MEDIAPIPE33.hips].mean(1)
+        q[:, 3:6] = hips - self.joints[0] - pelvis @ (self.rest_hips - self.joints[0])
+        return q, pelvis
 
     # -- the steps
 
-    def _forward(self, q: Tensor, R0: Tensor, joints: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Transforms ``[B, T + 1, 4, 4]`` since rest, last the identity, local rotations, and v."""
-        rig = self.rig
-        v = (q @ rig.M.flatten(0, 1).mT.to(q)).unflatten(1, (-1, 3))
-        R = axis_angle_to_matrix(v)
-        R = torch.cat([R[:, :1] @ R0[:, None], R[:, 1:]], dim=1)
-        o = joints[rig.joint]
+    def rotations(self, q: Tensor, root: Tensor) -> Tensor:
+        """``[B, T, 3, 3]`` of each turn."""
+        R = axis_angle_to_matrix((q @ self.matrix).unflatten(1, (-1, 3)))
+        return torch.cat([R[:, :1] @ root.unsqueeze(1), R[:, 1:]], dim=1)
+
+    def transforms(self, q: Tensor, root: Tensor, joints: Tensor) -> Tensor:
+        """``[B, T + 1, 4, 4]`` world transforms since rest after each turn; last the identity."""
+        R, o = self.rotations(q, root), joints[self.joint]
         shift = o - (R @ o.unsqueeze(-1)).squeeze(-1)
         shift = torch.cat([shift[:, :1] + q[:, None, 3:6], shift[:, 1:]], dim=1)
-        T = torch.cat([R, shift.unsqueeze(-1)], dim=-1)
-        T = torch.cat([T, constant((0.0, 0.0, 0.0, 1.0), T).expand(*T.shape[:2], 1, 4)], dim=-2)
+        bottom = constant((0.0, 0.0, 0.0, 1.0), R).expand(*R.shape[:2], 1, 4)
+        T = torch.cat([torch.cat([R, shift.unsqueeze(-1)], dim=-1), bottom], dim=-2)
         T = torch.cat([T, torch.eye(4).to(T).expand(len(T), 1, 4, 4)], dim=1)
-        for jump in self.jumps:
+        for jump in self.jumps:  # with the turn 1, 2, 4, ... before
             T = T[:, jump] @ T
-        return T, R, v
+        return T
 
-    def _points(self, T: Tensor, landmarks: Tensor) -> Tensor:
-        T = T[:, self.rig.carrier]
+    def points(self, T: Tensor, landmarks: Tensor) -> Tensor:
+        """``[B, 33, 3]`` the posed landmarks."""
+        T = T[:, self.carrier]
         return (T[..., :3, :3] @ landmarks.unsqueeze(-1)).squeeze(-1) + T[..., :3, 3]
 
-    def _linear(self, q: Tensor, R0: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
-        """Residuals ``[B, 33, 3]`` and their derivatives ``[B, 33, 3, D]``."""
-        rig = self.rig
-        joints = self.body.joints.detach()
-        T, _, v = self._forward(q, R0, joints)
-        landmarks = self.body.landmarks.detach().nan_to_num()
-        x = self._points(T, landmarks)
-        before = T[:, self.parent_row]
-        axes = (before[..., :3, :3] @ _left_jacobian(v)) @ rig.M.to(q)  # [B, T, 3, D]
-        o = (before[..., :3, :3] @ joints[rig.joint].unsqueeze(-1)).squeeze(-1) + before[..., :3, 3]
-        # the root's turn is about its moved joint
-        o = torch.cat([(joints[0] + q[:, 3:6]).unsqueeze(1), o[:, 1:]], dim=1)
-        moment = torch.linalg.cross(axes, o.unsqueeze(-1).expand_as(axes), dim=2)
-        above = self.above[rig.carrier].to(q)
-        turn = torch.einsum("lt,btx->blx", above, axes.flatten(2)).unflatten(2, (3, -1))
-        fixed = torch.einsum("lt,btx->blx", above, moment.flatten(2)).unflatten(2, (3, -1))
-        J = torch.linalg.cross(turn, x.unsqueeze(-1).expand_as(turn), dim=2) - fixed
-        J[..., 3:6] = torch.eye(3).to(J)
-        return x - p, J
+    def linear(self, q: Tensor, root: Tensor, p: Tensor) -> Linear:
+        """Residuals to ``p [B, 33, 3]`` and their derivatives, the root's about its rotation."""
+        joints = self.joints.detach()
+        T = self.transforms(q, root, joints)
+        x, before = self.points(T, self.landmarks.detach()), T[:, self.before]
+        origin = (before[..., :3, :3] @ joints[self.joint].unsqueeze(-1)).squeeze(-1)
+        origin = origin + before[..., :3, 3]
+        origin[:, 0] += q[:, 3:6]
+        turned = before[..., :3, :3] @ _left_jacobian((q @ self.matrix).unflatten(1, (-1, 3)))
+        axes = (turned[:, self.entry_turn] @ self.entry_axis.unsqueeze(-1)).squeeze(-1)
+        arms = (x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)) * self.follows
+        moved = torch.linalg.cross(axes.unsqueeze(2).expand_as(arms), arms)
+        J = x.new_zeros(len(x), len(self.prior), *x.shape[1:])
+        J.index_add_(1, self.entry_number, moved)
+        J[:, 3:6] = torch.eye(3).to(x).unsqueeze(1)
+        return Linear(x - p, J)
 
-    def _normal(
-        self, q: Tensor, r: Tensor, J: Tensor, weight: Tensor, mean: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost ``[B]``, gradient ``[B, D]`` and Gauss-Newton matrix ``[B, D, D]``."""
-        d2 = r.square().sum(-1)
-        scaled = weight * d2 / ROBUST**2
-        root = (1 + scaled).sqrt()
-        w = (weight / root).unsqueeze(-1)
-        J, weighted = J.flatten(1, 2), (J * w.unsqueeze(-1)).flatten(1, 2)
-        H = weighted.mT @ J
-        g = (weighted.mT @ r.flatten(1, 2).unsqueeze(-1)).squeeze(-1)
-        off = q - mean
-        below = (q - self.low).clamp_max(0)
-        active = (below < 0) / LIMIT_SPREAD**2
-        cost = (
-            (2 * ROBUST**2 * (root - 1)).sum(-1)
-            + (self.prior * off.square()).sum(-1)
-            + (below.square() / LIMIT_SPREAD**2).nan_to_num(0.0).sum(-1)
-        )
-        g = g + self.prior * off + torch.where(below < 0, below, 0.0) / LIMIT_SPREAD**2
-        H = H + torch.diag_embed(self.prior + active + 1e-3)
-        return cost, g, H
+    def normal(
+        self, q: Tensor, at: Linear, weight: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Cost ``[B]``, half its gradient ``[B, D]``, matrix ``[B, D, D]``, weights ``[B, 33]``.
 
-    def _descend(
-        self, q: Tensor, R0: Tensor, p: Tensor, weight: Tensor, mean: Tensor
+        The weights are those of iteratively reweighted least squares.
+        """
+        root = (1 + weight * at.residual.square().sum(-1) / ROBUST**2).sqrt()
+        w = weight / root
+        J = at.by_number.flatten(2)
+        weighted = (at.by_number * w[:, None, :, None]).flatten(2)
+        below = (q - self.least).clamp_max(0)
+        stop = (below < 0) / BEYOND**2
+        cost = 2 * ROBUST**2 * (root - 1).sum(-1)
+        cost = cost + (self.prior * q.square() + stop * below.square().nan_to_num()).sum(-1)
+        g = (weighted @ at.residual.flatten(1).unsqueeze(-1)).squeeze(-1)
+        g = g + self.prior * q + stop * below
+        return cost, g, weighted @ J.mT + torch.diag_embed(self.prior + stop + FLOOR), w
+
+    def descend(
+        self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor, steps: int = STEPS
     ) -> tuple[Tensor, Tensor]:
-        best, damping = None, torch.full((len(q), 1), 1e-3).to(q)
-        for step in range(STEPS + 1):
-            cost, g, H = self._normal(q, *self._linear(q, R0, p), weight, mean)
-            if best is None:
-                best = [q, R0, cost, g, H]
-            else:
-                better = cost < best[2]
-                now = (q, R0, cost, g, H)
-                best = [
-                    torch.where(better.view(-1, *[1] * (new.ndim - 1)), new, old)
-                    for new, old in zip(now, best, strict=True)
-                ]
-                damping = torch.where(better[:, None], damping * 0.2, damping * 20)
-            if step == STEPS:
+        """Numbers and root rotation after at most ``steps``; one that raises the cost is undone."""
+        best = (q, root, *self.normal(q, self.linear(q, root, p), weight)[:3])
+        damping = q.new_full((len(q), 1), DAMPING)
+        for _ in range(steps):
+            q, root, cost, g, H = best
+            scaled = H + torch.diag_embed(damping * torch.diagonal(H, dim1=-2, dim2=-1))
+            q = q + _solved(scaled, -g)
+            root = axis_angle_to_matrix(q[:, :3]) @ root  # the next step starts from no turn
+            q = torch.cat([torch.zeros_like(q[:, :3]), q[:, 3:]], dim=1)
+            new = (q, root, *self.normal(q, self.linear(q, root, p), weight)[:3])
+            better = new[2] < cost
+            best = tuple(
+                torch.where(better.view(-1, *[1] * (a.ndim - 1)), a, b)
+                for a, b in zip(new, best, strict=True)
+            )
+            damping = torch.where(better[:, None], damping * EASIER, damping * HARDER)
+            if bool((new[2] > cost * (1 - CONVERGED)).all()):
                 break
-            q, R0, _, g, H = best
-            scale = torch.diagonal(H, dim1=-2, dim2=-1)
-            move = torch.linalg.solve(H + torch.diag_embed(damping * scale), -g)
-            q, R0 = self._rebased(q + move, R0)
         return best[0], best[1]
 
-    def _rebased(self, q: Tensor, R0: Tensor) -> tuple[Tensor, Tensor]:
-        """The root's turn moved into its rotation."""
-        R0 = axis_angle_to_matrix(q[:, :3]) @ R0
-        return torch.cat([torch.zeros_like(q[:, :3]), q[:, 3:]], dim=1), R0
-
-    def _last_step(self, q: Tensor, R0: Tensor, p: Tensor, weight: Tensor, mean: Tensor) -> Tensor:
-        r, J = self._linear(q, R0, p.detach())
-        _, g, H = self._normal(q, r, J, weight, mean)
-        T, *_ = self._forward(q, R0, self.body.joints)
-        live = self._points(T, self.body.landmarks.nan_to_num()) - p
-        root = (1 + weight * r.square().sum(-1) / ROBUST**2).sqrt()
-        w = (weight / root)[..., None, None]
-        data = ((J * w).flatten(1, 2).mT @ (live - live.detach()).flatten(1).unsqueeze(-1)).squeeze(
-            -1
-        )
-        return q - torch.linalg.solve(H, g + data)
-
-    def _pose(self, q: Tensor, R0: Tensor, shift: Tensor) -> BodyPose:
-        rig = self.rig
-        q = q.clone()
-        v = (q @ rig.M.flatten(0, 1).mT.to(q)).unflatten(1, (-1, 3))
-        R = axis_angle_to_matrix(v)
-        R = torch.cat([R[:, :1] @ R0[:, None], R[:, 1:]], dim=1)
-        theta = [torch.zeros_like(v[:, 0])] * len(self.body.parents)
-        rows: dict[int, list[int]] = {}
-        for turn, joint in enumerate(rig.joint.tolist()):
-            rows.setdefault(joint, []).append(turn)
-        for joint, turns in rows.items():
-            if len(turns) == 1 and joint > 0:
-                theta[joint] = v[:, turns[0]]
-                continue
-            whole = R[:, turns[0]]
-            for turn in turns[1:]:
-                whole = whole @ R[:, turn]
-            theta[joint] = _log(whole)
-        return BodyPose(torch.stack(theta, dim=1), q[:, 3:6] + shift)
+    def _last_step(self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor) -> Tensor:
+        """One step whose right side depends on ``p`` and the body; the rest is constant."""
+        with torch.no_grad():
+            at = self.linear(q, root, p)
+            _, g, H, w = self.normal(q, at, weight)
+        live = self.points(self.transforms(q, root, self.joints), self.landmarks) - p
+        change = ((live - live.detach()) * w.unsqueeze(-1)).flatten(1).unsqueeze(-1)
+        return q + _solved(H, -g - (at.by_number.flatten(2) @ change).squeeze(-1))
 
 
-def _log(R: Tensor) -> Tensor:
+def _spreads(rig: Rig) -> tuple[Tensor, Tensor]:
+    """``[D]`` standard deviation of each number, infinite for the root's; and its least value."""
+    spread, least = [torch.inf] * 6, [-torch.inf] * 6
+    for name in rig.names[6:]:
+        key = name.removeprefix("left_").removeprefix("right_")
+        spread.append(SPREAD.get(key) or SPREAD[key.split("_")[0]])
+        least.append(LEAST.get(key, -torch.inf))
+    return torch.tensor(spread), torch.tensor(least)
+
+
+def _noise() -> Tensor:
+    """``[33]`` metres."""
+    noise = torch.full((len(MEDIAPIPE33.names),), NOISE)
+    noise[list(MEDIAPIPE33.face)], noise[PALM] = FACE_NOISE, PALM_NOISE
+    return noise
+
+
+def _jumps(parent: Tensor) -> Tensor:
+    """``[n, T + 1]`` the turns 1, 2, 4, ... before each; T, the identity, before the root's."""
+    T = len(parent)
+    jump = torch.cat([torch.where(parent < 0, T, parent), torch.tensor([T])])
+    found = []
+    while bool((jump < T).any()):
+        found.append(jump)
+        jump = jump[jump]
+    return torch.stack(found)
+
+
+def _solved(H: Tensor, g: Tensor) -> Tensor:
+    """``H⁻¹ g`` for positive definite ``H [B, D, D]``."""
+    factor, _ = torch.linalg.cholesky_ex(H)
+    return torch.cholesky_solve(g.unsqueeze(-1), factor).squeeze(-1)
+
+
+def log_of(R: Tensor) -> Tensor:
     """Axis-angle ``[..., 3]`` of rotations ``[..., 3, 3]``."""
     return quaternion_to_axis_angle(rotation_matrix_to_quaternion(R))
 
 
 def _swing(a: Tensor, b: Tensor) -> Tensor:
-    """``[B, 3]`` axis-angle of the shortest rotations from direction ``a [3]`` to ``b [B, 3]``."""
-    a = torch.nn.functional.normalize(a, dim=-1).expand_as(b)
-    b = torch.nn.functional.normalize(b, dim=-1, eps=1e-6)
+    """Axis-angle ``[B, 3]`` of the shortest rotations from unit ``a [B, 3]`` to ``b [B, 3]``."""
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)
-    angle = torch.atan2(sine, (a * b).sum(-1, keepdim=True))
-    return axis * (angle / sine.clamp_min(1e-6))
+    return axis * torch.atan2(sine, (a * b).sum(-1, keepdim=True)) / sine.clamp_min(1e-6)
 
 
 def _left_jacobian(v: Tensor) -> Tensor:
-    """``[..., 3, 3]``: the rotation that a change of an axis-angle ``v`` adds, from the left."""
+    """``[..., 3, 3]``: the rotation, applied last, that a change of the axis-angle ``v`` adds."""
     squared = v.square().sum(-1)[..., None, None]
     small = squared < 1e-4
     safe = torch.where(small, torch.ones_like(squared), squared)
@@ -364,3 +350,36 @@ def _left_jacobian(v: Tensor) -> Tensor:
     zero = torch.zeros_like(x)
     K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
     return torch.eye(3).to(v) + a * K + b * (K @ K)
+
+
+# -- left and right
+
+
+def refuse_swapped(p: Tensor, valid: Tensor) -> None:
+    """Refuses skeletons whose left and right are swapped in most frames.
+
+    Toes and nose say where the front is, whatever is called left; with the way from hips to
+    shoulders that gives the left.
+
+    Raises:
+        ValueError: naming the pairs that are swapped.
+    """
+    up = p[:, MEDIAPIPE33.shoulders].mean(1) - p[:, MEDIAPIPE33.hips].mean(1)
+    feet = (p[:, TOES] - p[:, HEELS]) * (valid[:, TOES] & valid[:, HEELS]).unsqueeze(-1)
+    face = p[:, NOSE] - p[:, PAIRS["ears"]].mean(1)
+    face = face * valid[:, (NOSE, *PAIRS["ears"])].all(1, keepdim=True)
+    body_left = torch.linalg.cross(up, normalize(feet.sum(1), dim=-1) + normalize(face, dim=-1))
+    swapped = []
+    for name, pair in PAIRS.items():
+        left = torch.linalg.cross(up, face) if name in ("ears", "eyes") else body_left
+        line = (p[:, pair[0]] - p[:, pair[1]]) * valid[:, pair].all(1, keepdim=True)
+        cosine = (normalize(line, dim=-1) * normalize(left, dim=-1)).sum(-1)
+        told = cosine[cosine != 0]
+        if len(told) and (told < OPPOSED).float().mean() > 0.5:
+            swapped.append(name)
+    if swapped:
+        raise ValueError(
+            f"solve: left and right are swapped: by the direction of toes and nose, the left of "
+            f"{', '.join(swapped)} lies on the person's right; exchange the names, or mirror the "
+            "joints back"
+        )

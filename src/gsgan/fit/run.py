@@ -20,7 +20,8 @@ from rich.console import Console
 from torch import Tensor
 
 from gsgan import __version__
-from gsgan.body.shape import BodyShape, fit_shape, shaped_body
+from gsgan.body.measure import fit_shape
+from gsgan.body.shape import BodyShape, shaped_body
 from gsgan.body.solve import Solver
 from gsgan.check.overlays import caption
 from gsgan.data.calibration.find import METRES

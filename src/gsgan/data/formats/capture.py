@@ -8,7 +8,8 @@
     labels/{camera}/%06d.png            optional part numbers, 255 = ignore
     landmarks3d.npz   p (F,33,3) NaN = missing, conf (F,33), frame_id (F,)
     body_pose.npz     optional theta (F,bones,3), transl (F,3), frame_id (F,); betas (S,) of SMPL
-    body_shape.npz    optional coefficients (K,), stretch (8,): of the free body, by gsgan.fit
+    body_shape.npz    optional coefficients (K,), stretch (8,), offsets (33,3): of the free body, by
+                      gsgan.fit
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from gsgan.body.shape import LANDMARKS as LANDMARKS_SHAPE
 from gsgan.body.shape import STRETCHED
 from gsgan.data.calibration.find import (
     METRES,
@@ -207,10 +209,8 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
 
 
 def _read_shape(path: Path) -> tuple[float, ...]:
-    """Coefficients and stretches of the free body, see `gsgan.body.shape.BodyShape.plain`."""
-    arrays = read_arrays(path, ("coefficients", "stretch"))
-    parts = [
-        expect_array(arrays, "coefficients", (None,), path),
-        expect_array(arrays, "stretch", (len(STRETCHED),), path),
-    ]
+    """The free body's shape as the numbers of `BodyShape.flat`."""
+    names = {"coefficients": (None,), "stretch": (len(STRETCHED),), "offsets": LANDMARKS_SHAPE}
+    arrays = read_arrays(path, names)
+    parts = [expect_array(arrays, name, shape, path).ravel() for name, shape in names.items()]
     return tuple(np.concatenate(parts).astype(np.float64).tolist())
