@@ -28,7 +28,6 @@ from gsgan.data.calibration.find import METRES
 from gsgan.data.crop import PersonCrop
 from gsgan.data.datamodule import GsganData
 from gsgan.data.formats.capture import POSES, SHAPE, CaptureReader
-from gsgan.data.skeletons import complete_skeletons
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.moments import Moments
 from gsgan.prepare.pictures import sampled
@@ -115,17 +114,21 @@ def fit_body(
     if moments.left_out:
         console.print(f"{moments.left_out} images with empty masks, or nearly so, are left out")
     with console.status("solving poses"):
-        shape, solved = _solved(data)
+        trained = sorted({frame for _, frame in data.splits.items["train"]})
+        shape = fit_shape(*_joints(data, trained))
+        solved = _solve(data, shape, layout.frames)
     rows = torch.tensor([layout.frames.index(frame) for frame in moments.frames])
     start = BodyPose(solved.theta[rows], solved.transl[rows])
     fitter = Fitter(settings, moments, shaped_body(shape), start, seed)
     _fitted(fitter, folder / STOPPED, _key(fitter, shape, seed), console)
     with torch.no_grad():
         found = fitter.pose()
-    report = _report(fitter, found)
-    unit = METRES[layout.meta.unit]
-    theta, transl = solved.theta.clone(), solved.transl.clone()
+    shape = replace(shape, offsets=_offsets(fitter, shape, found))
+    driven = _solve(data, shape, layout.frames)
+    theta, transl = driven.theta.clone(), driven.transl.clone()
+    report = _report(fitter, BodyPose(theta[rows], transl[rows]).to(device), found)
     theta[rows], transl[rows] = found.theta.cpu(), found.transl.cpu()
+    unit = METRES[layout.meta.unit]
     with writing(folder / SHEET):
         write_atomically(folder / SHEET, fit_picture(fitter, layout.camera_names, found, shown))
     write_json(folder / REPORT, report)
@@ -172,22 +175,33 @@ def _folder(out: Path, overwrite: bool) -> Path:
     return out
 
 
-def _solved(data: GsganData) -> tuple[BodyShape, BodyPose]:
-    """The shape by the training frames, and the pose of every frame by its skeleton."""
-    layout = data.layout
-    trained = sorted({frame for _, frame in data.splits.items["train"]})
-    whole_skeletons = complete_skeletons(layout.landmarks, layout.frames, trained)
+def _joints(data: GsganData, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Joints ``[F, 33, 3]`` metres and their visibility."""
+    landmarks = data.layout.landmarks
+    p, visibility = (
+        torch.from_numpy(np.stack([part[f] for f in frames])).float()
+        for part in (landmarks.p, landmarks.visibility)
+    )
+    return p, visibility
 
-    def joints(frames: Sequence[int]) -> tuple[Tensor, Tensor]:
-        p, visibility = (
-            np.stack([part[f] for f in frames])
-            for part in (whole_skeletons, layout.landmarks.visibility)
-        )
-        return torch.from_numpy(p).float(), torch.from_numpy(visibility).float()
 
-    shape = fit_shape(*joints(trained))
-    pose = Solver(shaped_body(shape)).solve(*joints(layout.frames))
-    return shape, BodyPose(pose.theta.detach(), pose.transl.detach())
+def _solve(data: GsganData, shape: BodyShape, frames: Sequence[int]) -> BodyPose:
+    with torch.no_grad():
+        return Solver(shaped_body(shape)).solve(*_joints(data, frames))
+
+
+@torch.no_grad()
+def _offsets(fitter: Fitter, shape: BodyShape, found: BodyPose) -> Tensor:
+    """``[33, 3]`` metres: where on the registered body this person's landmarks are, median over
+    frames. Poses solved with them are what registration would find, as far as a constant says."""
+    body, moments = fitter.surface.body, fitter.moments
+    bones = body.transforms(found)[:, body.landmark_bone]
+    at_rest = bones[..., :3, :3].mT @ (moments.skeletons - bones[..., :3, 3]).unsqueeze(-1)
+    moved = torch.where(
+        (moments.visibility > 0).unsqueeze(-1), at_rest.squeeze(-1) - body.landmarks, torch.nan
+    )
+    before = torch.zeros_like(body.landmarks) if shape.offsets is None else shape.offsets
+    return before + moved.nanmedian(dim=0).values.nan_to_num(0.0).cpu()
 
 
 def _key(fitter: Fitter, shape: BodyShape, seed: int) -> str:
@@ -234,13 +248,14 @@ def _fitted(fitter: Fitter, stopped: Path, key: str, console: Console) -> None:
 
 
 @torch.no_grad()
-def _report(fitter: Fitter, found: BodyPose) -> dict[str, Any]:
-    """Residuals in mm per joint and frame, and overlaps with the masks, solved and registered."""
+def _report(fitter: Fitter, driven: BodyPose, found: BodyPose) -> dict[str, Any]:
+    """Residuals in mm per joint and frame, and overlaps with the masks: of poses solved before the
+    registration, registered, and solved after it, as held-out frames are."""
     moments, body = fitter.moments, fitter.surface.body
     seen = moments.visibility > 0
     report: dict[str, Any] = {"frames": {}, "joints": {}}
     off, iou = {}, {}
-    for name, pose in (("solved", fitter.start), ("registered", found)):
+    for name, pose in (("solved", fitter.start), ("registered", found), ("driven", driven)):
         apart = (body.posed_landmarks(pose) - moments.skeletons).norm(dim=-1)
         off[name] = torch.where(seen, 1000 * apart, torch.nan)
         iou[name] = fitter.overlap(pose)
@@ -270,7 +285,7 @@ def _summary(report: dict[str, Any], folder: Path, moments: Moments) -> list[str
     return [
         f"{len(moments.frames)} frames, masks of {', '.join(moments.cameras)}: overlap (IoU) with "
         f"the body's surface {before['iou']:.3f} solved from the skeletons, {after['iou']:.3f} "
-        f"registered; least in frames {least}",
+        f"registered, {report['driven']['iou']:.3f} solved again; least in frames {least}",
         f"landmarks {before['residual_mm']:.0f} mm from the skeleton's solved, "
         f"{after['residual_mm']:.0f} mm registered (medians); most: {worst}",
         f"{folder} has {SHAPE} and {POSES}; look at {folder / SHEET}, {REPORT} has all numbers",
