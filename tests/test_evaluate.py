@@ -250,6 +250,8 @@ def test_arguments_that_do_not_fit_together_are_refused(run, copy, given, compos
         ([f"run={run}", *given], ("data= cannot be given with run=",)),
         ([f"run={run}", "method=x"], ("method= cannot be given with run=",)),
         ([here, *given, "data_root=/x"], ("data_root= cannot be given with predictions=",)),
+        ([here, *given, "drive=skeleton"], ("drive= cannot be given with predictions=",)),
+        ([f"run={run}", "drive=body"], ("drive must be skeleton or null",)),
         ([here, *given, "splits=[]"], ("splits must be a list of novel_view and novel_pose",)),
         ([here, *given, "predictions_pattern=x.png"], ("must have {frame} and {camera}",)),
         ([here, *given, "predictions_background=grey"], ("black, white or null",)),

@@ -51,7 +51,6 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import pick_device
 
 SPLITS = ("novel_view", "novel_pose")
-DRIVES = ("data", "skeleton")
 BY_SKELETON = "driven by skeletons alone"
 
 
@@ -69,18 +68,15 @@ def evaluate_config(config: DictConfig) -> Results:
         )
     kind, others = "run", ["data", "protocol", "out", "method"]
     if config.run is None:
-        kind, others = (
-            "predictions",
-            ["data_root", "data_smpl", *["drive"] * (config.drive != "data")],
-        )
+        kind, others = "predictions", ["data_root", "data_smpl", "drive"]
     for key in others:
         if config.get(key) is not None:
             raise ConfigError(f"{key}= cannot be given with {kind}=; leave it out")
     for key in ("background", "predictions_background"):
         if config[key] not in (None, *BACKGROUNDS):
             raise ConfigError(f"{key} must be black, white or null; got {config[key]!r}")
-    if config.drive not in DRIVES:
-        raise ConfigError(f"drive must be {' or '.join(DRIVES)}; got {config.drive!r}")
+    if config.get("drive") not in (None, "skeleton"):
+        raise ConfigError(f"drive must be skeleton or null; got {config.drive!r}")
     if not config.splits or not set(config.splits) <= set(SPLITS):
         raise ConfigError(f"splits must be a list of {' and '.join(SPLITS)}; got {config.splits}")
     score = evaluate_predictions if config.run is None else evaluate_folder
@@ -97,7 +93,7 @@ def evaluate_folder(config: DictConfig, console: Console, device: torch.device) 
     out = folder
     if config.background not in (None, _measures(data).background):  # others' scores stay
         out = folder / f"on_{config.background}"
-    if config.drive == "skeleton":
+    if config.drive is not None:
         out, marks = out / "by_skeleton", [*marks, BY_SKELETON]
     method = trained(
         folder,
@@ -106,7 +102,7 @@ def evaluate_folder(config: DictConfig, console: Console, device: torch.device) 
         train_seconds=state.get("train_seconds"),
         trained_by=state.get("code"),
     )
-    predict = painter(avatar.to(device), solve=config.drive == "skeleton")
+    predict = painter(avatar.to(device), solve=config.drive is not None)
     return evaluate_method(
         out, config, console, data, predict, method=method, device=device, marks=marks
     )
