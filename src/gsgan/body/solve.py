@@ -49,6 +49,7 @@ NOISE, FACE_NOISE, PALM_NOISE = 0.004, 0.008, 0.007
 PALM = slice(17, 23)
 ROBUST = 5.0  # standard deviations: landmarks further off pull no more than that
 STEPS, CONVERGED = 10, 1e-3  # of the cost
+GRADIENT_STEPS = 8  # leave a few percent where the surface hardly depends on a landmark
 DAMPING, EASIER, HARDER = 1e-3, 0.2, 20.0
 FLOOR = 1e-3  # on the diagonal: the root has no prior
 CHUNK = 64  # frames at a time: their matrices fit a processor's cache
@@ -72,7 +73,7 @@ class Solver(nn.Module):
     A first guess from the frames of trunk and head and the directions of limbs; then
     Levenberg-Marquardt steps on the distances to the landmarks and a prior on the turns, which
     decides what 33 landmarks do not show: knees and elbows are hinges, ankles hardly turn, twist
-    spreads along limbs. One more step carries gradients, by the implicit function theorem.
+    spreads along limbs. A few more steps at the solution carry gradients.
     Deterministic; the result of a frame does not depend on the others.
 
     Args:
@@ -160,7 +161,7 @@ class Solver(nn.Module):
     def _solve(self, p: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         with torch.no_grad():
             q, root = self.descend(*self.guess(p.detach()), p.detach(), weight)
-        q = self._last_step(q, root, p, weight)
+        q = self._last_steps(q, root, p, weight)
         turns = self.rotations(q, root).unbind(1)
         whole: dict[int, Tensor] = {}
         for joint, R in zip(self.rig.joint.tolist(), turns, strict=True):
@@ -225,12 +226,11 @@ class Solver(nn.Module):
 
     def linear(self, q: Tensor, root: Tensor, p: Tensor) -> Linear:
         """Residuals to ``p [B, 33, 3]`` and their derivatives, the root's about its rotation."""
-        joints = self.joints.detach()
-        T = self.transforms(q, root, joints)
-        x, before = self.points(T, self.landmarks.detach()), T[:, self.before]
-        origin = (before[..., :3, :3] @ joints[self.joint].unsqueeze(-1)).squeeze(-1)
+        T = self.transforms(q, root, self.joints)
+        x, before = self.points(T, self.landmarks), T[:, self.before]
+        origin = (before[..., :3, :3] @ self.joints[self.joint].unsqueeze(-1)).squeeze(-1)
         origin = origin + before[..., :3, 3]
-        origin[:, 0] += q[:, 3:6]
+        origin = torch.cat([origin[:, :1] + q[:, None, 3:6], origin[:, 1:]], dim=1)
         turned = before[..., :3, :3] @ _left_jacobian((q @ self.matrix).unflatten(1, (-1, 3)))
         axes = (turned[:, self.entry_turn] @ self.entry_axis.unsqueeze(-1)).squeeze(-1)
         arms = (x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)) * self.follows
@@ -264,7 +264,7 @@ class Solver(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Numbers and root rotation after at most ``steps``; one that raises the cost is undone."""
         best = (q, root, *self.normal(q, self.linear(q, root, p), weight)[:3])
-        damping = q.new_full((len(q), 1), DAMPING)
+        damping, done = q.new_full((len(q), 1), DAMPING), torch.zeros_like(best[2], dtype=torch.bool)
         for _ in range(steps):
             q, root, cost, g, H = best
             scaled = H + torch.diag_embed(damping * torch.diagonal(H, dim1=-2, dim2=-1))
@@ -272,24 +272,29 @@ class Solver(nn.Module):
             root = axis_angle_to_matrix(q[:, :3]) @ root  # the next step starts from no turn
             q = torch.cat([torch.zeros_like(q[:, :3]), q[:, 3:]], dim=1)
             new = (q, root, *self.normal(q, self.linear(q, root, p), weight)[:3])
-            better = new[2] < cost
+            better = (new[2] < cost) & ~done
             best = tuple(
                 torch.where(better.view(-1, *[1] * (a.ndim - 1)), a, b)
                 for a, b in zip(new, best, strict=True)
             )
             damping = torch.where(better[:, None], damping * EASIER, damping * HARDER)
-            if bool((new[2] > cost * (1 - CONVERGED)).all()):
+            # a frame stops by itself, so that its result does not depend on the others
+            done = done | ((new[2] - cost).abs() <= CONVERGED * cost)
+            if bool(done.all()):
                 break
         return best[0], best[1]
 
-    def _last_step(self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor) -> Tensor:
-        """One step whose right side depends on ``p`` and the body; the rest is constant."""
+    def _last_steps(self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor) -> Tensor:
+        """Steps with a fixed matrix, which move a solution by next to nothing; the derivative of
+        their result approaches the solution's own, whose matrix is not Gauss-Newton's."""
         with torch.no_grad():
-            at = self.linear(q, root, p)
-            _, g, H, w = self.normal(q, at, weight)
-        live = self.points(self.transforms(q, root, self.joints), self.landmarks) - p
-        change = ((live - live.detach()) * w.unsqueeze(-1)).flatten(1).unsqueeze(-1)
-        return q + _solved(H, -g - (at.by_number.flatten(2) @ change).squeeze(-1))
+            H = self.normal(q, self.linear(q, root, p), weight)[2]
+        live = torch.is_grad_enabled() and any(
+            x.requires_grad for x in (p, self.joints, self.landmarks)
+        )
+        for _ in range(GRADIENT_STEPS if live else 1):
+            q = q - _solved(H, self.normal(q, self.linear(q, root, p), weight)[1])
+        return q
 
 
 def _spreads(rig: Rig) -> tuple[Tensor, Tensor]:
