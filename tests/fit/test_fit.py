@@ -67,6 +67,10 @@ def test_the_masks_are_filled_better(people, compose):
 def test_held_out_frames_are_solved_by_their_skeleton(fitted, fit, people):
     found = dict(np.load(fitted / "body_pose.npz"))
     assert found["registered"].tolist() == [0, 1, 2]
+    again = fit(name="driven", keep=False)
+    assert again["registered"].tolist() == []
+    np.testing.assert_allclose(again["theta"][3:], found["theta"][3:], atol=1e-5)
+    assert np.abs(again["theta"][:3] - found["theta"][:3]).max() > 1e-3
     assert found["frame_id"].tolist() == [0, 1, 2, 3, 4]
     data = GsganData(str(fitted), size=48)
     shape = {name: torch.from_numpy(x) for name, x in np.load(fitted / "body_shape.npz").items()}

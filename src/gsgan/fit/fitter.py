@@ -36,6 +36,7 @@ class Fit:
     """Settings of the registration, see conf/fit/standard.yaml; docs/data.md has measurements."""
 
     accuracy: Accuracy
+    keep: bool = False
     held_out: bool = False
     least_mask: float = 0.1
     points: int = 3000

@@ -88,9 +88,10 @@ def fit_body(
     shown: int = 4,
     overwrite: bool = False,
 ) -> Path:
-    """Shape from limb lengths, poses solved from skeletons, then registered to the masks.
+    """Shape from skeletons, poses solved from skeletons, then registered to the masks.
 
-    A fit that was stopped resumes from a hidden file in ``out``.
+    The registered poses say where on the body this person's landmarks are. With that all poses are
+    solved again, and written unless the settings keep registered ones. A fit that was stopped resumes from a hidden file in ``out``.
 
     Args:
         data: a capture.
@@ -127,7 +128,9 @@ def fit_body(
     driven = _solve(data, shape, layout.frames)
     theta, transl = driven.theta.clone(), driven.transl.clone()
     report = _report(fitter, BodyPose(theta[rows], transl[rows]).to(device), found)
-    theta[rows], transl[rows] = found.theta.cpu(), found.transl.cpu()
+    kept = settings.held_out or settings.keep
+    if kept:
+        theta[rows], transl[rows] = found.theta.cpu(), found.transl.cpu()
     unit = METRES[layout.meta.unit]
     with writing(folder / SHEET):
         write_atomically(folder / SHEET, fit_picture(fitter, layout.camera_names, found, shown))
@@ -138,7 +141,7 @@ def fit_body(
         theta=theta.numpy(),
         transl=transl.numpy() / unit,
         frame_id=np.array(layout.frames),
-        registered=np.array(moments.frames),
+        registered=np.array(moments.frames if kept else (), np.int64),
         fitted_to=np.array(moments.cameras),
     )
     (folder / STOPPED).unlink(missing_ok=True)

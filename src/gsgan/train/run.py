@@ -150,9 +150,9 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
 
 
 def pose_corrections(data: GsganData, avatar: Avatar) -> PoseCorrections | None:
-    """For an avatar whose G moves with the poses that `gsgan.fit` made; None for all others."""
+    """For an avatar whose G moves with poses that `gsgan.fit` registered; None for all others."""
     poses = data.layout.poses
-    if poses is None or not poses.fitted or not (avatar.body_points or avatar.surface):
+    if poses is None or not poses.registered or not (avatar.body_points or avatar.surface):
         return None
     body = open_body(data.info.body, data.info.body_file, data.info.betas)
     assert body is not None  # the avatar is built on it
