@@ -91,7 +91,8 @@ def fit_body(
     """Shape from skeletons, poses solved from skeletons, then registered to the masks.
 
     The registered poses say where on the body this person's landmarks are. With that all poses are
-    solved again, and written unless the settings keep registered ones. A fit that was stopped resumes from a hidden file in ``out``.
+    solved again, and written unless the settings keep registered ones. A fit that was stopped
+    resumes from a hidden file in ``out``.
 
     Args:
         data: a capture.

@@ -255,6 +255,7 @@ class AvatarTraining(LightningModule):
             body,
             pose_noise=self._pose_noise(frame.skeleton),
             paint=paint,
+            supersample=self.schedule.fine(self.step),
             detach_features=self.step_two.detach_features,
             picture_height=height,
             camera_index=frame.camera_index,
