@@ -85,15 +85,24 @@ class Solver(nn.Module):
     Source: ours.
     """
 
-    joints: Tensor
-    landmarks: Tensor
-    precision: Tensor
-    prior: Tensor
-    least: Tensor
-    matrix: Tensor
-    follows: Tensor
-    jumps: Tensor
-    rest_hubs: Tensor
+    joints: Tensor  # [J, 3] rest
+    landmarks: Tensor  # [33, 3] rest, 0 where not known
+    known: Tensor  # [33] bool
+    precision: Tensor  # [33] of the body's own landmarks
+    prior: Tensor  # [D] precisions
+    least: Tensor  # [D]
+    matrix: Tensor  # [D, 3 T] from numbers to the turns' axis-angles
+    follows: Tensor  # [E, 33, 1] bool, whether a landmark follows an entry's turn
+    jumps: Tensor  # [n, T + 1]
+    before: Tensor  # [T]
+    rest_hubs: Tensor  # [3, 3, 3]
+    rest_hips: Tensor  # [3]
+    joint: Tensor  # of `Rig`, like the others
+    entry_turn: Tensor
+    entry_number: Tensor
+    entry_axis: Tensor
+    carrier: Tensor
+    reaches: Tensor
 
     def __init__(self, body: MarkedBody) -> None:
         super().__init__()
@@ -187,7 +196,7 @@ class Solver(nn.Module):
             bones = torch.stack([middle - first, end - middle], dim=1) @ hubs[:, limb.hub]
             upper, lower = normalize(bones, dim=-1, eps=1e-6).unbind(1)
             axes = limb.axes.to(p)
-            along, flat = axes[2], axes[3]
+            flat, _, along = axes
             swing = _swing(along.expand_as(upper), upper)
             lower = (lower.unsqueeze(1) @ axis_angle_to_matrix(swing)).squeeze(1)
             normal = torch.linalg.cross(along.expand_as(lower), lower)
@@ -263,8 +272,10 @@ class Solver(nn.Module):
         self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor, steps: int = STEPS
     ) -> tuple[Tensor, Tensor]:
         """Numbers and root rotation after at most ``steps``; one that raises the cost is undone."""
+        best: tuple[Tensor, ...]
         best = (q, root, *self.normal(q, self.linear(q, root, p), weight)[:3])
-        damping, done = q.new_full((len(q), 1), DAMPING), torch.zeros_like(best[2], dtype=torch.bool)
+        damping = q.new_full((len(q), 1), DAMPING)
+        done = torch.zeros(len(q), dtype=torch.bool, device=q.device)
         for _ in range(steps):
             q, root, cost, g, H = best
             scaled = H + torch.diag_embed(damping * torch.diagonal(H, dim1=-2, dim2=-1))
