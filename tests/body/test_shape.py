@@ -130,9 +130,8 @@ def test_a_shape_is_stored_as_numbers_and_wrong_ones_are_refused():
             make()
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_shape_is_found_from_skeletons(seed):
-    true = shaped_body(other(seed))
+def test_a_shape_is_found_from_skeletons():
+    true = shaped_body(other(1))
     p = true.posed_landmarks(moving(true))
     shape = fit_shape(p, torch.ones(p.shape[:2]))
     found = shaped_body(shape)
