@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 
 from gsgan.body.rig import rest_axes
-from gsgan.body.shape import STRETCHED, BodyShape, ShapeSpace, free_space
+from gsgan.body.shape import STRETCHED, B, BodyShape, ShapeSpace, free_space
 from gsgan.body.skinned import MarkedBody
 from gsgan.body.solve import Solver
 from gsgan.skeleton import MEDIAPIPE33, sanitise
 from gsgan.utils.errors import DataError
 
-FRAMES = 32  # are enough: every frame shows the same lengths
+FRAMES = 24  # are enough: every frame shows the same lengths
 # Standard deviations of the prior: coefficients have 1.
 STRETCH, OFFSET = 0.1, 0.015  # of a stretch's logarithm; metres
 # Distances of landmarks that no pose changes, or hardly, and those that poses do change; and the
@@ -32,7 +32,7 @@ LENGTH_STEPS, STEPS, POSE_STEPS = 10, 8, 4
 
 
 def fit_shape(
-    skeletons: Tensor, visibility: Tensor, space: ShapeSpace[MarkedBody] | None = None
+    skeletons: Tensor, visibility: Tensor, space: ShapeSpace[B] | None = None
 ) -> BodyShape:
     """The shape of the person whose skeletons these are: deterministic, a second or two.
 
@@ -50,11 +50,10 @@ def fit_shape(
 
     Source: ours.
     """
-    full = free_space() if space is None else space
-    reduced, (p, seen) = _without_surface(full), _usable(skeletons, visibility)
+    reduced = _without_surface(free_space()) if space is None else _without_surface(space)
+    p, seen = _usable(skeletons, visibility)
     x = _fit_lengths(reduced, p, seen)
-    shape = _fit_landmarks(reduced, x, p, seen)
-    return BodyShape(shape.coefficients.float(), shape.stretch.float(), shape.offsets.float())
+    return BodyShape.of_flat(_fit_landmarks(reduced, x, p, seen).flat().float())
 
 
 def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:
@@ -68,13 +67,17 @@ def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:
     return p, valid
 
 
-def _shape(space: ShapeSpace[MarkedBody], x: Tensor) -> BodyShape:
-    """The shape of the numbers: coefficients, logarithms of stretches, offsets made symmetric."""
+def _shape(space: ShapeSpace[B], x: Tensor) -> BodyShape:
+    """The shape of the numbers: coefficients, logarithms of stretches, offsets."""
     K, n = space.coefficients, len(STRETCHED)
-    offsets, across = x[K + n :].view(-1, 3), rest_axes(space.body)[0]
+    return BodyShape(x[:K], x[K : K + n].exp(), _offsets(space, x[K + n :]))
+
+
+def _offsets(space: ShapeSpace[B], values: Tensor) -> Tensor:
+    """``[33, 3]`` from 99 numbers: the mean of both sides."""
+    offsets, across = values.view(-1, 3), rest_axes(space.body)[0]
     mirrored = offsets[list(MEDIAPIPE33.mirror)]
-    mirrored = mirrored - 2 * (mirrored @ across).unsqueeze(-1) * across
-    return BodyShape(x[:K], x[K : K + n].exp(), (offsets + mirrored) / 2)
+    return (offsets + mirrored) / 2 - (mirrored @ across).unsqueeze(-1) * across
 
 
 def _prior(space: ShapeSpace[MarkedBody]) -> Tensor:
@@ -147,6 +150,8 @@ def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Te
     shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
     p = p - shift
     prior, share = _prior(space), min(1.0, INDEPENDENT / len(p))
+    own = space.coefficients + len(STRETCHED)
+    symmetric = torch.func.jacfwd(partial(_offsets, space))(x[own:])
     held: tuple[Tensor, Tensor] | None = None
     for _ in range(STEPS):
         with torch.no_grad():
@@ -159,7 +164,9 @@ def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Te
             _, g, H, w = solver.normal(q, at, weight)
 
         posed = partial(_posed, space, solver, q, root)
-        by_shape = torch.func.jacfwd(posed)(x).flatten(1, 2)  # [F, 99, S]
+        by_body = torch.func.jacfwd(posed)(x[:own], x[own:])
+        turned = solver.transforms(q, root, solver.joints)[:, solver.carrier, :3, :3]
+        by_shape = torch.cat([by_body, turned @ symmetric], dim=-1).flatten(1, 2)  # [F, 99, S]
         w3 = w.repeat_interleave(3, dim=1).unsqueeze(-1)
         J = at.by_number.flatten(2).mT
         cross = J.mT @ (w3 * by_shape)
@@ -173,14 +180,14 @@ def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Te
 
 
 def _posed(
-    space: ShapeSpace[MarkedBody], solver: Solver, q: Tensor, root: Tensor, x: Tensor
+    space: ShapeSpace[B], solver: Solver, q: Tensor, root: Tensor, own: Tensor, offsets: Tensor
 ) -> Tensor:
     """``[F, 33, 3]`` the landmarks of a shape in poses."""
-    body = space.shaped(_shape(space, x))
+    body = space.shaped(_shape(space, torch.cat([own, offsets])))
     return solver.points(solver.transforms(q, root, body.joints), body.landmarks.nan_to_num())
 
 
-def _without_surface(space: ShapeSpace[MarkedBody]) -> ShapeSpace[MarkedBody]:
+def _without_surface(space: ShapeSpace[B]) -> ShapeSpace[MarkedBody]:
     """The space in float64 with one vertex: landmarks are all that is compared."""
     body = space.body
     small = MarkedBody(

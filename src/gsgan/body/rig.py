@@ -19,6 +19,7 @@ from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.template import CHEST, PELVIS
 
 Chain = tuple[tuple[str, float], ...]  # joints, and the share of a number that each one takes
+Axes = tuple[Tensor, Tensor, Tensor]  # along a limb's upper bone, across it, along its lower
 # By role. Twist turns less near the trunk than at the far end, in the forearm up to the wrist.
 FREE: dict[str, Chain] = {
     "spine": (("spine05", 1 / 3), ("spine03", 1 / 3), ("spine01", 1 / 3)),
@@ -60,7 +61,8 @@ class Limb:
         hub: the bone frame that it hangs on, `PELVIS` or `CHEST`.
         points: landmarks of its first, middle and end joint.
         numbers: of the swing's two axes, the twist, and the hinge.
-        axes: ``[4, 3]`` of those two axes, along the upper bone, and across it towards the hinge.
+        axes: ``[3, 3]`` of the swing, the first as near to the hinge as can be; and of the twist,
+            along the upper bone.
         bend: at rest, radians.
     """
 
@@ -111,7 +113,7 @@ class _Turns(list[tuple[int, dict[str, Tensor]]]):
         name = self.chains[role][k][0].format(self.side)
         return self.body.joint_names.index(name) if name in self.body.joint_names else None
 
-    def put(self, role: str, joints: slice = slice(None), **axes: Tensor) -> None:
+    def put(self, role: str, axes: dict[str, Tensor], joints: slice = slice(None)) -> None:
         """One turn for each of a chain's joints that the body has."""
         for k, (_, share) in list(enumerate(self.chains[role]))[joints]:
             if (joint := self.joint(role, k)) is not None:
@@ -133,9 +135,9 @@ def build_rig(body: MarkedBody) -> Rig:
     axes = dict(zip(XYZ, rest_axes(body), strict=True))
     turns = _Turns(body, chains)
     turns.append((0, {f"root_{k}": axis for k, axis in zip(XYZ, torch.eye(3), strict=True)}))
-    turns.put("spine", **{f"spine_{k}": axis for k, axis in axes.items()})
-    turns.put("neck", **{f"neck_{k}": axis for k, axis in axes.items()})
-    limbs: dict[str, tuple[Tensor, Tensor, Tensor]] = {}
+    turns.put("spine", {f"spine_{k}": axis for k, axis in axes.items()})
+    turns.put("neck", {f"neck_{k}": axis for k, axis in axes.items()})
+    limbs: dict[str, Axes] = {}
     for side, letter in SIDES.items():
         of_side = _Turns(body, chains, letter if chains is FREE else side)
         limbs |= _arm(of_side, side, axes) | _leg(of_side, side, axes)
@@ -143,7 +145,7 @@ def build_rig(body: MarkedBody) -> Rig:
     return _rig(body, turns, limbs)
 
 
-def _arm(turns: _Turns, side: str, axes: dict[str, Tensor]) -> dict[str, tuple[Tensor, ...]]:
+def _arm(turns: _Turns, side: str, axes: dict[str, Tensor]) -> dict[str, Axes]:
     along = limb_axes(turns.body)
     upper, lower = (along[turns.joint(role)] for role in ("arm", "forearm"))
     hinge = torch.linalg.cross(upper, lower)
@@ -152,29 +154,29 @@ def _arm(turns: _Turns, side: str, axes: dict[str, Tensor]) -> dict[str, tuple[T
     hinge = normalize(hinge, dim=0)
     flat, across = _across(hinge, upper), torch.linalg.cross(lower, hinge)
     first, named = slice(0, 1), f"{side}_arm"
-    turns.put("collar", **{f"{side}_collar_{k}": axes[k] for k in "yz"})
-    turns.put("arm", first, **{f"{named}_a": flat, f"{named}_b": torch.linalg.cross(upper, flat)})
-    turns.put("arm", **{f"{named}_twist": upper})
-    turns.put("forearm", first, **{f"{side}_elbow": hinge})
-    turns.put("forearm", first, **{f"{side}_elbow_side": across})
-    turns.put("forearm", **{f"{side}_forearm_twist": lower})
-    turns.put("hand", **{f"{side}_wrist_a": hinge, f"{side}_wrist_b": across})
-    turns.put("thumb", **{f"{side}_thumb_{k}": axis for k, axis in axes.items()})
+    turns.put("collar", {f"{side}_collar_{k}": axes[k] for k in "yz"})
+    turns.put("arm", {f"{named}_a": flat, f"{named}_b": torch.linalg.cross(upper, flat)}, first)
+    turns.put("arm", {f"{named}_twist": upper})
+    turns.put("forearm", {f"{side}_elbow": hinge}, first)
+    turns.put("forearm", {f"{side}_elbow_side": across}, first)
+    turns.put("forearm", {f"{side}_forearm_twist": lower})
+    turns.put("hand", {f"{side}_wrist_a": hinge, f"{side}_wrist_b": across})
+    turns.put("thumb", {f"{side}_thumb_{k}": axis for k, axis in axes.items()})
     return {f"{side} arm shoulder elbow wrist": (upper, flat, lower)}
 
 
-def _leg(turns: _Turns, side: str, axes: dict[str, Tensor]) -> dict[str, tuple[Tensor, ...]]:
+def _leg(turns: _Turns, side: str, axes: dict[str, Tensor]) -> dict[str, Axes]:
     along = limb_axes(turns.body)
     thigh, shank = (along[turns.joint(role)] for role in ("thigh", "shank"))
     flat, knee = _across(axes["x"], thigh), _across(axes["x"], shank)
     first, named = slice(0, 1), f"{side}_thigh"
-    turns.put("thigh", first, **{f"{named}_a": flat, f"{named}_b": torch.linalg.cross(thigh, flat)})
-    turns.put("thigh", **{f"{named}_twist": thigh})
-    turns.put("shank", **{f"{side}_knee": knee})
+    turns.put("thigh", {f"{named}_a": flat, f"{named}_b": torch.linalg.cross(thigh, flat)}, first)
+    turns.put("thigh", {f"{named}_twist": thigh})
+    turns.put("shank", {f"{side}_knee": knee})
     tilt = torch.linalg.cross(shank, knee)
-    turns.put("shank", **{f"{side}_knee_side": tilt, f"{side}_shank_twist": shank})
-    turns.put("foot", **{f"{side}_foot_{k}": axis for k, axis in axes.items()})
-    turns.put("toe", **{f"{side}_toe": axes["x"]})
+    turns.put("shank", {f"{side}_knee_side": tilt, f"{side}_shank_twist": shank})
+    turns.put("foot", {f"{side}_foot_{k}": axis for k, axis in axes.items()})
+    turns.put("toe", {f"{side}_toe": axes["x"]})
     return {f"{side} thigh hip knee ankle": (thigh, flat, shank)}
 
 
@@ -193,7 +195,7 @@ def _across(v: Tensor, along: Tensor) -> Tensor:
     return normalize(v - (v @ along) * along, dim=0)
 
 
-def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, tuple[Tensor, ...]]) -> Rig:
+def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, Axes]) -> Rig:
     depth = [0]
     for parent in body.parents[1:]:
         depth.append(depth[parent] + 1)
@@ -236,14 +238,14 @@ def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, tuple[Tensor, ...]]) 
     )
 
 
-def _limb(names: tuple[str, ...], words: str, axes: tuple[Tensor, Tensor, Tensor]) -> Limb:
+def _limb(names: tuple[str, ...], words: str, axes: Axes) -> Limb:
     side, limb, *joints = words.split()
     along, flat, lower = axes
     first, middle, end = (MEDIAPIPE33.names.index(f"{side}_{joint}") for joint in joints)
     numbers = [f"{side}_{limb}_{k}" for k in ("a", "b", "twist")] + [f"{side}_{joints[1]}"]
     a, b, twist, hinge = map(names.index, numbers)
     bend = torch.atan2(torch.linalg.cross(along, lower).norm(), along @ lower)
-    frame = torch.stack([flat, torch.linalg.cross(along, flat), along, flat])
+    frame = torch.stack([flat, torch.linalg.cross(along, flat), along])
     hub = CHEST if limb == "arm" else PELVIS
     return Limb(hub, (first, middle, end), (a, b, twist, hinge), frame, float(bend))
 

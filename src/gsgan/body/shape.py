@@ -19,7 +19,7 @@ from gsgan.body.free import Body, free_body, free_body_path
 from gsgan.body.lbs import blend_transforms, skin
 from gsgan.body.skinned import MarkedBody
 from gsgan.body.smpl import SkinnedModel, read_smpl
-from gsgan.body.smpl_names import fitting_parts
+from gsgan.body.smpl_names import Parts, fitting_parts
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import DataError
 
@@ -204,7 +204,7 @@ def free_space() -> ShapeSpace[Body]:
         ) from error
 
 
-def model_space(model: SkinnedModel, **parts: str) -> ShapeSpace[MarkedBody]:
+def model_space(model: SkinnedModel, parts: Parts = "clothes") -> ShapeSpace[MarkedBody]:
     """The shape space of a body model file: its betas are the coefficients.
 
     Args:
@@ -221,7 +221,7 @@ def model_space(model: SkinnedModel, **parts: str) -> ShapeSpace[MarkedBody]:
         dim=-1,
     )
     found = {"vertices": shown, "joints": shape, "landmarks": landmarks}
-    return ShapeSpace(model.as_body(**parts), {n: d.float() for n, d in found.items()})
+    return ShapeSpace(model.as_body(parts=parts), {n: d.float() for n, d in found.items()})
 
 
 def shaped_body(shape: BodyShape) -> Body:

@@ -188,7 +188,11 @@ class SkinnedModel:
             return joints.new_full((len(MEDIAPIPE33.names), 3), torch.nan), torch.zeros(33).long()
         table = TABLES[self.kind]
         whole = len(vertices) == table.counts[1]
-        p, _ = to_mediapipe33(joints.numpy(), vertices.numpy() if whole else None, self.kind)
+        p, _ = to_mediapipe33(
+            joints.numpy(),
+            vertices.numpy() if whole else None,
+            "smpl" if self.kind == "smpl" else "smplx",
+        )
         first = self.weights.numpy().argmax(axis=1)
         carriers = {name: joint for name, (joint, _) in table.joints.items()}
         if whole:

@@ -17,6 +17,7 @@ from gsgan.body.rig import Rig, ancestors, build_rig
 from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, bone_frames, sanitise
+from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.tensors import constant
 
 # Standard deviation of each number about the rest pose: wide where a joint turns freely, narrow
@@ -54,10 +55,6 @@ DAMPING, EASIER, HARDER = 1e-3, 0.2, 20.0
 FLOOR = 1e-3  # on the diagonal: the root has no prior
 CHUNK = 64  # frames at a time: their matrices fit a processor's cache
 STRAIGHT, SHARP = 0.1, 0.4  # radians: below a bend says nothing of the twist, above all
-# A pair's line this much against the left of toes and nose (a cosine) has its sides swapped.
-OPPOSED = -0.3
-PAIRS = {"hips": (23, 24), "shoulders": (11, 12), "ears": (7, 8), "eyes": (2, 5)}
-TOES, HEELS, NOSE = (31, 32), (29, 30), 0
 
 
 class Linear(NamedTuple):
@@ -85,15 +82,24 @@ class Solver(nn.Module):
     Source: ours.
     """
 
-    joints: Tensor
-    landmarks: Tensor
-    precision: Tensor
-    prior: Tensor
-    least: Tensor
-    matrix: Tensor
-    follows: Tensor
-    jumps: Tensor
-    rest_hubs: Tensor
+    joints: Tensor  # [J, 3] rest
+    landmarks: Tensor  # [33, 3] rest, 0 where not known
+    known: Tensor  # [33] bool
+    precision: Tensor  # [33] of the body's own landmarks
+    prior: Tensor  # [D] precisions
+    least: Tensor  # [D]
+    matrix: Tensor  # [D, 3 T] from numbers to the turns' axis-angles
+    follows: Tensor  # [E, 33, 1] bool, whether a landmark follows an entry's turn
+    jumps: Tensor  # [n, T + 1]
+    before: Tensor  # [T]
+    rest_hubs: Tensor  # [3, 3, 3]
+    rest_hips: Tensor  # [3]
+    joint: Tensor  # of `Rig`, like the others
+    entry_turn: Tensor
+    entry_number: Tensor
+    entry_axis: Tensor
+    carrier: Tensor
+    reaches: Tensor
 
     def __init__(self, body: MarkedBody) -> None:
         super().__init__()
@@ -187,7 +193,7 @@ class Solver(nn.Module):
             bones = torch.stack([middle - first, end - middle], dim=1) @ hubs[:, limb.hub]
             upper, lower = normalize(bones, dim=-1, eps=1e-6).unbind(1)
             axes = limb.axes.to(p)
-            along, flat = axes[2], axes[3]
+            flat, _, along = axes
             swing = _swing(along.expand_as(upper), upper)
             lower = (lower.unsqueeze(1) @ axis_angle_to_matrix(swing)).squeeze(1)
             normal = torch.linalg.cross(along.expand_as(lower), lower)
@@ -263,8 +269,10 @@ class Solver(nn.Module):
         self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor, steps: int = STEPS
     ) -> tuple[Tensor, Tensor]:
         """Numbers and root rotation after at most ``steps``; one that raises the cost is undone."""
+        best: tuple[Tensor, ...]
         best = (q, root, *self.normal(q, self.linear(q, root, p), weight)[:3])
-        damping, done = q.new_full((len(q), 1), DAMPING), torch.zeros_like(best[2], dtype=torch.bool)
+        damping = q.new_full((len(q), 1), DAMPING)
+        done = torch.zeros(len(q), dtype=torch.bool, device=q.device)
         for _ in range(steps):
             q, root, cost, g, H = best
             scaled = H + torch.diag_embed(damping * torch.diagonal(H, dim1=-2, dim2=-1))
@@ -355,36 +363,3 @@ def _left_jacobian(v: Tensor) -> Tensor:
     zero = torch.zeros_like(x)
     K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
     return torch.eye(3).to(v) + a * K + b * (K @ K)
-
-
-# -- left and right
-
-
-def refuse_swapped(p: Tensor, valid: Tensor) -> None:
-    """Refuses skeletons whose left and right are swapped in most frames.
-
-    Toes and nose say where the front is, whatever is called left; with the way from hips to
-    shoulders that gives the left.
-
-    Raises:
-        ValueError: naming the pairs that are swapped.
-    """
-    up = p[:, MEDIAPIPE33.shoulders].mean(1) - p[:, MEDIAPIPE33.hips].mean(1)
-    feet = (p[:, TOES] - p[:, HEELS]) * (valid[:, TOES] & valid[:, HEELS]).unsqueeze(-1)
-    face = p[:, NOSE] - p[:, PAIRS["ears"]].mean(1)
-    face = face * valid[:, (NOSE, *PAIRS["ears"])].all(1, keepdim=True)
-    body_left = torch.linalg.cross(up, normalize(feet.sum(1), dim=-1) + normalize(face, dim=-1))
-    swapped = []
-    for name, pair in PAIRS.items():
-        left = torch.linalg.cross(up, face) if name in ("ears", "eyes") else body_left
-        line = (p[:, pair[0]] - p[:, pair[1]]) * valid[:, pair].all(1, keepdim=True)
-        cosine = (normalize(line, dim=-1) * normalize(left, dim=-1)).sum(-1)
-        told = cosine[cosine != 0]
-        if len(told) and (told < OPPOSED).float().mean() > 0.5:
-            swapped.append(name)
-    if swapped:
-        raise ValueError(
-            f"solve: left and right are swapped: by the direction of toes and nose, the left of "
-            f"{', '.join(swapped)} lies on the person's right; exchange the names, or mirror the "
-            "joints back"
-        )

@@ -25,9 +25,10 @@ from gsgan.body.shape import BodyShape, shaped_body
 from gsgan.body.solve import Solver
 from gsgan.check.overlays import caption
 from gsgan.data.calibration.find import METRES
+from gsgan.data.checks import spans
 from gsgan.data.crop import PersonCrop
 from gsgan.data.datamodule import GsganData
-from gsgan.data.formats.capture import POSES, SHAPE, CaptureReader
+from gsgan.data.formats.capture import LANDMARKS, POSES, SHAPE, CaptureReader
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.moments import Moments
 from gsgan.prepare.pictures import sampled
@@ -37,7 +38,7 @@ from gsgan.skeleton import MEDIAPIPE33
 from gsgan.splat import accuracy
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically
 from gsgan.utils.tensors import pick_device
 
@@ -190,8 +191,12 @@ def _joints(data: GsganData, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
 
 
 def _solve(data: GsganData, shape: BodyShape, frames: Sequence[int]) -> BodyPose:
-    with torch.no_grad():
-        return Solver(shaped_body(shape)).solve(*_joints(data, frames))
+    try:
+        with torch.no_grad():
+            return Solver(shaped_body(shape)).solve(*_joints(data, frames))
+    except ValueError as error:
+        names = f"items are the frames {spans(list(frames))} in order"
+        raise DataError(f"{data.layout.root / LANDMARKS}: {error} ({names})") from None
 
 
 @torch.no_grad()

@@ -150,9 +150,6 @@ class Avatar(nn.Module):
 
         Returns:
             ``[B, 3, H, W]`` RGB in [0, 1].
-
-        Raises:
-            ValueError: see `picture`.
         """
         painting = self.picture(skeleton, camera, visibility=visibility, body=body)
         assert painting.image is not None and painting.alpha is not None  # noqa: PT018
@@ -358,14 +355,9 @@ class Avatar(nn.Module):
             return (painting if maps else painting.only_image()).pasted(window)
 
     def body_pose(self, skeleton: Tensor, visibility: Tensor) -> BodyPose | None:
-        """The body pose of a skeleton ``[B, J, 3]``, finite; None where none is needed.
-
-        Raises:
-            ValueError: see `gsgan.body.solve.Solver.solve`.
-        """
-        if not self.needs_body:
+        """The body pose of skeletons ``[B, J, 3]``, see `Solver.solve`; None if none is needed."""
+        if self.solver is None:
             return None
-        assert self.solver is not None
         with self.stage("solve"), full_precision(skeleton):
             return self.solver.solve(skeleton, visibility)
 
