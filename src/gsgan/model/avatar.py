@@ -142,14 +142,11 @@ class Avatar(nn.Module):
         body: BodyPose | None = None,
         background: float | tuple[float, float, float] = 0.0,
     ) -> Tensor:
-        """The image of a new pose, in the colours of no particular camera.
+        """The image ``[B, 3, H, W]`` of a new pose, RGB in [0, 1], corrected for no camera.
 
         Args:
             skeleton, camera, visibility, body: see `picture`.
             background: RGB in [0, 1], or one number for all three.
-
-        Returns:
-            ``[B, 3, H, W]`` RGB in [0, 1].
         """
         painting = self.picture(skeleton, camera, visibility=visibility, body=body)
         assert painting.image is not None and painting.alpha is not None  # noqa: PT018
