@@ -147,10 +147,6 @@ def place(capture, run, bare, model_file, tmp_path_factory) -> Callable[[str], s
         "/path/to/000000.png": rendered,
         "/path/to/run_wo_gcn": lambda: another_run("run_wo_gcn"),
         "/path/to/run_wo_seg": lambda: another_run("run_wo_seg"),
-        "out=/path/to/capture/landmarks3d_fit.npz": lambda: f"out={folder() / 'fit.npz'}",
-        "data.reader.landmarks=landmarks3d_fit.npz": lambda: (
-            f"data.reader.landmarks={capture / 'landmarks3d.npz'}"
-        ),
         "out=/path/to/capture": lambda: f"out={folder() / 'capture'}",
         "/path/to/capture": lambda: capture,
         "<run folder>": lambda: run,
@@ -251,7 +247,8 @@ def test_every_documented_command_runs(line, place, capture, inside, tmp_path):
     if name == "bench":
         arguments = tiny_bench(arguments, tmp_path, capture)
     if name == "fit":
-        arguments += ["size.picture=32", "fit.shape_steps=2", "fit.sweeps=1", "shown=1"]
+        arguments += ["size.picture=32", "fit.points=200", "fit.surface_steps=2"]
+        arguments += ["fit.sweeps=1", "shown=1", f"out={tmp_path / 'fit'}"]
     if name == "prepare":  # MediaPipe is not at hand: its output is given
         source = next(a for a in arguments if a.startswith("source=")).removeprefix("source=")
         arguments = [a for a in arguments if a != "setup=true"]

@@ -7,7 +7,6 @@ from the trunk. The asset in this package is made by scripts/bake_free_body.py.
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -17,13 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsgan.body.skinned import SkinnedBody, carry
+from gsgan.body.skinned import MarkedBody, carry
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import DataError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Body(SkinnedBody):
+class Body(MarkedBody):
     """The free body: a skinned body with materials and landmarks, unbatched.
 
     A vertex has the part of most of its faces. Hand landmarks are MediaPipe's 21 of the left hand,
@@ -33,16 +32,10 @@ class Body(SkinnedBody):
     face_labels: Tensor  # [F] int64 part of each face, see label_names; 0 is the background
     face_surface: Tensor  # [F] int64 material of each face, see surface_names
     surface_names: tuple[str, ...]  # skin, hair, eye and the garments
-    landmarks: Tensor  # [33, 3] rest positions of the MediaPipe pose landmarks, metres
-    landmark_bone: Tensor  # [33] int64, the joint that each landmark moves with
     landmark_names: tuple[str, ...]
     hand_landmarks: Tensor  # [42, 3] metres
     hand_bone: Tensor  # [42] int64
     hand_names: tuple[str, ...]
-
-    def posed_landmarks(self, pose: BodyPose) -> Tensor:
-        """``[B, 33, 3]`` MediaPipe pose landmarks, metres, world frame."""
-        return carry(self.transforms(pose), self.landmarks, self.landmark_bone)
 
     def posed_hands(self, pose: BodyPose) -> Tensor:
         """``[B, 42, 3]`` MediaPipe hand landmarks, left then right, metres, world frame."""
@@ -115,45 +108,3 @@ def _body(arrays: dict[str, np.ndarray]) -> Body:
         vertex_labels=majority_vertex_labels(faces, face_labels, len(arrays["vertices"])),
         **fields,
     )
-
-
-def open_body(
-    kind: str | None,
-    file: str | None = None,
-    betas: Sequence[float] = (),
-    label_names: Sequence[str] = (),
-) -> SkinnedBody | None:
-    """The body with its part labels, or None when no mesh of it is available.
-
-    A model file gets the set of parts with the names of the images' labels (the free body's,
-    CIHP's, or one part per joint), by default the free body's. Clothes on a model file are a guess,
-    and their names may differ from the images' labels: see `SkinnedBody.shares_labels`.
-
-    Args:
-        kind: "free", "smpl", "smplx", or another name from the data.
-        file: the user's model file; not needed for the free body.
-        betas: shape coefficients of the person.
-        label_names: the parts in the data's label images, background first; empty when unknown.
-
-    Raises:
-        DataError: when the file cannot be read or is of another body.
-    """
-    if kind == "free":
-        return free_body()
-    if kind is None or file is None:
-        return None
-    from gsgan.body.smpl import read_smpl
-    from gsgan.body.smpl_names import fitting_parts
-
-    model = read_smpl(file)
-    if model.kind != kind:
-        raise DataError(
-            f"{file} is a model of kind {model.kind} ({len(model.parents)} joints), but the data's "
-            f"poses are of {kind}; give that model's file"
-        )
-    if len(betas) > model.shapedirs.shape[-1]:
-        raise DataError(
-            f"{file} has {model.shapedirs.shape[-1]} shape coefficients, the data gives "
-            f"{len(betas)}; give the model file that the data was fitted with"
-        )
-    return model.as_body(betas, fitting_parts(tuple(label_names), model.joint_names))

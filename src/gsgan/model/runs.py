@@ -32,7 +32,9 @@ FREE_KEYS = (
     *("data.root", "data.smpl", "data.workers", "data.cache_mb", "data.val_pictures"),
     *("data.source.workers", "training.max_skipped", "training.skip_window", "model.backend"),
 )
-REMOVED_KEYS = ("effects.measure", "data.reader.max_vertex_error")  # in the configs of older runs
+REMOVED_KEYS = (  # in the configs of older runs
+    *("effects.measure", "data.reader.max_vertex_error", "data.reader.landmarks"),
+)
 RENAMED = {  # in the configs of older runs
     "gsgan.training.": "gsgan.train.",
     "gsgan.model.avatar.Avatar": "gsgan.model.assemble.assemble_avatar",

@@ -1,0 +1,56 @@
+"""Left and right of a skeleton: whether they are swapped."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from gsgan.skeleton.template import MEDIAPIPE33
+
+# Cosines: a pair's line against the other pairs', and all lines against the left by feet and head.
+APART, OPPOSED = -0.3, -0.6
+PAIRS = {"hips": (23, 24), "shoulders": (11, 12), "ears": (7, 8), "eyes": (2, 5)}
+NOSE, LEGS = 0, ((25, 27, 29, 31), (26, 28, 30, 32))  # knee, ankle, heel, toes
+
+
+def refuse_swapped(p: Tensor, valid: Tensor) -> None:
+    """Refuses skeletons whose left and right are swapped in most frames.
+
+    Lines from right to left of hips, shoulders, ears and eyes must agree; and with the left as it
+    follows from each foot and its shank, and from nose and eyes, whatever they are called.
+
+    Args:
+        p: ``[B, 33, 3]`` finite.
+        valid: ``[B, 33]`` bool, landmarks that were seen.
+
+    Raises:
+        ValueError: naming the pairs that are swapped.
+    """
+
+    def seen(v: Tensor, joints: tuple[int, ...]) -> Tensor:
+        return v * valid[:, joints].all(1, keepdim=True)
+
+    by_feet = torch.zeros_like(p[:, 0])
+    for knee, ankle, heel, toes in LEGS:
+        left = torch.linalg.cross(p[:, knee] - p[:, ankle], p[:, toes] - p[:, heel])
+        by_feet = by_feet + seen(left, (knee, ankle, heel, toes))
+    ears, eyes = (p[:, PAIRS[name]].mean(1) for name in ("ears", "eyes"))
+    by_head = torch.linalg.cross(eyes - p[:, NOSE], p[:, NOSE] - ears)
+    by_head = seen(by_head, (NOSE, *PAIRS["ears"], *PAIRS["eyes"]))
+    lines = torch.stack([seen(p[:, a] - p[:, b], (a, b)) for a, b in PAIRS.values()], dim=1)
+    lines = normalize(lines, dim=-1)
+    others = normalize(lines.sum(1, keepdim=True) - lines, dim=-1)
+    apart = (lines * others).sum(-1) < APART
+    whole = normalize((lines * ~apart.unsqueeze(-1)).sum(1), dim=-1)
+    left = normalize(by_feet, dim=-1) + normalize(by_head, dim=-1)
+    opposed = (whole * left).sum(-1, keepdim=True) < OPPOSED
+    shown = (lines != 0).any(-1)
+    wrong = ((apart ^ opposed) & shown).sum(0) > 0.5 * shown.sum(0)
+    swapped = [name for name, is_wrong in zip(PAIRS, wrong.tolist(), strict=True) if is_wrong]
+    if swapped:
+        raise ValueError(
+            f"left and right are swapped: by the direction of nose and toes, the left of "
+            f"{', '.join(swapped)} lies on the person's right; exchange the names, or mirror the "
+            "joints back"
+        )
