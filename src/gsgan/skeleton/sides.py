@@ -6,8 +6,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gsgan.skeleton.template import MEDIAPIPE33
-
 # Cosines: a pair's line against the other pairs', and all lines against the left by feet and head.
 APART, OPPOSED = -0.3, -0.6
 PAIRS = {"hips": (23, 24), "shoulders": (11, 12), "ears": (7, 8), "eyes": (2, 5)}
