@@ -6,6 +6,7 @@ COMMANDS = {
     "gsgan.fit": "refine landmarks to fit the masks: data.root=<folder> out=<file.npz>",
     "gsgan.train": "train an avatar, then score it on the held-out splits",
     "gsgan.evaluate": "score a run, run=<folder>, or any method's images, predictions=<folder>",
+    "gsgan.render": "drive an avatar: run=<folder> motion=<file> out=<video.mp4|folder>",
     "gsgan.report": "tables of scored runs, runs=[<folder>,…], and figures of a run, run=<folder>",
     "gsgan.bench": "measure speed and accuracy: raster, speed, trade-off, effects",
 }

@@ -141,6 +141,34 @@ class Avatar(nn.Module):
     ) -> Tensor:
         """The image of a new pose, in the colours of no particular camera.
 
+        Args:
+            skeleton, camera, visibility, body: see `picture`.
+            background: RGB in [0, 1], or one number for all three.
+
+        Returns:
+            ``[B, 3, H, W]`` RGB in [0, 1].
+
+        Raises:
+            GsganError, ValueError: see `picture`.
+        """
+        painting = self.picture(skeleton, camera, visibility=visibility, body=body)
+        assert painting.image is not None and painting.alpha is not None  # noqa: PT018
+        colour = painting.image.new_tensor(background).expand(3).view(1, 3, 1, 1)
+        image = painting.image.clamp(0, 1)
+        return (image + (1 - painting.alpha.clamp(0, 1)) * colour).clamp(0, 1)
+
+    @torch.no_grad()
+    def picture(
+        self,
+        skeleton: Tensor,
+        camera: Camera,
+        *,
+        visibility: Tensor | None = None,
+        body: BodyPose | None = None,
+        camera_index: Tensor | None = None,
+    ) -> Painting:
+        """Image and alpha of a new pose.
+
         Convention: inputs are moved to the avatar's device, where the image stays.
 
         Args:
@@ -148,10 +176,10 @@ class Avatar(nn.Module):
             camera: B cameras, or one for all.
             visibility: ``[J]`` or ``[B, J]`` in [0, 1]; 0 marks a stand-in; None: all seen.
             body: B poses of the skinned body, where the avatar was trained with one.
-            background: RGB in [0, 1], or one number for all three.
+            camera_index: ``[B]`` cameras whose colours to correct for; None corrects nothing.
 
         Returns:
-            ``[B, 3, H, W]`` RGB in [0, 1].
+            A painting of image and alpha alone, not clamped.
 
         Raises:
             GsganError: when the avatar needs a body pose and none is given.
@@ -174,11 +202,8 @@ class Avatar(nn.Module):
             raise ValueError(f"render: expected 1 or {len(p)} cameras, got {len(camera)}")
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
         body = None if body is None else body.to(device)
-        painting = self._paint(p, seen, cameras.to(device), body, maps=False)
-        assert painting.image is not None and painting.alpha is not None  # noqa: PT018
-        colour = p.new_tensor(background).expand(3).view(1, 3, 1, 1)
-        image = painting.image.clamp(0, 1)
-        return (image + (1 - painting.alpha.clamp(0, 1)) * colour).clamp(0, 1)
+        index = None if camera_index is None else camera_index.to(device)
+        return self._paint(p, seen, cameras.to(device), body, index, maps=False).only_image()
 
     def forward(
         self,

@@ -168,6 +168,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 def scene_of(plain: Mapping[str, Any]) -> SceneInfo:
     """The facts about a scene that a checkpoint holds as plain values."""
+    from gsgan.data.figure import Figure
     from gsgan.data.scene_info import SceneInfo
     from gsgan.data.surface_colours import SurfaceColours
 
@@ -176,6 +177,8 @@ def scene_of(plain: Mapping[str, Any]) -> SceneInfo:
     }
     if values["surface"] is not None:
         values["surface"] = SurfaceColours(**values["surface"])
+    if values.get("figure") is not None:
+        values["figure"] = Figure(**values["figure"])
     return SceneInfo(**values)
 
 
