@@ -232,8 +232,9 @@ def _landmark_row(path: Path, number: int, frame: Any) -> Float:
     """``[33, 4]`` x, y, z, visibility of a frame; NaN and 0 where nobody was found."""
     found = frame
     if isinstance(frame, dict):
-        found = next((frame[key] for key in WORLD_KEYS if key in frame), None)
-        if found is None:
+        key = next((key for key in WORLD_KEYS if key in frame), None)
+        found = frame.get(key)
+        if key is None:
             raise DataError(
                 f"{path}, frame {number}: no pose_world_landmarks; the other landmarks of "
                 "MediaPipe are of the image, without depth in metres"

@@ -292,10 +292,10 @@ def _cameras(config: DictConfig, run: Run, drive: Drive) -> tuple[Camera, Tensor
     trained = run.stored.data.size
     if drive.camera is not None:
         camera, index = drive.camera
-        if config.size is not None:
-            camera = camera.resize((whole("size", config.size, 1),) * 2)
+        if config.pixels is not None:
+            camera = camera.resize((whole("pixels", config.pixels, 1),) * 2)
         return camera, index
-    size = whole("size", config.size or trained or 512, 1)
+    size = whole("pixels", config.pixels or trained or 512, 1)
     name = config.camera or "orbit"
     if name == "orbit":
         orbit = views.Orbit(**OmegaConf.to_container(config.orbit))  # type: ignore[arg-type]
@@ -336,7 +336,7 @@ def _image(
         assert drive.truth is not None
         frame = drive.truth(i)
         if frame.camera.size != camera.size:
-            raise ConfigError("compare=truth shows images of the data's size; leave size out")
+            raise ConfigError("compare=truth shows images of the data's size; leave pixels out")
         held.insert(0, (frame.image[0], frame.mask[0]))
     return np.concatenate([eight_bits(*pair, paint_on(camera.size)) for pair in held], axis=1)
 
@@ -350,6 +350,7 @@ def _record(config: DictConfig, run: Run, drive: Drive, cameras: Camera) -> dict
     for part in parts:
         hashed.update(np.ascontiguousarray(part).tobytes())
     return {
+        "run": str(run.folder.resolve()),
         "drive": drive.text,
         "frames": drive.numbers,
         "size": list(cameras.size),

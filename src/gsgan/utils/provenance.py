@@ -155,10 +155,11 @@ def verify(path: Path) -> Provenance:
         raise DataError(f"{path} is of no format that carries its origin: {', '.join(MIMES)}")
     try:
         data = path.read_bytes()
-        xmp = _mp4_xmp(data) if mime == "video/mp4" else _image_xmp(data)
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from None
-    except (ValueError, struct.error, SyntaxError):
+    try:
+        xmp = _mp4_xmp(data) if mime == "video/mp4" else _image_xmp(data)
+    except (OSError, ValueError, struct.error, SyntaxError):
         raise DataError(f"{path} is damaged or no {mime} file") from None
     credentials, unread = _credentials(data, mime)
     kind, tool = _property(xmp, "DigitalSourceType"), _property(xmp, "CreatorTool")
