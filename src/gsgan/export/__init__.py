@@ -1,0 +1,1 @@
+"""``gsgan.export``: an avatar in the formats of other programs."""
