@@ -166,6 +166,7 @@ class Avatar(nn.Module):
         visibility: Tensor | None = None,
         body: BodyPose | None = None,
         camera_index: Tensor | None = None,
+        maps: bool = False,
     ) -> Painting:
         """Image and alpha of a new pose.
 
@@ -177,9 +178,10 @@ class Avatar(nn.Module):
             visibility: ``[J]`` or ``[B, J]`` in [0, 1]; 0 marks a stand-in; None: all seen.
             body: B poses of the skinned body, where the avatar was trained with one.
             camera_index: ``[B]`` cameras whose colours to correct for; None corrects nothing.
+            maps: keep the maps that led to the image, and the Gaussians.
 
         Returns:
-            A painting of image and alpha alone, not clamped.
+            A painting of image and alpha alone, unless maps are kept; not clamped.
 
         Raises:
             GsganError: when the avatar needs a body pose and none is given.
@@ -203,7 +205,8 @@ class Avatar(nn.Module):
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
         body = None if body is None else body.to(device)
         index = None if camera_index is None else camera_index.to(device)
-        return self._paint(p, seen, cameras.to(device), body, index, maps=False).only_image()
+        painting = self._paint(p, seen, cameras.to(device), body, index, maps=maps)
+        return painting if maps else painting.only_image()
 
     def forward(
         self,
