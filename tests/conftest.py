@@ -174,3 +174,29 @@ def run(capture: Path, shared, tmp_path_factory: pytest.TempPathFactory) -> Path
         assert "marked: perceptual loss" in result.stdout
 
     return shutil.copytree(shared("run", make), tmp_path_factory.mktemp("runs") / "one")
+
+
+@pytest.fixture(scope="session")
+def bare_run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run folder as training leaves it, but of an untrained avatar that needs no body pose."""
+    from dataclasses import asdict
+
+    from omegaconf import OmegaConf
+
+    from gsgan.model.runs import build_avatar, build_data
+
+    folder = tmp_path_factory.mktemp("runs") / "bare"
+    given = ("model=wo_seg", "effects.body_points=off", f"data.root={capture}")
+    config = composed("train", *TINY, *given)
+    data = build_data(config)
+    avatar = build_avatar(config, data)
+    facts = {"step": 0, "averaged": False, "marks": [], "effects": avatar.effects.plain()}
+    state = {f"avatar.{name}": value for name, value in avatar.state_dict().items()}
+    (folder / ".hydra").mkdir(parents=True)
+    (folder / "checkpoints").mkdir()
+    OmegaConf.save(config, folder / ".hydra" / "config.yaml")
+    torch.save(
+        {"gsgan": facts | {"scene": asdict(data.info)}, "state_dict": state},
+        folder / "checkpoints" / "last.ckpt",
+    )
+    return folder

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import logging
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -37,7 +40,7 @@ def view_config(config: DictConfig) -> None:
     console.print(viewer.show.drive.text, markup=False, highlight=False)
     console.print(f"open http://{host}:{port} in a browser; end with Ctrl+C", highlight=False)
     try:
-        threading.Event().wait()
+        viewer.serve()
     finally:
         viewer.stop()
 
@@ -62,7 +65,9 @@ class Viewer:
         rate = float(above("rate", config.rate))
         self.show = Show(self.run.avatar, drive, read, behind, size, fps, rate)
         host, port = str(config.host), whole("port", config.port, 0)
-        self.server = viser.ViserServer(host, port, label="gsgan", verbose=False)
+        logging.getLogger("websockets").setLevel(logging.WARNING)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
+            self.server = viser.ViserServer(host, port, label="gsgan", verbose=False)
         # viser's button for a public address would show the avatar to anyone
         self.server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
         self.server.gui.configure_theme(show_share_button=False, control_width="medium")
@@ -74,6 +79,10 @@ class Viewer:
         self.server.on_client_disconnect(lambda client: self.sessions.pop(client.client_id, None))
         self._painter = threading.Thread(target=self._paint, daemon=True, name="painting")
         self._painter.start()
+
+    def serve(self) -> None:
+        """Waits until interrupted."""
+        threading.Event().wait()
 
     def stop(self) -> None:
         """Ends the server and its thread."""
@@ -143,6 +152,9 @@ def _bound_uploads(client: Any, limit: int) -> None:
         state = held.get(message.transfer_uuid)
         if state and max(state["total_bytes"], state["transferred_bytes"]) > limit:
             held.pop(message.transfer_uuid)
+            total = state["total_bytes"]  # the browser stops waiting
+            ends = message.source_component_uuid, message.transfer_uuid, total, total
+            connection.queue_message(_messages.FileTransferPartAck(*ends))
             text = f"A motion file may have {limit // MEGABYTE} MB at most."
             client.add_notification("This file is too large", text, color="red")
 

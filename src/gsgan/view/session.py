@@ -73,6 +73,7 @@ class Session:
         self.seconds = 0.0  # of a full image
         self.times: deque[float] = deque(maxlen=200)
         self.image: NDArray[np.uint8] | None = None
+        self._problem = ""  # that the page shows
         self._drawn: tuple[Any, ...] | None = None  # the pose and what is shown of it in 3D
         self._nodes: list[Any] = []
         self._gizmos: dict[str, Any] = {}
@@ -197,13 +198,16 @@ class Session:
         share = 1.0
         if moving and self.seconds:
             share = min(1.0, max(SMALLEST, (1 / self.show.rate / self.seconds) ** 0.5))
-        self.painted = now
+        self.painted, self.full = now, False
         try:
             self._paint(share)
         except (GsganError, ValueError) as error:
-            self._warn("This pose cannot be painted", str(error))
+            if self._problem != str(error):  # once, not for every image
+                self._problem = str(error)
+                self._warn("This pose cannot be painted", self._problem)
             self.play.value, self.full = False, True
             return False
+        self._problem = ""
         self.full = share == 1
         took = time.monotonic() - now
         whole = took / share**2
