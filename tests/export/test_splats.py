@@ -100,7 +100,7 @@ def test_a_ply_read_back_is_the_gaussians(case, posed):
 
 def test_a_ply_drawn_is_step_ones_image(posed):
     avatar, frame = posed(*CASES["densify"])
-    splats, truth = splats_and_truth(avatar, frame)
+    splats, _ = splats_and_truth(avatar, frame)
     read = read_ply(ply_bytes(splats))
     view = read.means - frame.camera.centre[:, None]
     colour = sh_to_colour(read.features.unflatten(-1, (16, 3)), view).clamp_min(0)

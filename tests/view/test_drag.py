@@ -35,7 +35,7 @@ def test_a_joint_goes_to_the_pointer_where_bones_reach(name):
     if limb:  # towards the joint that stays
         target = start + 0.2 * (REST[HANDLES[name].chain[0]] - start)
     elif name == BODY:
-        target = start + [1.0, 2.0, 3.0]
+        target = start + np.array([1.0, 2.0, 3.0])
     else:  # on the sphere about the joint before it
         pivot = (REST[11] + REST[12]) / 2 if name == HEAD else REST[HANDLES[name].chain[0]]
         side = start - pivot

@@ -46,7 +46,9 @@ def inputs_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor, Bod
         GsganError: when the avatar needs a body pose and the motion has none.
         ValueError: when too few shoulders and hips are known.
     """
-    p, known = sanitise(torch.from_numpy(drive.p[i : i + 1]).float(), None, body_height=avatar.limb_length_sum)
+    p, known = sanitise(
+        torch.from_numpy(drive.p[i : i + 1]).float(), None, body_height=avatar.limb_length_sum
+    )
     body = None
     if avatar.needs_body:
         if drive.body is None:

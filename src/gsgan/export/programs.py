@@ -109,7 +109,9 @@ class Painter(nn.Module):
     def __init__(self, avatar: Avatar) -> None:
         super().__init__()
         if avatar.generator is None:
-            raise ConfigError("this avatar has no generator to export: its image is Step I's colour")
+            raise ConfigError(
+                "this avatar has no generator to export: its image is Step I's colour"
+            )
         self.splats = avatar.splat_channels > 0
         self.pose_encoder, self.generator = avatar.pose_encoder, avatar.generator
         classes = 0 if avatar.segmentation is None else avatar.segmentation.classes

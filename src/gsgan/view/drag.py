@@ -32,12 +32,17 @@ class Handle:
     moved: tuple[int, ...] = ()
 
 
+SIDES = (("left", 11, 13, 15, 23, 25, 27), ("right", 12, 14, 16, 24, 26, 28))
 HANDLES = {
-    **{f"{s} wrist": Handle((11 + i, 13 + i, w), HANDS[w]) for i, s, w in ((0, "left", 15), (1, "right", 16))},
-    **{f"{s} elbow": Handle((11 + i, 13 + i), (), (w, *HANDS[w])) for i, s, w in ((0, "left", 15), (1, "right", 16))},
-    **{f"{s} ankle": Handle((23 + i, 25 + i, a), FEET[a]) for i, s, a in ((0, "left", 27), (1, "right", 28))},
-    **{f"{s} knee": Handle((23 + i, 25 + i), (), (a, *FEET[a])) for i, s, a in ((0, "left", 27), (1, "right", 28))},
-}  # fmt: skip
+    f"{side} {name}": handle
+    for side, shoulder, elbow, wrist, hip, knee, ankle in SIDES
+    for name, handle in {
+        "wrist": Handle((shoulder, elbow, wrist), turned=HANDS[wrist]),
+        "elbow": Handle((shoulder, elbow), moved=(wrist, *HANDS[wrist])),
+        "ankle": Handle((hip, knee, ankle), turned=FEET[ankle]),
+        "knee": Handle((hip, knee), moved=(ankle, *FEET[ankle])),
+    }.items()
+}
 NOSE, HEAD, BODY = 0, "head", "body"
 NAMES = (*HANDLES, HEAD, BODY)
 

@@ -119,7 +119,9 @@ def fitted(image: Bytes, aspect: float) -> Bytes:
     its height."""
     height, width = image.shape[:2]
     want: Sequence[int] = (
-        (height, round(height * aspect)) if aspect * height >= width else (round(width / aspect), width)
+        (height, round(height * aspect))
+        if aspect * height >= width
+        else (round(width / aspect), width)
     )
     room = [(b - a) // 2 for a, b in zip((height, width), want, strict=True)]
     sides = [(r, b - a - r) for r, a, b in zip(room, (height, width), want, strict=True)]

@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 
 from gsgan.export.motion import inputs_of
 from gsgan.model.avatar import Avatar
-from gsgan.render.run import Drive
 from gsgan.model.painting import Painting
+from gsgan.render.images import eight_bits
+from gsgan.render.run import Drive
 from gsgan.scene import Camera
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import GsganError
@@ -131,7 +132,9 @@ class Session:
                 path.write_bytes(file.content)
                 drive = self.show.read(path)
         except Exception as error:  # of a file by anyone: the server must live
-            text = str(error) if isinstance(error, GsganError) else f"{type(error).__name__}: {error}"
+            text = (
+                str(error) if isinstance(error, GsganError) else f"{type(error).__name__}: {error}"
+            )
             self._warn("This motion cannot be used", text.replace(folder + "/", ""))
             return
         self.drive, self.told.content = drive, drive.text
@@ -146,7 +149,9 @@ class Session:
     def _save(self) -> None:
         if self.image is not None:
             name = f"gsgan_{self.frame:06d}.png"
-            self.client.send_file_download(name, png_bytes(Image.fromarray(self.image)), save_immediately=True)
+            self.client.send_file_download(
+                name, png_bytes(Image.fromarray(self.image)), save_immediately=True
+            )
 
     # -- dragging
 
@@ -225,7 +230,8 @@ class Session:
         R = Rotation.from_quat([x, y, z, w]).as_matrix().T
         K = [[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1]]
         t = -R @ view.position
-        return Camera(*(torch.tensor(np.array(a), dtype=torch.float32)[None] for a in (K, R, t)), size)
+        world = [torch.tensor(np.array(a), dtype=torch.float32)[None] for a in (K, R, t)]
+        return Camera(world[0], world[1], world[2], size)
 
     def _paint(self, share: float) -> None:
         avatar, layer = self.show.avatar, self.layer.value
@@ -247,19 +253,26 @@ class Session:
         image = shown(layer, painting, camera, avatar, behind, int(self.channel.value), truth)
         self.image = image
         whole = fitted(image, self.client.camera.aspect) if truth is not None else image
+        if self.splats.value and painting.gaussians is not None:  # the browser draws them instead
+            whole = eight_bits(behind, torch.ones(1), behind)
         self.client.scene.set_background_image(whole, "jpeg", jpeg_quality=90)
         self._place(painting)
         self.times.append(time.monotonic())
         recent = [x for x in self.times if x > self.times[-1] - SPEED_OVER]
         rate = (len(recent) - 1) / max(recent[-1] - recent[0], 1e-6)
         height, width = image.shape[:2]
-        self.status.value = f"{rate:.1f} at {width} × {height}"
+        shown_rate = f"{rate:.1f} at " if len(recent) > 1 else ""
+        self.status.value = f"{shown_rate}{width} × {height}"
 
     def _place(self, painting: Painting) -> None:
-        """Draws skeleton and Gaussians, and moves the handles of a pose that is not being dragged."""
+        """Draws skeleton and Gaussians, and moves the handles unless they are being dragged."""
         scene, p, splats = self.client.scene, self.joints(), painting.gaussians
         wanted = self.bones.value, self.splats.value and splats is not None
-        if self._drawn is not None and self._drawn[1:] == wanted and np.array_equal(self._drawn[0], p):
+        if (
+            self._drawn is not None
+            and self._drawn[1:] == wanted
+            and np.array_equal(self._drawn[0], p)
+        ):
             return
         self._drawn = (p, *wanted)
         for node in self._nodes:
