@@ -177,26 +177,13 @@ def run(capture: Path, shared, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 @pytest.fixture(scope="session")
-def bare_run(capture: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run folder as training leaves it, but of an untrained avatar that needs no body pose."""
-    from dataclasses import asdict
+def bare(capture: Path, shared, tmp_path_factory) -> Path:
+    """A tiny run whose avatar is driven by skeletons alone."""
+    from commands import train
 
-    from omegaconf import OmegaConf
+    def make(folder: Path) -> None:
+        off = ("model=wo_seg", "effects.body_points=off", "evaluate=false")
+        result = train(capture, folder, *off)
+        assert result.returncode == 0, result.stdout + result.stderr
 
-    from gsgan.model.runs import build_avatar, build_data
-
-    folder = tmp_path_factory.mktemp("runs") / "bare"
-    given = ("model=wo_seg", "effects.body_points=off", f"data.root={capture}")
-    config = composed("train", *TINY, *given)
-    data = build_data(config)
-    avatar = build_avatar(config, data)
-    facts = {"step": 0, "averaged": False, "marks": [], "effects": avatar.effects.plain()}
-    state = {f"avatar.{name}": value for name, value in avatar.state_dict().items()}
-    (folder / ".hydra").mkdir(parents=True)
-    (folder / "checkpoints").mkdir()
-    OmegaConf.save(config, folder / ".hydra" / "config.yaml")
-    torch.save(
-        {"gsgan": facts | {"scene": asdict(data.info)}, "state_dict": state},
-        folder / "checkpoints" / "last.ckpt",
-    )
-    return folder
+    return shutil.copytree(shared("bare", make), tmp_path_factory.mktemp("runs") / "bare")

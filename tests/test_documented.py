@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commands import ROOT, TINY
 
@@ -68,7 +69,7 @@ def model_file(shared) -> Callable[[str], Path]:
 
 
 @pytest.fixture
-def place(capture, run, model_file, tmp_path_factory) -> Callable[[str], str]:
+def place(capture, run, bare, model_file, tmp_path_factory) -> Callable[[str], str]:
     """Puts real, tiny files in the place of a documented line's placeholders."""
 
     def folder() -> Path:
@@ -123,7 +124,27 @@ def place(capture, run, model_file, tmp_path_factory) -> Callable[[str], str]:
     def another_run(name: str) -> Path:
         return Path(shutil.copytree(run, folder() / name))
 
+    def moving(name: str) -> Path:
+        from mannequin import mannequin, write_bvh
+
+        from gsgan.data.synthetic.motion import Choreography
+
+        person = mannequin()
+        return write_bvh(folder() / name, person, Choreography(person).at(np.ones(2)), 1 / 30)
+
+    def rendered() -> Path:
+        from PIL import Image
+
+        from gsgan.utils.provenance import png_bytes
+
+        path = folder() / "000000.png"
+        path.write_bytes(png_bytes(Image.new("RGB", (8, 8))))
+        return path
+
     makers: dict[str, Callable[[], Path | str]] = {
+        "gsgan.render run=<run folder>": lambda: f"gsgan.render run={bare}",
+        "/path/to/dance.bvh": lambda: moving("dance.bvh"),
+        "/path/to/000000.png": rendered,
         "/path/to/run_wo_gcn": lambda: another_run("run_wo_gcn"),
         "/path/to/run_wo_seg": lambda: another_run("run_wo_seg"),
         "out=/path/to/capture/landmarks3d_fit.npz": lambda: f"out={folder() / 'fit.npz'}",

@@ -9,9 +9,9 @@ from PIL import Image
 from gsgan.utils.provenance import png_bytes
 
 
-def test_a_sequence_of_ply_files_and_its_card(bare_run, tmp_path, inside):
+def test_a_sequence_of_ply_files_and_its_card(bare, tmp_path, inside):
     out = tmp_path / "poses"
-    given = [f"run={bare_run}", f"out={out}", "motion=novel_pose"]
+    given = [f"run={bare}", f"out={out}", "motion=novel_pose"]
     result = inside("export", *given)
     assert result.returncode == 0, result.stderr
     files = sorted(path.name for path in out.iterdir())
@@ -29,9 +29,9 @@ def test_a_sequence_of_ply_files_and_its_card(bare_run, tmp_path, inside):
     assert "license: cc-by-nc-4.0" in (out / "MODEL_CARD.md").read_text()
 
 
-def test_the_rest_pose_as_glb(bare_run, tmp_path, inside):
+def test_the_rest_pose_as_glb(bare, tmp_path, inside):
     out = tmp_path / "rest.glb"
-    result = inside("export", f"run={bare_run}", "format=gltf", f"out={out}")
+    result = inside("export", f"run={bare}", "format=gltf", f"out={out}")
     assert result.returncode == 0, result.stderr
     assert out.read_bytes()[:4] == b"glTF"
     assert "KHR_gaussian_splatting" in (tmp_path / "rest.MODEL_CARD.md").read_text()
@@ -67,8 +67,8 @@ def test_verify_reads_a_file(tmp_path, inside):
         (("out=a.glb", "format=gltf", "fps=0", "motion=novel_pose"), ("fps",)),
     ],
 )
-def test_refusals(given, words, bare_run, tmp_path, inside):
-    refused(inside("export", f"run={bare_run}", *given), *words)
+def test_refusals(given, words, bare, tmp_path, inside):
+    refused(inside("export", f"run={bare}", *given), *words)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,9 +1,6 @@
-"""Motions of the free body in every format, and a run whose avatar needs no body pose."""
+"""A motion of the free body, its landmarks and proportions."""
 
 from __future__ import annotations
-
-import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,16 +35,3 @@ def landmarks(dance) -> np.ndarray:
 def figure(landmarks):
     p = torch.from_numpy(landmarks)
     return figure_of(p, torch.ones(p.shape[:2], dtype=torch.bool), "z")
-
-
-@pytest.fixture(scope="session")
-def bare(capture: Path, shared, tmp_path_factory) -> Path:
-    """A tiny run whose avatar is driven by skeletons alone."""
-    from commands import train
-
-    def make(folder: Path) -> None:
-        off = ("model=wo_seg", "effects.body_points=off", "evaluate=false")
-        result = train(capture, folder, *off)
-        assert result.returncode == 0, result.stdout + result.stderr
-
-    return shutil.copytree(shared("bare", make), tmp_path_factory.mktemp("runs") / "bare")

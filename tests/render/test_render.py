@@ -56,9 +56,14 @@ def expected(run: Path, split: str, background: str) -> dict[tuple[str, int], np
     return found
 
 
-@pytest.mark.parametrize("name", ["bare", "run"])
-@pytest.mark.parametrize("background", ["black", "white"])
-@pytest.mark.parametrize("split", ["novel_pose", "novel_view"])
+@pytest.mark.parametrize(
+    ("name", "background", "split"),
+    [
+        ("bare", "black", "novel_pose"),
+        ("bare", "white", "novel_view"),
+        ("run", "white", "novel_pose"),
+    ],
+)
 def test_held_out_frames_are_the_scored_images(inside, tmp_path, request, name, background, split):
     """Byte for byte."""
     folder = request.getfixturevalue(name)
@@ -147,7 +152,7 @@ def test_a_video_and_the_truth_beside_it(render, tmp_path):
 
 def test_a_killed_render_goes_on(render, motion, tmp_path, monkeypatch):
     """Frames that are there are not painted again; the video appears whole."""
-    pytest.importorskip("av")
+    av = pytest.importorskip("av")
     from gsgan.model.avatar import Avatar
 
     painted, paint = [], Avatar.picture
@@ -163,18 +168,20 @@ def test_a_killed_render_goes_on(render, motion, tmp_path, monkeypatch):
     result = render(*given)
     assert result.returncode == 130
     assert not (tmp_path / "a.mp4").exists()
-    kept = {p: p.stat().st_mtime_ns for p in (tmp_path / ".a.mp4.frames").glob("*.png")}
+    kept = {p: read(p) for p in (tmp_path / ".a.mp4.frames").glob("*.png")}
     assert len(kept) == 5
     stop = -1
     result = render(*given)
     assert result.returncode == 0, result.stderr
     assert "5 of 12 frames are there already" in result.stdout
     assert len(painted) == 12
-    whole = (tmp_path / "a.mp4").read_bytes()
-    assert render(f"motion={motion}", "out=b.mp4").returncode == 0
-    assert (tmp_path / "b.mp4").read_bytes() == whole
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert len(list(container.decode(video=0))) == 12
     painted.clear()
     assert render(f"motion={motion}", "out=frames").returncode == 0
+    again = {p.name: read(p) for p in (tmp_path / "frames").glob("*.png")}
+    for path, pixels in kept.items():
+        np.testing.assert_array_equal(again[path.name], pixels)
     assert render(f"motion={motion}", "out=frames").returncode == 0
     assert len(painted) == 12
     refused(render(f"motion={motion}", "out=frames", "background=red"), "of another render")

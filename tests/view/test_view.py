@@ -21,12 +21,12 @@ PATIENCE = 60.0  # seconds
 
 
 @pytest.fixture(scope="module")
-def viewer(bare_run):
+def viewer(bare):
     from conftest import composed
 
     from gsgan.view.server import Viewer
 
-    given = (f"run={bare_run}", "port=0", "device=cpu", "max_upload=1", "background=white")
+    given = (f"run={bare}", "port=0", "device=cpu", "max_upload=1", "background=white")
     made = Viewer(composed("view", *given))
     yield made
     made.stop()

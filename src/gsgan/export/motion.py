@@ -11,7 +11,8 @@ from torch import Tensor
 
 from gsgan.data.figure import HEELS_AND_TOES, Figure, upright
 from gsgan.model.avatar import Avatar
-from gsgan.render.run import Drive, Run, _drive
+from gsgan.render.run import Drive, Run
+from gsgan.render.run import drive_of as rendered
 from gsgan.scene import BodyPose
 from gsgan.skeleton import sanitise
 from gsgan.utils.config import config_folder
@@ -29,7 +30,7 @@ def drive_of(config: DictConfig, run: Run, fps: float) -> Drive:
     options = OmegaConf.load(config_folder() / "render.yaml")
     options = OmegaConf.create({k: v for k, v in options.items() if k not in ("defaults", "hydra")})
     given = {key: value for key, value in config.items() if key in options}
-    return _drive(cast(DictConfig, OmegaConf.merge(options, given)), run, fps)
+    return rendered(cast(DictConfig, OmegaConf.merge(options, given)), run, fps)
 
 
 def rest_pose(figure: Figure) -> Drive:

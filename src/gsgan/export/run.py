@@ -43,7 +43,10 @@ def export_config(config: DictConfig) -> None:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     if config.verify is not None:
-        for line in verify(Path(config.verify).expanduser()).lines():
+        path = Path(config.verify).expanduser()
+        found = verify(path)
+        state = "marked as synthetic" if found.synthetic else "not marked as synthetic"
+        for line in (f"{path.name}: {state}", *found.lines()):
             tell(line)
         return
     kind = one_of("format", config.format, tuple(ENDINGS))

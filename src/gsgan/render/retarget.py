@@ -19,6 +19,7 @@ from gsgan.data.figure import (
     HIPS,
     LEGS,
     SHOULDERS,
+    TO_STANDARD,
     Figure,
     hand_frame,
     length,
@@ -26,11 +27,13 @@ from gsgan.data.figure import (
     part_frame,
 )
 from gsgan.data.synthetic.bvh import StandardMotion, drift, floor_under
-from gsgan.data.synthetic.retarget import rotation
+from gsgan.data.synthetic.retarget import axis_angle, between, rotation
 from gsgan.skeleton import bone_frames
-from gsgan.skeleton.template import HEAD, PELVIS
+from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 
 Float = NDArray[np.float64]
+
+NECK = 0.45  # radians that a neck bends from rest at most: detectors put faces too far forward
 
 
 def unit(v: Float) -> Float:
@@ -60,7 +63,10 @@ def on_figure(p: Float, figure: Figure) -> Float:
         turn = _foot_frame(p, ankle) @ _foot_frame(rest, ankle).T
         q[:, feet] = q[:, ankle, None] + (rest[list(feet)] - rest[ankle]) @ turn.mT
     neck = middle(rest, EARS) - middle(rest, SHOULDERS)
-    ears = chest + unit(middle(p, EARS) - middle(p, SHOULDERS)) * np.linalg.norm(neck)
+    level = bone_frames(torch.from_numpy(p)).hubs[:, CHEST].numpy() @ (TO_STANDARD.T @ neck)
+    bend = axis_angle(between(level, middle(p, EARS) - middle(p, SHOULDERS)))
+    most = NECK / np.maximum(np.linalg.norm(bend, axis=-1, keepdims=True), NECK)
+    ears = chest + (rotation(bend * most) @ level[..., None])[..., 0]
     turn = _head_frame(p) @ _head_frame(rest[None]).mT
     q[:, FACE] = ears[:, None] + (rest[list(FACE)] - middle(rest, EARS)) @ turn.mT
     return q

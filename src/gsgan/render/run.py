@@ -145,7 +145,7 @@ def render_config(config: DictConfig) -> None:
     paint_on = background(str(config.background), output.video)
     fps = float(above("fps", config.fps))
     run = Run(config)
-    drive = _chosen(_drive(config, run, fps), config, fps)
+    drive = _chosen(drive_of(config, run, fps), config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)
     views.refuse_inside(cameras, drive.p, drive.numbers)
@@ -185,7 +185,8 @@ def _output(config: DictConfig) -> Output:
 # -- what drives the avatar
 
 
-def _drive(config: DictConfig, run: Run, fps: float) -> Drive:
+def drive_of(config: DictConfig, run: Run, fps: float) -> Drive:
+    """What ``config.motion`` gives at ``fps`` frames per second: all of its frames."""
     if config.motion is None:
         splits = run.data.splits.items
         split = next(name for name in ("novel_pose", "novel_view", "train") if splits[name])

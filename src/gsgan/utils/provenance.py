@@ -129,7 +129,7 @@ def signed(data: bytes, suffix: str, signer: Signer) -> bytes:
     try:
         chain, key = signer.certificate.read_bytes(), signer.key.read_bytes()
         algorithm = signer.algorithm.encode()
-        info = c2pa.C2paSignerInfo(alg=algorithm, sign_cert=chain, private_key=key, ta_url=b"")
+        info = c2pa.C2paSignerInfo(alg=algorithm, sign_cert=chain, private_key=key, ta_url=None)
         out = io.BytesIO()
         with c2pa.Signer.from_info(info) as own, c2pa.Builder(json.dumps(manifest)) as builder:
             builder.sign(own, MIMES[suffix], io.BytesIO(data), out)
