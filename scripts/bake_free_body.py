@@ -337,7 +337,8 @@ def hand_landmarks(source: Source, side: str) -> list[tuple[Array, str]]:
 def pack(pieces: list[Piece], source: Source, full: Source) -> dict[str, Array]:
     """The arrays of the asset, in their stored dtypes."""
     vertices = np.concatenate([p.mesh.vertices for p in pieces])
-    weights = np.concatenate([p.mesh.weights for p in pieces])
+    weights = np.concatenate([p.mesh.weights for p in pieces])[:, : len(source.names)]
+    weights = np.maximum(weights, 0)  # subdivision may leave -1e-17
     starts = np.cumsum([0] + [len(p.mesh.vertices) for p in pieces])
     faces = np.concatenate([p.mesh.faces + s for p, s in zip(pieces, starts, strict=False)])
     index = np.argsort(-weights, axis=1, kind="stable")[:, :4]

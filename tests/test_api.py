@@ -13,7 +13,8 @@ import gsgan
 from gsgan.metrics.regions import on_background
 from gsgan.model.runs import CHECKPOINT, CONFIG, build_data, load_avatar, load_config
 from gsgan.scene import cat
-from gsgan.utils.errors import DataError, GsganError
+from gsgan.skeleton import MEDIAPIPE33
+from gsgan.utils.errors import DataError
 
 
 @pytest.fixture(scope="module")
@@ -55,10 +56,15 @@ def test_one_camera_serves_many_poses_and_lost_joints_are_replaced(run, scored):
     assert torch.isfinite(images).all()
 
 
-def test_a_missing_body_pose_is_one_sentence(run, scored):
+def test_a_bare_skeleton_is_enough(run, scored):
     frame, _ = scored
-    with pytest.raises(GsganError, match=r"trained with a body pose .* body=gsgan\.scene"):
-        gsgan.load(run, device="cpu").render(frame.skeleton, frame.camera)
+    avatar = gsgan.load(run, device="cpu")
+    body = avatar.body_pose(frame.skeleton, frame.visibility)
+    image = avatar.render(frame.skeleton, frame.camera)
+    assert torch.equal(image, avatar.render(frame.skeleton, frame.camera, body=body))
+    swapped = frame.skeleton[:, list(MEDIAPIPE33.mirror)]
+    with pytest.raises(ValueError, match="left and right are swapped"):
+        avatar.render(swapped, frame.camera)
 
 
 def test_an_older_checkpoint_needs_the_dataset(run, tmp_path):

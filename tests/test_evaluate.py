@@ -182,6 +182,19 @@ def test_a_run_is_scored_on_white_by_request(run, inside, tmp_path):
             assert "scored on white" not in black[split][name]["marks"]
 
 
+def test_a_run_is_scored_as_skeletons_alone_drive_it(run, inside, tmp_path):
+    """Beside the scores with the data's body poses, and marked."""
+    copy = shutil.copytree(run, tmp_path / "copy")
+    result = inside("evaluate", f"run={copy}", "drive=skeleton", "splits=[novel_pose]")
+    assert result.returncode == 0, result.stderr
+    assert "driven by skeletons alone" in (copy / "by_skeleton" / "metrics.md").read_text()
+    assert scores(copy) == scores(run)
+    driven, exact = scores(copy / "by_skeleton")["novel_pose"], scores(run)["novel_pose"]
+    assert driven["full"]["marks"][-1] == "driven by skeletons alone"
+    assert driven["full"]["psnr"] != exact["full"]["psnr"]
+    assert driven["floor"]["psnr"] == exact["floor"]["psnr"]
+
+
 def test_another_background_departs_from_the_protocol(copy, given, inside):
     protocol = [
         *("protocol=paper_thuman4", "protocol.train_cameras=[cam00,cam01]"),
@@ -237,6 +250,8 @@ def test_arguments_that_do_not_fit_together_are_refused(run, copy, given, compos
         ([f"run={run}", *given], ("data= cannot be given with run=",)),
         ([f"run={run}", "method=x"], ("method= cannot be given with run=",)),
         ([here, *given, "data_root=/x"], ("data_root= cannot be given with predictions=",)),
+        ([here, *given, "drive=skeleton"], ("drive= cannot be given with predictions=",)),
+        ([f"run={run}", "drive=body"], ("drive must be skeleton or null",)),
         ([here, *given, "splits=[]"], ("splits must be a list of novel_view and novel_pose",)),
         ([here, *given, "predictions_pattern=x.png"], ("must have {frame} and {camera}",)),
         ([here, *given, "predictions_background=grey"], ("black, white or null",)),

@@ -61,10 +61,13 @@ def test_a_missing_joint_still_paints(build):
     assert torch.isfinite(painting.image).all()
 
 
-def test_segmentation_needs_its_body_pose(build):
+def test_a_missing_body_pose_is_solved_from_the_skeleton(build):
     _, avatar, frame = build()
-    with pytest.raises(ValueError, match="body pose"):
-        avatar.paint(dataclasses.replace(frame, body=None))
+    solved = avatar.body_pose(frame.skeleton, frame.visibility)
+    given, bare = (avatar.paint(dataclasses.replace(frame, body=b)) for b in (solved, None))
+    assert avatar.needs_body
+    assert torch.equal(bare.segmentation, given.segmentation)
+    assert (bare.segmentation != avatar.paint(frame).segmentation).any()
 
 
 @pytest.mark.parametrize(

@@ -228,10 +228,13 @@ def test_the_figure_of_densify_says_where_the_points_are(build, tmp_path):
         assert drawing.numbers[shots[0].name]["one"]["points"] == placed.n_points
 
 
-def test_without_the_frames_body_pose_it_says_what_is_missing(build):
+def test_without_the_frames_body_pose_it_is_solved_and_training_says_what_is_missing(build):
     _, avatar, frame = build(ON)
+    bare = replace(frame, body=None)
+    body = avatar.body_pose(frame.skeleton, frame.visibility)
+    assert torch.equal(avatar.paint(bare).image, avatar.paint(replace(frame, body=body)).image)
     with pytest.raises(ValueError, match="skinned body; give its body pose"):
-        avatar.paint(replace(frame, body=None))
+        avatar(frame.skeleton, frame.visibility, frame.camera)
 
 
 @pytest.mark.parametrize("model", ["image_to_image", "lbs_splat"])

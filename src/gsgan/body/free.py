@@ -17,13 +17,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsgan.body.skinned import SkinnedBody, carry
+from gsgan.body.skinned import MarkedBody, carry
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import DataError
 
 
 @dataclass(frozen=True, kw_only=True)
-class Body(SkinnedBody):
+class Body(MarkedBody):
     """The free body: a skinned body with materials and landmarks, unbatched.
 
     A vertex has the part of most of its faces. Hand landmarks are MediaPipe's 21 of the left hand,
@@ -33,16 +33,10 @@ class Body(SkinnedBody):
     face_labels: Tensor  # [F] int64 part of each face, see label_names; 0 is the background
     face_surface: Tensor  # [F] int64 material of each face, see surface_names
     surface_names: tuple[str, ...]  # skin, hair, eye and the garments
-    landmarks: Tensor  # [33, 3] rest positions of the MediaPipe pose landmarks, metres
-    landmark_bone: Tensor  # [33] int64, the joint that each landmark moves with
     landmark_names: tuple[str, ...]
     hand_landmarks: Tensor  # [42, 3] metres
     hand_bone: Tensor  # [42] int64
     hand_names: tuple[str, ...]
-
-    def posed_landmarks(self, pose: BodyPose) -> Tensor:
-        """``[B, 33, 3]`` MediaPipe pose landmarks, metres, world frame."""
-        return carry(self.transforms(pose), self.landmarks, self.landmark_bone)
 
     def posed_hands(self, pose: BodyPose) -> Tensor:
         """``[B, 42, 3]`` MediaPipe hand landmarks, left then right, metres, world frame."""
@@ -122,7 +116,7 @@ def open_body(
     file: str | None = None,
     betas: Sequence[float] = (),
     label_names: Sequence[str] = (),
-) -> SkinnedBody | None:
+) -> MarkedBody | None:
     """The body with its part labels, or None when no mesh of it is available.
 
     A model file gets the set of parts with the names of the images' labels (the free body's,

@@ -104,6 +104,18 @@ class SkinnedBody:
         return carry(self.transforms(pose), self.joints, own)
 
 
+@dataclass(frozen=True, kw_only=True)
+class MarkedBody(SkinnedBody):
+    """A skinned body with MediaPipe's 33 pose landmarks; NaN where the body does not define one."""
+
+    landmarks: Tensor  # [33, 3] rest positions, metres
+    landmark_bone: Tensor  # [33] int64, the joint that each landmark moves with
+
+    def posed_landmarks(self, pose: BodyPose) -> Tensor:
+        """``[B, 33, 3]`` MediaPipe pose landmarks, metres, world frame."""
+        return carry(self.transforms(pose), self.landmarks, self.landmark_bone)
+
+
 def carry(transforms: Tensor, points: Tensor, bones: Tensor) -> Tensor:
     """Points ``[N, 3]``, each moved rigidly with its bone: ``[B, N, 3]``."""
     T = transforms[:, bones]

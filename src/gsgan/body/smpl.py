@@ -26,9 +26,11 @@ from gsgan.body.lbs import (
     forward_kinematics,
     skin,
 )
-from gsgan.body.skinned import SkinnedBody
+from gsgan.body.skinned import MarkedBody
 from gsgan.body.smpl_files import Floats, read_arrays
 from gsgan.body.smpl_names import JOINT_NAMES, Parts, part_names, part_of_joint
+from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.smpl import TABLES, to_mediapipe33
 
 KINDS = {24: "smpl", 55: "smplx"}
 
@@ -68,7 +70,7 @@ class SkinnedModel:
         return index[:, :n].contiguous(), weight[:, :n].contiguous()
 
     @cached_property
-    def _joint_shapes(self) -> tuple[Tensor, Tensor, Tensor]:
+    def joint_shapes(self) -> tuple[Tensor, Tensor, Tensor]:
         """The joints of the mean shape ``[J, 3]``, and their shape and expression directions."""
         mean, shape, face = (
             (self.J_regressor @ of_vertices.flatten(1)).unflatten(1, of_vertices.shape[1:])
@@ -91,7 +93,7 @@ class SkinnedModel:
 
     def rest_joints(self, betas: Tensor, expression: Tensor | None = None) -> Tensor:
         """``[B, J, 3]`` metres, the joints of the shaped body at rest; arguments as above."""
-        mean, shape, face = self._joint_shapes
+        mean, shape, face = self.joint_shapes
         return _add("expression", _add("betas", mean, shape, betas), face, expression)
 
     def pose(
@@ -133,8 +135,8 @@ class SkinnedModel:
         transforms, _, rest = self._transforms(theta, betas, transl, expression)
         return _moved(transforms, rest)
 
-    def as_body(self, betas: ArrayLike = (), parts: Parts = "clothes") -> SkinnedBody:
-        """The shaped body as a `SkinnedBody`: float32, one part per vertex, no blend shapes.
+    def as_body(self, betas: ArrayLike = (), parts: Parts = "clothes") -> MarkedBody:
+        """The shaped body as a `MarkedBody`: float32, one part per vertex, no blend shapes.
 
         A vertex belongs to the part of the joint with its largest skinning weight, on a tie to that
         of the first joint. The paper blends the shaped rest vertices, ``x_o = (Σ_b w_b ΔB_b) x_c``:
@@ -159,18 +161,45 @@ class SkinnedModel:
         own = [names.index(part_of_joint(parts, joint)) for joint in self.joint_names]
         first = torch.from_numpy(self.weights.numpy().argmax(axis=1))  # the first of equals
         index, weight = self.bones
-        return SkinnedBody(
-            vertices=self.rest_vertices(shape)[0].float(),
+        vertices, joints = self.rest_vertices(shape)[0], self.rest_joints(shape)[0]
+        landmarks, bones = self.landmarks(vertices, joints)
+        return MarkedBody(
+            vertices=vertices.float(),
             faces=self.faces,
             bone_index=index,
             bone_weight=weight.float(),
-            joints=self.rest_joints(shape)[0].float(),
+            joints=joints.float(),
             parents=self.parents,
             joint_names=self.joint_names,
             vertex_labels=torch.tensor(own)[first],
             label_names=names,
             label_source="own" if parts == "joints" else "guess",
+            landmarks=landmarks.float(),
+            landmark_bone=bones,
         )
+
+    def landmarks(self, vertices: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:
+        """MediaPipe's 33 landmarks ``[33, 3]`` at rest, and the joint ``[33]`` that carries each.
+
+        Convention: NaN, carried by the root, where the model has none: the mouth; and without
+        SMPL's or SMPL-X's own vertices also face, heels and most of the hands.
+        """
+        if self.kind not in TABLES:
+            return joints.new_full((len(MEDIAPIPE33.names), 3), torch.nan), torch.zeros(33).long()
+        table = TABLES[self.kind]
+        whole = len(vertices) == table.counts[1]
+        p, _ = to_mediapipe33(
+            joints.numpy(),
+            vertices.numpy() if whole else None,
+            "smpl" if self.kind == "smpl" else "smplx",
+        )
+        first = self.weights.numpy().argmax(axis=1)
+        carriers = {name: joint for name, (joint, _) in table.joints.items()}
+        if whole:
+            carriers |= {name: int(first[v]) for name, (v, _) in table.vertices.items()}
+            carriers |= {name: joint for name, (joint, _) in table.midpoints.items()}
+        bones = torch.tensor([carriers.get(name, 0) for name in MEDIAPIPE33.names])
+        return torch.from_numpy(p), bones
 
     def _transforms(
         self, theta: Tensor, betas: Tensor, transl: Tensor, expression: Tensor | None

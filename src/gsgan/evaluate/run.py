@@ -51,6 +51,7 @@ from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import pick_device
 
 SPLITS = ("novel_view", "novel_pose")
+BY_SKELETON = "driven by skeletons alone"
 
 
 def evaluate_config(config: DictConfig) -> Results:
@@ -67,13 +68,15 @@ def evaluate_config(config: DictConfig) -> Results:
         )
     kind, others = "run", ["data", "protocol", "out", "method"]
     if config.run is None:
-        kind, others = "predictions", ["data_root", "data_smpl"]
+        kind, others = "predictions", ["data_root", "data_smpl", "drive"]
     for key in others:
         if config.get(key) is not None:
             raise ConfigError(f"{key}= cannot be given with {kind}=; leave it out")
     for key in ("background", "predictions_background"):
         if config[key] not in (None, *BACKGROUNDS):
             raise ConfigError(f"{key} must be black, white or null; got {config[key]!r}")
+    if config.get("drive") not in (None, "skeleton"):
+        raise ConfigError(f"drive must be skeleton or null; got {config.drive!r}")
     if not config.splits or not set(config.splits) <= set(SPLITS):
         raise ConfigError(f"splits must be a list of {' and '.join(SPLITS)}; got {config.splits}")
     score = evaluate_predictions if config.run is None else evaluate_folder
@@ -90,6 +93,8 @@ def evaluate_folder(config: DictConfig, console: Console, device: torch.device) 
     out = folder
     if config.background not in (None, _measures(data).background):  # others' scores stay
         out = folder / f"on_{config.background}"
+    if config.drive is not None:
+        out, marks = out / "by_skeleton", [*marks, BY_SKELETON]
     method = trained(
         folder,
         seed=stored.seed,
@@ -97,7 +102,7 @@ def evaluate_folder(config: DictConfig, console: Console, device: torch.device) 
         train_seconds=state.get("train_seconds"),
         trained_by=state.get("code"),
     )
-    predict = painter(avatar.to(device))
+    predict = painter(avatar.to(device), solve=config.drive is not None)
     return evaluate_method(
         out, config, console, data, predict, method=method, device=device, marks=marks
     )

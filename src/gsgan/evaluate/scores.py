@@ -189,13 +189,18 @@ class SplitScores:
     grid: list[dict[str, Tensor]] = field(default_factory=list)
 
 
-def painter(avatar: Avatar) -> Predict:
+def painter(avatar: Avatar, *, solve: bool = False) -> Predict:
     """The predictions of an avatar in eval mode: I_pred as ``full``, Step I's colour as ``splat``,
-    each with its own alpha."""
+    each with its own alpha.
+
+    Args:
+        avatar: to evaluate.
+        solve: solve every body pose from the skeleton, in place of the data's.
+    """
 
     def predict(frame: Frame, item: Item) -> Prediction:
         with torch.no_grad():
-            painting = avatar.paint(frame)
+            painting = avatar.paint(replace(frame, body=None) if solve else frame)
         assert painting.image is not None
         images, alphas = {FULL: painting.image}, {FULL: painting.alpha}
         if painting.colour is not None:

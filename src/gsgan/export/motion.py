@@ -16,7 +16,6 @@ from gsgan.render.run import drive_of as rendered
 from gsgan.scene import BodyPose
 from gsgan.skeleton import sanitise
 from gsgan.utils.config import config_folder
-from gsgan.utils.errors import GsganError
 
 
 def drive_of(config: DictConfig, run: Run, fps: float) -> Drive:
@@ -41,21 +40,17 @@ def rest_pose(figure: Figure) -> Drive:
 
 
 def inputs_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor, BodyPose | None]:
-    """Joints ``[1, 33, 3]``, finite, which of them are seen ``[1, 33]``, and the body's pose.
+    """Joints ``[1, 33, 3]``, finite, which of them are seen ``[1, 33]``, and the body's pose
+    where the avatar needs it, solved where the motion has none.
 
     Raises:
-        GsganError: when the avatar needs a body pose and the motion has none.
-        ValueError: when too few shoulders and hips are known.
+        ValueError: when too few shoulders and hips are known, or left and right are swapped where
+            a body pose must be solved.
     """
     p, known = sanitise(
         torch.from_numpy(drive.p[i : i + 1]).float(), None, body_height=avatar.limb_length_sum
     )
-    body = None
-    if avatar.needs_body:
-        if drive.body is None:
-            raise GsganError(
-                "this avatar was trained with a body pose for every frame and needs one: give a "
-                "motion that has it, e.g. motion=novel_pose"
-            )
-        body = drive.body[i : i + 1].to(torch.float32)
-    return p, known & (torch.from_numpy(drive.visibility[i : i + 1]) > 0), body
+    seen = known & (torch.from_numpy(drive.visibility[i : i + 1]) > 0)
+    if drive.body is not None and avatar.needs_body:
+        return p, seen, drive.body[i : i + 1].to(torch.float32)
+    return p, seen, avatar.body_pose(p, seen.to(p))

@@ -12,7 +12,9 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torch import Tensor, nn
 
-from gsgan.body import SkinnedBody, open_body
+from gsgan.body import open_body
+from gsgan.body.skinned import MarkedBody
+from gsgan.body.solve import Solver
 from gsgan.effects import Effects, EffectSettings, ModelParts, decide
 from gsgan.model.avatar import SKELETON_CHANNELS, Avatar
 from gsgan.model.body_points import BodyPoints
@@ -155,6 +157,9 @@ def assemble_avatar(
             S = segmentation(body=body, labelled=scene.has_labels if labelled is None else labelled)
             S.accuracy, S.backend = replace(S.accuracy, **formation), backend
 
+    on_a_body = on_body is not None or skin is not None or S is not None
+    solver = Solver(_body_of(scene, "the model")) if on_a_body else None
+
     torch.manual_seed(seed + 2)
     unet = None
     if generator is not None and pose_encoder is not None:
@@ -182,6 +187,7 @@ def assemble_avatar(
         pose_encoder=pose_encoder,
         generator=unet,
         colour=colour,
+        solver=solver,
         backend=backend,
         **options,
     )
@@ -204,7 +210,7 @@ def naming_group(group: str) -> Iterator[None]:
         raise ConfigError(f"{group}: {error}") from error
 
 
-def _body_of(scene: SceneInfo, part: str) -> SkinnedBody:
+def _body_of(scene: SceneInfo, part: str) -> MarkedBody:
     if not scene.has_body_pose:
         raise DataError(
             f"{part} cannot be built: the data lacks a body pose for every frame; choose "

@@ -10,6 +10,7 @@ from typing import Literal, Self
 import torch
 from torch import Tensor, nn
 
+from gsgan.body.solve import Solver
 from gsgan.effects import Effects
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.deformation import Deformation, bounded
@@ -30,7 +31,6 @@ from gsgan.skeleton import (
 )
 from gsgan.splat import Accuracy, rasterise
 from gsgan.splat.checks import checks_for
-from gsgan.utils.errors import GsganError
 from gsgan.utils.tensors import full_precision
 
 LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in an image 512 high
@@ -59,6 +59,7 @@ class Avatar(nn.Module):
             why there is none.
         pose_encoder, generator: None in ``splat_only``, where Step I's colour is the image.
         colour: per-camera colour correction, where that effect is on.
+        solver: of body poses that are not given, for avatars on a skinned body.
         backend: that rasterises F, see `gsgan.splat.rasterise`.
         twist: of bone frames, see `gsgan.skeleton.bone_frames`.
         window_margin, window_multiple, window_least: of the painted window, pixels and metres; see
@@ -86,6 +87,7 @@ class Avatar(nn.Module):
         pose_encoder: nn.Module | None = None,
         generator: Generator | None = None,
         colour: ColourCorrection | None = None,
+        solver: Solver | None = None,
         backend: str = "auto",
         twist: Literal["none", "hinge"] = "none",
         window_margin: float | None = 0.25,
@@ -102,6 +104,7 @@ class Avatar(nn.Module):
         self.surface = surface
         self.segmentation, self.segmentation_why = segmentation, segmentation_why
         self.pose_encoder, self.generator, self.colour = pose_encoder, generator, colour
+        self.solver = solver
 
     @property
     def splats(self) -> Deformation | SurfaceGaussians | None:
@@ -115,7 +118,7 @@ class Avatar(nn.Module):
 
     @property
     def needs_body(self) -> bool:
-        """Whether painting needs the pose of the skinned body beside the skeleton."""
+        """Whether parts move with a skinned body, whose pose is given or solved."""
         return any(part for part in (self.body_points, self.surface, self.segmentation))
 
     def freeze(self) -> Self:
@@ -147,9 +150,6 @@ class Avatar(nn.Module):
 
         Returns:
             ``[B, 3, H, W]`` RGB in [0, 1].
-
-        Raises:
-            GsganError, ValueError: see `picture`.
         """
         painting = self.picture(skeleton, camera, visibility=visibility, body=body)
         assert painting.image is not None and painting.alpha is not None  # noqa: PT018
@@ -176,7 +176,7 @@ class Avatar(nn.Module):
             skeleton: ``[J, 3]`` or ``[B, J, 3]`` metres, world frame; NaN for joints not seen.
             camera: B cameras, or one for all.
             visibility: ``[J]`` or ``[B, J]`` in [0, 1]; 0 marks a stand-in; None: all seen.
-            body: B poses of the skinned body, where the avatar was trained with one.
+            body: B poses of the skinned body; None: solved from the skeleton where it is needed.
             camera_index: ``[B]`` cameras whose colours to correct for; None corrects nothing.
             maps: keep the maps that led to the image, and the Gaussians.
 
@@ -184,14 +184,9 @@ class Avatar(nn.Module):
             A painting of image and alpha alone, unless maps are kept; not clamped.
 
         Raises:
-            GsganError: when the avatar needs a body pose and none is given.
-            ValueError: on wrong shapes, or when too few shoulders and hips are finite.
+            ValueError: on wrong shapes, when too few shoulders and hips are finite, or when a body
+                pose must be solved and left and right are swapped.
         """
-        if self.needs_body and body is None:
-            raise GsganError(
-                "this avatar was trained with a body pose for every frame and needs one: pass "
-                "body=gsgan.scene.BodyPose(theta, transl) to render"
-            )
         device = next(self.parameters()).device
         p, valid = sanitise(
             skeleton.reshape(-1, *skeleton.shape[-2:]).to(device, torch.float32),
@@ -205,8 +200,7 @@ class Avatar(nn.Module):
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
         body = None if body is None else body.to(device)
         index = None if camera_index is None else camera_index.to(device)
-        painting = self._paint(p, seen, cameras.to(device), body, index, maps=maps)
-        return painting if maps else painting.only_image()
+        return self._paint(p, seen, cameras.to(device), body, index, maps=maps)
 
     def forward(
         self,
@@ -229,7 +223,7 @@ class Avatar(nn.Module):
                 that were not seen.
             visibility: ``[B, J]`` in [0, 1]; 0 marks a stand-in.
             camera: B cameras.
-            body: pose of the skinned body; see `needs_body`.
+            body: pose of the skinned body; see `needs_body` and `body_pose`.
             pose_noise: ``[B, J, 3]`` body heights, added to Ψ's pose code (training only).
             paint: False stops after F (Step I needs no more).
             supersample: False draws F once per pixel, whatever ``accuracy`` says.
@@ -333,7 +327,7 @@ class Avatar(nn.Module):
 
     def paint(self, frame: Frame, *, maps: bool = True) -> Painting:
         """The whole image of a dataset's frame: its window painted, background around it; without
-        F, S and the Gaussians where ``maps`` is False."""
+        F, S and the Gaussians where ``maps`` is False. A missing body pose is solved."""
         given = (frame.skeleton, frame.visibility, frame.camera, frame.body, frame.camera_index)
         return self._paint(*given, maps=maps)
 
@@ -347,19 +341,25 @@ class Avatar(nn.Module):
         *,
         maps: bool = True,
     ) -> Painting:
+        body = self.body_pose(skeleton, visibility) if body is None else body
         window = self._window(skeleton, camera)
-        if window is None:
-            return self(skeleton, visibility, camera, body, camera_index=camera_index)
-        painting = self(
-            skeleton,
-            visibility,
-            window.camera(camera),
-            body,
-            picture_height=window.picture[0],
-            camera_index=camera_index,
+        seen_by, height = (
+            (camera, None) if window is None else (window.camera(camera), window.picture[0])
         )
+        given = (skeleton, visibility, seen_by, body)
+        painting = self(*given, picture_height=height, camera_index=camera_index)
+        painting = painting if maps else painting.only_image()
+        if window is None:
+            return painting
         with self.stage("paste"):
-            return (painting if maps else painting.only_image()).pasted(window)
+            return painting.pasted(window)
+
+    def body_pose(self, skeleton: Tensor, visibility: Tensor) -> BodyPose | None:
+        """The body pose of skeletons ``[B, J, 3]``, see `Solver.solve`; None if none is needed."""
+        if self.solver is None:
+            return None
+        with self.stage("solve"), full_precision(skeleton):
+            return self.solver.solve(skeleton, visibility)
 
     def window(self, frame: Frame) -> Window | None:
         """The part of a frame's image that holds the person; None means all of it."""

