@@ -343,10 +343,8 @@ class Avatar(nn.Module):
     ) -> Painting:
         body = self.body_pose(skeleton, visibility) if body is None else body
         window = self._window(skeleton, camera)
-        seen_by, height = (
-            (camera, None) if window is None else (window.camera(camera), window.picture[0])
-        )
-        given = (skeleton, visibility, seen_by, body)
+        height = None if window is None else window.picture[0]
+        given = skeleton, visibility, camera if window is None else window.camera(camera), body
         painting = self(*given, picture_height=height, camera_index=camera_index)
         painting = painting if maps else painting.only_image()
         if window is None:
