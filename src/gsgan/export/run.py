@@ -114,5 +114,5 @@ def _program(config: DictConfig, run: Run, kind: str) -> bytes:
 
     if kind == "onnx":
         return onnx_program(run.avatar)
-    side = whole("size", config.size or run.stored.data.size or 512, 1)
+    side = whole("pixels", config.pixels or run.stored.data.size or 512, 1)
     return torch_program(run.avatar, (side, side))

@@ -60,7 +60,7 @@ class Viewer:
         def read(path: Path) -> Drive:
             return drive_of(OmegaConf.merge(config, {"motion": str(path)}), self.run, fps)  # type: ignore[arg-type]
 
-        size = whole("size", config.size or self.run.stored.data.size or 512, 16)
+        size = whole("pixels", config.pixels or self.run.stored.data.size or 512, 16)
         behind: Any = background(str(config.background), video=True)
         rate = float(above("rate", config.rate))
         self.show = Show(self.run.avatar, drive, read, behind, size, fps, rate)
