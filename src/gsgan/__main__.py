@@ -7,7 +7,8 @@ COMMANDS = {
     "gsgan.train": "train an avatar, then score it on the held-out splits",
     "gsgan.evaluate": "score a run, run=<folder>, or any method's images, predictions=<folder>",
     "gsgan.render": "drive an avatar: run=<folder> motion=<file> out=<video.mp4|folder>",
-    "gsgan.export": "read what an image or video says about its origin: verify=<file>",
+    "gsgan.view": "look at an avatar in the browser, drag its joints: run=<folder>",
+    "gsgan.export": "write .ply, glTF, ONNX, torch.export, safetensors: run=<folder> out=<file>",
     "gsgan.report": "tables of scored runs, runs=[<folder>,…], and figures of a run, run=<folder>",
     "gsgan.bench": "measure speed and accuracy: raster, speed, trade-off, effects",
 }

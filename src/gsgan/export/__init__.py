@@ -1,1 +1,1 @@
-"""``gsgan.export``: what leaves the project, and what files say about their origin."""
+"""``gsgan.export``: an avatar in the formats of other programs."""

@@ -147,6 +147,9 @@ class Avatar(nn.Module):
         Args:
             skeleton, camera, visibility, body: see `picture`.
             background: RGB in [0, 1], or one number for all three.
+
+        Returns:
+            ``[B, 3, H, W]`` RGB in [0, 1].
         """
         painting = self.picture(skeleton, camera, visibility=visibility, body=body)
         assert painting.image is not None and painting.alpha is not None  # noqa: PT018
@@ -163,6 +166,7 @@ class Avatar(nn.Module):
         visibility: Tensor | None = None,
         body: BodyPose | None = None,
         camera_index: Tensor | None = None,
+        maps: bool = False,
     ) -> Painting:
         """Image and alpha of a new pose.
 
@@ -174,9 +178,10 @@ class Avatar(nn.Module):
             visibility: ``[J]`` or ``[B, J]`` in [0, 1]; 0 marks a stand-in; None: all seen.
             body: B poses of the skinned body; None: solved from the skeleton where it is needed.
             camera_index: ``[B]`` cameras whose colours to correct for; None corrects nothing.
+            maps: keep the maps that led to the image, and the Gaussians.
 
         Returns:
-            A painting of image and alpha alone, not clamped.
+            A painting of image and alpha alone, unless maps are kept; not clamped.
 
         Raises:
             ValueError: on wrong shapes, when too few shoulders and hips are finite, or when a body
@@ -195,7 +200,7 @@ class Avatar(nn.Module):
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
         body = None if body is None else body.to(device)
         index = None if camera_index is None else camera_index.to(device)
-        return self._paint(p, seen, cameras.to(device), body, index, maps=False).only_image()
+        return self._paint(p, seen, cameras.to(device), body, index, maps=maps)
 
     def forward(
         self,
@@ -338,18 +343,14 @@ class Avatar(nn.Module):
     ) -> Painting:
         body = self.body_pose(skeleton, visibility) if body is None else body
         window = self._window(skeleton, camera)
+        height = None if window is None else window.picture[0]
+        given = skeleton, visibility, camera if window is None else window.camera(camera), body
+        painting = self(*given, picture_height=height, camera_index=camera_index)
+        painting = painting if maps else painting.only_image()
         if window is None:
-            return self(skeleton, visibility, camera, body, camera_index=camera_index)
-        painting = self(
-            skeleton,
-            visibility,
-            window.camera(camera),
-            body,
-            picture_height=window.picture[0],
-            camera_index=camera_index,
-        )
+            return painting
         with self.stage("paste"):
-            return (painting if maps else painting.only_image()).pasted(window)
+            return painting.pasted(window)
 
     def body_pose(self, skeleton: Tensor, visibility: Tensor) -> BodyPose | None:
         """The body pose of skeletons ``[B, J, 3]``, see `Solver.solve`; None if none is needed."""

@@ -204,10 +204,24 @@ def load(run: str | Path, *, smpl: str | Path | None = None, device: str = "auto
         data = build_data(load_config(folder, moved))
         avatar = _trained(folder, config, checkpoint, data.info, data.labelled("train"))
     else:
-        scene = scene_of(stored)
-        file = _from_start(folder, scene.body_file) if smpl is None else str(smpl)
-        avatar = _trained(folder, config, checkpoint, replace(scene, body_file=file))
+        avatar = avatar_of(folder, config, checkpoint, smpl)
     return avatar.to(pick_device(device))
+
+
+def avatar_of(
+    folder: Path, config: DictConfig, checkpoint: dict[str, Any], smpl: str | Path | None = None
+) -> Avatar:
+    """The trained, frozen avatar of a checkpoint that holds the facts about its scene.
+
+    Args:
+        folder: the run's, for messages.
+        config: of the run.
+        checkpoint: its weights and facts.
+        smpl: as for `load`.
+    """
+    scene = scene_of(checkpoint["gsgan"]["scene"])
+    file = _from_start(folder, scene.body_file) if smpl is None else str(smpl)
+    return _trained(folder, config, checkpoint, replace(scene, body_file=file))
 
 
 def load_avatar(folder: Path, config: DictConfig, data: GsganData) -> tuple[Avatar, list[str]]:

@@ -46,8 +46,9 @@ class _Job(ctypes.Structure):
 
 
 def available() -> bool:
-    """Whether the kernel can be used here; the first call may compile it (seconds)."""
-    return build.library()[0] is not None
+    """Whether the kernel can be used here; the first call may compile it (seconds). Programs that
+    ``torch.export`` records do not have it."""
+    return not torch.compiler.is_compiling() and build.library()[0] is not None
 
 
 def why_not() -> str:

@@ -9,7 +9,15 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from gsgan.scene import Camera, Gaussians, Raster
-from gsgan.splat import checks, gsplat_backend, native, native_project, reference, tiles
+from gsgan.splat import (
+    checks,
+    gsplat_backend,
+    native,
+    native_project,
+    operator,
+    reference,
+    tiles,
+)
 from gsgan.splat.lens import as_pinhole_sees
 from gsgan.splat.project import project
 from gsgan.splat.settings import Accuracy, accuracy
@@ -58,6 +66,8 @@ def rasterise(
     Source: paper Sec. 3.1.
     """
     settings = accuracy(settings) if isinstance(settings, str) else settings
+    if torch.compiler.is_compiling():
+        return operator.rasterised(gaussians, camera, settings, backend, depth)
     keep = checks.check(gaussians, camera, settings, on_invalid, rotation_tolerance)
     if camera.dist is not None:
         gaussians, camera = as_pinhole_sees(gaussians, camera, settings.near)

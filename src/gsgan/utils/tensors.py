@@ -20,7 +20,9 @@ LARGEST = 1 << 25  # bytes; glibc takes larger blocks from the system in any cas
 
 def constant(values: Any, like: Tensor) -> Tensor:
     """Nested tuples of numbers as a tensor with the dtype and device of ``like``; read only."""
-    return _constant(values, like.dtype, like.device)
+    # what torch.export sees is a stand-in, and must not be kept
+    make = _constant.__wrapped__ if torch.compiler.is_compiling() else _constant
+    return make(values, like.dtype, like.device)
 
 
 @lru_cache(maxsize=1024)

@@ -1,0 +1,192 @@
+"""The avatar's networks as programs of other runtimes: ONNX and ``torch.export``."""
+
+from __future__ import annotations
+
+import copy
+import io
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.export import Dim
+
+from gsgan.model.avatar import SKELETON_CHANNELS, Avatar
+from gsgan.scene import BodyPose, Camera
+from gsgan.utils.errors import ConfigError
+
+LARGEST = 8192  # pixels a side that an ONNX program takes
+
+
+def unfrozen(avatar: Avatar) -> Avatar:
+    """A copy that computes from its weights alone, not from what `Avatar.freeze` kept."""
+    bare = copy.deepcopy(avatar).cpu()
+    for part in bare.modules():
+        vars(part).pop("derived", None)
+    return bare.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload, no-any-return]
+
+
+class Whole(nn.Module):
+    """Skeleton and camera in, the whole image out: no window, whose size depends on the pose.
+
+    Args:
+        avatar: unfrozen.
+        size: ``(H, W)`` pixels of the image.
+    """
+
+    def __init__(self, avatar: Avatar, size: tuple[int, int]) -> None:
+        super().__init__()
+        self.avatar, self.size = avatar, size
+
+    def forward(
+        self,
+        skeleton: Tensor,
+        visibility: Tensor,
+        K: Tensor,
+        R: Tensor,
+        t: Tensor,
+        theta: Tensor | None = None,
+        transl: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """``[1, 3, H, W]`` RGB on black and ``[1, 1, H, W]`` alpha, both in [0, 1].
+
+        Args:
+            skeleton: ``[1, 33, 3]`` metres, world frame, finite.
+            visibility: ``[1, 33]`` 0 marks a stand-in.
+            K, R, t: ``[1, 3, 3]``, ``[1, 3, 3]``, ``[1, 3]`` of the camera.
+            theta, transl: pose of the skinned body, where the avatar needs one.
+        """
+        body = None if theta is None or transl is None else BodyPose(theta, transl)
+        painting = self.avatar(skeleton, visibility, Camera(K, R, t, self.size), body)
+        assert painting.image is not None and painting.alpha is not None  # noqa: PT018
+        return painting.image.clamp(0, 1), painting.alpha.clamp(0, 1)
+
+
+def torch_program(avatar: Avatar, size: tuple[int, int]) -> bytes:
+    """A .pt2 file of `Whole`, which ``torch.export.load`` reads.
+
+    Convention: rasterisation is the operator ``gsgan::rasterise``, so a program that loads it
+    imports `gsgan.splat` first.
+    """
+    p = torch.tensor(avatar.template.rest_positions)[None]
+    K = torch.tensor([[[float(size[1]), 0, size[1] / 2], [0, size[1], size[0] / 2], [0, 0, 1]]])
+    R, t = torch.tensor([[[-1.0, 0, 0], [0, -1, 0], [0, 0, 1]]]), torch.tensor([[0.0, 0.9, 3.0]])
+    given = [p, torch.ones(p.shape[:2]), K, R, t]
+    if avatar.needs_body:
+        part = avatar.body_points or avatar.surface or avatar.segmentation
+        bones = len(part.points.parents)  # type: ignore[union-attr]
+        given += [torch.zeros(1, bones, 3), torch.zeros(1, 3)]
+    program = Whole(unfrozen(avatar), size)
+    stream = io.BytesIO()
+    with torch.no_grad(), quiet():
+        program(*given)  # constants are made once, outside of the recording
+        torch.export.save(torch.export.export(program, tuple(given), strict=False), stream)
+    return stream.getvalue()
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The inputs of a `Painter` by name, with examples of one size; those that it takes."""
+
+    by_name: dict[str, Tensor]
+    times: dict[str, int]  # of images: pixels per pixel of the output
+
+
+class Painter(nn.Module):
+    """Images of the avatar's splats and skeleton in, its image out: pose encoder and UNet.
+
+    Its inputs, by name: ``features`` F ``[1, C, H, W]``, ``fine`` F before it was averaged, where
+    the avatar supersamples; ``splat_alpha`` of F ``[1, 1, H, W]``; ``segmentation`` S ``[1,
+    classes, H, W]``, where it has one; ``skeleton`` p₂D ``[1, 8, H, W]``; ``omega`` Ω ``[1, 33,
+    6]`` and ``joints`` ``[1, 33, 3]``, see `Avatar.pose_inputs`.
+
+    Args:
+        avatar: unfrozen, with a generator.
+    """
+
+    def __init__(self, avatar: Avatar) -> None:
+        super().__init__()
+        if avatar.generator is None:
+            raise ConfigError(
+                "this avatar has no generator to export: its image is Step I's colour"
+            )
+        self.splats = avatar.splat_channels > 0
+        self.pose_encoder, self.generator = avatar.pose_encoder, avatar.generator
+        classes = 0 if avatar.segmentation is None else avatar.segmentation.classes
+        self.channels = {"features": avatar.splat_channels, "segmentation": classes}
+
+    def inputs(self) -> Inputs:
+        """Examples, for the exporter."""
+        k = self.generator.supersample
+        channels = self.channels | {"skeleton": SKELETON_CHANNELS}
+        channels |= {"splat_alpha": int(self.splats), "fine": (k > 1) * channels["features"]}
+        times = {name: k if name == "fine" else 1 for name, count in channels.items() if count}
+        side = 4 * self.generator.stride
+        images = {n: torch.rand(1, channels[n], f * side, f * side) for n, f in times.items()}
+        joints = {"omega": torch.rand(1, 33, 6), "joints": torch.rand(1, 33, 3)}
+        return Inputs(images | joints, times)
+
+    def forward(
+        self,
+        omega: Tensor,
+        joints: Tensor,
+        skeleton: Tensor,
+        features: Tensor | None = None,
+        fine: Tensor | None = None,
+        splat_alpha: Tensor | None = None,
+        segmentation: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """``[1, 3, H, W]`` RGB on black and ``[1, 1, H, W]`` alpha, both in [0, 1]."""
+        assert self.pose_encoder is not None
+        g = self.pose_encoder(omega, joints)
+        if features is None:  # image_to_image: the drawing stands in F's place
+            painted = self.generator(skeleton, segmentation, None, g)
+        else:
+            painted = self.generator(features, segmentation, skeleton, g, fine, splat_alpha)
+        painted = painted.clamp(0, 1)
+        return painted[:, :3], painted[:, 3:]
+
+
+def onnx_program(avatar: Avatar) -> bytes:
+    """A .onnx file of `Painter`, for any height and width that are multiples of the UNet's stride.
+
+    Raises:
+        ConfigError: when the packages are missing, or the avatar has no generator.
+    """
+    try:
+        import onnx  # noqa: F401
+        import onnxscript  # noqa: F401
+    except ImportError:
+        raise ConfigError("format=onnx needs: pip install 'gsgan[export]'") from None
+    painter = Painter(unfrozen(avatar)).eval()
+    given, stride = painter.inputs(), painter.generator.stride
+    sides = [stride * Dim(name, min=1, max=LARGEST // stride) for name in ("h", "w")]
+    shapes = {
+        name: {2 + i: given.times[name] * side for i, side in enumerate(sides)}
+        if name in given.times
+        else None
+        for name in given.by_name
+    }
+    with torch.no_grad(), quiet():
+        program = torch.onnx.export(
+            painter,
+            kwargs=given.by_name,
+            dynamo=True,
+            dynamic_shapes=shapes,
+            input_names=list(given.by_name),
+            output_names=["image", "alpha"],
+            verbose=False,
+        )
+    assert program is not None
+    content: bytes = program.model_proto.SerializeToString()
+    return content
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without the exporter's warnings about its own parts."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield

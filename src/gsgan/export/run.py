@@ -1,0 +1,118 @@
+"""Writes what an export config asks for."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+from omegaconf import DictConfig, open_dict
+from rich.progress import track
+
+from gsgan.export.card import card
+from gsgan.export.motion import drive_of, inputs_of, rest_pose
+from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
+from gsgan.render.run import Drive, Run
+from gsgan.utils.checks import above, one_of, whole
+from gsgan.utils.console import make_console
+from gsgan.utils.errors import ConfigError
+from gsgan.utils.files import write_atomically
+from gsgan.utils.provenance import verify
+
+ENDINGS = {
+    "ply": ".ply",
+    "gltf": ".glb",
+    "onnx": ".onnx",
+    "torch": ".pt2",
+    "safetensors": ".safetensors",
+}
+CARD = "MODEL_CARD.md"
+REST = "rest"
+
+
+def export_config(config: DictConfig) -> None:
+    """Writes what a config asks for, and a model card beside it.
+
+    Raises:
+        ConfigError: on a value that cannot be used, or a place that is taken.
+        DataError: when the run, the motion or the file to verify cannot be used.
+    """
+    console = make_console()
+
+    def tell(line: str) -> None:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    if config.verify is not None:
+        path = Path(config.verify).expanduser()
+        found = verify(path)
+        state = "marked as synthetic" if found.synthetic else "not marked as synthetic"
+        for line in (f"{path.name}: {state}", *found.lines()):
+            tell(line)
+        return
+    kind = one_of("format", config.format, tuple(ENDINGS))
+    out = _place(config, kind)
+    sequence = not out.suffix
+    with open_dict(config):
+        config.device = "cpu"
+    run = Run(config)
+    if kind in ("ply", "gltf"):
+        drive = _poses(config, run, kind)
+        tell(drive.text)
+        numbers = range(len(drive.p)) if sequence else range(1)
+        for i in track(numbers, "writing", console=console, transient=True):
+            name = out / f"{drive.numbers[i]:06d}{ENDINGS[kind]}" if sequence else out
+            splats = _splats(run, drive, i)
+            up = run.figure.up
+            write_atomically(name, ply_bytes(splats) if kind == "ply" else glb_bytes(splats, up))
+    else:
+        write_atomically(out, _program(config, run, kind))
+    beside = out / CARD if sequence else out.with_name(f"{out.stem}.{CARD}")
+    write_atomically(beside, card(run, kind, out.name, config.licence))
+    tell(f"written: {out}, {beside.name}")
+
+
+def _place(config: DictConfig, kind: str) -> Path:
+    """``out``, checked: a file of the format's ending, or a folder for a sequence of .ply files."""
+    ending = ENDINGS[kind]
+    folders = " or a folder" if kind == "ply" else ""
+    if config.out is None:
+        raise ConfigError(f"out is not set: give out=<file>{ending}{folders}")
+    out = Path(config.out).expanduser()
+    if out.suffix.lower() != ending and (out.suffix or kind != "ply"):
+        raise ConfigError(f"out={out}: format={kind} needs a {ending} file{folders}")
+    taken = out.is_file() if out.suffix else out.exists() and any(out.iterdir())
+    if taken and not config.overwrite:
+        raise ConfigError(f"out={out} exists; give overwrite=true or another name")
+    return out
+
+
+def _poses(config: DictConfig, run: Run, kind: str) -> Drive:
+    """The frames to export: of glTF the rest pose, of .ply a held-out one where none is given."""
+    if (config.motion or (REST if kind == "gltf" else None)) == REST:
+        return rest_pose(run.figure)
+    drive = drive_of(config, run, float(above("fps", config.fps)))
+    start = whole("start", config.start, 0)
+    if start >= len(drive.p):
+        raise ConfigError(f"start={start}: the motion has {len(drive.p)} frames")
+    end = None if config.frames is None else start + whole("frames", config.frames, 1)
+    return drive.rows(torch.arange(len(drive.p))[start:end].numpy())
+
+
+@torch.no_grad()
+def _splats(run: Run, drive: Drive, i: int) -> Splats:
+    return splats_of(run.avatar, *inputs_of(run.avatar, drive, i))
+
+
+def _program(config: DictConfig, run: Run, kind: str) -> bytes:
+    """The content of a .onnx, .pt2 or .safetensors file."""
+    if kind == "safetensors":
+        from gsgan.export.weights import weights_bytes
+
+        facts = run.checkpoint | {"scene": asdict(run.scene)}
+        return weights_bytes(run.folder, run.avatar, facts)
+    from gsgan.export.programs import onnx_program, torch_program
+
+    if kind == "onnx":
+        return onnx_program(run.avatar)
+    side = whole("pixels", config.pixels or run.stored.data.size or 512, 1)
+    return torch_program(run.avatar, (side, side))

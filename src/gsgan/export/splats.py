@@ -1,0 +1,193 @@
+"""The Gaussians of a pose as other programs have them: scales, quaternions, harmonics in world
+axes; written as .ply (3D Gaussian splatting) and as glTF (KHR_gaussian_splatting)."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from kornia.geometry.conversions import rotation_matrix_to_quaternion
+from numpy.typing import NDArray
+from pygltflib import GLTF2
+from torch import Tensor
+from torch.nn import functional
+
+from gsgan import __version__
+from gsgan.data.figure import upright
+from gsgan.model.avatar import Avatar
+from gsgan.scene import BodyPose, Gaussians
+from gsgan.skeleton import bone_frames, root_of
+from gsgan.skeleton.densify import even_sphere
+from gsgan.splat.sh import MAX_DEGREE, sh_basis
+from gsgan.utils.errors import ConfigError
+
+Float = NDArray[np.float32]
+
+DIRECTIONS = 64  # over which harmonics are fitted; 16 would do for rotations
+THINNEST = 1e-7  # metres: covariances are rounded to float32, and eigenvalues may be below 0
+FAINTEST = 1e-30  # opacity of what is not drawn: its logit is finite
+EXTENSION = "KHR_gaussian_splatting"
+GENERATOR = f"gsgan {__version__}"
+FLOAT, POINTS, ARRAY_BUFFER = 5126, 0, 34962  # glTF's numbers
+
+
+@dataclass(frozen=True)
+class Splats:
+    """N Gaussians of one pose.
+
+    Args:
+        means: ``[N, 3]`` metres, world frame.
+        scales: ``[N, 3]`` metres, standard deviations along the axes.
+        quats: ``[N, 4]`` w x y z, unit.
+        opacities: ``[N]`` in [0, 1].
+        sh: ``[N, (d+1)², 3]`` as `gsgan.splat.sh_to_colour` takes them, world frame.
+    """
+
+    means: Float
+    scales: Float
+    quats: Float
+    opacities: Float
+    sh: Float
+
+
+def splats_of(avatar: Avatar, p: Tensor, valid: Tensor, body: BodyPose | None) -> Splats:
+    """Ĝ of a pose: Step I's Gaussians, whose colours are Step I's image.
+
+    Convention: Ψ's harmonics turn with the body part. Here they are in world axes, so that other
+    programs see the same colours: exact for densify's frames, which are rotations. Frames of a
+    skinned body shear; their harmonics are the least-squares fit over all directions.
+
+    Args:
+        avatar: that splats.
+        p: ``[1, 33, 3]`` metres, finite.
+        valid: ``[1, 33]``.
+        body: the pose of the skinned body, where the avatar needs it.
+
+    Raises:
+        ConfigError: when the avatar has no Gaussians (``image_to_image``).
+    """
+    gaussians, sh, frames = _posed(avatar, p, valid, body)
+    assert gaussians.covariances is not None
+    values, axes = torch.linalg.eigh(gaussians.covariances[0].double())
+    axes = axes * torch.linalg.det(axes).sign()[:, None, None]  # eigenvectors may be mirrored
+    given = (
+        gaussians.means[0],
+        values.clamp_min(THINNEST**2).sqrt(),
+        functional.normalize(rotation_matrix_to_quaternion(axes), dim=-1),
+        gaussians.opacities[0],
+        in_world(sh.double(), frames.double())[0],
+    )
+    return Splats(*(np.ascontiguousarray(x.float().cpu().numpy()) for x in given))
+
+
+def _posed(
+    avatar: Avatar, p: Tensor, valid: Tensor, body: BodyPose | None
+) -> tuple[Gaussians, Tensor, Tensor]:
+    """Ĝ, its harmonics ``[1, N, (d+1)², 3]``, and the frames ``[1, N, 3, 3]`` they are in."""
+    eye = p.new_zeros(1, 3)  # colours as seen from there are not used
+    if avatar.surface is not None:
+        assert body is not None
+        A, _ = avatar.surface.points.blend(body)
+        return avatar.surface(body, eye), avatar.surface.sh[None], A
+    psi = avatar.deformation
+    if psi is None:
+        raise ConfigError("this avatar has no Gaussians (model=image_to_image) to export")
+    frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
+    if avatar.body_points is not None:
+        points = avatar.body_points(body)
+    else:
+        assert avatar.densify is not None
+        points = avatar.densify(p, valid, frames)
+    root = root_of(p)
+    residuals = psi.residuals(points, psi.pose_code(p, root, frames.hubs[:, 0], None), root)
+    return psi.compose(points, residuals, eye), residuals.sh, points.frames
+
+
+def in_world(sh: Tensor, frames: Tensor) -> Tensor:
+    """Harmonics ``[B, N, (d+1)², 3]`` of parts with frames ``[B, N, 3, 3]``, in world axes."""
+    degree = math.isqrt(sh.shape[-2]) - 1
+    if degree == 0:
+        return sh
+    world = torch.from_numpy(even_sphere(DIRECTIONS)[1]).to(sh)  # [K, 3]
+    own = functional.normalize(world @ frames, dim=-1, eps=1e-6)  # rows Fᵀ v
+    colours = sh_basis(own, degree) @ sh
+    return torch.linalg.pinv(sh_basis(world, degree)) @ colours
+
+
+def ply_bytes(splats: Splats) -> bytes:
+    """A binary .ply file as 3D Gaussian splatting writes it (Kerbl et al., 2023).
+
+    Convention: log scales, logit opacities, harmonics channel by channel, zeros above the avatar's
+    degree; quaternions w x y z; normals are zero.
+    """
+    count = len(splats.means)
+    rest = np.zeros((count, 3, (MAX_DEGREE + 1) ** 2 - 1), np.float32)
+    rest[..., : splats.sh.shape[1] - 1] = splats.sh[:, 1:].transpose(0, 2, 1)
+    opacities = splats.opacities.astype(np.float64).clip(FAINTEST)
+    # of float32's 1.0 too: no logit of a float64 below 1 is infinite
+    logits = np.log(opacities) - np.log1p(-opacities.clip(max=1 - 1e-12))
+    columns = {
+        ("x", "y", "z"): splats.means,
+        ("nx", "ny", "nz"): np.zeros((count, 3)),
+        tuple(f"f_dc_{i}" for i in range(3)): splats.sh[:, 0],
+        tuple(f"f_rest_{i}" for i in range(rest[0].size)): rest.reshape(count, -1),
+        ("opacity",): logits[:, None],
+        tuple(f"scale_{i}" for i in range(3)): np.log(splats.scales.astype(np.float64)),
+        tuple(f"rot_{i}" for i in range(4)): splats.quats,
+    }
+    header = ["ply", "format binary_little_endian 1.0", f"comment {GENERATOR}"]
+    header += [f"element vertex {count}"]
+    header += [f"property float {name}" for names in columns for name in names]
+    rows = np.concatenate(list(columns.values()), axis=1).astype("<f4")
+    return "\n".join([*header, "end_header\n"]).encode() + rows.tobytes()
+
+
+def glb_bytes(splats: Splats, up: str) -> bytes:
+    """A binary glTF file of one point primitive with KHR_gaussian_splatting.
+
+    Convention: linear scales and opacities, quaternions x y z w. A node turns the world, whose up
+    axis is ``up``, to glTF's: Y up, a person in the standard pose faces +Z.
+
+    Source: KHR_gaussian_splatting as ratified in 2026, kernel ``ellipse``.
+    """
+    degree = math.isqrt(splats.sh.shape[1]) - 1
+    arrays = {
+        "POSITION": splats.means,
+        f"{EXTENSION}:ROTATION": np.roll(splats.quats, -1, axis=1),
+        f"{EXTENSION}:SCALE": splats.scales,
+        f"{EXTENSION}:OPACITY": splats.opacities[:, None],
+    }
+    for l in range(degree + 1):
+        for m in range(2 * l + 1):
+            arrays[f"{EXTENSION}:SH_DEGREE_{l}_COEF_{m}"] = splats.sh[:, l * l + m]
+    data, views, accessors = b"", [], []
+    for i, array in enumerate(arrays.values()):
+        raw = np.ascontiguousarray(array, "<f4").tobytes()
+        view = {"buffer": 0, "byteOffset": len(data), "byteLength": len(raw)}
+        views.append(view | {"target": ARRAY_BUFFER})
+        kind = "SCALAR" if array.shape[1] == 1 else f"VEC{array.shape[1]}"
+        accessor = {"bufferView": i, "componentType": FLOAT, "count": len(array), "type": kind}
+        accessors.append(accessor | {"min": array.min(0).tolist(), "max": array.max(0).tolist()})
+        data += raw
+    kernel = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {"mode": POINTS, "attributes": {name: i for i, name in enumerate(arrays)}}
+    primitive["extensions"] = {EXTENSION: kernel}
+    to_gltf = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]) @ upright(up)
+    w, x, y, z = rotation_matrix_to_quaternion(torch.from_numpy(to_gltf)[None])[0].tolist()
+    content = {
+        "asset": {"version": "2.0", "generator": GENERATOR},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": [x, y, z, w]}],
+        "meshes": [{"primitives": [primitive]}],
+        "buffers": [{"byteLength": len(data)}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    gltf = GLTF2.gltf_from_json(json.dumps(content))
+    gltf.set_binary_blob(data)
+    return b"".join(gltf.save_to_bytes())

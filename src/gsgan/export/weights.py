@@ -1,0 +1,61 @@
+"""Weights as safetensors: what `gsgan.load` needs of a run, in one file without pickle."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from gsgan.model.avatar import Avatar
+from gsgan.model.runs import avatar_of, read_config
+from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.tensors import pick_device
+
+KEPT = ("effects", "scene", "marks")  # of a checkpoint's facts
+
+
+def weights_bytes(folder: Path, avatar: Avatar, facts: dict[str, Any]) -> bytes:
+    """A .safetensors file of the avatar of a run folder.
+
+    Args:
+        folder: the run's.
+        avatar: its avatar.
+        facts: ``gsgan`` of its checkpoint.
+    """
+    from safetensors.torch import save
+
+    config = OmegaConf.to_container(read_config(folder), resolve=False)
+    metadata = {"format": "pt", "config": json.dumps(config)}
+    metadata["gsgan"] = json.dumps({key: facts.get(key) for key in KEPT})
+    return save({k: v.contiguous() for k, v in avatar.state_dict().items()}, metadata)
+
+
+def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
+    """The frozen avatar of a .safetensors file that `gsgan.export` wrote.
+
+    Args:
+        path: the file.
+        device: as for `gsgan.load`.
+
+    Raises:
+        DataError: when it is missing, damaged, or of another program.
+        ConfigError: when the package safetensors is missing.
+    """
+    try:
+        from safetensors import SafetensorError, safe_open
+    except ImportError:
+        raise ConfigError("safetensors files need: pip install 'gsgan[export]'") from None
+    path = Path(path).expanduser()
+    try:
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+            state = {f"avatar.{key}": file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except (OSError, SafetensorError) as error:
+        raise DataError(f"{path}: not a readable safetensors file ({error})") from None
+    if not {"config", "gsgan"} <= metadata.keys():
+        raise DataError(f"{path}: not written by gsgan.export (its metadata has no config)")
+    config = OmegaConf.create(json.loads(metadata["config"]))
+    checkpoint = {"gsgan": json.loads(metadata["gsgan"]), "state_dict": state}
+    return avatar_of(path, config, checkpoint).to(pick_device(device))

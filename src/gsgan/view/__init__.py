@@ -1,0 +1,1 @@
+"""``gsgan.view``: an avatar in the browser."""

@@ -1,0 +1,128 @@
+"""What the viewer shows of a painting: the image, or one of the maps that led to it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsgan.model.avatar import Avatar
+from gsgan.model.painting import Painting
+from gsgan.render.images import eight_bits
+from gsgan.scene import Camera
+from gsgan.splat import rasterise
+
+if TYPE_CHECKING:
+    from gsgan.scene import Frame
+
+Bytes = NDArray[np.uint8]
+
+IMAGE, COLOUR, PARTS, ALPHA = "image", "Step I's colour", "segmentation S", "alpha"
+DEPTH, FEATURE, ERROR = "depth", "feature channel", "error against truth"
+ERROR_SCALE = 4.0  # differences of 1/4 and more are the brightest
+
+
+def layers(avatar: Avatar, truth: bool) -> tuple[str, ...]:
+    """The layers that an avatar has."""
+    names = [IMAGE, ALPHA]
+    if avatar.splats is not None:
+        names += [COLOUR, DEPTH]
+    if avatar.splat_channels > 3:
+        names.append(FEATURE)
+    if avatar.segmentation is not None:
+        names.append(PARTS)
+    return (*names, *[ERROR] * truth)
+
+
+def shown(
+    layer: str,
+    painting: Painting,
+    camera: Camera,
+    avatar: Avatar,
+    behind: Tensor,
+    channel: int = 0,
+    truth: Frame | None = None,
+) -> Bytes:
+    """``[H, W, 3]`` a layer of one painting.
+
+    Args:
+        layer: of `layers`.
+        painting: with its maps where the layer is not the image.
+        camera: that sees it.
+        avatar: whose it is.
+        behind: ``[3, H, W]`` the image's background.
+        channel: of F, for that layer: its values between the image's least and largest.
+        truth: the frame with the true image, for the error.
+    """
+    assert painting.image is not None and painting.alpha is not None  # noqa: PT018
+    image, alpha = painting.image[0].cpu(), painting.alpha[0].cpu()
+    if layer == ALPHA:
+        return _grey(alpha[0])
+    if layer == ERROR and truth is not None:
+        error = (image.clamp(0, 1) - truth.image[0]).abs().mean(dim=0)
+        return _coloured(error * ERROR_SCALE)
+    if layer == PARTS and painting.segmentation is not None:
+        return _parts(painting.segmentation[0].cpu())
+    if layer == COLOUR and painting.features is not None and painting.splat_alpha is not None:
+        return eight_bits(painting.features[0, :3].cpu(), painting.splat_alpha[0].cpu(), behind)
+    if layer == FEATURE and painting.features is not None:
+        return _coloured(_stretched(painting.features[0, 3 + channel].cpu()))
+    if layer == DEPTH and painting.gaussians is not None:
+        return _depth(painting, camera, avatar)
+    return eight_bits(image, alpha, behind)
+
+
+def _depth(painting: Painting, camera: Camera, avatar: Avatar) -> Bytes:
+    assert painting.gaussians is not None
+    gaussians = avatar.bounded(painting.gaussians)
+    raster = rasterise(gaussians, camera, settings=avatar.accuracy, depth=True)
+    assert raster.depth is not None
+    alpha = raster.alpha[0, 0].cpu()
+    metres = raster.depth[0, 0].cpu() / alpha.clamp_min(1e-6)
+    seen = alpha > 0.5
+    near = 1 - _stretched(torch.where(seen, metres, metres[seen].mean() if seen.any() else 0.0))
+    return _coloured(near) * seen.numpy()[..., None]
+
+
+def _parts(probabilities: Tensor) -> Bytes:
+    """Classes ``[classes, H, W]`` in colours of the wheel, background black."""
+    import matplotlib
+
+    count = len(probabilities)
+    wheel = matplotlib.colormaps["hsv"](np.linspace(0, 1, count)[:, None] % 1)[:, 0, :3]
+    wheel[0] = 0
+    mixed = np.einsum("chw,ck->hwk", probabilities.numpy(), wheel)
+    return np.asarray((mixed.clip(0, 1) * 255).astype(np.uint8))
+
+
+def _stretched(x: Tensor) -> Tensor:
+    low, high = torch.aminmax(x)
+    return (x - low) / (high - low).clamp_min(1e-6)
+
+
+def _grey(x: Tensor) -> Bytes:
+    return np.repeat((x.clamp(0, 1) * 255).byte().numpy()[..., None], 3, axis=2)
+
+
+def _coloured(x: Tensor) -> Bytes:
+    import matplotlib
+
+    return np.asarray(matplotlib.colormaps["turbo"](x.clamp(0, 1).numpy(), bytes=True)[..., :3])
+
+
+def fitted(image: Bytes, aspect: float) -> Bytes:
+    """An image with black at its sides, or above and below, so that its width is ``aspect`` times
+    its height."""
+    height, width = image.shape[:2]
+    want: Sequence[int] = (
+        (height, round(height * aspect))
+        if aspect * height >= width
+        else (round(width / aspect), width)
+    )
+    room = [(b - a) // 2 for a, b in zip((height, width), want, strict=True)]
+    sides = [(r, b - a - r) for r, a, b in zip(room, (height, width), want, strict=True)]
+    return np.pad(image, (*sides, (0, 0)))

@@ -1,0 +1,163 @@
+"""The viewer's server: one painting thread, a session for each browser."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from gsgan.data.figure import upright
+from gsgan.export.motion import drive_of, rest_pose
+from gsgan.render.cameras import Orbit
+from gsgan.render.images import background
+from gsgan.render.run import Drive, Run
+from gsgan.utils.checks import above, whole
+from gsgan.utils.console import make_console
+from gsgan.utils.errors import ConfigError
+from gsgan.view.session import Session, Show
+
+MEGABYTE = 1 << 20
+IDLE = 0.1  # seconds between looks at whether an image is due
+
+
+def view_config(config: DictConfig) -> None:
+    """Serves until interrupted.
+
+    Raises:
+        ConfigError: on a value that cannot be used, or when viser is missing.
+        DataError: when the run or the motion cannot be used.
+    """
+    viewer = Viewer(config)
+    host, port = viewer.server.get_host(), viewer.server.get_port()
+    console = make_console()
+    console.print(viewer.show.drive.text, markup=False, highlight=False)
+    console.print(f"open http://{host}:{port} in a browser; end with Ctrl+C", highlight=False)
+    try:
+        viewer.serve()
+    finally:
+        viewer.stop()
+
+
+class Viewer:
+    """A server of one avatar.
+
+    Args:
+        config: as conf/view.yaml has it.
+    """
+
+    def __init__(self, config: DictConfig) -> None:
+        viser = _viser()
+        self.run, fps = Run(config), float(above("fps", config.fps))
+        drive = _start(config, self.run, fps)
+
+        def read(path: Path) -> Drive:
+            return drive_of(OmegaConf.merge(config, {"motion": str(path)}), self.run, fps)  # type: ignore[arg-type]
+
+        size = whole("pixels", config.pixels or self.run.stored.data.size or 512, 16)
+        behind: Any = background(str(config.background), video=True)
+        rate = float(above("rate", config.rate))
+        self.show = Show(self.run.avatar, drive, read, behind, size, fps, rate)
+        host, port = str(config.host), whole("port", config.port, 0)
+        logging.getLogger("websockets").setLevel(logging.WARNING)
+        with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
+            self.server = viser.ViserServer(host, port, label="gsgan", verbose=False)
+        # viser's button for a public address would show the avatar to anyone
+        self.server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
+        self.server.gui.configure_theme(show_share_button=False, control_width="medium")
+        self._camera(size)
+        limit = int(above("max_upload", config.max_upload) * MEGABYTE)
+        self.sessions: dict[int, Session] = {}
+        self._wake, self._ended = threading.Event(), False
+        self.server.on_client_connect(lambda client: self._join(client, limit))
+        self.server.on_client_disconnect(lambda client: self.sessions.pop(client.client_id, None))
+        self._painter = threading.Thread(target=self._paint, daemon=True, name="painting")
+        self._painter.start()
+
+    def serve(self) -> None:
+        """Waits until interrupted."""
+        threading.Event().wait()
+
+    def stop(self) -> None:
+        """Ends the server and its thread."""
+        self._ended = True
+        self._wake.set()
+        self._painter.join()
+        self.server.stop()
+
+    def _camera(self, size: int) -> None:
+        """Where new browsers look from: in front of the first pose, as near as training cameras."""
+        drive, scene, figure = self.show.drive, self.run.scene, self.run.figure
+        first = drive.p[:1]
+        known = np.where(np.isfinite(first), first, np.nanmean(first, 1, keepdims=True))
+        trained = self.run.stored.data.size or size
+        camera = Orbit().cameras(known, figure, scene, size, trained)
+        up = upright(figure.up)[2]
+        self.server.scene.set_up_direction(tuple(map(float, up)))
+        self.server.initial_camera.up = up
+        self.server.initial_camera.position = camera.centre[0].double().numpy()
+        self.server.initial_camera.look_at = known[0].mean(axis=0)
+        self.server.initial_camera.fov = float(np.radians(Orbit().fov))
+
+    def _join(self, client: Any, limit: int) -> None:
+        _bound_uploads(client, limit)
+        self.sessions[client.client_id] = Session(client, self.show, self._wake.set)
+        self._wake.set()
+
+    def _paint(self) -> None:
+        """Paints for one browser after the other, while any of them has something to show."""
+        while not self._ended:
+            busy = [session.step() for session in list(self.sessions.values())]
+            if not any(busy):
+                self._wake.wait(IDLE)
+                self._wake.clear()
+
+
+def _start(config: DictConfig, run: Run, fps: float) -> Drive:
+    """The motion to begin with: what is asked for, else held-out frames, else the rest pose."""
+    if config.motion == "rest":
+        return rest_pose(run.figure)
+    if config.motion is None:
+        splits = run.data.splits.items
+        split = next(name for name in ("novel_pose", "novel_view", "train") if splits[name])
+        config = OmegaConf.merge(config, {"motion": split})  # type: ignore[assignment]
+    return drive_of(config, run, fps)
+
+
+def _viser() -> Any:
+    try:
+        import viser
+    except ImportError:
+        raise ConfigError("the viewer needs the package viser: pip install 'gsgan[view]'") from None
+    return viser
+
+
+def _bound_uploads(client: Any, limit: int) -> None:
+    """Drops a browser's uploads of more than ``limit`` bytes, whatever size they declare.
+
+    viser keeps the parts of an upload until all are there, without a bound of its own.
+    """
+    from viser import _messages
+
+    held: dict[str, Any] = client.gui._current_file_upload_states
+    connection = client._websock_connection
+
+    def check(_: int, message: Any) -> None:
+        state = held.get(message.transfer_uuid)
+        if state and max(state["total_bytes"], state["transferred_bytes"]) > limit:
+            held.pop(message.transfer_uuid)
+            total = state["total_bytes"]  # the browser stops waiting
+            ends = message.source_component_uuid, message.transfer_uuid, total, total
+            connection.queue_message(_messages.FileTransferPartAck(*ends))
+            text = f"A motion file may have {limit // MEGABYTE} MB at most."
+            client.add_notification("This file is too large", text, color="red")
+
+    register: Callable[..., None] = connection.register_handler
+    for kind in (_messages.FileTransferStartUpload, _messages.FileTransferPart):
+        register(kind, check)

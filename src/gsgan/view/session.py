@@ -1,0 +1,294 @@
+"""One browser's view of the avatar: its camera, pose, layer, and what is painted next."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from gsgan.export.motion import inputs_of
+from gsgan.model.avatar import Avatar
+from gsgan.model.painting import Painting
+from gsgan.render.images import eight_bits
+from gsgan.render.run import Drive
+from gsgan.scene import Camera
+from gsgan.skeleton import MEDIAPIPE33
+from gsgan.utils.errors import GsganError
+from gsgan.utils.provenance import png_bytes
+from gsgan.view.drag import NAMES, dragged, position
+from gsgan.view.layers import ERROR, IMAGE, fitted, layers, shown
+
+Float = NDArray[np.float64]
+
+RESTS = 0.3  # seconds without movement, after which the image is painted in full
+SMALLEST = 0.25  # share of the full size that is painted while moving, at least
+WIDEST = 3.0  # widths per height: a browser window may be any
+SPEED_OVER = 2.0  # seconds over which the shown rate is counted
+YELLOW = (255, 200, 0)
+BONES = np.array(MEDIAPIPE33.edges)
+
+
+@dataclass(frozen=True)
+class Show:
+    """What all sessions share.
+
+    Args:
+        avatar: frozen.
+        drive: the motion at the start.
+        read: the motion in a file, for uploads.
+        behind: the background ``[3, H, W]`` of a size.
+        size: pixels of the height of a full image.
+        fps: frames per second of a motion that plays.
+        rate: images per second to keep while moving.
+    """
+
+    avatar: Avatar
+    drive: Drive
+    read: Callable[[Path], Drive]
+    behind: Callable[[tuple[int, int]], torch.Tensor]
+    size: int
+    fps: float
+    rate: float
+
+
+class Session:
+    """One client of the server; `step` is called by the painting thread alone."""
+
+    def __init__(self, client: Any, show: Show, wake: Callable[[], None]) -> None:
+        self.client, self.show, self._wake = client, show, wake
+        self.drive, self.frame = show.drive, 0
+        self.pose: Float | None = None  # dragged
+        self.changed = self.moved = time.monotonic()
+        self.painted = 0.0  # when what is shown was begun
+        self.full = False  # whether what is shown is of full size
+        self.seconds = 0.0  # of a full image
+        self.times: deque[float] = deque(maxlen=200)
+        self.image: NDArray[np.uint8] | None = None
+        self._problem = ""  # that the page shows
+        self._drawn: tuple[Any, ...] | None = None  # the pose and what is shown of it in 3D
+        self._nodes: list[Any] = []
+        self._gizmos: dict[str, Any] = {}
+        self._controls()
+
+    # -- the page
+
+    def _controls(self) -> None:
+        gui, client = self.client.gui, self.client
+        self.status = gui.add_text("images per second", "", disabled=True)
+        names = layers(self.show.avatar, self.drive.truth is not None)
+        self.layer = gui.add_dropdown("layer", names, initial_value=IMAGE)
+        last = max(0, self.show.avatar.splat_channels - 4)
+        self.channel = gui.add_slider("channel of F", 0, max(1, last), 1, 0, visible=last > 0)
+        with gui.add_folder("motion"):
+            self.slider = gui.add_slider("frame", 0, max(1, len(self.drive.p) - 1), 1, 0)
+            self.play = gui.add_checkbox("play", False)
+            upload = gui.add_upload_button("load a motion file")
+            self.told = gui.add_markdown(self.drive.text)
+        with gui.add_folder("3D"):
+            self.handles = gui.add_checkbox("drag joints", False)
+            reset = gui.add_button("undo dragging")
+            self.bones = gui.add_checkbox("skeleton", False)
+            self.splats = gui.add_checkbox("Gaussians", False)
+        save = gui.add_button("save the image")
+        for control in (self.layer, self.channel, self.bones, self.splats, self.play):
+            control.on_update(lambda _: self.touch(moving=False))
+        self.handles.on_update(lambda _: self._show_handles())
+        self.slider.on_update(self._scrubbed)
+        upload.on_upload(lambda event: self._load(event.target.value))
+        reset.on_click(lambda _: self._scrub(self.frame))
+        save.on_click(lambda _: self._save())
+        client.camera.on_update(lambda _: self.touch())
+
+    def touch(self, moving: bool = True) -> None:
+        """Has the next image painted: fast where something moves, else in full."""
+        self.changed = time.monotonic()
+        if moving:
+            self.moved = self.changed
+        self._wake()
+
+    def _scrubbed(self, event: Any) -> None:
+        if event.client_id is not None:  # the user moved it, not `step`
+            self._scrub(int(self.slider.value))
+
+    def _scrub(self, frame: int) -> None:
+        self.frame, self.pose = min(frame, len(self.drive.p) - 1), None
+        self.touch()
+
+    def _load(self, file: Any) -> None:
+        """Plays an uploaded motion; what is wrong with it is shown on the page."""
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                path = Path(folder) / Path(file.name).name
+                path.write_bytes(file.content)
+                drive = self.show.read(path)
+        except Exception as error:  # of a file by anyone: the server must live
+            text = (
+                str(error) if isinstance(error, GsganError) else f"{type(error).__name__}: {error}"
+            )
+            self._warn("This motion cannot be used", text.replace(folder + "/", ""))
+            return
+        self.drive, self.told.content = drive, drive.text
+        self.layer.options = layers(self.show.avatar, drive.truth is not None)
+        self.slider.max = max(1, len(drive.p) - 1)
+        self.slider.value = 0
+        self._scrub(0)
+
+    def _warn(self, title: str, text: str) -> None:
+        self.client.add_notification(title, text, color="red")
+
+    def _save(self) -> None:
+        if self.image is not None:
+            name = f"gsgan_{self.frame:06d}.png"
+            self.client.send_file_download(
+                name, png_bytes(Image.fromarray(self.image)), save_immediately=True
+            )
+
+    # -- dragging
+
+    def _show_handles(self) -> None:
+        for gizmo in self._gizmos.values():
+            gizmo.remove()
+        self._gizmos = {}
+        if self.handles.value:
+            for name in NAMES:
+                gizmo = self.client.scene.add_transform_controls(
+                    f"/drag/{name}", scale=0.12, disable_rotations=True, depth_test=False,
+                    position=position(self.joints(), name),
+                )  # fmt: skip
+                gizmo.on_update(lambda event, name=name: self.drag(name, event.target.position))
+                self._gizmos[name] = gizmo
+        self.touch(moving=False)
+
+    def drag(self, name: str, target: Any) -> None:
+        """Moves a joint to ``target`` ``[3]``, metres."""
+        self.pose = dragged(self.joints(), name, np.asarray(target, np.float64))
+        self.play.value = False
+        for other, gizmo in self._gizmos.items():
+            if other != name:
+                gizmo.position = position(self.pose, other)
+        self.touch()
+
+    def joints(self) -> Float:
+        """``[33, 3]`` metres: the pose that is shown, finite."""
+        if self.pose is not None:
+            return self.pose
+        p, _, _ = inputs_of(self.show.avatar, self.drive, self.frame)
+        return np.asarray(p[0].numpy(), np.float64)
+
+    # -- painting
+
+    def step(self) -> bool:
+        """Paints where something has changed; whether it did."""
+        now = time.monotonic()
+        if self.play.value and len(self.drive.p) > 1:
+            if now - self.painted < 1 / self.show.fps:
+                return True
+            passed = max(1, round((now - self.painted) * self.show.fps)) if self.painted else 1
+            self.frame, self.pose = (self.frame + passed) % len(self.drive.p), None
+            self.slider.value = self.frame
+            self.changed = self.moved = now
+        moving = now - self.moved < RESTS
+        if self.painted > self.changed and (self.full or moving):
+            return moving
+        share = 1.0
+        if moving and self.seconds:
+            share = min(1.0, max(SMALLEST, (1 / self.show.rate / self.seconds) ** 0.5))
+        self.painted, self.full = now, False
+        try:
+            self._paint(share)
+        except (GsganError, ValueError) as error:
+            if self._problem != str(error):  # once, not for every image
+                self._problem = str(error)
+                self._warn("This pose cannot be painted", self._problem)
+            self.play.value, self.full = False, True
+            return False
+        self._problem = ""
+        self.full = share == 1
+        took = time.monotonic() - now
+        whole = took / share**2
+        self.seconds = whole if not self.seconds else 0.7 * self.seconds + 0.3 * whole
+        return True
+
+    def camera(self, share: float) -> Camera:
+        """The browser's camera; its image is ``share`` of the full height."""
+        view = self.client.camera
+        height = max(16, round(self.show.size * share))
+        aspect = min(WIDEST, max(1 / WIDEST, view.aspect))
+        size = height, max(16, round(height * aspect))
+        focal = height / 2 / np.tan(view.fov / 2)
+        w, x, y, z = view.wxyz
+        R = Rotation.from_quat([x, y, z, w]).as_matrix().T
+        K = [[focal, 0, size[1] / 2], [0, focal, size[0] / 2], [0, 0, 1]]
+        t = -R @ view.position
+        world = [torch.tensor(np.array(a), dtype=torch.float32)[None] for a in (K, R, t)]
+        return Camera(world[0], world[1], world[2], size)
+
+    def _paint(self, share: float) -> None:
+        avatar, layer = self.show.avatar, self.layer.value
+        truth = self.drive.truth(self.frame) if layer == ERROR and self.drive.truth else None
+        camera = self.camera(share) if truth is None else truth.camera
+        p, body = self.drive.p[self.frame], None
+        if self.pose is not None:
+            p = self.pose
+        elif self.drive.body is not None:
+            body = self.drive.body[self.frame : self.frame + 1]
+        painting = avatar.picture(
+            torch.from_numpy(p),
+            camera,
+            visibility=torch.from_numpy(self.drive.visibility[self.frame]),
+            body=body,
+            maps=layer != IMAGE or self.splats.value,
+        )
+        behind = self.show.behind(camera.size)
+        image = shown(layer, painting, camera, avatar, behind, int(self.channel.value), truth)
+        self.image = image
+        whole = fitted(image, self.client.camera.aspect) if truth is not None else image
+        if self.splats.value and painting.gaussians is not None:  # the browser draws them instead
+            whole = eight_bits(behind, torch.ones(1), behind)
+        self.client.scene.set_background_image(whole, "jpeg", jpeg_quality=90)
+        self._place(painting)
+        self.times.append(time.monotonic())
+        recent = [x for x in self.times if x > self.times[-1] - SPEED_OVER]
+        rate = (len(recent) - 1) / max(recent[-1] - recent[0], 1e-6)
+        height, width = image.shape[:2]
+        shown_rate = f"{rate:.1f} at " if len(recent) > 1 else ""
+        self.status.value = f"{shown_rate}{width} × {height}"
+
+    def _place(self, painting: Painting) -> None:
+        """Draws skeleton and Gaussians, and moves the handles unless they are being dragged."""
+        scene, p, splats = self.client.scene, self.joints(), painting.gaussians
+        wanted = self.bones.value, self.splats.value and splats is not None
+        if (
+            self._drawn is not None
+            and self._drawn[1:] == wanted
+            and np.array_equal(self._drawn[0], p)
+        ):
+            return
+        self._drawn = (p, *wanted)
+        for node in self._nodes:
+            node.remove()
+        self._nodes = []
+        if wanted[0]:
+            lines = scene.add_line_segments("/skeleton", p[BONES], colors=YELLOW, line_width=3.0)
+            self._nodes.append(lines)
+        if wanted[1]:
+            assert splats is not None and splats.covariances is not None  # noqa: PT018
+            given = (
+                *(splats.means[0], splats.covariances[0]),
+                *(splats.features[0, :, :3].clamp(0, 1), splats.opacities[0, :, None]),
+            )
+            arrays = (x.cpu().numpy() for x in given)
+            self._nodes.append(scene.add_gaussian_splats("/gaussians", *arrays))
+        if self.pose is None:
+            for name, gizmo in self._gizmos.items():
+                gizmo.position = position(p, name)

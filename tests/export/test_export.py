@@ -1,0 +1,79 @@
+"""``python -m gsgan.export``: files, cards and refusals of the real command."""
+
+from __future__ import annotations
+
+import pytest
+from commands import refused
+from PIL import Image
+
+from gsgan.utils.provenance import png_bytes
+
+
+def test_a_sequence_of_ply_files_and_its_card(bare, tmp_path, inside):
+    out = tmp_path / "poses"
+    given = [f"run={bare}", f"out={out}", "motion=novel_pose"]
+    result = inside("export", *given)
+    assert result.returncode == 0, result.stderr
+    files = sorted(path.name for path in out.iterdir())
+    assert files == ["000004.ply", "000005.ply", "MODEL_CARD.md"]
+    first, second = ((out / name).read_bytes() for name in files[:2])
+    assert first[:3] == b"ply"
+    assert first != second
+    card = (out / "MODEL_CARD.md").read_text()
+    for part in ("Effects", "Scores on held-out images", "Intended use", "Licence", "Apache-2.0"):
+        assert part in card
+    assert "license: other" in card
+    refused(inside("export", *given), "exists", "overwrite=true")
+    again = inside("export", *given, "overwrite=true", "licence=cc-by-nc-4.0")
+    assert again.returncode == 0, again.stderr
+    assert "license: cc-by-nc-4.0" in (out / "MODEL_CARD.md").read_text()
+
+
+def test_the_rest_pose_as_glb(bare, tmp_path, inside):
+    out = tmp_path / "rest.glb"
+    result = inside("export", f"run={bare}", "format=gltf", f"out={out}")
+    assert result.returncode == 0, result.stderr
+    assert out.read_bytes()[:4] == b"glTF"
+    assert "KHR_gaussian_splatting" in (tmp_path / "rest.MODEL_CARD.md").read_text()
+
+
+def test_a_trained_run_as_safetensors_with_its_scores(run, tmp_path, inside):
+    out = tmp_path / "one.safetensors"
+    result = inside("export", f"run={run}", "format=safetensors", f"out={out}")
+    assert result.returncode == 0, result.stderr
+    card = (tmp_path / "one.MODEL_CARD.md").read_text()
+    assert "| novel_pose | final image |" in card
+    assert "marked: perceptual loss" in card
+
+
+def test_verify_reads_a_file(tmp_path, inside):
+    path = tmp_path / "a.png"
+    path.write_bytes(png_bytes(Image.new("RGB", (2, 2))))
+    result = inside("export", f"verify={path}")
+    assert result.returncode == 0, result.stderr
+    assert "trainedAlgorithmicMedia" in result.stdout
+    refused(inside("export", f"verify={tmp_path / 'none.png'}"), "none.png", "cannot be read")
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        (("out=a.ply", "format=fbx"), ("format", "safetensors")),
+        ((), ("out is not set",)),
+        (("out=a.glb",), (".ply file or a folder",)),
+        (("out=folder", "format=onnx"), (".onnx file",)),
+        (("out=a.ply", "motion=none.bvh"), ("none.bvh", "does not exist")),
+        (("out=a.ply", "start=9"), ("start=9", "has")),
+        (("out=a.glb", "format=gltf", "fps=0", "motion=novel_pose"), ("fps",)),
+    ],
+)
+def test_refusals(given, words, bare, tmp_path, inside):
+    refused(inside("export", f"run={bare}", *given), *words)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_body_pose_that_is_missing_is_solved(run, tmp_path, inside):
+    out = tmp_path / "a.ply"
+    result = inside("export", f"run={run}", "motion=rest", f"out={out}")
+    assert result.returncode == 0, result.stderr
+    assert out.read_bytes()[:3] == b"ply"

@@ -1,0 +1,161 @@
+"""Exported Gaussians: what other programs read is what the avatar draws."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pygltflib
+import pytest
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from gsgan.export.splats import Splats, glb_bytes, in_world, ply_bytes, splats_of
+from gsgan.scene import Gaussians
+from gsgan.splat import rasterise, sh_to_colour
+
+NAMES = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3))]
+NAMES += [*(f"f_rest_{i}" for i in range(45)), "opacity"]
+NAMES += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
+
+
+@pytest.fixture
+def posed(build):
+    """An avatar with weights of some size, and a frame: ``posed(overrides…)``."""
+
+    def run(*overrides: str):
+        _, avatar, frame = build(*overrides)
+        generator = torch.Generator().manual_seed(0)
+        with torch.no_grad():
+            for parameter in avatar.splats.parameters():
+                parameter += 0.05 * torch.randn(parameter.shape, generator=generator)
+        for part in avatar.modules():
+            if hasattr(part, "active_degree"):
+                part.active_degree = part.sh_degree
+        return avatar.freeze(), frame
+
+    return run
+
+
+def splats_and_truth(avatar, frame) -> tuple[Splats, Gaussians]:
+    with torch.no_grad():
+        splats = splats_of(avatar, frame.skeleton, frame.visibility > 0, frame.body)
+        painting = avatar(frame.skeleton, frame.visibility, frame.camera, frame.body)
+    return splats, painting.gaussians
+
+
+def read_ply(content: bytes) -> Gaussians:
+    """As 3D Gaussian splatting's own reader: sigmoid, exp, harmonics channel by channel."""
+    raw = trimesh.load(io.BytesIO(content), "ply", process=False).metadata["_ply_raw"]["vertex"]
+    assert raw["length"] == len(raw["data"]["x"])
+    assert list(raw["properties"]) == NAMES
+    column = {name: torch.from_numpy(np.array(raw["data"][name]).reshape(-1)) for name in NAMES}
+
+    def rows(*names: str) -> torch.Tensor:
+        return torch.stack([column[name] for name in names], dim=-1)
+
+    rest = rows(*NAMES[9:54]).unflatten(-1, (3, 15)).mT
+    sh = torch.cat([rows(*NAMES[6:9])[:, None], rest], dim=1)
+    return Gaussians(
+        rows("x", "y", "z")[None],
+        rows(*NAMES[-4:])[None],
+        rows(*NAMES[-7:-4]).exp()[None],
+        column["opacity"].sigmoid()[None],
+        sh.flatten(1)[None],
+    )
+
+
+def covariances(gaussians: Gaussians) -> np.ndarray:
+    x, y, z, w = np.roll(gaussians.quats[0].numpy(), -1, axis=1).T
+    turn = Rotation.from_quat(np.stack([x, y, z, w], axis=1)).as_matrix()
+    axes = turn * gaussians.scales[0].double().numpy()[:, None]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+CASES = {
+    "densify": ("effects.body_points=off", "effects.view_dependence=2"),
+    "on the body": ("effects.body_points=on", "effects.view_dependence=0"),
+    "lbs": ("model=lbs_splat", "effects.view_dependence=1"),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_ply_read_back_is_the_gaussians(case, posed):
+    avatar, frame = posed(*CASES[case])
+    splats, truth = splats_and_truth(avatar, frame)
+    read = read_ply(ply_bytes(splats))
+    torch.testing.assert_close(read.means, truth.means)
+    torch.testing.assert_close(read.opacities, truth.opacities)
+    known = truth.covariances[0].numpy()
+    largest = np.abs(known).max(axis=(1, 2), keepdims=True)
+    assert (np.abs(covariances(read) - known) / largest).max() < 2e-6
+    view = torch.nn.functional.normalize(truth.means - frame.camera.centre[:, None], dim=-1)
+    colour = sh_to_colour(read.features.unflatten(-1, (16, 3)), view).clamp_min(0)
+    # frames of a skinned body shear: their harmonics are fitted
+    tolerance = 0.02 if case == "lbs" else 2e-5
+    assert (colour - truth.features[..., :3]).abs().max() < tolerance
+    assert truth.features[..., :3].std() > 0.01
+
+
+def test_a_ply_drawn_is_step_ones_image(posed):
+    avatar, frame = posed(*CASES["densify"])
+    splats, _ = splats_and_truth(avatar, frame)
+    read = read_ply(ply_bytes(splats))
+    view = read.means - frame.camera.centre[:, None]
+    colour = sh_to_colour(read.features.unflatten(-1, (16, 3)), view).clamp_min(0)
+    read = Gaussians(read.means, read.quats, read.scales, read.opacities, colour)
+    drawn = rasterise(read, frame.camera, settings=avatar.accuracy, on_invalid="drop")
+    with torch.no_grad():
+        painting = avatar(frame.skeleton, frame.visibility, frame.camera, frame.body)
+    assert (drawn.features - painting.features[:, :3]).abs().max() < 1e-4
+
+
+def test_harmonics_turn_with_their_part():
+    generator = torch.Generator().manual_seed(0)
+    sh = torch.randn(1, 5, 16, 3, generator=generator, dtype=torch.float64)
+    turns = torch.from_numpy(Rotation.random(5, random_state=0).as_matrix())[None]
+    view = torch.randn(1, 5, 3, generator=generator, dtype=torch.float64)
+    own = (turns.mT @ view[..., None])[..., 0]
+    torch.testing.assert_close(sh_to_colour(in_world(sh, turns), view), sh_to_colour(sh, own))
+
+
+def test_what_is_not_drawn_has_finite_numbers():
+    one = np.ones((2, 3), np.float32)
+    opacities = np.array([0, 1], np.float32)
+    splats = Splats(one, one, np.eye(4, dtype=np.float32)[:2], opacities, one[:, None])
+    read = read_ply(ply_bytes(splats))
+    assert all(torch.isfinite(x).all() for x in (read.opacities, read.features))
+    np.testing.assert_allclose(read.opacities[0], opacities, atol=1e-7)
+
+
+def test_a_glb_holds_the_same_gaussians(posed):
+    avatar, frame = posed(*CASES["densify"])
+    splats, truth = splats_and_truth(avatar, frame)
+    gltf = pygltflib.GLTF2.load_from_bytes(glb_bytes(splats, "-y"))
+    assert gltf.extensionsUsed == ["KHR_gaussian_splatting"]
+    primitive = gltf.meshes[0].primitives[0]
+    assert primitive.mode == pygltflib.POINTS
+    kernel = primitive.extensions["KHR_gaussian_splatting"]
+    assert kernel == {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    read = {}
+    for name, at in vars(primitive.attributes).items():
+        if at is None:
+            continue
+        accessor = gltf.accessors[at]
+        view = gltf.bufferViews[accessor.bufferView]
+        raw = gltf.binary_blob()[view.byteOffset : view.byteOffset + view.byteLength]
+        read[name.removeprefix("KHR_gaussian_splatting:")] = np.frombuffer(raw, "<f4").reshape(
+            accessor.count, -1
+        )
+    harmonics = [f"SH_DEGREE_{l}_COEF_{m}" for l in range(3) for m in range(2 * l + 1)]
+    assert set(read) == {"POSITION", "ROTATION", "SCALE", "OPACITY", *harmonics}
+    np.testing.assert_array_equal(np.stack([read[n] for n in harmonics], 1), splats.sh)
+    np.testing.assert_array_equal(read["POSITION"], truth.means[0])
+    np.testing.assert_allclose(read["OPACITY"][:, 0], truth.opacities[0])
+    turn = Rotation.from_quat(read["ROTATION"]).as_matrix()  # x y z w, as glTF has it
+    axes = turn * read["SCALE"][:, None]
+    known = truth.covariances[0].numpy()
+    np.testing.assert_allclose(axes @ axes.transpose(0, 2, 1), known, atol=2e-6 * known.max())
+    up = Rotation.from_quat(gltf.nodes[0].rotation).apply([0, -1, 0])
+    np.testing.assert_allclose(up, [0, 1, 0], atol=1e-9)
