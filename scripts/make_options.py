@@ -24,6 +24,7 @@ ORDER = (
     "fit",
     "train",
     "evaluate",
+    "render",
     "report",
 )
 

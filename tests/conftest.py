@@ -174,3 +174,16 @@ def run(capture: Path, shared, tmp_path_factory: pytest.TempPathFactory) -> Path
         assert "marked: perceptual loss" in result.stdout
 
     return shutil.copytree(shared("run", make), tmp_path_factory.mktemp("runs") / "one")
+
+
+@pytest.fixture(scope="session")
+def bare(capture: Path, shared, tmp_path_factory) -> Path:
+    """A tiny run whose avatar is driven by skeletons alone."""
+    from commands import train
+
+    def make(folder: Path) -> None:
+        off = ("model=wo_seg", "effects.body_points=off", "evaluate=false")
+        result = train(capture, folder, *off)
+        assert result.returncode == 0, result.stdout + result.stderr
+
+    return shutil.copytree(shared("bare", make), tmp_path_factory.mktemp("runs") / "bare")

@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from commands import ROOT, TINY
 
@@ -68,7 +69,7 @@ def model_file(shared) -> Callable[[str], Path]:
 
 
 @pytest.fixture
-def place(capture, run, model_file, tmp_path_factory) -> Callable[[str], str]:
+def place(capture, run, bare, model_file, tmp_path_factory) -> Callable[[str], str]:
     """Puts real, tiny files in the place of a documented line's placeholders."""
 
     def folder() -> Path:
@@ -123,13 +124,29 @@ def place(capture, run, model_file, tmp_path_factory) -> Callable[[str], str]:
     def another_run(name: str) -> Path:
         return Path(shutil.copytree(run, folder() / name))
 
+    def moving(name: str) -> Path:
+        from mannequin import mannequin, write_bvh
+
+        from gsgan.data.synthetic.motion import Choreography
+
+        person = mannequin()
+        return write_bvh(folder() / name, person, Choreography(person).at(np.ones(2)), 1 / 30)
+
+    def rendered() -> Path:
+        from PIL import Image
+
+        from gsgan.utils.provenance import png_bytes
+
+        path = folder() / "000000.png"
+        path.write_bytes(png_bytes(Image.new("RGB", (8, 8))))
+        return path
+
     makers: dict[str, Callable[[], Path | str]] = {
+        "gsgan.render run=<run folder>": lambda: f"gsgan.render run={bare}",
+        "/path/to/dance.bvh": lambda: moving("dance.bvh"),
+        "/path/to/000000.png": rendered,
         "/path/to/run_wo_gcn": lambda: another_run("run_wo_gcn"),
         "/path/to/run_wo_seg": lambda: another_run("run_wo_seg"),
-        "out=/path/to/capture/landmarks3d_fit.npz": lambda: f"out={folder() / 'fit.npz'}",
-        "data.reader.landmarks=landmarks3d_fit.npz": lambda: (
-            f"data.reader.landmarks={capture / 'landmarks3d.npz'}"
-        ),
         "out=/path/to/capture": lambda: f"out={folder() / 'capture'}",
         "/path/to/capture": lambda: capture,
         "<run folder>": lambda: run,
@@ -230,7 +247,8 @@ def test_every_documented_command_runs(line, place, capture, inside, tmp_path):
     if name == "bench":
         arguments = tiny_bench(arguments, tmp_path, capture)
     if name == "fit":
-        arguments += ["size.picture=32", "fit.shape_steps=2", "fit.sweeps=1", "shown=1"]
+        arguments += ["size.picture=32", "fit.points=200", "fit.surface_steps=2"]
+        arguments += ["fit.sweeps=1", "shown=1", f"out={tmp_path / 'fit'}"]
     if name == "prepare":  # MediaPipe is not at hand: its output is given
         source = next(a for a in arguments if a.startswith("source=")).removeprefix("source=")
         arguments = [a for a in arguments if a != "setup=true"]

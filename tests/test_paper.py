@@ -131,7 +131,13 @@ def test_the_page_lists_keys_that_exist_and_values_of_the_preset(compose):
 
 # Under the preset these are off, or say what another listed key says.
 UNLISTED = (
-    *("model.body_points", "training.recipes.colour", "training.schedule.stretch"),
+    *(
+        "model.body_points",
+        "training.recipes.colour",
+        "training.schedule.stretch",
+        "training.schedule.coarse",
+    ),
+    *("training.recipes.pose", "training.pose_prior"),  # no body, or one with its own poses
     *("model.segmentation.hands_face", "training.perceptual.width", "training.recipes.psi.span"),
 )
 

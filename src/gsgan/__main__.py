@@ -3,9 +3,11 @@
 COMMANDS = {
     "gsgan.prepare": "make a dataset from videos: source=<folder> out=<folder>",
     "gsgan.check": "check a dataset before training: data=capture data.root=<folder>",
-    "gsgan.fit": "refine landmarks to fit the masks: data.root=<folder> out=<file.npz>",
+    "gsgan.fit": "fit the body to a capture's masks: data=capture data.root=<folder>",
     "gsgan.train": "train an avatar, then score it on the held-out splits",
     "gsgan.evaluate": "score a run, run=<folder>, or any method's images, predictions=<folder>",
+    "gsgan.render": "drive an avatar: run=<folder> motion=<file> out=<video.mp4|folder>",
+    "gsgan.export": "read what an image or video says about its origin: verify=<file>",
     "gsgan.report": "tables of scored runs, runs=[<folder>,…], and figures of a run, run=<folder>",
     "gsgan.bench": "measure speed and accuracy: raster, speed, trade-off, effects",
 }

@@ -246,6 +246,19 @@ def test_the_degree_is_raised_by_the_schedule():
 # --- runs
 
 
+def test_f_is_supersampled_after_the_coarse_iterations_of_step_one():
+    from gsgan.train.schedule import Schedule
+
+    schedule = Schedule(segmentation=10, step_one=30, step_two=30, coarse=20, stretch=0.5)
+    fitted = schedule.fitted(segmentation=True, from_masks=False, splats=True, generator=True)
+    assert [fitted.fine(step) for step in (9, 10, 19, 20, 25, 39)] == [
+        True,
+        False,
+        False,
+        *[True] * 3,
+    ]
+
+
 def test_decisions_are_stored_and_taken_up_again(capture, inside, tmp_path):
     from commands import arguments
 

@@ -158,7 +158,7 @@ def test_finer_settings_are_more_accurate(backend):
         float((rasterise(gaussians, cam, settings=s, backend=backend).features - want).abs().max())
         for s in ("high", "standard", "draft")
     ]
-    assert errors[0] < 2e-5 < 1e-3 < errors[1] < errors[2] < 0.1
+    assert errors[0] < 1e-4 < 1e-3 < errors[1] < errors[2] < 0.1
 
 
 @fast_backend

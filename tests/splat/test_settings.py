@@ -35,7 +35,7 @@ def test_values_of_the_presets():
     table = {name: (s.alpha_min, s.transmittance_min, s.extent) for name, s in ACCURACY.items()}
     assert table == {
         "exact": (0, 0, "all"),
-        "high": (1e-6, 1e-6, "opacity"),
+        "high": (1e-5, 1e-5, "opacity"),
         "standard": (1 / 255, 1e-4, "opacity"),
         "draft": (1 / 64, 1e-2, "sigma"),
     }

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from gsgan.bench import common, compare
 from gsgan.bench.common import NOTHING, check_whole, markdown, number
+from gsgan.bench.roofline import least, peaks
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.splat import BACKENDS, Accuracy, rasterise, resolve_backend
 from gsgan.utils.checks import at_least, whole
@@ -32,6 +33,7 @@ TIMES = {"forward_ms": "forward", "both_ms": "forward + backward"}
 NUMBERS = {
     "forward_ms": ("forward ms", 3),
     "both_ms": ("forward + backward ms", 3),
+    "over_least": ("forward / least", 2),
     "value_max": ("largest error", 2),
     "value_mean": ("mean error", 2),
     "bound": ("proven bound", 2),
@@ -61,23 +63,25 @@ def run(config: DictConfig, folder: Path) -> None:
     bench = common.Bench.start("raster", config, folder)
     grid = [(n, c, s) for n in config.gaussians for c in config.channels for s in config.sizes]
     rows: list[dict[str, Any]] = []
+    peak = peaks(bench.device)
     with bench.progress() as progress:
         task = progress.add_task("", total=len(grid))
         for n, channels, size in grid:
             progress.update(task, description=f"N={n} C={channels} {size}²")
             found = variants(config, settings, n, bench.device)
             cell = {"gaussians": n, "channels": channels, "size": size}
-            rows += measure_cell(config, cell, found, bench.device)
+            rows += measure_cell(config, cell, found, bench.device, peak)
             progress.advance(task)
     frame = pd.DataFrame(rows)
     n, size = config.reference.gaussians, config.reference.size
     here = frame[(frame.gaussians == n) & (frame["size"] == size)]
     bench.write(
         "What accuracy costs in time",
-        number_table(frame),
+        f"{number_table(frame)}\n\n`least` is compositing at this machine's peak: "
+        + " and ".join(f"{number(value)} {name}" for name, value in peak.items()),
         {"bench": OmegaConf.to_container(config), "rows": common.records(frame)},
         frame,
-        {"raster_error.png": error_plot(here)},
+        {"raster_error.png": error_plot(here), "raster_growth.png": growth_plot(frame)},
         docs=summary(frame, here, bench.where),
     )
     beyond = frame[frame.beyond > config.rounding] if "beyond" in frame else frame[:0]
@@ -124,9 +128,17 @@ def variants(
 
 
 def measure_cell(
-    config: DictConfig, cell: dict[str, int], found: list[Variant], device: torch.device
+    config: DictConfig,
+    cell: dict[str, int],
+    found: list[Variant],
+    device: torch.device,
+    peak: dict[str, float],
 ) -> list[dict[str, Any]]:
-    """One row per variant in one scene, a cell of the grid; what was not measured is missing."""
+    """One row per variant in one scene, a cell of the grid; what was not measured is missing.
+
+    ``over_least`` is the forward time as a multiple of what compositing takes at the machine's
+    ``peak``, see `gsgan.bench.roofline`.
+    """
     n, channels, size = cell.values()
     gaussians = compare.human_cloud(n, channels, config.seed).to(device)
     camera = compare.ring_camera(size).to(device)
@@ -135,6 +147,9 @@ def measure_cell(
         {**cell, "backend": backend, "setting": name, **own}
         for (backend, name, _), own in zip(found, times, strict=True)
     ]
+    for row, (_, _, setting) in zip(rows, found, strict=True):
+        if setting.alpha_min:
+            row["over_least"] = row["forward_ms"] / least(gaussians, camera, setting, peak)
     if n in config.compare_at:
         many, side, seed = config.windows, config.window, config.seed
         patches = compare.choose_patches(gaussians, camera, many, side, seed)
@@ -218,8 +233,31 @@ def summary(frame: pd.DataFrame, here: pd.DataFrame, where: Mapping[str, Any]) -
             number_table(here),
             f"`{GROWTH}`, milliseconds forward / forward + backward:",
             growth_table(frame),
+            "![time against Gaussians and pixels](pictures/raster_growth.png)",
         ]
     )
+
+
+def growth_plot(frame: pd.DataFrame) -> bytes:
+    """Time of `GROWTH` forward + backward against Gaussians and against pixels, by backend; PNG.
+
+    Left: one line per size of image; right: one per number of Gaussians; the most channels.
+    """
+    rows = frame[(frame.setting == GROWTH) & (frame.channels == frame.channels.max())]
+    rows = rows.assign(pixels=rows["size"] ** 2)
+    figure, panels = common.panels(2, 10.4, 4.2)
+    for axes, x, kind in zip(panels, ("gaussians", "pixels"), ("size", "gaussians"), strict=True):
+        for (backend, value), line in rows.groupby(["backend", kind]):
+            dash = DASHES[sorted(rows[kind].unique()).index(value) % len(DASHES)]
+            label = f"{backend}, {value}²" if kind == "size" else f"{backend}, N={value}"
+            axes.plot(line[x], line.both_ms, dash, color=COLOURS.get(backend, PURPLE), label=label)
+        axes.set(xlabel=x, xscale="log", yscale="log")
+        for axis in (axes.xaxis, axes.yaxis):
+            common.plain_ticks(axis)
+        if axes.get_lines():
+            axes.legend(fontsize=7, frameon=False)
+    panels[0].set_ylabel(f"{TIMES['both_ms']}, ms")
+    return common.png(figure)
 
 
 def error_plot(here: pd.DataFrame) -> bytes:

@@ -141,6 +141,14 @@ def composited(gaussians: Gaussians, camera: Camera, accuracy: Accuracy) -> tupl
     return pairs * (PER_PAIR + 2 * C), float(moved)
 
 
+def least(
+    gaussians: Gaussians, camera: Camera, accuracy: Accuracy, peak: dict[str, float]
+) -> float:
+    """Milliseconds that compositing takes at the machine's `peaks`."""
+    flop, moved = composited(gaussians, camera, accuracy)
+    return max(flop / peak["GFLOP/s"], moved / peak["GB/s"]) / 1e6
+
+
 def against(work: pd.DataFrame, ms: pd.Series, peak: dict[str, float]) -> pd.DataFrame:
     """The work beside its times: ``bound_ms``, the least that the peaks allow, and its share."""
     table = work.join(ms.rename("ms"), how="inner")

@@ -3,7 +3,7 @@
 Body models of the SMPL family are in `gsgan.body.smpl`.
 """
 
-from gsgan.body.free import Body, free_body, open_body, read_body
+from gsgan.body.free import Body, free_body, read_body
 from gsgan.body.lbs import (
     axis_angle_to_matrix,
     blend_transforms,
@@ -11,6 +11,7 @@ from gsgan.body.lbs import (
     forward_kinematics,
     skin,
 )
+from gsgan.body.shape import open_body
 from gsgan.body.skinned import SkinnedBody
 
 __all__ = [

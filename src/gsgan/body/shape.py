@@ -6,7 +6,7 @@ Convention: metres; the rest pose and axes of the body (see `gsgan.body.free`, `
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Generic, TypeVar
@@ -18,8 +18,8 @@ from torch import Tensor
 from gsgan.body.free import Body, free_body, free_body_path
 from gsgan.body.lbs import blend_transforms, skin
 from gsgan.body.skinned import MarkedBody
-from gsgan.body.smpl import SkinnedModel
-from gsgan.body.smpl_names import Parts
+from gsgan.body.smpl import SkinnedModel, read_smpl
+from gsgan.body.smpl_names import Parts, fitting_parts
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import DataError
 
@@ -227,3 +227,43 @@ def model_space(model: SkinnedModel, parts: Parts = "clothes") -> ShapeSpace[Mar
 def shaped_body(shape: BodyShape) -> Body:
     """The free body in a shape; differentiable in the shape's tensors."""
     return free_space().shaped(shape)
+
+
+def open_body(
+    kind: str | None,
+    file: str | None = None,
+    betas: Sequence[float] = (),
+    label_names: Sequence[str] = (),
+) -> MarkedBody | None:
+    """The body with its part labels, or None when no mesh of it is available.
+
+    A model file gets the set of parts with the names of the images' labels (the free body's,
+    CIHP's, or one part per joint), by default the free body's. Clothes on a model file are a guess,
+    and their names may differ from the images' labels: see `SkinnedBody.shares_labels`.
+
+    Args:
+        kind: "free", "smpl", "smplx", or another name from the data.
+        file: the user's model file; not needed for the free body.
+        betas: shape coefficients of the person; of the free body, the numbers of `BodyShape.flat`
+            or nothing for the body as it is.
+        label_names: the parts in the data's label images, background first; empty when unknown.
+
+    Raises:
+        DataError: when the file cannot be read or is of another body.
+    """
+    if kind == "free":
+        return shaped_body(BodyShape.of_flat(torch.tensor(betas))) if betas else free_body()
+    if kind is None or file is None:
+        return None
+    model = read_smpl(file)
+    if model.kind != kind:
+        raise DataError(
+            f"{file} is a model of kind {model.kind} ({len(model.parents)} joints), but the data's "
+            f"poses are of {kind}; give that model's file"
+        )
+    if len(betas) > model.shapedirs.shape[-1]:
+        raise DataError(
+            f"{file} has {model.shapedirs.shape[-1]} shape coefficients, the data gives "
+            f"{len(betas)}; give the model file that the data was fitted with"
+        )
+    return model.as_body(betas, fitting_parts(tuple(label_names), model.joint_names))

@@ -124,8 +124,8 @@ def reprojection_errors(subject: Subject) -> Float:
     """
     result = np.full(subject.visible.shape, np.nan)
     path = subject.layout.root / "landmarks3d.npz"
-    if subject.layout.landmarks.fitted_to or not path.is_file():
-        return result  # the errors are those of other joints
+    if not path.is_file():
+        return result
     arrays = read_arrays(path, ("reproj_px", "frame_id"))
     if "reproj_px" in arrays:
         ids = expect_array(arrays, "frame_id", (None,), path)

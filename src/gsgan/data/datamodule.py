@@ -37,6 +37,7 @@ __all__ = ["GsganData", "SceneInfo", "StepSampler", "count_labels", "pass_order"
 log = logging.getLogger(__name__)
 
 MOST_WORKERS = 8
+BODY = ("auto", "file", "fit", "none")
 LENSES: dict[str, Lens] = {
     "auto": "undistort",
     "on": "undistort",
@@ -62,6 +63,9 @@ class GsganData(LightningDataModule):
         root: the folder; or None when ``source`` makes it.
         source: called without arguments, makes the dataset if needed and returns its folder.
         reader: of the dataset's format (`gsgan.data.formats`); None is the bring-your-own layout.
+        body: ``file``, the poses that the dataset has, if any; ``fit``, those of `gsgan.fit`, which
+            training runs where they are missing; ``auto``, the dataset's, else `gsgan.fit`'s;
+            ``none``, no poses.
         protocol: the splits of a publication; None takes those of the dataset or the keys below.
         train_cameras, test_cameras, train_frames, test_frames, test_share: see `make_splits`.
         workers: loading processes; 0 loads in this one; None is 0 without a GPU, else up to
@@ -81,6 +85,7 @@ class GsganData(LightningDataModule):
         source: Callable[[], Path] | None = None,
         reader: Reader | None = None,
         smpl: str | None = None,
+        body: str = "auto",
         protocol: Protocol | None = None,
         size: int | None = None,
         crop: PersonCrop | str | None = None,
@@ -110,6 +115,7 @@ class GsganData(LightningDataModule):
         self.source = source
         self.reader = CaptureReader() if reader is None else reader
         self.smpl = smpl
+        self.body = one_of("data.body", body, BODY)
         self.protocol = protocol
         self.size = size
         if not (crop in (None, "person") or isinstance(crop, PersonCrop)):
@@ -152,7 +158,20 @@ class GsganData(LightningDataModule):
     @cached_property
     def layout(self) -> Layout:
         """The capture, read on first use."""
-        return self.reader(self._folder(), self.checks, self.smpl)
+        layout = self.reader(self._folder(), self.checks, self.smpl)
+        if self.body == "none":
+            layout = replace(layout, poses=None, meta=replace(layout.meta, body=None))
+        elif self.body == "fit" and not (layout.poses is None or layout.poses.fitted):
+            raise ConfigError(
+                f"data.body=fit, but {layout.root} has body poses of its own; choose data.body=file"
+            )
+        return layout
+
+    @property
+    def lacks_body(self) -> bool:
+        """Whether `gsgan.fit` is still to make the body poses."""
+        fits = self.body in ("auto", "fit") and isinstance(self.reader, CaptureReader)
+        return fits and self.layout.poses is None
 
     @cached_property
     def splits(self) -> Splits:
@@ -167,14 +186,23 @@ class GsganData(LightningDataModule):
                     "leave one of them out"
                 )
             splits = protocol_splits(self.layout, self.protocol)
-        marks = self.layout.landmarks
         held_out = set(splits.test_cameras) - set(splits.train_cameras)
-        if leaks := [camera for camera in marks.fitted_to if camera in held_out]:
+        poses = self.layout.poses
+        if leaks := [c for c in (poses.fitted_to if poses else ()) if c in held_out]:
             raise ConfigError(
-                f"{marks.source} was fitted to the masks of {leaks[0]}, which is held out here; "
-                "run gsgan.fit with the same data.train_cameras, data.test_cameras or protocol"
+                f"{self.layout.root}: body poses were fitted to the masks of {leaks[0]}, which is "
+                "held out here; run gsgan.fit with the same data.train_cameras, data.test_cameras "
+                "or protocol, and overwrite=true"
             )
         return splits
+
+    @property
+    def registered_held_out(self) -> tuple[int, ...]:
+        """Frames of held-out poses whose body `gsgan.fit` registered to their own masks."""
+        poses, items = self.layout.poses, self.splits.items
+        trained = {frame for _, frame in items["train"]}
+        frames = {frame for _, frame in items["novel_pose"]} - trained
+        return tuple(sorted(frames & (poses.registered if poses else frozenset())))
 
     @cached_property
     def _datasets(self) -> dict[str, CaptureDataset]:

@@ -169,7 +169,11 @@ class CaptureDataset(Dataset[Frame]):
 
     def camera(self, item: Item) -> Camera:
         """The camera of the item's image: window and scale are in its K."""
-        window, entry = self.window(item), self.layout.cameras[item[0]]
+        return self.camera_of(item[0], self.window(item))
+
+    def camera_of(self, name: str, window: Crop) -> Camera:
+        """A camera of the capture that sees a window of its image, at the dataset's size."""
+        entry = self.layout.cameras[name]
         K, R, t = (torch.from_numpy(a)[None] for a in (entry.K, entry.R, entry.t))
         lens = torch.from_numpy(entry.dist[None, :5]) if self._raw(entry) else None
         camera = Camera(K, R, t, entry.size, lens)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from gsgan.body import SkinnedBody, open_body
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.dataset import CaptureDataset
+from gsgan.data.figure import Figure, figure_of
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
 from gsgan.data.skeletons import body_height
@@ -61,6 +62,7 @@ class SceneInfo:
         darkest: brightness in [0, 1] of the person's darkest percent.
         body_inside: share of the posed body that lies inside the masks of training images; None
             without a body pose or mesh.
+        figure: the subject's proportions; None in checkpoints of older versions.
     """
 
     camera_names: tuple[str, ...]
@@ -90,6 +92,7 @@ class SceneInfo:
     surface: SurfaceColours | None = None
     darkest: float = 0.0
     body_inside: float | None = None
+    figure: Figure | None = None
 
 
 def scene_info(
@@ -151,6 +154,7 @@ def scene_info(
         surface=_shared_surface(layout, dataset, tuple(entries), samples, mesh),
         darkest=darkest,
         body_inside=inside,
+        figure=figure_of(p, valid, layout.meta.up_axis),
     )
 
 

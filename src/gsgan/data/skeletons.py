@@ -28,19 +28,12 @@ class Landmarks:
     """Skeletons by frame: ``p [J, 3]`` metres, finite, ``visibility [J]`` in [0, 1].
 
     A joint of visibility 0 is an estimate. ``source`` names the file or folder of the landmarks,
-    for messages; ``fitted_to`` the cameras to whose masks `gsgan.fit` moved them, empty for
-    landmarks that were not fitted.
+    for messages.
     """
 
     p: Mapping[int, Float]
     visibility: Mapping[int, Float]
     source: str = "landmarks3d.npz"
-    fitted_to: tuple[str, ...] = ()
-
-    def digest(self, frames: Iterable[int]) -> str:
-        """A hash of the skeletons of those frames."""
-        held = [part[f].tobytes() for f in frames for part in (self.p, self.visibility)]
-        return hashlib.sha256(b"".join(held)).hexdigest()
 
     def seen(self, frame: int) -> Float:
         """``[N, 3]`` the joints of a frame that were seen."""
@@ -54,11 +47,23 @@ class Landmarks:
 
 @dataclass(frozen=True)
 class Poses:
-    """Body poses by frame: ``theta [bones, 3]`` axis-angle, ``transl [3]`` metres."""
+    """Body poses by frame: ``theta [bones, 3]`` axis-angle, ``transl [3]`` metres.
+
+    ``fitted`` says that `gsgan.fit` made them: those of the frames ``registered`` by the masks of
+    the cameras ``fitted_to``, all others by their skeleton alone.
+    """
 
     theta: Mapping[int, Float]
     transl: Mapping[int, Float]
     source: str = "body_pose.npz"
+    fitted: bool = False
+    registered: frozenset[int] = frozenset()
+    fitted_to: tuple[str, ...] = ()
+
+    def digest(self, frames: Iterable[int]) -> str:
+        """A hash of the poses of those frames."""
+        held = [part[f].tobytes() for f in frames for part in (self.theta, self.transl)]
+        return hashlib.sha256(b"".join(held)).hexdigest()
 
 
 def make_landmarks(

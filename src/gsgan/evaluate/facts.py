@@ -96,7 +96,7 @@ def _commit() -> tuple[str | None, bool | None]:
 
 
 def fingerprint(data: GsganData) -> str:
-    """A short hash of cameras, frames, splits, image size and fitted landmarks, independent of the
+    """A short hash of cameras, frames, splits, image size and fitted body poses, independent of the
     contents of images and of where the files are."""
     layout = data.layout
     content: dict[str, Any] = {
@@ -106,8 +106,8 @@ def fingerprint(data: GsganData) -> str:
         "size": data.size,
         "crop": None if data.crop is None else asdict(data.crop),
     }
-    if layout.landmarks.fitted_to:  # other skeletons are other inputs, and crop other windows
-        content["landmarks"] = layout.landmarks.digest(layout.frames)
+    if layout.poses is not None and layout.poses.fitted:  # other poses are other inputs
+        content["poses"] = layout.poses.digest(layout.frames)
     plain = json.dumps(content, sort_keys=True).encode()
     return hashlib.sha256(plain).hexdigest()[:12]
 

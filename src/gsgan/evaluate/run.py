@@ -228,9 +228,8 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
     if background not in (None, measures.background):
         measures = replace(measures, background=background)
         marks = [*marks, f"scored on {background}"]
-    if fitted := data.layout.landmarks.fitted_to:
-        cameras = ", ".join(fitted)
-        marks = [*marks, f"skeletons fitted to the masks of {cameras}, held-out frames' too"]
+    if frames := data.registered_held_out:
+        marks = [*marks, f"body poses of {len(frames)} held-out frames fitted to their own masks"]
     boxes = BodyBoxes(data) if measures.needs_body_box else None
     record = data.protocol_record(config.lpips.net)
     if record is not None:

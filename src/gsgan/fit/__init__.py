@@ -1,1 +1,1 @@
-"""Skeletons moved so that the person fits the masks of all cameras."""
+"""The body fitted to a capture: its shape, and its pose registered to masks."""

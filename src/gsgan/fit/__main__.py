@@ -1,4 +1,4 @@
-"""``python -m gsgan.fit data.root=<folder> out=<file>``: landmarks that fit the masks."""
+"""``python -m gsgan.fit data.root=<folder>``: the body and its poses that fit the masks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from gsgan.utils.config import entry
 
 
 def fit(config: DictConfig) -> None:
-    """Moves the landmarks of ``config.data`` until the person fits its masks.
+    """Fits the body to the skeletons and masks of ``config.data``.
 
     Raises:
         GsganError: on anything the user can correct.

@@ -21,7 +21,7 @@ USUAL = 0.75  # quantile of the masks' areas that counts as usual: most may be n
 
 
 class Moments:
-    """The frames of a capture and their images by the training cameras.
+    """Frames of a capture and their images by the training cameras.
 
     Held-out cameras are not used: their images are for evaluation only. Images without a person, or
     nearly so, are left out, and frames without any other image.
@@ -30,16 +30,24 @@ class Moments:
         data: the capture.
         device: of the images.
         least_mask: least share of the usual mask area.
+        held_out: whether frames of held-out poses are used, too.
 
     Raises:
         DataError: when no image is left.
     """
 
-    def __init__(self, data: GsganData, device: torch.device, least_mask: float = 0.1) -> None:
+    def __init__(
+        self,
+        data: GsganData,
+        device: torch.device,
+        least_mask: float = 0.1,
+        held_out: bool = False,
+    ) -> None:
         layout, cameras = data.layout, data.splits.train_cameras
+        trained = sorted({frame for _, frame in data.splits.items["train"]})
         items = [
             (camera, frame)
-            for frame in layout.frames
+            for frame in (layout.frames if held_out else trained)
             for camera in cameras
             if frame in layout.images[camera]
         ]

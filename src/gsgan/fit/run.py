@@ -1,11 +1,12 @@
-"""`gsgan.fit`: a capture in, landmarks that fit its masks out."""
+"""`gsgan.fit`: a capture in, the person's body and its pose in every frame out."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,198 +15,300 @@ import numpy as np
 import torch
 from hydra.utils import instantiate
 from numpy.typing import NDArray
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 from rich.console import Console
 from torch import Tensor
 
 from gsgan import __version__
+from gsgan.body.measure import fit_shape
+from gsgan.body.shape import BodyShape, shaped_body
+from gsgan.body.solve import Solver
 from gsgan.check.overlays import caption
+from gsgan.data.calibration.find import METRES
+from gsgan.data.checks import spans
+from gsgan.data.crop import PersonCrop
 from gsgan.data.datamodule import GsganData
-from gsgan.data.files import read_arrays
-from gsgan.data.formats.capture import LANDMARKS, CaptureReader, landmarks_path
+from gsgan.data.formats.capture import LANDMARKS, POSES, SHAPE, CaptureReader
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.moments import Moments
 from gsgan.prepare.pictures import sampled
-from gsgan.prepare.work import progress, write_npz, writing
-from gsgan.scene import Frame
+from gsgan.prepare.work import progress, write_json, write_npz, writing
+from gsgan.scene import BodyPose, Frame
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.splat import accuracy
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically
 from gsgan.utils.tensors import pick_device
 
-SMALL_FILES = ("cameras.json", "meta.json")
+REPORT, SHEET, STOPPED = "body_fit.json", "body_fit.png", ".body_fit.stopped"
+PICTURE, MARGIN = 128, 0.2  # pixels; metres round the person
+LOW_PASS = 1 / 12  # square pixels: a pixel's own square
 TILE = 300  # pixels
 GREEN, ORANGE, BLUE = (60, 200, 60), (255, 140, 0), (60, 140, 255)
 BAR = (70, 70, 70)
-LEGEND = "green: mask   orange: the shape before   blue: after"
-METRES = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+LEGEND = "green: mask   orange: the body solved from the skeleton   blue: registered to the masks"
+WORST = 5  # joints and frames named in the summary
 
 
 def run_fit(config: DictConfig) -> Path:
-    """Fits the landmarks of ``config.data`` to its masks and writes ``config.out``.
-
-    A fit that was stopped resumes from a hidden file beside ``out``.
+    """Fits the body to ``config.data`` and writes it into ``config.out``, or into the capture.
 
     Returns:
-        The written file.
+        The folder of the written files.
 
     Raises:
         ConfigError, DataError: on anything the user can correct.
     """
-    console = make_console()
-    out = _out(config)
+    whole("shown", config.shown, 1)
     settings: Fit = instantiate(config.fit)
     data: GsganData = instantiate(config.data, _convert_="all")
+    device, out = pick_device(config.device), None if config.out is None else str(config.out)
+    return fit_body(data, settings, out, config.seed, device, config.shown, config.overwrite)
+
+
+def fit_before_training(data: GsganData, device: str = "auto") -> None:
+    """Fits the body of a capture that has no body pose, with the default settings.
+
+    Raises:
+        DataError: when the masks hold no person, or the folder is read-only.
+    """
+    seen = replace_size(data)
+    fit_body(
+        seen, Fit(replace(accuracy("standard"), low_pass=LOW_PASS)), device=pick_device(device)
+    )
+
+
+def fit_body(
+    data: GsganData,
+    settings: Fit,
+    out: str | None = None,
+    seed: int = 0,
+    device: torch.device | None = None,
+    shown: int = 4,
+    overwrite: bool = False,
+) -> Path:
+    """Shape from skeletons, poses solved from skeletons, then registered to the masks.
+
+    The registered poses say where on the body this person's landmarks are. With that all poses are
+    solved again, and written unless the settings keep registered ones. A fit that was stopped
+    resumes from a hidden file in ``out``.
+
+    Args:
+        data: a capture.
+        settings: of the registration.
+        out: folder to write into; None for the capture's own.
+        seed: of the order of frames and cameras.
+        device: of the images; None for the CPU.
+        shown: frames in the overlay.
+        overwrite: whether files of an earlier fit are replaced.
+
+    Returns:
+        The folder.
+    """
+    console, device = make_console(), device or torch.device("cpu")
     if not isinstance(data.reader, CaptureReader):
         raise ConfigError("gsgan.fit supports captures in the bring-your-own layout: data=capture")
     layout = data.layout
-    source = landmarks_path(layout.root, data.reader.landmarks)
-    if out.resolve() in {source.resolve(), (layout.root / LANDMARKS).resolve()}:
-        raise ConfigError(f"out={config.out} holds the landmarks themselves; give another name")
-    original = read_arrays(source, ("p", "conf", "frame_id", "fitted_to"))
-    device = pick_device(config.device)
+    folder = _folder(layout.root if out is None else Path(out).expanduser(), overwrite)
     with console.status("reading masks"):
-        moments = Moments(data, device, settings.least_mask)
+        moments = Moments(data, device, settings.least_mask, settings.held_out)
     if moments.left_out:
         console.print(f"{moments.left_out} images with empty masks, or nearly so, are left out")
-    if layout.poses is not None:
-        console.print("the capture's body pose stays: effects.body_points=off trains without it")
-    partial, key = _partial(out), _key(config, source, moments)
-    fitter = _fitted(settings, moments, config.seed, partial, key, console)
-    joints = fitter.joints()
-    write_npz(out, **_arrays(original, METRES[layout.meta.unit], moments, joints))
-    picture = fit_picture(fitter, layout.camera_names, joints, config.shown)
-    with writing(out):
-        write_atomically(out.with_suffix(".png"), picture)
-    partial.unlink(missing_ok=True)
-    lines = _summary(config, out, fitter, joints)
+    with console.status("solving poses"):
+        trained = sorted({frame for _, frame in data.splits.items["train"]})
+        shape = fit_shape(*_joints(data, trained))
+        solved = _solve(data, shape, layout.frames)
+    rows = torch.tensor([layout.frames.index(frame) for frame in moments.frames])
+    start = BodyPose(solved.theta[rows], solved.transl[rows])
+    fitter = Fitter(settings, moments, shaped_body(shape), start, seed)
+    _fitted(fitter, folder / STOPPED, _key(fitter, shape, seed), console)
+    with torch.no_grad():
+        found = fitter.pose()
+    shape = replace(shape, offsets=_offsets(fitter, shape, found))
+    driven = _solve(data, shape, layout.frames)
+    theta, transl = driven.theta.clone(), driven.transl.clone()
+    report = _report(fitter, BodyPose(theta[rows], transl[rows]).to(device), found)
+    kept = settings.held_out or settings.keep
+    if kept:
+        theta[rows], transl[rows] = found.theta.cpu(), found.transl.cpu()
+    unit = METRES[layout.meta.unit]
+    with writing(folder / SHEET):
+        write_atomically(folder / SHEET, fit_picture(fitter, layout.camera_names, found, shown))
+    write_json(folder / REPORT, report)
+    write_npz(folder / SHAPE, **{name: x.numpy() for name, x in vars(shape).items()})
+    write_npz(
+        folder / POSES,
+        theta=theta.numpy(),
+        transl=transl.numpy() / unit,
+        frame_id=np.array(layout.frames),
+        registered=np.array(moments.frames if kept else (), np.int64),
+        fitted_to=np.array(moments.cameras),
+    )
+    (folder / STOPPED).unlink(missing_ok=True)
+    lines = _summary(report, folder, moments)
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
-    return out
+    return folder
 
 
-def _out(config: DictConfig) -> Path:
-    if not config.out:
-        raise ConfigError("out is not set: give out=/path/to/capture/landmarks3d_fit.npz")
-    if not str(config.out).endswith(".npz"):
-        raise ConfigError(f"out={config.out} must end in .npz")
-    whole("shown", config.shown, 1)
-    out = Path(str(config.out)).expanduser()
-    attempt = out.with_name(f".{out.name}.try")
-    with writing(out):  # before an hour's work, not after
+def replace_size(data: GsganData) -> GsganData:
+    """The capture at the size of a fit, cropped to the person."""
+    return GsganData(
+        root=str(data.layout.root),
+        reader=data.reader,
+        protocol=data.protocol,
+        size=PICTURE,
+        crop=PersonCrop(margin=MARGIN),
+        **data.split_keys,
+    )
+
+
+def _folder(out: Path, overwrite: bool) -> Path:
+    attempt = out / f"{STOPPED}.try"
+    with writing(out):  # before minutes of work, not after
+        out.mkdir(parents=True, exist_ok=True)
         write_atomically(attempt, b"")
         attempt.unlink()
-        existing = [file for file in (out, out.with_suffix(".png")) if file.exists()]
-    stopped = _partial(out).exists()  # perhaps between the two files
-    if existing and not config.overwrite and not stopped:
-        raise ConfigError(f"{existing[0]} exists already; overwrite=true replaces it")
+    if (out / POSES).exists():
+        if not (out / SHAPE).exists():
+            raise ConfigError(
+                f"{out / POSES} holds poses that gsgan.fit did not make; give another folder, out="
+            )
+        if not overwrite:
+            raise ConfigError(f"{out / POSES} exists already; overwrite=true replaces it")
     return out
 
 
-def _partial(out: Path) -> Path:
-    """The state of a stopped fit."""
-    return out.with_name(f".{out.name}.fitting")
+def _joints(data: GsganData, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
+    """Joints ``[F, 33, 3]`` metres and their visibility."""
+    landmarks = data.layout.landmarks
+    p, visibility = (
+        torch.from_numpy(np.stack([part[f] for f in frames])).float()
+        for part in (landmarks.p, landmarks.visibility)
+    )
+    return p, visibility
 
 
-def _key(config: DictConfig, source: Path, moments: Moments) -> str:
+def _solve(data: GsganData, shape: BodyShape, frames: Sequence[int]) -> BodyPose:
+    try:
+        with torch.no_grad():
+            return Solver(shaped_body(shape)).solve(*_joints(data, frames))
+    except ValueError as error:
+        names = f"items are the frames {spans(list(frames))} in order"
+        raise DataError(f"{data.layout.root / LANDMARKS}: {error} ({names})") from None
+
+
+@torch.no_grad()
+def _offsets(fitter: Fitter, shape: BodyShape, found: BodyPose) -> Tensor:
+    """``[33, 3]`` metres: where on the registered body this person's landmarks are, median over
+    frames. Poses solved with them are what registration would find, as far as a constant says."""
+    body, moments = fitter.surface.body, fitter.moments
+    bones = body.transforms(found)[:, body.landmark_bone]
+    at_rest = bones[..., :3, :3].mT @ (moments.skeletons - bones[..., :3, 3]).unsqueeze(-1)
+    moved = torch.where(
+        (moments.visibility > 0).unsqueeze(-1), at_rest.squeeze(-1) - body.landmarks, torch.nan
+    )
+    before = torch.zeros_like(body.landmarks) if shape.offsets is None else shape.offsets
+    return before + moved.nanmedian(dim=0).values.nan_to_num(0.0).cpu()
+
+
+def _key(fitter: Fitter, shape: BodyShape, seed: int) -> str:
     """Digest of everything that a stopped fit must share with this one to be resumed."""
-    layout = moments.dataset.layout
-    parts = [OmegaConf.to_container(part, resolve=True) for part in (config.data, config.fit)]
-    content: list[Any] = [__version__, config.seed, parts]
-    for item in moments.dataset.items:
-        files = [path.stat() for _, path in layout.mask_files(*item)]
+    dataset = fitter.moments.dataset
+    content: list[Any] = [__version__, seed, asdict(fitter.settings), dataset.size]
+    for item in dataset.items:
+        files = [path.stat() for _, path in dataset.layout.mask_files(*item)]
         content.append([*item, *((file.st_size, file.st_mtime_ns) for file in files)])
-    small = [file.read_bytes() for file in (source, *(layout.root / f for f in SMALL_FILES))]
     text = json.dumps(content, sort_keys=True, default=str).encode()
-    return hashlib.sha256(b"".join([text, *small])).hexdigest()
+    tensors = [*vars(shape).values(), fitter.start.theta, fitter.start.transl]
+    numbers = [x.cpu().numpy().tobytes() for x in (*tensors, fitter.moments.skeletons)]
+    cameras = (dataset.layout.root / "cameras.json").read_bytes()
+    return hashlib.sha256(b"".join([text, *numbers, cameras])).hexdigest()
 
 
-def _fitted(
-    settings: Fit, moments: Moments, seed: int, partial: Path, key: str, console: Console
-) -> Fitter:
-    """The fit after all steps that a stopped process left; the state is saved after each sweep."""
-    fitter = Fitter(settings, moments, seed)
-    if partial.is_file():
+def _fitted(fitter: Fitter, stopped: Path, key: str, console: Console) -> None:
+    """Does all steps that a stopped process left; the state is saved after each sweep."""
+    settings = fitter.settings
+    if stopped.is_file():
+        fresh = fitter.state_dict()
         try:
-            state = torch.load(partial, map_location=moments.device, weights_only=True)
+            state = torch.load(stopped, map_location=fitter.moments.device, weights_only=True)
             if state["key"] != key:
                 raise ValueError
             fitter.load_state_dict(state["fitter"])
             console.print(f"resuming after {fitter.swept} of {settings.sweeps} sweeps")
         except Exception:  # of another fit, or damaged: torch raises many kinds
             console.print("an earlier fit had other settings or data: starting again")
-            fitter = Fitter(settings, moments, seed)
+            fitter.load_state_dict(fresh)
     with progress(console) as bars:
-        task = bars.add_task("shape", total=settings.shape_steps, completed=fitter.shaped)
-        while fitter.shaped < settings.shape_steps:
-            fitter.shape_step()
+        task = bars.add_task("surface", total=settings.surface_steps, completed=fitter.shaped)
+        while fitter.shaped < settings.surface_steps:
+            fitter.surface_step()
             bars.advance(task)
-        task = bars.add_task("joints", total=settings.sweeps, completed=fitter.swept)
+        task = bars.add_task("poses", total=settings.sweeps, completed=fitter.swept)
         while fitter.swept < settings.sweeps:
             fitter.sweep()
             bars.advance(task)
             stream = io.BytesIO()
             torch.save({"key": key, "fitter": fitter.state_dict()}, stream)
-            with writing(partial):
-                write_atomically(partial, stream.getvalue())
-    return fitter
+            with writing(stopped):
+                write_atomically(stopped, stream.getvalue())
 
 
-def _arrays(
-    original: Mapping[str, NDArray[Any]], unit: float, moments: Moments, joints: Tensor
-) -> dict[str, Any]:
-    """The landmarks' file with moved joints; those not seen or without image keep their place."""
-    p = original["p"].astype(np.float64)
-    distance = np.full(p.shape[:2], np.nan)
-    row_of = {int(frame): row for row, frame in enumerate(original["frame_id"])}
-    seen = (moments.visibility > 0).cpu().numpy()
-    i, joint = np.nonzero(seen)
-    row = np.array([row_of[frame] for frame in moments.frames])[i]
-    p[row, joint] = joints.cpu().numpy().astype(np.float64)[i, joint] / unit
-    moved = (joints - moments.skeletons).norm(dim=-1)
-    distance[row, joint] = moved.cpu().numpy()[i, joint]
-    earlier = original.get("fitted_to", np.array([], str)).tolist()
-    return {
-        **original,
-        "p": p,
-        "names": np.array(MEDIAPIPE33.names),
-        "moved_m": distance,
-        "fitted_to": np.array(sorted({*earlier, *moments.cameras})),
-    }
+@torch.no_grad()
+def _report(fitter: Fitter, driven: BodyPose, found: BodyPose) -> dict[str, Any]:
+    """Residuals in mm per joint and frame, and overlaps with the masks: of poses solved before the
+    registration, registered, and solved after it, as held-out frames are."""
+    moments, body = fitter.moments, fitter.surface.body
+    seen = moments.visibility > 0
+    report: dict[str, Any] = {"frames": {}, "joints": {}}
+    off, iou = {}, {}
+    for name, pose in (("solved", fitter.start), ("registered", found), ("driven", driven)):
+        apart = (body.posed_landmarks(pose) - moments.skeletons).norm(dim=-1)
+        off[name] = torch.where(seen, 1000 * apart, torch.nan)
+        iou[name] = fitter.overlap(pose)
+        report[name] = {
+            "residual_mm": float(off[name].nanmedian()),
+            "iou": float(iou[name].nanmean()),
+        }
+    for j, joint in enumerate(MEDIAPIPE33.names):
+        report["joints"][joint] = {n: float(x[:, j].nanmedian()) for n, x in off.items()}
+    for i, frame in enumerate(moments.frames):
+        residual = {n: float(x[i].nanmedian()) for n, x in off.items()}
+        overlap = {n: float(x[i]) for n, x in iou.items()}
+        report["frames"][str(frame)] = {"residual_mm": residual, "iou": overlap}
+    turned = (found.theta - fitter.start.theta).norm(dim=-1).rad2deg()
+    report["turned_degrees"] = float(turned.quantile(0.95))
+    return report
 
 
-def _summary(config: DictConfig, out: Path, fitter: Fitter, joints: Tensor) -> list[str]:
-    moments = fitter.moments
-    before, after = (fitter.agreement(s) for s in (moments.skeletons, joints))
-    moved = (joints - moments.skeletons).norm(dim=-1)[fitter.seen]
-    median, far = (float(moved.quantile(q)) for q in (0.5, 0.95)) if moved.numel() else (0.0, 0.0)
-    lines = [
-        f"{len(moments.frames)} frames, masks of {', '.join(moments.cameras)}: overlap (IoU) with "
-        f"the fitted shape {before.iou:.3f} at the old joints, {after.iou:.3f} at the new; wrong "
-        f"alpha {before.share:.3f} and {after.share:.3f} of the mask",
-        f"joints moved {1000 * median:.0f} mm in the median, 95 % by less than {1000 * far:.0f} mm",
-    ]
-    if median > config.fit.noise:
-        lines.append("that is more than fit.noise: calibration or masks may be wrong")
-    root, name = moments.dataset.layout.root, out.resolve()
-    if name.is_relative_to(root.resolve()):  # then the folder can be moved as a whole
-        name = name.relative_to(root.resolve())
+def _summary(report: dict[str, Any], folder: Path, moments: Moments) -> list[str]:
+    before, after = report["solved"], report["registered"]
+    joints = sorted(report["joints"].items(), key=lambda x: -np.nan_to_num(x[1]["registered"]))
+    frames = sorted(
+        report["frames"].items(), key=lambda x: np.nan_to_num(x[1]["iou"]["registered"])
+    )
+    worst = ", ".join(f"{n} {x['registered']:.0f}" for n, x in joints[:WORST])
+    least = ", ".join(f"{n} {x['iou']['registered']:.3f}" for n, x in frames[:WORST])
     return [
-        *lines,
-        f"{out} is ready; look at {out.with_suffix('.png')}, then, with this command's data keys,",
-        f"python -m gsgan.train data=capture data.root={root} data.reader.landmarks={name}",
+        f"{len(moments.frames)} frames, masks of {', '.join(moments.cameras)}: overlap (IoU) with "
+        f"the body's surface {before['iou']:.3f} solved from the skeletons, {after['iou']:.3f} "
+        f"registered, {report['driven']['iou']:.3f} solved again; least in frames {least}",
+        f"landmarks {before['residual_mm']:.0f} mm from the skeleton's solved, "
+        f"{after['residual_mm']:.0f} mm registered (medians); most: {worst}",
+        f"{folder} has {SHAPE} and {POSES}; look at {folder / SHEET}, {REPORT} has all numbers",
     ]
 
 
 @torch.no_grad()
-def fit_picture(fitter: Fitter, names: Sequence[str], joints: Tensor, shown: int) -> bytes:
+def fit_picture(fitter: Fitter, names: Sequence[str], found: BodyPose, shown: int) -> bytes:
     """A PNG: evenly spaced frames as rows, cameras as columns.
 
     Args:
         fitter: after the fit.
         names: of all cameras, in the order of `camera_index`.
-        joints: ``[F, J, 3]`` the fitted skeletons.
+        found: F registered poses.
         shown: rows, at most.
     """
     moments = fitter.moments
@@ -216,27 +319,28 @@ def fit_picture(fitter: Fitter, names: Sequence[str], joints: Tensor, shown: int
     columns = sorted(set().union(*rows.values()))
     lines = []
     for i, row in rows.items():
-        tiles = [
-            caption(
-                _tile(fitter, i, row.get(camera), joints[i]),
-                f"{names[camera]}  frame {moments.frames[i]}",
-                BAR,
-            )
-            for camera in columns
+        people = [
+            fitter.surface.posed(BodyPose(pose.theta[i][None], pose.transl[i][None]))[0]
+            for pose in (fitter.start, found)
         ]
+        tiles = []
+        for camera in columns:
+            alphas = [] if (frame := row.get(camera)) is None else [frame.mask]
+            alphas += [fitter.surface.alpha(g, frame.camera) for g in people if frame is not None]
+            title = f"{names[camera]}  frame {moments.frames[i]}"
+            tiles.append(caption(_tile(frame, alphas), title, BAR))
         lines.append(np.concatenate(tiles, axis=1))
     sheet = caption(np.concatenate(lines), LEGEND, BAR)
     return cv2.imencode(".png", sheet[..., ::-1])[1].tobytes()
 
 
-def _tile(fitter: Fitter, i: int, frame: Frame | None, after: Tensor) -> NDArray[np.uint8]:
+def _tile(frame: Frame | None, alphas: Sequence[Tensor]) -> NDArray[np.uint8]:
     tile = np.zeros((TILE, TILE, 3), np.uint8)
     if frame is None:
         return tile
     image = (_large(frame.image[0].permute(1, 2, 0)).clip(0, 1) * 255).astype(np.uint8)
     tile[: image.shape[0], : image.shape[1]] = image
-    before, fitted = (fitter.alpha(i, p, frame) for p in (fitter.start[i], after))
-    for alpha, colour in ((frame.mask, GREEN), (before, ORANGE), (fitted, BLUE)):
+    for alpha, colour in zip(alphas, (GREEN, ORANGE, BLUE), strict=True):
         inside = (_large(alpha[0, 0]) > 0.5).astype(np.uint8)
         lines = cv2.findContours(inside, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
         cv2.drawContours(tile, lines, -1, colour, 1, cv2.LINE_AA)

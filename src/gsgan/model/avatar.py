@@ -142,14 +142,11 @@ class Avatar(nn.Module):
         body: BodyPose | None = None,
         background: float | tuple[float, float, float] = 0.0,
     ) -> Tensor:
-        """The image of a new pose, in the colours of no particular camera.
+        """The image ``[B, 3, H, W]`` of a new pose, RGB in [0, 1], corrected for no camera.
 
         Args:
             skeleton, camera, visibility, body: see `picture`.
             background: RGB in [0, 1], or one number for all three.
-
-        Returns:
-            ``[B, 3, H, W]`` RGB in [0, 1].
         """
         painting = self.picture(skeleton, camera, visibility=visibility, body=body)
         assert painting.image is not None and painting.alpha is not None  # noqa: PT018
@@ -209,6 +206,7 @@ class Avatar(nn.Module):
         *,
         pose_noise: Tensor | None = None,
         paint: bool = True,
+        supersample: bool = True,
         detach_features: bool = False,
         picture_height: int | None = None,
         camera_index: Tensor | None = None,
@@ -223,6 +221,7 @@ class Avatar(nn.Module):
             body: pose of the skinned body; see `needs_body` and `body_pose`.
             pose_noise: ``[B, J, 3]`` body heights, added to Ψ's pose code (training only).
             paint: False stops after F (Step I needs no more).
+            supersample: False draws F once per pixel, whatever ``accuracy`` says.
             detach_features: keep Step II's gradient out of Ψ.
             picture_height: pixels of the whole image, when ``camera`` sees a window of it: the
                 drawn skeleton's lines are as wide as they would be there.
@@ -239,13 +238,14 @@ class Avatar(nn.Module):
 
             gaussians = self.splat(p, valid, frames, camera, body, pose_noise)
             raster = None
+            accuracy = self.accuracy if supersample else replace(self.accuracy, supersample=1)
             if gaussians is not None:
                 gaussians = self.bounded(gaussians)
                 with self.stage("F"):
                     raster = rasterise(
                         gaussians,
                         camera,
-                        settings=self.accuracy,
+                        settings=accuracy,
                         backend=self.backend,
                         on_invalid=checks_for(skeleton.device),
                     )

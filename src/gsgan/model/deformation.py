@@ -110,13 +110,18 @@ class Deformation(nn.Module):
     def residuals(self, points: Points, pose: Tensor, root: Tensor) -> Residuals:
         """ΔG of posed points, from the `pose_code` and the pelvis ``root`` ``[B, 3]`` (metres)."""
         position = (points.means - root[:, None]) / self.body_height
+        normals = points.normals
+        if (
+            self.training
+        ):  # corrected poses learn from where Ψ puts points, not from what it is told
+            position, normals = position.detach(), normals.detach()
         code = positional_encoding(position, self.position_octaves)
-        if torch.is_grad_enabled() and not (code.requires_grad or points.normals.requires_grad):
-            x = self._trained(code, points.normals, pose)
+        if torch.is_grad_enabled() and not (code.requires_grad or normals.requires_grad):
+            x = self._trained(code, normals, pose)
         else:
             weight = self.from_position.weight
             if self.from_normal is not None:
-                code = torch.cat([code, points.normals], dim=-1)
+                code = torch.cat([code, normals], dim=-1)
                 weight = torch.cat([weight, self.from_normal.weight], dim=1)
             start = self._point_part() + self.from_pose(pose).unsqueeze(1)
             x = torch.baddbmm(start, code, weight.mT.expand(len(pose), -1, -1))

@@ -32,7 +32,9 @@ FREE_KEYS = (
     *("data.root", "data.smpl", "data.workers", "data.cache_mb", "data.val_pictures"),
     *("data.source.workers", "training.max_skipped", "training.skip_window", "model.backend"),
 )
-REMOVED_KEYS = ("effects.measure", "data.reader.max_vertex_error")  # in the configs of older runs
+REMOVED_KEYS = (  # in the configs of older runs
+    *("effects.measure", "data.reader.max_vertex_error", "data.reader.landmarks"),
+)
 RENAMED = {  # in the configs of older runs
     "gsgan.training.": "gsgan.train.",
     "gsgan.model.avatar.Avatar": "gsgan.model.assemble.assemble_avatar",
@@ -168,6 +170,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 def scene_of(plain: Mapping[str, Any]) -> SceneInfo:
     """The facts about a scene that a checkpoint holds as plain values."""
+    from gsgan.data.figure import Figure
     from gsgan.data.scene_info import SceneInfo
     from gsgan.data.surface_colours import SurfaceColours
 
@@ -176,6 +179,8 @@ def scene_of(plain: Mapping[str, Any]) -> SceneInfo:
     }
     if values["surface"] is not None:
         values["surface"] = SurfaceColours(**values["surface"])
+    if values.get("figure") is not None:
+        values["figure"] = Figure(**values["figure"])
     return SceneInfo(**values)
 
 

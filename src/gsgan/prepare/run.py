@@ -71,9 +71,8 @@ def prepare(options: Options, console: Console) -> Path:
     lines = (
         f"{out} is ready; look at {out / 'report.html'}, then",
         f"python -m gsgan.check data=capture data.root={out}",
-        f"python -m gsgan.fit data=capture data.root={out} out={out / 'landmarks3d_fit.npz'}",
-        f"python -m gsgan.train data=capture data.root={out} "
-        "data.reader.landmarks=landmarks3d_fit.npz",
+        f"python -m gsgan.fit data=capture data.root={out}",
+        f"python -m gsgan.train data=capture data.root={out}",
     )
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     return out

@@ -22,7 +22,7 @@ from gsgan.utils.errors import ConfigError, DataError
 
 METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"
 CONFIG = Path(".hydra") / "config.yaml"
-DATA = "data (cameras, frames, split, image size, crop or fitted landmarks)"
+DATA = "data (cameras, frames, split, image size, crop or fitted poses)"
 TOLERANCE = 1e-3  # between equal floats, for rounding
 
 

@@ -74,7 +74,7 @@ class Accuracy:
 
 
 exact = Accuracy("exact", 0.0, 0.0, "all", "float64", alpha_max=1.0)
-high = Accuracy("high", 1e-6, 1e-6, "opacity", "float32")
+high = Accuracy("high", 1e-5, 1e-5, "opacity", "float32")
 standard = Accuracy("standard", 1 / 255, 1e-4, "opacity", "float32")
 draft = Accuracy("draft", 1 / 64, 1e-2, "sigma", "float32")
 

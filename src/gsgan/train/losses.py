@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from gsgan.losses.adversarial import (
     COMPARING,
@@ -58,8 +57,10 @@ class StepOneLoss:
             loss = photometric(painting.colour + behind, target, unsure=frame.unsure, **pixels)
             if head is not None:
                 # the bias weighted by alpha: the readout commutes with alpha blending
-                read = functional.conv2d(painting.features, head.weight)
-                read = read + painting.splat_alpha * head.bias.view(1, 3, 1, 1)  # type: ignore[union-attr]
+                # as one product: a convolution with few channels is slower on a CPU
+                seen = torch.cat([painting.features, painting.splat_alpha], dim=1)
+                weight = torch.cat([head.weight.flatten(1), head.bias[:, None]], dim=1)  # type: ignore[index]
+                read = (weight @ seen.flatten(2)).unflatten(2, seen.shape[2:])
                 loss = loss + self.feature_head * photometric(
                     read + behind, target, unsure=frame.unsure, **pixels
                 )

@@ -20,13 +20,14 @@ from gsgan.model.discriminator import Discriminator
 from gsgan.scene import Frame
 from gsgan.train.losses import DiscriminatorMaps, StepOneLoss, StepTwoLoss
 from gsgan.train.optimisers import MovingAverage, Recipe, clip, parameter_groups
+from gsgan.train.pose import PoseCorrections
 from gsgan.train.rollback import Rollback, SkippedSteps
 from gsgan.train.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
 from gsgan.utils.checks import at_least
 from gsgan.utils.errors import ConfigError, GsganError
 
 PSNR_CAP = 100.0  # dB: one image equal to the ground truth would make the mean infinite
-SPLATTING = ("psi", "colour")  # optimisers of the parts that make Step I's image
+SPLATTING = ("psi", "colour", "pose")  # optimisers of the parts that make Step I's image
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
 
 
@@ -38,13 +39,15 @@ class AvatarTraining(LightningModule):
         discriminator: None, or no adversarial weight, leaves the GAN out.
         perceptual: L_perc; None leaves it out.
         schedule: iterations of each phase, see `Schedule.fitted`.
-        recipes: optimisers by name: segmentation, psi, colour, generator, discriminator.
+        recipes: optimisers by name: segmentation, psi, colour, pose, generator, discriminator.
         step_one, step_two: loss weights.
         seed: with the iteration it determines every random number drawn here, so a resumed run
             draws the same ones.
         pose_noise, max_skipped, skip_window, log_every, average, average_every: see
             conf/training/long.yaml.
         rollback: recovers from a collapse of the rendered person.
+        pose: corrections of the body's pose in training frames; None leaves it as the data has it.
+        pose_prior: weight of their mean square.
         extra_losses: further terms of Step II by name: modules of a painting and its frame.
         record: plain config values stored with every checkpoint.
         scene: facts about the scene as plain values, likewise, for `gsgan.load`.
@@ -70,6 +73,8 @@ class AvatarTraining(LightningModule):
         average: float | None = None,
         average_every: int = 1,
         rollback: Rollback | None = None,
+        pose: PoseCorrections | None = None,
+        pose_prior: float = 0.0,
         extra_losses: dict[str, nn.Module] | None = None,
         record: dict[str, Any] | None = None,
         scene: dict[str, Any] | None = None,
@@ -87,6 +92,7 @@ class AvatarTraining(LightningModule):
             splats=avatar.splats is not None,
             generator=avatar.generator is not None,
         )
+        self.pose, self.pose_prior = pose, at_least("training.pose_prior", pose_prior, 0)
         self.recipes, self.step_one, self.step_two = recipes, step_one, step_two
         self.pose_noise, self.seed, self.log_every = pose_noise, seed, log_every
         at_least("training.log_every", log_every, 1)
@@ -136,13 +142,15 @@ class AvatarTraining(LightningModule):
     # -- optimisers
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
-        groups = parameter_groups(self.avatar, self.feature_head, self.discriminator)
+        groups = parameter_groups(self.avatar, self.feature_head, self.discriminator, self.pose)
         missing = sorted(set(groups) - set(self.recipes))
         if missing:
             raise ConfigError(f"training.recipes lacks {', '.join(missing)}")
         for name in set(groups) - set(SPLATTING):
             if self.recipes[name].span != "both":
-                raise ConfigError(f"training.recipes.{name}.span is read for psi and colour only")
+                raise ConfigError(
+                    f"training.recipes.{name}.span is read for psi, colour and pose only"
+                )
         self._names = list(groups)
         return [self.recipes[name].build(groups[name]) for name in self._names]
 
@@ -204,19 +212,21 @@ class AvatarTraining(LightningModule):
         self.step += 1
 
     def _train_step_one(self, frame: Frame, height: int) -> None:
-        painting = self._paint(frame, height, paint=False)
-        loss = self.step_one_loss(painting, frame)
+        painting, prior = self._paint(frame, height, paint=False)
+        loss = self.step_one_loss(painting, frame) + self.pose_prior * prior
         self._descend(loss, *self._splatting())
         if self.avatar.generator is None:  # this is its last step
             self._update_average()
         self._log("step_one/loss", loss)
 
     def _train_step_two(self, frame: Frame, height: int) -> None:
-        painting = self._paint(frame, height, paint=True)
+        painting, prior = self._paint(frame, height, paint=True)
         maps = None
         if self.discriminator is not None and self.schedule.adversarial(self.step):
             maps = self.step_two.discriminator_maps(self.discriminator, painting, frame)
         terms = self.step_two_terms(painting, frame, maps)
+        if self.pose is not None:
+            terms["pose"] = self.pose_prior * prior
         self._descend(torch.stack(list(terms.values())).sum(), *self._splatting(), "generator")
         self._update_average()
         for name, term in terms.items():
@@ -234,21 +244,25 @@ class AvatarTraining(LightningModule):
         """The optimisers of the parts that make Step I's image."""
         return tuple(name for name in SPLATTING if name in self._names)
 
-    def _paint(self, frame: Frame, height: int, *, paint: bool) -> Painting:
+    def _paint(self, frame: Frame, height: int, *, paint: bool) -> tuple[Painting, Tensor | float]:
+        body, prior = frame.body, 0.0
+        if self.pose is not None:
+            body, prior = self.pose(frame.body, frame.frame_id)
         painting: Painting = self.avatar(
             frame.skeleton,
             frame.visibility,
             frame.camera,
-            frame.body,
+            body,
             pose_noise=self._pose_noise(frame.skeleton),
             paint=paint,
+            supersample=self.schedule.fine(self.step),
             detach_features=self.step_two.detach_features,
             picture_height=height,
             camera_index=frame.camera_index,
         )
         if painting.splat_alpha is not None:
             self.rollback.watch(painting.splat_alpha, frame.mask)
-        return painting
+        return painting, prior
 
     def on_train_epoch_end(self) -> None:
         """Restores the last good state when the person has vanished, before it is saved."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
 from gsgan.model.avatar import Avatar
+from gsgan.train.pose import PoseCorrections
 from gsgan.train.schedule import Rate
 from gsgan.utils.checks import between, one_of
 
@@ -23,8 +24,8 @@ class Recipe:
         rate: learning rate over the phases of the optimiser.
         betas, eps: Adam's. A second beta of 0.99 keeps Ψ from a collapse (`Rollback`).
         clip: largest gradient norm; None leaves gradients alone.
-        span: of psi and colour: the rate's shares are of ``both`` steps, or of ``step_one``, after
-            which the rate stays.
+        span: of psi, colour and pose: the rate's shares are of ``both`` steps, or of ``step_one``,
+            after which the rate stays.
     """
 
     rate: Rate
@@ -47,7 +48,10 @@ class Recipe:
 
 
 def parameter_groups(
-    avatar: Avatar, feature_head: nn.Module | None, discriminator: nn.Module | None
+    avatar: Avatar,
+    feature_head: nn.Module | None,
+    discriminator: nn.Module | None,
+    pose: PoseCorrections | None = None,
 ) -> dict[str, list[tuple[list[nn.Parameter], float]]]:
     """Groups of (parameters, rate multiplier) by optimiser, for the parts that are built."""
     groups = {}
@@ -58,9 +62,11 @@ def parameter_groups(
         groups["psi"] = [*avatar.splats.parameter_groups(), (head, 1.0)]
     if avatar.colour is not None:
         groups["colour"] = [(list(avatar.colour.parameters()), 1.0)]
+    if pose is not None:
+        groups["pose"] = pose.parameter_groups()
     if avatar.generator is not None and avatar.pose_encoder is not None:
-        pose = list(avatar.pose_encoder.parameters())
-        groups["generator"] = [([*avatar.generator.parameters(), *pose], 1.0)]
+        encoder = avatar.pose_encoder.parameters()
+        groups["generator"] = [([*avatar.generator.parameters(), *encoder], 1.0)]
     if discriminator is not None:
         groups["discriminator"] = [(list(discriminator.parameters()), 1.0)]
     return groups

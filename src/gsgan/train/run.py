@@ -21,14 +21,17 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
+from gsgan.body import open_body
 from gsgan.data.datamodule import GsganData
 from gsgan.effects.table import effects_table
 from gsgan.evaluate.facts import trained, training_code
 from gsgan.evaluate.files import NAMES
 from gsgan.evaluate.run import evaluate_method
 from gsgan.evaluate.scores import painter
+from gsgan.fit.run import fit_before_training
 from gsgan.metrics.lpips import check_lpips
 from gsgan.model.assemble import naming_group
+from gsgan.model.avatar import Avatar
 from gsgan.model.runs import (
     CHECKPOINT,
     as_resumed,
@@ -40,6 +43,7 @@ from gsgan.model.runs import (
 from gsgan.splat import resolve_backend
 from gsgan.train.callbacks import AtomicCheckpoints, PictureGrid, ProgressLines
 from gsgan.train.module import AvatarTraining
+from gsgan.train.pose import PoseCorrections
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
@@ -131,22 +135,37 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     """
     whole("seed", config.seed, 0)
     data = build_data(config)
+    if data.lacks_body:
+        fit_before_training(data)
+        data = build_data(config)
     avatar = build_avatar(config, data)
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
     with naming_group("training"):
         return data, instantiate(config.training)(
             avatar,
+            pose=pose_corrections(data, avatar),
             record=training_record(config, data),
             scene=json.loads(json.dumps(asdict(data.info))),
         )
 
 
+def pose_corrections(data: GsganData, avatar: Avatar) -> PoseCorrections | None:
+    """For an avatar whose G moves with poses that `gsgan.fit` registered; None for all others."""
+    poses = data.layout.poses
+    if poses is None or not poses.registered or not (avatar.body_points or avatar.surface):
+        return None
+    body = open_body(data.info.body, data.info.body_file, data.info.betas)
+    assert body is not None  # the avatar is built on it
+    return PoseCorrections(sorted({f for _, f in data.splits.items["train"]}), body.joint_names)
+
+
 def training_record(config: DictConfig, data: GsganData) -> dict[str, Any]:
-    """What two parts of one run must share: the settings, and the skeletons that `gsgan.fit` made,
+    """What two parts of one run must share: the settings, and the poses that `gsgan.fit` made,
     whose file may be overwritten under the same name."""
     held = record(config)
-    if data.layout.landmarks.fitted_to:
-        held["fitted landmarks"] = data.layout.landmarks.digest(data.layout.frames)
+    poses = data.layout.poses
+    if poses is not None and poses.fitted:
+        held["fitted poses"] = poses.digest(data.layout.frames)
     return held
 
 
@@ -271,6 +290,7 @@ def describe(
         "pose encoder": avatar.pose_encoder,
         "generator": avatar.generator,
         "discriminator": module.discriminator,
+        "pose corrections": module.pose,
         "segmentation S": avatar.segmentation,
     }
     for name, part in parts.items():

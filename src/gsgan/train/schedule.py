@@ -9,6 +9,7 @@ from gsgan.utils.checks import above, at_least, between, one_of
 from gsgan.utils.errors import ConfigError
 
 SEGMENTATION, STEP_ONE, STEP_TWO = "segmentation", "step I", "step II"
+STRETCHED = ("step_one", "step_two", "discriminator_start", "degree_every", "coarse")
 FROM_MASKS = 800  # iterations of S, at most, where two numbers learn from masks (docs/effects.md)
 
 
@@ -26,10 +27,11 @@ class Schedule:
     epoch: int = 250
     stretch: float = 1.0
     degree_every: int = 0
+    coarse: int = 0
 
     def __post_init__(self) -> None:
         above("training.schedule.stretch", self.stretch)
-        for name in ("segmentation", "step_one", "step_two", "discriminator_start", "degree_every"):
+        for name in ("segmentation", *STRETCHED):
             at_least(f"training.schedule.{name}", getattr(self, name), 0)
         at_least("training.schedule.epoch", self.epoch, 1)
         if self.total == 0:
@@ -44,10 +46,8 @@ class Schedule:
         without splats the other way round, so that every variant trains equally long. From masks
         S learns two numbers, which needs fewer iterations.
         """
-        one, two, start, degree = (
-            round(n * self.stretch)
-            for n in (self.step_one, self.step_two, self.discriminator_start, self.degree_every)
-        )
+        numbers = {name: round(getattr(self, name) * self.stretch) for name in STRETCHED}
+        one, two = numbers["step_one"], numbers["step_two"]
         if not generator:
             one, two = one + two, 0
         if not splats:
@@ -56,10 +56,7 @@ class Schedule:
         return replace(
             self,
             segmentation=min(self.segmentation, most) if segmentation else 0,
-            step_one=one,
-            step_two=two,
-            discriminator_start=start,
-            degree_every=degree,
+            **numbers | {"step_one": one, "step_two": two},
         )
 
     @property
@@ -78,6 +75,10 @@ class Schedule:
         if self.degree_every == 0:
             return most
         return min(most, max(0, step - self.segmentation) // self.degree_every)
+
+    def fine(self, step: int) -> bool:
+        """Whether F is supersampled at an iteration: not in the first ``coarse`` of Step I."""
+        return not (self.phase(step) == STEP_ONE and step - self.segmentation < self.coarse)
 
     def bounds(self, phase: str) -> tuple[int, int]:
         """First iteration of a phase, and the first after it."""

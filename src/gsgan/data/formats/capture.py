@@ -8,6 +8,8 @@
     labels/{camera}/%06d.png            optional part numbers, 255 = ignore
     landmarks3d.npz   p (F,33,3) NaN = missing, conf (F,33), frame_id (F,)
     body_pose.npz     optional theta (F,bones,3), transl (F,3), frame_id (F,); betas (S,) of SMPL
+    body_shape.npz    optional coefficients (K,), stretch (8,), offsets (33,3): of the free body, by
+                      gsgan.fit
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from gsgan.body.shape import LANDMARKS as LANDMARKS_SHAPE
+from gsgan.body.shape import STRETCHED
 from gsgan.data.calibration.find import (
     METRES,
     Conventions,
@@ -39,6 +43,7 @@ from gsgan.utils.checks import is_number
 from gsgan.utils.errors import DataError
 
 LANDMARKS = "landmarks3d.npz"
+POSES, SHAPE = "body_pose.npz", "body_shape.npz"
 MASKS = (".png",)
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
 LOOKED_AT = Trust(min_box_iou=0.0)
@@ -47,12 +52,8 @@ LOOKED_AT = Trust(min_box_iou=0.0)
 
 @dataclass(frozen=True)
 class CaptureReader:
-    """Reads a capture in the bring-your-own layout; conf/data/capture.yaml explains the settings.
+    """Reads a capture in the bring-your-own layout; see conf/data/capture.yaml."""
 
-    ``landmarks`` is the skeletons' file, in the folder unless its path is absolute.
-    """
-
-    landmarks: str | None = None
     drop_frames: Any = None
     trust: Trust = LOOKED_AT
 
@@ -78,10 +79,9 @@ def read_capture(
     smpl: str | None = None,
     trust: Trust = LOOKED_AT,
     drop_frames: Any = None,
-    landmarks: str | None = None,
 ) -> Layout:
     """The capture in a folder, see `CaptureReader`; ``checks`` are `Checks()` when None."""
-    return CaptureReader(landmarks, drop_frames, trust)(root, checks or Checks(), smpl)
+    return CaptureReader(drop_frames, trust)(root, checks or Checks(), smpl)
 
 
 def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -> Found:
@@ -95,13 +95,10 @@ def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -
         notes.append(f"lengths converted from {meta.unit} to metres")
     cameras = read_cameras(root / "cameras.json", cameras_json, conventions, checks)
     images = _index_images(root, cameras)
-    joints_file = landmarks_path(root, reader.landmarks)
-    if joints_file != root / LANDMARKS:
-        notes.append(f"skeletons come from {reader.landmarks}, not from {LANDMARKS}")
-    skeletons = _read_landmarks(joints_file, meta, conventions, checks, notes)
+    skeletons = _read_landmarks(root / LANDMARKS, meta, conventions, checks, notes)
     poses = None
-    if (root / "body_pose.npz").exists():
-        poses, meta = _read_poses(root / "body_pose.npz", meta, conventions)
+    if (root / POSES).exists():
+        poses, meta = _read_poses(root, meta, conventions)
     return Found(
         root=root,
         meta=meta,
@@ -119,24 +116,6 @@ def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -
         ),
         notes=tuple(notes),
     )
-
-
-def landmarks_path(root: Path, name: str | None) -> Path:
-    """The skeletons' file: in the capture's folder unless its path is absolute.
-
-    Raises:
-        DataError: when it does not exist, or is not an npz file.
-    """
-    if name is None:
-        return root / LANDMARKS
-    if not isinstance(name, str) or not name.endswith(".npz"):
-        raise DataError(f"data.reader.landmarks must name an .npz file, got {name!r}")
-    path = root / Path(name).expanduser()
-    if not path.is_file():
-        raise DataError(
-            f"data.reader.landmarks={name}: {path} does not exist; gsgan.fit makes such files"
-        )
-    return path
 
 
 def _read_meta(path: Path, content: Mapping[str, Any], smpl: str | None) -> Meta:
@@ -188,22 +167,21 @@ def _read_landmarks(
 ) -> Landmarks:
     """Skeletons of every frame."""
     joints = SKELETONS[meta.skeleton]
-    arrays = read_arrays(path, ("p", "conf", "frame_id", "fitted_to"))
+    arrays = read_arrays(path, ("p", "conf", "frame_id"))
     p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64) * conventions.scale
     ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(p),), path), str(path))
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:
         conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
-    found = make_landmarks(ids, p, conf, checks.max_reach, notes, path.name)
-    cameras = arrays.get("fitted_to", np.array([], str))
-    if cameras.ndim != 1 or cameras.dtype.kind != "U":
-        raise DataError(f"{path}: 'fitted_to' must list camera names; run gsgan.fit again")
-    return replace(found, fitted_to=tuple(cameras.tolist()))
+    return make_landmarks(ids, p, conf, checks.max_reach, notes, path.name)
 
 
-def _read_poses(path: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
-    """Poses of frames whose numbers are finite, and ``meta`` with the file's body shape."""
-    arrays = read_arrays(path, ("theta", "transl", "frame_id", "betas"))
+def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
+    """Poses of frames whose numbers are finite, and ``meta`` with the body and its shape."""
+    path, fitted = root / POSES, (root / SHAPE).exists()
+    arrays = read_arrays(path, ("theta", "transl", "frame_id", "betas", "registered", "fitted_to"))
+    if fitted:  # by gsgan.fit: the free body in the person's shape
+        meta = replace(meta, body=BodyModel("free", betas=_read_shape(root / SHAPE)))
     bones = None if meta.body is None else BODY_BONES[meta.body.kind]
     theta = expect_array(arrays, "theta", (None, bones, 3), path).astype(np.float64)
     transl = expect_array(arrays, "transl", (len(theta), 3), path).astype(np.float64)
@@ -211,10 +189,28 @@ def _read_poses(path: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
     ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(theta),), path), str(path))
     finite = np.isfinite(theta).all((1, 2)) & np.isfinite(transl).all(1)
     rows = {int(ids[i]): int(i) for i in np.flatnonzero(finite)}
-    poses = Poses({f: theta[i] for f, i in rows.items()}, {f: transl[i] for f, i in rows.items()})
+    registered: frozenset[int] = frozenset()
+    if "registered" in arrays:
+        found = expect_array(arrays, "registered", (None,), path)
+        registered = frozenset(whole_frame_ids(found, str(path)).tolist())
+    poses = Poses(
+        {f: theta[i] for f, i in rows.items()},
+        {f: transl[i] for f, i in rows.items()},
+        fitted=fitted,
+        registered=registered,
+        fitted_to=tuple(map(str, arrays.get("fitted_to", ()))),
+    )
     if meta.body is None or "betas" not in arrays:
         return poses, meta
     betas = expect_array(arrays, "betas", (None,), path).astype(np.float64)
     if not np.isfinite(betas).all():
         raise DataError(f"{path}: 'betas' must hold finite numbers")
     return poses, replace(meta, body=replace(meta.body, betas=tuple(betas.tolist())))
+
+
+def _read_shape(path: Path) -> tuple[float, ...]:
+    """The free body's shape as the numbers of `BodyShape.flat`."""
+    names = {"coefficients": (None,), "stretch": (len(STRETCHED),), "offsets": LANDMARKS_SHAPE}
+    arrays = read_arrays(path, names)
+    parts = [expect_array(arrays, name, shape, path).ravel() for name, shape in names.items()]
+    return tuple(np.concatenate(parts).astype(np.float64).tolist())

@@ -211,10 +211,11 @@ class BvhMotion:
         bvh = read_bvh(path)
         self.duration = len(bvh.root) * bvh.frame_time
         self._times = np.arange(len(bvh.root), dtype=np.float64) * bvh.frame_time
-        self._turns, middle, leg = _standard(bvh, path)
-        joint = self.rig.joint
+        standard = standard_motion(bvh, path)
+        self._turns, joint = standard.turns, self.rig.joint
         offset = (joint["LeftUpLeg"] + joint["RightUpLeg"]) / 2 - joint["Hips"]
-        self._hips = middle * self.rig.leg / leg - self._turns["Hips"] @ offset
+        thighs = (standard.joints["LeftUpLeg"] + standard.joints["RightUpLeg"]) / 2
+        self._hips = thighs * self.rig.leg / standard.leg - self._turns["Hips"] @ offset
         self._settle(bvh.frame_time)
 
     def _settle(self, step: float) -> None:
@@ -222,10 +223,8 @@ class BvhMotion:
         hips, leg = self._hips, self.rig.leg
         pose = self._pose(self._turns, hips)
         lows = [pose.lowest(side) for side in SIDES]
-        lowest, window = np.minimum(*lows), max(1, round(1 / step))
-        floor = gaussian_filter1d(minimum_filter1d(lowest, window), window / 4)
-        floor = floor + np.minimum(lowest - floor, HOVER * leg)
-        shift = np.column_stack([-self._drift(hips[:, :2], step), -floor])
+        floor = floor_under(np.minimum(*lows), leg, step)
+        shift = np.column_stack([-drift(hips[:, :2], step), -floor])
         self._hips, self._ankles = hips + shift, []
         for side, low in zip(SIDES, lows, strict=True):
             toe = side + "ToeBase" if side + "ToeBase" in self.rig.index else side + "Foot"
@@ -234,15 +233,6 @@ class BvhMotion:
             ankle[:, 2] += (floor - low).clip(0)
             ankle[:, :2] += _held(ball, low - floor < CONTACT_HEIGHT * leg, leg, step)
             self._ankles.append(ankle)
-
-    def _drift(self, path: Array, step: float) -> Array:
-        """``[F, 2]`` what to subtract from a horizontal path."""
-        middle = (path.min(axis=0) + path.max(axis=0)) / 2
-        if np.linalg.norm(path - middle, axis=1).max() <= ROOM:
-            return np.broadcast_to(middle, path.shape)
-        pad = len(path) - 1
-        odd = np.pad(path, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd")
-        return gaussian_filter1d(odd, DRIFT_SECONDS / step, axis=0)[pad : pad + len(path)]
 
     def _pose(self, turns: dict[str, Array], hips: Array) -> Pose:
         pose = Pose(self.rig, hips)
@@ -277,12 +267,21 @@ class BvhMotion:
         return pose.motion(blink, tuple(f"{self.name} {k}" for k in sections))
 
 
-def _standard(bvh: Bvh, path: Path) -> tuple[dict[str, Array], Array, float]:
-    """A file's motion in standard axes, starting towards -Y.
+@dataclass(frozen=True)
+class StandardMotion:
+    """A file's motion in standard axes, starting towards -Y; by Mixamo's bone name."""
 
-    Returns:
-        Turns ``[F, 3, 3]`` by Mixamo's bone name; ``[F, 3]`` the middle between the hip joints,
-        and the legs' length at rest, in units of the file.
+    turns: dict[str, Array]  # [F, 3, 3]
+    joints: dict[str, Array]  # [F, 3] positions, units of the file
+    leg: float  # the legs' length at rest, units of the file
+    up: str  # the axis of the file that points up, e.g. "y"
+
+
+def standard_motion(bvh: Bvh, path: Path) -> StandardMotion:
+    """The motion of a tree of joints on the bones that people have.
+
+    Raises:
+        DataError: when a joint of the limbs is not found.
     """
     known = {"Hips": 0} | known_joints(bvh.names)
     if missing := [bone for bone in REQUIRED if bone not in known]:
@@ -311,9 +310,32 @@ def _standard(bvh: Bvh, path: Path) -> tuple[dict[str, Array], Array, float]:
     turns = {bone: R[:, j] @ at_rest.get(bone, np.eye(3)) for bone, j in known.items()}
     turns |= _trunk(bvh, known, R)
     posed = bvh.positions(bvh.rotations, bvh.root) @ (yaw @ axes).T
-    middle = (posed[:, known["LeftUpLeg"]] + posed[:, known["RightUpLeg"]]) / 2
     hip, knee, ankle = (joint["Left" + bone] for bone in LEG)
-    return turns, middle, float(np.linalg.norm(hip - knee) + np.linalg.norm(knee - ankle))
+    leg = float(np.linalg.norm(hip - knee) + np.linalg.norm(knee - ankle))
+    at = int(np.abs(up).argmax())
+    name = ("-" if up[at] < 0 else "") + "xyz"[at]
+    return StandardMotion(turns, {bone: posed[:, j] for bone, j in known.items()}, leg, name)
+
+
+def floor_under(lowest: Array, leg: float, step: float) -> Array:
+    """``[F]`` the floor's height below feet at heights ``[F]``, one of which stands but in jumps.
+
+    Jumps lose `HOVER`: a floor that follows the lowest of a second may be too low by that much.
+    """
+    window = max(1, round(1 / step))
+    floor = gaussian_filter1d(minimum_filter1d(lowest, window), window / 4)
+    return np.asarray(floor + np.minimum(lowest - floor, HOVER * leg))
+
+
+def drift(path: Array, step: float) -> Array:
+    """``[F, 2]`` what to subtract from a horizontal path so that it stays near the origin."""
+    middle = (path.min(axis=0) + path.max(axis=0)) / 2
+    if np.linalg.norm(path - middle, axis=1).max() <= ROOM:
+        return np.broadcast_to(middle, path.shape)
+    pad = len(path) - 1
+    odd = np.pad(path, ((pad, pad), (0, 0)), mode="reflect", reflect_type="odd")
+    smooth = gaussian_filter1d(odd, DRIFT_SECONDS / step, axis=0)
+    return np.asarray(smooth[pad : pad + len(path)])
 
 
 def _trunk(bvh: Bvh, known: dict[str, int], R: Array) -> dict[str, Array]:

@@ -1,0 +1,1 @@
+"""``gsgan.render``: motions of other people, cameras, frames and videos."""

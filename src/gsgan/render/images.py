@@ -1,0 +1,60 @@
+"""Images of a render: backgrounds, and 8-bit pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageColor, ImageOps
+from torch import Tensor
+
+from gsgan.utils.errors import ConfigError
+
+Background = Tensor | None
+
+
+def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background]:
+    """The background ``[3, H, W]`` by image size; None keeps alpha.
+
+    Raises:
+        ConfigError: when it is no colour and no image, or a video should have alpha.
+    """
+    if name == "alpha":
+        if video:
+            raise ConfigError("background=alpha needs PNG files: H.264 has no alpha; give a folder")
+        return lambda size: None
+    path = Path(name).expanduser()
+    if path.is_file():
+        try:
+            with Image.open(path) as opened:
+                picture = opened.convert("RGB")
+        except OSError as error:
+            raise ConfigError(f"background={name} cannot be read as an image ({error})") from None
+        return lambda size: _unit(np.asarray(ImageOps.fit(picture, size[::-1])))
+    try:
+        colour = torch.tensor(ImageColor.getrgb(name)[:3]).float() / 255
+    except ValueError:
+        raise ConfigError(
+            f"background={name} is no colour and no file; give black, white, a colour's name, "
+            "#rrggbb, an image file, or alpha"
+        ) from None
+    return lambda size: colour[:, None, None].expand(3, *size)
+
+
+def _unit(image: NDArray[np.uint8]) -> Tensor:
+    return torch.from_numpy(image.copy()).permute(2, 0, 1).float() / 255
+
+
+def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> NDArray[np.uint8]:
+    """``[H, W, 3]`` an image ``[3, H, W]`` on black put on a background; without one, with alpha
+    ``[H, W, 4]``, not premultiplied."""
+    image, alpha = image.clamp(0, 1), alpha.clamp(0, 1)
+    if behind is None:
+        straight = torch.where(alpha > 0, image / alpha.clamp_min(1e-6), image).clamp(0, 1)
+        image = torch.cat([straight, alpha])
+    else:
+        image = (image + (1 - alpha) * behind).clamp(0, 1)
+    return (image * 255).round().byte().permute(1, 2, 0).numpy()

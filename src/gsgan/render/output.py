@@ -1,0 +1,159 @@
+"""Frames and videos on disk: whole files under their names, and renders that go on where they were.
+
+A folder holds ``000000.png`` and so on, and render.json, which says what they are of. The frames of
+a video lie in a hidden folder beside it until it is written.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from gsgan.data.files import read_colour
+from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.files import write_atomically
+from gsgan.utils.provenance import Signer, marked_mp4, png_bytes, signed
+
+Bytes = NDArray[np.uint8]
+
+RECORD = "render.json"
+VIDEO = ".mp4"
+QUALITY = "16"  # x264's constant rate factor: no loss that is seen
+BT601, STUDIO_RANGE = 6, 1  # ffmpeg's numbers of what its RGB conversion writes
+
+
+@dataclass(frozen=True)
+class Output:
+    """Where a render goes.
+
+    Args:
+        out: a .mp4 file or a folder.
+        fps: of the video.
+        marked: whether files say that they are synthetic.
+        signer: signs what the user gets; None leaves it unsigned.
+    """
+
+    out: Path
+    fps: float
+    marked: bool = True
+    signer: Signer | None = None
+
+    @property
+    def video(self) -> bool:
+        """Whether a video is asked for."""
+        return self.out.suffix.lower() == VIDEO
+
+    @property
+    def folder(self) -> Path:
+        """Of the frames."""
+        return self.out.with_name(f".{self.out.name}.frames") if self.video else self.out
+
+    def path(self, number: int) -> Path:
+        """The file of a frame."""
+        return self.folder / f"{number:06d}.png"
+
+    def begin(self, record: dict[str, Any], overwrite: bool) -> None:
+        """Prepares the folder; frames of the same render that are there stay.
+
+        Args:
+            record: what the images depend on, for render.json.
+            overwrite: replace another render.
+
+        Raises:
+            ConfigError: when the place is taken, or PyAV is missing.
+        """
+        if self.video:
+            _av()
+            if self.out.exists() and not overwrite:
+                raise ConfigError(f"out={self.out} exists; give overwrite=true or another name")
+        held, record = self.folder / RECORD, json.loads(json.dumps(record))
+        if (
+            self.folder.exists()
+            and not held.is_file()
+            and (not self.folder.is_dir() or any(self.folder.iterdir()))
+        ):
+            raise ConfigError(
+                f"out={self.out} is no folder of a render and not empty; give another one"
+            )
+        try:
+            same = held.is_file() and json.loads(held.read_text()) == record
+        except ValueError:
+            same = False
+        if held.is_file() and not same:
+            if not overwrite and not self.video:
+                raise ConfigError(
+                    f"out={self.out} holds frames of another render; give overwrite=true or "
+                    "another folder"
+                )
+            for path in self.folder.glob("[0-9]*.png"):
+                path.unlink()
+        if not same:
+            write_atomically(held, json.dumps(record, indent=2))
+
+    def write(self, number: int, image: Bytes) -> None:
+        """Writes a frame ``[H, W, 3 or 4]``."""
+        data = png_bytes(Image.fromarray(image), self.marked)
+        if self.signer is not None and not self.video:
+            data = signed(data, ".png", self.signer)
+        write_atomically(self.path(number), data)
+
+    def finish(self, numbers: Sequence[int]) -> None:
+        """Writes the video of the frames, and removes them.
+
+        Raises:
+            DataError: when a frame cannot be read, or this build of PyAV has no H.264.
+        """
+        if not self.video:
+            return
+        data = encoded((read_colour(self.path(n)) for n in numbers), self.fps)
+        data = marked_mp4(data) if self.marked else data
+        if self.signer is not None:
+            data = signed(data, VIDEO, self.signer)
+        write_atomically(self.out, data)
+        shutil.rmtree(self.folder)
+
+
+def _av() -> Any:
+    try:
+        import av
+    except ImportError:
+        raise ConfigError(
+            "a video needs the package av: pip install 'gsgan[render]'; or give a folder as out"
+        ) from None
+    return av
+
+
+def encoded(images: Iterator[Bytes], fps: float) -> bytes:
+    """An MP4 file of images ``[H, W, 3]``, H.264; odd sides repeat their last row or column."""
+    av, stream, out = _av(), None, io.BytesIO()
+    with av.open(out, "w", format="mp4") as container:
+        for image in images:
+            if stream is None:
+                try:
+                    rate = Fraction(fps).limit_denominator(100_000)
+                    options = {"crf": QUALITY}
+                    stream = container.add_stream("libx264", rate=rate, options=options)
+                except Exception as error:  # PyAV's own kinds
+                    raise DataError(
+                        f"this build of av has no H.264 encoder ({error}); give a folder as out"
+                    ) from error
+                stream.height, stream.width = (n + n % 2 for n in image.shape[:2])
+                stream.pix_fmt = "yuv420p"
+                context = stream.codec_context
+                context.colorspace, context.color_range = BT601, STUDIO_RANGE
+            sides = ((0, image.shape[0] % 2), (0, image.shape[1] % 2), (0, 0))
+            padded = np.ascontiguousarray(np.pad(image, sides, mode="edge"))
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(padded, format="rgb24")))
+        if stream is not None:
+            container.mux(stream.encode())
+    return out.getvalue()

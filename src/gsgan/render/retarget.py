@@ -1,0 +1,135 @@
+"""Retargeting: another person's directions with the subject's bone lengths, hands, feet and face.
+
+Convention: standard axes (`gsgan.data.figure`), Z up, metres.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsgan.data.figure import (
+    BONES,
+    EARS,
+    FACE,
+    FEET,
+    HANDS,
+    HEELS_AND_TOES,
+    HIPS,
+    LEGS,
+    SHOULDERS,
+    TO_STANDARD,
+    Figure,
+    hand_frame,
+    length,
+    middle,
+    part_frame,
+)
+from gsgan.data.synthetic.bvh import StandardMotion, drift, floor_under
+from gsgan.data.synthetic.retarget import axis_angle, between, rotation
+from gsgan.skeleton import bone_frames
+from gsgan.skeleton.template import CHEST, HEAD, PELVIS
+
+Float = NDArray[np.float64]
+
+NECK = 0.45  # radians that a neck bends from rest at most: detectors put faces too far forward
+
+
+def unit(v: Float) -> Float:
+    """Vectors ``[..., 3]`` divided by their length."""
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
+
+
+def on_figure(p: Float, figure: Figure) -> Float:
+    """``[F, 33, 3]`` the subject in the pose of landmarks ``[F, 33, 3]`` without gaps.
+
+    Trunk and limbs keep their directions and get the subject's lengths; face, hands and feet are
+    the subject's own, turned like the source's. The way is scaled by the legs' length.
+    """
+    rest, q = figure.rest, np.zeros_like(p)
+    legs = [np.linalg.norm(p[:, b] - p[:, a], axis=-1) for limb in LEGS for a, b in limb]
+    hips = middle(p, HIPS) * 2 * figure.leg / np.median(legs, axis=1).sum()
+    chest = hips + unit(middle(p, SHOULDERS) - middle(p, HIPS)) * rest[SHOULDERS[0], 2]
+    for pair, centre in ((HIPS, hips), (SHOULDERS, chest)):
+        half = unit(p[:, pair[0]] - p[:, pair[1]]) * length(rest, pair) / 2
+        q[:, pair[0]], q[:, pair[1]] = centre + half, centre - half
+    for a, b in BONES:
+        q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
+    for wrist, ends in HANDS.items():
+        turn = hand_frame(p, wrist) @ hand_frame(rest, wrist).T
+        q[:, ends] = q[:, wrist, None] + (rest[list(ends)] - rest[wrist]) @ turn.mT
+    for ankle, feet in FEET.items():
+        turn = _foot_frame(p, ankle) @ _foot_frame(rest, ankle).T
+        q[:, feet] = q[:, ankle, None] + (rest[list(feet)] - rest[ankle]) @ turn.mT
+    neck = middle(rest, EARS) - middle(rest, SHOULDERS)
+    level = bone_frames(torch.from_numpy(p)).hubs[:, CHEST].numpy() @ (TO_STANDARD.T @ neck)
+    bend = axis_angle(between(level, middle(p, EARS) - middle(p, SHOULDERS)))
+    most = NECK / np.maximum(np.linalg.norm(bend, axis=-1, keepdims=True), NECK)
+    ears = chest + (rotation(bend * most) @ level[..., None])[..., 0]
+    turn = _head_frame(p) @ _head_frame(rest[None]).mT
+    q[:, FACE] = ears[:, None] + (rest[list(FACE)] - middle(rest, EARS)) @ turn.mT
+    return q
+
+
+def _foot_frame(p: Float, ankle: int) -> Float:
+    heel, toe = FEET[ankle]
+    return part_frame(p[..., toe, :] - p[..., heel, :], p[..., ankle, :] - p[..., heel, :])
+
+
+def _head_frame(p: Float) -> Float:
+    return bone_frames(torch.from_numpy(p)).hubs[:, HEAD].numpy()
+
+
+def rig_landmarks(standard: StandardMotion, figure: Figure) -> Float:
+    """``[F, 33, 3]`` landmarks of a rig, in standard axes and the subject's size.
+
+    Shoulders, elbows, wrists, hips, knees and ankles are the rig's joints; hands, feet and face,
+    for which rigs have none, are the subject's, turned like the rig's hands, feet and head.
+    """
+    rest, scale = figure.rest, figure.leg / standard.leg
+    p = np.full((len(standard.joints["Hips"]), *rest.shape), np.nan)
+    for i, side in enumerate(("Left", "Right")):
+        names = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
+        for bone, landmark in zip(names, (11, 13, 15, 23, 25, 27), strict=True):
+            p[:, landmark + i] = standard.joints[side + bone] * scale
+        for bone, start, ends in (("Hand", 15, HANDS), ("Foot", 27, FEET)):
+            points, turn = rest[list(ends[start + i])], standard.turns[side + bone]
+            p[:, ends[start + i]] = p[:, start + i, None] + (points - rest[start + i]) @ turn.mT
+    if "Head" in standard.turns:
+        neck = middle(rest, EARS) - middle(rest, SHOULDERS)
+        ears = middle(p, SHOULDERS) + (standard.turns["Neck"] @ neck)
+        face = rest[list(FACE)] - middle(rest, EARS)
+        p[:, FACE] = ears[:, None] + face @ standard.turns["Head"].mT
+    return p
+
+
+def heading(p: Float) -> float:
+    """Radians about the up axis, 0 towards -Y: where the hips of ``[33, 3]`` face."""
+    front = bone_frames(torch.from_numpy(p[None])).hubs[0, PELVIS, :, 2]
+    return float(torch.atan2(front[0], -front[1]))
+
+
+def placed(
+    p: Float, figure: Figure, centre: Float, fps: float, *, ground: bool, stay: bool
+) -> Float:
+    """Landmarks ``[F, 33, 3]`` turned, moved and put on the ground of the subject's place.
+
+    Convention: the person starts towards the subject's mean heading, in the middle of its place.
+
+    Args:
+        p: standard axes.
+        figure: the subject.
+        centre: ``[3]`` metres, standard axes: the middle of the place; its height is not used.
+        fps: of the frames.
+        ground: keeps a foot on the ground, jumps aside; else only the lowest foot of all frames is.
+        stay: takes the way from a motion that leaves its place, as on a treadmill.
+    """
+    q = p @ rotation(np.array([0, 0, figure.facing - heading(p[0])])).T
+    way = middle(q, HIPS)[:, :2]
+    lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)
+    floor = floor_under(lowest, figure.leg, 1 / fps) if ground else np.full(len(q), lowest.min())
+    gone = drift(way, 1 / fps) if stay else way[:1]
+    q[..., :2] += centre[:2] - np.broadcast_to(gone, way.shape)[:, None]
+    q[..., 2] += (figure.ground - floor)[:, None]
+    return q

@@ -1,0 +1,290 @@
+"""``gsgan.render``: images of evaluation, cameras, backgrounds, going on, clear messages."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from commands import refused
+from PIL import Image
+
+from gsgan.data.measures import Measures
+from gsgan.evaluate.predictions import Preparation
+from gsgan.evaluate.scores import painter
+from gsgan.model.runs import CHECKPOINT, build_data, load, load_avatar, load_config
+from gsgan.utils.provenance import SOURCE_TYPE, verify
+
+
+def read(path: Path) -> np.ndarray:
+    with Image.open(path) as image:
+        return np.asarray(image)
+
+
+@pytest.fixture
+def motion(tmp_path, landmarks) -> Path:
+    path = tmp_path / "a.npz"
+    np.savez(path, p=1.1 * landmarks, fps=30)
+    return path
+
+
+@pytest.fixture
+def render(inside, bare, tmp_path):
+    """Runs the command on the run that needs no body pose."""
+
+    def run(*args: str):
+        return inside("render", f"run={bare}", *args)
+
+    return run
+
+
+def expected(run: Path, split: str, background: str) -> dict[tuple[str, int], np.ndarray]:
+    """What evaluation scores, as bytes, by camera and frame."""
+    config = load_config(run)
+    data = build_data(config)
+    predict = painter(load_avatar(run, config, data)[0])
+    prepare = Preparation(Measures(background=background), None)
+    found = {}
+    dataset = data.dataset(split)
+    for i, item in enumerate(dataset.items):
+        image = prepare.image(predict(dataset[i], item), "full", dataset[i], None)
+        found[item] = (image[0] * 255).round().byte().permute(1, 2, 0).numpy()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("name", "background", "split"),
+    [
+        ("bare", "black", "novel_pose"),
+        ("bare", "white", "novel_view"),
+        ("run", "white", "novel_pose"),
+    ],
+)
+def test_held_out_frames_are_the_scored_images(inside, tmp_path, request, name, background, split):
+    """Byte for byte."""
+    folder = request.getfixturevalue(name)
+    scored = expected(folder, split, background)
+    for camera in dict.fromkeys(camera for camera, _ in scored):
+        out = tmp_path / camera
+        given = (f"run={folder}", f"motion={split}", f"camera={camera}", f"out={out}")
+        result = inside("render", *given, f"background={background}")
+        assert result.returncode == 0, result.stderr
+        frames = {frame for c, frame in scored if c == camera}
+        assert {p.name for p in out.glob("*.png")} == {f"{frame:06d}.png" for frame in frames}
+        for frame in frames:
+            np.testing.assert_array_equal(read(out / f"{frame:06d}.png"), scored[camera, frame])
+
+
+def test_a_motion_of_another_person(render, motion, tmp_path):
+    result = render(f"motion={motion}", "out=frames", "fps=15", "start=1", "frames=4", "pixels=40")
+    assert result.returncode == 0, result.stderr
+    assert "a.npz: 12 frames at 30 per second, metres, Z up -> 6 frames at 15" in result.stdout
+    assert "on the subject's bones" in result.stdout
+    files = sorted((tmp_path / "frames").glob("*.png"))
+    assert [p.name for p in files] == [f"{i:06d}.png" for i in range(1, 5)]
+    assert read(files[0]).shape == (40, 40, 3)
+    assert (read(files[0]) != read(files[3])).any()
+    assert verify(files[0]).source_type == SOURCE_TYPE
+
+
+def test_a_run_without_figure_or_dataset(render, bare, motion, tmp_path):
+    """The dataset is not needed; for a checkpoint without proportions it is."""
+    copy = shutil.copytree(bare, tmp_path / "copy")
+    config = copy / ".hydra" / "config.yaml"
+    config.write_text(config.read_text().replace("root: /", "root: /no/longer/there/"))
+    ok = render(f"run={copy}", f"motion={motion}", "out=a", "frames=1")
+    assert ok.returncode == 0, ok.stderr
+    old = shutil.copytree(bare, tmp_path / "old")
+    checkpoint = torch.load(old / CHECKPOINT, weights_only=True)
+    del checkpoint["gsgan"]["scene"]["figure"]
+    torch.save(checkpoint, old / CHECKPOINT)
+    result = render(f"run={old}", f"motion={motion}", "out=b", "frames=1")
+    assert result.returncode == 0, result.stderr
+    (a,), (b,) = ((tmp_path / x).glob("*.png") for x in "ab")
+    np.testing.assert_array_equal(read(a), read(b))
+
+
+def test_the_subjects_own_motion_is_left_alone(render, capture, tmp_path):
+    path = tmp_path / "own.npz"
+    with np.load(capture / "landmarks3d.npz") as held:
+        np.savez(path, p=held["p"][:4], conf=held["conf"][:4], fps=30)
+    result = render(f"motion={path}", "camera=cam00", "out=a")
+    assert "bones as they are" in result.stdout, result.stderr
+    assert render("motion=train", "camera=cam00", "out=b").returncode == 0
+    np.testing.assert_array_equal(read(tmp_path / "a/000002.png"), read(tmp_path / "b/000002.png"))
+    again = render(f"motion={path}", "out=c", "retarget=true", "frames=1")
+    assert "on the subject's bones" in again.stdout, again.stderr
+
+
+def test_a_body_pose_drives_an_avatar_with_a_body(inside, run, capture, tmp_path):
+    motion = f"motion={capture / 'body_pose.npz'}"
+    result = inside("render", f"run={run}", motion, "retarget=false", "out=a", "frames=2")
+    assert result.returncode == 0, result.stderr
+
+
+def test_a_video_and_the_truth_beside_it(render, tmp_path):
+    av = pytest.importorskip("av")
+    result = render(
+        "motion=novel_pose", "compare=truth", "background=white", "out=a.mp4", "fps=7.5"
+    )
+    assert result.returncode == 0, result.stderr
+    assert not (tmp_path / ".a.mp4.frames").exists()
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        stream = container.streams.video[0]
+        frames = [f.to_ndarray(format="rgb24") for f in container.decode(video=0)]
+        assert (stream.codec_context.name, float(stream.average_rate)) == ("h264", 7.5)
+    assert [f.shape for f in frames] == [(32, 64, 3)] * 2
+    assert verify(tmp_path / "a.mp4").synthetic
+    refused(render("out=a.mp4"), "exists; give overwrite=true")
+    assert render("out=a.mp4", "overwrite=true", "frames=2", "pixels=33").returncode == 0
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert container.streams.video[0].width == 34  # H.264 has even sides
+    assert render("out=truth", "motion=novel_pose", "compare=truth").returncode == 0
+    config = load_config(Path(json.loads((tmp_path / "truth/render.json").read_text())["run"]))
+    data = build_data(config).dataset("novel_pose")
+    truth = (data[0].image[0] * 255).round().byte().permute(1, 2, 0).numpy()
+    np.testing.assert_array_equal(read(tmp_path / "truth" / "000004.png")[:, :32], truth)
+
+
+def test_a_killed_render_goes_on(render, motion, tmp_path, monkeypatch):
+    """Frames that are there are not painted again; the video appears whole."""
+    av = pytest.importorskip("av")
+    from gsgan.model.avatar import Avatar
+
+    painted, paint = [], Avatar.picture
+
+    def counted(self, *args, **named):
+        if len(painted) == stop:
+            raise KeyboardInterrupt
+        painted.append(1)
+        return paint(self, *args, **named)
+
+    monkeypatch.setattr(Avatar, "picture", counted)
+    stop, given = 5, (f"motion={motion}", "out=a.mp4")
+    result = render(*given)
+    assert result.returncode == 130
+    assert not (tmp_path / "a.mp4").exists()
+    kept = {p: read(p) for p in (tmp_path / ".a.mp4.frames").glob("*.png")}
+    assert len(kept) == 5
+    stop = -1
+    result = render(*given)
+    assert result.returncode == 0, result.stderr
+    assert "5 of 12 frames are there already" in result.stdout
+    assert len(painted) == 12
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert len(list(container.decode(video=0))) == 12
+    painted.clear()
+    assert render(f"motion={motion}", "out=frames").returncode == 0
+    again = {p.name: read(p) for p in (tmp_path / "frames").glob("*.png")}
+    for path, pixels in kept.items():
+        np.testing.assert_array_equal(again[path.name], pixels)
+    assert render(f"motion={motion}", "out=frames").returncode == 0
+    assert len(painted) == 12
+    refused(render(f"motion={motion}", "out=frames", "background=red"), "of another render")
+    assert (
+        render(f"motion={motion}", "out=frames", "background=red", "overwrite=true").returncode == 0
+    )
+    assert len(painted) == 24
+
+
+def test_backgrounds(render, tmp_path):
+    cv2.imwrite(str(tmp_path / "wall.png"), np.full((20, 50, 3), (30, 20, 10), np.uint8))
+    for name, colour in (
+        ("red", (255, 0, 0)),
+        ("#0a141e", (10, 20, 30)),
+        ("wall.png", (10, 20, 30)),
+    ):
+        result = render("motion=novel_pose", f"background='{name}'", f"out={name.strip('#')}.d/x")
+        assert result.returncode == 0, result.stderr
+        assert tuple(read(tmp_path / f"{name.strip('#')}.d" / "x" / "000004.png")[0, 0]) == colour
+    assert render("motion=novel_pose", "background=alpha", "out=clear").returncode == 0
+    assert render("motion=novel_pose", "out=black").returncode == 0
+    clear, black = (read(tmp_path / x / "000004.png").astype(float) for x in ("clear", "black"))
+    assert clear.shape == (32, 32, 4)
+    assert clear[0, 0, 3] == 0
+    np.testing.assert_allclose(clear[..., :3] * clear[..., 3:] / 255, black, atol=1.5)
+    refused(render("background=alpha", "out=a.mp4"), "needs PNG files")
+    refused(render("background=nocolour", "out=a"), "is no colour and no file")
+
+
+def test_cameras(render, bare, capture, motion, tmp_path):
+    still = ("out=orbit", "frames=8", "orbit.turns=1")
+    result = render(*still)
+    assert "frame 4 of novel_pose, held still" in result.stdout, result.stderr
+    files = sorted((tmp_path / "orbit").glob("*.png"))
+    assert len(files) == 8
+    sizes = [(read(p).max(-1) > 60).sum() for p in files]
+    assert min(sizes) > 0
+    calibration = json.loads((capture / "cameras.json").read_text())
+    one = tmp_path / "one.json"
+    one.write_text(json.dumps({"cam00": calibration["cam00"]}))
+    assert render(f"motion={motion}", f"camera={one}", "out=a", "frames=1").returncode == 0
+    assert render(f"motion={motion}", "camera=cam00", "out=b", "frames=1").returncode == 0
+    np.testing.assert_array_equal(read(tmp_path / "a/000000.png"), read(tmp_path / "b/000000.png"))
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps(calibration))
+    assert render(f"motion={motion}", f"camera={path}", "out=c", "frames=3").returncode == 0
+    refused(render(f"motion={motion}", f"camera={path}", "out=d"), "3 cameras; expected 1, or 12")
+    refused(render(f"motion={motion}", "camera=cam77", "out=d"), "no camera", "cam00, cam01, cam02")
+
+
+def test_a_camera_inside_the_person(render, motion, tmp_path):
+    refused(
+        render(f"motion={motion}", "orbit.distance=0.05", "out=d"),
+        "the camera is inside the person", "cm from the",
+    )  # fmt: skip
+    assert not (tmp_path / "d").exists()
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        ((), "out is not set"),
+        (("out=a.avi",), "must be a .mp4 file, or a folder"),
+        (("out=a", "motion=none.bvh"), "motion=none.bvh does not exist"),
+        (("out=a", "fps=0"), "fps must be a number above 0"),
+        (("out=a", "motion=novel_pose", "start=9"), "start=9: the motion has 2 frames"),
+        (("out=a", "compare=truth"), "compare=truth needs held-out frames"),
+        (("out=a", "orbit.elevation=90"), "orbit.elevation must be"),
+        (("out=a", "c2pa.key=k.pem"), "go together"),
+        (("out=a", "retarget=maybe"), "retarget must be one of auto"),
+    ],
+)
+def test_one_clear_sentence(render, tmp_path, motion, args, message):
+    extra = (
+        () if any("motion" in a for a in args) or "compare=truth" in args else (f"motion={motion}",)
+    )
+    refused(render(*args, *extra), message)
+    assert not list(tmp_path.glob("a*/*.png"))
+
+
+def test_frames_with_gaps_keep_what_is_rendered(render, motion, landmarks, tmp_path):
+    assert render(f"motion={motion}", "out=a").returncode == 0
+    p = 1.1 * landmarks
+    p[7, [11, 23]] = np.nan
+    np.savez(motion, p=p, fps=30)
+    refused(render(f"motion={motion}", "out=a"), "the first is 7, lack shoulders or hips")
+    assert len(list((tmp_path / "a").glob("*.png"))) == 12
+
+
+def test_other_folders_are_not_touched(render, motion, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "000000.png").write_text("mine")
+    for more in ((), ("overwrite=true",)):
+        refused(render(f"motion={motion}", "out=mine", *more), "no folder of a render")
+    assert (tmp_path / "mine" / "000000.png").read_text() == "mine"
+
+
+def test_the_picture_of_the_avatar(bare, landmarks):
+    """`Avatar.render` is `Avatar.picture` on a background."""
+    avatar = load(bare, device="cpu")
+    config = load_config(bare)
+    frame = build_data(config).dataset("train")[0]
+    painting = avatar.picture(frame.skeleton, frame.camera)
+    image = avatar.render(frame.skeleton, frame.camera)
+    assert torch.equal(image, painting.image.clamp(0, 1))
+    assert painting.features is None
