@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import asdict
 
 import torch
@@ -12,6 +13,9 @@ from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.splat.settings import Accuracy
 
 NAME = "gsgan::rasterise"
+draw: Callable[..., Raster] | None = (
+    None  # gsgan.splat.rasterise sets it, as that module calls this one
+)
 
 
 def rasterised(
@@ -46,9 +50,8 @@ def _rasterise(
     settings: str,
     backend: str,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    from gsgan.splat.rasterise import rasterise  # which calls this module
-
-    made = rasterise(
+    assert draw is not None
+    made = draw(
         Gaussians(means, None, None, opacities, features, covariances),
         Camera(K, R, t, (height, width), dist),
         settings=Accuracy(**json.loads(settings)),

@@ -91,6 +91,9 @@ def rasterise(
     return Raster(features.to(out), alpha.to(out), None if z is None else z.to(out), fine)
 
 
+operator.draw = rasterise
+
+
 def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tuple[str, str]:
     """The backend that is used, and why when it is not the requested or the fastest one.
 
