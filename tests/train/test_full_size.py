@@ -23,7 +23,7 @@ def test_200_iterations_learn_within_memory_and_do_not_collapse(compose, tmp_pat
         "train",
         *("size=full", "training=demo", "data=synthetic", "data.source.size=128", "data.size=512"),
         *("data.source.train_cameras=2", "data.source.test_cameras=1", "data.source.frames=6"),
-        *("data.source.test_frames=1", "data.source.rays_per_pixel=4"),
+        *("data.source.test_frames=1", "data.source.rays_per_pixel=4", "data.body=none"),
         *("effects.body_points=off", "model.segmentation=null", "training.average=null"),
         f"training.schedule.step_one={STEP_ONE}",
         f"training.schedule.step_two={BEFORE_GAN + GAN}",
