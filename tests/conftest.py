@@ -93,7 +93,7 @@ def composed(name: str, *overrides: str) -> DictConfig:
         return compose(name, overrides=list(overrides))
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def compose():
     """Composes a config as the command line does: ``compose("train", "model=wo_seg")``."""
     return lambda name, *overrides: copy.deepcopy(composed(name, *overrides))

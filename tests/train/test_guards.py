@@ -118,7 +118,7 @@ def test_psis_rate_ends_with_step_one_however_long_step_two_is(make):
 
 def test_a_span_that_is_not_read_is_refused(make):
     module, _, _ = make("+training.recipes.generator.span=step_one")
-    with pytest.raises(ConfigError, match="is read for psi and colour only"):
+    with pytest.raises(ConfigError, match="is read for psi, colour and pose only"):
         module.configure_optimizers()
 
 

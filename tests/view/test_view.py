@@ -21,13 +21,11 @@ PATIENCE = 60.0  # seconds
 
 
 @pytest.fixture(scope="module")
-def viewer(bare):
-    from conftest import composed
-
+def viewer(bare, compose):
     from gsgan.view.server import Viewer
 
     given = (f"run={bare}", "port=0", "device=cpu", "max_upload=1", "background=white")
-    made = Viewer(composed("view", *given))
+    made = Viewer(compose("view", *given))
     yield made
     made.stop()
 
