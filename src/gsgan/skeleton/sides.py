@@ -6,8 +6,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gsgan.skeleton.template import MEDIAPIPE33
-
 # A pair's line that lies this far from the person's left (a cosine) has its sides swapped.
 OPPOSED = -0.3
 PAIRS = {"hips": (23, 24), "shoulders": (11, 12), "ears": (7, 8), "eyes": (2, 5)}
