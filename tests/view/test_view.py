@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from commands import refused
 
 viser = pytest.importorskip("viser", reason="the extra view is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
@@ -200,6 +201,12 @@ def test_it_listens_on_this_machine_alone(viewer, compose):
     assert compose("view").host == "127.0.0.1"
     assert viewer.server.get_host() == "127.0.0.1"
     assert viewer.server.request_share_url() is None  # no public address
+
+
+def test_another_machines_address_is_refused(bare, inside):
+    refused(inside("view", f"run={bare}", "host=203.0.113.1", "motion=rest"), "host=203.0.113.1")
+    refused(inside("view"), "run is not set")
+    refused(inside("view", f"run={bare}", "motion=none.bvh"), "none.bvh", "does not exist")
 
 
 def test_a_pose_that_cannot_be_painted_is_told(open_page):

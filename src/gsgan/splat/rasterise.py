@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import logging
+from dataclasses import asdict
 
 import torch
 from torch import Tensor
@@ -14,7 +16,6 @@ from gsgan.splat import (
     gsplat_backend,
     native,
     native_project,
-    operator,
     reference,
     tiles,
 )
@@ -67,7 +68,7 @@ def rasterise(
     """
     settings = accuracy(settings) if isinstance(settings, str) else settings
     if torch.compiler.is_compiling():
-        return operator.rasterised(gaussians, camera, settings, backend, depth)
+        return _recorded(gaussians, camera, settings, backend, depth)
     keep = checks.check(gaussians, camera, settings, on_invalid, rotation_tolerance)
     if camera.dist is not None:
         gaussians, camera = as_pinhole_sees(gaussians, camera, settings.near)
@@ -89,9 +90,6 @@ def rasterise(
                 average, alpha = avg_pool2d(features, times), avg_pool2d(alpha, times)
             features, z = average, None if z is None else avg_pool2d(z, times)
     return Raster(features.to(out), alpha.to(out), None if z is None else z.to(out), fine)
-
-
-operator.draw = rasterise
 
 
 def resolve_backend(name: str, device: torch.device, settings: Accuracy) -> tuple[str, str]:
@@ -151,3 +149,67 @@ def _warn_once(message: str) -> None:
     if message not in _logged:
         _logged.add(message)
         _log.warning(message)
+
+
+# -- what torch.export records
+
+
+def _recorded(
+    gaussians: Gaussians, camera: Camera, settings: Accuracy, backend: str, depth: bool
+) -> Raster:
+    """The operator that ``torch.export`` records in place of `rasterise`, without gradient."""
+    assert gaussians.covariances is not None and not depth  # noqa: PT018  (as avatars splat)
+    features, alpha, fine = _rasterise(
+        *(gaussians.means, gaussians.covariances, gaussians.opacities, gaussians.features),
+        *(camera.K, camera.R, camera.t, camera.dist, *camera.size),
+        json.dumps(asdict(settings)),
+        backend,
+    )
+    return Raster(features, alpha, None, fine if settings.supersample > 1 else None)
+
+
+@torch.library.custom_op("gsgan::rasterise", mutates_args=())
+def _rasterise(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    K: Tensor,
+    R: Tensor,
+    t: Tensor,
+    dist: Tensor | None,
+    height: int,
+    width: int,
+    settings: str,
+    backend: str,
+) -> tuple[Tensor, Tensor, Tensor]:
+    made = rasterise(
+        Gaussians(means, None, None, opacities, features, covariances),
+        Camera(K, R, t, (height, width), dist),
+        settings=Accuracy(**json.loads(settings)),
+        backend=backend,
+    )
+    fine = features.new_empty(0) if made.fine is None else made.fine
+    return tuple(x.contiguous() for x in (made.features, made.alpha, fine))  # type: ignore[return-value]
+
+
+@_rasterise.register_fake
+def _shapes(
+    means: Tensor,
+    covariances: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    K: Tensor,
+    R: Tensor,
+    t: Tensor,
+    dist: Tensor | None,
+    height: int,
+    width: int,
+    settings: str,
+    backend: str,
+) -> tuple[Tensor, Tensor, Tensor]:
+    B, _, C = features.shape
+    k = json.loads(settings)["supersample"]
+    fine = (B, C, k * height, k * width) if k > 1 else (0,)
+    sizes = ((B, C, height, width), (B, 1, height, width), fine)
+    return tuple(features.new_empty(size) for size in sizes)  # type: ignore[return-value]

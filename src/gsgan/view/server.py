@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import socket
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -65,6 +66,10 @@ class Viewer:
         rate = float(above("rate", config.rate))
         self.show = Show(self.run.avatar, drive, read, behind, size, fps, rate)
         host, port = str(config.host), whole("port", config.port, 0)
+        try:  # viser would wait for ever
+            socket.create_server((host, 0)).close()
+        except OSError as error:
+            raise ConfigError(f"host={host} is no address of this machine ({error})") from None
         logging.getLogger("websockets").setLevel(logging.WARNING)
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
             self.server = viser.ViserServer(host, port, label="gsgan", verbose=False)
