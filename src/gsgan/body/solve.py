@@ -23,7 +23,7 @@ from gsgan.utils.tensors import constant
 # Standard deviation of each number about the rest pose: wide where a joint turns freely, narrow
 # across hinges and where 33 landmarks do not see the turn.
 SPREAD = {
-    "spine": 0.5,
+    "spine": 0.25,
     "neck": 0.5,
     "collar": 0.2,
     "arm": 1.5,
@@ -39,7 +39,7 @@ SPREAD = {
     "knee_side": 0.05,
     "shank_twist": 0.05,
     "foot": 0.4,
-    "foot_y": 0.12,
+    "foot_y": 0.2,
     "foot_z": 0.2,
     "toe": 0.2,
 }
