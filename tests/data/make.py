@@ -139,6 +139,21 @@ def write_landmarks(root: Path, p: np.ndarray, frame_id: np.ndarray, **arrays: A
     np.savez(root / "landmarks3d.npz", **(held | {"p": p, "frame_id": frame_id} | arrays))
 
 
+def write_hands(root: Path, frames: int, per_metre: float = 1.0, **arrays: Any) -> np.ndarray:
+    """Writes hands3d.npz, hands of the template's rest pose at that person's wrists ``[F, 42, 3]``,
+    half closed in odd frames; returns the points in metres."""
+    from gsgan.skeleton import HOLISTIC
+
+    rest = np.asarray(HOLISTIC.rest_positions)[33:].reshape(2, 21, 3)[..., [0, 2, 1]] * [1, -1, 1]
+    tips = rest - rest[:, :1]
+    tips[:, [8, 12, 16, 20]] = tips[:, [6, 10, 14, 18]] + [0, -0.02, 0]
+    offset = np.stack([tips if f % 2 else rest - rest[:, :1] for f in range(frames)])
+    p = (skeletons(frames)[:, [15, 16], None] + offset).reshape(frames, 42, 3)
+    held = {"p": p * per_metre, "frame_id": np.arange(frames)}
+    np.savez(root / "hands3d.npz", **(held | arrays))
+    return p
+
+
 def edit_json(path: Path, change: Any) -> None:
     """Applies ``change`` to the object in a JSON file, in place."""
     content = json.loads(path.read_text())

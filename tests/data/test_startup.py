@@ -34,7 +34,7 @@ def without_mouth(capture, tmp_path):
 
 def test_a_mouth_that_no_frame_has_is_put_in_place_once(build, without_mouth):
     data, _, frame = build(f"data.root={without_mouth}")
-    whole = data.dataset("train").skeletons
+    whole = data.dataset("train").skeletons.p
     assert set(whole) == set(data.layout.frames)
     assert all(np.isfinite(p).all() for p in whole.values())
     assert float(frame.visibility[0, MOUTH].max()) == 0

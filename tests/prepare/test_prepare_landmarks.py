@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsgan.data.joints import BODY, HAND, LEFT, RIGHT, SETS, hand_names
+from gsgan.data.joints import BODY, LEFT, RIGHT, SETS
 from gsgan.prepare.landmarks import find_landmarks, gather, read_detections
+from gsgan.skeleton.hands import HAND, hand_names
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.errors import DataError
 

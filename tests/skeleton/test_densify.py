@@ -314,7 +314,7 @@ def test_shipped_templates_can_be_made_again() -> None:
         ({"torso": "ball"}, "torso must be one of fit, cube, got 'ball'"),
         ({"sampler": "random"}, "sampler must be one of even, trimesh, got 'random'"),
         ({"limbs": "all"}, "limbs must be one of paper22, all26, got 'all'"),
-        ({"face_points": 0}, r"at least one point, got \(200, 0, 500\)"),
+        ({"face_points": 0}, r"at least one point, got \(200, 0, 500, 60\)"),
         ({"radius_ratio": 0.0}, "must be positive, got 0.0"),
         ({"sampler": "trimesh", "points_per_limb": 64}, "has 200 cylinder points.*64"),
     ],

@@ -32,6 +32,13 @@ def axis_angle_to_matrix(axis_angle: Tensor, small: float = 1e-6) -> Tensor:
     return eye + a * K + b * (K @ K)
 
 
+def shortest_turn(a: Tensor, b: Tensor) -> Tensor:
+    """Axis-angle ``[..., 3]`` of the shortest rotations from unit ``a`` to ``b [..., 3]``."""
+    axis = torch.linalg.cross(a, b)
+    sine = axis.norm(dim=-1, keepdim=True)
+    return axis * torch.atan2(sine, (a * b).sum(-1, keepdim=True)) / sine.clamp_min(1e-6)
+
+
 def _cross_matrix(v: Tensor) -> Tensor:
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)

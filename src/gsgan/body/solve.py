@@ -12,14 +12,18 @@ from kornia.geometry.conversions import quaternion_to_axis_angle, rotation_matri
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
-from gsgan.body.lbs import axis_angle_to_matrix
+from gsgan.body.fingers import Fingers
+from gsgan.body.free import Body
+from gsgan.body.lbs import axis_angle_to_matrix, shortest_turn
 from gsgan.body.rig import Rig, ancestors, build_rig
 from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, bone_frames, sanitise
+from gsgan.skeleton.hands import HAND
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.tensors import constant
 
+BODY, ALL = len(MEDIAPIPE33.names), len(MEDIAPIPE33.names) + 2 * HAND
 # Standard deviation of each number about the rest pose: wide where a joint turns freely, narrow
 # across hinges and where 33 landmarks do not see the turn.
 SPREAD = {
@@ -71,7 +75,8 @@ class Solver(nn.Module):
     Levenberg-Marquardt steps on the distances to the landmarks and a prior on the turns, which
     decides what 33 landmarks do not show: knees and elbows are hinges, ankles hardly turn, twist
     spreads along limbs. A few more steps at the solution carry gradients.
-    Deterministic; the result of a frame does not depend on the others.
+    Deterministic; the result of a frame does not depend on the others. Fingers follow hand
+    landmarks, where they are given and the body has some (`gsgan.body.fingers`).
 
     Args:
         body: of the subject's shape.
@@ -104,6 +109,7 @@ class Solver(nn.Module):
     def __init__(self, body: MarkedBody) -> None:
         super().__init__()
         self.parents = len(body.parents)
+        self.fingers = Fingers(body) if isinstance(body, Body) else None
         with torch.no_grad():
             rig = self.rig = build_rig(body)
             known = body.landmarks.isfinite().all(-1)
@@ -136,13 +142,22 @@ class Solver(nn.Module):
         Convention: joints that no seen landmark shows stay at rest, see `at_rest`.
 
         Args:
-            skeleton: ``[B, 33, 3]`` metres, world.
-            visibility: ``[B, 33]`` in [0, 1], a landmark's weight; those not finite count as 0.
+            skeleton: ``[B, 33, 3]`` metres, world; or ``[B, 75, 3]`` with the 21 landmarks of the
+                left hand and of the right one. A hand that is not seen rests.
+            visibility: ``[B, 33]`` in [0, 1], a landmark's weight; those not finite count as 0. Or
+                ``[B, 75]``, where any above 0 counts alike for hands.
 
         Raises:
             ValueError: on a wrong shape; with too few shoulders and hips (`sanitise`); where left
                 and right are swapped.
         """
+        hands, seen = skeleton[:, BODY:], visibility[:, BODY:]
+        if hands.shape[1] not in (0, 2 * HAND):
+            raise ValueError(
+                f"Solver: the skeleton must have {BODY} joints or {ALL} with hands, got "
+                f"{skeleton.shape[1]}"
+            )
+        skeleton, visibility = skeleton[:, :BODY], visibility[:, :BODY]
         p, valid = sanitise(skeleton, visibility)
         refuse_swapped(p.detach(), valid)
         shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
@@ -152,17 +167,26 @@ class Solver(nn.Module):
             for near, w in zip((p - shift).split(CHUNK), weight.detach().split(CHUNK), strict=True)
         ]
         theta, transl = (torch.cat(parts) for parts in zip(*solved, strict=True))
+        if self.fingers is not None and hands.shape[1]:
+            seen = (seen > 0) & hands.isfinite().all(-1)
+            at = torch.where(seen.unsqueeze(-1), hands - shift, 0.0)
+            turns, shown = self.fingers(at, seen)
+            joints = self.fingers.joints
+            turns = torch.where(shown.unsqueeze(-1), turns, theta[:, joints])
+            theta = theta.index_copy(1, joints, turns)
         return BodyPose(theta, transl + shift[:, 0])
 
     def at_rest(self, visibility: Tensor) -> Tensor:
         """``[B, joints]`` bool: joints that no seen landmark shows: `solve` leaves them at rest."""
-        shown = (
-            ((visibility > 0) & self.known).to(self.prior) @ self.reaches.to(self.prior).mT
-        ) > 0
+        seen, hands = (visibility > 0).split([BODY, visibility.shape[1] - BODY], dim=1)
+        shown = ((seen & self.known).to(self.prior) @ self.reaches.to(self.prior).mT) > 0
         shown[:, :6] = True
         moved = torch.zeros(len(visibility), self.parents, device=visibility.device)
         joints = self.joint[self.entry_turn].expand(len(visibility), -1)
-        return moved.scatter_add(1, joints, shown[:, self.entry_number].float()) == 0
+        moved = moved.scatter_add(1, joints, shown[:, self.entry_number].float())
+        if self.fingers is not None and hands.shape[1]:
+            moved[:, self.fingers.joints] += self.fingers.shown(hands)
+        return moved == 0
 
     def _solve(self, p: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         with torch.no_grad():
@@ -194,7 +218,7 @@ class Solver(nn.Module):
             upper, lower = normalize(bones, dim=-1, eps=1e-6).unbind(1)
             axes = limb.axes.to(p)
             flat, _, along = axes
-            swing = _swing(along.expand_as(upper), upper)
+            swing = shortest_turn(along.expand_as(upper), upper)
             lower = (lower.unsqueeze(1) @ axis_angle_to_matrix(swing)).squeeze(1)
             normal = torch.linalg.cross(along.expand_as(lower), lower)
             bend = torch.atan2(normal.norm(dim=-1), lower @ along)
@@ -342,13 +366,6 @@ def _solved(H: Tensor, g: Tensor) -> Tensor:
 def log_of(R: Tensor) -> Tensor:
     """Axis-angle ``[..., 3]`` of rotations ``[..., 3, 3]``."""
     return quaternion_to_axis_angle(rotation_matrix_to_quaternion(R))
-
-
-def _swing(a: Tensor, b: Tensor) -> Tensor:
-    """Axis-angle ``[B, 3]`` of the shortest rotations from unit ``a [B, 3]`` to ``b [B, 3]``."""
-    axis = torch.linalg.cross(a, b)
-    sine = axis.norm(dim=-1, keepdim=True)
-    return axis * torch.atan2(sine, (a * b).sum(-1, keepdim=True)) / sine.clamp_min(1e-6)
 
 
 def _left_jacobian(v: Tensor) -> Tensor:

@@ -29,6 +29,7 @@ from gsgan.data.scene_info import SceneInfo, count_labels, scene_info
 from gsgan.data.skeletons import complete_skeletons
 from gsgan.data.splits import SPLITS, Splits, make_splits, protocol_splits
 from gsgan.scene import Frame, cat
+from gsgan.skeleton import TEMPLATES
 from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.errors import ConfigError
 
@@ -66,6 +67,7 @@ class GsganData(LightningDataModule):
         body: ``file``, the poses that the dataset has, if any; ``fit``, those of `gsgan.fit`, which
             training runs where they are missing; ``auto``, the dataset's, else `gsgan.fit`'s;
             ``none``, no poses.
+        skeleton: ``mediapipe33``, or ``holistic`` with the hands of hands3d.npz: 75 joints.
         protocol: the splits of a publication; None takes those of the dataset or the keys below.
         train_cameras, test_cameras, train_frames, test_frames, test_share: see `make_splits`.
         workers: loading processes; 0 loads in this one; None is 0 without a GPU, else up to
@@ -86,6 +88,7 @@ class GsganData(LightningDataModule):
         reader: Reader | None = None,
         smpl: str | None = None,
         body: str = "auto",
+        skeleton: str = "mediapipe33",
         protocol: Protocol | None = None,
         size: int | None = None,
         crop: PersonCrop | str | None = None,
@@ -116,6 +119,7 @@ class GsganData(LightningDataModule):
         self.reader = CaptureReader() if reader is None else reader
         self.smpl = smpl
         self.body = one_of("data.body", body, BODY)
+        self.skeleton = one_of("data.skeleton", skeleton, TEMPLATES)
         self.protocol = protocol
         self.size = size
         if not (crop in (None, "person") or isinstance(crop, PersonCrop)):
@@ -159,11 +163,25 @@ class GsganData(LightningDataModule):
     def layout(self) -> Layout:
         """The capture, read on first use."""
         layout = self.reader(self._folder(), self.checks, self.smpl)
+        if self.skeleton == "holistic":
+            if layout.hands is None:
+                raise ConfigError(
+                    f"data.skeleton=holistic needs a capture's hands3d.npz, which {layout.root} "
+                    "lacks; choose data.skeleton=mediapipe33"
+                )
+            layout = replace(layout, meta=replace(layout.meta, skeleton=self.skeleton))
+        poses = layout.poses
         if self.body == "none":
-            layout = replace(layout, poses=None, meta=replace(layout.meta, body=None))
-        elif self.body == "fit" and not (layout.poses is None or layout.poses.fitted):
+            return replace(layout, poses=None, meta=replace(layout.meta, body=None))
+        if self.body == "fit" and not (poses is None or poses.fitted):
             raise ConfigError(
                 f"data.body=fit, but {layout.root} has body poses of its own; choose data.body=file"
+            )
+        if poses is not None and poses.fitted and poses.skeleton != self.skeleton:
+            raise ConfigError(
+                f"{layout.root}: body poses were solved from data.skeleton={poses.skeleton}, but "
+                f"data.skeleton is {self.skeleton}; run gsgan.fit with data.body=none, this "
+                "data.skeleton and overwrite=true"
             )
         return layout
 
@@ -216,7 +234,8 @@ class GsganData(LightningDataModule):
         # every process has its own, and training and validation start their own workers
         cache = PictureCache(int(self.cache_mb * 2**20) // (2 * self.workers + 1))
         trained = sorted({frame for _, frame in splits.items["train"]})
-        skeletons = complete_skeletons(layout.landmarks, layout.frames, trained)
+        hands = layout.hands if self.skeleton == "holistic" else None
+        skeletons = complete_skeletons(layout.landmarks, layout.frames, trained, hands)
         return {
             name: CaptureDataset(
                 layout, splits.items[name], self.size, self.crop, cache, self.lens, skeletons

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -22,6 +22,7 @@ from gsgan.data.crop import Crop, PersonCrop
 from gsgan.data.files import read_colour
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL
+from gsgan.data.skeletons import Landmarks
 from gsgan.data.splits import Item
 from gsgan.scene import BodyPose, Camera, Frame
 from gsgan.utils.checks import whole
@@ -79,8 +80,8 @@ class CaptureDataset(Dataset[Frame]):
         crop: None for the full image, padded to a square when a size is given.
         cache: shared between datasets of one layout, size and crop, without an item in two of them;
             None decodes every time.
-        skeletons: ``[33, 3]`` by frame, without gaps, see `complete_skeletons`; None takes the
-            capture's own, with NaN where a joint was not seen.
+        skeletons: without gaps, see `complete_skeletons`; None takes the capture's own, without
+            hands.
         lens: ``undistort``; ``ignore`` treats images as a pinhole's; ``raw`` keeps the
             distortion, in ``camera.dist`` (five coefficients; lenses with more are undistorted).
 
@@ -96,7 +97,7 @@ class CaptureDataset(Dataset[Frame]):
         crop: PersonCrop | None = None,
         cache: PictureCache | None = None,
         lens: Lens = "undistort",
-        skeletons: Mapping[int, NDArray[np.float64]] | None = None,
+        skeletons: Landmarks | None = None,
     ) -> None:
         self.layout = layout
         self.items = tuple(items)
@@ -104,7 +105,7 @@ class CaptureDataset(Dataset[Frame]):
         self.crop = crop
         self.lens = lens
         self.cache = PictureCache(0) if cache is None else cache
-        self.skeletons = layout.landmarks.p if skeletons is None else skeletons
+        self.skeletons = layout.landmarks if skeletons is None else skeletons
         self._indices = {name: i for i, name in enumerate(layout.camera_names)}
 
     def __len__(self) -> int:
@@ -130,8 +131,8 @@ class CaptureDataset(Dataset[Frame]):
             image=_unit(decoded.image)[None],
             mask=_unit(decoded.mask)[None, None],
             camera=self.camera(item),
-            skeleton=_float(self.skeletons[frame]),
-            visibility=_float(self.layout.landmarks.visibility[frame]),
+            skeleton=_float(self.skeletons.p[frame]),
+            visibility=_float(self.skeletons.visibility[frame]),
             frame_id=torch.tensor([frame]),
             camera_index=torch.tensor([self._indices[name]]),
             body=body,

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
+from gsgan.skeleton.hands import HAND, hand_names
 from gsgan.skeleton.template import MEDIAPIPE33
 
-BODY, HAND = 33, 21
+BODY = len(MEDIAPIPE33.names)
 LEFT, RIGHT = slice(BODY, BODY + HAND), slice(BODY + HAND, BODY + 2 * HAND)
 ALL = BODY + 2 * HAND
 
-HAND_NAMES = (
-    "wrist",
-    *(f"thumb_{part}" for part in ("cmc", "mcp", "ip", "tip")),
-    *(
-        f"{finger}_{part}"
-        for finger in ("index", "middle", "ring", "pinky")
-        for part in ("mcp", "pip", "dip", "tip")
-    ),
-)
 PALM = (5, 9, 13, 17)  # knuckles: their bones from the wrist keep their length
 
 HEAD_PAIRS = ((1, 4), (2, 5), (3, 6), (7, 8), (9, 10))
@@ -68,8 +60,3 @@ FROM_HANDS = {
 def joint_names() -> tuple[str, ...]:
     """Names of all 75 joints."""
     return MEDIAPIPE33.names + hand_names()
-
-
-def hand_names() -> tuple[str, ...]:
-    """Names of the 42 hand joints, left hand first."""
-    return tuple(f"{side}_{name}" for side in ("left", "right") for name in HAND_NAMES)

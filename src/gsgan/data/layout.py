@@ -90,6 +90,7 @@ class _Contents:
         masks: by camera and frame, one or more per image.
         labels: by camera and frame; empty without labels.
         landmarks: by frame.
+        hands: 21 landmarks of the left hand and of the right one by frame, or None.
         poses: by frame, or None.
         pixels: how to decode the files.
         notes: one sentence for each conversion or omission.
@@ -102,6 +103,7 @@ class _Contents:
     masks: MaskIndex
     labels: Index = field(default_factory=dict)
     landmarks: Landmarks
+    hands: Landmarks | None = None
     poses: Poses | None = None
     pixels: PixelRules = field(default_factory=PixelRules)
     notes: tuple[str, ...] = ()
@@ -202,6 +204,7 @@ def assemble(found: Found, checks: Checks) -> Layout:
         masks=masks,
         labels=labels,
         landmarks=marks,
+        hands=found.hands,
         poses=found.poses,
         pixels=found.pixels,
         notes=tuple(notes),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.data.files import LARGEST_FRAME
-from gsgan.skeleton import limb_length_sum, sanitise
+from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, limb_length_sum, sanitise
+from gsgan.skeleton.hands import HAND
 from gsgan.utils.errors import DataError
 
 Float = NDArray[np.float64]
@@ -44,13 +45,25 @@ class Landmarks:
         p, visibility = (np.stack([part[f] for f in frames]) for part in (self.p, self.visibility))
         return torch.from_numpy(p), torch.from_numpy(visibility) > 0
 
+    def with_hands(self, hands: Landmarks) -> Landmarks:
+        """Skeletons of 75 joints; hands of frames that have none are not seen."""
+        nothing, unseen = np.zeros((2 * HAND, 3)), np.zeros(2 * HAND)
+        return Landmarks(
+            {f: np.concatenate([p, hands.p.get(f, nothing)]) for f, p in self.p.items()},
+            {
+                f: np.concatenate([seen, hands.visibility.get(f, unseen)])
+                for f, seen in self.visibility.items()
+            },
+            self.source,
+        )
+
 
 @dataclass(frozen=True)
 class Poses:
     """Body poses by frame: ``theta [bones, 3]`` axis-angle, ``transl [3]`` metres.
 
     ``fitted`` says that `gsgan.fit` made them: those of the frames ``registered`` by the masks of
-    the cameras ``fitted_to``, all others by their skeleton alone.
+    the cameras ``fitted_to``, all others by their ``skeleton`` alone, of that name.
     """
 
     theta: Mapping[int, Float]
@@ -59,6 +72,7 @@ class Poses:
     fitted: bool = False
     registered: frozenset[int] = frozenset()
     fitted_to: tuple[str, ...] = ()
+    skeleton: str = "mediapipe33"
 
     def digest(self, frames: Iterable[int]) -> str:
         """A hash of the poses of those frames."""
@@ -166,9 +180,12 @@ def body_height(p: Tensor, valid: Tensor) -> float:
 
 
 def complete_skeletons(
-    landmarks: Landmarks, frames: Sequence[int], trained: Sequence[int]
-) -> dict[int, Float]:
-    """Every frame's joints ``[J, 3]`` metres, with estimates of those that were not seen.
+    landmarks: Landmarks,
+    frames: Sequence[int],
+    trained: Sequence[int],
+    hands: Landmarks | None = None,
+) -> Landmarks:
+    """Every frame's joints, with estimates of those that were not seen.
 
     Done once per capture, so that no frame is repaired while it is rendered: some of a template's
     joints are in no body model (the mouth), so with SMPL every frame would be.
@@ -177,7 +194,10 @@ def complete_skeletons(
         landmarks: of the capture.
         frames: to complete.
         trained: frames that set the body's height, which gives the length of missing bones.
+        hands: makes skeletons of 75 joints.
     """
     height = body_height(*landmarks.joints(trained))
-    p, _ = sanitise(*landmarks.joints(frames), body_height=height)
-    return dict(zip(frames, p.numpy(), strict=True))
+    whole = landmarks if hands is None else landmarks.with_hands(hands)
+    template = MEDIAPIPE33 if hands is None else HOLISTIC
+    p, _ = sanitise(*whole.joints(frames), template, height)
+    return replace(whole, p=dict(zip(frames, p.numpy(), strict=True)))

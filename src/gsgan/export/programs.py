@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.export import Dim
 
-from gsgan.model.avatar import SKELETON_CHANNELS, Avatar
+from gsgan.model.avatar import Avatar
 from gsgan.scene import BodyPose, Camera
 from gsgan.utils.errors import ConfigError
 
@@ -112,7 +112,7 @@ class Painter(nn.Module):
             raise ConfigError(
                 "this avatar has no generator to export: its image is Step I's colour"
             )
-        self.splats = avatar.splat_channels > 0
+        self.splats, self.template = avatar.splat_channels > 0, avatar.template
         self.pose_encoder, self.generator = avatar.pose_encoder, avatar.generator
         classes = 0 if avatar.segmentation is None else avatar.segmentation.classes
         self.channels = {"features": avatar.splat_channels, "segmentation": classes}
@@ -120,12 +120,13 @@ class Painter(nn.Module):
     def inputs(self) -> Inputs:
         """Examples, for the exporter."""
         k = self.generator.supersample
-        channels = self.channels | {"skeleton": SKELETON_CHANNELS}
+        channels = self.channels | {"skeleton": len(self.template.draw_groups)}
         channels |= {"splat_alpha": int(self.splats), "fine": (k > 1) * channels["features"]}
         times = {name: k if name == "fine" else 1 for name, count in channels.items() if count}
         side = 4 * self.generator.stride
         images = {n: torch.rand(1, channels[n], f * side, f * side) for n, f in times.items()}
-        joints = {"omega": torch.rand(1, 33, 6), "joints": torch.rand(1, 33, 3)}
+        J = len(self.template.names)
+        joints = {"omega": torch.rand(1, J, 6), "joints": torch.rand(1, J, 3)}
         return Inputs(images | joints, times)
 
     def forward(

@@ -145,6 +145,7 @@ def fit_body(
         frame_id=np.array(layout.frames),
         registered=np.array(moments.frames if kept else (), np.int64),
         fitted_to=np.array(moments.cameras),
+        skeleton=np.array(data.skeleton),
     )
     (folder / STOPPED).unlink(missing_ok=True)
     lines = _summary(report, folder, moments)
@@ -160,6 +161,7 @@ def replace_size(data: GsganData) -> GsganData:
         protocol=data.protocol,
         size=PICTURE,
         crop=PersonCrop(margin=MARGIN),
+        skeleton=data.skeleton,
         **data.split_keys,
     )
 
@@ -180,9 +182,11 @@ def _folder(out: Path, overwrite: bool) -> Path:
     return out
 
 
-def _joints(data: GsganData, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
-    """Joints ``[F, 33, 3]`` metres and their visibility."""
+def _joints(data: GsganData, frames: Sequence[int], hands: bool = False) -> tuple[Tensor, Tensor]:
+    """Joints ``[F, 33, 3]`` metres and their visibility; 75 with hands, where the data has some."""
     landmarks = data.layout.landmarks
+    if hands and data.skeleton == "holistic" and data.layout.hands is not None:
+        landmarks = landmarks.with_hands(data.layout.hands)
     p, visibility = (
         torch.from_numpy(np.stack([part[f] for f in frames])).float()
         for part in (landmarks.p, landmarks.visibility)
@@ -193,7 +197,7 @@ def _joints(data: GsganData, frames: Sequence[int]) -> tuple[Tensor, Tensor]:
 def _solve(data: GsganData, shape: BodyShape, frames: Sequence[int]) -> BodyPose:
     try:
         with torch.no_grad():
-            return Solver(shaped_body(shape)).solve(*_joints(data, frames))
+            return Solver(shaped_body(shape)).solve(*_joints(data, frames, hands=True))
     except ValueError as error:
         names = f"items are the frames {spans(list(frames))} in order"
         raise DataError(f"{data.layout.root / LANDMARKS}: {error} ({names})") from None

@@ -16,7 +16,7 @@ from gsgan.body import open_body
 from gsgan.body.skinned import MarkedBody
 from gsgan.body.solve import Solver
 from gsgan.effects import Effects, EffectSettings, ModelParts, decide
-from gsgan.model.avatar import SKELETON_CHANNELS, Avatar
+from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.class_vote import ClassVote, Pictures, labelled_body
 from gsgan.model.deformation import Deformation
@@ -24,7 +24,7 @@ from gsgan.model.generator import Generator
 from gsgan.model.painting import ColourCorrection
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
-from gsgan.skeleton import MEDIAPIPE33, Densify
+from gsgan.skeleton import TEMPLATES, Densify
 from gsgan.splat import BACKENDS, Accuracy
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
@@ -113,7 +113,8 @@ def assemble_avatar(
         ValueError: on parts that do not go together.
     """
     one_of("model.backend", backend, BACKENDS)
-    paper22 = densify is None or densify.template is MEDIAPIPE33
+    template = TEMPLATES[scene.skeleton]
+    paper22 = densify is None or densify.template is template
     for wrong, message in (
         (not paper22 and options.get("twist", "none") != "none", "twist=hinge needs limbs=paper22"),
         ((deformation is None) != (densify is None), "densify and deformation go together"),
@@ -135,7 +136,7 @@ def assemble_avatar(
         effects = decide(scene, settings or EffectSettings(), model)
     formation: dict[str, Any] = {"low_pass": low_pass, "antialias": effects.antialias.on}
     # Stature, from limb lengths: the skeleton measures it and no pose changes it.
-    body_height = float(scene.body_height) * MEDIAPIPE33.stature / MEDIAPIPE33.limb_length_sum
+    body_height = float(scene.body_height) * template.stature / template.limb_length_sum
     sizes = {"body_height": body_height, "sh_degree": effects.degree}
 
     seed = torch.initial_seed()
@@ -146,7 +147,7 @@ def assemble_avatar(
         on_body = body_points(body=held, body_height=body_height)
     psi = None
     if densify is not None and deformation is not None:
-        rest, joints = (on_body or densify).rest_points, len(MEDIAPIPE33.names)
+        rest, joints = (on_body or densify).rest_points, len(template.names)
         psi = deformation(rest_points=rest, joints=joints, **sizes)
     skin = None if surface is None else surface(body=_body_of(scene, "model.surface"), **sizes)
     splats: Deformation | SurfaceGaussians | None = psi or skin
@@ -161,12 +162,12 @@ def assemble_avatar(
     solver = Solver(_body_of(scene, "the model")) if on_a_body else None
 
     torch.manual_seed(seed + 2)
-    unet = None
+    unet, drawn = None, len(template.draw_groups)
     if generator is not None and pose_encoder is not None:
         unet = generator(
-            feature_channels=SKELETON_CHANNELS if splats is None else 3 + splats.features,
+            feature_channels=drawn if splats is None else 3 + splats.features,
             segmentation_channels=S.classes if S else 0,
-            skeleton_channels=SKELETON_CHANNELS if splats else 0,
+            skeleton_channels=drawn if splats else 0,
             pose_channels=pose_encoder.channels,
             supersample=supersample if splats else 1,
         )
@@ -175,6 +176,7 @@ def assemble_avatar(
         colour = ColourCorrection(effects.cameras, scene.camera_names)
     return Avatar(
         effects=effects,
+        template=template,
         accuracy=replace(accuracy, supersample=supersample, **formation),
         limb_length_sum=float(scene.body_height),
         body_height=body_height,

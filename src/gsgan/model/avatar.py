@@ -23,18 +23,18 @@ from gsgan.skeleton import (
     MEDIAPIPE33,
     BoneFrames,
     Densify,
+    SkeletonTemplate,
     bone_frames,
+    completed,
     draw_skeleton,
     omega,
     root_of,
-    sanitise,
 )
 from gsgan.splat import Accuracy, rasterise
 from gsgan.splat.checks import checks_for
 from gsgan.utils.tensors import full_precision
 
 LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in an image 512 high
-SKELETON_CHANNELS = len(MEDIAPIPE33.draw_groups)
 UNWATCHED: AbstractContextManager[None] = nullcontext()  # entering it costs next to nothing
 
 
@@ -51,6 +51,7 @@ class Avatar(nn.Module):
     Args:
         effects: decided when training began.
         accuracy: the rasteriser's settings for F.
+        template: of the skeletons that drive it.
         limb_length_sum: metres, the subject's summed limb lengths.
         body_height: metres, the subject's stature: the length scale of the networks' inputs.
         deformation: Ψ; with it either densify (Alg. 1) or body_points places G.
@@ -78,6 +79,7 @@ class Avatar(nn.Module):
         accuracy: Accuracy,
         limb_length_sum: float,
         body_height: float,
+        template: SkeletonTemplate = MEDIAPIPE33,
         deformation: Deformation | None = None,
         densify: Densify | None = None,
         body_points: BodyPoints | None = None,
@@ -97,7 +99,7 @@ class Avatar(nn.Module):
         super().__init__()
         self.effects, self.accuracy, self.backend = effects, accuracy, backend
         self.limb_length_sum, self.body_height = limb_length_sum, body_height
-        self.template, self.twist = MEDIAPIPE33, twist
+        self.template, self.twist = template, twist
         self.window_margin = window_margin
         self.window_multiple, self.window_least = window_multiple, window_least
         self.deformation, self.densify, self.body_points = deformation, densify, body_points
@@ -147,9 +149,6 @@ class Avatar(nn.Module):
         Args:
             skeleton, camera, visibility, body: see `picture`.
             background: RGB in [0, 1], or one number for all three.
-
-        Returns:
-            ``[B, 3, H, W]`` RGB in [0, 1].
         """
         painting = self.picture(skeleton, camera, visibility=visibility, body=body)
         assert painting.image is not None and painting.alpha is not None  # noqa: PT018
@@ -173,7 +172,9 @@ class Avatar(nn.Module):
         Convention: inputs are moved to the avatar's device, where the image stays.
 
         Args:
-            skeleton: ``[J, 3]`` or ``[B, J, 3]`` metres, world frame; NaN for joints not seen.
+            skeleton: ``[J, 3]`` or ``[B, J, 3]`` metres, world frame; NaN for joints not seen. An
+                avatar with hands takes skeletons without: they are not seen; one without leaves
+                hands out.
             camera: B cameras, or one for all.
             visibility: ``[J]`` or ``[B, J]`` in [0, 1]; 0 marks a stand-in; None: all seen.
             body: B poses of the skinned body; None: solved from the skeleton where it is needed.
@@ -188,13 +189,8 @@ class Avatar(nn.Module):
                 pose must be solved and left and right are swapped.
         """
         device = next(self.parameters()).device
-        p, valid = sanitise(
-            skeleton.reshape(-1, *skeleton.shape[-2:]).to(device, torch.float32),
-            body_height=self.limb_length_sum,
-        )
-        seen = valid.to(p)
-        if visibility is not None:
-            seen = seen * visibility.reshape(-1, visibility.shape[-1]).to(p)
+        height = self.limb_length_sum
+        p, seen = completed(skeleton.to(device), visibility, self.template, height)
         if len(camera) not in (1, len(p)):
             raise ValueError(f"render: expected 1 or {len(p)} cameras, got {len(camera)}")
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
@@ -216,7 +212,7 @@ class Avatar(nn.Module):
         picture_height: int | None = None,
         camera_index: Tensor | None = None,
     ) -> Painting:
-        """Paints a pose.
+        """Paints a pose: I_pred and every map that led to it.
 
         Args:
             skeleton: ``[B, J, 3]`` metres, world, finite: `gsgan.skeleton.sanitise` replaces joints
@@ -231,9 +227,6 @@ class Avatar(nn.Module):
             picture_height: pixels of the whole image, when ``camera`` sees a window of it: the
                 drawn skeleton's lines are as wide as they would be there.
             camera_index: ``[B]`` cameras whose colours to correct for; None corrects nothing.
-
-        Returns:
-            I_pred and every map that led to it.
         """
         paints = paint and self.generator is not None
         with full_precision(skeleton):
@@ -379,7 +372,7 @@ class Avatar(nn.Module):
             return self.segmentation(_given(body), camera)
 
     def draw(self, p: Tensor, valid: Tensor, camera: Camera, picture_height: int | None) -> Tensor:
-        """p₂D ``[B, 8, H, W]``, its lines scaled to the whole image's height."""
+        """p₂D ``[B, groups, H, W]``, its lines scaled to the whole image's height."""
         share = (picture_height or camera.size[0]) / camera.size[0]
         with self.stage("p₂D"):
             return draw_skeleton(p, valid, camera, self.template, LINE_WIDTH * share)

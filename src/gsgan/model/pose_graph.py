@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsgan.model.deformation import encoded_size, positional_encoding
-from gsgan.skeleton import MEDIAPIPE33, SkeletonTemplate
+from gsgan.skeleton import MEDIAPIPE33, SkeletonTemplate, named_template
 from gsgan.utils.checks import one_of
 
 READOUT_START = 0.8  # initial standard deviation of g for joint channels of 1
@@ -51,7 +51,7 @@ class PoseGraph(nn.Module):
     """Graph network over joint rotations Ω, pooled to one number per skeleton edge.
 
     Args:
-        template: the skeleton's joints and edges.
+        template: the skeleton's joints and edges, or its name.
         width, joint_channels, octaves: hidden and output channels per joint, encoding of Ω.
         readout: ``edge`` (each number of g from the two joints of its edge) or ``linear``.
 
@@ -62,7 +62,7 @@ class PoseGraph(nn.Module):
 
     def __init__(
         self,
-        template: SkeletonTemplate = MEDIAPIPE33,
+        template: SkeletonTemplate | str = MEDIAPIPE33,
         *,
         width: int = 128,
         joint_channels: int = 32,
@@ -71,6 +71,7 @@ class PoseGraph(nn.Module):
     ) -> None:
         super().__init__()
         one_of("model.pose_encoder.readout", readout, ("edge", "linear"))
+        template = named_template(template)
         joints = len(template.names)
         mask = torch.eye(joints)
         for a, b in template.gnn_edges:
@@ -108,8 +109,9 @@ class PoseGraph(nn.Module):
 class PoseLinear(nn.Module):
     """The ablation ``wo_gcn``: g = W p + b on the flattened skeleton (paper Sec. 4, ablation)."""
 
-    def __init__(self, template: SkeletonTemplate = MEDIAPIPE33) -> None:
+    def __init__(self, template: SkeletonTemplate | str = MEDIAPIPE33) -> None:
         super().__init__()
+        template = named_template(template)
         self.channels = len(template.edges)
         self.linear = nn.Linear(3 * len(template.names), self.channels)
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsgan.data.joints import ALL, BODY, HAND, PALM
+from gsgan.data.joints import ALL, BODY, PALM
 from gsgan.prepare.rig import Bool, Float, known
+from gsgan.skeleton.hands import HAND
 from gsgan.utils.checks import above, at_least
 
 Bones = tuple[tuple[int, int], ...]

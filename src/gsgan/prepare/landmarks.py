@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from gsgan.data.files import frame_files, read_arrays, read_json, read_json_value
-from gsgan.data.joints import ALL, BODY, FROM_HANDS, HAND, LEFT, RIGHT, SETS
+from gsgan.data.joints import ALL, BODY, FROM_HANDS, LEFT, RIGHT, SETS
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.prepare.rig import Float, Ints, known
+from gsgan.skeleton.hands import HAND
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import DataError

@@ -18,12 +18,13 @@ from gsgan.check.report import Figure, Finding, Report, Section, Table, page, pr
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, Crop, PersonCrop, cut, project, resize
 from gsgan.data.files import read_colour, read_grey
-from gsgan.data.joints import BODY, hand_names
+from gsgan.data.joints import BODY
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.pictures import Written, sampled
 from gsgan.prepare.rig import FOCAL, Float, Ints, Rig, camera_moves, known
 from gsgan.prepare.solve import Solution, median
 from gsgan.prepare.work import GENERATOR, write_json, write_npz, writing
+from gsgan.skeleton.hands import hand_names
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.files import write_atomically
 

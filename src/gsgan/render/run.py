@@ -221,8 +221,8 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
         views_of = [dataset.camera(item) for item in items]
         seen = views.cat(views_of), index
     return Drive(
-        p=np.stack([dataset.skeletons[f] for f in frames]),
-        visibility=np.stack([layout.landmarks.visibility[f] for f in frames]),
+        p=np.stack([dataset.skeletons.p[f] for f in frames]),
+        visibility=np.stack([dataset.skeletons.visibility[f] for f in frames]),
         body=body,
         numbers=frames,
         text=f"{split}: {len(frames)} frames" + f" of camera {camera}" * own,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from gsgan.skeleton.frames import MIN_LENGTH, BoneFrames, bone_frames
+from gsgan.skeleton.holistic import named_template
 from gsgan.skeleton.template import HEAD, MEDIAPIPE33, SkeletonTemplate
 from gsgan.skeleton.tensors import Swing, check_skeleton, constants
 from gsgan.utils.errors import ConfigError
@@ -61,19 +62,23 @@ class Densify(nn.Module):
 
     Convention: unit shapes are sampled once in their part's frame and moved by similarity
     transforms, so that index k is the same body point in every pose. The layout is fixed: limb
-    l has ``[n l, n (l + 1))`` with ``n = points_per_limb``, then the face, then the torso; 5400
-    points by default. The module has no parameters and no state.
+    l has ``[n l, n (l + 1))`` with ``n = points_per_limb``, then the bones of hands where the
+    template has some, then the face, then the torso; 5400 points by default, 7800 with hands. The
+    module has no parameters and no state.
 
     Args:
-        template: joints and limbs.
+        template: joints and limbs, or their name in `TEMPLATES`.
         points_per_limb: points on each limb's cylinder.
         face_points: points on the sphere.
         torso_points: points on the box.
         radius_ratio: cylinder radius over its length.
+        points_per_finger_bone, finger_radius_ratio: the same for the bones of hands, where the
+            template has some: they are short and thick.
         face_radius_scale: sphere radius over the longest distance between face joints.
         torso: ``fit`` (as wide as shoulders or hips, as high as the spine, half as deep as wide)
             or ``cube`` (edge length: the longest distance between shoulders and hips).
-        sampler: ``even`` (low discrepancy) or ``trimesh`` (shipped random surface samples).
+        sampler: ``even`` (low discrepancy) or ``trimesh`` (shipped random surface samples; hands
+            are even).
         limbs: ``paper22``, or ``all26``: with the trunk's four edges.
         sigma: initial standard deviation divided by the mean spacing ``sqrt(area / points)``.
         torso_range: bounds of the box's edges, in multiples of the rest pose's (``fit``).
@@ -92,6 +97,8 @@ class Densify(nn.Module):
     normals: Tensor
     rest_points: Tensor
     _limb_points: Tensor
+    _bone_points: Tensor
+    _limb_sigma: Tensor
     _face_points: Tensor
     _torso_points: Tensor
     _face_pairs: Tensor
@@ -101,7 +108,7 @@ class Densify(nn.Module):
 
     def __init__(
         self,
-        template: SkeletonTemplate = MEDIAPIPE33,
+        template: SkeletonTemplate | str = MEDIAPIPE33,
         points_per_limb: int = 200,
         face_points: int = 500,
         torso_points: int = 500,
@@ -111,6 +118,8 @@ class Densify(nn.Module):
         sampler: Sampler = "even",
         limbs: Limbs = "paper22",
         *,
+        points_per_finger_bone: int = 60,
+        finger_radius_ratio: float = 0.25,
         sigma: float = 0.6,
         torso_range: tuple[float, float] = (0.25, 4.0),
         min_length: float = MIN_LENGTH,
@@ -125,17 +134,20 @@ class Densify(nn.Module):
             if value not in get_args(known):
                 expected = ", ".join(get_args(known))
                 raise ConfigError(f"Densify: {name} must be one of {expected}, got {value!r}")
-        counts = (points_per_limb, face_points, torso_points)
+        counts = (points_per_limb, face_points, torso_points, points_per_finger_bone)
         if min(counts) < 1:
             raise ConfigError(f"Densify: every part must have at least one point, got {counts}")
-        if min(radius_ratio, face_radius_scale, sigma, min_length) <= 0:
+        ratios = (radius_ratio, face_radius_scale, finger_radius_ratio, sigma, min_length)
+        if min(ratios) <= 0:
             raise ConfigError(
-                "Densify: radius_ratio, face_radius_scale, sigma and min_length must be positive, "
-                f"got {radius_ratio}, {face_radius_scale}, {sigma}, {min_length}"
+                "Densify: radius_ratio, face_radius_scale, finger_radius_ratio, sigma and "
+                f"min_length must be positive, got {', '.join(map(str, ratios))}"
             )
-        self.template = template if limbs == "paper22" else template.with_torso_limbs()
+        chosen = named_template(template)
+        self.template = chosen if limbs == "paper22" else chosen.with_torso_limbs()
         self.counts = counts
-        self.radius_ratio, self.face_radius_scale = radius_ratio, face_radius_scale
+        self.radius_ratio, self.finger_radius_ratio = radius_ratio, finger_radius_ratio
+        self.face_radius_scale = face_radius_scale
         self.torso = torso
         self.sigma, self.torso_range, self.min_length = sigma, tuple(torso_range), min_length
         self._make_buffers(sampler, dtype or torch.get_default_dtype())
@@ -146,23 +158,24 @@ class Densify(nn.Module):
         return len(self.part_id)
 
     def _make_buffers(self, sampler: str, dtype: torch.dtype) -> None:
-        t, (n_limb, n_face, n_torso) = self.template, self.counts
+        t, (n_limb, n_face, n_torso, n_bone) = self.template, self.counts
         torso_rest = t.rest_torso
         if sampler == "trimesh":
             fit = "box" if self.torso == "cube" else "box_fit"
-            cylinder, sphere = (
-                shipped("cylinder", n_limb),
-                shipped("sphere", n_face),
-            )
+            cylinder, sphere = shipped("cylinder", n_limb), shipped("sphere", n_face)
             box = shipped(fit, n_torso)
         else:
             extents = (1.0, 1.0, 1.0) if self.torso == "cube" else torso_rest
             cylinder, sphere = even_cylinder(n_limb), even_sphere(n_face)
             box = even_box(n_torso, extents)
-        along = _limb_axes(t)
-        limb_points = (cylinder[0] * [self.radius_ratio, self.radius_ratio, 1.0]) @ along.mT.numpy()
-        limb_normals = cylinder[1] @ along.mT.numpy()
-        n_limbs = len(t.limbs)
+        along = _limb_axes(t).mT.numpy()
+        (limb_points, limb_normals), (bone_points, bone_normals) = (
+            ((points * [radius, radius, 1.0]) @ along[list(limbs)], normals @ along[list(limbs)])
+            for limbs, radius, (points, normals) in (
+                (t.measured, self.radius_ratio, cylinder),
+                (t.fingers, self.finger_radius_ratio, even_cylinder(n_bone)),
+            )
+        )
 
         def buffer(name: str, value: object) -> None:
             tensor = torch.as_tensor(np.asarray(value))
@@ -172,11 +185,14 @@ class Densify(nn.Module):
                 persistent=not name.startswith("_"),
             )
 
-        parts = np.repeat(np.arange(n_limbs + 2), [n_limb] * n_limbs + [n_face, n_torso])
-        buffer("part_id", parts)
-        buffer("template_points", np.concatenate([*limb_points, sphere[0], box[0]]))
-        buffer("normals", np.concatenate([*limb_normals, sphere[1], box[1]]))
+        face = len(t.limbs)
+        counts = [n_limb] * len(t.measured) + [n_bone] * len(t.fingers) + [n_face, n_torso]
+        buffer("part_id", np.repeat([*t.measured, *t.fingers, face, face + 1], counts))
+        buffer("template_points", np.concatenate([*limb_points, *bone_points, sphere[0], box[0]]))
+        buffer("normals", np.concatenate([*limb_normals, *bone_normals, sphere[1], box[1]]))
         buffer("_limb_points", limb_points)
+        buffer("_bone_points", bone_points)
+        buffer("_limb_sigma", self._sigma_by_limb())
         buffer("_face_points", sphere[0])
         buffer("_torso_points", box[0])
         buffer("_torso_rest", torso_rest)
@@ -223,16 +239,20 @@ class Densify(nn.Module):
         radius = self._longest(q, self._face_pairs) * self.face_radius_scale
         edges = self._torso_edges(q, torso)
 
-        limbs = self._limb_points @ (frames.limbs * frames.lengths[..., None, None]).mT
-        limbs = (limbs + origins[:, :-2, None]).flatten(1, 2)
+        axes = (frames.limbs * frames.lengths[..., None, None]).mT
+        cylinders = [
+            (points @ axes.index_select(1, chosen) + origins.index_select(1, chosen).unsqueeze(2))
+            for points, chosen in ((self._limb_points, c.measured), (self._bone_points, c.fingers))
+            if len(chosen)
+        ]
         head = self._face_points @ (head_R * radius[:, None, None]).mT + origins[:, -2:-1]
         trunk = self._torso_points @ (trunk_R * edges.unsqueeze(1)).mT + origins[:, -1:]
-        spread = torch.cat([frames.lengths * self._limb_sigma(), self._hub_sigma(radius, edges)], 1)
+        spread = torch.cat([frames.lengths * self._limb_sigma, self._hub_sigma(radius, edges)], 1)
         rotations = torch.cat([frames.limbs, head_R.unsqueeze(1), trunk_R.unsqueeze(1)], dim=1)
         # Stretching a cylinder or a box along its axes does not change its normals.
         turned = rotations.index_select(1, self.part_id) @ self.normals.unsqueeze(-1)
         return Points(
-            means=torch.cat([limbs, head, trunk], dim=1) + root,
+            means=torch.cat([*(x.flatten(1, 2) for x in cylinders), head, trunk], dim=1) + root,
             rotations=rotations,
             origins=origins + root,
             scales=spread.index_select(1, self.part_id),
@@ -265,9 +285,17 @@ class Densify(nn.Module):
         edges = torch.stack([width, height, 0.5 * width], dim=1)
         return edges.clamp(self._torso_rest * low, self._torso_rest * high)
 
-    def _limb_sigma(self) -> float:
+    def _sigma_by_limb(self) -> list[float]:
         """Per metre of limb: ``sigma sqrt(area / n)`` with lateral area ``2 pi r h²``."""
-        return float(self.sigma * (2 * np.pi * self.radius_ratio / self.counts[0]) ** 0.5)
+        limb, finger = (
+            float(self.sigma * (2 * np.pi * radius / count) ** 0.5)
+            for radius, count in (
+                (self.radius_ratio, self.counts[0]),
+                (self.finger_radius_ratio, self.counts[3]),
+            )
+        )
+        thin = set(self.template.fingers)
+        return [finger if i in thin else limb for i in range(len(self.template.limbs))]
 
     def _hub_sigma(self, radius: Tensor, edges: Tensor) -> Tensor:
         """``[B, 2]`` metres: initial standard deviations of face and torso."""

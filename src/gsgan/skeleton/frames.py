@@ -16,8 +16,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from gsgan.skeleton.hands import palm_frames
 from gsgan.skeleton.rotation6d import across, rotation_from_6d, rotation_to_6d, unit
-from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, N_HUBS, SkeletonTemplate
+from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, SkeletonTemplate
 from gsgan.skeleton.tensors import FOLDED, Constants, Level, check_skeleton, constants
 from gsgan.utils.tensors import constant
 
@@ -25,6 +26,7 @@ Twist = Literal["none", "hinge"]
 
 MIN_LENGTH = 1e-3
 """Metres: a shorter bone or baseline has no direction (1 mm, below any landmark's accuracy)."""
+WHOLE = 2.99  # summed squares of a rotation's entries are 3, those of a palm that shrinks are less
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,8 @@ class BoneFrames:
     frame equals its hub's.
     """
 
-    hubs: Tensor  # [B, 3, 3, 3] pelvis, chest, head; columns are left, up, front
+    # [B, 3 + hands, 3, 3] pelvis, chest, head, with columns left, up, front; and palms
+    hubs: Tensor
     limbs: Tensor  # [B, L, 3, 3]
     local: Tensor  # [B, L, 3, 3] the same relative to the parent's frame
     lengths: Tensor  # [B, L] metres, sqrt(|bone|² + min_length²)
@@ -94,6 +97,8 @@ def bone_frames(
     q = p - p[:, template.hips[0], None].detach()
     trunk = _trunk(q, c, min_length, folded)
     hubs = torch.cat([trunk[:, :2], _head(q, valid, trunk[:, 1], c, min_length)], dim=1)
+    if template.palms:
+        hubs = torch.cat([hubs, _palms(q, trunk[:, 1:2], c)], dim=1)
 
     bones = q.index_select(1, c.ends) - q.index_select(1, c.starts)
     length2 = bones.square().sum(-1, keepdim=True)
@@ -112,7 +117,7 @@ def bone_frames(
         known = torch.cat([known, parent @ local], dim=1)
     return BoneFrames(
         hubs=hubs,
-        limbs=known[:, N_HUBS:].index_select(1, c.limb_order),
+        limbs=known[:, template.n_hubs :].index_select(1, c.limb_order),
         local=torch.cat(relative, dim=1).index_select(1, c.limb_order),
         lengths=lengths,
         torso=trunk[:, 2],
@@ -165,6 +170,16 @@ def _head(q: Tensor, valid: Tensor, chest: Tensor, c: Constants, min_length: flo
     head = by_eyes * (eyes @ c.head_from_eyes) + (1 - by_eyes) * chest
     head = rotation_from_6d(rotation_to_6d(by_ears * ears + (1 - by_ears) * head))
     return head.unsqueeze(1)
+
+
+def _palms(q: Tensor, chest: Tensor, c: Constants) -> Tensor:
+    """``[B, hands, 3, 3]`` frames of the palms; of one that vanishes, the chest's ``[B, 1, 3, 3]``.
+
+    Fingers' swings then start from the palm, which turns with the forearm as no bone shows.
+    """
+    frames = palm_frames(q.index_select(1, c.palms).unflatten(1, (-1, 3)))
+    lost = frames.square().sum((-2, -1), keepdim=True) < WHOLE
+    return torch.where(lost, chest, frames)
 
 
 def _faded(v: Tensor, fallback: Tensor, min_length: float, folded: float) -> Tensor:

@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gsgan.scene import Camera
 from gsgan.skeleton.frames import bone_frames
+from gsgan.skeleton.holistic import HOLISTIC
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, SkeletonTemplate
 from gsgan.skeleton.tensors import check_skeleton, constants
 
+WITH_AND_WITHOUT = {len(t.names) for t in (MEDIAPIPE33, HOLISTIC)}
 MIN_TRUNK_JOINTS = 3
 """Of the two shoulders and two hips: with fewer the trunk's frame is undefined."""
 
@@ -40,10 +43,11 @@ def limb_length_sum(
     """
     valid = check_skeleton("limb_length_sum", p, valid, template)
     c = constants(template, p.device, p.dtype)
-    seen = valid.index_select(1, c.starts) & valid.index_select(1, c.ends)
-    bones = p.index_select(1, c.ends) - p.index_select(1, c.starts)
+    starts, ends = c.starts[c.measured], c.ends[c.measured]
+    seen = valid.index_select(1, starts) & valid.index_select(1, ends)
+    bones = p.index_select(1, ends) - p.index_select(1, starts)
     lengths = torch.where(seen.unsqueeze(-1), bones, 0.0).norm(dim=-1).sum(-1)
-    rest = (c.rest[c.ends] - c.rest[c.starts]).norm(dim=-1)
+    rest = (c.rest[ends] - c.rest[starts]).norm(dim=-1)
     return lengths * rest.sum() / (seen * rest).sum(-1)
 
 
@@ -95,6 +99,33 @@ def sanitise(
         return p, valid
     _refuse_without_trunk(valid, template, min_trunk_joints)
     return _filled(p, valid, template, body_height), valid
+
+
+def completed(
+    skeleton: Tensor, visibility: Tensor | None, template: SkeletonTemplate, body_height: float
+) -> tuple[Tensor, Tensor]:
+    """Joints ``[B, J, 3]`` of a template, finite, and their visibility ``[B, J]``, 0 for stand-ins.
+
+    Convention: hands that a skeleton lacks are not seen; those a template lacks are left out.
+
+    Args:
+        skeleton: ``[J, 3]`` or ``[B, J, 3]`` metres; NaN for joints not seen.
+        visibility: ``[J]`` or ``[B, J]`` in [0, 1]; None: all seen.
+        template, body_height: see `sanitise`.
+
+    Raises:
+        ValueError: as `sanitise` does.
+    """
+    J = len(template.names)
+    p = skeleton.reshape(-1, *skeleton.shape[-2:]).to(torch.float32)
+    shown = torch.ones_like(p[..., 0]) if visibility is None else visibility.to(p)
+    shown = shown.reshape(-1, shown.shape[-1])
+    if (found := p.shape[1]) != J and {found, J} == WITH_AND_WITHOUT:
+        missing = (0, max(J - found, 0))
+        p = pad(p[:, :J], (0, 0, *missing), value=torch.nan)
+        shown = pad(shown[:, :J], missing)
+    p, valid = sanitise(p, None, template, body_height)
+    return p, valid * shown
 
 
 def recentre(

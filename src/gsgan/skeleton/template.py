@@ -14,7 +14,7 @@ Vector = tuple[float, float, float]
 Edge = tuple[int, int]
 
 PELVIS, CHEST, HEAD = 0, 1, 2
-"""Positions of the hub frames; frame ``N_HUBS + l`` is that of limb ``l``."""
+"""Positions of the hub frames; those of palms follow, then those of limbs, see `n_hubs`."""
 N_HUBS = 3
 
 
@@ -31,7 +31,8 @@ class SkeletonTemplate:
     names: tuple[str, ...]  # of the J joints
     edges: tuple[Edge, ...]  # the connections that the landmark detector draws
     limbs: tuple[Edge, ...]  # (parent joint, child joint) of the bones with a cylinder
-    # per limb, the frame that its own is relative to: 0 pelvis, 1 chest, 2 head, 3 + l limb l
+    # per limb, the frame that its own is relative to: 0 pelvis, 1 chest, 2 head, 3 + h palm h,
+    # n_hubs + l limb l
     limb_parents: tuple[int, ...]
     # per limb, unit, in its parent's frame; not the rest pose: chosen so that the opposite
     # direction, where the swing is undefined, is out of reach
@@ -49,6 +50,9 @@ class SkeletonTemplate:
     mirror: tuple[int, ...]  # per joint, its counterpart (itself on the midline)
     draw_groups: tuple[tuple[str, tuple[Edge, ...]], ...]  # (name, segments) of drawn channels
     gnn_edges: tuple[Edge, ...]  # the edges connected to one component, for message passing
+    palms: tuple[tuple[int, int, int], ...] = ()  # wrist, index's and little finger's knuckles
+    fingers: tuple[int, ...] = ()  # limbs that are bones of hands
+    bare: tuple[int, ...] = ()  # limbs without a cylinder: another limb lies there
 
     @property
     def torso(self) -> tuple[int, int, int, int]:
@@ -56,11 +60,26 @@ class SkeletonTemplate:
         return (*self.shoulders, *self.hips)
 
     @property
+    def n_hubs(self) -> int:
+        """Number of frames before the limbs': pelvis, chest, head and palms."""
+        return N_HUBS + len(self.palms)
+
+    @property
+    def measured(self) -> tuple[int, ...]:
+        """Limbs whose lengths measure the subject's size: all but those of hands."""
+        left_out = {*self.fingers, *self.bare}
+        return tuple(i for i in range(len(self.limbs)) if i not in left_out)
+
+    @property
     def levels(self) -> tuple[tuple[int, ...], ...]:
-        """Limbs by depth: every limb's parent frame is a hub or in an earlier level."""
+        """Limbs by depth: every limb's parent frame is a hub or in an earlier level, where a palm's
+        are the limbs that end at its knuckles."""
         depth: dict[int, int] = {}
         for limb, parent in enumerate(self.limb_parents):
-            depth[limb] = 0 if parent < N_HUBS else depth[parent - N_HUBS] + 1
+            before = parent - self.n_hubs
+            if N_HUBS <= parent < self.n_hubs:
+                before = self.incoming[self.palms[parent - N_HUBS][1]]
+            depth[limb] = 0 if parent < N_HUBS else depth[before] + 1
         return tuple(
             tuple(limb for limb in depth if depth[limb] == level)
             for level in range(max(depth.values()) + 1)
@@ -78,8 +97,8 @@ class SkeletonTemplate:
     @property
     def limb_length_sum(self) -> float:
         """Metres: the sum of limb lengths of the rest pose, the counterpart of ``h_body``."""
-        rest = np.asarray(self.rest_positions)
-        return float(sum(np.linalg.norm(rest[j] - rest[i]) for i, j in self.limbs))
+        rest, limbs = np.asarray(self.rest_positions), [self.limbs[i] for i in self.measured]
+        return float(sum(np.linalg.norm(rest[j] - rest[i]) for i, j in limbs))
 
     @property
     def rest_torso(self) -> Vector:

@@ -73,6 +73,9 @@ class Constants(NamedTuple):
     head_from_eyes: Tensor  # [3, 3]
     head_points: Tensor  # [5] left ear, right ear, left eye, right eye, nose
     torso: Tensor  # [4]
+    palms: Tensor  # [3 H] wrist, index's and little finger's knuckle of each hand
+    measured: Tensor  # limbs that measure the subject's size
+    fingers: Tensor  # limbs that are bones of hands
     face_turned: Tensor  # [F] face joints but the nose
     face_swing: Swing
     omega_order: Tensor  # [J] into pelvis, chest, head, face, limbs
@@ -105,8 +108,8 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
     rest = number(t.rest_positions)
     directions = number(t.rest_directions)
     sorted_limbs = [limb for level in t.levels for limb in level]
-    known = {hub: hub for hub in range(N_HUBS)}
-    known |= {N_HUBS + limb: N_HUBS + k for k, limb in enumerate(sorted_limbs)}
+    known = {hub: hub for hub in range(t.n_hubs)}
+    known |= {t.n_hubs + limb: t.n_hubs + k for k, limb in enumerate(sorted_limbs)}
     hinge_of = {limb: pair for pair in t.hinges for limb in pair}
     axis_of = {limb: a for pair, a in zip(t.hinges, t.hinge_axes, strict=True) for limb in pair}
 
@@ -151,6 +154,9 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
         head_from_eyes=cast(eye_frame.mT.contiguous()),
         head_points=index([*t.ears, *t.eyes, t.nose]),
         torso=index(t.torso),
+        palms=index([joint for palm in t.palms for joint in palm]),
+        measured=index(t.measured),
+        fingers=index(t.fingers),
         face_turned=index(turned),
         face_swing=swing(from_ears / from_ears.norm(dim=-1, keepdim=True)),
         omega_order=index([place[joint] for joint in range(len(t.names))]),

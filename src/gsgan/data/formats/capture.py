@@ -7,6 +7,7 @@
     images/{camera}/%06d.jpg|png        masks/{camera}/%06d.png   0..255
     labels/{camera}/%06d.png            optional part numbers, 255 = ignore
     landmarks3d.npz   p (F,33,3) NaN = missing, conf (F,33), frame_id (F,)
+    hands3d.npz       optional, the same (F,42,3): MediaPipe's 21 of the left hand, then the right
     body_pose.npz     optional theta (F,bones,3), transl (F,3), frame_id (F,); betas (S,) of SMPL
     body_shape.npz    optional coefficients (K,), stretch (8,), offsets (33,3): of the free body, by
                       gsgan.fit
@@ -38,11 +39,12 @@ from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, dataset_folder
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import SKELETONS, Landmarks, Poses, make_landmarks, whole_frame_ids
+from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.checks import is_number
 from gsgan.utils.errors import DataError
 
-LANDMARKS = "landmarks3d.npz"
+LANDMARKS, HANDS = "landmarks3d.npz", "hands3d.npz"
 POSES, SHAPE = "body_pose.npz", "body_shape.npz"
 MASKS = (".png",)
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
@@ -95,7 +97,11 @@ def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -
         notes.append(f"lengths converted from {meta.unit} to metres")
     cameras = read_cameras(root / "cameras.json", cameras_json, conventions, checks)
     images = _index_images(root, cameras)
-    skeletons = _read_landmarks(root / LANDMARKS, meta, conventions, checks, notes)
+    joints = SKELETONS[meta.skeleton]
+    skeletons = _read_landmarks(root / LANDMARKS, joints, conventions, checks, notes)
+    hands = None
+    if (root / HANDS).exists():
+        hands = _read_landmarks(root / HANDS, 2 * HAND, conventions, checks, notes)
     poses = None
     if (root / POSES).exists():
         poses, meta = _read_poses(root, meta, conventions)
@@ -108,6 +114,7 @@ def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -
         mask_folder="masks/{camera}",
         labels={c: frame_files(root, f"labels/{c}", MASKS) for c in cameras},
         landmarks=skeletons,
+        hands=hands,
         poses=poses,
         pixels=PixelRules(composed=conventions.composed),
         calibration=root / "cameras.json",
@@ -163,10 +170,9 @@ def _index_images(root: Path, cameras: Mapping[str, CameraEntry]) -> dict[str, d
 
 
 def _read_landmarks(
-    path: Path, meta: Meta, conventions: Conventions, checks: Checks, notes: list[str]
+    path: Path, joints: int, conventions: Conventions, checks: Checks, notes: list[str]
 ) -> Landmarks:
-    """Skeletons of every frame."""
-    joints = SKELETONS[meta.skeleton]
+    """Skeletons, or hands, of every frame."""
     arrays = read_arrays(path, ("p", "conf", "frame_id"))
     p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64) * conventions.scale
     ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(p),), path), str(path))
@@ -179,7 +185,8 @@ def _read_landmarks(
 def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
     """Poses of frames whose numbers are finite, and ``meta`` with the body and its shape."""
     path, fitted = root / POSES, (root / SHAPE).exists()
-    arrays = read_arrays(path, ("theta", "transl", "frame_id", "betas", "registered", "fitted_to"))
+    names = ("theta", "transl", "frame_id", "betas", "registered", "fitted_to", "skeleton")
+    arrays = read_arrays(path, names)
     if fitted:  # by gsgan.fit: the free body in the person's shape
         meta = replace(meta, body=BodyModel("free", betas=_read_shape(root / SHAPE)))
     bones = None if meta.body is None else BODY_BONES[meta.body.kind]
@@ -199,6 +206,7 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
         fitted=fitted,
         registered=registered,
         fitted_to=tuple(map(str, arrays.get("fitted_to", ()))),
+        skeleton=str(arrays.get("skeleton", "mediapipe33")),
     )
     if meta.body is None or "betas" not in arrays:
         return poses, meta

@@ -31,10 +31,11 @@ from gsgan.data.formats.common import (
     up_axis,
 )
 from gsgan.data.formats.smpl_motion import landmarks_of, zju_motion
-from gsgan.data.joints import BODY, FROM_HANDS, HAND, SETS
+from gsgan.data.joints import BODY, FROM_HANDS, SETS
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import MASK_RULES, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
+from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import as_floats
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import DataError

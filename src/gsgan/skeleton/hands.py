@@ -1,0 +1,44 @@
+"""MediaPipe's 21 landmarks of a hand: names, fingers, connections, and the frame of the palm."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+FINGER_NAMES = ("thumb", "index", "middle", "ring", "pinky")
+HAND_NAMES = (
+    "wrist",
+    *(f"thumb_{part}" for part in ("cmc", "mcp", "ip", "tip")),
+    *(f"{finger}_{part}" for finger in FINGER_NAMES[1:] for part in ("mcp", "pip", "dip", "tip")),
+)
+HAND = len(HAND_NAMES)
+FINGERS = tuple(tuple(range(1 + 4 * k, 5 + 4 * k)) for k in range(5))  # base to tip, thumb first
+WRIST, INDEX, PINKY = 0, 5, 17
+PALM = (WRIST, INDEX, PINKY)  # points that span it
+SHORT = 1e-3  # metres: a palm that vanishes has no frame
+HAND_EDGES = (
+    *((0, 1), (1, 2), (2, 3), (3, 4), (0, 5), (5, 6), (6, 7), (7, 8)),
+    *((5, 9), (9, 10), (10, 11), (11, 12), (9, 13), (13, 14), (14, 15), (15, 16)),
+    *((13, 17), (17, 18), (18, 19), (19, 20), (0, 17)),
+)
+
+
+def hand_names() -> tuple[str, ...]:
+    """Names of 42 landmarks, the left hand's first."""
+    return tuple(f"{side}_{name}" for side in ("left", "right") for name in HAND_NAMES)
+
+
+def palm_frames(palm: Tensor) -> Tensor:
+    """``[..., 3, 3]`` axes of palms, from their `PALM` ``[..., 3, 3]`` in metres.
+
+    Convention: columns are the direction to the middle of the knuckles, the one from the little
+    finger to the index, and their cross product, which points out of a left palm and into a right
+    one. They shrink to zero where the palm does.
+    """
+    wrist, index, pinky = palm.unbind(-2)
+    along = normalize((index + pinky) / 2 - wrist, dim=-1, eps=SHORT)
+    across = index - pinky
+    across = across - (across * along).sum(-1, keepdim=True) * along
+    across = normalize(across, dim=-1, eps=SHORT)
+    return torch.stack([along, across, torch.linalg.cross(along, across)], dim=-1)

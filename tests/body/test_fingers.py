@@ -1,0 +1,227 @@
+"""Finger joints of the free body from hand landmarks: accuracy, limits, missing hands, damage."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from gsgan.body import axis_angle_to_matrix, free_body
+from gsgan.body.fingers import Fingers
+from gsgan.body.shape import BodyShape, free_space, shaped_body
+from gsgan.body.solve import Solver, log_of
+from gsgan.data.synthetic.free_subject import free_character, free_pose
+from gsgan.data.synthetic.motion import Choreography
+from gsgan.scene import BodyPose
+from gsgan.skeleton.hands import FINGERS, HAND
+
+torch.set_num_threads(1)
+LEFT, RIGHT = slice(33, 33 + HAND), slice(33 + HAND, 33 + 2 * HAND)
+JOINTS = [i for i, name in enumerate(free_body().joint_names) if name.startswith("finger")]
+
+
+@pytest.fixture(scope="module")
+def poses() -> BodyPose:
+    """Of a motion that signs and makes fists."""
+    motion = Choreography(free_character(), seed=11)
+    return free_pose(motion.at(np.arange(0.4, motion.duration, 0.5)))
+
+
+@pytest.fixture(scope="module")
+def solver() -> Solver:
+    return Solver(free_body())
+
+
+def shown(truth: BodyPose, noise: float = 0.0) -> tuple[Tensor, Tensor]:
+    body = free_body()
+    p = torch.cat([body.posed_landmarks(truth), body.posed_hands(truth)], dim=1)
+    p = p + noise * torch.randn(p.shape, generator=torch.Generator().manual_seed(0))
+    return p, torch.ones(p.shape[:2])
+
+
+def degrees_off(got: Tensor, truth: Tensor) -> Tensor:
+    """Between axis-angles ``[..., 3]``."""
+    apart = axis_angle_to_matrix(got).mT @ axis_angle_to_matrix(truth)
+    return log_of(apart).norm(dim=-1).rad2deg()
+
+
+def test_fingers_of_exact_landmarks_are_the_true_ones(solver, poses):
+    p, seen = shown(poses)
+    pose = solver.solve(p, seen)
+    assert poses.theta[:, JOINTS].norm(dim=-1).max() > 1.2  # they do bend
+    off = degrees_off(pose.theta[:, JOINTS], poses.theta[:, JOINTS])
+    assert off.median() < 3
+    assert off.flatten().quantile(0.9) < 6
+    body = free_body()
+    hands = torch.isin(body.vertex_labels, torch.tensor([7, 8]))
+    assert [body.label_names[i] for i in (7, 8)] == ["left_hand", "right_hand"]
+    without = solver.solve(p[:, :33], seen[:, :33])
+    away, before = (
+        (body.posed_vertices(x) - body.posed_vertices(poses))[:, hands].norm(dim=-1)
+        for x in (pose, without)
+    )
+    assert away.median() < 0.005
+    assert away.median() < 0.4 * before.median()
+
+
+def test_the_rest_of_the_body_does_not_depend_on_the_hands(solver, poses):
+    p, seen = shown(poses[:4])
+    others = [i for i in range(56) if i not in JOINTS]
+    with_hands, without = solver.solve(p, seen), solver.solve(p[:, :33], seen[:, :33])
+    assert torch.equal(with_hands.theta[:, others], without.theta[:, others])
+    assert torch.equal(with_hands.transl, without.transl)
+    assert not without.theta[
+        :, [j for j in JOINTS if "1-1" not in free_body().joint_names[j]]
+    ].any()
+
+
+def test_a_persons_proportions_and_place_do_not_matter(poses):
+    p, seen = shown(poses[:6])
+    fingers = Fingers(free_body())
+    expected, _ = fingers(p[:, 33:], seen[:, 33:] > 0)
+    R = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(3)))[0]
+    moved = 1.3 * p[:, 33:] @ (R * torch.det(R)).mT + 2.0
+    tip = moved.clone()
+    for start in (0, HAND):  # longer last bones
+        for *_, before, last in (tuple(start + j for j in f) for f in FINGERS):
+            tip[:, last] += 0.5 * (tip[:, last] - tip[:, before])
+    found, _ = fingers(tip, seen[:, 33:] > 0)
+    assert degrees_off(found, expected).max() < 0.2
+
+
+def test_noise_stays_within_anatomical_limits(solver, poses):
+    p, seen = shown(poses, 0.03)
+    fingers = solver.fingers
+    turns, _ = fingers(p[:, 33:], seen[:, 33:] > 0)
+    numbers = (fingers.axes @ turns.unsqueeze(-1)).squeeze(-1)
+    assert (numbers >= fingers.least - 1e-4).all()
+    assert (numbers <= fingers.most + 1e-4).all()
+    assert (fingers.most - fingers.least)[:, 0].max() < math.pi
+    hinges = (fingers.most[:, 1] == 0).sum()
+    assert hinges == 8  # of both hands' four fingers
+
+
+def test_noise_moves_fingers_less_than_their_landmarks_would_alone(solver, poses):
+    off = degrees_off(solver.solve(*shown(poses, 0.003)).theta, poses.theta)[:, JOINTS]
+    assert off.median() < 8
+
+
+@pytest.mark.parametrize("how", ["visibility", "NaN"])
+def test_a_missing_hand_rests_and_the_other_does_not_change(solver, poses, how):
+    p, seen = shown(poses[:4])
+    whole = solver.solve(p, seen).theta
+    if how == "NaN":
+        p[:, LEFT] = math.nan
+    else:
+        p[:, LEFT], seen[:, LEFT] = 0.0, 0.0
+    theta, names = solver.solve(p, seen).theta, free_body().joint_names
+    for joint in JOINTS:
+        if names[joint].endswith("R"):
+            assert torch.equal(theta[:, joint], whole[:, joint])
+        elif names[joint] != "finger1-1.L":  # the pose's own thumb landmark shows it
+            assert not theta[:, joint].any()
+    seen[:, LEFT] = 0
+    rest = solver.at_rest(seen)
+    assert rest[:, names.index("finger3-2.L")].all()
+    assert not rest[:, [names.index("finger3-2.R"), names.index("finger1-1.L")]].any()
+
+
+def test_a_finger_rests_from_the_first_joint_that_is_not_seen(solver, poses):
+    p, seen = shown(poses[:4])
+    names = free_body().joint_names
+    truth = solver.solve(p, seen).theta
+    p[:, 33 + 8] = math.nan  # the index's tip: its middle still shows the bend
+    p[:, 33 + 9] = math.nan  # the middle finger's knuckle
+    p[:, [33 + 15, 33 + 16]] = math.nan  # all beyond the ring finger's second joint
+    theta = solver.solve(p, seen).theta
+    torch.testing.assert_close(*(x[:, names.index("finger2-2.L")] for x in (theta, truth)))
+    assert not theta[:, [names.index("finger3-1.L"), names.index("finger3-2.L")]].any()
+    assert not theta[:, names.index("finger4-2.L")].any()
+    torch.testing.assert_close(*(x[:, names.index("finger4-1.L")] for x in (theta, truth)))
+
+
+@pytest.mark.parametrize("kind", ["one point", "flat", "infinite", "folded"])
+def test_damaged_hands_have_finite_fingers_and_gradients(solver, poses, kind):
+    p, seen = shown(poses[:2])
+    if kind == "one point":
+        p[:, LEFT] = p[:, 15:16]
+    elif kind == "flat":
+        p[:, LEFT.start + 5 : LEFT.stop] = p[:, LEFT.start + 5 : LEFT.start + 6]
+    elif kind == "infinite":
+        p[0, LEFT.start], p[1, RIGHT.start + 7] = math.inf, -math.inf
+    else:  # every finger back onto itself
+        p[:, LEFT.start + 7] = p[:, LEFT.start + 5]
+    p.requires_grad_()
+    theta = solver.solve(p, seen).theta
+    theta.square().sum().backward()
+    assert theta.isfinite().all()
+    assert p.grad.isfinite().all()
+
+
+def test_gradients_are_those_of_finite_differences(poses):
+    fingers = Fingers(free_body().to(torch.float64))
+    p, seen = (x[:3] for x in shown(poses))
+    hands, seen = p[:, 33:].double().requires_grad_(), seen[:, 33:] > 0
+    goal = torch.randn(20, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    (slope,) = torch.autograd.grad((fingers(hands, seen)[0] * goal).sum(), hands)
+    for joint, axis in ((0, 0), (6, 1), (8, 2), (HAND + 3, 0), (HAND + 17, 1)):
+        step = torch.zeros_like(hands)
+        step[:, joint, axis] = 1e-5
+        with torch.no_grad():
+            ahead, back = (fingers(hands + s * step, seen)[0] for s in (1, -1))
+        found = ((ahead - back) * goal).sum() / 2e-5
+        assert slope[:, joint, axis].sum() == pytest.approx(float(found), rel=1e-3, abs=1e-4)
+
+
+def test_gradients_reach_landmarks_and_shape(poses):
+    K = free_space().coefficients
+    shape = BodyShape(torch.zeros(K, requires_grad=True), torch.ones(8, requires_grad=True))
+    p, seen = shown(poses[3:4])
+    p.requires_grad_()
+    theta = Solver(shaped_body(shape)).solve(p, seen).theta
+    theta[:, JOINTS].square().sum().backward()
+    assert shape.coefficients.grad.abs().sum() > 0
+    assert p.grad[:, LEFT].abs().sum() > 0
+
+
+def test_a_number_of_joints_that_is_neither_is_refused(solver, poses):
+    p, seen = shown(poses[:2])
+    with pytest.raises(ValueError, match="33 joints or 75 with hands, got 54"):
+        solver.solve(p[:, :54], seen[:, :54])
+
+
+def test_a_mirrored_person_has_mirrored_fingers(poses):
+    """The free body is symmetric: left and right exchanged give each other's angles."""
+    fingers = Fingers(free_body())
+    p, seen = shown(poses[:6])
+    mirrored = (p[:, 33:] * torch.tensor([-1.0, 1, 1])).unflatten(1, (2, HAND)).flip(1)
+    own, _ = fingers(p[:, 33:], seen[:, 33:] > 0)
+    other, _ = fingers(mirrored.flatten(1, 2), seen[:, 33:] > 0)
+    other = other.unflatten(1, (2, 2, 5)).flip(2).flatten(1, 3) * torch.tensor([1.0, -1, -1])
+    assert degrees_off(own, other).median() < 2
+
+
+def test_bodies_without_hand_landmarks_keep_their_fingers_at_rest(tmp_path):
+    from writers.smpl import write_smpl
+
+    from gsgan.body.smpl import read_smpl
+
+    write_smpl(tmp_path / "model.npz", kind="smplx")
+    body = read_smpl(tmp_path / "model.npz").as_body()
+    p = body.posed_landmarks(BodyPose(torch.zeros(1, 55, 3), torch.zeros(1, 3)))
+    p = torch.cat([p, torch.randn(1, 42, 3)], dim=1)
+    theta = Solver(body).solve(p, p.isfinite().all(-1).float()).theta
+    assert not theta[:, body.joint_names.index("left_index2")].any()
+
+
+def test_shaped_bodies_have_their_own_fingers(poses):
+    """Landmarks of another person, solved on that person's body."""
+    body = shaped_body(replace(free_space().neutral(), stretch=torch.tensor([1.0] * 4 + [1.2] * 4)))
+    truth = poses[:6]
+    p = torch.cat([body.posed_landmarks(truth), body.posed_hands(truth)], dim=1)
+    theta = Solver(body).solve(p, torch.ones(p.shape[:2])).theta
+    assert degrees_off(theta[:, JOINTS], truth.theta[:, JOINTS]).median() < 3

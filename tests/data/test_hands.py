@@ -1,0 +1,127 @@
+"""Hands of a capture: 75 joints with data.skeleton=holistic, 33 without."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from make import skeletons, write_hands, write_tiny_capture
+
+from gsgan.data.datamodule import GsganData
+from gsgan.data.formats.capture import read_capture
+from gsgan.utils.errors import ConfigError, DataError
+
+HOLISTIC = {"size": 32, "skeleton": "holistic", "body": "none"}
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_tiny_capture(tmp_path / "capture")
+
+
+def every_frame(root: Path, **settings):
+    data = GsganData(str(root), **(HOLISTIC | settings))
+    return data, [data.dataset(split)[i] for split, i in (("train", 0), ("train", 2))]
+
+
+def test_skeletons_have_75_joints(root: Path) -> None:
+    p = write_hands(root, 4)
+    data, (frame, later) = every_frame(root)
+    for one in (frame, later):
+        number = int(one.frame_id)
+        expected = np.concatenate([skeletons(4)[number], p[number]])
+        np.testing.assert_allclose(one.skeleton[0], expected, atol=1e-6)
+        assert one.visibility.tolist() == [[1.0] * 75]
+    assert data.info.skeleton == "holistic"
+    plain = GsganData(str(root), size=32, body="none")
+    assert plain.dataset("train")[0].skeleton.shape == (1, 33, 3)
+    assert data.info.body_height == plain.info.body_height
+
+
+def test_lengths_are_in_the_captures_unit(tmp_path: Path) -> None:
+    root = write_tiny_capture(tmp_path, unit="mm")
+    p = write_hands(root, 4, per_metre=1000)
+    _, (frame, _) = every_frame(root)
+    np.testing.assert_allclose(frame.skeleton[0, 33:], p[0], atol=1e-6)
+
+
+def test_a_missing_hand_is_not_seen_and_hangs_on_the_forearm(root: Path) -> None:
+    p = write_hands(root, 4)
+    p[:, :21] = np.nan
+    conf = np.ones((4, 42))
+    conf[0, 21:] = 0
+    np.savez(root / "hands3d.npz", p=p, conf=conf, frame_id=np.arange(4))
+    _, (frame, later) = every_frame(root)
+    assert frame.visibility[0, 33:].tolist() == [0.0] * 42
+    assert later.visibility[0, 33:].tolist() == [0.0] * 21 + [1.0] * 21
+    assert frame.skeleton.isfinite().all()
+    for wrist, hand in ((15, slice(33, 54)), (16, slice(54, 75))):
+        away = (frame.skeleton[0, hand] - frame.skeleton[0, wrist]).norm(dim=-1)
+        assert away.max() < 0.3
+
+
+def test_frames_without_a_row_have_no_hands(root: Path) -> None:
+    p = write_hands(root, 4)
+    np.savez(root / "hands3d.npz", p=p[2:], frame_id=np.arange(2, 4))
+    _, (frame, _) = every_frame(root)
+    assert int(frame.frame_id) == 0
+    assert not frame.visibility[0, 33:].any()
+    assert frame.visibility[0, :33].all()
+
+
+def test_a_capture_in_which_no_hand_was_found_trains_without(root: Path) -> None:
+    np.savez(root / "hands3d.npz", p=np.full((4, 42, 3), np.nan), frame_id=np.arange(4))
+    _, (frame, _) = every_frame(root)
+    assert frame.skeleton.isfinite().all()
+    assert not frame.visibility[0, 33:].any()
+
+
+def test_a_capture_without_hands_is_refused_by_name(root: Path) -> None:
+    with pytest.raises(ConfigError, match=r"needs a capture's hands3d.npz, which .*capture lacks"):
+        assert GsganData(str(root), **HOLISTIC).layout
+    with pytest.raises(ConfigError, match=r"data\.skeleton must be one of"):
+        GsganData(str(root), skeleton="hands")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        ({"p": np.zeros((4, 21, 3))}, r"'p' must have shape \(any, 42, 3\), found \(4, 21, 3\)"),
+        ({"conf": np.ones((4, 33))}, r"'conf' must have shape \(4, 42\)"),
+        ({"frame_id": np.zeros(4)}, "frame_id 0 appears more than once"),
+    ],
+)
+def test_damaged_files_are_named(root: Path, damage: dict, message: str) -> None:
+    write_hands(root, 4, **damage)
+    with pytest.raises(DataError, match=rf"hands3d.npz: .*{message}"):
+        read_capture(root)
+
+
+def test_a_truncated_file_is_named(root: Path) -> None:
+    write_hands(root, 4)
+    path = root / "hands3d.npz"
+    path.write_bytes(path.read_bytes()[:200])
+    with pytest.raises(DataError, match=r"hands3d.npz"):
+        read_capture(root)
+
+
+def test_poses_solved_from_another_skeleton_are_refused(root: Path) -> None:
+    write_hands(root, 4)
+    np.savez(
+        root / "body_shape.npz",
+        coefficients=np.zeros(10),
+        stretch=np.ones(8),
+        offsets=np.zeros((33, 3)),
+    )
+    poses = {"theta": np.zeros((4, 56, 3)), "transl": np.zeros((4, 3)), "frame_id": np.arange(4)}
+    np.savez(root / "body_pose.npz", **poses)
+    with pytest.raises(ConfigError, match=r"data.skeleton=mediapipe33, but .* holistic"):
+        assert GsganData(str(root), size=32, skeleton="holistic").layout
+    assert GsganData(str(root), size=32).layout.poses is not None
+    np.savez(root / "body_pose.npz", **poses, skeleton=np.array("holistic"))
+    data = GsganData(str(root), size=32, skeleton="holistic")
+    assert isinstance(data.dataset("train")[0].body.theta, torch.Tensor)
+    with pytest.raises(ConfigError, match=r"data.skeleton=holistic, but .* mediapipe33"):
+        assert GsganData(str(root), size=32).layout

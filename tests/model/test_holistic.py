@@ -1,0 +1,86 @@
+"""Avatars of skeletons with hands: every part takes 75 joints, and hands may be missing."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+import torch
+from make import write_hands
+
+from gsgan.model.body_points import BodyPoints
+from gsgan.model.pose_graph import PoseGraph, PoseLinear
+from gsgan.skeleton import HOLISTIC
+
+HANDS = slice(33, 75)
+
+
+@pytest.fixture(scope="module")
+def signing(capture, tmp_path_factory):
+    """The small capture with hands."""
+    root = shutil.copytree(capture, tmp_path_factory.mktemp("signing") / "capture")
+    write_hands(root, 6)
+    return root
+
+
+@pytest.fixture
+def made(build, signing):
+    return lambda *given: build(f"data.root={signing}", "data.skeleton=holistic", *given)
+
+
+@pytest.mark.parametrize("model", ["full", "wo_gcn", "splat_only", "image_to_image", "lbs_splat"])
+def test_every_model_takes_hands(made, model):
+    _, avatar, frame = made(f"model={model}")
+    assert avatar.template is HOLISTIC
+    assert frame.skeleton.shape == (1, 75, 3)
+    with torch.no_grad():
+        image = avatar.paint(frame).image
+    assert image.shape == frame.image.shape
+    assert image.isfinite().all()
+
+
+def test_points_on_the_skeleton_are_on_the_fingers_too(made):
+    _, avatar, frame = made("effects.body_points=off")
+    assert avatar.body_points is None
+    assert avatar.densify.template is HOLISTIC
+    assert avatar.deformation.from_pose.in_features == 3 * 75
+    with torch.no_grad():
+        found = avatar.paint(frame).gaussians
+    assert found.means.shape[1] == avatar.densify.n_points
+    assert avatar.densify.n_points > 40 * 60
+    assert avatar.generator is not None
+
+
+def test_fingers_move_what_is_on_the_body(made):
+    """Solved from skeletons: the fingers that the hands show, at rest without them."""
+    _, avatar, frame = made("effects.body_points=on", "model=splat_only")
+    assert isinstance(avatar.body_points, BodyPoints)
+    p, seen = frame.skeleton, frame.visibility
+    with_hands = avatar.body_pose(p, seen).theta
+    without = avatar.body_pose(p, torch.cat([seen[:, :33], 0 * seen[:, HANDS]], 1)).theta
+    moved = (with_hands - without).norm(dim=-1)[0] > 1e-3
+    names = avatar.solver.fingers.joints.tolist()
+    assert set(moved.nonzero().flatten().tolist()) <= set(names)
+    assert moved.sum() > 8
+
+
+def test_a_skeleton_without_hands_drives_it_and_hands_drive_one_without(made, build):
+    _, avatar, frame = made("model=splat_only")
+    given = frame.skeleton[0], frame.camera
+    whole = avatar.render(*given)
+    unseen = frame.visibility[0].clone()
+    unseen[HANDS] = 0
+    bare = avatar.render(given[0][:33], given[1])
+    assert bare.isfinite().all()
+    assert whole.shape == bare.shape
+    lost = given[0].clone()
+    lost[HANDS] = torch.nan
+    assert torch.equal(avatar.render(lost, given[1]), bare)
+    _, plain, frame = build("model=splat_only")
+    assert torch.equal(plain.render(*given), plain.render(given[0][:33], given[1]))
+
+
+def test_pose_encoders_have_a_number_per_edge():
+    for encoder in (PoseGraph("holistic", width=8, joint_channels=4), PoseLinear("holistic")):
+        assert encoder.channels == 77
+        assert encoder(torch.randn(2, 75, 6), torch.randn(2, 75, 3)).shape == (2, 77)

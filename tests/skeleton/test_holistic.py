@@ -1,0 +1,212 @@
+"""The skeleton with hands: its table, and that every part of the method follows from it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from skeleton_poses import assert_rotation, camera, rotation
+from torch import Tensor
+
+from gsgan.skeleton import (
+    HOLISTIC,
+    MEDIAPIPE33,
+    Densify,
+    bone_frames,
+    completed,
+    draw_skeleton,
+    limb_length_sum,
+    named_template,
+    omega,
+    sanitise,
+)
+from gsgan.skeleton.hands import HAND, PALM, palm_frames
+from gsgan.skeleton.template import N_HUBS
+from gsgan.utils.errors import ConfigError
+
+F64, T = torch.float64, HOLISTIC
+REST = torch.tensor(T.rest_positions, dtype=F64)[None]
+HANDS = (slice(33, 33 + HAND), slice(33 + HAND, 33 + 2 * HAND))
+NAN = float("nan")
+
+
+def noisy(seed: int, size: float = 0.01) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return REST + size * torch.randn(1, 75, 3, generator=generator, dtype=F64)
+
+
+def test_counts() -> None:
+    assert len(T.names) == len(set(T.names)) == 75
+    assert T.names[:33] == MEDIAPIPE33.names
+    assert T.names[33 + HAND + 8] == "right_index_tip"
+    assert len(T.edges) == len(set(T.edges)) == 77
+    assert len(T.limbs) == len(set(T.limbs)) == len(T.rest_directions) == 64
+    assert T.limbs[:22] == MEDIAPIPE33.limbs
+    assert [len(T.fingers), len(T.bare), len(T.measured)] == [40, 2, 22]
+    assert len(T.draw_groups) == 18  # eight of the body, ten fingers
+    assert sorted(set(range(75)) - set(T.incoming)) == [*range(13), 23, 24]
+    assert named_template("holistic") is T
+    with pytest.raises(ConfigError, match=r"data.skeleton must be one of .*got 'hands'"):
+        named_template("hands")
+
+
+def test_the_rest_pose_has_hands_that_mirror_each_other() -> None:
+    rest, mirror = np.asarray(T.rest_positions), list(T.mirror)
+    np.testing.assert_allclose(rest[mirror] * [-1, 1, 1], rest)
+    assert [mirror[m] for m in mirror] == list(range(75))
+    for hand, (wrist, index, pinky, thumb) in zip(
+        HANDS, ((15, 19, 17, 21), (16, 20, 18, 22)), strict=True
+    ):  # the pose's own landmarks of the hand are those of the hand
+        np.testing.assert_allclose(rest[hand][[0, 5, 17, 2]], rest[[wrist, index, pinky, thumb]])
+        tips = np.linalg.norm(rest[hand][[8, 12, 16, 20]] - rest[wrist], axis=-1)
+        assert (tips > 0.13).all()
+        assert (tips < 0.22).all()
+
+
+def test_parents_come_first() -> None:
+    level_of = {limb: k for k, level in enumerate(T.levels) for limb in level}
+    assert sorted(level_of) == list(range(64))
+    for limb, parent in enumerate(T.limb_parents):
+        if parent >= T.n_hubs:
+            assert level_of[parent - T.n_hubs] < level_of[limb]
+        elif parent >= N_HUBS:  # a palm is known once its knuckles are
+            knuckles = (T.incoming[j] for j in T.palms[parent - N_HUBS][1:])
+            assert all(level_of[k] < level_of[limb] for k in knuckles)
+
+
+def test_size_is_that_of_the_body_without_hands() -> None:
+    p = noisy(0)
+    assert T.limb_length_sum == MEDIAPIPE33.limb_length_sum
+    torch.testing.assert_close(limb_length_sum(p, None, T), limb_length_sum(p[:, :33]))
+
+
+def test_frames_of_the_body_are_the_same_with_and_without_hands() -> None:
+    p = noisy(1, 0.05)
+    both, body = bone_frames(p, None, T), bone_frames(p[:, :33])
+    assert torch.equal(both.limbs[:, :22], body.limbs)
+    assert torch.equal(both.hubs[:, :3], body.hubs)
+    assert torch.equal(both.lengths[:, :22], body.lengths)
+    own, other = omega(p, None, None, T, "world"), omega(p[:, :33], None, None, frame="world")
+    assert torch.equal(own[:, :33], other)
+
+
+def test_frames_are_rotations_that_turn_with_the_skeleton() -> None:
+    p, R = noisy(2), rotation(5)
+    frames, turned = bone_frames(p, None, T), bone_frames(p @ R.mT, None, T)
+    assert_rotation(frames.limbs[0])
+    assert_rotation(frames.hubs[0])
+    torch.testing.assert_close(turned.limbs[:, 4:], R @ frames.limbs[:, 4:])
+    torch.testing.assert_close(turned.local[:, list(T.fingers)], frames.local[:, list(T.fingers)])
+
+
+def test_a_turned_forearm_turns_the_fingers_frames() -> None:
+    """What no bone of the 33 landmarks shows: the hand turns about the forearm's axis."""
+    p, hand = REST.clone(), HANDS[0]
+    axis = torch.nn.functional.normalize(p[0, 15] - p[0, 13], dim=0)
+    K = torch.linalg.cross(axis.expand(3, 3), torch.eye(3, dtype=F64), dim=-1).mT
+    turn = torch.eye(3, dtype=F64) + K + (1 - 0.0) * (K @ K)  # a quarter
+    p[:, hand] = p[:, 15:16] + (p[:, hand] - p[:, 15:16]) @ turn.mT
+    index = T.limbs.index((33 + 5, 33 + 6))
+    before, after = (bone_frames(x, None, T).limbs[0, index] for x in (REST, p))
+    torch.testing.assert_close(after, turn @ before)
+
+
+def test_a_palm_that_vanishes_has_finite_frames_and_slopes() -> None:
+    p = REST.clone()
+    p[:, HANDS[0]] = p[:, 15:16]
+    p.requires_grad_()
+    code = omega(p, None, torch.eye(3, dtype=F64)[None], T)
+    code.square().sum().backward()
+    assert code.isfinite().all()
+    assert p.grad.isfinite().all()
+    assert palm_frames(torch.zeros(1, 3, 3)).eq(0).all()
+
+
+@pytest.mark.parametrize(
+    "gone", [[33 + 8], [*range(33, 75)], [33 + 5, 33 + 6], [15, *range(33, 54)]]
+)
+def test_missing_joints_are_placed_at_rest(gone: list[int]) -> None:
+    R = rotation(3)
+    p = REST @ R.mT + torch.tensor([1.0, 2.0, -3.0], dtype=F64)
+    lost = p.clone()
+    lost[:, gone] = NAN
+    q, valid = sanitise(lost, None, T)
+    assert (~valid[0]).nonzero().flatten().tolist() == gone
+    torch.testing.assert_close(q, p, atol=1e-9, rtol=0)
+
+
+def test_a_missing_hand_follows_the_forearm_and_has_the_subjects_size() -> None:
+    p = 1.2 * REST
+    p[:, HANDS[1]] = NAN
+    q, _ = sanitise(p, None, T)
+    torch.testing.assert_close(q, 1.2 * REST, atol=1e-9, rtol=0)
+
+
+def test_skeletons_without_hands_drive_a_template_that_has_some_and_the_reverse() -> None:
+    p = noisy(4).float()
+    q, seen = completed(p[0, :33], None, T, T.limb_length_sum)
+    assert q.shape == (1, 75, 3)
+    assert q.isfinite().all()
+    assert seen[0].tolist() == [1.0] * 33 + [0.0] * 42
+    weights = torch.linspace(0.1, 1, 75)
+    q, seen = completed(p, weights, MEDIAPIPE33, T.limb_length_sum)
+    assert torch.equal(q, p[:, :33])
+    assert torch.equal(seen[0], weights[:33])
+    with pytest.raises(ValueError, match=r"\[B, 75, 3\].*\[1, 60, 3\]"):
+        completed(p[:, :60], None, T, T.limb_length_sum)
+
+
+def test_points_lie_on_thin_cylinders_along_the_fingers() -> None:
+    d, p = Densify("holistic", dtype=F64), noisy(5, 0.003)
+    points, lengths = d(p), bone_frames(p, None, T).lengths[0]
+    assert d.n_points == 5400 + 40 * 60
+    assert d.part_id.bincount(minlength=66)[list(T.bare)].tolist() == [0, 0]
+    for limb in T.fingers:
+        a, b = T.limbs[limb]
+        axis = torch.nn.functional.normalize(p[0, b] - p[0, a], dim=0)
+        offset = points.means[0, d.part_id == limb] - p[0, a]
+        assert len(offset) == 60
+        height = offset @ axis
+        radius = (offset - height[:, None] * axis).norm(dim=-1)
+        torch.testing.assert_close(radius, (0.25 * lengths[limb]).expand(60), atol=1e-12, rtol=0)
+    body = Densify(dtype=F64)(p[:, :33])
+    torch.testing.assert_close(points.means[:, :4400], body.means[:, :4400])
+    torch.testing.assert_close(points.means[:, -1000:], body.means[:, -1000:])
+    torch.testing.assert_close(points.scales[:, -1000:], body.scales[:, -1000:])
+    all26 = Densify("holistic", limbs="all26", dtype=F64)
+    assert all26.n_points == d.n_points + 800
+
+
+def test_points_of_a_missing_hand_are_not_seen() -> None:
+    p = REST.clone()
+    p[:, HANDS[0]] = NAN
+    q, valid = sanitise(p, None, T)
+    d = Densify("holistic", dtype=F64)
+    seen = d(q, valid).valid[0]
+    left = torch.isin(d.part_id, torch.tensor(T.fingers[:20]))
+    assert not seen[left].any()
+    assert seen[~left].all()
+
+
+def test_fingers_are_drawn_in_channels_of_their_own() -> None:
+    view = camera((96, 96))
+    image = draw_skeleton(REST, None, view, T)
+    assert image.shape == (1, 18, 96, 96)
+    assert torch.equal(image[:, :8], draw_skeleton(REST[:, :33], None, view))
+    assert (image[0, 8:].amax((-2, -1)) > 0.5).all()
+    names = [name for name, _ in T.draw_groups]
+    tip = view.project(REST[:, [33 + 8]])[0][0, 0]
+    column, row = tip.floor().long().tolist()
+    assert image[0, names.index("left_index"), row, column] > 0.5
+    valid = torch.ones(1, 75, dtype=torch.bool)
+    valid[:, HANDS[1]] = False
+    hidden = draw_skeleton(REST, valid, view, T)
+    assert not hidden[0, 13:].any()
+    assert torch.equal(hidden[0, :13], image[0, :13])
+
+
+def test_a_palm_points_out_of_the_left_hand_and_into_the_right() -> None:
+    """In the rest pose the palms face the thighs: the left one -x, the right one +x."""
+    left, right = (palm_frames(REST[:, hand][:, PALM])[0, :, 2] for hand in HANDS)
+    assert left[0] < -0.7
+    assert right[0] < -0.7
