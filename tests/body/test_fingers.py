@@ -52,7 +52,6 @@ def degrees_off(got: Tensor, truth: Tensor) -> Tensor:
 def test_fingers_of_exact_landmarks_are_the_true_ones(solver, poses):
     p, seen = shown(poses)
     pose = solver.solve(p, seen)
-    assert poses.theta[:, JOINTS].norm(dim=-1).max() > 1.2  # they do bend
     off = degrees_off(pose.theta[:, JOINTS], poses.theta[:, JOINTS])
     assert off.median() < 3
     assert off.flatten().quantile(0.9) < 6
@@ -79,6 +78,27 @@ def test_the_rest_of_the_body_does_not_depend_on_the_hands(solver, poses):
     ].any()
 
 
+def test_hands_that_close_and_spread(solver):
+    """Both joints of every finger, about the line of the knuckles: no axis that the solver has."""
+    body, random = free_body(), torch.Generator().manual_seed(0)
+    theta = torch.zeros(40, 56, 3)
+    for start, letter, side in ((0, "L", 1.0), (HAND, "R", -1.0)):
+        wrist, index, pinky = (body.hand_landmarks[start + j] for j in (0, 5, 17))
+        knuckles = -side * torch.nn.functional.normalize(index - pinky, dim=0)
+        out = torch.linalg.cross((index + pinky) / 2 - wrist, index - pinky)
+        for finger in range(2, 6):
+            bends = torch.rand(2, 40, 1, generator=random) * torch.tensor([1.4, 1.8]).view(2, 1, 1)
+            apart = 0.15 * torch.randn(40, 1, generator=random) * out / out.norm()
+            for joint, turn in enumerate((bends[0] * knuckles + apart, bends[1] * knuckles), 1):
+                theta[:, body.joint_names.index(f"finger{finger}-{joint}.{letter}")] = turn
+    truth = BodyPose(theta, torch.zeros(40, 3))
+    pose = solver.solve(*shown(truth))
+    hands = torch.isin(body.vertex_labels, torch.tensor([7, 8]))
+    away = (body.posed_vertices(pose) - body.posed_vertices(truth))[:, hands].norm(dim=-1)
+    assert away.median() < 0.003
+    assert np.quantile(away.numpy(), 0.9) < 0.01
+
+
 def test_a_persons_proportions_and_place_do_not_matter(poses):
     p, seen = shown(poses[:6])
     fingers = Fingers(free_body())
@@ -97,12 +117,14 @@ def test_noise_stays_within_anatomical_limits(solver, poses):
     p, seen = shown(poses, 0.03)
     fingers = solver.fingers
     turns, _ = fingers(p[:, 33:], seen[:, 33:] > 0)
-    numbers = (fingers.axes @ turns.unsqueeze(-1)).squeeze(-1)
-    assert (numbers >= fingers.least - 1e-4).all()
-    assert (numbers <= fingers.most + 1e-4).all()
-    assert (fingers.most - fingers.least)[:, 0].max() < math.pi
-    hinges = (fingers.most[:, 1] == 0).sum()
-    assert hinges == 8  # of both hands' four fingers
+    first, second = turns.unflatten(1, (2, 10)).unsqueeze(2).unbind(1)
+    axes = fingers.axes.transpose(0, 1)  # [5, 10, 3], each number's
+    numbers = torch.cat([(axes[:3] * first).sum(-1), (axes[3:] * second).sum(-1)], dim=1).mT
+    assert (numbers >= fingers.least - 1e-3).all()
+    assert (numbers <= fingers.most + 1e-3).all()
+    assert ((fingers.most - fingers.least)[:, [0, 3]] < math.pi).all()
+    off_hinge = turns[:, 10:].norm(dim=-1) - (axes[3] * second[:, 0]).sum(-1).abs()
+    assert off_hinge.max() < 0.2
 
 
 def test_noise_moves_fingers_less_than_their_landmarks_would_alone(solver, poses):
@@ -138,10 +160,11 @@ def test_a_finger_rests_from_the_first_joint_that_is_not_seen(solver, poses):
     p[:, 33 + 9] = math.nan  # the middle finger's knuckle
     p[:, [33 + 15, 33 + 16]] = math.nan  # all beyond the ring finger's second joint
     theta = solver.solve(p, seen).theta
-    torch.testing.assert_close(*(x[:, names.index("finger2-2.L")] for x in (theta, truth)))
+    index, ring = names.index("finger2-2.L"), names.index("finger4-1.L")
+    torch.testing.assert_close(theta[:, index], truth[:, index], atol=0.01, rtol=0)
     assert not theta[:, [names.index("finger3-1.L"), names.index("finger3-2.L")]].any()
     assert not theta[:, names.index("finger4-2.L")].any()
-    torch.testing.assert_close(*(x[:, names.index("finger4-1.L")] for x in (theta, truth)))
+    torch.testing.assert_close(theta[:, ring], truth[:, ring], atol=0.1, rtol=0)
 
 
 @pytest.mark.parametrize("kind", ["one point", "flat", "infinite", "folded"])

@@ -5,74 +5,69 @@ Convention: metres, radians; a joint's turn is its axis-angle in `BodyPose.theta
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from gsgan.body.free import Body
-from gsgan.body.lbs import axis_angle_to_matrix, shortest_turn
+from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
 from gsgan.skeleton.hands import FINGERS, HAND, PALM, PINKY, palm_frames
 
-# Least and most flexion, of a finger's from straight, and most turn to the side: of the first
-# joint, and of the next one, which stands for the last two where a body has no third.
-THUMB = ((-0.8, 1.2, 0.8), (-0.6, 2.0, 0.3))  # from rest
-FINGER = ((-0.6, 1.75, 0.45), (-0.2, 2.6, 0.0))
-LEAST = 1e-4  # of a bone at rest, added to the seen one: a bone that vanishes rests
-
-
-class _Joint(NamedTuple):
-    joint: int  # of the body
-    own: int  # the landmark that lies there
-    points: tuple[int, ...]  # landmarks up to the next joint
-    thumb: bool
+# By number, for the thumb and for fingers: flexion, turn to the side and twist of the first joint;
+# flexion and turn to the side of the next one, which stands for the last two where a body has no
+# third. Standard deviation about rest; the least and the most, of a finger's flexion from straight.
+SPREAD = ((0.7, 0.5, 0.4, 0.8, 0.15), (0.8, 0.2, 0.2, 1.0, 0.03))
+LEAST = ((-0.8, -0.8, -0.8, -0.6, -0.3), (-0.6, -0.45, -0.4, -0.2, -0.1))
+MOST = ((1.2, 0.8, 0.8, 2.0, 0.3), (1.75, 0.45, 0.4, 2.6, 0.1))
+NOISE = 0.004  # metres, standard deviation of a landmark
+STEPS = 4
+TRACE = 1e-4  # of a bone at rest, added to the seen one: a bone that vanishes rests
 
 
 class Fingers(nn.Module):
-    """Turns of a body's finger joints that point its bones where a hand's landmarks lie.
+    """Turns of a body's finger joints, two a finger, in which its bones point as the landmarks'.
 
-    Directions in the palm's frame, so that neither the person's proportions nor an error of the
-    solved wrist matters: joint by joint from the palm on, the shortest turn to the direction of the
-    landmarks that the joint moves, within anatomical limits. Second joints of the four fingers are
-    hinges.
+    Landmarks are compared in the palm's frame and with the body's own bone lengths, so that neither
+    the person's proportions nor an error of the solved wrist bends a finger. The shortest turns to
+    the bones' directions, then Gauss-Newton steps on the distances and a prior, within anatomical
+    limits: fingers bend, their second joints are hinges.
 
     Args:
-        body: with hand landmarks, in the subject's shape; two joints a finger.
+        body: with hand landmarks, in the subject's shape.
 
     Source: ours.
     """
 
-    rest: Tensor  # [42, 3]
-    palms: Tensor  # [2, 3, 3]
+    chains: Tensor  # [10, 4] landmarks of each finger, base to tip, the left hand's first
     joints: Tensor  # [20] of the body: each finger's first joint, then each one's second
-    own: Tensor  # [20] the landmark at the joint
-    moved: Tensor  # [20, 42] 1 where a landmark gives its direction
-    axes: Tensor  # [20, 2, 3] of flexion, and of turns to the side
-    least: Tensor  # [20, 2]
-    most: Tensor  # [20, 2]
+    palms: Tensor  # [2, 3, 3]
+    bones: Tensor  # [10, 3, 3] at rest: base to middle; middle to both landmarks beyond
+    axes: Tensor  # [10, 5, 3] of the numbers
+    prior: Tensor  # [10, 5] precisions
+    least: Tensor  # [10, 5]
+    most: Tensor  # [10, 5]
 
     def __init__(self, body: Body) -> None:
         super().__init__()
-        rest, rows = body.hand_landmarks, _joints(body.hand_bone.tolist())
-        own, self.half = torch.tensor([row.own for row in rows]), len(rows) // 2
-        moved = torch.stack([rest.new_zeros(len(rest)).index_fill_(0, torch.tensor(row.points), 1)
-                             for row in rows])  # fmt: skip
-        limits = rest.new_tensor([(THUMB if row.thumb else FINGER)[i >= self.half]
-                                  for i, row in enumerate(rows)])  # fmt: skip
-        low, high, side = limits.unbind(-1)
-        palms = palm_frames(rest.unflatten(0, (2, HAND))[:, PALM])
+        rest = body.hand_landmarks
+        chains = torch.tensor([[start + j for j in f] for start in (0, HAND) for f in FINGERS])
+        palms, bones = palm_frames(rest.unflatten(0, (2, HAND))[:, PALM]), _bones(rest, chains)
+        thumb = chains[:, 0] % HAND == FINGERS[0][0]
         with torch.no_grad():
-            axes, bend = _axes(_bones(rest, moved, own), rest, palms, rows)
+            pinky = rest[[PINKY, HAND + PINKY]]
+            axes, bend = _axes(bones, palms, pinky, rest[chains[:, :2]], thumb)
+        spread, least, most = (
+            torch.where(thumb[:, None], *rest.new_tensor(table)) for table in (SPREAD, LEAST, MOST)
+        )
         held = {
-            "rest": rest,
+            "chains": chains,
+            "joints": body.hand_bone[chains[:, :2]].mT.flatten(),
             "palms": palms,
-            "joints": torch.tensor([row.joint for row in rows]),
-            "own": own,
-            "moved": moved,
+            "bones": bones,
             "axes": axes,
-            "least": torch.stack([low - bend, -side], dim=-1),
-            "most": torch.stack([high - bend, side], dim=-1),
+            "prior": spread.square().reciprocal(),
+            "least": least - bend,
+            "most": most - bend,
         }
         for name, value in held.items():
             self.register_buffer(name, value, persistent=False)
@@ -84,70 +79,98 @@ class Fingers(nn.Module):
         Args:
             hands: ``[B, 42, 3]`` metres, finite, in any axes.
             seen: ``[B, 42]`` bool. A hand needs its wrist and the knuckles of index and little
-                finger; a joint its own landmark and one that it moves.
+                finger, a finger its two landmarks nearest to the palm, its second joint one more.
         """
         frames = palm_frames(hands.unflatten(1, (2, HAND))[:, :, PALM])
-        R = (frames @ self.palms.mT).repeat_interleave(HAND, dim=1)
-        q = (hands.unsqueeze(-2) @ R).squeeze(-2)  # with the palms as they rest
-        weight = self.moved * seen.unsqueeze(1)
-        rests, bones = (
-            _bones(x, weight, self.own).split(self.half, dim=1) for x in (self.rest.expand_as(q), q)
-        )
-        parts = (x.split(self.half) for x in (self.axes, self.least, self.most))
-        before, turns = torch.eye(3).to(q), []
-        for rest, bone, axes, least, most in zip(rests, bones, *parts, strict=True):
-            now = (bone.unsqueeze(-2) @ before).squeeze(-2) + LEAST * rest
-            hinge = (most[:, 1:] == 0) * axes[:, 0]
-            flat = (x - (x * hinge).sum(-1, keepdim=True) * hinge for x in (rest, now))
-            turn = shortest_turn(*(normalize(x, dim=-1, eps=1e-9) for x in flat))
-            numbers = (axes @ turn.unsqueeze(-1)).squeeze(-1).clamp(least, most)
-            turns.append((numbers.unsqueeze(-2) @ axes).squeeze(-2))
-            before = before @ axis_angle_to_matrix(turns[-1])
-        return torch.cat(turns, dim=1), self.shown(seen)
+        R = (frames @ self.palms.mT).repeat_interleave(len(FINGERS), dim=1)
+        bones = _bones(hands, self.chains) @ R + TRACE * self.bones  # with the palms as they rest
+        lengths = self.bones.norm(dim=-1, keepdim=True)
+        bones = lengths * normalize(bones, dim=-1, eps=1e-9)
+        weight = seen[:, self.chains[:, 1:]].to(bones) / NOISE**2
+        numbers = self._start(bones, weight)
+        for _ in range(STEPS):
+            numbers = (numbers - self._step(numbers, bones, weight)).clamp(self.least, self.most)
+        return torch.cat(self._turns(numbers), dim=1), self.shown(seen)
 
     def shown(self, seen: Tensor) -> Tensor:
         """``[B, 20]`` bool: the joints that landmarks ``seen [B, 42]`` bool show."""
         palm = seen.unflatten(1, (2, HAND))[:, :, PALM].all(-1)
-        moved = (self.moved * seen.unsqueeze(1)).sum(-1) > 0
-        first, second = (moved & seen[:, self.own]).split(self.half, dim=1)
-        first = first & palm.repeat_interleave(len(FINGERS), dim=1)
-        return torch.cat([first, first & second], dim=1)
+        base, middle, *beyond = seen[:, self.chains].unbind(-1)
+        first = base & middle & palm.repeat_interleave(len(FINGERS), dim=1)
+        return torch.cat([first, first & (beyond[0] | beyond[1])], dim=1)
+
+    def _turns(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """``[B, 10, 3]`` of first and second joints."""
+        first, second = (numbers.unsqueeze(-1) * self.axes).split([3, 2], dim=2)
+        return first.sum(2), second.sum(2)
+
+    def _start(self, bones: Tensor, weight: Tensor) -> Tensor:
+        """``[B, 10, 5]`` by the shortest turns to the bones' directions, one after the other."""
+        seen = (weight > 0).unsqueeze(-1)
+        rests, nows = (
+            [(x * seen)[:, :, part].sum(2) for part in (slice(0, 1), slice(1, None))]
+            for x in (self.bones, bones)
+        )
+        before, parts = torch.eye(3).to(bones), []
+        for axes, rest, now in zip(self.axes.split([3, 2], dim=1), rests, nows, strict=True):
+            now = (now.unsqueeze(-2) @ before).squeeze(-2)
+            turn = shortest_turn(*(normalize(x, dim=-1, eps=1e-9) for x in (rest, now)))
+            parts.append((axes @ turn.unsqueeze(-1)).squeeze(-1))
+            before = axis_angle_to_matrix((parts[-1].unsqueeze(-1) * axes).sum(2))
+        return torch.cat(parts, dim=2).clamp(self.least, self.most)
+
+    def _step(self, numbers: Tensor, bones: Tensor, weight: Tensor) -> Tensor:
+        """``[B, 10, 5]``: what a Gauss-Newton step subtracts."""
+        turns = self._turns(numbers)
+        first, second = (axis_angle_to_matrix(turn) for turn in turns)
+        middle = self.bones[:, :1] @ first.mT
+        beyond = self.bones[:, 1:] @ (first @ second).mT
+        x = torch.cat([middle, middle + beyond], dim=2)
+        seen, further = bones.split([1, 2], dim=2)
+        r = x - torch.cat([seen, seen + further], dim=2)  # [B, 10, 3, 3], by landmark
+        arms = x, torch.cat([torch.zeros_like(middle), beyond], dim=2)
+        own, others = self.axes.split([3, 2], dim=1)
+        axes = own @ left_jacobian(turns[0]).mT, others @ (first @ left_jacobian(turns[1])).mT
+        moved = [
+            torch.linalg.cross(*torch.broadcast_tensors(axis.unsqueeze(3), arm.unsqueeze(2)))
+            for axis, arm in zip(axes, arms, strict=True)
+        ]
+        J = torch.cat(moved, dim=2)  # [B, 10, 5, 3, 3]
+        weighted = (J * weight[:, :, None, :, None]).flatten(3)
+        H = weighted @ J.flatten(3).mT + torch.diag_embed(self.prior)
+        g = (weighted @ r.flatten(2).unsqueeze(-1)).squeeze(-1) + self.prior * numbers
+        return torch.linalg.solve(H, g)
 
 
-def _joints(bones: list[int]) -> list[_Joint]:
-    """Each finger's first joint, left hand first, then each one's second.
+def _bones(x: Tensor, chains: Tensor) -> Tensor:
+    """``[..., 10, 3, 3]`` from base to middle, and from there to the two landmarks beyond."""
+    base, middle, *beyond = x[..., chains, :].unbind(-2)
+    return torch.stack([middle - base, *(end - middle for end in beyond)], dim=-2)
+
+
+def _axes(
+    bones: Tensor, palms: Tensor, pinky: Tensor, places: Tensor, thumb: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Axes ``[10, 5, 3]`` of the numbers, and the limits' origins ``[10, 5]``: the bend at rest.
 
     Args:
-        bones: the joint that each of the 42 landmarks moves with.
+        bones: ``[10, 3, 3]`` at rest, see `_bones`.
+        palms: ``[2, 3, 3]`` at rest.
+        pinky: ``[2, 3]`` bases of the little fingers, to which a thumb bends; fingers, to the palm.
+        places: ``[10, 2, 3]`` of the joints.
+        thumb: ``[10]`` bool.
     """
-    first, second = [], []
-    for start in (0, HAND):
-        for k, finger in enumerate(FINGERS):
-            base, *others = (start + j for j in finger)
-            at = next(i for i, j in enumerate(others) if bones[j] != bones[base])
-            middle, thumb = others[at], k == 0
-            first.append(_Joint(bones[base], base, tuple(others[: at + 1]), thumb))
-            second.append(_Joint(bones[middle], middle, tuple(others[at + 1 :]), thumb))
-    return first + second
-
-
-def _bones(x: Tensor, weight: Tensor, own: Tensor) -> Tensor:
-    """``[..., K, 3]`` sums of landmarks ``x [..., 42, 3]``, weighted, from those at the joints."""
-    return weight @ x - weight.sum(-1, keepdim=True) * x[..., own, :]
-
-
-def _axes(bones: Tensor, rest: Tensor, palms: Tensor, rows: list[_Joint]) -> tuple[Tensor, Tensor]:
-    """Axes ``[K, 2, 3]`` of flexion and of turns to the side; the limits' origin ``[K]``, radians:
-    how far a finger is bent at rest."""
-    own, half = torch.tensor([row.own for row in rows]), len(rows) // 2
-    hand, thumb = own // HAND, torch.tensor([[row.thumb] for row in rows])
-    along = normalize(bones, dim=-1)
-    out = (palms[..., 2] * palms.new_tensor([[1.0], [-1.0]]))[hand]  # of the palm
-    # a thumb bends towards the base of the little finger
-    across = rest.unflatten(0, (2, HAND))[:, PINKY][hand] - rest[own]
-    flexion = normalize(torch.linalg.cross(along, torch.where(thumb, across, out)), dim=-1)
-    before = torch.cat([palms[hand[:half], :, 0], along[:half]])
-    bend = torch.linalg.cross(before, along) * flexion
-    bend = torch.atan2(bend.sum(-1), (before * along).sum(-1))
-    axes = torch.stack([flexion, torch.linalg.cross(along, flexion)], dim=1)
-    return axes, torch.where(thumb[:, 0], 0.0, bend)
+    along = normalize(torch.stack([bones[:, 0], bones[:, 1:].sum(1)], dim=1), dim=-1)  # [10, 2, 3]
+    out = palms[..., 2] * palms.new_tensor([[1.0], [-1.0]])
+    out, pinky, straight = (
+        x.repeat_interleave(len(FINGERS), dim=0).unsqueeze(1) for x in (out, pinky, palms[..., 0])
+    )
+    aim = torch.where(thumb[:, None, None], pinky - places, out)
+    flexion = normalize(torch.linalg.cross(along, aim), dim=-1)
+    side = torch.linalg.cross(along, flexion)
+    before = torch.cat([straight, along[:, :1]], dim=1)
+    bend = (torch.linalg.cross(before, along) * flexion).sum(-1)
+    bend = torch.where(thumb[:, None], 0.0, torch.atan2(bend, (before * along).sum(-1)))
+    axes = torch.stack([flexion[:, 0], side[:, 0], along[:, 0], flexion[:, 1], side[:, 1]], dim=1)
+    nothing = torch.zeros_like(bend[:, 0])
+    return axes, torch.stack([bend[:, 0], nothing, nothing, bend[:, 1], nothing], dim=1)

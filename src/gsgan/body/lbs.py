@@ -39,6 +39,18 @@ def shortest_turn(a: Tensor, b: Tensor) -> Tensor:
     return axis * torch.atan2(sine, (a * b).sum(-1, keepdim=True)) / sine.clamp_min(1e-6)
 
 
+def left_jacobian(v: Tensor) -> Tensor:
+    """``[..., 3, 3]``: the rotation, applied last, that a change of the axis-angle ``v`` adds."""
+    squared = v.square().sum(-1)[..., None, None]
+    small = squared < 1e-4
+    safe = torch.where(small, torch.ones_like(squared), squared)
+    angle = safe.sqrt()
+    a = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
+    b = torch.where(small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle))
+    K = _cross_matrix(v)
+    return torch.eye(3).to(v) + a * K + b * (K @ K)
+
+
 def _cross_matrix(v: Tensor) -> Tensor:
     x, y, z = v.unbind(-1)
     zero = torch.zeros_like(x)

@@ -14,7 +14,7 @@ from torch.nn.functional import normalize
 
 from gsgan.body.fingers import Fingers
 from gsgan.body.free import Body
-from gsgan.body.lbs import axis_angle_to_matrix, shortest_turn
+from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
 from gsgan.body.rig import Rig, ancestors, build_rig
 from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
@@ -261,7 +261,7 @@ class Solver(nn.Module):
         origin = (before[..., :3, :3] @ self.joints[self.joint].unsqueeze(-1)).squeeze(-1)
         origin = origin + before[..., :3, 3]
         origin = torch.cat([origin[:, :1] + q[:, None, 3:6], origin[:, 1:]], dim=1)
-        turned = before[..., :3, :3] @ _left_jacobian((q @ self.matrix).unflatten(1, (-1, 3)))
+        turned = before[..., :3, :3] @ left_jacobian((q @ self.matrix).unflatten(1, (-1, 3)))
         axes = (turned[:, self.entry_turn] @ self.entry_axis.unsqueeze(-1)).squeeze(-1)
         arms = (x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)) * self.follows
         moved = torch.linalg.cross(axes.unsqueeze(2).expand_as(arms), arms)
@@ -366,17 +366,3 @@ def _solved(H: Tensor, g: Tensor) -> Tensor:
 def log_of(R: Tensor) -> Tensor:
     """Axis-angle ``[..., 3]`` of rotations ``[..., 3, 3]``."""
     return quaternion_to_axis_angle(rotation_matrix_to_quaternion(R))
-
-
-def _left_jacobian(v: Tensor) -> Tensor:
-    """``[..., 3, 3]``: the rotation, applied last, that a change of the axis-angle ``v`` adds."""
-    squared = v.square().sum(-1)[..., None, None]
-    small = squared < 1e-4
-    safe = torch.where(small, torch.ones_like(squared), squared)
-    angle = safe.sqrt()
-    a = torch.where(small, 0.5 - squared / 24, (1 - angle.cos()) / safe)
-    b = torch.where(small, 1 / 6 - squared / 120, (angle - angle.sin()) / (safe * angle))
-    x, y, z = v.unbind(-1)
-    zero = torch.zeros_like(x)
-    K = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).unflatten(-1, (3, 3))
-    return torch.eye(3).to(v) + a * K + b * (K @ K)

@@ -12,6 +12,7 @@ from rich.console import Console
 from gsgan.check import agreement, overlays, rig, views
 from gsgan.check.calibration import calibration_findings, score_cameras
 from gsgan.check.frames import doubts, frame_findings, motion_of, shortened
+from gsgan.check.hands import hand_findings
 from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
 from gsgan.data.formats.trust import spread
@@ -241,7 +242,10 @@ def _frames(m: Measured) -> Section:
         text=(text,),
         tables=(Table(("frame", "why"), table[:TABLE_FRAMES]),) if table else (),
         figures=tuple(figures),
-        findings=tuple(frame_findings(m.subject, m.doubts, m.motion, m.limits)),
+        findings=(
+            *frame_findings(m.subject, m.doubts, m.motion, m.limits),
+            *hand_findings(m.subject, m.limits),
+        ),
     )
 
 

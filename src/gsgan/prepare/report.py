@@ -88,10 +88,12 @@ def write_small_files(root: Path, outcome: Outcome, key: str) -> None:
         write_npz(root / "hands3d.npz", **hands, frame_id=frames, names=np.array(hand_names()))
     for c, camera in enumerate(outcome.cameras) if solution.seen.any() else ():
         ratio = np.diag(camera.K)[:2] / np.diag(solution.rig.K[c])[:2]
+        uv = (solution.uv[c] * ratio).astype(np.float32)
         write_npz(
             root / "landmarks2d" / f"{camera.name}.npz",
-            p=(solution.uv[c, :, :BODY] * ratio).astype(np.float32),
+            p=uv[:, :BODY],
             conf=solution.seen[c, :, :BODY].astype(np.float32),
+            **({"hands": uv[:, BODY:]} if uv.shape[1] > BODY else {}),
             frame_id=frames,
             undistorted=np.array(True),
         )

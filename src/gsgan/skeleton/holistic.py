@@ -104,7 +104,7 @@ def _holistic() -> SkeletonTemplate:
     swapped = tuple(start + j for start in reversed(STARTS) for j in range(HAND))
     return replace(
         POSE,
-        names=(*POSE.names, *hand_names()),
+        names=(*POSE.names, *(name.replace("wrist", "hand_wrist") for name in hand_names())),
         edges=(*POSE.edges, *edges),
         limbs=tuple(limbs),
         limb_parents=tuple(parents),
