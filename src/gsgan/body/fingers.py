@@ -56,9 +56,8 @@ class Fingers(nn.Module):
         with torch.no_grad():
             pinky = rest[[PINKY, HAND + PINKY]]
             axes, bend = _axes(bones, palms, pinky, rest[chains[:, :2]], thumb)
-        spread, least, most = (
-            torch.where(thumb[:, None], *rest.new_tensor(table)) for table in (SPREAD, LEAST, MOST)
-        )
+        row = (~thumb).long()
+        spread, least, most = (rest.new_tensor(table)[row] for table in (SPREAD, LEAST, MOST))
         held = {
             "chains": chains,
             "joints": body.hand_bone[chains[:, :2]].mT.flatten(),
