@@ -13,11 +13,11 @@ import torch
 from commands import refused
 from fit_quick import QUICK
 from hydra.utils import instantiate
-from make import write_tiny_capture
+from make import write_hands, write_tiny_capture
 
 import gsgan.utils.compat  # noqa: F401
 from gsgan.body.measure import fit_shape
-from gsgan.body.shape import BodyShape, shaped_body
+from gsgan.body.shape import BodyShape, free_space, shaped_body
 from gsgan.body.solve import Solver
 from gsgan.data.datamodule import GsganData
 from gsgan.evaluate.facts import fingerprint
@@ -80,6 +80,23 @@ def test_held_out_frames_are_solved_by_their_skeleton(fitted, fit, people):
     both = fit("fit.held_out=true")
     assert both["registered"].tolist() == [0, 1, 2, 3, 4]
     assert np.abs(both["theta"][3:] - found["theta"][3:]).max() > 1e-3
+
+
+def test_fingers_follow_the_hands_of_every_frame(people, fit, tmp_path):
+    root = shutil.copytree(people, tmp_path / "hands")
+    p = write_hands(root, 5, per_metre=100)
+    p[4] = np.nan
+    write_hands(root, 5, p=100 * p)
+    found = fit("data.skeleton=holistic", "fit.sweeps=1", root=root, keep=False)
+    assert str(found["skeleton"]) == "holistic"
+    names = shaped_body(free_space().neutral()).joint_names
+    fingers = [i for i, name in enumerate(names) if name.startswith("finger") and "1-1" not in name]
+    bent = np.linalg.norm(found["theta"][:, fingers], axis=-1).max(-1)
+    assert (bent[:4] > 0.05).all()  # held-out frames too
+    assert bent[4] == 0  # hands that are not seen rest
+    plain = fit("fit.sweeps=1", root=root, name="plain", keep=False)
+    assert str(plain["skeleton"]) == "mediapipe33"
+    assert not plain["theta"][:, fingers].any()
 
 
 def test_what_is_written_is_read(fitted, people, compose):
