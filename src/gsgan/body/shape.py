@@ -83,7 +83,9 @@ class BodyShape:
         if values.ndim != 1 or len(values) < rest:
             raise ValueError(f"BodyShape: at least {rest} numbers, got {list(values.shape)}")
         K = len(values) - rest
-        return cls(values[:K], values[K : K + len(STRETCHED)], values[K + len(STRETCHED) :].view(LANDMARKS))
+        return cls(
+            values[:K], values[K : K + len(STRETCHED)], values[K + len(STRETCHED) :].view(LANDMARKS)
+        )
 
 
 @dataclass(frozen=True)

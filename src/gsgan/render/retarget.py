@@ -5,9 +5,13 @@ Convention: standard axes (`gsgan.data.figure`), Z up, metres.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from gsgan.data.figure import (
     BONES,
@@ -102,6 +106,20 @@ def rig_landmarks(standard: StandardMotion, figure: Figure) -> Float:
         face = rest[list(FACE)] - middle(rest, EARS)
         p[:, FACE] = ears[:, None] + face @ standard.turns["Head"].mT
     return p
+
+
+def joined(clips: Sequence[Float], figure: Figure, between: int) -> Float:
+    """Clips ``[F, 33, 3]`` of the subject one after the other, each frame kept, with ``between``
+    frames from one to the next: joints go on at the speed they had, and arrive at the next one's.
+    """
+    parts = [clips[0]]
+    for a, b in pairwise(clips):
+        speeds = [x[-1] - x[-2] if len(x) > 1 else 0 * x[0] for x in (a, b[1::-1])]
+        way = CubicHermiteSpline(
+            [0, between + 1], np.stack([a[-1], b[0]]), np.stack([speeds[0], -speeds[1]])
+        )
+        parts += [on_figure(way(np.arange(1, between + 1)), figure), b]
+    return np.concatenate(parts)
 
 
 def heading(p: Float) -> float:
