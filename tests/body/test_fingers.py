@@ -28,7 +28,7 @@ JOINTS = [i for i, name in enumerate(free_body().joint_names) if name.startswith
 def poses() -> BodyPose:
     """Of a motion that signs and makes fists."""
     motion = Choreography(free_character(), seed=11)
-    return free_pose(motion.at(np.arange(0.4, motion.duration, 0.5)))
+    return free_pose(motion.at(np.arange(0.4, motion.duration, 1.0)))
 
 
 @pytest.fixture(scope="module")

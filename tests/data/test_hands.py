@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from make import skeletons, write_hands, write_tiny_capture
 
 from gsgan.data.datamodule import GsganData
@@ -107,21 +106,18 @@ def test_a_truncated_file_is_named(root: Path) -> None:
         read_capture(root)
 
 
-def test_poses_solved_from_another_skeleton_are_refused(root: Path) -> None:
+def test_fitted_poses_have_their_fingers_with_hands_alone(root: Path) -> None:
     write_hands(root, 4)
-    np.savez(
-        root / "body_shape.npz",
-        coefficients=np.zeros(10),
-        stretch=np.ones(8),
-        offsets=np.zeros((33, 3)),
-    )
+    shape = {"coefficients": np.zeros(10), "stretch": np.ones(8), "offsets": np.zeros((33, 3))}
+    np.savez(root / "body_shape.npz", **shape)
     poses = {"theta": np.zeros((4, 56, 3)), "transl": np.zeros((4, 3)), "frame_id": np.arange(4)}
     np.savez(root / "body_pose.npz", **poses)
-    with pytest.raises(ConfigError, match=r"data.skeleton=mediapipe33, but .* holistic"):
+    with pytest.raises(ConfigError, match=r"made body_pose.npz without hands; run it again"):
         assert GsganData(str(root), size=32, skeleton="holistic").layout
-    assert GsganData(str(root), size=32).layout.poses is not None
-    np.savez(root / "body_pose.npz", **poses, skeleton=np.array("holistic"))
-    data = GsganData(str(root), size=32, skeleton="holistic")
-    assert isinstance(data.dataset("train")[0].body.theta, torch.Tensor)
-    with pytest.raises(ConfigError, match=r"data.skeleton=holistic, but .* mediapipe33"):
-        assert GsganData(str(root), size=32).layout
+    np.savez(root / "body_pose.npz", **poses, theta_hands=np.ones((4, 56, 3)))
+    for skeleton, value in (("mediapipe33", 0.0), ("holistic", 1.0)):
+        frame = GsganData(str(root), size=32, skeleton=skeleton).dataset("train")[0]
+        assert frame.body.theta.unique().tolist() == [value]
+    np.savez(root / "body_pose.npz", **poses, theta_hands=np.ones((4, 20, 3)))
+    with pytest.raises(DataError, match=r"'theta_hands' must have shape \(4, 56, 3\)"):
+        read_capture(root)

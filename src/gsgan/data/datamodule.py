@@ -177,12 +177,13 @@ class GsganData(LightningDataModule):
             raise ConfigError(
                 f"data.body=fit, but {layout.root} has body poses of its own; choose data.body=file"
             )
-        if poses is not None and poses.fitted and poses.skeleton != self.skeleton:
-            raise ConfigError(
-                f"{layout.root}: body poses were solved from data.skeleton={poses.skeleton}, but "
-                f"data.skeleton is {self.skeleton}; run gsgan.fit with data.body=none, this "
-                "data.skeleton and overwrite=true"
-            )
+        if poses is not None and poses.fitted and self.skeleton == "holistic":
+            if poses.with_hands is None:
+                raise ConfigError(
+                    f"{layout.root}: gsgan.fit made body_pose.npz without hands; run it again with "
+                    "overwrite=true"
+                )
+            layout = replace(layout, poses=replace(poses, theta=poses.with_hands))
         return layout
 
     @property

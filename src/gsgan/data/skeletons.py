@@ -63,7 +63,8 @@ class Poses:
     """Body poses by frame: ``theta [bones, 3]`` axis-angle, ``transl [3]`` metres.
 
     ``fitted`` says that `gsgan.fit` made them: those of the frames ``registered`` by the masks of
-    the cameras ``fitted_to``, all others by their ``skeleton`` alone, of that name.
+    the cameras ``fitted_to``, all others by their skeleton alone; and that ``with_hands`` is
+    ``theta`` with the fingers that hand landmarks show, or None.
     """
 
     theta: Mapping[int, Float]
@@ -72,7 +73,7 @@ class Poses:
     fitted: bool = False
     registered: frozenset[int] = frozenset()
     fitted_to: tuple[str, ...] = ()
-    skeleton: str = "mediapipe33"
+    with_hands: Mapping[int, Float] | None = None
 
     def digest(self, frames: Iterable[int]) -> str:
         """A hash of the poses of those frames."""

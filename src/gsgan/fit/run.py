@@ -146,12 +146,11 @@ def fit_body(
     write_npz(folder / SHAPE, **{name: x.numpy() for name, x in vars(shape).items()})
     write_npz(
         folder / POSES,
-        theta=theta.numpy(),
+        **_with_and_without_hands(data, shape, theta),
         transl=transl.numpy() / unit,
         frame_id=np.array(layout.frames),
         registered=np.array(moments.frames if kept else (), np.int64),
         fitted_to=np.array(moments.cameras),
-        skeleton=np.array(data.skeleton),
     )
     (folder / STOPPED).unlink(missing_ok=True)
     lines = _summary(report, folder, moments)
@@ -175,10 +174,24 @@ def _folder(out: Path, overwrite: bool) -> Path:
     return out
 
 
+def _with_and_without_hands(
+    data: GsganData, shape: BodyShape, theta: Tensor
+) -> dict[str, NDArray[np.float32]]:
+    """``[F, 56, 3]`` poses with fingers by 33 landmarks and, where there are hands, by these."""
+    fingers = [i for i, n in enumerate(shaped_body(shape).joint_names) if n.startswith("finger")]
+    found = {}
+    for name, hands in {"theta": False, "theta_hands": True}.items():
+        if not hands or data.layout.hands is not None:
+            solved = _solve(data, shape, data.layout.frames, hands).theta
+            found[name] = theta.clone()
+            found[name][:, fingers] = solved[:, fingers]
+    return {name: x.numpy() for name, x in found.items()}
+
+
 def _joints(data: GsganData, frames: Sequence[int], hands: bool = False) -> tuple[Tensor, Tensor]:
     """Joints ``[F, 33, 3]`` metres and their visibility; 75 with hands, where the data has some."""
     landmarks = data.layout.landmarks
-    if hands and data.skeleton == "holistic" and data.layout.hands is not None:
+    if hands and data.layout.hands is not None:
         landmarks = landmarks.with_hands(data.layout.hands)
     p, visibility = (
         torch.from_numpy(np.stack([part[f] for f in frames])).float()
@@ -187,10 +200,14 @@ def _joints(data: GsganData, frames: Sequence[int], hands: bool = False) -> tupl
     return p, visibility
 
 
-def _solve(data: GsganData, shape: BodyShape, frames: Sequence[int]) -> BodyPose:
+def _solve(
+    data: GsganData, shape: BodyShape, frames: Sequence[int], hands: bool | None = None
+) -> BodyPose:
+    """Poses by skeletons with or without hands; None: as ``data.skeleton`` says."""
+    hands = data.skeleton == "holistic" if hands is None else hands
     try:
         with torch.no_grad():
-            return Solver(shaped_body(shape)).solve(*_joints(data, frames, hands=True))
+            return Solver(shaped_body(shape)).solve(*_joints(data, frames, hands))
     except ValueError as error:
         names = f"items are the frames {spans(list(frames))} in order"
         raise DataError(f"{data.layout.root / LANDMARKS}: {error} ({names})") from None

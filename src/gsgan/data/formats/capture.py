@@ -9,6 +9,7 @@
     landmarks3d.npz   p (F,33,3) NaN = missing, conf (F,33), frame_id (F,)
     hands3d.npz       optional, the same (F,42,3): MediaPipe's 21 of the left hand, then the right
     body_pose.npz     optional theta (F,bones,3), transl (F,3), frame_id (F,); betas (S,) of SMPL
+                      by gsgan.fit also theta_hands (F,56,3), with the fingers of hands3d.npz
     body_shape.npz    optional coefficients (K,), stretch (8,), offsets (33,3): of the free body, by
                       gsgan.fit
 """
@@ -189,7 +190,7 @@ def _read_landmarks(
 def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
     """Poses of frames whose numbers are finite, and ``meta`` with the body and its shape."""
     path, fitted = root / POSES, (root / SHAPE).exists()
-    names = ("theta", "transl", "frame_id", "betas", "registered", "fitted_to", "skeleton")
+    names = ("theta", "transl", "frame_id", "betas", "registered", "fitted_to", "theta_hands")
     arrays = read_arrays(path, names)
     if fitted:  # by gsgan.fit: the free body in the person's shape
         meta = replace(meta, body=BodyModel("free", betas=_read_shape(root / SHAPE)))
@@ -200,6 +201,9 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
     ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(theta),), path), str(path))
     finite = np.isfinite(theta).all((1, 2)) & np.isfinite(transl).all(1)
     rows = {int(ids[i]): int(i) for i in np.flatnonzero(finite)}
+    with_hands = None
+    if "theta_hands" in arrays:
+        with_hands = expect_array(arrays, "theta_hands", theta.shape, path).astype(np.float64)
     registered: frozenset[int] = frozenset()
     if "registered" in arrays:
         found = expect_array(arrays, "registered", (None,), path)
@@ -210,7 +214,7 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
         fitted=fitted,
         registered=registered,
         fitted_to=tuple(map(str, arrays.get("fitted_to", ()))),
-        skeleton=str(arrays.get("skeleton", "mediapipe33")),
+        with_hands=None if with_hands is None else {f: with_hands[i] for f, i in rows.items()},
     )
     if meta.body is None or "betas" not in arrays:
         return poses, meta
