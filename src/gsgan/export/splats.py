@@ -96,11 +96,7 @@ def _posed(
     if psi is None:
         raise ConfigError("this avatar has no Gaussians (model=image_to_image) to export")
     frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
-    if avatar.body_points is not None:
-        points = avatar.body_points(body)
-    else:
-        assert avatar.densify is not None
-        points = avatar.densify(p, valid, frames)
+    points = avatar.points(p, valid, frames, body)
     root = root_of(p)
     residuals = psi.residuals(points, psi.pose_code(p, root, frames.hubs[:, 0], None), root)
     return psi.compose(points, residuals, eye), residuals.sh, points.frames

@@ -23,6 +23,7 @@ from gsgan.skeleton import (
     MEDIAPIPE33,
     BoneFrames,
     Densify,
+    Points,
     bone_frames,
     draw_skeleton,
     omega,
@@ -147,9 +148,6 @@ class Avatar(nn.Module):
         Args:
             skeleton, camera, visibility, body: see `picture`.
             background: RGB in [0, 1], or one number for all three.
-
-        Returns:
-            ``[B, 3, H, W]`` RGB in [0, 1].
         """
         painting = self.picture(skeleton, camera, visibility=visibility, body=body)
         assert painting.image is not None and painting.alpha is not None  # noqa: PT018
@@ -216,7 +214,7 @@ class Avatar(nn.Module):
         picture_height: int | None = None,
         camera_index: Tensor | None = None,
     ) -> Painting:
-        """Paints a pose.
+        """Paints a pose: I_pred and every map that led to it.
 
         Args:
             skeleton: ``[B, J, 3]`` metres, world, finite: `gsgan.skeleton.sanitise` replaces joints
@@ -231,9 +229,6 @@ class Avatar(nn.Module):
             picture_height: pixels of the whole image, when ``camera`` sees a window of it: the
                 drawn skeleton's lines are as wide as they would be there.
             camera_index: ``[B]`` cameras whose colours to correct for; None corrects nothing.
-
-        Returns:
-            I_pred and every map that led to it.
         """
         paints = paint and self.generator is not None
         with full_precision(skeleton):
@@ -307,16 +302,19 @@ class Avatar(nn.Module):
                 return self.surface(_given(body), camera.centre)
         if self.deformation is None:
             return None
-        with self.stage("densify"):
-            if self.body_points is not None:  # on the body's surface, where that effect is on
-                points = self.body_points(_given(body))
-            else:
-                assert self.densify is not None
-                points = self.densify(p, valid, frames)  # Alg. 1
+        points = self.points(p, valid, frames, body)
         with self.stage("Ψ"):
             return self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
                 p, points, camera.centre, frames.hubs[:, 0], pose_noise
             )
+
+    def points(self, p: Tensor, valid: Tensor, frames: BoneFrames, body: BodyPose | None) -> Points:
+        """G: Alg. 1's points, or points on the body's surface where that effect is on."""
+        with self.stage("densify"):
+            if self.body_points is not None:
+                return self.body_points(_given(body))
+            assert self.densify is not None
+            return self.densify(p, valid, frames)
 
     def bounded(self, gaussians: Gaussians) -> Gaussians:
         """Features clamped to what the generator takes: their blends are then in that range too."""

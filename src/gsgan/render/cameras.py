@@ -101,11 +101,7 @@ def of_entry(
         joints = p.reshape(-1, 3)
         known: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(-1))
         window = crop.window(entry, joints, known)
-    K, R, t = (torch.from_numpy(x)[None] for x in (entry.K, entry.R, entry.t))
-    keep = lens and entry.distorted and not entry.dist[5:].any()
-    dist = torch.from_numpy(entry.dist[None, :5]) if keep else None
-    camera = Camera(K, R, t, entry.size, dist).crop(window.top, window.left, window.size)
-    return camera.resize((size, size)).to(torch.float32)
+    return entry.seen(window, (size, size), lens=lens)
 
 
 def from_file(path: Path, p: Float, size: int) -> Camera:

@@ -13,12 +13,13 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from gsgan.body import free_body
+from gsgan.body import free_body, open_body
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.calibration.find import METRES
 from gsgan.data.figure import BONES, EARS, HIPS, SHOULDERS, Figure, length
 from gsgan.data.files import read_arrays, read_json, read_json_value
 from gsgan.data.formats import smpl_motion
+from gsgan.data.formats.capture import SHAPE, read_shape
 from gsgan.data.synthetic.bvh import Bvh, read_bvh, standard_motion
 from gsgan.prepare.landmarks import read_points3d
 from gsgan.render.asf import asf_of, read_amc
@@ -39,7 +40,7 @@ WORLD_KEYS = (
 POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose")
 ROOT_KEYS, MOVE_KEYS = ("global_orient", "root_orient"), ("trans", "transl", "smpl_trans")
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
-FREE_BONES, SMPL_BODY = 56, 22  # SMPL_BODY: joints that SMPL, SMPL-H and SMPL-X share
+SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
 LEG_UNITS = {"metres": 1.0, "decimetres": 0.1, "centimetres": 0.01, "inches": 0.0254}
 LEG_UNITS |= {"millimetres": 0.001, "CMU units (inches / 0.45)": 0.0254 / 0.45}
 LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))  # rigid, for the scale of axes
@@ -136,14 +137,18 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Motion:
 def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Motion:
     theta = expect_array(arrays, "theta", (None, None, 3), path)
     arrays = arrays | {k: arrays[name] for k, name in (("transl", "trans"),) if name in arrays}
-    transl = expect_array(arrays, "transl", (len(theta), 3), path)
     meta = _beside(path)
+    scale = METRES.get(meta.get("unit", "m"), 1.0)
+    transl = scale * expect_array(arrays, "transl", (len(theta), 3), path)
     fps, up = fps or meta.get("fps"), meta.get("up_axis")
-    if theta.shape[1] != FREE_BONES:
+    if theta.shape[1] != len(free_body().parents):
         flat = {"poses": theta.reshape(len(theta), -1), "trans": transl}
         return _smpl(path, flat | {k: arrays[k] for k in ("betas",) if k in arrays}, fps, source)
+    shape = path.with_name(SHAPE)  # by gsgan.fit
+    subject = open_body("free", betas=read_shape(shape) if shape.is_file() else ())
+    assert subject is not None
     body = BodyPose(*(torch.from_numpy(np.nan_to_num(x)).float() for x in (theta, transl)))
-    p = free_body().posed_landmarks(body).double().numpy()
+    p = subject.posed_landmarks(body).double().numpy()
     p[~np.isfinite(theta).all((1, 2)) | ~np.isfinite(transl).all(1)] = np.nan
     return Motion(path, p, np.ones(p.shape[:2]), fps, up or "z", "metres", body=body)
 

@@ -27,6 +27,7 @@ from gsgan.data.figure import (
     part_frame,
 )
 from gsgan.data.synthetic.bvh import StandardMotion, drift, floor_under
+from gsgan.data.synthetic.character import unit
 from gsgan.data.synthetic.retarget import axis_angle, between, rotation
 from gsgan.skeleton import bone_frames
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
@@ -34,11 +35,6 @@ from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 Float = NDArray[np.float64]
 
 NECK = 0.45  # radians that a neck bends from rest at most: detectors put faces too far forward
-
-
-def unit(v: Float) -> Float:
-    """Vectors ``[..., 3]`` divided by their length."""
-    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
 
 
 def on_figure(p: Float, figure: Figure) -> Float:

@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from gsgan.data.figure import FACE, FEET, HANDS, HIPS, SHOULDERS, middle
+from gsgan.data.synthetic.character import unit
+from gsgan.data.synthetic.retarget import between
 
 Float = NDArray[np.float64]
 
 ROUNDS = 20
 BEND = 0.01  # of a chain's length: a straight one would only shorten along itself, and cannot
-TINY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -72,14 +72,14 @@ def dragged(p: Float, name: str, target: Float) -> Float:
         return q + (target - middle(p, HIPS))
     if name == HEAD:
         neck = middle(p, SHOULDERS)
-        turn = _between(p[NOSE] - neck, target - neck)
+        turn = between(p[NOSE] - neck, target - neck)
         q[list(FACE)] = neck + (p[list(FACE)] - neck) @ turn.T
         return q
     handle = HANDLES[name]
     chain = list(handle.chain)
     q[chain] = fabrik(p[chain], target)
     before, end = chain[-2:]
-    turn = _between(p[end] - p[before], q[end] - q[before])
+    turn = between(p[end] - p[before], q[end] - q[before])
     turned, moved = list(handle.turned), list(handle.moved)
     q[turned] = q[end] + (p[turned] - p[end]) @ turn.T
     q[moved] += q[end] - p[end]
@@ -93,28 +93,14 @@ def fabrik(chain: Float, target: Float) -> Float:
     along = target - root
     if np.linalg.norm(along) >= reach:
         steps = np.concatenate([[0.0], np.cumsum(lengths)])
-        return np.asarray(root + steps[:, None] * _unit(along))
-    if len(q) > 2 and np.linalg.norm(np.cross(_unit(q[1] - root), _unit(along))) < BEND:
-        q[1:-1] += BEND * reach * _unit(np.cross(along, [1.0, 2.0, 3.0]))
+        return np.asarray(root + steps[:, None] * unit(along))
+    if len(q) > 2 and np.linalg.norm(np.cross(unit(q[1] - root), unit(along))) < BEND:
+        q[1:-1] += BEND * reach * unit(np.cross(along, [1.0, 2.0, 3.0]))
     for _ in range(ROUNDS):
         q[-1] = target
         for i in range(len(q) - 2, -1, -1):
-            q[i] = q[i + 1] + lengths[i] * _unit(q[i] - q[i + 1])
+            q[i] = q[i + 1] + lengths[i] * unit(q[i] - q[i + 1])
         q[0] = root
         for i in range(len(lengths)):
-            q[i + 1] = q[i] + lengths[i] * _unit(q[i + 1] - q[i])
+            q[i + 1] = q[i] + lengths[i] * unit(q[i + 1] - q[i])
     return q
-
-
-def _unit(v: Float) -> Float:
-    return np.asarray(v / max(float(np.linalg.norm(v)), TINY))
-
-
-def _between(a: Float, b: Float) -> Float:
-    """``[3, 3]`` the smallest rotation that turns direction a to b."""
-    u, v = _unit(a), _unit(b)
-    axis, cosine = np.cross(u, v), float(u @ v)
-    sine = float(np.linalg.norm(axis))
-    return np.asarray(
-        Rotation.from_rotvec(_unit(axis) * np.arctan2(sine, cosine)).as_matrix(), np.float64
-    )
