@@ -48,7 +48,7 @@ class BodyShape:
         coefficients: ``[K]`` of the shape space, in standard deviations; SMPL's betas.
         stretch: ``[8]`` factors by group, in the order of `STRETCHED`; 1 leaves it as it is.
         offsets: ``[33, 3]`` metres at rest, from the body's landmarks to where this person's
-            skeletons have them: detectors and rigs define joints differently. None: nowhere else.
+            skeletons have them: detectors and rigs define joints differently. None: no offsets.
 
     Raises:
         ValueError: on wrong shapes.

@@ -1,4 +1,4 @@
-"""Writes what an export config asks for."""
+"""Writes the export that a config describes."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ CARD = "MODEL_CARD.md"
 
 
 def export_config(config: DictConfig) -> None:
-    """Writes what a config asks for, and a model card beside it.
+    """Writes the export that a config describes, and a model card beside it.
 
     Raises:
-        ConfigError: on a value that cannot be used, or a place that is taken.
-        DataError: when the run, the motion or the file to verify cannot be used.
+        ConfigError: when an option has an invalid value, or the output exists.
+        DataError: when the run, the motion or the file to verify cannot be read.
     """
     console = make_console()
 

@@ -89,7 +89,9 @@ class Run:
             raise ConfigError("run is not set: give run=<the folder that gsgan.train printed>")
         folder, moved = Path(config.run).expanduser(), Moved.from_config(config)
         stored, facts = read_config(folder), read_checkpoint(folder / CHECKPOINT)["gsgan"]
-        return cls(folder, stored, facts, load(folder, smpl=moved.smpl, device=config.device), moved)
+        return cls(
+            folder, stored, facts, load(folder, smpl=moved.smpl, device=config.device), moved
+        )
 
     @property
     def data(self) -> GsganData:
@@ -127,16 +129,16 @@ class Run:
 
 @dataclass(frozen=True)
 class Drive:
-    """What the avatar is driven with.
+    """A motion that drives the avatar.
 
     Args:
         p: ``[F, 33, 3]`` metres, world frame; NaN where unknown.
         visibility: ``[F, 33]`` in [0, 1].
         body: F poses of the skinned body, or None.
-        numbers: of the frames, in their files' names.
-        text: one line about it.
-        truth: of a frame's place, the dataset's frame; None where there is none.
-        camera: F cameras and their indices, where the frames have cameras of their own.
+        numbers: of the frames, for their file names.
+        text: one line that describes it.
+        truth: gives the dataset's frame by index, or None.
+        camera: F cameras and their indices, if the frames have their own.
     """
 
     p: Float
@@ -148,7 +150,7 @@ class Drive:
     camera: tuple[Camera, Tensor] | None = None
 
     def rows(self, chosen: NDArray[np.int64]) -> Drive:
-        """The frames at some places, which may repeat; repeated frames are numbered anew."""
+        """The frames at some indices; if an index repeats, frames are numbered from 0."""
         own = len(set(chosen.tolist())) == len(chosen)
         at, truth, camera = torch.from_numpy(chosen), self.truth, self.camera
         index = chosen.tolist()

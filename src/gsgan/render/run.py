@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +29,11 @@ STILL_SECONDS = 4.0
 
 
 def render_config(config: DictConfig) -> None:
-    """Renders what a config asks for.
+    """Renders the motion of a config.
 
     Raises:
-        ConfigError: on a value that cannot be used, or a place that is taken.
-        DataError: when the run or the motion cannot be used.
+        ConfigError: when an option has an invalid value, or the output exists.
+        DataError: when the run or the motion cannot be read.
     """
     console = make_console()
     output = _output(config)
@@ -55,7 +54,7 @@ def render_config(config: DictConfig) -> None:
     output.begin(_record(config, run, drive, cameras), bool(config.overwrite))
     missing = [i for i, n in enumerate(drive.numbers) if not output.path(n).is_file()]
     if kept := len(drive.numbers) - len(missing):
-        console.print(f"{kept} of {len(drive.numbers)} frames are there already")
+        console.print(f"{kept} of {len(drive.numbers)} frames are already rendered")
     for i in track(missing, "rendering", console=console, transient=True):
         output.write(drive.numbers[i], _image(config, run, drive, cameras, index, i, paint_on))
     output.finish(drive.numbers)
@@ -79,7 +78,7 @@ def _output(config: DictConfig) -> Output:
 
 
 def _chosen(drive: Drive, config: DictConfig, fps: float) -> Drive:
-    """The frames from ``start`` on, ``frames`` of them; a single one is held still."""
+    """``frames`` frames from ``start`` on; a single pose is held."""
     start, total = whole("start", config.start, 0), len(drive.p)
     if start >= total:
         raise ConfigError(f"start={start}: the motion has {total} frames at {fps:g} per second")
@@ -97,7 +96,7 @@ def _chosen(drive: Drive, config: DictConfig, fps: float) -> Drive:
 
 
 def _cameras(config: DictConfig, run: Run, drive: Drive) -> tuple[Camera, Tensor | None]:
-    """One camera, or one for each frame; and their indices where their colours are to be taken."""
+    """One camera, or one per frame; and their indices, if images are to have their colours."""
     trained = run.stored.data.size
     if drive.camera is not None:
         camera, index = drive.camera
@@ -129,7 +128,7 @@ def _image(
     i: int,
     paint_on: Callable[[tuple[int, int]], Background],
 ) -> NDArray[np.uint8]:
-    """``[H, W, 3 or 4]`` a frame, the truth at its left where that is asked for."""
+    """``[H, W, 3 or 4]`` one frame, with the ground truth at its left if requested."""
     at = slice(i, i + 1) if len(cameras) > 1 else slice(0, 1)
     camera = cameras[at]
     painting = run.avatar.picture(
@@ -151,7 +150,7 @@ def _image(
 
 
 def _record(config: DictConfig, run: Run, drive: Drive, cameras: Camera) -> dict[str, Any]:
-    """What the images depend on: a render goes on only where this is the same."""
+    """What the images depend on: a render is resumed only if this is unchanged."""
     hashed = hashlib.sha256((run.folder / CHECKPOINT).read_bytes())
     parts = [drive.p, drive.visibility, cameras.K.numpy(), cameras.R.numpy(), cameras.t.numpy()]
     if drive.body is not None:

@@ -91,7 +91,7 @@ class ProgressLines(Callback):
 class LiveViewer(Callback):
     """Serves `gsgan.view` during training, with the weights of the last validation.
 
-    Convention: the viewer's own thread renders a frozen copy, and only while a browser is connected.
+    Convention: a thread of the viewer renders a frozen copy, only while a browser is connected.
 
     Args:
         folder: of the run.
@@ -100,9 +100,7 @@ class LiveViewer(Callback):
         console: prints the address.
     """
 
-    def __init__(
-        self, folder: Path, config: DictConfig, data: GsganData, console: Console
-    ) -> None:
+    def __init__(self, folder: Path, config: DictConfig, data: GsganData, console: Console) -> None:
         self.folder, self.config, self.data, self.console = folder, config, data, console
         self.viewer: Viewer | None = None
 

@@ -67,6 +67,8 @@ def run_training(config: DictConfig) -> None:
     torch.set_flush_denormal(True)  # black background decays into denormals: slow on CPUs
     check_lpips(config.lpips.net, config.lpips.path)  # now, not after hours of training
     if config.viewer:
+        from gsgan.view.server import import_viser
+
         import_viser()
 
     data, module = build_training(config)

@@ -1,4 +1,4 @@
-"""Inverse kinematics: a joint is dragged, every bone keeps its length."""
+"""Inverse kinematics: dragged joints, with bones of constant length."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from gsgan.data.synthetic.retarget import between
 Float = NDArray[np.float64]
 
 ROUNDS = 20
-BEND = 0.01  # of a chain's length: a straight one would only shorten along itself, and cannot
+BEND = 0.01  # of a chain's length: FABRIK cannot bend a straight chain along itself
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class Handle:
     """What moves with a dragged joint.
 
     Args:
-        chain: joints from the one that stays to the one that is dragged.
-        turned: joints that turn with the last bone.
-        moved: joints that move along without turning.
+        chain: joints from the fixed one to the dragged one.
+        turned: joints that rotate with the last bone.
+        moved: joints that follow without rotating.
     """
 
     chain: tuple[int, ...]
@@ -48,7 +48,7 @@ NAMES = (*HANDLES, HEAD, BODY)
 
 
 def position(p: Float, name: str) -> Float:
-    """``[3]`` metres: where the handle of a pose ``[33, 3]`` is."""
+    """``[3]`` metres: the position of a handle in a pose ``[33, 3]``."""
     if name == BODY:
         return middle(p, HIPS)
     return np.asarray(p[NOSE if name == HEAD else HANDLES[name].chain[-1]])
@@ -57,8 +57,8 @@ def position(p: Float, name: str) -> Float:
 def dragged(p: Float, name: str, target: Float) -> Float:
     """The pose with a handle at ``target``, or as near as the bones reach.
 
-    Limbs bend by FABRIK from shoulder or hip; hands and feet turn with the last bone. The head
-    turns about the neck. The body moves as a whole.
+    Limbs bend by FABRIK from shoulder or hip; hands and feet rotate with the last bone. The head
+    rotates about the neck. The body moves as a whole.
 
     Args:
         p: ``[33, 3]`` metres, finite.
@@ -87,7 +87,7 @@ def dragged(p: Float, name: str, target: Float) -> Float:
 
 
 def fabrik(chain: Float, target: Float) -> Float:
-    """Joints ``[n, 3]`` whose first stays and whose last is at ``target``, or as near as can be."""
+    """Joints ``[n, 3]`` with the first fixed and the last at ``target``, or as near as possible."""
     lengths = np.linalg.norm(np.diff(chain, axis=0), axis=1)
     q, root, reach = chain.copy(), chain[0], lengths.sum()
     along = target - root

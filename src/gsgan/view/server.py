@@ -8,7 +8,6 @@ import logging
 import socket
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -108,8 +107,8 @@ class Viewer:
         self.server.stop()
 
     def _camera(self, size: int) -> None:
-        """Sets the first view of new browsers: the first pose from the front, at the distance of the
-        training cameras."""
+        """Sets the first view of new browsers: the first pose from the front, as large as in
+        training images."""
         drive, scene, figure = self.show.drive, self.run.scene, self.run.figure
         first = drive.p[:1]
         known = np.where(np.isfinite(first), first, np.nanmean(first, 1, keepdims=True))
