@@ -103,7 +103,7 @@ def test_smpl_and_amass(tmp_path, shared, figure, kind, numbers):
     truth[0, list(at)] = joints[list(at.values())] @ upright(up_axis(motion)).T
     np.testing.assert_allclose(directions(p)[:1], directions(truth), atol=1e-6)
     np.savez(path, poses=poses[:, :50])
-    with pytest.raises(DataError, match="50 numbers a frame"):
+    with pytest.raises(DataError, match="50 numbers per frame"):
         standard(path, figure, smpl=model)
 
 

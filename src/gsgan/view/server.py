@@ -91,7 +91,7 @@ class Viewer:
 
     def swap(self, avatar: Avatar) -> None:
         """Shows another avatar of the same run: one with newer weights."""
-        self.show.avatar = avatar
+        self.run.avatar = self.show.avatar = avatar
         for session in list(self.sessions.values()):
             session.touch(moving=False)
 
