@@ -53,7 +53,8 @@ def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> NDArray[np.u
     background, with straight alpha: ``[H, W, 4]``."""
     image, alpha = image.clamp(0, 1), alpha.clamp(0, 1)
     if behind is None:
-        straight = torch.where(alpha > 0, image / alpha.clamp_min(1e-6), image).clamp(0, 1)
+        shown = alpha >= 0.5 / 255  # elsewhere 8-bit alpha is 0, and colours would be noise
+        straight = torch.where(shown, image / alpha.clamp_min(1e-6), 0.0).clamp(0, 1)
         image = torch.cat([straight, alpha])
     else:
         image = (image + (1 - alpha) * behind).clamp(0, 1)

@@ -281,7 +281,8 @@ class Session:
         if self.mesh.value and body is not None and pose is not None:
             vertices = body.posed_vertices(pose.to("cpu"))[0]
             arrays = (vertices.numpy(), body.faces.numpy())
-            self._nodes.append(scene.add_mesh_simple("/body", *arrays, color=GREY))
+            mesh = scene.add_mesh_simple("/body", *arrays, color=GREY, opacity=0.5)
+            self._nodes.append(mesh)
         if splats is not None:
             assert splats.covariances is not None
             given = (
