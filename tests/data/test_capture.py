@@ -16,11 +16,11 @@ from make import edit_json, ring_camera, skeletons, write_landmarks, write_tiny_
 from gsgan.data.checks import Checks, spans
 from gsgan.data.dataset import CaptureDataset, Picture, PictureCache
 from gsgan.data.files import cut_off, read_header
-from gsgan.data.formats.capture import read_capture
+from gsgan.data.formats.capture import CaptureReader, read_capture
 from gsgan.data.formats.trust import Trust
 from gsgan.data.skeletons import fill_missing
 from gsgan.scene import cat
-from gsgan.utils.errors import DataError
+from gsgan.utils.errors import ConfigError, DataError
 
 
 def test_frame_holds_what_its_docstring_says(tmp_path: Path) -> None:
@@ -101,6 +101,20 @@ def test_frames_pair_by_number_not_by_position(tmp_path: Path) -> None:
         assert torch.equal(dataset[i].skeleton[0], expected)
         assert dataset[i].frame_id.item() == number
     assert any("cam01 3 (matched by frame number)" in note for note in layout.notes)
+
+
+def test_a_band_round_the_outline_is_left_out_of_the_loss(tmp_path: Path) -> None:
+    layout = CaptureReader(ignore_band=3)(write_tiny_capture(tmp_path), Checks())
+    frame = CaptureDataset(layout, items(layout))[0]
+    assert frame.unsure is not None
+    band = frame.unsure[0, 0] > 0
+    person = frame.mask[0, 0] > 0.5
+    assert band.any()
+    assert (person & ~band).any()
+    edge = (person[:, 1:] != person[:, :-1]).nonzero()
+    assert band[edge[:, 0], edge[:, 1]].all()
+    with pytest.raises(ConfigError, match=r"data\.reader\.ignore_band must be a whole number"):
+        CaptureReader(ignore_band=-1)
 
 
 def test_landmark_rows_in_any_order(tmp_path: Path) -> None:

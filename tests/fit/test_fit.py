@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -24,11 +23,10 @@ from gsgan.data.datamodule import GsganData
 from gsgan.evaluate.facts import fingerprint
 from gsgan.evaluate.run import make_scorer
 from gsgan.fit import run as running
-from gsgan.fit.fitter import Fit, Fitter, _wrong
+from gsgan.fit.fitter import Fitter, _wrong
 from gsgan.fit.moments import Moments
-from gsgan.fit.run import LOW_PASS, run_fit
+from gsgan.fit.run import DEFAULT, run_fit
 from gsgan.scene import BodyPose
-from gsgan.splat import accuracy
 from gsgan.train.run import pose_corrections, training_record
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -133,8 +131,7 @@ def test_unseen_joints(fit, people, tmp_path):
 
 def test_defaults_are_those_of_the_config(compose):
     given = instantiate(compose("fit").fit)
-    assert given == Fit(replace(accuracy("standard"), low_pass=given.accuracy.low_pass))
-    assert given.accuracy.low_pass == pytest.approx(LOW_PASS, abs=1e-4)
+    assert given == DEFAULT
 
 
 def test_held_out_cameras_are_not_used(fit, fitted, people, tmp_path):

@@ -16,6 +16,7 @@ from gsgan.metrics.image import (
     high_frequencies,
     person_box,
     psnr,
+    psnr_inside,
     psnr_person,
     psnr_where,
     ssim,
@@ -127,6 +128,17 @@ def test_the_persons_box_leaves_the_background_out():
     assert float(psnr(image, target)) == pytest.approx(20 + 10 * math.log10(10))  # 40 of 400 pixels
     assert math.isnan(float(psnr_person(image, target, torch.zeros_like(mask))))
     assert math.isnan(float(ssim_person(image, target, torch.zeros_like(mask))))
+
+
+def test_the_outline_is_left_out():
+    target, mask = torch.zeros(2, 3, 20, 20), torch.zeros(2, 1, 20, 20)
+    mask[0, :, 5:17, 5:17] = 1.0
+    image = target.clone()
+    image[..., 5:7, :] = 0.5  # within two pixels of the outline
+    image[..., 8:14, 8:14] = 0.1  # not
+    error = 0.1**2 * 36 / 64  # 8 × 8 pixels of the box are left
+    assert float(psnr_inside(image, target, mask)[0]) == pytest.approx(-10 * math.log10(error))
+    assert math.isnan(float(psnr_inside(image, target, mask)[1]))
 
 
 def test_the_persons_box_is_filled_between_its_ends():

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from gsgan.body import SkinnedBody, free_body, open_body
+from gsgan.body.shape import BodyShape
 from gsgan.body.smpl_names import CIHP
 from gsgan.model.body_points import neighbour_distance
 from gsgan.model.class_vote import ClassVote, seen
@@ -244,6 +245,15 @@ def test_labels_that_are_the_bodys_own_are_not_voted_on(build, monkeypatch):
     assert avatar.segmentation is not None
     assert "no class vote" in avatar.segmentation_why
     assert "segmentation.vertex_labels" not in avatar.state_dict()
+
+
+def test_a_fitted_body_gets_the_persons_clothes(capture, tmp_path, build):
+    """Its own labels have those of the person it was modelled on."""
+    folder = shutil.copytree(capture, tmp_path / "fitted")
+    shape = BodyShape(torch.zeros(10), torch.ones(8), torch.zeros(33, 3))
+    np.savez(folder / "body_shape.npz", **{k: v.numpy() for k, v in vars(shape).items()})
+    _, avatar, _ = build(f"data.root={folder}", FEW)
+    assert "class vote over 2 images" in avatar.segmentation_why
 
 
 def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_path, monkeypatch):

@@ -48,7 +48,7 @@ class BodyShape:
         coefficients: ``[K]`` of the shape space, in standard deviations; SMPL's betas.
         stretch: ``[8]`` factors by group, in the order of `STRETCHED`; 1 leaves it as it is.
         offsets: ``[33, 3]`` metres at rest, from the body's landmarks to where this person's
-            skeletons have them: detectors and rigs define joints differently. None: no offsets.
+            skeletons have them: detectors and rigs define joints differently. None means zero.
 
     Raises:
         ValueError: on wrong shapes.
@@ -83,7 +83,9 @@ class BodyShape:
         if values.ndim != 1 or len(values) < rest:
             raise ValueError(f"BodyShape: at least {rest} numbers, got {list(values.shape)}")
         K = len(values) - rest
-        return cls(values[:K], values[K : K + len(STRETCHED)], values[-99:].view(LANDMARKS))
+        return cls(
+            values[:K], values[K : K + len(STRETCHED)], values[K + len(STRETCHED) :].view(LANDMARKS)
+        )
 
 
 @dataclass(frozen=True)

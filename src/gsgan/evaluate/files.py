@@ -28,6 +28,7 @@ TITLE = "Held-out cameras (novel_view) and poses (novel_pose)"
 COLUMNS = {  # heading and number of decimals
     "psnr": ("PSNR ↑", 2),
     "psnr_person": ("in box ↑", 2),
+    "psnr_inside": ("off the outline ↑", 2),
     "ssim": ("SSIM ↑", 4),
     "ssim_person": ("SSIM in box ↑", 4),
     "lpips": ("LPIPS ↓", 4),

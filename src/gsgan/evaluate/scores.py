@@ -22,6 +22,7 @@ from gsgan.metrics.image import (
     high_frequencies,
     person_box,
     psnr,
+    psnr_inside,
     psnr_person,
     psnr_where,
     ssim,
@@ -36,7 +37,7 @@ from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
 
 IMAGE_METRICS = (
-    *("psnr", "psnr_person", "ssim", "ssim_person", "lpips", "lpips_person"),
+    *("psnr", "psnr_person", "psnr_inside", "ssim", "ssim_person", "lpips", "lpips_person"),
     *("edge_f1", "edge_f1_person", "edge_ratio", "edge_ratio_person", "high_frequencies"),
 )
 PART_METRICS = ("miou", "miou_with_background")
@@ -84,6 +85,7 @@ def image_scores(
     if mask is not None:
         person = person_box(mask)
         scores["psnr_person"] = psnr_person(image, target, mask)
+        scores["psnr_inside"] = psnr_inside(image, target, mask)
         scores["ssim_person"] = ssim_person(image, target, mask)
         scores["edge_f1_person"], scores["edge_ratio_person"] = edge_scores(image, target, person)
     if lpips is not None:

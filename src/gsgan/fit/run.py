@@ -44,7 +44,7 @@ from gsgan.utils.tensors import pick_device
 
 REPORT, SHEET, STOPPED = "body_fit.json", "body_fit.png", ".body_fit.stopped"
 PICTURE, MARGIN = 128, 0.2  # pixels; metres round the person
-LOW_PASS = 1 / 12  # square pixels: a pixel's own square
+DEFAULT = Fit(replace(accuracy("standard"), low_pass=0.0833))  # as conf/fit/standard.yaml
 TILE = 300  # pixels
 GREEN, ORANGE, BLUE = (60, 200, 60), (255, 140, 0), (60, 140, 255)
 BAR = (70, 70, 70)
@@ -68,16 +68,21 @@ def run_fit(config: DictConfig) -> Path:
     return fit_body(data, settings, out, config.seed, device, config.shown, config.overwrite)
 
 
-def fit_before_training(data: GsganData, device: str = "auto") -> None:
-    """Fits the body of a capture that has no body pose, with the default settings.
+def fit_before_training(data: GsganData) -> None:
+    """Fits the body of a capture that has no body pose, with the settings of ``conf/fit``.
 
     Raises:
         DataError: when the masks hold no person, or the folder is read-only.
     """
-    seen = replace_size(data)
-    fit_body(
-        seen, Fit(replace(accuracy("standard"), low_pass=LOW_PASS)), device=pick_device(device)
+    seen = GsganData(
+        root=str(data.layout.root),
+        reader=data.reader,
+        protocol=data.protocol,
+        size=PICTURE,
+        crop=PersonCrop(margin=MARGIN),
+        **data.split_keys,
     )
+    fit_body(seen, DEFAULT, device=pick_device("auto"))
 
 
 def fit_body(
@@ -152,24 +157,12 @@ def fit_body(
     return folder
 
 
-def replace_size(data: GsganData) -> GsganData:
-    """The capture at the size of a fit, cropped to the person."""
-    return GsganData(
-        root=str(data.layout.root),
-        reader=data.reader,
-        protocol=data.protocol,
-        size=PICTURE,
-        crop=PersonCrop(margin=MARGIN),
-        **data.split_keys,
-    )
-
-
 def _folder(out: Path, overwrite: bool) -> Path:
     attempt = out / f"{STOPPED}.try"
     with writing(out):  # before minutes of work, not after
         out.mkdir(parents=True, exist_ok=True)
         write_atomically(attempt, b"")
-        attempt.unlink()
+        attempt.unlink(missing_ok=True)  # runs in parallel try alike
     if (out / POSES).exists():
         if not (out / SHAPE).exists():
             raise ConfigError(

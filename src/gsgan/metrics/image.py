@@ -19,6 +19,7 @@ from gsgan.losses.photometric import d_ssim_map
 Score = Callable[[Tensor, Tensor], Tensor]
 SSIM_CONSTANTS = (0.01, 0.03)
 LEAST_SIDE = 6  # pixels: smaller images cannot be reflected by half of SSIM's window
+OUTLINE = 2  # pixels
 UNIFORM_WINDOW = 7  # pixels, scikit-image's default
 
 
@@ -60,6 +61,15 @@ def psnr_person(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     The PSNR of a whole frame that is mostly background is high for any person.
     """
     return psnr_where(image, target, person_box(mask))
+
+
+def psnr_inside(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+    """`psnr_person` without the pixels within `OUTLINE` of the mask's outline, whose error is the
+    mask's own where masks are uneven; NaN where the mask is empty. Ours."""
+    person = (mask >= 0.5).to(mask)
+    side = 2 * OUTLINE + 1
+    dilated, shrunk = (s * functional.max_pool2d(s * person, side, 1, OUTLINE) for s in (1, -1))
+    return psnr_where(image, target, person_box(mask) & (dilated == shrunk))
 
 
 def ssim_person(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:

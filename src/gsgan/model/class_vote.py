@@ -39,8 +39,9 @@ def labelled_body(
 ) -> tuple[SkinnedBody | None, str]:
     """The body, and a clause on where its labels come from, or why there is no body.
 
-    The body's own labels are used where they are the data's, or the data has none; otherwise those
-    of a checkpoint (``vertex_labels [V]``), or of a vote over ``pictures``.
+    The body's own labels are used where they are the data's, or the data has none. Otherwise, and
+    on a body fitted to a person, whose clothes end elsewhere, those of a checkpoint
+    (``vertex_labels [V]``), or of a vote over ``pictures``.
 
     Raises:
         DataError: when a vote is needed and not possible, or the labels do not fit the body.
@@ -55,7 +56,8 @@ def labelled_body(
     if not scene.has_labels and vertex_labels is None:
         guess = body.label_source == "guess"
         return body, "parts by the body's joints" if guess else "parts are the body's own"
-    if scene.has_labels and body.shares_labels(scene.label_names):
+    fitted = bool(scene.betas) and scene.body == "free"  # to a person in other clothes
+    if scene.has_labels and not fitted and body.shares_labels(scene.label_names):
         if scene.n_labels > len(body.label_names):
             raise DataError(
                 f"labels: the images have {scene.n_labels} parts, the {scene.body} body has only "

@@ -111,9 +111,8 @@ class Deformation(nn.Module):
         """ΔG of posed points, from the `pose_code` and the pelvis ``root`` ``[B, 3]`` (metres)."""
         position = (points.means - root[:, None]) / self.body_height
         normals = points.normals
-        if (
-            self.training
-        ):  # corrected poses learn from where Ψ puts points, not from what it is told
+        # A corrected pose learns through the means of G, not through Ψ's inputs.
+        if self.training:
             position, normals = position.detach(), normals.detach()
         code = positional_encoding(position, self.position_octaves)
         if torch.is_grad_enabled() and not (code.requires_grad or normals.requires_grad):

@@ -26,6 +26,7 @@ class Metric(NamedTuple):
 METRICS = {
     "psnr": Metric("PSNR dB", 2, "↑"),
     "psnr_person": Metric("PSNR dB in box", 2, "↑"),
+    "psnr_inside": Metric("PSNR dB in box off the outline", 2, "↑"),
     "ssim": Metric("SSIM", 4, "↑"),
     "ssim_person": Metric("SSIM in box", 4, "↑"),
     "lpips": Metric("LPIPS", 4, "↓"),

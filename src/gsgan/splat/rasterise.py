@@ -5,20 +5,14 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import asdict
+from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from gsgan.scene import Camera, Gaussians, Raster
-from gsgan.splat import (
-    checks,
-    gsplat_backend,
-    native,
-    native_project,
-    reference,
-    tiles,
-)
+from gsgan.splat import checks, gsplat_backend, native, native_project, reference, tiles
 from gsgan.splat.lens import as_pinhole_sees
 from gsgan.splat.project import project
 from gsgan.splat.settings import Accuracy, accuracy
@@ -194,22 +188,10 @@ def _rasterise(
 
 
 @_rasterise.register_fake
-def _shapes(
-    means: Tensor,
-    covariances: Tensor,
-    opacities: Tensor,
-    features: Tensor,
-    K: Tensor,
-    R: Tensor,
-    t: Tensor,
-    dist: Tensor | None,
-    height: int,
-    width: int,
-    settings: str,
-    backend: str,
-) -> tuple[Tensor, Tensor, Tensor]:
+def _shapes(*inputs: Any) -> tuple[Tensor, ...]:
+    features, (height, width, settings, _) = inputs[3], inputs[-4:]
     B, _, C = features.shape
     k = json.loads(settings)["supersample"]
     fine = (B, C, k * height, k * width) if k > 1 else (0,)
     sizes = ((B, C, height, width), (B, 1, height, width), fine)
-    return tuple(features.new_empty(size) for size in sizes)  # type: ignore[return-value]
+    return tuple(features.new_empty(size) for size in sizes)

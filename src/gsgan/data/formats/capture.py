@@ -39,7 +39,7 @@ from gsgan.data.layout import BodyModel, Found, Layout, Meta, dataset_folder
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import SKELETONS, Landmarks, Poses, make_landmarks, whole_frame_ids
 from gsgan.utils.arrays import expect_array
-from gsgan.utils.checks import is_number
+from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
 
 LANDMARKS = "landmarks3d.npz"
@@ -56,6 +56,10 @@ class CaptureReader:
 
     drop_frames: Any = None
     trust: Trust = LOOKED_AT
+    ignore_band: int = 0
+
+    def __post_init__(self) -> None:
+        whole("data.reader.ignore_band", self.ignore_band, 0)
 
     def __call__(self, root: str | Path, checks: Checks, smpl: str | None = None) -> Layout:
         """Reads and checks everything except most images' pixels.
@@ -109,7 +113,7 @@ def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -
         labels={c: frame_files(root, f"labels/{c}", MASKS) for c in cameras},
         landmarks=skeletons,
         poses=poses,
-        pixels=PixelRules(composed=conventions.composed),
+        pixels=PixelRules(composed=conventions.composed, unsure_band=reader.ignore_band),
         calibration=root / "cameras.json",
         unit_hint=(
             "check 'unit' in meta.json and that cameras.json and landmarks3d.npz use the same one"
