@@ -144,6 +144,7 @@ def place(capture, run, bare, model_file, tmp_path_factory) -> Callable[[str], s
     makers: dict[str, Callable[[], Path | str]] = {
         "gsgan.render run=<run folder>": lambda: f"gsgan.render run={bare}",
         "/path/to/dance.bvh": lambda: moving("dance.bvh"),
+        "/path/to/walk.bvh": lambda: moving("walk.bvh"),
         "/path/to/000000.png": rendered,
         "/path/to/run_wo_gcn": lambda: another_run("run_wo_gcn"),
         "/path/to/run_wo_seg": lambda: another_run("run_wo_seg"),

@@ -125,6 +125,18 @@ def test_a_motion_of_another_person(render, motion, tmp_path):
     assert verify(files[0]).source_type == SOURCE_TYPE
 
 
+def test_clips_become_one_motion(render, motion, landmarks, tmp_path):
+    other = tmp_path / "b.npz"
+    np.savez(other, p=0.9 * landmarks[::-1], fps=30)
+    result = render(f"motion=[{motion},{other}]", "transition=0.2", "out=frames", "pixels=32")
+    assert result.returncode == 0, result.stderr
+    assert "0.2 s from each to the next" in result.stdout
+    between = 5  # frames at 30 per second
+    assert len(list((tmp_path / "frames").glob("*.png"))) == 2 * len(landmarks) + between
+    refused(render("motion=[]", "out=none"), "names no file")
+    refused(render(f"motion=[{motion},gone.pose]", "out=none"), "gone.pose does not exist")
+
+
 def test_a_run_without_figure_or_dataset(render, bare, motion, tmp_path):
     """The dataset is not needed; for a checkpoint without proportions it is."""
     copy = shutil.copytree(bare, tmp_path / "copy")

@@ -9,7 +9,7 @@ from test_motion_readers import directions
 
 from gsgan.data.figure import BONES, FACE, HEELS_AND_TOES, HIPS, figure_of, length, middle, upright
 from gsgan.data.synthetic.retarget import rotation
-from gsgan.render.retarget import heading, on_figure, placed
+from gsgan.render.retarget import heading, joined, on_figure, placed
 from gsgan.skeleton import MEDIAPIPE33
 
 ALL = torch.ones(1, 33, dtype=torch.bool)
@@ -50,6 +50,24 @@ def test_another_person_keeps_directions_and_gets_the_lengths(landmarks, figure)
     assert np.linalg.norm(way) / np.linalg.norm(theirs[-1] - theirs[0]) == pytest.approx(
         1 / (1.2 * 0.7), rel=0.02
     )
+
+
+def test_joined_clips_keep_their_frames_their_speed_and_the_bones(figure):
+    step = np.array([0.01, 0, 0])
+    p = np.stack([figure.rest + i * step for i in range(4)])
+    q = p[::-1] + 50 * step
+    found = joined([p, q, p], figure, 7)
+    assert len(found) == 3 * 4 + 2 * 7
+    assert np.array_equal(found[:4], p)
+    assert np.array_equal(found[11:15], q)
+    steps = np.diff(found[2:13, 11, 0])
+    assert steps[0] == pytest.approx(0.01)
+    assert steps[-1] == pytest.approx(-0.01)
+    assert steps.max() > 0.08
+    assert np.abs(np.diff(steps)).max() < 0.04  # no jump
+    for a, b in BONES:
+        length = np.linalg.norm(found[:, a] - found[:, b], axis=1)
+        assert np.ptp(length) < 1e-6
 
 
 def test_the_standard_pose_stands_upright(figure):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -41,7 +42,7 @@ from gsgan.render.motion import (
     up_axis,
 )
 from gsgan.render.readers import Source, read_motion
-from gsgan.render.retarget import on_figure, placed
+from gsgan.render.retarget import joined, on_figure, placed
 from gsgan.scene import BodyPose, Camera, Frame, cat
 from gsgan.skeleton import sanitise
 from gsgan.utils.checks import above, one_of
@@ -194,11 +195,14 @@ def _given(config: DictConfig, run: Run, fps: float) -> Drive:
         frame = found.numbers[0]
         still = found.rows(np.zeros(1, np.int64))
         return replace(still, text=f"frame {frame} of {split}, held still", truth=None, camera=None)
+    if OmegaConf.is_list(config.motion):
+        clips = [_from_file(config, run, str(path), fps) for path in config.motion]
+        return _joined(clips, run.figure, float(above("transition", config.transition)), fps)
     if config.motion == REST:
         return rest_pose(run.figure)
     if config.motion in SPLITS:
         return _held_out(config, run, config.motion)
-    return _from_file(config, run, fps)
+    return _from_file(config, run, config.motion, fps)
 
 
 def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
@@ -234,18 +238,34 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
     )
 
 
-def _from_file(config: DictConfig, run: Run, fps: float) -> Drive:
+def _joined(clips: list[Drive], figure: Figure, seconds: float, fps: float) -> Drive:
+    """Clips one after the other, with transitions of ``seconds``."""
+    if not clips:
+        raise ConfigError("motion=[] names no file; expected motion=[a.pose,b.pose]")
+    standard = upright(figure.up)
+    between = max(1, round(seconds * fps) - 1)
+    p = joined([clip.p @ standard.T for clip in clips], figure, between) @ standard
+    visibility = [clips[0].visibility]
+    for a, b in pairwise(clips):
+        least = np.minimum(a.visibility[-1], b.visibility[0])
+        visibility += [np.repeat(least[None], between, axis=0), b.visibility]
+    text = "; ".join(clip.text for clip in clips) + f"; {seconds:g} s from each to the next"
+    return Drive(p, np.concatenate(visibility), None, list(range(len(p))), text)
+
+
+def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     figure = run.figure
     smpl, skeleton = config.smpl or run.body_file, config.skeleton
     files = (None if x is None else Path(x).expanduser() for x in (smpl, skeleton))
     source = Source(figure, *files)
-    motion = read_motion(Path(config.motion).expanduser(), source)
+    motion = read_motion(Path(path).expanduser(), source)
     motion = checked(motion, float(config.min_visibility))
     rate = config.motion_fps or motion.fps
     rate = float(above("motion_fps", rate)) if rate else FPS
     up = config.up or motion.up or up_axis(motion)
     choice = one_of("retarget", config.retarget, ("auto", True, False))
     own = is_own(motion, figure) if choice == "auto" else not choice
+    own = own and not OmegaConf.is_list(config.motion)  # transitions need every joint
     times = frame_times(len(motion), rate, fps)
     nearest = np.rint(times).astype(int)
     visibility, body = motion.visibility[nearest], None

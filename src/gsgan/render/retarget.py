@@ -5,9 +5,13 @@ Convention: standard axes (`gsgan.data.figure`), Z up, metres.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import pairwise
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.interpolate import CubicHermiteSpline
 
 from gsgan.data.figure import (
     BONES,
@@ -98,6 +102,21 @@ def rig_landmarks(standard: StandardMotion, figure: Figure) -> Float:
         face = rest[list(FACE)] - middle(rest, EARS)
         p[:, FACE] = ears[:, None] + face @ standard.turns["Head"].mT
     return p
+
+
+def joined(clips: Sequence[Float], figure: Figure, n: int) -> Float:
+    """Clips ``[F, 33, 3]`` of the subject, one after the other, with transitions of n frames.
+
+    A transition is a cubic that continues the joints' speeds at both ends, on the subject's bones.
+    """
+    parts = [clips[0]]
+    for a, b in pairwise(clips):
+        speeds = [x[-1] - x[-2] if len(x) > 1 else 0 * x[0] for x in (a, b[1::-1])]
+        path = CubicHermiteSpline(
+            [0, n + 1], np.stack([a[-1], b[0]]), np.stack([speeds[0], -speeds[1]])
+        )
+        parts += [on_figure(path(np.arange(1, n + 1)), figure), b]
+    return np.concatenate(parts)
 
 
 def heading(p: Float) -> float:
