@@ -76,3 +76,4 @@ def test_no_circles():
             found = {other.split(".")[1] for other in others if "." in other}
             packages.setdefault(package[0], set()).update(found - set(package))
     TopologicalSorter(packages).prepare()
+    assert "export" not in packages["view"]

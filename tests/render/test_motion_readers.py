@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from gsgan.body.shape import free_space, shaped_body
 from gsgan.body.smpl import read_smpl
 from gsgan.data.figure import BONES, figure_of, upright
 from gsgan.data.synthetic.retarget import rotation
@@ -58,6 +60,25 @@ def test_body_poses_of_the_free_body(tmp_path, dance, landmarks, figure):
         standard(path, figure)
 
 
+def test_body_poses_of_a_fitted_body(tmp_path, dance):
+    """gsgan.fit writes the person's shape beside the poses, in the capture's unit."""
+    shape = replace(free_space().neutral(), offsets=0.02 * torch.randn(33, 3))
+    shape.stretch[:2] = 1.3
+    np.savez(tmp_path / "body_shape.npz", **{name: x.numpy() for name, x in vars(shape).items()})
+    (tmp_path / "meta.json").write_text('{"unit": "cm", "fps": 50}')
+    path = tmp_path / "body_pose.npz"
+    np.savez(path, theta=dance.theta.numpy(), transl=100 * dance.transl.numpy())
+    posed = shaped_body(shape).posed_landmarks(dance).double()
+    own = figure_of(posed, torch.ones(posed.shape[:2], dtype=torch.bool), "z")
+    p, motion = standard(path, own)
+    np.testing.assert_allclose(p, posed, atol=1e-5)
+    assert motion.fps == 50
+    assert is_own(motion, own)
+    (tmp_path / "body_shape.npz").write_bytes(b"PK cut")
+    with pytest.raises(DataError, match=r"body_shape\.npz"):
+        standard(path, own)
+
+
 @pytest.mark.parametrize("kind", ["smpl", "smplx"])
 @pytest.mark.parametrize("numbers", [66, 72, 156, 165])
 def test_smpl_and_amass(tmp_path, shared, figure, kind, numbers):
@@ -82,7 +103,7 @@ def test_smpl_and_amass(tmp_path, shared, figure, kind, numbers):
     truth[0, list(at)] = joints[list(at.values())] @ upright(up_axis(motion)).T
     np.testing.assert_allclose(directions(p)[:1], directions(truth), atol=1e-6)
     np.savez(path, poses=poses[:, :50])
-    with pytest.raises(DataError, match="50 numbers a frame"):
+    with pytest.raises(DataError, match="50 numbers per frame"):
         standard(path, figure, smpl=model)
 
 
@@ -171,7 +192,7 @@ def test_pose_files_with_axes_of_unknown_scale(tmp_path, landmarks, figure):
     turned = directions(p @ (upright("-y") @ Y_DOWN))
     np.testing.assert_allclose(turned, directions(landmarks), atol=0.02)
     path.write_bytes(path.read_bytes()[:4000])
-    with pytest.raises(DataError, match=r"no whole \.pose file"):
+    with pytest.raises(DataError, match=r"not a valid \.pose file"):
         standard(path, figure)
     write(path, q[..., :2], "XYC", "pose_keypoints_2d")
     with pytest.raises(DataError, match="pose_keypoints_2d without depth"):
@@ -282,11 +303,11 @@ def test_amc(tmp_path, figure):
 @pytest.mark.parametrize(
     ("file", "damage", "message"),
     [
-        ("07_01.amc", lambda t: t[:-40], "no whole AMC motion .*gives"),
+        ("07_01.amc", lambda t: t[:-40], "not a complete AMC motion .*gives"),
         ("07_01.amc", lambda t: t.replace("lfemur", "tail"), "moves a bone tail"),
         ("07_01.amc", lambda t: "", "is empty"),
         ("07_01.amc", lambda t: t.replace("17", "nan"), "not finite"),
-        ("07.asf", lambda t: t[: len(t) // 2], "no whole ASF skeleton|no whole AMC"),
+        ("07.asf", lambda t: t[: len(t) // 2], "not a complete (ASF skeleton|AMC)"),
         ("07.asf", lambda t: t.replace("name lhand", "nome lhand"), "'name' is missing"),
     ],
 )
@@ -309,7 +330,7 @@ def test_an_amc_without_its_skeleton(tmp_path, figure):
 
 def test_other_files(tmp_path, figure):
     for name, content, message in (
-        ("a.fbx", b"x", r"no known format; expected one of \.npz"),
+        ("a.fbx", b"x", r"unknown format; expected one of \.npz"),
         ("a.npz", b"", "is empty"),
         ("b.npz", b"PK not a zip", r"b\.npz"),
     ):
@@ -319,10 +340,10 @@ def test_other_files(tmp_path, figure):
     with pytest.raises(DataError, match="does not exist; give a file, or novel_pose"):
         standard(tmp_path / "c.bvh", figure)
     np.savez(tmp_path / "d.npz", image=np.zeros(3))
-    with pytest.raises(DataError, match="no motion that is known"):
+    with pytest.raises(DataError, match="no known kind of motion"):
         standard(tmp_path / "d.npz", figure)
     np.savez(tmp_path / "e.npz", p=np.zeros((0, 33, 3)))
-    with pytest.raises(DataError, match="holds no frame"):
+    with pytest.raises(DataError, match="has no frames"):
         standard(tmp_path / "e.npz", figure)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -11,12 +12,15 @@ import numpy as np
 import pytest
 import torch
 from commands import refused
+from omegaconf import OmegaConf
 from PIL import Image
 
+from gsgan.body.shape import free_space
 from gsgan.data.measures import Measures
 from gsgan.evaluate.predictions import Preparation
 from gsgan.evaluate.scores import painter
-from gsgan.model.runs import CHECKPOINT, build_data, load, load_avatar, load_config
+from gsgan.model.runs import CHECKPOINT, CONFIG, build_data, load, load_avatar, load_config
+from gsgan.train.run import build_training
 from gsgan.utils.provenance import SOURCE_TYPE, verify
 
 
@@ -42,11 +46,34 @@ def render(inside, bare, tmp_path):
     return run
 
 
-def expected(run: Path, split: str, background: str) -> dict[tuple[str, int], np.ndarray]:
+@pytest.fixture
+def fitted(capture, tiny, tmp_path) -> Path:
+    """A run that has just begun, of an avatar on a body whose shape `gsgan.fit` wrote."""
+    root = shutil.copytree(capture, tmp_path / "fitted")
+    shape = replace(free_space().neutral(), offsets=0.02 * torch.ones(33, 3))
+    shape.stretch[2] = 1.2
+    np.savez(root / "body_shape.npz", **{name: x.numpy() for name, x in vars(shape).items()})
+    config = tiny(f"data.root={root}", "effects.body_points=on")
+    _, module = build_training(config)
+    with torch.no_grad():
+        for parameter in module.avatar.splats.parameters():
+            parameter.add_(0.02 * torch.randn_like(parameter))
+    checkpoint = {"state_dict": module.state_dict()}
+    module.on_save_checkpoint(checkpoint)
+    for name in (CHECKPOINT, CONFIG):
+        (tmp_path / "run" / name).parent.mkdir(parents=True)
+    torch.save(checkpoint, tmp_path / "run" / CHECKPOINT)
+    OmegaConf.save(config, tmp_path / "run" / CONFIG)
+    return tmp_path / "run"
+
+
+def expected(
+    run: Path, split: str, background: str, solve: bool
+) -> dict[tuple[str, int], np.ndarray]:
     """What evaluation scores, as bytes, by camera and frame."""
     config = load_config(run)
     data = build_data(config)
-    predict = painter(load_avatar(run, config, data)[0])
+    predict = painter(load_avatar(run, config, data)[0], solve=solve)
     prepare = Preparation(Measures(background=background), None)
     found = {}
     dataset = data.dataset(split)
@@ -57,26 +84,33 @@ def expected(run: Path, split: str, background: str) -> dict[tuple[str, int], np
 
 
 @pytest.mark.parametrize(
-    ("name", "background", "split"),
+    ("name", "background", "split", "drive"),
     [
-        ("bare", "black", "novel_pose"),
-        ("bare", "white", "novel_view"),
-        ("run", "white", "novel_pose"),
+        ("bare", "black", "novel_pose", "null"),
+        ("bare", "white", "novel_view", "skeleton"),
+        ("run", "white", "novel_pose", "null"),
+        ("run", "white", "novel_pose", "skeleton"),
+        ("fitted", "black", "novel_pose", "skeleton"),
     ],
 )
-def test_held_out_frames_are_the_scored_images(inside, tmp_path, request, name, background, split):
-    """Byte for byte."""
+def test_held_out_frames_are_the_scored_images(
+    inside, tmp_path, request, name, background, split, drive
+):
+    """Byte for byte, also of an avatar on a body that skeletons alone drive."""
     folder = request.getfixturevalue(name)
-    scored = expected(folder, split, background)
+    scored = expected(folder, split, background, drive == "skeleton")
     for camera in dict.fromkeys(camera for camera, _ in scored):
         out = tmp_path / camera
         given = (f"run={folder}", f"motion={split}", f"camera={camera}", f"out={out}")
-        result = inside("render", *given, f"background={background}")
+        result = inside("render", *given, f"background={background}", f"drive={drive}")
         assert result.returncode == 0, result.stderr
         frames = {frame for c, frame in scored if c == camera}
         assert {p.name for p in out.glob("*.png")} == {f"{frame:06d}.png" for frame in frames}
         for frame in frames:
             np.testing.assert_array_equal(read(out / f"{frame:06d}.png"), scored[camera, frame])
+    if name == "fitted":  # the data's poses give other images
+        given = expected(folder, split, background, solve=False)
+        assert all((given[item] != scored[item]).any() for item in scored)
 
 
 def test_a_motion_of_another_person(render, motion, tmp_path):
@@ -185,7 +219,7 @@ def test_a_killed_render_goes_on(render, motion, tmp_path, monkeypatch):
     stop = -1
     result = render(*given)
     assert result.returncode == 0, result.stderr
-    assert "5 of 12 frames are there already" in result.stdout
+    assert "5 of 12 frames are already rendered" in result.stdout
     assert len(painted) == 12
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert len(list(container.decode(video=0))) == 12
@@ -220,7 +254,7 @@ def test_backgrounds(render, tmp_path):
     assert clear[0, 0, 3] == 0
     np.testing.assert_allclose(clear[..., :3] * clear[..., 3:] / 255, black, atol=1.5)
     refused(render("background=alpha", "out=a.mp4"), "needs PNG files")
-    refused(render("background=nocolour", "out=a"), "is no colour and no file")
+    refused(render("background=nocolour", "out=a"), "is neither a colour nor a file")
 
 
 def test_cameras(render, bare, capture, motion, tmp_path):
@@ -241,7 +275,11 @@ def test_cameras(render, bare, capture, motion, tmp_path):
     path.write_text(json.dumps(calibration))
     assert render(f"motion={motion}", f"camera={path}", "out=c", "frames=3").returncode == 0
     refused(render(f"motion={motion}", f"camera={path}", "out=d"), "3 cameras; expected 1, or 12")
-    refused(render(f"motion={motion}", "camera=cam77", "out=d"), "no camera", "cam00, cam01, cam02")
+    refused(
+        render(f"motion={motion}", "camera=cam77", "out=d"),
+        "neither a camera",
+        "cam00, cam01, cam02",
+    )
 
 
 def test_a_camera_inside_the_person(render, motion, tmp_path):
@@ -264,6 +302,7 @@ def test_a_camera_inside_the_person(render, motion, tmp_path):
         (("out=a", "orbit.elevation=90"), "orbit.elevation must be"),
         (("out=a", "c2pa.key=k.pem"), "go together"),
         (("out=a", "retarget=maybe"), "retarget must be one of auto"),
+        (("out=a", "drive=body"), "drive must be one of None, skeleton"),
     ],
 )
 def test_one_clear_sentence(render, tmp_path, motion, args, message):
@@ -287,7 +326,7 @@ def test_other_folders_are_not_touched(render, motion, tmp_path):
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "000000.png").write_text("mine")
     for more in ((), ("overwrite=true",)):
-        refused(render(f"motion={motion}", "out=mine", *more), "no folder of a render")
+        refused(render(f"motion={motion}", "out=mine", *more), "holds no render")
     assert (tmp_path / "mine" / "000000.png").read_text() == "mine"
 
 

@@ -13,7 +13,7 @@ from gsgan.skeleton import (
     MEDIAPIPE33,
     Densify,
     bone_frames,
-    completed,
+    complete_skeleton,
     draw_skeleton,
     limb_length_sum,
     named_template,
@@ -144,16 +144,16 @@ def test_a_missing_hand_follows_the_forearm_and_has_the_subjects_size() -> None:
 
 def test_skeletons_without_hands_drive_a_template_that_has_some_and_the_reverse() -> None:
     p = noisy(4).float()
-    q, seen = completed(p[0, :33], None, T, T.limb_length_sum)
+    q, seen = complete_skeleton(p[0, :33], None, T, T.limb_length_sum)
     assert q.shape == (1, 75, 3)
     assert q.isfinite().all()
     assert seen[0].tolist() == [1.0] * 33 + [0.0] * 42
     weights = torch.linspace(0.1, 1, 75)
-    q, seen = completed(p, weights, MEDIAPIPE33, T.limb_length_sum)
+    q, seen = complete_skeleton(p, weights, MEDIAPIPE33, T.limb_length_sum)
     assert torch.equal(q, p[:, :33])
     assert torch.equal(seen[0], weights[:33])
     with pytest.raises(ValueError, match=r"\[B, 75, 3\].*\[1, 60, 3\]"):
-        completed(p[:, :60], None, T, T.limb_length_sum)
+        complete_skeleton(p[:, :60], None, T, T.limb_length_sum)
 
 
 def test_points_lie_on_thin_cylinders_along_the_fingers() -> None:

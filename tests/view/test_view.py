@@ -21,14 +21,20 @@ SOFTWARE = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftsha
 PATIENCE = 60.0  # seconds
 
 
-@pytest.fixture(scope="module")
-def viewer(bare, compose):
+@contextlib.contextmanager
+def served(compose, run):
     from gsgan.view.server import Viewer
 
-    given = (f"run={bare}", "port=0", "device=cpu", "max_upload=1", "background=white")
+    given = (f"run={run}", "port=0", "device=cpu", "max_upload=1", "background=white")
     made = Viewer(compose("view", *given))
     yield made
     made.stop()
+
+
+@pytest.fixture(scope="module")
+def viewer(bare, compose):
+    with served(compose, bare) as made:
+        yield made
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +50,7 @@ def open_page(viewer, chromium):
     """``open_page()``: a page and its session, once an image is there; no errors may follow."""
     problems, pages = [], []
 
-    def run():
+    def run(viewer=viewer):
         known = set(viewer.sessions)
         page = chromium.new_page(viewport={"width": 800, "height": 500})
         pages.append(page)
@@ -148,6 +154,23 @@ def test_layers_and_3d(open_page):
     page.get_by_label("skeleton").check()
     page.get_by_label("Gaussians").check()
     until(lambda: len(session._nodes) == 2, page)
+    assert not session.mesh.visible  # this avatar has no body
+
+
+def test_the_body_lies_on_the_skeleton(open_page, run, compose):
+    with served(compose, run) as viewer:
+        page, session = open_page(viewer)
+        assert not session.mesh.value
+        page.get_by_label("body", exact=True).check()
+        until(lambda: session._nodes, page)
+        (mesh,) = session._nodes
+        pose = session.drive.body[:1]
+        vertices = viewer.show.body.posed_vertices(pose)[0]
+        np.testing.assert_allclose(mesh.vertices, vertices, atol=1e-5)
+        session.drag("left wrist", session.joints()[15] + 0.2)  # the pose is now solved
+        until(lambda: session._nodes and session._nodes[0] is not mesh, page)
+        assert np.abs(session._nodes[0].vertices - vertices.numpy()).max() > 0.05
+        page.close()
 
 
 def test_play_moves_on_and_two_browsers_are_apart(open_page):
@@ -209,11 +232,11 @@ def test_another_machines_address_is_refused(bare, inside):
     refused(inside("view", f"run={bare}", "motion=none.bvh"), "none.bvh", "does not exist")
 
 
-def test_a_pose_that_cannot_be_painted_is_told(open_page):
+def test_a_pose_that_cannot_be_rendered_is_told(open_page):
     page, session = open_page()
     kept = session.drive
     session.drive = replace(kept, p=np.full_like(kept.p, np.nan))
     session.touch()
-    page.get_by_text("This pose cannot be painted").wait_for()
+    page.get_by_text("This pose cannot be rendered").wait_for()
     session.drive = kept
     assert changed(session, page, lambda: session._scrub(1))

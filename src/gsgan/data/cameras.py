@@ -8,8 +8,11 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from gsgan.data.crop import Crop
+from gsgan.scene import Camera
 from gsgan.utils.arrays import as_floats
 from gsgan.utils.errors import DataError
 
@@ -47,6 +50,24 @@ class CameraEntry:
     def distorted(self) -> bool:
         """Whether any distortion coefficient is not zero."""
         return bool(np.any(self.dist != 0))
+
+    @property
+    def keeps_lens(self) -> bool:
+        """Whether `Camera` can hold its distortion: five coefficients at most."""
+        return self.distorted and not self.dist[5:].any()
+
+    def seen(self, window: Crop, size: tuple[int, int] | None, *, lens: bool) -> Camera:
+        """The camera of a window of the image.
+
+        Args:
+            window: may reach beyond the image.
+            size: ``(H, W)`` that the window is scaled to; None leaves it as it is.
+            lens: keep the distortion where `keeps_lens`; otherwise the camera is a pinhole.
+        """
+        K, R, t = (torch.from_numpy(x)[None] for x in (self.K, self.R, self.t))
+        dist = torch.from_numpy(self.dist[None, :5]) if lens and self.keeps_lens else None
+        camera = Camera(K, R, t, self.size, dist).crop(window.top, window.left, window.size)
+        return (camera if size is None else camera.resize(size)).to(torch.float32)
 
     def stored_pixels(self, points: Float) -> Float:
         """``[N, 2]`` world points ``[N, 3]`` in the stored, distorted image.

@@ -170,22 +170,13 @@ class CaptureDataset(Dataset[Frame]):
 
     def camera(self, item: Item) -> Camera:
         """The camera of the item's image: window and scale are in its K."""
-        return self.camera_of(item[0], self.window(item))
-
-    def camera_of(self, name: str, window: Crop) -> Camera:
-        """A camera of the capture that sees a window of its image, at the dataset's size."""
-        entry = self.layout.cameras[name]
-        K, R, t = (torch.from_numpy(a)[None] for a in (entry.K, entry.R, entry.t))
-        lens = torch.from_numpy(entry.dist[None, :5]) if self._raw(entry) else None
-        camera = Camera(K, R, t, entry.size, lens)
-        camera = camera.crop(window.top, window.left, window.size)
-        if self.size is not None:
-            camera = camera.resize((self.size, self.size))
-        return camera.to(torch.float32)
+        size = None if self.size is None else (self.size, self.size)
+        entry = self.layout.cameras[item[0]]
+        return entry.seen(self.window(item), size, lens=self.lens == "raw")
 
     def _raw(self, camera: CameraEntry) -> bool:
         """Whether the camera's images keep their distortion, with ``camera.dist`` set."""
-        return self.lens == "raw" and camera.distorted and not camera.dist[5:].any()
+        return self.lens == "raw" and camera.keeps_lens
 
     def _mapping(self, camera: CameraEntry, window: Crop) -> NDArray[np.float32] | None:
         """Where the window's pixels lie in the stored image; None for a pinhole."""

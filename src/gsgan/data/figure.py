@@ -1,4 +1,4 @@
-"""The subject's proportions, as a skeleton in a standard pose: what motions of others are put on.
+"""The subject's proportions, as a skeleton in a standard pose: the target of retargeting.
 
 Convention: metres; standard axes have Z up. The standard pose is an upright T: it faces -Y, the
 person's left is +X, palms down, legs straight down, the middle of the hips at the origin.

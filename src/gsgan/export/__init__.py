@@ -1,1 +1,1 @@
-"""``gsgan.export``: an avatar in the formats of other programs."""
+"""``gsgan.export``: write an avatar in the formats of other programs."""

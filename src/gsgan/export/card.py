@@ -1,4 +1,4 @@
-"""The model card that lies beside an exported file."""
+"""The model card written beside an exported file."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import yaml
 
 from gsgan import __version__
 from gsgan.effects.table import rows
-from gsgan.render.run import Run
+from gsgan.render.poses import Run
 from gsgan.utils.pages import markdown
 
 HOLDS = {
@@ -29,11 +29,11 @@ SCORES = {"psnr": "PSNR ↑", "ssim": "SSIM ↑", "lpips": "LPIPS ↓", "edge_f1
 VARIANTS = {"full": "final image", "splat": "Step I's colour"}
 USE = """\
 Images of this one person in new poses and from new cameras, with the person's consent: sign
-language, research, telepresence, film. What it paints is synthetic: say so where it is shown
-(`gsgan.render` writes that into the files' metadata).
+language, research, telepresence, film. Its images are synthetic: say so where they are shown
+(`gsgan.render` writes it into the files' metadata).
 
-Not for deceiving anyone about what the person did or said, and not for identifying people. Poses
-and cameras far from the training data give worse images than the scores say."""
+Not intended for deceiving anyone about what the person did or said, or for identifying people.
+Poses and cameras far from the training data give worse images than the scores suggest."""
 
 
 def card(run: Run, kind: str, name: str, licence: str | None) -> str:
@@ -41,9 +41,9 @@ def card(run: Run, kind: str, name: str, licence: str | None) -> str:
 
     Args:
         run: the avatar's.
-        kind: of the export, a key of `HOLDS`.
+        kind: a key of `HOLDS`.
         name: of the exported file or folder.
-        licence: of the weights, or None where the user gives none.
+        licence: of the weights, or None if the user gave none.
     """
     facts = _read(run.folder / "facts.json")
     data = facts.get("data", {})
@@ -79,8 +79,8 @@ def _licence(data: str | None) -> str:
     owner = (
         "The default person is a character under the MIT licence; weights trained on it are too."
         if data == "synthetic"
-        else "The weights show a person: what may be done with them is for that person and the "
-        "owner of the training images to say. State it with licence=."
+        else "The weights show a person: that person and the owner of the training images decide "
+        "what may be done with them. State it with licence=."
     )
     return f"gsgan itself is under Apache-2.0. {owner}"
 

@@ -1,4 +1,4 @@
-"""The avatar's networks as programs of other runtimes: ONNX and ``torch.export``."""
+"""The avatar's networks as programs for other runtimes: ONNX and ``torch.export``."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from gsgan.model.avatar import Avatar
 from gsgan.scene import BodyPose, Camera
 from gsgan.utils.errors import ConfigError
 
-LARGEST = 8192  # pixels a side that an ONNX program takes
+LARGEST = 8192  # largest side of an ONNX program's images, pixels
 
 
 def unfrozen(avatar: Avatar) -> Avatar:
-    """A copy that computes from its weights alone, not from what `Avatar.freeze` kept."""
+    """A copy without the values that `Avatar.freeze` caches: it computes from its weights alone."""
     bare = copy.deepcopy(avatar).cpu()
     for part in bare.modules():
         vars(part).pop("derived", None)
@@ -29,7 +29,7 @@ def unfrozen(avatar: Avatar) -> Avatar:
 
 
 class Whole(nn.Module):
-    """Skeleton and camera in, the whole image out: no window, whose size depends on the pose.
+    """Skeleton and camera in, the whole image out; a window's size would depend on the pose.
 
     Args:
         avatar: unfrozen.
@@ -88,7 +88,7 @@ def torch_program(avatar: Avatar, size: tuple[int, int]) -> bytes:
 
 @dataclass(frozen=True)
 class Inputs:
-    """The inputs of a `Painter` by name, with examples of one size; those that it takes."""
+    """Example inputs of a `Painter`: those that its avatar needs."""
 
     by_name: dict[str, Tensor]
     times: dict[str, int]  # of images: pixels per pixel of the output
@@ -187,7 +187,7 @@ def onnx_program(avatar: Avatar) -> bytes:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Without the exporter's warnings about its own parts."""
+    """Suppresses the exporter's warnings about its own internals."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield

@@ -1,18 +1,18 @@
-"""Writes what an export config asks for."""
+"""Writes the export that a config describes."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import cast
 
 import torch
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.progress import track
 
 from gsgan.export.card import card
-from gsgan.export.motion import drive_of, inputs_of, rest_pose
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
-from gsgan.render.run import Drive, Run
+from gsgan.render.poses import REST, Drive, Run, drive_of, inputs_of
 from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
@@ -27,15 +27,14 @@ ENDINGS = {
     "safetensors": ".safetensors",
 }
 CARD = "MODEL_CARD.md"
-REST = "rest"
 
 
 def export_config(config: DictConfig) -> None:
-    """Writes what a config asks for, and a model card beside it.
+    """Writes the export that a config describes, and a model card beside it.
 
     Raises:
-        ConfigError: on a value that cannot be used, or a place that is taken.
-        DataError: when the run, the motion or the file to verify cannot be used.
+        ConfigError: when an option has an invalid value, or the output exists.
+        DataError: when the run, the motion or the file to verify cannot be read.
     """
     console = make_console()
 
@@ -54,7 +53,7 @@ def export_config(config: DictConfig) -> None:
     sequence = not out.suffix
     with open_dict(config):
         config.device = "cpu"
-    run = Run(config)
+    run = Run.load(config)
     if kind in ("ply", "gltf"):
         drive = _poses(config, run, kind)
         tell(drive.text)
@@ -87,9 +86,9 @@ def _place(config: DictConfig, kind: str) -> Path:
 
 
 def _poses(config: DictConfig, run: Run, kind: str) -> Drive:
-    """The frames to export: of glTF the rest pose, of .ply a held-out one where none is given."""
-    if (config.motion or (REST if kind == "gltf" else None)) == REST:
-        return rest_pose(run.figure)
+    """The frames to export; by default the rest pose for glTF, a held-out one for .ply."""
+    if config.motion is None and kind == "gltf":
+        config = cast(DictConfig, OmegaConf.merge(config, {"motion": REST}))
     drive = drive_of(config, run, float(above("fps", config.fps)))
     start = whole("start", config.start, 0)
     if start >= len(drive.p):
@@ -100,7 +99,8 @@ def _poses(config: DictConfig, run: Run, kind: str) -> Drive:
 
 @torch.no_grad()
 def _splats(run: Run, drive: Drive, i: int) -> Splats:
-    return splats_of(run.avatar, *inputs_of(run.avatar, drive, i))
+    p, visibility, body = inputs_of(run.avatar, drive, i)
+    return splats_of(run.avatar, p, visibility > 0, body)
 
 
 def _program(config: DictConfig, run: Run, kind: str) -> bytes:

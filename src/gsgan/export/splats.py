@@ -1,4 +1,4 @@
-"""The Gaussians of a pose as other programs have them: scales, quaternions, harmonics in world
+"""The Gaussians of a pose as other programs expect them: scales, quaternions, harmonics in world
 axes; written as .ply (3D Gaussian splatting) and as glTF (KHR_gaussian_splatting)."""
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ Float = NDArray[np.float32]
 
 DIRECTIONS = 64  # over which harmonics are fitted; 16 would do for rotations
 THINNEST = 1e-7  # metres: covariances are rounded to float32, and eigenvalues may be below 0
-FAINTEST = 1e-30  # opacity of what is not drawn: its logit is finite
+FAINTEST = 1e-30  # opacity of Gaussians that are not drawn, for a finite logit
 EXTENSION = "KHR_gaussian_splatting"
 GENERATOR = f"gsgan {__version__}"
 FLOAT, POINTS, ARRAY_BUFFER = 5126, 0, 34962  # glTF's numbers
@@ -54,17 +54,17 @@ class Splats:
 
 
 def splats_of(avatar: Avatar, p: Tensor, valid: Tensor, body: BodyPose | None) -> Splats:
-    """Ĝ of a pose: Step I's Gaussians, whose colours are Step I's image.
+    """Ĝ of a pose: Step I's Gaussians, in Step I's colours.
 
     Convention: Ψ's harmonics turn with the body part. Here they are in world axes, so that other
     programs see the same colours: exact for densify's frames, which are rotations. Frames of a
     skinned body shear; their harmonics are the least-squares fit over all directions.
 
     Args:
-        avatar: that splats.
+        avatar: with Gaussians.
         p: ``[1, 33, 3]`` metres, finite.
         valid: ``[1, 33]``.
-        body: the pose of the skinned body, where the avatar needs it.
+        body: the pose of the skinned body, if the avatar needs it.
 
     Raises:
         ConfigError: when the avatar has no Gaussians (``image_to_image``).
@@ -96,11 +96,7 @@ def _posed(
     if psi is None:
         raise ConfigError("this avatar has no Gaussians (model=image_to_image) to export")
     frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
-    if avatar.body_points is not None:
-        points = avatar.body_points(body)
-    else:
-        assert avatar.densify is not None
-        points = avatar.densify(p, valid, frames)
+    points = avatar.points(p, valid, frames, body)
     root = root_of(p)
     residuals = psi.residuals(points, psi.pose_code(p, root, frames.hubs[:, 0], None), root)
     return psi.compose(points, residuals, eye), residuals.sh, points.frames

@@ -23,9 +23,10 @@ from gsgan.skeleton import (
     MEDIAPIPE33,
     BoneFrames,
     Densify,
+    Points,
     SkeletonTemplate,
     bone_frames,
-    completed,
+    complete_skeleton,
     draw_skeleton,
     omega,
     root_of,
@@ -190,7 +191,7 @@ class Avatar(nn.Module):
         """
         device = next(self.parameters()).device
         height = self.limb_length_sum
-        p, seen = completed(skeleton.to(device), visibility, self.template, height)
+        p, seen = complete_skeleton(skeleton.to(device), visibility, self.template, height)
         if len(camera) not in (1, len(p)):
             raise ValueError(f"render: expected 1 or {len(p)} cameras, got {len(camera)}")
         cameras = camera if len(camera) == len(p) else cat([camera] * len(p))
@@ -300,16 +301,19 @@ class Avatar(nn.Module):
                 return self.surface(_given(body), camera.centre)
         if self.deformation is None:
             return None
-        with self.stage("densify"):
-            if self.body_points is not None:  # on the body's surface, where that effect is on
-                points = self.body_points(_given(body))
-            else:
-                assert self.densify is not None
-                points = self.densify(p, valid, frames)  # Alg. 1
+        points = self.points(p, valid, frames, body)
         with self.stage("Ψ"):
             return self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
                 p, points, camera.centre, frames.hubs[:, 0], pose_noise
             )
+
+    def points(self, p: Tensor, valid: Tensor, frames: BoneFrames, body: BodyPose | None) -> Points:
+        """G: Alg. 1's points, or points on the body's surface where that effect is on."""
+        with self.stage("densify"):
+            if self.body_points is not None:
+                return self.body_points(_given(body))
+            assert self.densify is not None
+            return self.densify(p, valid, frames)
 
     def bounded(self, gaussians: Gaussians) -> Gaussians:
         """Features clamped to what the generator takes: their blends are then in that range too."""

@@ -28,7 +28,7 @@ CHECKPOINT = Path("checkpoints") / "last.ckpt"
 CONFIG = Path(".hydra") / "config.yaml"
 # Keys that may differ between a run and its continuation: they do not change what it learns.
 FREE_KEYS = (
-    *("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips", "cpu_hours"),
+    *("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips", "cpu_hours", "viewer"),
     *("data.root", "data.smpl", "data.workers", "data.cache_mb", "data.val_pictures"),
     *("data.source.workers", "training.max_skipped", "training.skip_window", "model.backend"),
 )
@@ -101,7 +101,7 @@ def load_config(folder: Path, moved: Moved | None = None) -> DictConfig:
     for key, what in (("root", "dataset"), ("smpl", "body model file")):
         now = getattr(moved, key)
         stored = OmegaConf.select(config, f"data.{key}")
-        place = _from_start(folder, stored) if now is None else now
+        place = from_start(folder, stored) if now is None else now
         if place is None:
             continue
         if not Path(place).expanduser().exists():
@@ -112,7 +112,7 @@ def load_config(folder: Path, moved: Moved | None = None) -> DictConfig:
     return config
 
 
-def _from_start(folder: Path, place: str | None) -> str | None:
+def from_start(folder: Path, place: str | None) -> str | None:
     """A path of a run's config; a relative one counts from where the run was started."""
     if place is None or Path(place).expanduser().is_absolute():
         return place
@@ -220,7 +220,7 @@ def avatar_of(
         smpl: as for `load`.
     """
     scene = scene_of(checkpoint["gsgan"]["scene"])
-    file = _from_start(folder, scene.body_file) if smpl is None else str(smpl)
+    file = from_start(folder, scene.body_file) if smpl is None else str(smpl)
     return _trained(folder, config, checkpoint, replace(scene, body_file=file))
 
 

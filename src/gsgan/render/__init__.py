@@ -1,1 +1,1 @@
-"""``gsgan.render``: motions of other people, cameras, frames and videos."""
+"""``gsgan.render``: drive an avatar with a motion, into images or a video."""

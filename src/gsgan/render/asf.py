@@ -19,14 +19,14 @@ from gsgan.utils.errors import DataError
 
 INCH = 0.0254
 ROOT = "root"
-FPS = 120.0  # of CMU's clips; the format has no place for it
+FPS = 120.0  # of CMU's clips; the format does not store it
 
 
 def asf_of(amc: Path) -> Path:
-    """The skeleton that belongs to a motion: ``01.asf`` beside ``01_14.amc``.
+    """The skeleton file of a motion: ``01.asf`` beside ``01_14.amc``.
 
     Raises:
-        DataError: when there is none, or more than one could be meant.
+        DataError: when there is none, or more than one candidate.
     """
     stems = {amc.stem, amc.stem.split("_")[0]}
     found = sorted(p for p in amc.parent.glob("*.asf"))
@@ -48,12 +48,12 @@ def read_amc(amc: Path, asf: Path) -> tuple[Bvh, float]:
     try:
         bones, parents, scale, radians = _skeleton(asf)
     except (ValueError, KeyError, IndexError) as error:
-        raise DataError(f"{asf} is no whole ASF skeleton ({_reason(error)})") from error
+        raise DataError(f"{asf} is not a complete ASF skeleton ({_reason(error)})") from error
     try:
         return _motion(amc, bones, parents, radians), scale
     except (ValueError, KeyError, IndexError) as error:
         raise DataError(
-            f"{amc} is no whole AMC motion of the skeleton {asf.name} ({_reason(error)})"
+            f"{amc} is not a complete AMC motion of the skeleton {asf.name} ({_reason(error)})"
         ) from error
 
 
@@ -127,7 +127,7 @@ def _motion(path: Path, bones: dict[str, _Bone], parents: dict[str, str], radian
     while len(names) < len(bones):
         more = [n for n, parent in parents.items() if parent in names and n not in names]
         if not more:
-            raise ValueError("its hierarchy has bones that do not hang on the root")
+            raise ValueError("its hierarchy has bones that are not connected to the root")
         names += more
     frames: list[dict[str, list[float]]] = []
     for words in _lines(path):
@@ -146,7 +146,7 @@ def _motion(path: Path, bones: dict[str, _Bone], parents: dict[str, str], radian
                     f"numbers for {name}"
                 )
     if not frames:
-        raise ValueError("it holds no frame")
+        raise ValueError("it has no frames")
     values = {name: np.array([frame[name] for frame in frames]) for name in moving}
     if not all(np.isfinite(v).all() for v in values.values()):
         raise ValueError("a number is not finite")

@@ -1,4 +1,4 @@
-"""Cameras of a render: round the person, of the capture, or from a calibration file."""
+"""Cameras to render with: an orbit, a camera of the capture, or those of a calibration file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-FLESH = 0.1  # metres round a bone: a camera nearer than this is inside the person
+FLESH = 0.1  # metres: a camera nearer to a bone than this is inside the person
 SEGMENTS = np.array([*MEDIAPIPE33.edges, (11, 24), (12, 23)])  # bones and the trunk's diagonals
 
 
@@ -49,12 +49,12 @@ class Orbit:
     def cameras(
         self, p: Float, figure: Figure, scene: SceneInfo, size: int, trained: int
     ) -> Camera:
-        """One camera for each skeleton ``[F, 33, 3]``, round the middle of them all.
+        """One camera per skeleton ``[F, 33, 3]``, on a circle round the centre of the motion.
 
         Args:
             p: metres, world frame.
             figure: of the subject.
-            scene: gives the size of the person in training images.
+            scene: sets the person's size, that of training images.
             size: pixels of the square images.
             trained: pixels of the training images.
         """
@@ -87,40 +87,36 @@ class Orbit:
 def of_entry(
     entry: CameraEntry, p: Float, size: int, crop: PersonCrop | None, lens: bool
 ) -> Camera:
-    """A calibrated camera with square images; where training cropped, round the whole motion.
+    """A calibrated camera with square images, cropped to the whole motion if training cropped.
 
     Args:
         entry: the camera.
         p: ``[F, 33, 3]`` metres, world frame.
         size: pixels.
         crop: of the training images, or None.
-        lens: keep its distortion (five coefficients at most).
+        lens: keep its distortion, see `CameraEntry.seen`.
     """
     window = square_window(entry.size)
     if crop is not None:
         joints = p.reshape(-1, 3)
         known: NDArray[np.bool_] = np.asarray(np.isfinite(joints).all(-1))
         window = crop.window(entry, joints, known)
-    K, R, t = (torch.from_numpy(x)[None] for x in (entry.K, entry.R, entry.t))
-    keep = lens and entry.distorted and not entry.dist[5:].any()
-    dist = torch.from_numpy(entry.dist[None, :5]) if keep else None
-    camera = Camera(K, R, t, entry.size, dist).crop(window.top, window.left, window.size)
-    return camera.resize((size, size)).to(torch.float32)
+    return entry.seen(window, (size, size), lens=lens)
 
 
 def from_file(path: Path, p: Float, size: int) -> Camera:
-    """The camera of a calibration file, or its cameras, one for each skeleton ``[F, 33, 3]``.
+    """The camera of a calibration file, or its cameras, one per skeleton ``[F, 33, 3]``.
 
     Raises:
-        DataError: when it cannot be read, or holds another number of cameras.
+        DataError: when it cannot be read, or the number of cameras is neither 1 nor F.
     """
     found = list(read_calibration(path).cameras.values())
     if len(found) not in (1, len(p)):
         raise DataError(
-            f"{path} holds {len(found)} cameras; expected 1, or {len(p)}, one for each frame"
+            f"{path} holds {len(found)} cameras; expected 1, or {len(p)}, one per frame"
         )
     if any(0 in entry.size for entry in found):
-        raise DataError(f"{path} gives no image size; expected one for every camera")
+        raise DataError(f"{path} lacks an image size; every camera needs one")
     return cat([of_entry(entry, p, size, None, lens=True) for entry in found])
 
 
@@ -128,12 +124,12 @@ def of_capture(entries: Mapping[str, CameraEntry], name: str) -> CameraEntry:
     """A camera of the run's data by name.
 
     Raises:
-        ConfigError: listing the names, when there is none of this one.
+        ConfigError: listing the names, when there is no such camera.
     """
     if name not in entries:
         raise ConfigError(
-            f"camera={name} is no camera of the run's data and no file; there are orbit and "
-            f"{', '.join(entries)}"
+            f"camera={name} is neither a camera of the run's data nor a file; choose orbit or one "
+            f"of {', '.join(entries)}"
         )
     return entries[name]
 
@@ -142,9 +138,9 @@ def refuse_inside(cameras: Camera, p: Float, names: Sequence[int]) -> None:
     """Refuses cameras inside the person.
 
     Args:
-        cameras: one, or one for each skeleton.
+        cameras: one, or one per skeleton.
         p: ``[F, 33, 3]`` metres, world frame; NaN where unknown.
-        names: numbers of the frames, for the message.
+        names: frame numbers, for the message.
 
     Raises:
         ConfigError: naming the first frame and the nearest bone.

@@ -17,10 +17,10 @@ Background = Tensor | None
 
 
 def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background]:
-    """The background ``[3, H, W]`` by image size; None keeps alpha.
+    """A function that gives the background ``[3, H, W]`` of an image size, or None to keep alpha.
 
     Raises:
-        ConfigError: when it is no colour and no image, or a video should have alpha.
+        ConfigError: when it is neither a colour nor an image, or is alpha in a video.
     """
     if name == "alpha":
         if video:
@@ -38,7 +38,7 @@ def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background
         colour = torch.tensor(ImageColor.getrgb(name)[:3]).float() / 255
     except ValueError:
         raise ConfigError(
-            f"background={name} is no colour and no file; give black, white, a colour's name, "
+            f"background={name} is neither a colour nor a file; give black, white, a colour name, "
             "#rrggbb, an image file, or alpha"
         ) from None
     return lambda size: colour[:, None, None].expand(3, *size)
@@ -49,11 +49,12 @@ def _unit(image: NDArray[np.uint8]) -> Tensor:
 
 
 def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> NDArray[np.uint8]:
-    """``[H, W, 3]`` an image ``[3, H, W]`` on black put on a background; without one, with alpha
-    ``[H, W, 4]``, not premultiplied."""
+    """An image ``[3, H, W]`` on black, composited over a background: ``[H, W, 3]``; without a
+    background, with straight alpha: ``[H, W, 4]``."""
     image, alpha = image.clamp(0, 1), alpha.clamp(0, 1)
     if behind is None:
-        straight = torch.where(alpha > 0, image / alpha.clamp_min(1e-6), image).clamp(0, 1)
+        shown = alpha >= 0.5 / 255  # elsewhere 8-bit alpha is 0, and colours would be noise
+        straight = torch.where(shown, image / alpha.clamp_min(1e-6), 0.0).clamp(0, 1)
         image = torch.cat([straight, alpha])
     else:
         image = (image + (1 - alpha) * behind).clamp(0, 1)

@@ -1,4 +1,4 @@
-"""Motions: what every reader returns, and what is done to all of them.
+"""Motions: what every reader returns, and the steps that follow for all formats.
 
 Convention: landmarks are MediaPipe's 33, ``p [F, 33, 3]`` metres.
 """
@@ -24,7 +24,7 @@ Bool = NDArray[np.bool_]
 TRUNK = (*SHOULDERS, *HIPS)
 FPS = 30.0  # assumed where neither the file nor the user gives it
 OWN = 0.02  # largest relative difference of bone lengths at which a motion is the subject's own
-SELDOM = 0.2  # share of the frames below which what is seen of a joint is taken as a false guess
+SELDOM = 0.2  # a joint seen in a smaller share of the frames counts as a false detection
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 PARENT = {b: a for a, b in MEDIAPIPE33.limbs if b not in TRUNK}
 
@@ -37,8 +37,8 @@ class Motion:
         path: the file.
         p: ``[F, 33, 3]`` metres; NaN where a landmark is unknown.
         visibility: ``[F, 33]`` in [0, 1].
-        fps: frames per second, None where the file does not say.
-        up: the axis that points up, or None: found from the skeleton.
+        fps: frames per second, or None if unknown.
+        up: the axis that points up, or None to infer it from the skeleton.
         unit: of the file's lengths, in words.
         file_up: the file's own axis, where ``up`` is that of converted landmarks.
         body: ``[F]`` poses of the subject's body that the landmarks come from, or None.
@@ -58,16 +58,16 @@ class Motion:
 
 
 def checked(motion: Motion, least_visibility: float) -> Motion:
-    """The motion with what is not seen marked as unknown.
+    """The motion with unseen landmarks set to NaN.
 
-    Shoulders and hips always count where they are finite: without them there is no skeleton.
+    Shoulders and hips are kept wherever they are finite: without them there is no skeleton.
 
     Raises:
-        DataError: when there is no frame, or one in which fewer than three shoulders and hips are
-            known, naming it.
+        DataError: when there are no frames, or fewer than three of shoulders and hips are known in
+            a frame, naming the first.
     """
     if not len(motion):
-        raise DataError(f"{motion.path} holds no frame; expected a motion")
+        raise DataError(f"{motion.path} has no frames; expected a motion")
     known: Bool = np.isfinite(motion.p).all(-1) & (motion.visibility >= least_visibility)
     known[:, list(TRUNK)] = np.isfinite(motion.p[:, list(TRUNK)]).all(-1) & (
         motion.visibility[:, TRUNK] > 0
@@ -103,8 +103,8 @@ def up_axis(motion: Motion) -> str:
 def completed(motion: Motion, up: str) -> Float:
     """``[F, 33, 3]`` every landmark in standard axes, Z up.
 
-    A joint that is not seen for a while moves evenly between the frames that show it, relative to
-    the joint before it; one that is `SELDOM` seen rests on that joint.
+    Gaps of a joint are interpolated linearly, relative to its parent joint. A joint that fewer than
+    `SELDOM` of the frames show takes its place in the rest pose, relative to its parent.
     """
     p = motion.p @ upright(up).T
     known: Bool = np.asarray(np.isfinite(p).all(-1))
@@ -122,7 +122,7 @@ def completed(motion: Motion, up: str) -> Float:
 
 
 def resampled(p: Float, fps: float, wanted: float) -> Float:
-    """Landmarks ``[F, 33, 3]`` at another rate, linearly between frames."""
+    """Landmarks ``[F, 33, 3]`` at another frame rate, interpolated linearly."""
     if len(p) == 1 or fps == wanted:
         return p
     times = frame_times(len(p), fps, wanted)
@@ -134,6 +134,6 @@ def resampled(p: Float, fps: float, wanted: float) -> Float:
 
 
 def frame_times(frames: int, fps: float, wanted: float) -> Float:
-    """Moments of a new rate, in frames of the old one, from the first frame to the last at most."""
+    """Times of the frames at a new rate, in frames of the old rate; the last is not exceeded."""
     count = int((frames - 1) * wanted / fps + 1e-6) + 1
     return np.arange(count, dtype=np.float64) * fps / wanted

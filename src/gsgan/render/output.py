@@ -1,7 +1,7 @@
-"""Frames and videos on disk: whole files under their names, and renders that go on where they were.
+"""Frames and videos on disk: files are written atomically, interrupted renders can be resumed.
 
-A folder holds ``000000.png`` and so on, and render.json, which says what they are of. The frames of
-a video lie in a hidden folder beside it until it is written.
+A folder holds ``000000.png`` and so on, and render.json, which records what they depend on. The
+frames of a video are kept in a hidden folder beside it until it is written.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ Bytes = NDArray[np.uint8]
 
 RECORD = "render.json"
 VIDEO = ".mp4"
-QUALITY = "16"  # x264's constant rate factor: no loss that is seen
-BT601, STUDIO_RANGE = 6, 1  # ffmpeg's numbers of what its RGB conversion writes
+QUALITY = "16"  # x264's constant rate factor: visually lossless
+BT601, STUDIO_RANGE = 6, 1  # ffmpeg's codes for the result of its RGB conversion
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Output:
         out: a .mp4 file or a folder.
         fps: of the video.
         marked: whether files say that they are synthetic.
-        signer: signs what the user gets; None leaves it unsigned.
+        signer: signs the final files; None leaves them unsigned.
     """
 
     out: Path
@@ -50,12 +50,12 @@ class Output:
 
     @property
     def video(self) -> bool:
-        """Whether a video is asked for."""
+        """Whether the output is a video."""
         return self.out.suffix.lower() == VIDEO
 
     @property
     def folder(self) -> Path:
-        """Of the frames."""
+        """The folder of the frames."""
         return self.out.with_name(f".{self.out.name}.frames") if self.video else self.out
 
     def path(self, number: int) -> Path:
@@ -63,14 +63,14 @@ class Output:
         return self.folder / f"{number:06d}.png"
 
     def begin(self, record: dict[str, Any], overwrite: bool) -> None:
-        """Prepares the folder; frames of the same render that are there stay.
+        """Prepares the folder; existing frames of the same render are kept.
 
         Args:
             record: what the images depend on, for render.json.
             overwrite: replace another render.
 
         Raises:
-            ConfigError: when the place is taken, or PyAV is missing.
+            ConfigError: when the output exists, or PyAV is missing.
         """
         if self.video:
             _av()
@@ -83,7 +83,7 @@ class Output:
             and (not self.folder.is_dir() or any(self.folder.iterdir()))
         ):
             raise ConfigError(
-                f"out={self.out} is no folder of a render and not empty; give another one"
+                f"out={self.out} is not empty and holds no render; give another folder"
             )
         try:
             same = held.is_file() and json.loads(held.read_text()) == record
@@ -108,7 +108,7 @@ class Output:
         write_atomically(self.path(number), data)
 
     def finish(self, numbers: Sequence[int]) -> None:
-        """Writes the video of the frames, and removes them.
+        """Encodes the frames as a video and removes them; does nothing for a folder.
 
         Raises:
             DataError: when a frame cannot be read, or this build of PyAV has no H.264.

@@ -13,12 +13,13 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from gsgan.body import free_body
+from gsgan.body import free_body, open_body
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.calibration.find import METRES
 from gsgan.data.figure import BONES, EARS, HIPS, SHOULDERS, Figure, length
 from gsgan.data.files import read_arrays, read_json, read_json_value
 from gsgan.data.formats import smpl_motion
+from gsgan.data.formats.capture import SHAPE, read_shape
 from gsgan.data.synthetic.bvh import Bvh, read_bvh, standard_motion
 from gsgan.prepare.landmarks import read_points3d
 from gsgan.render.asf import asf_of, read_amc
@@ -39,7 +40,7 @@ WORLD_KEYS = (
 POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose")
 ROOT_KEYS, MOVE_KEYS = ("global_orient", "root_orient"), ("trans", "transl", "smpl_trans")
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
-FREE_BONES, SMPL_BODY = 56, 22  # SMPL_BODY: joints that SMPL, SMPL-H and SMPL-X share
+SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
 LEG_UNITS = {"metres": 1.0, "decimetres": 0.1, "centimetres": 0.01, "inches": 0.0254}
 LEG_UNITS |= {"millimetres": 0.001, "CMU units (inches / 0.45)": 0.0254 / 0.45}
 LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))  # rigid, for the scale of axes
@@ -47,7 +48,7 @@ LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))  # rigid, for the 
 
 @dataclass(frozen=True)
 class Source:
-    """What readers may need beside the file.
+    """What readers may need besides the file.
 
     Args:
         figure: the subject's proportions, for formats without face, hands and scale.
@@ -61,10 +62,10 @@ class Source:
 
 
 def read_motion(path: Path, source: Source) -> Motion:
-    """The motion in a file of any known format, by its name's ending.
+    """The motion in a file; its suffix decides the format.
 
     Raises:
-        DataError: when it cannot be read, is of an unknown format, or holds something else.
+        DataError: when it cannot be read, has an unknown format, or holds no motion.
     """
     if not path.is_file():
         raise DataError(
@@ -75,7 +76,7 @@ def read_motion(path: Path, source: Source) -> Motion:
         raise DataError(f"{path} is empty; expected a motion")
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        raise DataError(f"{path} is of no known format; expected one of {', '.join(READERS)}")
+        raise DataError(f"{path} has an unknown format; expected one of {', '.join(READERS)}")
     return reader(path, source)
 
 
@@ -83,7 +84,7 @@ def read_motion(path: Path, source: Source) -> Motion:
 
 
 def read_npz(path: Path, source: Source) -> Motion:
-    """A motion in an npz file, whose arrays tell its kind."""
+    """A motion in an npz file; the names of its arrays decide the kind."""
     keys = ("p", "conf", "theta", "betas", "visibility", *WORLD_KEYS, *POSE_KEYS, *ROOT_KEYS)
     arrays = read_arrays(path, (*keys, *MOVE_KEYS, *RATE_KEYS))
     rate = _first(arrays, RATE_KEYS)
@@ -99,7 +100,7 @@ def read_npz(path: Path, source: Source) -> Motion:
     if _first(arrays, POSE_KEYS) is not None:
         return _smpl(path, arrays, fps, source)
     raise DataError(
-        f"{path} has no motion that is known; expected the arrays 'p' (landmarks), 'theta' and "
+        f"{path} holds no known kind of motion; expected the arrays 'p' (landmarks), 'theta' and "
         "'transl' (body pose), 'poses' and 'trans' (SMPL, AMASS), or 'pose_world_landmarks' "
         "(MediaPipe)"
     )
@@ -117,7 +118,7 @@ def _rate(path: Path, value: Any) -> float:
 
 
 def _beside(path: Path) -> dict[str, Any]:
-    """The content of meta.json in the file's folder, of a capture."""
+    """The content of meta.json in the file's folder, if there is one."""
     meta = path.with_name("meta.json")
     return read_json(meta) if meta.is_file() else {}
 
@@ -136,14 +137,18 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Motion:
 def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Motion:
     theta = expect_array(arrays, "theta", (None, None, 3), path)
     arrays = arrays | {k: arrays[name] for k, name in (("transl", "trans"),) if name in arrays}
-    transl = expect_array(arrays, "transl", (len(theta), 3), path)
     meta = _beside(path)
+    scale = METRES.get(meta.get("unit", "m"), 1.0)
+    transl = scale * expect_array(arrays, "transl", (len(theta), 3), path)
     fps, up = fps or meta.get("fps"), meta.get("up_axis")
-    if theta.shape[1] != FREE_BONES:
+    if theta.shape[1] != len(free_body().parents):
         flat = {"poses": theta.reshape(len(theta), -1), "trans": transl}
         return _smpl(path, flat | {k: arrays[k] for k in ("betas",) if k in arrays}, fps, source)
+    shape = path.with_name(SHAPE)  # by gsgan.fit
+    subject = open_body("free", betas=read_shape(shape) if shape.is_file() else ())
+    assert subject is not None
     body = BodyPose(*(torch.from_numpy(np.nan_to_num(x)).float() for x in (theta, transl)))
-    p = free_body().posed_landmarks(body).double().numpy()
+    p = subject.posed_landmarks(body).double().numpy()
     p[~np.isfinite(theta).all((1, 2)) | ~np.isfinite(transl).all(1)] = np.nan
     return Motion(path, p, np.ones(p.shape[:2]), fps, up or "z", "metres", body=body)
 
@@ -151,7 +156,7 @@ def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: So
 def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Motion:
     if source.smpl is None:
         raise DataError(
-            f"{path} holds SMPL parameters, from which joints follow only with the body model: "
+            f"{path} holds SMPL parameters, which give joints only together with the body model: "
             "give smpl=/path/to/SMPL_NEUTRAL.pkl or SMPLX_NEUTRAL.npz (free for research from the "
             "model's own site, not part of gsgan)"
         )
@@ -160,11 +165,11 @@ def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source)
     model, poses = read_smpl(source.smpl), np.asarray(_first(arrays, POSE_KEYS), np.float64)
     poses = poses.reshape(len(poses), -1)
     root = _first(arrays, ROOT_KEYS)
-    if root is not None and poses.shape[1] % 72:  # without the root, which has a key of its own
+    if root is not None and poses.shape[1] % 72:  # the root is stored separately
         poses = np.concatenate([np.asarray(root).reshape(len(poses), 3), poses], axis=1)
     if poses.shape[1] % 3 or poses.shape[1] < 3 * SMPL_BODY:
         raise DataError(
-            f"{path}: the poses have {poses.shape[1]} numbers a frame; expected 3 for each of 22 "
+            f"{path}: the poses have {poses.shape[1]} numbers per frame; expected 3 for each of 22 "
             "or more SMPL joints"
         )
     moves = _first(arrays, MOVE_KEYS)
@@ -203,7 +208,7 @@ def _for_model(theta: Float, model: SkinnedModel) -> Float:
 
 
 def read_mediapipe_json(path: Path, source: Source) -> Motion:
-    """MediaPipe's results of every frame, as Python, JavaScript or Android write them.
+    """MediaPipe's results per frame, as its Python, JavaScript or Android API returns them.
 
     A frame is an object with one of `WORLD_KEYS`, or the 33 landmarks themselves; a landmark is
     ``{x, y, z, visibility}`` or a list of these numbers.
@@ -229,20 +234,20 @@ def read_mediapipe_json(path: Path, source: Source) -> Motion:
 
 
 def _landmark_row(path: Path, number: int, frame: Any) -> Float:
-    """``[33, 4]`` x, y, z, visibility of a frame; NaN and 0 where nobody was found."""
+    """``[33, 4]`` x, y, z, visibility of a frame; NaN and 0 where no person was detected."""
     found = frame
     if isinstance(frame, dict):
         key = next((key for key in WORLD_KEYS if key in frame), None)
         found = frame.get(key)
         if key is None:
             raise DataError(
-                f"{path}, frame {number}: no pose_world_landmarks; the other landmarks of "
-                "MediaPipe are of the image, without depth in metres"
+                f"{path}, frame {number}: no pose_world_landmarks; MediaPipe's other "
+                "landmarks are in image coordinates, without metric depth"
             )
     if isinstance(found, dict):
         found = found.get("landmark", found.get("landmarks"))
     if isinstance(found, list) and len(found) == 1:
-        found = found[0]  # the Tasks API lists persons
+        found = found[0]  # the Tasks API returns a list of people
     if not found:
         return np.concatenate([np.full((JOINTS, 3), np.nan), np.zeros((JOINTS, 1))], axis=1)
     try:
@@ -279,13 +284,13 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
 
 
 def read_bvh_motion(path: Path, source: Source) -> Motion:
-    """A BVH file of a person; the unit follows from the legs."""
+    """A BVH file of a person; the unit is inferred from the length of the legs."""
     bvh = read_bvh(path)
     return _rig(path, bvh, None, source)
 
 
 def read_amc_motion(path: Path, source: Source) -> Motion:
-    """An AMC file on its ASF skeleton."""
+    """An AMC file and its ASF skeleton."""
     asf = source.skeleton or asf_of(path)
     return _rig(path, *read_amc(path, asf), source)
 
@@ -304,11 +309,11 @@ def _rig(path: Path, bvh: Bvh, metres: float | None, source: Source) -> Motion:
     return Motion(path, p, seen, 1 / bvh.frame_time, "z", unit, standard.up)
 
 
-# -- others' points
+# -- triangulated and detected points
 
 
 def read_trc(path: Path, source: Source) -> Motion:
-    """Markers that Pose2Sim triangulated; others' marker names are not known."""
+    """Markers triangulated by Pose2Sim; other marker sets are not supported."""
     _, p, conf = read_points3d(path)
     fps = None
     with suppress(ValueError, IndexError):  # read_points3d has read the header
@@ -320,9 +325,9 @@ def read_trc(path: Path, source: Source) -> Motion:
 def read_pose(path: Path, source: Source) -> Motion:
     """MediaPipe's landmarks in a file of the ``pose-format`` package.
 
-    World landmarks if it has them, else those of the image with MediaPipe's depth. The package
-    scales x and y by the image's size and leaves z, and its normalisation hides these numbers: the
-    scale of each axis follows from the subject's bone lengths.
+    World landmarks if it has them, otherwise image landmarks with MediaPipe's depth. The package
+    scales x and y by the image size but not z, and normalised files no longer hold that size: the
+    scale of each axis is estimated from the subject's bone lengths.
 
     Raises:
         DataError: when the package is missing, the file is damaged or has no depth.
@@ -337,10 +342,10 @@ def read_pose(path: Path, source: Source) -> Motion:
         pose = Pose.read(path.read_bytes())
         data = np.ma.getdata(pose.body.data).astype(np.float64)
         conf = np.asarray(pose.body.confidence, np.float64)
-    except Exception as error:  # the package raises what its parser stumbles on
-        raise DataError(f"{path} is no whole .pose file ({type(error).__name__})") from error
+    except Exception as error:  # its parser raises many kinds
+        raise DataError(f"{path} is not a valid .pose file ({type(error).__name__})") from error
     if data.ndim != 4 or 0 in data.shape[:2]:
-        raise DataError(f"{path} holds no frame with a person; expected a motion")
+        raise DataError(f"{path} has no frames with a person; expected a motion")
     starts, parts = 0, {}
     for part in pose.header.components:
         parts[part.name] = (slice(starts, starts + len(part.points)), part.points, part.format)
@@ -363,9 +368,9 @@ def read_pose(path: Path, source: Source) -> Motion:
 
 
 def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure) -> Float:
-    """Points whose axes have three unknown units: the bones get the subject's lengths.
+    """Scales each of the three axes so that bones get the subject's lengths.
 
-    The squares of the scales solve ``Σ sᵢ² dᵢ² = length²`` of all seen bones and frames, by
+    The squares of the scales solve ``Σ sᵢ² dᵢ² = length²`` over all seen bones and frames, by
     non-negative least squares.
     """
     rows = []

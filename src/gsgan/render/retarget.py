@@ -1,4 +1,4 @@
-"""Retargeting: another person's directions with the subject's bone lengths, hands, feet and face.
+"""Retargeting: a motion's directions with the subject's own bone lengths, hands, feet and face.
 
 Convention: standard axes (`gsgan.data.figure`), Z up, metres.
 """
@@ -31,25 +31,21 @@ from gsgan.data.figure import (
     part_frame,
 )
 from gsgan.data.synthetic.bvh import StandardMotion, drift, floor_under
+from gsgan.data.synthetic.character import unit
 from gsgan.data.synthetic.retarget import axis_angle, between, rotation
 from gsgan.skeleton import bone_frames
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 
 Float = NDArray[np.float64]
 
-NECK = 0.45  # radians that a neck bends from rest at most: detectors put faces too far forward
-
-
-def unit(v: Float) -> Float:
-    """Vectors ``[..., 3]`` divided by their length."""
-    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-9)
+NECK = 0.45  # radians, the largest bend of the neck: detectors place faces too far forward
 
 
 def on_figure(p: Float, figure: Figure) -> Float:
-    """``[F, 33, 3]`` the subject in the pose of landmarks ``[F, 33, 3]`` without gaps.
+    """``[F, 33, 3]`` the subject in the poses of another person's landmarks ``[F, 33, 3]``, finite.
 
     Trunk and limbs keep their directions and get the subject's lengths; face, hands and feet are
-    the subject's own, turned like the source's. The way is scaled by the legs' length.
+    the subject's own, rotated as the source's. The path is scaled by the ratio of leg lengths.
     """
     rest, q = figure.rest, np.zeros_like(p)
     legs = [np.linalg.norm(p[:, b] - p[:, a], axis=-1) for limb in LEGS for a, b in limb]
@@ -88,8 +84,8 @@ def _head_frame(p: Float) -> Float:
 def rig_landmarks(standard: StandardMotion, figure: Figure) -> Float:
     """``[F, 33, 3]`` landmarks of a rig, in standard axes and the subject's size.
 
-    Shoulders, elbows, wrists, hips, knees and ankles are the rig's joints; hands, feet and face,
-    for which rigs have none, are the subject's, turned like the rig's hands, feet and head.
+    Shoulders, elbows, wrists, hips, knees and ankles are the rig's joints. Rigs have no landmarks
+    of hands, feet and face: the subject's own are rotated as the rig's hands, feet and head.
     """
     rest, scale = figure.rest, figure.leg / standard.leg
     p = np.full((len(standard.joints["Hips"]), *rest.shape), np.nan)
@@ -108,22 +104,23 @@ def rig_landmarks(standard: StandardMotion, figure: Figure) -> Float:
     return p
 
 
-def joined(clips: Sequence[Float], figure: Figure, between: int) -> Float:
-    """Clips ``[F, 33, 3]`` of the subject one after the other, each frame kept, with ``between``
-    frames from one to the next: joints go on at the speed they had, and arrive at the next one's.
+def joined(clips: Sequence[Float], figure: Figure, n: int) -> Float:
+    """Clips ``[F, 33, 3]`` of the subject, one after the other, with transitions of n frames.
+
+    A transition is a cubic that continues the joints' speeds at both ends, on the subject's bones.
     """
     parts = [clips[0]]
     for a, b in pairwise(clips):
         speeds = [x[-1] - x[-2] if len(x) > 1 else 0 * x[0] for x in (a, b[1::-1])]
-        way = CubicHermiteSpline(
-            [0, between + 1], np.stack([a[-1], b[0]]), np.stack([speeds[0], -speeds[1]])
+        path = CubicHermiteSpline(
+            [0, n + 1], np.stack([a[-1], b[0]]), np.stack([speeds[0], -speeds[1]])
         )
-        parts += [on_figure(way(np.arange(1, between + 1)), figure), b]
+        parts += [on_figure(path(np.arange(1, n + 1)), figure), b]
     return np.concatenate(parts)
 
 
 def heading(p: Float) -> float:
-    """Radians about the up axis, 0 towards -Y: where the hips of ``[33, 3]`` face."""
+    """The direction that the hips of ``[33, 3]`` face: radians about the up axis, 0 towards -Y."""
     front = bone_frames(torch.from_numpy(p[None])).hubs[0, PELVIS, :, 2]
     return float(torch.atan2(front[0], -front[1]))
 
@@ -131,17 +128,18 @@ def heading(p: Float) -> float:
 def placed(
     p: Float, figure: Figure, centre: Float, fps: float, *, ground: bool, stay: bool
 ) -> Float:
-    """Landmarks ``[F, 33, 3]`` turned, moved and put on the ground of the subject's place.
+    """Landmarks ``[F, 33, 3]`` moved to where the subject was captured.
 
-    Convention: the person starts towards the subject's mean heading, in the middle of its place.
+    Convention: the motion starts at the centre, with the subject's mean heading.
 
     Args:
         p: standard axes.
         figure: the subject.
-        centre: ``[3]`` metres, standard axes: the middle of the place; its height is not used.
+        centre: ``[3]`` metres, standard axes: of the training frames; its height is not used.
         fps: of the frames.
-        ground: keeps a foot on the ground, jumps aside; else only the lowest foot of all frames is.
-        stay: takes the way from a motion that leaves its place, as on a treadmill.
+        ground: keep a foot on the ground except in jumps; otherwise only the lowest foot of the
+            whole motion touches it.
+        stay: subtract the path of a person who walks away, as on a treadmill.
     """
     q = p @ rotation(np.array([0, 0, figure.facing - heading(p[0])])).T
     way = middle(q, HIPS)[:, :2]

@@ -5,7 +5,7 @@ from gsgan.skeleton.draw import draw_skeleton
 from gsgan.skeleton.frames import BoneFrames, bone_frames, omega, root_of
 from gsgan.skeleton.holistic import HOLISTIC, TEMPLATES, named_template
 from gsgan.skeleton.rotation6d import rotation_from_6d, rotation_to_6d
-from gsgan.skeleton.sanitise import completed, limb_length_sum, recentre, sanitise
+from gsgan.skeleton.sanitise import complete_skeleton, limb_length_sum, recentre, sanitise
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
 
 __all__ = [
@@ -17,7 +17,7 @@ __all__ = [
     "Points",
     "SkeletonTemplate",
     "bone_frames",
-    "completed",
+    "complete_skeleton",
     "draw_skeleton",
     "limb_length_sum",
     "named_template",

@@ -101,7 +101,7 @@ def sanitise(
     return _filled(p, valid, template, body_height), valid
 
 
-def completed(
+def complete_skeleton(
     skeleton: Tensor, visibility: Tensor | None, template: SkeletonTemplate, body_height: float
 ) -> tuple[Tensor, Tensor]:
     """Joints ``[B, J, 3]`` of a template, finite, and their visibility ``[B, J]``, 0 for stand-ins.

@@ -41,7 +41,7 @@ from gsgan.model.runs import (
     record,
 )
 from gsgan.splat import resolve_backend
-from gsgan.train.callbacks import AtomicCheckpoints, PictureGrid, ProgressLines
+from gsgan.train.callbacks import AtomicCheckpoints, LiveViewer, PictureGrid, ProgressLines
 from gsgan.train.module import AvatarTraining
 from gsgan.train.pose import PoseCorrections
 from gsgan.utils.checks import whole
@@ -66,6 +66,10 @@ def run_training(config: DictConfig) -> None:
     _quiet_lightning()
     torch.set_flush_denormal(True)  # black background decays into denormals: slow on CPUs
     check_lpips(config.lpips.net, config.lpips.path)  # now, not after hours of training
+    if config.viewer:
+        from gsgan.view.server import import_viser
+
+        import_viser()
 
     data, module = build_training(config)
     seed_everything(config.seed, workers=True, verbose=False)
@@ -256,6 +260,8 @@ def build_trainer(
             save_on_train_epoch_end=True,
         ),
     ]
+    if config.viewer:
+        callbacks.append(LiveViewer(folder, config, data, console))
     if console.is_terminal:
         callbacks.append(RichProgressBar())
     return instantiate(

@@ -36,6 +36,15 @@ def config_folder() -> Path:
     raise GsganError(f"{package / 'conf'}: the config folder is missing; install gsgan again")
 
 
+def defaults_of(command: str) -> DictConfig:
+    """The options of a command with their defaults, without Hydra's own entries."""
+    options = OmegaConf.load(config_folder() / f"{command}.yaml")
+    assert isinstance(options, DictConfig)
+    for key in ("defaults", "hydra"):
+        options.pop(key)
+    return options
+
+
 def folder_name(overrides: str) -> str:
     """The folder name of a run in a sweep: its overrides, shortened, in characters that need no
     quotes in a shell or in ``run=<folder>``.

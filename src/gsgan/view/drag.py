@@ -1,4 +1,4 @@
-"""Inverse kinematics: a joint is dragged, every bone keeps its length."""
+"""Inverse kinematics: dragged joints, with bones of constant length."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from gsgan.data.figure import FACE, FEET, HANDS, HIPS, SHOULDERS, middle
+from gsgan.data.synthetic.character import unit
+from gsgan.data.synthetic.retarget import between
 
 Float = NDArray[np.float64]
 
 ROUNDS = 20
-BEND = 0.01  # of a chain's length: a straight one would only shorten along itself, and cannot
-TINY = 1e-9
+BEND = 0.01  # of a chain's length: FABRIK cannot bend a straight chain along itself
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class Handle:
     """What moves with a dragged joint.
 
     Args:
-        chain: joints from the one that stays to the one that is dragged.
-        turned: joints that turn with the last bone.
-        moved: joints that move along without turning.
+        chain: joints from the fixed one to the dragged one.
+        turned: joints that rotate with the last bone.
+        moved: joints that follow without rotating.
     """
 
     chain: tuple[int, ...]
@@ -48,7 +48,7 @@ NAMES = (*HANDLES, HEAD, BODY)
 
 
 def position(p: Float, name: str) -> Float:
-    """``[3]`` metres: where the handle of a pose ``[33, 3]`` is."""
+    """``[3]`` metres: the position of a handle in a pose ``[33, 3]``."""
     if name == BODY:
         return middle(p, HIPS)
     return np.asarray(p[NOSE if name == HEAD else HANDLES[name].chain[-1]])
@@ -57,8 +57,8 @@ def position(p: Float, name: str) -> Float:
 def dragged(p: Float, name: str, target: Float) -> Float:
     """The pose with a handle at ``target``, or as near as the bones reach.
 
-    Limbs bend by FABRIK from shoulder or hip; hands and feet turn with the last bone. The head
-    turns about the neck. The body moves as a whole.
+    Limbs bend by FABRIK from shoulder or hip; hands and feet rotate with the last bone. The head
+    rotates about the neck. The body moves as a whole.
 
     Args:
         p: ``[33, 3]`` metres, finite.
@@ -72,14 +72,14 @@ def dragged(p: Float, name: str, target: Float) -> Float:
         return q + (target - middle(p, HIPS))
     if name == HEAD:
         neck = middle(p, SHOULDERS)
-        turn = _between(p[NOSE] - neck, target - neck)
+        turn = between(p[NOSE] - neck, target - neck)
         q[list(FACE)] = neck + (p[list(FACE)] - neck) @ turn.T
         return q
     handle = HANDLES[name]
     chain = list(handle.chain)
     q[chain] = fabrik(p[chain], target)
     before, end = chain[-2:]
-    turn = _between(p[end] - p[before], q[end] - q[before])
+    turn = between(p[end] - p[before], q[end] - q[before])
     turned, moved = list(handle.turned), list(handle.moved)
     q[turned] = q[end] + (p[turned] - p[end]) @ turn.T
     q[moved] += q[end] - p[end]
@@ -87,34 +87,20 @@ def dragged(p: Float, name: str, target: Float) -> Float:
 
 
 def fabrik(chain: Float, target: Float) -> Float:
-    """Joints ``[n, 3]`` whose first stays and whose last is at ``target``, or as near as can be."""
+    """Joints ``[n, 3]`` with the first fixed and the last at ``target``, or as near as possible."""
     lengths = np.linalg.norm(np.diff(chain, axis=0), axis=1)
     q, root, reach = chain.copy(), chain[0], lengths.sum()
     along = target - root
     if np.linalg.norm(along) >= reach:
         steps = np.concatenate([[0.0], np.cumsum(lengths)])
-        return np.asarray(root + steps[:, None] * _unit(along))
-    if len(q) > 2 and np.linalg.norm(np.cross(_unit(q[1] - root), _unit(along))) < BEND:
-        q[1:-1] += BEND * reach * _unit(np.cross(along, [1.0, 2.0, 3.0]))
+        return np.asarray(root + steps[:, None] * unit(along))
+    if len(q) > 2 and np.linalg.norm(np.cross(unit(q[1] - root), unit(along))) < BEND:
+        q[1:-1] += BEND * reach * unit(np.cross(along, [1.0, 2.0, 3.0]))
     for _ in range(ROUNDS):
         q[-1] = target
         for i in range(len(q) - 2, -1, -1):
-            q[i] = q[i + 1] + lengths[i] * _unit(q[i] - q[i + 1])
+            q[i] = q[i + 1] + lengths[i] * unit(q[i] - q[i + 1])
         q[0] = root
         for i in range(len(lengths)):
-            q[i + 1] = q[i] + lengths[i] * _unit(q[i + 1] - q[i])
+            q[i + 1] = q[i] + lengths[i] * unit(q[i + 1] - q[i])
     return q
-
-
-def _unit(v: Float) -> Float:
-    return np.asarray(v / max(float(np.linalg.norm(v)), TINY))
-
-
-def _between(a: Float, b: Float) -> Float:
-    """``[3, 3]`` the smallest rotation that turns direction a to b."""
-    u, v = _unit(a), _unit(b)
-    axis, cosine = np.cross(u, v), float(u @ v)
-    sine = float(np.linalg.norm(axis))
-    return np.asarray(
-        Rotation.from_rotvec(_unit(axis) * np.arctan2(sine, cosine)).as_matrix(), np.float64
-    )

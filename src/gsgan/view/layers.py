@@ -1,4 +1,4 @@
-"""What the viewer shows of a painting: the image, or one of the maps that led to it."""
+"""The viewer's layers: the image, or one of the maps that it is made from."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ Bytes = NDArray[np.uint8]
 
 IMAGE, COLOUR, PARTS, ALPHA = "image", "Step I's colour", "segmentation S", "alpha"
 DEPTH, FEATURE, ERROR = "depth", "feature channel", "error against truth"
-ERROR_SCALE = 4.0  # differences of 1/4 and more are the brightest
+ERROR_SCALE = 4.0  # differences from 1/4 on have the brightest colour
 
 
 def layers(avatar: Avatar, truth: bool) -> tuple[str, ...]:
-    """The layers that an avatar has."""
+    """The layers of an avatar, with the error if there is a ground truth."""
     names = [IMAGE, ALPHA]
     if avatar.splats is not None:
         names += [COLOUR, DEPTH]
@@ -51,12 +51,12 @@ def shown(
 
     Args:
         layer: of `layers`.
-        painting: with its maps where the layer is not the image.
-        camera: that sees it.
-        avatar: whose it is.
-        behind: ``[3, H, W]`` the image's background.
-        channel: of F, for that layer: its values between the image's least and largest.
-        truth: the frame with the true image, for the error.
+        painting: with maps, unless the layer is the image.
+        camera: of the painting.
+        avatar: that painted it.
+        behind: ``[3, H, W]`` the background.
+        channel: of F, for the feature layer; its values are stretched to the colour map's range.
+        truth: the frame with the ground truth, for the error layer.
     """
     assert painting.image is not None and painting.alpha is not None  # noqa: PT018
     image, alpha = painting.image[0].cpu(), painting.alpha[0].cpu()
@@ -115,8 +115,7 @@ def _coloured(x: Tensor) -> Bytes:
 
 
 def fitted(image: Bytes, aspect: float) -> Bytes:
-    """An image with black at its sides, or above and below, so that its width is ``aspect`` times
-    its height."""
+    """The image, padded with black until its width is ``aspect`` times its height."""
     height, width = image.shape[:2]
     want: Sequence[int] = (
         (height, round(height * aspect))

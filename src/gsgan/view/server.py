@@ -1,4 +1,4 @@
-"""The viewer's server: one painting thread, a session for each browser."""
+"""The viewer's server: one thread that renders, one session per browser."""
 
 from __future__ import annotations
 
@@ -8,38 +8,36 @@ import logging
 import socket
 import threading
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from gsgan.data.figure import upright
-from gsgan.export.motion import drive_of, rest_pose
+from gsgan.model.avatar import Avatar
 from gsgan.render.cameras import Orbit
 from gsgan.render.images import background
-from gsgan.render.run import Drive, Run
+from gsgan.render.poses import Drive, Run, drive_of
 from gsgan.utils.checks import above, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.view.session import Session, Show
 
 MEGABYTE = 1 << 20
-IDLE = 0.1  # seconds between looks at whether an image is due
+IDLE = 0.1  # seconds between two checks whether an image is due
 
 
 def view_config(config: DictConfig) -> None:
     """Serves until interrupted.
 
     Raises:
-        ConfigError: on a value that cannot be used, or when viser is missing.
-        DataError: when the run or the motion cannot be used.
+        ConfigError: when an option has an invalid value, or viser is missing.
+        DataError: when the run or the motion cannot be read.
     """
     viewer = Viewer(config)
-    host, port = viewer.server.get_host(), viewer.server.get_port()
     console = make_console()
     console.print(viewer.show.drive.text, markup=False, highlight=False)
-    console.print(f"open http://{host}:{port} in a browser; end with Ctrl+C", highlight=False)
+    console.print(f"open {viewer.address} in a browser; stop with Ctrl+C", highlight=False)
     try:
         viewer.serve()
     finally:
@@ -50,30 +48,31 @@ class Viewer:
     """A server of one avatar.
 
     Args:
-        config: as conf/view.yaml has it.
+        config: the options of conf/view.yaml.
+        run: to show in place of ``config.run``.
     """
 
-    def __init__(self, config: DictConfig) -> None:
-        viser = _viser()
-        self.run, fps = Run(config), float(above("fps", config.fps))
-        drive = _start(config, self.run, fps)
+    def __init__(self, config: DictConfig, run: Run | None = None) -> None:
+        viser = import_viser()
+        self.run, fps = run or Run.load(config), float(above("fps", config.fps))
 
-        def read(path: Path) -> Drive:
-            return drive_of(OmegaConf.merge(config, {"motion": str(path)}), self.run, fps)  # type: ignore[arg-type]
+        def read(motion: str) -> Drive:
+            return drive_of(OmegaConf.merge(config, {"motion": motion}), self.run, fps)  # type: ignore[arg-type]
 
+        drive = read(config.motion or self.run.data.watched[0])
         size = whole("pixels", config.pixels or self.run.stored.data.size or 512, 16)
         behind: Any = background(str(config.background), video=True)
         rate = float(above("rate", config.rate))
-        self.show = Show(self.run.avatar, drive, read, behind, size, fps, rate)
+        self.show = Show(self.run.avatar, self.run.body, drive, read, behind, size, fps, rate)
         host, port = str(config.host), whole("port", config.port, 0)
-        try:  # viser would wait for ever
+        try:  # viser itself would never return
             socket.create_server((host, 0)).close()
         except OSError as error:
-            raise ConfigError(f"host={host} is no address of this machine ({error})") from None
+            raise ConfigError(f"host={host} is not an address of this machine ({error})") from None
         logging.getLogger("websockets").setLevel(logging.WARNING)
         with contextlib.redirect_stdout(io.StringIO()):  # viser's own banner
             self.server = viser.ViserServer(host, port, label="gsgan", verbose=False)
-        # viser's button for a public address would show the avatar to anyone
+        # viser's share button would put the avatar on a public address
         self.server.request_share_url = lambda verbose=True: None  # type: ignore[method-assign]
         self.server.gui.configure_theme(show_share_button=False, control_width="medium")
         self._camera(size)
@@ -85,19 +84,31 @@ class Viewer:
         self._painter = threading.Thread(target=self._paint, daemon=True, name="painting")
         self._painter.start()
 
+    @property
+    def address(self) -> str:
+        """What to open in a browser."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def swap(self, avatar: Avatar) -> None:
+        """Shows another avatar of the same run: one with newer weights."""
+        self.run.avatar = self.show.avatar = avatar
+        for session in list(self.sessions.values()):
+            session.touch(moving=False)
+
     def serve(self) -> None:
         """Waits until interrupted."""
         threading.Event().wait()
 
     def stop(self) -> None:
-        """Ends the server and its thread."""
+        """Stops the server and its thread."""
         self._ended = True
         self._wake.set()
         self._painter.join()
         self.server.stop()
 
     def _camera(self, size: int) -> None:
-        """Where new browsers look from: in front of the first pose, as near as training cameras."""
+        """Sets the first view of new browsers: the first pose from the front, as large as in
+        training images."""
         drive, scene, figure = self.show.drive, self.run.scene, self.run.figure
         first = drive.p[:1]
         known = np.where(np.isfinite(first), first, np.nanmean(first, 1, keepdims=True))
@@ -116,7 +127,7 @@ class Viewer:
         self._wake.set()
 
     def _paint(self) -> None:
-        """Paints for one browser after the other, while any of them has something to show."""
+        """Renders for each browser in turn, as long as one of them needs a new image."""
         while not self._ended:
             busy = [session.step() for session in list(self.sessions.values())]
             if not any(busy):
@@ -124,18 +135,12 @@ class Viewer:
                 self._wake.clear()
 
 
-def _start(config: DictConfig, run: Run, fps: float) -> Drive:
-    """The motion to begin with: what is asked for, else held-out frames, else the rest pose."""
-    if config.motion == "rest":
-        return rest_pose(run.figure)
-    if config.motion is None:
-        splits = run.data.splits.items
-        split = next(name for name in ("novel_pose", "novel_view", "train") if splits[name])
-        config = OmegaConf.merge(config, {"motion": split})  # type: ignore[assignment]
-    return drive_of(config, run, fps)
+def import_viser() -> Any:
+    """The package viser.
 
-
-def _viser() -> Any:
+    Raises:
+        ConfigError: when it is not installed.
+    """
     try:
         import viser
     except ImportError:
@@ -144,9 +149,9 @@ def _viser() -> Any:
 
 
 def _bound_uploads(client: Any, limit: int) -> None:
-    """Drops a browser's uploads of more than ``limit`` bytes, whatever size they declare.
+    """Drops uploads of more than ``limit`` bytes, whatever size the browser declares.
 
-    viser keeps the parts of an upload until all are there, without a bound of its own.
+    viser itself collects the parts of an upload without a limit.
     """
     from viser import _messages
 
@@ -160,7 +165,7 @@ def _bound_uploads(client: Any, limit: int) -> None:
             total = state["total_bytes"]  # the browser stops waiting
             ends = message.source_component_uuid, message.transfer_uuid, total, total
             connection.queue_message(_messages.FileTransferPartAck(*ends))
-            text = f"A motion file may have {limit // MEGABYTE} MB at most."
+            text = f"Motion files are limited to {limit // MEGABYTE} MB."
             client.add_notification("This file is too large", text, color="red")
 
     register: Callable[..., None] = connection.register_handler

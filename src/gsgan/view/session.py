@@ -1,4 +1,4 @@
-"""One browser's view of the avatar: its camera, pose, layer, and what is painted next."""
+"""One browser's view of the avatar: camera, pose, layer, and which image is rendered next."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from gsgan.export.motion import inputs_of
+from gsgan.body import SkinnedBody
 from gsgan.model.avatar import Avatar
-from gsgan.model.painting import Painting
 from gsgan.render.images import eight_bits
-from gsgan.render.run import Drive
-from gsgan.scene import Camera
+from gsgan.render.poses import Drive, inputs_of, joints_of
+from gsgan.scene import BodyPose, Camera, Gaussians
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import GsganError
 from gsgan.utils.provenance import png_bytes
@@ -30,31 +29,33 @@ from gsgan.view.layers import ERROR, IMAGE, fitted, layers, shown
 
 Float = NDArray[np.float64]
 
-RESTS = 0.3  # seconds without movement, after which the image is painted in full
-SMALLEST = 0.25  # share of the full size that is painted while moving, at least
-WIDEST = 3.0  # widths per height: a browser window may be any
-SPEED_OVER = 2.0  # seconds over which the shown rate is counted
-YELLOW = (255, 200, 0)
+RESTS = 0.3  # seconds without movement after which the full-size image is rendered
+SMALLEST = 0.25  # least scale of the images while something moves
+WIDEST = 3.0  # bound on the aspect ratio, since a browser window can have any
+SPEED_OVER = 2.0  # seconds over which the displayed rate is averaged
+YELLOW, GREY = (255, 200, 0), (160, 165, 175)
 BONES = np.array(MEDIAPIPE33.edges)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Show:
     """What all sessions share.
 
     Args:
-        avatar: frozen.
-        drive: the motion at the start.
-        read: the motion in a file, for uploads.
+        avatar: frozen; `Viewer.swap` replaces it.
+        body: that the avatar moves with, or None.
+        drive: the first motion.
+        read: reads the motion in an uploaded file.
         behind: the background ``[3, H, W]`` of a size.
-        size: pixels of the height of a full image.
+        size: height of a full-size image, pixels.
         fps: frames per second of a motion that plays.
-        rate: images per second to keep while moving.
+        rate: images per second to reach while something moves.
     """
 
     avatar: Avatar
+    body: SkinnedBody | None
     drive: Drive
-    read: Callable[[Path], Drive]
+    read: Callable[[str], Drive]
     behind: Callable[[tuple[int, int]], torch.Tensor]
     size: int
     fps: float
@@ -62,20 +63,20 @@ class Show:
 
 
 class Session:
-    """One client of the server; `step` is called by the painting thread alone."""
+    """One client of the server; only the rendering thread calls `step`."""
 
     def __init__(self, client: Any, show: Show, wake: Callable[[], None]) -> None:
         self.client, self.show, self._wake = client, show, wake
         self.drive, self.frame = show.drive, 0
         self.pose: Float | None = None  # dragged
         self.changed = self.moved = time.monotonic()
-        self.painted = 0.0  # when what is shown was begun
-        self.full = False  # whether what is shown is of full size
-        self.seconds = 0.0  # of a full image
+        self.painted = 0.0  # when rendering of the current image began
+        self.full = False  # whether the current image is of full size
+        self.seconds = 0.0  # to render a full-size image
         self.times: deque[float] = deque(maxlen=200)
         self.image: NDArray[np.uint8] | None = None
         self._problem = ""  # that the page shows
-        self._drawn: tuple[Any, ...] | None = None  # the pose and what is shown of it in 3D
+        self._drawn: tuple[Any, ...] = ()  # what the 3D nodes show
         self._nodes: list[Any] = []
         self._gizmos: dict[str, Any] = {}
         self._controls()
@@ -98,9 +99,11 @@ class Session:
             self.handles = gui.add_checkbox("drag joints", False)
             reset = gui.add_button("undo dragging")
             self.bones = gui.add_checkbox("skeleton", False)
+            self.mesh = gui.add_checkbox("body", False, visible=self.show.body is not None)
             self.splats = gui.add_checkbox("Gaussians", False)
         save = gui.add_button("save the image")
-        for control in (self.layer, self.channel, self.bones, self.splats, self.play):
+        shown = (self.layer, self.channel, self.bones, self.mesh, self.splats, self.play)
+        for control in shown:
             control.on_update(lambda _: self.touch(moving=False))
         self.handles.on_update(lambda _: self._show_handles())
         self.slider.on_update(self._scrubbed)
@@ -110,14 +113,14 @@ class Session:
         client.camera.on_update(lambda _: self.touch())
 
     def touch(self, moving: bool = True) -> None:
-        """Has the next image painted: fast where something moves, else in full."""
+        """Requests a new image: a fast one while something moves, else one of full size."""
         self.changed = time.monotonic()
         if moving:
             self.moved = self.changed
         self._wake()
 
     def _scrubbed(self, event: Any) -> None:
-        if event.client_id is not None:  # the user moved it, not `step`
+        if event.client_id is not None:  # moved by the user, not by `step`
             self._scrub(int(self.slider.value))
 
     def _scrub(self, frame: int) -> None:
@@ -125,13 +128,13 @@ class Session:
         self.touch()
 
     def _load(self, file: Any) -> None:
-        """Plays an uploaded motion; what is wrong with it is shown on the page."""
+        """Loads an uploaded motion; an error is shown on the page."""
         try:
             with tempfile.TemporaryDirectory() as folder:
                 path = Path(folder) / Path(file.name).name
                 path.write_bytes(file.content)
-                drive = self.show.read(path)
-        except Exception as error:  # of a file by anyone: the server must live
+                drive = self.show.read(str(path))
+        except Exception as error:  # whatever the file is, the server must keep running
             text = (
                 str(error) if isinstance(error, GsganError) else f"{type(error).__name__}: {error}"
             )
@@ -179,16 +182,22 @@ class Session:
         self.touch()
 
     def joints(self) -> Float:
-        """``[33, 3]`` metres: the pose that is shown, finite."""
+        """``[33, 3]`` metres, finite: the current pose."""
         if self.pose is not None:
             return self.pose
-        p, _, _ = inputs_of(self.show.avatar, self.drive, self.frame)
-        return np.asarray(p[0].numpy(), np.float64)
+        p, _ = joints_of(self.show.avatar, self._current(), 0)
+        return np.asarray(p[0].cpu().numpy(), np.float64)
+
+    def _current(self) -> Drive:
+        """The current pose, as a motion of one frame."""
+        drive, pose = self.drive, self.pose  # another thread may load a shorter motion
+        drive = drive.rows(np.array([self.frame % len(drive.p)]))
+        return drive if pose is None else replace(drive, p=pose[None], body=None)
 
     # -- painting
 
     def step(self) -> bool:
-        """Paints where something has changed; whether it did."""
+        """Renders an image if one is due; returns whether the next one may be due at once."""
         now = time.monotonic()
         if self.play.value and len(self.drive.p) > 1:
             if now - self.painted < 1 / self.show.fps:
@@ -209,7 +218,7 @@ class Session:
         except (GsganError, ValueError) as error:
             if self._problem != str(error):  # once, not for every image
                 self._problem = str(error)
-                self._warn("This pose cannot be painted", self._problem)
+                self._warn("This pose cannot be rendered", self._problem)
             self.play.value, self.full = False, True
             return False
         self._problem = ""
@@ -220,7 +229,7 @@ class Session:
         return True
 
     def camera(self, share: float) -> Camera:
-        """The browser's camera; its image is ``share`` of the full height."""
+        """The browser's camera, its image ``share`` times the full height."""
         view = self.client.camera
         height = max(16, round(self.show.size * share))
         aspect = min(WIDEST, max(1 / WIDEST, view.aspect))
@@ -237,26 +246,17 @@ class Session:
         avatar, layer = self.show.avatar, self.layer.value
         truth = self.drive.truth(self.frame) if layer == ERROR and self.drive.truth else None
         camera = self.camera(share) if truth is None else truth.camera
-        p, body = self.drive.p[self.frame], None
-        if self.pose is not None:
-            p = self.pose
-        elif self.drive.body is not None:
-            body = self.drive.body[self.frame : self.frame + 1]
-        painting = avatar.picture(
-            torch.from_numpy(p),
-            camera,
-            visibility=torch.from_numpy(self.drive.visibility[self.frame]),
-            body=body,
-            maps=layer != IMAGE or self.splats.value,
-        )
+        p, visibility, body = inputs_of(avatar, self._current(), 0)
+        maps = layer != IMAGE or self.splats.value
+        painting = avatar.picture(p, camera, visibility=visibility, body=body, maps=maps)
         behind = self.show.behind(camera.size)
         image = shown(layer, painting, camera, avatar, behind, int(self.channel.value), truth)
         self.image = image
         whole = fitted(image, self.client.camera.aspect) if truth is not None else image
-        if self.splats.value and painting.gaussians is not None:  # the browser draws them instead
+        if self.splats.value and painting.gaussians is not None:  # the browser draws these instead
             whole = eight_bits(behind, torch.ones(1), behind)
         self.client.scene.set_background_image(whole, "jpeg", jpeg_quality=90)
-        self._place(painting)
+        self._place(painting.gaussians, np.asarray(p[0].cpu().numpy(), np.float64), body)
         self.times.append(time.monotonic())
         recent = [x for x in self.times if x > self.times[-1] - SPEED_OVER]
         rate = (len(recent) - 1) / max(recent[-1] - recent[0], 1e-6)
@@ -264,31 +264,33 @@ class Session:
         shown_rate = f"{rate:.1f} at " if len(recent) > 1 else ""
         self.status.value = f"{shown_rate}{width} × {height}"
 
-    def _place(self, painting: Painting) -> None:
-        """Draws skeleton and Gaussians, and moves the handles unless they are being dragged."""
-        scene, p, splats = self.client.scene, self.joints(), painting.gaussians
-        wanted = self.bones.value, self.splats.value and splats is not None
-        if (
-            self._drawn is not None
-            and self._drawn[1:] == wanted
-            and np.array_equal(self._drawn[0], p)
-        ):
+    def _place(self, splats: Gaussians | None, p: Float, pose: BodyPose | None) -> None:
+        """Draws skeleton, body and Gaussians, and moves the handles that are not being dragged."""
+        scene, avatar, body = self.client.scene, self.show.avatar, self.show.body
+        splats = splats if self.splats.value else None
+        drawn = (p.tobytes(), self.bones.value, self.mesh.value, splats is not None, avatar)
+        if drawn == self._drawn:
             return
-        self._drawn = (p, *wanted)
+        self._drawn = drawn
         for node in self._nodes:
             node.remove()
         self._nodes = []
-        if wanted[0]:
+        if self.bones.value:
             lines = scene.add_line_segments("/skeleton", p[BONES], colors=YELLOW, line_width=3.0)
             self._nodes.append(lines)
-        if wanted[1]:
-            assert splats is not None and splats.covariances is not None  # noqa: PT018
+        if self.mesh.value and body is not None and pose is not None:
+            vertices = body.posed_vertices(pose.to("cpu"))[0]
+            arrays = (vertices.numpy(), body.faces.numpy())
+            mesh = scene.add_mesh_simple("/body", *arrays, color=GREY, opacity=0.5)
+            self._nodes.append(mesh)
+        if splats is not None:
+            assert splats.covariances is not None
             given = (
                 *(splats.means[0], splats.covariances[0]),
                 *(splats.features[0, :, :3].clamp(0, 1), splats.opacities[0, :, None]),
             )
-            arrays = (x.cpu().numpy() for x in given)
-            self._nodes.append(scene.add_gaussian_splats("/gaussians", *arrays))
+            colours = (x.cpu().numpy() for x in given)
+            self._nodes.append(scene.add_gaussian_splats("/gaussians", *colours))
         if self.pose is None:
             for name, gizmo in self._gizmos.items():
                 gizmo.position = position(p, name)

@@ -193,7 +193,7 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
     names = ("theta", "transl", "frame_id", "betas", "registered", "fitted_to", "theta_hands")
     arrays = read_arrays(path, names)
     if fitted:  # by gsgan.fit: the free body in the person's shape
-        meta = replace(meta, body=BodyModel("free", betas=_read_shape(root / SHAPE)))
+        meta = replace(meta, body=BodyModel("free", betas=read_shape(root / SHAPE)))
     bones = None if meta.body is None else BODY_BONES[meta.body.kind]
     theta = expect_array(arrays, "theta", (None, bones, 3), path).astype(np.float64)
     transl = expect_array(arrays, "transl", (len(theta), 3), path).astype(np.float64)
@@ -224,8 +224,12 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
     return poses, replace(meta, body=replace(meta.body, betas=tuple(betas.tolist())))
 
 
-def _read_shape(path: Path) -> tuple[float, ...]:
-    """The free body's shape as the numbers of `BodyShape.flat`."""
+def read_shape(path: Path) -> tuple[float, ...]:
+    """The free body's shape in a body_shape.npz, as the numbers of `BodyShape.flat`.
+
+    Raises:
+        DataError: when the file is damaged or lacks an array.
+    """
     names = {"coefficients": (None,), "stretch": (len(STRETCHED),), "offsets": LANDMARKS_SHAPE}
     arrays = read_arrays(path, names)
     parts = [expect_array(arrays, name, shape, path).ravel() for name, shape in names.items()]
