@@ -53,8 +53,8 @@ class Whole(nn.Module):
         """``[1, 3, H, W]`` RGB on black and ``[1, 1, H, W]`` alpha, both in [0, 1].
 
         Args:
-            skeleton: ``[1, 33, 3]`` metres, world frame, finite.
-            visibility: ``[1, 33]`` 0 marks a stand-in.
+            skeleton: ``[1, J, 3]`` metres, world frame, finite; J is 33, or 75 with hands.
+            visibility: ``[1, J]`` 0 marks a stand-in.
             K, R, t: ``[1, 3, 3]``, ``[1, 3, 3]``, ``[1, 3]`` of the camera.
             theta, transl: pose of the skinned body, where the avatar needs one.
         """
@@ -99,8 +99,8 @@ class Painter(nn.Module):
 
     Its inputs, by name: ``features`` F ``[1, C, H, W]``, ``fine`` F before it was averaged, where
     the avatar supersamples; ``splat_alpha`` of F ``[1, 1, H, W]``; ``segmentation`` S ``[1,
-    classes, H, W]``, where it has one; ``skeleton`` p₂D ``[1, 8, H, W]``; ``omega`` Ω ``[1, 33,
-    6]`` and ``joints`` ``[1, 33, 3]``, see `Avatar.pose_inputs`.
+    classes, H, W]``, where it has one; ``skeleton`` p₂D ``[1, groups, H, W]``; ``omega`` Ω ``[1, J,
+    6]`` and ``joints`` ``[1, J, 3]``, see `Avatar.pose_inputs`.
 
     Args:
         avatar: unfrozen, with a generator.
