@@ -29,6 +29,14 @@ def test_a_sequence_of_ply_files_and_its_card(bare, tmp_path, inside):
     assert "license: cc-by-nc-4.0" in (out / "MODEL_CARD.md").read_text()
 
 
+def test_a_file_in_place_of_a_folder_and_the_reverse(bare, tmp_path, inside):
+    (tmp_path / "poses").write_text("mine")
+    (tmp_path / "a.ply").mkdir()
+    for name, words in (("poses", "is a file"), ("a.ply", "is a folder")):
+        given = (f"run={bare}", f"out={tmp_path / name}", "overwrite=true")
+        refused(inside("export", *given), words)
+
+
 def test_the_rest_pose_as_glb(bare, tmp_path, inside):
     out = tmp_path / "rest.glb"
     result = inside("export", f"run={bare}", "format=gltf", f"out={out}")

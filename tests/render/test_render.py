@@ -166,6 +166,17 @@ def test_the_subjects_own_motion_is_left_alone(render, capture, tmp_path):
     assert "on the subject's bones" in again.stdout, again.stderr
 
 
+def test_the_up_axis_of_a_rig_is_that_of_its_rest_pose(render, tmp_path):
+    from mannequin import mannequin, write_bvh
+
+    from gsgan.data.synthetic.motion import Choreography
+
+    person = mannequin()
+    signing = Choreography(person).at(21 + np.arange(2) / 30)
+    path = write_bvh(tmp_path / "a.bvh", person, signing, 1 / 30, scale=100.0)
+    refused(render(f"motion={path}", "up=x", "out=a"), "up=x: the rest pose", "leave up out")
+
+
 def test_a_body_pose_drives_an_avatar_with_a_body(inside, run, capture, tmp_path):
     motion = f"motion={capture / 'body_pose.npz'}"
     result = inside("render", f"run={run}", motion, "retarget=false", "out=a", "frames=2")
@@ -303,6 +314,8 @@ def test_a_camera_inside_the_person(render, motion, tmp_path):
         (("out=a", "c2pa.key=k.pem"), "go together"),
         (("out=a", "retarget=maybe"), "retarget must be one of auto"),
         (("out=a", "drive=body"), "drive must be one of None, skeleton"),
+        (("out=a", "motion=[a.npz,b.npz]", "retarget=false"), "is not supported for a list"),
+        (("out=a", "camera=0"), "camera=0 is neither a camera"),
     ],
 )
 def test_one_clear_sentence(render, tmp_path, motion, args, message):

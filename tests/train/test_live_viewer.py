@@ -42,6 +42,23 @@ def test_the_viewer_shows_the_weights_of_the_last_validation(make, tiny, tmp_pat
         urlopen(live.viewer.address)
 
 
+def test_the_viewer_stops_when_training_fails(make, tiny, tmp_path):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    module, trainer, data = make(limit_val_batches=1)
+
+    class Failing(LiveViewer):
+        def on_validation_end(self, trainer, module):
+            super().on_validation_end(trainer, module)
+            raise RuntimeError("out of memory")
+
+    live = Failing(tmp_path, tiny(), data, Console(quiet=True))
+    trainer.callbacks.append(live)
+    with pytest.raises(RuntimeError, match="out of memory"):
+        trainer.fit(module, data)
+    with pytest.raises(URLError):
+        urlopen(live.viewer.address)
+
+
 def test_without_viser_training_does_not_begin(inside, capture, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     result = inside("train", *arguments(capture, tmp_path / "run"), "viewer=true")

@@ -191,7 +191,7 @@ def upload(page, path) -> None:
     chosen.value.set_files(path)
 
 
-def test_a_motion_is_loaded_and_bad_files_are_told(open_page, capture, tmp_path):
+def test_a_motion_is_loaded_and_bad_files_are_reported(open_page, capture, tmp_path):
     page, session = open_page()
     bad = tmp_path / "bad.bvh"
     bad.write_text("HIERARCHY\nROOT")
@@ -203,7 +203,7 @@ def test_a_motion_is_loaded_and_bad_files_are_told(open_page, capture, tmp_path)
     upload(page, large)
     page.get_by_text("This file is too large").wait_for()
     upload(page, capture / "landmarks3d.npz")
-    until(lambda: "landmarks3d.npz" in session.told.content, page)
+    until(lambda: "landmarks3d.npz" in session.description.content, page)
     until(lambda: session.full, page)
 
 
@@ -228,15 +228,24 @@ def test_it_listens_on_this_machine_alone(viewer, compose):
 
 def test_another_machines_address_is_refused(bare, inside):
     refused(inside("view", f"run={bare}", "host=203.0.113.1", "motion=rest"), "host=203.0.113.1")
+    refused(inside("view", f"run={bare}", "port=70000", "motion=rest"), "port must be")
     refused(inside("view"), "run is not set")
     refused(inside("view", f"run={bare}", "motion=none.bvh"), "none.bvh", "does not exist")
 
 
-def test_a_pose_that_cannot_be_rendered_is_told(open_page):
+def test_a_pose_that_cannot_be_rendered_is_reported(open_page):
     page, session = open_page()
     kept = session.drive
     session.drive = replace(kept, p=np.full_like(kept.p, np.nan))
     session.touch()
     page.get_by_text("This pose cannot be rendered").wait_for()
-    session.drive = kept
+    session.drive, behind = kept, session.show.behind
+
+    def broken(size):
+        raise RuntimeError("out of memory")
+
+    session.show.behind = broken
+    session.touch()
+    page.get_by_text("RuntimeError: out of memory").wait_for()
+    session.show.behind = behind
     assert changed(session, page, lambda: session._scrub(1))

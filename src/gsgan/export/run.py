@@ -6,6 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import cast
 
+import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 from rich.progress import track
@@ -79,8 +80,12 @@ def _place(config: DictConfig, kind: str) -> Path:
     out = Path(config.out).expanduser()
     if out.suffix.lower() != ending and (out.suffix or kind != "ply"):
         raise ConfigError(f"out={out}: format={kind} needs a {ending} file{folders}")
-    taken = out.is_file() if out.suffix else out.exists() and any(out.iterdir())
-    if taken and not config.overwrite:
+    folder = not out.suffix
+    if out.exists() and out.is_dir() != folder:
+        kind = "a file; expected a folder" if folder else "a folder; expected a file"
+        found = "a file; expected a folder" if folder else "a folder; expected a file"
+        raise ConfigError(f"out={out} is {found}")
+    if out.exists() and not config.overwrite and (not folder or any(out.iterdir())):
         raise ConfigError(f"out={out} exists; give overwrite=true or another name")
     return out
 
@@ -94,7 +99,7 @@ def _poses(config: DictConfig, run: Run, kind: str) -> Drive:
     if start >= len(drive.p):
         raise ConfigError(f"start={start}: the motion has {len(drive.p)} frames")
     end = None if config.frames is None else start + whole("frames", config.frames, 1)
-    return drive.rows(torch.arange(len(drive.p))[start:end].numpy())
+    return drive.rows(np.arange(len(drive.p))[start:end])
 
 
 @torch.no_grad()

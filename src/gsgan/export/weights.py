@@ -14,6 +14,7 @@ from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.tensors import pick_device
 
 KEPT = ("effects", "scene", "marks")  # of a checkpoint's facts
+MISSING = "safetensors files need: pip install 'gsgan[export]'"
 
 
 def weights_bytes(folder: Path, avatar: Avatar, facts: dict[str, Any]) -> bytes:
@@ -23,8 +24,14 @@ def weights_bytes(folder: Path, avatar: Avatar, facts: dict[str, Any]) -> bytes:
         folder: the run's.
         avatar: its avatar.
         facts: ``gsgan`` of its checkpoint.
+
+    Raises:
+        ConfigError: when the package safetensors is missing.
     """
-    from safetensors.torch import save
+    try:
+        from safetensors.torch import save
+    except ImportError:
+        raise ConfigError(MISSING) from None
 
     config = OmegaConf.to_container(read_config(folder), resolve=False)
     metadata = {"format": "pt", "config": json.dumps(config)}
@@ -46,7 +53,7 @@ def load_weights(path: str | Path, *, device: str = "auto") -> Avatar:
     try:
         from safetensors import SafetensorError, safe_open
     except ImportError:
-        raise ConfigError("safetensors files need: pip install 'gsgan[export]'") from None
+        raise ConfigError(MISSING) from None
     path = Path(path).expanduser()
     try:
         with safe_open(path, "pt") as file:

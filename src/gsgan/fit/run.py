@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import io
 import json
@@ -97,9 +98,9 @@ def fit_body(
 ) -> Path:
     """Shape from skeletons, poses solved from skeletons, then registered to the masks.
 
-    The registered poses say where on the body this person's landmarks are. With that all poses are
-    solved again, and written unless the settings keep registered ones. A fit that was stopped
-    resumes from a hidden file in ``out``.
+    The registered poses determine where on the body this person's landmarks are. With these offsets
+    all poses are solved again, and written unless the settings keep registered ones. A fit that was
+    stopped resumes from a hidden file in ``out``.
 
     Args:
         data: a capture.
@@ -215,8 +216,8 @@ def _solve(
 
 @torch.no_grad()
 def _offsets(fitter: Fitter, shape: BodyShape, found: BodyPose) -> Tensor:
-    """``[33, 3]`` metres: where on the registered body this person's landmarks are, median over
-    frames. Poses solved with them are what registration would find, as far as a constant says."""
+    """``[33, 3]`` metres: offsets of this person's landmarks on the registered body, medians over
+    frames. With them solving approximates registration, up to what varies between frames."""
     body, moments = fitter.surface.body, fitter.moments
     bones = body.transforms(found)[:, body.landmark_bone]
     at_rest = bones[..., :3, :3].mT @ (moments.skeletons - bones[..., :3, 3]).unsqueeze(-1)
@@ -242,10 +243,10 @@ def _key(fitter: Fitter, shape: BodyShape, seed: int) -> str:
 
 
 def _fitted(fitter: Fitter, stopped: Path, key: str, console: Console) -> None:
-    """Does all steps that a stopped process left; the state is saved after each sweep."""
+    """Runs the remaining steps of a fit; the state is saved after each sweep."""
     settings = fitter.settings
     if stopped.is_file():
-        fresh = fitter.state_dict()
+        fresh = copy.deepcopy(fitter.state_dict())  # loading copies into the same tensors
         try:
             state = torch.load(stopped, map_location=fitter.moments.device, weights_only=True)
             if state["key"] != key:

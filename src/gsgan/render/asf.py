@@ -74,8 +74,8 @@ class _Bone:
     """A bone of the skeleton: its end from its start, its axes and its angles' names."""
 
     def __init__(self, words: dict[str, list[str]], radians: float) -> None:
-        way = np.array(words.get("direction", ["0", "0", "0"]), dtype=float)
-        self.end = way * float(words.get("length", ["0"])[0])
+        direction = np.array(words.get("direction", ["0", "0", "0"]), dtype=float)
+        self.end = direction * float(words.get("length", ["0"])[0])
         self.dof = [name.upper() for name in words.get("dof", words.get("order", []))]
         axis = words["axis"] if len(words["axis"]) > 3 else [*words["orientation"], *words["axis"]]
         order = axis[3]

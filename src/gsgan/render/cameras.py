@@ -52,13 +52,14 @@ class Orbit:
         """One camera per skeleton ``[F, 33, 3]``, on a circle round the centre of the motion.
 
         Args:
-            p: metres, world frame.
+            p: metres, world frame; NaN where unknown.
             figure: of the subject.
             scene: sets the person's size, that of training images.
             size: pixels of the square images.
             trained: pixels of the training images.
         """
         to_world = upright(figure.up).T
+        p = np.where(np.isfinite(p), p, np.nanmean(p, axis=1, keepdims=True))
         low, high = (f((p @ to_world).reshape(-1, 3), axis=0) for f in (np.min, np.max))
         middle = (low + high) / 2
         focal = size / 2 / np.tan(np.radians(self.fov) / 2)

@@ -75,8 +75,8 @@ def checked(motion: Motion, least_visibility: float) -> Motion:
     if len(bad := np.flatnonzero(known[:, TRUNK].sum(1) < MIN_TRUNK_JOINTS)):
         raise DataError(
             f"{motion.path}: {len(bad)} of {len(motion)} frames, the first is {bad[0]}, lack "
-            "shoulders or hips (NaN, or not seen); leave them out with start= and frames=, or fill "
-            "the gaps"
+            "shoulders or hips (NaN, or not seen); remove these frames from the file, or "
+            "fill the gaps"
         )
     p = np.where(known[..., None], motion.p, np.nan)
     return replace(motion, p=p, visibility=np.where(known, motion.visibility, 0.0))

@@ -76,20 +76,20 @@ class Output:
             _av()
             if self.out.exists() and not overwrite:
                 raise ConfigError(f"out={self.out} exists; give overwrite=true or another name")
-        held, record = self.folder / RECORD, json.loads(json.dumps(record))
+        stored, record = self.folder / RECORD, json.loads(json.dumps(record))
         if (
             self.folder.exists()
-            and not held.is_file()
+            and not stored.is_file()
             and (not self.folder.is_dir() or any(self.folder.iterdir()))
         ):
             raise ConfigError(
                 f"out={self.out} is not empty and holds no render; give another folder"
             )
         try:
-            same = held.is_file() and json.loads(held.read_text()) == record
+            same = stored.is_file() and json.loads(stored.read_text()) == record
         except ValueError:
             same = False
-        if held.is_file() and not same:
+        if stored.is_file() and not same:
             if not overwrite and not self.video:
                 raise ConfigError(
                     f"out={self.out} holds frames of another render; give overwrite=true or "
@@ -98,7 +98,7 @@ class Output:
             for path in self.folder.glob("[0-9]*.png"):
                 path.unlink()
         if not same:
-            write_atomically(held, json.dumps(record, indent=2))
+            write_atomically(stored, json.dumps(record, indent=2))
 
     def write(self, number: int, image: Bytes) -> None:
         """Writes a frame ``[H, W, 3 or 4]``."""

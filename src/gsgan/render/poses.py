@@ -196,6 +196,8 @@ def _given(config: DictConfig, run: Run, fps: float) -> Drive:
         still = found.rows(np.zeros(1, np.int64))
         return replace(still, text=f"frame {frame} of {split}, held still", truth=None, camera=None)
     if OmegaConf.is_list(config.motion):
+        if config.retarget is False:
+            raise ConfigError("retarget=false is not supported for a list of motions")
         clips = [_from_file(config, run, str(path), fps) for path in config.motion]
         return _joined(clips, run.figure, float(above("transition", config.transition)), fps)
     if config.motion == REST:
@@ -212,7 +214,7 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
     if not dataset.items:
         raise DataError(f"motion={split}: the run has no such frames ({run.data.reasons[split]})")
     names = list(dict.fromkeys(camera for camera, _ in dataset.items))
-    camera = config.camera or names[0]
+    camera = names[0] if config.camera is None else str(config.camera)  # "7" is parsed as a number
     own = camera in names
     items = [item for item in dataset.items if item[0] == (camera if own else names[0])]
     frames = [frame for _, frame in items]
@@ -262,7 +264,11 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     motion = checked(motion, float(config.min_visibility))
     rate = config.motion_fps or motion.fps
     rate = float(above("motion_fps", rate)) if rate else FPS
-    up = config.up or motion.up or up_axis(motion)
+    if config.up and motion.file_up and config.up != motion.file_up:
+        raise ConfigError(
+            f"up={config.up}: the rest pose of {motion.path} has {motion.file_up} up; leave up out"
+        )
+    up = (None if motion.file_up else config.up) or motion.up or up_axis(motion)
     choice = one_of("retarget", config.retarget, ("auto", True, False))
     own = is_own(motion, figure) if choice == "auto" else not choice
     own = own and not OmegaConf.is_list(config.motion)  # transitions need every joint

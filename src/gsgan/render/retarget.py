@@ -142,10 +142,10 @@ def placed(
         stay: subtract the path of a person who walks away, as on a treadmill.
     """
     q = p @ rotation(np.array([0, 0, figure.facing - heading(p[0])])).T
-    way = middle(q, HIPS)[:, :2]
+    path = middle(q, HIPS)[:, :2]
     lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)
     floor = floor_under(lowest, figure.leg, 1 / fps) if ground else np.full(len(q), lowest.min())
-    gone = drift(way, 1 / fps) if stay else way[:1]
-    q[..., :2] += centre[:2] - np.broadcast_to(gone, way.shape)[:, None]
+    gone = drift(path, 1 / fps) if stay else path[:1]
+    q[..., :2] += centre[:2] - np.broadcast_to(gone, path.shape)[:, None]
     q[..., 2] += (figure.ground - floor)[:, None]
     return q

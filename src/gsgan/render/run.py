@@ -104,14 +104,13 @@ def _cameras(config: DictConfig, run: Run, drive: Drive) -> tuple[Camera, Tensor
             camera = camera.resize((whole("pixels", config.pixels, 1),) * 2)
         return camera, index
     size = whole("pixels", config.pixels or trained or 512, 1)
-    name = config.camera or "orbit"
+    name = "orbit" if config.camera is None else str(config.camera)
     if name == "orbit":
         orbit = views.Orbit(**OmegaConf.to_container(config.orbit))  # type: ignore[arg-type]
-        known = np.where(np.isfinite(drive.p), drive.p, np.nanmean(drive.p, 1, keepdims=True))
-        return orbit.cameras(known, run.figure, run.scene, size, trained or size), None
-    if (path := Path(str(name)).expanduser()).is_file():
+        return orbit.cameras(drive.p, run.figure, run.scene, size, trained or size), None
+    if (path := Path(name).expanduser()).is_file():
         return views.from_file(path, drive.p, size), None
-    entry = views.of_capture(run.data.layout.cameras, str(name))
+    entry = views.of_capture(run.data.layout.cameras, name)
     crop, lens = run.data.crop, run.stored.data.get("lens") == "project"
     return views.of_entry(entry, drive.p, size, crop, lens), None
 
@@ -139,14 +138,14 @@ def _image(
         camera_index=None if index is None else index[at],
     )
     assert painting.image is not None and painting.alpha is not None  # noqa: PT018
-    held = [(painting.image[0].cpu(), painting.alpha[0].cpu())]
+    tiles = [(painting.image[0].cpu(), painting.alpha[0].cpu())]
     if config.compare is not None:
         assert drive.truth is not None
         frame = drive.truth(i)
         if frame.camera.size != camera.size:
             raise ConfigError("compare=truth shows images of the data's size; leave pixels out")
-        held.insert(0, (frame.image[0], frame.mask[0]))
-    return np.concatenate([eight_bits(*pair, paint_on(camera.size)) for pair in held], axis=1)
+        tiles.insert(0, (frame.image[0], frame.mask[0]))
+    return np.concatenate([eight_bits(*pair, paint_on(camera.size)) for pair in tiles], axis=1)
 
 
 def _record(config: DictConfig, run: Run, drive: Drive, cameras: Camera) -> dict[str, Any]:
@@ -155,6 +154,10 @@ def _record(config: DictConfig, run: Run, drive: Drive, cameras: Camera) -> dict
     parts = [drive.p, drive.visibility, cameras.K.numpy(), cameras.R.numpy(), cameras.t.numpy()]
     if drive.body is not None:
         parts += [drive.body.theta.numpy(), drive.body.transl.numpy()]
+    if cameras.dist is not None:
+        parts.append(cameras.dist.numpy())
+    if (image := Path(str(config.background)).expanduser()).is_file():
+        hashed.update(image.read_bytes())
     for part in parts:
         hashed.update(np.ascontiguousarray(part).tobytes())
     return {

@@ -120,7 +120,16 @@ class LiveViewer(Callback):
         self.console.print(f"viewer: {self.viewer.address}", highlight=False)
 
     def teardown(self, trainer: Trainer, module: LightningModule, stage: str) -> None:
-        if stage == "fit" and self.viewer is not None:
+        if stage == "fit":
+            self._stop()
+
+    def on_exception(
+        self, trainer: Trainer, module: LightningModule, exception: BaseException
+    ) -> None:
+        self._stop()  # Lightning calls no teardown; a sweep goes on in this process
+
+    def _stop(self) -> None:
+        if self.viewer is not None:
             self.viewer.stop()
 
 

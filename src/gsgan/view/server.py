@@ -18,13 +18,12 @@ from gsgan.model.avatar import Avatar
 from gsgan.render.cameras import Orbit
 from gsgan.render.images import background
 from gsgan.render.poses import Drive, Run, drive_of
-from gsgan.utils.checks import above, whole
+from gsgan.utils.checks import above, between, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
-from gsgan.view.session import Session, Show
+from gsgan.view.session import IDLE, Session, Show
 
 MEGABYTE = 1 << 20
-IDLE = 0.1  # seconds between two checks whether an image is due
 
 
 def view_config(config: DictConfig) -> None:
@@ -64,7 +63,7 @@ class Viewer:
         behind: Any = background(str(config.background), video=True)
         rate = float(above("rate", config.rate))
         self.show = Show(self.run.avatar, self.run.body, drive, read, behind, size, fps, rate)
-        host, port = str(config.host), whole("port", config.port, 0)
+        host, port = str(config.host), between("port", whole("port", config.port, 0), 0, 65535)
         try:  # viser itself would never return
             socket.create_server((host, 0)).close()
         except OSError as error:
@@ -100,7 +99,9 @@ class Viewer:
         threading.Event().wait()
 
     def stop(self) -> None:
-        """Stops the server and its thread."""
+        """Stops the server and its thread; a second call does nothing."""
+        if self._ended:
+            return
         self._ended = True
         self._wake.set()
         self._painter.join()
@@ -110,15 +111,13 @@ class Viewer:
         """Sets the first view of new browsers: the first pose from the front, as large as in
         training images."""
         drive, scene, figure = self.show.drive, self.run.scene, self.run.figure
-        first = drive.p[:1]
-        known = np.where(np.isfinite(first), first, np.nanmean(first, 1, keepdims=True))
         trained = self.run.stored.data.size or size
-        camera = Orbit().cameras(known, figure, scene, size, trained)
+        camera = Orbit().cameras(drive.p[:1], figure, scene, size, trained)
         up = upright(figure.up)[2]
         self.server.scene.set_up_direction(tuple(map(float, up)))
         self.server.initial_camera.up = up
         self.server.initial_camera.position = camera.centre[0].double().numpy()
-        self.server.initial_camera.look_at = known[0].mean(axis=0)
+        self.server.initial_camera.look_at = np.nanmean(drive.p[0], axis=0)
         self.server.initial_camera.fov = float(np.radians(Orbit().fov))
 
     def _join(self, client: Any, limit: int) -> None:
@@ -129,9 +128,9 @@ class Viewer:
     def _paint(self) -> None:
         """Renders for each browser in turn, as long as one of them needs a new image."""
         while not self._ended:
-            busy = [session.step() for session in list(self.sessions.values())]
-            if not any(busy):
-                self._wake.wait(IDLE)
+            due = min((s.step() for s in list(self.sessions.values())), default=IDLE)
+            if due > 0:
+                self._wake.wait(min(due, IDLE))
                 self._wake.clear()
 
 
@@ -155,13 +154,13 @@ def _bound_uploads(client: Any, limit: int) -> None:
     """
     from viser import _messages
 
-    held: dict[str, Any] = client.gui._current_file_upload_states
+    uploads: dict[str, Any] = client.gui._current_file_upload_states
     connection = client._websock_connection
 
     def check(_: int, message: Any) -> None:
-        state = held.get(message.transfer_uuid)
+        state = uploads.get(message.transfer_uuid)
         if state and max(state["total_bytes"], state["transferred_bytes"]) > limit:
-            held.pop(message.transfer_uuid)
+            uploads.pop(message.transfer_uuid)
             total = state["total_bytes"]  # the browser stops waiting
             ends = message.source_component_uuid, message.transfer_uuid, total, total
             connection.queue_message(_messages.FileTransferPartAck(*ends))

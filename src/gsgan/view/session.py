@@ -29,6 +29,7 @@ from gsgan.view.layers import ERROR, IMAGE, fitted, layers, shown
 
 Float = NDArray[np.float64]
 
+IDLE = 0.1  # seconds between two checks whether an image is due
 RESTS = 0.3  # seconds without movement after which the full-size image is rendered
 SMALLEST = 0.25  # least scale of the images while something moves
 WIDEST = 3.0  # bound on the aspect ratio, since a browser window can have any
@@ -94,7 +95,7 @@ class Session:
             self.slider = gui.add_slider("frame", 0, max(1, len(self.drive.p) - 1), 1, 0)
             self.play = gui.add_checkbox("play", False)
             upload = gui.add_upload_button("load a motion file")
-            self.told = gui.add_markdown(self.drive.text)
+            self.description = gui.add_markdown(self.drive.text)
         with gui.add_folder("3D"):
             self.handles = gui.add_checkbox("drag joints", False)
             reset = gui.add_button("undo dragging")
@@ -102,9 +103,9 @@ class Session:
             self.mesh = gui.add_checkbox("body", False, visible=self.show.body is not None)
             self.splats = gui.add_checkbox("Gaussians", False)
         save = gui.add_button("save the image")
-        shown = (self.layer, self.channel, self.bones, self.mesh, self.splats, self.play)
-        for control in shown:
+        for control in (self.layer, self.channel, self.bones, self.mesh, self.splats):
             control.on_update(lambda _: self.touch(moving=False))
+        self.play.on_update(lambda _: self._played())
         self.handles.on_update(lambda _: self._show_handles())
         self.slider.on_update(self._scrubbed)
         upload.on_upload(lambda event: self._load(event.target.value))
@@ -118,6 +119,10 @@ class Session:
         if moving:
             self.moved = self.changed
         self._wake()
+
+    def _played(self) -> None:
+        self.painted = 0.0  # the time since the last image is no part of the motion
+        self.touch(moving=False)
 
     def _scrubbed(self, event: Any) -> None:
         if event.client_id is not None:  # moved by the user, not by `step`
@@ -135,12 +140,9 @@ class Session:
                 path.write_bytes(file.content)
                 drive = self.show.read(str(path))
         except Exception as error:  # whatever the file is, the server must keep running
-            text = (
-                str(error) if isinstance(error, GsganError) else f"{type(error).__name__}: {error}"
-            )
-            self._warn("This motion cannot be used", text.replace(folder + "/", ""))
+            self._warn("This motion cannot be used", _message(error).replace(folder + "/", ""))
             return
-        self.drive, self.told.content = drive, drive.text
+        self.drive, self.description.content = drive, drive.text
         self.layer.options = layers(self.show.avatar, drive.truth is not None)
         self.slider.max = max(1, len(drive.p) - 1)
         self.slider.value = 0
@@ -159,17 +161,19 @@ class Session:
     # -- dragging
 
     def _show_handles(self) -> None:
-        for gizmo in self._gizmos.values():
+        old, self._gizmos = self._gizmos, {}
+        for gizmo in old.values():
             gizmo.remove()
-        self._gizmos = {}
         if self.handles.value:
+            gizmos = {}
             for name in NAMES:
                 gizmo = self.client.scene.add_transform_controls(
                     f"/drag/{name}", scale=0.12, disable_rotations=True, depth_test=False,
                     position=position(self.joints(), name),
                 )  # fmt: skip
                 gizmo.on_update(lambda event, name=name: self.drag(name, event.target.position))
-                self._gizmos[name] = gizmo
+                gizmos[name] = gizmo
+            self._gizmos = gizmos  # at once: the rendering thread iterates over them
         self.touch(moving=False)
 
     def drag(self, name: str, target: Any) -> None:
@@ -196,37 +200,37 @@ class Session:
 
     # -- painting
 
-    def step(self) -> bool:
-        """Renders an image if one is due; returns whether the next one may be due at once."""
+    def step(self) -> float:
+        """Renders an image if one is due; returns the seconds until the next one may be."""
         now = time.monotonic()
         if self.play.value and len(self.drive.p) > 1:
-            if now - self.painted < 1 / self.show.fps:
-                return True
+            if (early := self.painted + 1 / self.show.fps - now) > 0:
+                return early
             passed = max(1, round((now - self.painted) * self.show.fps)) if self.painted else 1
             self.frame, self.pose = (self.frame + passed) % len(self.drive.p), None
             self.slider.value = self.frame
             self.changed = self.moved = now
         moving = now - self.moved < RESTS
         if self.painted > self.changed and (self.full or moving):
-            return moving
+            return self.moved + RESTS - now if moving else IDLE
         share = 1.0
         if moving and self.seconds:
             share = min(1.0, max(SMALLEST, (1 / self.show.rate / self.seconds) ** 0.5))
         self.painted, self.full = now, False
         try:
             self._paint(share)
-        except (GsganError, ValueError) as error:
-            if self._problem != str(error):  # once, not for every image
-                self._problem = str(error)
+        except Exception as error:  # whatever the pose is, the thread renders for all browsers
+            if self._problem != _message(error):  # once, not for every image
+                self._problem = _message(error)
                 self._warn("This pose cannot be rendered", self._problem)
             self.play.value, self.full = False, True
-            return False
+            return IDLE
         self._problem = ""
         self.full = share == 1
         took = time.monotonic() - now
         whole = took / share**2
         self.seconds = whole if not self.seconds else 0.7 * self.seconds + 0.3 * whole
-        return True
+        return 0.0
 
     def camera(self, share: float) -> Camera:
         """The browser's camera, its image ``share`` times the full height."""
@@ -244,9 +248,10 @@ class Session:
 
     def _paint(self, share: float) -> None:
         avatar, layer = self.show.avatar, self.layer.value
-        truth = self.drive.truth(self.frame) if layer == ERROR and self.drive.truth else None
+        current = self._current()
+        truth = current.truth(0) if layer == ERROR and current.truth else None
         camera = self.camera(share) if truth is None else truth.camera
-        p, visibility, body = inputs_of(avatar, self._current(), 0)
+        p, visibility, body = inputs_of(avatar, current, 0)
         maps = layer != IMAGE or self.splats.value
         painting = avatar.picture(p, camera, visibility=visibility, body=body, maps=maps)
         behind = self.show.behind(camera.size)
@@ -294,3 +299,9 @@ class Session:
         if self.pose is None:
             for name, gizmo in self._gizmos.items():
                 gizmo.position = position(p, name)
+
+
+def _message(error: Exception) -> str:
+    """The error for the page; one that is not gsgan's own is named."""
+    expected = isinstance(error, (GsganError, ValueError))
+    return str(error) if expected else f"{type(error).__name__}: {error}"
