@@ -114,6 +114,9 @@ def test_fitted_poses_have_their_fingers_with_hands_alone(root: Path) -> None:
     np.savez(root / "body_pose.npz", **poses)
     with pytest.raises(ConfigError, match=r"made body_pose.npz without hands; run it again"):
         assert GsganData(str(root), size=32, skeleton="holistic").layout
+    assert (
+        GsganData(str(root), skeleton="holistic", body="none").layout.poses is None
+    )  # to fit anew
     np.savez(root / "body_pose.npz", **poses, theta_hands=np.ones((4, 56, 3)))
     for skeleton, value in (("mediapipe33", 0.0), ("holistic", 1.0)):
         frame = GsganData(str(root), size=32, skeleton=skeleton).dataset("train")[0]

@@ -181,7 +181,7 @@ class GsganData(LightningDataModule):
             if poses.with_hands is None:
                 raise ConfigError(
                     f"{layout.root}: gsgan.fit made body_pose.npz without hands; run it again with "
-                    "overwrite=true"
+                    "overwrite=true data.body=none, or choose data.skeleton=mediapipe33"
                 )
             layout = replace(layout, poses=replace(poses, theta=poses.with_hands))
         return layout
