@@ -147,16 +147,17 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     with naming_group("training"):
         return data, instantiate(config.training)(
             avatar,
-            pose=pose_corrections(data, avatar),
+            pose=pose_corrections(data, avatar, config.training.recipes.pose.rate.peak),
             record=training_record(config, data),
             scene=json.loads(json.dumps(asdict(data.info))),
         )
 
 
-def pose_corrections(data: GsganData, avatar: Avatar) -> PoseCorrections | None:
-    """For an avatar whose G moves with poses that `gsgan.fit` registered; None for all others."""
+def pose_corrections(data: GsganData, avatar: Avatar, rate: float) -> PoseCorrections | None:
+    """For an avatar whose G moves with poses that `gsgan.fit` registered, where they have a
+    learning rate; None for all others."""
     poses = data.layout.poses
-    if poses is None or not poses.registered or not (avatar.body_points or avatar.surface):
+    if not rate or poses is None or not poses.registered or not (avatar.body_points or avatar.surface):
         return None
     body = open_body(data.info.body, data.info.body_file, data.info.betas)
     assert body is not None  # the avatar is built on it
