@@ -157,7 +157,9 @@ def pose_corrections(data: GsganData, avatar: Avatar, rate: float) -> PoseCorrec
     """For an avatar whose G moves with poses that `gsgan.fit` registered, where they have a
     learning rate; None for all others."""
     poses = data.layout.poses
-    if not rate or poses is None or not poses.registered or not (avatar.body_points or avatar.surface):
+    if not rate or poses is None or not poses.registered:
+        return None
+    if avatar.body_points is None and avatar.surface is None:
         return None
     body = open_body(data.info.body, data.info.body_file, data.info.betas)
     assert body is not None  # the avatar is built on it
