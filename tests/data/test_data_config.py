@@ -54,7 +54,7 @@ def test_synthetic_config_reads_what_the_generator_would_make(capture: Path) -> 
     given = dict(data.source.keywords)
     assert given.pop("workers") == 2
     assert Settings(**given) == Settings(size=48, frames=12, test_frames=3)
-    made = instantiate(conf("synthetic", f"root={capture}"))
+    made = instantiate(conf("synthetic", f"root={capture}", "skeleton=mediapipe33"))
     assert made.dataset("train")[0].image.shape[-2:] == (128, 128)
 
 
