@@ -57,7 +57,7 @@ def test_counts() -> None:
 
 
 def test_the_face_continues_the_poses_own() -> None:
-    """The lids' corners are the eyes', the lips' those of the mouth, the lips lie below the nose."""
+    """Corners of lids and lips are those of eyes and mouth; lips, nose, lids, brows follow."""
     for own, pose in (("left_lid_inner", "left_eye_inner"), ("mouth_outer_6", "mouth_right")):
         a, b = (T.rest_positions[T.names.index(name)] for name in (own, pose))
         assert a == b
@@ -133,7 +133,7 @@ def test_a_persons_own_face_rests_in_place_of_the_templates() -> None:
 
 def test_slopes_are_finite_where_the_head_vanishes() -> None:
     p = REST.clone()
-    p[:, list(T.face)] = p[:, :1]
+    p[:, list(T.face)] = p[:, :1].clone()
     p.requires_grad_()
     omega(p, None, torch.eye(3, dtype=F64)[None], T).square().sum().backward()
     assert p.grad.isfinite().all()
