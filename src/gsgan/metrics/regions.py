@@ -220,16 +220,16 @@ def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tenso
 
 
 def describe_boxes(skeleton: str) -> str | None:
-    """What the boxes of a named skeleton hold, for notes; None for a skeleton without hands."""
+    """What the boxes of a named skeleton contain, for notes; None for one without hands."""
     template = TEMPLATES[skeleton]
     if not template.palms:
         return None
-    mouth = f"a square of {MOUTH_SIDE:g} times the mouth's width"
+    mouth = f"a square of {MOUTH_SIDE:g} times its width"
     if lip_landmarks(template):
-        mouth = f"the lips and {LIP_MARGIN:.0%} of their longer side"
+        mouth = f"lips, margin {LIP_MARGIN:.0%} of the longer side"
     return (
-        f"skeleton {skeleton}; hands: the landmarks of each hand and {HAND_MARGIN:.0%} of their "
-        f"longer side on every side; mouth: {mouth}; at least {LEAST_BOX} pixels"
+        f"skeleton {skeleton}; hands: {HAND} landmarks each, margin {HAND_MARGIN:.0%} of the "
+        f"longer side; mouth: {mouth}; at least {LEAST_BOX} pixels"
     )
 
 
