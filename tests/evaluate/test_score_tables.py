@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pandas as pd
+import pytest
 from rich.console import Console
 
 from gsgan.data.measures import Measures
@@ -19,7 +20,7 @@ from gsgan.evaluate.files import (
     write_scored,
 )
 from gsgan.evaluate.predictions import Preparation
-from gsgan.evaluate.scores import METRICS, Scorer, empty
+from gsgan.evaluate.scores import BOX_METRICS, METRICS, Scorer, empty, no_scores
 
 FACTS = {
     "method": "gsgan", "model": "wo_seg", "protocol": "zju_gauhuman", "seed": 3,
@@ -28,7 +29,7 @@ FACTS = {
 }  # fmt: skip
 
 
-def results(marks=("perceptual loss: stand-in",)):
+def results(marks=("perceptual loss: stand-in",), boxes=None):
     scores = {
         "psnr": 30.123, "psnr_person": 28.0, "psnr_inside": 31.0, "ssim": 0.98,
         "high_frequencies": 0.9, "ssim_person": 0.9,
@@ -36,8 +37,10 @@ def results(marks=("perceptual loss: stand-in",)):
         "lpips_person": None, "lpips_person_reason": "no weights", "edge_f1_person": 0.5,
         "edge_ratio_person": 1.2, "edge_f1": 0.5, "edge_ratio": 1.25, "miou": 0.9,
         "miou_with_background": 0.95,
-        "images": 3, "marks": list(marks),
+        "images": 3, "marks": list(marks), "boxes": boxes,
     }  # fmt: skip
+    held = {"psnr_hands": 24.5, "ssim_hands": 0.9, "psnr_mouth": 26.25, "ssim_mouth": 0.92}
+    scores |= held if boxes else no_scores(BOX_METRICS, "no hands")
     scores["cameras"] = {"cam07": dict.fromkeys(METRICS) | {"psnr": 29.5}}
     split = {"full": dict(scores), "splat": dict(scores), "floor": dict(scores)}
     scorer = Scorer(Preparation(Measures(), None), None, "no weights", "LPIPS", list(marks))
@@ -51,7 +54,8 @@ def test_every_table_shows_floor_mark_reason_and_what_was_scored():
     for text in (console.export_text(), markdown(results(), FACTS)):
         assert "floor" in text
         assert "marked: perceptual loss: stand-in" in text
-        assert "lpips n/a: no weights" in text
+        assert "lpips, lpips_person n/a: no weights" in text
+        assert "psnr_mouth, ssim_mouth n/a: no hands" in text
         assert "novel_view: no camera is held out" in text
         assert "30.12" in text
         for said in ("protocol zju_gauhuman", "my_377, 0123456789ab", "seed 3", "commit abc"):
@@ -59,12 +63,15 @@ def test_every_table_shows_floor_mark_reason_and_what_was_scored():
         assert "changed since" in text
 
 
-def test_the_table_fits_a_hundred_columns():
+@pytest.mark.parametrize("boxes", [None, "hands: their landmarks"])
+def test_the_table_fits_a_hundred_columns(boxes):
     console = Console(record=True, width=100)
-    print_table(results(), FACTS, console)
+    print_table(results(boxes=boxes), FACTS, console)
     text = console.export_text()
     assert "…" not in text
     assert text.count("mIoU") == 1
+    for said in ("hands ↑", "mouth ↑", "24.50", "26.25", "boxes: hands: their landmarks"):
+        assert (said in text) == (boxes is not None)
 
 
 def test_cameras_have_rows_where_asked_for():
@@ -91,7 +98,7 @@ def test_metrics_json_has_the_promised_shape(tmp_path):
 
 def test_notes_say_each_thing_once():
     said = notes(results())
-    assert len(said) == len(set(said)) == 3
+    assert len(said) == len(set(said)) == 4
 
 
 def test_a_caption_names_what_is_not_known():

@@ -6,10 +6,13 @@ import json
 from dataclasses import replace
 
 import pytest
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
 from report_folders import protocol, report_of, row, table, texts, variant, write_run, zju
 
 from gsgan.report.runs import read_run
 from gsgan.report.table import build
+from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError
 
 SPLITS = ("novel_view", "novel_pose")
@@ -91,6 +94,26 @@ def test_step_ones_colour_is_a_row_of_its_own(tmp_path):
         "full", "full: Step I's colour", "all background (floor)",
     ]  # fmt: skip
     assert texts(row(grid, "full: Step I's colour")) == ["29.00", "n/a"]
+
+
+def test_the_table_of_signs_has_boxes_of_one_kind(tmp_path):
+    spec = instantiate(OmegaConf.load(config_folder() / "table" / "slp.yaml"))
+    boxes = "skeleton holistic; hands: their landmarks"
+    runs = [
+        write_run(tmp_path / model, model, psnr=psnr, psnr_hands=psnr - 6, boxes=boxes)
+        for model, psnr in (("full", 33.0), ("image_to_image", 29.0), ("splat_only", 32.0))
+    ]
+    ours, paper = report_of(spec, *runs).grids
+    models = ["full", "image_to_image", "splat_only"]  # no empty row for a model without a run
+    assert [r.label for r in ours.rows] == [*models, "all background (floor)"]
+    assert texts(row(ours, "full"))[:2] == ["33.00", "27.00"]
+    assert ours.remarks[1] == f"Boxes: {boxes}."
+    assert "the paper's capture is private" in paper.remarks[0]
+    other = write_run(tmp_path / "x", "lbs_splat", psnr=30.0, boxes=boxes.replace("ho", "o"))
+    with pytest.raises(ConfigError, match="differ in boxes of hands and mouth"):
+        report_of(spec, *runs, other)
+    (grid,) = report_of(table(), *runs, other).grids  # which shows no score of boxes
+    assert len(grid.remarks) == 1
 
 
 MIXTURES = {

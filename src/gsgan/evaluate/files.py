@@ -38,11 +38,19 @@ COLUMNS = {  # heading and number of decimals
     "edge_ratio": ("edges →1", 2),
     "edge_ratio_person": ("edges in box →1", 2),
     "high_frequencies": ("detail →1", 2),
+    "psnr_hands": ("hands ↑", 2),
+    "ssim_hands": ("SSIM hands ↑", 4),
+    "psnr_mouth": ("mouth ↑", 2),
+    "ssim_mouth": ("SSIM mouth ↑", 4),
     "miou": ("mIoU ↑", 3),
     "miou_with_background": ("with background ↑", 3),
 }
 IN_TERMINAL = (  # narrow; metrics.md has all metrics
     *("psnr", "psnr_person", "ssim", "lpips", "edge_f1", "edge_ratio", "high_frequencies", "miou"),
+)
+WITH_HANDS = (  # where hands are scored, theirs in place of edges
+    *("psnr", "psnr_person", "psnr_hands", "psnr_mouth", "ssim", "lpips", "high_frequencies"),
+    "miou",
 )
 VARIANTS = {"full": "final image", "splat": "Step I's colour", "floor": "floor: background"}
 
@@ -112,7 +120,7 @@ def joined(now: Scored, folder: Path, splits: Iterable[str]) -> tuple[Scored, li
 def _way(facts: dict[str, Any], scores: dict[str, Any]) -> list[Any]:
     """How a split was scored; splits of one table share it."""
     way = [facts["data"]["fingerprint"], *(facts[key] for key in SAME)]
-    return way + [scores.get(key) for key in ("marks", "protocol", "lpips_name")]
+    return way + [scores.get(key) for key in ("marks", "protocol", "lpips_name", "boxes")]
 
 
 # -- tables
@@ -140,6 +148,8 @@ def notes(results: Results) -> list[str]:
         scores = variants["full"]
         if name := scores.get("lpips_name"):
             found[f"LPIPS is {name}"] = None
+        if boxes := scores.get("boxes"):
+            found[f"boxes: {boxes}"] = None
         for mark in scores["marks"]:
             found[f"marked: {mark}"] = None
         if protocol := scores.get("protocol"):
@@ -150,10 +160,11 @@ def notes(results: Results) -> list[str]:
         if not scores["images"]:
             found[f"{split}: {scores['psnr_reason']}"] = None
             continue
-        for metric in METRICS:
-            repeats = metric in ("miou_with_background", "lpips_person")  # miou's, lpips' reason
-            if not repeats and scores[metric] is None:
-                found[f"{metric} n/a: {scores[f'{metric}_reason']}"] = None
+        missing: dict[str, list[str]] = {}
+        for metric in (metric for metric in METRICS if scores[metric] is None):
+            missing.setdefault(scores[f"{metric}_reason"], []).append(metric)
+        for reason, metrics in missing.items():
+            found[f"{', '.join(metrics)} n/a: {reason}"] = None
     return list(found)
 
 
@@ -161,10 +172,12 @@ def print_table(results: Results, facts: dict[str, Any], console: Console) -> No
     """Prints the table, its caption and its notes."""
     table = Table(title=TITLE, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("variant", no_wrap=True)
-    for metric in IN_TERMINAL:
+    hands = any(scores["full"]["psnr_hands"] is not None for scores in results.values())
+    shown = WITH_HANDS if hands else IN_TERMINAL
+    for metric in shown:
         table.add_column(COLUMNS[metric][0], justify="right", no_wrap=True)
     previous = None
-    for split, variant, images, *scores in rows(results, IN_TERMINAL):
+    for split, variant, images, *scores in rows(results, shown):
         if split != previous:  # a column for the split would not fit a narrow terminal
             table.add_section()
             table.add_row(f"[bold]{split}[/bold], {images} images")

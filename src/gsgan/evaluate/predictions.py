@@ -22,11 +22,13 @@ from gsgan.metrics.regions import (
     box_mask,
     cleared,
     eight_bits,
+    hands_and_mouth,
     hard_outline,
     moved_background,
     on_background,
 )
 from gsgan.scene import Frame
+from gsgan.skeleton import TEMPLATES
 from gsgan.utils.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -108,10 +110,12 @@ class Preparation:
     Args:
         measures: of the protocol.
         boxes: where the measures need the body's box, else None.
+        skeleton: name of the frames' skeleton.
     """
 
     measures: Measures
     boxes: BodyBoxes | None
+    skeleton: str = "mediapipe33"
 
     @property
     def background(self) -> float:
@@ -150,6 +154,10 @@ class Preparation:
     def box(self, frame: Frame) -> Tensor | None:
         """``[B, 1, H, W]`` the body's projected box, or None where it is not needed."""
         return None if self.boxes is None else self.boxes.masks(frame)
+
+    def regions(self, frame: Frame) -> dict[str, Tensor]:
+        """``[B, 1, H, W]`` each: the boxes of hands and mouth, where the skeleton has hands."""
+        return hands_and_mouth(frame, TEMPLATES[self.skeleton])
 
 
 # -- a folder of images

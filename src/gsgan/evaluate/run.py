@@ -240,7 +240,8 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
         record["departures"] += [] if boxes is None else boxes.departures
     score, reason = lpips(config.lpips.net, config.lpips.path, measures.lpips_range)
     name = lpips_name(config.lpips.net, measures)
-    return Scorer(Preparation(measures, boxes), score, reason, name, list(marks), record)
+    prepare = Preparation(measures, boxes, data.skeleton)
+    return Scorer(prepare, score, reason, name, list(marks), record)
 
 
 def _measures(data: GsganData) -> Measures:

@@ -23,22 +23,31 @@ from gsgan.metrics.image import (
     person_box,
     psnr,
     psnr_inside,
-    psnr_person,
     psnr_where,
     ssim,
-    ssim_person,
     ssim_uniform,
+    ssim_where,
 )
-from gsgan.metrics.regions import BACKGROUNDS, cleared, mask_crop, rectangle
+from gsgan.metrics.regions import (
+    BACKGROUNDS,
+    HANDS,
+    MOUTH,
+    cleared,
+    describe_boxes,
+    mask_crop,
+    rectangle,
+)
 from gsgan.model.avatar import Avatar
 from gsgan.model.painting import Painting
 from gsgan.model.segmentation import IGNORE
 from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
 
+BOX_METRICS = tuple(f"{metric}_{part}" for part in (HANDS, MOUTH) for metric in ("psnr", "ssim"))
 IMAGE_METRICS = (
     *("psnr", "psnr_person", "psnr_inside", "ssim", "ssim_person", "lpips", "lpips_person"),
     *("edge_f1", "edge_f1_person", "edge_ratio", "edge_ratio_person", "high_frequencies"),
+    *BOX_METRICS,
 )
 PART_METRICS = ("miou", "miou_with_background")
 METRICS = (*IMAGE_METRICS, *PART_METRICS)
@@ -53,6 +62,7 @@ def image_scores(
     mask: Tensor | None = None,
     box: Tensor | None = None,
     *,
+    regions: Mapping[str, Tensor] | None = None,
     measures: Measures | None = None,
     lpips: Score | None = None,
 ) -> dict[str, float]:
@@ -62,6 +72,7 @@ def image_scores(
         image, target: ``[1, 3, H, W]``, prepared (`gsgan.evaluate.predictions.Preparation`).
         mask: ``[1, 1, H, W]`` of the person; required for the metrics of the person alone.
         box: ``[1, 1, H, W]`` bool, the body's projected box; required where the measures use it.
+        regions: of hands and mouth, from `gsgan.metrics.regions.hands_and_mouth`.
         measures: regions and ranges; None takes the defaults.
         lpips: from `gsgan.metrics.lpips.lpips`.
 
@@ -82,12 +93,15 @@ def image_scores(
         scores["psnr"] = psnr(image, target, pooling=pooling)
         scores["ssim"] = similarity(image, target)
     scores["edge_f1"], scores["edge_ratio"] = edge_scores(image, target)
+    regions = dict(regions or {})
     if mask is not None:
-        person = person_box(mask)
-        scores["psnr_person"] = psnr_person(image, target, mask)
+        regions["person"] = person = person_box(mask)
         scores["psnr_inside"] = psnr_inside(image, target, mask)
-        scores["ssim_person"] = ssim_person(image, target, mask)
         scores["edge_f1_person"], scores["edge_ratio_person"] = edge_scores(image, target, person)
+    similar = ssim_where(image, target, *regions.values()) if regions else []
+    for (name, region), mean in zip(regions.items(), similar, strict=True):
+        scores[f"psnr_{name}"] = psnr_where(image, target, region)
+        scores[f"ssim_{name}"] = mean
     if lpips is not None:
         if measures.lpips_channels == "bgr":
             image, target = image.flip(1), target.flip(1)
@@ -243,7 +257,7 @@ def score_split(
     grid: list[dict[str, Tensor]] = []
     matrices: dict[str, Tensor] = {}  # by camera
     for i, ((camera, number), frame) in enumerate(items):
-        target, box = prepare.target(frame), prepare.box(frame)
+        target, box, regions = prepare.target(frame), prepare.box(frame), prepare.regions(frame)
         prediction = predict(frame, (camera, number))
         hidden = hidden or prepare.hides_outline(prediction)
         images = {}
@@ -261,7 +275,13 @@ def score_split(
         images[FLOOR] = torch.full_like(frame.image, prepare.background)
         for name, image in images.items():
             own = image_scores(
-                image, target, frame.mask, box, measures=prepare.measures, lpips=scorer.lpips
+                image,
+                target,
+                frame.mask,
+                box,
+                regions=regions,
+                measures=prepare.measures,
+                lpips=scorer.lpips,
             )
             rows.setdefault(name, []).append({"camera": camera, "frame": number, **own})
         if parts is None or frame.labels is None:
@@ -288,6 +308,8 @@ def _variant(
 ) -> dict[str, Any]:
     """One variant as in metrics.json."""
     result = means(rows, scorer.lpips_reason)
+    if describe_boxes(scorer.prepare.skeleton) is None:
+        result |= no_scores(BOX_METRICS, f"the skeleton {scorer.prepare.skeleton} has no hands")
     if matrices:
         parts = miou(torch.stack(list(matrices.values())).sum(0))
         result |= parts
@@ -310,7 +332,8 @@ def empty(reason: str, scorer: Scorer) -> dict[str, Any]:
 
 def _common(scorer: Scorer, images: int) -> dict[str, Any]:
     name = scorer.lpips_name if scorer.lpips is not None else None
-    return {"images": images, "marks": list(scorer.marks), "lpips_name": name}
+    boxes = describe_boxes(scorer.prepare.skeleton)
+    return {"images": images, "marks": list(scorer.marks), "lpips_name": name, "boxes": boxes}
 
 
 def no_scores(metrics: Iterable[str], reason: str) -> dict[str, Any]:

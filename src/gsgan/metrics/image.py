@@ -55,28 +55,20 @@ def person_box(mask: Tensor) -> Tensor:
     return box
 
 
-def psnr_person(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """PSNR inside the person's box in dB; NaN where ``mask [B, 1, H, W]`` is empty.
-
-    The PSNR of a whole frame that is mostly background is high for any person.
-    """
-    return psnr_where(image, target, person_box(mask))
-
-
 def psnr_inside(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """`psnr_person` without the pixels within `OUTLINE` of the mask's outline, whose error is the
-    mask's own where masks are uneven; NaN where the mask is empty. Ours."""
+    """PSNR in the person's box without the pixels within `OUTLINE` of the mask's outline, whose
+    error is the mask's own where masks are uneven; NaN where the mask is empty. Ours."""
     person = (mask >= 0.5).to(mask)
     side = 2 * OUTLINE + 1
     dilated, shrunk = (s * functional.max_pool2d(s * person, side, 1, OUTLINE) for s in (1, -1))
     return psnr_where(image, target, person_box(mask) & (dilated == shrunk))
 
 
-def ssim_person(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """SSIM's mean over the person's box, with windows that reach beyond it; NaN without one."""
-    box = person_box(mask)
+def ssim_where(image: Tensor, target: Tensor, *regions: Tensor) -> list[Tensor]:
+    """SSIM's mean over each region ``[B, 1, H, W]``, with windows that reach beyond it; NaN for an
+    empty region."""
     similar = (1 - d_ssim_map(image, target)).mean(dim=1, keepdim=True)
-    return (similar * box).flatten(1).sum(dim=1) / box.flatten(1).sum(dim=1)
+    return [(similar * r).flatten(1).sum(dim=1) / r.flatten(1).sum(dim=1) for r in regions]
 
 
 def ssim(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:

@@ -1,4 +1,4 @@
-"""Images as they are scored: background, 8 bits, regions, the body's projected 3D box.
+"""Images as they are scored: background, 8 bits, regions, boxes of the body, hands and mouth.
 
 Convention: images ``[B, 3, H, W]`` RGB in [0, 1]; masks ``[B, 1, H, W]``; a background is a grey
 value, 0 black or 1 white.
@@ -14,13 +14,21 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsgan.metrics.image import person_box
-from gsgan.scene import Camera
+from gsgan.scene import Camera, Frame
+from gsgan.skeleton import TEMPLATES, SkeletonTemplate
+from gsgan.skeleton.hands import HAND
 from gsgan.splat.lens import straight_pixels
+from gsgan.utils.tensors import constant
 
 BACKGROUNDS = {"black": 0.0, "white": 1.0}
 CUT_SLACK = 1e-3  # of 1/255: values that are 8-bit already must not drop by one
 NEAR = 1e-2  # metres; nearer parts of the body's box are cut off
 PAIRS = torch.combinations(torch.arange(8))
+HANDS, MOUTH = "hands", "mouth"
+# On every side, of the longer side of the box round the projected landmarks.
+HAND_MARGIN, LIP_MARGIN = 0.15, 0.25
+MOUTH_SIDE = 1.5  # of the mouth's box without lip landmarks, relative to the mouth's width
+LEAST_BOX = 11  # pixels: SSIM's window
 
 
 def on_background(image: Tensor, alpha: Tensor, background: float) -> Tensor:
@@ -171,3 +179,100 @@ def inside_hull(hull: Tensor, points: Tensor) -> Tensor:
         sides.append(along[0] * away[..., 1] - along[1] * away[..., 0])
     side = torch.stack(sides)
     return (side >= 0).all(0) | (side <= 0).all(0)
+
+
+# -- boxes of hands and mouth
+
+
+def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tensor]:
+    """The pixels in the boxes of both hands, `HANDS`, and of the mouth, `MOUTH`.
+
+    Convention: a box is round the projected landmarks with a margin, at least `LEAST_BOX` pixels
+    wide and high, and clipped to the image. Landmarks of visibility 0 or behind the camera do not
+    count. A hand or mouth without a landmark in the image has no box, nor has the mouth of a head
+    that faces away from the camera; a hand hidden by the body has one.
+
+    Args:
+        frame: B items, of which the images are not read.
+        template: of its skeletons.
+
+    Returns:
+        ``[B, 1, H, W]`` bool each; nothing for a skeleton without hands.
+
+    Source: ours.
+    """
+    if not template.palms:
+        return {}
+    pixels, depth = frame.camera.project(frame.skeleton, NEAR)
+    seen, size = (frame.visibility > 0) & (depth > NEAR), frame.camera.size
+    hands = [slice(wrist, wrist + HAND) for wrist, *_ in template.palms]
+    boxes = [landmark_box(pixels[:, h], seen[:, h], size, HAND_MARGIN) for h in hands]
+    corners, lips = mouth_corners(template), lip_landmarks(template)
+    distance = frame.camera.to_camera(frame.skeleton).norm(dim=-1)
+    ahead = distance[:, corners].mean(dim=1) < distance[:, list(template.ears)].mean(dim=1)
+    if lips:
+        mouth = landmark_box(pixels[:, lips], seen[:, lips], size, LIP_MARGIN)
+    else:
+        around = mouth_square(frame.skeleton[:, corners], frame.camera)
+        known = seen[:, corners].all(dim=1, keepdim=True).expand(-1, around.shape[1])
+        mouth = landmark_box(around, known, size, 0.0)
+    return {HANDS: torch.stack(boxes).any(dim=0), MOUTH: mouth & ahead[:, None, None, None]}
+
+
+def describe_boxes(skeleton: str) -> str | None:
+    """What the boxes of a named skeleton contain, for notes; None for one without hands."""
+    template = TEMPLATES[skeleton]
+    if not template.palms:
+        return None
+    mouth = f"a square of {MOUTH_SIDE:g} times its width"
+    if lip_landmarks(template):
+        mouth = f"lips, margin {LIP_MARGIN:.0%} of the longer side"
+    return (
+        f"skeleton {skeleton}; hands: {HAND} landmarks each, margin {HAND_MARGIN:.0%} of the "
+        f"longer side; mouth: {mouth}; at least {LEAST_BOX} pixels"
+    )
+
+
+def lip_landmarks(template: SkeletonTemplate) -> list[int]:
+    """The joints round the lips; none where the skeleton has no face landmarks."""
+    return [i for i, name in enumerate(template.names) if name.startswith("mouth_outer")]
+
+
+def mouth_corners(template: SkeletonTemplate) -> list[int]:
+    """The pose landmarks at the mouth's corners, left and right."""
+    return [template.names.index(f"mouth_{side}") for side in ("left", "right")]
+
+
+def mouth_square(corners: Tensor, camera: Camera) -> Tensor:
+    """``[B, 4, 2]`` pixels at the sides of a square across the view round the mouth's corners ``[B,
+    2, 3]``, whose size does not depend on the direction of the head."""
+    left, right = corners.unbind(1)
+    half = MOUTH_SIDE / 2 * (left - right).norm(dim=-1)[:, None, None] * camera.R[:, :2]
+    middle = corners.mean(dim=1, keepdim=True)
+    return camera.project(torch.cat([middle - half, middle + half], dim=1), NEAR)[0]
+
+
+def landmark_box(pixels: Tensor, seen: Tensor, size: tuple[int, int], margin: float) -> Tensor:
+    """The pixels whose centre is in the box round landmarks.
+
+    Args:
+        pixels: ``[B, M, 2]`` of the landmarks.
+        seen: ``[B, M]`` bool; the others do not count.
+        size: ``(H, W)`` of the image.
+        margin: on every side, relative to the longer side of the landmarks' box.
+
+    Returns:
+        ``[B, 1, H, W]`` bool; all false without a landmark in the image.
+    """
+    inside = ((pixels >= 0) & (pixels < constant((size[1], size[0]), pixels))).all(dim=-1)
+    low = torch.where(seen.unsqueeze(-1), pixels, torch.inf).amin(dim=1)
+    high = torch.where(seen.unsqueeze(-1), pixels, -torch.inf).amax(dim=1)
+    extent, middle = high - low, (low + high) / 2
+    half = extent / 2 + margin * extent.amax(dim=1, keepdim=True)
+    half = half.clamp_min(LEAST_BOX / 2)
+    across, along = (
+        (torch.arange(n, device=pixels.device) + 0.5 - middle[:, i, None]).abs() <= half[:, i, None]
+        for i, n in enumerate(reversed(size))
+    )
+    shown = (seen & inside).any(dim=1)
+    return (along.unsqueeze(-1) & across.unsqueeze(-2) & shown[:, None, None]).unsqueeze(1)

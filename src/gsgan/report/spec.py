@@ -13,6 +13,7 @@ from gsgan.utils.errors import ConfigError
 
 PAINTED, SPLAT, FLOOR = "full", "splat", "floor"  # variants in metrics.json
 MEAN = "mean"  # the column over subjects
+IN_BOXES = ("psnr_hands", "ssim_hands", "psnr_mouth", "ssim_mouth")
 
 
 class Metric(NamedTuple):
@@ -36,6 +37,10 @@ METRICS = {
     "edge_ratio": Metric("edges", 3, "→1"),
     "edge_ratio_person": Metric("edges in box", 3, "→1"),
     "high_frequencies": Metric("detail", 3, "→1"),
+    "psnr_hands": Metric("PSNR dB hands", 2, "↑"),
+    "ssim_hands": Metric("SSIM hands", 4, "↑"),
+    "psnr_mouth": Metric("PSNR dB mouth", 2, "↑"),
+    "ssim_mouth": Metric("SSIM mouth", 4, "↑"),
     "miou": Metric("mIoU", 4, "↑"),
     "miou_with_background": Metric("mIoU with background", 4, "↑"),
 }

@@ -19,6 +19,7 @@ from gsgan.report.paper import PaperTable, read_paper
 from gsgan.report.runs import DATA, Run, by_settings, check_same, find_runs, read_runs
 from gsgan.report.spec import (
     FLOOR,
+    IN_BOXES,
     MEAN,
     METRICS,
     PAINTED,
@@ -132,7 +133,7 @@ class Part:
         for column in self.columns:
             scored = [run for run in self.of(None, column) if run.images(self.split)]
             mean = column == MEAN
-            facts = [_column_facts(run, self.split, mean, allow_dirty) for run in scored]
+            facts = [_column_facts(run, self, mean, allow_dirty) for run in scored]
             check_same(where, scored, facts)
             for name in {run.name for run in self.runs} if column != MEAN else ():
                 row = self.of(name, column)
@@ -152,12 +153,14 @@ def _row_facts(run: Run, split: str) -> dict[str, Any]:
     }
 
 
-def _column_facts(run: Run, split: str, mean: bool, allow_dirty: bool) -> dict[str, Any]:
+def _column_facts(run: Run, part: Part, mean: bool, allow_dirty: bool) -> dict[str, Any]:
     """What the runs of one column have in common; those of a mean over subjects differ in data."""
+    split = part.split
     record = run.protocol(split)
     facts = {
         "protocol": record["name"],
         "LPIPS": _lpips(run, split),
+        "boxes of hands and mouth": _boxes(run, part),
         DIRTY: None if allow_dirty else bool(run.facts.get("dirty")),
     }
     if mean:
@@ -291,9 +294,11 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
     floor = [mean_cell(m, part.values(None, FLOOR, c)) for c, m in columns.items()]
     rows.append(Row(FLOOR_LABEL, floor, (NOT_HAD, *_origin(part.runs)), "floor"))
     title = f"{part.split}{SPLIT_TITLES.get(part.split, '')}"
+    boxes = common(_boxes(run, part) or "" for run in part.runs)
+    remarks = [SPREAD, f"Boxes: {boxes}."] if boxes else [SPREAD]
     if part.metric is None:
-        return Grid(title, [part.heading(m) for m in columns], rows, [SPREAD])
-    return Grid(f"{part.heading(part.metric)}, {title}", list(columns), rows, [SPREAD])
+        return Grid(title, [part.heading(m) for m in columns], rows, remarks)
+    return Grid(f"{part.heading(part.metric)}, {title}", list(columns), rows, remarks)
 
 
 def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
@@ -385,3 +390,10 @@ def _lpips(run: Run, split: str) -> str | None:
     """Backbone and range of a run's LPIPS, where it has one."""
     scores = run.scores.get(split, {}).values()
     return next((s.get("lpips_name") for s in scores if s.get("lpips") is not None), None)
+
+
+def _boxes(run: Run, part: Part) -> str | None:
+    """What a run's boxes of hands and mouth contain, if the grid has a metric in them."""
+    shown = {*IN_BOXES} & {*part.columns.values()}
+    scores = run.scores.get(part.split, {}).values() if shown else ()
+    return next((s["boxes"] for s in scores if s.get("boxes")), None)
