@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import math
-
 import numpy as np
 import pytest
-from mannequin import mannequin
+from mannequin import inside, mannequin
 from scipy.spatial import cKDTree
 
-from gsgan.data.synthetic import ensure_synthetic
 from gsgan.data.synthetic.choreography import frame_times
 from gsgan.data.synthetic.gltf import avatar_path, read_character
 from gsgan.data.synthetic.motion import Choreography
@@ -19,7 +15,17 @@ from gsgan.data.synthetic.scene_setup import VERSION, Scene, Settings, dataset_k
 from gsgan.data.synthetic.signs import HELD_OUT, SIGNS, split_signs
 from gsgan.utils.errors import ConfigError
 
-TOUCHING = ("interlace", "palms", "support", "point", "roof")  # hands meet
+# Signs of both hands: seconds from their start, and the arms' largest gap then, metres.
+TOGETHER = {
+    "interlace": (1.2, 0.003),
+    "roof": (0.7, 0.003),
+    "palms": (1.0, 0.003),
+    "support": (1.0, 0.003),
+    "point": (1.0, 0.004),
+    "cancel": (0.55, 0.06),
+    "hug": (1.1, 0.005),
+    "peek": (0.7, 0.005),
+}
 TINY = {
     "avatar": "free_body",
     "secondary": False,
@@ -84,7 +90,7 @@ def test_motion_is_smooth(polo):
     times = np.arange(0, SIGNS.duration, 0.02)
     moves = Choreography(polo, programme=SIGNS).at(times)
     turned = np.swapaxes(moves.rotations[:-1], -1, -2) @ moves.rotations[1:]
-    assert np.linalg.norm(axis_angle(turned), axis=-1).max() < 0.5
+    assert np.linalg.norm(axis_angle(turned), axis=-1).max() < 0.7
     assert all((w >= 0).all() and (w <= 1).all() for w in moves.shapes.values())
     feet = [polo.bones.index(f"{side}ToeBase") for side in SIDES]
     assert np.ptp(moves.joints[:, feet], axis=0).max() < 1e-3  # the person stands still
@@ -92,22 +98,31 @@ def test_motion_is_smooth(polo):
         assert moves.shapes[shape].max() > 0.5
 
 
-def test_hands_touch_and_do_not_pass_through_each_other(polo, signing):
+def test_hands_touch_and_do_not_pass_through_each_other(polo):
     bones = np.array(polo.bones)[polo.dominant_bones()]
-    left, right = (np.array([bone.startswith(f"{side}Hand") for bone in bones]) for side in SIDES)
-    gaps = {}
-    for name in TOUCHING:
-        frames = [i for i, passage in enumerate(signing.passages) if passage == name]
-        near = []
-        for i in frames:
-            vertices, _ = polo.skinned(signing.rotations[i], signing.joints[i])
-            near.append(cKDTree(vertices[left]).query(vertices[right])[0].min())
-        gaps[name] = min(near)
-    assert max(gaps.values()) < 0.006, gaps
+    arms = [
+        np.flatnonzero([b.startswith((f"{side}Hand", f"{side}ForeArm")) for b in bones])
+        for side in SIDES
+    ]
+    meshes = [polo.faces[np.isin(polo.faces, arm).all(axis=1)] for arm in arms]
+    rows = zip(SIGNS.passages, SIGNS.ends, strict=True)
+    start = {name: end - seconds for (name, _, seconds), end in rows}
+    times = np.array([start[name] + since for name, (since, _) in TOGETHER.items()])
+    moves = Choreography(polo, programme=SIGNS).at(times)
+    for name, R, joints in zip(TOGETHER, moves.rotations, moves.joints, strict=True):
+        vertices, _ = polo.skinned(R, joints)
+        left, right = (vertices[arm] for arm in arms)
+        near = cKDTree(left).query(right)[0].min()
+        assert near < TOGETHER[name][1], name
+        assert inside(right, vertices, meshes[0]).mean() < 0.06, name
+        assert inside(left, vertices, meshes[1]).mean() < 0.06, name
 
 
-def test_cameras_stand_before_the_person_and_see_the_upper_body():
-    scene = Scene(Settings(**TINY, train_cameras=6, test_cameras=2))
+def test_a_scene_of_signs_is_split_by_sign_before_frontal_cameras():
+    scene = Scene(Settings(**TINY))
+    names = np.array(scene.motion.passages)
+    assert set(names[scene.test_frames]) <= set(HELD_OUT)
+    assert not set(names[scene.train_frames]) & set(HELD_OUT)
     centres = np.array([view.centre for view in scene.views.values()])
     vertices = scene.mesh(5)[0]
     around = np.degrees(np.arctan2(*(centres[:, :2] - vertices[:, :2].mean(0)).T * [[1], [-1]]))
@@ -121,14 +136,3 @@ def test_cameras_stand_before_the_person_and_see_the_upper_body():
         assert pixels.min() > 0
         assert pixels.max() < 48
         assert view.project(vertices)[:, 1].max() > 60  # feet are below the image
-
-
-def test_a_dataset_of_signs_is_split_by_sign(tmp_path):
-    few = {"train_cameras": 1, "test_cameras": 1}
-    root = ensure_synthetic(cache=tmp_path, workers=1, progress=False, **TINY, **few)
-    splits = json.loads((root / "meta.json").read_text())["splits"]
-    passage = np.load(root / "landmarks3d.npz")["passage"]
-    assert set(passage[splits["test_frames"]]) <= set(HELD_OUT)
-    assert not set(passage[splits["train_frames"]]) & set(HELD_OUT)
-    assert len(splits["test_frames"]) == 3
-    assert math.isfinite(np.load(root / "hands3d.npz")["p"].sum())

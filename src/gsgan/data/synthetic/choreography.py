@@ -40,10 +40,10 @@ class Controls:
         self.palm = still(0, 0)  # [F, 2] forearm twist, radians from mid-way, positive: palm up
         self.flex = still(0, 0)  # [F, 2] wrist flexion towards the palm, radians
         self.curl = still(*[[0.25] * 5] * 2)  # [F, 2, 5] finger flexion in [0, 1], thumb first
-        self.bend = still(*[[0] * 5] * 2)  # [F, 2, 5] added to the curl of the fingers' first joints
-        self.spread = still(0, 0)  # [F, 2] radians between neighbouring fingers, added to the rest's
-        # [F, 2, 3], mirrored, chest axes: the middle finger's knuckle, metres from the middle of the
-        # shoulders, where the hand points and the palm faces; NaN: wrist, palm and flex decide
+        self.bend = still(*[[0] * 5] * 2)  # [F, 2, 5] added to the curl of fingers' first joints
+        self.spread = still(0, 0)  # [F, 2] radians between neighbouring fingers, added to rest's
+        # [F, 2, 3] mirrored, chest axes: the middle finger's knuckle, metres from the middle of the
+        # shoulders; where hand and palm face. NaN: wrist, palm and flex decide instead
         self.knuckle = still(*[[math.nan] * 3] * 2)
         self.pointing, self.facing = still(*[(0, -1, 0)] * 2), still(*[(-1, 0, 0)] * 2)
         self.foot = still(*[(0, 0)] * 2)  # [F, 2, 2] mirrored, body axes, metres from standing

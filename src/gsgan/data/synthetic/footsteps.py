@@ -68,9 +68,7 @@ def _bump(u: Array) -> Array:
     return np.sin(math.pi * u.clip(0, 1)) ** 2
 
 
-def _standing(
-    times: Array, seed: int, foot: int, programme: Programme
-) -> tuple[Array, Array]:
+def _standing(times: Array, seed: int, foot: int, programme: Programme) -> tuple[Array, Array]:
     """Where a foot should stand ``[F, 3]`` (x, y, heading), and the march's height ``[F]``."""
     times = times.clip(max=programme.duration - 1e-6)
     c, sign = controls_at(times, seed, programme), 1 - 2 * foot

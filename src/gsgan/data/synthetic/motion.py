@@ -106,7 +106,8 @@ class Choreography:
         turn = pose.turn(chest) @ frame(along, palm) @ frame(sign * X, -Z).T
         middle = (joint["LeftArm"] + joint["RightArm"]) / 2
         origin = pose.position(chest) + pose.rotation(chest) @ (middle - joint[chest])
-        knuckle = origin + (pose.turn(chest) @ (scale * mirror * c.knuckle[:, i])[..., None])[..., 0]
+        place = scale * mirror * c.knuckle[:, i]
+        knuckle = origin + (pose.turn(chest) @ place[..., None])[..., 0]
         length = scale * KNUCKLE * sign * X
         if side + "HandMiddle1" in joint:
             length = joint[side + "HandMiddle1"] - joint[side + "Hand"]
@@ -144,7 +145,7 @@ class Choreography:
             k = FINGERS.index(finger)
             curl, base = c.curl[:, i, k, None], float(joint == 0)
             aside = base * FAN[k] * c.spread[:, i, None] * thumbwards
-            flexed = (FLEXION[finger][joint] * (curl + base * c.bend[:, i, k, None]) - straight)
+            flexed = FLEXION[finger][joint] * (curl + base * c.bend[:, i, k, None]) - straight
             turn = rotation(flexed * hinge + curl * across + aside)
             pose.world[bone] = pose.rotation(pose.parent(bone)) @ turn
 

@@ -25,13 +25,13 @@ from gsgan.utils.errors import ConfigError
 Shape = tuple[tuple[float, ...], tuple[float, ...], float]
 STRAIGHT = (0.0,) * 5
 LOOSE: Shape = ((0.2, 0.2, 0.25, 0.3, 0.35), STRAIGHT, 0.03)
-FLAT: Shape = ((0.1, 0.0, 0.0, 0.0, 0.0), STRAIGHT, 0.0)
-FAN: Shape = ((-0.2, 0.0, 0.0, 0.0, 0.0), (-0.4, 0, 0, 0, 0), 0.17)
+FLAT: Shape = (STRAIGHT, (-1.0, 0, 0, 0, 0), 0.0)
+FAN: Shape = (STRAIGHT, (-0.8, 0, 0, 0, 0), 0.17)
 FIST: Shape = ((0.75, 0.95, 0.97, 1.0, 1.0), STRAIGHT, 0.0)
 INDEX: Shape = ((0.8, 0.0, 0.95, 1.0, 1.0), STRAIGHT, 0.0)
 TWO: Shape = ((0.8, 0.0, 0.0, 0.95, 1.0), STRAIGHT, 0.12)
-OPEN: Shape = ((0.0, 0.05, 0.0, 0.0, 0.05), STRAIGHT, 0.14)
-CLASP: Shape = ((0.3, 0.5, 0.5, 0.5, 0.5), (0, 0.1, 0.1, 0.1, 0.1), 0.14)
+OPEN: Shape = (STRAIGHT, (-1.0, 0, 0, 0, 0), 0.2)
+CLASP: Shape = ((0.0, 0.45, 0.45, 0.45, 0.45), (-1.0, 0.03, 0.03, 0.03, 0.03), 0.28)
 BOTH, LEFT, RIGHT = (0, 1), (0,), (1,)
 
 
@@ -39,9 +39,8 @@ def at_ease(frames: int) -> Controls:
     """Hands rest before the belly: signs start and end there."""
     c = Controls(frames)
     c.elbow[...] = (0.8, 0.35, -1.0)
-    for side, ahead in zip(BOTH, (0.0, -0.03), strict=True):
-        _place(c, (side,), (0.05, -0.29 + ahead, -0.36), (-0.8, -0.6, 0.05), (-0.6, 0.8, 0.1))
-        _shape(c, (side,), LOOSE)
+    _place(c, BOTH, (0.1, -0.31, -0.34), (-0.55, -0.85, 0.05), (-0.85, 0.55, 0.1))
+    _shape(c, BOTH, LOOSE)
     return c
 
 
@@ -110,7 +109,7 @@ def interlace(c: Controls, s: Array, style: Style) -> None:
     sway = 0.03 * style.amplitude * np.sin(TAU * s)
     for side, sign in zip(BOTH, (1, -1), strict=True):
         # half a finger's width apart, so that fingers pass between fingers
-        knuckle = (0.085 - 0.06 * near + sign * sway, -0.33 - 0.0075 * sign, -0.1)
+        knuckle = (0.09 - 0.052 * near + sign * sway, -0.33 - 0.008 * sign, -0.1 - 0.005 * sign)
         _place(c, (side,), knuckle, (0, -0.5, 0.85), (-1, 0, 0))
     _shape(c, BOTH, OPEN)
     _shape(c, BOTH, CLASP, closed)
@@ -123,8 +122,8 @@ def palms(c: Controls, s: Array, style: Style) -> None:
     """Palm on palm, rubbing."""
     rub = 0.02 * style.amplitude * np.sin(TAU * 2 * s + style.phase)
     for side, sign in zip(BOTH, (1, -1), strict=True):
-        knuckle = (0.017, -0.32 + sign * rub, -0.1 - 0.4 * sign * rub)
-        _place(c, (side,), knuckle, (0, -0.6, 0.8), (-1, 0, 0))
+        knuckle = (0.023, -0.34 + sign * rub, -0.1 - 0.4 * sign * rub)
+        _place(c, (side,), knuckle, (-0.07, -0.6, 0.8), (-1, 0, 0))
     _shape(c, BOTH, FLAT)
     c.elbow[...] = (1.0, 0.2, -0.8)
     c.round[:], c.mouth[:], c.brows[:] = 0.5, 0.3, -0.7
@@ -134,7 +133,7 @@ def support(c: Controls, s: Array, style: Style) -> None:
     """A fist on the other hand's palm; both rise."""
     rise = -0.24 + 0.1 * _there(s, 0.25, 0.75)
     _place(c, LEFT, (0.0, -0.33, rise), (-0.75, -0.65, 0), (-0.4, 0.1, 0.9))
-    _place(c, RIGHT, (-0.02, -0.33, rise + 0.07), (-0.8, -0.6, 0), (-0.6, 0.8, 0))
+    _place(c, RIGHT, (-0.02, -0.33, rise + 0.1), (-0.8, -0.6, 0), (-0.6, 0.8, 0))
     _shape(c, LEFT, FLAT)
     _shape(c, RIGHT, FIST)
     c.wide[:], c.mouth[:], c.brows[:] = 0.5, 0.3, 0.5
@@ -153,9 +152,10 @@ def point(c: Controls, s: Array, style: Style) -> None:
 
 def hug(c: Controls, s: Array, style: Style) -> None:
     """Forearms crossed before the chest, the right one in front."""
+    x = 0.1 - 0.22 * _there(s, 0.1, 0.3) * (1 - _there(s, 0.7, 0.9))
     rock = 0.02 * style.amplitude * np.sin(TAU * s)
-    _place(c, LEFT, (-0.12 + rock, -0.22, -0.02), (-0.8, 0.05, 0.6), (0, 1, 0))
-    _place(c, RIGHT, (-0.12 - rock, -0.31, -0.02), (-0.8, 0.05, 0.6), (0, 1, 0))
+    _place(c, LEFT, (x + rock, -0.25, -0.02), (-0.8, 0.05, 0.6), (0, 1, 0))
+    _place(c, RIGHT, (x - rock, -0.34, -0.02), (-0.8, 0.05, 0.6), (0, 1, 0))
     _shape(c, BOTH, FIST)
     c.elbow[...] = (0.8, -0.2, -1.0)
     c.smile[:], c.mouth[:] = 1, 0.2
@@ -178,7 +178,7 @@ def look(c: Controls, s: Array, style: Style) -> None:
     """Two fingers go from before the eyes forwards."""
     out = _there(s)
     knuckle = _mix(out, (0.06, -0.3, 0.2), (0.02, -0.45, 0.08))
-    _place(c, RIGHT, knuckle, _mix(out, (-0.4, -0.3, 0.9), (-0.2, -1, 0.2)), (-0.2, -0.8, -0.6))
+    _place(c, RIGHT, knuckle, _mix(out, (-0.4, -0.3, 0.9), (-0.25, -0.8, 0.45)), (-0.2, -0.8, -0.6))
     _shape(c, RIGHT, TWO)
     c.brows[:], c.round[:] = -0.9, 0.6
     c.head[:, 0] = 0.1 * out
@@ -187,7 +187,7 @@ def look(c: Controls, s: Array, style: Style) -> None:
 def roof(c: Controls, s: Array, style: Style) -> None:
     """Finger tips touch as a roof; then the hands go down as walls."""
     down = _there(s, 0.4, 0.7)
-    knuckle = _mix(down, (0.085, -0.32, 0.0), (0.13, -0.32, -0.16))
+    knuckle = _mix(down, (0.081, -0.32, 0.0), (0.13, -0.32, -0.16))
     pointing = _mix(down, (-0.7, -0.15, 0.7), (0, -0.5, 0.85))
     _place(c, BOTH, knuckle, pointing, _mix(down, (-0.7, 0, -0.7), (-1, 0, 0)))
     _shape(c, BOTH, FLAT)
@@ -197,9 +197,9 @@ def roof(c: Controls, s: Array, style: Style) -> None:
 
 def cancel(c: Controls, s: Array, style: Style) -> None:
     """Spread hands cross and part, twice, the left one in front; the head shakes."""
-    x = 0.04 - 0.12 * np.cos(TAU * 1.5 * s - 0.5)
-    _place(c, LEFT, (x, -0.4, -0.06), (-0.5, -0.5, 0.7), (-0.4, -0.5, -0.8))
-    _place(c, RIGHT, (x, -0.31, -0.1), (-0.5, -0.5, 0.7), (-0.4, -0.5, -0.8))
+    x = 0.05 + 0.1 * np.cos(TAU * 2 * s)
+    _place(c, LEFT, (x, -0.41, -0.07), (-0.5, -0.2, 0.8), (-0.7, -0.7, 0))
+    _place(c, RIGHT, (x, -0.31, -0.01), (-0.5, -0.2, 0.8), (-0.7, -0.7, 0))
     _shape(c, BOTH, OPEN)
     c.wide[:], c.brows[:] = 0.9, -0.8
     c.head[:, 2] = 0.25 * np.sin(TAU * 2 * s)
@@ -208,8 +208,8 @@ def cancel(c: Controls, s: Array, style: Style) -> None:
 def peek(c: Controls, s: Array, style: Style) -> None:
     """Both hands cover the eyes, and open to the sides."""
     open_ = _there(s, 0.45, 0.7)
-    knuckle = _mix(open_, (0.05, -0.27, 0.21), (0.22, -0.27, 0.2))
-    _place(c, BOTH, knuckle, _mix(open_, (-0.5, 0.05, 0.9), (-0.2, 0, 1)), (-0.3, 1, 0))
+    knuckle = _mix(open_, (0.066, -0.28, 0.19), (0.22, -0.28, 0.19))
+    _place(c, BOTH, knuckle, (-0.12, 0.05, 1), (-0.2, 1, 0))
     _shape(c, BOTH, FLAT)
     _shape(c, BOTH, FAN, open_)
     c.elbow[...] = (1.0, -0.1, -0.9)
