@@ -86,6 +86,16 @@ def test_it_builds_with_the_papers_models(build, model):
     assert avatar.paint(frame).image.shape == frame.image.shape
 
 
+def test_its_sign_language_is_of_the_hands(settings):
+    found = settings("experiment=paper_slp")
+    assert found["data.skeleton"] == "holistic"
+    assert found["data.reader._target_"].endswith("CaptureReader")
+    assert found["model.segmentation.mode"] == "hands"
+    assert departures(found, "full", "capture") == []
+    found["model.low_pass"] = 0.1
+    assert departures(found, "full", "capture") == ["model.low_pass"]
+
+
 def test_unknown_models_and_data_are_no_departure_that_could_be_named(settings):
     assert departures(settings(), "mine", "synthetic") is None
     assert departures(settings(), "full", "mine") is None

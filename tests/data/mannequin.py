@@ -1,4 +1,4 @@
-"""A small rig in a T pose for motion tests, and a writer of BVH files."""
+"""A small rig in a T pose for motion tests, points inside meshes, and a writer of BVH files."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
 from scipy.spatial.transform import Rotation
 
 from gsgan.data.synthetic.character import Character, Motion
@@ -91,6 +93,25 @@ def reposed(character: Character, motion: Motion, frame: int) -> Character:
     R, joints = motion.rotations[frame], motion.joints[frame]
     vertices, normals = character.skinned(R, joints)
     return replace(character, vertices=vertices, normals=normals, joints=joints)
+
+
+def inside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Whether each point ``[N, 3]`` is within a mesh that is open above and below.
+
+    A ray in a horizontal direction leaves the mesh where it hits a face from behind: three of
+    four such rays have to.
+    """
+    scene = EmbreeScene()
+    TriangleMesh(scene, vertices[faces].astype(np.float32))
+    a, b, c = vertices[faces].swapaxes(0, 1)
+    normal = np.cross(b - a, c - a)
+    leaves = np.zeros(len(points))
+    for angle in 0.2 + np.pi / 2 * np.arange(4):
+        ray = np.array([np.cos(angle), np.sin(angle), 0.05])
+        rays = np.tile(ray.astype(np.float32), (len(points), 1))
+        hit = np.asarray(scene.run(points.astype(np.float32), rays)).astype(int)
+        leaves += (hit >= 0) & (normal[hit] @ ray > 0)
+    return leaves >= 3
 
 
 def write_bvh(

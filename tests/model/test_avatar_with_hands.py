@@ -80,6 +80,24 @@ def test_a_skeleton_without_hands_drives_it_and_hands_drive_one_without(made, bu
     assert torch.equal(plain.render(*given), plain.render(given[0][:33], given[1]))
 
 
+def test_a_missing_hand_rests_on_its_arm(made):
+    """Through rendering: no hand at the origin or elsewhere, in G or in S."""
+    _, avatar, frame = made("effects.body_points=on", "model.segmentation.mode=hands")
+    p = frame.skeleton[0].clone()
+    p[33:54] = torch.nan
+    painting = avatar.picture(p, frame.camera, maps=True)
+    assert painting.image.isfinite().all()
+    far = torch.cdist(painting.gaussians.means[0], p[:33]).amin(1)
+    assert far.max() < 0.3
+    wrist, depth = (x[0, 0] for x in frame.camera.project(p[None, 15:16]))
+    left = painting.segmentation[0, 1]
+    assert left.isfinite().all()
+    assert left.max() > 0.5
+    seen = (left > 0.3).nonzero().flip(1) + 0.5
+    reach = 0.25 * frame.camera.K[0, 0, 0] / depth
+    assert (seen - wrist).norm(dim=-1).max() < reach
+
+
 def test_pose_encoders_have_a_number_per_edge():
     name = "mediapipe33_hands"
     for encoder in (PoseGraph(name, width=8, joint_channels=4), PoseLinear(name)):

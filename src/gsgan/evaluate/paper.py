@@ -43,7 +43,8 @@ def settings_of(config: DictConfig) -> dict[str, Any]:
 
 
 def departures(settings: Mapping[str, Any], model: str, data: str) -> list[str] | None:
-    """Keys in which a run differs from ``experiment=paper`` with its model and data.
+    """Keys in which a run differs from ``experiment=paper`` with its model and data; with S of the
+    hands alone, from ``experiment=paper_slp``.
 
     Args:
         settings: of the run, resolved, by dotted key.
@@ -56,7 +57,8 @@ def departures(settings: Mapping[str, Any], model: str, data: str) -> list[str] 
     from hydra.errors import HydraException
 
     try:
-        paper = _paper(model, data)
+        hands = settings.get("model.segmentation.mode") == "hands"
+        paper = _paper("paper_slp" if hands else "paper", model, data)
     except HydraException:
         return None
     mine = {k: v for k, v in settings.items() if k.partition(".")[0] in METHOD}
@@ -83,12 +85,12 @@ def _idle(key: str) -> bool:
 
 
 @lru_cache(maxsize=64)
-def _paper(model: str, data: str) -> dict[str, Any]:
+def _paper(experiment: str, model: str, data: str) -> dict[str, Any]:
     from hydra import compose
 
     with _hydra():
         config: DictConfig = compose(
-            "train", ["experiment=paper", f"model={model}", f"data={data}"]
+            "train", [f"experiment={experiment}", f"model={model}", f"data={data}"]
         )
         config.seed = 0
         method = {group: OmegaConf.to_container(config[group], resolve=True) for group in METHOD}

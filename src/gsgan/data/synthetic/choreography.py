@@ -40,10 +40,18 @@ class Controls:
         self.palm = still(0, 0)  # [F, 2] forearm twist, radians from mid-way, positive: palm up
         self.flex = still(0, 0)  # [F, 2] wrist flexion towards the palm, radians
         self.curl = still(*[[0.25] * 5] * 2)  # [F, 2, 5] finger flexion in [0, 1], thumb first
+        self.bend = still(*[[0] * 5] * 2)  # [F, 2, 5] added to the curl of fingers' first joints
+        self.spread = still(0, 0)  # [F, 2] radians between neighbouring fingers, added to rest's
+        # [F, 2, 3] mirrored, chest axes: the middle finger's knuckle, metres from the middle of the
+        # shoulders; where hand and palm face. NaN: wrist, palm and flex decide instead
+        self.knuckle = still(*[[math.nan] * 3] * 2)
+        self.pointing, self.facing = still(*[(0, -1, 0)] * 2), still(*[(-1, 0, 0)] * 2)
         self.foot = still(*[(0, 0)] * 2)  # [F, 2, 2] mirrored, body axes, metres from standing
         self.march = np.zeros(frames)  # [F] metres: least height of steps; 0: only where needed
         self.swing = np.zeros(frames)  # [F] share of the arms' swing with the legs
-        self.mouth = np.zeros(frames)  # [F] opening, in [0, 1]
+        self.mouth = np.zeros(frames)  # [F] opening with vowels, in [0, 1]
+        self.round = np.zeros(frames)  # [F] lips, in [0, 1]
+        self.wide = np.zeros(frames)  # [F] lips, in [0, 1]
         self.smile = np.zeros(frames)  # [F] in [0, 1]
         self.brows = np.zeros(frames)  # [F] in [-1, 1], positive raises them
 
@@ -280,8 +288,32 @@ def _wander(s: Array, cycles: float, phase: float) -> Array:
 
 
 COMBINATION = "squat_and_wave"
-# name, passage, seconds
-PASSAGES: tuple[tuple[str, Callable[[Controls, Array, Style], None], float], ...] = (
+Passage = Callable[[Controls, Array, Style], None]
+
+
+@dataclass(frozen=True)
+class Programme:
+    """Passages in their order; each starts and ends in the resting controls."""
+
+    passages: tuple[tuple[str, Passage, float], ...]  # name, passage, seconds
+    resting: Callable[[int], Controls] = Controls
+    blend: float = 0.6  # seconds from rest into a passage, and back
+
+    @property
+    def ends(self) -> Array:
+        """``[P]`` the end of each passage, seconds."""
+        return np.cumsum([seconds for *_, seconds in self.passages])
+
+    @property
+    def duration(self) -> float:
+        return float(self.ends[-1])
+
+    def index_at(self, times: Array) -> NDArray[np.intp]:
+        """``[F]`` the number of the passage at each time."""
+        return np.searchsorted(self.ends, times, side="right").clip(max=len(self.passages) - 1)
+
+
+PASSAGES: tuple[tuple[str, Passage, float], ...] = (
     ("walk", walk, 5.5),
     ("arm_swings", arm_swings, 2.0),
     ("wave", wave, 2.5),
@@ -294,9 +326,8 @@ PASSAGES: tuple[tuple[str, Callable[[Controls, Array, Style], None], float], ...
     ("dance", dance, 3.0),
     ("freestyle", freestyle, 5.0),
 )
-BLEND = 0.6  # seconds from standing into a passage, and back
-ENDS = np.cumsum([seconds for _, _, seconds in PASSAGES])
-DURATION = float(ENDS[-1])
+EVERYDAY = Programme(PASSAGES)
+DURATION = EVERYDAY.duration
 
 
 def frame_times(frames: int, duration: float = DURATION) -> Array:
@@ -304,32 +335,31 @@ def frame_times(frames: int, duration: float = DURATION) -> Array:
     return (np.arange(frames) + 0.5) * duration / frames
 
 
-def passages_at(times: Array) -> tuple[str, ...]:
+def passages_at(times: Array, programme: Programme = EVERYDAY) -> tuple[str, ...]:
     """The passage at each of the times ``[F]``, seconds."""
-    return tuple(PASSAGES[i][0] for i in _passage_index(times))
+    return tuple(programme.passages[i][0] for i in programme.index_at(times))
 
 
-def _passage_index(times: Array) -> NDArray[np.intp]:
-    return np.searchsorted(ENDS, times, side="right").clip(max=len(PASSAGES) - 1)
-
-
-def controls_at(times: Array, seed: int) -> Controls:
-    """Targets at times ``[F]``, seconds: every passage starts and ends standing."""
-    index, base, random = _passage_index(times), Controls(len(times)), np.random.default_rng(seed)
-    for i, (_, passage, seconds) in enumerate(PASSAGES):
+def controls_at(times: Array, seed: int, programme: Programme = EVERYDAY) -> Controls:
+    """Targets at times ``[F]``, seconds: every passage starts and ends at rest."""
+    index, base = programme.index_at(times), programme.resting(len(times))
+    random, turns = np.random.default_rng(seed), np.zeros(len(times))
+    for i, (_, passage, seconds) in enumerate(programme.passages):
         draw = random.random(3)
         style = Style(0.85 + 0.3 * draw[0], TAU * draw[1], int(draw[2] < 0.5))
         here = np.flatnonzero(index == i)
-        s = 1 - (ENDS[i] - times[here]) / seconds
-        moved = Controls(len(here))
+        s = 1 - (programme.ends[i] - times[here]) / seconds
+        moved = programme.resting(len(here))
         passage(moved, s, style)
-        share = smoothstep(s * seconds / BLEND) * smoothstep((1 - s) * seconds / BLEND)
+        share = smoothstep(s * seconds / programme.blend)
+        share = share * smoothstep((1 - s) * seconds / programme.blend)
         for name, rest in vars(base).items():
             whole = passage is walk and name == "path"  # it starts and ends smoothly itself
             w = np.ones(len(here)) if whole else share
             goal = getattr(moved, name)
             rest[here] += w.reshape(-1, *[1] * (goal.ndim - 1)) * (goal - rest[here])
-    base.path[index > 0, 2] += TAU  # the walk's full turn
+        turns[index > i] += passage is walk  # a full one
+    base.path[:, 2] += TAU * turns
     return base
 
 

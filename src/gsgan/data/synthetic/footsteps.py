@@ -9,7 +9,14 @@ import math
 
 import numpy as np
 
-from gsgan.data.synthetic.choreography import DURATION, STANCE, Array, controls_at, smoothstep
+from gsgan.data.synthetic.choreography import (
+    EVERYDAY,
+    STANCE,
+    Array,
+    Programme,
+    controls_at,
+    smoothstep,
+)
 
 PERIOD, SWING, STAND = 1.0, 0.42, 0.58  # seconds: from step to step of a foot, its two parts
 SHORTEST = (0.03, 0.12)  # metres and radians: a standing foot this near to its goal stays
@@ -22,14 +29,14 @@ class Footsteps:
     stand, unless it is there already.
     """
 
-    def __init__(self, seed: int) -> None:
-        turns = np.arange(0, DURATION, PERIOD)
+    def __init__(self, seed: int, programme: Programme = EVERYDAY) -> None:
+        turns = np.arange(0, programme.duration, PERIOD)
         self.start: list[Array] = []  # per foot [K] seconds
         self.shift: list[Array] = []  # per foot [K, 3] x, y, heading
         self.height: list[Array] = []  # per foot [K] metres, 0 for no step
         for foot in range(2):
             start = turns + foot * PERIOD / 2
-            goals, march = _standing(start + SWING + STAND / 2, seed, foot)
+            goals, march = _standing(start + SWING + STAND / 2, seed, foot, programme)
             place, shift, height = np.array([(1 - 2 * foot) * STANCE, 0, 0]), [], []
             for goal, least in zip(goals, march, strict=True):
                 move = goal - place
@@ -61,9 +68,10 @@ def _bump(u: Array) -> Array:
     return np.sin(math.pi * u.clip(0, 1)) ** 2
 
 
-def _standing(times: Array, seed: int, foot: int) -> tuple[Array, Array]:
+def _standing(times: Array, seed: int, foot: int, programme: Programme) -> tuple[Array, Array]:
     """Where a foot should stand ``[F, 3]`` (x, y, heading), and the march's height ``[F]``."""
-    c, sign = controls_at(times.clip(max=DURATION - 1e-6), seed), 1 - 2 * foot
+    times = times.clip(max=programme.duration - 1e-6)
+    c, sign = controls_at(times, seed, programme), 1 - 2 * foot
     heading = c.path[:, 2]
     x, y = sign * (STANCE + c.foot[:, foot, 0]), c.foot[:, foot, 1]
     cosine, sine = np.cos(heading), np.sin(heading)

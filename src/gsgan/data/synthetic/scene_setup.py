@@ -18,11 +18,12 @@ from gsgan.body.free import free_body
 from gsgan.data.cameras import DISTORTION_LENGTHS
 from gsgan.data.synthetic.bvh import BvhMotion
 from gsgan.data.synthetic.character import Character
-from gsgan.data.synthetic.choreography import frame_times, held_out
+from gsgan.data.synthetic.choreography import EVERYDAY, frame_times, held_out
 from gsgan.data.synthetic.free_subject import free_character, free_pose
 from gsgan.data.synthetic.gltf import avatar_names, avatar_path, read_character
 from gsgan.data.synthetic.motion import Choreography
 from gsgan.data.synthetic.secondary import Moving, Secondary
+from gsgan.data.synthetic.signs import SIGNS, split_signs
 from gsgan.data.synthetic.tint import make_tints
 from gsgan.data.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles
 from gsgan.data.synthetic.view import View, look_at, through_lens, zoomed
@@ -34,7 +35,9 @@ VERSION = 2
 """Of the generator. Raise it when any pixel changes: cached datasets are then made again."""
 
 AVATARS = avatar_names()
-DEFAULT, FREE_BODY, CHOREOGRAPHY = "polo", "free_body", "choreography"
+DEFAULT, FREE_BODY, CHOREOGRAPHY, SIGNING = "polo", "free_body", "choreography", "signs"
+PROGRAMMES = {CHOREOGRAPHY: EVERYDAY, SIGNING: SIGNS}
+ARC = math.radians(150)  # round the front of a person who signs
 WHOLE, NUMBER, LIST = "a whole number", "a number", "a list of numbers"
 # Kind and range of each parameter; those that are not whole numbers may be None.
 RANGES = {
@@ -98,8 +101,8 @@ class Settings:
             f"avatar must be {', '.join(named)} or the path of a rigged .glb, got {self.avatar!r}",
         )
         _require(
-            self.motion == CHOREOGRAPHY or str(self.motion).endswith(".bvh"),
-            f"motion must be {CHOREOGRAPHY} or the path of a .bvh, got {self.motion!r}",
+            self.motion in tuple(PROGRAMMES) or str(self.motion).endswith(".bvh"),
+            f"motion must be {', '.join(PROGRAMMES)} or the path of a .bvh, got {self.motion!r}",
         )
         _require(
             isinstance(self.secondary, bool),
@@ -140,7 +143,7 @@ def dataset_key(settings: Settings) -> str:
     """
     parameters = asdict(settings)
     for name in ("avatar", "motion"):
-        if parameters[name] not in (*AVATARS, FREE_BODY, CHOREOGRAPHY):
+        if parameters[name] not in (*AVATARS, FREE_BODY, *PROGRAMMES):
             path = Path(parameters[name]).expanduser()
             if not path.is_file():
                 raise DataError(f"data.source.{name}: {path} does not exist")
@@ -181,19 +184,25 @@ class Scene:
         self.character = character = load_character(settings.avatar)
         self.appearance = Appearance(character)
         self.source: Moving = (
-            Choreography(character, settings.seed)
-            if settings.motion == CHOREOGRAPHY
+            Choreography(character, settings.seed, PROGRAMMES[settings.motion])
+            if settings.motion in PROGRAMMES
             else BvhMotion(character, Path(settings.motion).expanduser(), settings.seed)
         )
         times = frame_times(settings.frames, self.source.duration)
         self.motion = self.source.at(times)
         self.secondary = Secondary(character, self.source) if settings.secondary else None
         self.times = times
-        self.test_frames = held_out(self.motion.passages, settings.test_frames)
-        self.train_frames = [i for i in range(settings.frames) if i not in self.test_frames]
+        passages, signing = self.motion.passages, settings.motion == SIGNING
+        if signing:
+            self.train_frames, self.test_frames = split_signs(passages, settings.test_frames)
+        else:
+            self.test_frames = held_out(passages, settings.test_frames)
+            self.train_frames = [i for i in range(settings.frames) if i not in self.test_frames]
         names = [f"cam{i:02d}" for i in range(settings.train_cameras + settings.test_cameras)]
         self.train_cameras = names[: settings.train_cameras]
-        self.views = dict(zip(names, ring(settings, extent(character, self.source)), strict=True))
+        points = extent(character, self.source, upper=signing)
+        views = (front if signing else ring)(settings, points)
+        self.views = dict(zip(names, views, strict=True))
         for name in names[settings.train_cameras :]:
             for scale in settings.test_scale or ():
                 self.views[f"{name}_x{scale:g}"] = zoomed(self.views[name], scale)
@@ -243,19 +252,30 @@ class Scene:
         return character.skinned(motion.rotations[frame], motion.joints[frame], offsets)
 
 
-def extent(character: Character, source: Moving, samples: int = 160, stride: int = 24) -> Array:
-    """``[N, 3]`` points that a motion reaches, metres.
+def extent(
+    character: Character,
+    source: Moving,
+    samples: int = 160,
+    stride: int = 24,
+    upper: bool = False,
+) -> Array:
+    """``[N, 3]`` points that a motion reaches, metres; with ``upper`` from the waist upwards.
 
     Every ``stride``-th vertex at a fixed number of moments: cameras fitted to these points do not
     depend on ``frames``.
     """
+    chosen = np.arange(len(character.vertices))
+    if upper:
+        trunk = character.with_descendants(character.bones.index("Spine"))
+        chosen = np.flatnonzero(np.isin(character.dominant_bones(), trunk))
+    chosen = chosen[::stride]
     motion = source.at(frame_times(samples, source.duration))
     thinned = replace(
         character,
-        vertices=character.vertices[::stride],
-        normals=character.normals[::stride],
-        bone_index=character.bone_index[::stride],
-        bone_weight=character.bone_weight[::stride],
+        vertices=character.vertices[chosen],
+        normals=character.normals[chosen],
+        bone_index=character.bone_index[chosen],
+        bone_weight=character.bone_weight[chosen],
     )
     poses = zip(motion.rotations, motion.joints, strict=True)
     return np.concatenate([thinned.skinned(R, joints)[0] for R, joints in poses])
@@ -270,4 +290,14 @@ def ring(settings: Settings, points: Array) -> list[View]:
     train = [(0.3 + i * step, (1.35, 0.95, 1.75)[i % 3]) for i in range(n)]
     gaps = [(i * n) // max(settings.test_cameras, 1) for i in range(settings.test_cameras)]
     test = [(0.3 + (i + 0.5) * step, (1.15, 1.55)[k % 2]) for k, i in enumerate(gaps)]
+    return [look_at(a, h, middle, points, settings.size) for a, h in train + test]
+
+
+def front(settings: Settings, points: Array) -> list[View]:
+    """Cameras on an arc before the person, training cameras first, zoomed to ``points``."""
+    n, middle = settings.train_cameras, (points.min(axis=0) + points.max(axis=0)) / 2
+    step = ARC / n
+    train = [((i + 0.5) * step - ARC / 2, (1.35, 1.55, 1.2)[i % 3]) for i in range(n)]
+    gaps = [int((k + 0.5) * (n - 1) / settings.test_cameras) for k in range(settings.test_cameras)]
+    test = [((gap + 1) * step - ARC / 2, (1.45, 1.3)[k % 2]) for k, gap in enumerate(gaps)]
     return [look_at(a, h, middle, points, settings.size) for a, h in train + test]
