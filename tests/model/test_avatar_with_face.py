@@ -96,13 +96,11 @@ def test_a_run_with_a_face_is_trained_loaded_and_driven_without(inside, signing,
     assert torch.equal(bare, avatar.render(p[:, :75], camera))
     assert not torch.equal(bare, whole)
     assert avatar.render(p[:, :33], camera).isfinite().all()
-    given = inputs_of(avatar, rest_pose(data.info.figure), 0)
-    assert not given[1][:, 33:].any()
-    code = face_code(
-        given[0], bone_frames(given[0], given[1] > 0, avatar.template), avatar.template
-    )
+    q, seen, body = inputs_of(avatar, rest_pose(data.info.figure), 0)
+    assert not seen[:, 33:].any()
+    code = face_code(q, bone_frames(q, seen > 0, avatar.template), avatar.template)
     torch.testing.assert_close(code, torch.zeros(1, 30, 3), atol=1e-3, rtol=0)
-    assert np.isfinite(splats_of(avatar, given[0], given[1] > 0, given[2]).means).all()
+    assert np.isfinite(splats_of(avatar, q, seen > 0, body).means).all()
 
 
 def _centred(face):
