@@ -32,7 +32,9 @@ SMALL_BENCH = {
     "roofline": ["sizes=[tiny]", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
     "effects": [
         *("train=false", "only=[distortion]"),
-        "base=['size=tiny','data.source.frames=3','data.source.test_frames=1']",
+        "base=['size=tiny','data.source.frames=2','data.source.test_frames=1','data.body=none',"
+        "'data.source.train_cameras=2','data.source.test_cameras=1',"
+        "'data.source.rays_per_pixel=1']",
     ],
 }
 

@@ -16,9 +16,10 @@ from gsgan.model.runs import read_checkpoint
 from gsgan.utils.errors import ConfigError, DataError
 
 PARITY = 1e-3
+SHALLOW = "model.generator.multipliers=[1,2]"  # the other levels only repeat these
 MODELS = {
-    "supersampled": ("size.supersample=2", "effects.body_points=off"),
-    "full": (),
+    "supersampled": ("size.supersample=2", "effects.body_points=off", SHALLOW),
+    "full": (SHALLOW,),
     "no S, no graph": ("model=wo_seg", "model/pose_encoder=linear"),
     "image_to_image": ("model=image_to_image",),
     "lbs": ("model=lbs_splat",),
