@@ -5,27 +5,28 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, SkeletonTemplate
 from gsgan.view.drag import BODY, HANDLES, HEAD, NAMES, dragged, fabrik, position
 
 REST = np.array(MEDIAPIPE33.rest_positions)
-RIGID = [*MEDIAPIPE33.limbs, (0, 7), (7, 8), (9, 10)]
 
 
-def lengths(p: np.ndarray) -> np.ndarray:
-    return np.array([np.linalg.norm(p[b] - p[a]) for a, b in RIGID])
+def lengths(p: np.ndarray, template: SkeletonTemplate) -> np.ndarray:
+    bones = [*template.limbs, (0, 7), (7, 8), (9, 10)]
+    return np.array([np.linalg.norm(p[b] - p[a]) for a, b in bones])
 
 
+@pytest.mark.parametrize("template", [MEDIAPIPE33, HOLISTIC], ids=["body", "hands"])
 @pytest.mark.parametrize("name", NAMES)
-def test_bones_keep_their_lengths(name):
-    generator = np.random.default_rng(0)
+def test_bones_keep_their_lengths(name, template):
+    generator, rest = np.random.default_rng(0), np.array(template.rest_positions)
     for reach in (0.05, 0.3, 2.0):
-        p = REST.copy()
+        p = rest.copy()
         for _ in range(3):
             target = position(p, name) + reach * generator.normal(size=3)
             p = dragged(p, name, target)
             assert np.isfinite(p).all()
-            np.testing.assert_allclose(lengths(p), lengths(REST), atol=1e-9)
+            np.testing.assert_allclose(lengths(p, template), lengths(rest, template), atol=1e-9)
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.figure import FACE, FEET, HANDS, HIPS, SHOULDERS, middle
+from gsgan.data.figure import FACE, FEET, HAND_JOINTS, HANDS, HIPS, SHOULDERS, middle
 from gsgan.data.synthetic.character import unit
 from gsgan.data.synthetic.retarget import between
 
@@ -36,9 +36,10 @@ SIDES = (("left", 11, 13, 15, 23, 25, 27), ("right", 12, 14, 16, 24, 26, 28))
 HANDLES = {
     f"{side} {name}": handle
     for side, shoulder, elbow, wrist, hip, knee, ankle in SIDES
+    for hand in [(*HANDS[wrist], *range(HAND_JOINTS[wrist].start, HAND_JOINTS[wrist].stop))]
     for name, handle in {
-        "wrist": Handle((shoulder, elbow, wrist), turned=HANDS[wrist]),
-        "elbow": Handle((shoulder, elbow), moved=(wrist, *HANDS[wrist])),
+        "wrist": Handle((shoulder, elbow, wrist), turned=hand),
+        "elbow": Handle((shoulder, elbow), moved=(wrist, *hand)),
         "ankle": Handle((hip, knee, ankle), turned=FEET[ankle]),
         "knee": Handle((hip, knee), moved=(ankle, *FEET[ankle])),
     }.items()
@@ -48,7 +49,7 @@ NAMES = (*HANDLES, HEAD, BODY)
 
 
 def position(p: Float, name: str) -> Float:
-    """``[3]`` metres: the position of a handle in a pose ``[33, 3]``."""
+    """``[3]`` metres: the position of a handle in a pose ``[J, 3]``."""
     if name == BODY:
         return middle(p, HIPS)
     return np.asarray(p[NOSE if name == HEAD else HANDLES[name].chain[-1]])
@@ -61,7 +62,7 @@ def dragged(p: Float, name: str, target: Float) -> Float:
     rotates about the neck. The body moves as a whole.
 
     Args:
-        p: ``[33, 3]`` metres, finite.
+        p: ``[J, 3]`` metres, finite: 33 joints, then those of hands and face, if any.
         name: of ``NAMES``.
         target: ``[3]`` metres.
 
@@ -73,14 +74,15 @@ def dragged(p: Float, name: str, target: Float) -> Float:
     if name == HEAD:
         neck = middle(p, SHOULDERS)
         turn = between(p[NOSE] - neck, target - neck)
-        q[list(FACE)] = neck + (p[list(FACE)] - neck) @ turn.T
+        face = [*FACE, *range(HAND_JOINTS[16].stop, len(p))]
+        q[face] = neck + (p[face] - neck) @ turn.T
         return q
     handle = HANDLES[name]
     chain = list(handle.chain)
     q[chain] = fabrik(p[chain], target)
     before, end = chain[-2:]
     turn = between(p[end] - p[before], q[end] - q[before])
-    turned, moved = list(handle.turned), list(handle.moved)
+    turned, moved = ([j for j in part if j < len(p)] for part in (handle.turned, handle.moved))
     q[turned] = q[end] + (p[turned] - p[end]) @ turn.T
     q[moved] += q[end] - p[end]
     return q

@@ -21,7 +21,6 @@ from gsgan.model.avatar import Avatar
 from gsgan.render.images import eight_bits
 from gsgan.render.poses import Drive, inputs_of, joints_of
 from gsgan.scene import BodyPose, Camera, Gaussians
-from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import GsganError
 from gsgan.utils.provenance import png_bytes
 from gsgan.view.drag import NAMES, dragged, position
@@ -35,7 +34,6 @@ SMALLEST = 0.25  # least scale of the images while something moves
 WIDEST = 3.0  # bound on the aspect ratio, since a browser window can have any
 SPEED_OVER = 2.0  # seconds over which the displayed rate is averaged
 YELLOW, GREY = (255, 200, 0), (160, 165, 175)
-BONES = np.array(MEDIAPIPE33.edges)
 
 
 @dataclass
@@ -186,7 +184,7 @@ class Session:
         self.touch()
 
     def joints(self) -> Float:
-        """``[33, 3]`` metres, finite: the current pose."""
+        """``[J, 3]`` metres, finite: the current pose."""
         if self.pose is not None:
             return self.pose
         p, _ = joints_of(self.show.avatar, self._current(), 0)
@@ -281,7 +279,8 @@ class Session:
             node.remove()
         self._nodes = []
         if self.bones.value:
-            lines = scene.add_line_segments("/skeleton", p[BONES], colors=YELLOW, line_width=3.0)
+            bones = p[np.array(avatar.template.edges)]
+            lines = scene.add_line_segments("/skeleton", bones, colors=YELLOW, line_width=3.0)
             self._nodes.append(lines)
         if self.mesh.value and body is not None and pose is not None:
             vertices = body.posed_vertices(pose.to("cpu"))[0]
