@@ -69,7 +69,7 @@ def test_the_figure_has_the_lengths_of_finger_bones(signing, signer, figure):
     np.testing.assert_allclose(palms[1], np.diag([-1.0, 1, -1]), atol=1e-9)
     assert figure.hands is None
     template = figure.rest_with_hands  # of the right size, at the wrists
-    np.testing.assert_allclose(template[33:], rest[33:], atol=0.05)
+    np.testing.assert_allclose(template[33:], rest[33:], atol=0.06)
     half = replace(signer, joints=tuple(map(tuple, signer.rest / 2)), hands=None)
     np.testing.assert_allclose(half.rest_with_hands, template / 2, atol=0.01)
 
@@ -105,7 +105,7 @@ def test_missing_hands_are_not_seen_and_short_gaps_are_bridged(tmp_path, signing
     assert np.isnan(found[:, LEFT]).all()
     assert np.isfinite(found[:, RIGHT]).all()
     q = on_figure(found, signer)
-    assert angles(fingers(q)[3:6, 1], fingers(q)[2:3, 1]).max() < 30
+    assert angles(fingers(q)[3:6, 1], fingers(signing)[3:6, 1]).max() < 5
     p[2:8, RIGHT] = np.nan  # six frames
     q = on_figure(standard(write_holistic(tmp_path / "a.pose", p), signer)[0], signer)
     assert np.isnan(q[2:8, RIGHT]).all()

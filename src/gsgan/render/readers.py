@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from gsgan.data.calibration.find import METRES
 from gsgan.data.figure import (
     BONES,
     EARS,
-    FINGER_BONES,
     HAND_JOINTS,
     HIPS,
     SHOULDERS,
@@ -53,8 +53,11 @@ RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
 LEG_UNITS = {"metres": 1.0, "decimetres": 0.1, "centimetres": 0.01, "inches": 0.0254}
 LEG_UNITS |= {"millimetres": 0.001, "CMU units (inches / 0.45)": 0.0254 / 0.45}
-HANDS = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS")  # in files of pose-format
-HAND_LENGTHS = (*FINGER_BONES, *((WRIST, base) for base, *_ in FINGERS))
+GUESSED = 0.5  # visibility below which MediaPipe's hips are guesses
+IMAGE, WORLD = "POSE_LANDMARKS", "POSE_WORLD_LANDMARKS"  # in files of pose-format
+HANDS = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS")
+# Without the thumb: hands differ most in where its base is.
+HAND_LENGTHS = tuple(bone for f in FINGERS[1:] for bone in pairwise((WRIST, *f)))
 LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))  # rigid, for the scale of axes
 
 
@@ -339,10 +342,13 @@ def read_trc(path: Path, source: Source) -> Motion:
 def read_pose(path: Path, source: Source) -> Motion:
     """MediaPipe's landmarks in a file of the ``pose-format`` package.
 
-    World landmarks if it has them, otherwise image landmarks with MediaPipe's depth. The package
-    scales x and y by the image size but not z, and normalised files no longer hold that size: the
-    scale of each axis is estimated from the subject's bone lengths. Hands have image landmarks, each
-    relative to its own wrist, and scales of their own.
+    Image landmarks with MediaPipe's depth, which agree with those of the hands; without any, world
+    landmarks. The package scales x and y by the image size but not z, and normalised files no
+    longer hold that size: the scale of each axis is estimated from the subject's bone lengths.
+    Hands are relative to their own wrists and have scales of their own.
+
+    Hips that are hardly seen, as of people filmed from the waist up, are put upright below the
+    shoulders.
 
     Raises:
         DataError: when the package is missing, the file is damaged or has no depth.
@@ -365,11 +371,11 @@ def read_pose(path: Path, source: Source) -> Motion:
     for part in pose.header.components:
         parts[part.name] = (slice(starts, starts + len(part.points)), part.points, part.format)
         starts += len(part.points)
-    name = next((n for n in ("POSE_WORLD_LANDMARKS", "POSE_LANDMARKS") if n in parts), None)
+    name = next((n for n in (IMAGE, WORLD) if n in parts), None)
     if name is None or "Z" not in parts[name][2]:
         raise DataError(
             f"{path} has {', '.join(parts)} without depth; expected MediaPipe's "
-            "POSE_WORLD_LANDMARKS or POSE_LANDMARKS in 3D"
+            f"{WORLD} or {IMAGE} in 3D"
         )
 
     def landmarks(part: str, names: tuple[str, ...]) -> tuple[Float, Float]:
@@ -384,7 +390,12 @@ def read_pose(path: Path, source: Source) -> Motion:
 
     p, visibility = landmarks(name, MEDIAPIPE33.names)
     unit = f"{name.lower().replace('_', ' ')}, scaled to the subject"
-    p = _to_metres(path, p, visibility, source.figure)
+    if hidden := np.median(visibility[:, HIPS]) < GUESSED:
+        visibility[:, HIPS] = 0
+    p = _to_metres(path, p, visibility, source.figure, pixels=name == IMAGE)
+    if hidden:
+        p[:, HIPS] = p[:, SHOULDERS] + (0, length(source.figure.rest, (11, 23)), 0)
+        visibility[:, HIPS] = visibility[:, SHOULDERS]
     hands = [landmarks(hand, HAND_NAMES) for hand in HANDS]
     if any(seen.any() for _, seen in hands):
         p = np.concatenate([p, *_hands_to_metres(hands, source.figure)], axis=1)
@@ -392,11 +403,12 @@ def read_pose(path: Path, source: Source) -> Motion:
     return Motion(path, p, visibility, _rate(path, pose.body.fps), None, unit)
 
 
-def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure) -> Float:
+def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure, pixels: bool) -> Float:
     """Scales each of the three axes so that bones get the subject's lengths.
 
     The squares of the scales solve ``Σ sᵢ² dᵢ² = length²`` over all seen bones and frames, by
-    non-negative least squares.
+    non-negative least squares. Pixels are square: x and y then take the mean of theirs. One unknown
+    for both would leave no depth to a person with longer arms, or narrower shoulders.
     """
     rows = []
     for a, b in LENGTHS:
@@ -405,24 +417,26 @@ def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure) -> Float
     table = np.concatenate(rows)
     if not len(table):
         raise DataError(f"{path}: no frame shows two joints of a limb; expected a person")
-    return np.asarray(p * np.sqrt(nnls(table, np.ones(len(table)))[0]))
+    scales = np.sqrt(nnls(table, np.ones(len(table)))[0])
+    if pixels:
+        scales[:2] = scales[:2].mean()
+    return np.asarray(p * scales)
 
 
 def _hands_to_metres(hands: list[tuple[Float, Float]], figure: Figure) -> list[Float]:
-    """Hands ``[F, 21, 3]`` in metres relative to their wrists, from points and confidences.
+    """Hands ``[F, 21, 3]`` from their wrists, of points and confidences.
 
-    The scale of x and y, which pixels share, and that of z solve `_to_metres`' equations for the
-    palms' and fingers' bones.
+    The scale of x and y, and that of z, solve `_to_metres`' equations for the bones of both hands.
     """
     rest, rows, found = figure.rest_with_hands, [], []
     for (p, seen), at in zip(hands, HAND_JOINTS.values(), strict=True):
         p = np.where(seen[..., None] > 0, p - p[:, WRIST, None], np.nan)
         for a, b in HAND_LENGTHS:
-            across = (p[:, b] - p[:, a]) ** 2 / length(rest[at], (a, b)) ** 2
-            rows.append(np.stack([across[:, :2].sum(-1), across[:, 2]], axis=-1))
+            bone = (p[:, b] - p[:, a]) ** 2 / length(rest[at], (a, b)) ** 2
+            rows.append(np.stack([bone[:, 0] + bone[:, 1], bone[:, 2]], axis=1))
         found.append(p)
     table = np.concatenate(rows)
-    table = table[np.isfinite(table).all(-1)]
+    table = table[np.isfinite(table).all(1)]
     flat, deep = np.sqrt(nnls(table, np.ones(len(table)))[0])
     return [p * (flat, flat, deep) for p in found]
 
