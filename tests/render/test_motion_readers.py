@@ -37,7 +37,10 @@ def standard(path: Path, figure, **source) -> tuple[np.ndarray, object]:
 
 
 def write_pose(
-    path: Path, parts: dict[str, tuple[list[str], np.ndarray]], layout: str = "XYZC"
+    path: Path,
+    parts: dict[str, tuple[list[str], np.ndarray]],
+    layout: str = "XYZC",
+    unsure: tuple[int, ...] = (),
 ) -> Path:
     """A .pose file of parts: names of points, and points ``[F, n, 3]`` with NaN where not seen."""
     pose_format = pytest.importorskip("pose_format")
@@ -51,6 +54,7 @@ def write_pose(
     header = PoseHeader(0.1, PoseHeaderDimensions(640, 480, 0), components)
     q = np.concatenate([q for _, q in parts.values()], axis=1)
     seen = np.isfinite(q).all(-1)[:, None].astype(np.float64)
+    seen[..., unsure] *= 0.4
     with path.open("wb") as stream:
         body = NumPyPoseBody(25, np.nan_to_num(q)[:, None], seen)
         pose_format.Pose(header, body).write(stream)
@@ -214,6 +218,20 @@ def test_pose_files_with_axes_of_unknown_scale(tmp_path, landmarks, figure):
     write(path, q[..., :2], "XYC", "pose_keypoints_2d")
     with pytest.raises(DataError, match="pose_keypoints_2d without depth"):
         standard(path, figure)
+
+
+def test_people_filmed_from_the_waist_up_stand_upright(tmp_path, landmarks, figure):
+    names, q = [n.upper() for n in MEDIAPIPE33.names], landmarks @ Y_DOWN.T
+    world = ("POSE_WORLD_LANDMARKS", (names, q[::-1]))
+    q[:, 23:25, 2] -= 0.5  # MediaPipe's guess
+    parts = {"POSE_LANDMARKS": (names, q * (640, 640, 1)), world[0]: world[1]}
+    p, _ = standard(write_pose(tmp_path / "a.pose", parts, unsure=(23, 24)), figure)
+    spine = p[:, 11:13].mean(1) - p[:, 23:25].mean(1)
+    np.testing.assert_allclose(spine[:, :2], 0, atol=1e-9)
+    assert (spine[:, 2] > 0.4).all()
+    across = [x[:, 11] - x[:, 12] for x in (p @ (upright("-y") @ Y_DOWN), landmarks)]
+    across = [x / np.linalg.norm(x, axis=-1, keepdims=True) for x in across]
+    assert (across[0] * across[1]).sum(-1).min() > 0.9  # image landmarks, not the world's
 
 
 def test_bvh(tmp_path, figure):

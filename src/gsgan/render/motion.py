@@ -24,9 +24,9 @@ from gsgan.data.figure import (
     middle,
     upright,
 )
-from gsgan.skeleton.hands import WRIST
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, sanitise
+from gsgan.skeleton.hands import WRIST
 from gsgan.skeleton.sanitise import MIN_TRUNK_JOINTS
 from gsgan.utils.errors import DataError
 
@@ -171,7 +171,7 @@ def completed(motion: Motion, up: str) -> Float:
 def _bridged(hand: Float) -> Float:
     """``[F, 21, 3]`` a hand relative to its wrist, gaps of up to `GAP` frames interpolated."""
     hand = hand - hand[:, WRIST, None]
-    known: Bool = np.isfinite(hand).all((1, 2))
+    known: Bool = np.asarray(np.isfinite(hand).all((1, 2)))
     if not known.any():
         return hand
     before, after, share = neighbours(known)

@@ -257,7 +257,7 @@ def _joined(clips: list[Drive], figure: Figure, seconds: float, fps: float) -> D
 
 def _shown(p: Float, figure: Figure) -> Float:
     """``[F, J]`` visibility of retargeted joints: the body's as in training, hands where known."""
-    visibility = np.isfinite(p).all(-1).astype(np.float64)
+    visibility = np.asarray(np.isfinite(p).all(-1), np.float64)
     visibility[:, : len(figure.seen)] = figure.seen
     return visibility
 

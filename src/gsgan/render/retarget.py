@@ -69,7 +69,7 @@ def on_figure(p: Float, figure: Figure) -> Float:
         if hands.shape[1] > BODY:
             at, palm = _posed_hand(hands[:, HAND_JOINTS[wrist]], figure, wrist)
             whole[:, HAND_JOINTS[wrist]] = q[:, wrist, None] + at
-            turn = np.where(np.isfinite(palm).all((1, 2))[:, None, None], palm, turn)
+            turn = np.where(np.isfinite(palm), palm, turn)
         q[:, ends] = q[:, wrist, None] + (rest[list(ends)] - rest[wrist]) @ turn.mT
     for ankle, feet in FEET.items():
         turn = _foot_frame(p, ankle) @ _foot_frame(rest, ankle).T
@@ -85,8 +85,8 @@ def on_figure(p: Float, figure: Figure) -> Float:
 
 
 def _posed_hand(p: Float, figure: Figure, wrist: int) -> tuple[Float, Float]:
-    """The subject's hand as landmarks ``[F, 21, 3]`` show: ``[F, 21, 3]`` from the pose's wrist, and
-    the palm's rotation since the standard pose ``[F, 3, 3]``. NaN where the palm is unknown."""
+    """The subject's hand as landmarks ``[F, 21, 3]`` show it: ``[F, 21, 3]`` from the pose's wrist,
+    and the palm's rotation since the standard pose ``[F, 3, 3]``; NaN where the palm is unknown."""
     rest = figure.rest_with_hands[HAND_JOINTS[wrist]]
     palm = palm_frame(p) @ palm_frame(rest).T
     q = (rest - figure.rest[wrist]) @ palm.mT
