@@ -13,7 +13,7 @@ from gsgan.body import free_body
 from gsgan.data.figure import FINGER_BONES, HAND_JOINTS, figure_of, palm_frame, upright
 from gsgan.render.motion import is_own, up_axis
 from gsgan.render.retarget import joined, on_figure
-from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, complete_skeleton
+from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, complete_skeleton, limb_length_sum
 from gsgan.skeleton.hands import HAND_NAMES
 
 LEFT, RIGHT = HAND_JOINTS.values()
@@ -114,7 +114,8 @@ def test_missing_hands_are_not_seen_and_short_gaps_are_bridged(tmp_path, signing
     assert np.isnan(q[2:8, RIGHT]).all()
     assert np.isfinite(q[[0, 1, 8, 11], RIGHT]).all()
     given = torch.from_numpy(q[4:5])
-    whole, visibility = complete_skeleton(given, None, HOLISTIC, HOLISTIC.limb_length_sum)
+    height = float(limb_length_sum(torch.from_numpy(signer.rest[None])))
+    whole, visibility = complete_skeleton(given, None, HOLISTIC, height)
     assert not visibility[0, 33:75].any()
     for wrist, at in HAND_JOINTS.items():  # no hand is left behind
         assert (whole[0, at] - whole[0, wrist]).norm(dim=-1).max() < 0.3
