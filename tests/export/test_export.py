@@ -24,15 +24,18 @@ def test_a_sequence_of_ply_files_and_its_card(bare, tmp_path, inside):
         assert part in card
     assert "license: other" in card
     refused(inside("export", *given), "exists", "overwrite=true")
-    again = inside("export", *given, "overwrite=true", "licence=cc-by-nc-4.0")
+    (out / "notes.ply").write_text("mine")
+    again = inside("export", *given, "overwrite=true", "licence=cc-by-nc-4.0", "frames=1")
     assert again.returncode == 0, again.stderr
+    assert sorted(p.name for p in out.glob("*.ply")) == ["000004.ply", "notes.ply"]
     assert "license: cc-by-nc-4.0" in (out / "MODEL_CARD.md").read_text()
 
 
 def test_a_file_in_place_of_a_folder_and_the_reverse(bare, tmp_path, inside):
     (tmp_path / "poses").write_text("mine")
     (tmp_path / "a.ply").mkdir()
-    for name, words in (("poses", "is a file"), ("a.ply", "is a folder")):
+    cases = (("poses", "is a file"), ("a.ply", "is a folder"), ("poses/a.ply", "cannot be written"))
+    for name, words in cases:
         given = (f"run={bare}", f"out={tmp_path / name}", "overwrite=true")
         refused(inside("export", *given), words)
 

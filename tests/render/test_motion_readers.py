@@ -36,6 +36,31 @@ def standard(path: Path, figure, **source) -> tuple[np.ndarray, object]:
     return completed(motion, motion.up or up_axis(motion)), motion
 
 
+def write_pose(
+    path: Path,
+    parts: dict[str, tuple[list[str], np.ndarray]],
+    layout: str = "XYZC",
+    unsure: tuple[int, ...] = (),
+) -> Path:
+    """A .pose file of parts: names of points, and points ``[F, n, 3]`` with NaN where not seen."""
+    pose_format = pytest.importorskip("pose_format")
+    from pose_format.numpy import NumPyPoseBody
+    from pose_format.pose_header import PoseHeader, PoseHeaderComponent, PoseHeaderDimensions
+
+    components = [
+        PoseHeaderComponent(name, points, [(0, 1)], [(255, 0, 0)], layout)
+        for name, (points, _) in parts.items()
+    ]
+    header = PoseHeader(0.1, PoseHeaderDimensions(640, 480, 0), components)
+    q = np.concatenate([q for _, q in parts.values()], axis=1)
+    seen = np.isfinite(q).all(-1)[:, None].astype(np.float64)
+    seen[..., unsure] *= 0.4
+    with path.open("wb") as stream:
+        body = NumPyPoseBody(25, np.nan_to_num(q)[:, None], seen)
+        pose_format.Pose(header, body).write(stream)
+    return path
+
+
 def test_landmarks(tmp_path, landmarks, figure):
     path = tmp_path / "a.npz"
     np.savez(path, p=1000 * landmarks[..., [0, 2, 1]] * (1, 1, -1), fps=25)
@@ -56,8 +81,11 @@ def test_body_poses_of_the_free_body(tmp_path, dance, landmarks, figure):
     assert motion.body is not None
     theta[3, 0, 0] = np.nan
     np.savez(path, theta=theta, transl=dance.transl.numpy())
-    with pytest.raises(DataError, match="1 of 12 frames, the first is 3, lack shoulders or hips"):
-        standard(path, figure)
+    p, motion = standard(path, figure)
+    assert motion.filled == 1
+    for found in (p, motion.body.theta, motion.body.transl):
+        assert np.isfinite(found).all()
+        np.testing.assert_array_equal(found[3], found[2])
 
 
 def test_body_poses_of_a_fitted_body(tmp_path, dance):
@@ -139,7 +167,7 @@ def test_mediapipe(tmp_path, landmarks, figure, style):
         ([{"pose_landmarks": []}], "frame 0: no pose_world_landmarks"),
         ([{"pose_world_landmarks": [{"x": 1}] * 33}], "frame 0: expected 33 landmarks"),
         ([{"pose_world_landmarks": [[0, 0, 0]] * 17}], "frame 0: expected 33 landmarks"),
-        ([{"pose_world_landmarks": None}], "1 of 1 frames, the first is 0, lack"),
+        ([{"pose_world_landmarks": None}], "none of 1 frames has shoulders and hips"),
     ],
 )
 def test_bad_json(tmp_path, figure, content, message):
@@ -172,17 +200,10 @@ def test_pose2sim(tmp_path, landmarks, figure):
 
 
 def test_pose_files_with_axes_of_unknown_scale(tmp_path, landmarks, figure):
-    pose_format = pytest.importorskip("pose_format")
-    from pose_format.numpy import NumPyPoseBody
-    from pose_format.pose_header import PoseHeader, PoseHeaderComponent, PoseHeaderDimensions
+    names = [n.upper() for n in MEDIAPIPE33.names]
 
     def write(path, q, layout, name="POSE_WORLD_LANDMARKS"):
-        names = [n.upper() for n in MEDIAPIPE33.names]
-        part = PoseHeaderComponent(name, names, [(0, 1)], [(255, 0, 0)], layout)
-        header = PoseHeader(0.1, PoseHeaderDimensions(640, 480, 0), [part])
-        body = NumPyPoseBody(25, q[:, None], np.ones((len(q), 1, 33)))
-        with path.open("wb") as stream:
-            pose_format.Pose(header, body).write(stream)
+        write_pose(path, {name: (names, q)}, layout)
 
     path, q = tmp_path / "a.pose", landmarks @ Y_DOWN.T
     write(path, q * (687.0, 515.0, 1.07) + 250, "XYZC")
@@ -197,6 +218,20 @@ def test_pose_files_with_axes_of_unknown_scale(tmp_path, landmarks, figure):
     write(path, q[..., :2], "XYC", "pose_keypoints_2d")
     with pytest.raises(DataError, match="pose_keypoints_2d without depth"):
         standard(path, figure)
+
+
+def test_people_filmed_from_the_waist_up_stand_upright(tmp_path, landmarks, figure):
+    names, q = [n.upper() for n in MEDIAPIPE33.names], landmarks @ Y_DOWN.T
+    world = ("POSE_WORLD_LANDMARKS", (names, q[::-1]))
+    q[:, 23:25, 2] -= 0.5  # MediaPipe's guess
+    parts = {"POSE_LANDMARKS": (names, q * (640, 640, 1)), world[0]: world[1]}
+    p, _ = standard(write_pose(tmp_path / "a.pose", parts, unsure=(23, 24)), figure)
+    spine = p[:, 11:13].mean(1) - p[:, 23:25].mean(1)
+    np.testing.assert_allclose(spine[:, :2], 0, atol=1e-9)
+    assert (spine[:, 2] > 0.4).all()
+    across = [x[:, 11] - x[:, 12] for x in (p @ (upright("-y") @ Y_DOWN), landmarks)]
+    across = [x / np.linalg.norm(x, axis=-1, keepdims=True) for x in across]
+    assert (across[0] * across[1]).sum(-1).min() > 0.9  # image landmarks, not the world's
 
 
 def test_bvh(tmp_path, figure):
@@ -354,6 +389,23 @@ def test_frame_rates(landmarks):
     assert len(half) == 23
     np.testing.assert_allclose(half[1], (landmarks[0] + landmarks[1]) / 2)
     assert resampled(landmarks[:1], 24, 60).shape == (1, 33, 3)
+
+
+def test_frames_without_a_trunk(tmp_path, landmarks, figure):
+    p = landmarks.copy()
+    p[0] = p[11] = p[3] = p[4, [11, 23]] = np.nan
+    p[2, 12] = np.nan  # one shoulder of a neighbour
+    np.savez(tmp_path / "a.npz", p=p)
+    motion = checked(read_motion(tmp_path / "a.npz", Source(figure)), 0.1)
+    assert motion.filled == 4
+    np.testing.assert_array_equal(motion.p[0], landmarks[1])
+    np.testing.assert_array_equal(motion.p[11], landmarks[10])
+    np.testing.assert_allclose(motion.p[3, 15], landmarks[[2, 2, 5], 15].mean(0))
+    whole, _ = standard(tmp_path / "a.npz", figure)
+    assert np.isfinite(whole).all()
+    np.savez(tmp_path / "a.npz", p=np.full_like(p, np.nan))
+    with pytest.raises(DataError, match="none of 12 frames has shoulders and hips"):
+        standard(tmp_path / "a.npz", figure)
 
 
 def test_joints_out_of_sight(tmp_path, landmarks, figure):

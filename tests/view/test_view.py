@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import shutil
+import socket
 import time
 from dataclasses import replace
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -224,6 +226,21 @@ def test_it_listens_on_this_machine_alone(viewer, compose):
     assert compose("view").host == "127.0.0.1"
     assert viewer.server.get_host() == "127.0.0.1"
     assert viewer.server.request_share_url() is None  # no public address
+
+
+def test_an_ipv6_address(bare, compose):
+    from gsgan.view.server import Viewer
+
+    try:
+        socket.create_server(("::1", 0), family=socket.AF_INET6).close()
+    except OSError:
+        pytest.skip("no IPv6 here")
+    viewer = Viewer(compose("view", f"run={bare}", "host='::1'", "port=0", "motion=rest"))
+    try:
+        assert viewer.address == f"http://[::1]:{viewer.server.get_port()}"
+        assert urlopen(viewer.address).status == 200
+    finally:
+        viewer.stop()
 
 
 def test_another_machines_address_is_refused(bare, inside):

@@ -6,14 +6,17 @@ person's left is +X, palms down, legs straight down, the middle of the hips at t
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from gsgan.skeleton import MEDIAPIPE33, bone_frames, sanitise
+from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, bone_frames, sanitise
+from gsgan.skeleton.hands import FINGERS, HAND, INDEX, PINKY, WRIST
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 from gsgan.utils.errors import DataError
 
@@ -24,6 +27,10 @@ ARMS = ((11, 13), (13, 15)), ((12, 14), (14, 16))
 LEGS = ((23, 25), (25, 27)), ((24, 26), (26, 28))
 BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])  # parents first
 HANDS, FEET = {15: (17, 19, 21), 16: (18, 20, 22)}, {27: (29, 31), 28: (30, 32)}
+BODY = len(MEDIAPIPE33.names)
+HAND_JOINTS = {15: slice(BODY, BODY + HAND), 16: slice(BODY + HAND, BODY + 2 * HAND)}  # by wrist
+FINGER_BONES = tuple(bone for finger in FINGERS for bone in pairwise(finger))  # base to tip
+SIDES = {15: 1.0, 16: -1.0}  # of the standard pose's x
 HEELS_AND_TOES = (29, 30, 31, 32)
 FACE = tuple(range(11))
 STANDING = 10  # percentile of a foot's heights below which it counts as standing
@@ -40,6 +47,8 @@ class Figure:
         ground: metres along the world's up axis, of the lowest heel or toe of a standing person.
         facing: radians about the up axis, 0 towards -Y of the standard axes: the mean heading.
         up: the world's up axis, e.g. "z" or "-y".
+        hands: 42 hand landmarks in the standard pose, the left hand's first, of the training
+            frames' median proportions; None where no frame has a hand.
     """
 
     joints: tuple[tuple[float, float, float], ...]
@@ -47,11 +56,25 @@ class Figure:
     ground: float
     facing: float
     up: str
+    hands: tuple[tuple[float, float, float], ...] | None = None
 
     @property
     def rest(self) -> Float:
         """``[33, 3]`` the landmarks of the standard pose."""
         return np.array(self.joints)
+
+    @property
+    def rest_with_hands(self) -> Float:
+        """``[75, 3]`` with hands: the subject's, else the template's in the subject's size."""
+        rest = self.rest
+        if self.hands is not None:
+            return np.concatenate([rest, self.hands])
+        template = np.array(HOLISTIC.rest_positions)
+        pinky, index, _ = HANDS[15]
+        hands = {w: _hand(template[None, at], template[None, w]) for w, at in HAND_JOINTS.items()}
+        sizes = [np.linalg.norm(middle(p, (pinky, index)) - p[15]) for p in (rest, template)]
+        hands = {wrist: hand * sizes[0] / sizes[1] for wrist, hand in hands.items()}
+        return np.concatenate([rest, _standing_hands(rest, hands)])
 
     @property
     def leg(self) -> float:
@@ -63,11 +86,12 @@ def figure_of(p: Tensor, valid: Tensor, up: str) -> Figure:
     """The proportions of a person.
 
     Args:
-        p: ``[F, 33, 3]`` metres, world frame; anything where not valid.
-        valid: ``[F, 33]``.
+        p: ``[F, 33, 3]`` metres, world frame; anything where not valid. Or ``[F, 75, 3]`` with the
+            21 landmarks of the left hand and of the right one.
+        valid: ``[F, 33]`` or ``[F, 75]``.
         up: the world's up axis.
     """
-    whole, _ = sanitise(p.double(), valid)
+    whole, _ = sanitise(p[:, :BODY].double(), valid[:, :BODY])
     q = whole.numpy() @ upright(up).T
     hubs = bone_frames(torch.from_numpy(q)).hubs.numpy()
     rest = np.zeros((len(MEDIAPIPE33.names), 3))
@@ -89,9 +113,9 @@ def figure_of(p: Tensor, valid: Tensor, up: str) -> Figure:
         for limb, way in zip(limbs, ways, strict=True):
             for a, b in limb:
                 rest[b] = rest[a] + median_length(q[:, a], q[:, b]) * np.array(way)
-    for (wrist, ends), sign in zip(HANDS.items(), (1.0, -1.0), strict=True):
+    for wrist, ends in HANDS.items():
         held = local(hand_frame(q, wrist), q[:, ends] - q[:, wrist, None])
-        rest[list(ends)] = rest[wrist] + held @ np.diag([sign, 1.0, sign])
+        rest[list(ends)] = rest[wrist] + held * (SIDES[wrist], 1.0, SIDES[wrist])
     for ankle, (heel, toe) in FEET.items():
         foot = [heel, toe]
         low = q[:, foot, 2].max(axis=1)
@@ -111,12 +135,54 @@ def figure_of(p: Tensor, valid: Tensor, up: str) -> Figure:
     rest[list(FACE)] = middle(rest, SHOULDERS) + neck + face @ level
     ahead = hubs[:, PELVIS, :, 2].mean(axis=0)
     lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)
+    hands = _hands(p.double().numpy() @ upright(up).T, valid.numpy())
     return Figure(
-        joints=tuple((x, y, z) for x, y, z in rest.tolist()),
-        seen=tuple((valid.double().mean(0) > 0.5).tolist()),
+        joints=_plain(rest),
+        seen=tuple((valid[:, :BODY].double().mean(0) > 0.5).tolist()),
         ground=float(np.percentile(lowest, STANDING)),
         facing=float(np.arctan2(ahead[0], -ahead[1])),
         up=up,
+        hands=_plain(_standing_hands(rest, hands)) if hands else None,
+    )
+
+
+def _plain(p: Float) -> tuple[tuple[float, float, float], ...]:
+    return tuple((x, y, z) for x, y, z in p.tolist())
+
+
+def _hands(p: Float, seen: NDArray[np.bool_]) -> dict[int, Float]:
+    """Each hand of joints ``[F, J, 3]`` as `_hand` gives it, by its wrist; empty without any.
+
+    A hand that is never seen whole is the other one's mirror image.
+    """
+    found = {}
+    for wrist, hand in HAND_JOINTS.items():
+        whole = seen[:, hand].all(1) & seen[:, wrist]
+        if whole.any() and p.shape[1] > BODY:
+            found[wrist] = _hand(p[whole, hand], p[whole, wrist])
+    if len(found) == 1:
+        (other,) = found.values()
+        found = dict.fromkeys(HAND_JOINTS, other * (1, 1, -1)) | found
+    return found
+
+
+def _hand(p: Float, wrist: Float) -> Float:
+    """``[21, 3]`` medians of a hand ``[F, 21, 3]`` from the pose's wrist ``[F, 3]``, in the palm's
+    axes; fingers have the median lengths of their bones."""
+    local = (p - wrist[:, None]) @ palm_frame(p)
+    median = np.median(local, axis=0)
+    held = median.copy()
+    for a, b in FINGER_BONES:
+        bone = median[b] - median[a]
+        size = np.median(np.linalg.norm(p[:, b] - p[:, a], axis=-1))
+        held[b] = held[a] + size * bone / max(float(np.linalg.norm(bone)), 1e-9)
+    return held
+
+
+def _standing_hands(rest: Float, hands: Mapping[int, Float]) -> Float:
+    """``[42, 3]`` the hands of `_hands` at the wrists of a standard pose ``[33, 3]``."""
+    return np.concatenate(
+        [rest[wrist] + hand * (SIDES[wrist], 1.0, SIDES[wrist]) for wrist, hand in hands.items()]
     )
 
 
@@ -150,6 +216,12 @@ def hand_frame(p: Float, wrist: int) -> Float:
     return part_frame(
         middle(p, (pinky, index)) - p[..., wrist, :], p[..., pinky, :] - p[..., index, :]
     )
+
+
+def palm_frame(hand: Float) -> Float:
+    """``[..., 3, 3]`` axes of a palm of landmarks ``[..., 21, 3]``, as `hand_frame`'s."""
+    along = middle(hand, (PINKY, INDEX)) - hand[..., WRIST, :]
+    return part_frame(along, hand[..., PINKY, :] - hand[..., INDEX, :])
 
 
 def part_frame(along: Float, across: Float) -> Float:

@@ -117,6 +117,9 @@ def scene_info(
     """
     frames = sorted({frame for _, frame in splits.items["train"]})
     p, valid = layout.landmarks.joints(frames)
+    whole = layout.landmarks
+    if layout.hands is not None:
+        whole = whole.with_hands(layout.hands)
     middles = torch.stack([q[v].mean(0) for q, v in zip(p, valid, strict=True)])
     cameras = {camera for camera, _ in dataset.items}
     tested = {camera for data in held_out for camera, _ in data.items} - cameras
@@ -158,7 +161,7 @@ def scene_info(
         surface=_shared_surface(layout, dataset, tuple(entries), samples, mesh),
         darkest=darkest,
         body_inside=inside,
-        figure=figure_of(p, valid, layout.meta.up_axis),
+        figure=figure_of(*whole.joints(frames), layout.meta.up_axis),
     )
 
 

@@ -13,6 +13,7 @@ from rich.progress import track
 
 from gsgan.export.card import card
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
+from gsgan.prepare.work import writing
 from gsgan.render.poses import REST, Drive, Run, drive_of, inputs_of
 from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.console import make_console
@@ -63,12 +64,22 @@ def export_config(config: DictConfig) -> None:
             name = out / f"{drive.numbers[i]:06d}{ENDINGS[kind]}" if sequence else out
             splats = _splats(run, drive, i)
             up = run.figure.up
-            write_atomically(name, ply_bytes(splats) if kind == "ply" else glb_bytes(splats, up))
+            _write(name, ply_bytes(splats) if kind == "ply" else glb_bytes(splats, up))
+        if sequence:  # what is left of a longer one
+            kept = {f"{number:06d}.ply" for number in drive.numbers}
+            for path in out.glob("[0-9]" * 6 + ".ply"):
+                if path.name not in kept:
+                    path.unlink()
     else:
-        write_atomically(out, _program(config, run, kind))
+        _write(out, _program(config, run, kind))
     beside = out / CARD if sequence else out.with_name(f"{out.stem}.{CARD}")
-    write_atomically(beside, card(run, kind, out.name, config.licence))
+    _write(beside, card(run, kind, out.name, config.licence))
     tell(f"written: {out}, {beside.name}")
+
+
+def _write(path: Path, content: str | bytes) -> None:
+    with writing(path):
+        write_atomically(path, content)
 
 
 def _place(config: DictConfig, kind: str) -> Path:

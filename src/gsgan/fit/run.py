@@ -144,6 +144,8 @@ def fit_body(
     with writing(folder / SHEET):
         write_atomically(folder / SHEET, fit_picture(fitter, layout.camera_names, found, shown))
     write_json(folder / REPORT, report)
+    with writing(folder / POSES):  # a fit that is killed here leaves no poses of another shape
+        (folder / POSES).unlink(missing_ok=True)
     write_npz(folder / SHAPE, **{name: x.numpy() for name, x in vars(shape).items()})
     write_npz(
         folder / POSES,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from kornia.geometry.conversions import quaternion_to_rotation_matrix
 from torch import Tensor, nn
@@ -185,12 +186,14 @@ def farthest_points(vertices: Tensor, count: int) -> Tensor:
     """
     if count == len(vertices):
         return torch.arange(count)
-    chosen = torch.zeros(count, dtype=torch.long)
-    nearest = torch.full((len(vertices),), math.inf)
+    axes = np.ascontiguousarray(vertices.numpy().T)  # numpy: a third of torch's time at this size
+    chosen = np.zeros(count, np.int64)
+    nearest = np.full(len(vertices), np.inf, axes.dtype)
     for i in range(1, count):
-        nearest = torch.minimum(nearest, (vertices - vertices[chosen[i - 1]]).square().sum(-1))
+        x, y, z = (axes - axes[:, chosen[i - 1], None]) ** 2
+        np.minimum(nearest, x + y + z, out=nearest)
         chosen[i] = nearest.argmax()
-    return chosen
+    return torch.from_numpy(chosen)
 
 
 def neighbour_distance(points: Tensor, k: int = 1) -> Tensor:

@@ -1,6 +1,7 @@
 """Motions: what every reader returns, and the steps that follow for all formats.
 
-Convention: landmarks are MediaPipe's 33, ``p [F, 33, 3]`` metres.
+Convention: landmarks ``p [F, J, 3]`` in metres are MediaPipe's 33; or 75, with the 21 of the left
+hand and of the right one.
 """
 
 from __future__ import annotations
@@ -12,9 +13,20 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsgan.data.figure import BONES, HIPS, SHOULDERS, Figure, length, middle, upright
+from gsgan.data.figure import (
+    BODY,
+    BONES,
+    HAND_JOINTS,
+    HIPS,
+    SHOULDERS,
+    Figure,
+    length,
+    middle,
+    upright,
+)
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, sanitise
+from gsgan.skeleton.hands import WRIST
 from gsgan.skeleton.sanitise import MIN_TRUNK_JOINTS
 from gsgan.utils.errors import DataError
 
@@ -25,6 +37,7 @@ TRUNK = (*SHOULDERS, *HIPS)
 FPS = 30.0  # assumed where neither the file nor the user gives it
 OWN = 0.02  # largest relative difference of bone lengths at which a motion is the subject's own
 SELDOM = 0.2  # a joint seen in a smaller share of the frames counts as a false detection
+GAP = 5  # frames: in a longer gap a hand is not seen
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 PARENT = {b: a for a, b in MEDIAPIPE33.limbs if b not in TRUNK}
 
@@ -35,13 +48,15 @@ class Motion:
 
     Args:
         path: the file.
-        p: ``[F, 33, 3]`` metres; NaN where a landmark is unknown.
-        visibility: ``[F, 33]`` in [0, 1].
+        p: ``[F, J, 3]`` metres; NaN where a landmark is unknown. Where hands are relative to the
+            body is not known in all formats.
+        visibility: ``[F, J]`` in [0, 1].
         fps: frames per second, or None if unknown.
         up: the axis that points up, or None to infer it from the skeleton.
         unit: of the file's lengths, in words.
         file_up: the file's own axis, where ``up`` is that of converted landmarks.
         body: ``[F]`` poses of the subject's body that the landmarks come from, or None.
+        filled: number of frames without shoulders and hips, see `checked`.
     """
 
     path: Path
@@ -52,6 +67,7 @@ class Motion:
     unit: str
     file_up: str | None = None
     body: BodyPose | None = None
+    filled: int = 0
 
     def __len__(self) -> int:
         return len(self.p)
@@ -60,11 +76,12 @@ class Motion:
 def checked(motion: Motion, least_visibility: float) -> Motion:
     """The motion with unseen landmarks set to NaN.
 
-    Shoulders and hips are kept wherever they are finite: without them there is no skeleton.
+    Shoulders and hips are kept wherever they are finite: without them there is no skeleton. Frames
+    with fewer than three of them are interpolated between their neighbours; before the first frame
+    that has them, after the last one, and where the motion has body poses, they repeat the nearest.
 
     Raises:
-        DataError: when there are no frames, or fewer than three of shoulders and hips are known in
-            a frame, naming the first.
+        DataError: when there are no frames, or none in which three of shoulders and hips are known.
     """
     if not len(motion):
         raise DataError(f"{motion.path} has no frames; expected a motion")
@@ -72,14 +89,41 @@ def checked(motion: Motion, least_visibility: float) -> Motion:
     known[:, list(TRUNK)] = np.isfinite(motion.p[:, list(TRUNK)]).all(-1) & (
         motion.visibility[:, TRUNK] > 0
     )
-    if len(bad := np.flatnonzero(known[:, TRUNK].sum(1) < MIN_TRUNK_JOINTS)):
+    good: Bool = known[:, TRUNK].sum(1) >= MIN_TRUNK_JOINTS
+    if not good.any():
         raise DataError(
-            f"{motion.path}: {len(bad)} of {len(motion)} frames, the first is {bad[0]}, lack "
-            "shoulders or hips (NaN, or not seen); remove these frames from the file, or "
-            "fill the gaps"
+            f"{motion.path}: none of {len(motion)} frames has shoulders and hips (NaN, or not seen)"
         )
     p = np.where(known[..., None], motion.p, np.nan)
-    return replace(motion, p=p, visibility=np.where(known, motion.visibility, 0.0))
+    visibility, body = np.where(known, motion.visibility, 0.0), motion.body
+    before, after, share = neighbours(good)
+    nearest = np.where(share > 0.5, after, before)
+    if body is not None:
+        share, at = np.rint(share), torch.from_numpy(nearest)
+        body = BodyPose(body.theta[at], body.transl[at])
+    q = mixed(p[before], p[after], share)
+    return replace(
+        motion,
+        p=np.where(np.isfinite(q), q, p[nearest]),
+        visibility=visibility[nearest],
+        body=body,
+        filled=int((~good).sum()),
+    )
+
+
+def neighbours(known: Bool) -> tuple[NDArray[np.int64], NDArray[np.int64], Float]:
+    """Per frame of ``known [F]``, the nearest known frames before and after it (itself if known;
+    the same one twice where there is none on a side), and the share of the latter in [0, 1]."""
+    at, times = np.flatnonzero(known), np.arange(len(known))
+    after = at[np.searchsorted(at, times).clip(max=len(at) - 1)]
+    before = at[(np.searchsorted(at, times, side="right") - 1).clip(min=0)]
+    return before, after, ((times - before) / np.maximum(after - before, 1)).clip(0, 1)
+
+
+def mixed(a: Float, b: Float, share: Float) -> Float:
+    """Landmarks ``[F, J, 3]`` between two; where a share ``[F]`` is 0 or 1, exactly one of them."""
+    s = share[:, None, None]
+    return np.where(s > 0, np.where(s < 1, (1 - s) * a + s * b, b), a)
 
 
 def is_own(motion: Motion, figure: Figure) -> bool:
@@ -101,12 +145,14 @@ def up_axis(motion: Motion) -> str:
 
 
 def completed(motion: Motion, up: str) -> Float:
-    """``[F, 33, 3]`` every landmark in standard axes, Z up.
+    """``[F, J, 3]`` every landmark in standard axes, Z up.
 
     Gaps of a joint are interpolated linearly, relative to its parent joint. A joint that fewer than
-    `SELDOM` of the frames show takes its place in the rest pose, relative to its parent.
+    `SELDOM` of the frames show takes its place in the rest pose, relative to its parent. Gaps of a
+    hand of up to `GAP` frames are interpolated relative to its wrist; in longer ones it is NaN.
     """
-    p = motion.p @ upright(up).T
+    both = motion.p @ upright(up).T
+    p = both[:, :BODY]
     known: Bool = np.asarray(np.isfinite(p).all(-1))
     times = np.arange(len(p))
     for joint, parent in PARENT.items():
@@ -118,19 +164,28 @@ def completed(motion: Motion, up: str) -> Float:
             p[:, joint] = np.where(seen[:, None], p[:, joint], p[:, parent] + between)
             known[:, joint] = known[:, parent]
     whole, _ = sanitise(torch.from_numpy(p), torch.from_numpy(known))
-    return np.asarray(whole.numpy(), np.float64)
+    hands = [_bridged(both[:, hand]) for hand in HAND_JOINTS.values() if both.shape[1] > BODY]
+    return np.concatenate([whole.numpy(), *hands], axis=1)
+
+
+def _bridged(hand: Float) -> Float:
+    """``[F, 21, 3]`` a hand relative to its wrist, gaps of up to `GAP` frames interpolated."""
+    hand = hand - hand[:, WRIST, None]
+    known: Bool = np.asarray(np.isfinite(hand).all((1, 2)))
+    if not known.any():
+        return hand
+    before, after, share = neighbours(known)
+    short = ~known & (after - before - 1 <= GAP) & (after > before)
+    return np.where(short[:, None, None], mixed(hand[before], hand[after], share), hand)
 
 
 def resampled(p: Float, fps: float, wanted: float) -> Float:
-    """Landmarks ``[F, 33, 3]`` at another frame rate, interpolated linearly."""
+    """Landmarks ``[F, J, 3]`` at another frame rate, interpolated linearly."""
     if len(p) == 1 or fps == wanted:
         return p
     times = frame_times(len(p), fps, wanted)
-    flat = p.reshape(len(p), -1)
     at = np.minimum(times.astype(int), len(p) - 2)
-    share = (times - at)[:, None]
-    mixed = np.where(share > 0, (1 - share) * flat[at] + share * flat[at + 1], flat[at])
-    return np.asarray(mixed.reshape(len(times), *p.shape[1:]), np.float64)
+    return mixed(p[at], p[at + 1], times - at)
 
 
 def frame_times(frames: int, fps: float, wanted: float) -> Float:

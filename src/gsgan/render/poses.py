@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -18,7 +17,7 @@ from torch import Tensor
 from gsgan.body import open_body
 from gsgan.body.skinned import MarkedBody
 from gsgan.data.dataset import PictureCache
-from gsgan.data.figure import HEELS_AND_TOES, Figure, upright
+from gsgan.data.figure import BODY, HAND_JOINTS, HEELS_AND_TOES, Figure, upright
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
 from gsgan.model.runs import (
@@ -133,8 +132,8 @@ class Drive:
     """A motion that drives the avatar.
 
     Args:
-        p: ``[F, 33, 3]`` metres, world frame; NaN where unknown.
-        visibility: ``[F, 33]`` in [0, 1].
+        p: ``[F, J, 3]`` metres, world frame; NaN where unknown. J is 33, or 75 with hands.
+        visibility: ``[F, J]`` in [0, 1].
         body: F poses of the skinned body, or None.
         numbers: of the frames, for their file names.
         text: one line that describes it.
@@ -246,13 +245,21 @@ def _joined(clips: list[Drive], figure: Figure, seconds: float, fps: float) -> D
         raise ConfigError("motion=[] names no file; expected motion=[a.pose,b.pose]")
     standard = upright(figure.up)
     between = max(1, round(seconds * fps) - 1)
-    p = joined([clip.p @ standard.T for clip in clips], figure, between) @ standard
-    visibility = [clips[0].visibility]
-    for a, b in pairwise(clips):
-        least = np.minimum(a.visibility[-1], b.visibility[0])
-        visibility += [np.repeat(least[None], between, axis=0), b.visibility]
+    joints = max(clip.p.shape[1] for clip in clips)
+    parts = []
+    for clip in clips:  # some with hands, some without
+        lacking = (0, joints - clip.p.shape[1])
+        parts.append(np.pad(clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan) @ standard.T)
+    p = joined(parts, figure, between) @ standard
     text = "; ".join(clip.text for clip in clips) + f"; {seconds:g} s from each to the next"
-    return Drive(p, np.concatenate(visibility), None, list(range(len(p))), text)
+    return Drive(p, _shown(p, figure), None, list(range(len(p))), text)
+
+
+def _shown(p: Float, figure: Figure) -> Float:
+    """``[F, J]`` visibility of retargeted joints: the body's as in training, hands where known."""
+    visibility = np.asarray(np.isfinite(p).all(-1), np.float64)
+    visibility[:, : len(figure.seen)] = figure.seen
+    return visibility
 
 
 def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
@@ -285,12 +292,17 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
         centre = standard @ np.array(run.scene.centre)
         p = on_figure(resampled(completed(motion, up), rate, fps), figure)
         p = placed(p, figure, centre, fps, ground=config.ground, stay=config.stay) @ standard
-        visibility = np.repeat(np.array(figure.seen, np.float64)[None], len(p), axis=0)
+        visibility = _shown(p, figure)
+    filled = f", {_frames(motion.filled)} without shoulders or hips filled" if motion.filled else ""
+    seen = [np.isfinite(p[:, hand]).all((1, 2)).sum() for hand in HAND_JOINTS.values()]
+    hands = f", left hand in {seen[0]} frames, right hand in {seen[1]}" if p.shape[1] > BODY else ""
     assumed = "" if config.motion_fps or motion.fps else " (assumed: give motion_fps)"
     text = (
         f"{motion.path.name}: {_frames(len(motion))} at {rate:.5g} per second{assumed}, "
         f"{motion.unit}, {(motion.file_up or up).upper()} up -> {_frames(len(p))} at {fps:g}, "
         + ("bones as they are" if own else "on the subject's bones")
+        + hands
+        + filled
     )
     return Drive(p, visibility, body, list(range(len(p))), text)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,15 @@ from scipy.optimize import nnls
 from gsgan.body import free_body, open_body
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.calibration.find import METRES
-from gsgan.data.figure import BONES, EARS, HIPS, SHOULDERS, Figure, length
+from gsgan.data.figure import (
+    BONES,
+    EARS,
+    HAND_JOINTS,
+    HIPS,
+    SHOULDERS,
+    Figure,
+    length,
+)
 from gsgan.data.files import read_arrays, read_json, read_json_value
 from gsgan.data.formats import smpl_motion
 from gsgan.data.formats.capture import SHAPE, read_shape
@@ -27,6 +36,7 @@ from gsgan.render.motion import Motion
 from gsgan.render.retarget import rig_landmarks
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.hands import FINGERS, HAND, HAND_NAMES, WRIST
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -43,6 +53,11 @@ RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
 LEG_UNITS = {"metres": 1.0, "decimetres": 0.1, "centimetres": 0.01, "inches": 0.0254}
 LEG_UNITS |= {"millimetres": 0.001, "CMU units (inches / 0.45)": 0.0254 / 0.45}
+GUESSED = 0.5  # visibility below which MediaPipe's hips are guesses
+IMAGE, WORLD = "POSE_LANDMARKS", "POSE_WORLD_LANDMARKS"  # in files of pose-format
+HANDS = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS")
+# Without the thumb: hands differ most in where its base is.
+HAND_LENGTHS = tuple(bone for f in FINGERS[1:] for bone in pairwise((WRIST, *f)))
 LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))  # rigid, for the scale of axes
 
 
@@ -125,7 +140,9 @@ def _beside(path: Path) -> dict[str, Any]:
 
 def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Motion:
     meta = _beside(path)
-    p = expect_array(arrays, "p", (None, JOINTS, 3), path).astype(np.float64)
+    with_hands = JOINTS + 2 * HAND
+    joints = with_hands if arrays["p"].shape[1:2] == (with_hands,) else JOINTS
+    p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64)
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:
         conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
@@ -325,9 +342,13 @@ def read_trc(path: Path, source: Source) -> Motion:
 def read_pose(path: Path, source: Source) -> Motion:
     """MediaPipe's landmarks in a file of the ``pose-format`` package.
 
-    World landmarks if it has them, otherwise image landmarks with MediaPipe's depth. The package
-    scales x and y by the image size but not z, and normalised files no longer hold that size: the
-    scale of each axis is estimated from the subject's bone lengths.
+    Image landmarks with MediaPipe's depth, which agree with those of the hands; without any, world
+    landmarks. The package scales x and y by the image size but not z, and normalised files no
+    longer hold that size: the scale of each axis is estimated from the subject's bone lengths.
+    Hands are relative to their own wrists and have scales of their own.
+
+    Hips that are hardly seen, as of people filmed from the waist up, are put upright below the
+    shoulders.
 
     Raises:
         DataError: when the package is missing, the file is damaged or has no depth.
@@ -350,28 +371,44 @@ def read_pose(path: Path, source: Source) -> Motion:
     for part in pose.header.components:
         parts[part.name] = (slice(starts, starts + len(part.points)), part.points, part.format)
         starts += len(part.points)
-    name = next((n for n in ("POSE_WORLD_LANDMARKS", "POSE_LANDMARKS") if n in parts), None)
+    name = next((n for n in (IMAGE, WORLD) if n in parts), None)
     if name is None or "Z" not in parts[name][2]:
         raise DataError(
             f"{path} has {', '.join(parts)} without depth; expected MediaPipe's "
-            "POSE_WORLD_LANDMARKS or POSE_LANDMARKS in 3D"
+            f"{WORLD} or {IMAGE} in 3D"
         )
-    place, points, _ = parts[name]
-    p, visibility = np.full((len(data), JOINTS, 3), np.nan), np.zeros((len(data), JOINTS))
-    for k, point in enumerate(points):
-        if point.lower() in MEDIAPIPE33.names:
-            j = MEDIAPIPE33.names.index(point.lower())
-            p[:, j], visibility[:, j] = data[:, 0, place][:, k], conf[:, 0, place][:, k]
+
+    def landmarks(part: str, names: tuple[str, ...]) -> tuple[Float, Float]:
+        """``[F, n, 3]`` the points of a part by name, and their confidence ``[F, n]``."""
+        p, seen = np.full((len(data), len(names), 3), np.nan), np.zeros((len(data), len(names)))
+        place, points, layout = parts.get(part, (slice(0), [], ""))
+        for k, point in enumerate(points if "Z" in layout else ()):
+            if (known := point.lower().replace("_finger", "")) in names:
+                j = names.index(known)
+                p[:, j], seen[:, j] = data[:, 0, place][:, k], conf[:, 0, place][:, k]
+        return p, seen
+
+    p, visibility = landmarks(name, MEDIAPIPE33.names)
     unit = f"{name.lower().replace('_', ' ')}, scaled to the subject"
-    p = _to_metres(path, p, visibility, source.figure)
+    if hidden := np.median(visibility[:, HIPS]) < GUESSED:
+        visibility[:, HIPS] = 0
+    p = _to_metres(path, p, visibility, source.figure, pixels=name == IMAGE)
+    if hidden:
+        p[:, HIPS] = p[:, SHOULDERS] + (0, length(source.figure.rest, (11, 23)), 0)
+        visibility[:, HIPS] = visibility[:, SHOULDERS]
+    hands = [landmarks(hand, HAND_NAMES) for hand in HANDS]
+    if any(seen.any() for _, seen in hands):
+        p = np.concatenate([p, *_hands_to_metres(hands, source.figure)], axis=1)
+        visibility = np.concatenate([visibility, *(seen for _, seen in hands)], axis=1)
     return Motion(path, p, visibility, _rate(path, pose.body.fps), None, unit)
 
 
-def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure) -> Float:
+def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure, pixels: bool) -> Float:
     """Scales each of the three axes so that bones get the subject's lengths.
 
     The squares of the scales solve ``Σ sᵢ² dᵢ² = length²`` over all seen bones and frames, by
-    non-negative least squares.
+    non-negative least squares. Pixels are square: x and y then take the mean of theirs. One unknown
+    for both would leave no depth to a person with longer arms, or narrower shoulders.
     """
     rows = []
     for a, b in LENGTHS:
@@ -380,7 +417,28 @@ def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure) -> Float
     table = np.concatenate(rows)
     if not len(table):
         raise DataError(f"{path}: no frame shows two joints of a limb; expected a person")
-    return np.asarray(p * np.sqrt(nnls(table, np.ones(len(table)))[0]))
+    scales = np.sqrt(nnls(table, np.ones(len(table)))[0])
+    if pixels:
+        scales[:2] = scales[:2].mean()
+    return np.asarray(p * scales)
+
+
+def _hands_to_metres(hands: list[tuple[Float, Float]], figure: Figure) -> list[Float]:
+    """Hands ``[F, 21, 3]`` from their wrists, of points and confidences.
+
+    The scale of x and y, and that of z, solve `_to_metres`' equations for the bones of both hands.
+    """
+    rest, rows, found = figure.rest_with_hands, [], []
+    for (p, seen), at in zip(hands, HAND_JOINTS.values(), strict=True):
+        p = np.where(seen[..., None] > 0, p - p[:, WRIST, None], np.nan)
+        for a, b in HAND_LENGTHS:
+            bone = (p[:, b] - p[:, a]) ** 2 / length(rest[at], (a, b)) ** 2
+            rows.append(np.stack([bone[:, 0] + bone[:, 1], bone[:, 2]], axis=1))
+        found.append(p)
+    table = np.concatenate(rows)
+    table = table[np.isfinite(table).all(1)]
+    flat, deep = np.sqrt(nnls(table, np.ones(len(table)))[0])
+    return [p * (flat, flat, deep) for p in found]
 
 
 READERS: dict[str, Callable[[Path, Source], Motion]] = {

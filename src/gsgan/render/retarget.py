@@ -14,10 +14,13 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 
 from gsgan.data.figure import (
+    BODY,
     BONES,
     EARS,
     FACE,
     FEET,
+    FINGER_BONES,
+    HAND_JOINTS,
     HANDS,
     HEELS_AND_TOES,
     HIPS,
@@ -28,6 +31,7 @@ from gsgan.data.figure import (
     hand_frame,
     length,
     middle,
+    palm_frame,
     part_frame,
 )
 from gsgan.data.synthetic.bvh import StandardMotion, drift, floor_under
@@ -42,12 +46,16 @@ NECK = 0.45  # radians, the largest bend of the neck: detectors place faces too 
 
 
 def on_figure(p: Float, figure: Figure) -> Float:
-    """``[F, 33, 3]`` the subject in the poses of another person's landmarks ``[F, 33, 3]``, finite.
+    """``[F, J, 3]`` the subject in the poses of another person's landmarks ``[F, J, 3]``, finite.
 
     Trunk and limbs keep their directions and get the subject's lengths; face, hands and feet are
     the subject's own, rotated as the source's. The path is scaled by the ratio of leg lengths.
+
+    With hand landmarks, J = 75, palms are rotated as these show and fingers keep their directions;
+    where in the world they are does not matter. A hand with NaN stays NaN.
     """
-    rest, q = figure.rest, np.zeros_like(p)
+    whole, hands, p = np.full_like(p, np.nan), p, p[:, :BODY]
+    rest, q = figure.rest, whole[:, :BODY]
     legs = [np.linalg.norm(p[:, b] - p[:, a], axis=-1) for limb in LEGS for a, b in limb]
     hips = middle(p, HIPS) * 2 * figure.leg / np.median(legs, axis=1).sum()
     chest = hips + unit(middle(p, SHOULDERS) - middle(p, HIPS)) * rest[SHOULDERS[0], 2]
@@ -58,6 +66,10 @@ def on_figure(p: Float, figure: Figure) -> Float:
         q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
     for wrist, ends in HANDS.items():
         turn = hand_frame(p, wrist) @ hand_frame(rest, wrist).T
+        if hands.shape[1] > BODY:
+            at, palm = _posed_hand(hands[:, HAND_JOINTS[wrist]], figure, wrist)
+            whole[:, HAND_JOINTS[wrist]] = q[:, wrist, None] + at
+            turn = np.where(np.isfinite(palm), palm, turn)
         q[:, ends] = q[:, wrist, None] + (rest[list(ends)] - rest[wrist]) @ turn.mT
     for ankle, feet in FEET.items():
         turn = _foot_frame(p, ankle) @ _foot_frame(rest, ankle).T
@@ -69,7 +81,18 @@ def on_figure(p: Float, figure: Figure) -> Float:
     ears = chest + (rotation(bend * most) @ level[..., None])[..., 0]
     turn = _head_frame(p) @ _head_frame(rest[None]).mT
     q[:, FACE] = ears[:, None] + (rest[list(FACE)] - middle(rest, EARS)) @ turn.mT
-    return q
+    return whole
+
+
+def _posed_hand(p: Float, figure: Figure, wrist: int) -> tuple[Float, Float]:
+    """The subject's hand as landmarks ``[F, 21, 3]`` show it: ``[F, 21, 3]`` from the pose's wrist,
+    and the palm's rotation since the standard pose ``[F, 3, 3]``; NaN where the palm is unknown."""
+    rest = figure.rest_with_hands[HAND_JOINTS[wrist]]
+    palm = palm_frame(p) @ palm_frame(rest).T
+    q = (rest - figure.rest[wrist]) @ palm.mT
+    for a, b in FINGER_BONES:
+        q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
+    return q, palm
 
 
 def _foot_frame(p: Float, ankle: int) -> Float:
@@ -105,30 +128,32 @@ def rig_landmarks(standard: StandardMotion, figure: Figure) -> Float:
 
 
 def joined(clips: Sequence[Float], figure: Figure, n: int) -> Float:
-    """Clips ``[F, 33, 3]`` of the subject, one after the other, with transitions of n frames.
+    """Clips ``[F, J, 3]`` of the subject, one after the other, with transitions of n frames.
 
-    A transition is a cubic that continues the joints' speeds at both ends, on the subject's bones.
+    A transition is a cubic that continues the joints' speeds at both ends, on the subject's bones;
+    without a hand that either end lacks (NaN).
     """
     parts = [clips[0]]
     for a, b in pairwise(clips):
         speeds = [x[-1] - x[-2] if len(x) > 1 else 0 * x[0] for x in (a, b[1::-1])]
-        path = CubicHermiteSpline(
-            [0, n + 1], np.stack([a[-1], b[0]]), np.stack([speeds[0], -speeds[1]])
-        )
-        parts += [on_figure(path(np.arange(1, n + 1)), figure), b]
+        ends, speed = np.stack([a[-1], b[0]]), np.stack([speeds[0], -speeds[1]])
+        path = CubicHermiteSpline([0, n + 1], *(np.nan_to_num(x) for x in (ends, speed)))
+        known = np.isfinite(ends).all((0, 2))[:, None]
+        between = np.where(known, path(np.arange(1, n + 1)), np.nan)
+        parts += [on_figure(between, figure), b]
     return np.concatenate(parts)
 
 
 def heading(p: Float) -> float:
-    """The direction that the hips of ``[33, 3]`` face: radians about the up axis, 0 towards -Y."""
-    front = bone_frames(torch.from_numpy(p[None])).hubs[0, PELVIS, :, 2]
+    """The direction that the hips of ``[J, 3]`` face: radians about the up axis, 0 towards -Y."""
+    front = bone_frames(torch.from_numpy(p[None, :BODY])).hubs[0, PELVIS, :, 2]
     return float(torch.atan2(front[0], -front[1]))
 
 
 def placed(
     p: Float, figure: Figure, centre: Float, fps: float, *, ground: bool, stay: bool
 ) -> Float:
-    """Landmarks ``[F, 33, 3]`` moved to where the subject was captured.
+    """Landmarks ``[F, J, 3]`` moved to where the subject was captured.
 
     Convention: the motion starts at the centre, with the subject's mean heading.
 

@@ -15,6 +15,7 @@ from rich.progress import track
 from torch import Tensor
 
 from gsgan.model.runs import CHECKPOINT
+from gsgan.prepare.work import writing
 from gsgan.render import cameras as views
 from gsgan.render.images import Background, background, eight_bits
 from gsgan.render.output import Output
@@ -51,13 +52,20 @@ def render_config(config: DictConfig) -> None:
                 "compare=truth needs held-out frames seen by their own camera: give "
                 "motion=novel_pose or novel_view, and one of its cameras or none"
             )
-    output.begin(_record(config, run, drive, cameras), bool(config.overwrite))
+        assert drive.camera is not None
+        if cameras.size != drive.camera[0].size:
+            raise ConfigError("compare=truth shows images of the data's size; leave pixels out")
+    with writing(output.out):
+        output.begin(_record(config, run, drive, cameras), bool(config.overwrite))
     missing = [i for i, n in enumerate(drive.numbers) if not output.path(n).is_file()]
     if kept := len(drive.numbers) - len(missing):
         console.print(f"{kept} of {len(drive.numbers)} frames are already rendered")
     for i in track(missing, "rendering", console=console, transient=True):
-        output.write(drive.numbers[i], _image(config, run, drive, cameras, index, i, paint_on))
-    output.finish(drive.numbers)
+        image = _image(config, run, drive, cameras, index, i, paint_on)
+        with writing(output.out):
+            output.write(drive.numbers[i], image)
+    with writing(output.out):
+        output.finish(drive.numbers)
     console.print(f"rendered: {output.out}", markup=False, highlight=False, soft_wrap=True)
 
 
@@ -142,8 +150,6 @@ def _image(
     if config.compare is not None:
         assert drive.truth is not None
         frame = drive.truth(i)
-        if frame.camera.size != camera.size:
-            raise ConfigError("compare=truth shows images of the data's size; leave pixels out")
         tiles.insert(0, (frame.image[0], frame.mask[0]))
     return np.concatenate([eight_bits(*pair, paint_on(camera.size)) for pair in tiles], axis=1)
 

@@ -199,7 +199,16 @@ def _filled(
         )
         bone = (now @ at_rest.mT @ (c.rest[ends] - c.rest[starts]).unsqueeze(-1)).squeeze(-1)
         q = _put(q, valid, ends, q[:, starts] + bone * scale[:, None, None])
+        if bare := [limb for limb in limbs if limb in template.bare]:
+            # the same bone under two names, as from elbow to wrist: both end at the same place
+            twins = [_twin(template, limb) for limb in bare]
+            q = _put(q, valid, c.ends[bare], q[:, c.ends[twins]])
     return torch.where(valid.unsqueeze(-1), p, q + root)
+
+
+def _twin(template: SkeletonTemplate, bare: int) -> int:
+    start = template.limbs[bare][0]
+    return next(i for i, (a, _) in enumerate(template.limbs) if a == start and i != bare)
 
 
 def _put(q: Tensor, valid: Tensor, joints: Tensor, where_to: Tensor) -> Tensor:

@@ -65,7 +65,8 @@ class Viewer:
         self.show = Show(self.run.avatar, self.run.body, drive, read, behind, size, fps, rate)
         host, port = str(config.host), between("port", whole("port", config.port, 0), 0, 65535)
         try:  # viser itself would never return
-            socket.create_server((host, 0)).close()
+            family = socket.AF_INET6 if ":" in host else socket.AF_INET
+            socket.create_server((host, 0), family=family).close()
         except OSError as error:
             raise ConfigError(f"host={host} is not an address of this machine ({error})") from None
         logging.getLogger("websockets").setLevel(logging.WARNING)
@@ -86,7 +87,8 @@ class Viewer:
     @property
     def address(self) -> str:
         """What to open in a browser."""
-        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+        host = self.server.get_host()
+        return f"http://{f'[{host}]' if ':' in host else host}:{self.server.get_port()}"
 
     def swap(self, avatar: Avatar) -> None:
         """Shows another avatar of the same run: one with newer weights."""
@@ -148,7 +150,7 @@ def import_viser() -> Any:
 
 
 def _bound_uploads(client: Any, limit: int) -> None:
-    """Drops uploads of more than ``limit`` bytes, whatever size the browser declares.
+    """Drops uploads of more than ``limit`` bytes together, whatever size the browser declares.
 
     viser itself collects the parts of an upload without a limit.
     """
@@ -159,7 +161,8 @@ def _bound_uploads(client: Any, limit: int) -> None:
 
     def check(_: int, message: Any) -> None:
         state = uploads.get(message.transfer_uuid)
-        if state and max(state["total_bytes"], state["transferred_bytes"]) > limit:
+        held = (max(s["total_bytes"], s["transferred_bytes"]) for s in uploads.values())
+        if state and sum(held) > limit:
             uploads.pop(message.transfer_uuid)
             total = state["total_bytes"]  # the browser stops waiting
             ends = message.source_component_uuid, message.transfer_uuid, total, total

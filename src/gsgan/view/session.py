@@ -21,7 +21,6 @@ from gsgan.model.avatar import Avatar
 from gsgan.render.images import eight_bits
 from gsgan.render.poses import Drive, inputs_of, joints_of
 from gsgan.scene import BodyPose, Camera, Gaussians
-from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import GsganError
 from gsgan.utils.provenance import png_bytes
 from gsgan.view.drag import NAMES, dragged, position
@@ -35,7 +34,6 @@ SMALLEST = 0.25  # least scale of the images while something moves
 WIDEST = 3.0  # bound on the aspect ratio, since a browser window can have any
 SPEED_OVER = 2.0  # seconds over which the displayed rate is averaged
 YELLOW, GREY = (255, 200, 0), (160, 165, 175)
-BONES = np.array(MEDIAPIPE33.edges)
 
 
 @dataclass
@@ -186,20 +184,17 @@ class Session:
         self.touch()
 
     def joints(self) -> Float:
-        """``[J, 3]`` metres, finite: the current pose, J the joints that the motion has."""
+        """``[J, 3]`` metres, finite: the current pose."""
         if self.pose is not None:
             return self.pose
-        current = self._current()
-        p, _ = joints_of(self.show.avatar, current, 0)
-        return np.asarray(p[0, : current.p.shape[1]].cpu().numpy(), np.float64)
+        p, _ = joints_of(self.show.avatar, self._current(), 0)
+        return np.asarray(p[0].cpu().numpy(), np.float64)
 
     def _current(self) -> Drive:
         """The current pose, as a motion of one frame."""
         drive, pose = self.drive, self.pose  # another thread may load a shorter motion
         drive = drive.rows(np.array([self.frame % len(drive.p)]))
-        if pose is None:
-            return drive
-        return replace(drive, p=pose[None], visibility=drive.visibility[:, : len(pose)], body=None)
+        return drive if pose is None else replace(drive, p=pose[None], body=None)
 
     # -- painting
 
@@ -284,7 +279,8 @@ class Session:
             node.remove()
         self._nodes = []
         if self.bones.value:
-            lines = scene.add_line_segments("/skeleton", p[BONES], colors=YELLOW, line_width=3.0)
+            bones = p[np.array(avatar.template.edges)]
+            lines = scene.add_line_segments("/skeleton", bones, colors=YELLOW, line_width=3.0)
             self._nodes.append(lines)
         if self.mesh.value and body is not None and pose is not None:
             vertices = body.posed_vertices(pose.to("cpu"))[0]
