@@ -125,9 +125,10 @@ def doubts_about_solution(
                 f"{name}: refinement turned it by {turned[c]:.1f} degrees and moved it by "
                 f"{moved_mm[c]:.0f} mm: it was bumped, or the calibration is another camera's"
             )
-        swapped = float(solution.flips[c].any(-1).mean())
-        if swapped > limits.flips:
-            found.append(f"{name}: left and right were swapped in {swapped:.0%} of the frames")
+        for what, swapped in (("", solution.swapped), (" hand", solution.swapped_hands)):
+            if (share := float(swapped[c].mean())) > limits.flips:
+                text = f"left and right{what} were swapped in {share:.0%} of the frames"
+                found.append(f"{name}: {text}")
         if abs(delay[c]) > limits.delay and gain[c] > limits.delay_gain:
             found.append(
                 f"{name}: its clock seems {delay[c]:+.1f} frames late; if so, set "
