@@ -61,7 +61,7 @@ def off(found: Solution, p: np.ndarray, part: slice) -> float:
 
 
 def test_hands_that_agree_are_left_alone():
-    rig, p, uv, conf = seen(noise=3.0)
+    rig, p, uv, conf = seen(noise=2.0)
     found = solved(rig, uv, conf)
     assert not found.swapped_hands.any()
     assert not found.left_out.any()

@@ -26,6 +26,7 @@ FINGER_BONES = tuple(
     for finger in FINGERS
     for a, b in pairwise(finger)
 )
+FINGER_NOISE = 0.02  # metres by which noise alone changes the length of a finger's bone
 DEGREE = 2  # of the polynomial that smooths
 REACH = 3  # standard deviations at which the smoothing kernel ends
 
@@ -83,7 +84,7 @@ def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
         palms = _off(p, HAND_BONES, settings.hand_bone).reshape(len(p), 2, len(PALM))
         most = palms.sum(-1) * 2 > len(PALM)
         wrong[:, HANDS] |= most.repeat(HAND, axis=1)
-        fingers = _off(p, FINGER_BONES, settings.finger_bone).T
+        fingers = _off(p, FINGER_BONES, settings.finger_bone, FINGER_NOISE).T
         for (_, joint), bad in zip(FINGER_BONES, fingers, strict=True):
             wrong[:, joint] |= bad
     wrong &= known(p)
@@ -97,12 +98,14 @@ def bone_lengths(p: Float, bones: Bones) -> Float:
     return np.asarray(np.linalg.norm(p[:, ends[:, 1]] - p[:, ends[:, 0]], axis=-1))
 
 
-def _off(p: Float, bones: Bones, share: float) -> Bool:
-    """``[F, B]`` whether a bone's length differs from its median by more than the share."""
+def _off(p: Float, bones: Bones, share: float, least: float = 0.0) -> Bool:
+    """``[F, B]`` whether a bone's length differs from its median by more than the share, and by
+    more than ``least`` metres."""
     lengths = bone_lengths(p, bones)
     known_lengths = (one[np.isfinite(one)] for one in lengths.T)
     usual = [max(np.median(one), 1e-9) if one.size else 1.0 for one in known_lengths]
-    return np.asarray(np.abs(lengths / usual - 1) > share)
+    change = np.abs(lengths - usual)
+    return np.asarray((change > share * np.array(usual)) & (change > least))
 
 
 def smooth(p: Float, weight: Float, time: Float, seconds: float) -> Float:

@@ -125,9 +125,10 @@ def solve(
             flips[..., : len(FLIP_GROUPS)] = body
             sided, weight = (apply_flips(v, body, FLIP_GROUPS) for v in (uv, conf))
             if hands:
-                arms = (_flat(values[:, :, WRISTS]) for values in (sided, weight))
-                wrists = rig.project(triangulation.points(rig, *arms).p)[0]
-                wrists = wrists.reshape(*conf.shape[:2], 2, 2)
+                own = np.where(weight[..., WRISTS, None] > 0, sided[:, :, WRISTS], np.nan)
+                arms = triangulation.points(rig, _flat(own), _flat(weight[:, :, WRISTS]))
+                far = rig.project(arms.p)[0].reshape(own.shape)
+                wrists = np.where(np.isfinite(own), own, far)  # unseen: where other cameras see it
                 found = sided[:, :, HANDS], weight[:, :, HANDS], wrists
                 flips[..., -1] = match_hands(rig, *found, settings.hands, triangulation)
                 sided, weight = (apply_flips(v, flips, groups) for v in (uv, conf))
@@ -145,12 +146,11 @@ def solve(
     stages = {"plain": rig.errors(plain, _flat(uv)), "robust": robust.error}
     points = triangulate()
     stages["flips"] = points.error
-    # Evenly spaced frames and the body's joints: hands are less certain.
     F, J = conf.shape[1:]
     at = np.unique(np.linspace(0, F - 1, min(F, settings.refinement.frames)).round().astype(int))
     for _ in range(settings.refinement.rounds):
-        p = points.p.reshape(F, J, 3)[at, :BODY].reshape(-1, 3)
-        detections = _flat(sided[:, at, :BODY]), _flat(weight[:, at, :BODY])
+        p = points.p.reshape(F, J, 3)[at].reshape(-1, 3)
+        detections = _flat(sided[:, at]), _flat(weight[:, at])
         rig = refine_rig(start, rig, p, *detections, settings.refinement)
         points = triangulate()
     stages["refined"] = points.error

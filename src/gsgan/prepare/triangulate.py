@@ -18,6 +18,7 @@ FLAT = 1e-15  # determinant over trace³: below it the equations are singular in
 ITERATIONS, QUICK_ITERATIONS = 10, 3  # of reweighting; the search for swapped sides needs fewer
 CHUNK = 100_000  # points processed at once: bounds the memory, changes nothing else
 MAX_PAIRS = 60  # of cameras, tried as a start; of more, a spread-out part
+LEAST_JOINTS = 3  # of a group: hips at the border of an image do not tell left from right
 PROGRESSION = 7919  # a prime: spreads the chosen camera pairs when there are too many
 
 Pairs = tuple[tuple[int, int], ...]
@@ -224,9 +225,9 @@ def _group_flips(
         sided, trust = (apply_flips(v[:, frames], flips[..., None], local) for v in (uv, weight))
         return points_and_cost(rig, sided, trust, quick)
 
-    flips = cheapest_flips(
-        lambda flips, at: points(flips, at)[1], np.zeros((C, F), bool), gain * weight.sum(-1)
-    )
+    few = (weight > 0).sum(-1) < LEAST_JOINTS
+    price = np.where(few, np.inf, gain * weight.sum(-1))
+    flips = cheapest_flips(lambda f, at: points(f, at)[1], np.zeros((C, F), bool), price)
     flips = flips ^ _exchanged(points(flips, everywhere)[0])
     votes = weight.sum(-1)
     return ~flips if (votes * flips).sum() > votes.sum() / 2 else flips
