@@ -18,13 +18,14 @@ FACE_MESH = {
     },
     **{f"left_brow_{k}": point for k, point in enumerate((336, 296, 334, 293, 300))},
     **{f"right_brow_{k}": point for k, point in enumerate((107, 66, 105, 63, 70))},
-    **{"left_lid_inner": 362, "left_lid_upper": 386, "left_lid_outer": 263, "left_lid_lower": 374},
-    **{
-        "right_lid_inner": 133,
-        "right_lid_upper": 159,
-        "right_lid_outer": 33,
-        "right_lid_lower": 145,
-    },
+    "left_lid_inner": 362,
+    "left_lid_upper": 386,
+    "left_lid_outer": 263,
+    "left_lid_lower": 374,
+    "right_lid_inner": 133,
+    "right_lid_upper": 159,
+    "right_lid_outer": 33,
+    "right_lid_lower": 145,
 }
 FACE = slice(HANDS.stop, HANDS.stop + len(FACE_MESH))
 ALL = FACE.stop

@@ -14,7 +14,7 @@ from gsgan.data.joints import BODY, joint_names
 from gsgan.prepare.cleanse import BODY_BONES, bone_lengths
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.pictures import Written
-from gsgan.prepare.rig import FOCAL, Float, known
+from gsgan.prepare.rig import Float, known
 from gsgan.prepare.solve import Solution, median
 from gsgan.prepare.sources import Source
 from gsgan.utils.errors import DataError
@@ -117,9 +117,9 @@ def doubts_about_solution(
     """Cameras that do not fit, swapped sides, clocks, bones, missing joints."""
     found = []
     for c, name in enumerate(names):
-        error = median(solution.stages["smoothed"][c])
-        if error > limits.reprojection * solution.rig.focal[c] / FOCAL:
-            found.append(f"{name}: joints land {error:.1f} px off; is its calibration its own?")
+        if solution.off(limits.reprojection)[c]:
+            error = median(solution.error[c])
+            found.append(f"{name}: landmarks lie {error:.1f} px off; is its calibration its own?")
         if turned[c] > limits.camera_turn or moved_mm[c] > 1000 * limits.camera_move:
             found.append(
                 f"{name}: refinement turned it by {turned[c]:.1f} degrees and moved it by "

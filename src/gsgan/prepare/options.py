@@ -155,7 +155,9 @@ def read_inputs(options: Options) -> Inputs:
         notes.append(f"{name}: left out, {path.name} says to ignore its camera")
         del sources[name]
     if len(sources) < MIN_VIEWS:
-        raise DataError(f"{folder} holds only the camera {next(iter(sources), 'none')}; 3D needs two")
+        raise DataError(
+            f"{folder} holds only the camera {next(iter(sources), 'none')}; 3D needs two"
+        )
     pairs = pair_cameras(list(sources), list(calibration.cameras), options.cameras or {})
     for name, source in sources.items():
         camera = calibration.cameras[pairs[name]]

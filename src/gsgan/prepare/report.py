@@ -21,7 +21,7 @@ from gsgan.data.files import read_colour, read_grey
 from gsgan.data.joints import ALL, BODY, FACE, HANDS, joint_names
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.pictures import Written, sampled
-from gsgan.prepare.rig import FOCAL, Float, Ints, Rig, camera_moves, known
+from gsgan.prepare.rig import Bool, Float, Ints, Rig, camera_moves, known
 from gsgan.prepare.solve import Solution, median
 from gsgan.prepare.work import GENERATOR, write_json, write_npz, writing
 from gsgan.skeleton.hands import HAND, HAND_EDGES
@@ -32,8 +32,9 @@ Bytes = NDArray[np.uint8]
 BAR = (70, 70, 70)
 FAR = 10_000  # pixels: drawing stops there
 AGREEMENT = (
-    "Median reprojection error in pixels of the full-size image after each stage: plain and robust "
-    "triangulation, sides corrected, cameras refined, and smoothed, which is what is written."
+    "Median reprojection error of the body in pixels of the full-size image after each stage: "
+    "plain and robust triangulation, sides corrected, cameras refined, and smoothed, which is what is "
+    "written. Red: the error of all landmarks is too high."
 )
 LEGEND = (
     "Blue: the person's left, orange: the right, white: the middle. Lines: the 3D joints "
@@ -164,11 +165,11 @@ def write_report(root: Path, outcome: Outcome, doubts: Sequence[str], console: C
         for j, name in enumerate(MEDIAPIPE33.names)
     )
     headers = "joint", "frames found", "error px", "cameras that agree"
-    limits = options.doubts.reprojection * solution.rig.focal / FOCAL
+    off = solution.off(options.doubts.reprojection)
     sections = (
         Section(
             "How well joints and cameras agree",
-            tables=(_camera_table(numbers, limits), *_parts_table(numbers)),
+            tables=(_camera_table(numbers, off), *_parts_table(numbers)),
             findings=tuple(Finding("warning", "capture", doubt) for doubt in doubts),
             aside=(AGREEMENT,),
         ),
@@ -255,13 +256,13 @@ def _parts_table(numbers: Mapping[str, Any]) -> tuple[Table, ...]:
     return (Table(headers, rows, title=HANDS_AND_FACE),) if rows else ()
 
 
-def _camera_table(numbers: Mapping[str, Any], limits: Float) -> Table:
+def _camera_table(numbers: Mapping[str, Any], off: Bool) -> Table:
     """Errors by camera and stage, and what refinement, flips and clocks gave."""
     rows, flagged = [], set()
     stages = numbers["error_px"]
     for c, (name, one) in enumerate(numbers["cameras"].items()):
         errors = one["error_px"]
-        if errors["smoothed"] > limits[c]:
+        if off[c]:
             flagged.add((c, len(stages)))
         rows.append(
             (

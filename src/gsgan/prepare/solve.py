@@ -70,6 +70,12 @@ class Solution:
         """``[C, F]`` where the hands were swapped."""
         return np.asarray(self.flips[..., len(FLIP_GROUPS) :].any(-1))
 
+    def off(self, limit: float) -> Bool:
+        """``[C]`` cameras whose median error, of all landmarks, is above the limit, in thousandths
+        of the focal length: those of a body alone are vague where it is near."""
+        errors = np.array([median(error) for error in self.error])
+        return np.asarray(errors > limit * self.rig.focal / FOCAL)
+
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """All of it as plain arrays."""
         return {
@@ -104,7 +110,8 @@ def solve(
     Args:
         rig: as calibrated.
         time: ``[F]`` seconds.
-        uv: ``[C, F, J, 2]`` undistorted pixels, NaN = not seen; J is 33, or 105 with hands and face.
+        uv: ``[C, F, J, 2]`` undistorted pixels, NaN = not seen; J is 33, or 105 with hands
+            and face.
         conf: ``[C, F, J]`` 0 = not seen.
         settings: of every stage.
         lag: frames tried either way when clocks are compared; 0 skips it.

@@ -64,10 +64,10 @@ def sanitise(
 
     Convention: metres, world frame. A joint is unseen when a coordinate is NaN or infinite or its
     visibility is not above ``min_visibility``. One missing shoulder or hip is completed from the
-    other three; both hips, where they are unseen, keep finite positions that the caller estimated,
-    and are still marked; a face joint is placed by the head's frame; any other joint at the end of its rest
-    bone in its parent's frame. Filled-in joints move with the seen ones and pass gradients to them.
-    Seen joints are returned unchanged. The check costs one device synchronisation.
+    other three; two unseen hips keep finite positions, as estimates; a face joint is placed by the
+    head's frame; any other joint at the end of its rest bone in its parent's frame. Filled-in
+    joints move with the seen ones and pass gradients to them. Seen joints are returned unchanged.
+    The check costs one device synchronisation.
 
     Args:
         p: ``[B, J, 3]``.

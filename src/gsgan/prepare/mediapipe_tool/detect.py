@@ -2,9 +2,9 @@
 
 Runs in its own environment (requirements.txt beside it). `gsgan.prepare.mediapipe` starts it with a
 JSON object: source, out, masks (a folder, or empty), hands, face, rotate, threads (processors; 0 is
-all), slot (number among those that run at once), confidence and tracking (lowest), margin (of the mask's
-crop, share of the person's height). Prints a line ``<images done> <images in total>`` per image.
-Writes an npz:
+all), slot (number among those that run at once), confidence and tracking (lowest), margin (of the
+mask's crop, share of the person's height). Prints a line ``<images done> <images in total>`` per
+image. Writes an npz:
 
     px (F,33,2), conf (F,33)     pixels of the image as stored, first pixel's centre at (0.5, 0.5)
     left, right (F,21,2)         the person's hands; NaN = not found
