@@ -104,7 +104,7 @@ def inside(px: Float, conf: Float, sizes: Float) -> tuple[Float, Float]:
     ``px [C, F, J, 2]``, ``conf [C, F, J]`` and ``sizes [C, 2]``, width and height.
     """
     with np.errstate(invalid="ignore"):
-        seen = ((px >= 0) & (px < sizes[:, None, None])).all(-1)
+        seen = np.asarray(((px >= 0) & (px < sizes[:, None, None])).all(-1))
     return np.where(seen[..., None], px, np.nan), np.where(seen, conf, 0.0)
 
 

@@ -33,8 +33,8 @@ BAR = (70, 70, 70)
 FAR = 10_000  # pixels: drawing stops there
 AGREEMENT = (
     "Median reprojection error of the body in pixels of the full-size image after each stage: "
-    "plain and robust triangulation, sides corrected, cameras refined, and smoothed, which is what is "
-    "written. Red: the error of all landmarks is too high."
+    "plain and robust triangulation, sides corrected, cameras refined, and smoothed, which is what "
+    "is written. Red: the error of all landmarks is too high."
 )
 LEGEND = (
     "Blue: the person's left, orange: the right, white: the middle. Lines: the 3D joints "
