@@ -164,8 +164,19 @@ def test_one_frame_gaps_and_noise_still_give_a_person():
         found = shaped_body(fit_shape(p[part], seen[part]))
         assert stature(found) == pytest.approx(stature(body), abs=0.08)
     seen[:, 11] = 0
-    with pytest.raises(DataError, match="both shoulders and both hips"):
+    with pytest.raises(DataError, match="both shoulders"):
         fit_shape(p, seen)
+
+
+def test_an_upper_body_has_a_shape():
+    """Hips and legs that are never seen keep the lengths of the mean person."""
+    body = shaped_body(other(4))
+    p, seen = body.posed_landmarks(moving(body)), torch.ones(20, 33)
+    seen[:, 23:] = 0
+    found = shaped_body(fit_shape(p, seen))
+    arm = [(b.landmarks[11] - b.landmarks[13]).norm() for b in (found, body)]
+    torch.testing.assert_close(*arm, atol=0.01, rtol=0)
+    assert stature(found) == pytest.approx(stature(body), abs=0.15)
 
 
 def test_a_models_betas_are_coefficients(tmp_path):

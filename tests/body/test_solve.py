@@ -200,6 +200,23 @@ def test_limbs_that_are_not_seen_stay_at_rest_and_are_marked(solver, poses):
     assert elsewhere[:, whole].median() < 0.01
 
 
+def test_a_trunk_without_hips_does_not_nod_with_the_head(solver):
+    """Hips are estimates 3 cm off; legs stay at rest and are marked."""
+    theta = torch.zeros(1, len(free_body().parents), 3)
+    theta[:, free_body().joint_names.index("head")] = torch.tensor([0.5, 0.0, 0.0])
+    p, _ = shown(BodyPose(theta, torch.zeros(1, 3)))
+    truth, seen = p.clone(), SEEN.clone()
+    p[:, 23:25] += 0.02
+    p[:, 25:], seen[:, 23:] = torch.nan, 0
+    found = solver.solve(p, seen)
+    off = (free_body().posed_landmarks(found) - truth).norm(dim=-1)
+    assert off[0, 11:17].max() < 0.01
+    assert off[0, 23:25].max() < 0.05
+    rested = solver.at_rest(seen)[0]
+    assert rested[free_body().joint_names.index("upperleg01.L")]
+    assert found.theta[0, rested].abs().max() < 0.02
+
+
 def test_too_few_trunk_joints_are_refused_by_name(solver, poses):
     p, seen = shown(poses[:2])
     seen[1, [11, 12]] = 0

@@ -176,6 +176,28 @@ def test_frames_with_too_few_joints_are_dropped_and_counted(tmp_path: Path) -> N
     assert read_capture(root, Checks(min_joints=5, min_hubs=0)).frames == (0, 1, 2, 3)
 
 
+def test_an_upper_body_without_hips_is_read(tmp_path: Path) -> None:
+    """Hips are estimated below the shoulders, marked as unseen, and do not nod with the head."""
+    root = write_tiny_capture(tmp_path, frames=4)
+    truth = skeletons(4)
+    p = truth.copy()
+    p[:, 23:] = np.nan
+    p[1, :11, 1] -= 0.05  # a nod
+    write_landmarks(root, p=p, frame_id=np.arange(4))
+    layout = read_capture(root)
+    assert layout.frames == (0, 1, 2, 3)
+    hips = np.stack([layout.landmarks.p[f][[23, 24]] for f in range(4)])
+    np.testing.assert_allclose(hips, truth[:, [23, 24]], atol=0.07)  # size by the arms
+    down = hips.mean(1) - truth[:, [11, 12]].mean(1)
+    np.testing.assert_allclose(down, down[:1].repeat(4, axis=0), atol=1e-9)
+    assert (np.stack([layout.landmarks.visibility[f][23:] for f in range(4)]) == 0).all()
+    p[2] = truth[2]  # one frame shows them: its trunk is the others'
+    write_landmarks(root, p=p, frame_id=np.arange(4))
+    landmarks = read_capture(root).landmarks
+    np.testing.assert_allclose(landmarks.p[0][[23, 24]], truth[0, [23, 24]], atol=0.02)
+    np.testing.assert_allclose(landmarks.p[0][[23, 24], 2], truth[0, [23, 24], 2])
+
+
 def test_frames_without_landmarks_or_pose_are_dropped_and_counted(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path, frames=4, body_pose=True)
     write_landmarks(root, p=skeletons(4)[:3], frame_id=np.array([1, 2, 3]))

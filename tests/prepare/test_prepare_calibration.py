@@ -17,6 +17,7 @@ from capture_scenes import (
 )
 
 from gsgan.data.calibration import find_calibration, read_calibration
+from gsgan.prepare.sources import matching_cameras, pair_cameras
 from gsgan.utils.errors import DataError
 
 
@@ -73,6 +74,46 @@ def test_aniposelib_toml_in_millimetres(tmp_path: Path):
     cameras = ring(dist=LENS)
     path = write_toml(tmp_path / "calibration.toml", cameras, unit=1000, lens=5)
     equal(read_calibration(path, unit_scale=1e-3).cameras, cameras)
+
+
+CALISCOPE = """
+[cameras.{number}]
+cam_id = {number}
+rotation_count = 0
+error = 0.541
+ignore = {ignore}
+size = [1280, 720]
+matrix = [[900.0, 0.0, 618.25], [0.0, 910.0, 394.5], [0.0, 0.0, 1.0]]
+distortions = [-0.3, 0.05, -0.004, 0.002, 0.06]
+translation = [0.125, -0.25, 1.5]
+rotation = {rotation}
+"""
+
+
+def test_caliscope(tmp_path: Path):
+    """A quarter turn about y as a vector and as a matrix; ignored and uncalibrated cameras."""
+    vector, matrix = [0.0, np.pi / 2, 0.0], [[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]
+    path = tmp_path / "camera_array.toml"
+    path.write_text(
+        CALISCOPE.format(number=0, rotation=vector, ignore="false")
+        + CALISCOPE.format(number=3, rotation=matrix, ignore="false")
+        + "[cameras.5]\ncam_id = 5\nignore = true\nsize = [640, 480]\n"
+    )
+    calibration = read_calibration(find_calibration(tmp_path))
+    assert list(calibration.cameras) == ["0", "3"]
+    assert calibration.ignored == ("5",)
+    for camera in calibration.cameras.values():
+        np.testing.assert_allclose(camera.K, [[900, 0, 618.75], [0, 910, 395], [0, 0, 1]])
+        np.testing.assert_allclose(camera.R, matrix, atol=1e-12)
+        np.testing.assert_allclose(camera.t, [0.125, -0.25, 1.5])
+        np.testing.assert_allclose(camera.dist[:5], [-0.3, 0.05, -0.004, 0.002, 0.06])
+        assert camera.size == (720, 1280)
+    videos = ["cam_0", "cam_3"]
+    assert pair_cameras(videos, list(calibration.cameras), {}) == {"cam_0": "0", "cam_3": "3"}
+    assert matching_cameras("cam_5", calibration.ignored)
+    path.write_text(path.read_text().replace("ignore = true", "ignore = false"))
+    with pytest.raises(DataError, match=r"\[5\] lacks 'matrix'"):
+        read_calibration(path)
 
 
 def test_fisheye_is_refused(tmp_path: Path):

@@ -114,11 +114,11 @@ def test_cameras_that_moved_or_lag(values: dict, what: str):
 
 def test_cameras_that_do_not_fit_and_joints_that_miss():
     one = solved()
-    one.stages["smoothed"][2] = 50.0
+    one.error[2] = 50.0
     one.flips[1, :5, 0] = True
     one.p[:6, 30] = np.nan
     found = "; ".join(doubts(one))
-    assert "c: joints land 50.0 px off" in found
+    assert "c: landmarks lie 50.0 px off" in found
     assert "b: left and right were swapped in 50%" in found
     assert "missing in more than 20% of the frames: right_heel" in found
 

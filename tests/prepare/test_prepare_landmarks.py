@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsgan.data.joints import BODY, LEFT, RIGHT, SETS
-from gsgan.prepare.landmarks import find_landmarks, gather, read_detections
+from gsgan.data.joints import BODY, FACE, FACE_MESH, LEFT, RIGHT, SETS
+from gsgan.prepare.landmarks import find_landmarks, gather, inside, read_detections
 from gsgan.skeleton.hands import HAND, hand_names
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.errors import DataError
@@ -86,6 +86,31 @@ def test_npz_of_the_tool(tmp_path: Path):
     assert (found.conf[0, RIGHT] == 1).all()
     assert (found.conf[1, RIGHT] == 0).all()
     assert len(hand_names()) == 2 * HAND
+
+
+def test_face_of_the_tool(tmp_path: Path):
+    """The mesh's landmarks by name: the right corner of the mouth is 61, the left outer lid 263."""
+    px, mesh = np.full((2, BODY, 2), 4.0), np.full((2, 468, 2), np.nan)
+    mesh[1] = np.arange(468)[:, None]
+    given = {"px": px, "conf": np.ones((2, BODY)), "frame_id": [0, 1]}
+    np.savez(tmp_path / "a.npz", **given, face=mesh)
+    found = read_detections(tmp_path / "a.npz")
+    names = list(FACE_MESH)
+    by_name = dict(zip(names, found.px[1, FACE, 0], strict=True))
+    assert by_name["mouth_outer_6"] == 61
+    assert by_name["left_lid_outer"] == 263
+    assert (found.conf[1, FACE] == 1).all()
+    assert (found.conf[0, FACE] == 0).all()
+    np.savez(tmp_path / "b.npz", **given, face=mesh[:, :68])
+    with pytest.raises(DataError, match=r"b\.npz: 'face' must have shape \(2, 468, 2\)"):
+        read_detections(tmp_path / "b.npz")
+
+
+def test_joints_beyond_the_image_are_not_seen():
+    px = np.array([[[[5.0, 5], [5, 20], [-1, 5], [np.nan, 5]]]])
+    found, conf = inside(px, np.ones(px.shape[:3]), np.array([[30, 20]]))
+    assert conf[0, 0].tolist() == [1, 0, 0, 0]
+    assert np.isnan(found[0, 0, 1:]).all()
 
 
 @pytest.mark.parametrize(

@@ -256,7 +256,7 @@ STUB = """
 import json, pathlib, shutil, sys
 from types import SimpleNamespace
 given = SimpleNamespace(**json.loads(sys.argv[1]))
-names = "hands rotate threads slot confidence tracking margin"
+names = "hands face rotate threads slot confidence tracking margin"
 assert set(names.split()) < set(vars(given))
 name, root = pathlib.Path(given.source).stem, pathlib.Path({root!r})
 if name == {bad!r}:

@@ -7,7 +7,7 @@ import pytest
 from capture_scenes import LENS, ring, seen, turned
 from make import distorted_pixels, skeletons
 
-from gsgan.data.joints import flip_groups
+from gsgan.data.joints import FLIP_GROUPS
 from gsgan.prepare import triangulate
 from gsgan.prepare.cleanse import Cleansing, cleanse, smooth
 from gsgan.prepare.rig import Refinement, Rig, camera_moves, refine_rig, undistort_points
@@ -15,7 +15,7 @@ from gsgan.prepare.solve import Settings, Solution, clock_errors, median, solve
 from gsgan.prepare.triangulate import FlipSearch, Triangulation, apply_flips, find_flips
 from gsgan.utils.errors import ConfigError
 
-GROUPS = flip_groups(hands=False)
+GROUPS = FLIP_GROUPS
 
 
 def flat(values: np.ndarray) -> np.ndarray:

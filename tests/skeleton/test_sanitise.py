@@ -152,6 +152,19 @@ def test_a_skeleton_without_a_trunk_is_refused() -> None:
         sanitise(lose(noisy(0), [11]), min_trunk_joints=4)
 
 
+def test_estimated_hips_hold_a_trunk_of_which_only_the_shoulders_are_seen() -> None:
+    """Finite hips of visibility 0 are kept, not called seen; legs hang from them."""
+    p, legs = noisy(2), list(range(23, 33))
+    visibility = torch.ones(1, 33).index_fill(1, torch.tensor(legs), 0)
+    q, valid = sanitise(p, visibility)
+    assert (~valid[0]).nonzero().flatten().tolist() == legs
+    assert torch.equal(q[:, :25], p[:, :25])
+    assert q[0, 25:].isfinite().all()
+    assert (q[0, [25, 26], 1] < q[0, [23, 24], 1]).all()
+    with pytest.raises(ValueError, match="left_hip, right_hip"):
+        sanitise(lose(p, legs))
+
+
 def test_misuse_is_named() -> None:
     with pytest.raises(ValueError, match=r"sanitise: p must .*\[B, 33, 3\]"):
         sanitise(torch.zeros(1, 24, 3))

@@ -57,11 +57,14 @@ def fit_shape(
 
 
 def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:
-    """Frames that show the trunk, evenly spaced, completed: ``[f, 33, 3]`` and ``[f, 33]``."""
+    """Frames that show the trunk, or without any the shoulders, evenly spaced, completed:
+    ``[f, 33, 3]`` and ``[f, 33]``."""
     seen = (visibility > 0) & skeletons.isfinite().all(-1)
-    frames = seen[:, MEDIAPIPE33.torso].all(-1).nonzero().flatten().tolist()
-    if not frames:
-        raise DataError("fit_shape: no frame has both shoulders and both hips")
+    for trunk in (MEDIAPIPE33.torso, MEDIAPIPE33.shoulders):
+        if frames := seen[:, trunk].all(-1).nonzero().flatten().tolist():
+            break
+    else:
+        raise DataError("fit_shape: no frame has both shoulders")
     chosen = frames[:: -(-len(frames) // FRAMES)]
     p, valid = sanitise(skeletons[chosen].double(), seen[chosen].double())
     return p, valid
@@ -156,7 +159,7 @@ def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Te
     for _ in range(STEPS):
         with torch.no_grad():
             solver = Solver(space.shaped(_shape(space, x)))
-            weight = solver.precision * seen
+            weight = solver.weights(seen)
             start = solver.guess(p) if held is None else held
             q, root = solver.descend(*start, p, weight, POSE_STEPS if held else 10)
             held = q, root

@@ -52,6 +52,7 @@ BEYOND = 0.05  # standard deviation beyond it
 # Metres, standard deviation of a landmark: detectors place face and palm less well.
 NOISE, FACE_NOISE, PALM_NOISE = 0.004, 0.008, 0.007
 PALM = slice(17, 23)
+HELD = 0.05  # the same of hips that are estimates: nothing else keeps a trunk from nodding
 ROBUST = 5.0  # standard deviations: landmarks further off pull no more than that
 STEPS, CONVERGED = 10, 1e-3  # of the cost
 GRADIENT_STEPS = 8  # leave a few percent where the surface hardly depends on a landmark
@@ -161,7 +162,7 @@ class Solver(nn.Module):
         p, valid = sanitise(skeleton, visibility)
         refuse_swapped(p.detach(), valid)
         shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
-        weight = (self.precision * valid * visibility.clamp(0, 1)).to(p)
+        weight = (self.weights(valid) * torch.where(valid, visibility, 1).clamp(0, 1)).to(p)
         solved = [
             self._solve(near, w)
             for near, w in zip((p - shift).split(CHUNK), weight.detach().split(CHUNK), strict=True)
@@ -175,6 +176,16 @@ class Solver(nn.Module):
             turns = torch.where(shown.unsqueeze(-1), turns, theta[:, joints])
             theta = theta.index_copy(1, joints, turns)
         return BodyPose(theta, transl + shift[:, 0])
+
+    def weights(self, valid: Tensor) -> Tensor:
+        """``[B, 33]`` precisions of landmarks, 0 where not ``valid [B, 33]``, bool.
+
+        Where neither hip is valid, both hold the trunk weakly, as `sanitise` completed them.
+        """
+        hips = list(MEDIAPIPE33.hips)
+        held = torch.zeros_like(self.precision)
+        held[hips] = 1 / HELD**2
+        return self.precision * valid + held * ~valid[:, hips].any(1, keepdim=True)
 
     def at_rest(self, visibility: Tensor) -> Tensor:
         """``[B, joints]`` bool: joints that no seen landmark shows: `solve` leaves them at rest."""

@@ -17,13 +17,12 @@ from gsgan.check.views import Subject, nanmedian
 from gsgan.data.crop import project
 from gsgan.data.files import read_arrays
 from gsgan.data.formats.trust import Bool, Float
-from gsgan.data.joints import PALM
+from gsgan.data.joints import PALM, WRISTS
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.skeleton.hands import FINGERS, HAND
 from gsgan.utils.arrays import expect_array
 
 SIDES = ("left", "right")
-WRISTS = [15, 16]  # of the pose
 BONES = np.array([(0, j) for j in PALM] + [pair for f in FINGERS for pair in pairwise(f)])
 RATIO = 2.0  # a hand is exchanged where it lies this many times nearer to the other one's place
 METRES = 0.06  # and this much nearer: hands touch

@@ -22,7 +22,7 @@ from rich.progress import Progress
 
 from gsgan.check.settings import Sampling
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import NEAR, project
+from gsgan.data.crop import NEAR, inside, project
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.trust import (
     FAR_PIXELS,
@@ -253,7 +253,8 @@ def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
 
     def outside(row: int) -> Float:
         pixels, depth = project(camera, subject.p[row])
-        return joint_distance(distance, pixels, depth, subject.visible[row], focal)
+        seen = subject.visible[row] & inside(entry, subject.p[row])  # not in the padding
+        return joint_distance(distance, pixels, depth, seen, focal)
 
     lagged = np.full(2 * sampling.lag + 1, np.nan)
     for i, steps in enumerate(range(-sampling.lag, sampling.lag + 1)):

@@ -25,7 +25,7 @@ class Checks:
     """What a dataset must satisfy; each threshold can be set."""
 
     min_joints: int = 12  # a frame with fewer usable joints is dropped
-    min_hubs: int = 3  # the same for shoulders and hips, of which there are four
+    min_hubs: int = 3  # the same of shoulders and hips; both shoulders are enough
     min_joints_in_view: int = 4  # a camera that sees fewer joints of a frame does not use it
     max_reach: float = 3.0  # metres from the median joint; one further out counts as missing
     rotation_tolerance: float = 1e-3  # largest entry of R Rᵀ - I
@@ -79,7 +79,8 @@ def _unusable(frame: int, landmarks: Landmarks, poses: Poses | None, checks: Che
     valid = landmarks.visibility[frame] > 0
     if valid.sum() < checks.min_joints:
         return f"with fewer than {checks.min_joints} joints (NaN or confidence 0)"
-    if valid[list(HUBS)].sum() < checks.min_hubs:
+    trunk = valid[list(HUBS)]
+    if trunk.sum() < checks.min_hubs and not trunk[:2].all():
         return f"with fewer than {checks.min_hubs} of the shoulders and hips"
     if poses is not None and frame not in poses.theta:
         return f"without a finite row in {poses.source}"

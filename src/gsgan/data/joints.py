@@ -1,4 +1,4 @@
-"""The 33 + 21 + 21 joints of a capture, and their numbers in other detectors."""
+"""The joints of a capture, 33 + 2 x 21 + 30 of the face, and their numbers in other detectors."""
 
 from __future__ import annotations
 
@@ -7,8 +7,30 @@ from gsgan.skeleton.template import MEDIAPIPE33
 
 BODY = len(MEDIAPIPE33.names)
 LEFT, RIGHT = slice(BODY, BODY + HAND), slice(BODY + HAND, BODY + 2 * HAND)
-ALL = BODY + 2 * HAND
+HANDS = slice(BODY, BODY + 2 * HAND)
+# Landmarks of the face by name, in the order of face3d.npz, and their numbers among the 468 of
+# MediaPipe's face mesh. Round the outer lip from the person's left corner over the upper lip;
+# brows (their upper edge) from the nose outwards. Left is the person's.
+FACE_MESH = {
+    **{
+        f"mouth_outer_{k}": point
+        for k, point in enumerate((291, 270, 269, 0, 39, 40, 61, 91, 181, 17, 405, 321))
+    },
+    **{f"left_brow_{k}": point for k, point in enumerate((336, 296, 334, 293, 300))},
+    **{f"right_brow_{k}": point for k, point in enumerate((107, 66, 105, 63, 70))},
+    "left_lid_inner": 362,
+    "left_lid_upper": 386,
+    "left_lid_outer": 263,
+    "left_lid_lower": 374,
+    "right_lid_inner": 133,
+    "right_lid_upper": 159,
+    "right_lid_outer": 33,
+    "right_lid_lower": 145,
+}
+FACE = slice(HANDS.stop, HANDS.stop + len(FACE_MESH))
+ALL = FACE.stop
 
+WRISTS = [15, 16]  # of the body
 PALM = (5, 9, 13, 17)  # knuckles: their bones from the wrist keep their length
 
 HEAD_PAIRS = ((1, 4), (2, 5), (3, 6), (7, 8), (9, 10))
@@ -17,9 +39,7 @@ LEG_PAIRS = tuple((j, j + 1) for j in range(23, 33, 2))
 HAND_PAIRS = tuple((BODY + j, BODY + HAND + j) for j in range(HAND))
 
 
-def flip_groups(hands: bool) -> tuple[tuple[tuple[int, int], ...], ...]:
-    """(left, right) joints that a detector swaps together: head, arms (with hands), legs."""
-    return HEAD_PAIRS, ARM_PAIRS + (HAND_PAIRS if hands else ()), LEG_PAIRS
+FLIP_GROUPS = (HEAD_PAIRS, ARM_PAIRS, LEG_PAIRS)  # (left, right) joints swapped together
 
 
 # Other detectors' joint numbers by MediaPipe's, for those that both have.
@@ -58,5 +78,5 @@ FROM_HANDS = {
 
 
 def joint_names() -> tuple[str, ...]:
-    """Names of all 75 joints."""
-    return MEDIAPIPE33.names + hand_names()
+    """Names of all joints."""
+    return (*MEDIAPIPE33.names, *hand_names(), *FACE_MESH)

@@ -111,7 +111,7 @@ def make_landmarks(
 
     A joint is missing where it is not finite, its confidence is not above 0, or it lies further
     than ``max_reach`` from the rest of the body. It takes its position in the nearest frame that
-    has it, or the mean of the frame's joints.
+    has it, or the mean of the frame's joints; hips as in `hips_below`.
 
     Args:
         ids: ``[F]`` frame numbers in any order, each once.
@@ -137,6 +137,8 @@ def make_landmarks(
     order = np.argsort(ids)
     p, visibility, ids = p[order], visibility[order], ids[order]
     p = fill_missing(p, visibility > 0, ids)
+    if p.shape[1] == len(MEDIAPIPE33.names):
+        p = hips_below(p, visibility > 0)
     frames = [int(i) for i in ids]
     return Landmarks(
         dict(zip(frames, p, strict=True)), dict(zip(frames, visibility, strict=True)), source
@@ -191,6 +193,37 @@ def fill_missing(p: Float, valid: Bool, ids: NDArray[np.int64]) -> Float:
         ahead = np.abs(ids[known[after]] - ids[holes])
         filled[holes, joint] = p[known[np.where(back <= ahead, before, after)], joint]
     return filled
+
+
+def hips_below(p: Float, valid: Bool) -> Float:
+    """Joints ``p [F, 33, 3]`` with hips placed below the shoulders where no frame shows them.
+
+    Convention: only in frames that show (``valid [F, 33]``) both shoulders and no hip. The hips
+    follow the shoulders at the same distance and direction in the world, so that the trunk does not
+    nod with the head: the median of the frames that show the whole trunk; without any, along the
+    median direction from ears to shoulders, as far as in the template. Metres.
+    """
+    shoulders, hips, ears = (list(x) for x in (HUBS[:2], HUBS[2:], MEDIAPIPE33.ears))
+    hung = valid[:, shoulders].all(1) & ~valid[:, hips].any(1)
+    whole, headed = valid[:, HUBS].all(1), valid[:, shoulders + ears].all(1)
+    if not (hung.any() and (whole | headed).any()):
+        return p
+    rest, top = np.array(MEDIAPIPE33.rest_positions), p[:, shoulders].mean(1)
+    if whole.any():
+        down = np.median((p[:, hips].mean(1) - top)[whole], axis=0)
+    else:
+        down = np.median((top - p[:, ears].mean(1))[headed], axis=0)
+        size = body_height(torch.from_numpy(p), torch.from_numpy(valid))
+        reach = MEDIAPIPE33.rest_torso[1] * size / MEDIAPIPE33.limb_length_sum
+        down *= reach / np.linalg.norm(down)
+    axis = down / np.linalg.norm(down)
+    line = p[:, shoulders[0]] - p[:, shoulders[1]]
+    line -= (line @ axis)[:, None] * axis
+    wide, narrow = (np.linalg.norm(rest[a] - rest[b]) for a, b in (shoulders, hips))
+    half = line * (narrow / wide / 2)
+    out = p.copy()
+    out[hung, hips[0]], out[hung, hips[1]] = (top + down + half)[hung], (top + down - half)[hung]
+    return out
 
 
 def body_height(p: Tensor, valid: Tensor) -> float:

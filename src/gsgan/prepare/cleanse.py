@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
-from gsgan.data.joints import ALL, BODY, PALM
+from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM, WRISTS
 from gsgan.prepare.rig import Bool, Float, known
-from gsgan.skeleton.hands import HAND
+from gsgan.skeleton.hands import FINGERS, HAND
 from gsgan.utils.checks import above, at_least
 
 Bones = tuple[tuple[int, int], ...]
@@ -17,7 +18,15 @@ BODY_BONES = (
     *((11, 13), (13, 15), (12, 14), (14, 16)),
     *((23, 25), (25, 27), (24, 26), (26, 28)),
 )
+HAND_ROOTS = [BODY, BODY + HAND]
 HAND_BONES = tuple((start, start + knuckle) for start in (BODY, BODY + HAND) for knuckle in PALM)
+FINGER_BONES = tuple(
+    (start + a, start + b)
+    for start in (BODY, BODY + HAND)
+    for finger in FINGERS
+    for a, b in pairwise(finger)
+)
+FINGER_NOISE = 0.02  # metres by which noise alone changes the length of a finger's bone
 DEGREE = 2  # of the polynomial that smooths
 REACH = 3  # standard deviations at which the smoothing kernel ends
 
@@ -29,6 +38,9 @@ class Cleansing:
     max_reach: float = 1.5
     bone: float = 0.3
     hand_bone: float = 0.3
+    finger_bone: float = 0.5
+    wrist: float = 0.1
+    face: float = 0.15
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
@@ -49,14 +61,21 @@ def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
     """Points ``p [F, J, 3]`` with the impossible ones set to NaN; how many, by reason.
 
     Convention: of a bone with the wrong length the outer end is removed; of a hand with most palm
-    bones wrong, the whole hand. Medians are over all frames, so a person of any size fits. J is 33
-    or 75; metres.
+    bones wrong, or far from the pose's wrist, the whole hand. Medians are over all frames, so a
+    person of any size fits. J is 33, or 105 with hands and face; metres.
     """
     p, seen = p.copy(), known(p)
     centre = np.full((len(p), 1, 3), np.nan)
     rows = seen.any(1)
     centre[rows, 0] = np.nanmedian(p[rows], axis=1)
     far = seen & (np.linalg.norm(p - centre, axis=-1) > settings.max_reach)
+    if p.shape[1] == ALL:
+        gap = np.linalg.norm(p[:, HAND_ROOTS] - p[:, WRISTS], axis=-1)
+        far[:, HANDS] |= (gap > settings.wrist).repeat(HAND, axis=1)
+        rows = seen[:, FACE].any(1)
+        middle = np.nanmedian(p[rows, FACE], axis=1, keepdims=True)
+        far[rows, FACE] |= np.linalg.norm(p[rows, FACE] - middle, axis=-1) > settings.face
+    far &= seen
     p[far] = np.nan
     wrong = np.zeros(far.shape, bool)
     for (_, joint), bad in zip(BODY_BONES, _off(p, BODY_BONES, settings.bone).T, strict=True):
@@ -64,7 +83,10 @@ def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
     if p.shape[1] == ALL:
         palms = _off(p, HAND_BONES, settings.hand_bone).reshape(len(p), 2, len(PALM))
         most = palms.sum(-1) * 2 > len(PALM)
-        wrong[:, BODY:] |= most.repeat(HAND, axis=1)
+        wrong[:, HANDS] |= most.repeat(HAND, axis=1)
+        fingers = _off(p, FINGER_BONES, settings.finger_bone, FINGER_NOISE).T
+        for (_, joint), bad in zip(FINGER_BONES, fingers, strict=True):
+            wrong[:, joint] |= bad
     wrong &= known(p)
     p[wrong] = np.nan
     return p, {"too far away": int(far.sum()), "bone length": int(wrong.sum())}
@@ -76,12 +98,14 @@ def bone_lengths(p: Float, bones: Bones) -> Float:
     return np.asarray(np.linalg.norm(p[:, ends[:, 1]] - p[:, ends[:, 0]], axis=-1))
 
 
-def _off(p: Float, bones: Bones, share: float) -> Bool:
-    """``[F, B]`` whether a bone's length differs from its median by more than the share."""
+def _off(p: Float, bones: Bones, share: float, least: float = 0.0) -> Bool:
+    """``[F, B]`` whether a bone's length differs from its median by more than the share, and by
+    more than ``least`` metres."""
     lengths = bone_lengths(p, bones)
     known_lengths = (one[np.isfinite(one)] for one in lengths.T)
     usual = [max(np.median(one), 1e-9) if one.size else 1.0 for one in known_lengths]
-    return np.asarray(np.abs(lengths / usual - 1) > share)
+    change = np.abs(lengths - usual)
+    return np.asarray((change > share * np.array(usual)) & (change > least))
 
 
 def smooth(p: Float, weight: Float, time: Float, seconds: float) -> Float:

@@ -14,7 +14,7 @@ from gsgan.data.joints import BODY, joint_names
 from gsgan.prepare.cleanse import BODY_BONES, bone_lengths
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.pictures import Written
-from gsgan.prepare.rig import FOCAL, Float, known
+from gsgan.prepare.rig import Float, known
 from gsgan.prepare.solve import Solution, median
 from gsgan.prepare.sources import Source
 from gsgan.utils.errors import DataError
@@ -117,17 +117,18 @@ def doubts_about_solution(
     """Cameras that do not fit, swapped sides, clocks, bones, missing joints."""
     found = []
     for c, name in enumerate(names):
-        error = median(solution.stages["smoothed"][c])
-        if error > limits.reprojection * solution.rig.focal[c] / FOCAL:
-            found.append(f"{name}: joints land {error:.1f} px off; is its calibration its own?")
+        if solution.off(limits.reprojection)[c]:
+            error = median(solution.error[c])
+            found.append(f"{name}: landmarks lie {error:.1f} px off; is its calibration its own?")
         if turned[c] > limits.camera_turn or moved_mm[c] > 1000 * limits.camera_move:
             found.append(
                 f"{name}: refinement turned it by {turned[c]:.1f} degrees and moved it by "
                 f"{moved_mm[c]:.0f} mm: it was bumped, or the calibration is another camera's"
             )
-        swapped = float(solution.flips[c].any(-1).mean())
-        if swapped > limits.flips:
-            found.append(f"{name}: left and right were swapped in {swapped:.0%} of the frames")
+        for what, swapped in (("", solution.swapped), (" hand", solution.swapped_hands)):
+            if (share := float(swapped[c].mean())) > limits.flips:
+                text = f"left and right{what} were swapped in {share:.0%} of the frames"
+                found.append(f"{name}: {text}")
         if abs(delay[c]) > limits.delay and gain[c] > limits.delay_gain:
             found.append(
                 f"{name}: its clock seems {delay[c]:+.1f} frames late; if so, set "

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from gsgan.data.files import frame_files, read_arrays, read_json, read_json_value
-from gsgan.data.joints import ALL, BODY, FROM_HANDS, LEFT, RIGHT, SETS
+from gsgan.data.joints import ALL, BODY, FACE, FACE_MESH, FROM_HANDS, LEFT, RIGHT, SETS
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.prepare.rig import Float, Ints, known
 from gsgan.skeleton.hands import HAND
@@ -19,6 +19,7 @@ from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import DataError
 
+MESH = 468  # landmarks of MediaPipe's face mesh
 PIXEL_CENTRE = 0.5  # added to detectors that count from the centre of the first pixel
 OPENPOSE_KEYS = ("pose_keypoints_2d", "hand_left_keypoints_2d", "hand_right_keypoints_2d")
 EASYMOCAP_KEYS = ("keypoints", "handl2d", "handr2d")
@@ -30,11 +31,11 @@ Numbered = tuple[Ints, Float, Float]  # frame numbers, coordinates, confidence
 
 @dataclass(frozen=True)
 class Detections:
-    """One camera's detections of the 75 joints (33 body, 21 left hand, 21 right hand)."""
+    """One camera's detections of the J joints: 33 body, 21 left hand, 21 right hand, 30 face."""
 
     frame_id: Ints  # [F] rising
-    px: Float  # [F, 75, 2] pixels of the image as stored, pixel centres at +0.5; NaN = not seen
-    conf: Float  # [F, 75] in [0, 1], 0 = not seen
+    px: Float  # [F, J, 2] pixels of the image as stored, pixel centres at +0.5; NaN = not seen
+    conf: Float  # [F, J] in [0, 1], 0 = not seen
     people: Ints  # [F] number of persons found
 
 
@@ -83,8 +84,8 @@ def gather(
     """All cameras' detections by common frame numbers, a camera's own plus its offset.
 
     Returns:
-        ``frames [F]`` rising, those of any camera; ``px [C, F, 75, 2]`` NaN = not seen;
-        ``conf [C, F, 75]``.
+        ``frames [F]`` rising, those of any camera; ``px [C, F, J, 2]`` NaN = not seen;
+        ``conf [C, F, J]``.
     """
     ids = [d.frame_id + int(offsets.get(name, 0)) for name, d in detections.items()]
     frames = np.unique(np.concatenate(ids))
@@ -97,8 +98,18 @@ def gather(
     return frames, px, conf
 
 
+def inside(px: Float, conf: Float, sizes: Float) -> tuple[Float, Float]:
+    """Detections without those outside their image: detectors guess where a cut-off body goes on.
+
+    ``px [C, F, J, 2]``, ``conf [C, F, J]`` and ``sizes [C, 2]``, width and height.
+    """
+    with np.errstate(invalid="ignore"):
+        seen = np.asarray(((px >= 0) & (px < sizes[:, None, None])).all(-1))
+    return np.where(seen[..., None], px, np.nan), np.where(seen, conf, 0.0)
+
+
 def _read_npz(path: Path) -> Numbered:
-    arrays = read_arrays(path, ("px", "conf", "left", "right", "frame_id"))
+    arrays = read_arrays(path, ("px", "conf", "left", "right", "face", "frame_id"))
     body = expect_array(arrays, "px", (None, BODY, 2), path).astype(np.float64)
     F = len(body)
     frame_id = whole_frame_ids(expect_array(arrays, "frame_id", (F,), path), str(path))
@@ -107,7 +118,10 @@ def _read_npz(path: Path) -> Numbered:
     for name, part in (("left", LEFT), ("right", RIGHT)):
         if name in arrays:
             px[:, part] = expect_array(arrays, name, (F, HAND, 2), path)
-            conf[:, part] = 1.0  # MediaPipe has no confidence per hand joint
+            conf[:, part] = 1.0  # MediaPipe has no confidence per landmark of hands and face
+    if "face" in arrays:
+        mesh = expect_array(arrays, "face", (F, MESH, 2), path)
+        px[:, FACE], conf[:, FACE] = mesh[:, list(FACE_MESH.values())], 1.0
     return frame_id, px, conf
 
 

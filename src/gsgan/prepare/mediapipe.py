@@ -43,10 +43,11 @@ def run_tool(
         ConfigError: when the environment is missing and may not be created.
         DataError: when the tool fails or finds nobody in a source.
     """
-    tool, hands, masks = options.mediapipe, options.hands, options.masks == MEDIAPIPE
+    tool, masks = options.mediapipe, options.masks == MEDIAPIPE
+    parts = {"hands": options.hands, "face": options.face}
     results, folders = {}, {}
     for name, source in sources.items():
-        key = [source.fingerprint(), source.rotate, tool_key(tool), hands, masks]
+        key = [source.fingerprint(), source.rotate, tool_key(tool), parts, masks]
         folders[name] = work.place(f"mediapipe-{name}", key)
         results[name] = folders[name].with_suffix(".npz")
     # The npz is written last: where it exists, the masks are complete, too.
@@ -59,7 +60,7 @@ def run_tool(
                 "source": str(sources[name].path),
                 "out": str(results[name]),
                 "masks": str(folders[name]) * masks,
-                "hands": hands,
+                **parts,
                 "rotate": sources[name].rotate,
                 "slot": missing.index(name) % options.workers,
                 **vars(tool),

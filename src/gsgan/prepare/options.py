@@ -14,7 +14,7 @@ from gsgan.prepare.landmarks import UNITS
 from gsgan.prepare.pictures import MaskTidying, PictureFiles
 from gsgan.prepare.rig import MIN_VIEWS
 from gsgan.prepare.solve import Settings
-from gsgan.prepare.sources import Source, find_sources, fit_size, pair_cameras
+from gsgan.prepare.sources import Source, find_sources, fit_size, matching_cameras, pair_cameras
 from gsgan.utils.checks import above, at_least, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -76,6 +76,7 @@ class Options:
     landmarks3d: str | None = None
     masks: str = MEDIAPIPE
     hands: bool = True
+    face: bool = True
     setup: bool = False
     workers: int = 2
     overwrite: bool = False
@@ -142,8 +143,6 @@ def read_inputs(options: Options) -> Inputs:
     """
     folder = options.folder("source")
     sources = find_sources(folder, options.apply_rotation)
-    if len(sources) < MIN_VIEWS:
-        raise DataError(f"{folder} holds only the camera {next(iter(sources))}; 3D needs two")
     if unknown := sorted(set(options.offsets or {}) - set(sources)):
         raise ConfigError(f"offsets name {unknown[0]}, but the videos are {', '.join(sources)}")
     path = folder if options.calibration is None else options.folder("calibration")
@@ -152,6 +151,13 @@ def read_inputs(options: Options) -> Inputs:
     scale = None if options.unit is None else UNITS[options.unit]  # None: the format's own
     calibration = read_calibration(path, scale, options.pixel_centre)
     notes, cameras = list(calibration.notes), []
+    for name in [n for n in sources if matching_cameras(n, calibration.ignored)]:
+        notes.append(f"{name}: left out, {path.name} says to ignore its camera")
+        del sources[name]
+    if len(sources) < MIN_VIEWS:
+        raise DataError(
+            f"{folder} holds only the camera {next(iter(sources), 'none')}; 3D needs two"
+        )
     pairs = pair_cameras(list(sources), list(calibration.cameras), options.cameras or {})
     for name, source in sources.items():
         camera = calibration.cameras[pairs[name]]

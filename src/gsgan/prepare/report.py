@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +18,13 @@ from gsgan.check.report import Figure, Finding, Report, Section, Table, page, pr
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, Crop, PersonCrop, cut, project, resize
 from gsgan.data.files import read_colour, read_grey
-from gsgan.data.joints import BODY
+from gsgan.data.joints import ALL, BODY, FACE, HANDS, joint_names
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.pictures import Written, sampled
-from gsgan.prepare.rig import FOCAL, Float, Ints, Rig, camera_moves, known
+from gsgan.prepare.rig import Bool, Float, Ints, Rig, camera_moves, known
 from gsgan.prepare.solve import Solution, median
 from gsgan.prepare.work import GENERATOR, write_json, write_npz, writing
-from gsgan.skeleton.hands import hand_names
+from gsgan.skeleton.hands import HAND, HAND_EDGES
 from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.files import write_atomically
 
@@ -32,12 +32,36 @@ Bytes = NDArray[np.uint8]
 BAR = (70, 70, 70)
 FAR = 10_000  # pixels: drawing stops there
 AGREEMENT = (
-    "Median reprojection error in pixels of the full-size image after each stage: plain and robust "
-    "triangulation, sides corrected, cameras refined, and smoothed, which is what is written."
+    "Median reprojection error of the body in pixels of the full-size image after each stage: "
+    "plain and robust triangulation, sides corrected, cameras refined, and smoothed, which is what "
+    "is written. Red: the error of all landmarks is too high."
 )
 LEGEND = (
     "Blue: the person's left, orange: the right, white: the middle. Lines: the 3D joints "
     "projected; large dots: detections, sides corrected. Green: the mask's outline."
+)
+HANDS_AND_FACE = (
+    "Frames with hands and face in each camera. Swapped hands were put right by the pose's wrists "
+    "and the other cameras; hands that fit neither are left out."
+)
+LIPS, BROW, LID = 12, 5, 4  # landmarks of each
+
+
+def _chain(start: int, count: int, closed: bool = True) -> list[tuple[int, int]]:
+    return [(start + k, start + (k + 1) % count) for k in range(count if closed else count - 1)]
+
+
+BROWS, LIDS = FACE.start + LIPS, FACE.start + LIPS + 2 * BROW
+DRAWN = replace(
+    MEDIAPIPE33,
+    names=joint_names(),
+    edges=(
+        *MEDIAPIPE33.edges,
+        *((start + a, start + b) for start in (BODY, BODY + HAND) for a, b in HAND_EDGES),
+        *_chain(FACE.start, LIPS),
+        *(edge for side in (0, 1) for edge in _chain(BROWS + side * BROW, BROW, closed=False)),
+        *(edge for side in (0, 1) for edge in _chain(LIDS + side * LID, LID)),
+    ),
 )
 
 
@@ -59,7 +83,7 @@ class Outcome:
 
 
 def write_small_files(root: Path, outcome: Outcome, key: str) -> None:
-    """cameras.json, landmarks3d.npz, hands3d.npz, landmarks2d/, meta.json, in metres and pixels."""
+    """The dataset without images and masks, in metres and pixels."""
     solution, frames = outcome.solution, outcome.frames
     cameras = {
         camera.name: {key: getattr(camera, key).tolist() for key in ("K", "R", "t")}
@@ -71,21 +95,26 @@ def write_small_files(root: Path, outcome: Outcome, key: str) -> None:
     error = solution.error[:, :, :BODY] * outcome.options.pictures.scale
     seen = np.isfinite(error)
     mean = np.where(seen, error, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
-    body, hands = (
-        {"p": p[:, part].astype(np.float32), "conf": conf[:, part].astype(np.float32)}
-        for part in (slice(BODY), slice(BODY, None))
+    body, hands, face = (
+        {
+            "p": p[:, part].astype(np.float32),
+            "conf": conf[:, part].astype(np.float32),
+            "frame_id": frames,
+            "names": np.array(joint_names()[part]),
+        }
+        for part in (slice(BODY), HANDS, FACE)
     )
     write_npz(
         root / "landmarks3d.npz",
         **body,
         reproj_px=np.where(seen.any(0), mean, np.nan).astype(np.float32),
         n_views=solution.views[:, :BODY].astype(np.int16),
-        frame_id=frames,
-        names=np.array(MEDIAPIPE33.names),
         edges=np.array(MEDIAPIPE33.edges),
     )
-    if p.shape[1] > BODY:
-        write_npz(root / "hands3d.npz", **hands, frame_id=frames, names=np.array(hand_names()))
+    wanted = {"hands": outcome.options.hands, "face": outcome.options.face}
+    for name, part in (("hands", hands), ("face", face)):
+        if wanted[name] and p.shape[1] > BODY:
+            write_npz(root / f"{name}3d.npz", **part)
     for c, camera in enumerate(outcome.cameras) if solution.seen.any() else ():
         ratio = np.diag(camera.K)[:2] / np.diag(solution.rig.K[c])[:2]
         uv = (solution.uv[c] * ratio).astype(np.float32)
@@ -93,7 +122,7 @@ def write_small_files(root: Path, outcome: Outcome, key: str) -> None:
             root / "landmarks2d" / f"{camera.name}.npz",
             p=uv[:, :BODY],
             conf=solution.seen[c, :, :BODY].astype(np.float32),
-            **({"hands": uv[:, BODY:]} if uv.shape[1] > BODY else {}),
+            **({"hands": uv[:, HANDS], "face": uv[:, FACE]} if uv.shape[1] > BODY else {}),
             frame_id=frames,
             undistorted=np.array(True),
         )
@@ -111,10 +140,12 @@ def write_small_files(root: Path, outcome: Outcome, key: str) -> None:
 def standing_axis(p: Float) -> str:
     """The world axis along which a person ``p [F, J, 3]`` stands: "z", "-y", ...; unknown is "z".
 
-    It is the direction from ankles to nose; NaN = missing.
+    It is the direction from ankles to nose and from hips to shoulders; where these are never seen,
+    from shoulders to ears. NaN = missing.
     """
-    above = np.concatenate([p[:, 0] - (p[:, 27] + p[:, 28]) / 2, (p[:, 11] - p[:, 23])])
-    above = above[known(above)]
+    legs = np.concatenate([p[:, 0] - (p[:, 27] + p[:, 28]) / 2, (p[:, 11] - p[:, 23])])
+    head = p[:, [7, 8]].mean(1) - p[:, [11, 12]].mean(1)
+    above = next((a for a in (legs[known(legs)], head[known(head)]) if len(a)), legs[:0])
     up = np.median(above, axis=0) if len(above) else np.array([0.0, 0.0, 1.0])
     axis = int(np.abs(up).argmax())
     return ("-" if up[axis] < 0 else "") + "xyz"[axis]
@@ -134,11 +165,11 @@ def write_report(root: Path, outcome: Outcome, doubts: Sequence[str], console: C
         for j, name in enumerate(MEDIAPIPE33.names)
     )
     headers = "joint", "frames found", "error px", "cameras that agree"
-    limits = options.doubts.reprojection * solution.rig.focal / FOCAL
+    off = solution.off(options.doubts.reprojection)
     sections = (
         Section(
             "How well joints and cameras agree",
-            tables=(_camera_table(numbers, limits),),
+            tables=(_camera_table(numbers, off), *_parts_table(numbers)),
             findings=tuple(Finding("warning", "capture", doubt) for doubt in doubts),
             aside=(AGREEMENT,),
         ),
@@ -163,7 +194,8 @@ def _numbers(outcome: Outcome, doubts: Sequence[str]) -> dict[str, Any]:
             "error_px": {stage: median(error[c]) for stage, error in solution.stages.items()},
             "turned_degrees": float(turned[c]),
             "moved_mm": float(moved[c]),
-            "flipped_share": float(solution.flips[c].any(-1).mean()),
+            "flipped_share": float(solution.swapped[c].mean()),
+            **_parts(solution, c),
             "delay_frames": float(solution.delay[c]),
             "frames_with_person": int(np.isfinite(solution.error[c]).any(-1).sum()),
             "frames_written": len(outcome.written[name].frames),
@@ -187,13 +219,50 @@ def _numbers(outcome: Outcome, doubts: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _camera_table(numbers: Mapping[str, Any], limits: Float) -> Table:
+def _parts(solution: Solution, c: int) -> dict[str, Any]:
+    """Hands and face in one camera; nothing where they were not asked for."""
+    seen = solution.seen[c]
+    if seen.shape[1] == BODY:
+        return {}
+    left_out, hands = solution.left_out[c], (seen[:, HANDS].reshape(len(seen), 2, HAND) > 0).any(-1)
+    return {
+        "hands": {
+            "found": int(hands.sum() + left_out.sum()),
+            "swapped_frames": int(solution.swapped_hands[c].sum()),
+            "left_out": int(left_out.sum()),
+            "error_px": median(solution.error[c][:, HANDS]),
+        },
+        "face": {
+            "found": int((seen[:, FACE] > 0).any(-1).sum()),
+            "error_px": median(solution.error[c][:, FACE]),
+        },
+    }
+
+
+def _parts_table(numbers: Mapping[str, Any]) -> tuple[Table, ...]:
+    """Hands and face by camera, where they were asked for."""
+    rows = tuple(
+        (
+            name,
+            *(str(one["hands"][key]) for key in ("found", "swapped_frames", "left_out")),
+            _number(one["hands"]["error_px"], ".2f"),
+            str(one["face"]["found"]),
+            _number(one["face"]["error_px"], ".2f"),
+        )
+        for name, one in numbers["cameras"].items()
+        if "hands" in one
+    )
+    headers = "camera", "hands", "swapped in frames", "left out", "error px", "faces", "error px"
+    return (Table(headers, rows, title=HANDS_AND_FACE),) if rows else ()
+
+
+def _camera_table(numbers: Mapping[str, Any], off: Bool) -> Table:
     """Errors by camera and stage, and what refinement, flips and clocks gave."""
     rows, flagged = [], set()
     stages = numbers["error_px"]
     for c, (name, one) in enumerate(numbers["cameras"].items()):
         errors = one["error_px"]
-        if errors["smoothed"] > limits[c]:
+        if off[c]:
             flagged.add((c, len(stages)))
         rows.append(
             (
@@ -224,7 +293,7 @@ def _figures(root: Path, outcome: Outcome) -> tuple[Figure, ...]:
         frames, tiles = outcome.written[camera.name].frames, []
         for frame in (frames[i] for i in sampled(len(frames), options.overlays.frames)):
             at = np.searchsorted(outcome.frames, frame)
-            p, uv = outcome.solution.p[at, :BODY], outcome.solution.uv[c, at, :BODY] * ratio
+            p, uv = outcome.solution.p[at], outcome.solution.uv[c, at] * ratio
             image = root / "images" / camera.name / f"{frame:06d}.{options.pictures.format}"
             mask = root / "masks" / camera.name / f"{frame:06d}.png"
             tile = _tile(image, mask, camera, p, uv, options.overlays.size)
@@ -235,7 +304,7 @@ def _figures(root: Path, outcome: Outcome) -> tuple[Figure, ...]:
 
 
 def _tile(image: Path, mask: Path, camera: CameraEntry, p: Float, uv: Float, size: int) -> Bytes:
-    """Joints ``p [33, 3]``, detections ``uv [33, 2]`` and mask on the image around the person."""
+    """Joints ``p [J, 3]``, detections ``uv [J, 2]`` and mask on the image around the person."""
     pixels, depth = project(camera, np.nan_to_num(p))
     drawn = known(p) & (depth > NEAR)
     window = PersonCrop().window(camera, np.nan_to_num(p), drawn)
@@ -244,13 +313,15 @@ def _tile(image: Path, mask: Path, camera: CameraEntry, p: Float, uv: Float, siz
         for one in (read_colour(image), read_grey(mask))
     )
     at, nothing = _placed(pixels, window, size), np.zeros(len(p), bool)
-    picture = draw(np.ascontiguousarray(picture), alpha, at, drawn, nothing, MEDIAPIPE33)
+    template = DRAWN if len(p) == ALL else MEDIAPIPE33
+    picture = draw(np.ascontiguousarray(picture), alpha, at, drawn, nothing, template)
     at = _placed(uv, window, size)
     for joint in np.flatnonzero(known(at)):
-        name, place = MEDIAPIPE33.names[joint], np.round(at[joint] - 0.5).astype(int).tolist()
+        name, place = template.names[joint], np.round(at[joint] - 0.5).astype(int).tolist()
         colour = LEFT if "left" in name else RIGHT if "right" in name else MIDDLE
-        cv2.circle(picture, place, 4, (0, 0, 0), -1, cv2.LINE_AA)
-        cv2.circle(picture, place, 3, colour, -1, cv2.LINE_AA)
+        radius = 3 if joint < BODY else 1
+        cv2.circle(picture, place, radius + 1, (0, 0, 0), -1, cv2.LINE_AA)
+        cv2.circle(picture, place, radius, colour, -1, cv2.LINE_AA)
     return picture
 
 

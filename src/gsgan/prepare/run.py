@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from gsgan.data.joints import BODY
+from gsgan.data.joints import BODY, FACE, HANDS
 from gsgan.data.splits import parse_frames
 from gsgan.prepare import doubts, landmarks
 from gsgan.prepare.landmarks import Detections
@@ -26,7 +26,7 @@ from gsgan.prepare.sources import stamp
 from gsgan.prepare.work import Advance, Work, digest, each_camera, is_there, publish
 from gsgan.utils.errors import DataError
 
-STAGE_VERSION = 3  # incremented when the same settings begin to give another result
+STAGE_VERSION = 4  # incremented when the same settings begin to give another result
 
 
 def prepare(options: Options, console: Console) -> Path:
@@ -118,8 +118,11 @@ def _solved(
     """Triangulates 2D landmarks, or loads the result of an earlier run on the same ones."""
     frames, px, conf = landmarks.gather(detections, options.offsets or {})
     chosen = _chosen(options, frames)
-    joints = slice(None if options.hands else BODY)
+    joints = slice(None if options.hands or options.face else BODY)
     frames, px, conf = frames[chosen], px[:, chosen, joints], conf[:, chosen, joints]
+    for part, wanted in ((HANDS, options.hands), (FACE, options.face)):
+        conf[:, :, part] *= wanted
+    px, conf = landmarks.inside(px, conf, np.array([c.size[::-1] for c in inputs.cameras]))
     time, rig, lag = frames / inputs.fps, Rig.of(inputs.cameras), options.doubts.lag
     uv = np.stack([undistort_points(c, p) for c, p in zip(inputs.cameras, px, strict=True)])
     flat = uv.reshape(len(rig), -1, 2), conf.reshape(len(rig), -1)

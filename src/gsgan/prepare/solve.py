@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.joints import ALL, BODY, flip_groups
+from gsgan.data.joints import ALL, BODY, FLIP_GROUPS, HAND_PAIRS, HANDS, WRISTS
 from gsgan.prepare.cleanse import Cleansing, Smoothing, cleanse, smooth
+from gsgan.prepare.hands import HandMatching, match_hands, misfits
 from gsgan.prepare.landmarks import without_frozen
 from gsgan.prepare.rig import (
     FOCAL,
@@ -24,8 +25,9 @@ from gsgan.prepare.rig import (
     refine_rig,
 )
 from gsgan.prepare.triangulate import FlipSearch, Points, Triangulation, apply_flips, find_flips
+from gsgan.skeleton.hands import HAND
 
-ARRAYS = ("p", "conf", "views", "error", "uv", "seen", "flips", "delay", "gain")
+ARRAYS = ("p", "conf", "views", "error", "uv", "seen", "flips", "left_out", "delay", "gain")
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,7 @@ class Settings:
 
     triangulation: Triangulation = field(default_factory=Triangulation)
     flips: FlipSearch = field(default_factory=FlipSearch)
+    hands: HandMatching = field(default_factory=HandMatching)
     refinement: Refinement = field(default_factory=Refinement)
     cleansing: Cleansing = field(default_factory=Cleansing)
     smoothing: Smoothing = field(default_factory=Smoothing)
@@ -50,11 +53,28 @@ class Solution:
     error: Float  # [C, F, J] final reprojection error, full-size undistorted pixels
     uv: Float  # [C, F, J, 2] undistorted detections with the sides corrected
     seen: Float  # [C, F, J] their confidence
-    flips: Bool  # [C, F, G] sides that were swapped
+    flips: Bool  # [C, F, G] sides that were swapped: of `FLIP_GROUPS`, then of the hands
+    left_out: Bool  # [C, F, 2] detected hands that are none of the person's two, or a repeat
     delay: Float  # [C] of each camera's clock, see `clock_errors`
     gain: Float  # [C] the same
     stages: dict[str, Float]  # name of each stage and its body errors [C, F, 33]
     removed: dict[str, int]  # number of joints removed, by reason
+
+    @property
+    def swapped(self) -> Bool:
+        """``[C, F]`` where sides of the body were swapped."""
+        return np.asarray(self.flips[..., : len(FLIP_GROUPS)].any(-1))
+
+    @property
+    def swapped_hands(self) -> Bool:
+        """``[C, F]`` where the hands were swapped."""
+        return np.asarray(self.flips[..., len(FLIP_GROUPS) :].any(-1))
+
+    def off(self, limit: float) -> Bool:
+        """``[C]`` cameras whose median error, of all landmarks, is above the limit, in thousandths
+        of the focal length: those of a body alone are vague where it is near."""
+        errors = np.array([median(error) for error in self.error])
+        return np.asarray(errors > limit * self.rig.focal / FOCAL)
 
     def to_arrays(self) -> dict[str, NDArray[Any]]:
         """All of it as plain arrays."""
@@ -90,36 +110,54 @@ def solve(
     Args:
         rig: as calibrated.
         time: ``[F]`` seconds.
-        uv: ``[C, F, J, 2]`` undistorted pixels, NaN = not seen; J is 33, or 75 with hands.
+        uv: ``[C, F, J, 2]`` undistorted pixels, NaN = not seen; J is 33, or 105 with hands
+            and face.
         conf: ``[C, F, J]`` 0 = not seen.
         settings: of every stage.
         lag: frames tried either way when clocks are compared; 0 skips it.
     """
     triangulation, given, pixels, full = settings.triangulation, rig, uv, conf
-    groups = flip_groups(hands=uv.shape[2] == ALL)
+    hands = uv.shape[2] == ALL
+    groups = (*FLIP_GROUPS, HAND_PAIRS) if hands else FLIP_GROUPS
     rig, uv = rig.normalised(uv)
     start, conf = rig, np.where(conf > triangulation.min_confidence, conf, 0.0)
     flips = np.zeros((*conf.shape[:2], len(groups)), bool)
+    left_out = np.zeros((*conf.shape[:2], 2), bool)
     sided, weight = uv, conf
 
     def triangulate() -> Points:
-        nonlocal flips, sided, weight
+        nonlocal flips, left_out, sided, weight
         if settings.flips.enabled:
-            flips = find_flips(rig, uv, conf, groups, settings.flips, triangulation)
-            sided, weight = (apply_flips(v, flips, groups) for v in (uv, conf))
-        return triangulation.points(rig, _flat(sided), _flat(weight))
+            body = find_flips(rig, uv, conf, FLIP_GROUPS, settings.flips, triangulation)
+            flips[..., : len(FLIP_GROUPS)] = body
+            sided, weight = (apply_flips(v, body, FLIP_GROUPS) for v in (uv, conf))
+            if hands:
+                own = np.where(weight[..., WRISTS, None] > 0, sided[:, :, WRISTS], np.nan)
+                arms = triangulation.points(rig, _flat(own), _flat(weight[:, :, WRISTS]))
+                far = rig.project(arms.p)[0].reshape(own.shape)
+                wrists = np.where(np.isfinite(own), own, far)  # unseen: where other cameras see it
+                found = sided[:, :, HANDS], weight[:, :, HANDS], wrists
+                flips[..., -1] = match_hands(rig, *found, settings.hands, triangulation)
+                sided, weight = (apply_flips(v, flips, groups) for v in (uv, conf))
+        points = triangulation.points(rig, _flat(sided), _flat(weight))
+        if hands:
+            error = points.error.reshape(conf.shape)[:, :, HANDS]
+            left_out = misfits(error, settings.hands.max_error)
+            weight = weight.copy()
+            weight[:, :, HANDS] *= ~left_out.repeat(HAND, axis=-1)
+            points = triangulation.points(rig, _flat(sided), _flat(weight))
+        return points
 
     plain = triangulation.plain(rig, _flat(uv), _flat(conf))
     robust = triangulation.points(rig, _flat(uv), _flat(conf))
     stages = {"plain": rig.errors(plain, _flat(uv)), "robust": robust.error}
     points = triangulate()
     stages["flips"] = points.error
-    # Evenly spaced frames and the body's joints: hands are less certain.
     F, J = conf.shape[1:]
     at = np.unique(np.linspace(0, F - 1, min(F, settings.refinement.frames)).round().astype(int))
     for _ in range(settings.refinement.rounds):
-        p = points.p.reshape(F, J, 3)[at, :BODY].reshape(-1, 3)
-        detections = _flat(sided[:, at, :BODY]), _flat(weight[:, at, :BODY])
+        p = points.p.reshape(F, J, 3)[at].reshape(-1, 3)
+        detections = _flat(sided[:, at]), _flat(weight[:, at])
         rig = refine_rig(start, rig, p, *detections, settings.refinement)
         points = triangulate()
     stages["refined"] = points.error
@@ -128,7 +166,10 @@ def solve(
     p = smooth(p, agreed, time, settings.smoothing.seconds)
     error = rig.errors(p.reshape(-1, 3), _flat(sided)).reshape(conf.shape)
     stages["smoothed"] = error = np.where(weight > 0, error, np.nan)
-    trust = apply_flips(full, flips, groups)
+    trust, pixels = (apply_flips(v, flips, groups) for v in (full, pixels))
+    if hands:
+        gone = left_out.repeat(HAND, axis=-1)
+        trust[:, :, HANDS][gone], pixels[:, :, HANDS][gone] = 0.0, np.nan
     delay, gain = clock_errors(rig, sided[:, :, :BODY], trust[:, :, :BODY], triangulation, lag)
     to_pixels = (given.focal / FOCAL)[:, None, None]
     return Solution(
@@ -137,9 +178,10 @@ def solve(
         conf=np.where(known(p), _mean_seen(weight, weight), 0.0),
         views=(np.nan_to_num(error, nan=np.inf) <= triangulation.scale).sum(0),
         error=error * to_pixels,
-        uv=apply_flips(pixels, flips, groups),
+        uv=pixels,
         seen=trust,
         flips=flips,
+        left_out=left_out,
         delay=delay,
         gain=gain,
         stages={
@@ -170,7 +212,8 @@ def adopt(
         error=unseen,
         uv=np.full((C, F, J, 2), np.nan),
         seen=np.zeros((C, F, J)),
-        flips=np.zeros((C, F, len(flip_groups(hands=False))), bool),
+        flips=np.zeros((C, F, len(FLIP_GROUPS)), bool),
+        left_out=np.zeros((C, F, 2), bool),
         delay=unknown,
         gain=unknown,
         stages={"smoothed": unseen},

@@ -136,7 +136,7 @@ def pair_cameras(
             )
     pairs = dict[str, str]()
     for source in sources:
-        matching = [named[source]] if source in named else _matching(source, cameras)
+        matching = [named[source]] if source in named else matching_cameras(source, cameras)
         if len(matching) != 1 or matching[0] in pairs.values():
             problem = "no one camera of the calibration matches"
             if len(matching) == 1:
@@ -146,7 +146,8 @@ def pair_cameras(
     return pairs
 
 
-def _matching(source: str, cameras: Sequence[str]) -> list[str]:
+def matching_cameras(source: str, cameras: Sequence[str]) -> list[str]:
+    """The calibrated cameras that a source's name fits, see `pair_cameras`."""
     if source in cameras:
         return [source]
     words = re.split(r"[^0-9a-z]+", source.lower())

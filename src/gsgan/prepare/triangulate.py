@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -18,6 +18,7 @@ FLAT = 1e-15  # determinant over trace³: below it the equations are singular in
 ITERATIONS, QUICK_ITERATIONS = 10, 3  # of reweighting; the search for swapped sides needs fewer
 CHUNK = 100_000  # points processed at once: bounds the memory, changes nothing else
 MAX_PAIRS = 60  # of cameras, tried as a start; of more, a spread-out part
+LEAST_JOINTS = 3  # of a group: hips at the border of an image do not tell left from right
 PROGRESSION = 7919  # a prime: spreads the chosen camera pairs when there are too many
 
 Pairs = tuple[tuple[int, int], ...]
@@ -97,7 +98,7 @@ def _robust(rig: Rig, uv: Float, weight: Float, settings: Triangulation, iterati
     return Points(p, np.where(missing, 0.0, reweighted), np.where(missing, np.nan, error))
 
 
-def _robust_cost(error: Float, weight: Float, scale: float) -> Float:
+def robust_cost(error: Float, weight: Float, scale: float) -> Float:
     """``[N]`` weighted Cauchy loss over the cameras, of ``error`` and ``weight [C, N]``.
 
     Detections with weight 0 cost nothing; a point that was not found costs as one far away.
@@ -130,13 +131,13 @@ def _solve(a: Float, b: Float, weight: Float) -> tuple[Float, Float]:
 def _best_pair(rig: Rig, uv: Float, weight: Float, a: Float, b: Float, scale: float) -> Float:
     """``[N, 3]`` of all pairs' points and the linear one, that with the smallest robust cost."""
     best = _solve(a, b, weight)[0]
-    cost = _robust_cost(rig.errors(best, uv), weight, scale)
+    cost = robust_cost(rig.errors(best, uv), weight, scale)
     pairs = list(combinations(range(len(rig)), 2))
     if len(pairs) > MAX_PAIRS:
         pairs = [pairs[k * PROGRESSION % len(pairs)] for k in range(MAX_PAIRS)]
     for pair in map(list, pairs):
         p = _solve(a[pair], b[pair], weight[pair])[0]
-        new = _robust_cost(rig.errors(p, uv), weight, scale)
+        new = robust_cost(rig.errors(p, uv), weight, scale)
         better = (new < cost) & np.isfinite(p).all(-1)
         best, cost = np.where(better[:, None], p, best), np.where(better, new, cost)
     return best
@@ -198,6 +199,18 @@ def apply_flips(values: Float, flips: Bool, groups: Sequence[Pairs]) -> Float:
     return out
 
 
+def points_and_cost(
+    rig: Rig, uv: Float, weight: Float, quick: Triangulation
+) -> tuple[Float, Float]:
+    """``p [F, J, 3]`` of ``uv [C, F, J, 2]`` and ``weight [C, F, J]``, and its cost ``[F]``."""
+    C, F, J = weight.shape
+    trust = weight.reshape(C, -1)
+    found = quick.points(rig, uv.reshape(C, -1, 2), trust, QUICK_ITERATIONS)
+    seen = np.where(np.isfinite(found.error), trust, 0.0)
+    cost = robust_cost(found.error, seen, quick.scale)
+    return found.p.reshape(F, J, 3), cost.reshape(F, J).sum(-1)
+
+
 def _group_flips(
     rig: Rig, uv: Float, weight: Float, pairs: Pairs, gain: float, quick: Triangulation
 ) -> Bool:
@@ -205,23 +218,36 @@ def _group_flips(
     joints = [j for pair in pairs for j in pair]  # pairs are then adjacent: j and j ^ 1
     local = [tuple((2 * i, 2 * i + 1) for i in range(len(pairs)))]
     uv, weight = uv[:, :, joints], weight[:, :, joints]
-    C, F, J = weight.shape
+    C, F, _ = weight.shape
     everywhere = np.arange(F)
 
     def points(flips: Bool, frames: NDArray[np.int64]) -> tuple[Float, Float]:
-        """``p [F, J, 3]`` and the cost ``[F]`` of some frames with these flips ``[C, F]``."""
         sided, trust = (apply_flips(v[:, frames], flips[..., None], local) for v in (uv, weight))
-        trust = trust.reshape(C, -1)
-        found = quick.points(rig, sided.reshape(C, -1, 2), trust, QUICK_ITERATIONS)
-        seen = np.where(np.isfinite(found.error), trust, 0.0)
-        cost = _robust_cost(found.error, seen, quick.scale)
-        return found.p.reshape(-1, J, 3), cost.reshape(-1, J).sum(-1)
+        return points_and_cost(rig, sided, trust, quick)
 
-    flips, price = np.zeros((C, F), bool), gain * weight.sum(-1)
-    cost, active = points(flips, everywhere)[1], everywhere
+    few = (weight > 0).sum(-1) < LEAST_JOINTS
+    price = np.where(few, np.inf, gain * weight.sum(-1))
+    flips = cheapest_flips(lambda f, at: points(f, at)[1], np.zeros((C, F), bool), price)
+    flips = flips ^ _exchanged(points(flips, everywhere)[0])
+    votes = weight.sum(-1)
+    return ~flips if (votes * flips).sum() > votes.sum() / 2 else flips
+
+
+def cheapest_flips(
+    cost_of: Callable[[Bool, NDArray[np.int64]], Float], flips: Bool, price: Float
+) -> Bool:
+    """``flips [C, F]``, one camera at a time changed as long as that saves more than its price.
+
+    Args:
+        cost_of: cost ``[f]`` of flips ``[C, f]`` in these ``f`` frames.
+        flips: to start from.
+        price: ``[C, F]`` that a change must save.
+    """
+    C, F = flips.shape
+    flips, active, toggles = flips.copy(), np.arange(F), np.eye(C, dtype=bool)[:, :, None]
+    cost = cost_of(flips, active)
     for _ in range(C):
-        toggles = np.eye(C, dtype=bool)[:, :, None]
-        trials = np.stack([points(flips[:, active] ^ one, active)[1] for one in toggles])
+        trials = np.stack([cost_of(flips[:, active] ^ one, active) for one in toggles])
         saved = cost[active] - trials - price[:, active]
         best, better = saved.argmax(0), saved.max(0) > 0
         active, best = active[better], best[better]
@@ -229,9 +255,7 @@ def _group_flips(
             break
         flips[best, active] ^= True
         cost[active] = trials[best, better.nonzero()[0]]
-    flips = flips ^ _exchanged(points(flips, everywhere)[0])
-    votes = weight.sum(-1)
-    return ~flips if (votes * flips).sum() > votes.sum() / 2 else flips
+    return flips
 
 
 def _exchanged(p: Float) -> Bool:

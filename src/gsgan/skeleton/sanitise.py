@@ -64,10 +64,10 @@ def sanitise(
 
     Convention: metres, world frame. A joint is unseen when a coordinate is NaN or infinite or its
     visibility is not above ``min_visibility``. One missing shoulder or hip is completed from the
-    other three; a joint or landmark of the face is placed by the head's frame; any other joint at
-    the end of its rest bone in its parent's frame. Filled-in joints move with the seen ones and
-    pass gradients to them. Seen joints are returned unchanged. The check costs one device
-    synchronisation.
+    other three; two unseen hips keep finite positions, as estimates; a joint or landmark of the
+    face is placed by the head's frame; any other joint at the end of its rest bone in its parent's
+    frame. Filled-in joints move with the seen ones and pass gradients to them. Seen joints are
+    returned unchanged. The check costs one device synchronisation.
 
     Args:
         p: ``[B, J, 3]``.
@@ -98,8 +98,9 @@ def sanitise(
         valid = valid & (visibility > min_visibility)
     if bool(valid.all()):
         return p, valid
-    _refuse_without_trunk(valid, template, min_trunk_joints)
-    return _filled(p, valid, template, body_height), valid
+    placed = valid | _estimated_hips(p, valid, template)
+    _refuse_without_trunk(placed, template, min_trunk_joints)
+    return _filled(p, placed, template, body_height), valid
 
 
 def complete_skeleton(
@@ -150,6 +151,15 @@ def recentre(
     root = p[:, template.hips[0]].detach()
     shift = (camera.R @ root.to(camera.R).unsqueeze(-1)).squeeze(-1)
     return p - root.unsqueeze(1), replace(camera, t=camera.t + shift), root
+
+
+def _estimated_hips(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Tensor:
+    """``[B, J]`` bool: both hips of skeletons that show both shoulders and no hip, if finite."""
+    hips, shoulders = list(template.hips), list(template.shoulders)
+    seen = valid[:, shoulders].all(1) & ~valid[:, hips].any(1)
+    estimated = torch.zeros_like(valid)
+    estimated[:, hips] = (seen & p[:, hips].isfinite().all((1, 2))).unsqueeze(1)
+    return estimated
 
 
 def _refuse_without_trunk(valid: Tensor, template: SkeletonTemplate, least: int) -> None:

@@ -23,8 +23,8 @@ EXPECTED = "K, R, t, dist and size"
 HEAD = 65536  # bytes that are enough to recognise the format
 PATTERNS = ("cameras.json", "intri.yml", "intri.yaml", "*.qca.txt", "*.qca", "*.toml")
 KNOWN = (
-    "OpenCV YAML (intri.yml beside extri.yml), TOML of Pose2Sim or aniposelib, Qualisys .qca.txt, "
-    "or cameras.json"
+    "OpenCV YAML (intri.yml beside extri.yml), TOML of Pose2Sim, aniposelib or caliscope, Qualisys "
+    ".qca.txt, or cameras.json"
 )
 
 
@@ -80,12 +80,14 @@ class Calibration:
         format: its name in words.
         cameras: by name, metres, K with pixel centres at +0.5; a size of (0, 0) is unknown.
         notes: one sentence for each omission or oddity.
+        ignored: names of cameras that the file says to ignore.
     """
 
     path: Path
     format: str
     cameras: dict[str, CameraEntry]
     notes: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()
 
 
 def read_cameras_json(
@@ -139,7 +141,8 @@ def read_cameras(
     return cameras
 
 
-Reader = Callable[[Path, float | None, float], tuple[dict[str, CameraEntry], list[str]]]
+Cameras = Mapping[str, CameraEntry | None]  # by name; None is one that the file says to ignore
+Reader = Callable[[Path, float | None, float], tuple[Cameras, list[str]]]
 """Cameras and notes by path, metres in a unit (None: the format's own), and K's pixel centre."""
 FORMATS: dict[str, tuple[Callable[[str], bool], Reader]] = {
     "OpenCV YAML": (lambda head: head.lstrip().startswith("%YAML"), read_opencv_yaml),
@@ -172,10 +175,12 @@ def read_calibration(
         ) from None
     for name, (fits, reader) in FORMATS.items():
         if fits(head):
-            cameras, notes = reader(path, unit_scale, pixel_centre)
+            found, notes = reader(path, unit_scale, pixel_centre)
+            cameras = {key: camera for key, camera in found.items() if camera is not None}
             if not cameras:
                 raise DataError(f"{path} ({name}) lists no camera that can be used")
-            return Calibration(path, name, cameras, tuple(notes))
+            ignored = tuple(key for key in found if key not in cameras)
+            return Calibration(path, name, cameras, tuple(notes), ignored)
     raise DataError(f"{path} is not a known calibration; expected {KNOWN}")
 
 

@@ -1,4 +1,4 @@
-"""TOML of Pose2Sim and aniposelib, and Qualisys Track Manager's .qca.txt, which is XML."""
+"""TOML of Pose2Sim, aniposelib and caliscope, and Qualisys Track Manager's .qca.txt (XML)."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
 from gsgan.data.files import natural_order
+from gsgan.utils.arrays import as_floats
 from gsgan.utils.errors import DataError
 
 NO_CAMERAS = ("metadata", "capture_volume", "charuco", "checkerboard")
@@ -24,10 +25,12 @@ OPENCV_AXES = np.diag([1.0, -1.0, -1.0])  # Qualisys cameras look along -z, y up
 
 def read_toml(
     path: Path, scale: float | None, pixel_centre: float
-) -> tuple[dict[str, CameraEntry], list[str]]:
-    """Cameras by name: size [w, h], matrix, distortions, rotation (Rodrigues), translation.
+) -> tuple[dict[str, CameraEntry | None], list[str]]:
+    """Cameras by name: size [w, h], matrix, distortions, rotation, translation.
 
-    Convention: world to camera; metres as Pose2Sim writes them. aniposelib keeps the unit of its
+    Convention: world to camera; the rotation is a Rodrigues vector, or a matrix; metres as Pose2Sim
+    and caliscope write them. caliscope has one table per camera in another, [cameras.0]: the number
+    is its name, and a camera that it ignores is None here. aniposelib keeps the unit of its
     calibration board, often mm, without naming it: give it with ``unit``.
 
     Raises:
@@ -37,9 +40,13 @@ def read_toml(
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError, RecursionError) as error:
         raise DataError(f"{path} is not readable as TOML: {error}") from None
-    cameras: dict[str, CameraEntry] = {}
-    for table, entry in content.items():
+    cameras: dict[str, CameraEntry | None] = {}
+    inner = content.get("cameras")
+    for table, entry in (inner if isinstance(inner, dict) else content).items():
         if table in NO_CAMERAS or not isinstance(entry, dict):
+            continue
+        if entry.get("ignore"):
+            cameras[table] = None
             continue
         camera = _toml_camera(path, table, entry, scale or 1.0, pixel_centre)
         if camera.name in cameras:
@@ -60,11 +67,14 @@ def _toml_camera(
             "calibrate it without distortion"
         )
     width, height = numbers(where, entry["size"], "size", (2,))
+    R = entry["rotation"]
+    if as_floats(R).shape != (3, 3):
+        R = cv2.Rodrigues(numbers(where, R, "rotation", (3,)))[0]
     return make_camera(
         where,
         str(entry.get("name", table)),
         K=entry["matrix"],
-        R=cv2.Rodrigues(numbers(where, entry["rotation"], "rotation", (3,)))[0],
+        R=R,
         t=entry["translation"],
         dist=entry["distortions"],
         size=(int(height), int(width)),

@@ -1,13 +1,14 @@
-"""Finds body and hand landmarks, and the person's mask, in one video or folder of images.
+"""Finds body, hand and face landmarks, and the person's mask, in one video or folder of images.
 
 Runs in its own environment (requirements.txt beside it). `gsgan.prepare.mediapipe` starts it with a
-JSON object: source, out, masks (a folder, or empty), hands, rotate, threads (processors; 0 is all),
-slot (number among those that run at once), confidence and tracking (lowest), margin (of the mask's
-crop, share of the person's height). Prints a line ``<images done> <images in total>`` per image.
-Writes an npz:
+JSON object: source, out, masks (a folder, or empty), hands, face, rotate, threads (processors; 0 is
+all), slot (number among those that run at once), confidence and tracking (lowest), margin (of the
+mask's crop, share of the person's height). Prints a line ``<images done> <images in total>`` per
+image. Writes an npz:
 
     px (F,33,2), conf (F,33)     pixels of the image as stored, first pixel's centre at (0.5, 0.5)
     left, right (F,21,2)         the person's hands; NaN = not found
+    face (F,468,2)               MediaPipe's face mesh; NaN = not found
     frame_id (F,)
 
 and masks/%06d.png, 0..255. Depth estimates are not written: they are relative, not metric.
@@ -29,7 +30,7 @@ import mediapipe as mp
 import numpy as np
 
 PICTURES = (".jpg", ".jpeg", ".png")
-JOINTS, HAND = 33, 21
+JOINTS, HAND, FACE = 33, 21, 468
 
 
 def main() -> None:
@@ -103,7 +104,8 @@ class Detector:
         }
         self.margin = options.margin
         # Smoothing here would lag; gsgan smooths in 3D.
-        kind = solutions.holistic.Holistic if options.hands else solutions.pose.Pose
+        holistic = options.hands or options.face
+        kind = solutions.holistic.Holistic if holistic else solutions.pose.Pose
         self.body = kind(smooth_landmarks=False, **common)
         self.segmenter = solutions.pose.Pose(
             static_image_mode=True, enable_segmentation=True, **common
@@ -119,6 +121,7 @@ class Detector:
             "conf": np.array(visibility, np.float32),
             "left": pixels(getattr(found, "left_hand_landmarks", None), size, HAND),
             "right": pixels(getattr(found, "right_hand_landmarks", None), size, HAND),
+            "face": pixels(getattr(found, "face_landmarks", None), size, FACE),
         }
 
     def mask(self, picture: Any, px: Any) -> Any:
