@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from make import write_hands
+from make import write_face, write_hands
 
 from gsgan.check.hands import hand_findings
+from gsgan.check.sections import seen_in
 from gsgan.check.settings import Limits
 from gsgan.check.views import subject_of
 from gsgan.data.crop import project
@@ -93,3 +94,13 @@ def test_the_report_has_them(hands, check):
     write_hands(root, 12, p=p.reshape(12, 2, 21, 3)[:, ::-1].reshape(12, 42, 3))
     texts = [finding.sentence for finding in check(root).findings]
     assert any("the left hand lies at the right wrist in 12 of 12 frames" in t for t in texts)
+
+
+def test_frames_with_hands_and_with_a_face_are_counted(hands):
+    root, p = hands
+    write_hands(root, 12, p=np.where(np.arange(12)[:, None, None] < 2, np.nan, p))
+    write_face(root, 12, p=write_face(root, 12)[3:], frame_id=np.arange(3, 12))
+    layout = GsganData(str(root)).layout
+    assert layout.hands is not None
+    assert layout.face is not None
+    assert [seen_in(part, list(range(12))) for part in (layout.hands, layout.face)] == [10, 9]

@@ -142,9 +142,7 @@ def write_landmarks(root: Path, p: np.ndarray, frame_id: np.ndarray, **arrays: A
 def write_hands(root: Path, frames: int, per_metre: float = 1.0, **arrays: Any) -> np.ndarray:
     """Writes hands3d.npz, hands of the template's rest pose at that person's wrists ``[F, 42, 3]``,
     half closed in odd frames; returns the points in metres."""
-    from gsgan.skeleton import HOLISTIC
-
-    rest = np.asarray(HOLISTIC.rest_positions)[33:].reshape(2, 21, 3)[..., [0, 2, 1]] * [1, -1, 1]
+    rest = _rest()[33:75].reshape(2, 21, 3)
     tips = rest - rest[:, :1]
     tips[:, [8, 12, 16, 20]] = tips[:, [6, 10, 14, 18]] + [0, -0.02, 0]
     offset = np.stack([tips if f % 2 else rest - rest[:, :1] for f in range(frames)])
@@ -152,6 +150,25 @@ def write_hands(root: Path, frames: int, per_metre: float = 1.0, **arrays: Any) 
     held = {"p": p * per_metre, "frame_id": np.arange(frames)}
     np.savez(root / "hands3d.npz", **(held | arrays))
     return p
+
+
+def write_face(root: Path, frames: int, per_metre: float = 1.0, **arrays: Any) -> np.ndarray:
+    """Writes face3d.npz, the template's face at that person's nose ``[F, 30, 3]``, its lips moved
+    5 mm up in odd frames; returns the points in metres."""
+    from gsgan.skeleton.face import FACE_NAMES
+
+    rest = _rest()
+    p = skeletons(frames)[:, :1] + (rest[75:] - rest[0])
+    p[1::2, :12, 2] += 0.005
+    held = {"p": p * per_metre, "frame_id": np.arange(frames), "names": np.array(FACE_NAMES)}
+    np.savez(root / "face3d.npz", **(held | arrays))
+    return p
+
+
+def _rest() -> np.ndarray:
+    from gsgan.skeleton import HOLISTIC
+
+    return np.asarray(HOLISTIC.rest_positions)[:, [0, 2, 1]] * [1, -1, 1]
 
 
 def edit_json(path: Path, change: Any) -> None:

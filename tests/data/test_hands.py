@@ -1,4 +1,4 @@
-"""Hands of a capture: 75 joints with data.skeleton=holistic, 33 without."""
+"""Hands of a capture: 75 joints with data.skeleton=mediapipe33_hands, 33 without."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gsgan.data.datamodule import GsganData
 from gsgan.data.formats.capture import read_capture
 from gsgan.utils.errors import ConfigError, DataError
 
-HOLISTIC = {"size": 32, "skeleton": "holistic", "body": "none"}
+HANDS = {"size": 32, "skeleton": "mediapipe33_hands", "body": "none"}
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def root(tmp_path: Path) -> Path:
 
 
 def every_frame(root: Path, **settings):
-    data = GsganData(str(root), **(HOLISTIC | settings))
+    data = GsganData(str(root), **(HANDS | settings))
     return data, [data.dataset(split)[i] for split, i in (("train", 0), ("train", 2))]
 
 
@@ -33,7 +33,7 @@ def test_skeletons_have_75_joints(root: Path) -> None:
         expected = np.concatenate([skeletons(4)[number], p[number]])
         np.testing.assert_allclose(one.skeleton[0], expected, atol=1e-6)
         assert one.visibility.tolist() == [[1.0] * 75]
-    assert data.info.skeleton == "holistic"
+    assert data.info.skeleton == "mediapipe33_hands"
     plain = GsganData(str(root), size=32, body="none")
     assert plain.dataset("train")[0].skeleton.shape == (1, 33, 3)
     assert data.info.body_height == plain.info.body_height
@@ -79,7 +79,7 @@ def test_a_capture_in_which_no_hand_was_found_trains_without(root: Path) -> None
 
 def test_a_capture_without_hands_is_refused_by_name(root: Path) -> None:
     with pytest.raises(ConfigError, match=r"needs a capture's hands3d.npz, which .*capture lacks"):
-        assert GsganData(str(root), **HOLISTIC).layout
+        assert GsganData(str(root), **HANDS).layout
     with pytest.raises(ConfigError, match=r"data\.skeleton must be one of"):
         GsganData(str(root), skeleton="hands")
 
@@ -113,12 +113,12 @@ def test_fitted_poses_have_their_fingers_with_hands_alone(root: Path) -> None:
     poses = {"theta": np.zeros((4, 56, 3)), "transl": np.zeros((4, 3)), "frame_id": np.arange(4)}
     np.savez(root / "body_pose.npz", **poses)
     with pytest.raises(ConfigError, match=r"made body_pose.npz without hands; run it again"):
-        assert GsganData(str(root), size=32, skeleton="holistic").layout
+        assert GsganData(str(root), size=32, skeleton="mediapipe33_hands").layout
     assert (
-        GsganData(str(root), skeleton="holistic", body="none").layout.poses is None
+        GsganData(str(root), skeleton="mediapipe33_hands", body="none").layout.poses is None
     )  # to fit anew
     np.savez(root / "body_pose.npz", **poses, theta_hands=np.ones((4, 56, 3)))
-    for skeleton, value in (("mediapipe33", 0.0), ("holistic", 1.0)):
+    for skeleton, value in (("mediapipe33", 0.0), ("mediapipe33_hands", 1.0)):
         frame = GsganData(str(root), size=32, skeleton=skeleton).dataset("train")[0]
         assert frame.body.theta.unique().tolist() == [value]
     np.savez(root / "body_pose.npz", **poses, theta_hands=np.ones((4, 20, 3)))

@@ -87,7 +87,7 @@ def test_fingers_follow_the_hands_of_every_frame(people, fit, tmp_path):
     p = write_hands(root, 5, per_metre=100)
     p[4] = np.nan
     write_hands(root, 5, p=100 * p)
-    found = fit("data.skeleton=holistic", "fit.sweeps=1", root=root, keep=False)
+    found = fit("data.skeleton=mediapipe33_hands", "fit.sweeps=1", root=root, keep=False)
     plain = fit("fit.sweeps=1", root=root, name="plain", keep=False)
     names = shaped_body(free_space().neutral()).joint_names
     fingers = [i for i, name in enumerate(names) if name.startswith("finger") and "1-1" not in name]

@@ -10,7 +10,7 @@ from make import write_hands
 
 from gsgan.model.body_points import BodyPoints
 from gsgan.model.pose_graph import PoseGraph, PoseLinear
-from gsgan.skeleton import HOLISTIC
+from gsgan.skeleton import MEDIAPIPE33_HANDS
 
 HANDS = slice(33, 75)
 
@@ -25,13 +25,13 @@ def signing(capture, tmp_path_factory):
 
 @pytest.fixture
 def made(build, signing):
-    return lambda *given: build(f"data.root={signing}", "data.skeleton=holistic", *given)
+    return lambda *given: build(f"data.root={signing}", "data.skeleton=mediapipe33_hands", *given)
 
 
 @pytest.mark.parametrize("model", ["full", "wo_gcn", "splat_only", "image_to_image", "lbs_splat"])
 def test_every_model_takes_hands(made, model):
     _, avatar, frame = made(f"model={model}")
-    assert avatar.template is HOLISTIC
+    assert avatar.template is MEDIAPIPE33_HANDS
     assert frame.skeleton.shape == (1, 75, 3)
     with torch.no_grad():
         image = avatar.paint(frame).image
@@ -42,7 +42,7 @@ def test_every_model_takes_hands(made, model):
 def test_points_on_the_skeleton_are_on_the_fingers_too(made):
     _, avatar, frame = made("effects.body_points=off")
     assert avatar.body_points is None
-    assert avatar.densify.template is HOLISTIC
+    assert avatar.densify.template is MEDIAPIPE33_HANDS
     assert avatar.deformation.from_pose.in_features == 3 * 75
     with torch.no_grad():
         found = avatar.paint(frame).gaussians
@@ -81,6 +81,7 @@ def test_a_skeleton_without_hands_drives_it_and_hands_drive_one_without(made, bu
 
 
 def test_pose_encoders_have_a_number_per_edge():
-    for encoder in (PoseGraph("holistic", width=8, joint_channels=4), PoseLinear("holistic")):
+    name = "mediapipe33_hands"
+    for encoder in (PoseGraph(name, width=8, joint_channels=4), PoseLinear(name)):
         assert encoder.channels == 77
         assert encoder(torch.randn(2, 75, 6), torch.randn(2, 75, 3)).shape == (2, 77)

@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from gsgan.skeleton import MEDIAPIPE33 as T
-from gsgan.skeleton.template import N_HUBS
+from gsgan.skeleton import TEMPLATES
+from gsgan.skeleton.template import N_HUBS, SkeletonTemplate
+
+every_template = pytest.mark.parametrize("t", TEMPLATES.values(), ids=TEMPLATES)
 
 
 def test_counts() -> None:
@@ -31,16 +34,25 @@ def test_every_segment_is_drawn_once() -> None:
     assert sorted(drawn) == sorted([*T.edges, T.ears])
 
 
-def _components(edges: tuple[tuple[int, int], ...]) -> int:
-    label = list(range(33))
+def _components(edges: tuple[tuple[int, int], ...], joints: int = 33) -> int:
+    label = list(range(joints))
     for a, b in edges:
         label = [label[a] if x == label[b] else x for x in label]
     return len(set(label))
 
 
-def test_gnn_edges_join_the_three_components() -> None:
+@every_template
+def test_gnn_edges_join_the_components(t: SkeletonTemplate) -> None:
     assert _components(T.edges) == 3
-    assert _components(T.gnn_edges) == 1
+    assert _components(t.gnn_edges, len(t.names)) == 1
+    assert len({frozenset(edge) for edge in t.gnn_edges}) == len(t.gnn_edges)
+
+
+@every_template
+def test_tables_have_a_row_per_joint(t: SkeletonTemplate) -> None:
+    assert len(t.names) == len(set(t.names)) == len(t.rest_positions) == len(t.mirror)
+    drawn = {joint for _, group in t.draw_groups for edge in group for joint in edge}
+    assert drawn == set(range(len(t.names)))
 
 
 def test_parents_come_first_and_end_at_the_joint() -> None:
@@ -63,12 +75,13 @@ def test_every_joint_below_the_trunk_ends_one_bone() -> None:
     assert T.limbs[T.incoming[31]] == (27, 31)  # not from the heel
 
 
-def test_mirror_swaps_sides_of_the_rest_pose() -> None:
-    rest, mirror = np.asarray(T.rest_positions), list(T.mirror)
+@every_template
+def test_mirror_swaps_sides_of_the_rest_pose(t: SkeletonTemplate) -> None:
+    rest, mirror = np.asarray(t.rest_positions), list(t.mirror)
     np.testing.assert_allclose(rest[mirror] * [-1, 1, 1], rest)
-    assert [mirror[m] for m in mirror] == list(range(33))
-    assert [T.names[mirror[7]], mirror[0]] == ["right_ear", 0]
-    left = np.array([name.startswith("left") or name.endswith("left") for name in T.names])
+    assert [mirror[m] for m in mirror] == list(range(len(t.names)))
+    assert [t.names[mirror[7]], mirror[0]] == ["right_ear", 0]
+    left = np.array([name.startswith("left") or name.endswith("left") for name in t.names])
     assert (rest[left, 0] > 0).all()
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton import HOLISTIC, MEDIAPIPE33
 from gsgan.view.drag import BODY, HANDLES, HEAD, NAMES, dragged, fabrik, position
 
 REST = np.array(MEDIAPIPE33.rest_positions)
@@ -57,3 +57,19 @@ def test_out_of_reach_is_straight():
     far = dragged(REST, "left wrist", np.array([9.0, 1.4, 0.0]))
     upper, lower = far[13] - far[11], far[15] - far[13]
     assert upper @ lower / np.linalg.norm(upper) / np.linalg.norm(lower) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("name", "joints"),
+    [("left wrist", [15, 19, *range(33, 54)]), ("head", [0, 7, *range(75, 105)])],
+)
+def test_hands_and_face_go_along(name, joints):
+    """The landmarks that skeletons with hands and a face have beside the 33."""
+    rest = np.array(HOLISTIC.rest_positions)
+    target = position(rest, name) + np.array([0.1, 0.2, 0.1])
+    moved = dragged(rest, name, target)
+    assert np.linalg.norm(moved[joints] - rest[joints], axis=-1).min() > 0.02
+    before, after = (np.linalg.norm(p[joints] - p[joints[0]], axis=-1) for p in (rest, moved))
+    np.testing.assert_allclose(after, before, atol=1e-9)
+    np.testing.assert_array_equal(moved[54:75], rest[54:75])
+    np.testing.assert_array_equal(moved[:33], dragged(rest[:33], name, target))

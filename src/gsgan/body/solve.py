@@ -18,12 +18,12 @@ from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
 from gsgan.body.rig import Rig, ancestors, build_rig
 from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
-from gsgan.skeleton import MEDIAPIPE33, bone_frames, sanitise
-from gsgan.skeleton.hands import HAND
+from gsgan.skeleton import MEDIAPIPE33, MEDIAPIPE33_HANDS, TEMPLATES, bone_frames, sanitise
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.tensors import constant
 
-BODY, ALL = len(MEDIAPIPE33.names), len(MEDIAPIPE33.names) + 2 * HAND
+BODY, ALL = len(MEDIAPIPE33.names), len(MEDIAPIPE33_HANDS.names)
+SIZES = [len(template.names) for template in TEMPLATES.values()]
 # Standard deviation of each number about the rest pose: wide where a joint turns freely, narrow
 # across hinges and where 33 landmarks do not see the turn.
 SPREAD = {
@@ -143,21 +143,21 @@ class Solver(nn.Module):
         Convention: joints that no seen landmark shows stay at rest, see `at_rest`.
 
         Args:
-            skeleton: ``[B, 33, 3]`` metres, world; or ``[B, 75, 3]`` with the 21 landmarks of the
-                left hand and of the right one. A hand that is not seen rests.
-            visibility: ``[B, 33]`` in [0, 1], a landmark's weight; those not finite count as 0. Or
-                ``[B, 75]``, where any above 0 counts alike for hands.
+            skeleton: ``[B, J, 3]`` metres, world: of a template. With 75 joints or more the fingers
+                follow the hands; a hand that is not seen rests. A face's landmarks are not used.
+            visibility: ``[B, J]`` in [0, 1], a landmark's weight; those not finite count as 0. Any
+                above 0 counts alike for hands.
 
         Raises:
             ValueError: on a wrong shape; with too few shoulders and hips (`sanitise`); where left
                 and right are swapped.
         """
-        hands, seen = skeleton[:, BODY:], visibility[:, BODY:]
-        if hands.shape[1] not in (0, 2 * HAND):
+        if skeleton.shape[1] not in SIZES:
             raise ValueError(
-                f"Solver: the skeleton must have {BODY} joints or {ALL} with hands, got "
+                f"Solver: the skeleton must have {', '.join(map(str, SIZES))} joints, got "
                 f"{skeleton.shape[1]}"
             )
+        hands, seen = skeleton[:, BODY:ALL], visibility[:, BODY:ALL]
         skeleton, visibility = skeleton[:, :BODY], visibility[:, :BODY]
         p, valid = sanitise(skeleton, visibility)
         refuse_swapped(p.detach(), valid)
@@ -189,7 +189,7 @@ class Solver(nn.Module):
 
     def at_rest(self, visibility: Tensor) -> Tensor:
         """``[B, joints]`` bool: joints that no seen landmark shows: `solve` leaves them at rest."""
-        seen, hands = (visibility > 0).split([BODY, visibility.shape[1] - BODY], dim=1)
+        seen, hands = visibility[:, :BODY] > 0, visibility[:, BODY:ALL] > 0
         shown = ((seen & self.known).to(self.prior) @ self.reaches.to(self.prior).mT) > 0
         shown[:, :6] = True
         moved = torch.zeros(len(visibility), self.parents, device=visibility.device)

@@ -16,6 +16,7 @@ from gsgan.check.hands import hand_findings
 from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
 from gsgan.data.formats.trust import spread
+from gsgan.data.skeletons import Landmarks
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.table import HEADERS, rows
 from gsgan.utils.errors import DataError
@@ -144,6 +145,11 @@ def _contents(m: Measured) -> Section:
         ("part labels", f"{labels} images" if labels else "none"),
         ("body poses", "none" if layout.poses is None else f"{len(layout.poses.theta)} frames"),
         ("skeleton", skeleton),
+        *(
+            (part, f"in {seen_in(held, frames)} of {len(frames)} frames")
+            for part, held in (("hands", layout.hands), ("face", layout.face))
+            if held is not None
+        ),
         *((f"split {name}", _split(data, name)) for name in splits.items),
     ]
     if data.protocol is not None:
@@ -154,6 +160,11 @@ def _contents(m: Measured) -> Section:
         tables=(Table(("what", "how much"), tuple(rows)),),
         findings=(*m.files, *_missing_images(subject)),
     )
+
+
+def seen_in(part: Landmarks, frames: list[int]) -> int:
+    """In how many frames hands or a face were seen, in whole or in part."""
+    return sum(bool((part.visibility[f] > 0).any()) for f in frames if f in part.visibility)
 
 
 def _split(data: GsganData, name: str) -> str:

@@ -22,14 +22,15 @@ from torch.utils.data import DataLoader, Dataset, Subset
 from gsgan.data.checks import Checks
 from gsgan.data.crop import PersonCrop
 from gsgan.data.dataset import CaptureDataset, Lens, PictureCache, StepSampler, pass_order
-from gsgan.data.formats.capture import CaptureReader
+from gsgan.data.formats.capture import FACES, HANDS, CaptureReader
 from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
 from gsgan.data.scene_info import SceneInfo, count_labels, scene_info
-from gsgan.data.skeletons import complete_skeletons
+from gsgan.data.skeletons import complete_skeletons, face_at_rest
 from gsgan.data.splits import SPLITS, Splits, make_splits, protocol_splits
 from gsgan.scene import Frame, cat
-from gsgan.skeleton import TEMPLATES
+from gsgan.skeleton import TEMPLATES, template_of
+from gsgan.skeleton.template import Vector
 from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.errors import ConfigError
 
@@ -67,7 +68,8 @@ class GsganData(LightningDataModule):
         body: ``file``, the poses that the dataset has, if any; ``fit``, those of `gsgan.fit`, which
             training runs where they are missing; ``auto``, the dataset's, else `gsgan.fit`'s;
             ``none``, no poses.
-        skeleton: ``mediapipe33``, or ``holistic`` with the hands of hands3d.npz: 75 joints.
+        skeleton: ``mediapipe33``; ``mediapipe33_hands``, with the hands of hands3d.npz: 75 joints;
+            or ``holistic``, also with the face of face3d.npz: 105 joints.
         protocol: the splits of a publication; None takes those of the dataset or the keys below.
         train_cameras, test_cameras, train_frames, test_frames, test_share: see `make_splits`.
         workers: loading processes; 0 loads in this one; None is 0 without a GPU, else up to
@@ -163,12 +165,17 @@ class GsganData(LightningDataModule):
     def layout(self) -> Layout:
         """The capture, read on first use."""
         layout = self.reader(self._folder(), self.checks, self.smpl)
-        if self.skeleton == "holistic":
-            if layout.hands is None:
+        skeleton = TEMPLATES[self.skeleton]
+        for wanted, held, file, other in (
+            (skeleton.palms, layout.hands, HANDS, "mediapipe33"),
+            (skeleton.expression, layout.face, FACES, "mediapipe33_hands"),
+        ):
+            if wanted and held is None:
                 raise ConfigError(
-                    f"data.skeleton=holistic needs a capture's hands3d.npz, which {layout.root} "
-                    "lacks; choose data.skeleton=mediapipe33"
+                    f"data.skeleton={self.skeleton} needs a capture's {file}, which {layout.root} "
+                    f"lacks; choose data.skeleton={other}"
                 )
+        if skeleton.palms:
             layout = replace(layout, meta=replace(layout.meta, skeleton=self.skeleton))
         poses = layout.poses
         if self.body == "none":
@@ -177,7 +184,7 @@ class GsganData(LightningDataModule):
             raise ConfigError(
                 f"data.body=fit, but {layout.root} has body poses of its own; choose data.body=file"
             )
-        if poses is not None and poses.fitted and self.skeleton == "holistic":
+        if poses is not None and poses.fitted and skeleton.palms:
             if poses.with_hands is None:
                 raise ConfigError(
                     f"{layout.root}: gsgan.fit made body_pose.npz without hands; run it again with "
@@ -216,11 +223,23 @@ class GsganData(LightningDataModule):
         return splits
 
     @property
+    def trained(self) -> list[int]:
+        """Frames of the training split, rising."""
+        return sorted({frame for _, frame in self.splits.items["train"]})
+
+    @cached_property
+    def face(self) -> tuple[Vector, ...] | None:
+        """The person's face at rest, see `face_at_rest`; None for skeletons without."""
+        if not TEMPLATES[self.skeleton].expression:
+            return None
+        assert self.layout.face is not None
+        return face_at_rest(self.layout.landmarks, self.layout.face, self.trained)
+
+    @property
     def registered_held_out(self) -> tuple[int, ...]:
         """Frames of held-out poses whose body `gsgan.fit` registered to their own masks."""
         poses, items = self.layout.poses, self.splits.items
-        trained = {frame for _, frame in items["train"]}
-        frames = {frame for _, frame in items["novel_pose"]} - trained
+        frames = {frame for _, frame in items["novel_pose"]} - {*self.trained}
         return tuple(sorted(frames & (poses.registered if poses else frozenset())))
 
     @cached_property
@@ -234,9 +253,10 @@ class GsganData(LightningDataModule):
             )
         # every process has its own, and training and validation start their own workers
         cache = PictureCache(int(self.cache_mb * 2**20) // (2 * self.workers + 1))
-        trained = sorted({frame for _, frame in splits.items["train"]})
-        hands = layout.hands if self.skeleton == "holistic" else None
-        skeletons = complete_skeletons(layout.landmarks, layout.frames, trained, hands)
+        template = template_of(self.skeleton, self.face)
+        skeletons = complete_skeletons(
+            layout.landmarks, layout.frames, self.trained, template, layout.hands, layout.face
+        )
         return {
             name: CaptureDataset(
                 layout, splits.items[name], self.size, self.crop, cache, self.lens, skeletons
@@ -274,7 +294,8 @@ class GsganData(LightningDataModule):
     def info(self) -> SceneInfo:
         """Facts about the scene from the training split, computed on first use."""
         train, *held_out = (self.dataset(name) for name in SPLITS)
-        return scene_info(self.layout, self.splits, train, self.info_samples, held_out)
+        found = scene_info(self.layout, self.splits, train, self.info_samples, held_out)
+        return replace(found, face=self.face)
 
     @property
     def eval_names(self) -> tuple[str, ...]:

@@ -91,6 +91,7 @@ class _Contents:
         labels: by camera and frame; empty without labels.
         landmarks: by frame.
         hands: 21 landmarks of the left hand and of the right one by frame, or None.
+        face: `gsgan.skeleton.face.FACE_NAMES` by frame, or None.
         poses: by frame, or None.
         pixels: how to decode the files.
         notes: one sentence for each conversion or omission.
@@ -104,6 +105,7 @@ class _Contents:
     labels: Index = field(default_factory=dict)
     landmarks: Landmarks
     hands: Landmarks | None = None
+    face: Landmarks | None = None
     poses: Poses | None = None
     pixels: PixelRules = field(default_factory=PixelRules)
     notes: tuple[str, ...] = ()
@@ -205,6 +207,7 @@ def assemble(found: Found, checks: Checks) -> Layout:
         labels=labels,
         landmarks=marks,
         hands=found.hands,
+        face=found.face,
         poses=found.poses,
         pixels=found.pixels,
         notes=tuple(notes),

@@ -22,6 +22,7 @@ from gsgan.data.skeletons import body_height
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
 from gsgan.scene import Frame
+from gsgan.skeleton.template import Vector
 from gsgan.utils.errors import DataError
 
 SOLID = 0.9  # of the mask: pixels at the outline are darkened by the black behind them
@@ -63,6 +64,8 @@ class SceneInfo:
         body_inside: share of the posed body that lies inside the masks of training images; None
             without a body pose or mesh.
         figure: the subject's proportions; None in checkpoints of older versions.
+        face: metres, the subject's face at rest in the head's frame, see `face_at_rest`; None for
+            skeletons without a face.
     """
 
     camera_names: tuple[str, ...]
@@ -93,6 +96,7 @@ class SceneInfo:
     darkest: float = 0.0
     body_inside: float | None = None
     figure: Figure | None = None
+    face: tuple[Vector, ...] | None = None
 
 
 def scene_info(

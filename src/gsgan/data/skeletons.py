@@ -13,8 +13,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.data.files import LARGEST_FRAME
-from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, limb_length_sum, sanitise
+from gsgan.skeleton import (
+    HOLISTIC,
+    MEDIAPIPE33,
+    SkeletonTemplate,
+    bone_frames,
+    in_head,
+    limb_length_sum,
+    sanitise,
+)
+from gsgan.skeleton.face import FACE
 from gsgan.skeleton.hands import HAND
+from gsgan.skeleton.template import HEAD, Vector
+from gsgan.skeleton.tensors import constants
 from gsgan.utils.errors import DataError
 
 Float = NDArray[np.float64]
@@ -47,11 +58,18 @@ class Landmarks:
 
     def with_hands(self, hands: Landmarks) -> Landmarks:
         """Skeletons of 75 joints; hands of frames that have none are not seen."""
-        nothing, unseen = np.zeros((2 * HAND, 3)), np.zeros(2 * HAND)
+        return self._beside(hands, 2 * HAND)
+
+    def with_face(self, face: Landmarks) -> Landmarks:
+        """Skeletons with 30 more joints; faces of frames that have none are not seen."""
+        return self._beside(face, FACE)
+
+    def _beside(self, part: Landmarks, joints: int) -> Landmarks:
+        nothing, unseen = np.zeros((joints, 3)), np.zeros(joints)
         return Landmarks(
-            {f: np.concatenate([p, hands.p.get(f, nothing)]) for f, p in self.p.items()},
+            {f: np.concatenate([p, part.p.get(f, nothing)]) for f, p in self.p.items()},
             {
-                f: np.concatenate([seen, hands.visibility.get(f, unseen)])
+                f: np.concatenate([seen, part.visibility.get(f, unseen)])
                 for f, seen in self.visibility.items()
             },
             self.source,
@@ -213,11 +231,34 @@ def body_height(p: Tensor, valid: Tensor) -> float:
     return float(limb_length_sum(p, valid).nanmedian())
 
 
+def face_at_rest(
+    landmarks: Landmarks, face: Landmarks, trained: Sequence[int]
+) -> tuple[Vector, ...]:
+    """Metres: a person's face without expression, see `gsgan.skeleton.in_head`.
+
+    Convention: medians over the training frames; a landmark that none has takes the template's.
+
+    Args:
+        landmarks: of the capture.
+        face: its faces.
+        trained: training frames.
+    """
+    p, seen = landmarks.with_face(face).joints(trained)
+    own = slice(len(MEDIAPIPE33.names), None)
+    body, valid = sanitise(p[:, : own.start], seen[:, : own.start])
+    local = in_head(p[:, own], body, bone_frames(body, valid).hubs[:, HEAD], MEDIAPIPE33)
+    found = local.masked_fill(~seen[:, own, None], torch.nan).nanmedian(0).values
+    usual = constants(HOLISTIC, found.device, found.dtype).face_rest
+    return tuple((x, y, z) for x, y, z in torch.where(found.isnan(), usual, found).tolist())
+
+
 def complete_skeletons(
     landmarks: Landmarks,
     frames: Sequence[int],
     trained: Sequence[int],
+    template: SkeletonTemplate = MEDIAPIPE33,
     hands: Landmarks | None = None,
+    face: Landmarks | None = None,
 ) -> Landmarks:
     """Every frame's joints, with estimates of those that were not seen.
 
@@ -228,10 +269,14 @@ def complete_skeletons(
         landmarks: of the capture.
         frames: to complete.
         trained: frames that set the body's height, which gives the length of missing bones.
-        hands: makes skeletons of 75 joints.
+        template: of the skeletons.
+        hands, face: of the capture, where the template has them.
     """
     height = body_height(*landmarks.joints(trained))
-    whole = landmarks if hands is None else landmarks.with_hands(hands)
-    template = MEDIAPIPE33 if hands is None else HOLISTIC
+    whole = landmarks
+    if template.palms and hands is not None:
+        whole = whole.with_hands(hands)
+    if template.expression and face is not None:
+        whole = whole.with_face(face)
     p, _ = sanitise(*whole.joints(frames), template, height)
     return replace(whole, p=dict(zip(frames, p.numpy(), strict=True)))

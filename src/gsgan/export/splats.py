@@ -19,7 +19,7 @@ from gsgan import __version__
 from gsgan.data.figure import upright
 from gsgan.model.avatar import Avatar
 from gsgan.scene import BodyPose, Gaussians
-from gsgan.skeleton import bone_frames, root_of
+from gsgan.skeleton import bone_frames, face_code, root_of
 from gsgan.skeleton.densify import even_sphere
 from gsgan.splat.sh import MAX_DEGREE, sh_basis
 from gsgan.utils.errors import ConfigError
@@ -62,8 +62,8 @@ def splats_of(avatar: Avatar, p: Tensor, valid: Tensor, body: BodyPose | None) -
 
     Args:
         avatar: with Gaussians.
-        p: ``[1, 33, 3]`` metres, finite.
-        valid: ``[1, 33]``.
+        p: ``[1, J, 3]`` metres, finite.
+        valid: ``[1, J]``.
         body: the pose of the skinned body, if the avatar needs it.
 
     Raises:
@@ -98,7 +98,9 @@ def _posed(
     frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
     points = avatar.points(p, valid, frames, body)
     root = root_of(p)
-    residuals = psi.residuals(points, psi.pose_code(p, root, frames.hubs[:, 0], None), root)
+    face = face_code(p, frames, avatar.template)
+    code = psi.pose_code(p, root, frames.hubs[:, 0], None, face)
+    residuals = psi.residuals(points, code, root)
     return psi.compose(points, residuals, eye), residuals.sh, points.frames
 
 

@@ -35,7 +35,7 @@ from gsgan.fit.moments import Moments
 from gsgan.prepare.pictures import sampled
 from gsgan.prepare.work import progress, write_json, write_npz, writing
 from gsgan.scene import BodyPose, Frame
-from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton import MEDIAPIPE33, TEMPLATES
 from gsgan.splat import accuracy
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
@@ -205,7 +205,7 @@ def _solve(
     data: GsganData, shape: BodyShape, frames: Sequence[int], hands: bool | None = None
 ) -> BodyPose:
     """Poses by skeletons with or without hands; None: as ``data.skeleton`` says."""
-    hands = data.skeleton == "holistic" if hands is None else hands
+    hands = bool(TEMPLATES[data.skeleton].palms) if hands is None else hands
     try:
         with torch.no_grad():
             return Solver(shaped_body(shape)).solve(*_joints(data, frames, hands))

@@ -24,7 +24,7 @@ from gsgan.model.generator import Generator
 from gsgan.model.painting import ColourCorrection
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
-from gsgan.skeleton import TEMPLATES, Densify
+from gsgan.skeleton import Densify, template_of
 from gsgan.splat import BACKENDS, Accuracy
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
@@ -113,8 +113,8 @@ def assemble_avatar(
         ValueError: on parts that do not go together.
     """
     one_of("model.backend", backend, BACKENDS)
-    template = TEMPLATES[scene.skeleton]
-    paper22 = densify is None or densify.template is template
+    template = template_of(scene.skeleton, scene.face)
+    paper22 = densify is None or densify.template.limbs == template.limbs
     for wrong, message in (
         (not paper22 and options.get("twist", "none") != "none", "twist=hinge needs limbs=paper22"),
         ((deformation is None) != (densify is None), "densify and deformation go together"),

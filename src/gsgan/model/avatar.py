@@ -28,6 +28,7 @@ from gsgan.skeleton import (
     bone_frames,
     complete_skeleton,
     draw_skeleton,
+    face_code,
     omega,
     root_of,
 )
@@ -174,8 +175,8 @@ class Avatar(nn.Module):
 
         Args:
             skeleton: ``[J, 3]`` or ``[B, J, 3]`` metres, world frame; NaN for joints not seen. An
-                avatar with hands takes skeletons without: they are not seen; one without leaves
-                hands out.
+                avatar with hands and face takes skeletons without: they are not seen. One without
+                leaves them out.
             camera: B cameras, or one for all.
             visibility: ``[J]`` or ``[B, J]`` in [0, 1]; 0 marks a stand-in; None: all seen.
             body: B poses of the skinned body; None: solved from the skeleton where it is needed.
@@ -221,7 +222,7 @@ class Avatar(nn.Module):
             visibility: ``[B, J]`` in [0, 1]; 0 marks a stand-in.
             camera: B cameras.
             body: pose of the skinned body; see `needs_body` and `body_pose`.
-            pose_noise: ``[B, J, 3]`` body heights, added to Ψ's pose code (training only).
+            pose_noise: ``[B, J, 3]`` added to Ψ's pose code, in its units (training only).
             paint: False stops after F (Step I needs no more).
             supersample: False draws F once per pixel, whatever ``accuracy`` says.
             detach_features: keep Step II's gradient out of Ψ.
@@ -303,9 +304,9 @@ class Avatar(nn.Module):
             return None
         points = self.points(p, valid, frames, body)
         with self.stage("Ψ"):
-            return self.deformation(  # Sec. 3.3: Ĝ = G + Ψ(p)
-                p, points, camera.centre, frames.hubs[:, 0], pose_noise
-            )
+            face = face_code(p, frames, self.template)
+            given = points, camera.centre, frames.hubs[:, 0], pose_noise, face
+            return self.deformation(p, *given)  # Sec. 3.3: Ĝ = G + Ψ(p)
 
     def points(self, p: Tensor, valid: Tensor, frames: BoneFrames, body: BodyPose | None) -> Points:
         """G: Alg. 1's points, or points on the body's surface where that effect is on."""
@@ -384,10 +385,12 @@ class Avatar(nn.Module):
     def pose_inputs(
         self, p: Tensor, valid: Tensor, frames: BoneFrames, camera: Camera
     ) -> tuple[Tensor, Tensor]:
-        """Ω ``[B, J, 6]``, and the root-centred joints in camera axes, in body heights."""
+        """Ω ``[B, J, 6]``; root-centred joints in camera axes, in body heights, and `face_code`."""
         with self.stage("Ω"):
             root = root_of(p, self.template).unsqueeze(1)
             in_camera = (p - root) @ camera.R.mT / self.body_height
+            if (face := face_code(p, frames, self.template)) is not None:
+                in_camera = torch.cat([in_camera[:, : -face.shape[1]], face], dim=1)
             return omega(p, valid, camera.R, self.template, frames=frames), in_camera
 
 

@@ -217,18 +217,29 @@ class Deformation(nn.Module):
         opacities = torch.sigmoid(logits) * points.valid.to(logits.dtype)
         return means, axes @ axes.mT, opacities
 
-    def pose_code(self, p: Tensor, root: Tensor, pelvis: Tensor, noise: Tensor | None) -> Tensor:
+    def pose_code(
+        self,
+        p: Tensor,
+        root: Tensor,
+        pelvis: Tensor,
+        noise: Tensor | None,
+        face: Tensor | None = None,
+    ) -> Tensor:
         """``[B, 3 J]``: joints about the root, in body heights, noise added when given.
 
         Args:
             p: ``[B, J, 3]`` metres.
             root: ``[B, 3]`` metres.
             pelvis: ``[B, 3, 3]`` the pelvis frame (columns are its axes).
-            noise: ``[B, J, 3]`` body heights, or None.
+            noise: ``[B, J, 3]`` in the code's units, or None.
+            face: ``[B, E, 3]`` in place of the last E joints: in body heights, in the world's axes,
+                an expression would be a hundredth of the code. None: E is 0.
         """
         code = (p - root[:, None]) / self.body_height
         if self.pose_frame == "pelvis":
             code = code @ pelvis
+        if face is not None:
+            code = torch.cat([code[:, : -face.shape[1]], face], dim=1)
         if noise is not None:
             code = code + noise
         return code.flatten(1)
@@ -240,10 +251,11 @@ class Deformation(nn.Module):
         eye: Tensor,
         pelvis: Tensor,
         noise: Tensor | None = None,
+        face: Tensor | None = None,
     ) -> Gaussians:
         """Ĝ for joints ``p`` ``[B, J, 3]``, seen from ``eye`` ``[B, 3]`` (both world, metres)."""
         root = root_of(p)
-        residuals = self.residuals(points, self.pose_code(p, root, pelvis, noise), root)
+        residuals = self.residuals(points, self.pose_code(p, root, pelvis, noise, face), root)
         return self.compose(points, residuals, eye)
 
 

@@ -308,7 +308,7 @@ def rest_pose(figure: Figure) -> Drive:
 
 def joints_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor]:
     """Joints ``[1, J, 3]`` of frame i, metres, finite, and their visibility ``[1, J]``; 0 marks a
-    stand-in. J is 33, or 75 for an avatar with hands. Both are on the avatar's device.
+    stand-in. J is that of the avatar's skeleton. Both are on the avatar's device.
 
     Raises:
         ValueError: when fewer than three of shoulders and hips are known.

@@ -2,8 +2,15 @@
 
 from gsgan.skeleton.densify import Densify, Points
 from gsgan.skeleton.draw import draw_skeleton
+from gsgan.skeleton.face import face_code, in_head
 from gsgan.skeleton.frames import BoneFrames, bone_frames, omega, root_of
-from gsgan.skeleton.holistic import HOLISTIC, TEMPLATES, named_template
+from gsgan.skeleton.holistic import (
+    HOLISTIC,
+    MEDIAPIPE33_HANDS,
+    TEMPLATES,
+    named_template,
+    template_of,
+)
 from gsgan.skeleton.rotation6d import rotation_from_6d, rotation_to_6d
 from gsgan.skeleton.sanitise import complete_skeleton, limb_length_sum, recentre, sanitise
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
@@ -11,6 +18,7 @@ from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
 __all__ = [
     "HOLISTIC",
     "MEDIAPIPE33",
+    "MEDIAPIPE33_HANDS",
     "TEMPLATES",
     "BoneFrames",
     "Densify",
@@ -19,6 +27,8 @@ __all__ = [
     "bone_frames",
     "complete_skeleton",
     "draw_skeleton",
+    "face_code",
+    "in_head",
     "limb_length_sum",
     "named_template",
     "omega",
@@ -27,4 +37,5 @@ __all__ = [
     "rotation_from_6d",
     "rotation_to_6d",
     "sanitise",
+    "template_of",
 ]

@@ -15,7 +15,9 @@ from typing import Literal
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
+from gsgan.skeleton.face import face_code
 from gsgan.skeleton.hands import palm_frames
 from gsgan.skeleton.rotation6d import across, rotation_from_6d, rotation_to_6d, unit
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, SkeletonTemplate
@@ -241,8 +243,8 @@ def omega(
     Convention: joint j has the rotation of the bone that ends at j relative to its parent's
     frame. Hips have the pelvis and shoulders the chest, in camera axes, so that the code depends on
     the viewpoint; the nose has the head relative to the chest, the other face joints the swing of
-    their line from the middle of the ears. All but hips and shoulders are invariant to rigid
-    motions.
+    their line from the middle of the ears. A face's landmarks have their `face_code`, then zeros,
+    in place of a rotation. All but hips and shoulders are invariant to rigid motions.
 
     Args:
         p: ``[B, J, 3]`` finite joints, metres, world frame.
@@ -277,4 +279,6 @@ def omega(
     d = d * d.square().sum(-1, keepdim=True).clamp_min(min_length**2).rsqrt()
     face = c.face_swing.to(d @ head)
     rotations = torch.cat([pelvis_chest, (chest.mT @ head).unsqueeze(1), face, f.local], dim=1)
-    return rotation_to_6d(rotations.index_select(1, c.omega_order))
+    code = rotation_to_6d(rotations.index_select(1, c.omega_order))
+    offsets = face_code(p, f, template)
+    return code if offsets is None else torch.cat([code, pad(offsets, (0, 3))], dim=1)

@@ -1,15 +1,24 @@
-"""The skeleton with hands: MediaPipe's 33 pose landmarks, then 21 of the left and right hand.
+"""Skeletons with hands and face: MediaPipe's 33 pose landmarks, 21 of each hand, 30 of the face.
 
 Convention: as in `gsgan.skeleton.template`. Constants only.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
+from gsgan.skeleton.face import (
+    FACE,
+    FACE_NAMES,
+    face_groups,
+    face_links,
+    face_mirror,
+    rest_face,
+)
 from gsgan.skeleton.hands import (
     FINGER_NAMES,
     FINGERS,
@@ -78,7 +87,7 @@ def _hand_at_rest() -> np.ndarray:
     return p
 
 
-def _holistic() -> SkeletonTemplate:
+def _with_hands() -> SkeletonTemplate:
     limbs, parents, directions = list(POSE.limbs), [], list(POSE.rest_directions)
     parents = [p if p < N_HUBS else p + len(STARTS) for p in POSE.limb_parents]
     groups = []
@@ -119,11 +128,40 @@ def _holistic() -> SkeletonTemplate:
     )
 
 
-HOLISTIC = _holistic()
+def _with_face(hands: SkeletonTemplate) -> SkeletonTemplate:
+    start = len(hands.names)
+    groups = face_groups(start)
+    edges = tuple(edge for _, group in groups for edge in group)
+    return replace(
+        hands,
+        names=(*hands.names, *FACE_NAMES),
+        edges=(*hands.edges, *edges),
+        rest_positions=(*hands.rest_positions, *rest_face()),
+        mirror=(*hands.mirror, *face_mirror(start)),
+        draw_groups=(*hands.draw_groups, *groups),
+        gnn_edges=(*hands.gnn_edges, *edges, *face_links(start)),
+        expression=tuple(range(start, start + FACE)),
+    )
+
+
+MEDIAPIPE33_HANDS = _with_hands()
 """75 joints, 77 edges, 64 limbs: 40 bones of hands, and two forearms to the hands' own wrists."""
 
-TEMPLATES = {"mediapipe33": MEDIAPIPE33, "holistic": HOLISTIC}
-"""By the name that ``data.skeleton`` has."""
+HOLISTIC = _with_face(MEDIAPIPE33_HANDS)
+"""105 joints, 105 edges: also lips, brows and lids, which have no limbs."""
+
+TEMPLATES = {
+    "mediapipe33": MEDIAPIPE33,
+    "mediapipe33_hands": MEDIAPIPE33_HANDS,
+    "holistic": HOLISTIC,
+}
+"""By the name that ``data.skeleton`` has; the joints of each are the first ones of the next."""
+
+
+def template_of(skeleton: str, face: Sequence[Vector] | None) -> SkeletonTemplate:
+    """A template by its name, with a person's own face at rest where there is one."""
+    template = TEMPLATES[skeleton]
+    return template if face is None else template.with_face(face)
 
 
 def named_template(template: SkeletonTemplate | str) -> SkeletonTemplate:

@@ -10,11 +10,11 @@ from torch.nn.functional import pad
 
 from gsgan.scene import Camera
 from gsgan.skeleton.frames import bone_frames
-from gsgan.skeleton.holistic import HOLISTIC
+from gsgan.skeleton.holistic import TEMPLATES
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, SkeletonTemplate
 from gsgan.skeleton.tensors import check_skeleton, constants
 
-WITH_AND_WITHOUT = {len(t.names) for t in (MEDIAPIPE33, HOLISTIC)}
+SIZES = {len(t.names) for t in TEMPLATES.values()}
 MIN_TRUNK_JOINTS = 3
 """Of the two shoulders and two hips: with fewer the trunk's frame is undefined."""
 
@@ -64,10 +64,10 @@ def sanitise(
 
     Convention: metres, world frame. A joint is unseen when a coordinate is NaN or infinite or its
     visibility is not above ``min_visibility``. One missing shoulder or hip is completed from the
-    other three; two unseen hips keep finite positions, as estimates; a face joint is placed by the
-    head's frame; any other joint at the end of its rest bone in its parent's frame. Filled-in
-    joints move with the seen ones and pass gradients to them. Seen joints are returned unchanged.
-    The check costs one device synchronisation.
+    other three; two unseen hips keep finite positions, as estimates; a joint or landmark of the
+    face is placed by the head's frame; any other joint at the end of its rest bone in its parent's
+    frame. Filled-in joints move with the seen ones and pass gradients to them. Seen joints are
+    returned unchanged. The check costs one device synchronisation.
 
     Args:
         p: ``[B, J, 3]``.
@@ -108,7 +108,8 @@ def complete_skeleton(
 ) -> tuple[Tensor, Tensor]:
     """Joints ``[B, J, 3]`` of a template, finite, and their visibility ``[B, J]``, 0 for stand-ins.
 
-    Convention: hands that a skeleton lacks are not seen; those a template lacks are left out.
+    Convention: hands and a face that a skeleton lacks are not seen; those a template lacks are left
+    out.
 
     Args:
         skeleton: ``[J, 3]`` or ``[B, J, 3]`` metres; NaN for joints not seen.
@@ -122,7 +123,7 @@ def complete_skeleton(
     p = skeleton.reshape(-1, *skeleton.shape[-2:]).to(torch.float32)
     shown = torch.ones_like(p[..., 0]) if visibility is None else visibility.to(p)
     shown = shown.reshape(-1, shown.shape[-1])
-    if (found := p.shape[1]) != J and {found, J} == WITH_AND_WITHOUT:
+    if (found := p.shape[1]) != J and {found, J} <= SIZES:
         missing = (0, max(J - found, 0))
         p = pad(p[:, :J], (0, 0, *missing), value=torch.nan)
         shown = pad(shown[:, :J], missing)
@@ -231,7 +232,8 @@ def _complete_trunk(q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: 
 def _complete_face(
     q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: Tensor, scale: Tensor
 ) -> Tensor:
-    """Unseen face joints: the rest face aligned with the seen ones, else with the shoulders."""
+    """Unseen face joints: the rest face aligned with the seen ones, else with the shoulders. Then
+    unseen landmarks of lips, brows and lids, at rest, in metres: they are the subject's own."""
     hubs = bone_frames(q, valid, template).hubs
     face = torch.tensor(template.face, device=q.device)
     seen = valid[:, face].to(q.dtype).unsqueeze(-1)
@@ -242,4 +244,7 @@ def _complete_face(
     at_rest = torch.where(anchored, (rest[face] * weight).sum(1), rest[shoulders].mean(0))
     R = torch.where(anchored.unsqueeze(-1), hubs[:, HEAD], hubs[:, CHEST])
     offset = (rest[face] - at_rest.unsqueeze(1)) @ R.mT
-    return _put(q, valid, face, now.unsqueeze(1) + offset * scale[:, None, None])
+    q = _put(q, valid, face, now.unsqueeze(1) + offset * scale[:, None, None])
+    c = constants(template, q.device, q.dtype)
+    centre = q.index_select(1, c.head_points).mean(1, keepdim=True)
+    return _put(q, valid, c.expression, centre + c.face_rest @ hubs[:, HEAD].mT)

@@ -6,6 +6,7 @@ metres. Left and right are the person's.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,11 +54,17 @@ class SkeletonTemplate:
     palms: tuple[tuple[int, int, int], ...] = ()  # wrist, index's and little finger's knuckles
     fingers: tuple[int, ...] = ()  # limbs that are bones of hands
     bare: tuple[int, ...] = ()  # limbs without a cylinder: another limb lies there
+    expression: tuple[int, ...] = ()  # the last joints: landmarks of a face, which rest on the head
 
     @property
     def torso(self) -> tuple[int, int, int, int]:
         """The joints of the trunk: left and right shoulder, left and right hip."""
         return (*self.shoulders, *self.hips)
+
+    @property
+    def head(self) -> tuple[int, ...]:
+        """Joints that turn and move with the head alone: left and right ear and eye, the nose."""
+        return (*self.ears, *self.eyes, self.nose)
 
     @property
     def n_hubs(self) -> int:
@@ -106,6 +113,13 @@ class SkeletonTemplate:
         l_sh, r_sh, l_hip, r_hip = np.asarray(self.rest_positions)[list(self.torso)]
         width = float(max(np.linalg.norm(l_sh - r_sh), np.linalg.norm(l_hip - r_hip)))
         return width, float(np.linalg.norm((l_sh + r_sh - l_hip - r_hip) / 2)), width / 2
+
+    def with_face(self, at_rest: Sequence[Vector]) -> SkeletonTemplate:
+        """The same skeleton with another person's face at rest, as of `gsgan.skeleton.in_head`."""
+        rest = np.asarray(self.rest_positions)
+        moved = np.asarray(at_rest) + rest[list(self.head)].mean(0)
+        kept = self.rest_positions[: -len(self.expression)]
+        return replace(self, rest_positions=(*kept, *((x, y, z) for x, y, z in moved.tolist())))
 
     def with_torso_limbs(self) -> SkeletonTemplate:
         """The same skeleton with a cylinder on the four trunk edges too (``all26``)."""

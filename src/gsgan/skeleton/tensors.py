@@ -78,7 +78,9 @@ class Constants(NamedTuple):
     fingers: Tensor  # limbs that are bones of hands
     face_turned: Tensor  # [F] face joints but the nose
     face_swing: Swing
-    omega_order: Tensor  # [J] into pelvis, chest, head, face, limbs
+    expression: Tensor  # [E] landmarks of a face
+    face_rest: Tensor  # [E, 3] metres, from the middle of the head's points
+    omega_order: Tensor  # [J - E] into pelvis, chest, head, face, limbs
     axes: Tensor  # [3, 3] world axes
 
 
@@ -152,14 +154,16 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
         levels=tuple(levels),
         limb_order=index([sorted_limbs.index(limb) for limb in range(len(t.limbs))]),
         head_from_eyes=cast(eye_frame.mT.contiguous()),
-        head_points=index([*t.ears, *t.eyes, t.nose]),
+        head_points=index(t.head),
         torso=index(t.torso),
         palms=index([joint for palm in t.palms for joint in palm]),
         measured=index(t.measured),
         fingers=index(t.fingers),
         face_turned=index(turned),
         face_swing=swing(from_ears / from_ears.norm(dim=-1, keepdim=True)),
-        omega_order=index([place[joint] for joint in range(len(t.names))]),
+        expression=index(t.expression),
+        face_rest=cast(rest[list(t.expression)] - rest[list(t.head)].mean(0)),
+        omega_order=index([place[j] for j in range(len(t.names)) if j not in t.expression]),
         axes=cast(eye),
     )
 

@@ -8,8 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.figure import FACE, FEET, HANDS, HIPS, SHOULDERS, middle
+from gsgan.data.joints import LEFT, RIGHT
 from gsgan.data.synthetic.character import unit
 from gsgan.data.synthetic.retarget import between
+from gsgan.skeleton import HOLISTIC
 
 Float = NDArray[np.float64]
 
@@ -32,13 +34,16 @@ class Handle:
     moved: tuple[int, ...] = ()
 
 
-SIDES = (("left", 11, 13, 15, 23, 25, 27), ("right", 12, 14, 16, 24, 26, 28))
+SIDES = (
+    ("left", 11, 13, 15, 23, 25, 27, range(LEFT.start, LEFT.stop)),
+    ("right", 12, 14, 16, 24, 26, 28, range(RIGHT.start, RIGHT.stop)),
+)
 HANDLES = {
     f"{side} {name}": handle
-    for side, shoulder, elbow, wrist, hip, knee, ankle in SIDES
+    for side, shoulder, elbow, wrist, hip, knee, ankle, hand in SIDES
     for name, handle in {
-        "wrist": Handle((shoulder, elbow, wrist), turned=HANDS[wrist]),
-        "elbow": Handle((shoulder, elbow), moved=(wrist, *HANDS[wrist])),
+        "wrist": Handle((shoulder, elbow, wrist), turned=(*HANDS[wrist], *hand)),
+        "elbow": Handle((shoulder, elbow), moved=(wrist, *HANDS[wrist], *hand)),
         "ankle": Handle((hip, knee, ankle), turned=FEET[ankle]),
         "knee": Handle((hip, knee), moved=(ankle, *FEET[ankle])),
     }.items()
@@ -47,8 +52,13 @@ NOSE, HEAD, BODY = 0, "head", "body"
 NAMES = (*HANDLES, HEAD, BODY)
 
 
+def _of(p: Float, joints: tuple[int, ...]) -> list[int]:
+    """Those of the joints that a pose ``[J, 3]`` has."""
+    return [j for j in joints if j < len(p)]
+
+
 def position(p: Float, name: str) -> Float:
-    """``[3]`` metres: the position of a handle in a pose ``[33, 3]``."""
+    """``[3]`` metres: the position of a handle in a pose ``[J, 3]``."""
     if name == BODY:
         return middle(p, HIPS)
     return np.asarray(p[NOSE if name == HEAD else HANDLES[name].chain[-1]])
@@ -58,10 +68,10 @@ def dragged(p: Float, name: str, target: Float) -> Float:
     """The pose with a handle at ``target``, or as near as the bones reach.
 
     Limbs bend by FABRIK from shoulder or hip; hands and feet rotate with the last bone. The head
-    rotates about the neck. The body moves as a whole.
+    rotates about the neck with its face. The body moves as a whole.
 
     Args:
-        p: ``[33, 3]`` metres, finite.
+        p: ``[J, 3]`` metres, finite; 33 joints, 75 with hands or 105 with a face.
         name: of ``NAMES``.
         target: ``[3]`` metres.
 
@@ -73,14 +83,15 @@ def dragged(p: Float, name: str, target: Float) -> Float:
     if name == HEAD:
         neck = middle(p, SHOULDERS)
         turn = between(p[NOSE] - neck, target - neck)
-        q[list(FACE)] = neck + (p[list(FACE)] - neck) @ turn.T
+        face = _of(p, (*FACE, *HOLISTIC.expression))
+        q[face] = neck + (p[face] - neck) @ turn.T
         return q
     handle = HANDLES[name]
     chain = list(handle.chain)
     q[chain] = fabrik(p[chain], target)
     before, end = chain[-2:]
     turn = between(p[end] - p[before], q[end] - q[before])
-    turned, moved = list(handle.turned), list(handle.moved)
+    turned, moved = _of(p, handle.turned), _of(p, handle.moved)
     q[turned] = q[end] + (p[turned] - p[end]) @ turn.T
     q[moved] += q[end] - p[end]
     return q

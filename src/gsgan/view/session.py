@@ -186,17 +186,20 @@ class Session:
         self.touch()
 
     def joints(self) -> Float:
-        """``[33, 3]`` metres, finite: the current pose."""
+        """``[J, 3]`` metres, finite: the current pose, J the joints that the motion has."""
         if self.pose is not None:
             return self.pose
-        p, _ = joints_of(self.show.avatar, self._current(), 0)
-        return np.asarray(p[0].cpu().numpy(), np.float64)
+        current = self._current()
+        p, _ = joints_of(self.show.avatar, current, 0)
+        return np.asarray(p[0, : current.p.shape[1]].cpu().numpy(), np.float64)
 
     def _current(self) -> Drive:
         """The current pose, as a motion of one frame."""
         drive, pose = self.drive, self.pose  # another thread may load a shorter motion
         drive = drive.rows(np.array([self.frame % len(drive.p)]))
-        return drive if pose is None else replace(drive, p=pose[None], body=None)
+        if pose is None:
+            return drive
+        return replace(drive, p=pose[None], visibility=drive.visibility[:, : len(pose)], body=None)
 
     # -- painting
 

@@ -8,6 +8,7 @@
     labels/{camera}/%06d.png            optional part numbers, 255 = ignore
     landmarks3d.npz   p (F,33,3) NaN = missing, conf (F,33), frame_id (F,)
     hands3d.npz       optional, the same (F,42,3): MediaPipe's 21 of the left hand, then the right
+    face3d.npz        optional, the same (F,30,3), names (30,): lips, brows and lids
     body_pose.npz     optional theta (F,bones,3), transl (F,3), frame_id (F,); betas (S,) of SMPL
                       by gsgan.fit also theta_hands (F,56,3), with the fingers of hands3d.npz
     body_shape.npz    optional coefficients (K,), stretch (8,), offsets (33,3): of the free body, by
@@ -40,12 +41,13 @@ from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, dataset_folder
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import SKELETONS, Landmarks, Poses, make_landmarks, whole_frame_ids
+from gsgan.skeleton.face import FACE, FACE_NAMES
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
 
-LANDMARKS, HANDS = "landmarks3d.npz", "hands3d.npz"
+LANDMARKS, HANDS, FACES = "landmarks3d.npz", "hands3d.npz", "face3d.npz"
 POSES, SHAPE = "body_pose.npz", "body_shape.npz"
 MASKS = (".png",)
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
@@ -107,6 +109,10 @@ def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -
     hands = None
     if (root / HANDS).exists():
         hands = _read_landmarks(root / HANDS, 2 * HAND, conventions, checks, notes)
+    face = None
+    if (root / FACES).exists():
+        face = _read_landmarks(root / FACES, FACE, conventions, checks, notes)
+        _refuse_other_names(root / FACES)
     poses = None
     if (root / POSES).exists():
         poses, meta = _read_poses(root, meta, conventions)
@@ -120,6 +126,7 @@ def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -
         labels={c: frame_files(root, f"labels/{c}", MASKS) for c in cameras},
         landmarks=skeletons,
         hands=hands,
+        face=face,
         poses=poses,
         pixels=PixelRules(composed=conventions.composed, unsure_band=reader.ignore_band),
         calibration=root / "cameras.json",
@@ -177,7 +184,7 @@ def _index_images(root: Path, cameras: Mapping[str, CameraEntry]) -> dict[str, d
 def _read_landmarks(
     path: Path, joints: int, conventions: Conventions, checks: Checks, notes: list[str]
 ) -> Landmarks:
-    """Skeletons, or hands, of every frame."""
+    """Skeletons, hands or faces of every frame."""
     arrays = read_arrays(path, ("p", "conf", "frame_id"))
     p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64) * conventions.scale
     ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(p),), path), str(path))
@@ -185,6 +192,16 @@ def _read_landmarks(
     if "conf" in arrays:
         conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
     return make_landmarks(ids, p, conf, checks.max_reach, notes, path.name)
+
+
+def _refuse_other_names(path: Path) -> None:
+    """Detectors have hundreds of a face's landmarks: 30 others would be taken for these."""
+    names = read_arrays(path, ("names",)).get("names")
+    if names is not None and tuple(map(str, names.tolist())) != FACE_NAMES:
+        raise DataError(
+            f"{path}: 'names' must be those of gsgan.skeleton.face.FACE_NAMES, from "
+            f"{FACE_NAMES[0]} to {FACE_NAMES[-1]}; write these 30 landmarks in that order"
+        )
 
 
 def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:

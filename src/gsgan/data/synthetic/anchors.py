@@ -11,6 +11,7 @@ from gsgan.data.synthetic.character import Array, Character, Ints, unit
 from gsgan.data.synthetic.humanoid import FINGERS, SIDES
 from gsgan.data.synthetic.parts import LABEL_NAMES, texture_lab
 from gsgan.data.synthetic.trace import Tracer
+from gsgan.skeleton.face import BROW_POINTS, FACE_NAMES, LIP_POINTS
 
 JOINTS = {"shoulder": "Arm", "elbow": "ForeArm", "wrist": "Hand", "hip": "UpLeg", "knee": "Leg",
           "ankle": "Foot", "thumb": "HandThumb2", "index": "HandIndex1",
@@ -20,17 +21,6 @@ THUMB = ("cmc", "mcp", "ip", "tip")
 # Thumb to pinky: first joint, step to the next, offset to the thumb's side, in hand lengths.
 ABSENT_FINGERS = ((0.2, 0.13, 0.35), (0.5, 0.15, 0.18), (0.5, 0.17, 0.05), (0.5, 0.15, -0.08),
                   (0.45, 0.13, -0.2))  # fmt: skip
-LIP_POINTS = 12  # round the outer edge: 0 left corner, 3 top, 6 right corner, 9 bottom
-BROW_POINTS = 5  # from the nose outwards
-FACE_NAMES = (
-    *(f"mouth_outer_{k}" for k in range(LIP_POINTS)),
-    *(f"{side}_brow_{k}" for side in ("left", "right") for k in range(BROW_POINTS)),
-    *(
-        f"{side}_lid_{k}"
-        for side in ("left", "right")
-        for k in ("inner", "upper", "outer", "lower")
-    ),
-)
 STEP = 0.0005  # metres between the rays that look at the face
 Anchors = dict[str, tuple[int, int]]  # landmark → joint and vertex, one of them -1
 

@@ -9,8 +9,8 @@ from skeleton_poses import assert_rotation, camera, rotation
 from torch import Tensor
 
 from gsgan.skeleton import (
-    HOLISTIC,
     MEDIAPIPE33,
+    MEDIAPIPE33_HANDS,
     Densify,
     bone_frames,
     complete_skeleton,
@@ -24,7 +24,7 @@ from gsgan.skeleton.hands import HAND, PALM, palm_frames
 from gsgan.skeleton.template import N_HUBS
 from gsgan.utils.errors import ConfigError
 
-F64, T = torch.float64, HOLISTIC
+F64, T = torch.float64, MEDIAPIPE33_HANDS
 REST = torch.tensor(T.rest_positions, dtype=F64)[None]
 HANDS = (slice(33, 33 + HAND), slice(33 + HAND, 33 + 2 * HAND))
 NAN = float("nan")
@@ -45,15 +45,13 @@ def test_counts() -> None:
     assert [len(T.fingers), len(T.bare), len(T.measured)] == [40, 2, 22]
     assert len(T.draw_groups) == 18  # eight of the body, ten fingers
     assert sorted(set(range(75)) - set(T.incoming)) == [*range(13), 23, 24]
-    assert named_template("holistic") is T
+    assert named_template("mediapipe33_hands") is T
     with pytest.raises(ConfigError, match=r"data.skeleton must be one of .*got 'hands'"):
         named_template("hands")
 
 
-def test_the_rest_pose_has_hands_that_mirror_each_other() -> None:
-    rest, mirror = np.asarray(T.rest_positions), list(T.mirror)
-    np.testing.assert_allclose(rest[mirror] * [-1, 1, 1], rest)
-    assert [mirror[m] for m in mirror] == list(range(75))
+def test_the_rest_pose_has_hands() -> None:
+    rest = np.asarray(T.rest_positions)
     for hand, (wrist, index, pinky, thumb) in zip(
         HANDS, ((15, 19, 17, 21), (16, 20, 18, 22)), strict=True
     ):  # the pose's own landmarks of the hand are those of the hand
@@ -157,7 +155,7 @@ def test_skeletons_without_hands_drive_a_template_that_has_some_and_the_reverse(
 
 
 def test_points_lie_on_thin_cylinders_along_the_fingers() -> None:
-    d, p = Densify("holistic", dtype=F64), noisy(5, 0.003)
+    d, p = Densify("mediapipe33_hands", dtype=F64), noisy(5, 0.003)
     points, lengths = d(p), bone_frames(p, None, T).lengths[0]
     assert d.n_points == 5400 + 40 * 60
     assert d.part_id.bincount(minlength=66)[list(T.bare)].tolist() == [0, 0]
@@ -173,7 +171,7 @@ def test_points_lie_on_thin_cylinders_along_the_fingers() -> None:
     torch.testing.assert_close(points.means[:, :4400], body.means[:, :4400])
     torch.testing.assert_close(points.means[:, -1000:], body.means[:, -1000:])
     torch.testing.assert_close(points.scales[:, -1000:], body.scales[:, -1000:])
-    all26 = Densify("holistic", limbs="all26", dtype=F64)
+    all26 = Densify("mediapipe33_hands", limbs="all26", dtype=F64)
     assert all26.n_points == d.n_points + 800
 
 
@@ -181,7 +179,7 @@ def test_points_of_a_missing_hand_are_not_seen() -> None:
     p = REST.clone()
     p[:, HANDS[0]] = NAN
     q, valid = sanitise(p, None, T)
-    d = Densify("holistic", dtype=F64)
+    d = Densify("mediapipe33_hands", dtype=F64)
     seen = d(q, valid).valid[0]
     left = torch.isin(d.part_id, torch.tensor(T.fingers[:20]))
     assert not seen[left].any()

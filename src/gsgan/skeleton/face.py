@@ -1,0 +1,130 @@
+"""Landmarks of a face: lips, brows and lids, and their offsets from the face at rest.
+
+They carry what a face adds to a sign: the mouth's shape, brows, gaze and blinks. The oval is left
+out: the pose's own ears, eyes and nose give the head's place and turn. Convention: as in
+`gsgan.skeleton.template`.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from gsgan.skeleton.template import HEAD, MEDIAPIPE33, Edge, SkeletonTemplate, Vector
+from gsgan.skeleton.tensors import constants
+
+if TYPE_CHECKING:
+    from gsgan.skeleton.frames import BoneFrames  # loads this module
+
+LIP_POINTS = 12  # round the outer edge: 0 left corner, 3 top, 6 right corner, 9 bottom
+BROW_POINTS = 5  # from the nose outwards
+LID_POINTS = ("inner", "upper", "outer", "lower")
+SIDES = ("left", "right")
+LIPS = tuple(f"mouth_outer_{k}" for k in range(LIP_POINTS))
+BROWS = tuple(tuple(f"{side}_brow_{k}" for k in range(BROW_POINTS)) for side in SIDES)
+LIDS = tuple(tuple(f"{side}_lid_{name}" for name in LID_POINTS) for side in SIDES)
+FACE_NAMES = (*LIPS, *BROWS[0], *BROWS[1], *LIDS[0], *LIDS[1])
+"""In the order of face3d.npz."""
+FACE = len(FACE_NAMES)
+
+OFFSET = 0.005
+"""Metres per unit of `face_code`: in speech and signs these landmarks move by 2 to 10 mm, in body
+heights a hundredth of what joints move by."""
+
+# Left half and midline: the default person's, as deep as the pose's own eyes and mouth.
+_LEFT_REST: dict[str, Vector] = {
+    "mouth_outer_0": (0.026, 1.515, 0.105),
+    "mouth_outer_1": (0.022, 1.520, 0.110),
+    "mouth_outer_2": (0.012, 1.526, 0.118),
+    "mouth_outer_3": (0.0, 1.527, 0.120),
+    "mouth_outer_9": (0.0, 1.509, 0.120),
+    "mouth_outer_10": (0.013, 1.511, 0.117),
+    "mouth_outer_11": (0.022, 1.512, 0.109),
+    "left_brow_0": (0.015, 1.601, 0.110),
+    "left_brow_1": (0.025, 1.603, 0.109),
+    "left_brow_2": (0.038, 1.605, 0.105),
+    "left_brow_3": (0.050, 1.604, 0.095),
+    "left_brow_4": (0.062, 1.598, 0.075),
+    "left_lid_inner": (0.016, 1.590, 0.105),
+    "left_lid_upper": (0.033, 1.596, 0.103),
+    "left_lid_outer": (0.046, 1.588, 0.088),
+    "left_lid_lower": (0.033, 1.584, 0.102),
+}
+_TWINS = {
+    **{LIPS[k]: LIPS[(LIP_POINTS // 2 - k) % LIP_POINTS] for k in range(LIP_POINTS)},
+    **{name: name.replace("left", "right") for name in (*BROWS[0], *LIDS[0])},
+    **{name: name.replace("right", "left") for name in (*BROWS[1], *LIDS[1])},
+}
+
+
+def rest_face() -> tuple[Vector, ...]:
+    """Metres: where the face lies on the rest pose of the skeleton templates."""
+
+    def place(name: str) -> Vector:
+        if name in _LEFT_REST:
+            return _LEFT_REST[name]
+        x, y, z = _LEFT_REST[_TWINS[name]]
+        return -x, y, z
+
+    return tuple(place(name) for name in FACE_NAMES)
+
+
+def face_mirror(start: int) -> tuple[int, ...]:
+    """Per landmark its counterpart's number, where the first one has the number ``start``."""
+    return tuple(start + FACE_NAMES.index(_TWINS[name]) for name in FACE_NAMES)
+
+
+def face_groups(start: int) -> tuple[tuple[str, tuple[Edge, ...]], ...]:
+    """Connections, by the names of the drawn channels: lips and lids are rings, brows chains."""
+
+    def joined(*chains: tuple[str, ...]) -> tuple[Edge, ...]:
+        numbers = ([start + FACE_NAMES.index(name) for name in chain] for chain in chains)
+        return tuple(pair for chain in numbers for pair in pairwise(chain))
+
+    rings = [(*ring, ring[0]) for ring in (LIPS, *LIDS)]
+    return ("brows", joined(*BROWS)), ("eyes", joined(*rings[1:])), ("lips", joined(rings[0]))
+
+
+def face_links(start: int) -> tuple[Edge, ...]:
+    """Edges to the pose's mouth and eyes: without them lips, brows and lids are components."""
+    ends = {"mouth_left": LIPS[0], "mouth_right": LIPS[LIP_POINTS // 2]}
+    for side, brow, lid in zip(SIDES, BROWS, LIDS, strict=True):
+        ends |= {f"{side}_eye": brow[BROW_POINTS // 2]}
+        ends |= {f"{side}_eye_inner": lid[0], f"{side}_eye_outer": lid[2]}
+    names = MEDIAPIPE33.names
+    return tuple((names.index(a), start + FACE_NAMES.index(b)) for a, b in ends.items())
+
+
+def in_head(points: Tensor, p: Tensor, head: Tensor, template: SkeletonTemplate) -> Tensor:
+    """``[B, N, 3]`` metres: points in the head's axes, from the middle of ears, eyes and nose.
+
+    Args:
+        points: ``[B, N, 3]`` metres, world frame.
+        p: ``[B, J, 3]`` finite joints, of which only those of the head are used.
+        head: ``[B, 3, 3]`` the head's frame, see `gsgan.skeleton.bone_frames`.
+        template: of the joints.
+    """
+    c = constants(template, p.device, p.dtype)
+    return (points - p.index_select(1, c.head_points).mean(1, keepdim=True)) @ head
+
+
+def face_code(p: Tensor, frames: BoneFrames, template: SkeletonTemplate) -> Tensor | None:
+    """``[B, E, 3]`` offsets of the face's landmarks from the face at rest, in units of `OFFSET`.
+
+    Convention: in the head's axes; zero for a face at rest, however the head turns, and so for one
+    that `sanitise` placed. Differentiable in p. None for a skeleton without a face.
+
+    Args:
+        p: ``[B, J, 3]`` finite joints, metres, world frame.
+        frames: of these skeletons.
+        template: of the joints.
+
+    Source: ours; the paper leaves the face's part in the pose open.
+    """
+    if not template.expression:
+        return None
+    c = constants(template, p.device, p.dtype)
+    found = in_head(p.index_select(1, c.expression), p, frames.hubs[:, HEAD], template)
+    return (found - c.face_rest) / OFFSET
