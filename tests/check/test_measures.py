@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
-from make import write_landmarks
+from make import edit_json, write_landmarks
 
 from gsgan.check.agreement import colour_findings, hull_findings, mean_colours, score_hulls
 from gsgan.check.frames import motion_of
@@ -66,6 +67,17 @@ def test_pictures_are_the_same_moments_in_every_camera(subject):
     items = sampled_items(subject, 12)
     frames = {camera: [f for c, f in items if c == camera] for camera in subject.cameras}
     assert set(map(tuple, frames.values())) == {(0, 6, 11)}
+
+
+def test_joints_below_the_image_are_not_outside_its_mask(copy):
+    """A camera that sees the upper body: images are padded to squares, which hold no mask."""
+    for path in copy.glob("*/cam00/*.png"):
+        cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:48])
+    edit_json(copy / "cameras.json", lambda content: content["cam00"].update(size=[64, 48]))
+    subject = subject_of(GsganData(root=str(copy)))
+    views = measure(subject, [("cam00", 3)], SAMPLING)[0]
+    assert np.isnan(views[0].outside[25:]).all()
+    assert views[0].known.sum() > 12
 
 
 def test_values_are_spread():

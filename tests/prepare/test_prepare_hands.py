@@ -8,11 +8,11 @@ from capture_scenes import ring
 from make import skeletons
 
 from gsgan.data.joints import ALL, BODY, FACE, FACE_MESH, HAND_PAIRS, HANDS, LEFT, RIGHT
-from gsgan.data.synthetic.anchors import FACE_NAMES
 from gsgan.prepare.cleanse import Cleansing, cleanse
 from gsgan.prepare.rig import Refinement, Rig
 from gsgan.prepare.solve import Settings, Solution, solve
 from gsgan.prepare.triangulate import apply_flips
+from gsgan.skeleton import HOLISTIC
 from gsgan.skeleton.hands import FINGERS, HAND
 
 FRAMES = 8
@@ -137,7 +137,8 @@ def test_wild_fingers_and_hands_off_the_wrist_are_removed():
     assert removed == {"too far away": 1 + HAND, "bone length": 3}
 
 
-def test_the_face_is_in_the_order_of_the_synthetic_data():
-    assert tuple(FACE_MESH) == FACE_NAMES
-    assert len(set(FACE_MESH.values())) == len(FACE_NAMES)
-    assert max(FACE_MESH.values()) < 468
+def test_joints_are_those_of_the_template_with_hands_and_face():
+    """In its order; the mesh's numbers are different ones."""
+    assert len(HOLISTIC.names) == ALL
+    assert tuple(FACE_MESH) == HOLISTIC.names[FACE]
+    assert len(set(FACE_MESH.values())) == len(FACE_MESH)

@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
+from gsgan.skeleton.face import FACE_NAMES
 from gsgan.skeleton.hands import HAND, hand_names
 from gsgan.skeleton.template import MEDIAPIPE33
 
 BODY = len(MEDIAPIPE33.names)
 LEFT, RIGHT = slice(BODY, BODY + HAND), slice(BODY + HAND, BODY + 2 * HAND)
 HANDS = slice(BODY, BODY + 2 * HAND)
-# Landmarks of the face by name, in the order of face3d.npz, and their numbers among the 468 of
-# MediaPipe's face mesh. Round the outer lip from the person's left corner over the upper lip;
-# brows (their upper edge) from the nose outwards. Left is the person's.
-FACE_MESH = {
-    **{
-        f"mouth_outer_{k}": point
-        for k, point in enumerate((291, 270, 269, 0, 39, 40, 61, 91, 181, 17, 405, 321))
-    },
-    **{f"left_brow_{k}": point for k, point in enumerate((336, 296, 334, 293, 300))},
-    **{f"right_brow_{k}": point for k, point in enumerate((107, 66, 105, 63, 70))},
-    "left_lid_inner": 362,
-    "left_lid_upper": 386,
-    "left_lid_outer": 263,
-    "left_lid_lower": 374,
-    "right_lid_inner": 133,
-    "right_lid_upper": 159,
-    "right_lid_outer": 33,
-    "right_lid_lower": 145,
-}
+# Landmarks of the face by name, and their numbers among the 468 of MediaPipe's face mesh: the outer
+# lip; the upper edges of left and right brow; inner, upper, outer and lower lid of both eyes.
+FACE_MESH = dict(
+    zip(
+        FACE_NAMES,
+        (
+            *(291, 270, 269, 0, 39, 40, 61, 91, 181, 17, 405, 321),
+            *(336, 296, 334, 293, 300, 107, 66, 105, 63, 70),
+            *(362, 386, 263, 374, 133, 159, 33, 145),
+        ),
+        strict=True,
+    )
+)
 FACE = slice(HANDS.stop, HANDS.stop + len(FACE_MESH))
 ALL = FACE.stop
 

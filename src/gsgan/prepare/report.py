@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,8 @@ from gsgan.prepare.pictures import Written, sampled
 from gsgan.prepare.rig import Bool, Float, Ints, Rig, camera_moves, known
 from gsgan.prepare.solve import Solution, median
 from gsgan.prepare.work import GENERATOR, write_json, write_npz, writing
-from gsgan.skeleton.hands import HAND, HAND_EDGES
-from gsgan.skeleton.template import MEDIAPIPE33
+from gsgan.skeleton import HOLISTIC, MEDIAPIPE33
+from gsgan.skeleton.hands import HAND
 from gsgan.utils.files import write_atomically
 
 Bytes = NDArray[np.uint8]
@@ -43,25 +43,6 @@ LEGEND = (
 HANDS_AND_FACE = (
     "Frames with hands and face in each camera. Swapped hands were put right by the pose's wrists "
     "and the other cameras; hands that fit neither are left out."
-)
-LIPS, BROW, LID = 12, 5, 4  # landmarks of each
-
-
-def _chain(start: int, count: int, closed: bool = True) -> list[tuple[int, int]]:
-    return [(start + k, start + (k + 1) % count) for k in range(count if closed else count - 1)]
-
-
-BROWS, LIDS = FACE.start + LIPS, FACE.start + LIPS + 2 * BROW
-DRAWN = replace(
-    MEDIAPIPE33,
-    names=joint_names(),
-    edges=(
-        *MEDIAPIPE33.edges,
-        *((start + a, start + b) for start in (BODY, BODY + HAND) for a, b in HAND_EDGES),
-        *_chain(FACE.start, LIPS),
-        *(edge for side in (0, 1) for edge in _chain(BROWS + side * BROW, BROW, closed=False)),
-        *(edge for side in (0, 1) for edge in _chain(LIDS + side * LID, LID)),
-    ),
 )
 
 
@@ -313,7 +294,7 @@ def _tile(image: Path, mask: Path, camera: CameraEntry, p: Float, uv: Float, siz
         for one in (read_colour(image), read_grey(mask))
     )
     at, nothing = _placed(pixels, window, size), np.zeros(len(p), bool)
-    template = DRAWN if len(p) == ALL else MEDIAPIPE33
+    template = HOLISTIC if len(p) == ALL else MEDIAPIPE33
     picture = draw(np.ascontiguousarray(picture), alpha, at, drawn, nothing, template)
     at = _placed(uv, window, size)
     for joint in np.flatnonzero(known(at)):
