@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -192,3 +193,15 @@ def frame_times(frames: int, fps: float, wanted: float) -> Float:
     """Times of the frames at a new rate, in frames of the old rate; the last is not exceeded."""
     count = int((frames - 1) * wanted / fps + 1e-6) + 1
     return np.arange(count, dtype=np.float64) * fps / wanted
+
+
+def rate_of(path: Path, value: Any) -> float:
+    """A number of frames per second, as a file gives it.
+
+    Raises:
+        DataError: when it is not a number above 0.
+    """
+    rate = float(np.asarray(value).reshape(-1)[0]) if np.asarray(value).dtype.kind in "iuf" else 0
+    if not 0 < rate < 1e5:
+        raise DataError(f"{path}: the frame rate is {value!r}; expected a number above 0")
+    return rate

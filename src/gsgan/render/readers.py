@@ -5,26 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
 from gsgan.body import free_body, open_body
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.calibration.find import METRES
 from gsgan.data.figure import (
-    BONES,
-    EARS,
-    HAND_JOINTS,
-    HIPS,
-    SHOULDERS,
     Figure,
-    length,
 )
 from gsgan.data.files import read_arrays, read_json, read_json_value
 from gsgan.data.formats import smpl_motion
@@ -32,11 +24,12 @@ from gsgan.data.formats.capture import SHAPE, read_shape
 from gsgan.data.synthetic.bvh import Bvh, read_bvh, standard_motion
 from gsgan.prepare.landmarks import read_points3d
 from gsgan.render.asf import asf_of, read_amc
-from gsgan.render.motion import Motion
+from gsgan.render.motion import Motion, rate_of
+from gsgan.render.pose_files import read_pose
 from gsgan.render.retarget import rig_landmarks
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
-from gsgan.skeleton.hands import FINGERS, HAND, HAND_NAMES, WRIST
+from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -53,12 +46,6 @@ RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
 LEG_UNITS = {"metres": 1.0, "decimetres": 0.1, "centimetres": 0.01, "inches": 0.0254}
 LEG_UNITS |= {"millimetres": 0.001, "CMU units (inches / 0.45)": 0.0254 / 0.45}
-GUESSED = 0.5  # visibility below which MediaPipe's hips are guesses
-IMAGE, WORLD = "POSE_LANDMARKS", "POSE_WORLD_LANDMARKS"  # in files of pose-format
-HANDS = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS")
-# Without the thumb: hands differ most in where its base is.
-HAND_LENGTHS = tuple(bone for f in FINGERS[1:] for bone in pairwise((WRIST, *f)))
-LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))  # rigid, for the scale of axes
 
 
 @dataclass(frozen=True)
@@ -103,7 +90,7 @@ def read_npz(path: Path, source: Source) -> Motion:
     keys = ("p", "conf", "theta", "betas", "visibility", *WORLD_KEYS, *POSE_KEYS, *ROOT_KEYS)
     arrays = read_arrays(path, (*keys, *MOVE_KEYS, *RATE_KEYS))
     rate = _first(arrays, RATE_KEYS)
-    fps = None if rate is None else _rate(path, rate)
+    fps = None if rate is None else rate_of(path, rate)
     if "p" in arrays:
         return _landmarks(path, arrays, fps)
     if "theta" in arrays:
@@ -123,13 +110,6 @@ def read_npz(path: Path, source: Source) -> Motion:
 
 def _first(arrays: dict[str, NDArray[Any]], keys: tuple[str, ...]) -> Any:
     return next((arrays[key] for key in keys if key in arrays), None)
-
-
-def _rate(path: Path, value: Any) -> float:
-    rate = float(np.asarray(value).reshape(-1)[0]) if np.asarray(value).dtype.kind in "iuf" else 0
-    if not 0 < rate < 1e5:
-        raise DataError(f"{path}: the frame rate is {value!r}; expected a number above 0")
-    return rate
 
 
 def _beside(path: Path) -> dict[str, Any]:
@@ -246,7 +226,7 @@ def read_mediapipe_json(path: Path, source: Source) -> Motion:
     rows = [_landmark_row(path, number, frame) for number, frame in enumerate(frames)]
     p = np.stack(rows)
     return Motion(
-        path, p[..., :3], p[..., 3], None if fps is None else _rate(path, fps), None, "metres"
+        path, p[..., :3], p[..., 3], None if fps is None else rate_of(path, fps), None, "metres"
     )
 
 
@@ -335,110 +315,8 @@ def read_trc(path: Path, source: Source) -> Motion:
     fps = None
     with suppress(ValueError, IndexError):  # read_points3d has read the header
         names, values = (line.split() for line in path.read_text().splitlines()[1:3])
-        fps = _rate(path, float(values[names.index("DataRate")]))
+        fps = rate_of(path, float(values[names.index("DataRate")]))
     return Motion(path, p, conf, fps, None, "metres")
-
-
-def read_pose(path: Path, source: Source) -> Motion:
-    """MediaPipe's landmarks in a file of the ``pose-format`` package.
-
-    Image landmarks with MediaPipe's depth, which agree with those of the hands; without any, world
-    landmarks. The package scales x and y by the image size but not z, and normalised files no
-    longer hold that size: the scale of each axis is estimated from the subject's bone lengths.
-    Hands are relative to their own wrists and have scales of their own.
-
-    Hips that are hardly seen, as of people filmed from the waist up, are put upright below the
-    shoulders.
-
-    Raises:
-        DataError: when the package is missing, the file is damaged or has no depth.
-    """
-    try:
-        from pose_format import Pose
-    except ImportError:
-        raise DataError(
-            f"{path} needs the package pose-format: pip install 'gsgan[render]'"
-        ) from None
-    try:
-        pose = Pose.read(path.read_bytes())
-        data = np.ma.getdata(pose.body.data).astype(np.float64)
-        conf = np.asarray(pose.body.confidence, np.float64)
-    except Exception as error:  # its parser raises many kinds
-        raise DataError(f"{path} is not a valid .pose file ({type(error).__name__})") from error
-    if data.ndim != 4 or 0 in data.shape[:2]:
-        raise DataError(f"{path} has no frames with a person; expected a motion")
-    starts, parts = 0, {}
-    for part in pose.header.components:
-        parts[part.name] = (slice(starts, starts + len(part.points)), part.points, part.format)
-        starts += len(part.points)
-    name = next((n for n in (IMAGE, WORLD) if n in parts), None)
-    if name is None or "Z" not in parts[name][2]:
-        raise DataError(
-            f"{path} has {', '.join(parts)} without depth; expected MediaPipe's "
-            f"{WORLD} or {IMAGE} in 3D"
-        )
-
-    def landmarks(part: str, names: tuple[str, ...]) -> tuple[Float, Float]:
-        """``[F, n, 3]`` the points of a part by name, and their confidence ``[F, n]``."""
-        p, seen = np.full((len(data), len(names), 3), np.nan), np.zeros((len(data), len(names)))
-        place, points, layout = parts.get(part, (slice(0), [], ""))
-        for k, point in enumerate(points if "Z" in layout else ()):
-            if (known := point.lower().replace("_finger", "")) in names:
-                j = names.index(known)
-                p[:, j], seen[:, j] = data[:, 0, place][:, k], conf[:, 0, place][:, k]
-        return p, seen
-
-    p, visibility = landmarks(name, MEDIAPIPE33.names)
-    unit = f"{name.lower().replace('_', ' ')}, scaled to the subject"
-    if hidden := np.median(visibility[:, HIPS]) < GUESSED:
-        visibility[:, HIPS] = 0
-    p = _to_metres(path, p, visibility, source.figure, pixels=name == IMAGE)
-    if hidden:
-        p[:, HIPS] = p[:, SHOULDERS] + (0, length(source.figure.rest, (11, 23)), 0)
-        visibility[:, HIPS] = visibility[:, SHOULDERS]
-    hands = [landmarks(hand, HAND_NAMES) for hand in HANDS]
-    if any(seen.any() for _, seen in hands):
-        p = np.concatenate([p, *_hands_to_metres(hands, source.figure)], axis=1)
-        visibility = np.concatenate([visibility, *(seen for _, seen in hands)], axis=1)
-    return Motion(path, p, visibility, _rate(path, pose.body.fps), None, unit)
-
-
-def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure, pixels: bool) -> Float:
-    """Scales each of the three axes so that bones get the subject's lengths.
-
-    The squares of the scales solve ``Σ sᵢ² dᵢ² = length²`` over all seen bones and frames, by
-    non-negative least squares. Pixels are square: x and y then take the mean of theirs. One unknown
-    for both would leave no depth to a person with longer arms, or narrower shoulders.
-    """
-    rows = []
-    for a, b in LENGTHS:
-        seen = (visibility[:, (a, b)] > 0.2).all(1) & np.isfinite(p[:, (a, b)]).all((1, 2))
-        rows.append((p[seen, b] - p[seen, a]) ** 2 / length(figure.rest, (a, b)) ** 2)
-    table = np.concatenate(rows)
-    if not len(table):
-        raise DataError(f"{path}: no frame shows two joints of a limb; expected a person")
-    scales = np.sqrt(nnls(table, np.ones(len(table)))[0])
-    if pixels:
-        scales[:2] = scales[:2].mean()
-    return np.asarray(p * scales)
-
-
-def _hands_to_metres(hands: list[tuple[Float, Float]], figure: Figure) -> list[Float]:
-    """Hands ``[F, 21, 3]`` from their wrists, of points and confidences.
-
-    The scale of x and y, and that of z, solve `_to_metres`' equations for the bones of both hands.
-    """
-    rest, rows, found = figure.rest_with_hands, [], []
-    for (p, seen), at in zip(hands, HAND_JOINTS.values(), strict=True):
-        p = np.where(seen[..., None] > 0, p - p[:, WRIST, None], np.nan)
-        for a, b in HAND_LENGTHS:
-            bone = (p[:, b] - p[:, a]) ** 2 / length(rest[at], (a, b)) ** 2
-            rows.append(np.stack([bone[:, 0] + bone[:, 1], bone[:, 2]], axis=1))
-        found.append(p)
-    table = np.concatenate(rows)
-    table = table[np.isfinite(table).all(1)]
-    flat, deep = np.sqrt(nnls(table, np.ones(len(table)))[0])
-    return [p * (flat, flat, deep) for p in found]
 
 
 READERS: dict[str, Callable[[Path, Source], Motion]] = {
@@ -447,5 +325,5 @@ READERS: dict[str, Callable[[Path, Source], Motion]] = {
     ".bvh": read_bvh_motion,
     ".amc": read_amc_motion,
     ".trc": read_trc,
-    ".pose": read_pose,
+    ".pose": lambda path, source: read_pose(path, source.figure),
 }
