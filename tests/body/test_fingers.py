@@ -213,7 +213,7 @@ def test_gradients_reach_landmarks_and_shape(poses):
 
 def test_a_number_of_joints_that_is_neither_is_refused(solver, poses):
     p, seen = shown(poses[:2])
-    with pytest.raises(ValueError, match="33 joints or 75 with hands, got 54"):
+    with pytest.raises(ValueError, match="33, 75, 105 joints, got 54"):
         solver.solve(p[:, :54], seen[:, :54])
 
 

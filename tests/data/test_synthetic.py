@@ -346,7 +346,7 @@ def test_a_missing_file_is_named(parameters, tmp_path):
         ({"test_scale": 2}, "test_scale must be"),
         ({"test_scale": [2], "test_cameras": 0}, "set test_cameras"),
         ({"avatar": "nobody"}, "avatar must be blouse, polo, free_body or the path"),
-        ({"motion": "waltz"}, "motion must be choreography or the path of a .bvh"),
+        ({"motion": "waltz"}, "motion must be choreography, signs or the path of a .bvh"),
         ({"secondary": "some"}, "secondary must be true or false"),
     ],
 )
