@@ -434,7 +434,7 @@ def test_real_files(figure):
                 continue
             p, _ = standard(path, figure)
             q = on_figure(p, figure)
-            assert np.isfinite(q).all(), path
+            assert np.isfinite(q[:, :33]).all(), path
             own = torch.from_numpy(q)
             again = figure_of(own, torch.ones(own.shape[:2], dtype=torch.bool), "z")
             lengths = [np.linalg.norm(f.rest[13] - f.rest[11]) for f in (again, figure)]

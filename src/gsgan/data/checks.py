@@ -80,7 +80,9 @@ def _unusable(frame: int, landmarks: Landmarks, poses: Poses | None, checks: Che
     if valid.sum() < checks.min_joints:
         return f"with fewer than {checks.min_joints} joints (NaN or confidence 0)"
     trunk = valid[list(HUBS)]
-    if trunk.sum() < checks.min_hubs and not trunk[:2].all():
+    left, right = landmarks.p[frame][list(HUBS[2:])]
+    estimated = trunk[:2].all() and (left != right).any()  # see `gsgan.data.skeletons.hips_below`
+    if trunk.sum() < checks.min_hubs and not estimated:
         return f"with fewer than {checks.min_hubs} of the shoulders and hips"
     if poses is not None and frame not in poses.theta:
         return f"without a finite row in {poses.source}"

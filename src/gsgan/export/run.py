@@ -65,11 +65,12 @@ def export_config(config: DictConfig) -> None:
             splats = _splats(run, drive, i)
             up = run.figure.up
             _write(name, ply_bytes(splats) if kind == "ply" else glb_bytes(splats, up))
-        if sequence:  # what is left of a longer one
+        if sequence and (out / CARD).is_file():  # what is left of a longer one
             kept = {f"{number:06d}.ply" for number in drive.numbers}
-            for path in out.glob("[0-9]" * 6 + ".ply"):
-                if path.name not in kept:
-                    path.unlink()
+            with writing(out):
+                for path in out.glob("[0-9]" * 6 + ".ply"):
+                    if path.name not in kept:
+                        path.unlink()
     else:
         _write(out, _program(config, run, kind))
     beside = out / CARD if sequence else out.with_name(f"{out.stem}.{CARD}")

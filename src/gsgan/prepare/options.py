@@ -151,7 +151,9 @@ def read_inputs(options: Options) -> Inputs:
     scale = None if options.unit is None else UNITS[options.unit]  # None: the format's own
     calibration = read_calibration(path, scale, options.pixel_centre)
     notes, cameras = list(calibration.notes), []
-    for name in [n for n in sources if matching_cameras(n, calibration.ignored)]:
+    named = {*(options.cameras or {})}
+    named |= {n for n in sources if matching_cameras(n, [*calibration.cameras])}
+    for name in [n for n in sources if matching_cameras(n, calibration.ignored) and n not in named]:
         notes.append(f"{name}: left out, {path.name} says to ignore its camera")
         del sources[name]
     if len(sources) < MIN_VIEWS:

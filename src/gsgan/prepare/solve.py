@@ -127,18 +127,19 @@ def solve(
 
     def triangulate() -> Points:
         nonlocal flips, left_out, sided, weight
+        sided, weight = uv, conf
         if settings.flips.enabled:
             body = find_flips(rig, uv, conf, FLIP_GROUPS, settings.flips, triangulation)
             flips[..., : len(FLIP_GROUPS)] = body
             sided, weight = (apply_flips(v, body, FLIP_GROUPS) for v in (uv, conf))
-            if hands:
-                own = np.where(weight[..., WRISTS, None] > 0, sided[:, :, WRISTS], np.nan)
-                arms = triangulation.points(rig, _flat(own), _flat(weight[:, :, WRISTS]))
-                far = rig.project(arms.p)[0].reshape(own.shape)
-                wrists = np.where(np.isfinite(own), own, far)  # unseen: where other cameras see it
-                found = sided[:, :, HANDS], weight[:, :, HANDS], wrists
-                flips[..., -1] = match_hands(rig, *found, settings.hands, triangulation)
-                sided, weight = (apply_flips(v, flips, groups) for v in (uv, conf))
+        if hands:
+            own = np.where(weight[..., WRISTS, None] > 0, sided[:, :, WRISTS], np.nan)
+            arms = triangulation.points(rig, _flat(own), _flat(weight[:, :, WRISTS]))
+            far = rig.project(arms.p)[0].reshape(own.shape)
+            wrists = np.where(np.isfinite(own), own, far)  # unseen: where other cameras see it
+            found = sided[:, :, HANDS], weight[:, :, HANDS], wrists
+            flips[..., -1] = match_hands(rig, *found, settings.hands, triangulation)
+            sided, weight = (apply_flips(v, flips, groups) for v in (uv, conf))
         points = triangulation.points(rig, _flat(sided), _flat(weight))
         if hands:
             error = points.error.reshape(conf.shape)[:, :, HANDS]

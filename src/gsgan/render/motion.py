@@ -58,6 +58,7 @@ class Motion:
         file_up: the file's own axis, where ``up`` is that of converted landmarks.
         body: ``[F]`` poses of the subject's body that the landmarks come from, or None.
         filled: number of frames without shoulders and hips, see `checked`.
+        detached: whether hands are relative to their wrists, so that the motion must be retargeted.
     """
 
     path: Path
@@ -69,6 +70,7 @@ class Motion:
     file_up: str | None = None
     body: BodyPose | None = None
     filled: int = 0
+    detached: bool = False
 
     def __len__(self) -> int:
         return len(self.p)
@@ -80,6 +82,7 @@ def checked(motion: Motion, least_visibility: float) -> Motion:
     Shoulders and hips are kept wherever they are finite: without them there is no skeleton. Frames
     with fewer than three of them are interpolated between their neighbours; before the first frame
     that has them, after the last one, and where the motion has body poses, they repeat the nearest.
+    Hands stay as they are.
 
     Raises:
         DataError: when there are no frames, or none in which three of shoulders and hips are known.
@@ -102,11 +105,13 @@ def checked(motion: Motion, least_visibility: float) -> Motion:
     if body is not None:
         share, at = np.rint(share), torch.from_numpy(nearest)
         body = BodyPose(body.theta[at], body.transl[at])
-    q = mixed(p[before], p[after], share)
+    q, shown = mixed(p[before], p[after], share), visibility[nearest]
+    q = np.where(np.isfinite(q), q, p[nearest])
+    q[:, BODY:], shown[:, BODY:] = p[:, BODY:], visibility[:, BODY:]
     return replace(
         motion,
-        p=np.where(np.isfinite(q), q, p[nearest]),
-        visibility=visibility[nearest],
+        p=q,
+        visibility=shown,
         body=body,
         filled=int((~good).sum()),
     )

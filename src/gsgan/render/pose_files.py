@@ -76,7 +76,8 @@ def read_pose(path: Path, figure: Figure) -> Motion:
 
     p, visibility = landmarks(name, MEDIAPIPE33.names)
     unit = f"{name.lower().replace('_', ' ')}, scaled to the subject"
-    if hidden := np.median(visibility[:, HIPS]) < GUESSED:
+    person = visibility[:, SHOULDERS].all(1)
+    if hidden := person.any() and np.median(visibility[person][:, HIPS]) < GUESSED:
         visibility[:, HIPS] = 0
     p = _to_metres(path, p, visibility, figure, pixels=name == IMAGE)
     if hidden:
@@ -86,7 +87,7 @@ def read_pose(path: Path, figure: Figure) -> Motion:
     if any(seen.any() for _, seen in hands):
         p = np.concatenate([p, *_hands_to_metres(hands, figure)], axis=1)
         visibility = np.concatenate([visibility, *(seen for _, seen in hands)], axis=1)
-    return Motion(path, p, visibility, rate_of(path, pose.body.fps), None, unit)
+    return Motion(path, p, visibility, rate_of(path, pose.body.fps), None, unit, detached=True)
 
 
 def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure, pixels: bool) -> Float:
@@ -123,5 +124,7 @@ def _hands_to_metres(hands: list[tuple[Float, Float]], figure: Figure) -> list[F
         found.append(p)
     table = np.concatenate(rows)
     table = table[np.isfinite(table).all(1)]
+    if not len(table):
+        return [np.full_like(p, np.nan) for p in found]
     flat, deep = np.sqrt(nnls(table, np.ones(len(table)))[0])
     return [p * (flat, flat, deep) for p in found]

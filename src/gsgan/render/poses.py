@@ -278,7 +278,10 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     up = (None if motion.file_up else config.up) or motion.up or up_axis(motion)
     choice = one_of("retarget", config.retarget, ("auto", True, False))
     own = is_own(motion, figure) if choice == "auto" else not choice
-    own = own and not OmegaConf.is_list(config.motion)  # transitions need every joint
+    if choice is False and motion.detached:
+        raise ConfigError(f"retarget=false is not supported for {motion.path}: leave retarget out")
+    # transitions need every joint
+    own = own and not motion.detached and not OmegaConf.is_list(config.motion)
     times = frame_times(len(motion), rate, fps)
     nearest = np.rint(times).astype(int)
     visibility, body = motion.visibility[nearest], None

@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 from gsgan.body import free_body, open_body
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.calibration.find import METRES
-from gsgan.data.figure import (
-    Figure,
-)
+from gsgan.data.figure import HIPS, SHOULDERS, Figure
 from gsgan.data.files import read_arrays, read_json, read_json_value
 from gsgan.data.formats import smpl_motion
 from gsgan.data.formats.capture import SHAPE, read_shape
+from gsgan.data.skeletons import hips_below
 from gsgan.data.synthetic.bvh import Bvh, read_bvh, standard_motion
 from gsgan.prepare.landmarks import read_points3d
 from gsgan.render.asf import asf_of, read_amc
@@ -121,14 +120,25 @@ def _beside(path: Path) -> dict[str, Any]:
 def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Motion:
     meta = _beside(path)
     with_hands = JOINTS + 2 * HAND
-    joints = with_hands if arrays["p"].shape[1:2] == (with_hands,) else JOINTS
-    p = expect_array(arrays, "p", (None, joints, 3), path).astype(np.float64)
+    if arrays["p"].shape[1:] not in ((JOINTS, 3), (with_hands, 3)):
+        raise DataError(
+            f"{path}: 'p' must have shape [F, {JOINTS} or with hands {with_hands}, 3], got "
+            f"{list(arrays['p'].shape)}"
+        )
+    p = arrays["p"].astype(np.float64)
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:
         conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
+    conf = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0)
+    shown, body = conf[:, :JOINTS] > 0, np.nan_to_num(p[:, :JOINTS])
+    hung = shown[:, SHOULDERS].all(1) & ~shown[:, HIPS].any(1)  # people filmed from the waist up
+    if hung.any() and ((placed := hips_below(body, shown)) != body).any():
+        p[hung, :JOINTS] = np.where(shown[hung, :, None], p[hung, :JOINTS], np.nan)
+        for hip, shoulder in zip(HIPS, SHOULDERS, strict=True):
+            p[hung, hip], conf[hung, hip] = placed[hung, hip], conf[hung, shoulder]
     scale = METRES.get(meta.get("unit", "m"), 1.0)
     rate, up = fps or meta.get("fps"), meta.get("up_axis")
-    return Motion(path, p * scale, np.nan_to_num(conf), rate, up, "metres")
+    return Motion(path, p * scale, conf, rate, up, "metres")
 
 
 def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Motion:

@@ -45,7 +45,7 @@ Float = NDArray[np.float64]
 NECK = 0.45  # radians, the largest bend of the neck: detectors place faces too far forward
 
 
-def on_figure(p: Float, figure: Figure) -> Float:
+def on_figure(p: Float, figure: Figure, scale: float | None = None) -> Float:
     """``[F, J, 3]`` the subject in the poses of another person's landmarks ``[F, J, 3]``, finite.
 
     Trunk and limbs keep their directions and get the subject's lengths; face, hands and feet are
@@ -53,11 +53,18 @@ def on_figure(p: Float, figure: Figure) -> Float:
 
     With hand landmarks, J = 75, palms are rotated as these show and fingers keep their directions;
     where in the world they are does not matter. A hand with NaN stays NaN.
+
+    Args:
+        p: of the other person.
+        figure: the subject.
+        scale: of the path, in place of that ratio.
     """
     whole, hands, p = np.full_like(p, np.nan), p, p[:, :BODY]
     rest, q = figure.rest, whole[:, :BODY]
-    legs = [np.linalg.norm(p[:, b] - p[:, a], axis=-1) for limb in LEGS for a, b in limb]
-    hips = middle(p, HIPS) * 2 * figure.leg / np.median(legs, axis=1).sum()
+    if scale is None:
+        legs = [np.linalg.norm(p[:, b] - p[:, a], axis=-1) for limb in LEGS for a, b in limb]
+        scale = 2 * figure.leg / float(np.median(legs, axis=1).sum())
+    hips = middle(p, HIPS) * scale
     chest = hips + unit(middle(p, SHOULDERS) - middle(p, HIPS)) * rest[SHOULDERS[0], 2]
     for pair, centre in ((HIPS, hips), (SHOULDERS, chest)):
         half = unit(p[:, pair[0]] - p[:, pair[1]]) * length(rest, pair) / 2
@@ -140,7 +147,7 @@ def joined(clips: Sequence[Float], figure: Figure, n: int) -> Float:
         path = CubicHermiteSpline([0, n + 1], *(np.nan_to_num(x) for x in (ends, speed)))
         known = np.isfinite(ends).all((0, 2))[:, None]
         between = np.where(known, path(np.arange(1, n + 1)), np.nan)
-        parts += [on_figure(between, figure), b]
+        parts += [on_figure(between, figure, scale=1.0), b]
     return np.concatenate(parts)
 
 

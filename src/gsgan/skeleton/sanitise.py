@@ -154,11 +154,13 @@ def recentre(
 
 
 def _estimated_hips(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Tensor:
-    """``[B, J]`` bool: both hips of skeletons that show both shoulders and no hip, if finite."""
+    """``[B, J]`` bool: both hips of skeletons that show both shoulders and no hip, if finite
+    and apart: zeros are no estimate."""
     hips, shoulders = list(template.hips), list(template.shoulders)
     seen = valid[:, shoulders].all(1) & ~valid[:, hips].any(1)
     estimated = torch.zeros_like(valid)
-    estimated[:, hips] = (seen & p[:, hips].isfinite().all((1, 2))).unsqueeze(1)
+    apart = (p[:, hips[0]] != p[:, hips[1]]).any(1)
+    estimated[:, hips] = (seen & apart & p[:, hips].isfinite().all((1, 2))).unsqueeze(1)
     return estimated
 
 
