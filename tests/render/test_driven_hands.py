@@ -10,11 +10,11 @@ import torch
 from test_motion_readers import Y_DOWN, standard, write_pose
 
 from gsgan.body import free_body
-from gsgan.data.figure import FINGER_BONES, HAND_JOINTS, figure_of, palm_frame, upright
+from gsgan.data.figure import HAND_JOINTS, figure_of, palm_frame, upright
 from gsgan.render.motion import is_own, up_axis
 from gsgan.render.retarget import joined, on_figure
 from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, complete_skeleton, limb_length_sum
-from gsgan.skeleton.hands import HAND_NAMES
+from gsgan.skeleton.hands import FINGER_BONES, HAND_NAMES
 
 LEFT, RIGHT = HAND_JOINTS.values()
 POINTS = [n.upper().replace("_", "_FINGER_") if n[0] in "imr" else n.upper() for n in HAND_NAMES]

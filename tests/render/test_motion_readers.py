@@ -408,6 +408,19 @@ def test_frames_without_a_trunk(tmp_path, landmarks, figure):
         standard(tmp_path / "a.npz", figure)
 
 
+def test_landmarks_from_the_waist_up(tmp_path, landmarks, figure):
+    """Hips that no frame shows are placed below the shoulders, as when a capture is opened."""
+    p = landmarks.copy()
+    p[:, 23:] = np.nan
+    np.savez(tmp_path / "a.npz", p=p)
+    whole, motion = standard(tmp_path / "a.npz", figure)
+    assert motion.filled == 0
+    assert np.isfinite(whole).all()
+    spine = np.linalg.norm(whole[:, [23, 24]].mean(1) - whole[:, [11, 12]].mean(1), axis=-1)
+    own = np.linalg.norm(figure.rest[[23, 24]].mean(0) - figure.rest[[11, 12]].mean(0))
+    np.testing.assert_allclose(spine, own, rtol=0.3)
+
+
 def test_joints_out_of_sight(tmp_path, landmarks, figure):
     p = landmarks.copy()
     p[3:6, 15] = np.nan  # a wrist for a moment: it moves evenly

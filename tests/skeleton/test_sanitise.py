@@ -163,6 +163,8 @@ def test_estimated_hips_hold_a_trunk_of_which_only_the_shoulders_are_seen() -> N
     assert (q[0, [25, 26], 1] < q[0, [23, 24], 1]).all()
     with pytest.raises(ValueError, match="left_hip, right_hip"):
         sanitise(lose(p, legs))
+    with pytest.raises(ValueError, match="left_hip, right_hip"):  # zeros are no estimate
+        sanitise(lose(p, legs, 0.0), visibility)
 
 
 def test_misuse_is_named() -> None:

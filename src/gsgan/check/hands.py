@@ -6,7 +6,6 @@ Convention: as in `gsgan.check.frames`; hands are ``[F, 2, 21, ...]``, the left 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
@@ -19,11 +18,11 @@ from gsgan.data.files import read_arrays
 from gsgan.data.formats.trust import Bool, Float
 from gsgan.data.joints import PALM, WRISTS
 from gsgan.data.skeletons import whole_frame_ids
-from gsgan.skeleton.hands import FINGERS, HAND
+from gsgan.skeleton.hands import FINGER_BONES, HAND
 from gsgan.utils.arrays import expect_array
 
 SIDES = ("left", "right")
-BONES = np.array([(0, j) for j in PALM] + [pair for f in FINGERS for pair in pairwise(f)])
+BONES = np.array([*((0, j) for j in PALM), *FINGER_BONES])
 RATIO = 2.0  # a hand is exchanged where it lies this many times nearer to the other one's place
 METRES = 0.06  # and this much nearer: hands touch
 JITTER = 0.15  # change of a bone's length from frame to frame, median: triangulated hands have 0.05

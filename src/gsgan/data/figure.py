@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import torch
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, bone_frames, sanitise
-from gsgan.skeleton.hands import FINGERS, HAND, INDEX, PINKY, WRIST
+from gsgan.skeleton.hands import FINGER_BONES, HAND, INDEX, PINKY, WRIST
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 from gsgan.utils.errors import DataError
 
@@ -29,7 +28,6 @@ BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])  # parents first
 HANDS, FEET = {15: (17, 19, 21), 16: (18, 20, 22)}, {27: (29, 31), 28: (30, 32)}
 BODY = len(MEDIAPIPE33.names)
 HAND_JOINTS = {15: slice(BODY, BODY + HAND), 16: slice(BODY + HAND, BODY + 2 * HAND)}  # by wrist
-FINGER_BONES = tuple(bone for finger in FINGERS for bone in pairwise(finger))  # base to tip
 SIDES = {15: 1.0, 16: -1.0}  # of the standard pose's x
 HEELS_AND_TOES = (29, 30, 31, 32)
 FACE = tuple(range(11))

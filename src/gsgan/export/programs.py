@@ -53,8 +53,8 @@ class Whole(nn.Module):
         """``[1, 3, H, W]`` RGB on black and ``[1, 1, H, W]`` alpha, both in [0, 1].
 
         Args:
-            skeleton: ``[1, J, 3]`` metres, world frame, finite; J is 33, 75
-                with hands, 105 with a face.
+            skeleton: ``[1, J, 3]`` metres, world frame, finite; J is 33, 75 with hands, 105
+                with a face.
             visibility: ``[1, J]`` 0 marks a stand-in.
             K, R, t: ``[1, 3, 3]``, ``[1, 3, 3]``, ``[1, 3]`` of the camera.
             theta, transl: pose of the skinned body, where the avatar needs one.

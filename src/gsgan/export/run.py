@@ -94,7 +94,6 @@ def _place(config: DictConfig, kind: str) -> Path:
         raise ConfigError(f"out={out}: format={kind} needs a {ending} file{folders}")
     folder = not out.suffix
     if out.exists() and out.is_dir() != folder:
-        kind = "a file; expected a folder" if folder else "a folder; expected a file"
         found = "a file; expected a folder" if folder else "a folder; expected a file"
         raise ConfigError(f"out={out} is {found}")
     if out.exists() and not config.overwrite and (not folder or any(out.iterdir())):

@@ -44,7 +44,7 @@ class Moments:
         held_out: bool = False,
     ) -> None:
         layout, cameras = data.layout, data.splits.train_cameras
-        trained = sorted({frame for _, frame in data.splits.items["train"]})
+        trained = data.trained
         items = [
             (camera, frame)
             for frame in (layout.frames if held_out else trained)

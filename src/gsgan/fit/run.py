@@ -124,8 +124,7 @@ def fit_body(
     if moments.left_out:
         console.print(f"{moments.left_out} images with empty masks, or nearly so, are left out")
     with console.status("solving poses"):
-        trained = sorted({frame for _, frame in data.splits.items["train"]})
-        shape = fit_shape(*_joints(data, trained))
+        shape = fit_shape(*_joints(data, data.trained))
         solved = _solve(data, shape, layout.frames)
     rows = torch.tensor([layout.frames.index(frame) for frame in moments.frames])
     start = BodyPose(solved.theta[rows], solved.transl[rows])

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM, WRISTS
 from gsgan.prepare.rig import Bool, Float, known
-from gsgan.skeleton.hands import FINGERS, HAND
+from gsgan.skeleton.hands import FINGER_BONES, HAND
 from gsgan.utils.checks import above, at_least
 
 Bones = tuple[tuple[int, int], ...]
@@ -19,13 +18,8 @@ BODY_BONES = (
     *((23, 25), (25, 27), (24, 26), (26, 28)),
 )
 HAND_ROOTS = [BODY, BODY + HAND]
-HAND_BONES = tuple((start, start + knuckle) for start in (BODY, BODY + HAND) for knuckle in PALM)
-FINGER_BONES = tuple(
-    (start + a, start + b)
-    for start in (BODY, BODY + HAND)
-    for finger in FINGERS
-    for a, b in pairwise(finger)
-)
+HAND_BONES = tuple((start, start + knuckle) for start in HAND_ROOTS for knuckle in PALM)
+FINGERS = tuple((start + a, start + b) for start in HAND_ROOTS for a, b in FINGER_BONES)
 FINGER_NOISE = 0.02  # metres by which noise alone changes the length of a finger's bone
 DEGREE = 2  # of the polynomial that smooths
 REACH = 3  # standard deviations at which the smoothing kernel ends
@@ -84,8 +78,8 @@ def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
         palms = _off(p, HAND_BONES, settings.hand_bone).reshape(len(p), 2, len(PALM))
         most = palms.sum(-1) * 2 > len(PALM)
         wrong[:, HANDS] |= most.repeat(HAND, axis=1)
-        fingers = _off(p, FINGER_BONES, settings.finger_bone, FINGER_NOISE).T
-        for (_, joint), bad in zip(FINGER_BONES, fingers, strict=True):
+        fingers = _off(p, FINGERS, settings.finger_bone, FINGER_NOISE).T
+        for (_, joint), bad in zip(FINGERS, fingers, strict=True):
             wrong[:, joint] |= bad
     wrong &= known(p)
     p[wrong] = np.nan

@@ -66,7 +66,7 @@ def match_hands(
     weight = np.where(weight > quick.min_confidence, weight, 0.0)
     roots, trust = (v.reshape(*v.shape[:2], 2, HAND, -1)[:, :, :, 0] for v in (uv, weight))
     off = np.linalg.norm(roots[:, :, :, None] - wrists[:, :, None], axis=-1)  # [C, F, hand, wrist]
-    # A hand of which one wrist is unknown says nothing: its distances cannot be compared.
+    # A hand is left out where one wrist is unknown: its distances cannot be compared.
     known = np.isfinite(off).all(-1, keepdims=True)
     loss = np.where(known, HAND * trust * np.log1p((off / matching.wrist) ** 2), 0.0)
     kept, swapped = loss[..., 0, 0] + loss[..., 1, 1], loss[..., 0, 1] + loss[..., 1, 0]

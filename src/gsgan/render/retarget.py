@@ -19,7 +19,6 @@ from gsgan.data.figure import (
     EARS,
     FACE,
     FEET,
-    FINGER_BONES,
     HAND_JOINTS,
     HANDS,
     HEELS_AND_TOES,
@@ -38,6 +37,7 @@ from gsgan.data.synthetic.bvh import StandardMotion, drift, floor_under
 from gsgan.data.synthetic.character import unit
 from gsgan.data.synthetic.retarget import axis_angle, between, rotation
 from gsgan.skeleton import bone_frames
+from gsgan.skeleton.hands import FINGER_BONES
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 
 Float = NDArray[np.float64]

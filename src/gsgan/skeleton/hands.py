@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
@@ -14,6 +16,7 @@ HAND_NAMES = (
 )
 HAND = len(HAND_NAMES)
 FINGERS = tuple(tuple(range(1 + 4 * k, 5 + 4 * k)) for k in range(5))  # base to tip, thumb first
+FINGER_BONES = tuple(bone for finger in FINGERS for bone in pairwise(finger))
 WRIST, INDEX, PINKY = 0, 5, 17
 PALM = (WRIST, INDEX, PINKY)  # points that span it
 SHORT = 1e-3  # metres: a palm that vanishes has no frame
