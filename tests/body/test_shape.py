@@ -117,16 +117,18 @@ def test_limbs_keep_their_girth():
 
 def test_a_shape_is_stored_as_numbers_and_wrong_ones_are_refused():
     shape = replace(other(3), offsets=0.01 * torch.randn(33, 3))
-    back = BodyShape.of_flat(shape.flat())
-    for name in ("coefficients", "stretch", "offsets"):
-        assert torch.equal(getattr(back, name), getattr(shape, name))
+    for one in (shape, replace(shape, hands=0.01 * torch.randn(2, 2, 3))):
+        back = BodyShape.of_flat(one.flat())
+        for name, value in vars(one).items():
+            assert getattr(back, name) is value is None or torch.equal(getattr(back, name), value)
     for make in (
         lambda: BodyShape(torch.zeros(K), torch.ones(7)),
         lambda: BodyShape(torch.zeros(K), torch.ones(8), torch.zeros(3, 33)),
+        lambda: BodyShape(torch.zeros(K), torch.ones(8), hands=torch.zeros(2, 3)),
         lambda: BodyShape.of_flat(torch.zeros(20)),
         lambda: shaped_body(BodyShape(torch.zeros(11), torch.ones(8))),
     ):
-        with pytest.raises(ValueError, match=r"expected|at least|at most"):
+        with pytest.raises(ValueError, match=r"expected|117 or 129|at most"):
             make()
 
 

@@ -12,10 +12,10 @@ from torch import Tensor
 from writers.smpl import write_smpl
 
 from gsgan.body import free_body, solve
-from gsgan.body.rig import build_rig
+from gsgan.body.rig import LEAST, build_rig
 from gsgan.body.shape import BodyShape, free_space, shaped_body
 from gsgan.body.smpl import read_smpl
-from gsgan.body.solve import LEAST, Solver
+from gsgan.body.solve import Solver
 from gsgan.data.synthetic.free_subject import free_character, free_pose
 from gsgan.data.synthetic.motion import Choreography
 from gsgan.scene import BodyPose

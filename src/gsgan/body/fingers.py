@@ -5,13 +5,15 @@ Convention: metres, radians; a joint's turn is its axis-angle in `BodyPose.theta
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
-from gsgan.skeleton.hands import FINGERS, HAND, PALM, PINKY, palm_frames
+from gsgan.skeleton.hands import FINGERS, HAND, PALM, PINKY, SHORT, palm_frames
 
 # By number, for the thumb and for fingers: flexion, turn to the side and twist of the first joint;
 # flexion and turn to the side of the next one, which stands for the last two where a body has no
@@ -20,17 +22,38 @@ SPREAD = ((0.7, 0.5, 0.4, 0.8, 0.15), (0.8, 0.2, 0.2, 1.0, 0.03))
 LEAST = ((-0.8, -0.8, -0.8, -0.6, -0.3), (-0.6, -0.45, -0.4, -0.2, -0.1))
 MOST = ((1.2, 0.8, 0.8, 2.0, 0.3), (1.75, 0.45, 0.4, 2.6, 0.1))
 NOISE = 0.004  # metres, standard deviation of a landmark
-STEPS = 4
+ROUNDS = (1, 2)  # steps of the fingers, before the hand is placed
+TURNS = 3  # steps of a hand's rotation
 TRACE = 1e-4  # of a bone at rest, added to the seen one: a bone that vanishes rests
 
 
-class Fingers(nn.Module):
-    """Turns of a body's finger joints, two a finger, in which its bones point as the landmarks'.
+class Hands(NamedTuple):
+    """What hand landmarks show of B frames.
 
-    Landmarks are compared in the palm's frame and with the body's own bone lengths, so that neither
+    Args:
+        turns: ``[B, 20, 3]`` of `Fingers.joints`.
+        shown: ``[B, 20]`` bool: the turns that landmarks show; the others are anything finite.
+        rotations, shifts: ``[B, 2, 3, 3]`` and ``[B, 2, 3]`` metres: of each hand since rest, where
+            it is nearest to all its landmarks.
+        placed: ``[B, 2]`` bool: the hands that landmarks show; the others are anything finite.
+    """
+
+    turns: Tensor
+    shown: Tensor
+    rotations: Tensor
+    shifts: Tensor
+    placed: Tensor
+
+
+class Fingers(nn.Module):
+    """Turns of a body's finger joints, two a finger, in which its bones point as the landmarks',
+    and where the hand is then nearest to all of them.
+
+    Landmarks are compared in the hand's axes and with the body's own bone lengths, so that neither
     the person's proportions nor an error of the solved wrist bends a finger. The shortest turns to
     the bones' directions, then Gauss-Newton steps on the distances and a prior, within anatomical
-    limits: fingers bend, their second joints are hinges.
+    limits: fingers bend, their second joints are hinges. The hand's axes are first the palm's, then
+    those of the rigid motion onto its landmarks: bodies and detectors define knuckles differently.
 
     Args:
         body: with hand landmarks, in the subject's shape.
@@ -40,6 +63,7 @@ class Fingers(nn.Module):
 
     chains: Tensor  # [10, 4] landmarks of each finger, base to tip, the left hand's first
     joints: Tensor  # [20] of the body: each finger's first joint, then each one's second
+    rest: Tensor  # [42, 3] landmarks
     palms: Tensor  # [2, 3, 3]
     bones: Tensor  # [10, 3, 3] at rest: base to middle; middle to both landmarks beyond
     axes: Tensor  # [10, 5, 3] of the numbers
@@ -61,6 +85,7 @@ class Fingers(nn.Module):
         held = {
             "chains": chains,
             "joints": body.hand_bone[chains[:, :2]].mT.flatten(),
+            "rest": rest,
             "palms": palms,
             "bones": bones,
             "axes": axes,
@@ -71,31 +96,52 @@ class Fingers(nn.Module):
         for name, value in held.items():
             self.register_buffer(name, value, persistent=False)
 
-    def forward(self, hands: Tensor, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Turns ``[B, 20, 3]`` of `joints`, and which of them are shown ``[B, 20]`` bool; others
-        hold anything finite.
+    def forward(self, hands: Tensor, seen: Tensor) -> Hands:
+        """The fingers' turns and the hands' places.
 
         Args:
             hands: ``[B, 42, 3]`` metres, finite, in any axes.
             seen: ``[B, 42]`` bool. A hand needs its wrist and the knuckles of index and little
                 finger, a finger its two landmarks nearest to the palm, its second joint one more.
         """
-        frames = palm_frames(hands.unflatten(1, (2, HAND))[:, :, PALM])
-        R = (frames @ self.palms.mT).repeat_interleave(len(FINGERS), dim=1)
+        R = palm_frames(hands.unflatten(1, (2, HAND))[:, :, PALM]) @ self.palms.mT
+        for steps in ROUNDS:
+            turns = self._turned(R, hands, seen, steps)
+            R, shift = _placed(self._posed(turns), hands, seen, R)
+        return Hands(turns, self.shown(seen), R, shift, self.placed(seen))
+
+    def _turned(self, R: Tensor, hands: Tensor, seen: Tensor, steps: int) -> Tensor:
+        """Turns ``[B, 20, 3]`` on hands that are turned by ``R [B, 2, 3, 3]`` since rest."""
+        R = R.repeat_interleave(len(FINGERS), dim=1)
         bones = _bones(hands, self.chains) @ R + TRACE * self.bones  # with the palms as they rest
         lengths = self.bones.norm(dim=-1, keepdim=True)
         bones = lengths * normalize(bones, dim=-1, eps=1e-9)
         weight = seen[:, self.chains[:, 1:]].to(bones) / NOISE**2
         numbers = self._start(bones, weight)
-        for _ in range(STEPS):
+        for _ in range(steps):
             numbers = (numbers - self._step(numbers, bones, weight)).clamp(self.least, self.most)
-        return torch.cat(self._turns(numbers), dim=1), self.shown(seen)
+        return torch.cat(self._turns(numbers), dim=1)
+
+    def _posed(self, turns: Tensor) -> Tensor:
+        """``[B, 42, 3]`` landmarks of hands at rest with turned fingers."""
+        first, second = axis_angle_to_matrix(turns).chunk(2, dim=1)
+        base, *others = self.chains.unbind(1)
+        middle = self.rest[base] + (first @ self.bones[:, 0].unsqueeze(-1)).squeeze(-1)
+        beyond = middle.unsqueeze(2) + self.bones[:, 1:] @ (first @ second).mT
+        x = self.rest.expand(len(turns), -1, -1)
+        for k, at in zip(others, (middle, *beyond.unbind(2)), strict=True):
+            x = x.index_copy(1, k, at)
+        return x
+
+    @staticmethod
+    def placed(seen: Tensor) -> Tensor:
+        """``[B, 2]`` bool: the hands whose palms landmarks ``seen [B, 42]`` bool show."""
+        return seen.unflatten(1, (2, HAND))[:, :, PALM].all(-1)
 
     def shown(self, seen: Tensor) -> Tensor:
         """``[B, 20]`` bool: the joints that landmarks ``seen [B, 42]`` bool show."""
-        palm = seen.unflatten(1, (2, HAND))[:, :, PALM].all(-1)
         base, middle, *beyond = seen[:, self.chains].unbind(-1)
-        first = base & middle & palm.repeat_interleave(len(FINGERS), dim=1)
+        first = base & middle & self.placed(seen).repeat_interleave(len(FINGERS), dim=1)
         return torch.cat([first, first & (beyond[0] | beyond[1])], dim=1)
 
     def _turns(self, numbers: Tensor) -> tuple[Tensor, Tensor]:
@@ -139,6 +185,24 @@ class Fingers(nn.Module):
         H = weighted @ J.flatten(3).mT + torch.diag_embed(self.prior)
         g = (weighted @ r.flatten(2).unsqueeze(-1)).squeeze(-1) + self.prior * numbers
         return torch.linalg.solve(H, g)
+
+
+def _placed(x: Tensor, hands: Tensor, seen: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations ``[B, 2, 3, 3]`` and shifts ``[B, 2, 3]`` that take ``x [B, 42, 3]`` nearest to the
+    landmarks seen: Gauss-Newton steps from ``R``, whose gradients are finite where an SVD's are
+    not."""
+    x, y, w = (v.unflatten(1, (2, HAND)) for v in (x, hands, seen.to(hands).unsqueeze(-1)))
+    share = w / w.sum(2, keepdim=True).clamp_min(1)
+    centre, goal = ((share * v).sum(2) for v in (x, y))
+    away, towards = x - centre.unsqueeze(2), y - goal.unsqueeze(2)
+    eye = torch.eye(3).to(x)
+    for _ in range(TURNS):
+        now = away @ R.mT
+        H = (share * now).mT @ now
+        H = (torch.einsum("...ii", H)[..., None, None] + SHORT**2) * eye - H
+        slope = (share * torch.linalg.cross(now, towards)).sum(2)
+        R = axis_angle_to_matrix(torch.linalg.solve(H, slope)) @ R
+    return R, goal - (R @ centre.unsqueeze(-1)).squeeze(-1)
 
 
 def _bones(x: Tensor, chains: Tensor) -> Tensor:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import torch
 from torch import Tensor
 
+from gsgan.body.fingers import Fingers
 from gsgan.body.rig import rest_axes
-from gsgan.body.shape import STRETCHED, B, BodyShape, ShapeSpace, free_space
+from gsgan.body.shape import STRETCHED, WRISTS, B, BodyShape, ShapeSpace, free_space, shaped_body
 from gsgan.body.skinned import MarkedBody
-from gsgan.body.solve import Solver
+from gsgan.body.solve import BODY, Solver
+from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, sanitise
+from gsgan.skeleton.hands import FINGER_BONES, FINGERS, HAND, WRIST
 from gsgan.utils.errors import DataError
 
 FRAMES = 24  # are enough: every frame shows the same lengths
@@ -53,7 +57,77 @@ def fit_shape(
     reduced = _without_surface(free_space()) if space is None else _without_surface(space)
     p, seen = _usable(skeletons, visibility)
     x = _fit_lengths(reduced, p, seen)
-    return BodyShape.of_flat(_fit_landmarks(reduced, x, p, seen).flat().float())
+    shape = _fit_landmarks(reduced, x, p, seen)
+    return BodyShape(*(v.float() for v in vars(shape).values() if v is not None))
+
+
+def with_hands(
+    shape: BodyShape, poses: BodyPose, skeletons: Tensor, visibility: Tensor
+) -> BodyShape:
+    """The free body's shape with the person's hands: their size, where they turn, and where they
+    are on the forearms. `fit_shape` sees few landmarks of a hand.
+
+    Args:
+        shape: of the person.
+        poses: F poses by which the forearms are known.
+        skeletons: ``[F, 75, 3]`` metres.
+        visibility: ``[F, 75]``; landmarks at 0 are not used.
+
+    Source: ours.
+    """
+    body, hands = shaped_body(shape), skeletons[:, BODY:]
+    seen = (visibility[:, BODY:] > 0) & hands.isfinite().all(-1)
+    bones = torch.tensor([*((WRIST, finger[0]) for finger in FINGERS), *FINGER_BONES])
+    first, last = torch.cat([bones, bones + HAND]).mT
+    length = (hands[:, last] - hands[:, first]).norm(dim=-1)
+    length = length.where(seen[:, last] & seen[:, first], torch.nan).nanmedian(dim=0).values
+    if not (known := length.isfinite()).any():
+        return shape
+    own = (body.hand_landmarks[last] - body.hand_landmarks[first]).norm(dim=-1)
+    stretch = shape.stretch.clone()
+    stretch[STRETCHED.index("hand")] *= length[known].sum() / own[known].sum()
+    shape = replace(shape, stretch=stretch)
+
+    body, wrists = shaped_body(shape), [WRIST, HAND + WRIST]
+    fingers = Fingers(body)
+    beyond = seen.clone()
+    beyond[:, wrists] = False
+    found = fingers(hands.where(seen.unsqueeze(-1), 0.0), beyond)
+    forearms = body.transforms(poses)[:, body.hand_bone[wrists]]
+    at_rest = [
+        (R.mT @ (hands[:, wrists] - t).unsqueeze(-1)).squeeze(-1)
+        for R, t in (
+            (forearms[..., :3, :3], forearms[..., :3, 3]),
+            (found.rotations, found.shifts),
+        )
+    ]
+    placed = fingers.placed(seen).unsqueeze(-1)
+    on_arm, in_hand = (x.where(placed, torch.nan).nanmedian(dim=0).values for x in at_rest)
+    moves = torch.stack(
+        [on_arm - body.joints[[body.joint_names.index(name) for name in WRISTS]], on_arm - in_hand],
+        dim=1,
+    )
+    return replace(shape, hands=moves.nan_to_num(0.0))
+
+
+def fit_offsets(shape: BodyShape, poses: BodyPose, skeletons: Tensor, visibility: Tensor) -> Tensor:
+    """``[33, 3]`` metres: offsets with which a body in these poses has the person's landmarks:
+    medians over frames, zero for landmarks that no frame shows.
+
+    Args:
+        shape: of the person.
+        poses: F poses.
+        skeletons: ``[F, 33, 3]`` metres.
+        visibility: ``[F, 33]``; landmarks at 0 are not used.
+    """
+    body = shaped_body(shape)
+    bones = body.transforms(poses)[:, body.landmark_bone]
+    at_rest = bones[..., :3, :3].mT @ (skeletons - bones[..., :3, 3]).unsqueeze(-1)
+    moved = torch.where(
+        (visibility > 0).unsqueeze(-1), at_rest.squeeze(-1) - body.landmarks, torch.nan
+    )
+    before = torch.zeros_like(body.landmarks) if shape.offsets is None else shape.offsets
+    return before + moved.nanmedian(dim=0).values.nan_to_num(0.0)
 
 
 def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:

@@ -47,6 +47,30 @@ SMPL: dict[str, Chain] = {
     "foot": (("{}_ankle", 1.0),),
     "toe": (("{}_foot", 1.0),),
 }
+# Standard deviation of each number about the rest pose: wide where a joint turns freely, narrow
+# across hinges and where 33 landmarks do not see the turn.
+SPREAD = {
+    "spine": 0.25,
+    "neck": 0.5,
+    "collar": 0.2,
+    "arm": 1.5,
+    "arm_twist": 0.7,
+    "elbow": 1.5,
+    "elbow_side": 0.1,
+    "forearm_twist": 0.6,
+    "wrist": 0.4,
+    "thumb": 0.3,
+    "thigh": 1.0,
+    "thigh_twist": 0.2,
+    "knee": 1.5,
+    "knee_side": 0.05,
+    "shank_twist": 0.05,
+    "foot": 0.4,
+    "foot_y": 0.2,
+    "foot_z": 0.2,
+    "toe": 0.2,
+}
+LEAST = {"knee": -0.1, "elbow": -0.7}  # a hinge does not bend backwards; elbows are bent at rest
 SIDES = {"left": "L", "right": "R"}
 BENT = 0.15  # sine: a rest pose's elbow that is bent more shows where its hinge is
 AT_JOINT = 1e-4  # metres
@@ -236,6 +260,16 @@ def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, Axes]) -> Rig:
         reaches=reaches,
         limbs=tuple(_limb(names, *item) for item in limbs.items()),
     )
+
+
+def spreads(rig: Rig) -> tuple[Tensor, Tensor]:
+    """``[D]`` standard deviation of each number, infinite for the root's; and its least value."""
+    spread, least = [torch.inf] * 6, [-torch.inf] * 6
+    for name in rig.names[6:]:
+        key = name.removeprefix("left_").removeprefix("right_")
+        spread.append(SPREAD.get(key) or SPREAD[key.split("_")[0]])
+        least.append(LEAST.get(key, -torch.inf))
+    return torch.tensor(spread), torch.tensor(least)
 
 
 def _limb(names: tuple[str, ...], words: str, axes: Axes) -> Limb:

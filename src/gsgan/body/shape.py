@@ -5,11 +5,12 @@ Convention: metres; the rest pose and axes of the body (see `gsgan.body.free`, `
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
@@ -21,6 +22,7 @@ from gsgan.body.skinned import MarkedBody
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.body.smpl_names import Parts, fitting_parts
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.hands import HAND, WRIST
 from gsgan.utils.errors import DataError
 
 # What each group's stretch scales: along the limb, or all of the part. Left and right share it.
@@ -35,7 +37,8 @@ GROUPS = {  # by the joint's name in the free body | in SMPL's family; the other
     "foot": r"(foot|toe).*|.*_(ankle|foot)",
     "head": r"head|jaw|.*_eye",
 }
-LANDMARKS = (len(MEDIAPIPE33.names), 3)
+WRISTS = ("wrist.L", "wrist.R")
+LANDMARKS, HANDS = (len(MEDIAPIPE33.names), 3), (2, 2, 3)
 
 B = TypeVar("B", bound=MarkedBody)
 
@@ -49,6 +52,8 @@ class BodyShape:
         stretch: ``[8]`` factors by group, in the order of `STRETCHED`; 1 leaves it as it is.
         offsets: ``[33, 3]`` metres at rest, from the body's landmarks to where this person's
             skeletons have them: detectors and rigs define joints differently. None means zero.
+        hands: ``[2, 2, 3]`` metres at rest, of left and right: how far the person's wrist is from
+            the body's, and by how much the hand beyond it moves. None means as the body has them.
 
     Raises:
         ValueError: on wrong shapes.
@@ -57,35 +62,40 @@ class BodyShape:
     coefficients: Tensor
     stretch: Tensor
     offsets: Tensor | None = None
+    hands: Tensor | None = None
 
     def __post_init__(self) -> None:
         off = LANDMARKS if self.offsets is None else self.offsets.shape
-        if (self.coefficients.ndim, self.stretch.shape, off) != (1, (len(STRETCHED),), LANDMARKS):
+        hands = HANDS if self.hands is None else self.hands.shape
+        given = (self.coefficients.ndim, self.stretch.shape, off, hands)
+        if given != (1, (len(STRETCHED),), LANDMARKS, HANDS):
             raise ValueError(
-                f"BodyShape: expected coefficients [K], stretch [{len(STRETCHED)}] and offsets "
-                f"{list(LANDMARKS)}, got {list(self.coefficients.shape)}, "
-                f"{list(self.stretch.shape)} and {list(off)}"
+                f"BodyShape: expected coefficients [K], stretch [{len(STRETCHED)}], offsets "
+                f"{list(LANDMARKS)} and hands {list(HANDS)}, got {list(self.coefficients.shape)}, "
+                f"{list(self.stretch.shape)}, {list(off)} and {list(hands)}"
             )
 
     def flat(self) -> Tensor:
-        """``[K + 8 + 99]`` all numbers, to store; see `of_flat`."""
+        """``[K + 8 + 99]`` all numbers, with hands 12 more, to store; see `of_flat`."""
         off = self.stretch.new_zeros(LANDMARKS) if self.offsets is None else self.offsets
-        return torch.cat([self.coefficients, self.stretch, off.flatten()])
+        hands = [] if self.hands is None else [self.hands.flatten()]
+        return torch.cat([self.coefficients, self.stretch, off.flatten(), *hands])
 
     @classmethod
     def of_flat(cls, values: Tensor) -> BodyShape:
-        """The shape whose numbers `flat` gave.
+        """The shape of the free body whose numbers `flat` gave.
 
         Raises:
-            ValueError: when there are fewer numbers than stretches and offsets.
+            ValueError: when there are neither as many as with hands or without.
         """
-        rest = len(STRETCHED) + LANDMARKS[0] * LANDMARKS[1]
-        if values.ndim != 1 or len(values) < rest:
-            raise ValueError(f"BodyShape: at least {rest} numbers, got {list(values.shape)}")
-        K = len(values) - rest
-        return cls(
-            values[:K], values[K : K + len(STRETCHED)], values[K + len(STRETCHED) :].view(LANDMARKS)
-        )
+        sizes = [free_space().coefficients, len(STRETCHED), math.prod(LANDMARKS)]
+        with_hands = [*sizes, math.prod(HANDS)]
+        if values.shape not in ((sum(sizes),), (sum(with_hands),)):
+            raise ValueError(
+                f"BodyShape: {sum(sizes)} or {sum(with_hands)} numbers, got {list(values.shape)}"
+            )
+        K, stretch, off, *hands = values.split(with_hands if len(values) > sum(sizes) else sizes)
+        return cls(K, stretch, off.view(LANDMARKS), *(x.view(HANDS) for x in hands))
 
 
 @dataclass(frozen=True)
@@ -128,7 +138,8 @@ class ShapeSpace(Generic[B]):
         body = _stretched(replace(self.body, **moved), shape.stretch)
         if shape.offsets is None:
             return body
-        return replace(body, landmarks=body.landmarks + shape.offsets)
+        body = replace(body, landmarks=body.landmarks + shape.offsets)
+        return body if shape.hands is None else _with_hands(body, shape.hands)
 
 
 def group_of(joint: str) -> str:
@@ -174,6 +185,29 @@ def _stretched(body: B, stretch: Tensor) -> B:
         n: (S[b] @ getattr(body, n).unsqueeze(-1)).squeeze(-1) + shift[b] for n, b in points.items()
     }
     return replace(body, vertices=skin(body.vertices, A[0], t[0]), joints=moved, **carried)
+
+
+def _with_hands(body: B, hands: Tensor) -> B:
+    """The body with wrists and hands moved by ``hands [2, 2, 3]``, see `BodyShape`."""
+    sides = torch.tensor([_side_of_hand(name) for name in body.joint_names])
+    moves = torch.cat([torch.zeros_like(hands[:1, 1]), hands[:, 1]])  # [3, 3], none first
+    weight = body.bone_weight.unsqueeze(-1)
+    out: dict[str, Any] = {
+        "vertices": body.vertices + (weight * moves[sides[body.bone_index]]).sum(1),
+        "landmarks": body.landmarks + moves[sides[body.landmark_bone]],
+    }
+    wrists = [body.joint_names.index(name) for name in WRISTS]
+    at = body.joints[wrists] + hands[:, 0]
+    out["joints"] = (body.joints + moves[sides]).index_copy(0, torch.tensor(wrists), at)
+    if isinstance(body, Body):
+        own = body.hand_landmarks + moves[sides[body.hand_bone]]
+        out["hand_landmarks"] = own.index_copy(0, torch.tensor([WRIST, HAND + WRIST]), at)
+    return replace(body, **out)
+
+
+def _side_of_hand(joint: str) -> int:
+    """1 for a joint of the left hand, 2 for the right hand's, else 0."""
+    return (1 + (joint[-1] == "R")) * (group_of(joint) == "hand")
 
 
 def constant_row(S: Tensor) -> Tensor:

@@ -5,53 +5,33 @@ Convention: metres, world frame, radians.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
 from kornia.geometry.conversions import quaternion_to_axis_angle, rotation_matrix_to_quaternion
 from torch import Tensor, nn
-from torch.nn.functional import normalize
+from torch.nn.functional import normalize, pad
 
 from gsgan.body.fingers import Fingers
 from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
-from gsgan.body.rig import Rig, ancestors, build_rig
+from gsgan.body.rig import ancestors, build_rig, spreads
 from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, MEDIAPIPE33_HANDS, TEMPLATES, bone_frames, sanitise
+from gsgan.skeleton.hands import HAND
+from gsgan.skeleton.hands import PALM as SPAN
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.tensors import constant
 
 BODY, ALL = len(MEDIAPIPE33.names), len(MEDIAPIPE33_HANDS.names)
 SIZES = [len(template.names) for template in TEMPLATES.values()]
-# Standard deviation of each number about the rest pose: wide where a joint turns freely, narrow
-# across hinges and where 33 landmarks do not see the turn.
-SPREAD = {
-    "spine": 0.25,
-    "neck": 0.5,
-    "collar": 0.2,
-    "arm": 1.5,
-    "arm_twist": 0.7,
-    "elbow": 1.5,
-    "elbow_side": 0.1,
-    "forearm_twist": 0.6,
-    "wrist": 0.4,
-    "thumb": 0.3,
-    "thigh": 1.0,
-    "thigh_twist": 0.2,
-    "knee": 1.5,
-    "knee_side": 0.05,
-    "shank_twist": 0.05,
-    "foot": 0.4,
-    "foot_y": 0.2,
-    "foot_z": 0.2,
-    "toe": 0.2,
-}
-LEAST = {"knee": -0.1, "elbow": -0.7}  # a hinge does not bend backwards; elbows are bent at rest
-BEYOND = 0.05  # standard deviation beyond it
+BEYOND = 0.05  # standard deviation beyond the least value of a number
 # Metres, standard deviation of a landmark: detectors place face and palm less well.
 NOISE, FACE_NOISE, PALM_NOISE = 0.004, 0.008, 0.007
 PALM = slice(17, 23)
+HANDS = ((17, 19, 21), (18, 20, 22))  # of 33: landmarks that hand landmarks replace
 HELD = 0.05  # the same of hips that are estimates: nothing else keeps a trunk from nodding
 ROBUST = 5.0  # standard deviations: landmarks further off pull no more than that
 STEPS, CONVERGED = 10, 1e-3  # of the cost
@@ -65,8 +45,8 @@ STRAIGHT, SHARP = 0.1, 0.4  # radians: below a bend says nothing of the twist, a
 class Linear(NamedTuple):
     """Residuals at some numbers, and their derivatives."""
 
-    residual: Tensor  # [B, 33, 3] metres
-    by_number: Tensor  # [B, D, 33, 3]
+    residual: Tensor  # [B, N, 3] metres
+    by_number: Tensor  # [B, D, N, 3]
 
 
 class Solver(nn.Module):
@@ -76,8 +56,9 @@ class Solver(nn.Module):
     Levenberg-Marquardt steps on the distances to the landmarks and a prior on the turns, which
     decides what 33 landmarks do not show: knees and elbows are hinges, ankles hardly turn, twist
     spreads along limbs. A few more steps at the solution carry gradients.
-    Deterministic; the result of a frame does not depend on the others. Fingers follow hand
-    landmarks, where they are given and the body has some (`gsgan.body.fingers`).
+    Deterministic; the result of a frame does not depend on the others. Where hand landmarks are
+    given and the body has hands, fingers follow them, and the hand is placed by all of them
+    (`gsgan.body.fingers`) instead of by the few that 33 landmarks have.
 
     Args:
         body: of the subject's shape.
@@ -89,13 +70,14 @@ class Solver(nn.Module):
     """
 
     joints: Tensor  # [J, 3] rest
-    landmarks: Tensor  # [33, 3] rest, 0 where not known
-    known: Tensor  # [33] bool
+    landmarks: Tensor  # [N, 3] rest, 0 where not known: 33, and 3 of each hand of the free body
+    known: Tensor  # [N] bool
+    replaced: Tensor  # [2, 33] bool, `HANDS`
     precision: Tensor  # [33] of the body's own landmarks
     prior: Tensor  # [D] precisions
     least: Tensor  # [D]
     matrix: Tensor  # [D, 3 T] from numbers to the turns' axis-angles
-    follows: Tensor  # [E, 33, 1] bool, whether a landmark follows an entry's turn
+    follows: Tensor  # [E, N, 1] bool, whether a landmark follows an entry's turn
     jumps: Tensor  # [n, T + 1]
     before: Tensor  # [T]
     rest_hubs: Tensor  # [3, 3, 3]
@@ -111,13 +93,21 @@ class Solver(nn.Module):
         super().__init__()
         self.parents = len(body.parents)
         self.fingers = Fingers(body) if isinstance(body, Body) else None
+        known = body.landmarks.isfinite().all(-1)
+        if isinstance(body, Body):
+            palms = [i + start for start in (0, HAND) for i in SPAN]
+            body = replace(
+                body,
+                landmarks=torch.cat([body.landmarks, body.hand_landmarks[palms]]),
+                landmark_bone=torch.cat([body.landmark_bone, body.hand_bone[palms]]),
+            )
         with torch.no_grad():
             rig = self.rig = build_rig(body)
-            known = body.landmarks.isfinite().all(-1)
-            rest, _ = sanitise(torch.where(known[:, None], body.landmarks, torch.nan)[None])
+            own = body.landmarks[:BODY]
+            rest, _ = sanitise(torch.where(known[:, None], own, torch.nan)[None])
             matrix = body.joints.new_zeros(len(rig.names), len(rig.joint), 3)
             matrix[rig.entry_number, rig.entry_turn] = rig.entry_axis.to(matrix)
-            spread, least = _spreads(rig)
+            spread, least = spreads(rig)
             held = {
                 "precision": known / _noise().square(),
                 "prior": spread.square().reciprocal(),
@@ -128,7 +118,8 @@ class Solver(nn.Module):
                 "before": torch.where(rig.parent < 0, len(rig.parent), rig.parent),
                 "rest_hubs": bone_frames(rest).hubs[0],
                 "rest_hips": rest[0, MEDIAPIPE33.hips].mean(0),
-                "known": known,
+                "replaced": torch.tensor([[i in hand for i in range(BODY)] for hand in HANDS]),
+                "known": body.landmarks.isfinite().all(-1),
                 **{k: v for k, v in vars(rig).items() if isinstance(v, Tensor)},
             }
         # the body's own tensors keep their graph: gradients reach its shape
@@ -163,17 +154,26 @@ class Solver(nn.Module):
         refuse_swapped(p.detach(), valid)
         shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
         weight = (self.weights(valid) * torch.where(valid, visibility, 1).clamp(0, 1)).to(p)
-        solved = [
-            self._solve(near, w)
-            for near, w in zip((p - shift).split(CHUNK), weight.detach().split(CHUNK), strict=True)
-        ]
-        theta, transl = (torch.cat(parts) for parts in zip(*solved, strict=True))
+        p, found = p - shift, None
         if self.fingers is not None and hands.shape[1]:
             seen = (seen > 0) & hands.isfinite().all(-1)
-            at = torch.where(seen.unsqueeze(-1), hands - shift, 0.0)
-            turns, shown = self.fingers(at, seen)
+            found = self.fingers(torch.where(seen.unsqueeze(-1), hands - shift, 0.0), seen)
+            replaced = (found.placed.unsqueeze(-1) & self.replaced).any(1)
+            held = found.placed.repeat_interleave(len(SPAN), dim=1).to(weight) / NOISE**2
+            weight = torch.cat([weight.masked_fill(replaced, 0), held], dim=1)
+            own = self.landmarks[BODY:].unflatten(0, (2, -1))
+            at = own @ found.rotations.mT + found.shifts.unsqueeze(-2)
+            p = torch.cat([p, at.flatten(1, 2)], dim=1)
+        elif self.fingers is not None:
+            p, weight = pad(p, (0, 0, 0, 2 * len(SPAN))), pad(weight, (0, 2 * len(SPAN)))
+        solved = [
+            self._solve(near, w)
+            for near, w in zip(p.split(CHUNK), weight.detach().split(CHUNK), strict=True)
+        ]
+        theta, transl = (torch.cat(parts) for parts in zip(*solved, strict=True))
+        if self.fingers is not None and found is not None:
             joints = self.fingers.joints
-            turns = torch.where(shown.unsqueeze(-1), turns, theta[:, joints])
+            turns = torch.where(found.shown.unsqueeze(-1), found.turns, theta[:, joints])
             theta = theta.index_copy(1, joints, turns)
         return BodyPose(theta, transl + shift[:, 0])
 
@@ -190,6 +190,9 @@ class Solver(nn.Module):
     def at_rest(self, visibility: Tensor) -> Tensor:
         """``[B, joints]`` bool: joints that no seen landmark shows: `solve` leaves them at rest."""
         seen, hands = visibility[:, :BODY] > 0, visibility[:, BODY:ALL] > 0
+        if self.fingers is not None:
+            placed = self.fingers.placed(hands) if hands.shape[1] else seen.new_zeros(len(seen), 2)
+            seen = torch.cat([seen, placed.repeat_interleave(len(SPAN), dim=1)], dim=1)
         shown = ((seen & self.known).to(self.prior) @ self.reaches.to(self.prior).mT) > 0
         shown[:, :6] = True
         moved = torch.zeros(len(visibility), self.parents, device=visibility.device)
@@ -215,7 +218,7 @@ class Solver(nn.Module):
 
     def guess(self, p: Tensor) -> tuple[Tensor, Tensor]:
         """Numbers ``[B, D]`` and the root's rotation ``[B, 3, 3]`` of finite joints."""
-        hubs = bone_frames(p).hubs @ self.rest_hubs.mT
+        hubs = bone_frames(p[:, :BODY]).hubs @ self.rest_hubs.mT
         pelvis, chest, head = hubs.unbind(1)
         q = p.new_zeros(len(p), len(self.prior))
         for name, R in (("spine", pelvis.mT @ chest), ("neck", chest.mT @ head)):
@@ -261,12 +264,12 @@ class Solver(nn.Module):
         return T
 
     def points(self, T: Tensor, landmarks: Tensor) -> Tensor:
-        """``[B, 33, 3]`` the posed landmarks."""
+        """``[B, N, 3]`` the posed landmarks."""
         T = T[:, self.carrier]
         return (T[..., :3, :3] @ landmarks.unsqueeze(-1)).squeeze(-1) + T[..., :3, 3]
 
     def linear(self, q: Tensor, root: Tensor, p: Tensor) -> Linear:
-        """Residuals to ``p [B, 33, 3]`` and their derivatives, the root's about its rotation."""
+        """Residuals to ``p [B, N, 3]`` and their derivatives, the root's about its rotation."""
         T = self.transforms(q, root, self.joints)
         x, before = self.points(T, self.landmarks), T[:, self.before]
         origin = (before[..., :3, :3] @ self.joints[self.joint].unsqueeze(-1)).squeeze(-1)
@@ -284,7 +287,7 @@ class Solver(nn.Module):
     def normal(
         self, q: Tensor, at: Linear, weight: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Cost ``[B]``, half its gradient ``[B, D]``, matrix ``[B, D, D]``, weights ``[B, 33]``.
+        """Cost ``[B]``, half its gradient ``[B, D]``, matrix ``[B, D, D]``, weights ``[B, N]``.
 
         The weights are those of iteratively reweighted least squares.
         """
@@ -338,16 +341,6 @@ class Solver(nn.Module):
         for _ in range(GRADIENT_STEPS if live else 1):
             q = q - _solved(H, self.normal(q, self.linear(q, root, p), weight)[1])
         return q
-
-
-def _spreads(rig: Rig) -> tuple[Tensor, Tensor]:
-    """``[D]`` standard deviation of each number, infinite for the root's; and its least value."""
-    spread, least = [torch.inf] * 6, [-torch.inf] * 6
-    for name in rig.names[6:]:
-        key = name.removeprefix("left_").removeprefix("right_")
-        spread.append(SPREAD.get(key) or SPREAD[key.split("_")[0]])
-        least.append(LEAST.get(key, -torch.inf))
-    return torch.tensor(spread), torch.tensor(least)
 
 
 def _noise() -> Tensor:

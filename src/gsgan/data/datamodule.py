@@ -190,7 +190,7 @@ class GsganData(LightningDataModule):
                     f"{layout.root}: gsgan.fit made body_pose.npz without hands; run it again with "
                     "overwrite=true data.body=none, or choose data.skeleton=mediapipe33"
                 )
-            layout = replace(layout, poses=replace(poses, theta=poses.with_hands))
+            layout = replace(layout, poses=poses.with_hands)
         return layout
 
     @property

@@ -81,8 +81,8 @@ class Poses:
     """Body poses by frame: ``theta [bones, 3]`` axis-angle, ``transl [3]`` metres.
 
     ``fitted`` says that `gsgan.fit` made them: those of the frames ``registered`` by the masks of
-    the cameras ``fitted_to``, all others by their skeleton alone; and that ``with_hands`` is
-    ``theta`` with the fingers that hand landmarks show, or None.
+    the cameras ``fitted_to``, all others by their skeleton alone. ``with_hands`` are the poses that
+    follow hand landmarks too, or None.
     """
 
     theta: Mapping[int, Float]
@@ -91,7 +91,7 @@ class Poses:
     fitted: bool = False
     registered: frozenset[int] = frozenset()
     fitted_to: tuple[str, ...] = ()
-    with_hands: Mapping[int, Float] | None = None
+    with_hands: Poses | None = None
 
     def digest(self, frames: Iterable[int]) -> str:
         """A hash of the poses of those frames."""

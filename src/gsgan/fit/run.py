@@ -21,9 +21,9 @@ from rich.console import Console
 from torch import Tensor
 
 from gsgan import __version__
-from gsgan.body.measure import fit_shape
+from gsgan.body.measure import fit_offsets, fit_shape, with_hands
 from gsgan.body.shape import BodyShape, shaped_body
-from gsgan.body.solve import Solver
+from gsgan.body.solve import HANDS, Solver
 from gsgan.check.overlays import caption
 from gsgan.data.calibration.find import METRES
 from gsgan.data.checks import spans
@@ -125,33 +125,34 @@ def fit_body(
         console.print(f"{moments.left_out} images with empty masks, or nearly so, are left out")
     with console.status("solving poses"):
         shape = fit_shape(*_joints(data, data.trained))
-        solved = _solve(data, shape, layout.frames)
+        solved = _solve(data, shape, hands=False)
+        if _by_hands(data):
+            fingers = _fingers(shape)
+            solved.theta[:, fingers] = _solve(data, shape, hands=True).theta[:, fingers]
     rows = torch.tensor([layout.frames.index(frame) for frame in moments.frames])
     start = BodyPose(solved.theta[rows], solved.transl[rows])
     fitter = Fitter(settings, moments, shaped_body(shape), start, seed)
     _fitted(fitter, folder / STOPPED, _key(fitter, shape, seed), console)
     with torch.no_grad():
         found = fitter.pose()
-    shape = replace(shape, offsets=_offsets(fitter, shape, found))
-    driven = _solve(data, shape, layout.frames)
-    theta, transl = driven.theta.clone(), driven.transl.clone()
-    report = _report(fitter, BodyPose(theta[rows], transl[rows]).to(device), found)
-    kept = settings.held_out or settings.keep
-    if kept:
-        theta[rows], transl[rows] = found.theta.cpu(), found.transl.cpu()
+        registered = found.to(torch.device("cpu"))
+        shape = _refined(data, shape, moments.frames, registered)
+    driven = _solve(data, shape, _by_hands(data))
+    again = BodyPose(driven.theta[rows], driven.transl[rows]).to(device)
+    report = _report(fitter, again, found)
+    kept = registered if settings.held_out or settings.keep else None
     unit = METRES[layout.meta.unit]
     with writing(folder / SHEET):
         write_atomically(folder / SHEET, fit_picture(fitter, layout.camera_names, found, shown))
     write_json(folder / REPORT, report)
     with writing(folder / POSES):  # a fit that is killed here leaves no poses of another shape
         (folder / POSES).unlink(missing_ok=True)
-    write_npz(folder / SHAPE, **{name: x.numpy() for name, x in vars(shape).items()})
+    write_npz(folder / SHAPE, **{n: x.numpy() for n, x in vars(shape).items() if x is not None})
     write_npz(
         folder / POSES,
-        **_with_and_without_hands(data, shape, theta),
-        transl=transl.numpy() / unit,
+        **_with_and_without_hands(data, shape, rows, kept, unit),
         frame_id=np.array(layout.frames),
-        registered=np.array(moments.frames if kept else (), np.int64),
+        registered=np.array(() if kept is None else moments.frames, np.int64),
         fitted_to=np.array(moments.cameras),
     )
     (folder / STOPPED).unlink(missing_ok=True)
@@ -177,17 +178,21 @@ def _folder(out: Path, overwrite: bool) -> Path:
 
 
 def _with_and_without_hands(
-    data: GsganData, shape: BodyShape, theta: Tensor
-) -> dict[str, NDArray[np.float32]]:
-    """``[F, 56, 3]`` poses with fingers by 33 landmarks and, where there are hands, by these."""
-    fingers = [i for i, n in enumerate(shaped_body(shape).joint_names) if n.startswith("finger")]
-    found = {}
-    for name, hands in {"theta": False, "theta_hands": True}.items():
+    data: GsganData, shape: BodyShape, rows: Tensor, kept: BodyPose | None, unit: float
+) -> dict[str, NDArray[Any]]:
+    """Poses by 33 landmarks and, where there are hands, by these too. Registered poses ``kept``
+    replace those of ``rows``, but for the fingers."""
+    fingers = _fingers(shape)
+    found: dict[str, NDArray[Any]] = {}
+    for name, hands in {"": False, "_hands": True}.items():
         if not hands or data.layout.hands is not None:
-            solved = _solve(data, shape, data.layout.frames, hands).theta
-            found[name] = theta.clone()
-            found[name][:, fingers] = solved[:, fingers]
-    return {name: x.numpy() for name, x in found.items()}
+            solved = _solve(data, shape, hands)
+            theta, transl = solved.theta.clone(), solved.transl.clone()
+            if kept is not None:
+                theta[rows], transl[rows] = kept.theta, kept.transl
+                theta[:, fingers] = solved.theta[:, fingers]
+            found |= {f"theta{name}": theta.numpy(), f"transl{name}": transl.numpy() / unit}
+    return found
 
 
 def _joints(data: GsganData, frames: Sequence[int], hands: bool = False) -> tuple[Tensor, Tensor]:
@@ -202,11 +207,9 @@ def _joints(data: GsganData, frames: Sequence[int], hands: bool = False) -> tupl
     return p, visibility
 
 
-def _solve(
-    data: GsganData, shape: BodyShape, frames: Sequence[int], hands: bool | None = None
-) -> BodyPose:
-    """Poses by skeletons with or without hands; None: as ``data.skeleton`` says."""
-    hands = bool(TEMPLATES[data.skeleton].palms) if hands is None else hands
+def _solve(data: GsganData, shape: BodyShape, hands: bool) -> BodyPose:
+    """Poses of all frames by skeletons with or without hands."""
+    frames = data.layout.frames
     try:
         with torch.no_grad():
             return Solver(shaped_body(shape)).solve(*_joints(data, frames, hands))
@@ -215,18 +218,30 @@ def _solve(
         raise DataError(f"{data.layout.root / LANDMARKS}: {error} ({names})") from None
 
 
-@torch.no_grad()
-def _offsets(fitter: Fitter, shape: BodyShape, found: BodyPose) -> Tensor:
-    """``[33, 3]`` metres: offsets of this person's landmarks on the registered body, medians over
-    frames. With them solving approximates registration, up to what varies between frames."""
-    body, moments = fitter.surface.body, fitter.moments
-    bones = body.transforms(found)[:, body.landmark_bone]
-    at_rest = bones[..., :3, :3].mT @ (moments.skeletons - bones[..., :3, 3]).unsqueeze(-1)
-    moved = torch.where(
-        (moments.visibility > 0).unsqueeze(-1), at_rest.squeeze(-1) - body.landmarks, torch.nan
-    )
-    before = torch.zeros_like(body.landmarks) if shape.offsets is None else shape.offsets
-    return before + moved.nanmedian(dim=0).values.nan_to_num(0.0).cpu()
+def _by_hands(data: GsganData) -> bool:
+    return data.layout.hands is not None and bool(TEMPLATES[data.skeleton].palms)
+
+
+def _fingers(shape: BodyShape) -> list[int]:
+    return [i for i, n in enumerate(shaped_body(shape).joint_names) if n.startswith("finger")]
+
+
+def _refined(
+    data: GsganData, shape: BodyShape, frames: Sequence[int], registered: BodyPose
+) -> BodyShape:
+    """The shape with the landmarks that this person has in registered poses, so that solving
+    approximates registration, up to what varies between frames; and with the person's hands."""
+    offsets = fit_offsets(shape, registered, *_joints(data, frames))
+    shape = replace(shape, offsets=offsets)
+    if data.layout.hands is None:
+        return shape
+    arms, everywhere = _solve(data, shape, hands=False), data.layout.frames
+    shape = with_hands(shape, arms, *_joints(data, everywhere, hands=True))
+    by_hands = _solve(data, shape, hands=True)
+    again = fit_offsets(shape, by_hands, *_joints(data, everywhere))
+    on_hand = torch.zeros(len(offsets), 1, dtype=torch.bool)
+    on_hand[[*HANDS[0], *HANDS[1]]] = True
+    return replace(shape, offsets=torch.where(on_hand, again, offsets))
 
 
 def _key(fitter: Fitter, shape: BodyShape, seed: int) -> str:
@@ -237,7 +252,7 @@ def _key(fitter: Fitter, shape: BodyShape, seed: int) -> str:
         files = [path.stat() for _, path in dataset.layout.mask_files(*item)]
         content.append([*item, *((file.st_size, file.st_mtime_ns) for file in files)])
     text = json.dumps(content, sort_keys=True, default=str).encode()
-    tensors = [*vars(shape).values(), fitter.start.theta, fitter.start.transl]
+    tensors = [shape.flat(), fitter.start.theta, fitter.start.transl]
     numbers = [x.cpu().numpy().tobytes() for x in (*tensors, fitter.moments.skeletons)]
     cameras = (dataset.layout.root / "cameras.json").read_bytes()
     return hashlib.sha256(b"".join([text, *numbers, cameras])).hexdigest()

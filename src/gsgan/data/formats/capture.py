@@ -10,9 +10,9 @@
     hands3d.npz       optional, the same (F,42,3): MediaPipe's 21 of the left hand, then the right
     face3d.npz        optional, the same (F,30,3), names (30,): lips, brows and lids
     body_pose.npz     optional theta (F,bones,3), transl (F,3), frame_id (F,); betas (S,) of SMPL
-                      by gsgan.fit also theta_hands (F,56,3), with the fingers of hands3d.npz
-    body_shape.npz    optional coefficients (K,), stretch (8,), offsets (33,3): of the free body, by
-                      gsgan.fit
+                      by gsgan.fit also theta_hands and transl_hands, which follow hands3d.npz
+    body_shape.npz    optional coefficients (K,), stretch (8,), offsets (33,3), hands (2,2,3) where
+                      there are some: of the free body, by gsgan.fit
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from gsgan.body.shape import HANDS as HANDS_SHAPE
 from gsgan.body.shape import LANDMARKS as LANDMARKS_SHAPE
 from gsgan.body.shape import STRETCHED
 from gsgan.data.calibration.find import (
@@ -49,6 +50,7 @@ from gsgan.utils.errors import DataError
 
 LANDMARKS, HANDS, FACES = "landmarks3d.npz", "hands3d.npz", "face3d.npz"
 POSES, SHAPE = "body_pose.npz", "body_shape.npz"
+WITH_HANDS = ("theta_hands", "transl_hands")
 MASKS = (".png",)
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
 LOOKED_AT = Trust(min_box_iou=0.0)
@@ -207,32 +209,33 @@ def _refuse_other_names(path: Path) -> None:
 def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
     """Poses of frames whose numbers are finite, and ``meta`` with the body and its shape."""
     path, fitted = root / POSES, (root / SHAPE).exists()
-    names = ("theta", "transl", "frame_id", "betas", "registered", "fitted_to", "theta_hands")
+    names = ("theta", "transl", "frame_id", "betas", "registered", "fitted_to", *WITH_HANDS)
     arrays = read_arrays(path, names)
     if fitted:  # by gsgan.fit: the free body in the person's shape
         meta = replace(meta, body=BodyModel("free", betas=read_shape(root / SHAPE)))
     bones = None if meta.body is None else BODY_BONES[meta.body.kind]
-    theta = expect_array(arrays, "theta", (None, bones, 3), path).astype(np.float64)
-    transl = expect_array(arrays, "transl", (len(theta), 3), path).astype(np.float64)
-    transl = transl * conventions.scale
-    ids = whole_frame_ids(expect_array(arrays, "frame_id", (len(theta),), path), str(path))
-    finite = np.isfinite(theta).all((1, 2)) & np.isfinite(transl).all(1)
-    rows = {int(ids[i]): int(i) for i in np.flatnonzero(finite)}
-    with_hands = None
-    if "theta_hands" in arrays:
-        with_hands = expect_array(arrays, "theta_hands", theta.shape, path).astype(np.float64)
+    ids = whole_frame_ids(expect_array(arrays, "frame_id", (None,), path), str(path))
     registered: frozenset[int] = frozenset()
     if "registered" in arrays:
         found = expect_array(arrays, "registered", (None,), path)
         registered = frozenset(whole_frame_ids(found, str(path)).tolist())
-    poses = Poses(
-        {f: theta[i] for f, i in rows.items()},
-        {f: transl[i] for f, i in rows.items()},
-        fitted=fitted,
-        registered=registered,
-        fitted_to=tuple(map(str, arrays.get("fitted_to", ()))),
-        with_hands=None if with_hands is None else {f: with_hands[i] for f, i in rows.items()},
-    )
+
+    def read(theta: str, transl: str) -> Poses:
+        turns = expect_array(arrays, theta, (len(ids), bones, 3), path).astype(np.float64)
+        moves = expect_array(arrays, transl, (len(ids), 3), path).astype(np.float64)
+        finite = np.isfinite(turns).all((1, 2)) & np.isfinite(moves).all(1)
+        rows = {int(ids[i]): int(i) for i in np.flatnonzero(finite)}
+        return Poses(
+            {f: turns[i] for f, i in rows.items()},
+            {f: conventions.scale * moves[i] for f, i in rows.items()},
+            fitted=fitted,
+            registered=registered,
+            fitted_to=tuple(map(str, arrays.get("fitted_to", ()))),
+        )
+
+    poses = read("theta", "transl")
+    if all(name in arrays for name in WITH_HANDS):
+        poses = replace(poses, with_hands=read(*WITH_HANDS))
     if meta.body is None or "betas" not in arrays:
         return poses, meta
     betas = expect_array(arrays, "betas", (None,), path).astype(np.float64)
@@ -248,6 +251,8 @@ def read_shape(path: Path) -> tuple[float, ...]:
         DataError: when the file is damaged or lacks an array.
     """
     names = {"coefficients": (None,), "stretch": (len(STRETCHED),), "offsets": LANDMARKS_SHAPE}
-    arrays = read_arrays(path, names)
+    arrays = read_arrays(path, (*names, "hands"))
+    if "hands" in arrays:
+        names["hands"] = HANDS_SHAPE
     parts = [expect_array(arrays, name, shape, path).ravel() for name, shape in names.items()]
     return tuple(np.concatenate(parts).astype(np.float64).tolist())
