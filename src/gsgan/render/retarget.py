@@ -44,8 +44,8 @@ from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 
 Float = NDArray[np.float64]
 
-STILL = 0.001  # metres: landmarks of a face that move less are all as good to align by
-ROUNDS = 5
+STILL = 0.001  # metres: landmarks of a face that move less count fully in its alignment
+ROUNDS = 20  # of the alignment
 NECK = 0.45  # radians, the largest bend of the neck: detectors place faces too far forward
 
 
@@ -104,8 +104,8 @@ def expressed(p: Float, rest: Float) -> Float:
 
     Each frame's face is aligned with the subject's by a similarity, which removes the turn of the
     head and the size. Its offset from the median over the frames, the other person's face at rest,
-    is added to the subject's face at rest. Landmarks that move much count little in the alignment:
-    a mouth that opens does not lower the brows.
+    is added to the subject's face at rest. Landmarks that move much count little in the frame's
+    alignment: brows that rise do not lower the mouth.
 
     Args:
         p: the other person's landmarks ``[F, 30, 3]``, in any frame and unit; NaN where not seen.
@@ -115,12 +115,12 @@ def expressed(p: Float, rest: Float) -> Float:
         Metres; NaN where not seen.
     """
     found, own = torch.from_numpy(p), torch.from_numpy(rest)
-    seen, usual, weight = found.isfinite().all(-1, keepdim=True), own, torch.ones_like(own[:, :1])
+    usual, weight = own, found.isfinite().all(-1, keepdim=True).double()
     for _ in range(ROUNDS):
-        found = _aligned(found, usual.nan_to_num(), weight * seen)
+        found = _aligned(found, usual.nan_to_num(), weight)
         usual = found.nanmedian(0).values
-        spread = (found - usual).square().sum(-1, keepdim=True).nanmean(0)
-        weight = 1 / (STILL**2 + spread.nan_to_num())
+        moved = (found - usual).square().sum(-1, keepdim=True) / STILL**2
+        weight = (1 / (1 + moved)).nan_to_num()  # Cauchy's
     return (own + found - usual).numpy()
 
 
