@@ -11,7 +11,7 @@ from gsgan.data.figure import EXPRESSION
 from gsgan.data.joints import FACE_MESH
 from gsgan.data.synthetic.retarget import rotation
 from gsgan.render.motion import is_own
-from gsgan.render.retarget import expressed, joined, on_figure
+from gsgan.render.retarget import expressed, face_in_head, joined, on_figure, steadied
 from gsgan.skeleton import (
     HOLISTIC,
     MEDIAPIPE33,
@@ -83,7 +83,8 @@ def write_face(path, p: np.ndarray, kept: tuple[int, ...] = tuple(range(30))):
 
 def driven(path, figure, rest) -> np.ndarray:
     """``[F, 105, 3]`` the subject as `gsgan.render` drives it, in standard axes."""
-    p, _ = standard(path, figure)
+    p, motion = standard(path, figure)
+    p = p if motion.detached else face_in_head(p)
     p[:, EXPRESSION] = expressed(p[:, EXPRESSION], rest)
     return on_figure(p, figure)
 
@@ -102,7 +103,7 @@ def test_a_mouth_that_opens_opens_the_subjects(tmp_path, talking, signer, rest, 
 
 
 def test_the_source_may_be_turned_and_the_heads_of_both_differ(talking, rest, moves):
-    turned = 500 * talking[:, EXPRESSION] @ TURNED.T + 7
+    turned = 500 * steadied(talking[:, EXPRESSION] @ TURNED.T) + 7
     check(expressed(turned, rest) - rest, moves)
 
 
@@ -150,11 +151,13 @@ def test_next_to_no_landmarks(talking, rest, seen):
 
 def test_landmarks_with_a_face(tmp_path, talking, signer, rest, moves):
     """An .npz file of 105 joints; the subject's own are not changed."""
-    path = tmp_path / "a.npz"
-    np.savez(path, p=talking, fps=30)
+    path, p = tmp_path / "a.npz", talking.copy()
+    head, centre = head_of(p)
+    p[:, EXPRESSION] = centre + BIGGER * (rest + moves) @ head.mT
+    np.savez(path, p=p, fps=30)
     _, motion = standard(path, signer)
     assert is_own(motion, signer)
-    np.testing.assert_array_equal(motion.p, talking)
+    np.testing.assert_array_equal(motion.p, p)
     check(offsets_of(driven(path, signer, rest), rest), moves)
     np.savez(path, p=talking[:, :80])
     with pytest.raises(DataError, match="with hands and face"):

@@ -13,6 +13,7 @@ from scipy.optimize import nnls
 from gsgan.data.figure import BONES, EARS, HAND_JOINTS, HIPS, SHOULDERS, Figure, length
 from gsgan.data.joints import FACE_MESH
 from gsgan.render.motion import Motion, rate_of
+from gsgan.render.retarget import steadied
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.face import rest_face
 from gsgan.skeleton.hands import FINGERS, HAND_NAMES, WRIST
@@ -23,13 +24,14 @@ Float = NDArray[np.float64]
 GUESSED = 0.5  # visibility below which MediaPipe's hips are guesses
 IMAGE, WORLD = "POSE_LANDMARKS", "POSE_WORLD_LANDMARKS"  # in files of pose-format
 HANDS, MESH = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS"), "FACE_LANDMARKS"
-FACE_NUMBERS = tuple(str(number) for number in FACE_MESH.values())
+MESH_SIZE = 478
 # Without the thumb: hands differ most in where its base is.
 HAND_LENGTHS = tuple(bone for f in FINGERS[1:] for bone in pairwise((WRIST, *f)))
-AVERAGE_FACE = np.array(rest_face())
+AVERAGE_FACE = np.full((MESH_SIZE, 3), np.nan)
+AVERAGE_FACE[list(FACE_MESH.values())] = rest_face()
 # Pairs of landmarks that are further apart than an expression moves them, by far.
 FACE_LENGTHS = tuple(
-    pair for pair in combinations(range(len(AVERAGE_FACE)), 2) if length(AVERAGE_FACE, pair) > 0.05
+    pair for pair in combinations(FACE_MESH.values(), 2) if length(AVERAGE_FACE, pair) > 0.05
 )
 LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))  # rigid, for the scale of axes
 
@@ -40,7 +42,8 @@ def read_pose(path: Path, figure: Figure) -> Motion:
     Image landmarks with MediaPipe's depth, which agree with those of the hands; without any, world
     landmarks. The package scales x and y by the image size but not z, and normalised files no
     longer hold that size: the scale of each axis is estimated from the subject's bone lengths.
-    Hands and the face have scales of their own.
+    Hands and the face have scales of their own. The face is in axes fixed to the head, by all
+    landmarks of the mesh that the file has.
 
     Hips that are hardly seen, as of people filmed from the waist up, are put upright below the
     shoulders.
@@ -92,7 +95,8 @@ def read_pose(path: Path, figure: Figure) -> Motion:
     if hidden:
         p[:, HIPS] = p[:, SHOULDERS] + (0, length(figure.rest, (11, 23)), 0)
         visibility[:, HIPS] = visibility[:, SHOULDERS]
-    hands, face = [landmarks(hand, HAND_NAMES) for hand in HANDS], landmarks(MESH, FACE_NUMBERS)
+    hands = [landmarks(hand, HAND_NAMES) for hand in HANDS]
+    face = landmarks(MESH, tuple(str(number) for number in range(MESH_SIZE)))
     if any(seen.any() for _, seen in (*hands, face)):
         whole = figure.rest_with_hands
         rest = [whole[at] for at in HAND_JOINTS.values()]
@@ -100,7 +104,9 @@ def read_pose(path: Path, figure: Figure) -> Motion:
         visibility = np.concatenate([visibility, *(seen for _, seen in hands)], axis=1)
     if face[1].any():
         (mesh,) = _parts_to_metres([face], [AVERAGE_FACE], FACE_LENGTHS)
-        p, visibility = np.hstack([p, mesh]), np.hstack([visibility, face[1]])
+        ours = list(FACE_MESH.values())
+        p = np.concatenate([p, steadied(mesh)[:, ours]], axis=1)
+        visibility = np.concatenate([visibility, face[1][:, ours]], axis=1)
     return Motion(path, p, visibility, rate_of(path, pose.body.fps), None, unit, detached=True)
 
 

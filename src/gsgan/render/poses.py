@@ -41,7 +41,7 @@ from gsgan.render.motion import (
     up_axis,
 )
 from gsgan.render.readers import Source, read_motion
-from gsgan.render.retarget import expressed, joined, on_figure, placed
+from gsgan.render.retarget import expressed, face_in_head, joined, on_figure, placed
 from gsgan.scene import BodyPose, Camera, Frame, cat
 from gsgan.skeleton import HOLISTIC, complete_skeleton
 from gsgan.skeleton.tensors import constants
@@ -305,6 +305,7 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
         centre = standard @ np.array(run.scene.centre)
         p = completed(motion, up)
         if p.shape[1] > EXPRESSION.start:
+            p = p if motion.detached else face_in_head(p)
             p[:, EXPRESSION] = expressed(p[:, EXPRESSION], run.face)
         p = on_figure(resampled(p, rate, fps), figure)
         p = placed(p, figure, centre, fps, ground=config.ground, stay=config.stay) @ standard

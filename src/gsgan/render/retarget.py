@@ -58,14 +58,14 @@ def on_figure(p: Float, figure: Figure, scale: float | None = None) -> Float:
     With hand landmarks, J = 75, palms are rotated as these show and fingers keep their directions;
     where in the world they are does not matter. A hand with NaN stays NaN.
 
-    With a face, J = 105, its landmarks are the subject's in the head's axes, see `expressed`.
+    A face, J = 105, is given as `expressed` returns it, and put on the head. NaN stays NaN.
 
     Args:
         p: of the other person.
         figure: the subject.
         scale: of the path, in place of that ratio.
     """
-    whole, hands, p = np.full_like(p, np.nan), p, p[:, :BODY]
+    whole, given, p = np.full_like(p, np.nan), p, p[:, :BODY]
     rest, q = figure.rest, whole[:, :BODY]
     if scale is None:
         legs = [np.linalg.norm(p[:, b] - p[:, a], axis=-1) for limb in LEGS for a, b in limb]
@@ -79,8 +79,8 @@ def on_figure(p: Float, figure: Figure, scale: float | None = None) -> Float:
         q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
     for wrist, ends in HANDS.items():
         turn = hand_frame(p, wrist) @ hand_frame(rest, wrist).T
-        if hands.shape[1] > BODY:
-            at, palm = _posed_hand(hands[:, HAND_JOINTS[wrist]], figure, wrist)
+        if given.shape[1] > BODY:
+            at, palm = _posed_hand(given[:, HAND_JOINTS[wrist]], figure, wrist)
             whole[:, HAND_JOINTS[wrist]] = q[:, wrist, None] + at
             turn = np.where(np.isfinite(palm), palm, turn)
         q[:, ends] = q[:, wrist, None] + (rest[list(ends)] - rest[wrist]) @ turn.mT
@@ -95,33 +95,46 @@ def on_figure(p: Float, figure: Figure, scale: float | None = None) -> Float:
     turn = _head_frame(p) @ _head_frame(rest[None]).mT
     q[:, FACE] = ears[:, None] + (rest[list(FACE)] - middle(rest, EARS)) @ turn.mT
     centre = q[:, MEDIAPIPE33.head].mean(1, keepdims=True)
-    whole[:, EXPRESSION] = centre + hands[:, EXPRESSION] @ _head_frame(q).mT
+    whole[:, EXPRESSION] = centre + given[:, EXPRESSION] @ _head_frame(q).mT
     return whole
 
 
 def expressed(p: Float, rest: Float) -> Float:
     """``[F, 30, 3]`` the subject's face with another person's expressions, in the head's axes.
 
-    Each frame's face is aligned with the subject's by a similarity, which removes the turn of the
-    head and the size. Its offset from the median over the frames, the other person's face at rest,
-    is added to the subject's face at rest. Landmarks that move much count little in the frame's
-    alignment: brows that rise do not lower the mouth.
+    One similarity aligns all frames with the subject's face. Offsets from the median over the
+    frames, the other person's face at rest, are added to the subject's face at rest.
 
     Args:
-        p: the other person's landmarks ``[F, 30, 3]``, in any frame and unit; NaN where not seen.
+        p: the other person's landmarks ``[F, 30, 3]`` in axes fixed to the head, of any place, turn
+            and unit; NaN where not seen.
         rest: ``[30, 3]`` metres, the subject's, see `gsgan.skeleton.in_head`.
 
     Returns:
         Metres; NaN where not seen.
     """
-    found, own = torch.from_numpy(p), torch.from_numpy(rest)
-    usual, weight = own, found.isfinite().all(-1, keepdim=True).double()
+    given, own = torch.from_numpy(p), torch.from_numpy(rest)
+    seen = given.isfinite().all(-1).double().reshape(1, -1, 1)
+    found = _aligned(given.reshape(1, -1, 3), own.repeat(len(given), 1), seen).reshape(p.shape)
+    return (own + found - found.nanmedian(0).values).numpy()
+
+
+def steadied(p: Float) -> Float:
+    """Landmarks of a face ``[F, n, 3]``, metres, NaN where not seen, in axes fixed to the head.
+
+    Frames are aligned with their median. Landmarks that move much count little in the frame's
+    alignment: a jaw that drops does not nod the head.
+    """
+    found = torch.from_numpy(p)
+    seen = found.isfinite().all(-1, keepdim=True).double()
+    usual = found[seen.sum((1, 2)).argmax()]
+    weight = seen * usual.isfinite()[:, :1]
     for _ in range(ROUNDS):
         found = _aligned(found, usual.nan_to_num(), weight)
         usual = found.nanmedian(0).values
         moved = (found - usual).square().sum(-1, keepdim=True) / STILL**2
         weight = (1 / (1 + moved)).nan_to_num()  # Cauchy's
-    return (own + found - usual).numpy()
+    return found.numpy()
 
 
 def _aligned(p: Tensor, onto: Tensor, weight: Tensor) -> Tensor:
@@ -188,7 +201,7 @@ def joined(clips: Sequence[Float], figure: Figure, n: int) -> Float:
     without a hand or face that either end lacks (NaN).
     """
     parts = [clips[0]]
-    for (a, b), after in zip(pairwise(map(_face_in_head, clips)), clips[1:], strict=True):
+    for (a, b), after in zip(pairwise(map(face_in_head, clips)), clips[1:], strict=True):
         speeds = [x[-1] - x[-2] if len(x) > 1 else 0 * x[0] for x in (a, b[1::-1])]
         ends, speed = np.stack([a[-1], b[0]]), np.stack([speeds[0], -speeds[1]])
         path = CubicHermiteSpline([0, n + 1], *(np.nan_to_num(x) for x in (ends, speed)))
@@ -198,7 +211,7 @@ def joined(clips: Sequence[Float], figure: Figure, n: int) -> Float:
     return np.concatenate(parts)
 
 
-def _face_in_head(p: Float) -> Float:
+def face_in_head(p: Float) -> Float:
     """Landmarks ``[F, J, 3]`` with those of the face as `on_figure` takes them."""
     body, face = torch.from_numpy(p[:, :BODY]), torch.from_numpy(p[:, EXPRESSION])
     local = in_head(face, body, bone_frames(body).hubs[:, HEAD], MEDIAPIPE33)
