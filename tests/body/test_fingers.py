@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsgan.body import axis_angle_to_matrix, free_body
 from gsgan.body.fingers import Fingers
-from gsgan.body.measure import with_hands
+from gsgan.body.measure import fit_hands
 from gsgan.body.shape import STRETCHED, BodyShape, free_space, shaped_body
 from gsgan.body.solve import Solver, log_of
 from gsgan.data.synthetic.free_subject import free_character, free_pose
@@ -77,6 +77,9 @@ def test_hands_move_no_more_of_the_body_than_the_arms(solver, poses):
     without = solver.solve(p[:, :33], seen[:, :33])
     far = p.clone()
     far[:, LEFT] += 0.02
+    wrist = names.index("wrist.L")
+    moved = (solver.solve(p, seen).theta - solver.solve(far, seen).theta)[:, wrist]
+    assert moved.norm(dim=-1).min() > 0.02  # the arm follows
     for pose in (solver.solve(p, seen), solver.solve(far, seen)):
         assert (pose.theta[:, others] - without.theta[:, others]).abs().max() < 0.02
         assert (pose.transl - without.transl).abs().max() < 0.002
@@ -284,14 +287,23 @@ def test_a_person_whose_hands_are_larger_and_elsewhere_on_the_arms(poses):
     seen[0, LEFT] = 0
     p[0, LEFT] = torch.nan
     shape = replace(own, offsets=torch.zeros(33, 3))
-    found = with_hands(shape, truth, p, seen)
+    found = fit_hands(shape, truth, p, seen)
     hand = STRETCHED.index("hand")
-    np.testing.assert_allclose(found.stretch[hand], 1.2, atol=0.03)
+    np.testing.assert_allclose(found.stretch[hand], 1.2, atol=0.005)
     np.testing.assert_allclose(found.hands, moves, atol=0.006)
-    assert with_hands(shape, truth, p, 0 * seen).hands is None
-    one = with_hands(shape, truth, p, torch.cat([seen[:, :54], 0 * seen[:, RIGHT]], 1)).hands
+    assert fit_hands(shape, truth, p, 0 * seen).hands is None
+    one = fit_hands(shape, truth, p, torch.cat([seen[:, :54], 0 * seen[:, RIGHT]], 1)).hands
     np.testing.assert_allclose(one[0], moves[0], atol=0.006)
     assert not one[1].any()
+    few = seen.clone()
+    few[2:, [13, 15]] = 0  # without its forearm a hand shows no place on it
+    rest = truth.theta.clone()
+    rest[2:] = 0
+    hidden = fit_hands(shape, BodyPose(rest, truth.transl), p, few).hands
+    np.testing.assert_allclose(hidden[0], moves[0], atol=0.006)
+    wild = p.clone()
+    wild[:, LEFT] += 0.3
+    assert not fit_hands(shape, truth, wild, seen).hands[0].any()
     solved = Solver(shaped_body(found)).solve(p[1:], seen[1:])
     off = (shaped_body(found).posed_hands(solved) - p[1:, 33:]).norm(dim=-1)
     assert off.median() < 0.003

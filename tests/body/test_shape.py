@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 import torch
 from writers.smpl import write_smpl
@@ -119,8 +120,9 @@ def test_a_shape_is_stored_as_numbers_and_wrong_ones_are_refused():
     shape = replace(other(3), offsets=0.01 * torch.randn(33, 3))
     for one in (shape, replace(shape, hands=0.01 * torch.randn(2, 2, 3))):
         back = BodyShape.of_flat(one.flat())
-        for name, value in vars(one).items():
-            assert getattr(back, name) is value is None or torch.equal(getattr(back, name), value)
+        assert back.arrays().keys() == one.arrays().keys()
+        for name, value in one.arrays().items():
+            np.testing.assert_array_equal(back.arrays()[name], value)
     for make in (
         lambda: BodyShape(torch.zeros(K), torch.ones(7)),
         lambda: BodyShape(torch.zeros(K), torch.ones(8), torch.zeros(3, 33)),
@@ -128,7 +130,7 @@ def test_a_shape_is_stored_as_numbers_and_wrong_ones_are_refused():
         lambda: BodyShape.of_flat(torch.zeros(20)),
         lambda: shaped_body(BodyShape(torch.zeros(11), torch.ones(8))),
     ):
-        with pytest.raises(ValueError, match=r"expected|117 or 129|at most"):
+        with pytest.raises(ValueError, match=r"expected|at most"):
             make()
 
 

@@ -117,12 +117,14 @@ def test_fitted_poses_have_their_fingers_with_hands_alone(root: Path) -> None:
     assert (
         GsganData(str(root), skeleton="mediapipe33_hands", body="none").layout.poses is None
     )  # to fit anew
+    poses["transl"][:, 0] = 2.0
     with_hands = {"theta_hands": np.ones((4, 56, 3)), "transl_hands": np.ones((4, 3))}
-    np.savez(root / "body_pose.npz", **poses, **with_hands)
-    for skeleton, value in (("mediapipe33", 0.0), ("mediapipe33_hands", 1.0)):
-        frame = GsganData(str(root), size=32, skeleton=skeleton).dataset("train")[0]
-        assert frame.body.theta.unique().tolist() == [value]
-        assert bool(frame.body.transl.any()) == bool(value)
+    for stored, moved in ((with_hands, 1.0), ({"theta_hands": with_hands["theta_hands"]}, 2.0)):
+        np.savez(root / "body_pose.npz", **poses, **stored)
+        for skeleton, value, x in (("mediapipe33", 0.0, 2.0), ("mediapipe33_hands", 1.0, moved)):
+            body = GsganData(str(root), size=32, skeleton=skeleton).dataset("train")[0].body
+            assert body.theta.unique().tolist() == [value]
+            assert body.transl[0, 0] == x
     with_hands["theta_hands"] = np.ones((4, 20, 3))
     np.savez(root / "body_pose.npz", **poses, **with_hands)
     with pytest.raises(DataError, match=r"'theta_hands' must have shape \(4, 56, 3\)"):

@@ -89,6 +89,9 @@ def test_fingers_follow_the_hands_of_every_frame(people, fit, tmp_path):
     write_hands(root, 5, p=100 * p)
     found = fit("data.skeleton=mediapipe33_hands", "fit.sweeps=1", root=root, keep=False)
     plain = fit("fit.sweeps=1", root=root, name="plain", keep=False)
+    with np.load(tmp_path / "out" / "body_shape.npz") as shape:
+        assert shape["hands"].shape == (2, 2, 3)
+        assert (np.linalg.norm(shape["hands"], axis=-1) > 0).any()
     names = shaped_body(free_space().neutral()).joint_names
     fingers = [i for i, name in enumerate(names) if name.startswith("finger") and "1-1" not in name]
     trunk = [i for i, n in enumerate(names) if n.startswith(("root", "spine", "neck", "upperleg"))]

@@ -251,7 +251,7 @@ def test_a_fitted_body_gets_the_persons_clothes(capture, tmp_path, build):
     """Its own labels have those of the person it was modelled on."""
     folder = shutil.copytree(capture, tmp_path / "fitted")
     shape = BodyShape(torch.zeros(10), torch.ones(8), torch.zeros(33, 3))
-    np.savez(folder / "body_shape.npz", **{k: v.numpy() for k, v in vars(shape).items()})
+    np.savez(folder / "body_shape.npz", **shape.arrays())
     _, avatar, _ = build(f"data.root={folder}", FEW)
     assert "class vote over 2 images" in avatar.segmentation_why
 

@@ -92,7 +92,7 @@ def test_body_poses_of_a_fitted_body(tmp_path, dance):
     """gsgan.fit writes the person's shape beside the poses, in the capture's unit."""
     shape = replace(free_space().neutral(), offsets=0.02 * torch.randn(33, 3))
     shape.stretch[:2] = 1.3
-    np.savez(tmp_path / "body_shape.npz", **{name: x.numpy() for name, x in vars(shape).items()})
+    np.savez(tmp_path / "body_shape.npz", **shape.arrays())
     (tmp_path / "meta.json").write_text('{"unit": "cm", "fps": 50}')
     path = tmp_path / "body_pose.npz"
     np.savez(path, theta=dance.theta.numpy(), transl=100 * dance.transl.numpy())

@@ -52,7 +52,7 @@ def fitted(capture, tiny, tmp_path) -> Path:
     root = shutil.copytree(capture, tmp_path / "fitted")
     shape = replace(free_space().neutral(), offsets=0.02 * torch.ones(33, 3))
     shape.stretch[2] = 1.2
-    np.savez(root / "body_shape.npz", **{name: x.numpy() for name, x in vars(shape).items()})
+    np.savez(root / "body_shape.npz", **shape.arrays())
     config = tiny(f"data.root={root}", "effects.body_points=on")
     _, module = build_training(config)
     with torch.no_grad():

@@ -32,10 +32,10 @@ class Hands(NamedTuple):
 
     Args:
         turns: ``[B, 20, 3]`` of `Fingers.joints`.
-        shown: ``[B, 20]`` bool: the turns that landmarks show; the others are anything finite.
+        shown: ``[B, 20]`` bool: the turns that landmarks show; others are finite but arbitrary.
         rotations, shifts: ``[B, 2, 3, 3]`` and ``[B, 2, 3]`` metres: of each hand since rest, where
             it is nearest to all its landmarks.
-        placed: ``[B, 2]`` bool: the hands that landmarks show; the others are anything finite.
+        placed: ``[B, 2]`` bool: the hands that landmarks show; others are finite but arbitrary.
     """
 
     turns: Tensor
@@ -46,7 +46,7 @@ class Hands(NamedTuple):
 
 
 class Fingers(nn.Module):
-    """Turns of a body's finger joints, two a finger, in which its bones point as the landmarks',
+    """Turns of a body's finger joints, two per finger, in which its bones point as the landmarks',
     and where the hand is then nearest to all of them.
 
     Landmarks are compared in the hand's axes and with the body's own bone lengths, so that neither
@@ -125,13 +125,10 @@ class Fingers(nn.Module):
     def _posed(self, turns: Tensor) -> Tensor:
         """``[B, 42, 3]`` landmarks of hands at rest with turned fingers."""
         first, second = axis_angle_to_matrix(turns).chunk(2, dim=1)
-        base, *others = self.chains.unbind(1)
-        middle = self.rest[base] + (first @ self.bones[:, 0].unsqueeze(-1)).squeeze(-1)
+        middle = self.rest[self.chains[:, 0]] + (first @ self.bones[:, 0].unsqueeze(-1)).squeeze(-1)
         beyond = middle.unsqueeze(2) + self.bones[:, 1:] @ (first @ second).mT
-        x = self.rest.expand(len(turns), -1, -1)
-        for k, at in zip(others, (middle, *beyond.unbind(2)), strict=True):
-            x = x.index_copy(1, k, at)
-        return x
+        x = torch.cat([middle.unsqueeze(2), beyond], dim=2).flatten(1, 2)
+        return self.rest.expand(len(turns), -1, -1).index_copy(1, self.chains[:, 1:].flatten(), x)
 
     @staticmethod
     def placed(seen: Tensor) -> Tensor:

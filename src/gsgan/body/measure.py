@@ -1,4 +1,4 @@
-"""A person's shape from skeletons alone: `fit_shape`."""
+"""A person's shape from skeletons: `fit_shape`; its hands and landmarks in known poses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsgan.body.skinned import MarkedBody
 from gsgan.body.solve import BODY, Solver
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, sanitise
-from gsgan.skeleton.hands import FINGER_BONES, FINGERS, HAND, WRIST
+from gsgan.skeleton.hands import HAND, HAND_EDGES, WRIST
 from gsgan.utils.errors import DataError
 
 FRAMES = 24  # are enough: every frame shows the same lengths
@@ -32,6 +32,8 @@ ACROSS = "shoulder, hip, ear, eye, mouth"
 SURE, UNSURE = 0.04, 0.1
 # Frames repeat the same systematic errors: all of them count as this many.
 INDEPENDENT = 4.0
+FOREARMS = [[13, 15], [14, 16]]  # elbow and wrist
+SIZES, FARTHEST = (0.75, 1.35), 0.05  # a hand's, as a share of the body's; metres
 LENGTH_STEPS, STEPS, POSE_STEPS = 10, 8, 4
 
 
@@ -57,62 +59,64 @@ def fit_shape(
     reduced = _without_surface(free_space()) if space is None else _without_surface(space)
     p, seen = _usable(skeletons, visibility)
     x = _fit_lengths(reduced, p, seen)
-    shape = _fit_landmarks(reduced, x, p, seen)
-    return BodyShape(*(v.float() for v in vars(shape).values() if v is not None))
+    found = vars(_fit_landmarks(reduced, x, p, seen))
+    return BodyShape(**{name: v.float() for name, v in found.items() if v is not None})
 
 
-def with_hands(
+def fit_hands(
     shape: BodyShape, poses: BodyPose, skeletons: Tensor, visibility: Tensor
 ) -> BodyShape:
-    """The free body's shape with the person's hands: their size, where they turn, and where they
-    are on the forearms. `fit_shape` sees few landmarks of a hand.
+    """The free body's shape with the person's hands: their size, their hinge and their place on the
+    forearms; `fit_shape` sees three landmarks of a hand.
 
     Args:
         shape: of the person.
-        poses: F poses by which the forearms are known.
+        poses: F poses that show where the forearms are.
         skeletons: ``[F, 75, 3]`` metres.
         visibility: ``[F, 75]``; landmarks at 0 are not used.
 
+    Returns:
+        The shape; as it was where no frame shows a hand. The hinge and place of a hand stay the
+        body's where no frame shows it with its forearm, or where they differ by more than
+        `FARTHEST`.
+
     Source: ours.
     """
-    body, hands = shaped_body(shape), skeletons[:, BODY:]
+    shape, hands = replace(shape, hands=None), skeletons[:, BODY:]
     seen = (visibility[:, BODY:] > 0) & hands.isfinite().all(-1)
-    bones = torch.tensor([*((WRIST, finger[0]) for finger in FINGERS), *FINGER_BONES])
+    # Not the wrist: definitions of it differ most.
+    bones = torch.tensor([edge for edge in HAND_EDGES if WRIST not in edge])
     first, last = torch.cat([bones, bones + HAND]).mT
     length = (hands[:, last] - hands[:, first]).norm(dim=-1)
     length = length.where(seen[:, last] & seen[:, first], torch.nan).nanmedian(dim=0).values
     if not (known := length.isfinite()).any():
         return shape
-    own = (body.hand_landmarks[last] - body.hand_landmarks[first]).norm(dim=-1)
+    own = shaped_body(shape).hand_landmarks
+    own = (own[last] - own[first]).norm(dim=-1)
     stretch = shape.stretch.clone()
-    stretch[STRETCHED.index("hand")] *= length[known].sum() / own[known].sum()
+    stretch[STRETCHED.index("hand")] *= (length[known].sum() / own[known].sum()).clamp(*SIZES)
     shape = replace(shape, stretch=stretch)
 
     body, wrists = shaped_body(shape), [WRIST, HAND + WRIST]
-    fingers = Fingers(body)
-    beyond = seen.clone()
+    fingers, beyond = Fingers(body), seen.clone()
     beyond[:, wrists] = False
     found = fingers(hands.where(seen.unsqueeze(-1), 0.0), beyond)
     forearms = body.transforms(poses)[:, body.hand_bone[wrists]]
-    at_rest = [
-        (R.mT @ (hands[:, wrists] - t).unsqueeze(-1)).squeeze(-1)
-        for R, t in (
-            (forearms[..., :3, :3], forearms[..., :3, 3]),
-            (found.rotations, found.shifts),
-        )
-    ]
-    placed = fingers.placed(seen).unsqueeze(-1)
-    on_arm, in_hand = (x.where(placed, torch.nan).nanmedian(dim=0).values for x in at_rest)
-    moves = torch.stack(
-        [on_arm - body.joints[[body.joint_names.index(name) for name in WRISTS]], on_arm - in_hand],
-        dim=1,
+    on_arm = _at_rest(forearms[..., :3, :3], forearms[..., :3, 3], hands[:, wrists])
+    in_hand = _at_rest(found.rotations, found.shifts, hands[:, wrists])
+    usable = fingers.placed(seen) & (visibility[:, FOREARMS] > 0).all(-1)
+    on_arm, in_hand = (
+        x.where(usable.unsqueeze(-1), torch.nan).nanmedian(dim=0).values for x in (on_arm, in_hand)
     )
-    return replace(shape, hands=moves.nan_to_num(0.0))
+    joints = body.joints[[body.joint_names.index(name) for name in WRISTS]]
+    moves = torch.stack([on_arm - joints, on_arm - in_hand], dim=1)
+    near = (moves.norm(dim=-1) <= FARTHEST).all(-1)
+    return replace(shape, hands=moves.where(near[:, None, None], 0.0))
 
 
 def fit_offsets(shape: BodyShape, poses: BodyPose, skeletons: Tensor, visibility: Tensor) -> Tensor:
     """``[33, 3]`` metres: offsets with which a body in these poses has the person's landmarks:
-    medians over frames, zero for landmarks that no frame shows.
+    medians over frames. Landmarks that no frame shows keep the shape's.
 
     Args:
         shape: of the person.
@@ -122,12 +126,15 @@ def fit_offsets(shape: BodyShape, poses: BodyPose, skeletons: Tensor, visibility
     """
     body = shaped_body(shape)
     bones = body.transforms(poses)[:, body.landmark_bone]
-    at_rest = bones[..., :3, :3].mT @ (skeletons - bones[..., :3, 3]).unsqueeze(-1)
-    moved = torch.where(
-        (visibility > 0).unsqueeze(-1), at_rest.squeeze(-1) - body.landmarks, torch.nan
-    )
+    moved = _at_rest(bones[..., :3, :3], bones[..., :3, 3], skeletons) - body.landmarks
+    moved = moved.where((visibility > 0).unsqueeze(-1), torch.nan).nanmedian(dim=0).values
     before = torch.zeros_like(body.landmarks) if shape.offsets is None else shape.offsets
-    return before + moved.nanmedian(dim=0).values.nan_to_num(0.0)
+    return before + moved.nan_to_num(0.0)
+
+
+def _at_rest(R: Tensor, t: Tensor, points: Tensor) -> Tensor:
+    """Points ``[..., 3]`` before the motion by ``R [..., 3, 3]`` and ``t [..., 3]``."""
+    return (R.mT @ (points - t).unsqueeze(-1)).squeeze(-1)
 
 
 def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,6 +14,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.body.free import Body, free_body, free_body_path
@@ -38,7 +39,7 @@ GROUPS = {  # by the joint's name in the free body | in SMPL's family; the other
     "head": r"head|jaw|.*_eye",
 }
 WRISTS = ("wrist.L", "wrist.R")
-LANDMARKS, HANDS = (len(MEDIAPIPE33.names), 3), (2, 2, 3)
+LANDMARKS, HANDS_SHAPE = (len(MEDIAPIPE33.names), 3), (2, 2, 3)
 
 B = TypeVar("B", bound=MarkedBody)
 
@@ -66,14 +67,19 @@ class BodyShape:
 
     def __post_init__(self) -> None:
         off = LANDMARKS if self.offsets is None else self.offsets.shape
-        hands = HANDS if self.hands is None else self.hands.shape
+        hands = HANDS_SHAPE if self.hands is None else self.hands.shape
         given = (self.coefficients.ndim, self.stretch.shape, off, hands)
-        if given != (1, (len(STRETCHED),), LANDMARKS, HANDS):
+        if given != (1, (len(STRETCHED),), LANDMARKS, HANDS_SHAPE):
             raise ValueError(
                 f"BodyShape: expected coefficients [K], stretch [{len(STRETCHED)}], offsets "
-                f"{list(LANDMARKS)} and hands {list(HANDS)}, got {list(self.coefficients.shape)}, "
-                f"{list(self.stretch.shape)}, {list(off)} and {list(hands)}"
+                f"{list(LANDMARKS)}, hands {list(HANDS_SHAPE)}, got "
+                f"{list(self.coefficients.shape)}, {list(self.stretch.shape)}, {list(off)}, "
+                f"{list(hands)}"
             )
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """The tensors by name, to store in body_shape.npz."""
+        return {name: x.detach().numpy() for name, x in vars(self).items() if x is not None}
 
     def flat(self) -> Tensor:
         """``[K + 8 + 99]`` all numbers, with hands 12 more, to store; see `of_flat`."""
@@ -86,16 +92,17 @@ class BodyShape:
         """The shape of the free body whose numbers `flat` gave.
 
         Raises:
-            ValueError: when there are neither as many as with hands or without.
+            ValueError: when the count is neither that with hands nor that without.
         """
         sizes = [free_space().coefficients, len(STRETCHED), math.prod(LANDMARKS)]
-        with_hands = [*sizes, math.prod(HANDS)]
+        with_hands = [*sizes, math.prod(HANDS_SHAPE)]
         if values.shape not in ((sum(sizes),), (sum(with_hands),)):
             raise ValueError(
-                f"BodyShape: {sum(sizes)} or {sum(with_hands)} numbers, got {list(values.shape)}"
+                f"BodyShape: expected {sum(sizes)} or {sum(with_hands)} numbers, got "
+                f"{list(values.shape)}"
             )
         K, stretch, off, *hands = values.split(with_hands if len(values) > sum(sizes) else sizes)
-        return cls(K, stretch, off.view(LANDMARKS), *(x.view(HANDS) for x in hands))
+        return cls(K, stretch, off.view(LANDMARKS), *(x.view(HANDS_SHAPE) for x in hands))
 
 
 @dataclass(frozen=True)
@@ -136,9 +143,8 @@ class ShapeSpace(Generic[B]):
             for name, directions in self.directions.items()
         }
         body = _stretched(replace(self.body, **moved), shape.stretch)
-        if shape.offsets is None:
-            return body
-        body = replace(body, landmarks=body.landmarks + shape.offsets)
+        if shape.offsets is not None:
+            body = replace(body, landmarks=body.landmarks + shape.offsets)
         return body if shape.hands is None else _with_hands(body, shape.hands)
 
 
@@ -206,8 +212,8 @@ def _with_hands(body: B, hands: Tensor) -> B:
 
 
 def _side_of_hand(joint: str) -> int:
-    """1 for a joint of the left hand, 2 for the right hand's, else 0."""
-    return (1 + (joint[-1] == "R")) * (group_of(joint) == "hand")
+    """1 for a joint of the free body's left hand, 2 for the right hand's, else 0."""
+    return ".LR".index(joint[-1]) if group_of(joint) == "hand" else 0
 
 
 def constant_row(S: Tensor) -> Tensor:

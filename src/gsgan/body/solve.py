@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from kornia.geometry.conversions import quaternion_to_axis_angle, rotation_matrix_to_quaternion
 from torch import Tensor, nn
-from torch.nn.functional import normalize, pad
+from torch.nn.functional import normalize
 
 from gsgan.body.fingers import Fingers
 from gsgan.body.free import Body
@@ -31,7 +31,7 @@ BEYOND = 0.05  # standard deviation beyond the least value of a number
 # Metres, standard deviation of a landmark: detectors place face and palm less well.
 NOISE, FACE_NOISE, PALM_NOISE = 0.004, 0.008, 0.007
 PALM = slice(17, 23)
-HANDS = ((17, 19, 21), (18, 20, 22))  # of 33: landmarks that hand landmarks replace
+ON_HANDS = ((17, 19, 21), (18, 20, 22))  # of 33: landmarks that hand landmarks replace
 HELD = 0.05  # the same of hips that are estimates: nothing else keeps a trunk from nodding
 ROBUST = 5.0  # standard deviations: landmarks further off pull no more than that
 STEPS, CONVERGED = 10, 1e-3  # of the cost
@@ -72,7 +72,7 @@ class Solver(nn.Module):
     joints: Tensor  # [J, 3] rest
     landmarks: Tensor  # [N, 3] rest, 0 where not known: 33, and 3 of each hand of the free body
     known: Tensor  # [N] bool
-    replaced: Tensor  # [2, 33] bool, `HANDS`
+    replaced: Tensor  # [2, 33] bool, `ON_HANDS`
     precision: Tensor  # [33] of the body's own landmarks
     prior: Tensor  # [D] precisions
     least: Tensor  # [D]
@@ -118,7 +118,7 @@ class Solver(nn.Module):
                 "before": torch.where(rig.parent < 0, len(rig.parent), rig.parent),
                 "rest_hubs": bone_frames(rest).hubs[0],
                 "rest_hips": rest[0, MEDIAPIPE33.hips].mean(0),
-                "replaced": torch.tensor([[i in hand for i in range(BODY)] for hand in HANDS]),
+                "replaced": torch.tensor([[i in hand for i in range(BODY)] for hand in ON_HANDS]),
                 "known": body.landmarks.isfinite().all(-1),
                 **{k: v for k, v in vars(rig).items() if isinstance(v, Tensor)},
             }
@@ -164,8 +164,6 @@ class Solver(nn.Module):
             own = self.landmarks[BODY:].unflatten(0, (2, -1))
             at = own @ found.rotations.mT + found.shifts.unsqueeze(-2)
             p = torch.cat([p, at.flatten(1, 2)], dim=1)
-        elif self.fingers is not None:
-            p, weight = pad(p, (0, 0, 0, 2 * len(SPAN))), pad(weight, (0, 2 * len(SPAN)))
         solved = [
             self._solve(near, w)
             for near, w in zip(p.split(CHUNK), weight.detach().split(CHUNK), strict=True)
@@ -190,10 +188,12 @@ class Solver(nn.Module):
     def at_rest(self, visibility: Tensor) -> Tensor:
         """``[B, joints]`` bool: joints that no seen landmark shows: `solve` leaves them at rest."""
         seen, hands = visibility[:, :BODY] > 0, visibility[:, BODY:ALL] > 0
-        if self.fingers is not None:
-            placed = self.fingers.placed(hands) if hands.shape[1] else seen.new_zeros(len(seen), 2)
+        if self.fingers is not None and hands.shape[1]:
+            placed = self.fingers.placed(hands)
+            seen = seen & ~(placed.unsqueeze(-1) & self.replaced).any(1)
             seen = torch.cat([seen, placed.repeat_interleave(len(SPAN), dim=1)], dim=1)
-        shown = ((seen & self.known).to(self.prior) @ self.reaches.to(self.prior).mT) > 0
+        seen, n = seen & self.known[: seen.shape[1]], seen.shape[1]
+        shown = (seen.to(self.prior) @ self.reaches[:, :n].to(self.prior).mT) > 0
         shown[:, :6] = True
         moved = torch.zeros(len(visibility), self.parents, device=visibility.device)
         joints = self.joint[self.entry_turn].expand(len(visibility), -1)
@@ -265,19 +265,20 @@ class Solver(nn.Module):
 
     def points(self, T: Tensor, landmarks: Tensor) -> Tensor:
         """``[B, N, 3]`` the posed landmarks."""
-        T = T[:, self.carrier]
+        T = T[:, self.carrier[: len(landmarks)]]
         return (T[..., :3, :3] @ landmarks.unsqueeze(-1)).squeeze(-1) + T[..., :3, 3]
 
     def linear(self, q: Tensor, root: Tensor, p: Tensor) -> Linear:
         """Residuals to ``p [B, N, 3]`` and their derivatives, the root's about its rotation."""
         T = self.transforms(q, root, self.joints)
-        x, before = self.points(T, self.landmarks), T[:, self.before]
+        n = p.shape[1]
+        x, before = self.points(T, self.landmarks[:n]), T[:, self.before]
         origin = (before[..., :3, :3] @ self.joints[self.joint].unsqueeze(-1)).squeeze(-1)
         origin = origin + before[..., :3, 3]
         origin = torch.cat([origin[:, :1] + q[:, None, 3:6], origin[:, 1:]], dim=1)
         turned = before[..., :3, :3] @ left_jacobian((q @ self.matrix).unflatten(1, (-1, 3)))
         axes = (turned[:, self.entry_turn] @ self.entry_axis.unsqueeze(-1)).squeeze(-1)
-        arms = (x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)) * self.follows
+        arms = (x.unsqueeze(1) - origin[:, self.entry_turn].unsqueeze(2)) * self.follows[:, :n]
         moved = torch.linalg.cross(axes.unsqueeze(2).expand_as(arms), arms)
         J = x.new_zeros(len(x), len(self.prior), *x.shape[1:])
         J.index_add_(1, self.entry_number, moved)

@@ -21,9 +21,11 @@ from rich.console import Console
 from torch import Tensor
 
 from gsgan import __version__
-from gsgan.body.measure import fit_offsets, fit_shape, with_hands
+from gsgan.body import Body
+from gsgan.body.fingers import Fingers
+from gsgan.body.measure import fit_hands, fit_offsets, fit_shape
 from gsgan.body.shape import BodyShape, shaped_body
-from gsgan.body.solve import HANDS, Solver
+from gsgan.body.solve import ON_HANDS, Solver
 from gsgan.check.overlays import caption
 from gsgan.data.calibration.find import METRES
 from gsgan.data.checks import spans
@@ -125,10 +127,11 @@ def fit_body(
         console.print(f"{moments.left_out} images with empty masks, or nearly so, are left out")
     with console.status("solving poses"):
         shape = fit_shape(*_joints(data, data.trained))
-        solved = _solve(data, shape, hands=False)
+        solved = _solve(data, shape, layout.frames)
         if _by_hands(data):
             fingers = _fingers(shape)
-            solved.theta[:, fingers] = _solve(data, shape, hands=True).theta[:, fingers]
+            by_hands = _solve(data, shape, layout.frames, hands=True)
+            solved.theta[:, fingers] = by_hands.theta[:, fingers]
     rows = torch.tensor([layout.frames.index(frame) for frame in moments.frames])
     start = BodyPose(solved.theta[rows], solved.transl[rows])
     fitter = Fitter(settings, moments, shaped_body(shape), start, seed)
@@ -137,9 +140,9 @@ def fit_body(
         found = fitter.pose()
         registered = found.to(torch.device("cpu"))
         shape = _refined(data, shape, moments.frames, registered)
-    driven = _solve(data, shape, _by_hands(data))
+    driven = _solve(data, shape, layout.frames, _by_hands(data))
     again = BodyPose(driven.theta[rows], driven.transl[rows]).to(device)
-    report = _report(fitter, again, found)
+    report = _report(fitter, shaped_body(shape).to(device), again, found)
     kept = registered if settings.held_out or settings.keep else None
     unit = METRES[layout.meta.unit]
     with writing(folder / SHEET):
@@ -147,7 +150,7 @@ def fit_body(
     write_json(folder / REPORT, report)
     with writing(folder / POSES):  # a fit that is killed here leaves no poses of another shape
         (folder / POSES).unlink(missing_ok=True)
-    write_npz(folder / SHAPE, **{n: x.numpy() for n, x in vars(shape).items() if x is not None})
+    write_npz(folder / SHAPE, **shape.arrays())
     write_npz(
         folder / POSES,
         **_with_and_without_hands(data, shape, rows, kept, unit),
@@ -181,12 +184,12 @@ def _with_and_without_hands(
     data: GsganData, shape: BodyShape, rows: Tensor, kept: BodyPose | None, unit: float
 ) -> dict[str, NDArray[Any]]:
     """Poses by 33 landmarks and, where there are hands, by these too. Registered poses ``kept``
-    replace those of ``rows``, but for the fingers."""
+    replace those of ``rows``, but for the fingers: their hands are where the masks have them."""
     fingers = _fingers(shape)
     found: dict[str, NDArray[Any]] = {}
     for name, hands in {"": False, "_hands": True}.items():
         if not hands or data.layout.hands is not None:
-            solved = _solve(data, shape, hands)
+            solved = _solve(data, shape, data.layout.frames, hands)
             theta, transl = solved.theta.clone(), solved.transl.clone()
             if kept is not None:
                 theta[rows], transl[rows] = kept.theta, kept.transl
@@ -207,9 +210,10 @@ def _joints(data: GsganData, frames: Sequence[int], hands: bool = False) -> tupl
     return p, visibility
 
 
-def _solve(data: GsganData, shape: BodyShape, hands: bool) -> BodyPose:
-    """Poses of all frames by skeletons with or without hands."""
-    frames = data.layout.frames
+def _solve(
+    data: GsganData, shape: BodyShape, frames: Sequence[int], hands: bool = False
+) -> BodyPose:
+    """Poses by skeletons with or without hands."""
     try:
         with torch.no_grad():
             return Solver(shaped_body(shape)).solve(*_joints(data, frames, hands))
@@ -235,13 +239,13 @@ def _refined(
     shape = replace(shape, offsets=offsets)
     if data.layout.hands is None:
         return shape
-    arms, everywhere = _solve(data, shape, hands=False), data.layout.frames
-    shape = with_hands(shape, arms, *_joints(data, everywhere, hands=True))
-    by_hands = _solve(data, shape, hands=True)
-    again = fit_offsets(shape, by_hands, *_joints(data, everywhere))
-    on_hand = torch.zeros(len(offsets), 1, dtype=torch.bool)
-    on_hand[[*HANDS[0], *HANDS[1]]] = True
-    return replace(shape, offsets=torch.where(on_hand, again, offsets))
+    p, seen = _joints(data, frames, hands=True)
+    shape = fit_hands(shape, _solve(data, shape, frames), p, seen)
+    by_hands = _solve(data, shape, frames, hands=True)
+    used = torch.zeros(len(p), len(offsets))  # the landmarks that 33 have of placed hands
+    for side, rows in enumerate(ON_HANDS):
+        used[:, rows] = seen[:, rows] * Fingers.placed(seen[:, len(offsets) :] > 0)[:, [side]]
+    return replace(shape, offsets=fit_offsets(shape, by_hands, p[:, : len(offsets)], used))
 
 
 def _key(fitter: Fitter, shape: BodyShape, seed: int) -> str:
@@ -288,15 +292,17 @@ def _fitted(fitter: Fitter, stopped: Path, key: str, console: Console) -> None:
 
 
 @torch.no_grad()
-def _report(fitter: Fitter, driven: BodyPose, found: BodyPose) -> dict[str, Any]:
+def _report(fitter: Fitter, body: Body, driven: BodyPose, found: BodyPose) -> dict[str, Any]:
     """Residuals in mm per joint and frame, and overlaps with the masks: of poses solved before the
-    registration, registered, and solved after it, as held-out frames are."""
-    moments, body = fitter.moments, fitter.surface.body
+    registration, registered, and solved after it on ``body``, as held-out frames are. All overlaps
+    are of the registered surface."""
+    moments, before = fitter.moments, fitter.surface.body
     seen = moments.visibility > 0
     report: dict[str, Any] = {"frames": {}, "joints": {}}
     off, iou = {}, {}
     for name, pose in (("solved", fitter.start), ("registered", found), ("driven", driven)):
-        apart = (body.posed_landmarks(pose) - moments.skeletons).norm(dim=-1)
+        posed = (body if name == "driven" else before).posed_landmarks(pose)
+        apart = (posed - moments.skeletons).norm(dim=-1)
         off[name] = torch.where(seen, 1000 * apart, torch.nan)
         iou[name] = fitter.overlap(pose)
         report[name] = {

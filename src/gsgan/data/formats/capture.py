@@ -12,7 +12,7 @@
     body_pose.npz     optional theta (F,bones,3), transl (F,3), frame_id (F,); betas (S,) of SMPL
                       by gsgan.fit also theta_hands and transl_hands, which follow hands3d.npz
     body_shape.npz    optional coefficients (K,), stretch (8,), offsets (33,3), hands (2,2,3) where
-                      there are some: of the free body, by gsgan.fit
+                      some were seen: of the free body, by gsgan.fit
 """
 
 from __future__ import annotations
@@ -24,9 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from gsgan.body.shape import HANDS as HANDS_SHAPE
+from gsgan.body.shape import HANDS_SHAPE, STRETCHED, free_space
 from gsgan.body.shape import LANDMARKS as LANDMARKS_SHAPE
-from gsgan.body.shape import STRETCHED
 from gsgan.data.calibration.find import (
     METRES,
     Conventions,
@@ -220,22 +219,32 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
         found = expect_array(arrays, "registered", (None,), path)
         registered = frozenset(whole_frame_ids(found, str(path)).tolist())
 
-    def read(theta: str, transl: str) -> Poses:
-        turns = expect_array(arrays, theta, (len(ids), bones, 3), path).astype(np.float64)
-        moves = expect_array(arrays, transl, (len(ids), 3), path).astype(np.float64)
-        finite = np.isfinite(turns).all((1, 2)) & np.isfinite(moves).all(1)
-        rows = {int(ids[i]): int(i) for i in np.flatnonzero(finite)}
-        return Poses(
+    parts = [("theta", "transl")]
+    if "theta_hands" in arrays:  # fits before 2026-11-23 share the translation
+        parts.append(("theta_hands", "transl_hands" if "transl_hands" in arrays else "transl"))
+    values = [
+        tuple(
+            expect_array(arrays, name, shape, path).astype(np.float64)
+            for name, shape in zip(pair, ((len(ids), bones, 3), (len(ids), 3)), strict=True)
+        )
+        for pair in parts
+    ]
+    finite = np.all(
+        [np.isfinite(x).reshape(len(ids), -1).all(1) for pair in values for x in pair], axis=0
+    )
+    rows = {int(ids[i]): int(i) for i in np.flatnonzero(finite)}
+    poses, *with_hands = (
+        Poses(
             {f: turns[i] for f, i in rows.items()},
             {f: conventions.scale * moves[i] for f, i in rows.items()},
             fitted=fitted,
             registered=registered,
             fitted_to=tuple(map(str, arrays.get("fitted_to", ()))),
         )
-
-    poses = read("theta", "transl")
-    if all(name in arrays for name in WITH_HANDS):
-        poses = replace(poses, with_hands=read(*WITH_HANDS))
+        for turns, moves in values
+    )
+    if with_hands:
+        poses = replace(poses, with_hands=with_hands[0])
     if meta.body is None or "betas" not in arrays:
         return poses, meta
     betas = expect_array(arrays, "betas", (None,), path).astype(np.float64)
@@ -250,7 +259,8 @@ def read_shape(path: Path) -> tuple[float, ...]:
     Raises:
         DataError: when the file is damaged or lacks an array.
     """
-    names = {"coefficients": (None,), "stretch": (len(STRETCHED),), "offsets": LANDMARKS_SHAPE}
+    K = free_space().coefficients
+    names = {"coefficients": (K,), "stretch": (len(STRETCHED),), "offsets": LANDMARKS_SHAPE}
     arrays = read_arrays(path, (*names, "hands"))
     if "hands" in arrays:
         names["hands"] = HANDS_SHAPE
