@@ -45,7 +45,7 @@ from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 Float = NDArray[np.float64]
 
 STILL = 0.001  # metres: landmarks of a face that move less count fully in its alignment
-ROUNDS = 20  # of the alignment
+ROUNDS = 10  # of the alignment
 NECK = 0.45  # radians, the largest bend of the neck: detectors place faces too far forward
 
 
