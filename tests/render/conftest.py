@@ -35,3 +35,16 @@ def landmarks(dance) -> np.ndarray:
 def figure(landmarks):
     p = torch.from_numpy(landmarks)
     return figure_of(p, torch.ones(p.shape[:2], dtype=torch.bool), "z")
+
+
+@pytest.fixture(scope="session")
+def signing(dance) -> np.ndarray:
+    """``[12, 75, 3]`` metres, Z up: the free body's motion with its hands."""
+    body = free_body()
+    both = torch.cat([body.posed_landmarks(dance), body.posed_hands(dance)], dim=1)
+    return both.double().numpy()
+
+
+@pytest.fixture(scope="session")
+def signer(signing):
+    return figure_of(torch.from_numpy(signing), torch.ones(signing.shape[:2]).bool(), "z")

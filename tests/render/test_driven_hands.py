@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from test_motion_readers import Y_DOWN, standard, write_pose
 
-from gsgan.body import free_body
 from gsgan.data.figure import HAND_JOINTS, figure_of, palm_frame, upright
 from gsgan.render.motion import is_own, up_axis
 from gsgan.render.retarget import joined, on_figure
@@ -18,19 +16,6 @@ from gsgan.skeleton.hands import FINGER_BONES, HAND_NAMES
 
 LEFT, RIGHT = HAND_JOINTS.values()
 POINTS = [n.upper().replace("_", "_FINGER_") if n[0] in "imr" else n.upper() for n in HAND_NAMES]
-
-
-@pytest.fixture(scope="module")
-def signing(dance) -> np.ndarray:
-    """``[12, 75, 3]`` metres, Z up: the free body's motion with its hands."""
-    body = free_body()
-    both = torch.cat([body.posed_landmarks(dance), body.posed_hands(dance)], dim=1)
-    return both.double().numpy()
-
-
-@pytest.fixture(scope="module")
-def signer(signing):
-    return figure_of(torch.from_numpy(signing), torch.ones(signing.shape[:2]).bool(), "z")
 
 
 def fingers(p: np.ndarray) -> np.ndarray:

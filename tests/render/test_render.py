@@ -129,10 +129,12 @@ def test_a_motion_of_another_person(render, motion, tmp_path):
 
 def test_clips_become_one_motion(render, motion, landmarks, tmp_path):
     other = tmp_path / "b.npz"
-    np.savez(other, p=0.9 * landmarks[::-1], fps=30)
+    p = np.full((len(landmarks), 105, 3), np.nan)  # with a face, which this avatar has not
+    p[:, :33], p[:, 75:] = landmarks[::-1], landmarks[:, :30]
+    np.savez(other, p=0.9 * p, fps=30)
     result = render(f"motion=[{motion},{other}]", "transition=0.2", "out=frames", "pixels=32")
     assert result.returncode == 0, result.stderr
-    assert "0.2 s from each to the next" in result.stdout
+    assert f"face in {len(p)}; 0.2 s from each to the next" in result.stdout
     between = 5  # frames at 30 per second
     assert len(list((tmp_path / "frames").glob("*.png"))) == 2 * len(landmarks) + between
     refused(render("motion=[]", "out=none"), "names no file")

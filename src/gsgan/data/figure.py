@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, bone_frames, sanitise
+from gsgan.skeleton.face import FACE as FACE_LANDMARKS
 from gsgan.skeleton.hands import FINGER_BONES, HAND, INDEX, PINKY, WRIST
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 from gsgan.utils.errors import DataError
@@ -28,6 +29,7 @@ BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])  # parents first
 HANDS, FEET = {15: (17, 19, 21), 16: (18, 20, 22)}, {27: (29, 31), 28: (30, 32)}
 BODY = len(MEDIAPIPE33.names)
 HAND_JOINTS = {15: slice(BODY, BODY + HAND), 16: slice(BODY + HAND, BODY + 2 * HAND)}  # by wrist
+EXPRESSION = slice(BODY + 2 * HAND, BODY + 2 * HAND + FACE_LANDMARKS)  # lips, brows and lids
 SIDES = {15: 1.0, 16: -1.0}  # of the standard pose's x
 HEELS_AND_TOES = (29, 30, 31, 32)
 FACE = tuple(range(11))

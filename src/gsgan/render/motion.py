@@ -1,7 +1,7 @@
 """Motions: what every reader returns, and the steps that follow for all formats.
 
 Convention: landmarks ``p [F, J, 3]`` in metres are MediaPipe's 33; or 75, with the 21 of the left
-hand and of the right one.
+hand and of the right one; or 105, also with the 30 of the face.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from gsgan.data.figure import (
     BODY,
     BONES,
+    EXPRESSION,
     HAND_JOINTS,
     HIPS,
     SHOULDERS,
@@ -27,7 +28,6 @@ from gsgan.data.figure import (
 )
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, sanitise
-from gsgan.skeleton.hands import WRIST
 from gsgan.skeleton.sanitise import MIN_TRUNK_JOINTS
 from gsgan.utils.errors import DataError
 
@@ -38,7 +38,7 @@ TRUNK = (*SHOULDERS, *HIPS)
 FPS = 30.0  # assumed where neither the file nor the user gives it
 OWN = 0.02  # largest relative difference of bone lengths at which a motion is the subject's own
 SELDOM = 0.2  # a joint seen in a smaller share of the frames counts as a false detection
-GAP = 5  # frames: in a longer gap a hand is not seen
+GAP = 5  # frames: in a longer gap a hand or face is not seen
 AXES = ("x", "y", "z", "-x", "-y", "-z")
 PARENT = {b: a for a, b in MEDIAPIPE33.limbs if b not in TRUNK}
 
@@ -49,7 +49,7 @@ class Motion:
 
     Args:
         path: the file.
-        p: ``[F, J, 3]`` metres; NaN where a landmark is unknown. Where hands are relative to the
+        p: ``[F, J, 3]`` metres; NaN where a landmark is unknown. Where hands and face are on the
             body is not known in all formats.
         visibility: ``[F, J]`` in [0, 1].
         fps: frames per second, or None if unknown.
@@ -58,7 +58,8 @@ class Motion:
         file_up: the file's own axis, where ``up`` is that of converted landmarks.
         body: ``[F]`` poses of the subject's body that the landmarks come from, or None.
         filled: number of frames without shoulders and hips, see `checked`.
-        detached: whether hands are relative to their wrists, so that the motion must be retargeted.
+        detached: whether hands and face are not where they are on the body, so that the motion
+            must be retargeted.
     """
 
     path: Path
@@ -82,7 +83,7 @@ def checked(motion: Motion, least_visibility: float) -> Motion:
     Shoulders and hips are kept wherever they are finite: without them there is no skeleton. Frames
     with fewer than three of them are interpolated between their neighbours; before the first frame
     that has them, after the last one, and where the motion has body poses, they repeat the nearest.
-    Hands stay as they are.
+    Hands and face stay as they are.
 
     Raises:
         DataError: when there are no frames, or none in which three of shoulders and hips are known.
@@ -155,7 +156,7 @@ def completed(motion: Motion, up: str) -> Float:
 
     Gaps of a joint are interpolated linearly, relative to its parent joint. A joint that fewer than
     `SELDOM` of the frames show takes its place in the rest pose, relative to its parent. Gaps of a
-    hand of up to `GAP` frames are interpolated relative to its wrist; in longer ones it is NaN.
+    hand or the face of up to `GAP` frames are interpolated; in longer ones it is NaN.
     """
     both = motion.p @ upright(up).T
     p = both[:, :BODY]
@@ -170,19 +171,18 @@ def completed(motion: Motion, up: str) -> Float:
             p[:, joint] = np.where(seen[:, None], p[:, joint], p[:, parent] + between)
             known[:, joint] = known[:, parent]
     whole, _ = sanitise(torch.from_numpy(p), torch.from_numpy(known))
-    hands = [_bridged(both[:, hand]) for hand in HAND_JOINTS.values() if both.shape[1] > BODY]
-    return np.concatenate([whole.numpy(), *hands], axis=1)
+    parts = [_bridged(both[:, part]) for part in (*HAND_JOINTS.values(), EXPRESSION)]
+    return np.concatenate([whole.numpy(), *parts], axis=1)
 
 
-def _bridged(hand: Float) -> Float:
-    """``[F, 21, 3]`` a hand relative to its wrist, gaps of up to `GAP` frames interpolated."""
-    hand = hand - hand[:, WRIST, None]
-    known: Bool = np.asarray(np.isfinite(hand).all((1, 2)))
+def _bridged(part: Float) -> Float:
+    """``[F, n, 3]`` a hand or face, gaps of up to `GAP` frames interpolated."""
+    known: Bool = np.asarray(np.isfinite(part).all((1, 2)))
     if not known.any():
-        return hand
+        return part
     before, after, share = neighbours(known)
     short = ~known & (after - before - 1 <= GAP) & (after > before)
-    return np.where(short[:, None, None], mixed(hand[before], hand[after], share), hand)
+    return np.where(short[:, None, None], mixed(part[before], part[after], share), part)
 
 
 def resampled(p: Float, fps: float, wanted: float) -> Float:

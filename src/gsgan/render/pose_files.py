@@ -1,8 +1,9 @@
-"""The reader of .pose files: MediaPipe's landmarks of body and hands by the package pose-format."""
+"""The reader of .pose files: MediaPipe's body, hands and face, read by the package pose-format."""
 
 from __future__ import annotations
 
-from itertools import pairwise
+from collections.abc import Sequence
+from itertools import combinations, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,11 @@ from numpy.typing import NDArray
 from scipy.optimize import nnls
 
 from gsgan.data.figure import BONES, EARS, HAND_JOINTS, HIPS, SHOULDERS, Figure, length
+from gsgan.data.joints import FACE_MESH
 from gsgan.render.motion import Motion, rate_of
+from gsgan.render.retarget import steadied
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.skeleton.face import rest_face
 from gsgan.skeleton.hands import FINGERS, HAND_NAMES, WRIST
 from gsgan.utils.errors import DataError
 
@@ -19,9 +23,16 @@ Float = NDArray[np.float64]
 
 GUESSED = 0.5  # visibility below which MediaPipe's hips are guesses
 IMAGE, WORLD = "POSE_LANDMARKS", "POSE_WORLD_LANDMARKS"  # in files of pose-format
-HANDS = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS")
+HANDS, MESH = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS"), "FACE_LANDMARKS"
+MESH_SIZE = 478
 # Without the thumb: hands differ most in where its base is.
 HAND_LENGTHS = tuple(bone for f in FINGERS[1:] for bone in pairwise((WRIST, *f)))
+AVERAGE_FACE = np.full((MESH_SIZE, 3), np.nan)
+AVERAGE_FACE[list(FACE_MESH.values())] = rest_face()
+# Pairs of landmarks that are further apart than an expression moves them, by far.
+FACE_LENGTHS = tuple(
+    pair for pair in combinations(FACE_MESH.values(), 2) if length(AVERAGE_FACE, pair) > 0.05
+)
 LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))  # rigid, for the scale of axes
 
 
@@ -31,7 +42,8 @@ def read_pose(path: Path, figure: Figure) -> Motion:
     Image landmarks with MediaPipe's depth, which agree with those of the hands; without any, world
     landmarks. The package scales x and y by the image size but not z, and normalised files no
     longer hold that size: the scale of each axis is estimated from the subject's bone lengths.
-    Hands are relative to their own wrists and have scales of their own.
+    Hands and the face have scales of their own. The face is in axes fixed to the head, by all
+    landmarks of the mesh that the file has.
 
     Hips that are hardly seen, as of people filmed from the waist up, are put upright below the
     shoulders.
@@ -84,9 +96,17 @@ def read_pose(path: Path, figure: Figure) -> Motion:
         p[:, HIPS] = p[:, SHOULDERS] + (0, length(figure.rest, (11, 23)), 0)
         visibility[:, HIPS] = visibility[:, SHOULDERS]
     hands = [landmarks(hand, HAND_NAMES) for hand in HANDS]
-    if any(seen.any() for _, seen in hands):
-        p = np.concatenate([p, *_hands_to_metres(hands, figure)], axis=1)
+    face = landmarks(MESH, tuple(str(number) for number in range(MESH_SIZE)))
+    if any(seen.any() for _, seen in (*hands, face)):
+        whole = figure.rest_with_hands
+        rest = [whole[at] for at in HAND_JOINTS.values()]
+        p = np.concatenate([p, *_parts_to_metres(hands, rest, HAND_LENGTHS)], axis=1)
         visibility = np.concatenate([visibility, *(seen for _, seen in hands)], axis=1)
+    if face[1].any():
+        (mesh,) = _parts_to_metres([face], [AVERAGE_FACE], FACE_LENGTHS)
+        ours = list(FACE_MESH.values())
+        p = np.concatenate([p, steadied(mesh)[:, ours]], axis=1)
+        visibility = np.concatenate([visibility, face[1][:, ours]], axis=1)
     return Motion(path, p, visibility, rate_of(path, pose.body.fps), None, unit, detached=True)
 
 
@@ -110,16 +130,21 @@ def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure, pixels: 
     return np.asarray(p * scales)
 
 
-def _hands_to_metres(hands: list[tuple[Float, Float]], figure: Figure) -> list[Float]:
-    """Hands ``[F, 21, 3]`` from their wrists, of points and confidences.
+def _parts_to_metres(
+    parts: Sequence[tuple[Float, Float]],
+    rest: Sequence[Float],
+    lengths: Sequence[tuple[int, int]],
+) -> list[Float]:
+    """Both hands, or the face, ``[F, n, 3]``, of points and confidences.
 
-    The scale of x and y, and that of z, solve `_to_metres`' equations for the bones of both hands.
+    The scale of x and y, and that of z, solve `_to_metres`' equations for pairs of all parts that
+    are as long as in ``rest [n, 3]``.
     """
-    rest, rows, found = figure.rest_with_hands, [], []
-    for (p, seen), at in zip(hands, HAND_JOINTS.values(), strict=True):
-        p = np.where(seen[..., None] > 0, p - p[:, WRIST, None], np.nan)
-        for a, b in HAND_LENGTHS:
-            bone = (p[:, b] - p[:, a]) ** 2 / length(rest[at], (a, b)) ** 2
+    rows, found = [], []
+    for (p, seen), at_rest in zip(parts, rest, strict=True):
+        p = np.where(seen[..., None] > 0, p, np.nan)
+        for a, b in lengths:
+            bone = (p[:, b] - p[:, a]) ** 2 / length(at_rest, (a, b)) ** 2
             rows.append(np.stack([bone[:, 0] + bone[:, 1], bone[:, 2]], axis=1))
         found.append(p)
     table = np.concatenate(rows)

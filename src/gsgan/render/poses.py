@@ -17,7 +17,7 @@ from torch import Tensor
 from gsgan.body import open_body
 from gsgan.body.skinned import MarkedBody
 from gsgan.data.dataset import PictureCache
-from gsgan.data.figure import BODY, HAND_JOINTS, HEELS_AND_TOES, Figure, upright
+from gsgan.data.figure import BODY, EXPRESSION, HAND_JOINTS, HEELS_AND_TOES, Figure, upright
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
 from gsgan.model.runs import (
@@ -41,9 +41,10 @@ from gsgan.render.motion import (
     up_axis,
 )
 from gsgan.render.readers import Source, read_motion
-from gsgan.render.retarget import joined, on_figure, placed
+from gsgan.render.retarget import expressed, face_in_head, joined, on_figure, placed
 from gsgan.scene import BodyPose, Camera, Frame, cat
-from gsgan.skeleton import complete_skeleton
+from gsgan.skeleton import HOLISTIC, complete_skeleton
+from gsgan.skeleton.tensors import constants
 from gsgan.utils.checks import above, one_of
 from gsgan.utils.config import defaults_of
 from gsgan.utils.errors import ConfigError, DataError
@@ -126,13 +127,22 @@ class Run:
         assert self.scene.figure is not None
         return self.scene.figure
 
+    @property
+    def face(self) -> Float:
+        """``[30, 3]`` metres: the subject's face at rest, see `gsgan.skeleton.in_head`; the
+        template's for avatars without a face."""
+        template = self.avatar.template
+        template = template if template.expression else HOLISTIC
+        return constants(template, torch.device("cpu"), torch.float64).face_rest.numpy()
+
 
 @dataclass(frozen=True)
 class Drive:
     """A motion that drives the avatar.
 
     Args:
-        p: ``[F, J, 3]`` metres, world frame; NaN where unknown. J is 33, or 75 with hands.
+        p: ``[F, J, 3]`` metres, world frame; NaN where unknown. J is 33, 75 with hands, or
+            105 with hands and face.
         visibility: ``[F, J]`` in [0, 1].
         body: F poses of the skinned body, or None.
         numbers: of the frames, for their file names.
@@ -247,7 +257,7 @@ def _joined(clips: list[Drive], figure: Figure, seconds: float, fps: float) -> D
     between = max(1, round(seconds * fps) - 1)
     joints = max(clip.p.shape[1] for clip in clips)
     parts = []
-    for clip in clips:  # some with hands, some without
+    for clip in clips:  # some with hands or a face, some without
         lacking = (0, joints - clip.p.shape[1])
         parts.append(np.pad(clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan) @ standard.T)
     p = joined(parts, figure, between) @ standard
@@ -256,7 +266,7 @@ def _joined(clips: list[Drive], figure: Figure, seconds: float, fps: float) -> D
 
 
 def _shown(p: Float, figure: Figure) -> Float:
-    """``[F, J]`` visibility of retargeted joints: the body's as in training, hands where known."""
+    """``[F, J]`` visibility of retargeted joints: the body's as in training, others where known."""
     visibility = np.asarray(np.isfinite(p).all(-1), np.float64)
     visibility[:, : len(figure.seen)] = figure.seen
     return visibility
@@ -293,12 +303,18 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     else:
         standard = upright(figure.up)
         centre = standard @ np.array(run.scene.centre)
-        p = on_figure(resampled(completed(motion, up), rate, fps), figure)
+        p = completed(motion, up)
+        if p.shape[1] > EXPRESSION.start:
+            p = p if motion.detached else face_in_head(p)
+            p[:, EXPRESSION] = expressed(p[:, EXPRESSION], run.face)
+        p = on_figure(resampled(p, rate, fps), figure)
         p = placed(p, figure, centre, fps, ground=config.ground, stay=config.stay) @ standard
         visibility = _shown(p, figure)
     filled = f", {_frames(motion.filled)} without shoulders or hips filled" if motion.filled else ""
     seen = [np.isfinite(p[:, hand]).all((1, 2)).sum() for hand in HAND_JOINTS.values()]
     hands = f", left hand in {seen[0]} frames, right hand in {seen[1]}" if p.shape[1] > BODY else ""
+    if p.shape[1] > EXPRESSION.start:
+        hands += f", face in {np.isfinite(p[:, EXPRESSION]).any((1, 2)).sum()}"
     assumed = "" if config.motion_fps or motion.fps else " (assumed: give motion_fps)"
     text = (
         f"{motion.path.name}: {_frames(len(motion))} at {rate:.5g} per second{assumed}, "

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from gsgan.body import free_body, open_body
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.calibration.find import METRES
-from gsgan.data.figure import HIPS, SHOULDERS, Figure
+from gsgan.data.figure import EXPRESSION, HIPS, SHOULDERS, Figure
 from gsgan.data.files import read_arrays, read_json, read_json_value
 from gsgan.data.formats import smpl_motion
 from gsgan.data.formats.capture import SHAPE, read_shape
@@ -28,7 +28,6 @@ from gsgan.render.pose_files import read_pose
 from gsgan.render.retarget import rig_landmarks
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
-from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -119,11 +118,11 @@ def _beside(path: Path) -> dict[str, Any]:
 
 def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Motion:
     meta = _beside(path)
-    with_hands = JOINTS + 2 * HAND
-    if arrays["p"].shape[1:] not in ((JOINTS, 3), (with_hands, 3)):
+    hands, face = EXPRESSION.start, EXPRESSION.stop
+    if arrays["p"].shape[1:] not in ((JOINTS, 3), (hands, 3), (face, 3)):
         raise DataError(
-            f"{path}: 'p' must have shape [F, {JOINTS} or with hands {with_hands}, 3], got "
-            f"{list(arrays['p'].shape)}"
+            f"{path}: 'p' must have shape [F, {JOINTS}, 3], with hands [F, {hands}, 3], or with "
+            f"hands and face [F, {face}, 3]; got {list(arrays['p'].shape)}"
         )
     p = arrays["p"].astype(np.float64)
     conf = np.ones(p.shape[:2])

@@ -12,11 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
+from torch import Tensor
 
 from gsgan.data.figure import (
     BODY,
     BONES,
     EARS,
+    EXPRESSION,
     FACE,
     FEET,
     HAND_JOINTS,
@@ -36,12 +38,14 @@ from gsgan.data.figure import (
 from gsgan.data.synthetic.bvh import StandardMotion, drift, floor_under
 from gsgan.data.synthetic.character import unit
 from gsgan.data.synthetic.retarget import axis_angle, between, rotation
-from gsgan.skeleton import bone_frames
+from gsgan.skeleton import MEDIAPIPE33, bone_frames, in_head
 from gsgan.skeleton.hands import FINGER_BONES
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 
 Float = NDArray[np.float64]
 
+STILL = 0.001  # metres: landmarks of a face that move less count fully in its alignment
+ROUNDS = 10  # of the alignment
 NECK = 0.45  # radians, the largest bend of the neck: detectors place faces too far forward
 
 
@@ -54,12 +58,14 @@ def on_figure(p: Float, figure: Figure, scale: float | None = None) -> Float:
     With hand landmarks, J = 75, palms are rotated as these show and fingers keep their directions;
     where in the world they are does not matter. A hand with NaN stays NaN.
 
+    A face, J = 105, is given as `expressed` returns it, and put on the head. NaN stays NaN.
+
     Args:
         p: of the other person.
         figure: the subject.
         scale: of the path, in place of that ratio.
     """
-    whole, hands, p = np.full_like(p, np.nan), p, p[:, :BODY]
+    whole, given, p = np.full_like(p, np.nan), p, p[:, :BODY]
     rest, q = figure.rest, whole[:, :BODY]
     if scale is None:
         legs = [np.linalg.norm(p[:, b] - p[:, a], axis=-1) for limb in LEGS for a, b in limb]
@@ -73,8 +79,8 @@ def on_figure(p: Float, figure: Figure, scale: float | None = None) -> Float:
         q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
     for wrist, ends in HANDS.items():
         turn = hand_frame(p, wrist) @ hand_frame(rest, wrist).T
-        if hands.shape[1] > BODY:
-            at, palm = _posed_hand(hands[:, HAND_JOINTS[wrist]], figure, wrist)
+        if given.shape[1] > BODY:
+            at, palm = _posed_hand(given[:, HAND_JOINTS[wrist]], figure, wrist)
             whole[:, HAND_JOINTS[wrist]] = q[:, wrist, None] + at
             turn = np.where(np.isfinite(palm), palm, turn)
         q[:, ends] = q[:, wrist, None] + (rest[list(ends)] - rest[wrist]) @ turn.mT
@@ -88,7 +94,61 @@ def on_figure(p: Float, figure: Figure, scale: float | None = None) -> Float:
     ears = chest + (rotation(bend * most) @ level[..., None])[..., 0]
     turn = _head_frame(p) @ _head_frame(rest[None]).mT
     q[:, FACE] = ears[:, None] + (rest[list(FACE)] - middle(rest, EARS)) @ turn.mT
+    centre = q[:, MEDIAPIPE33.head].mean(1, keepdims=True)
+    whole[:, EXPRESSION] = centre + given[:, EXPRESSION] @ _head_frame(q).mT
     return whole
+
+
+def expressed(p: Float, rest: Float) -> Float:
+    """``[F, 30, 3]`` the subject's face with another person's expressions, in the head's axes.
+
+    One similarity aligns all frames with the subject's face. Offsets from the median over the
+    frames, the other person's face at rest, are added to the subject's face at rest.
+
+    Args:
+        p: the other person's landmarks ``[F, 30, 3]`` in axes fixed to the head, of any place, turn
+            and unit; NaN where not seen.
+        rest: ``[30, 3]`` metres, the subject's, see `gsgan.skeleton.in_head`.
+
+    Returns:
+        Metres; NaN where not seen.
+    """
+    given, own = torch.from_numpy(p), torch.from_numpy(rest)
+    seen = given.isfinite().all(-1).double().reshape(1, -1, 1)
+    found = _aligned(given.reshape(1, -1, 3), own.repeat(len(given), 1), seen).reshape(p.shape)
+    return (own + found - found.nanmedian(0).values).numpy()
+
+
+def steadied(p: Float) -> Float:
+    """Landmarks of a face ``[F, n, 3]``, metres, NaN where not seen, in axes fixed to the head.
+
+    Frames are aligned with their median. Landmarks that move much count little in the frame's
+    alignment: a jaw that drops does not nod the head.
+    """
+    found = torch.from_numpy(p)
+    seen = found.isfinite().all(-1, keepdim=True).double()
+    usual = found[seen.sum((1, 2)).argmax()]
+    weight = seen * usual.isfinite()[:, :1]
+    for _ in range(ROUNDS):
+        found = _aligned(found, usual.nan_to_num(), weight)
+        usual = found.nanmedian(0).values
+        moved = (found - usual).square().sum(-1, keepdim=True) / STILL**2
+        weight = (1 / (1 + moved)).nan_to_num()  # Cauchy's
+    return found.numpy()
+
+
+def _aligned(p: Tensor, onto: Tensor, weight: Tensor) -> Tensor:
+    """Points ``[F, n, 3]`` moved by the similarity of each frame that brings them nearest to
+    ``onto [n, 3]``, by weights ``[F, n, 1]``, 0 for NaN (Umeyama 1991)."""
+    weight = weight / weight.sum(1, keepdim=True).clamp_min(1e-9)
+    centre = (weight * p.nan_to_num()).sum(1, keepdim=True)
+    a, to = p - centre, (weight * onto).sum(1, keepdim=True)
+    flat = weight * a.nan_to_num()
+    U, S, Vh = torch.linalg.svd(flat.mT @ (onto - to))
+    S[:, 2] *= torch.linalg.det(U @ Vh)
+    U[..., 2] *= torch.linalg.det(U @ Vh)[:, None]
+    size = S.sum(-1) / (flat * a.nan_to_num()).sum((1, 2))
+    return to + size[:, None, None] * a @ U @ Vh
 
 
 def _posed_hand(p: Float, figure: Figure, wrist: int) -> tuple[Float, Float]:
@@ -138,17 +198,24 @@ def joined(clips: Sequence[Float], figure: Figure, n: int) -> Float:
     """Clips ``[F, J, 3]`` of the subject, one after the other, with transitions of n frames.
 
     A transition is a cubic that continues the joints' speeds at both ends, on the subject's bones;
-    without a hand that either end lacks (NaN).
+    without a hand or face that either end lacks (NaN).
     """
     parts = [clips[0]]
-    for a, b in pairwise(clips):
+    for (a, b), after in zip(pairwise(map(face_in_head, clips)), clips[1:], strict=True):
         speeds = [x[-1] - x[-2] if len(x) > 1 else 0 * x[0] for x in (a, b[1::-1])]
         ends, speed = np.stack([a[-1], b[0]]), np.stack([speeds[0], -speeds[1]])
         path = CubicHermiteSpline([0, n + 1], *(np.nan_to_num(x) for x in (ends, speed)))
         known = np.isfinite(ends).all((0, 2))[:, None]
         between = np.where(known, path(np.arange(1, n + 1)), np.nan)
-        parts += [on_figure(between, figure, scale=1.0), b]
+        parts += [on_figure(between, figure, scale=1.0), after]
     return np.concatenate(parts)
+
+
+def face_in_head(p: Float) -> Float:
+    """Landmarks ``[F, J, 3]`` with those of the face as `on_figure` takes them."""
+    body, face = torch.from_numpy(p[:, :BODY]), torch.from_numpy(p[:, EXPRESSION])
+    local = in_head(face, body, bone_frames(body).hubs[:, HEAD], MEDIAPIPE33)
+    return np.concatenate([p[:, : EXPRESSION.start], local.numpy()], axis=1)
 
 
 def heading(p: Float) -> float:
