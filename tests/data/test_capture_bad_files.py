@@ -191,7 +191,7 @@ BAD_INDEX = {
     ),
     "theta of another body": (
         smpl_poses_of_free_body,
-        r"'theta' must have shape \(any, 56, 3\), found \(4, 24, 3\)",
+        r"'theta' must have shape \(4, 56, 3\), found \(4, 24, 3\)",
     ),
     "unknown body": (meta(body="smplh"), "'body' is 'smplh'; expected one of free, smpl, smplx"),
     "masks all empty": (
@@ -206,7 +206,7 @@ BAD_INDEX = {
         write("images/cam00/20240131120000123456.png", b""),
         "20240131120000123456.png has no frame number up to .*frames 0, 1, 2 … equally",
     ),
-    "theta shape": (poses(theta=np.zeros((4, 168))), r"'theta' must have shape \(any, any, 3\)"),
+    "theta shape": (poses(theta=np.zeros((4, 168))), r"'theta' must have shape \(4, any, 3\)"),
     "transl shape": (poses(transl=np.zeros((3, 3))), r"'transl' must have shape \(4, 3\)"),
     "no mask": (
         remove("masks/cam01/000002.png"),
