@@ -1,4 +1,4 @@
-"""Finger joints of a body from the 21 landmarks of each hand.
+"""Finger joints of a body, and where its hands are, from the 21 landmarks of each hand.
 
 Convention: metres, radians; a joint's turn is its axis-angle in `BodyPose.theta`.
 """
@@ -22,8 +22,8 @@ SPREAD = ((0.7, 0.5, 0.4, 0.8, 0.15), (0.8, 0.2, 0.2, 1.0, 0.03))
 LEAST = ((-0.8, -0.8, -0.8, -0.6, -0.3), (-0.6, -0.45, -0.4, -0.2, -0.1))
 MOST = ((1.2, 0.8, 0.8, 2.0, 0.3), (1.75, 0.45, 0.4, 2.6, 0.1))
 NOISE = 0.004  # metres, standard deviation of a landmark
-ROUNDS = (1, 2)  # steps of the fingers, before the hand is placed
-TURNS = 3  # steps of a hand's rotation
+ROUNDS = (1, 2)  # Gauss-Newton steps of the fingers per round; each round then places the hand
+PLACING = 3  # Gauss-Newton steps of a hand's rotation
 TRACE = 1e-4  # of a bone at rest, added to the seen one: a bone that vanishes rests
 
 
@@ -193,7 +193,7 @@ def _placed(x: Tensor, hands: Tensor, seen: Tensor, R: Tensor) -> tuple[Tensor, 
     centre, goal = ((share * v).sum(2) for v in (x, y))
     away, towards = x - centre.unsqueeze(2), y - goal.unsqueeze(2)
     eye = torch.eye(3).to(x)
-    for _ in range(TURNS):
+    for _ in range(PLACING):
         now = away @ R.mT
         H = (share * now).mT @ now
         H = (torch.einsum("...ii", H)[..., None, None] + SHORT**2) * eye - H

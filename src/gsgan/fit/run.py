@@ -100,9 +100,9 @@ def fit_body(
 ) -> Path:
     """Shape from skeletons, poses solved from skeletons, then registered to the masks.
 
-    The registered poses determine where on the body this person's landmarks are. With these offsets
-    all poses are solved again, and written unless the settings keep registered ones. A fit that was
-    stopped resumes from a hidden file in ``out``.
+    The registered poses determine where on the body this person's landmarks are; hand landmarks,
+    the size and place of the hands. With these all poses are solved again, and written unless the
+    settings keep registered ones. A fit that was stopped resumes from a hidden file in ``out``.
 
     Args:
         data: a capture.
@@ -140,7 +140,10 @@ def fit_body(
         found = fitter.pose()
         registered = found.to(torch.device("cpu"))
         shape = _refined(data, shape, moments.frames, registered)
-    driven = _solve(data, shape, layout.frames, _by_hands(data))
+    poses = {False: _solve(data, shape, layout.frames)}
+    if layout.hands is not None:
+        poses[True] = _solve(data, shape, layout.frames, hands=True)
+    driven = poses[_by_hands(data)]
     again = BodyPose(driven.theta[rows], driven.transl[rows]).to(device)
     report = _report(fitter, shaped_body(shape).to(device), again, found)
     kept = registered if settings.held_out or settings.keep else None
@@ -153,7 +156,7 @@ def fit_body(
     write_npz(folder / SHAPE, **shape.arrays())
     write_npz(
         folder / POSES,
-        **_with_and_without_hands(data, shape, rows, kept, unit),
+        **_with_and_without_hands(poses, _fingers(shape), rows, kept, unit),
         frame_id=np.array(layout.frames),
         registered=np.array(() if kept is None else moments.frames, np.int64),
         fitted_to=np.array(moments.cameras),
@@ -181,20 +184,23 @@ def _folder(out: Path, overwrite: bool) -> Path:
 
 
 def _with_and_without_hands(
-    data: GsganData, shape: BodyShape, rows: Tensor, kept: BodyPose | None, unit: float
+    poses: dict[bool, BodyPose],
+    fingers: list[int],
+    rows: Tensor,
+    kept: BodyPose | None,
+    unit: float,
 ) -> dict[str, NDArray[Any]]:
-    """Poses by 33 landmarks and, where there are hands, by these too. Registered poses ``kept``
-    replace those of ``rows``, but for the fingers: their hands are where the masks have them."""
-    fingers = _fingers(shape)
+    """The arrays of ``poses`` by 33 landmarks and, where there are hands, by these too. Registered
+    poses ``kept`` replace those of ``rows``, but for the fingers: their hands are where the masks
+    have them."""
     found: dict[str, NDArray[Any]] = {}
-    for name, hands in {"": False, "_hands": True}.items():
-        if not hands or data.layout.hands is not None:
-            solved = _solve(data, shape, data.layout.frames, hands)
-            theta, transl = solved.theta.clone(), solved.transl.clone()
-            if kept is not None:
-                theta[rows], transl[rows] = kept.theta, kept.transl
-                theta[:, fingers] = solved.theta[:, fingers]
-            found |= {f"theta{name}": theta.numpy(), f"transl{name}": transl.numpy() / unit}
+    for hands, solved in poses.items():
+        theta, transl = solved.theta.clone(), solved.transl.clone()
+        if kept is not None:
+            theta[rows], transl[rows] = kept.theta, kept.transl
+            theta[:, fingers] = solved.theta[:, fingers]
+        name = "_hands" if hands else ""
+        found |= {f"theta{name}": theta.numpy(), f"transl{name}": transl.numpy() / unit}
     return found
 
 

@@ -49,7 +49,6 @@ from gsgan.utils.errors import DataError
 
 LANDMARKS, HANDS, FACES = "landmarks3d.npz", "hands3d.npz", "face3d.npz"
 POSES, SHAPE = "body_pose.npz", "body_shape.npz"
-WITH_HANDS = ("theta_hands", "transl_hands")
 MASKS = (".png",)
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
 LOOKED_AT = Trust(min_box_iou=0.0)
@@ -208,8 +207,8 @@ def _refuse_other_names(path: Path) -> None:
 def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses, Meta]:
     """Poses of frames whose numbers are finite, and ``meta`` with the body and its shape."""
     path, fitted = root / POSES, (root / SHAPE).exists()
-    names = ("theta", "transl", "frame_id", "betas", "registered", "fitted_to", *WITH_HANDS)
-    arrays = read_arrays(path, names)
+    names = ("theta", "transl", "frame_id", "betas", "registered", "fitted_to")
+    arrays = read_arrays(path, (*names, "theta_hands", "transl_hands"))
     if fitted:  # by gsgan.fit: the free body in the person's shape
         meta = replace(meta, body=BodyModel("free", betas=read_shape(root / SHAPE)))
     bones = None if meta.body is None else BODY_BONES[meta.body.kind]
