@@ -322,7 +322,7 @@ def test_amc(tmp_path, proportions):
     path = write_amc(tmp_path)
     bvh, metres = read_amc(path, asf_of(path))
     assert metres == pytest.approx(0.0254 / 0.45)
-    hand = bvh.positions(bvh.rotations, bvh.root)[:, bvh.names.index("lhand")]
+    hand = bvh.posed()[:, bvh.names.index("lhand")]
     np.testing.assert_allclose(hand[0], [3 + 5 + 4.5, 17 + 8, 0], atol=1e-9)
     # C M C⁻¹ with C a quarter turn about y: about x in the bone's axes is about -z of the parent's
     np.testing.assert_allclose(hand[1], [3 - 4.5, 17 + 8 - 5, 0], atol=1e-9)

@@ -17,21 +17,44 @@ from gsgan.utils.errors import DataError
 
 @dataclass(frozen=True)
 class Bvh:
-    """A parsed file: joints, parents first, and their world rotations since the rest pose."""
+    """A parsed file: joints, parents first, and their world rotations since the zero pose.
+
+    Args:
+        names: of the J joints; end sites are called "<joint> end".
+        parents: ``[J]``, -1 for roots.
+        offsets: ``[J, 3]`` from the parent in the zero pose, units and axes of the file.
+        rotations: ``[F, J, 3, 3]`` world, axes of the file.
+        root: ``[F, 3]`` position of the first joint.
+        frame_time: seconds.
+        local: ``[F, J, 3]`` positions in the parent's axes, in place of the offsets, or None where
+            only the root has position channels.
+    """
 
     names: tuple[str, ...]
     parents: tuple[int, ...]
-    offsets: Array  # [J, 3] from the parent at rest, units and axes of the file
-    rotations: Array  # [F, J, 3, 3] world, axes of the file
-    root: Array  # [F, 3] position of the first joint
-    frame_time: float  # seconds
+    offsets: Array
+    rotations: Array
+    root: Array
+    frame_time: float
+    local: Array | None = None
 
-    def positions(self, rotations: Array, root: Array) -> Array:
-        """Joints ``[..., J, 3]`` for world rotations ``[..., J, 3, 3]``."""
-        p = np.zeros((*root.shape[:-1], len(self.names), 3))
-        p[..., 0, :] = root
+    def zero_pose(self) -> Array:
+        """Joints ``[J, 3]`` without any rotation, the first one at the origin."""
+        p = np.zeros((len(self.names), 3))
         for j, parent in enumerate(self.parents[1:], 1):
-            p[..., j, :] = p[..., parent, :] + rotations[..., parent, :, :] @ self.offsets[j]
+            p[j] = p[parent] + self.offsets[j] if parent >= 0 else self.offsets[j]
+        return p
+
+    def posed(self) -> Array:
+        """Joints ``[F, J, 3]`` of all frames, units and axes of the file."""
+        p = np.zeros((*self.root.shape[:-1], len(self.names), 3))
+        p[:, 0] = self.root
+        for j, parent in enumerate(self.parents[1:], 1):
+            offset = self.offsets[j] if self.local is None else self.local[:, j]
+            if parent < 0:
+                p[:, j] = offset
+            else:
+                p[:, j] = p[:, parent] + (self.rotations[:, parent] @ offset[..., None])[..., 0]
         return p
 
 
@@ -64,6 +87,8 @@ def _parse(words: list[str]) -> Bvh:
     tree = iter(words[1:split])
     for word in tree:
         if word in ("ROOT", "JOINT", "End"):
+            if (word == "ROOT") == bool(open_joints):
+                raise ValueError(f"the {word} {next(tree)} is out of place")
             names.append(next(tree) + " end" * (word == "End"))
             parents.append(open_joints[-1] if open_joints else -1)
             channels.append([])
@@ -89,16 +114,36 @@ def _parse(words: list[str]) -> Bvh:
     values = np.array(numbers, dtype=float).reshape(frames, columns)
     if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
         raise ValueError("a number is not finite")
-    rotations, root = np.empty((frames, len(names), 3, 3)), np.zeros((frames, 3))
+    rotations = np.empty((frames, len(names), 3, 3))
+    local = np.broadcast_to(np.array(offsets), (frames, len(names), 3)).copy()
     column = 0
     for j, parent in enumerate(parents):
         R = np.eye(3) if parent < 0 else rotations[:, parent]
+        given: list[int] = []  # axes with a position channel
         for channel in channels[j]:
             axis = "XYZ".index(channel[0].upper())
             if channel.lower().endswith("rotation"):
                 R = R @ rotation(np.radians(values[:, column, None]) * np.eye(3)[axis])
-            elif parent < 0:  # other joints keep their offsets: bones do not change length
-                root[:, axis] = values[:, column]
+            else:
+                local[:, j, axis] = values[:, column]
+                given.append(axis)
             column += 1
+        if parent >= 0 and not local[:, j, given].any():  # some writers count from the offset
+            local[:, j] = offsets[j]
         rotations[:, j] = R
-    return Bvh(tuple(names), tuple(parents), np.array(offsets), rotations, root, frame_time)
+    moving = any(p >= 0 and (local[:, j] != offsets[j]).any() for j, p in enumerate(parents))
+    root = np.where(np.isin(range(3), _axes(channels[0])), local[:, 0], 0.0)
+    return Bvh(
+        tuple(names),
+        tuple(parents),
+        np.array(offsets),
+        rotations,
+        root,
+        frame_time,
+        local if moving or parents.count(-1) > 1 else None,
+    )
+
+
+def _axes(channels: list[str]) -> list[int]:
+    """The axes of a joint's position channels."""
+    return ["XYZ".index(c[0].upper()) for c in channels if c.lower().endswith("position")]
