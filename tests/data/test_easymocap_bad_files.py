@@ -16,8 +16,8 @@ from easymocap_folders import edit_people, read, refused
 from writers.common import Subject, write_picture
 from writers.easymocap import body_25, write_calibration, write_easymocap
 
-from gsgan.data.checks import Checks
 from gsgan.data.formats.easymocap import EasymocapReader
+from gsgan.data.validation import Thresholds
 from gsgan.utils.errors import DataError
 
 pytestmark = pytest.mark.usefixtures("model_once")
@@ -202,7 +202,7 @@ def test_bad_cameras_are_refused(
     cameras[1] = replace(cameras[1], **values)
     write_rig(root, replace(subject, cameras=tuple(cameras)))
     with pytest.raises(DataError, match=message) as caught:
-        EasymocapReader()(root, Checks())
+        EasymocapReader()(root, Thresholds())
     assert "\n" not in str(caught.value)
 
 

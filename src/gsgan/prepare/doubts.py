@@ -37,7 +37,7 @@ class Doubts:
     delay: float = 0.5
     delay_gain: float = 0.05
     fps: float = 0.01
-    distance: tuple[float, float] = checks.Checks.distance
+    distance: tuple[float, float] = checks.Thresholds.distance
 
 
 def doubts_about_sources(sources: Mapping[str, Source], limits: Doubts) -> list[str]:

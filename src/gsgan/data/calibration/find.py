@@ -14,8 +14,8 @@ from typing import Any
 from gsgan.data.calibration.opencv_yaml import read_opencv_yaml
 from gsgan.data.calibration.text import read_qualisys, read_toml
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
-from gsgan.data.checks import Checks
 from gsgan.data.files import read_json
+from gsgan.data.validation import Thresholds
 from gsgan.utils.errors import DataError
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
@@ -102,11 +102,11 @@ def read_cameras_json(
     found = read_conventions(meta, read_json(meta)) if meta.is_file() else Conventions()
     if scale is not None:
         found = replace(found, scale=scale)
-    return read_cameras(path, read_json(path), found, Checks()), []
+    return read_cameras(path, read_json(path), found, Thresholds()), []
 
 
 def read_cameras(
-    path: Path, content: Mapping[str, Any], conventions: Conventions, checks: Checks
+    path: Path, content: Mapping[str, Any], conventions: Conventions, checks: Thresholds
 ) -> dict[str, CameraEntry]:
     """The cameras of cameras.json by name, in metres, pixel centres moved to +0.5.
 
