@@ -25,13 +25,6 @@ written = easymocap_folders.written
 root = easymocap_folders.root
 
 
-def test_rotations_that_disagree(root: Path) -> None:
-    path = root / "extri.yml"
-    text = re.sub(r"(Rot_2:.*?data: \[ *)[^,]+", r"\g<1>0.125", path.read_text(), flags=re.S)
-    path.write_text(text)
-    refused(root, "extri.yml, camera 2: Rot_2 and R_2 are different rotations")
-
-
 def test_a_camera_in_one_file_only(root: Path) -> None:
     path = root / "extri.yml"
     whole = path.read_text()

@@ -26,7 +26,7 @@ import numpy as np
 
 from gsgan.body.shape import HANDS_SHAPE, STRETCHED, free_space
 from gsgan.body.shape import LANDMARKS as LANDMARKS_SHAPE
-from gsgan.data.calibration.find import (
+from gsgan.data.calibration import (
     METRES,
     Conventions,
     choose,
@@ -102,7 +102,9 @@ def _find(root: Path, checks: Thresholds, smpl: str | None, reader: CaptureReade
     conventions = read_conventions(meta_path, meta_json)
     if conventions.scale != 1.0:
         notes.append(f"lengths converted from {meta.unit} to metres")
-    cameras = read_cameras(root / "cameras.json", cameras_json, conventions, checks)
+    cameras = read_cameras(
+        root / "cameras.json", cameras_json, conventions, checks.rotation_tolerance
+    )
     images = _index_images(root, cameras)
     joints = SKELETONS[meta.skeleton]
     skeletons = _read_landmarks(root / LANDMARKS, joints, conventions, checks, notes)
