@@ -12,14 +12,14 @@ import pytest
 from writers.common import Subject
 from writers.easymocap import write_easymocap, write_people
 
-from gsgan.data.checks import Checks
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.layout import Layout
+from gsgan.data.validation import Thresholds
 from gsgan.utils.errors import DataError
 
 
 def read(root: Path, smpl: Path | None = None, **settings: Any) -> Layout:
-    return EasymocapReader(**settings)(root, Checks(), None if smpl is None else str(smpl))
+    return EasymocapReader(**settings)(root, Thresholds(), None if smpl is None else str(smpl))
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,11 @@ from writers.avatarrex import SERIALS, write_avatarrex
 from writers.common import write_picture
 from writers.smplx_rig import SmplxSubject
 
-from gsgan.data.checks import Checks
 from gsgan.data.files import read_colour
 from gsgan.data.formats.avatarrex import AvatarrexReader
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
+from gsgan.data.validation import Thresholds
 from gsgan.skeleton.smpl import to_mediapipe33
 from gsgan.utils.errors import DataError
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.usefixtures("model_once")
 
 
 def read(root: Path, smplx: Path) -> Layout:
-    return AvatarrexReader()(root, Checks(), str(smplx))
+    return AvatarrexReader()(root, Thresholds(), str(smplx))
 
 
 @pytest.fixture

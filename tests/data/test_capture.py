@@ -13,12 +13,12 @@ import torch
 from capture_frames import every_frame, items, png
 from make import edit_json, ring_camera, skeletons, write_landmarks, write_tiny_capture
 
-from gsgan.data.checks import Checks, spans
 from gsgan.data.dataset import CaptureDataset, Picture, PictureCache
 from gsgan.data.files import cut_off, read_header
 from gsgan.data.formats.capture import CaptureReader, read_capture
-from gsgan.data.formats.trust import Trust
+from gsgan.data.formats.consistency import Consistency
 from gsgan.data.skeletons import fill_missing
+from gsgan.data.validation import Thresholds, spans
 from gsgan.scene import cat
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -62,10 +62,10 @@ def test_soft_masks_mix_with_black_once(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path, cameras=1, frames=1)
     cv2.imwrite(str(root / "images/cam00/000000.png"), np.full((24, 32, 3), 100, np.uint8))
     cv2.imwrite(str(root / "masks/cam00/000000.png"), np.full((24, 32), 51, np.uint8))
-    trust = Trust(frames=0)  # no pixel of such a mask counts as the person
-    assert torch.allclose(every_frame(root, trust)[0].image, torch.tensor(20 / 255))
+    consistency = Consistency(frames=0)  # no pixel of such a mask counts as the person
+    assert torch.allclose(every_frame(root, consistency)[0].image, torch.tensor(20 / 255))
     edit_json(root / "meta.json", lambda meta: meta.update(background="black"))
-    assert torch.allclose(every_frame(root, trust)[0].image, torch.tensor(100 / 255))
+    assert torch.allclose(every_frame(root, consistency)[0].image, torch.tensor(100 / 255))
 
 
 def test_millimetres_become_metres_and_it_is_said(tmp_path: Path) -> None:
@@ -104,7 +104,7 @@ def test_frames_pair_by_number_not_by_position(tmp_path: Path) -> None:
 
 
 def test_a_band_round_the_outline_is_left_out_of_the_loss(tmp_path: Path) -> None:
-    layout = CaptureReader(ignore_band=3)(write_tiny_capture(tmp_path), Checks())
+    layout = CaptureReader(ignore_band=3)(write_tiny_capture(tmp_path), Thresholds())
     frame = CaptureDataset(layout, items(layout))[0]
     assert frame.unsure is not None
     band = frame.unsure[0, 0] > 0
@@ -173,7 +173,7 @@ def test_frames_with_too_few_joints_are_dropped_and_counted(tmp_path: Path) -> N
     assert layout.frames == (0, 3)
     assert any("1 of 4 frames dropped, with fewer than 12 joints" in n for n in layout.notes)
     assert any("fewer than 3 of the shoulders and hips: 2" in n for n in layout.notes)
-    assert read_capture(root, Checks(min_joints=5, min_hubs=0)).frames == (0, 1, 2, 3)
+    assert read_capture(root, Thresholds(min_joints=5, min_hubs=0)).frames == (0, 1, 2, 3)
 
 
 def test_an_upper_body_without_hips_is_read(tmp_path: Path) -> None:

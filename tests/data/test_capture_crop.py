@@ -15,7 +15,7 @@ from make import edit_json, write_tiny_capture
 from gsgan.data.crop import Crop, PersonCrop, cut, square_window, undistort_map
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.capture import read_capture
-from gsgan.data.formats.trust import Trust
+from gsgan.data.formats.consistency import Consistency
 from gsgan.utils.errors import ConfigError
 
 LENS = (-0.25, 0.08, 0.002, -0.001, 0.01)
@@ -99,7 +99,7 @@ def test_the_crop_comes_from_skeleton_and_camera_alone(tmp_path: Path) -> None:
     windows = [CaptureDataset(before, [i], crop=PersonCrop()).window(i) for i in items(before)]
     for path in (root / "masks").rglob("*.png"):
         cv2.imwrite(str(path), np.zeros((24, 32), np.uint8))
-    after = read_capture(root, trust=Trust(frames=0))
+    after = read_capture(root, consistency=Consistency(frames=0))
     blind = CaptureDataset(after, items(after), size=16, crop=PersonCrop())
     assert [blind.window(i) for i in items(after)] == windows
     assert (blind[0].image == 0).all()

@@ -14,14 +14,14 @@ from easymocap_folders import read, refused
 from writers.common import Subject, write_picture
 from writers.easymocap import NAMES, body_25, hand_joints, write_calibration, write_easymocap
 
-from gsgan.data.checks import Checks
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import read_colour
+from gsgan.data.formats.consistency import Consistency
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.formats.smpl_motion import Motion, posed
-from gsgan.data.formats.trust import Trust
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
+from gsgan.data.validation import Thresholds
 from gsgan.skeleton.smpl import to_mediapipe33
 from gsgan.utils.errors import ConfigError
 
@@ -34,7 +34,7 @@ LANDMARKS = {
     0: 0, 2: 16, 5: 15, 7: 18, 8: 17, 11: 5, 12: 2, 13: 6, 14: 3, 15: 7, 16: 4, 23: 12, 24: 9,
     25: 13, 26: 10, 27: 14, 28: 11, 29: 21, 30: 24, 31: 19, 32: 22,
 }  # fmt: skip
-NO_LOOK = Trust(frames=0, watched_masks=0)
+NO_LOOK = Consistency(frames=0, watched_masks=0)
 
 
 def check_cameras(layout: Layout, subject: Subject) -> None:
@@ -145,7 +145,7 @@ def test_pictures_are_undistorted(written: Path, subject: Subject) -> None:
 def test_sizes_come_from_images_if_absent(subject: Subject, tmp_path: Path) -> None:
     root = write_easymocap(tmp_path / "e", subject)
     write_calibration(root, subject, sizes=False)
-    sizes = {camera.size for camera in EasymocapReader()(root, Checks()).cameras.values()}
+    sizes = {camera.size for camera in EasymocapReader()(root, Thresholds()).cameras.values()}
     assert sizes == {(40, 40)}
 
 
@@ -179,7 +179,7 @@ def test_a_persons_own_mask_goes_before_nobodys(tmp_path: Path, subject: Subject
 def test_mask_rules(root: Path) -> None:
     write_picture(root / "mask/1/000000.png", np.full((40, 40), 100, np.uint8))
     for rule, expected in (("nonzero", 255), ("threshold", 0), ("grey", 100), ("label", 255)):
-        layout = read(root, mask_rule=rule, trust=NO_LOOK)
+        layout = read(root, mask_rule=rule, consistency=NO_LOOK)
         assert (read_mask(layout.mask_files("1", 0), layout.pixels) == expected).all()
     with pytest.raises(ConfigError, match="mask_rule must be one of grey"):
         EasymocapReader(mask_rule="soft")

@@ -15,10 +15,10 @@ from writers.smplx_rig import SmplxSubject
 
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import read_colour
+from gsgan.data.formats.consistency import Consistency
 from gsgan.data.formats.smpl_motion import Motion, posed
 from gsgan.data.formats.smplx_rig import read_motion
 from gsgan.data.formats.thuman4 import Thuman4Reader
-from gsgan.data.formats.trust import Trust
 from gsgan.data.pixels import read_mask, read_unsure
 from gsgan.skeleton.smpl import to_mediapipe33
 from gsgan.utils.errors import ConfigError
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("model_once")
 written = thuman4_folders.written
 root = thuman4_folders.root
 
-NO_LOOK = Trust(frames=0, watched_masks=0)
+NO_LOOK = Consistency(frames=0, watched_masks=0)
 
 
 def test_cameras_are_those_that_were_written(
@@ -160,7 +160,7 @@ def test_an_alpha_of_exactly_the_threshold_is_the_person(root: Path, smplx_file:
     path = root / "masks/cam00/00000000.jpg"
     for value, expected in ((127, 0), (128, 255)):
         write_picture(path, np.full((44, 52), value, np.uint8))
-        layout = read(root, smplx_file, trust=NO_LOOK)
+        layout = read(root, smplx_file, consistency=NO_LOOK)
         assert (read_mask(layout.mask_files("cam00", 0), layout.pixels) == expected).all()
 
 
@@ -171,7 +171,7 @@ def test_the_unsure_band_is_an_option(root: Path, smplx_file: Path) -> None:
     write_picture(root / "masks/cam00/00000000.jpg", alpha)
 
     def unsure(**settings: Any) -> np.ndarray | None:
-        layout = read(root, smplx_file, trust=NO_LOOK, **settings)
+        layout = read(root, smplx_file, consistency=NO_LOOK, **settings)
         files = layout.mask_files("cam00", 0)
         return read_unsure(files, read_mask(files, layout.pixels), layout.pixels)
 
@@ -181,12 +181,15 @@ def test_the_unsure_band_is_an_option(root: Path, smplx_file: Path) -> None:
     assert both is not None
     assert np.flatnonzero(band[20]).tolist() == [22, 23, 24, 25]
     assert np.flatnonzero(both[20]).tolist() == [*range(8), 22, 23, 24, 25]
-    layout = read(root, smplx_file, trust=NO_LOOK, ignore_band=5)
+    layout = read(root, smplx_file, consistency=NO_LOOK, ignore_band=5)
     frame = CaptureDataset(layout, [("cam00", 0)], size=26)[0]
     assert frame.unsure is not None
     assert frame.unsure.shape == (1, 1, 26, 26)
     assert frame.unsure.unique().tolist() == [0, 1]
-    assert CaptureDataset(read(root, smplx_file, trust=NO_LOOK), [("cam00", 0)])[0].unsure is None
+    assert (
+        CaptureDataset(read(root, smplx_file, consistency=NO_LOOK), [("cam00", 0)])[0].unsure
+        is None
+    )
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,8 @@ from zju_folders import frame_of, read
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import frame_files, natural_order
+from gsgan.data.formats.consistency import Consistency, box_iou, mask_box
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
-from gsgan.data.formats.trust import Trust, box_iou, mask_box
 from gsgan.data.formats.zju import camera_folders, frame_number, read_annots
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_labels, read_mask
@@ -299,9 +299,9 @@ def test_some_missing_masks_are_left_out_and_counted(original: Path, smpl_file: 
 
 def test_a_mask_of_odd_area_is_noted_and_can_be_left_out(original: Path, smpl_file: Path) -> None:
     write_picture(original / "mask/Camera_B1/000002.png", np.full((40, 40), 255, np.uint8))
-    layout = read(original, smpl_file, trust=Trust(frames=0))
+    layout = read(original, smpl_file, consistency=Consistency(frames=0))
     assert any("more than 50% off the usual at frames 2 of 4" in note for note in layout.notes)
-    without = read(original, smpl_file, trust=Trust(frames=0), drop_frames="2")
+    without = read(original, smpl_file, consistency=Consistency(frames=0), drop_frames="2")
     assert without.frames == (0, 1, 3)
     assert not any("off the usual" in note for note in without.notes)
 

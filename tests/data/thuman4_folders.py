@@ -12,14 +12,14 @@ import pytest
 from writers.smplx_rig import SmplxSubject
 from writers.thuman4 import write_thuman4
 
-from gsgan.data.checks import Checks
 from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.layout import Layout
+from gsgan.data.validation import Thresholds
 from gsgan.utils.errors import DataError
 
 
 def read(root: Path, smplx: Path | None, **settings: Any) -> Layout:
-    return Thuman4Reader(**settings)(root, Checks(), None if smplx is None else str(smplx))
+    return Thuman4Reader(**settings)(root, Thresholds(), None if smplx is None else str(smplx))
 
 
 @pytest.fixture(scope="module")

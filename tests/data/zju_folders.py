@@ -10,15 +10,15 @@ import pytest
 from writers import zju as writers
 from writers.common import Subject
 
-from gsgan.data.checks import Checks
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.formats.zju import ZjuReader
 from gsgan.data.layout import Layout
+from gsgan.data.validation import Thresholds
 from gsgan.scene import Frame
 
 
 def read(root: Path, smpl: Path | None, **settings: Any) -> Layout:
-    return ZjuReader(**settings)(root, Checks(), None if smpl is None else str(smpl))
+    return ZjuReader(**settings)(root, Thresholds(), None if smpl is None else str(smpl))
 
 
 def frame_of(layout: Layout, camera: int, frame: int) -> Frame:

@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from gsgan.body.shape import free_space
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import Preparation
 from gsgan.evaluate.scores import painter
 from gsgan.model.runs import CHECKPOINT, CONFIG, build_data, load, load_avatar, load_config
@@ -74,7 +74,7 @@ def expected(
     config = load_config(run)
     data = build_data(config)
     predict = painter(load_avatar(run, config, data)[0], solve=solve)
-    prepare = Preparation(Measures(background=background), None)
+    prepare = Preparation(MetricVariants(background=background), None)
     found = {}
     dataset = data.dataset(split)
     for i, item in enumerate(dataset.items):

@@ -19,15 +19,15 @@ import torch
 from lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, Subset
 
-from gsgan.data.checks import Checks
 from gsgan.data.crop import PersonCrop
 from gsgan.data.dataset import CaptureDataset, Lens, PictureCache, StepSampler, pass_order
-from gsgan.data.formats.capture import FACES, HANDS, CaptureReader
+from gsgan.data.formats.capture import FACE_FILE, HANDS_FILE, CaptureReader
 from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
 from gsgan.data.scene_info import SceneInfo, count_labels, scene_info
 from gsgan.data.skeletons import complete_skeletons, face_at_rest
 from gsgan.data.splits import SPLITS, Splits, make_splits, protocol_splits
+from gsgan.data.validation import Thresholds
 from gsgan.scene import Frame, cat
 from gsgan.skeleton import TEMPLATES, template_of
 from gsgan.skeleton.template import Vector
@@ -48,7 +48,7 @@ LENSES: dict[str, Lens] = {
     "project": "raw",
 }
 
-Reader = Callable[[str | Path, Checks, str | None], Layout]
+Reader = Callable[[str | Path, Thresholds, str | None], Layout]
 """The layout of a dataset's folder, by thresholds and the user's body model file."""
 
 
@@ -106,7 +106,7 @@ class GsganData(LightningDataModule):
         seed: int = 0,
         cache_mb: float = 1024,
         info_samples: int = 8,
-        min_joints: int = Checks.min_joints,
+        min_joints: int = Thresholds.min_joints,
         distortion: str = "auto",
         wanted: str = "a capture in the bring-your-own layout",
     ) -> None:
@@ -143,7 +143,7 @@ class GsganData(LightningDataModule):
         self.seed = whole("data.seed", seed, 0)
         self.cache_mb = at_least("data.cache_mb", cache_mb, 0)
         self.info_samples = whole("data.info_samples", info_samples, 1)
-        self.checks = replace(Checks(), min_joints=whole("data.min_joints", min_joints, 1))
+        self.checks = replace(Thresholds(), min_joints=whole("data.min_joints", min_joints, 1))
         self.lens = LENSES[one_of("effects.distortion", distortion, LENSES)]
 
     def prepare_data(self) -> None:
@@ -167,8 +167,8 @@ class GsganData(LightningDataModule):
         layout = self.reader(self._folder(), self.checks, self.smpl)
         skeleton = TEMPLATES[self.skeleton]
         for wanted, held, file, other in (
-            (skeleton.palms, layout.hands, HANDS, "mediapipe33"),
-            (skeleton.expression, layout.face, FACES, "mediapipe33_hands"),
+            (skeleton.palms, layout.hands, HANDS_FILE, "mediapipe33"),
+            (skeleton.expression, layout.face, FACE_FILE, "mediapipe33_hands"),
         ):
             if wanted and held is None:
                 raise ConfigError(

@@ -211,7 +211,7 @@ class CaptureDataset(Dataset[Frame]):
 
     @staticmethod
     def _check_size(path: Path, image: Bytes, camera: CameraEntry) -> None:
-        """Only some headers are checked at the start, see `Checks.header_stride`."""
+        """Only some headers are checked at the start, see `Thresholds.header_stride`."""
         if image.shape[:2] != camera.size:
             h, w = image.shape[:2]
             raise DataError(

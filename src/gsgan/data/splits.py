@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
-from gsgan.data.checks import spans
 from gsgan.data.files import LARGEST_FRAME
 from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
+from gsgan.data.validation import spans
 from gsgan.utils.errors import ConfigError, DataError
 
 T = TypeVar("T", int, str)

@@ -23,7 +23,7 @@ Float = NDArray[np.float64]
 
 GUESSED = 0.5  # visibility below which MediaPipe's hips are guesses
 IMAGE, WORLD = "POSE_LANDMARKS", "POSE_WORLD_LANDMARKS"  # in files of pose-format
-HANDS, MESH = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS"), "FACE_LANDMARKS"
+HAND_PARTS, MESH = ("LEFT_HAND_LANDMARKS", "RIGHT_HAND_LANDMARKS"), "FACE_LANDMARKS"
 MESH_SIZE = 478
 # Without the thumb: hands differ most in where its base is.
 HAND_LENGTHS = tuple(bone for f in FINGERS[1:] for bone in pairwise((WRIST, *f)))
@@ -95,7 +95,7 @@ def read_pose(path: Path, subject: Proportions) -> Motion:
     if hidden:
         p[:, HIPS] = p[:, SHOULDERS] + (0, length(subject.rest, (11, 23)), 0)
         visibility[:, HIPS] = visibility[:, SHOULDERS]
-    hands = [landmarks(hand, HAND_NAMES) for hand in HANDS]
+    hands = [landmarks(hand, HAND_NAMES) for hand in HAND_PARTS]
     face = landmarks(MESH, tuple(str(number) for number in range(MESH_SIZE)))
     if any(seen.any() for _, seen in (*hands, face)):
         whole = subject.rest_with_hands

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from gsgan.body import free_body, open_body
 from gsgan.body.smpl import SkinnedModel, read_smpl
-from gsgan.data.calibration.find import METRES
+from gsgan.data.calibration import METRES
 from gsgan.data.files import read_arrays, read_json, read_json_value
 from gsgan.data.formats import smpl_motion
 from gsgan.data.formats.capture import SHAPE, read_shape

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 
 import gsgan
 from gsgan.body.free import free_body
+from gsgan.data.joints import BODY, FACE, HANDS
 from gsgan.synthetic.free_subject import free_pose
 from gsgan.synthetic.scene_setup import FREE_BODY, Scene, Settings, dataset_key
 from gsgan.synthetic.view import View
@@ -36,7 +37,6 @@ from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root, write_atomically
 
 KINDS = ("images", "masks", "labels")
-BODY, HANDS = 33, 33 + 42  # landmarks up to the end of the pose's and of the hands'
 POLL_SECONDS = 0.05
 WORKER = "from gsgan.synthetic.scenes import trace_share; trace_share()"
 
@@ -211,7 +211,7 @@ def _write_skeletons(root: Path, scene: Scene) -> None:
         names=np.array(names[:BODY]),
         passage=np.array(scene.motion.passages),
     )
-    for name, part in (("hands3d", slice(BODY, HANDS)), ("face3d", slice(HANDS, None))):
+    for name, part in (("hands3d", HANDS), ("face3d", FACE)):
         if names[part]:
             np.savez(root / f"{name}.npz", p=p[:, part], frame_id=ids, names=np.array(names[part]))
     if scene.settings.avatar == FREE_BODY:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from gsgan.body.smpl import SkinnedModel
 from gsgan.data.cameras import CameraEntry, make_camera, numbers
-from gsgan.data.checks import Checks, spans
 from gsgan.data.files import frame_files, last_number, read_json
 from gsgan.data.formats.common import (
     IMAGES,
@@ -31,6 +30,7 @@ from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import make_landmarks
+from gsgan.data.validation import Thresholds, spans
 from gsgan.utils.arrays import as_floats
 from gsgan.utils.checks import whole
 from gsgan.utils.errors import ConfigError, DataError
@@ -52,7 +52,7 @@ POSES = {  # in the order of SMPL-X's joints: numbers per frame of each
     "right_hand_pose": 45,
 }
 NEEDED = ("global_orient", "body_pose", "transl", "betas")
-HANDS = ("left_hand_pose", "right_hand_pose")
+HAND_POSES = ("left_hand_pose", "right_hand_pose")
 SMPL_BODY = 69
 
 
@@ -91,7 +91,7 @@ class SmplxRigReader(FolderReader):
                 f"[5, 250], got {list(alpha)}"
             )
 
-    def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
+    def find(self, root: Path, checks: Thresholds, smpl: str | None) -> Found:
         """The subject's files, each checked separately.
 
         Raises:
@@ -161,7 +161,7 @@ class SmplxRigReader(FolderReader):
         path: Path,
         entries: Mapping[str, Any],
         images: Files,
-        checks: Checks,
+        checks: Thresholds,
         notes: list[str],
     ) -> dict[str, CameraEntry]:
         """The cameras in the calibration's order."""
@@ -273,7 +273,7 @@ def read_motion(
         ],
         axis=1,
     )
-    if absent := [key for key in HANDS if key not in arrays]:
+    if absent := [key for key in HAND_POSES if key not in arrays]:
         notes.append(f"{path} has no {' and '.join(absent)}: taken as flat hands")
     betas = _coefficients(arrays, "betas", model.shapedirs.shape[-1], path)[0]
     if not np.isfinite(betas).all():
@@ -314,7 +314,7 @@ def _rows(
     hint = ""
     if key == "body_pose" and found == SMPL_BODY:
         hint = "; 69 are those of SMPL: fit SMPL-X to the sequence, or use its own smpl_params.npz"
-    elif key in HANDS and 0 < found < POSES[key]:
+    elif key in HAND_POSES and 0 < found < POSES[key]:
         hint = "; fewer look like PCA coefficients (expected use_pca=False)"
     shape = getattr(arrays[key], "shape", type(arrays[key]).__name__)
     expected = f"({count or 'frames'}, {width or 'any'})"

@@ -22,13 +22,13 @@ import numpy as np
 from gsgan.body.smpl import SkinnedModel
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.cameras import CameraEntry, make_camera
-from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, frame_of, last_number, natural_order
 from gsgan.data.formats.common import IMAGES, FolderReader, body_model, picture_size, up_axis
 from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed, zju_motion
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
+from gsgan.data.validation import Thresholds
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import DataError
 from gsgan.utils.pickles import read_npy
@@ -68,7 +68,7 @@ class ZjuReader(FolderReader):
         one_of("data.reader.masks", self.masks, ("both", *MASKS))
         one_of("data.reader.fit", self.fit, ("auto", *FITS))
 
-    def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
+    def find(self, root: Path, checks: Thresholds, smpl: str | None) -> Found:
         """The subject's files, each checked separately.
 
         Raises:
@@ -113,7 +113,7 @@ class ZjuReader(FolderReader):
         )
 
     def _cameras(
-        self, root: Path, annots: Annots, images: Files, checks: Checks
+        self, root: Path, annots: Annots, images: Files, checks: Thresholds
     ) -> dict[str, CameraEntry]:
         """By name, in the order of annots.npy."""
         some = next(files for files in images.values() if files)
