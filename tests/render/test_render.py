@@ -20,6 +20,7 @@ from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import Preparation
 from gsgan.evaluate.scores import painter
 from gsgan.model.runs import CHECKPOINT, CONFIG, build_data, load, load_avatar, load_config
+from gsgan.render import run as render_run
 from gsgan.train.run import build_training
 from gsgan.utils.provenance import SOURCE_TYPE, verify
 
@@ -362,3 +363,18 @@ def test_the_picture_of_the_avatar(bare, landmarks):
     image = avatar.render(frame.skeleton, frame.camera)
     assert torch.equal(image, painting.image.clamp(0, 1))
     assert painting.features is None
+
+
+def test_what_is_rendered_stays_when_a_later_frame_fails(render, motion, tmp_path, monkeypatch):
+    painted, eight_bits = [], render_run.eight_bits
+
+    def failing(*given):
+        painted.append(given)
+        if len(painted) == 4:
+            raise ValueError("the skeleton is too small")
+        return eight_bits(*given)
+
+    monkeypatch.setattr(render_run, "eight_bits", failing)
+    result = render(f"motion={motion}", "out=a")
+    refused(result, "frame 3 cannot be rendered (the skeleton is too small)", "are in a")
+    assert len(list((tmp_path / "a").glob("*.png"))) == 3
