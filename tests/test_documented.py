@@ -19,23 +19,7 @@ from commands import ROOT, TINY
 ELSEWHERE = ("trainer=gpu", "trainer=ddp")
 REPORTS = ("ablation", "ablation_skeleton", "gan")  # blocks of docs/ablations.md
 SMALL_BENCH = {
-    "raster": [
-        *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "reference.gaussians=300"),
-        *("reference.size=32", "compare_at=[300]", "windows=1", "window=16"),
-        "memory=false",
-    ],
     "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
-    "trade-off": [
-        *("settings.accuracies=[draft]", "settings.scales=[0.5]", "settings.backends=[]"),
-        *("settings.precisions=[]", "settings.windows=[]", "repeats=1", "pictures=1"),
-    ],
-    "roofline": ["sizes=[tiny]", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
-    "effects": [
-        *("train=false", "only=[distortion]"),
-        "base=['size=tiny','data.source.frames=2','data.source.test_frames=1','data.body=none',"
-        "'data.source.train_cameras=2','data.source.test_cameras=1',"
-        "'data.source.rays_per_pixel=1']",
-    ],
 }
 
 

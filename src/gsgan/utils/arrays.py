@@ -38,3 +38,9 @@ def as_floats(raw: Any) -> NDArray[np.float64]:
         return np.array(raw, np.float64)
     except (TypeError, ValueError, OverflowError):
         return np.zeros(0)
+
+
+def evenly_spaced(count: int, most: int) -> list[int]:
+    """At most ``most`` of ``count`` positions: the middles of equal parts, rising."""
+    most = min(most, count)
+    return [(2 * i + 1) * count // (2 * most) for i in range(most)]
