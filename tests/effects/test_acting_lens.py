@@ -55,32 +55,6 @@ def test_with_all_effects_off_a_lens_is_followed_still(build, bent, word):
     assert not torch.equal(ignored.dataset("novel_view")[0].image, wanted)
 
 
-def test_a_lens_with_more_coefficients_is_undistorted_where_others_stay(tmp_path):
-    """What ``effects.impossible=off`` makes of ``project``: never a lens that is half known."""
-    from make import write_tiny_capture
-
-    from gsgan.data.datamodule import GsganData
-    from gsgan.data.dataset import CaptureDataset
-
-    root = write_tiny_capture(
-        tmp_path / "rational", cameras=3, frames=2, size=(64, 64), dist=(*LENS, 0.01, 0, 0)
-    )
-    train = GsganData(str(root), size=64).dataset("train")
-    raw = CaptureDataset(train.layout, train.items, size=64, lens="raw")
-    assert raw[0].camera.dist is None
-    assert torch.equal(raw[0].image, train[0].image)
-
-
-def test_a_raw_crop_follows_the_lens(build, bent):
-    """The person's window in a picture as taken holds the whole mask."""
-    word = ("effects.distortion=project", "data.crop=person", "data.size=48")
-    data, _, _ = build(f"data.root={bent}", *word)
-    frame = data.dataset("novel_view")[0]
-    assert frame.camera.dist is not None
-    border = torch.cat([frame.mask[0, 0, 0], frame.mask[0, 0, -1], frame.mask[0, 0, :, 0]])
-    assert not border.any()
-
-
 def test_paintings_follow_the_lens_with_every_map(build, bent):
     data, avatar, _ = build(
         *(f"data.root={bent}", "data.size=64", "effects.distortion=project"),
