@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from gsgan.evaluate.facts import SAME, caption
-from gsgan.evaluate.scores import METRICS
+from gsgan.evaluate.origin import SAME, caption
+from gsgan.metrics.names import METRICS
 from gsgan.utils import pages
 from gsgan.utils.files import write_atomically
 
@@ -25,26 +25,6 @@ PLACE = {"split": str, "variant": str, "camera": str, "frame": int}
 HEADER = (*PLACE, *METRICS)
 Results = dict[str, dict[str, dict[str, Any]]]
 TITLE = "Held-out cameras (novel_view) and poses (novel_pose)"
-COLUMNS = {  # heading and number of decimals
-    "psnr": ("PSNR ↑", 2),
-    "psnr_person": ("in box ↑", 2),
-    "psnr_inside": ("off the outline ↑", 2),
-    "ssim": ("SSIM ↑", 4),
-    "ssim_person": ("SSIM in box ↑", 4),
-    "lpips": ("LPIPS ↓", 4),
-    "lpips_person": ("LPIPS in box ↓", 4),
-    "edge_f1": ("edge F1 ↑", 3),
-    "edge_f1_person": ("edge F1 in box ↑", 3),
-    "edge_ratio": ("edges →1", 2),
-    "edge_ratio_person": ("edges in box →1", 2),
-    "high_frequencies": ("detail →1", 2),
-    "psnr_hands": ("hands ↑", 2),
-    "ssim_hands": ("SSIM hands ↑", 4),
-    "psnr_mouth": ("mouth ↑", 2),
-    "ssim_mouth": ("SSIM mouth ↑", 4),
-    "miou": ("mIoU ↑", 3),
-    "miou_with_background": ("with background ↑", 3),
-}
 IN_TERMINAL = (  # narrow; metrics.md has all metrics
     *("psnr", "psnr_person", "ssim", "lpips", "edge_f1", "edge_ratio", "high_frequencies", "miou"),
 )
@@ -127,12 +107,13 @@ def _way(facts: dict[str, Any], scores: dict[str, Any]) -> list[Any]:
 
 
 def rows(
-    results: Results, metrics: tuple[str, ...] = METRICS, *, cameras: bool = False
+    results: Results, metrics: Sequence[str] = tuple(METRICS), *, cameras: bool = False
 ) -> Iterator[list[str]]:
     """One formatted row per split and variant, and per camera if ``cameras``; None is ``n/a``."""
 
     def formatted(values: dict[str, Any]) -> list[str]:
-        return ["n/a" if (v := values[m]) is None else f"{v:.{COLUMNS[m][1]}f}" for m in metrics]
+        held = [(values[m], METRICS[m].digits) for m in metrics]
+        return ["n/a" if value is None else f"{value:.{digits}f}" for value, digits in held]
 
     for split, variants in results.items():
         for variant, scores in variants.items():
@@ -175,7 +156,7 @@ def print_table(results: Results, facts: dict[str, Any], console: Console) -> No
     hands = any(scores["full"]["psnr_hands"] is not None for scores in results.values())
     shown = WITH_HANDS if hands else IN_TERMINAL
     for metric in shown:
-        table.add_column(COLUMNS[metric][0], justify="right", no_wrap=True)
+        table.add_column(METRICS[metric].short_heading, justify="right", no_wrap=True)
     previous = None
     for split, variant, images, *scores in rows(results, shown):
         if split != previous:  # a column for the split would not fit a narrow terminal
@@ -190,7 +171,7 @@ def print_table(results: Results, facts: dict[str, Any], console: Console) -> No
 
 def markdown(results: Results, facts: dict[str, Any]) -> str:
     """The table in Markdown with its caption and every metric, and again by camera."""
-    header = ["split", "variant", "images", *(COLUMNS[m][0] for m in METRICS)]
+    header = ["split", "variant", "images", *(METRICS[m].short_heading for m in METRICS)]
     by_split, by_camera = (
         pages.markdown(header, list(rows(results, cameras=each))) for each in (False, True)
     )

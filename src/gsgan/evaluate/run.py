@@ -16,7 +16,6 @@ from rich.progress import track
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.measures import Measures
-from gsgan.evaluate.facts import Method, facts, trained
 from gsgan.evaluate.files import (
     FACTS_FILE,
     HEADER,
@@ -26,6 +25,7 @@ from gsgan.evaluate.files import (
     print_table,
     write_scored,
 )
+from gsgan.evaluate.origin import Method, origin, trained
 from gsgan.evaluate.pictures import write_grid
 from gsgan.evaluate.predictions import (
     FLOOR,
@@ -206,7 +206,7 @@ def evaluate_method(
         for variant, of_variant in found.rows.items()
         for row in of_variant
     )
-    now = Scored(results, pd.DataFrame(table, columns=HEADER), facts(method, data, device))
+    now = Scored(results, pd.DataFrame(table, columns=HEADER), origin(method, data, device))
     whole, dropped = joined(now, folder, SPLITS)
     if dropped:
         names = ", ".join(dropped)

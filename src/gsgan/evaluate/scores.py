@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torchmetrics.functional.classification import multiclass_confusion_matrix
 
 from gsgan.data.measures import Measures
 from gsgan.data.splits import Item
@@ -28,29 +27,20 @@ from gsgan.metrics.image import (
     ssim_uniform,
     ssim_where,
 )
+from gsgan.metrics.names import BOX_METRICS, IMAGE_METRICS, METRICS, PART_METRICS
 from gsgan.metrics.regions import (
     BACKGROUNDS,
-    HANDS,
-    MOUTH,
     cleared,
     describe_boxes,
     mask_crop,
     rectangle,
 )
+from gsgan.metrics.segmentation import confusion, miou
 from gsgan.model.avatar import Avatar
 from gsgan.model.painting import Painting
-from gsgan.model.segmentation import IGNORE
 from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
 
-BOX_METRICS = tuple(f"{metric}_{part}" for part in (HANDS, MOUTH) for metric in ("psnr", "ssim"))
-IMAGE_METRICS = (
-    *("psnr", "psnr_person", "psnr_inside", "ssim", "ssim_person", "lpips", "lpips_person"),
-    *("edge_f1", "edge_f1_person", "edge_ratio", "edge_ratio_person", "high_frequencies"),
-    *BOX_METRICS,
-)
-PART_METRICS = ("miou", "miou_with_background")
-METRICS = (*IMAGE_METRICS, *PART_METRICS)
 LPIPS_LEAST = 64  # pixels: AlexNet's last map is empty below
 Predict = Callable[[Frame, Item], Prediction]
 Row = dict[str, Any]  # "camera", "frame", and a score by metric
@@ -140,29 +130,6 @@ def means(rows: Sequence[Mapping[str, Any]], lpips_reason: str = "") -> dict[str
             missing = lpips_reason if metric.startswith("lpips") else ""
             result[f"{metric}_reason"] = missing or no_score
     return result
-
-
-def confusion(segmentation: Tensor, labels: Tensor) -> Tensor:
-    """``[classes, classes]`` pixels of S ``[B, classes, H, W]``, rows by labels ``[B, H, W]``."""
-    return multiclass_confusion_matrix(
-        segmentation.argmax(dim=1), labels, segmentation.shape[1], ignore_index=IGNORE
-    ).cpu()
-
-
-def miou(matrix: Tensor) -> dict[str, float | None]:
-    """Mean intersection over union of the ground truth's classes, without and with background.
-
-    Args:
-        matrix: from `confusion`; background is class 0.
-    """
-    matrix = matrix.double()
-    truth, union = matrix.sum(1), matrix.sum(0) + matrix.sum(1) - matrix.diag()
-    present = truth > 0
-    iou = torch.where(present, matrix.diag() / union.clamp_min(1), torch.nan)
-    return {
-        "miou": float(iou[1:][present[1:]].mean()) if present[1:].any() else None,
-        "miou_with_background": float(iou[present].mean()) if present.any() else None,
-    }
 
 
 # -- a split

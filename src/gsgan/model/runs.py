@@ -147,6 +147,12 @@ def hydra_record(folder: Path) -> DictConfig:
     return found
 
 
+def choices(folder: Path) -> dict[str, Any]:
+    """The config groups' choices that Hydra recorded in a run folder; empty without a record."""
+    found = OmegaConf.select(hydra_record(folder), "hydra.runtime.choices")
+    return {} if found is None else {str(key): value for key, value in found.items()}
+
+
 # -- building
 
 

@@ -20,7 +20,7 @@ def curves(report: Report) -> bytes | None:
     panels = []
     for grid in report.grids:
         for i, column in enumerate(grid.columns):
-            rows = [r for r in grid.rows if r.kind == "run" and "mean" in r.cells[i].numbers]
+            rows = [r for r in grid.rows if r.kind == "run" and r.cells[i].mean is not None]
             panels += [(f"{grid.title}\n{column}", rows, i)] if rows else []
     if not panels:
         return None
@@ -50,8 +50,8 @@ def _draw(axes: Axes, rows: list[Row], i: int) -> None:
     for k, (name, line) in enumerate(lines.items()):
         axes.errorbar(
             [settings.index(setting) for setting, _ in line],
-            [row.cells[i].numbers["mean"] for _, row in line],
-            yerr=[row.cells[i].numbers["spread"] or 0.0 for _, row in line],
+            [row.cells[i].mean for _, row in line],
+            yerr=[row.cells[i].spread or 0.0 for _, row in line],
             color=COLOURS[k % len(COLOURS)],
             marker=MARKERS[k % len(MARKERS)],
             markersize=4,

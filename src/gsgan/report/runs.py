@@ -15,9 +15,9 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsgan.evaluate.facts import choices
-from gsgan.evaluate.paper import departures, settings_of
-from gsgan.report.spec import METRICS
+from gsgan.metrics.names import METRICS
+from gsgan.model.runs import choices
+from gsgan.report.departures import departures, settings_of
 from gsgan.utils.errors import ConfigError, DataError
 
 METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"

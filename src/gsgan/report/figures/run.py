@@ -1,4 +1,4 @@
-"""Figures of ``run``: draws those that the runs allow, and reports the others with the reason."""
+"""Draws the figures of ``run`` that the runs allow, and reports the reasons for the others."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from rich.progress import track
 
 from gsgan.model.runs import Moved, load_config
 from gsgan.report.figures import images
-from gsgan.report.figures.body import densify, segmentation
 from gsgan.report.figures.layout import Drawing, Settings, Unavailable, style
 from gsgan.report.figures.subjects import Shot, Subject, choose_items, make_shots, open_subjects
 from gsgan.utils.checks import one_of, whole
@@ -36,14 +35,12 @@ METADATA: dict[str, dict[str, Any]] = {  # no dates: the same figure gives the s
 
 # Each draws shots of subjects, the first one leading.
 FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot], Settings], Drawing]] = {
-    "teaser": images.teaser,
-    "densify": densify,
-    "segmentation": segmentation,
-    "canny": images.canny,
-    "errors": images.errors,
-    "strip": images.strip,
     "comparison": images.comparison,
     "ablation": partial(images.comparison, detail=True),
+    "strip": images.strip,
+    "canny": images.canny,
+    "errors": images.errors,
+    "segmentation": images.segmentation,
     "training": images.training,
 }
 COMPARE = ("comparison", "ablation")  # need a second run

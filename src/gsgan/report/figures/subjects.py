@@ -12,9 +12,8 @@ from torch import Tensor
 
 from gsgan.data.checks import spans
 from gsgan.data.datamodule import GsganData
+from gsgan.data.fingerprint import fingerprint
 from gsgan.data.splits import SPLITS, Item
-from gsgan.evaluate.facts import fingerprint
-from gsgan.evaluate.paper import NAME
 from gsgan.metrics.image import edge_scores, psnr
 from gsgan.model.avatar import Avatar, Painting
 from gsgan.model.runs import (
@@ -25,8 +24,10 @@ from gsgan.model.runs import (
     load_config,
     read_checkpoint,
 )
+from gsgan.report.departures import NAME
 from gsgan.report.runs import DATA, Run, check_same, read_run
 from gsgan.scene import Camera, Frame, Window, body_window, cat
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -94,8 +95,7 @@ def choose_items(
     held = [item for item in items if camera in (None, item[0])]
     known = sorted({frame for _, frame in held})
     if frames is None:
-        count = min(count, len(known))
-        frames = [known[(2 * i + 1) * len(known) // (2 * count)] for i in range(count)]
+        frames = [known[i] for i in evenly_spaced(len(known), count)]
     if lacking := [frame for frame in frames if frame not in known]:
         of = f"split {split}" if camera is None else f"camera {camera} in split {split}"
         raise ConfigError(f"frames: {of} lacks {spans(lacking)}; it has {spans(known)}")
@@ -135,7 +135,7 @@ class Subject:
     _painted: dict[Item, Painting] = field(default_factory=dict, repr=False)
 
     def paint(self, shot: Shot) -> Painting:
-        """What the avatar makes of a shot's whole image, rendered once, kept on the CPU.
+        """The avatar's rendering of a shot's whole image, made once and kept on the CPU.
 
         Raises:
             DataError: when the image is not finite.
@@ -150,9 +150,7 @@ class Subject:
             if not all(part is None or part.isfinite().all() for part in (image, colour, labels)):
                 where = f"{self.run.folder}: its image of {shot.name}"
                 raise DataError(f"{where} is not finite; train it again")
-            gaussians = None if painting.gaussians is None else painting.gaussians.to("cpu")
-            kept = Painting(image, features=colour, segmentation=labels, gaussians=gaussians)
-            self._painted[shot.item] = kept
+            self._painted[shot.item] = Painting(image, features=colour, segmentation=labels)
         return self._painted[shot.item]
 
     def image(self, shot: Shot) -> Tensor:
