@@ -42,21 +42,21 @@ class Scored:
     Args:
         results: ``{split: {variant: {metric: value}}}``, as in metrics.json.
         rows: per image, with the columns `HEADER`; an undefined score is NaN.
-        facts: as in facts.json.
+        origin: as in facts.json.
     """
 
     results: Results
     rows: pd.DataFrame
-    facts: dict[str, Any]
+    origin: dict[str, Any]
 
 
 def write_scored(scored: Scored, folder: Path) -> None:
     """Writes the four files, each whole or not at all; metrics.json last: if it is new, all are."""
-    facts = json.dumps(scored.facts, indent=2, allow_nan=False)
+    origin = json.dumps(scored.origin, indent=2, allow_nan=False)
     table = scored.rows.to_csv(columns=list(HEADER), index=False, lineterminator="\n")
     write_atomically(folder / SCORES_FILE, table)
-    write_atomically(folder / TABLE_FILE, markdown(scored.results, scored.facts))
-    write_atomically(folder / FACTS_FILE, facts)
+    write_atomically(folder / TABLE_FILE, markdown(scored.results, scored.origin))
+    write_atomically(folder / FACTS_FILE, origin)
     results = json.dumps(scored.results, indent=2, allow_nan=False)
     write_atomically(folder / METRICS_FILE, results)
 
@@ -83,9 +83,9 @@ def joined(now: Scored, folder: Path, splits: Iterable[str]) -> tuple[Scored, li
         results: Results = json.loads((folder / METRICS_FILE).read_text())
         others = [split for split in results if split not in now.results]
         rows = read_rows(folder / SCORES_FILE)
-        facts = json.loads((folder / FACTS_FILE).read_text())
-        ways = [_way(facts, results[split]["full"]) for split in others]
-        ways += [_way(now.facts, scored["full"]) for scored in now.results.values()]
+        origin = json.loads((folder / FACTS_FILE).read_text())
+        ways = [_way(origin, results[split]["full"]) for split in others]
+        ways += [_way(now.origin, scored["full"]) for scored in now.results.values()]
     except (OSError, ValueError, KeyError, TypeError, AttributeError):  # damaged, or too old
         return now, others
     if any(way != ways[-1] for way in ways):
@@ -94,12 +94,12 @@ def joined(now: Scored, folder: Path, splits: Iterable[str]) -> tuple[Scored, li
     rows = pd.concat([rows[rows["split"].isin(others)], now.rows])
     order = [split for split in splits if split in results]
     rows = pd.concat([rows[rows["split"] == split] for split in order])
-    return Scored({split: results[split] for split in order}, rows, now.facts), []
+    return Scored({split: results[split] for split in order}, rows, now.origin), []
 
 
-def _way(facts: dict[str, Any], scores: dict[str, Any]) -> list[Any]:
+def _way(origin: dict[str, Any], scores: dict[str, Any]) -> list[Any]:
     """How a split was scored; splits of one table share it."""
-    way = [facts["data"]["fingerprint"], *(facts[key] for key in SAME)]
+    way = [origin["data"]["fingerprint"], *(origin[key] for key in SAME)]
     return way + [scores.get(key) for key in ("marks", "protocol", "lpips_name", "boxes")]
 
 
@@ -149,7 +149,7 @@ def notes(results: Results) -> list[str]:
     return list(found)
 
 
-def print_table(results: Results, facts: dict[str, Any], console: Console) -> None:
+def print_table(results: Results, origin: dict[str, Any], console: Console) -> None:
     """Prints the table, its caption and its notes."""
     table = Table(title=TITLE, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("variant", no_wrap=True)
@@ -165,16 +165,16 @@ def print_table(results: Results, facts: dict[str, Any], console: Console) -> No
             previous = split
         table.add_row(variant, *scores)
     console.print(table)
-    for line in (caption(facts), *notes(results)):
+    for line in (caption(origin), *notes(results)):
         console.print(f"  {line}", markup=False, highlight=False)
 
 
-def markdown(results: Results, facts: dict[str, Any]) -> str:
+def markdown(results: Results, origin: dict[str, Any]) -> str:
     """The table in Markdown with its caption and every metric, and again by camera."""
     header = ["split", "variant", "images", *(METRICS[m].short_heading for m in METRICS)]
     by_split, by_camera = (
         pages.markdown(header, list(rows(results, cameras=each))) for each in (False, True)
     )
     listed = "\n".join(f"- {note}" for note in notes(results))
-    parts = (f"# {TITLE}", caption(facts), by_split, listed, "## By camera", by_camera)
+    parts = (f"# {TITLE}", caption(origin), by_split, listed, "## By camera", by_camera)
     return "\n\n".join(filter(None, parts)) + "\n"

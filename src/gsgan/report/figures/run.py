@@ -31,8 +31,6 @@ METADATA: dict[str, dict[str, Any]] = {  # no dates: the same figure gives the s
     "png": {"Software": ""},
     "pdf": {"CreationDate": None},
 }
-
-
 # Each draws shots of subjects, the first one leading.
 FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot], Settings], Drawing]] = {
     "comparison": images.comparison,
@@ -69,41 +67,34 @@ def make_figures(config: DictConfig) -> None:
         raise ConfigError(f"out={out}: cannot be written to ({error.strerror})") from error
     logging.getLogger("fontTools").setLevel(logging.WARNING)  # it logs every glyph of a PDF
     subjects = open_subjects(folders, config.names, moved, pick_device(config.device))
-    console, left_out = make_console(), {}
-    made: dict[str, dict[str, Any]] = {}
+    console, lines = make_console(), []
+    made: dict[str, Drawing] = {}
     with style(settings):
         for name in track(list(dict.fromkeys(names)), "drawing", console=console, transient=True):
             try:
-                drawing = _draw(name, subjects, config, settings)
+                made[name] = _draw(name, subjects, config, settings)
             except Unavailable as reason:
-                left_out[name] = f"{name}: left out, {reason}"
+                lines.append(f"{name}: left out, {reason}")
                 continue
             for kind in formats:
                 stream = io.BytesIO()
-                drawing.figure.savefig(stream, format=kind, metadata=METADATA[kind])
+                made[name].figure.savefig(stream, format=kind, metadata=METADATA[kind])
                 write_atomically(out / f"{name}.{kind}", stream.getvalue())
-            panels = [panel for held in drawing.numbers.values() for panel in held]
-            shown = [subject for subject in subjects if subject.name in panels]
-            made[name] = {
-                "caption": drawing.caption,
-                "numbers": drawing.numbers,
-                "runs": {subject.name: str(subject.run.folder) for subject in shown},
-                "marks": sorted({mark for subject in shown for mark in subject.marks}),
-                "files": [f"{name}.{kind}" for kind in formats],
-            }
-            _write_record(out, made)  # now, so that a stopped command leaves no stale numbers
     if not made:
-        raise ConfigError(f"no figure could be made: {'; '.join(left_out.values())}")
-    lines = [f"{name}: {', '.join(entry['files'])}" for name, entry in made.items()]
-    marks = sorted({mark for entry in made.values() for mark in entry["marks"]})
-    lines += [*left_out.values(), *(f"marked: {mark}" for mark in marks)]
-    lines.append(f"figures: {out} ({CAPTIONS} has their captions, {RECORD} their numbers)")
+        raise ConfigError(f"no figure could be made: {'; '.join(lines)}")
+    marks = sorted({mark for subject in subjects for mark in subject.marks})
+    _write_record(out, made, subjects, marks)
+    lines += [f"marked: {mark}" for mark in marks]
+    lines.append(
+        f"figures: {out}: {', '.join(made)} ({CAPTIONS} has their captions, {RECORD} their numbers)"
+    )
     console.print("\n".join(lines), soft_wrap=True, markup=False, highlight=False)
 
 
 def _draw(
     name: str, subjects: Sequence[Subject], config: DictConfig, settings: Settings
 ) -> Drawing:
+    """One figure with its whole caption."""
     data = subjects[0].data
     if name in COMPARE and len(subjects) < 2:
         raise Unavailable("there is one run; add others as compare=[<folder>,…]")
@@ -127,16 +118,7 @@ def _draw(
             one_camera=name == "strip",
         )
     shots = make_shots(data, split, items, settings.margin)
-    for subject in subjects[1:]:
-        dataset = subject.data.dataset(split)
-        for shot in shots:
-            a, b = shot.frame, dataset[dataset.items.index(shot.item)]
-            pairs = ((a.image, b.image), (a.camera.K, b.camera.K), (a.skeleton, b.skeleton))
-            if not all(torch.equal(x, y) for x, y in pairs):
-                raise ConfigError(
-                    f"figures: {subjects[0].run} and {subject.run} differ in the image, camera or "
-                    f"skeleton of {shot.name}; leave one of them out"
-                )
+    _check_same_pixels(subjects, split, shots)
     drawing = FIGURES[name](subjects, shots, settings)
     about = ""
     if name != "training":
@@ -147,6 +129,20 @@ def _draw(
     return replace(drawing, caption=f"{drawing.caption}{about} Split {split}.")
 
 
+def _check_same_pixels(subjects: Sequence[Subject], split: str, shots: Sequence[Shot]) -> None:
+    """Refuses runs whose data has other images, cameras or skeletons under the same names."""
+    for subject in subjects[1:]:
+        dataset = subject.data.dataset(split)
+        for shot in shots:
+            a, b = shot.frame, dataset[dataset.items.index(shot.item)]
+            pairs = ((a.image, b.image), (a.camera.K, b.camera.K), (a.skeleton, b.skeleton))
+            if not all(torch.equal(x, y) for x, y in pairs):
+                raise ConfigError(
+                    f"figures: {subjects[0].run} and {subject.run} differ in the image, camera or "
+                    f"skeleton of {shot.name}; leave one of them out"
+                )
+
+
 def _list(value: Any) -> list[Any]:
     """A list as it is, one value as a list of one, null as none."""
     if OmegaConf.is_list(value):
@@ -154,17 +150,15 @@ def _list(value: Any) -> list[Any]:
     return [] if value is None else [value]
 
 
-def _write_record(out: Path, made: dict[str, dict[str, Any]]) -> None:
-    """Numbers as JSON and captions as Markdown, beside those of figures made here before."""
-    try:
-        record = {**json.loads((out / RECORD).read_text()), **made}
-    except (OSError, ValueError):
-        record = made
-    record = {name: record[name] for name in FIGURES if name in record}
+def _write_record(
+    out: Path, made: dict[str, Drawing], subjects: Sequence[Subject], marks: Sequence[str]
+) -> None:
+    """Numbers as JSON and captions as Markdown."""
+    runs = {subject.name: str(subject.run.folder) for subject in subjects}
+    figures = {name: {"caption": d.caption, "numbers": d.numbers} for name, d in made.items()}
+    record = {"runs": runs, "marks": marks, "figures": figures}
     write_atomically(out / RECORD, json.dumps(record, indent=1, allow_nan=False) + "\n")
-    parts = ["# Captions"]
-    for name, entry in record.items():
-        runs = "; ".join(f"{title}: `{folder}`" for title, folder in entry["runs"].items())
-        marked = f"\n\nMarked: {'; '.join(entry['marks'])}." if entry["marks"] else ""
-        parts.append(f"## {name}\n\n{entry['caption']}\n\nRuns: {runs}{marked}")
+    parts = ["# Captions", *(f"## {name}\n\n{d.caption}" for name, d in made.items())]
+    parts += ["## Runs\n\n" + "\n".join(f"- {name}: `{folder}`" for name, folder in runs.items())]
+    parts += [f"Marked: {'; '.join(marks)}."] if marks else []
     write_atomically(out / CAPTIONS, "\n\n".join(parts) + "\n")

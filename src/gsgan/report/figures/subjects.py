@@ -170,7 +170,8 @@ class Subject:
 def open_subjects(
     folders: Sequence[Path], names: Sequence[str] | None, moved: Moved, device: torch.device | str
 ) -> list[Subject]:
-    """The avatars of run folders; without ``names`` they have their models', with more where equal.
+    """The avatars of run folders; without ``names`` they have their models', with the folder where
+    models are equal.
 
     Raises:
         ConfigError: on wrong names, a folder given twice, or runs of different data.
@@ -186,12 +187,13 @@ def open_subjects(
     runs = [subject.run for subject in subjects]
     check_same("figures", runs, [{DATA: run.data["fingerprint"]} for run in runs])
     if names is None:
-        models = [s.name for s in subjects]
-        seeds = [f"seed {run.seed}" for run in runs]
-        places = [folder.resolve().name for folder in folders], list(map(str, folders))
-        more = next(texts for texts in (seeds, *places) if len(set(texts)) == len(texts))
-        pairs = zip(models, more, strict=True)
-        names = [m if models.count(m) < 2 else f"{m}, {text}" for m, text in pairs]
+        models = [subject.name for subject in subjects]
+        names = [
+            model if models.count(model) < 2 else f"{model}, {folder.resolve().name}"
+            for model, folder in zip(models, folders, strict=True)
+        ]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"the runs' names in print are equal ({names[0]}); give names=[…]")
     return [replace(s, name=str(name)) for s, name in zip(subjects, names, strict=True)]
 
 
