@@ -17,7 +17,7 @@ from torch.nn import functional
 from gsgan.metrics.image import canny as canny_edges
 from gsgan.metrics.image import psnr
 from gsgan.metrics.segmentation import colour_labels, confusion, miou
-from gsgan.report.figures.layout import Drawing, Panel, Settings, Sheet, Unavailable, written
+from gsgan.report.figures.layout import Drawing, Panel, Settings, Unavailable, draw_panels, written
 from gsgan.report.figures.subjects import Numbers, Shot, Subject, finite, measure
 from gsgan.report.training_curve import curve
 from gsgan.utils.errors import DataError
@@ -37,9 +37,9 @@ def strip(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings
         notes = [_decibels(numbers[shot.name][name]) for shot in shots]
         panels.append([Panel(x[name], note) for x, note in zip(images, notes, strict=True)])
     titles, names = [f"frame {shot.item[1]}" for shot in shots], ["truth", *images[0]]
-    sheet = Sheet(panels, settings, titles=titles, names=names)
+    figure, _ = draw_panels(panels, settings, titles=titles, names=names)
     caption = "One camera over time: the ground truth and each run's images, with PSNR."
-    return Drawing(sheet.figure, caption, numbers)
+    return Drawing(figure, caption, numbers)
 
 
 def comparison(
@@ -63,13 +63,13 @@ def comparison(
                 found["psnr_detail"] = finite(psnr(image[..., *box], shot.truth[..., *box]))
                 below.append(Panel(image[..., *box], written(found["psnr_detail"], 2, " dB")))
         panels += [above, below] if detail else [above]
-    sheet = Sheet(panels, settings, titles=["truth", *images[0]])
+    figure, axes = draw_panels(panels, settings, titles=["truth", *images[0]])
     caption = "The ground truth and each run's image, with PSNR and the F1 of Canny edges"
     if not detail:
-        return Drawing(sheet.figure, f"{caption}.", numbers)
+        return Drawing(figure, f"{caption}.", numbers)
     for i, (rows, columns) in enumerate(boxes):
         size = columns.stop - columns.start, rows.stop - rows.start
-        for whole, magnified in zip(sheet.axes[2 * i], sheet.axes[2 * i + 1], strict=True):
+        for whole, magnified in zip(axes[2 * i], axes[2 * i + 1], strict=True):
             frame = Rectangle((columns.start, rows.start), *size, fill=False, ec=VERMILLION, lw=0.8)
             whole.add_patch(frame)
             magnified.spines[:].set(visible=True, color=VERMILLION, linewidth=1.6)
@@ -77,7 +77,7 @@ def comparison(
         "; below, magnified, the box in which the runs' images differ most from each other, with "
         "PSNR in the box."
     )
-    return Drawing(sheet.figure, caption, numbers)
+    return Drawing(figure, caption, numbers)
 
 
 def most_disputed(images: Tensor, share: float) -> tuple[slice, slice]:
@@ -104,12 +104,12 @@ def canny(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings
             found = numbers[shot.name][name]
             note = f"ratio {written(found['edge_ratio'], 2)}\nF1 {written(found['edge_f1'], 3)}"
             panels[-1].append(Panel(canny_edges(image[0]), note, framed=True, look=look))
-    sheet = Sheet(panels, settings, titles=["truth", *images[0]])
+    figure, _ = draw_panels(panels, settings, titles=["truth", *images[0]])
     caption = (
         "Canny edges (thresholds 100 and 200 on 8-bit grey); below the ground truth, their number "
         "of pixels. Ratio: edge pixels over the ground truth's. F1: of edges at most one pixel off."
     )
-    return Drawing(sheet.figure, caption, numbers)
+    return Drawing(figure, caption, numbers)
 
 
 def errors(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
@@ -129,12 +129,12 @@ def errors(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setting
             numbers[shot.name][name]["error_mean"] = float(error.mean())
             note = f"mean {error.mean():.2f}"
             panels[-1].append(Panel(error.numpy(), note, framed=True, look=look))
-    sheet = Sheet(panels, settings, titles=["truth", *images[0]])
+    figure, _ = draw_panels(panels, settings, titles=["truth", *images[0]])
     caption = (
         "Absolute error of each pixel, mean over the three channels, in levels of 255; one scale "
         f"for all maps, from pale (0) to dark ({top} or more). The mean is below each map."
     )
-    return Drawing(sheet.figure, caption, numbers)
+    return Drawing(figure, caption, numbers)
 
 
 def segmentation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
@@ -170,7 +170,7 @@ def segmentation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: S
         "The true parts and each run's segmentation S (most probable part). mIoU: mean over the "
         "parts present, without the background."
     )
-    return Drawing(Sheet(panels, settings, titles=titles).figure, caption, numbers)
+    return Drawing(draw_panels(panels, settings, titles=titles)[0], caption, numbers)
 
 
 def training(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:

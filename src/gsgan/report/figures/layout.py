@@ -9,16 +9,11 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.text import Text
 from torch import Tensor
 
 from gsgan.utils.checks import between
 
-GAP = 0.05  # inches between panels
-EDGE = 0.02  # inches around the whole, so that no frame is cut off
-LEAST_FONT = 3.0  # points
 LINE = 1.4 / 72  # inches per line and point of font size
 LIMITS = {  # of settings: what is readable and fits into memory
     "column": (1, 50), "page": (2, 50), "tallest": (0.3, 50), "font": (1, 20), "dpi": (1, 2400),
@@ -78,70 +73,44 @@ class Panel:
     look: Mapping[str, Any] = field(default_factory=dict)
 
 
-class Sheet:
-    """Equal panels by row, the widest that fit into a page (or a column, for at most three of
-    them), with titles above the columns and names left of the rows.
+def draw_panels(
+    panels: Sequence[Sequence[Panel]],
+    settings: Settings,
+    *,
+    titles: Sequence[str] = (),
+    names: Sequence[str] = (),
+) -> tuple[Figure, np.ndarray]:
+    """Equal panels by row, with titles above the columns and names left of the rows.
 
-    Text that does not fit is made smaller. ``axes`` are ``[rows, columns]``, in pixels of the
-    images, pixel centres at +0.5.
+    The figure is as wide as a page, or as a column with at most three panels in a row.
+
+    Returns:
+        The figure, and its axes ``[rows, columns]``, in pixels of the images, pixel centres at
+        +0.5.
     """
-
-    def __init__(
-        self,
-        panels: Sequence[Sequence[Panel]],
-        settings: Settings,
-        *,
-        titles: Sequence[str] = (),
-        names: Sequence[str] = (),
-    ) -> None:
-        small = settings.font - 1
-        shown = [[pixels(panel.image) for panel in row] for row in panels]
-        aspect = max(image.shape[0] / image.shape[1] for row in shown for image in row)
-        rows, columns, line = len(panels), len(panels[0]), settings.font * LINE
-        width = settings.column if columns <= 3 else settings.page
-        left = EDGE + (line if names else 0.0)
-        top = EDGE + (line if titles else 0.0)
-        notes = [panel.note for row in panels for panel in row if panel.note]
-        below = max((1 + n.count("\n") for n in notes), default=0) * small * LINE + GAP
-        gaps = left + EDGE + GAP * (columns - 1)
-        panel_width = min((width - gaps) / columns, settings.tallest / aspect)
-        panel_height = panel_width * aspect
-        self.width = gaps + columns * panel_width
-        height = top + rows * (panel_height + below)
-        self.figure = Figure(figsize=(self.width, height))
-        self._renderer = FigureCanvasAgg(self.figure).get_renderer()
-        places = {
-            "left": left / self.width,
-            "right": 1 - EDGE / self.width,
-            "top": 1 - top / height,
-            "bottom": below / height,
-            "wspace": GAP / panel_width,
-            "hspace": below / panel_height,
-        }
-        self.axes = self.figure.subplots(rows, columns, squeeze=False, gridspec_kw=places)
-        for i, row in enumerate(panels):
-            for axes, panel, image in zip(self.axes[i], row, shown[i], strict=True):
-                axes.set(xticks=[], yticks=[])
-                axes.spines[:].set_visible(panel.framed)
-                extent = (0, image.shape[1], image.shape[0], 0)
-                axes.imshow(image, interpolation="nearest", extent=extent, **panel.look)
-                self._fit([axes.set_xlabel(panel.note, size=small, labelpad=2)], panel_width)
-        plain: dict[str, Any] = {"parse_math": False, "size": settings.font}  # "$x" is no formula
-        heads = [a.set_title(t, pad=2, **plain) for a, t in zip(self.axes[0], titles, strict=False)]
-        self._fit(heads, panel_width)
-        for axes, name in zip(self.axes[:, 0], names, strict=False):
-            self._fit([axes.set_ylabel(name, labelpad=2, **plain)], panel_height)
-
-    def _fit(self, texts: Sequence[Text], room: float) -> None:
-        """Gives texts the largest common size at which none is longer than ``room`` inches."""
-
-        def long(text: Text) -> bool:
-            box = text.get_window_extent(self._renderer)
-            return max(box.width, box.height) / self.figure.dpi > room
-
-        while any(map(long, texts)) and (size := float(texts[0].get_fontsize())) > LEAST_FONT:
-            for text in texts:
-                text.set_fontsize(size - 0.25)
+    shown = [[pixels(panel.image) for panel in row] for row in panels]
+    aspect = max(image.shape[0] / image.shape[1] for row in shown for image in row)
+    rows, columns = len(panels), len(panels[0])
+    width = settings.column if columns <= 3 else settings.page
+    notes = max(1 + panel.note.count("\n") if panel.note else 0 for row in panels for panel in row)
+    tall = min(width / columns * aspect, settings.tallest) + notes * settings.font * LINE
+    height = rows * tall + (settings.font * LINE if titles else 0)
+    figure = Figure(figsize=(width, height), layout="compressed")
+    figure.get_layout_engine().set(w_pad=0.01, h_pad=0.01, wspace=0.01, hspace=0.01)  # type: ignore[union-attr]
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for i, row in enumerate(panels):
+        for one, panel, image in zip(axes[i], row, shown[i], strict=True):
+            one.set(xticks=[], yticks=[])
+            one.spines[:].set_visible(panel.framed)
+            extent = (0, image.shape[1], image.shape[0], 0)
+            one.imshow(image, interpolation="nearest", extent=extent, **panel.look)
+            one.set_xlabel(panel.note, size=settings.font - 1, labelpad=2)
+    plain: dict[str, Any] = {"parse_math": False, "size": settings.font}  # "$x" is no formula
+    for one, title in zip(axes[0], titles, strict=False):
+        one.set_title(title, pad=2, **plain)
+    for one, name in zip(axes[:, 0], names, strict=False):
+        one.set_ylabel(name, labelpad=2, **plain)
+    return figure, axes
 
 
 def pixels(image: Tensor | np.ndarray) -> np.ndarray:
