@@ -11,7 +11,6 @@ from operators import Calls
 
 from gsgan.model.painting import ColourCorrection
 from gsgan.model.runs import load_avatar, read_checkpoint
-from gsgan.utils.errors import ConfigError
 
 NONE = "effects=none"
 
@@ -48,44 +47,6 @@ def test_off_builds_no_parameter_and_calls_no_operator(build, effect, word, adds
         assert not off.accuracy.antialias
 
 
-def test_all_off_is_the_plain_chain_operator_by_operator(build):
-    """The forward pass with effects off against its parts called one after the other."""
-    from gsgan.skeleton import bone_frames
-    from gsgan.splat import rasterise
-
-    _, avatar, frame = build(NONE)
-    camera = frame.camera
-
-    def chain():
-        p, valid = frame.skeleton, frame.visibility > 0
-        frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
-        points = avatar.densify(p, valid, frames)
-        gaussians = avatar.deformation(p, points, camera.centre, frames.hubs[:, 0], None)
-        gaussians = avatar.bounded(gaussians)
-        raster = rasterise(gaussians, camera, settings=avatar.accuracy)
-        S = avatar.segmentation(frame.body, camera)
-        p2d = avatar.draw(p, valid, camera, None)
-        g = avatar.pose_encoder(*avatar.pose_inputs(p, valid, frames, camera))
-        painted = avatar.generator(raster.features, S, p2d, g, raster.fine, raster.alpha)
-        return painted[:, :3], painted[:, 3:]
-
-    def whole():
-        painting = avatar(frame.skeleton, frame.visibility, camera, frame.body)
-        return painting.image, painting.alpha
-
-    counts = []
-    with torch.no_grad():
-        assert all(torch.equal(a, b) for a, b in zip(chain(), whole(), strict=True))
-        for paint in (chain, whole):
-            with Calls() as seen:
-                paint()
-            counts.append(seen.count)
-    assert counts[0] == counts[1]
-
-
-# --- colour correction
-
-
 def test_the_mean_of_all_maps_is_the_identity_and_unseen_cameras_keep_theirs():
     colour = ColourCorrection(["b", "a", "d"], ["a", "b", "c", "d"])
     torch.nn.init.normal_(colour.offsets, std=0.3)
@@ -96,17 +57,15 @@ def test_the_mean_of_all_maps_is_the_identity_and_unseen_cameras_keep_theirs():
     assert torch.equal(maps[[1, 0, 3]], colour.affine)  # by name, whatever the order
 
 
-def test_pictures_are_mapped_and_the_background_stays_black():
+def test_images_are_mapped_and_the_background_stays_black():
     colour = ColourCorrection(["a", "b"], ["a", "b"])
     with torch.no_grad():
         colour.offsets[0, 0, 0], colour.offsets[0, 1, 3] = 0.4, 0.2  # red gain, green offset
-    picture = torch.zeros(2, 3, 4, 4)
-    alpha = torch.zeros(2, 1, 4, 4)
-    picture[..., :2], alpha[..., :2] = 0.5, 1.0
-    mapped = colour(picture, alpha, torch.tensor([0, 1]))
-    assert torch.equal(mapped[..., 2:], picture[..., 2:])
+    image, alpha = torch.zeros(2, 3, 4, 4), torch.zeros(2, 1, 4, 4)
+    image[..., :2], alpha[..., :2] = 0.5, 1.0
+    mapped = colour(image, alpha, torch.tensor([0, 1]))
+    assert torch.equal(mapped[..., 2:], image[..., 2:])
     assert mapped[0, :, 0, 0].tolist() == pytest.approx([0.6, 0.6, 0.5])  # halves: the mean stays
-    assert mapped[1, :, 0, 0].tolist() == pytest.approx([0.4, 0.4, 0.5])
 
 
 def test_correction_acts_on_both_pictures_and_leaves_f_alone(build):
@@ -121,9 +80,6 @@ def test_correction_acts_on_both_pictures_and_leaves_f_alone(build):
     torch.testing.assert_close(after.image[:, 0], 1.25 * before.image[:, 0])
     unseen = avatar.paint(replace(frame, camera_index=torch.tensor([2])))  # cam02 is held out
     torch.testing.assert_close(unseen.image, before.image)
-
-
-# --- spherical harmonics, raised by degrees
 
 
 def test_degrees_above_the_active_one_are_neither_computed_nor_moved(build):
@@ -147,33 +103,6 @@ def test_degrees_above_the_active_one_are_neither_computed_nor_moved(build):
     assert psi._head(trunk)[0].shape[-1] == sum(psi.parts) - 3 * (9 - 4)
 
 
-def test_the_degree_is_raised_by_the_schedule():
-    from gsgan.train.schedule import Schedule
-
-    schedule = Schedule(10, 30, 30, degree_every=20)
-    assert [schedule.degree(s, 3) for s in (0, 9, 29, 30, 49, 50, 69)] == [0, 0, 0, 1, 1, 2, 2]
-    assert schedule.degree(69, 1) == 1
-    assert Schedule(10, 30, 30).degree(0, 3) == 3  # 0: all at once
-    with pytest.raises(ConfigError, match="degree_every"):
-        Schedule(1, 1, 1, degree_every=-1)
-
-
-# --- runs
-
-
-def test_f_is_supersampled_after_the_coarse_iterations_of_step_one():
-    from gsgan.train.schedule import Schedule
-
-    schedule = Schedule(segmentation=10, step_one=30, step_two=30, coarse=20, stretch=0.5)
-    fitted = schedule.fitted(segmentation=True, from_masks=False, splats=True, generator=True)
-    assert [fitted.fine(step) for step in (9, 10, 19, 20, 25, 39)] == [
-        True,
-        False,
-        False,
-        *[True] * 3,
-    ]
-
-
 def test_decisions_are_stored_and_taken_up_again(capture, inside, tmp_path):
     from commands import arguments
 
@@ -184,9 +113,7 @@ def test_decisions_are_stored_and_taken_up_again(capture, inside, tmp_path):
     assert "colour correction" in result.stdout
     assert "degree 1" in result.stdout
     checkpoint = read_checkpoint(folder / "checkpoints" / "last.ckpt")
-    assert (
-        checkpoint["state_dict"]["avatar.colour.offsets"].abs().max() > 0
-    )  # the maps were trained
+    assert checkpoint["state_dict"]["avatar.colour.offsets"].any()  # the maps were trained
     stored = checkpoint["gsgan"]["effects"]
     assert stored["view_dependence"]["value"] == 1
     assert stored["cameras"] == ["cam00", "cam01"]
@@ -209,20 +136,6 @@ def test_a_trained_avatar_has_what_its_checkpoint_says_not_what_the_scene_says_n
     avatar, _ = load_avatar(copy, config, build_data(config))
     assert not avatar.effects.antialias.on
     assert not avatar.accuracy.antialias
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("effects.distortion=undistort",), "no camera of this data has a lens coefficient"),
-        (("effects.body_points=on", "model.body_points=null"), "the model leaves them out"),
-        (("effects=[antialias,distortion]",), "no camera of this data has a lens coefficient"),
-    ],
-)
-def test_the_impossible_ends_a_command_in_one_sentence(capture, inside, tmp_path, words, said):
-    from commands import arguments, refused
-
-    refused(inside("train", *arguments(capture, tmp_path / "run"), *words), "not possible", said)
 
 
 def test_all_means_all_that_this_model_can_have(build):

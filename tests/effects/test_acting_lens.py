@@ -22,25 +22,6 @@ def bent(tmp_path):
     )  # fmt: skip
 
 
-def test_pictures_are_taken_as_the_word_says(build, bent):
-    from make import distorted_pixels, ring_camera, skeletons
-
-    raw, _, _ = build(f"data.root={bent}", "data.size=64", "effects.distortion=project")
-    straight, _, _ = build(f"data.root={bent}", "data.size=64")
-    ignored, _, _ = build(f"data.root={bent}", "data.size=64", "effects.distortion=off")
-    views = [data.dataset("novel_view")[0] for data in (raw, straight, ignored)]
-    assert views[0].camera.dist is not None
-    assert views[1].camera.dist is None
-    assert views[2].camera.dist is None
-    assert torch.equal(views[0].image, views[2].image)  # the file's own pixels
-    assert not torch.equal(views[0].image, views[1].image)
-    assert torch.equal(raw.dataset("train")[0].image, ignored.dataset("train")[0].image)
-    assert raw.dataset("train")[0].camera.dist is not None
-    entry = ring_camera(4 * torch.pi / 3, (64, 64)) | {"dist": LENS}
-    wrist = distorted_pixels(entry, skeletons(5)[0][15:16])[0]
-    assert float(views[0].mask[0, 0, int(wrist[1]), int(wrist[0])]) == 1
-
-
 @pytest.mark.parametrize("word", [NONE, "effects.only=[antialias]", "effects.only=[]"])
 def test_with_all_effects_off_a_lens_is_followed_still(build, bent, word):
     """It is the camera's own, and no choice; taken as a pinhole's only where a word says so."""

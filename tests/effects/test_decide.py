@@ -42,7 +42,6 @@ def test_a_plain_scene_calls_for_what_it_always_had():
         ({"surface": GLOSSY}, "view_dependence", 2),
         ({"surface": replace(ALIKE, difference=0.07)}, "colour_correction", "on"),
         ({"has_distortion": True}, "distortion", "undistort"),
-        ({"held_out_distortion": True}, "distortion", "undistort"),
         ({"scale_test": (25.0, 60.0)}, "antialias", "on"),  # half the scale
         ({"scale_test": (50.0, 120.0)}, "antialias", "on"),  # double
         ({"body_inside": 1.0}, "body_points", "on"),
@@ -82,6 +81,7 @@ def test_the_degree_follows_the_number_of_cameras(cameras, degree):
         ({"distortion": "undistort"}, {}, "no camera of this data has a lens coefficient"),
         ({"colour_correction": "on"}, {"n_train_cameras": 1}, "one training camera"),
         ({"body_points": "on"}, {"has_body_pose": False}, "no body pose"),
+        ({"body_points": "on"}, {"body": "smpl"}, "no model file"),
         ({"only": ["distortion"]}, {}, "effects.distortion=on is not possible"),
     ],
 )
@@ -116,7 +116,6 @@ def test_a_list_leaves_lenses_to_their_own_word(word):
     ("model", "effect", "why"),
     [
         (ModelParts(points=False), "body_points", "puts no points on the skeleton"),
-        (ModelParts(body_points=False), "body_points", "leaves them out"),
         (ModelParts(splats=False), "antialias", "splats nothing"),
     ],
 )
@@ -128,14 +127,6 @@ def test_an_effect_that_the_model_lacks_is_off_or_refused(model, effect, why):
     with pytest.raises(ConfigError, match=rf"effects\.{effect}=on is not possible: .*{why}"):
         decide(scene(), forced, model)
     assert not getattr(decide(scene(), replace(forced, impossible="off"), model), effect).on
-
-
-def test_points_on_a_body_need_its_model_file():
-    bare = scene(body="smpl", body_inside=1.0)
-    assert "no model file" in decide(bare, EffectSettings()).body_points.why
-    with pytest.raises(ConfigError, match="no model file"):
-        decide(bare, EffectSettings(body_points="on"))
-    assert decide(replace(bare, body_file="m.pkl"), EffectSettings()).body_points.on
 
 
 def test_decisions_survive_a_checkpoint(tmp_path):

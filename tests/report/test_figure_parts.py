@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from matplotlib import rc_context
 
 from gsgan.report.figures import images
-from gsgan.report.figures.layout import Panel, Settings, Unavailable, draw_panels, style, written
+from gsgan.report.figures.layout import (
+    COLUMN,
+    STYLE,
+    TALLEST,
+    Panel,
+    Unavailable,
+    draw_panels,
+    written,
+)
 from gsgan.report.figures.run import FIGURES
 from gsgan.report.figures.subjects import Subject, choose_items, make_shots, measure
 from gsgan.report.runs import Run
 from gsgan.utils.errors import ConfigError, DataError
-
-SETTINGS = Settings()
 
 
 def rendered(figure) -> np.ndarray:
@@ -58,26 +64,16 @@ def test_the_box_lies_where_the_runs_differ():
 def test_a_panel_holds_its_image():
     image = torch.zeros(1, 3, 4, 2)
     image[0, 0, 3, 1] = 1.0  # the lower right pixel is red
-    with style(SETTINGS):
+    with rc_context(STYLE):
         panels = [[Panel(image, "note"), Panel(image)]]
-        figure, axes = draw_panels(panels, SETTINGS, titles=["one", "$x^$"], names=["row"])
+        figure, axes = draw_panels(panels, titles=["one", "$x^$"], names=["row"])
         drawn = rendered(figure)  # and no title is a formula
     box, height = axes[0, 1].get_window_extent(), drawn.shape[0]
     corner = drawn[round(height - box.y0) - 3, round(box.x1) - 3]
     assert corner.tolist() == [255, 0, 0]
     assert drawn[round(height - box.y1) + 3, round(box.x0) + 3].tolist() == [0, 0, 0]
-    assert figure.get_size_inches()[0] == SETTINGS.column
-    assert figure.get_size_inches()[1] < SETTINGS.tallest + 0.5  # with text
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("font", 0), ("dpi", 10**8), ("page", "wide"), ("column", 0.1), ("page", math.inf),
-     ("margin", math.nan)],
-)  # fmt: skip
-def test_settings_that_cannot_be_are_refused(key, value):
-    with pytest.raises(ConfigError, match=key):
-        Settings(**{key: value})
+    assert figure.get_size_inches()[0] == COLUMN
+    assert figure.get_size_inches()[1] < TALLEST + 0.5  # with text
 
 
 @pytest.fixture
@@ -140,8 +136,8 @@ def subject_of(build, *overrides: str) -> Subject:
 def test_a_figure_that_a_model_cannot_have_says_why(build, model, figure, words):
     subject = subject_of(build, f"model={model}")
     shots = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)
-    with style(SETTINGS), pytest.raises(Unavailable, match=words):
-        FIGURES[figure]([subject], shots, SETTINGS)
+    with rc_context(STYLE), pytest.raises(Unavailable, match=words):
+        FIGURES[figure]([subject], shots)
 
 
 def test_data_without_labels_has_no_segmentation_figure(build):
@@ -149,7 +145,7 @@ def test_data_without_labels_has_no_segmentation_figure(build):
     shot = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)[0]
     bare = replace(shot, frame=replace(shot.frame, labels=None))
     with pytest.raises(Unavailable, match="no part labels"):
-        FIGURES["segmentation"]([subject], [bare], SETTINGS)
+        FIGURES["segmentation"]([subject], [bare])
 
 
 def test_what_is_kept_of_a_painting_is_on_the_cpu(build):
@@ -177,8 +173,8 @@ def test_a_splat_only_run_stands_for_splatting_alone(build):
     """In place of Step I's colour, whose column it takes."""
     full, splat = subject_of(build), subject_of(build, "model=splat_only")
     shots = make_shots(full.data, "novel_pose", [("cam00", 4)], 0.2)
-    with style(SETTINGS):
-        alone = images.canny([full], shots, SETTINGS).numbers["cam00/000004"]
-        both = images.canny([full, splat], shots, SETTINGS).numbers["cam00/000004"]
+    with rc_context(STYLE):
+        alone = images.canny([full], shots).numbers["cam00/000004"]
+        both = images.canny([full, splat], shots).numbers["cam00/000004"]
     assert list(alone) == ["full", "Step I's colour"]
     assert list(both) == ["full", "splat_only"]

@@ -16,7 +16,7 @@ from gsgan.metrics.image import edge_f1, psnr
 from gsgan.model.runs import build_data, load_avatar, load_config
 from gsgan.report.figures.run import FIGURES
 
-FEW = ("shots.strip=2", "shots.errors=1", "shots.canny=1", "settings.dpi=60")
+FEW = ("shots.strip=2", "shots.errors=1", "shots.canny=1")
 
 pytestmark = pytest.mark.slow  # make test runs `report run=` as the README has it
 
@@ -37,7 +37,7 @@ def edit(run: Path, **values) -> None:
 
 def test_every_figure_is_made_with_numbers_of_the_images_shown(run, twin, tmp_path, inside):
     out = tmp_path / "out"
-    whole = "settings.margin=9"  # metres: the window is the image
+    whole = "margin=9"  # metres: the window is the image
     result = inside("report", f"run={run}", f"compare=[{twin}]", f"out={out}", whole, *FEW)
     assert result.returncode == 0, result.stdout + result.stderr
     record = json.loads((out / "figures.json").read_text())["figures"]
@@ -185,7 +185,7 @@ def test_a_collapsed_run_is_not_drawn(twin, tmp_path, inside):
         (("frames=[a]",), ("frames must be a whole number",)),
         (("camera=cam07",), ("cam07", "which has cam00")),
         (("shots.canny=0", "figures=canny"), ("shots.canny", "at least 1")),
-        (("settings.dpi=-1",), ("settings.dpi",)),
+        (("margin=-1",), ("margin",)),
         (("out={run}/metrics.json",), ("metrics.json", "cannot be written to")),
         (("data_root=/nowhere",), ("/nowhere",)),
     ],

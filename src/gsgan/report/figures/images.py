@@ -17,7 +17,15 @@ from torch.nn import functional
 from gsgan.metrics.image import canny as canny_edges
 from gsgan.metrics.image import psnr
 from gsgan.metrics.segmentation import colour_labels, confusion, miou
-from gsgan.report.figures.layout import Drawing, Panel, Settings, Unavailable, draw_panels, written
+from gsgan.report.figures.layout import (
+    COLUMN,
+    SMALL,
+    Drawing,
+    Panel,
+    Unavailable,
+    draw_panels,
+    written,
+)
 from gsgan.report.figures.subjects import Numbers, Shot, Subject, finite, measure
 from gsgan.report.training_curve import curve
 from gsgan.utils.errors import DataError
@@ -29,7 +37,7 @@ STEP_ONE = "Step I's colour"
 Images = list[dict[str, Tensor]]  # per shot, by name
 
 
-def strip(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
+def strip(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
     """One camera over time: a row for the ground truth and one per run, PSNR below each image."""
     images, numbers = _measured(subjects, shots)
     panels = [[Panel(shot.truth) for shot in shots]]
@@ -37,13 +45,13 @@ def strip(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings
         notes = [_decibels(numbers[shot.name][name]) for shot in shots]
         panels.append([Panel(x[name], note) for x, note in zip(images, notes, strict=True)])
     titles, names = [f"frame {shot.item[1]}" for shot in shots], ["truth", *images[0]]
-    figure, _ = draw_panels(panels, settings, titles=titles, names=names)
+    figure, _ = draw_panels(panels, titles=titles, names=names)
     caption = "One camera over time: the ground truth and each run's images, with PSNR."
     return Drawing(figure, caption, numbers)
 
 
 def comparison(
-    subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings, *, detail: bool = False
+    subjects: Sequence[Subject], shots: Sequence[Shot], *, detail: bool = False
 ) -> Drawing:
     """A row per shot: the ground truth and each run's image, with PSNR and edge F1.
 
@@ -63,7 +71,7 @@ def comparison(
                 found["psnr_detail"] = finite(psnr(image[..., *box], shot.truth[..., *box]))
                 below.append(Panel(image[..., *box], written(found["psnr_detail"], 2, " dB")))
         panels += [above, below] if detail else [above]
-    figure, axes = draw_panels(panels, settings, titles=["truth", *images[0]])
+    figure, axes = draw_panels(panels, titles=["truth", *images[0]])
     caption = "The ground truth and each run's image, with PSNR and the F1 of Canny edges"
     if not detail:
         return Drawing(figure, f"{caption}.", numbers)
@@ -92,7 +100,7 @@ def most_disputed(images: Tensor, share: float) -> tuple[slice, slice]:
     return slice(top, top + size[0]), slice(left, left + size[1])
 
 
-def canny(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
+def canny(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
     """Canny edges of the ground truth and of each image, with edge ratio and edge F1."""
     images, numbers = _measured(subjects, shots, splatting=True)
     look = {"cmap": "gray_r", "vmin": 0, "vmax": 1}
@@ -104,7 +112,7 @@ def canny(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings
             found = numbers[shot.name][name]
             note = f"ratio {written(found['edge_ratio'], 2)}\nF1 {written(found['edge_f1'], 3)}"
             panels[-1].append(Panel(canny_edges(image[0]), note, framed=True, look=look))
-    figure, _ = draw_panels(panels, settings, titles=["truth", *images[0]])
+    figure, _ = draw_panels(panels, titles=["truth", *images[0]])
     caption = (
         "Canny edges (thresholds 100 and 200 on 8-bit grey); below the ground truth, their number "
         "of pixels. Ratio: edge pixels over the ground truth's. F1: of edges at most one pixel off."
@@ -112,7 +120,7 @@ def canny(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings
     return Drawing(figure, caption, numbers)
 
 
-def errors(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
+def errors(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
     """The ground truth and each image's absolute error on one scale, the mean below each map."""
     images, numbers = _measured(subjects, shots, splatting=True)
     maps = [
@@ -129,7 +137,7 @@ def errors(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setting
             numbers[shot.name][name]["error_mean"] = float(error.mean())
             note = f"mean {error.mean():.2f}"
             panels[-1].append(Panel(error.numpy(), note, framed=True, look=look))
-    figure, _ = draw_panels(panels, settings, titles=["truth", *images[0]])
+    figure, _ = draw_panels(panels, titles=["truth", *images[0]])
     caption = (
         "Absolute error of each pixel, mean over the three channels, in levels of 255; one scale "
         f"for all maps, from pale (0) to dark ({top} or more). The mean is below each map."
@@ -137,7 +145,7 @@ def errors(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setting
     return Drawing(figure, caption, numbers)
 
 
-def segmentation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
+def segmentation(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
     """The image, its true parts, and each run's segmentation S with its mIoU.
 
     Raises:
@@ -170,16 +178,16 @@ def segmentation(subjects: Sequence[Subject], shots: Sequence[Shot], settings: S
         "The true parts and each run's segmentation S (most probable part). mIoU: mean over the "
         "parts present, without the background."
     )
-    return Drawing(draw_panels(panels, settings, titles=titles)[0], caption, numbers)
+    return Drawing(draw_panels(panels, titles=titles)[0], caption, numbers)
 
 
-def training(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
+def training(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
     """PSNR of the watched images against minutes, a line per run, Step I's colour dashed.
 
     Raises:
         Unavailable: when a run has no log that can be read.
     """
-    figure = Figure((settings.column, 0.75 * settings.column), layout="constrained")
+    figure = Figure((COLUMN, 0.75 * COLUMN), layout="constrained")
     axes = figure.add_subplot()
     shown: list[float] = []
     numbers: dict[str, Any] = {}
@@ -205,14 +213,13 @@ def training(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setti
             lines.append(found.colour)
         # without the untrained start, many dB below the rest
         shown += [v for line in lines for m, v in zip(minutes, line, strict=True) if m > 0]
-    small = settings.font - 1
-    axes.set_xlabel("minutes of training", fontsize=small)
-    axes.set_ylabel("PSNR of watched images, dB", fontsize=small)
-    axes.tick_params(labelsize=small)
+    axes.set_xlabel("minutes of training", fontsize=SMALL)
+    axes.set_ylabel("PSNR of watched images, dB", fontsize=SMALL)
+    axes.tick_params(labelsize=SMALL)
     room = 0.08 * max(max(shown) - min(shown), 0.1)
     axes.set(xlim=(0, None), ylim=(min(shown) - room, max(shown) + room))
     axes.grid(visible=True, alpha=0.25)
-    for text in axes.legend(fontsize=small, frameon=False, loc=4).get_texts():
+    for text in axes.legend(fontsize=SMALL, frameon=False, loc=4).get_texts():
         text.set_parse_math(False)
     caption = (
         f"PSNR of the {len(shots)} held-out images that were watched while training, against "

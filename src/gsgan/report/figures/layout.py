@@ -3,42 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from gsgan.utils.checks import between
-
+COLUMN, PAGE = 3.5, 7.16  # inches, width of a figure in one column and across the page
+TALLEST = 1.9  # inches, maximum height of a row of images, without its text
+FONT, SMALL = 8.0, 7.0  # points
 LINE = 1.4 / 72  # inches per line and point of font size
-LIMITS = {  # of settings: what is readable and fits into memory
-    "column": (1, 50), "page": (2, 50), "tallest": (0.3, 50), "font": (1, 20), "dpi": (1, 2400),
-    "margin": (0, 1e6),
+# Text in the PDF stays text (TrueType).
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans", "font.size": FONT, "pdf.fonttype": 42, "axes.linewidth": 0.5,
+    "savefig.dpi": 300,
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How figures look; `conf/report.yaml` has units.
-
-    Raises:
-        ConfigError: on a value outside `LIMITS`.
-    """
-
-    column: float = 3.5
-    page: float = 7.16
-    tallest: float = 1.9
-    font: float = 8.0
-    dpi: float = 300
-    margin: float = 0.2
-
-    def __post_init__(self) -> None:
-        for name, limits in LIMITS.items():
-            between(f"settings.{name}", getattr(self, name), *limits)
 
 
 @dataclass(frozen=True)
@@ -55,13 +35,6 @@ class Unavailable(Exception):
     """What the runs lack for a figure; the other figures are still made."""
 
 
-def style(settings: Settings) -> AbstractContextManager[None]:
-    """Fonts and lines of every figure; text in the PDF stays text (TrueType)."""
-    look: dict[Any, Any] = {"font.family": "DejaVu Sans", "font.size": settings.font}
-    look |= {"pdf.fonttype": 42, "axes.linewidth": 0.5, "savefig.dpi": settings.dpi}
-    return matplotlib.rc_context(look)
-
-
 @dataclass(frozen=True)
 class Panel:
     """One image ``[1, 3, h, w]`` in [0, 1], or ``[h, w]`` with options of ``imshow`` in ``look``; a
@@ -75,7 +48,6 @@ class Panel:
 
 def draw_panels(
     panels: Sequence[Sequence[Panel]],
-    settings: Settings,
     *,
     titles: Sequence[str] = (),
     names: Sequence[str] = (),
@@ -91,10 +63,10 @@ def draw_panels(
     shown = [[pixels(panel.image) for panel in row] for row in panels]
     aspect = max(image.shape[0] / image.shape[1] for row in shown for image in row)
     rows, columns = len(panels), len(panels[0])
-    width = settings.column if columns <= 3 else settings.page
+    width = COLUMN if columns <= 3 else PAGE
     notes = max(1 + panel.note.count("\n") if panel.note else 0 for row in panels for panel in row)
-    tall = min(width / columns * aspect, settings.tallest) + notes * settings.font * LINE
-    height = rows * tall + (settings.font * LINE if titles else 0)
+    tall = min(width / columns * aspect, TALLEST) + notes * FONT * LINE
+    height = rows * tall + (FONT * LINE if titles else 0)
     figure = Figure(figsize=(width, height), layout="compressed")
     figure.get_layout_engine().set(w_pad=0.01, h_pad=0.01, wspace=0.01, hspace=0.01)  # type: ignore[union-attr]
     axes = figure.subplots(rows, columns, squeeze=False)
@@ -104,8 +76,8 @@ def draw_panels(
             one.spines[:].set_visible(panel.framed)
             extent = (0, image.shape[1], image.shape[0], 0)
             one.imshow(image, interpolation="nearest", extent=extent, **panel.look)
-            one.set_xlabel(panel.note, size=settings.font - 1, labelpad=2)
-    plain: dict[str, Any] = {"parse_math": False, "size": settings.font}  # "$x" is no formula
+            one.set_xlabel(panel.note, size=SMALL, labelpad=2)
+    plain: dict[str, Any] = {"parse_math": False, "size": FONT}  # "$x" is no formula
     for one, title in zip(axes[0], titles, strict=False):
         one.set_title(title, pad=2, **plain)
     for one, name in zip(axes[:, 0], names, strict=False):

@@ -11,16 +11,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import torch
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
 
 from gsgan.model.runs import Moved, load_config
 from gsgan.report.figures import images
-from gsgan.report.figures.layout import Drawing, Settings, Unavailable, style
+from gsgan.report.figures.layout import STYLE, Drawing, Unavailable
 from gsgan.report.figures.subjects import Shot, Subject, choose_items, make_shots, open_subjects
-from gsgan.utils.checks import one_of, whole
+from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically
@@ -32,7 +32,7 @@ METADATA: dict[str, dict[str, Any]] = {  # no dates: the same figure gives the s
     "pdf": {"CreationDate": None},
 }
 # Each draws shots of subjects, the first one leading.
-FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot], Settings], Drawing]] = {
+FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot]], Drawing]] = {
     "comparison": images.comparison,
     "ablation": partial(images.comparison, detail=True),
     "strip": images.strip,
@@ -56,7 +56,7 @@ def make_figures(config: DictConfig) -> None:
     if not names:
         names = [name for name in FIGURES if len(folders) > 1 or name not in COMPARE]
     formats = [one_of("formats", name, METADATA) for name in _list(config.formats) or METADATA]
-    settings: Settings = instantiate(config.settings)
+    at_least("margin", config.margin, 0)
     out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
     moved = Moved.from_config(config)
     for folder in folders:
@@ -69,10 +69,10 @@ def make_figures(config: DictConfig) -> None:
     subjects = open_subjects(folders, config.names, moved, pick_device(config.device))
     console, lines = make_console(), []
     made: dict[str, Drawing] = {}
-    with style(settings):
+    with matplotlib.rc_context(STYLE):
         for name in track(list(dict.fromkeys(names)), "drawing", console=console, transient=True):
             try:
-                made[name] = _draw(name, subjects, config, settings)
+                made[name] = _draw(name, subjects, config)
             except Unavailable as reason:
                 lines.append(f"{name}: left out, {reason}")
                 continue
@@ -91,9 +91,7 @@ def make_figures(config: DictConfig) -> None:
     console.print("\n".join(lines), soft_wrap=True, markup=False, highlight=False)
 
 
-def _draw(
-    name: str, subjects: Sequence[Subject], config: DictConfig, settings: Settings
-) -> Drawing:
+def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing:
     """One figure with its whole caption."""
     data = subjects[0].data
     if name in COMPARE and len(subjects) < 2:
@@ -117,14 +115,14 @@ def _draw(
             count=whole(f"shots.{name}", config.shots.get(name), 1),
             one_camera=name == "strip",
         )
-    shots = make_shots(data, split, items, settings.margin)
+    shots = make_shots(data, split, items, config.margin)
     _check_same_pixels(subjects, split, shots)
-    drawing = FIGURES[name](subjects, shots, settings)
+    drawing = FIGURES[name](subjects, shots)
     about = ""
     if name != "training":
         about = (
             f" Images: {', '.join(shot.name for shot in shots)}. Numbers are of the windows shown, "
-            f"which reach at least {settings.margin:g} m beyond the joints, not of whole images."
+            f"which reach at least {config.margin:g} m beyond the joints, not of whole images."
         )
     return replace(drawing, caption=f"{drawing.caption}{about} Split {split}.")
 
