@@ -19,9 +19,9 @@ from PIL import Image, ImageChops
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from gsgan.data.synthetic.character import Character
-from gsgan.data.synthetic.glb import Glb
-from gsgan.data.synthetic.gltf import read_character
+from gsgan.motion.character import Character
+from gsgan.synthetic.glb import Glb
+from gsgan.synthetic.gltf import read_character
 
 AVATARS = {"blouse": "Hispanic_F_1_Casual.glb", "polo": "White_M_1_Casual.glb"}
 OUT = Path(__file__).parents[1] / "src" / "gsgan" / "data" / "synthetic" / "avatars"

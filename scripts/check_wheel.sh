@@ -13,7 +13,7 @@ cd "$work"
 export GSGAN_CACHE="$work/cache" # no caches of the checkout
 inside=$(venv/bin/python -m zipfile -l "$(ls -t "$repo"/dist/gsgan-*.whl | head -1)")
 for file in gsgan/conf/train.yaml gsgan/body/assets/free_body.npz gsgan/body/assets/body_space.npz gsgan/body/assets/ATTRIBUTION.md \
-  gsgan/data/synthetic/avatars/{blouse,polo}.glb gsgan/data/synthetic/avatars/{LICENSE,ATTRIBUTION.md} \
+  gsgan/synthetic/avatars/{blouse,polo}.glb gsgan/synthetic/avatars/{LICENSE,ATTRIBUTION.md} \
   gsgan/splat/native.cpp gsgan/splat/kernels/tile.h gsgan/skeleton/templates.npz; do
   [[ $inside == *"$file"* ]] || { echo "the wheel lacks $file"; exit 1; }
 done

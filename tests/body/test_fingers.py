@@ -16,10 +16,10 @@ from gsgan.body.fingers import Fingers
 from gsgan.body.measure import fit_hands
 from gsgan.body.shape import STRETCHED, BodyShape, free_space, shaped_body
 from gsgan.body.solve import Solver, log_of
-from gsgan.data.synthetic.free_subject import free_character, free_pose
-from gsgan.data.synthetic.motion import Choreography
 from gsgan.scene import BodyPose
 from gsgan.skeleton.hands import FINGERS, HAND
+from gsgan.synthetic.free_subject import free_character, free_pose
+from gsgan.synthetic.motion import Choreography
 
 torch.set_num_threads(1)
 LEFT, RIGHT = slice(33, 33 + HAND), slice(33 + HAND, 33 + 2 * HAND)

@@ -16,10 +16,10 @@ from gsgan.body.rig import LEAST, build_rig
 from gsgan.body.shape import BodyShape, free_space, shaped_body
 from gsgan.body.smpl import read_smpl
 from gsgan.body.solve import Solver
-from gsgan.data.synthetic.free_subject import free_character, free_pose
-from gsgan.data.synthetic.motion import Choreography
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.synthetic.free_subject import free_character, free_pose
+from gsgan.synthetic.motion import Choreography
 
 torch.set_num_threads(1)
 index = MEDIAPIPE33.names.index

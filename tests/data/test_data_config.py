@@ -47,7 +47,7 @@ def test_capture_config_builds_and_reads(capture: Path) -> None:
 
 def test_synthetic_config_reads_what_the_generator_would_make(capture: Path) -> None:
     """The generator is not run here: its parameters are checked, its folder replaced."""
-    from gsgan.data.synthetic.scene_setup import Settings
+    from gsgan.synthetic.scene_setup import Settings
 
     data = instantiate(conf("synthetic", "size=48", "source.frames=12", "source.test_frames=3"))
     assert data.source.func.__name__ == "ensure_synthetic"

@@ -12,8 +12,8 @@ from make import write_face, write_hands
 
 import gsgan
 from gsgan.export.splats import splats_of
+from gsgan.model.drive import inputs_of, rest_pose
 from gsgan.model.runs import build_data, load_config
-from gsgan.render.poses import inputs_of, rest_pose
 from gsgan.skeleton import bone_frames, face_code
 
 FACE = slice(75, 105)

@@ -8,11 +8,11 @@ import torch
 
 from gsgan.body import open_body
 from gsgan.data.datamodule import GsganData
-from gsgan.data.synthetic import ensure_synthetic
-from gsgan.data.synthetic.scene_setup import Scene, Settings
-from gsgan.data.synthetic.trace import Tracer
-from gsgan.data.synthetic.view import pixel_rays
 from gsgan.model.segmentation import HANDS, Segmentation
+from gsgan.synthetic import ensure_synthetic
+from gsgan.synthetic.scene_setup import Scene, Settings
+from gsgan.synthetic.trace import Tracer
+from gsgan.synthetic.view import pixel_rays
 
 SIZE = 128
 SCENE = {

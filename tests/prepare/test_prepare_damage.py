@@ -20,8 +20,9 @@ from test_prepare_points3d import write_trc
 import gsgan.prepare.mediapipe as tool
 from gsgan.data.calibration import read_calibration
 from gsgan.data.joints import BODY
+from gsgan.motion.points import read_points3d
 from gsgan.prepare.doubts import Doubts, doubts_about_pictures
-from gsgan.prepare.landmarks import read_detections, read_points3d
+from gsgan.prepare.landmarks import read_detections
 from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.pictures import MaskTidying, PictureFiles, Written, check_values, write_pictures
 from gsgan.prepare.rig import undistort_points
@@ -166,7 +167,7 @@ def test_damaged_results_are_made_again_and_a_full_disk_is_reported(tmp_path: Pa
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("gsgan.prepare.work.write_atomically", full)
+    monkeypatch.setattr("gsgan.utils.files.write_atomically", full)
     with pytest.raises(DataError, match=r"cannot be written \(No space left"):
         work.arrays("a", 2, lambda: {"x": np.arange(2)})
 

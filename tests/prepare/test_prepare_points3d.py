@@ -10,7 +10,8 @@ import pytest
 from make import skeletons
 
 from gsgan.data.joints import SETS
-from gsgan.prepare.landmarks import read_points3d, without_frozen
+from gsgan.motion.points import read_points3d
+from gsgan.prepare.landmarks import without_frozen
 from gsgan.utils.errors import DataError
 
 MARKERS = {

@@ -240,11 +240,3 @@ def test_a_wrong_value_ends_in_one_message(run, inside, given, words):
     result = inside("report", *given)
     refused(result, *words)
     assert len(result.stderr.strip().splitlines()) == 1
-
-
-def test_the_old_command_names_the_new_one_and_does_the_work(run, tmp_path, inside):
-    given = (f"run={run}", f"out={tmp_path / 'out'}", "figures=strip", "formats=png", *FEW)
-    result = inside("figures", *given)
-    assert result.returncode == 0, result.stderr
-    assert result.stderr.strip() == ("gsgan.figures is now python -m gsgan.report run=<folder>")
-    assert (tmp_path / "out" / "strip.png").exists()

@@ -15,6 +15,7 @@ from gsgan.data.crop import NEAR, Crop
 from gsgan.data.files import read_colour
 from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float
 from gsgan.skeleton.template import SkeletonTemplate
+from gsgan.utils.images import caption, encode
 
 Bytes = NDArray[np.uint8]
 
@@ -22,9 +23,7 @@ ASPECT = 0.75  # width to height of a tile: a standing person
 MARGIN = 0.08  # of the box about person and skeleton, on each side
 LEFT, RIGHT, MIDDLE = (60, 150, 255), (255, 140, 40), (240, 240, 240)  # RGB, the person's sides
 OUTLINE, OUTSIDE, NEUTRAL = (70, 255, 90), (255, 40, 60), (70, 70, 70)
-BAR = 18  # pixels of the caption above a tile
 GAP = 4  # pixels between tiles
-QUALITY = 88  # of the JPEG
 LEGEND = (
     "Green: the mask's outline. Blue: the person's left, orange: the right, white: the middle; "
     "red rings: joints outside the mask. Images are cropped to the person and undistorted."
@@ -120,17 +119,3 @@ def _side(template: SkeletonTemplate, a: int, b: int) -> tuple[int, int, int]:
         if side in template.names[a] and side in template.names[b]:
             return colour
     return MIDDLE
-
-
-def caption(image: Bytes, text: str, colour: tuple[int, int, int]) -> Bytes:
-    """The image under a bar of the colour with white text."""
-    bar = np.full((BAR, image.shape[1], 3), colour, np.uint8)
-    cv2.putText(
-        bar, text, (5, BAR - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA
-    )
-    return np.concatenate([bar, image])
-
-
-def encode(image: Bytes) -> bytes:
-    """A JPEG of an RGB image."""
-    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import NDArray
+
 from gsgan.skeleton.face import FACE_NAMES
 from gsgan.skeleton.hands import HAND, hand_names
 from gsgan.skeleton.template import MEDIAPIPE33
+
+Float = NDArray[np.float64]
+Bool = NDArray[np.bool_]
 
 BODY = len(MEDIAPIPE33.names)
 LEFT, RIGHT = slice(BODY, BODY + HAND), slice(BODY + HAND, BODY + 2 * HAND)
@@ -75,3 +81,8 @@ FROM_HANDS = {
 def joint_names() -> tuple[str, ...]:
     """Names of all joints."""
     return (*MEDIAPIPE33.names, *hand_names(), *FACE_MESH)
+
+
+def known(points: Float) -> Bool:
+    """``[...]`` whether all coordinates of ``points [..., D]`` are finite."""
+    return np.asarray(np.isfinite(points).all(-1), np.bool_)

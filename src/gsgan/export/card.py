@@ -10,7 +10,7 @@ import yaml
 
 from gsgan import __version__
 from gsgan.effects.table import rows
-from gsgan.render.poses import Run
+from gsgan.model.runs import Run
 from gsgan.utils.pages import markdown
 
 HOLDS = {

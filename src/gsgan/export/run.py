@@ -13,12 +13,12 @@ from rich.progress import track
 
 from gsgan.export.card import card
 from gsgan.export.splats import Splats, glb_bytes, ply_bytes, splats_of
-from gsgan.prepare.work import writing
-from gsgan.render.poses import REST, Drive, Run, drive_of, inputs_of
+from gsgan.model.drive import REST, Drive, drive_of, inputs_of
+from gsgan.model.runs import Run
 from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
-from gsgan.utils.files import write_atomically
+from gsgan.utils.files import write_atomically, writing
 from gsgan.utils.provenance import verify
 
 ENDINGS = {

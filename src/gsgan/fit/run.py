@@ -26,7 +26,6 @@ from gsgan.body.fingers import Fingers
 from gsgan.body.measure import fit_hands, fit_offsets, fit_shape
 from gsgan.body.shape import BodyShape, shaped_body
 from gsgan.body.solve import ON_HANDS, Solver
-from gsgan.check.overlays import caption
 from gsgan.data.calibration.find import METRES
 from gsgan.data.checks import spans
 from gsgan.data.crop import PersonCrop
@@ -35,14 +34,14 @@ from gsgan.data.formats.capture import LANDMARKS, POSES, SHAPE, CaptureReader
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.moments import Moments
 from gsgan.prepare.pictures import sampled
-from gsgan.prepare.work import progress, write_json, write_npz, writing
 from gsgan.scene import BodyPose, Frame
 from gsgan.skeleton import MEDIAPIPE33, TEMPLATES
 from gsgan.splat import accuracy
 from gsgan.utils.checks import whole
-from gsgan.utils.console import make_console
+from gsgan.utils.console import make_console, progress
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import write_atomically
+from gsgan.utils.files import write_atomically, write_json, write_npz, writing
+from gsgan.utils.images import caption
 from gsgan.utils.tensors import pick_device
 
 REPORT, SHEET, STOPPED = "body_fit.json", "body_fit.png", ".body_fit.stopped"

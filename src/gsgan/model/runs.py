@@ -4,26 +4,38 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 import yaml
 from hydra.utils import instantiate
+from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 import gsgan.model.assemble as assemble
+from gsgan.body import open_body
+from gsgan.body.skinned import MarkedBody
+from gsgan.data.figure import Figure
 from gsgan.effects import Effects
 from gsgan.model.avatar import Avatar
+from gsgan.skeleton import HOLISTIC
+from gsgan.skeleton.tensors import constants
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.tensors import pick_device
+
+if TYPE_CHECKING:
+    from gsgan.data.datamodule import GsganData
+    from gsgan.data.scene_info import SceneInfo
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData, SceneInfo
     from gsgan.model.class_vote import Pictures
 
+Float = NDArray[np.float64]
 CHECKPOINT = Path("checkpoints") / "last.ckpt"
 CONFIG = Path(".hydra") / "config.yaml"
 # Keys that may differ between a run and its continuation: they do not change what it learns.
@@ -294,3 +306,81 @@ def as_resumed(plain: dict[str, Any]) -> dict[str, Any]:
         if isinstance(node, dict):
             node.pop(last, None)
     return plain
+
+
+@dataclass
+class Run:
+    """A run folder; its dataset is opened only where it is needed.
+
+    Args:
+        folder: of the run.
+        stored: its config.
+        checkpoint: ``gsgan`` of its checkpoint; empty where training has not written one yet.
+        avatar: frozen.
+        moved: where its dataset and body model file are now.
+        opened: its dataset, or None.
+    """
+
+    folder: Path
+    stored: DictConfig
+    checkpoint: dict[str, Any]
+    avatar: Avatar
+    moved: Moved = field(default_factory=Moved)
+    opened: GsganData | None = None
+
+    @classmethod
+    def load(cls, config: DictConfig) -> Run:
+        """The run of ``config.run``.
+
+        Raises:
+            ConfigError: when it is not set.
+            DataError: when the folder holds no run, or a damaged one.
+        """
+        if config.run is None:
+            raise ConfigError("run is not set: give run=<the folder that gsgan.train printed>")
+        folder, moved = Path(config.run).expanduser(), Moved.from_config(config)
+        stored, facts = read_config(folder), read_checkpoint(folder / CHECKPOINT)["gsgan"]
+        return cls(
+            folder, stored, facts, load(folder, smpl=moved.smpl, device=config.device), moved
+        )
+
+    @property
+    def data(self) -> GsganData:
+        """The run's dataset."""
+        if self.opened is None:
+            self.opened = build_data(load_config(self.folder, self.moved))
+        return self.opened
+
+    @property
+    def scene(self) -> SceneInfo:
+        """Facts about the scene; older checkpoints lack some, and need the dataset."""
+        stored = self.checkpoint.get("scene")
+        if self.opened is None and stored is not None and stored.get("figure") is not None:
+            return scene_of(stored)
+        return self.data.info
+
+    @property
+    def body(self) -> MarkedBody | None:
+        """The skinned body that the avatar moves with, in the subject's shape, or None."""
+        if not self.avatar.needs_body:
+            return None
+        return open_body(self.scene.body, self.body_file, self.scene.betas)
+
+    @property
+    def body_file(self) -> str | None:
+        """The user's model file of the body, or None."""
+        return self.moved.smpl or from_start(self.folder, self.scene.body_file)
+
+    @property
+    def figure(self) -> Figure:
+        """The subject's proportions."""
+        assert self.scene.figure is not None
+        return self.scene.figure
+
+    @property
+    def face(self) -> Float:
+        """``[30, 3]`` metres: the subject's face at rest, see `gsgan.skeleton.in_head`; the
+        template's for avatars without a face."""
+        template = self.avatar.template
+        template = template if template.expression else HOLISTIC
+        return constants(template, torch.device("cpu"), torch.float64).face_rest.numpy()

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM, WRISTS
-from gsgan.prepare.rig import Bool, Float, known
+from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM, WRISTS, known
+from gsgan.prepare.rig import Bool, Float
 from gsgan.skeleton.hands import FINGER_BONES, HAND
 from gsgan.utils.checks import above, at_least
 

@@ -10,11 +10,11 @@ import numpy as np
 
 from gsgan.data import checks
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.joints import BODY, joint_names
+from gsgan.data.joints import BODY, joint_names, known
 from gsgan.prepare.cleanse import BODY_BONES, bone_lengths
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.pictures import Written
-from gsgan.prepare.rig import Float, known
+from gsgan.prepare.rig import Float
 from gsgan.prepare.solve import Solution, median
 from gsgan.prepare.sources import Source
 from gsgan.utils.errors import DataError

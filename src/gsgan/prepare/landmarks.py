@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from gsgan.data.files import frame_files, read_arrays, read_json, read_json_value
-from gsgan.data.joints import ALL, BODY, FACE, FACE_MESH, FROM_HANDS, LEFT, RIGHT, SETS
+from gsgan.data.files import read_arrays, read_json
+from gsgan.data.joints import ALL, BODY, FACE, FACE_MESH, FROM_HANDS, LEFT, RIGHT, SETS, known
 from gsgan.data.skeletons import whole_frame_ids
-from gsgan.prepare.rig import Float, Ints, known
+from gsgan.motion.points import Numbered, json_files
+from gsgan.prepare.rig import Float, Ints
 from gsgan.skeleton.hands import HAND
-from gsgan.skeleton.template import MEDIAPIPE33
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import DataError
 
@@ -23,10 +22,6 @@ MESH = 468  # landmarks of MediaPipe's face mesh
 PIXEL_CENTRE = 0.5  # added to detectors that count from the centre of the first pixel
 OPENPOSE_KEYS = ("pose_keypoints_2d", "hand_left_keypoints_2d", "hand_right_keypoints_2d")
 EASYMOCAP_KEYS = ("keypoints", "handl2d", "handr2d")
-UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-TRC_HEADER = 5  # lines before the first frame; markers are named in the fourth
-TRC_AXES = [2, 0, 1]  # Pose2Sim writes (y, z, x) so that y is up: columns of x, y, z
-Numbered = tuple[Ints, Float, Float]  # frame numbers, coordinates, confidence
 
 
 @dataclass(frozen=True)
@@ -65,7 +60,7 @@ def read_detections(path: Path) -> Detections:
         DataError: on a damaged file or an unknown set of joints.
     """
     if path.is_dir():
-        files = _json_files(path)
+        files = json_files(path)
         px, conf, people = map(np.array, zip(*map(_read_frame, files.values()), strict=True))
         frames = np.array(list(files))
     else:
@@ -125,13 +120,6 @@ def _read_npz(path: Path) -> Numbered:
     return frame_id, px, conf
 
 
-def _json_files(path: Path) -> dict[int, Path]:
-    files = frame_files(path.parent, path.name, (".json",))
-    if not files:
-        raise DataError(f"{path} holds no JSON files; expected one per frame, numbered")
-    return {number: path.parent / files[number] for number in sorted(files)}
-
-
 def _read_frame(path: Path) -> tuple[Float, Float, int]:
     content = read_json(path)
     if isinstance(content.get("people"), list):
@@ -176,31 +164,6 @@ def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Float, Fl
     return px, conf
 
 
-def read_points3d(path: Path) -> Numbered:
-    """3D joints that another tool triangulated: a .trc file, or a folder of EasyMocap JSON files.
-
-    Returns:
-        ``frames [F]`` rising; ``p [F, 33, 3]`` metres, in the calibration's world, NaN = missing,
-        as exact zeros are; ``conf [F, 33]``, 0 = missing.
-
-    Raises:
-        DataError: when it is neither, damaged, or without shoulders and hips.
-    """
-    if path.is_dir():
-        files = _json_files(path)
-        both = np.stack([_read_people(file) for file in files.values()])
-        frames, p, conf = np.array(list(files)), both[..., :3], both[..., 3]
-    else:
-        frames, p, conf = _read_trc(path)
-    order = np.argsort(frames)
-    p = np.where((p == 0).all(-1, keepdims=True), np.nan, p)[order]
-    conf = np.where(known(p), conf[order], 0.0)
-    p = np.where((conf > 0)[..., None], p, np.nan)
-    if not (conf[:, [11, 12, 23, 24]] > 0).any():
-        raise DataError(f"{path} has no shoulders and hips; expected a whole body's joints")
-    return frames[order], p, conf
-
-
 def without_frozen(p: Float, frames: int) -> tuple[Float, int]:
     """Points ``p [F, J, 3]`` without gaps that another tool filled, and how many were removed.
 
@@ -214,57 +177,3 @@ def without_frozen(p: Float, frames: int) -> tuple[Float, int]:
         for start, end in edges.reshape(-1, 2):
             frozen[start:end, j] = end - start + 1 >= frames
     return np.where(frozen[..., None], np.nan, p), int(frozen.sum())
-
-
-def _read_trc(path: Path) -> Numbered:
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        names, values = lines[1].split(), lines[2].split()
-        markers = [name for name in lines[3].split("\t")[2:] if name]
-        count = 2 + 3 * len(markers)  # frame, time and the coordinates; an empty cell is missing
-        rows = [
-            [
-                float(cell) if cell.strip() else np.nan
-                for cell in (line.split("\t") + [""] * count)[:count]
-            ]
-            for line in lines[TRC_HEADER:]
-            if line.strip()
-        ]
-        unit = values[names.index("Units")]
-    except (OSError, ValueError, IndexError) as error:
-        raise DataError(f"{path} cannot be read as a .trc file ({error})") from None
-    if unit not in UNITS:
-        raise DataError(f"{path}: Units is {unit!r}; expected one of {', '.join(UNITS)}")
-    table = np.array(rows).reshape(-1, count)
-    read = table[:, 2:].reshape(len(table), len(markers), 3)[..., TRC_AXES] * UNITS[unit]
-    p = np.full((len(table), BODY, 3), np.nan)
-    for marker, name in enumerate(markers):
-        if (joint := _joint(name)) is not None:
-            p[:, joint] = read[:, marker]
-    return whole_frame_ids(table[:, 0], str(path)), p, np.ones(p.shape[:2])
-
-
-def _joint(name: str) -> int | None:
-    """The MediaPipe joint of a marker: LShoulder, left_shoulder, Lknee, LBigToe, Nose."""
-    word = re.sub(r"[^a-z]", "", name.lower()).replace("bigtoe", "footindex")
-    word = re.sub("^l(?!eft)", "left", re.sub("^r(?!ight)", "right", word))
-    plain = [name.replace("_", "") for name in MEDIAPIPE33.names]
-    return plain.index(word) if word in plain else None
-
-
-def _read_people(path: Path) -> Float:
-    """``[33, 4]`` x, y, z, confidence of the person seen best; EasyMocap's zeros stay zeros."""
-    best, numbers = np.zeros((BODY, 4)), SETS[25][1]
-    try:
-        for person in read_json_value(path):
-            joints = np.array(person["keypoints3d"], np.float64)[list(numbers.values())]
-            if joints.shape[1] == 3:
-                joints = np.c_[joints, np.ones(len(joints))]
-            if joints[:, 3].sum() > best[:, 3].sum():
-                best[list(numbers)] = joints
-    except (ArithmeticError, ValueError, TypeError, LookupError) as error:
-        raise DataError(
-            f"{path} is not an EasyMocap keypoints3d file: expected a list of persons with "
-            f"(25, 4) numbers each ({error})"
-        ) from None
-    return best

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from gsgan.prepare.options import MEDIAPIPE, MediaPipe, Options
 from gsgan.prepare.sources import Source
-from gsgan.prepare.work import Advance, Work, each_camera, writing
+from gsgan.prepare.work import Advance, Work, each_camera
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import cache_root
+from gsgan.utils.files import cache_root, writing
 
 TOOL = Path(__file__).parent / "mediapipe_tool"
 SCRIPT, REQUIREMENTS = TOOL / "detect.py", TOOL / "requirements.txt"

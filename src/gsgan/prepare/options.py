@@ -9,8 +9,8 @@ from typing import Any
 
 from gsgan.data.calibration import Calibration, find_calibration, read_calibration
 from gsgan.data.cameras import CameraEntry
+from gsgan.motion.points import UNITS
 from gsgan.prepare.doubts import Doubts
-from gsgan.prepare.landmarks import UNITS
 from gsgan.prepare.pictures import MaskTidying, PictureFiles
 from gsgan.prepare.rig import MIN_VIEWS
 from gsgan.prepare.solve import Settings

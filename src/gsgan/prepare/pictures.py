@@ -15,9 +15,10 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Crop, resize, take, undistort_map
 from gsgan.data.files import frame_files, last_number, read_grey
 from gsgan.prepare.sources import PICTURE_SUFFIXES, Source
-from gsgan.prepare.work import Advance, writing
+from gsgan.prepare.work import Advance
 from gsgan.utils.checks import above, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.files import writing
 
 Bytes = NDArray[np.uint8]
 PROBED = 8  # masks per camera whose values are checked before any work is done

@@ -13,20 +13,21 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 import gsgan
-from gsgan.check.overlays import LEFT, MIDDLE, RIGHT, caption, draw, encode
+from gsgan.check.overlays import LEFT, MIDDLE, RIGHT, draw
 from gsgan.check.report import Figure, Finding, Report, Section, Table, page, print_report
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, Crop, PersonCrop, cut, project, resize
 from gsgan.data.files import read_colour, read_grey
-from gsgan.data.joints import ALL, BODY, FACE, HANDS, joint_names
+from gsgan.data.joints import ALL, BODY, FACE, HANDS, joint_names, known
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.pictures import Written, sampled
-from gsgan.prepare.rig import Bool, Float, Ints, Rig, camera_moves, known
+from gsgan.prepare.rig import Bool, Float, Ints, Rig, camera_moves
 from gsgan.prepare.solve import Solution, median
-from gsgan.prepare.work import GENERATOR, write_json, write_npz, writing
+from gsgan.prepare.work import GENERATOR
 from gsgan.skeleton import HOLISTIC, MEDIAPIPE33
 from gsgan.skeleton.hands import HAND
-from gsgan.utils.files import write_atomically
+from gsgan.utils.files import write_atomically, write_json, write_npz, writing
+from gsgan.utils.images import caption, encode
 
 Bytes = NDArray[np.uint8]
 BAR = (70, 70, 70)

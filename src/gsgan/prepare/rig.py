@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR
+from gsgan.data.joints import known
 from gsgan.utils.checks import above
 
 MIN_VIEWS = 2
@@ -92,11 +93,6 @@ class Rig:
         pixels, depth = self.project(p)
         error = np.linalg.norm(pixels - uv, axis=-1)
         return np.where(depth <= NEAR, np.where(np.isfinite(error), np.inf, np.nan), error)
-
-
-def known(points: Float) -> Bool:
-    """``[...]`` whether all coordinates of ``points [..., D]`` are finite."""
-    return np.asarray(np.isfinite(points).all(-1), np.bool_)
 
 
 def undistort_points(camera: CameraEntry, px: Float) -> Float:

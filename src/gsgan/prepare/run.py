@@ -12,15 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from gsgan.data.joints import BODY, FACE, HANDS
+from gsgan.data.joints import BODY, FACE, HANDS, known
 from gsgan.data.splits import parse_frames
+from gsgan.motion.points import read_points3d
 from gsgan.prepare import doubts, landmarks
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.mediapipe import run_tool, tool_key
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options, read_inputs
 from gsgan.prepare.pictures import Written, check_values, find_masks, write_pictures
 from gsgan.prepare.report import Outcome, write_report, write_small_files
-from gsgan.prepare.rig import Bool, Ints, Rig, camera_moves, known, undistort_points
+from gsgan.prepare.rig import Bool, Ints, Rig, camera_moves, undistort_points
 from gsgan.prepare.solve import Solution, adopt, solve
 from gsgan.prepare.sources import stamp
 from gsgan.prepare.work import Advance, Work, digest, each_camera, is_there, publish
@@ -141,7 +142,7 @@ def _solved(
 
 def _adopted(options: Options, inputs: Inputs) -> tuple[Ints, Solution]:
     """The joints of another tool."""
-    frames, p, conf = landmarks.read_points3d(options.folder("landmarks3d"))
+    frames, p, conf = read_points3d(options.folder("landmarks3d"))
     chosen = _chosen(options, frames)
     frames, p, conf = frames[chosen], p[chosen], conf[chosen]
     where, limits = inputs.calibration.path, options.doubts

@@ -9,21 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.joints import ALL, BODY, FLIP_GROUPS, HAND_PAIRS, HANDS, WRISTS
+from gsgan.data.joints import ALL, BODY, FLIP_GROUPS, HAND_PAIRS, HANDS, WRISTS, known
 from gsgan.prepare.cleanse import Cleansing, Smoothing, cleanse, smooth
 from gsgan.prepare.hands import HandMatching, match_hands, misfits
 from gsgan.prepare.landmarks import without_frozen
-from gsgan.prepare.rig import (
-    FOCAL,
-    MIN_VIEWS,
-    Bool,
-    Float,
-    Ints,
-    Refinement,
-    Rig,
-    known,
-    refine_rig,
-)
+from gsgan.prepare.rig import FOCAL, MIN_VIEWS, Bool, Float, Ints, Refinement, Rig, refine_rig
 from gsgan.prepare.triangulate import FlipSearch, Points, Triangulation, apply_flips, find_flips
 from gsgan.skeleton.hands import HAND
 

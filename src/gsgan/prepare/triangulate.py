@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.crop import NEAR
-from gsgan.prepare.rig import MIN_VIEWS, Bool, Float, Rig, known
+from gsgan.data.joints import known
+from gsgan.prepare.rig import MIN_VIEWS, Bool, Float, Rig
 from gsgan.utils.checks import above, at_least
 
 FAR = 1e6  # pixels: stands for an infinite error

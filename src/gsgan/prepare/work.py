@@ -4,65 +4,27 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import io
 import json
 import os
 import shutil
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
 from gsgan.data.formats.capture import read_capture
+from gsgan.utils.console import progress
 from gsgan.utils.errors import DataError
-from gsgan.utils.files import write_atomically
+from gsgan.utils.files import write_npz, writing
 
 T = TypeVar("T")
 Advance = Callable[[int, int], None]  # takes the number of steps done and in total
 GENERATOR = "gsgan.prepare"
 KEY_LENGTH = 12
-
-
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[None]:
-    """Turns an `OSError` (disk full, read-only, not allowed) into a `DataError` with ``path``."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(f"{path} cannot be written ({error.strerror or error})") from None
-
-
-def write_npz(path: Path, **arrays: Any) -> None:
-    """Writes an npz completely or not at all."""
-    stream = io.BytesIO()
-    np.savez_compressed(stream, **arrays)
-    with writing(path):
-        write_atomically(path, stream.getvalue())
-
-
-def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """Writes a JSON file completely or not at all; NaN becomes null."""
-    with writing(path):
-        write_atomically(path, json.dumps(_plain(content), indent=1) + "\n")
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def progress(console: Console, disable: bool = False) -> Progress:
-    """Progress bars that disappear when done: title, bar, count, remaining time."""
-    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=console, transient=True, disable=disable)
 
 
 def each_camera(

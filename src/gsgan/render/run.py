@@ -14,16 +14,17 @@ from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
 from torch import Tensor
 
-from gsgan.model.runs import CHECKPOINT
-from gsgan.prepare.work import writing
-from gsgan.render import cameras as views
-from gsgan.render.images import Background, background, eight_bits
+from gsgan.model.drive import Drive, drive_of
+from gsgan.model.runs import CHECKPOINT, Run
+from gsgan.motion.orbit import Orbit
+from gsgan.render.cameras import from_file, of_capture, of_entry, refuse_inside
 from gsgan.render.output import Output
-from gsgan.render.poses import Drive, Run, drive_of
 from gsgan.scene import Camera
 from gsgan.utils.checks import above, one_of, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
+from gsgan.utils.files import writing
+from gsgan.utils.images import Background, background, eight_bits
 from gsgan.utils.provenance import Signer
 
 STILL_SECONDS = 4.0
@@ -44,7 +45,7 @@ def render_config(config: DictConfig) -> None:
     drive = _chosen(drive_of(config, run, fps), config, fps)
     console.print(drive.text, markup=False, highlight=False, soft_wrap=True)
     cameras, index = _cameras(config, run, drive)
-    views.refuse_inside(cameras, drive.p, drive.numbers)
+    refuse_inside(cameras, drive.p, drive.numbers)
     if config.compare is not None:
         one_of("compare", config.compare, ("truth",))
         if drive.truth is None:
@@ -114,13 +115,13 @@ def _cameras(config: DictConfig, run: Run, drive: Drive) -> tuple[Camera, Tensor
     size = whole("pixels", config.pixels or trained or 512, 1)
     name = "orbit" if config.camera is None else str(config.camera)
     if name == "orbit":
-        orbit = views.Orbit(**OmegaConf.to_container(config.orbit))  # type: ignore[arg-type]
+        orbit = Orbit(**OmegaConf.to_container(config.orbit))  # type: ignore[arg-type]
         return orbit.cameras(drive.p, run.figure, run.scene, size, trained or size), None
     if (path := Path(name).expanduser()).is_file():
-        return views.from_file(path, drive.p, size), None
-    entry = views.of_capture(run.data.layout.cameras, name)
+        return from_file(path, drive.p, size), None
+    entry = of_capture(run.data.layout.cameras, name)
     crop, lens = run.data.crop, run.stored.data.get("lens") == "project"
-    return views.of_entry(entry, drive.p, size, crop, lens), None
+    return of_entry(entry, drive.p, size, crop, lens), None
 
 
 # -- images

@@ -112,7 +112,7 @@ class LiveViewer(Callback):
         if self.viewer is not None:
             self.viewer.swap(avatar)
             return
-        from gsgan.render.poses import Run
+        from gsgan.model.runs import Run
         from gsgan.view.server import Viewer
 
         run = Run(self.folder, self.config, {}, avatar, opened=self.data)

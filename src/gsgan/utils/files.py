@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
+import json
 import os
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsgan.utils.errors import DataError
 
 
 def cache_root() -> Path:
@@ -27,3 +36,34 @@ def write_atomically(path: Path, content: str | bytes) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turns an `OSError` (disk full, read-only, not allowed) into a `DataError` with ``path``."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"{path} cannot be written ({error.strerror or error})") from None
+
+
+def write_npz(path: Path, **arrays: Any) -> None:
+    """Writes an npz completely or not at all."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, **arrays)
+    with writing(path):
+        write_atomically(path, stream.getvalue())
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Writes a JSON file completely or not at all; NaN becomes null."""
+    with writing(path):
+        write_atomically(path, json.dumps(_plain(content), indent=1) + "\n")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

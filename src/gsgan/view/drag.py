@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.figure import FACE, FEET, HANDS, HIPS, SHOULDERS, middle
 from gsgan.data.joints import LEFT, RIGHT
-from gsgan.data.synthetic.character import unit
-from gsgan.data.synthetic.retarget import between
+from gsgan.motion.rotations import between, unit
 from gsgan.skeleton import HOLISTIC
 
 Float = NDArray[np.float64]

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from gsgan.model.avatar import Avatar
 from gsgan.model.painting import Painting
-from gsgan.render.images import eight_bits
 from gsgan.scene import Camera
 from gsgan.splat import rasterise
+from gsgan.utils.images import eight_bits
 
 if TYPE_CHECKING:
     from gsgan.scene import Frame

@@ -15,12 +15,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsgan.data.figure import upright
 from gsgan.model.avatar import Avatar
-from gsgan.render.cameras import Orbit
-from gsgan.render.images import background
-from gsgan.render.poses import Drive, Run, drive_of
+from gsgan.model.drive import Drive, drive_of
+from gsgan.model.runs import Run
+from gsgan.motion.orbit import Orbit
 from gsgan.utils.checks import above, between, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
+from gsgan.utils.images import background
 from gsgan.view.session import IDLE, Session, Show
 
 MEGABYTE = 1 << 20

@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from gsgan.body import SkinnedBody
 from gsgan.model.avatar import Avatar
-from gsgan.render.images import eight_bits
-from gsgan.render.poses import Drive, inputs_of, joints_of
+from gsgan.model.drive import Drive, inputs_of, joints_of
 from gsgan.scene import BodyPose, Camera, Gaussians
 from gsgan.utils.errors import GsganError
+from gsgan.utils.images import eight_bits
 from gsgan.utils.provenance import png_bytes
 from gsgan.view.drag import NAMES, dragged, position
 from gsgan.view.layers import ERROR, IMAGE, fitted, layers, shown

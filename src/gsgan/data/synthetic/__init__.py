@@ -1,5 +1,0 @@
-"""The default person: a rigged character, ray-traced from a ring of cameras on first use."""
-
-from gsgan.data.synthetic.scenes import ensure_synthetic
-
-__all__ = ["ensure_synthetic"]

@@ -1,0 +1,264 @@
+"""What drives an avatar: frames of its run, a motion file, or the subject's rest pose."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from omegaconf import DictConfig, OmegaConf
+from torch import Tensor
+
+from gsgan.data.dataset import PictureCache
+from gsgan.data.figure import BODY, EXPRESSION, HAND_JOINTS, HEELS_AND_TOES, Figure, upright
+from gsgan.data.splits import SPLITS
+from gsgan.model.avatar import Avatar
+from gsgan.model.runs import (
+    Run,
+)
+from gsgan.motion.clip import FPS, checked, completed, frame_times, is_own, resampled, up_axis
+from gsgan.motion.readers import Source, read_motion
+from gsgan.motion.retarget import expressed, face_in_head, joined, on_figure, placed
+from gsgan.scene import BodyPose, Camera, Frame, cat
+from gsgan.skeleton import complete_skeleton
+from gsgan.utils.checks import above, one_of
+from gsgan.utils.config import defaults_of
+from gsgan.utils.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    pass
+
+Float = NDArray[np.float64]
+REST = "rest"
+CACHE = 1 << 26  # bytes of decoded images, for comparisons with the ground truth
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A motion that drives the avatar.
+
+    Args:
+        p: ``[F, J, 3]`` metres, world frame; NaN where unknown. J is 33, 75 with hands, or
+            105 with hands and face.
+        visibility: ``[F, J]`` in [0, 1].
+        body: F poses of the skinned body, or None.
+        numbers: of the frames, for their file names.
+        text: one line that describes it.
+        truth: gives the dataset's frame by index, or None.
+        camera: F cameras and their indices, if the frames have their own.
+    """
+
+    p: Float
+    visibility: Float
+    body: BodyPose | None
+    numbers: list[int]
+    text: str
+    truth: Callable[[int], Frame] | None = None
+    camera: tuple[Camera, Tensor] | None = None
+
+    def rows(self, chosen: NDArray[np.int64]) -> Drive:
+        """The frames at some indices; if an index repeats, frames are numbered from 0."""
+        own = len(set(chosen.tolist())) == len(chosen)
+        at, truth, camera = torch.from_numpy(chosen), self.truth, self.camera
+        index = chosen.tolist()
+        return replace(
+            self,
+            p=self.p[chosen],
+            visibility=self.visibility[chosen],
+            body=None if self.body is None else BodyPose(self.body.theta[at], self.body.transl[at]),
+            numbers=[self.numbers[i] for i in index] if own else list(range(len(index))),
+            truth=None if truth is None else lambda place: truth(index[place]),
+            camera=None if camera is None else (_rows(camera[0], at), camera[1][at]),
+        )
+
+
+def _rows(camera: Camera, at: Tensor) -> Camera:
+    dist = None if camera.dist is None else camera.dist[at]
+    return replace(camera, K=camera.K[at], R=camera.R[at], t=camera.t[at], dist=dist)
+
+
+def drive_of(config: DictConfig, run: Run, fps: float) -> Drive:
+    """The whole motion of a config at ``fps`` frames per second.
+
+    Convention: options of `gsgan.render` that the config lacks take their defaults.
+
+    Raises:
+        ConfigError: when an option has an invalid value.
+        DataError: when the motion cannot be read.
+    """
+    defaults = defaults_of("render")
+    given = {key: value for key, value in config.items() if key in defaults}
+    config = cast(DictConfig, OmegaConf.merge(defaults, given))
+    one_of("drive", config.drive, (None, "skeleton"))
+    found = _given(config, run, fps)
+    return found if config.drive is None else replace(found, body=None)
+
+
+def _given(config: DictConfig, run: Run, fps: float) -> Drive:
+    if config.motion is None:
+        split, _ = run.data.watched
+        found = _held_out(config, run, split)
+        frame = found.numbers[0]
+        still = found.rows(np.zeros(1, np.int64))
+        return replace(still, text=f"frame {frame} of {split}, held still", truth=None, camera=None)
+    if OmegaConf.is_list(config.motion):
+        if config.retarget is False:
+            raise ConfigError("retarget=false is not supported for a list of motions")
+        clips = [_from_file(config, run, str(path), fps) for path in config.motion]
+        return _joined(clips, run.figure, float(above("transition", config.transition)), fps)
+    if config.motion == REST:
+        return rest_pose(run.figure)
+    if config.motion in SPLITS:
+        return _held_out(config, run, config.motion)
+    return _from_file(config, run, config.motion, fps)
+
+
+def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
+    """Frames of a split, seen by one camera."""
+    dataset = copy(run.data.dataset(split))
+    dataset.cache = PictureCache(CACHE)  # a run in training uses the other one at the same time
+    if not dataset.items:
+        raise DataError(f"motion={split}: the run has no such frames ({run.data.reasons[split]})")
+    names = list(dict.fromkeys(camera for camera, _ in dataset.items))
+    camera = names[0] if config.camera is None else str(config.camera)  # "7" is parsed as a number
+    own = camera in names
+    items = [item for item in dataset.items if item[0] == (camera if own else names[0])]
+    frames = [frame for _, frame in items]
+    layout, poses = dataset.layout, dataset.layout.poses
+    body = None
+    if poses is not None and run.avatar.needs_body:
+        stacked = (np.stack([part[f] for f in frames]) for part in (poses.theta, poses.transl))
+        body = BodyPose(*(torch.from_numpy(x).float() for x in stacked))
+    place = {item: i for i, item in enumerate(dataset.items)}
+    index = torch.tensor([layout.camera_names.index(items[0][0])] * len(items))
+    seen = None
+    if own:
+        views_of = [dataset.camera(item) for item in items]
+        seen = cat(views_of), index
+    return Drive(
+        p=np.stack([dataset.skeletons.p[f] for f in frames]),
+        visibility=np.stack([dataset.skeletons.visibility[f] for f in frames]),
+        body=body,
+        numbers=frames,
+        text=f"{split}: {len(frames)} frames" + f" of camera {camera}" * own,
+        truth=(lambda i: dataset[place[items[i]]]) if own else None,
+        camera=seen,
+    )
+
+
+def _joined(clips: list[Drive], figure: Figure, seconds: float, fps: float) -> Drive:
+    """Clips one after the other, with transitions of ``seconds``."""
+    if not clips:
+        raise ConfigError("motion=[] names no file; expected motion=[a.pose,b.pose]")
+    standard = upright(figure.up)
+    between = max(1, round(seconds * fps) - 1)
+    joints = max(clip.p.shape[1] for clip in clips)
+    parts = []
+    for clip in clips:  # some with hands or a face, some without
+        lacking = (0, joints - clip.p.shape[1])
+        parts.append(np.pad(clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan) @ standard.T)
+    p = joined(parts, figure, between) @ standard
+    text = "; ".join(clip.text for clip in clips) + f"; {seconds:g} s from each to the next"
+    return Drive(p, _shown(p, figure), None, list(range(len(p))), text)
+
+
+def _shown(p: Float, figure: Figure) -> Float:
+    """``[F, J]`` visibility of retargeted joints: the body's as in training, others where known."""
+    visibility = np.asarray(np.isfinite(p).all(-1), np.float64)
+    visibility[:, : len(figure.seen)] = figure.seen
+    return visibility
+
+
+def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
+    figure = run.figure
+    smpl, skeleton = config.smpl or run.body_file, config.skeleton
+    files = (None if x is None else Path(x).expanduser() for x in (smpl, skeleton))
+    source = Source(figure, *files)
+    motion = read_motion(Path(path).expanduser(), source)
+    motion = checked(motion, float(config.min_visibility))
+    rate = config.motion_fps or motion.fps
+    rate = float(above("motion_fps", rate)) if rate else FPS
+    if config.up and motion.file_up and config.up != motion.file_up:
+        raise ConfigError(
+            f"up={config.up}: the rest pose of {motion.path} has {motion.file_up} up; leave up out"
+        )
+    up = (None if motion.file_up else config.up) or motion.up or up_axis(motion)
+    choice = one_of("retarget", config.retarget, ("auto", True, False))
+    own = is_own(motion, figure) if choice == "auto" else not choice
+    if choice is False and motion.detached:
+        raise ConfigError(f"retarget=false is not supported for {motion.path}: leave retarget out")
+    # transitions need every joint
+    own = own and not motion.detached and not OmegaConf.is_list(config.motion)
+    times = frame_times(len(motion), rate, fps)
+    nearest = np.rint(times).astype(int)
+    visibility, body = motion.visibility[nearest], None
+    if own:
+        p = resampled(motion.p, rate, fps)
+        if motion.body is not None and run.avatar.needs_body:
+            at = torch.from_numpy(nearest)
+            body = BodyPose(motion.body.theta[at], motion.body.transl[at])
+    else:
+        standard = upright(figure.up)
+        centre = standard @ np.array(run.scene.centre)
+        p = completed(motion, up)
+        if p.shape[1] > EXPRESSION.start:
+            p = p if motion.detached else face_in_head(p)
+            p[:, EXPRESSION] = expressed(p[:, EXPRESSION], run.face)
+        p = on_figure(resampled(p, rate, fps), figure)
+        p = placed(p, figure, centre, fps, ground=config.ground, stay=config.stay) @ standard
+        visibility = _shown(p, figure)
+    filled = f", {_frames(motion.filled)} without shoulders or hips filled" if motion.filled else ""
+    seen = [np.isfinite(p[:, hand]).all((1, 2)).sum() for hand in HAND_JOINTS.values()]
+    hands = f", left hand in {seen[0]} frames, right hand in {seen[1]}" if p.shape[1] > BODY else ""
+    if p.shape[1] > EXPRESSION.start:
+        hands += f", face in {np.isfinite(p[:, EXPRESSION]).any((1, 2)).sum()}"
+    assumed = "" if config.motion_fps or motion.fps else " (assumed: give motion_fps)"
+    text = (
+        f"{motion.path.name}: {_frames(len(motion))} at {rate:.5g} per second{assumed}, "
+        f"{motion.unit}, {(motion.file_up or up).upper()} up -> {_frames(len(p))} at {fps:g}, "
+        + ("bones as they are" if own else "on the subject's bones")
+        + hands
+        + filled
+    )
+    return Drive(p, visibility, body, list(range(len(p))), text)
+
+
+def _frames(count: int) -> str:
+    return "1 frame" if count == 1 else f"{count} frames"
+
+
+def rest_pose(figure: Figure) -> Drive:
+    """The subject standing in a T-pose at the world's origin, feet at height 0."""
+    standing = figure.rest - [0, 0, figure.rest[list(HEELS_AND_TOES), 2].min()]
+    p = (standing @ upright(figure.up))[None]
+    return Drive(p, np.array(figure.seen, np.float64)[None], None, [0], "the rest pose")
+
+
+def joints_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor]:
+    """Joints ``[1, J, 3]`` of frame i, metres, finite, and their visibility ``[1, J]``; 0 marks a
+    stand-in. J is that of the avatar's skeleton. Both are on the avatar's device.
+
+    Raises:
+        ValueError: when fewer than three of shoulders and hips are known.
+    """
+    device = next(avatar.parameters()).device
+    p, seen = (torch.from_numpy(x[i : i + 1]).to(device) for x in (drive.p, drive.visibility))
+    return complete_skeleton(p, seen, avatar.template, avatar.limb_length_sum)
+
+
+def inputs_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor, BodyPose | None]:
+    """`joints_of`, and the body pose where the avatar needs one: the drive's, else solved.
+
+    Raises:
+        ValueError: as `joints_of`; also when a body pose must be solved and left and right are
+            swapped.
+    """
+    p, visibility = joints_of(avatar, drive, i)
+    if drive.body is not None and avatar.needs_body:
+        return p, visibility, drive.body[i : i + 1].to(p)
+    return p, visibility, avatar.body_pose(p, visibility)

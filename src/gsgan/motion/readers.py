@@ -1,0 +1,339 @@
+"""Readers of motion files, one per format."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from gsgan.body import free_body, open_body
+from gsgan.body.smpl import SkinnedModel, read_smpl
+from gsgan.data.calibration.find import METRES
+from gsgan.data.figure import EXPRESSION, HIPS, SHOULDERS, Figure
+from gsgan.data.files import read_arrays, read_json, read_json_value
+from gsgan.data.formats import smpl_motion
+from gsgan.data.formats.capture import SHAPE, read_shape
+from gsgan.data.skeletons import hips_below
+from gsgan.motion.asf import asf_of, read_amc
+from gsgan.motion.bvh import Bvh, read_bvh
+from gsgan.motion.clip import Motion, rate_of
+from gsgan.motion.points import read_points3d
+from gsgan.motion.pose_files import read_pose
+from gsgan.motion.retarget import rig_landmarks
+from gsgan.motion.standard import standard_motion
+from gsgan.scene import BodyPose
+from gsgan.skeleton import MEDIAPIPE33
+from gsgan.utils.arrays import expect_array
+from gsgan.utils.errors import ConfigError, DataError
+
+Float = NDArray[np.float64]
+
+JOINTS = len(MEDIAPIPE33.names)
+WORLD_KEYS = (
+    *("pose_world_landmarks", "poseWorldLandmarks", "world_landmarks", "worldLandmarks"),
+    "POSE_WORLD_LANDMARKS",
+)
+POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose")
+ROOT_KEYS, MOVE_KEYS = ("global_orient", "root_orient"), ("trans", "transl", "smpl_trans")
+RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
+SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
+LEG_UNITS = {"metres": 1.0, "decimetres": 0.1, "centimetres": 0.01, "inches": 0.0254}
+LEG_UNITS |= {"millimetres": 0.001, "CMU units (inches / 0.45)": 0.0254 / 0.45}
+
+
+@dataclass(frozen=True)
+class Source:
+    """What readers may need besides the file.
+
+    Args:
+        figure: the subject's proportions, for formats without face, hands and scale.
+        smpl: an SMPL or SMPL-X model file, or None.
+        skeleton: the ASF file of an AMC motion, or None for the one beside it.
+    """
+
+    figure: Figure
+    smpl: Path | None = None
+    skeleton: Path | None = None
+
+
+def read_motion(path: Path, source: Source) -> Motion:
+    """The motion in a file; its suffix decides the format.
+
+    Raises:
+        DataError: when it cannot be read, has an unknown format, or holds no motion.
+    """
+    if not path.is_file():
+        raise DataError(
+            f"motion={path} does not exist; give a file, or novel_pose or novel_view for the run's "
+            "held-out frames"
+        )
+    if path.stat().st_size == 0:
+        raise DataError(f"{path} is empty; expected a motion")
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise DataError(f"{path} has an unknown format; expected one of {', '.join(READERS)}")
+    return reader(path, source)
+
+
+# -- numpy's npz: landmarks, body poses, SMPL, MediaPipe
+
+
+def read_npz(path: Path, source: Source) -> Motion:
+    """A motion in an npz file; the names of its arrays decide the kind."""
+    keys = ("p", "conf", "theta", "betas", "visibility", *WORLD_KEYS, *POSE_KEYS, *ROOT_KEYS)
+    arrays = read_arrays(path, (*keys, *MOVE_KEYS, *RATE_KEYS))
+    rate = _first(arrays, RATE_KEYS)
+    fps = None if rate is None else rate_of(path, rate)
+    if "p" in arrays:
+        return _landmarks(path, arrays, fps)
+    if "theta" in arrays:
+        return _body_pose(path, arrays, fps, source)
+    for key in WORLD_KEYS:
+        if key in arrays:
+            p = _with_visibility(path, arrays[key], arrays.get("visibility"))
+            return Motion(path, p[..., :3], p[..., 3], fps, None, "metres")
+    if _first(arrays, POSE_KEYS) is not None:
+        return _smpl(path, arrays, fps, source)
+    raise DataError(
+        f"{path} holds no known kind of motion; expected the arrays 'p' (landmarks), 'theta' and "
+        "'transl' (body pose), 'poses' and 'trans' (SMPL, AMASS), or 'pose_world_landmarks' "
+        "(MediaPipe)"
+    )
+
+
+def _first(arrays: dict[str, NDArray[Any]], keys: tuple[str, ...]) -> Any:
+    return next((arrays[key] for key in keys if key in arrays), None)
+
+
+def _beside(path: Path) -> dict[str, Any]:
+    """The content of meta.json in the file's folder, if there is one."""
+    meta = path.with_name("meta.json")
+    return read_json(meta) if meta.is_file() else {}
+
+
+def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Motion:
+    meta = _beside(path)
+    hands, face = EXPRESSION.start, EXPRESSION.stop
+    if arrays["p"].shape[1:] not in ((JOINTS, 3), (hands, 3), (face, 3)):
+        raise DataError(
+            f"{path}: 'p' must have shape [F, {JOINTS}, 3], with hands [F, {hands}, 3], or with "
+            f"hands and face [F, {face}, 3]; got {list(arrays['p'].shape)}"
+        )
+    p = arrays["p"].astype(np.float64)
+    conf = np.ones(p.shape[:2])
+    if "conf" in arrays:
+        conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
+    conf = np.where(np.isfinite(p).all(-1), np.nan_to_num(conf), 0.0)
+    shown, body = conf[:, :JOINTS] > 0, np.nan_to_num(p[:, :JOINTS])
+    hung = shown[:, SHOULDERS].all(1) & ~shown[:, HIPS].any(1)  # people filmed from the waist up
+    if hung.any() and ((placed := hips_below(body, shown)) != body).any():
+        p[hung, :JOINTS] = np.where(shown[hung, :, None], p[hung, :JOINTS], np.nan)
+        for hip, shoulder in zip(HIPS, SHOULDERS, strict=True):
+            p[hung, hip], conf[hung, hip] = placed[hung, hip], conf[hung, shoulder]
+    scale = METRES.get(meta.get("unit", "m"), 1.0)
+    rate, up = fps or meta.get("fps"), meta.get("up_axis")
+    return Motion(path, p * scale, conf, rate, up, "metres")
+
+
+def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Motion:
+    theta = expect_array(arrays, "theta", (None, None, 3), path)
+    arrays = arrays | {k: arrays[name] for k, name in (("transl", "trans"),) if name in arrays}
+    meta = _beside(path)
+    scale = METRES.get(meta.get("unit", "m"), 1.0)
+    transl = scale * expect_array(arrays, "transl", (len(theta), 3), path)
+    fps, up = fps or meta.get("fps"), meta.get("up_axis")
+    if theta.shape[1] != len(free_body().parents):
+        flat = {"poses": theta.reshape(len(theta), -1), "trans": transl}
+        return _smpl(path, flat | {k: arrays[k] for k in ("betas",) if k in arrays}, fps, source)
+    shape = path.with_name(SHAPE)  # by gsgan.fit
+    subject = open_body("free", betas=read_shape(shape) if shape.is_file() else ())
+    assert subject is not None
+    body = BodyPose(*(torch.from_numpy(np.nan_to_num(x)).float() for x in (theta, transl)))
+    p = subject.posed_landmarks(body).double().numpy()
+    p[~np.isfinite(theta).all((1, 2)) | ~np.isfinite(transl).all(1)] = np.nan
+    return Motion(path, p, np.ones(p.shape[:2]), fps, up or "z", "metres", body=body)
+
+
+def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Motion:
+    if source.smpl is None:
+        raise DataError(
+            f"{path} holds SMPL parameters, which give joints only together with the body model: "
+            "give smpl=/path/to/SMPL_NEUTRAL.pkl or SMPLX_NEUTRAL.npz (free for research from the "
+            "model's own site, not part of gsgan)"
+        )
+    if not source.smpl.is_file():
+        raise ConfigError(f"smpl={source.smpl} does not exist; expected a .pkl or .npz file")
+    model, poses = read_smpl(source.smpl), np.asarray(_first(arrays, POSE_KEYS), np.float64)
+    poses = poses.reshape(len(poses), -1)
+    root = _first(arrays, ROOT_KEYS)
+    if root is not None and poses.shape[1] % 72:  # the root is stored separately
+        poses = np.concatenate([np.asarray(root).reshape(len(poses), 3), poses], axis=1)
+    if poses.shape[1] % 3 or poses.shape[1] < 3 * SMPL_BODY:
+        raise DataError(
+            f"{path}: the poses have {poses.shape[1]} numbers per frame; expected 3 for each of 22 "
+            "or more SMPL joints"
+        )
+    moves = _first(arrays, MOVE_KEYS)
+    moves = np.zeros((len(poses), 3)) if moves is None else np.asarray(moves, np.float64)
+    betas = np.asarray(arrays.get("betas", np.zeros(10)), np.float64)
+    betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)[: model.shapedirs.shape[-1]]
+    good = np.isfinite(poses).all(1) & np.isfinite(moves).all(1)
+    theta = _for_model(np.nan_to_num(poses).reshape(len(poses), -1, 3), model)
+    motion = smpl_motion.Motion(
+        np.arange(len(poses)),
+        theta,
+        np.nan_to_num(moves).reshape(-1, 3),
+        np.repeat(betas[None], len(poses), axis=0),
+    )
+    p, conf = smpl_motion.landmarks_of(model, motion)
+    p[~good] = np.nan
+    return Motion(path, p, conf, fps, None, "metres")
+
+
+def _for_model(theta: Float, model: SkinnedModel) -> Float:
+    """Poses ``[F, n, 3]`` of SMPL, SMPL-H (52) or SMPL-X (55) as the model's joints.
+
+    The 22 joints of the body are common to all; SMPL-X's fingers are SMPL-H's, after jaw and eyes.
+    """
+    count, found = len(model.parents), theta.shape[1]
+    out = np.zeros((len(theta), count, 3))
+    out[:, :SMPL_BODY] = theta[:, :SMPL_BODY]
+    if found == count:
+        return theta
+    if count > 24 and found > 24:
+        out[:, -30:] = theta[:, -30:]
+    return out
+
+
+# -- MediaPipe's world landmarks as JSON
+
+
+def read_mediapipe_json(path: Path, source: Source) -> Motion:
+    """MediaPipe's results per frame, as its Python, JavaScript or Android API returns them.
+
+    A frame is an object with one of `WORLD_KEYS`, or the 33 landmarks themselves; a landmark is
+    ``{x, y, z, visibility}`` or a list of these numbers.
+    """
+    content = read_json_value(path)
+    fps = content.get("fps") if isinstance(content, dict) else None
+    frames = content
+    if isinstance(content, dict):
+        lists = [
+            v for k, v in content.items() if isinstance(v, list) and k in ("frames", *WORLD_KEYS)
+        ]
+        frames = lists[0] if lists else []
+    if not isinstance(frames, list) or not frames:
+        raise DataError(
+            f"{path} holds no frames; expected a list, or an object with 'frames', of MediaPipe's "
+            "pose_world_landmarks"
+        )
+    rows = [_landmark_row(path, number, frame) for number, frame in enumerate(frames)]
+    p = np.stack(rows)
+    return Motion(
+        path, p[..., :3], p[..., 3], None if fps is None else rate_of(path, fps), None, "metres"
+    )
+
+
+def _landmark_row(path: Path, number: int, frame: Any) -> Float:
+    """``[33, 4]`` x, y, z, visibility of a frame; NaN and 0 where no person was detected."""
+    found = frame
+    if isinstance(frame, dict):
+        key = next((key for key in WORLD_KEYS if key in frame), None)
+        found = frame.get(key)
+        if key is None:
+            raise DataError(
+                f"{path}, frame {number}: no pose_world_landmarks; MediaPipe's other "
+                "landmarks are in image coordinates, without metric depth"
+            )
+    if isinstance(found, dict):
+        found = found.get("landmark", found.get("landmarks"))
+    if isinstance(found, list) and len(found) == 1:
+        found = found[0]  # the Tasks API returns a list of people
+    if not found:
+        return np.concatenate([np.full((JOINTS, 3), np.nan), np.zeros((JOINTS, 1))], axis=1)
+    try:
+        rows = [
+            [p["x"], p["y"], p["z"], p.get("visibility", 1.0)] if isinstance(p, dict)
+            else [*p[:3], p[3] if len(p) > 3 else 1.0]
+            for p in found
+        ]  # fmt: skip
+        row = np.array(rows, np.float64)
+    except (KeyError, TypeError, ValueError, IndexError):
+        row = np.zeros(0)
+    if row.shape != (JOINTS, 4):
+        raise DataError(
+            f"{path}, frame {number}: expected {JOINTS} landmarks with x, y, z; found {len(found)}"
+        )
+    return row
+
+
+def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float:
+    """``[F, 33, 4]`` from ``[F, 33, 3 or 4 or 5]`` and, in an array of its own, visibility."""
+    if points.ndim != 3 or points.shape[1] != JOINTS or points.shape[2] < 3:
+        raise DataError(
+            f"{path}: the world landmarks must have shape (any, {JOINTS}, 3 or 4), found "
+            f"{points.shape}"
+        )
+    if visibility is None:
+        visibility = points[..., 3] if points.shape[2] > 3 else np.ones(points.shape[:2])
+    if visibility.shape != points.shape[:2]:
+        raise DataError(f"{path}: 'visibility' must have shape {points.shape[:2]}")
+    return np.concatenate([points[..., :3], visibility[..., None]], axis=-1).astype(np.float64)
+
+
+# -- rigs
+
+
+def read_bvh_motion(path: Path, source: Source) -> Motion:
+    """A BVH file of a person; the unit is inferred from the length of the legs."""
+    bvh = read_bvh(path)
+    return _rig(path, bvh, None, source)
+
+
+def read_amc_motion(path: Path, source: Source) -> Motion:
+    """An AMC file and its ASF skeleton."""
+    asf = source.skeleton or asf_of(path)
+    return _rig(path, *read_amc(path, asf), source)
+
+
+def _rig(path: Path, bvh: Bvh, metres: float | None, source: Source) -> Motion:
+    standard = standard_motion(bvh, path)
+    if metres is None:
+        ratios = {
+            unit: abs(np.log(standard.leg * x / source.figure.leg)) for unit, x in LEG_UNITS.items()
+        }
+        unit = min(ratios, key=ratios.__getitem__)
+    else:
+        unit = f"units of {100 * metres:.3g} cm"
+    p = rig_landmarks(standard, source.figure)
+    seen = np.asarray(np.isfinite(p).all(-1), np.float64)
+    return Motion(path, p, seen, 1 / bvh.frame_time, "z", unit, standard.up)
+
+
+# -- triangulated and detected points
+
+
+def read_trc(path: Path, source: Source) -> Motion:
+    """Markers triangulated by Pose2Sim; other marker sets are not supported."""
+    _, p, conf = read_points3d(path)
+    fps = None
+    with suppress(ValueError, IndexError):  # read_points3d has read the header
+        names, values = (line.split() for line in path.read_text().splitlines()[1:3])
+        fps = rate_of(path, float(values[names.index("DataRate")]))
+    return Motion(path, p, conf, fps, None, "metres")
+
+
+READERS: dict[str, Callable[[Path, Source], Motion]] = {
+    ".npz": read_npz,
+    ".json": read_mediapipe_json,
+    ".bvh": read_bvh_motion,
+    ".amc": read_amc_motion,
+    ".trc": read_trc,
+    ".pose": lambda path, source: read_pose(path, source.figure),
+}

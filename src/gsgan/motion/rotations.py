@@ -1,0 +1,45 @@
+"""Rotations and directions as NumPy arrays, batched over leading dimensions."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+def unit(v: Array) -> Array:
+    """Vectors ``[..., 3]`` divided by their length."""
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)
+
+
+def rotation(axis_angle: Array) -> Array:
+    """Rotation matrices ``[..., 3, 3]`` of axis-angle vectors ``[..., 3]``, radians."""
+    R = Rotation.from_rotvec(axis_angle.reshape(-1, 3)).as_matrix()
+    return R.reshape(*axis_angle.shape[:-1], 3, 3)
+
+
+def axis_angle(R: Array) -> Array:
+    """Axis-angle vectors ``[..., 3]`` of rotation matrices ``[..., 3, 3]``, radians."""
+    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-2], 3)
+
+
+def between(a: Array, b: Array) -> Array:
+    """Smallest rotations ``[..., 3, 3]`` that take directions ``a`` to directions ``b``."""
+    axis = np.cross(unit(a), unit(b))
+    sine = np.linalg.norm(axis, axis=-1)
+    angle = np.arctan2(sine, (unit(a) * unit(b)).sum(-1))
+    return rotation(unit(axis) * angle[..., None])
+
+
+def blend(a: Array, b: Array, share: float) -> Array:
+    """Rotations on the shortest way from ``a`` to ``b``."""
+    return a @ rotation(share * axis_angle(np.swapaxes(a, -1, -2) @ b))
+
+
+def twist(R: Array, axis: int) -> Array:
+    """Angle ``[...]`` in [-π, π] of rotations about a coordinate axis, their swing left aside."""
+    q = Rotation.from_matrix(R.reshape(-1, 3, 3)).as_quat().reshape(*R.shape[:-2], 4)
+    q = q * np.where(q[..., 3:] < 0, -1, 1)
+    return np.asarray(2 * np.arctan2(q[..., axis], q[..., 3]))

@@ -1,0 +1,86 @@
+"""The free body as a character: a test scene whose exact body pose is known.
+
+Its motion is that of any other character; its file has `body_pose.npz` beside the landmarks.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from gsgan.body.free import free_body
+from gsgan.body.skinned import vertex_normals
+from gsgan.motion.character import Character, Motion, Surface
+from gsgan.motion.rig import FINGERS
+from gsgan.scene import BodyPose
+
+# Mixamo's names of the free body's joints; other joints keep their names and follow their parents.
+TRUNK = {"root": "Hips", "spine05": "Spine", "spine03": "Spine1", "spine01": "Spine2"}
+TRUNK |= {"neck01": "Neck", "head": "Head"}
+LIMBS = {"clavicle": "Shoulder", "upperarm01": "Arm", "lowerarm01": "ForeArm", "wrist": "Hand"}
+LIMBS |= {"upperleg01": "UpLeg", "lowerleg01": "Leg", "foot": "Foot", "toe1-1": "ToeBase"}
+# sRGB of skin, hair, eyes, shirt, trousers and shoes
+COLOURS = (
+    (214, 160, 128),
+    (70, 48, 34),
+    (235, 235, 230),
+    (52, 110, 168),
+    (64, 66, 88),
+    (150, 60, 48),
+)
+
+
+def mixamo_name(joint: str) -> str:
+    """Mixamo's name of a joint of the free body."""
+    if joint in TRUNK:
+        return TRUNK[joint]
+    part, _, letter = joint.partition(".")
+    side = {"L": "Left", "R": "Right"}.get(letter, "")
+    if part in LIMBS:
+        return side + LIMBS[part]
+    if match := re.fullmatch(r"finger(\d)-(\d)", part):
+        return f"{side}Hand{FINGERS[int(match[1]) - 1]}{match[2]}"
+    return joint
+
+
+def free_character() -> Character:
+    """The free body with one colour per material."""
+    body = free_body()
+    faces, vertices = body.faces.numpy(), body.vertices.double().numpy()
+    none = np.zeros(0, dtype=np.int64)
+    colours = np.full((len(COLOURS), 1, 1, 4), 255, np.uint8)
+    colours[:, 0, 0, :3] = COLOURS
+    surfaces = zip(body.surface_names, colours, strict=True)
+    return Character(
+        name="free_body",
+        vertices=vertices,
+        normals=vertex_normals(body.vertices.double(), body.faces).numpy(),
+        uv=np.zeros((len(vertices), 2)),
+        faces=faces,
+        material=body.face_surface.numpy(),
+        labels=body.face_labels.numpy(),
+        label_names=body.label_names,
+        surfaces=tuple(Surface(name, colour) for name, colour in surfaces),
+        bones=tuple(map(mixamo_name, body.joint_names)),
+        parents=np.array(body.parents),
+        joints=body.joints.double().numpy(),
+        bone_index=body.bone_index.numpy(),
+        bone_weight=body.bone_weight.double().numpy(),
+        shapes={},
+        anchor_names=(),
+        anchor_joint=none,
+        anchor_vertex=none,
+    )
+
+
+def free_pose(motion: Motion) -> BodyPose:
+    """The free body's pose at every moment of the motion of `free_character`."""
+    body, R = free_body(), motion.rotations
+    parents = np.array(body.parents)
+    local = np.where((parents < 0)[:, None, None], R, np.swapaxes(R[:, parents], -1, -2) @ R)
+    theta = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:2], 3)
+    transl = motion.joints[:, 0] - body.joints[0].double().numpy()
+    return BodyPose(torch.from_numpy(theta).float(), torch.from_numpy(transl).float())

@@ -1,0 +1,143 @@
+"""Bone and face shape names of common rigs, as those of Mixamo and a canonical set of shapes."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from gsgan.motion.rig import FINGERS, SIDES
+from gsgan.motion.rotations import Array
+
+LIMBS = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
+REQUIRED = ("Hips", "Spine", "Head", *(side + limb for side in SIDES for limb in LIMBS))
+BONES = (
+    *REQUIRED,
+    *("Spine1", "Spine2", "Neck", "Jaw"),
+    *(side + name for side in SIDES for name in ("Shoulder", "ToeBase", "ToeEnd", "Eye")),
+    *(f"{side}Hand{finger}{k}" for side in SIDES for finger in FINGERS for k in (1, 2, 3, 4)),
+)
+CANONICAL = {bone.lower(): bone for bone in BONES}
+
+VRM_LIMBS = {"shoulder": "Shoulder", "upperArm": "Arm", "lowerArm": "ForeArm", "hand": "Hand"}
+VRM_LIMBS |= {"upperLeg": "UpLeg", "lowerLeg": "Leg", "foot": "Foot", "toes": "ToeBase"}
+VRM_LIMBS |= {"eye": "Eye"}
+VRM_BONES = {"hips": "Hips", "spine": "Spine", "chest": "Spine1", "upperChest": "Spine2"}
+VRM_BONES |= {"neck": "Neck", "head": "Head", "jaw": "Jaw"}
+
+
+def vrm_bone(name: str, version: int) -> str | None:
+    """Mixamo's name of a humanoid bone of VRM; ``version`` 0 or 1 (thumbs differ)."""
+    if name in VRM_BONES:
+        return VRM_BONES[name]
+    side, rest = ("Left", name[4:]) if name.startswith("left") else ("Right", name[5:])
+    if (limb := rest[:1].lower() + rest[1:]) in VRM_LIMBS:
+        return side + VRM_LIMBS[limb]
+    match = re.fullmatch(r"(\w+?)(Metacarpal|Proximal|Intermediate|Distal)", rest)
+    if match is None:
+        return None
+    finger = {"Little": "Pinky"}.get(match[1], match[1])
+    segments = ["Proximal", "Intermediate", "Distal"]
+    if finger == "Thumb" and version == 1:
+        segments = ["Metacarpal", "Proximal", "Distal"]
+    return f"{side}Hand{finger}{segments.index(match[2]) + 1}"
+
+
+def mixamo_bone(name: str) -> str | None:
+    """Mixamo's name without prefix of a bone, None for other bones."""
+    plain = re.sub(r"^.*[:|]|^mixamorig\d*_?|[ _.-]", "", name)
+    return CANONICAL.get(re.sub(r"^mixamorig\d*", "", plain).lower())
+
+
+def humanoid_bones(names: Iterable[str | None], extensions: Mapping[str, Any]) -> dict[int, str]:
+    """Node number → Mixamo's bone name, of a document's node names and extensions."""
+    if "VRMC_vrm" in extensions:
+        bones = extensions["VRMC_vrm"]["humanoid"]["humanBones"]
+        pairs = [(bone["node"], vrm_bone(name, 1)) for name, bone in bones.items()]
+    elif "VRM" in extensions:
+        bones = extensions["VRM"]["humanoid"]["humanBones"]
+        pairs = [(bone["node"], vrm_bone(bone["bone"], 0)) for bone in bones]
+    else:
+        pairs = [(node, mixamo_bone(name or "")) for node, name in enumerate(names)]
+    found: dict[str, int] = {}
+    for node, bone in pairs:
+        if bone is not None:
+            found.setdefault(bone, node)
+    return {node: bone for bone, node in found.items()}
+
+
+def _choices(table: str) -> dict[str, tuple[dict[str, float], ...]]:
+    """Canonical shape → choices, of lines ``shape: name, 0.5*name+name``.
+
+    ``{side}`` stands for left and right, ``{S}`` for l and r.
+    """
+    shapes = {}
+    for line in table.strip().splitlines():
+        shape, names = (part.strip() for part in line.split(":"))
+        for side in ("left", "right") if "{" in names else ("",):
+            whole = f"{shape}_{side}" if side else shape
+            sums = [{plain_shape(whole): 1.0}]
+            for choice in names.format(S=side[:1], side=side).split(","):
+                terms = [term.strip().split("*") for term in choice.split("+")]
+                sums.append({term[-1]: float(term[0]) if term[1:] else 1.0 for term in terms})
+            shapes[whole] = tuple(sums)
+    return shapes
+
+
+def plain_shape(name: str) -> str:
+    """A shape's name in lower case without separators, prefix and VALID's suffix."""
+    name = re.sub(r"^.*(?=Fcl_)|^t_|_h$", "", name.split(".")[-1])
+    return re.sub(r"[ _-]", "", name).lower()
+
+
+# What a canonical shape is made of, best choice first: names as `plain_shape` writes them, of
+# gsgan's own avatars (always the first choice), VALID, ARKit, Ready Player Me, VRM and VRoid.
+SHAPES = _choices("""
+    mouth_open: jawopen, mouthopen, vrm.aa, fclmtha
+    mouth_round: kiss, mouthpucker, vrm.ou, fclmthu
+    mouth_wide: tdi, mouthstretchleft+mouthstretchright, vrm.ih, fclmthi
+    lips_pressed: mpbup+mpbdown, mouthpressleft+mouthpressright, fclmthclose
+    smile: {S}smileclose, mouthsmile{side}, 0.5*mouthsmile, 0.5*vrm.happy, 0.5*fclmthjoy
+    frown: {S}mouthsad, mouthfrown{side}, 0.5*vrm.sad, 0.5*fclmthsorrow
+    puff: {S}blow, 0.5*cheekpuff
+    blink: {S}eyeclose, eyeblink{side}, vrm.blink{side}, fcleyeclose{S}, 0.5*vrm.blink
+    wide: {S}eyeopen, eyewide{side}
+    squint: {S}squint, eyesquint{side}
+    brow_up: {S}browup+{S}{S}browup, browouterup{side}+0.5*browinnerup, 0.5*fclbrwsurprised
+    brow_down: {S}browdown+{S}{S}browdown, browdown{side}, 0.5*fclbrwangry
+""")
+WANTED = {name for choices in SHAPES.values() for choice in choices for name in choice}
+VRM0_PRESETS = {"a": "aa", "i": "ih", "u": "ou", "joy": "happy", "sorrow": "sad"}
+VRM0_PRESETS |= {"blink_l": "blinkleft", "blink_r": "blinkright"}
+
+
+def canonical_shapes(found: Mapping[str, Array]) -> dict[str, Array]:
+    """The canonical shapes ``[V, 3]`` that a file's own shapes can make."""
+    shapes = {}
+    for shape, choices in SHAPES.items():
+        for choice in choices:
+            if all(name in found for name in choice):
+                total = np.sum([weight * found[name] for name, weight in choice.items()], 0)
+                if np.abs(total).max() > 0:
+                    shapes[shape] = total
+                break
+    return shapes
+
+
+def vrm_shapes(extensions: Mapping[str, Any]) -> list[tuple[str, bool, int, int, float]]:
+    """Name, whether the next number is a node (else a mesh), that number, target and weight."""
+    rows: list[tuple[str, bool, int, int, float]] = []
+    groups = extensions.get("VRM", {}).get("blendShapeMaster", {}).get("blendShapeGroups", ())
+    for group in groups:
+        preset = str(group.get("presetName", "")).lower()
+        name = "vrm." + VRM0_PRESETS.get(preset, preset)
+        for bind in group.get("binds") or ():
+            rows.append((name, False, bind["mesh"], bind["index"], bind["weight"] / 100))
+    presets = (extensions.get("VRMC_vrm", {}).get("expressions") or {}).get("preset") or {}
+    for preset, expression in presets.items():
+        for bind in expression.get("morphTargetBinds") or ():
+            name = f"vrm.{preset.lower()}"
+            rows.append((name, True, bind["node"], bind["index"], bind["weight"]))
+    return rows

@@ -1,0 +1,247 @@
+"""Writes the synthetic dataset, once, into a cache folder.
+
+The layout is that of a capture: cameras.json, images/{cam}/%06d.png, masks/, labels/,
+landmarks3d.npz, hands3d.npz, face3d.npz, meta.json. Every image is written whole, and meta.json
+last: a dataset whose making was interrupted is not taken for complete, and continued. Tints are
+written nowhere: a model has to estimate them.
+
+Workers are separate programs rather than children of multiprocessing, which would import the
+user's main script again, and fail where it is a notebook or lacks a ``__main__`` guard.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import gsgan
+from gsgan.body.free import free_body
+from gsgan.synthetic.free_subject import free_pose
+from gsgan.synthetic.scene_setup import FREE_BODY, Scene, Settings, dataset_key
+from gsgan.synthetic.view import View
+from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.files import cache_root, write_atomically
+
+KINDS = ("images", "masks", "labels")
+BODY, HANDS = 33, 33 + 42  # landmarks up to the end of the pose's and of the hands'
+POLL_SECONDS = 0.05
+WORKER = "from gsgan.synthetic.scenes import trace_share; trace_share()"
+
+
+def ensure_synthetic(
+    *, cache: Path | None = None, workers: int = 2, progress: bool = True, **parameters: Any
+) -> Path:
+    """The synthetic dataset with these parameters: found in the cache, or made there.
+
+    Two processes may request the same dataset at once: the second waits, then finds it.
+
+    Args:
+        cache: cache folder, :func:`gsgan.utils.files.cache_root` by default.
+        workers: processes that trace; 1 traces in this one. Does not change the result.
+        progress: whether to draw a progress bar.
+        parameters: of :class:`gsgan.synthetic.scene_setup.Settings`.
+
+    Returns:
+        The dataset's folder.
+
+    Raises:
+        ConfigError: on an unknown parameter or one out of range.
+        DataError: when the folder cannot be written.
+    """
+    known = [field.name for field in fields(Settings)]
+    if unknown := sorted(set(parameters) - set(known)):
+        raise ConfigError(
+            f"synthetic data: unknown parameter {unknown[0]!r}; known are {', '.join(known)}"
+        )
+    settings = Settings(**parameters)
+    root = (cache or cache_root()) / "data" / "synthetic" / dataset_key(settings)
+    if not _is_complete(root):
+        try:
+            root.mkdir(parents=True, exist_ok=True)
+            with _locked(root.with_name(f".{root.name}.lock")):
+                if not _is_complete(root):  # else made while this process waited
+                    _write(root, settings, workers, progress)
+        except OSError as error:
+            raise DataError(
+                f"{root} cannot be written ({error}): make room, or set GSGAN_CACHE to a folder "
+                f"that you may write to"
+            ) from error
+    return root
+
+
+ensure_scene = ensure_synthetic
+"""The name under which config files request the synthetic person."""
+
+
+def _is_complete(root: Path) -> bool:
+    return (root / "meta.json").is_file()
+
+
+@contextlib.contextmanager
+def _locked(lock: Path) -> Iterator[None]:
+    """Holds a lock that the system releases when the process dies."""
+    with lock.open("w") as file:
+        # not on Windows and some network file systems: two processes then write the same files
+        with contextlib.suppress(ImportError, OSError):
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _write(root: Path, settings: Settings, workers: int, progress: bool) -> None:
+    from rich.console import Console
+    from rich.progress import Progress
+
+    scene = Scene(settings)
+    with Progress(console=Console(stderr=True), disable=not progress, transient=True) as bar:
+        count = f"{settings.frames} frames, {len(scene.views)} cameras"
+        task = bar.add_task(f"tracing the synthetic person ({count})", total=settings.frames)
+        if workers <= 1 or settings.frames == 1:
+            for frame in range(settings.frames):
+                trace_frames(root, scene, [frame])
+                bar.advance(task)
+        else:
+            last = root / "labels" / list(scene.views)[-1]
+            for _ in _trace_in_processes(root, settings, min(workers, settings.frames)):
+                bar.update(task, completed=len(list(last.glob("*.png"))))
+    _write_skeletons(root, scene)
+    cameras = {name: _calibration(view) for name, view in scene.views.items()}
+    write_atomically(root / "cameras.json", json.dumps(cameras, indent=1) + "\n")
+    write_atomically(root / "meta.json", json.dumps(_meta(scene), indent=1) + "\n")
+
+
+def _trace_in_processes(root: Path, settings: Settings, workers: int) -> Iterator[None]:
+    """Divides the frames among processes; yields from time to time until all are done.
+
+    Raises:
+        DataError: with a failed worker's last line of output.
+    """
+    environment = dict(os.environ, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    environment["PYTHONPATH"] = os.pathsep.join(p or os.getcwd() for p in sys.path)
+    command = [sys.executable, "-c", WORKER, str(root), json.dumps(asdict(settings))]
+    with tempfile.TemporaryFile("w+") as errors, contextlib.ExitStack() as stack:
+        running = []
+        for first in range(workers):
+            process = subprocess.Popen(
+                [*command, str(first), str(workers)], stderr=errors, env=environment
+            )
+            stack.callback(process.wait)
+            stack.callback(process.kill)
+            running.append(process)
+        while None in (codes := [process.poll() for process in running]) and not any(codes):
+            yield
+            time.sleep(POLL_SECONDS)
+        if any(codes):
+            errors.seek(0)
+            lines = [line.strip() for line in errors if line.strip()]
+            raise DataError(
+                f"a process tracing the synthetic person failed: "
+                f"{lines[-1] if lines else 'it was killed'}; workers=1 traces in this process"
+            )
+
+
+def trace_share() -> None:
+    """A worker's program: frames ``first, first + step, …``; argv: root, settings, first, step."""
+    import torch
+
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    root, parameters, first, step = sys.argv[1:]
+    settings = Settings(**json.loads(parameters))
+    trace_frames(Path(root), Scene(settings), range(int(first), settings.frames, int(step)))
+
+
+def trace_frames(root: Path, scene: Scene, frames: Iterable[int]) -> None:
+    """Writes images, masks and labels of the frames for all cameras, where they do not exist."""
+    for frame in frames:
+        person = None
+        for name, view in scene.views.items():
+            paths = [root / kind / name / f"{frame:06d}.png" for kind in KINDS]
+            if all(path.is_file() for path in paths):
+                continue
+            person = person or scene.posed(frame)
+            image, alpha, labels = person.render(view, scene.settings.rays_per_pixel)
+            if name in scene.tints:
+                image = scene.tints[name](image, alpha)
+            pixels = (_bytes(image[..., ::-1]), _bytes(alpha), labels.astype(np.uint8))
+            for path, content in zip(paths, pixels, strict=True):
+                encoded = cv2.imencode(".png", np.ascontiguousarray(content))[1]
+                write_atomically(path, encoded.tobytes())
+
+
+def _bytes(x: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return np.floor(255 * np.clip(x, 0, 1) + 0.5).astype(np.uint8)
+
+
+def _calibration(view: View) -> dict[str, Any]:
+    return {
+        "K": view.K.tolist(),
+        "R": view.R.tolist(),
+        "t": view.t.tolist(),
+        "dist": [0.0] * 5 if view.dist is None else view.dist.tolist(),
+        "size": [view.size[1], view.size[0]],
+    }
+
+
+def _write_skeletons(root: Path, scene: Scene) -> None:
+    names, points = scene.landmarks()
+    p, ids = points.astype(np.float32), np.arange(len(points))
+    shape = (len(p), BODY)
+    np.savez(
+        root / "landmarks3d.npz",
+        p=p[:, :BODY],
+        conf=np.ones(shape, dtype=np.float32),
+        reproj_px=np.zeros(shape, dtype=np.float32),
+        n_views=np.full(shape, len(scene.views)),
+        frame_id=ids,
+        names=np.array(names[:BODY]),
+        passage=np.array(scene.motion.passages),
+    )
+    for name, part in (("hands3d", slice(BODY, HANDS)), ("face3d", slice(HANDS, None))):
+        if names[part]:
+            np.savez(root / f"{name}.npz", p=p[:, part], frame_id=ids, names=np.array(names[part]))
+    if scene.settings.avatar == FREE_BODY:
+        pose = free_pose(scene.motion)
+        np.savez(
+            root / "body_pose.npz",
+            theta=pose.theta.numpy(),
+            transl=pose.transl.numpy(),
+            frame_id=ids,
+            joint_names=np.array(free_body().joint_names),
+        )
+
+
+def _meta(scene: Scene) -> dict[str, Any]:
+    chosen = {name: value for name, value in asdict(scene.settings).items() if value is not None}
+    splits = ("train_cameras", "test_cameras", "train_frames", "test_frames")
+    return {
+        "fps": scene.settings.frames / scene.source.duration,
+        "unit": "m",
+        "up_axis": "z",
+        "skeleton": "mediapipe33",
+        "pixel_centre": 0.5,
+        "background": "black",  # images are premultiplied: blending them again darkens edges
+        **({"body": "free"} if scene.settings.avatar == FREE_BODY else {}),
+        "label_names": list(scene.character.label_names),
+        "splits": {name: getattr(scene, name) for name in splits},
+        "made_by": {
+            "generator": "gsgan.synthetic",
+            "version": gsgan.__version__,
+            "key": dataset_key(scene.settings),
+            **chosen,
+        },
+    }

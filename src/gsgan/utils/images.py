@@ -1,0 +1,84 @@
+"""Images of a render: backgrounds, and 8-bit pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image, ImageColor, ImageOps
+from torch import Tensor
+
+from gsgan.utils.errors import ConfigError
+
+Bytes = NDArray[np.uint8]
+
+Background = Tensor | None
+
+
+def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background]:
+    """A function that gives the background ``[3, H, W]`` of an image size, or None to keep alpha.
+
+    Raises:
+        ConfigError: when it is neither a colour nor an image, or is alpha in a video.
+    """
+    if name == "alpha":
+        if video:
+            raise ConfigError("background=alpha needs PNG files: H.264 has no alpha; give a folder")
+        return lambda size: None
+    path = Path(name).expanduser()
+    if path.is_file():
+        try:
+            with Image.open(path) as opened:
+                picture = opened.convert("RGB")
+        except OSError as error:
+            raise ConfigError(f"background={name} cannot be read as an image ({error})") from None
+        return lambda size: _unit(np.asarray(ImageOps.fit(picture, size[::-1])))
+    try:
+        colour = torch.tensor(ImageColor.getrgb(name)[:3]).float() / 255
+    except ValueError:
+        raise ConfigError(
+            f"background={name} is neither a colour nor a file; give black, white, a colour name, "
+            "#rrggbb, an image file, or alpha"
+        ) from None
+    return lambda size: colour[:, None, None].expand(3, *size)
+
+
+def _unit(image: NDArray[np.uint8]) -> Tensor:
+    return torch.from_numpy(image.copy()).permute(2, 0, 1).float() / 255
+
+
+def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> NDArray[np.uint8]:
+    """An image ``[3, H, W]`` on black, composited over a background: ``[H, W, 3]``; without a
+    background, with straight alpha: ``[H, W, 4]``."""
+    image, alpha = image.clamp(0, 1), alpha.clamp(0, 1)
+    if behind is None:
+        shown = alpha >= 0.5 / 255  # elsewhere 8-bit alpha is 0, and colours would be noise
+        straight = torch.where(shown, image / alpha.clamp_min(1e-6), 0.0).clamp(0, 1)
+        image = torch.cat([straight, alpha])
+    else:
+        image = (image + (1 - alpha) * behind).clamp(0, 1)
+    return (image * 255).round().byte().permute(1, 2, 0).numpy()
+
+
+BAR = 18  # pixels of the caption above a tile
+
+
+QUALITY = 88  # of the JPEG
+
+
+def caption(image: Bytes, text: str, colour: tuple[int, int, int]) -> Bytes:
+    """The image under a bar of the colour with white text."""
+    bar = np.full((BAR, image.shape[1], 3), colour, np.uint8)
+    cv2.putText(
+        bar, text, (5, BAR - 5), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255, 255, 255), 1, cv2.LINE_AA
+    )
+    return np.concatenate([bar, image])
+
+
+def encode(image: Bytes) -> bytes:
+    """A JPEG of an RGB image."""
+    return cv2.imencode(".jpg", image[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes()

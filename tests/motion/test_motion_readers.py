@@ -1,0 +1,455 @@
+"""Every motion format gives the skeletons that were written into it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from gsgan.body.shape import free_space, shaped_body
+from gsgan.body.smpl import read_smpl
+from gsgan.data.figure import BONES, figure_of, upright
+from gsgan.motion.asf import asf_of, read_amc
+from gsgan.motion.clip import checked, completed, is_own, resampled, up_axis
+from gsgan.motion.readers import Source, read_motion
+from gsgan.motion.retarget import on_figure
+from gsgan.motion.rotations import rotation
+from gsgan.skeleton import MEDIAPIPE33
+from gsgan.utils.errors import DataError
+
+REAL = Path(__file__).parents[3] / "shared" / "data" / "motion"
+Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # of Z up: MediaPipe's image axes
+
+
+def directions(p: np.ndarray) -> np.ndarray:
+    bones = np.stack([p[:, b] - p[:, a] for a, b in BONES], axis=1)
+    return bones / np.linalg.norm(bones, axis=-1, keepdims=True)
+
+
+def standard(path: Path, figure, **source) -> tuple[np.ndarray, object]:
+    """The file's landmarks without gaps, Z up; and the motion."""
+    motion = checked(read_motion(path, Source(figure, **source)), 0.1)
+    return completed(motion, motion.up or up_axis(motion)), motion
+
+
+def write_pose(
+    path: Path,
+    parts: dict[str, tuple[list[str], np.ndarray]],
+    layout: str = "XYZC",
+    unsure: tuple[int, ...] = (),
+) -> Path:
+    """A .pose file of parts: names of points, and points ``[F, n, 3]`` with NaN where not seen."""
+    pose_format = pytest.importorskip("pose_format")
+    from pose_format.numpy import NumPyPoseBody
+    from pose_format.pose_header import PoseHeader, PoseHeaderComponent, PoseHeaderDimensions
+
+    components = [
+        PoseHeaderComponent(name, points, [(0, 1)], [(255, 0, 0)], layout)
+        for name, (points, _) in parts.items()
+    ]
+    header = PoseHeader(0.1, PoseHeaderDimensions(640, 480, 0), components)
+    q = np.concatenate([q for _, q in parts.values()], axis=1)
+    seen = np.isfinite(q).all(-1)[:, None].astype(np.float64)
+    seen[..., unsure] *= 0.4
+    with path.open("wb") as stream:
+        body = NumPyPoseBody(25, np.nan_to_num(q)[:, None], seen)
+        pose_format.Pose(header, body).write(stream)
+    return path
+
+
+def test_landmarks(tmp_path, landmarks, figure):
+    path = tmp_path / "a.npz"
+    np.savez(path, p=1000 * landmarks[..., [0, 2, 1]] * (1, 1, -1), fps=25)
+    (tmp_path / "meta.json").write_text('{"unit": "mm", "up_axis": "y"}')
+    p, motion = standard(path, figure)
+    assert motion.fps == 25
+    turned = p @ (upright("y") @ np.array([[1, 0, 0], [0, 0, 1], [0, -1.0, 0]]))
+    np.testing.assert_allclose(turned, landmarks, atol=1e-6)
+    assert is_own(motion, figure)
+
+
+def test_body_poses_of_the_free_body(tmp_path, dance, landmarks, figure):
+    path = tmp_path / "a.npz"
+    theta = dance.theta.numpy().copy()
+    np.savez(path, theta=theta, transl=dance.transl.numpy(), frame_id=np.arange(len(theta)))
+    p, motion = standard(path, figure)
+    np.testing.assert_allclose(p, landmarks, atol=1e-5)
+    assert motion.body is not None
+    theta[3, 0, 0] = np.nan
+    np.savez(path, theta=theta, transl=dance.transl.numpy())
+    p, motion = standard(path, figure)
+    assert motion.filled == 1
+    for found in (p, motion.body.theta, motion.body.transl):
+        assert np.isfinite(found).all()
+        np.testing.assert_array_equal(found[3], found[2])
+
+
+def test_body_poses_of_a_fitted_body(tmp_path, dance):
+    """gsgan.fit writes the person's shape beside the poses, in the capture's unit."""
+    shape = replace(free_space().neutral(), offsets=0.02 * torch.randn(33, 3))
+    shape.stretch[:2] = 1.3
+    np.savez(tmp_path / "body_shape.npz", **shape.arrays())
+    (tmp_path / "meta.json").write_text('{"unit": "cm", "fps": 50}')
+    path = tmp_path / "body_pose.npz"
+    np.savez(path, theta=dance.theta.numpy(), transl=100 * dance.transl.numpy())
+    posed = shaped_body(shape).posed_landmarks(dance).double()
+    own = figure_of(posed, torch.ones(posed.shape[:2], dtype=torch.bool), "z")
+    p, motion = standard(path, own)
+    np.testing.assert_allclose(p, posed, atol=1e-5)
+    assert motion.fps == 50
+    assert is_own(motion, own)
+    (tmp_path / "body_shape.npz").write_bytes(b"PK cut")
+    with pytest.raises(DataError, match=r"body_shape\.npz"):
+        standard(path, own)
+
+
+@pytest.mark.parametrize("kind", ["smpl", "smplx"])
+@pytest.mark.parametrize("numbers", [66, 72, 156, 165])
+def test_smpl_and_amass(tmp_path, shared, figure, kind, numbers):
+    from writers.smpl import write_smpl
+
+    end = "pkl" if kind == "smpl" else "npz"
+    model = shared(f"{kind}.{end}", lambda path: write_smpl(path, kind=kind))
+    path, poses = tmp_path / "a.npz", np.zeros((5, numbers))
+    poses[:, 3 * 18 + 2] = 1.5  # the left elbow
+    np.savez(path, poses=poses, trans=np.zeros((5, 3)), betas=np.zeros(16), mocap_framerate=120.0)
+    with pytest.raises(DataError, match=r"SMPL parameters.* give smpl="):
+        standard(path, figure)
+    p, motion = standard(path, figure, smpl=model)
+    assert motion.fps == 120
+    body = read_smpl(model)
+    theta = torch.zeros(1, len(body.parents), 3, dtype=torch.float64)
+    theta[0, 18, 2] = 1.5
+    shape = body.v_template.new_zeros(1, 1)
+    joints = body.posed_joints(theta, shape, shape.new_zeros(1, 3))[0].numpy()
+    at = {11: 16, 13: 18, 15: 20, 12: 17, 14: 19, 16: 21, 23: 1, 25: 4, 27: 7, 24: 2, 26: 5, 28: 8}
+    truth = np.zeros((1, 33, 3))
+    truth[0, list(at)] = joints[list(at.values())] @ upright(up_axis(motion)).T
+    np.testing.assert_allclose(directions(p)[:1], directions(truth), atol=1e-6)
+    np.savez(path, poses=poses[:, :50])
+    with pytest.raises(DataError, match="50 numbers per frame"):
+        standard(path, figure, smpl=model)
+
+
+@pytest.mark.parametrize("style", ["python", "tasks", "bare", "lists", "npz"])
+def test_mediapipe(tmp_path, landmarks, figure, style):
+    q = landmarks @ Y_DOWN.T
+    frames = [[{"x": x, "y": y, "z": z, "visibility": 0.9} for x, y, z in p] for p in q.tolist()]
+    content = {
+        "python": {
+            "fps": 25,
+            "frames": [{"pose_world_landmarks": {"landmark": f}} for f in frames],
+        },
+        "tasks": [{"worldLandmarks": [f], "landmarks": [f]} for f in frames],
+        "bare": frames,
+        "lists": q.tolist(),
+    }
+    path = tmp_path / "a.json"
+    if style == "npz":
+        path = tmp_path / "a.npz"
+        np.savez(path, pose_world_landmarks=np.concatenate([q, np.ones((12, 33, 1))], -1), fps=25)
+    else:
+        path.write_text(json.dumps(content[style]))
+    p, motion = standard(path, figure)
+    assert up_axis(motion) == "-y"
+    assert motion.fps == (25 if style in ("python", "npz") else None)
+    np.testing.assert_allclose(p @ (upright("-y") @ Y_DOWN), landmarks, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([], "holds no frames"),
+        ([{"pose_landmarks": []}], "frame 0: no pose_world_landmarks"),
+        ([{"pose_world_landmarks": [{"x": 1}] * 33}], "frame 0: expected 33 landmarks"),
+        ([{"pose_world_landmarks": [[0, 0, 0]] * 17}], "frame 0: expected 33 landmarks"),
+        ([{"pose_world_landmarks": None}], "none of 1 frames has shoulders and hips"),
+    ],
+)
+def test_bad_json(tmp_path, figure, content, message):
+    path = tmp_path / "a.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(DataError, match=message):
+        standard(path, figure)
+
+
+def test_pose2sim(tmp_path, landmarks, figure):
+    names = [n for n in MEDIAPIPE33.names if "eye" not in n]
+    shown = [f"{n[0].upper()}{n.split('_')[1]}" if "_" in n[4:] else n for n in names]
+    shown = [n if n not in ("Lfoot", "Rfoot") else n[0] + "BigToe" for n in shown]
+    lines = [
+        "PathFileType\t4\t(X/Y/Z)\ta.trc",
+        "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits",
+    ]
+    lines += [f"50\t50\t12\t{len(shown)}\tmm", "Frame#\tTime\t" + "\t\t\t".join(shown), ""]
+    for i, p in enumerate(landmarks[:, [MEDIAPIPE33.names.index(n) for n in names]]):
+        numbers = "\t".join(f"{1000 * x:.9f}" for x in p[:, [1, 2, 0]].ravel())
+        lines.append(f"{i}\t{i / 50}\t{numbers}")
+    path = tmp_path / "a.trc"
+    path.write_text("\n".join(lines))
+    p, motion = standard(path, figure)
+    assert motion.fps == 50
+    np.testing.assert_allclose(directions(p), directions(landmarks), atol=1e-6)
+    path.write_text("\n".join(lines)[:700])
+    with pytest.raises(DataError, match=r"a\.trc"):
+        standard(path, figure)
+
+
+def test_pose_files_with_axes_of_unknown_scale(tmp_path, landmarks, figure):
+    names = [n.upper() for n in MEDIAPIPE33.names]
+
+    def write(path, q, layout, name="POSE_WORLD_LANDMARKS"):
+        write_pose(path, {name: (names, q)}, layout)
+
+    path, q = tmp_path / "a.pose", landmarks @ Y_DOWN.T
+    write(path, q * (687.0, 515.0, 1.07) + 250, "XYZC")
+    p, motion = standard(path, figure)
+    assert motion.fps == 25
+    assert is_own(motion, figure)
+    turned = directions(p @ (upright("-y") @ Y_DOWN))
+    np.testing.assert_allclose(turned, directions(landmarks), atol=0.02)
+    path.write_bytes(path.read_bytes()[:4000])
+    with pytest.raises(DataError, match=r"not a valid \.pose file"):
+        standard(path, figure)
+    write(path, q[..., :2], "XYC", "pose_keypoints_2d")
+    with pytest.raises(DataError, match="pose_keypoints_2d without depth"):
+        standard(path, figure)
+
+
+def test_people_filmed_from_the_waist_up_stand_upright(tmp_path, landmarks, figure):
+    names, q = [n.upper() for n in MEDIAPIPE33.names], landmarks @ Y_DOWN.T
+    world = ("POSE_WORLD_LANDMARKS", (names, q[::-1]))
+    q[:, 23:25, 2] -= 0.5  # MediaPipe's guess
+    parts = {"POSE_LANDMARKS": (names, q * (640, 640, 1)), world[0]: world[1]}
+    p, _ = standard(write_pose(tmp_path / "a.pose", parts, unsure=(23, 24)), figure)
+    spine = p[:, 11:13].mean(1) - p[:, 23:25].mean(1)
+    np.testing.assert_allclose(spine[:, :2], 0, atol=1e-9)
+    assert (spine[:, 2] > 0.4).all()
+    across = [x[:, 11] - x[:, 12] for x in (p @ (upright("-y") @ Y_DOWN), landmarks)]
+    across = [x / np.linalg.norm(x, axis=-1, keepdims=True) for x in across]
+    assert (across[0] * across[1]).sum(-1).min() > 0.9  # image landmarks, not the world's
+
+
+def test_bvh(tmp_path, figure):
+    from mannequin import mannequin, write_bvh
+
+    from gsgan.synthetic.motion import Choreography
+
+    person = mannequin()
+    signing = Choreography(person).at(21 + np.arange(30) / 30)
+    path = write_bvh(tmp_path / "a.bvh", person, signing, 1 / 30, scale=100.0)
+    p, motion = standard(path, figure)
+    assert motion.unit == "centimetres"
+    names = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
+    at = {
+        i + 2 * k: signing.joints[:, person.bones.index(side + name)]
+        for name, i in zip(names, (11, 13, 15, 23, 25, 27), strict=True)
+        for k, side in enumerate(("Left", "Right"))
+        for i in [i - k]
+    }
+    truth = np.zeros_like(p)
+    for joint, position in at.items():
+        truth[:, joint] = position
+    # the reader turns the first frame towards -Y
+    ours, theirs = (np.arctan2(*(x[0, 23] - x[0, 24])[[1, 0]]) for x in (p, truth))
+    yaw = rotation(np.array([0, 0, theirs - ours]))
+    np.testing.assert_allclose(directions(p @ yaw.T), directions(truth), atol=1e-4)
+    q = on_figure(p, figure)
+    assert np.isfinite(q).all()
+    path.write_text(path.read_text().replace("LeftLeg", "Tentacle"))
+    with pytest.raises(DataError, match="no joint found for LeftLeg"):
+        standard(path, figure)
+
+
+BONES_OF_ASF = [  # name, parent, direction, length, dof
+    ("lhipjoint", "root", (1, 0, 0), 1.6, ""), ("rhipjoint", "root", (-1, 0, 0), 1.6, ""),
+    ("lfemur", "lhipjoint", (0, -1, 0), 7, "rx ry rz"), ("ltibia", "lfemur", (0, -1, 0), 7, "rx"),
+    ("lfoot", "ltibia", (0, 0, 1), 2, "rx rz"), ("rfemur", "rhipjoint", (0, -1, 0), 7, "rx ry rz"),
+    ("rtibia", "rfemur", (0, -1, 0), 7, "rx"), ("rfoot", "rtibia", (0, 0, 1), 2, "rx rz"),
+    ("thorax", "root", (0, 1, 0), 8, "rx ry rz"), ("head", "thorax", (0, 1, 0), 3, "rx ry rz"),
+    ("lclavicle", "thorax", (1, 0, 0), 3, ""), ("rclavicle", "thorax", (-1, 0, 0), 3, ""),
+    ("lhumerus", "lclavicle", (1, 0, 0), 5, "rx ry rz"),
+    ("lradius", "lhumerus", (1, 0, 0), 3, "rx"),
+    ("lwrist", "lradius", (1, 0, 0), 1.5, "ry"), ("lhand", "lwrist", (1, 0, 0), 1, "rx rz"),
+    ("rhumerus", "rclavicle", (-1, 0, 0), 5, "rx ry rz"),
+    ("rradius", "rhumerus", (-1, 0, 0), 3, "rx"), ("rwrist", "rradius", (-1, 0, 0), 1.5, "ry"),
+    ("rhand", "rwrist", (-1, 0, 0), 1, "rx rz"),
+]  # fmt: skip
+
+
+def write_amc(folder: Path) -> Path:
+    """A T pose, then the left upper arm turned down; its elbow's axis is the file's z."""
+    lines = [":version 1.10", ":name VICON", ":units", "  mass 1.0", "  length 0.45", "  angle deg"]
+    lines += [":root", "  order TX TY TZ RX RY RZ", "  axis XYZ", "  position 0 0 0"]
+    lines += ["  orientation 0 0 0", ":bonedata"]
+    for name, _, way, length, dof in BONES_OF_ASF:
+        axis = "0 90 0" if name == "lradius" else "0 0 0"
+        lines += [
+            "  begin",
+            "    id 1",
+            f"    name {name}",
+            f"    direction {way[0]} {way[1]} {way[2]}",
+        ]
+        lines += [f"    length {length}", f"    axis {axis} XYZ"]
+        if dof:
+            lines += [f"    dof {dof}", *(["    limits (-90 90)"] + ["           (-90 90)"] * 2)]
+        lines.append("  end")
+    lines += [":hierarchy", "  begin", "    root lhipjoint rhipjoint thorax"]
+    for parent in dict.fromkeys(b[1] for b in BONES_OF_ASF if b[1] != "root"):
+        lines.append("    " + " ".join([parent, *(b[0] for b in BONES_OF_ASF if b[1] == parent)]))
+    (folder / "07.asf").write_text("\n".join([*lines, "  end"]))
+    frames = [":FULLY-SPECIFIED", ":DEGREES"]
+    for number in (1, 2):
+        frames += [str(number), "root 0 17 0 0 0 0"]
+        for name, *_, dof in BONES_OF_ASF:
+            values = [0.0] * len(dof.split())
+            if number == 2 and name == "lhumerus":
+                values[2] = -90.0
+            if number == 2 and name == "lradius":
+                values[0] = 90.0
+            if dof:
+                frames.append(" ".join([name, *map(str, values)]))
+    path = folder / "07_01.amc"
+    path.write_text("\n".join(frames))
+    return path
+
+
+def test_amc(tmp_path, figure):
+    path = write_amc(tmp_path)
+    bvh, metres = read_amc(path, asf_of(path))
+    assert metres == pytest.approx(0.0254 / 0.45)
+    hand = bvh.positions(bvh.rotations, bvh.root)[:, bvh.names.index("lhand")]
+    np.testing.assert_allclose(hand[0], [3 + 5 + 4.5, 17 + 8, 0], atol=1e-9)
+    # C M C⁻¹ with C a quarter turn about y: about x in the bone's axes is about -z of the parent's
+    np.testing.assert_allclose(hand[1], [3 - 4.5, 17 + 8 - 5, 0], atol=1e-9)
+    p, motion = standard(path, figure)
+    assert motion.fps == 120
+    assert motion.file_up == "y"
+    along = directions(p)
+    np.testing.assert_allclose(along[0, :2], [[1, 0, 0]] * 2, atol=1e-9)
+    np.testing.assert_allclose(along[1, :2], [[0, 0, -1], [-1, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(along[:, 4:], np.tile([0, 0, -1.0], (2, 4, 1)), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("file", "damage", "message"),
+    [
+        ("07_01.amc", lambda t: t[:-40], "not a complete AMC motion .*gives"),
+        ("07_01.amc", lambda t: t.replace("lfemur", "tail"), "moves a bone tail"),
+        ("07_01.amc", lambda t: "", "is empty"),
+        ("07_01.amc", lambda t: t.replace("17", "nan"), "not finite"),
+        ("07.asf", lambda t: t[: len(t) // 2], "not a complete (ASF skeleton|AMC)"),
+        ("07.asf", lambda t: t.replace("name lhand", "nome lhand"), "'name' is missing"),
+    ],
+)
+def test_damaged_amc(tmp_path, figure, file, damage, message):
+    path = write_amc(tmp_path)
+    (tmp_path / file).write_text(damage((tmp_path / file).read_text()))
+    with pytest.raises(DataError, match=message):
+        standard(path, figure)
+
+
+def test_an_amc_without_its_skeleton(tmp_path, figure):
+    path = write_amc(tmp_path)
+    (tmp_path / "07.asf").rename(tmp_path / "x.asf")
+    standard(path, figure)  # the only one there
+    (tmp_path / "y.asf").write_text("")
+    with pytest.raises(DataError, match=r"found 2 beside it; give skeleton="):
+        standard(path, figure)
+    standard(path, figure, skeleton=tmp_path / "x.asf")
+
+
+def test_other_files(tmp_path, figure):
+    for name, content, message in (
+        ("a.fbx", b"x", r"unknown format; expected one of \.npz"),
+        ("a.npz", b"", "is empty"),
+        ("b.npz", b"PK not a zip", r"b\.npz"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(DataError, match=message):
+            standard(tmp_path / name, figure)
+    with pytest.raises(DataError, match="does not exist; give a file, or novel_pose"):
+        standard(tmp_path / "c.bvh", figure)
+    np.savez(tmp_path / "d.npz", image=np.zeros(3))
+    with pytest.raises(DataError, match="no known kind of motion"):
+        standard(tmp_path / "d.npz", figure)
+    np.savez(tmp_path / "e.npz", p=np.zeros((0, 33, 3)))
+    with pytest.raises(DataError, match="has no frames"):
+        standard(tmp_path / "e.npz", figure)
+
+
+def test_frame_rates(landmarks):
+    assert len(resampled(landmarks, 120, 30)) == 3
+    np.testing.assert_allclose(resampled(landmarks, 120, 30)[1], landmarks[4])
+    half = resampled(landmarks, 30, 60)
+    assert len(half) == 23
+    np.testing.assert_allclose(half[1], (landmarks[0] + landmarks[1]) / 2)
+    assert resampled(landmarks[:1], 24, 60).shape == (1, 33, 3)
+
+
+def test_frames_without_a_trunk(tmp_path, landmarks, figure):
+    p = landmarks.copy()
+    p[0] = p[11] = p[3] = p[4, [11, 23]] = np.nan
+    p[2, 12] = np.nan  # one shoulder of a neighbour
+    np.savez(tmp_path / "a.npz", p=p)
+    motion = checked(read_motion(tmp_path / "a.npz", Source(figure)), 0.1)
+    assert motion.filled == 4
+    np.testing.assert_array_equal(motion.p[0], landmarks[1])
+    np.testing.assert_array_equal(motion.p[11], landmarks[10])
+    np.testing.assert_allclose(motion.p[3, 15], landmarks[[2, 2, 5], 15].mean(0))
+    whole, _ = standard(tmp_path / "a.npz", figure)
+    assert np.isfinite(whole).all()
+    np.savez(tmp_path / "a.npz", p=np.full_like(p, np.nan))
+    with pytest.raises(DataError, match="none of 12 frames has shoulders and hips"):
+        standard(tmp_path / "a.npz", figure)
+
+
+def test_landmarks_from_the_waist_up(tmp_path, landmarks, figure):
+    """Hips that no frame shows are placed below the shoulders, as when a capture is opened."""
+    p = landmarks.copy()
+    p[:, 23:] = np.nan
+    np.savez(tmp_path / "a.npz", p=p)
+    whole, motion = standard(tmp_path / "a.npz", figure)
+    assert motion.filled == 0
+    assert np.isfinite(whole).all()
+    spine = np.linalg.norm(whole[:, [23, 24]].mean(1) - whole[:, [11, 12]].mean(1), axis=-1)
+    own = np.linalg.norm(figure.rest[[23, 24]].mean(0) - figure.rest[[11, 12]].mean(0))
+    np.testing.assert_allclose(spine, own, rtol=0.3)
+
+
+def test_joints_out_of_sight(tmp_path, landmarks, figure):
+    p = landmarks.copy()
+    p[3:6, 15] = np.nan  # a wrist for a moment: it moves evenly
+    p[:, 14] = np.nan  # an elbow always: the arm hangs
+    p[1:, 28] = np.nan  # an ankle that is seen once: a false guess
+    np.savez(tmp_path / "a.npz", p=p)
+    whole, _ = standard(tmp_path / "a.npz", figure)
+    assert np.isfinite(whole).all()
+    middle = (whole[4, 15] - whole[4, 13]) - (landmarks[4, 15] - landmarks[4, 13])
+    assert np.linalg.norm(middle) < 0.04
+    np.testing.assert_array_equal(whole[:, 13], landmarks[:, 13])
+    assert np.linalg.norm(whole[0, 28] - landmarks[0, 28]) > 1e-3
+    hang = directions(whole)[:, 2]
+    assert (hang[:, 2] < 0).all()
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="no motion files here")
+def test_real_files(figure):
+    for path in sorted(REAL.rglob("*.*")):
+        if path.suffix in (".bvh", ".pose") or path.name in ("02_03.amc", "03_02.amc"):
+            if path.name == "openpose.pose":
+                with pytest.raises(DataError, match="without depth"):
+                    standard(path, figure)
+                continue
+            p, _ = standard(path, figure)
+            q = on_figure(p, figure)
+            assert np.isfinite(q[:, :33]).all(), path
+            own = torch.from_numpy(q)
+            again = figure_of(own, torch.ones(own.shape[:2], dtype=torch.bool), "z")
+            lengths = [np.linalg.norm(f.rest[13] - f.rest[11]) for f in (again, figure)]
+            assert lengths[0] == pytest.approx(lengths[1], rel=1e-5), path
+            assert (q[:, 23:25, 2].mean(1) > q[:, 29:33, 2].min(1)).all(), path

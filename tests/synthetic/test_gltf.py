@@ -1,0 +1,338 @@
+"""Rigged .glb files read as characters: geometry, bones, textures, labels, landmarks, errors."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pygltflib
+import pytest
+from PIL import Image
+from tiny_glb import BONES, TinyGlb
+
+from gsgan.body.free import free_body
+from gsgan.synthetic.anchors import FACE_NAMES
+from gsgan.synthetic.gltf import avatar_names, avatar_path, read_character
+from gsgan.synthetic.humanoid import mixamo_bone, vrm_bone
+from gsgan.utils.errors import ConfigError, DataError
+
+VALID = Path(__file__).resolve().parents[3] / "shared" / "data" / "valid"
+VRM = {
+    "Hips": "hips", "Spine": "spine", "Neck": "neck", "Head": "head",
+    **{f"{side}{bone}": side.lower() + name for side in ("Left", "Right") for bone, name in {
+        "Arm": "UpperArm", "ForeArm": "LowerArm", "Hand": "Hand",
+        "UpLeg": "UpperLeg", "Leg": "LowerLeg", "Foot": "Foot"}.items()},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    return read_character(TinyGlb().write(tmp_path_factory.mktemp("glb") / "tiny.glb"))
+
+
+@pytest.fixture(scope="module", params=avatar_names())
+def avatar(request):
+    return read_character(avatar_path(request.param))
+
+
+def joint(character, bone: str) -> np.ndarray:
+    return character.joints[character.bones.index(bone)]
+
+
+def landmark(character, name: str) -> np.ndarray:
+    points = character.landmarks(character.vertices, character.joints)
+    return points[character.anchor_names.index(name)]
+
+
+def test_geometry_is_metric_upright_and_faces_minus_y(tiny) -> None:
+    np.testing.assert_allclose(tiny.vertices[:, 2].min(), 0, atol=1e-6)
+    np.testing.assert_allclose(np.ptp(tiny.vertices[:, 2]), 1.77, atol=1e-5)
+    np.testing.assert_allclose(joint(tiny, "LeftHand"), [0.7, 0, 1.42], atol=1e-5)
+    assert landmark(tiny, "left_foot_index")[1] < joint(tiny, "LeftFoot")[1] - 0.1
+    assert tiny.parents[0] == -1
+    assert (tiny.parents < np.arange(len(tiny.bones))).all()
+    np.testing.assert_allclose(tiny.bone_weight.sum(1), 1)
+    np.testing.assert_allclose(np.linalg.norm(tiny.normals, axis=1), 1)  # made: the file has none
+
+
+def test_a_sparse_morph_moves_only_its_vertices(tiny) -> None:
+    assert set(tiny.shapes) == {"mouth_open"}
+    moved = np.flatnonzero(tiny.shapes["mouth_open"].any(1))
+    assert len(moved) == 8
+    np.testing.assert_allclose(tiny.shapes["mouth_open"][moved, 2], -0.01, atol=1e-7)
+
+
+@pytest.mark.parametrize("unit", [0.01, 1.0, 3.7, 100.0])
+def test_the_unit_is_found_from_the_height(tmp_path, unit, tiny) -> None:
+    other = read_character(TinyGlb(unit=unit).write(tmp_path / "a.glb"))
+    scale = 1.7 / 1.77 if unit in (0.01, 3.7) else 1  # no usual unit: 1.7 m tall
+    np.testing.assert_allclose(other.vertices, scale * tiny.vertices, atol=1e-5)
+    np.testing.assert_allclose(other.shapes["mouth_open"], scale * tiny.shapes["mouth_open"],
+                               atol=1e-6)  # fmt: skip
+
+
+def test_another_heading_and_place_make_no_difference(tmp_path, tiny) -> None:
+    glb = TinyGlb()
+    root = pygltflib.Node(
+        name="Armature", translation=[3, 1, 2], rotation=[0, 1, 0, 0], children=[0]
+    )
+    glb.doc.nodes.append(root)
+    other = read_character(glb.write(tmp_path / "a.glb"))
+    np.testing.assert_allclose(other.vertices, tiny.vertices, atol=1e-5)
+    np.testing.assert_allclose(other.joints, tiny.joints, atol=1e-5)
+
+
+def test_quantised_positions_are_those_of_floats(tmp_path, tiny) -> None:
+    """KHR_mesh_quantization: the inverse bind matrices take integers back to metres."""
+    glb = TinyGlb()
+    x = tiny.vertices @ np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]).T
+    mesh = glb.doc.meshes[0].primitives[0]
+    quantised = np.zeros((len(x), 3), "i2")
+    quantised[:] = np.rint(x / 2 * 32767)
+    mesh.attributes.POSITION = glb.accessor(quantised, "VEC3", normalized=True)
+    bind = np.tile(np.eye(4), (len(BONES), 1, 1))
+    bind[:, :3, :3] *= 2
+    bind[:, 3, :3] = [-np.array(at) for _, at in BONES.values()]
+    glb.doc.skins[0].inverseBindMatrices = glb.accessor(bind.reshape(-1, 16).astype("f4"), "MAT4")
+    other = read_character(glb.write(tmp_path / "a.glb"))
+    np.testing.assert_allclose(other.vertices, tiny.vertices, atol=1e-4)
+
+
+def test_the_four_largest_of_eight_weights_are_kept(tmp_path) -> None:
+    glb = TinyGlb()
+    attributes = glb.doc.meshes[0].primitives[0].attributes
+    count = glb.doc.accessors[attributes.POSITION].count
+    rows = np.arange(8, dtype="u1")[None].repeat(count, 0)
+    weights = np.array([[0, 0.1, 0, 0.2, 0.05, 0.3, 0, 0.35]], "f4").repeat(count, 0)
+    for k in (0, 1):
+        joints = np.ascontiguousarray(rows[:, 4 * k : 4 * k + 4])
+        setattr(attributes, f"JOINTS_{k}", glb.accessor(joints, "VEC4"))
+        weight = np.ascontiguousarray(weights[:, 4 * k : 4 * k + 4])
+        setattr(attributes, f"WEIGHTS_{k}", glb.accessor(weight, "VEC4"))
+    character = read_character(glb.write(tmp_path / "a.glb"))
+    kept = {character.bones[k] for k in character.bone_index[0]}
+    assert kept == {list(BONES)[k] for k in (1, 3, 5, 7)}
+    np.testing.assert_allclose(character.bone_weight[0], np.array([0.35, 0.3, 0.2, 0.1]) / 0.95)
+
+
+def test_textures_factors_and_coverage(tmp_path) -> None:
+    glb = TinyGlb()
+    material = glb.doc.materials[0]
+    plain = read_character(glb.write(tmp_path / "opaque.glb")).surfaces[0]
+    assert plain.cutoff == 0
+    np.testing.assert_array_equal(plain.colour[0, 0], [200, 150, 120, 255])
+    material.alphaMode, material.alphaCutoff = "MASK", 0.3
+    colour = Image.fromarray(np.full((4, 4, 4), (180, 180, 180, 100), np.uint8))
+    material.pbrMetallicRoughness.baseColorTexture.index = glb.texture(colour, "WEBP")
+    material.pbrMetallicRoughness.baseColorFactor = [0.5, 1, 1, 0.5]
+    masked = read_character(glb.write(tmp_path / "masked.glb")).surfaces[0]
+    assert masked.cutoff == 0.3
+    np.testing.assert_allclose(masked.colour[0, 0], [132, 180, 180, 50], atol=1)  # linear halved
+
+
+def test_texture_coordinates_are_transformed(tmp_path) -> None:
+    glb = TinyGlb()
+    info = glb.doc.materials[0].pbrMetallicRoughness.baseColorTexture
+    transform = {"offset": [0.1, 0.2], "rotation": np.pi / 2, "scale": [2, 1]}
+    info.extensions = {"KHR_texture_transform": transform}
+    uv = read_character(glb.write(tmp_path / "a.glb")).uv[0]
+    np.testing.assert_allclose(uv, [0.1 + 0.25, 0.2 - 0.5], atol=1e-6)  # glTF's own matrix
+
+
+@pytest.mark.parametrize("version", [0, 1])
+def test_vrm_maps_bones_and_shapes(tmp_path, version, tiny) -> None:
+    names = {bone: f"J_{k}" for k, bone in enumerate(BONES)}
+    glb = TinyGlb(names=names)
+    glb.doc.meshes[0].extras = {}
+    mapped = {name: k for k, bone in enumerate(BONES) for name in [VRM[bone]]}
+    if version == 0:
+        bind = {"mesh": 0, "index": 0, "weight": 50}
+        glb.doc.extensions["VRM"] = {
+            "humanoid": {"humanBones": [{"bone": n, "node": k} for n, k in mapped.items()]},
+            "blendShapeMaster": {"blendShapeGroups": [{"presetName": "a", "binds": [bind]}]},
+        }
+    else:
+        bind = {"node": len(BONES), "index": 0, "weight": 0.5}
+        glb.doc.extensions["VRMC_vrm"] = {
+            "humanoid": {"humanBones": {n: {"node": k} for n, k in mapped.items()}},
+            "expressions": {"preset": {"aa": {"morphTargetBinds": [bind]}}},
+        }
+    character = read_character(glb.write(tmp_path / "a.glb"))
+    assert set(character.bones) == set(BONES)
+    np.testing.assert_allclose(character.shapes["mouth_open"], tiny.shapes["mouth_open"] / 2)
+
+
+@pytest.mark.parametrize(("name", "bone"), [
+    ("mixamorig:LeftForeArm", "LeftForeArm"), ("mixamorig9_Hips", "Hips"),
+    ("mixamorigRightHandIndex1", "RightHandIndex1"), ("LeftUpLeg", "LeftUpLeg"),
+    ("HeadTop_End", None), ("Hair1", None),
+])  # fmt: skip
+def test_names_of_mixamo(name, bone) -> None:
+    assert mixamo_bone(name) == bone
+
+
+def test_names_of_vrm_thumbs_and_fingers() -> None:
+    assert vrm_bone("leftThumbProximal", 0) == "LeftHandThumb1"
+    assert vrm_bone("leftThumbProximal", 1) == "LeftHandThumb2"
+    assert vrm_bone("rightLittleDistal", 1) == "RightHandPinky3"
+    assert vrm_bone("jaw", 1) == "Jaw"
+
+
+def test_labels_and_landmarks_without_colours_fingers_or_eyes(tiny) -> None:
+    name = np.array(tiny.label_names)[tiny.labels]
+    assert tiny.label_names == free_body().label_names
+    assert {"upper_clothes", "face_neck", "left_hand", "right_shoe"} <= set(name)
+    centre = tiny.vertices[tiny.faces].mean(1)
+    assert (centre[name == "left_hand", 0] > 0.6).all()
+    body = free_body()
+    assert tiny.anchor_names == (*body.landmark_names, *body.hand_names, *FACE_NAMES)
+    tip, knuckle = (landmark(tiny, f"left_middle_{k}") for k in ("tip", "mcp"))
+    assert tip[0] >= knuckle[0] >= joint(tiny, "LeftHand")[0]
+    np.testing.assert_allclose(landmark(tiny, "right_hip"), joint(tiny, "RightUpLeg"))
+
+
+def test_names_of_materials_decide_labels(tmp_path) -> None:
+    glb = TinyGlb()
+    glb.doc.materials[0].name = "Wolf3D_Outfit_Footwear"
+    character = read_character(glb.write(tmp_path / "a.glb"))
+    assert set(np.array(character.label_names)[character.labels]) == {"left_shoe", "right_shoe"}
+
+
+def damage(path: Path, kind: str) -> Path:
+    glb = TinyGlb()
+    if kind == "skin":
+        glb.doc.skins, glb.doc.nodes[-1].skin = [], None
+    if kind == "names":
+        glb = TinyGlb(names={bone: f"Bone.{k:03}" for k, bone in enumerate(BONES)})
+    if kind == "hand":
+        glb = TinyGlb(names={"LeftHand": "Paw"})
+    if kind == "triangles":
+        glb.doc.meshes[0].primitives[0].mode = 1
+    if kind == "image":
+        glb.doc.images[0] = pygltflib.Image(uri="skin.png")
+    if kind == "draco":
+        glb.doc.extensionsRequired = ["KHR_draco_mesh_compression"]
+    if kind == "indices":
+        glb.doc.meshes[0].primitives[0].indices = glb.accessor(
+            np.array([[0], [1], [999]], "u2"), "SCALAR"
+        )
+    if kind == "nan":
+        position = glb.doc.bufferViews[0]
+        glb.blob[position.byteOffset : position.byteOffset + 4] = np.float32("nan").tobytes()
+    if kind == "circle":
+        glb.doc.nodes[3].children = [0]
+    if kind == "accessor":
+        glb.doc.accessors[0].count = 10**6
+    glb.write(path)
+    data = path.read_bytes()
+    if kind == "truncated":
+        path.write_bytes(data[: len(data) // 2])
+    if kind == "empty":
+        path.write_bytes(b"")
+    if kind == "json":
+        path.write_bytes(data[:40] + b"\xff" * 200 + data[240:])
+    if kind == "other":
+        path.write_text('{"asset": {"version": "2.0"}}')
+    return path
+
+
+@pytest.mark.parametrize(("kind", "message"), [
+    ("missing", "no such file"), ("skin", "no skin"), ("triangles", "no triangles"),
+    ("names", "Bone.000.*do not include Hips"), ("hand", "do not include LeftHand;"),
+    ("image", "separate file"), ("draco", "Draco"), ("truncated", "truncated"),
+    ("empty", "not a binary glTF"), ("other", "not a binary glTF"), ("json", "damaged"),
+    ("indices", "damaged"), ("nan", "not numbers"), ("circle", "circle"), ("accessor", "damaged"),
+])  # fmt: skip
+def test_bad_files_end_in_one_sentence(tmp_path, kind, message) -> None:
+    path = tmp_path / "a.glb"
+    if kind != "missing":
+        damage(path, kind)
+    with pytest.raises(DataError, match=message) as error:
+        read_character(path)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_unknown_avatars_are_named() -> None:
+    assert avatar_names() == ("blouse", "polo")
+    with pytest.raises(ConfigError, match=r"'nobody'; expected blouse, polo or the path"):
+        avatar_path("nobody")
+
+
+def test_avatars_are_whole(avatar) -> None:
+    assert avatar_path(avatar.name).stat().st_size < 4e6
+    assert 1.6 < np.ptp(avatar.vertices[:, 2]) < 1.9
+    assert (avatar.labels >= 1).all()
+    parts = set(np.array(avatar.label_names)[avatar.labels])
+    assert parts >= set(avatar.label_names[1:5]) | {"left_arm", "right_hand", "left_shoe"}
+    assert avatar.surfaces[0].normal is not None
+    shapes = {"mouth_open", *(f"{k}_{s}" for k in ("smile", "blink", "brow_up", "brow_down")
+                              for s in ("left", "right"))}  # fmt: skip
+    assert shapes <= avatar.shapes.keys()
+    assert max(np.abs(v).max() for v in avatar.shapes.values()) < 0.04  # metres
+
+
+def test_sides_of_avatars(avatar) -> None:
+    """Left is +X: bones, shapes and landmarks agree."""
+    for name in ("smile", "blink", "brow_up"):
+        offsets = np.linalg.norm(avatar.shapes[f"{name}_left"], axis=1)
+        assert avatar.vertices[offsets.argmax(), 0] > 0.01, name
+    for name in avatar.anchor_names:
+        if name.startswith(("left", "mouth_left")):
+            assert landmark(avatar, name)[0] > 0.005, name
+
+
+def test_face_landmarks_of_avatars_lie_on_the_face(avatar) -> None:
+    for side in ("left", "right"):
+        eye = avatar.joints[avatar.bones.index(f"{side.capitalize()}Eye")]
+        seen = landmark(avatar, f"{side}_eye")
+        assert np.linalg.norm((seen - eye)[[0, 2]]) < 0.006
+        assert seen[1] < eye[1]
+        lids = {
+            k: landmark(avatar, f"{side}_lid_{k}") for k in ("upper", "lower", "inner", "outer")
+        }
+        assert 0.004 < lids["upper"][2] - lids["lower"][2] < 0.02
+        assert 0.02 < abs(lids["outer"][0] - lids["inner"][0]) < 0.04
+        assert landmark(avatar, f"{side}_brow_2")[2] > lids["upper"][2] + 0.005
+        assert abs(landmark(avatar, f"{side}_ear")[0]) > 0.06
+    ring = np.array([landmark(avatar, f"mouth_outer_{k}") for k in range(12)])
+    assert ring[3, 2] > ring[0, 2] > ring[9, 2]
+    assert 0.035 < ring[0, 0] - ring[6, 0] < 0.07
+    assert landmark(avatar, "nose")[1] < ring[:, 1].min()
+
+
+def test_avatars_are_their_originals() -> None:
+    """The bake moved no vertex by more than its quantisation, and kept landmarks and labels."""
+    pytest.importorskip("meshoptimizer")
+    source = VALID / "White_M_1_Casual.glb"
+    if not source.is_file():
+        pytest.skip(f"no original avatar at {source}")
+    original, baked = read_character(source), read_character(avatar_path("polo"))
+    from scipy.spatial import cKDTree
+
+    distance, _ = cKDTree(original.vertices).query(baked.vertices)
+    assert distance.max() < 5e-5
+    before, after = (c.landmarks(c.vertices, c.joints) for c in (original, baked))
+    assert np.linalg.norm(before - after, axis=1).max() < 0.003
+    body = [3, 4, 5, 6, 7, 8, 11, 12]
+    counts = [np.bincount(c.labels, minlength=13)[body] for c in (original, baked)]
+    np.testing.assert_allclose(*counts, rtol=0.02)
+
+
+def test_compressed_files_without_the_decoder_name_the_extra(monkeypatch) -> None:
+    source = VALID / "White_M_1_Casual.glb"
+    if not source.is_file():
+        pytest.skip(f"no original avatar at {source}")
+    monkeypatch.setitem(sys.modules, "meshoptimizer", None)
+    with pytest.raises(DataError, match=re.escape("pip install 'gsgan[gltf]'")):
+        read_character(source)
+
+
+def test_normal_maps_of_avatars_have_y_up(avatar) -> None:
+    """A bump's slopes are those of one surface: d(slope x)/dy = d(slope y)/dx, y up."""
+    x, y, z = np.moveaxis(avatar.surfaces[0].normal.astype(float) / 127.5 - 1, -1, 0)
+    down = np.gradient(x / np.maximum(z, 0.2), axis=0)
+    across = np.gradient(y / np.maximum(z, 0.2), axis=1)
+    assert np.corrcoef(down.ravel(), across.ravel())[0, 1] < -0.3
