@@ -1,4 +1,4 @@
-"""Hooks of mkdocs.yml: the top level's pages in the website, with links that work in both places."""
+"""Hooks of mkdocs.yml: the top level's pages in the website, with links that work there too."""
 
 from __future__ import annotations
 
@@ -9,7 +9,11 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+PAGES = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+}
 LINK = re.compile(r"(?<!!)\[([^\]]+)\]\(([^)#:]+)(#[^)]*)?\)")
 
 
@@ -29,7 +33,7 @@ def on_page_markdown(markdown: str, **_: object) -> str:
 
 
 def _at_top(link: re.Match[str]) -> str:
-    """A link of a top page: to another one, to docs/, or, where the website has no such file, its text."""
+    """A link to another top page or into docs/; its text where the website lacks the file."""
     text, target, anchor = link[1], link[2], link[3] or ""
     if target in PAGES:
         return f"[{text}]({PAGES[target]}{anchor})"
