@@ -12,6 +12,7 @@ import runpy
 import shutil
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -36,7 +37,8 @@ SMALL_BENCH = {
 }
 
 
-SIGNING = ("skeleton=holistic", "33_hands", "sign_demo", "paper_slp")  # need hands, or a face too
+# These need hands, or a face too.
+SIGNING = ("skeleton=holistic", "33_hands", "sign_demo", "paper_slp", "data=synthetic")
 FEW = {"segmentation": 2, "step_one": 2, "step_two": 4, "discriminator_start": 1, "epoch": 4}
 
 
@@ -141,10 +143,29 @@ def place(capture, run, bare, model_file, tmp_path_factory) -> Callable[[str], s
         path.write_bytes(png_bytes(Image.new("RGB", (8, 8))))
         return path
 
+    def sign(name: str) -> Path:
+        import pose_format
+        from make import skeletons
+        from pose_format.numpy import NumPyPoseBody
+        from pose_format.pose_header import PoseHeader, PoseHeaderComponent, PoseHeaderDimensions
+
+        from gsgan.skeleton import MEDIAPIPE33
+
+        p = skeletons(4)[:, None][..., [0, 2, 1]] * [1, -1, 1]  # y down
+        points = ("POSE_WORLD_LANDMARKS", [n.upper() for n in MEDIAPIPE33.names])
+        part = PoseHeaderComponent(*points, [(0, 1)], [(255, 0, 0)], "XYZC")
+        header = PoseHeader(0.1, PoseHeaderDimensions(640, 480, 0), [part])
+        path = folder() / name
+        with path.open("wb") as stream:
+            body = NumPyPoseBody(25, p, np.ones(p.shape[:3]))
+            pose_format.Pose(header, body).write(stream)
+        return path
+
     makers: dict[str, Callable[[], Path | str]] = {
         "gsgan.render run=<run folder>": lambda: f"gsgan.render run={bare}",
         "/path/to/dance.bvh": lambda: moving("dance.bvh"),
         "/path/to/walk.bvh": lambda: moving("walk.bvh"),
+        **{f"/path/to/sign_{i}.pose": partial(sign, f"sign_{i}.pose") for i in (1, 2, 3)},
         "/path/to/000000.png": rendered,
         "/path/to/run_wo_gcn": lambda: another_run("run_wo_gcn"),
         "/path/to/run_wo_seg": lambda: another_run("run_wo_seg"),
