@@ -43,6 +43,13 @@ def test_links_and_images_exist(page):
         assert not anchor or anchor in anchors(linked), f"{page.name}: {target}#{anchor}"
 
 
+def test_pages_named_in_the_code_exist():
+    for folder in ("src", "conf", "scripts"):
+        for path in (p for p in (ROOT / folder).rglob("*") if p.suffix in (".py", ".yaml", ".sh")):
+            for page in re.findall(r"docs/[a-z_/]+\.md", path.read_text()):
+                assert (ROOT / page).exists() or page == "docs/results/gpu.md", f"{path}: {page}"
+
+
 def test_pages_are_short():
     words = {page: len(page.read_text().split()) for page in [ROOT / "README.md", *WRITTEN]}
     assert words[ROOT / "README.md"] <= 900
