@@ -26,13 +26,18 @@ HERE = Path(__file__).parent
 
 
 def main(name: str, run: Callable[[DictConfig, Path], None]) -> None:
-    """Runs a benchmark with the options of ``<name>.yaml``, changed by ``key=value`` arguments."""
+    """Runs a benchmark with the options of ``<name>.yaml``, changed by ``key=value`` arguments; any
+    other argument, such as ``--help``, prints the options."""
     options = OmegaConf.load(HERE / f"{name}.yaml")
     OmegaConf.set_struct(options, value=True)
+    changes = [word for word in sys.argv[1:] if "=" in word]
     try:
-        config = OmegaConf.merge(options, OmegaConf.from_cli())
+        config = OmegaConf.merge(options, OmegaConf.from_cli(changes))
         assert isinstance(config, DictConfig)
-        run(config, Path(config.out))
+        if len(changes) < len(sys.argv[1:]):
+            print(OmegaConf.to_yaml(config))
+        else:
+            run(config, Path(config.out))
     except OmegaConfBaseException as error:
         sys.exit(f"gsgan: {str(error).splitlines()[0]}")
     except GsganError as error:

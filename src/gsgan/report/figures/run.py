@@ -41,6 +41,7 @@ FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot]], Drawing]] = {
     "segmentation": images.segmentation,
     "training": images.training,
 }
+TRIMMED: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.02}
 COMPARE = ("comparison", "ablation")  # need a second run
 
 
@@ -78,7 +79,7 @@ def make_figures(config: DictConfig) -> None:
                 continue
             for kind in formats:
                 stream = io.BytesIO()
-                made[name].figure.savefig(stream, format=kind, metadata=METADATA[kind])
+                made[name].figure.savefig(stream, format=kind, metadata=METADATA[kind], **TRIMMED)
                 write_atomically(out / f"{name}.{kind}", stream.getvalue())
     if not made:
         raise ConfigError(f"no figure could be made: {'; '.join(lines)}")
