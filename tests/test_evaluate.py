@@ -64,7 +64,7 @@ def test_images_of_a_run_score_as_the_run_does(run, painted, given, inside):
         for metric in ("psnr", "psnr_person", "ssim", "ssim_person"):
             a, b = (x[split]["full"][metric] for x in (own, others))
             assert a == pytest.approx(b, abs=0.05)
-        assert variants["full"]["miou_reason"] == "predictions are pictures, not a segmentation"
+        assert variants["full"]["miou_reason"] == "predictions are images, not a segmentation"
         assert variants["full"]["images"] == own[split]["full"]["images"]
     facts, runs = (json.loads((f / "facts.json").read_text()) for f in (out, run))
     for key in ("name", "fingerprint"):  # where it lies may have been another folder

@@ -38,7 +38,10 @@ def test_the_box_is_round_the_posed_vertices_where_there_is_a_mesh(data):
 def test_else_it_is_round_the_seen_joints_with_a_larger_margin_and_says_so(data):
     boxes, frame = BodyBoxes(data), data.dataset("train")[1]
     boxes.body = None
-    assert "20 cm round the joints, asked for: 5 cm round the vertices" in boxes.departures[0]
+    assert (
+        "20 cm around the joints; the protocol requires 5 cm around the vertices"
+        in boxes.departures[0]
+    )
     seen = torch.ones_like(frame.visibility)
     seen[0, 0] = 0
     away = frame.skeleton.clone()

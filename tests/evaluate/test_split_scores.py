@@ -250,7 +250,7 @@ def test_miou_of_a_split_without_parts_is_none():
         scorer(),
     )
     assert found.variants[FULL]["miou"] is None
-    assert found.variants[FULL]["miou_reason"] == "the truth holds no part"
+    assert found.variants[FULL]["miou_reason"] == "the ground truth has no part"
 
 
 def test_lpips_in_the_persons_box_sees_that_box_alone():

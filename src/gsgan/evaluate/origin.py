@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
 DIRTY = "+changes"
-# Scores that differ in one of these do not share a table.
+# Scores that differ in one of these are not in one table.
 SAME = ("method", "model", "protocol", "seed", "iterations", "version", "commit", "dirty")
 
 

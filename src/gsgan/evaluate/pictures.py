@@ -17,7 +17,7 @@ from gsgan.scene import Frame
 from gsgan.utils.files import write_atomically
 
 CAPTION_HEIGHT = 22
-ERROR_GAIN = 4.0  # errors are small and shown brighter by this factor
+ERROR_GAIN = 4.0  # errors are small: they are shown brighter by this factor
 
 
 def error_heat(image: Tensor, target: Tensor) -> Tensor:

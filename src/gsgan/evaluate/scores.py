@@ -1,4 +1,4 @@
-"""Scores of images and segmentations, and of a split: each frame predicted, prepared, scored."""
+"""Scores of images and segmentations, and of all frames of a split."""
 
 from __future__ import annotations
 
@@ -165,7 +165,7 @@ class SplitScores:
     Args:
         variants: ``{variant: {metric: value}}`` as in metrics.json; empty without frames.
         rows: one per variant and image.
-        hidden_outline: a ground-truth mask stood in for the alpha of a prediction.
+        hidden_outline: a ground-truth mask was used as the alpha of a prediction.
         grid: rows of images to show, from `gsgan.evaluate.pictures.grid_rows`.
     """
 
@@ -301,7 +301,7 @@ def _variant(
     if matrices:
         parts = miou(torch.stack(list(matrices.values())).sum(0))
         result |= parts
-        result |= {f"{m}_reason": "the truth holds no part" for m in parts if parts[m] is None}
+        result |= {f"{m}_reason": "the ground truth has no part" for m in parts if parts[m] is None}
     else:
         result |= no_scores(PART_METRICS, no_parts)
     cameras = {}
