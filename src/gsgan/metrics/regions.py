@@ -243,8 +243,11 @@ def mouth_corners(template: SkeletonTemplate) -> list[int]:
 
 
 def mouth_square(corners: Tensor, camera: Camera) -> Tensor:
-    """``[B, 4, 2]`` pixels at the sides of a square across the view around the mouth's corners ``[B,
-    2, 3]``, whose size does not depend on the direction of the head."""
+    """``[B, 4, 2]`` pixels at the sides of a square across the view.
+
+    The square is around the mouth's corners ``[B, 2, 3]``; its size does not depend on the
+    direction of the head.
+    """
     left, right = corners.unbind(1)
     half = MOUTH_SIDE / 2 * (left - right).norm(dim=-1)[:, None, None] * camera.R[:, :2]
     middle = corners.mean(dim=1, keepdim=True)

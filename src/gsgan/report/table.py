@@ -351,7 +351,7 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
     found = [list(row.cells) for row in rows]
     for i, metric in enumerate(part.columns.values()):
         sign = {"↑": -1, "↓": 1}.get(METRICS[metric].better)
-        means = [cells[i].mean for cells in found if cells[i].mean is not None]
+        means = [mean for cells in found if (mean := cells[i].mean) is not None]
         if len(means) < 2:
             continue
         best = min(means, key=lambda mean: abs(mean - 1) if sign is None else sign * mean)
