@@ -18,7 +18,7 @@ from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import read_colour
 from gsgan.data.formats.consistency import Consistency
 from gsgan.data.formats.easymocap import EasymocapReader
-from gsgan.data.formats.smpl_motion import Motion, posed
+from gsgan.data.formats.smpl_motion import SmplMotion, posed
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
 from gsgan.data.validation import Thresholds
@@ -102,7 +102,7 @@ def test_fits_give_skeletons_and_poses(written: Path, subject: Subject, smpl_fil
         for held in (layout.poses.theta, layout.poses.transl)
     )
     betas = np.repeat(subject.shapes[None], len(theta), 0)
-    motion = Motion(np.array(subject.frames), theta, transl, betas)
+    motion = SmplMotion(np.array(subject.frames), theta, transl, betas)
     assert np.allclose(posed(subject.model, motion)[0], subject.vertices, atol=1e-6)
     assert layout.meta.skeleton_source == "smpl24 -> mediapipe33"
     assert layout.meta.body is not None

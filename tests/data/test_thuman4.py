@@ -16,7 +16,7 @@ from writers.smplx_rig import SmplxSubject
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import read_colour
 from gsgan.data.formats.consistency import Consistency
-from gsgan.data.formats.smpl_motion import Motion, posed
+from gsgan.data.formats.smpl_motion import SmplMotion, posed
 from gsgan.data.formats.smplx_rig import read_motion
 from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.pixels import read_mask, read_unsure
@@ -60,7 +60,7 @@ def test_skeletons_and_poses_are_those_that_were_written(
         assert np.array_equal(layout.landmarks.visibility[frame], conf)
         face = s.params["expression"][i : i + 1].astype(np.float64)
         theta, transl = layout.poses.theta[frame][None], layout.poses.transl[frame][None]
-        motion = Motion(np.array([frame]), theta, transl, s.params["betas"].astype(float), face)
+        motion = SmplMotion(np.array([frame]), theta, transl, s.params["betas"].astype(float), face)
         assert np.allclose(posed(s.model, motion)[0][0], s.vertices[i], atol=1e-6)
     meta = layout.meta
     assert (meta.skeleton_source, meta.up_axis, meta.fps) == ("smplx -> mediapipe33", "-z", 30)

@@ -21,7 +21,7 @@ from gsgan.body.smpl_names import CIHP
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import frame_files, natural_order
 from gsgan.data.formats.consistency import Consistency, box_iou, mask_box
-from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
+from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, posed
 from gsgan.data.formats.zju import camera_folders, frame_number, read_annots
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_labels, read_mask
@@ -62,7 +62,7 @@ def check_poses(layout: Layout, subject: Subject, blend: bool = True) -> None:
         for held in (layout.poses.theta, layout.poses.transl)
     )
     betas = np.repeat(subject.shapes[None], len(theta), 0)
-    motion = Motion(np.array(subject.frames), theta, transl, betas)
+    motion = SmplMotion(np.array(subject.frames), theta, transl, betas)
     assert np.allclose(posed(subject.model, motion, blend)[0], subject.vertices, atol=1e-6)
 
 
@@ -242,7 +242,7 @@ def test_landmarks_from_few_vertices_are_those_of_all(subject: Subject) -> None:
     betas = np.repeat(subject.shapes[None], 4, 0)
     theta = subject.poses.reshape(4, 24, 3).copy()
     theta[:, 0] = subject.Rh
-    motion = Motion(np.arange(4), theta, subject.Th, betas)
+    motion = SmplMotion(np.arange(4), theta, subject.Th, betas)
     for blend in (True, False):
         vertices, joints = posed(subject.model, motion, blend)
         expected, conf = to_mediapipe33(joints, vertices)

@@ -173,7 +173,7 @@ def test_the_subjects_own_motion_is_left_alone(render, capture, tmp_path):
 def test_the_up_axis_of_a_rig_is_that_of_its_rest_pose(render, tmp_path):
     from mannequin import mannequin, write_bvh
 
-    from gsgan.synthetic.motion import Choreography
+    from gsgan.synthetic.posing import Choreography
 
     person = mannequin()
     signing = Choreography(person).at(21 + np.arange(2) / 30)

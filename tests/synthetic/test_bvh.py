@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from mannequin import mannequin, write_bvh
 
-from gsgan.motion.character import Motion
+from gsgan.motion.character import Animation
 from gsgan.motion.rig import REQUIRED
 from gsgan.motion.rotations import axis_angle, rotation
 from gsgan.motion.standard import ROOM, known_joints
-from gsgan.synthetic.motion import Choreography
-from gsgan.synthetic.motion_file import BvhMotion
+from gsgan.synthetic.bvh_motion import BvhMotion
+from gsgan.synthetic.posing import Choreography
 from gsgan.utils.errors import DataError
 
 STEP = 1 / 30
@@ -45,13 +45,13 @@ def whole(tmp_path_factory, person, signing):
     return write_bvh(tmp_path_factory.mktemp("bvh") / "a.bvh", person, signing, STEP).read_text()
 
 
-def travelling(person, metres: float) -> Motion:
+def travelling(person, metres: float) -> Animation:
     """A body that glides over the floor at a constant speed, without moving a joint."""
     frames = 60
     joints = np.repeat(person.joints[None], frames, axis=0)
     joints[..., 1] -= np.linspace(0, metres, frames)[:, None]
     eye = np.broadcast_to(np.eye(3), (frames, len(person.bones), 3, 3))
-    return Motion(eye, joints, {}, ("glide",) * frames)
+    return Animation(eye, joints, {}, ("glide",) * frames)
 
 
 def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tiny_characters import character
 
-from gsgan.motion.character import Motion
+from gsgan.motion.character import Animation
 from gsgan.synthetic.secondary import LIMIT, Secondary
 
 BONES = ("Hips", "LeftUpLeg", "LeftLeg", "LeftFoot")
@@ -59,7 +59,7 @@ class Swing:
         for child in range(1, len(BONES)):
             up = R[:, child - 1]
             joints[:, child] = joints[:, child - 1] + up @ (rest[child] - rest[child - 1])
-        return Motion(R, joints, {}, ("swing",) * F)
+        return Animation(R, joints, {}, ("swing",) * F)
 
 
 def frame(c, secondary, motion, time):

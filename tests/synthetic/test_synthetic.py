@@ -18,7 +18,7 @@ from gsgan.data.datamodule import GsganData
 from gsgan.scene import BodyPose
 from gsgan.synthetic import ensure_synthetic, scenes
 from gsgan.synthetic.free_subject import free_pose
-from gsgan.synthetic.scene_setup import Scene, Settings, dataset_key
+from gsgan.synthetic.scene_setup import Scene, SceneSettings, dataset_key
 from gsgan.synthetic.trace import PosedCharacter
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root
@@ -144,7 +144,7 @@ def test_the_baked_avatars_have_landmarks_labels_and_no_body_pose(avatar, tmp_pa
 @pytest.mark.parametrize("avatar", EACH_AVATAR)
 def test_landmarks_of_the_baked_avatars_lie_on_their_parts(avatar):
     """Both eyes and the mouth on the face, wrists on arms or hands, toes on shoes."""
-    scene = Scene(Settings(**TINY | {"avatar": avatar, "size": 160, "train_cameras": 2}))
+    scene = Scene(SceneSettings(**TINY | {"avatar": avatar, "size": 160, "train_cameras": 2}))
     names, points = scene.landmarks()
     expected = {"left_eye": "face", "mouth_left": "face", "nose": "face", "left_thumb": "hand"}
     expected |= {"right_index": "hand", "left_foot_index": "shoe", "right_heel": "shoe"}
@@ -158,7 +158,7 @@ def test_landmarks_of_the_baked_avatars_lie_on_their_parts(avatar):
 
 @pytest.mark.slow
 def test_left_and_right_labels_lie_on_left_and_right_landmarks():
-    scene = Scene(Settings(**TINY | {"size": 96, "frames": 8}))
+    scene = Scene(SceneSettings(**TINY | {"size": 96, "frames": 8}))
     names, hits = free_body().label_names, 0
     points = scene.landmarks()[1]
     for frame in range(0, 8, 2):
@@ -172,7 +172,7 @@ def test_left_and_right_labels_lie_on_left_and_right_landmarks():
 
 
 def test_person_is_in_view_and_fills_it():
-    scene = Scene(Settings(avatar="free_body", secondary=False, frames=24, test_frames=6))
+    scene = Scene(SceneSettings(avatar="free_body", secondary=False, frames=24, test_frames=6))
     top, bottom = [], []
     for frame in range(24):
         vertices = scene.mesh(frame)[0]
@@ -186,7 +186,7 @@ def test_person_is_in_view_and_fills_it():
 
 
 def test_test_cameras_are_between_training_cameras():
-    scene = Scene(Settings(avatar="free_body", secondary=False, frames=2, test_frames=1))
+    scene = Scene(SceneSettings(avatar="free_body", secondary=False, frames=2, test_frames=1))
     angle = {
         name: math.atan2(view.centre[0], -view.centre[1]) for name, view in scene.views.items()
     }
@@ -205,12 +205,12 @@ def test_bytes_do_not_depend_on_workers(dataset, tmp_path):
 
 
 def test_another_seed_gives_another_motion():
-    one, two = (Scene(Settings(**TINY, seed=seed)).motion for seed in (0, 1))
+    one, two = (Scene(SceneSettings(**TINY, seed=seed)).motion for seed in (0, 1))
     assert np.abs(one.rotations - two.rotations).max() > 0.1
 
 
 def test_without_secondary_motion_the_mesh_is_skinned_and_landmarks_stay():
-    still, moving = (Scene(Settings(**TINY | {"secondary": on})) for on in (False, True))
+    still, moving = (Scene(SceneSettings(**TINY | {"secondary": on})) for on in (False, True))
     vertices, _, wrinkles = still.mesh(1)
     assert wrinkles is None
     exact = free_body().posed_vertices(free_pose(still.motion))[1].numpy()
@@ -247,7 +247,7 @@ def test_an_interrupted_dataset_is_continued(dataset, tmp_path, monkeypatch):
         patch.setattr(PosedCharacter, "render", stops)
         with pytest.raises(KeyboardInterrupt):
             tiny(tmp_path)
-    root = folder(tmp_path) / dataset_key(Settings(**TINY))
+    root = folder(tmp_path) / dataset_key(SceneSettings(**TINY))
     assert len(images(root, "labels")) == 2
     assert not (root / "meta.json").exists()
     first = root / "images" / "cam00" / "000000.png"
@@ -297,28 +297,28 @@ def test_cache_root_follows_the_environment(monkeypatch, tmp_path):
 
 
 def test_key_depends_on_every_parameter():
-    base = dataset_key(Settings())
+    base = dataset_key(SceneSettings())
     changed = [
-        Settings(size=64),
-        Settings(train_cameras=5),
-        Settings(test_cameras=1),
-        Settings(frames=61),
-        Settings(test_frames=14),
-        Settings(rays_per_pixel=5),
-        Settings(seed=1),
-        Settings(avatar="free_body"),
-        Settings(secondary=False),
-        Settings(lens=(0.1, 0, 0, 0)),
-        Settings(lens=(0.1, 0, 0, 0, 0)),
-        Settings(tint=0.1),
-        Settings(tint=0.2),
-        Settings(gloss=0.1),
-        Settings(test_scale=(2.0,)),
-        Settings(test_scale=(2.0,), tint=0.1),
+        SceneSettings(size=64),
+        SceneSettings(train_cameras=5),
+        SceneSettings(test_cameras=1),
+        SceneSettings(frames=61),
+        SceneSettings(test_frames=14),
+        SceneSettings(rays_per_pixel=5),
+        SceneSettings(seed=1),
+        SceneSettings(avatar="free_body"),
+        SceneSettings(secondary=False),
+        SceneSettings(lens=(0.1, 0, 0, 0)),
+        SceneSettings(lens=(0.1, 0, 0, 0, 0)),
+        SceneSettings(tint=0.1),
+        SceneSettings(tint=0.2),
+        SceneSettings(gloss=0.1),
+        SceneSettings(test_scale=(2.0,)),
+        SceneSettings(test_scale=(2.0,), tint=0.1),
     ]
     assert len({base, *map(dataset_key, changed)}) == 1 + len(changed)
     assert dataset_key(changed[-1]).endswith("-tint-test_scale")
-    assert base == dataset_key(Settings())
+    assert base == dataset_key(SceneSettings())
 
 
 @pytest.mark.parametrize("parameters", [{"avatar": "mine.glb"}, {"motion": "mine.bvh"}])

@@ -10,10 +10,10 @@ import pytest
 
 from gsgan.data.crop import Crop, distort, take, undistort_map
 from gsgan.data.datamodule import GsganData
-from gsgan.synthetic.scene_setup import AVATARS, Scene, Settings, dataset_key
+from gsgan.synthetic.camera import undistort
+from gsgan.synthetic.scene_setup import AVATARS, Scene, SceneSettings, dataset_key
 from gsgan.synthetic.scenes import ensure_scene
 from gsgan.synthetic.tint import Tint, make_tints
-from gsgan.synthetic.view import undistort
 from gsgan.utils.errors import ConfigError
 
 LENS = (-0.28, 0.09, 0.001, -0.0008, -0.01)
@@ -43,7 +43,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def stage():
-    return Scene(Settings(**TINY))
+    return Scene(SceneSettings(**TINY))
 
 
 def images(root, kind, camera):
@@ -55,9 +55,9 @@ def images(root, kind, camera):
 
 
 def test_options_without_effect_give_the_default_persons_folder():
-    nothing = Settings(**TINY, lens=[0.0] * 5, tint=0, gloss=0, test_scale=[])
-    assert nothing == Settings(**TINY)
-    assert dataset_key(nothing) == dataset_key(Settings(**TINY))
+    nothing = SceneSettings(**TINY, lens=[0.0] * 5, tint=0, gloss=0, test_scale=[])
+    assert nothing == SceneSettings(**TINY)
+    assert dataset_key(nothing) == dataset_key(SceneSettings(**TINY))
 
 
 def test_person_and_motion_of_a_variant_are_the_default_ones(scene):
@@ -92,7 +92,7 @@ def test_distort_is_opencvs_model():
 
 
 def test_the_ray_of_a_points_pixel_hits_the_point(stage):
-    views = Scene(Settings(**TINY, lens=LENS)).views
+    views = Scene(SceneSettings(**TINY, lens=LENS)).views
     points = stage.mesh(0)[0][::700]
     for view in views.values():
         assert view.dist is not None
@@ -108,8 +108,8 @@ def test_distorted_images_undistort_to_those_of_the_pinholes():
     """At a size at which textures are several pixels wide: undistorting averages neighbours."""
     lens = (-0.5, 0.15, 0.003, -0.002, -0.01)
     settings = {**TINY, "size": 160, "avatar": AVATARS[0]}  # of textures
-    straight = Scene(Settings(**settings))
-    bent = Scene(Settings(**settings, lens=lens))
+    straight = Scene(SceneSettings(**settings))
+    bent = Scene(SceneSettings(**settings, lens=lens))
     person = straight.posed(1)
     image, alpha, _ = person.render(straight.views["cam00"], 9)
     view = bent.views["cam00"]
@@ -138,7 +138,7 @@ def test_the_reader_finds_the_lens(scene):
 @pytest.mark.parametrize("lens", [(-2.0, 0, 0, 0, 0), (0, 0, 0, 0, -9.0)])
 def test_a_lens_that_folds_back_is_refused(lens):
     with pytest.raises(ConfigError, match="folds back"):
-        Scene(Settings(**TINY, lens=lens))
+        Scene(SceneSettings(**TINY, lens=lens))
 
 
 # ---------------------------------------------------------------- tints
@@ -205,7 +205,7 @@ def test_scaled_test_cameras_see_the_person_at_their_scale(scene, stage):
     data = GsganData(root=str(root))
     layout, p = data.layout, stage.mesh(0)[0][::500]
     middle = np.array([24.0, 24.0])
-    views = Scene(Settings(**TINY, test_scale=(0.5, 2.0))).views
+    views = Scene(SceneSettings(**TINY, test_scale=(0.5, 2.0))).views
     for scale in (0.5, 2.0):
         twin = f"cam03_x{scale:g}"
         assert layout.cameras[twin].K[0, 0] == scale * layout.cameras["cam03"].K[0, 0]

@@ -11,6 +11,7 @@ from tiny_characters import character, from_above, from_front, plain, square
 
 from gsgan.motion.character import Surface
 from gsgan.synthetic import trace
+from gsgan.synthetic.camera import SceneCamera, pixel_offsets, pixel_rays
 from gsgan.synthetic.textures import Textures, linear
 from gsgan.synthetic.trace import (
     Appearance,
@@ -21,7 +22,6 @@ from gsgan.synthetic.trace import (
     encode,
     majority,
 )
-from gsgan.synthetic.view import View, pixel_offsets, pixel_rays
 
 GREY = 0.21586  # linear light of sRGB 128
 MATT = Light(direction=(0, 3, 4), sun=(0.4, 0.3, 0.2), sky=(0.3,) * 3, ground=(0.1,) * 3,
@@ -66,7 +66,7 @@ def test_shading_matches_the_formula():
 
 
 def test_the_back_of_cloth_is_lit_on_its_own_side():
-    below = View(from_above().K, np.eye(3), np.array([0, 0, 1.0]), (20, 20))
+    below = SceneCamera(from_above().K, np.eye(3), np.array([0, 0, 1.0]), (20, 20))
     image, alpha, _ = posed(character([square(1.0, 0.5)])).render(below, 1)
     assert alpha[10, 10] == 1
     np.testing.assert_allclose(image[10, 10], encode(np.full(3, GREY * 0.1)), rtol=2e-4)

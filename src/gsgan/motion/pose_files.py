@@ -12,7 +12,7 @@ from scipy.optimize import nnls
 
 from gsgan.data.joints import FACE_MESH
 from gsgan.data.proportions import BONES, EARS, HAND_JOINTS, HIPS, SHOULDERS, Proportions, length
-from gsgan.motion.clip import Motion, rate_of
+from gsgan.motion.clip import Clip, rate_of
 from gsgan.motion.retarget import steadied
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.face import rest_face
@@ -36,7 +36,7 @@ FACE_LENGTHS = tuple(
 LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))  # rigid, for the scale of axes
 
 
-def read_pose(path: Path, subject: Proportions) -> Motion:
+def read_pose(path: Path, subject: Proportions) -> Clip:
     """MediaPipe's landmarks in a file of the ``pose-format`` package.
 
     Image landmarks with MediaPipe's depth, which agree with those of the hands; without any, world
@@ -107,7 +107,7 @@ def read_pose(path: Path, subject: Proportions) -> Motion:
         ours = list(FACE_MESH.values())
         p = np.concatenate([p, steadied(mesh)[:, ours]], axis=1)
         visibility = np.concatenate([visibility, face[1][:, ours]], axis=1)
-    return Motion(path, p, visibility, rate_of(path, pose.body.fps), None, unit, detached=True)
+    return Clip(path, p, visibility, rate_of(path, pose.body.fps), None, unit, detached=True)
 
 
 def _to_metres(

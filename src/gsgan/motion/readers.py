@@ -22,7 +22,7 @@ from gsgan.data.proportions import EXPRESSION, HIPS, SHOULDERS, Proportions
 from gsgan.data.skeletons import hips_below
 from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.bvh import Bvh, read_bvh
-from gsgan.motion.clip import Motion, rate_of
+from gsgan.motion.clip import Clip, rate_of
 from gsgan.motion.points import read_points3d
 from gsgan.motion.pose_files import read_pose
 from gsgan.motion.retarget import rig_landmarks
@@ -62,7 +62,7 @@ class Source:
     skeleton: Path | None = None
 
 
-def read_motion(path: Path, source: Source) -> Motion:
+def read_motion(path: Path, source: Source) -> Clip:
     """The motion in a file; its suffix decides the format.
 
     Raises:
@@ -84,7 +84,7 @@ def read_motion(path: Path, source: Source) -> Motion:
 # -- numpy's npz: landmarks, body poses, SMPL, MediaPipe
 
 
-def read_npz(path: Path, source: Source) -> Motion:
+def read_npz(path: Path, source: Source) -> Clip:
     """A motion in an npz file; the names of its arrays decide the kind."""
     keys = ("p", "conf", "theta", "betas", "visibility", *WORLD_KEYS, *POSE_KEYS, *ROOT_KEYS)
     arrays = read_arrays(path, (*keys, *MOVE_KEYS, *RATE_KEYS))
@@ -97,7 +97,7 @@ def read_npz(path: Path, source: Source) -> Motion:
     for key in WORLD_KEYS:
         if key in arrays:
             p = _with_visibility(path, arrays[key], arrays.get("visibility"))
-            return Motion(path, p[..., :3], p[..., 3], fps, None, "metres")
+            return Clip(path, p[..., :3], p[..., 3], fps, None, "metres")
     if _first(arrays, POSE_KEYS) is not None:
         return _smpl(path, arrays, fps, source)
     raise DataError(
@@ -117,7 +117,7 @@ def _beside(path: Path) -> dict[str, Any]:
     return read_json(meta) if meta.is_file() else {}
 
 
-def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Motion:
+def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     meta = _beside(path)
     hands, face = EXPRESSION.start, EXPRESSION.stop
     if arrays["p"].shape[1:] not in ((JOINTS, 3), (hands, 3), (face, 3)):
@@ -138,10 +138,10 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Motion:
             p[hung, hip], conf[hung, hip] = placed[hung, hip], conf[hung, shoulder]
     scale = METRES.get(meta.get("unit", "m"), 1.0)
     rate, up = fps or meta.get("fps"), meta.get("up_axis")
-    return Motion(path, p * scale, conf, rate, up, "metres")
+    return Clip(path, p * scale, conf, rate, up, "metres")
 
 
-def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Motion:
+def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Clip:
     theta = expect_array(arrays, "theta", (None, None, 3), path)
     arrays = arrays | {k: arrays[name] for k, name in (("transl", "trans"),) if name in arrays}
     meta = _beside(path)
@@ -157,10 +157,10 @@ def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: So
     body = BodyPose(*(torch.from_numpy(np.nan_to_num(x)).float() for x in (theta, transl)))
     p = subject.posed_landmarks(body).double().numpy()
     p[~np.isfinite(theta).all((1, 2)) | ~np.isfinite(transl).all(1)] = np.nan
-    return Motion(path, p, np.ones(p.shape[:2]), fps, up or "z", "metres", body=body)
+    return Clip(path, p, np.ones(p.shape[:2]), fps, up or "z", "metres", body=body)
 
 
-def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Motion:
+def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Clip:
     if source.smpl is None:
         raise DataError(
             f"{path} holds SMPL parameters, which give joints only together with the body model: "
@@ -185,7 +185,7 @@ def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source)
     betas = np.median(betas.reshape(-1, betas.shape[-1]), axis=0)[: model.shapedirs.shape[-1]]
     good = np.isfinite(poses).all(1) & np.isfinite(moves).all(1)
     theta = _for_model(np.nan_to_num(poses).reshape(len(poses), -1, 3), model)
-    motion = smpl_motion.Motion(
+    motion = smpl_motion.SmplMotion(
         np.arange(len(poses)),
         theta,
         np.nan_to_num(moves).reshape(-1, 3),
@@ -193,7 +193,7 @@ def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source)
     )
     p, conf = smpl_motion.landmarks_of(model, motion)
     p[~good] = np.nan
-    return Motion(path, p, conf, fps, None, "metres")
+    return Clip(path, p, conf, fps, None, "metres")
 
 
 def _for_model(theta: Float, model: SkinnedModel) -> Float:
@@ -214,7 +214,7 @@ def _for_model(theta: Float, model: SkinnedModel) -> Float:
 # -- MediaPipe's world landmarks as JSON
 
 
-def read_mediapipe_json(path: Path, source: Source) -> Motion:
+def read_mediapipe_json(path: Path, source: Source) -> Clip:
     """MediaPipe's results per frame, as its Python, JavaScript or Android API returns them.
 
     A frame is an object with one of `WORLD_KEYS`, or the 33 landmarks themselves; a landmark is
@@ -235,7 +235,7 @@ def read_mediapipe_json(path: Path, source: Source) -> Motion:
         )
     rows = [_landmark_row(path, number, frame) for number, frame in enumerate(frames)]
     p = np.stack(rows)
-    return Motion(
+    return Clip(
         path, p[..., :3], p[..., 3], None if fps is None else rate_of(path, fps), None, "metres"
     )
 
@@ -290,19 +290,19 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
 # -- rigs
 
 
-def read_bvh_motion(path: Path, source: Source) -> Motion:
+def read_bvh_motion(path: Path, source: Source) -> Clip:
     """A BVH file of a person; the unit is inferred from the length of the legs."""
     bvh = read_bvh(path)
     return _rig(path, bvh, None, source)
 
 
-def read_amc_motion(path: Path, source: Source) -> Motion:
+def read_amc_motion(path: Path, source: Source) -> Clip:
     """An AMC file and its ASF skeleton."""
     asf = source.skeleton or asf_of(path)
     return _rig(path, *read_amc(path, asf), source)
 
 
-def _rig(path: Path, bvh: Bvh, metres: float | None, source: Source) -> Motion:
+def _rig(path: Path, bvh: Bvh, metres: float | None, source: Source) -> Clip:
     standard = standard_motion(bvh, path)
     if metres is None:
         ratios = {
@@ -314,23 +314,23 @@ def _rig(path: Path, bvh: Bvh, metres: float | None, source: Source) -> Motion:
         unit = f"units of {100 * metres:.3g} cm"
     p = rig_landmarks(standard, source.subject)
     seen = np.asarray(np.isfinite(p).all(-1), np.float64)
-    return Motion(path, p, seen, 1 / bvh.frame_time, "z", unit, standard.up)
+    return Clip(path, p, seen, 1 / bvh.frame_time, "z", unit, standard.up)
 
 
 # -- triangulated and detected points
 
 
-def read_trc(path: Path, source: Source) -> Motion:
+def read_trc(path: Path, source: Source) -> Clip:
     """Markers triangulated by Pose2Sim; other marker sets are not supported."""
     _, p, conf = read_points3d(path)
     fps = None
     with suppress(ValueError, IndexError):  # read_points3d has read the header
         names, values = (line.split() for line in path.read_text().splitlines()[1:3])
         fps = rate_of(path, float(values[names.index("DataRate")]))
-    return Motion(path, p, conf, fps, None, "metres")
+    return Clip(path, p, conf, fps, None, "metres")
 
 
-READERS: dict[str, Callable[[Path, Source], Motion]] = {
+READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".npz": read_npz,
     ".json": read_mediapipe_json,
     ".bvh": read_bvh_motion,

@@ -1,6 +1,6 @@
 """The synthetic scene in numbers: its parameters, cameras, character and motion.
 
-Everything here follows from :class:`Settings` alone: worker processes rebuild the scene from them.
+Everything here follows from :class:`SceneSettings` alone: workers rebuild the scene from them.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from numpy.typing import NDArray
 from gsgan.body.free import free_body
 from gsgan.data.cameras import DISTORTION_LENGTHS
 from gsgan.motion.character import Character
-from gsgan.synthetic.choreography import EVERYDAY, frame_times, held_out
+from gsgan.synthetic.bvh_motion import BvhMotion
+from gsgan.synthetic.camera import SceneCamera, look_at, through_lens, zoomed
+from gsgan.synthetic.choreography import EVERYDAY, held_out
+from gsgan.synthetic.controls import frame_times
 from gsgan.synthetic.free_subject import free_character, free_pose
 from gsgan.synthetic.gltf import avatar_names, avatar_path, read_character
-from gsgan.synthetic.motion import Choreography
-from gsgan.synthetic.motion_file import BvhMotion
+from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.secondary import Moving, Secondary
 from gsgan.synthetic.signs import SIGNS, split_signs
 from gsgan.synthetic.tint import make_tints
 from gsgan.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles
-from gsgan.synthetic.view import View, look_at, through_lens, zoomed
 from gsgan.utils.errors import ConfigError, DataError
 
 Array = NDArray[np.float64]
@@ -52,7 +53,7 @@ RANGES = {
 
 
 @dataclass(frozen=True)
-class Settings:
+class SceneSettings:
     """The parameters of a synthetic dataset, as in conf/data/synthetic.yaml.
 
     Together with `VERSION` they determine every byte. Effects without effect are stored as None.
@@ -133,7 +134,7 @@ def _require(holds: bool, message: str) -> None:
         raise ConfigError(f"synthetic data: {message}")
 
 
-def dataset_key(settings: Settings) -> str:
+def dataset_key(settings: SceneSettings) -> str:
     """Name of a dataset in the cache: its main parameters and a hash of all of them.
 
     Files count by their content, not by their path.
@@ -179,7 +180,7 @@ class Scene:
         DataError: when the avatar's or the motion's file cannot be used.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SceneSettings) -> None:
         self.settings, self.light = settings, Light(gloss=settings.gloss or 0.0)
         self.character = character = load_character(settings.avatar)
         self.appearance = Appearance(character)
@@ -281,7 +282,7 @@ def extent(
     return np.concatenate([thinned.skinned(R, joints)[0] for R, joints in poses])
 
 
-def ring(settings: Settings, points: Array) -> list[View]:
+def ring(settings: SceneSettings, points: Array) -> list[SceneCamera]:
     """Cameras around the person, training cameras first, zoomed to keep ``points`` in view."""
     n, low, high = settings.train_cameras, points.min(axis=0), points.max(axis=0)
     middle = (low + high) / 2
@@ -293,7 +294,7 @@ def ring(settings: Settings, points: Array) -> list[View]:
     return [look_at(a, h, middle, points, settings.size) for a, h in train + test]
 
 
-def front(settings: Settings, points: Array) -> list[View]:
+def front(settings: SceneSettings, points: Array) -> list[SceneCamera]:
     """Cameras on an arc before the person, training cameras first, zoomed to ``points``."""
     n, middle = settings.train_cameras, (points.min(axis=0) + points.max(axis=0)) / 2
     step = ARC / n

@@ -221,8 +221,8 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
         registered = frozenset(whole_frame_ids(found, str(path)).tolist())
 
     parts = [("theta", "transl")]
-    if "theta_hands" in arrays:  # fits before 2026-11-23 share the translation
-        parts.append(("theta_hands", "transl_hands" if "transl_hands" in arrays else "transl"))
+    if "theta_hands" in arrays:
+        parts.append(("theta_hands", "transl_hands"))
     values = [
         tuple(
             expect_array(arrays, name, shape, path).astype(np.float64)
