@@ -36,6 +36,7 @@ from gsgan.utils.pickles import read_npy
 Files = dict[str, dict[int, str]]
 """Paths relative to the root, by camera and frame."""
 
+ANNOTS = ("annots.npy", "annots_new.npy")
 MILLIMETRES = 1e-3
 NAMED_FRAME = re.compile(r"\)_(\d+)")  # CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592
 MASKS = {"mask_cihp": "label", "mask": "nonzero"}
@@ -178,13 +179,13 @@ class Annots(NamedTuple):
 
 
 def read_annots(root: Path) -> Annots:
-    """The content of annots.npy.
+    """The content of the first of `ANNOTS` that exists; that of some copies lists no images.
 
     Raises:
         DataError: when there is none, it is damaged, or its cameras are not complete.
     """
-    path = root / "annots.npy"
-    if not path.exists():
+    path = next((root / name for name in ANNOTS if (root / name).exists()), None)
+    if path is None:
         raise DataError(
             f"{root} is not a ZJU-MoCap subject: it has no annots.npy (copies that other projects "
             "prepared are not supported)"
@@ -196,6 +197,8 @@ def read_annots(root: Path) -> Annots:
     ims = _entries(content.get("ims"))
     names = _entries(ims[0].get("ims")) if ims and isinstance(ims[0], Mapping) else []
     folders = [str(PurePosixPath(str(name).replace("\\", "/")).parent) for name in names]
+    if not ims:
+        folders = [f"images/{p.name}" for p in sorted(root.glob("images/*")) if p.is_dir()]
     lists = [*(_entries(cams.get(key)) for key in "KRTD"), folders]
     if len({len(entries) for entries in lists}) != 1 or not folders:
         counts = zip(lists, (*"KRTD", "image folders"), strict=True)
