@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from writers.avatarrex import SERIALS, write_avatarrex
-from writers.common import write_picture
 from writers.smplx_rig import SmplxSubject
 
 from gsgan.data.files import read_colour
@@ -50,11 +49,6 @@ def test_read_equals_written(root: Path, smplx_subject: SmplxSubject, smplx_file
         p, conf = to_mediapipe33(s.joints[i], s.vertices[i], "smplx")
         assert np.allclose(layout.landmarks.p[frame][conf > 0], p[conf > 0], atol=1e-5)
     assert layout.meta.layout == "AvatarReX"
-
-
-def test_other_folders_beside_the_cameras_do_no_harm(root: Path, smplx_file: Path) -> None:
-    write_picture(root / "smpl_pos_map" / "00000000.jpg", np.zeros((4, 4), np.uint8))
-    assert read(root, smplx_file).camera_names == SERIALS
 
 
 def test_the_list_of_missing_files_is_optional_and_names_serials(

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from writers.common import Subject, write_picture
 from writers.easymocap import (
     NAMES,
@@ -21,7 +20,6 @@ from writers.easymocap import (
     write_people,
 )
 
-from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import read_colour
 from gsgan.data.formats.consistency import Consistency
 from gsgan.data.formats.easymocap import EasymocapReader
@@ -171,14 +169,6 @@ def test_pictures_and_masks_are_those_that_were_written(written: Path, subject: 
             assert np.array_equal(mask, np.where(subject.labels[i][c] > 0, 255, 0))
             image = read_colour(layout.image_path(name, frame)).astype(int)
             assert np.abs(image - subject.images[i][c]).mean() < 12
-
-
-def test_pictures_are_undistorted(written: Path, subject: Subject) -> None:
-    """The body's vertices, projected without a lens, land on the mask seen through one."""
-    frame = CaptureDataset(read(written), [("10", 1)])[0]
-    points = torch.from_numpy(subject.vertices[1]).float()[None]
-    u, v = frame.camera.project(points)[0][0].floor().long().T
-    assert frame.mask[0, 0][v.clamp(0, 39), u.clamp(0, 39)].mean() > 0.9
 
 
 def test_the_config_reads_it_in_worker_processes(written: Path, smpl_file: Path, compose) -> None:

@@ -39,13 +39,6 @@ def test_skeletons_have_75_joints(root: Path) -> None:
     assert data.info.body_height == plain.info.body_height
 
 
-def test_lengths_are_in_the_captures_unit(tmp_path: Path) -> None:
-    root = write_tiny_capture(tmp_path, unit="mm")
-    p = write_hands(root, 4, per_metre=1000)
-    _, (frame, _) = every_frame(root)
-    np.testing.assert_allclose(frame.skeleton[0, 33:], p[0], atol=1e-6)
-
-
 def test_a_missing_hand_is_not_seen_and_hangs_on_the_forearm(root: Path) -> None:
     p = write_hands(root, 4)
     p[:, :21] = np.nan
@@ -68,13 +61,6 @@ def test_frames_without_a_row_have_no_hands(root: Path) -> None:
     assert int(frame.frame_id) == 0
     assert not frame.visibility[0, 33:].any()
     assert frame.visibility[0, :33].all()
-
-
-def test_a_capture_in_which_no_hand_was_found_trains_without(root: Path) -> None:
-    np.savez(root / "hands3d.npz", p=np.full((4, 42, 3), np.nan), frame_id=np.arange(4))
-    _, (frame, _) = every_frame(root)
-    assert frame.skeleton.isfinite().all()
-    assert not frame.visibility[0, 33:].any()
 
 
 def test_a_capture_without_hands_is_refused_by_name(root: Path) -> None:

@@ -132,10 +132,6 @@ def test_the_share_of_a_mask_beyond_all_joints() -> None:
     assert np.isnan(mask_beyond(mask, camera, joints[2:], 0.3))
 
 
-def test_frames_are_left_out(root: Path) -> None:
-    assert CaptureReader(drop_frames="1")(root, Thresholds()).frames == (0, 2)
-
-
 def test_the_share_of_joints_inside_a_mask() -> None:
     K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
     camera = CameraEntry("c", K, np.eye(3), np.zeros(3), np.zeros(8), (100, 100))
@@ -171,15 +167,6 @@ def test_the_config_passes_its_settings(root: Path, compose) -> None:
     config = compose("train", "data=capture", f"data.root={root}")
     with pytest.raises(DataError, match="joints lie outside the masks"):
         _ = instantiate(config.data).layout
-
-
-def test_timestamps_are_no_frame_numbers(root: Path) -> None:
-    with np.load(root / "landmarks3d.npz") as held:
-        arrays = dict(held)
-    arrays["frame_id"] = arrays["frame_id"] + 1_700_000_000_123
-    np.savez(root / "landmarks3d.npz", **arrays)
-    with pytest.raises(DataError, match="frame_id 1700000000125 is a time stamp"):
-        read(root)
 
 
 def test_joint_distance_in_metres():

@@ -15,7 +15,7 @@ from gsgan.data.formats.capture import read_capture
 from gsgan.data.layout import Layout
 from gsgan.data.metric_variants import CHOICES, MetricVariants
 from gsgan.data.protocol import Protocol
-from gsgan.data.splits import camera_name, make_splits, parse_frames, protocol_splits
+from gsgan.data.splits import parse_frames, protocol_splits
 from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -150,11 +150,6 @@ def test_frames_by_subject() -> None:
         replace(protocol, subject=378).frames("test")
 
 
-def test_camera_names_and_indices(layout: Layout) -> None:
-    assert camera_name(layout, 2, "p") == "cam02"
-    assert camera_name(layout, "cam02", "p") == "cam02"
-
-
 def test_departures_are_said() -> None:
     same = replace(ONE, scale=0.5)
     assert list(same.departures(lpips_net="vgg", scale=0.5)) == []
@@ -185,16 +180,6 @@ def test_the_data_follows_the_protocol_and_records_it(root: Path) -> None:
     cut = GsganData(str(root), size=16, crop="person", protocol=ONE).protocol_record("vgg")
     assert cut is not None
     assert len(cut["departures"]) == 1
-
-
-def test_splits_are_given_once(root: Path) -> None:
-    data = GsganData(str(root), protocol=ONE, test_cameras=["cam02"])
-    with pytest.raises(ConfigError, match="protocol one sets the splits"):
-        data.setup()
-
-
-def test_without_a_protocol_nothing_changes(layout: Layout) -> None:
-    assert make_splits(layout).train_frames == tuple(range(8))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,6 @@ from writers.common import Subject, make_subject, write_object, write_picture
 
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.files import frame_files
 from gsgan.data.formats.consistency import Consistency, box_iou, mask_box
 from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, posed
 from gsgan.data.formats.zju import ZjuReader, camera_folders, frame_number, read_annots
@@ -116,33 +114,6 @@ def test_the_original_release_is_read_as_it_was_written(
     assert (meta.body.kind, meta.body.file) == ("smpl", str(smpl_file))
     assert np.allclose(meta.body.betas, subject.shapes)
     assert meta.label_names == CIHP
-
-
-def test_the_mouth_that_smpl_does_not_know_is_masked_and_not_zero(
-    written: Path, smpl_file: Path
-) -> None:
-    frame = frame_of(read(written, smpl_file), 0, 0)
-    assert frame.visibility[0, 9:11].tolist() == [0, 0]
-    assert (frame.skeleton[0, 9:11].norm(dim=-1) > 0.1).all()
-    assert (frame.visibility[0, [11, 12, 23, 24]] == 1).all()
-
-
-def test_undistorted_pictures_meet_the_pinhole_camera(
-    written: Path, subject: Subject, smpl_file: Path
-) -> None:
-    """The body's vertices, projected without a lens, land on the mask that was seen through one."""
-    layout = read(written, smpl_file)
-    for c in range(3):
-        frame = frame_of(layout, c, 1)
-        assert frame.camera.dist is None
-        vertices = torch.from_numpy(subject.vertices[1]).float()[None]
-        pixels, _ = frame.camera.project(vertices)
-        u, v = pixels[0].floor().long().clamp(0, 39).unbind(-1)
-        near = torch.nn.functional.max_pool2d(frame.mask, 3, 1, 1)[0, 0]
-        assert near[v, u].mean() > 0.99
-        assert set(frame.mask.unique().tolist()) <= {0.0, 1.0}  # nearest: no value is invented
-        assert frame.labels is not None
-        assert set(frame.labels.unique().tolist()) <= {*range(20), 255}
 
 
 def test_the_outline_of_the_labels_is_ignored_as_wide_as_asked(
@@ -317,15 +288,6 @@ def test_boxes() -> None:
     assert mask_box(mask) is None
     mask[2:4, 5:7] = 255
     assert mask_box(mask) == (5, 2, 7, 4)
-
-
-def test_files_are_found_by_number(tmp_path: Path) -> None:
-    assert frame_files(tmp_path, "none", (".png",)) == {}
-    (tmp_path / "a").mkdir()
-    for name in ("f_10.png", "f_2.PNG", ".f_3.png", "f_4.txt"):
-        (tmp_path / "a" / name).touch()
-    assert frame_files(tmp_path, "a", (".png",)) == {10: "a/f_10.png", 2: "a/f_2.PNG"}
-    assert re.fullmatch(r"a/f_\d+\.\w+", frame_files(tmp_path, "a", (".png",))[2])
 
 
 # -- runs

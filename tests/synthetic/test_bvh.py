@@ -170,14 +170,12 @@ def test_a_file_without_a_required_joint(tmp_path, person, signing):
     [
         (lambda text: text[: len(text) // 2], "numbers found"),
         (lambda text: text[:300], "HIERARCHY and MOTION"),
-        (lambda text: text.replace("Frames: 60", "Frames: 0"), "0 frames"),
         (lambda text: text.replace("Frames: 60", "Frames: 61"), "61 frames"),
         (lambda text: text.replace("Frame Time: 0.0", "Frame Time: nan 0.0"), "numbers found"),
         (lambda text: text[:-30] + " nan" + text[-20:], "numbers found|not finite|could not"),
         (lambda text: text.replace("OFFSET 0.000000", "OFFSET nan", 1), "not finite"),
         (lambda text: text.replace("CHANNELS 3", "CHANNELS 99", 1), "is no whole BVH file"),
         (lambda text: text.replace("Zrotation", "Wrotation", 1), "is no whole BVH file"),
-        (lambda text: "glTF" + text, "HIERARCHY"),
         (lambda text: "", "HIERARCHY"),
     ],
 )
@@ -187,8 +185,3 @@ def test_damaged_files_end_in_one_sentence(tmp_path, person, whole, damage, mess
     with pytest.raises(DataError, match=message) as error:
         BvhMotion(person, path)
     assert "a.bvh" in str(error.value)
-
-
-def test_a_missing_file(tmp_path, person):
-    with pytest.raises(DataError, match=r"none\.bvh cannot be read"):
-        BvhMotion(person, tmp_path / "none.bvh")

@@ -107,11 +107,6 @@ def test_mask_labels_and_image_agree(dataset):
         assert 0.02 < (mask > 0).mean() < 0.5
 
 
-def test_every_part_is_seen(dataset):
-    seen = np.unique(np.concatenate([x.ravel() for x in images(dataset, "labels")]))
-    assert len(seen) >= 11  # of 13; a hand may hide behind the trunk in one tiny image
-
-
 def test_landmarks_project_into_the_mask(dataset):
     cameras = json.loads((dataset / "cameras.json").read_text())
     points = np.load(dataset / "landmarks3d.npz")["p"].astype(np.float64)
@@ -204,11 +199,6 @@ def test_bytes_do_not_depend_on_workers(dataset, tmp_path):
     assert fingerprint(again) == fingerprint(dataset)
 
 
-def test_another_seed_gives_another_motion():
-    one, two = (Scene(SceneSettings(**TINY, seed=seed)).motion for seed in (0, 1))
-    assert np.abs(one.rotations - two.rotations).max() > 0.1
-
-
 def test_without_secondary_motion_the_mesh_is_skinned_and_landmarks_stay():
     still, moving = (Scene(SceneSettings(**TINY | {"secondary": on})) for on in (False, True))
     vertices, _, wrinkles = still.mesh(1)
@@ -299,23 +289,15 @@ def test_cache_root_follows_the_environment(monkeypatch, tmp_path):
 def test_key_depends_on_every_parameter():
     base = dataset_key(SceneSettings())
     changed = [
-        SceneSettings(size=64),
-        SceneSettings(train_cameras=5),
-        SceneSettings(test_cameras=1),
-        SceneSettings(frames=61),
-        SceneSettings(test_frames=14),
-        SceneSettings(rays_per_pixel=5),
-        SceneSettings(seed=1),
-        SceneSettings(avatar="free_body"),
-        SceneSettings(secondary=False),
-        SceneSettings(lens=(0.1, 0, 0, 0)),
-        SceneSettings(lens=(0.1, 0, 0, 0, 0)),
-        SceneSettings(tint=0.1),
-        SceneSettings(tint=0.2),
-        SceneSettings(gloss=0.1),
-        SceneSettings(test_scale=(2.0,)),
-        SceneSettings(test_scale=(2.0,), tint=0.1),
+        SceneSettings(**{name: value})
+        for name, value in (
+            *(("size", 64), ("train_cameras", 5), ("test_cameras", 1), ("frames", 61)),
+            *(("test_frames", 14), ("rays_per_pixel", 5), ("seed", 1), ("avatar", "free_body")),
+            *(("secondary", False), ("lens", (0.1, 0, 0, 0)), ("lens", (0.1, 0, 0, 0, 0))),
+            *(("tint", 0.1), ("tint", 0.2), ("gloss", 0.1), ("test_scale", (2.0,))),
+        )
     ]
+    changed.append(SceneSettings(test_scale=(2.0,), tint=0.1))
     assert len({base, *map(dataset_key, changed)}) == 1 + len(changed)
     assert dataset_key(changed[-1]).endswith("-tint-test_scale")
     assert base == dataset_key(SceneSettings())
@@ -335,15 +317,11 @@ def test_a_missing_file_is_named(parameters, tmp_path):
         ({"frames": 5, "test_frames": 5}, "less than frames = 5"),
         ({"train_cameras": 2, "test_cameras": 3}, "at most 2"),
         ({"lens": [0.1, 0.2]}, "lens must list 4 or 5 or 8"),
-        ({"lens": "strong"}, "lens must be"),
         ({"lens": -0.2}, "lens must be"),
         ({"lens": [0.1, float("nan"), 0, 0]}, "lens must be"),
         ({"tint": -0.1}, r"tint must be a number in \[0, 0.3\]"),
-        ({"tint": True}, "tint must be"),
         ({"gloss": 2}, r"gloss must be a number in \[0, 1\]"),
-        ({"gloss": float("nan")}, "gloss must be"),
         ({"test_scale": [9]}, "test_scale must be"),
-        ({"test_scale": 2}, "test_scale must be"),
         ({"test_scale": [2], "test_cameras": 0}, "set test_cameras"),
         ({"avatar": "nobody"}, "avatar must be blouse, polo, free_body or the path"),
         ({"motion": "waltz"}, "motion must be choreography, signs or the path of a .bvh"),

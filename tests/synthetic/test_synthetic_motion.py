@@ -7,18 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from mannequin import SHAPES, inside, mannequin, reposed
 
-from gsgan.body.free import free_body
 from gsgan.motion.rig import SIDES, Pose, Rig, two_bone
 from gsgan.motion.rotations import axis_angle, between, blend, rotation, twist
 from gsgan.synthetic.choreography import COMBINATION, EVERYDAY, PASSAGES, held_out
 from gsgan.synthetic.controls import frame_times, passages_at
 from gsgan.synthetic.footsteps import Footsteps
-from gsgan.synthetic.free_subject import free_character, free_pose
+from gsgan.synthetic.free_subject import free_character
 from gsgan.synthetic.posing import Choreography
-from gsgan.synthetic.scene_setup import Scene, SceneSettings
 from gsgan.synthetic.signs import SIGNS
 
 # Largest rotation of a bone against its parent since a T pose, degrees. Arms and legs reach
@@ -206,41 +203,6 @@ def test_rigs_without_some_bones(missing):
     moves = Choreography(plain).at(frame_times(30, EVERYDAY.duration))
     assert np.isfinite(moves.joints).all()
     assert moves.rotations.shape == (30, len(plain.bones), 3, 3)
-
-
-def test_the_free_body_follows(free):
-    moves = Choreography(free, seed=3).at(frame_times(20, EVERYDAY.duration))
-    posed = free_body().posed_vertices(free_pose(moves))
-    vertices, _ = free.skinned(moves.rotations[7], moves.joints[7])
-    np.testing.assert_allclose(posed[7].numpy(), vertices, atol=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
-)
-def test_every_camera_sees_the_whole_motion(seed):
-    """Cameras are placed by fewer moments than this: those between them must fit as well."""
-    scene = Scene(
-        SceneSettings(avatar="free_body", secondary=False, frames=350, test_frames=60, seed=seed)
-    )
-    for frame in range(0, 350, 5):
-        vertices = scene.mesh(frame)[0][::23]
-        for view in scene.views.values():
-            pixels = view.project(vertices)
-            assert pixels.min() > 1
-            assert pixels.max() < 127
-
-
-def test_freestyle_has_poses_of_no_other_passage(person, dense):
-    _, moves = dense
-    R = torch.from_numpy(moves.rotations[::5])
-    turned = (R[:, :1].mT @ R[:, 1:]).flatten(1)
-    free = torch.tensor([name == "freestyle" for name in moves.passages[::5]])
-    named = turned[~free]
-    nearest = torch.cdist(turned[free], named).amin(dim=1)
-    within = torch.cdist(named, named).fill_diagonal_(torch.inf).amin(dim=1)
-    assert nearest.median() > 3 * within.median()
 
 
 def test_held_out_frames_are_blocks_and_one_whole_passage():
