@@ -29,7 +29,7 @@ from gsgan.motion.retarget import rig_landmarks
 from gsgan.motion.standard import standard_motion
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
-from gsgan.utils.arrays import expect_array
+from gsgan.utils.arrays import as_floats, expect_array
 from gsgan.utils.errors import ConfigError, DataError
 
 Float = NDArray[np.float64]
@@ -39,6 +39,7 @@ WORLD_KEYS = (
     *("pose_world_landmarks", "poseWorldLandmarks", "world_landmarks", "worldLandmarks"),
     "POSE_WORLD_LANDMARKS",
 )
+LANDMARK = ("x", "y", "z", "visibility")
 POSE_KEYS = ("poses", "pose", "smpl_poses", "body_pose")
 ROOT_KEYS, MOVE_KEYS = ("global_orient", "root_orient"), ("trans", "transl", "smpl_trans")
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
@@ -220,56 +221,45 @@ def read_mediapipe_json(path: Path, source: Source) -> Clip:
     A frame is an object with one of `WORLD_KEYS`, or the 33 landmarks themselves; a landmark is
     ``{x, y, z, visibility}`` or a list of these numbers.
     """
-    content = read_json_value(path)
-    fps = content.get("fps") if isinstance(content, dict) else None
-    frames = content
-    if isinstance(content, dict):
-        lists = [
-            v for k, v in content.items() if isinstance(v, list) and k in ("frames", *WORLD_KEYS)
-        ]
-        frames = lists[0] if lists else []
+    frames, fps = read_json_value(path), None
+    if isinstance(frames, dict):
+        fps = frames.get("fps")
+        frames = next((frames[key] for key in ("frames", *WORLD_KEYS) if key in frames), None)
     if not isinstance(frames, list) or not frames:
         raise DataError(
             f"{path} holds no frames; expected a list, or an object with 'frames', of MediaPipe's "
             "pose_world_landmarks"
         )
-    rows = [_landmark_row(path, number, frame) for number, frame in enumerate(frames)]
-    p = np.stack(rows)
-    return Clip(
-        path, p[..., :3], p[..., 3], None if fps is None else rate_of(path, fps), None, "metres"
-    )
+    p = np.stack([_landmark_row(f"{path}, frame {i}", frame) for i, frame in enumerate(frames)])
+    rate = None if fps is None else rate_of(path, fps)
+    return Clip(path, p[..., :3], p[..., 3], rate, None, "metres")
 
 
-def _landmark_row(path: Path, number: int, frame: Any) -> Float:
+def _landmark_row(where: str, frame: Any) -> Float:
     """``[33, 4]`` x, y, z, visibility of a frame; NaN and 0 where no person was detected."""
     found = frame
     if isinstance(frame, dict):
         key = next((key for key in WORLD_KEYS if key in frame), None)
-        found = frame.get(key)
         if key is None:
             raise DataError(
-                f"{path}, frame {number}: no pose_world_landmarks; MediaPipe's other "
-                "landmarks are in image coordinates, without metric depth"
+                f"{where}: no pose_world_landmarks; MediaPipe's other landmarks are in image "
+                "coordinates, without metric depth"
             )
+        found = frame[key]
     if isinstance(found, dict):
         found = found.get("landmark", found.get("landmarks"))
     if isinstance(found, list) and len(found) == 1:
         found = found[0]  # the Tasks API returns a list of people
     if not found:
-        return np.concatenate([np.full((JOINTS, 3), np.nan), np.zeros((JOINTS, 1))], axis=1)
+        return np.repeat([[np.nan, np.nan, np.nan, 0]], JOINTS, axis=0)
     try:
-        rows = [
-            [p["x"], p["y"], p["z"], p.get("visibility", 1.0)] if isinstance(p, dict)
-            else [*p[:3], p[3] if len(p) > 3 else 1.0]
-            for p in found
-        ]  # fmt: skip
-        row = np.array(rows, np.float64)
-    except (KeyError, TypeError, ValueError, IndexError):
-        row = np.zeros(0)
-    if row.shape != (JOINTS, 4):
-        raise DataError(
-            f"{path}, frame {number}: expected {JOINTS} landmarks with x, y, z; found {len(found)}"
-        )
+        rows = [[p.get(k, 1.0 if k == "visibility" else None) for k in LANDMARK]
+                if isinstance(p, dict) else [*p, 1.0][:4] for p in found]  # fmt: skip
+    except TypeError:
+        rows = []
+    row = as_floats(rows)
+    if row.shape != (JOINTS, 4) or np.isnan(row).any():
+        raise DataError(f"{where}: expected {JOINTS} landmarks with x, y, z; found {len(rows)}")
     return row
 
 

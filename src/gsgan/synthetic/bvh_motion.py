@@ -17,8 +17,6 @@ from gsgan.synthetic.posing import blinks
 
 # A foot stands where it is this low and slow, legs and legs per second.
 CONTACT_HEIGHT, CONTACT_SPEED = 0.04, 0.3
-
-
 SECTION = 2.5  # seconds that share a passage's name
 
 

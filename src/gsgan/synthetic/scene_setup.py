@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -28,6 +29,8 @@ from gsgan.synthetic.secondary import Moving, Secondary
 from gsgan.synthetic.signs import SIGNS, split_signs
 from gsgan.synthetic.tint import make_tints
 from gsgan.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles
+from gsgan.utils.arrays import as_floats
+from gsgan.utils.checks import between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
 Array = NDArray[np.float64]
@@ -39,24 +42,18 @@ AVATARS = avatar_names()
 DEFAULT, FREE_BODY, CHOREOGRAPHY, SIGNING = "polo", "free_body", "choreography", "signs"
 PROGRAMMES = {CHOREOGRAPHY: EVERYDAY, SIGNING: SIGNS}
 ARC = math.radians(150)  # round the front of a person who signs
-WHOLE, NUMBER, LIST = "a whole number", "a number", "a list of numbers"
-# Kind and range of each parameter; those that are not whole numbers may be None.
-RANGES = {
-    "size": (WHOLE, 8, math.inf),
-    **dict.fromkeys(("train_cameras", "frames", "rays_per_pixel"), (WHOLE, 1, math.inf)),
-    **dict.fromkeys(("test_cameras", "test_frames", "seed"), (WHOLE, 0, math.inf)),
-    "lens": (LIST, -math.inf, math.inf),
-    "tint": (NUMBER, 0, 0.3),
-    "gloss": (NUMBER, 0, 1),
-    "test_scale": (LIST, 0.25, 4),
-}
+# Least value of each whole number, and the ranges of those that may be None.
+LEAST = {"size": 8, "train_cameras": 1, "frames": 1, "rays_per_pixel": 1}
+LEAST |= {"test_cameras": 0, "test_frames": 0, "seed": 0}
+NUMBERS = {"tint": (0, 0.3), "gloss": (0, 1)}
+LISTS = {"lens": (-math.inf, math.inf), "test_scale": (0.25, 4)}
 
 
 @dataclass(frozen=True)
 class SceneSettings:
     """The parameters of a synthetic dataset, as in conf/data/synthetic.yaml.
 
-    Together with `VERSION` they determine every byte. Effects without effect are stored as None.
+    Together with `VERSION` they determine every byte. Disabled effects are stored as None.
 
     Raises:
         ConfigError: naming the parameter that is out of range.
@@ -78,24 +75,21 @@ class SceneSettings:
     test_scale: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        for name, (kind, low, high) in RANGES.items():
+        for name, least in LEAST.items():
+            whole(f"data.source.{name}", getattr(self, name), least)
+        for name, (low, high) in NUMBERS.items():
+            if (value := getattr(self, name)) is not None:
+                between(f"data.source.{name}", value, low, high)
+            object.__setattr__(self, name, float(value) if value else None)
+        for name, (low, high) in LISTS.items():
             raw = getattr(self, name)
-            if raw is None and kind != WHOLE:
-                continue
-            try:
-                values = np.array(raw, dtype=float)
-            except (TypeError, ValueError):
-                values = np.array(math.nan)
-            good = np.isfinite(values) & (values >= low) & (values <= high)
-            typed = not isinstance(raw, bool) and (kind != WHOLE or isinstance(raw, int))
+            values = as_floats([] if raw is None else raw)
             _require(
-                typed and values.ndim == (kind == LIST) and bool(good.all()),
-                f"{name} must be {kind} in [{low:g}, {high:g}], got {raw!r}",
+                (raw is None or (isinstance(raw, Sequence) and len(values) == len(raw)))
+                and bool((np.isfinite(values) & (values >= low) & (values <= high)).all()),
+                f"{name} must be a list of numbers in [{low:g}, {high:g}], got {raw!r}",
             )
-            if kind != WHOLE:
-                numbers = values.tolist()
-                stored = tuple(numbers) if kind == LIST else numbers
-                object.__setattr__(self, name, stored if values.any() else None)
+            object.__setattr__(self, name, tuple(values.tolist()) if values.any() else None)
         named = (*AVATARS, FREE_BODY)
         _require(
             self.avatar in named or str(self.avatar).endswith(".glb"),
@@ -105,10 +99,7 @@ class SceneSettings:
             self.motion in tuple(PROGRAMMES) or str(self.motion).endswith(".bvh"),
             f"motion must be {', '.join(PROGRAMMES)} or the path of a .bvh, got {self.motion!r}",
         )
-        _require(
-            isinstance(self.secondary, bool),
-            f"secondary must be true or false, got {self.secondary!r}",
-        )
+        one_of("data.source.secondary", self.secondary, (True, False))
         _require(
             self.test_frames < self.frames,
             f"test_frames must be less than frames = {self.frames}, got {self.test_frames}",
@@ -131,7 +122,7 @@ class SceneSettings:
 
 def _require(holds: bool, message: str) -> None:
     if not holds:
-        raise ConfigError(f"synthetic data: {message}")
+        raise ConfigError(f"data.source.{message}")
 
 
 def dataset_key(settings: SceneSettings) -> str:
