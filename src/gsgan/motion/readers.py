@@ -21,12 +21,12 @@ from gsgan.data.formats.capture import SHAPE, read_shape
 from gsgan.data.proportions import EXPRESSION, HIPS, SHOULDERS, Proportions
 from gsgan.data.skeletons import hips_below
 from gsgan.motion.asf import asf_of, read_amc
-from gsgan.motion.bvh import Bvh, read_bvh
+from gsgan.motion.bvh import read_bvh
 from gsgan.motion.clip import Clip, rate_of
 from gsgan.motion.points import read_points3d
 from gsgan.motion.pose_files import read_pose
 from gsgan.motion.retarget import rig_landmarks
-from gsgan.motion.standard import standard_motion
+from gsgan.motion.standard import RigMotion, standard_motion
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.arrays import as_floats, expect_array
@@ -282,18 +282,16 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
 
 def read_bvh_motion(path: Path, source: Source) -> Clip:
     """A BVH file of a person; the unit is inferred from the length of the legs."""
-    bvh = read_bvh(path)
-    return _rig(path, bvh, None, source)
+    return _rig(path, read_bvh(path), None, source)
 
 
 def read_amc_motion(path: Path, source: Source) -> Clip:
     """An AMC file and its ASF skeleton."""
-    asf = source.skeleton or asf_of(path)
-    return _rig(path, *read_amc(path, asf), source)
+    return _rig(path, *read_amc(path, source.skeleton or asf_of(path)), source)
 
 
-def _rig(path: Path, bvh: Bvh, metres: float | None, source: Source) -> Clip:
-    standard = standard_motion(bvh, path)
+def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) -> Clip:
+    standard = standard_motion(motion, path)
     if metres is None:
         ratios = {
             unit: abs(np.log(standard.leg * x / source.subject.leg))
@@ -304,7 +302,7 @@ def _rig(path: Path, bvh: Bvh, metres: float | None, source: Source) -> Clip:
         unit = f"units of {100 * metres:.3g} cm"
     p = rig_landmarks(standard, source.subject)
     seen = np.asarray(np.isfinite(p).all(-1), np.float64)
-    return Clip(path, p, seen, 1 / bvh.frame_time, "z", unit, standard.up)
+    return Clip(path, p, seen, 1 / motion.frame_time, "z", unit, standard.up)
 
 
 # -- triangulated and detected points
