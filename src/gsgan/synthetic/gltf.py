@@ -62,7 +62,7 @@ def read_character(path: Path) -> Character:
     All skinned meshes are merged, and unskinned ones that hang on a bone; textures keep their
     resolution up to 2048 pixels a side. The person is turned to face -Y, put on z = 0 with the
     hips over the origin, and scaled to metres: by the file's likeliest unit if that makes 1.2 to
-    2.3 m, else to 1.7 m. Ours.
+    2.3 m, else to 1.7 m.
 
     Args:
         path: a binary glTF 2 file whose bones are named as Mixamo's (with or without prefix) or

@@ -54,7 +54,7 @@ def face_labels(character: Character, names: np.ndarray) -> Ints:
 
     A material or mesh named after a part or a garment decides. Elsewhere the bones say which limb
     a face is on, and its colour whether it is skin, hair or cloth; pieces of cloth (connected
-    vertices) are then upper or lower clothes or a shoe as a whole. Ours.
+    vertices) are then upper or lower clothes or a shoe as a whole.
 
     Args:
         character: its ``labels`` are not read.

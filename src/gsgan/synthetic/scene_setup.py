@@ -45,7 +45,7 @@ ARC = math.radians(150)  # round the front of a person who signs
 # Least value of each whole number, and the ranges of those that may be None.
 LEAST = {"size": 8, "train_cameras": 1, "frames": 1, "rays_per_pixel": 1}
 LEAST |= {"test_cameras": 0, "test_frames": 0, "seed": 0}
-NUMBERS = {"tint": (0, 0.3), "gloss": (0, 1)}
+NUMBERS = {"tint": (0.0, 0.3), "gloss": (0.0, 1.0)}
 LISTS = {"lens": (-math.inf, math.inf), "test_scale": (0.25, 4)}
 
 
@@ -77,9 +77,9 @@ class SceneSettings:
     def __post_init__(self) -> None:
         for name, least in LEAST.items():
             whole(f"data.source.{name}", getattr(self, name), least)
-        for name, (low, high) in NUMBERS.items():
+        for name, bounds in NUMBERS.items():
             if (value := getattr(self, name)) is not None:
-                between(f"data.source.{name}", value, low, high)
+                between(f"data.source.{name}", value, *bounds)
             object.__setattr__(self, name, float(value) if value else None)
         for name, (low, high) in LISTS.items():
             raw = getattr(self, name)

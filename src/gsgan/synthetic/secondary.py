@@ -70,10 +70,7 @@ class Moving(Protocol):
 
 
 class Secondary:
-    """What is added to the skinned vertices and normals of a character in motion.
-
-    Source: ours.
-    """
+    """What is added to the skinned vertices and normals of a character in motion."""
 
     def __init__(self, character: Character, motion: Moving) -> None:
         self.character = character
