@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from gsgan.data.cameras import make_camera
 from gsgan.data.files import frame_files
-from gsgan.data.formats.common import FolderReader, one_mask_each, picture_size
+from gsgan.data.formats.common import FolderReader, image_size, one_mask_each
 from gsgan.data.layout import Found, Meta
 from gsgan.data.skeletons import make_landmarks
 from gsgan.model.body_points import SkinnedPoints
@@ -38,7 +38,7 @@ class NpzReader(FolderReader):
             ):
                 images[name] = frame_files(root, name, (".png",))
                 masks[name] = frame_files(root, f"{name}_mask", (".png",))
-                size = picture_size(root, images[name])
+                size = image_size(root, images[name])
                 cameras[name] = make_camera(
                     f"{file}: {name}", name, K=K, R=R, t=t, dist=None, size=size
                 )

@@ -13,7 +13,7 @@ import torch
 from capture_frames import every_frame, items, png
 from make import edit_json, ring_camera, skeletons, write_landmarks, write_tiny_capture
 
-from gsgan.data.dataset import CaptureDataset, PictureCache
+from gsgan.data.dataset import CaptureDataset, ImageCache
 from gsgan.data.files import cut_off
 from gsgan.data.formats.capture import CaptureReader, read_capture
 from gsgan.data.formats.consistency import Consistency
@@ -250,7 +250,7 @@ def test_an_exif_rotation_is_not_applied(tmp_path: Path) -> None:
 
 def test_cache_keeps_within_its_bound_and_changes_nothing(tmp_path: Path) -> None:
     layout = read_capture(write_tiny_capture(tmp_path, frames=4))
-    cache = PictureCache(3 * 24 * 32 * 4)
+    cache = ImageCache(3 * 24 * 32 * 4)
     cached = CaptureDataset(layout, items(layout), cache=cache)
     plain = CaptureDataset(layout, items(layout))
     for i in (0, 1, 2, 3, 4, 1, 0, 0):

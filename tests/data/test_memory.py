@@ -13,7 +13,7 @@ from make import write_tiny_capture
 from torch.utils.data import DataLoader, Dataset
 
 from gsgan.data.datamodule import _quiet_worker
-from gsgan.data.dataset import CaptureDataset, PictureCache
+from gsgan.data.dataset import CaptureDataset, ImageCache
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.layout import Layout
 from gsgan.scene import Frame
@@ -46,7 +46,7 @@ def long_dataset(layout: Layout, count: int) -> CaptureDataset:
     """A dataset of ``count`` pictures: far more than the cache holds."""
     items = [(c, f) for c, files in layout.images.items() for f in files]
     repeated = (items * -(-count // len(items)))[:count]
-    return CaptureDataset(layout, repeated, 256, cache=PictureCache(CACHE))
+    return CaptureDataset(layout, repeated, 256, cache=ImageCache(CACHE))
 
 
 def test_memory_does_not_grow_with_the_pictures_read(layout: Layout) -> None:

@@ -83,7 +83,7 @@ def check_poses(layout: Layout, subject: Subject, blend: bool = True) -> None:
     assert np.allclose(posed(subject.model, motion, blend)[0], subject.vertices, atol=1e-6)
 
 
-def check_pictures(layout: Layout, subject: Subject) -> None:
+def check_images(layout: Layout, subject: Subject) -> None:
     for i, frame in enumerate(subject.frames):
         for c, name in enumerate(layout.camera_names):
             labels = subject.labels[i][c]
@@ -106,7 +106,7 @@ def test_the_original_release_is_read_as_it_was_written(
     check_cameras(layout, subject)
     check_skeletons(layout, subject)
     check_poses(layout, subject)
-    check_pictures(layout, subject)
+    check_images(layout, subject)
     assert layout.notes == ("lengths of the cameras converted from mm to metres",)
     meta = layout.meta
     assert (meta.skeleton_source, meta.up_axis) == ("smpl24 -> mediapipe33", "-z")
@@ -139,7 +139,7 @@ def test_one_of_the_two_masks_is_enough(
     layout = read(root, smpl_file)
     assert bool(layout.labels) == (masks == "mask_cihp")
     assert (layout.meta.label_names is None) == (masks == "mask")
-    check_pictures(layout, subject)
+    check_images(layout, subject)
 
 
 def test_masks_are_joined_and_small_labels_are_not_thresholded(
@@ -189,7 +189,7 @@ def test_subjects_313_and_315(smpl_file: Path, tmp_path: Path, renamed: bool) ->
     assert layout.frames == (1, 2, 3, 4)
     check_cameras(layout, odd)
     check_skeletons(layout, odd)
-    check_pictures(layout, odd)
+    check_images(layout, odd)
 
 
 def test_frame_numbers_of_long_names() -> None:
@@ -221,7 +221,7 @@ def test_the_refined_release(
     check_cameras(layout, subject)
     check_skeletons(layout, subject)
     check_poses(layout, subject)
-    check_pictures(layout, subject)
+    check_images(layout, subject)
     assert not layout.labels
 
 

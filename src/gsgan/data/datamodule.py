@@ -20,7 +20,7 @@ from lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from gsgan.data.crop import PersonCrop
-from gsgan.data.dataset import CaptureDataset, Lens, PictureCache, StepSampler, pass_order
+from gsgan.data.dataset import CaptureDataset, ImageCache, Lens, StepSampler, pass_order
 from gsgan.data.formats.capture import FACE_FILE, HANDS_FILE, CaptureReader
 from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
@@ -239,7 +239,7 @@ class GsganData(LightningDataModule):
                 f"{self.batch_size} cannot be made; set data.size (e.g. 512) or data.batch_size=1"
             )
         # every process has its own, and training and validation start their own workers
-        cache = PictureCache(int(self.cache_mb * 2**20) // (2 * self.workers + 1))
+        cache = ImageCache(int(self.cache_mb * 2**20) // (2 * self.workers + 1))
         template = template_of(self.skeleton, self.face)
         skeletons = complete_skeletons(
             layout.landmarks, layout.frames, self.trained, template, layout.hands, layout.face

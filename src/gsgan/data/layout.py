@@ -22,7 +22,7 @@ from gsgan.data.validation import (
     Index,
     Thresholds,
     check_geometry,
-    check_pictures,
+    check_images,
     drop_frames,
     drop_unmasked,
     drop_unseen,
@@ -196,7 +196,7 @@ def assemble(found: Found, checks: Thresholds) -> Layout:
     labels = labels if labelled else {}
     if 0 < labelled < count:
         notes.append(f"{count - labelled} of {count} images have no labels, they count as 'ignore'")
-    check_pictures(root, cameras, images, masks, labels, checks.header_stride, calibration)
+    check_images(root, cameras, images, masks, labels, checks.header_stride, calibration)
     return Layout(
         root=root,
         meta=found.meta,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, inside, project
-from gsgan.data.files import check_picture
+from gsgan.data.files import check_image
 from gsgan.data.pixels import MaskFile
 from gsgan.data.skeletons import HUBS, Landmarks, Poses
 from gsgan.utils.errors import DataError
@@ -32,7 +32,7 @@ class Thresholds:
     # metres, minimum and maximum median distance from the cameras to the person
     distance: tuple[float, float] = (0.3, 30.0)
     max_behind: float = 0.05  # share of joints behind a camera above which its pose is wrong
-    max_missing_masks: float = 0.0  # share of images left out for want of a mask
+    max_missing_masks: float = 0.0  # largest share of images without a mask
     header_stride: int = 1  # of images whose header is read on opening, 0.1 ms each; 1 reads all
 
 
@@ -215,7 +215,7 @@ def drop_unmasked(
     return {c: {f: p for f, p in files.items() if masks[c].get(f)} for c, files in images.items()}
 
 
-def check_pictures(
+def check_images(
     root: Path,
     cameras: Mapping[str, CameraEntry],
     images: Index,
@@ -233,9 +233,9 @@ def check_pictures(
         size = cameras[name].size
         for frame in list(files)[::stride]:
             image = root / files[frame]
-            check_picture(image, "image", size, str(calibration))
+            check_image(image, "image", size, str(calibration))
             by = f"the image {image}"
             for mask in masks[name][frame]:
-                check_picture(root / mask.path, "mask", size, by)
+                check_image(root / mask.path, "mask", size, by)
             if label := labels.get(name, {}).get(frame):
-                check_picture(root / label, "labels", size, by)
+                check_image(root / label, "labels", size, by)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from gsgan.data.dataset import PictureCache
+from gsgan.data.dataset import ImageCache
 from gsgan.data.proportions import (
     BODY,
     EXPRESSION,
@@ -128,7 +128,7 @@ def _given(config: DictConfig, run: Run, fps: float) -> Drive:
 def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
     """Frames of a split, seen by one camera."""
     dataset = copy(run.data.dataset(split))
-    dataset.cache = PictureCache(CACHE)  # a run in training uses the other one at the same time
+    dataset.cache = ImageCache(CACHE)  # a run in training uses the other one at the same time
     if not dataset.items:
         raise DataError(f"motion={split}: the run has no such frames ({run.data.reasons[split]})")
     names = list(dict.fromkeys(camera for camera, _ in dataset.items))

@@ -26,6 +26,7 @@ from gsgan.data.proportions import (
     middle,
     upright,
 )
+from gsgan.data.skeletons import bone_lengths
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, sanitise
 from gsgan.skeleton.sanitise import MIN_TRUNK_JOINTS
@@ -136,7 +137,7 @@ def mixed(a: Float, b: Float, share: Float) -> Float:
 def is_own(motion: Clip, subject: Proportions) -> bool:
     """Whether the motion's bones are as long as the subject's: it needs no retargeting."""
     with np.errstate(invalid="ignore"):
-        found = [np.linalg.norm(motion.p[:, b] - motion.p[:, a], axis=-1) for a, b in BONES]
+        found = bone_lengths(motion.p, BONES).T
     seen = [(np.median(x[np.isfinite(x)]), bone) for x, bone in zip(found, BONES, strict=True)
             if np.isfinite(x).any()]  # fmt: skip
     rest = subject.rest

@@ -107,7 +107,7 @@ def finger_hinges(
 
 
 class Rig:
-    """What posing needs of a character: its bones by name, limb lengths, rest turns and soles."""
+    """The properties of a character that posing uses: bones, limb lengths, rest turns and soles."""
 
     def __init__(self, character: Character) -> None:
         self.character = character

@@ -39,7 +39,7 @@ PARTS = {"metacarpal": 1, "proximal": 1, "intermediate": 2, "distal": 3}
 def known_joints(names: tuple[str, ...]) -> dict[str, int]:
     """Mixamo's bone name → index, for joints named as by Mixamo, MakeHuman, CMU, Blender, ….
 
-    Spine, neck and collarbones are not among them: the tree says where they are.
+    Spine, neck and collarbones are not among them: they follow from the tree of joints.
     """
     found: dict[str, tuple[int, int]] = {}
     for j, name in enumerate(names):

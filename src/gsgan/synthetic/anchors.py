@@ -22,7 +22,7 @@ THUMB = ("cmc", "mcp", "ip", "tip")
 # Thumb to pinky: first joint, step to the next, offset to the thumb's side, in hand lengths.
 ABSENT_FINGERS = ((0.2, 0.13, 0.35), (0.5, 0.15, 0.18), (0.5, 0.17, 0.05), (0.5, 0.15, -0.08),
                   (0.45, 0.13, -0.2))  # fmt: skip
-STEP = 0.0005  # metres between the rays that look at the face
+STEP = 0.0005  # metres between the rays cast at the face
 Anchors = dict[str, tuple[int, int]]  # landmark → joint and vertex, one of them -1
 
 

@@ -77,7 +77,7 @@ def free_character() -> Character:
 
 
 def free_pose(motion: Animation) -> BodyPose:
-    """The free body's pose at every moment of the motion of `free_character`."""
+    """The free body's pose in every frame of the animation of `free_character`."""
     body, R = free_body(), motion.rotations
     parents = np.array(body.parents)
     local = np.where((parents < 0)[:, None, None], R, np.swapaxes(R[:, parents], -1, -2) @ R)

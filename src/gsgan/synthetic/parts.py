@@ -52,8 +52,8 @@ CHEST = 0.16  # metres below the shoulders: skin above is the neck's, below the 
 def face_labels(character: Character, names: np.ndarray) -> Ints:
     """``[F]`` the part of each face, at least 1.
 
-    A material or mesh named after a part or a garment decides. Elsewhere the bones say which limb
-    a face is on, and its colour whether it is skin, hair or cloth; pieces of cloth (connected
+    A material or mesh named after a part or a garment decides. Elsewhere bones decide which limb a
+    face is on, and its colour whether it is skin, hair or cloth; pieces of cloth (connected
     vertices) are then upper or lower clothes or a shoe as a whole.
 
     Args:

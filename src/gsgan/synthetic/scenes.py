@@ -1,9 +1,9 @@
 """Writes the synthetic dataset, once, into a cache folder.
 
 The layout is that of a capture: cameras.json, images/{cam}/%06d.png, masks/, labels/,
-landmarks3d.npz, hands3d.npz, face3d.npz, meta.json. Every image is written whole, and meta.json
-last: a dataset whose making was interrupted is not taken for complete, and continued. Tints are
-written nowhere: a model has to estimate them.
+landmarks3d.npz, hands3d.npz, face3d.npz, meta.json. Every image is written atomically, and
+meta.json last: a dataset that was interrupted is incomplete and is continued. Tints are not
+written to any file: a model has to estimate them.
 
 Workers are separate programs rather than children of multiprocessing, which would import the
 user's main script again, and fail where it is a notebook or lacks a ``__main__`` guard.

@@ -149,7 +149,7 @@ def up_axis(cameras: Iterable[CameraEntry]) -> str:
     return ("-" if up[axis] < 0 else "") + AXES[axis]
 
 
-def picture_size(root: Path, files: Mapping[int, str]) -> tuple[int, int]:
+def image_size(root: Path, files: Mapping[int, str]) -> tuple[int, int]:
     """``(H, W)`` of a camera's first image.
 
     Raises:

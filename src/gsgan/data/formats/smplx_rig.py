@@ -22,8 +22,8 @@ from gsgan.data.formats.common import (
     IMAGES,
     FolderReader,
     body_model,
+    image_size,
     one_mask_each,
-    picture_size,
     up_axis,
 )
 from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, posed
@@ -160,7 +160,7 @@ class SmplxRigReader(FolderReader):
                 R=numbers(where, entry["R"], "R", (9,)).reshape(3, 3),
                 t=entry["T"],
                 dist=entry.get("distCoeff"),
-                size=picture_size(root, images[name]),
+                size=image_size(root, images[name]),
                 pixel_centre=self.pixel_centre,
                 rotation_tolerance=checks.rotation_tolerance,
             )

@@ -23,7 +23,7 @@ from gsgan.body.smpl import SkinnedModel
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.cameras import CameraEntry, make_camera
 from gsgan.data.files import frame_files, frame_of, last_number
-from gsgan.data.formats.common import IMAGES, FolderReader, body_model, picture_size, up_axis
+from gsgan.data.formats.common import IMAGES, FolderReader, body_model, image_size, up_axis
 from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, posed, zju_motion
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
@@ -124,7 +124,7 @@ class ZjuReader(FolderReader):
                 R=annots.R[i],
                 t=annots.T[i],
                 dist=annots.D[i],
-                size=picture_size(root, files or some),
+                size=image_size(root, files or some),
                 scale=MILLIMETRES,
                 pixel_centre=self.pixel_centre,
                 rotation_tolerance=checks.rotation_tolerance,
