@@ -29,7 +29,7 @@ class NpzReader(FolderReader):
     contents = "cameras.npz, skeletons.npz, CAMERA/ and CAMERA_mask/"
     hint = "check that cameras.npz and skeletons.npz have the same world frame and unit"
 
-    def find(self, root, checks, smpl) -> Found:
+    def find(self, root, limits, smpl) -> Found:
         images, masks, cameras = {}, {}, {}
         file = root / "cameras.npz"
         with np.load(file) as arrays:
@@ -51,7 +51,7 @@ class NpzReader(FolderReader):
             images=images,
             masks=one_mask_each(masks, "grey"),
             mask_folder="{camera}_mask",
-            landmarks=make_landmarks(ids, p, np.ones(p.shape[:2]), checks.max_reach, []),
+            landmarks=make_landmarks(ids, p, np.ones(p.shape[:2]), limits.max_reach, []),
             calibration=file,
             unit_hint="lengths must be in metres",
         )

@@ -130,7 +130,7 @@ class GsganData(LightningDataModule):
         self.seed = whole("data.seed", seed, 0)
         self.cache_mb = at_least("data.cache_mb", cache_mb, 0)
         self.info_samples = whole("data.info_samples", info_samples, 1)
-        self.checks = replace(Thresholds(), min_joints=whole("data.min_joints", min_joints, 1))
+        self.limits = replace(Thresholds(), min_joints=whole("data.min_joints", min_joints, 1))
         self.lens = LENSES[one_of("effects.distortion", distortion, LENSES)]
 
     def prepare_data(self) -> None:
@@ -151,7 +151,7 @@ class GsganData(LightningDataModule):
     @cached_property
     def layout(self) -> Layout:
         """The capture, read on first use."""
-        layout = self.reader(self._folder(), self.checks, self.smpl)
+        layout = self.reader(self._folder(), self.limits, self.smpl)
         skeleton = TEMPLATES[self.skeleton]
         for wanted, held, file, other in (
             (skeleton.palms, layout.hands, HANDS_FILE, "mediapipe33"),

@@ -76,7 +76,7 @@ class EasymocapReader(FolderReader):
         one_of("data.reader.skeleton", self.skeleton, ("auto", *SKELETONS))
         one_of("data.reader.mask_rule", self.mask_rule, MASK_RULES)
 
-    def find(self, root: Path, checks: Thresholds, smpl: str | None) -> Found:
+    def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """The dataset's files, each checked separately.
 
         Raises:
@@ -112,7 +112,7 @@ class EasymocapReader(FolderReader):
             images=images,
             masks=self._masks(root, names),
             mask_folder=f"{self.masks}/{{camera}}",
-            landmarks=make_landmarks(ids, p, conf, checks.max_reach, notes, source=f"{place}/"),
+            landmarks=make_landmarks(ids, p, conf, limits.max_reach, notes, source=f"{place}/"),
             poses=None if motion is None else motion.poses(f"{place}/"),
             pixels=PixelRules(threshold=self.threshold),
             calibration=root / "intri.yml and extri.yml",

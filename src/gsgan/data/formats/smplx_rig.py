@@ -88,7 +88,7 @@ class SmplxRigReader(FolderReader):
                 f"[5, 250], got {list(alpha)}"
             )
 
-    def find(self, root: Path, checks: Thresholds, smpl: str | None) -> Found:
+    def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """The subject's files, each checked separately.
 
         Raises:
@@ -106,7 +106,7 @@ class SmplxRigReader(FolderReader):
         images = _index(root, entries, self.images, "images")
         masks = _index(root, entries, self.masks, "masks")
         _leave_out(images, root / MISSING, self.lists_missing, notes)
-        cameras = self._cameras(root, path, entries, images, checks, notes)
+        cameras = self._cameras(root, path, entries, images, limits, notes)
         frames = {f for files in images.values() for f in files}
         motion = read_motion(root / PARAMETERS, frames, model, notes)
         row = {int(f): i for i, f in enumerate(motion.ids)}
@@ -124,7 +124,7 @@ class SmplxRigReader(FolderReader):
             images=images,
             masks=one_mask_each(masks, "threshold"),
             mask_folder=self.masks,
-            landmarks=make_landmarks(motion.ids, p, conf, checks.max_reach, notes, PARAMETERS),
+            landmarks=make_landmarks(motion.ids, p, conf, limits.max_reach, notes, PARAMETERS),
             poses=motion.poses(PARAMETERS),
             pixels=PixelRules(
                 threshold=self.threshold,
@@ -143,7 +143,7 @@ class SmplxRigReader(FolderReader):
         path: Path,
         entries: Mapping[str, Any],
         images: Files,
-        checks: Thresholds,
+        limits: Thresholds,
         notes: list[str],
     ) -> dict[str, CameraEntry]:
         """The cameras in the calibration's order."""
@@ -162,7 +162,7 @@ class SmplxRigReader(FolderReader):
                 dist=entry.get("distCoeff"),
                 size=image_size(root, images[name]),
                 pixel_centre=self.pixel_centre,
-                rotation_tolerance=checks.rotation_tolerance,
+                rotation_tolerance=limits.rotation_tolerance,
             )
         bent = [name for name, camera in cameras.items() if camera.distorted]
         if bent and not self.undistort:

@@ -66,7 +66,7 @@ class ZjuReader(FolderReader):
         one_of("data.reader.masks", self.masks, ("both", *MASKS))
         one_of("data.reader.fit", self.fit, ("auto", *FITS))
 
-    def find(self, root: Path, checks: Thresholds, smpl: str | None) -> Found:
+    def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """The subject's files, each checked separately.
 
         Raises:
@@ -77,7 +77,7 @@ class ZjuReader(FolderReader):
         notes = ["lengths of the cameras converted from mm to metres"]
         folders = camera_folders(root, annots)
         images = _index_images(root, folders, notes)
-        cameras = self._cameras(root, annots, images, checks)
+        cameras = self._cameras(root, annots, images, limits)
         fit, params = self._fit(root)
         frames = {f for files in images.values() for f in files}
         motion = _read_motion(root, params, frames, model, notes)
@@ -99,7 +99,7 @@ class ZjuReader(FolderReader):
             images=images,
             masks=masks,
             labels=labels,
-            landmarks=make_landmarks(motion.ids, p, conf, checks.max_reach, notes, f"{params}/"),
+            landmarks=make_landmarks(motion.ids, p, conf, limits.max_reach, notes, f"{params}/"),
             poses=motion.poses(f"{params}/"),
             pixels=PixelRules(
                 mask_sampling="nearest", label_table=CIHP_TABLE, ignore_band=self.ignore_band
@@ -111,7 +111,7 @@ class ZjuReader(FolderReader):
         )
 
     def _cameras(
-        self, root: Path, annots: Annots, images: Files, checks: Thresholds
+        self, root: Path, annots: Annots, images: Files, limits: Thresholds
     ) -> dict[str, CameraEntry]:
         """By name, in the order of annots.npy."""
         some = next(files for files in images.values() if files)
@@ -127,7 +127,7 @@ class ZjuReader(FolderReader):
                 size=image_size(root, files or some),
                 scale=MILLIMETRES,
                 pixel_centre=self.pixel_centre,
-                rotation_tolerance=checks.rotation_tolerance,
+                rotation_tolerance=limits.rotation_tolerance,
             )
         length = float(np.median([np.linalg.norm(camera.t) for camera in cameras.values()]))
         low, high = self.translation
