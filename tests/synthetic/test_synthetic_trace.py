@@ -19,7 +19,6 @@ from gsgan.synthetic.trace import (
     PosedCharacter,
     Wrinkles,
     encode,
-    majority,
 )
 
 GREY = 0.21586  # linear light of sRGB 128
@@ -295,8 +294,3 @@ def test_rays_are_spread_about_pixel_centres(rays):
     origin, directions = pixel_rays(view, np.array([3]), np.array([4]), rays)
     pixel = view.project(origin + directions)
     np.testing.assert_allclose(pixel - [3, 4], offsets, atol=1e-9)
-
-
-def test_majority_of_rays():
-    part = np.array([[0, 0, 2, 2], [0, 0, 0, 2], [1, 2, 2, 0], [2, 1, 1, 2]])
-    assert majority(part, 3).tolist() == [2, 0, 2, 1]
