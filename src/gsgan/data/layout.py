@@ -8,7 +8,7 @@ one missing image must not shift the others.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -197,18 +197,6 @@ def assemble(found: Found, limits: Thresholds) -> Layout:
     if 0 < labelled < count:
         notes.append(f"{count - labelled} of {count} images have no labels, they count as 'ignore'")
     check_images(root, cameras, images, masks, labels, limits.header_stride, calibration)
-    return Layout(
-        root=root,
-        meta=found.meta,
-        cameras=cameras,
-        frames=tuple(sorted({f for files in images.values() for f in files})),
-        images=images,
-        masks=masks,
-        labels=labels,
-        landmarks=marks,
-        hands=found.hands,
-        face=found.face,
-        poses=found.poses,
-        pixels=found.pixels,
-        notes=tuple(notes),
-    )
+    kept = {one.name: getattr(found, one.name) for one in fields(_Contents)}
+    kept |= {"images": images, "masks": masks, "labels": labels, "notes": tuple(notes)}
+    return Layout(**kept, frames=tuple(sorted({f for files in images.values() for f in files})))

@@ -71,8 +71,9 @@ def face_labels(character: Character, names: np.ndarray) -> Ints:
     low = (skin == FACE) & (root == "Spine") & (centre[:, 2] < shoulders - CHEST)
     skin = np.where(low, UPPER, skin)
 
-    head = root == "Head"
-    front = head & (c.normals[corner, 1] < -0.6) & (np.abs(centre[:, 2] - _cheeks(c)) < 0.05)
+    head, neck = root == "Head", c.joints[c.bones.index("Head"), 2]
+    cheeks = float(neck + 0.35 * (c.vertices[:, 2].max() - neck))
+    front = head & (c.normals[corner, 1] < -0.6) & (np.abs(centre[:, 2] - cheeks) < 0.05)
     tone = np.median(lab[front] if front.any() else lab, 0)
     bare = _voted(c, np.linalg.norm(lab - tone, axis=1) < SKIN_DISTANCE)
     labels = np.where(bare, skin, cloth)
@@ -153,12 +154,6 @@ def _lab(c: Character) -> Array:
     uv = np.einsum("pk,fkd->pfd", points, c.uv[c.faces])
     lab = np.mean([texture_lab(c, at, c.material) for at in uv], 0)
     return lab * np.array([0.5, 1, 1])
-
-
-def _cheeks(c: Character) -> float:
-    """Height of the cheeks, metres."""
-    head = c.joints[c.bones.index("Head"), 2]
-    return float(head + 0.35 * (c.vertices[:, 2].max() - head))
 
 
 def _neighbours(c: Character) -> Ints:
