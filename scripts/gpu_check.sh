@@ -43,8 +43,8 @@ count=$("$python" -c 'import torch; print(torch.cuda.device_count())')
 
 step parity 180 "$python" -m pytest -q -p no:cacheprovider tests/train/test_cuda.py
 step tests 360 "$python" -m pytest -q -p no:cacheprovider -n auto tests
-step raster 120 "$python" -m gsgan.bench raster device=cuda 'backends=[torch,gsplat]' \
-  'gaussians=[8000]' 'sizes=[512]' 'channels=[3,32]' repeats=5 hydra.run.dir="$out/raster"
+step raster 120 "$python" scripts/bench/raster.py device=cuda 'backends=[torch,gsplat]' \
+  'gaussians=[8000]' 'sizes=[512]' 'channels=[3,32]' repeats=5 out="$out/raster"
 step speed_512 60 "${speed[@]}" hydra.run.dir="$out/speed_512"
 step speed_512_bf16 60 "${speed[@]}" precision=bf16-mixed hydra.run.dir="$out/speed_512_bf16"
 step speed_1024_bf16 60 "${speed[@]}" size.picture=1024 precision=bf16-mixed \

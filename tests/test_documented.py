@@ -24,15 +24,13 @@ from commands import ROOT, TINY
 ELSEWHERE = ("trainer=gpu", "trainer=ddp")
 REPORTS = ("ablation", "ablation_skeleton", "gan")  # blocks of docs/results/ablations.md
 SMALL_BENCH = {
-    "raster": [
-        *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "reference.gaussians=300"),
-        *("reference.size=32", "compare_at=[300]", "windows=1", "window=16"),
-        "memory=false",
-    ],
     "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
     "trade_off": [
         *("settings.accuracies=[draft]", "settings.scales=[0.5]", "settings.backends=[]"),
-        *("settings.precisions=[]", "settings.windows=[]", "repeats=1", "pictures=1"),
+        *("settings.precisions=[]", "settings.windows=[]", "repeats=1", "images=1"),
+    ],
+    "raster": [
+        *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "windows=1", "window=16"),
     ],
 }
 

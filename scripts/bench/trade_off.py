@@ -1,32 +1,47 @@
-"""``python -m gsgan.bench trade-off``: quality against time, of trained avatars and settings."""
+"""Quality against time, of trained avatars and settings; options: trade_off.yaml.
+
+python scripts/bench/trade_off.py run=<run folder>
+python scripts/bench/trade_off.py runs=<folder of a multirun>
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import bench_common
 import numpy as np
 import pandas as pd
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
+from torch.nn import functional
 
 from gsgan.bench import common
 from gsgan.bench.common import NOTHING, Bench, markdown, number
-from gsgan.bench.painter import Painter, Way, painting_memory, place, spread, without_denormals
-from gsgan.bench.speed import deciles
+from gsgan.bench.speed import (
+    PRECISIONS,
+    deciles,
+    make_painter,
+    painting_memory,
+    place,
+    set_backend,
+    spread,
+    without_denormals,
+)
 from gsgan.metrics.image import edge_f1, psnr, ssim
 from gsgan.metrics.lpips import lpips
+from gsgan.model.avatar import Avatar
 from gsgan.model.runs import CHECKPOINT, Moved, build_data, load_avatar, load_config
 from gsgan.report.training_curve import curve
 from gsgan.scene import Frame
-from gsgan.splat import Accuracy
-from gsgan.utils.checks import above, one_of
+from gsgan.splat import BACKENDS, Accuracy
+from gsgan.utils.checks import above, between, one_of
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.palette import BLACK, COLOURS, GREY, MARKERS
 from gsgan.utils.timing import interleaved
@@ -47,8 +62,62 @@ QUALITIES = {
 }
 ORDER = (BLACK, *COLOURS[:-1], GREY)  # the base point's first
 
-AS_TRAINED = Way()
 Score = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class Way:
+    """How an avatar paints. Raises ConfigError on an invalid value."""
+
+    accuracy: Accuracy | None = None  # of F; None: as it was trained
+    precision: str = "32-true"  # of the networks
+    backend: str = "auto"  # of both rasterisations
+    scale: float = 1.0  # of the image's sides; the image is resized to its own size
+    whole: bool = False  # paint the whole image, not only the window around the person
+
+    def __post_init__(self) -> None:
+        one_of("precision", self.precision, PRECISIONS)
+        one_of("backend", self.backend, BACKENDS)
+        between("scale", self.scale, 0.05, 8)
+
+
+AS_TRAINED = Way()
+
+
+class Painter:
+    """Paints frames with one avatar, in eval mode, in one way; painters may share an avatar."""
+
+    def __init__(self, avatar: Avatar, way: Way) -> None:
+        self.avatar, self.way = avatar, way
+
+    def __call__(self, frame: Frame) -> Tensor:
+        """``[B, 3, H, W]`` I_pred in the frame's own size, float32, not clamped."""
+        way, size = self.way, frame.camera.size
+        if way.scale != 1:
+            side = (max(1, round(size[0] * way.scale)), max(1, round(size[1] * way.scale)))
+            frame = replace(frame, camera=frame.camera.resize(side))
+        with changed(self.avatar, way):
+            image = make_painter(self.avatar, way.precision, way.backend)(frame)
+        if way.scale == 1:
+            return image
+        return functional.interpolate(
+            image, size=size, mode="bicubic", antialias=way.scale > 1, align_corners=False
+        )
+
+
+@contextmanager
+def changed(avatar: Avatar, way: Way) -> Iterator[None]:
+    """Gives the avatar the accuracy and window of a way, and restores its own afterwards."""
+    before = avatar.accuracy, avatar.window_margin
+    if way.accuracy is not None:  # how pixels are formed belongs to the model, not to the preset
+        formed = {k: getattr(before[0], k) for k in ("low_pass", "supersample", "antialias")}
+        avatar.accuracy = replace(way.accuracy, **formed)
+    avatar.window_margin = None if way.whole else avatar.window_margin
+    try:
+        yield
+    finally:
+        avatar.accuracy, avatar.window_margin = before
+        set_backend(avatar, "auto")
 
 
 @dataclass(frozen=True)
@@ -65,14 +134,14 @@ def run(config: DictConfig, folder: Path) -> None:
     """Measures every point, writes a table and a plot.
 
     Args:
-        config: as conf/bench_trade_off.yaml.
+        config: as trade_off.yaml.
         folder: where everything goes.
 
     Raises:
         ConfigError: on a wrong value.
         DataError: when a run or its data cannot be read.
     """
-    common.check_whole(config, repeats=1, pictures=1)
+    common.check_whole(config, repeats=1, images=1)
     above("patience", config.patience)
     one_of("split", config.split, ("novel_pose", "novel_view"))
     one_of("quality", config.quality, QUALITIES)
@@ -80,13 +149,12 @@ def run(config: DictConfig, folder: Path) -> None:
     perceptual, _ = lpips(config.lpips.net, config.lpips.path)
     runs = trained(config, bench)
     subject = standard_run(runs).folder
-    accuracies = {str(name): instantiate(one) for name, one in config.accuracies.items()}
-    points = [*runs, *ways(subject, config.settings, accuracies)]
+    points = [*runs, *ways(subject, config.settings)]
     painters, frames, marks = load(points, config, bench)
     found, samples = measure(points, painters, frames, perceptual, config, bench)
     seconds = {p.folder: c.seconds[-1] for p in runs if (c := curve(p.label, p.folder))}
     frame = make_rows(points, found, samples, seconds)
-    about = {"split": config.split, "pictures": len(frames), "subject": subject.name}
+    about = {"split": config.split, "images": len(frames), "subject": subject.name}
     page = text(frame, config.quality, about, bench.where, marks)
     record = {
         **about,
@@ -95,9 +163,9 @@ def run(config: DictConfig, folder: Path) -> None:
         "front": [frame.label[i] for i in front(frame, config.quality)],
     }
     second = "edge_f1" if perceptual is None else "lpips"
-    plots = {"trade_off.png": plot(frame, [*dict.fromkeys((config.quality, second))])}
+    images = {"trade_off.png": plot(frame, [*dict.fromkeys((config.quality, second))])}
     docs = f"{page}\n\n![Quality against time per frame](pictures/trade_off.png)"
-    bench.write("Quality against time", page, record, frame, plots, docs=docs)
+    bench.write("Quality against time", page, record, frame, images, docs=docs)
 
 
 def trained(config: DictConfig, bench: Bench) -> list[Point]:
@@ -147,18 +215,14 @@ def standard_run(runs: Sequence[Point]) -> Point:
     return named.get(BASE) or named.get("full") or runs[0]
 
 
-def ways(
-    folder: Path, settings: Mapping[str, Any], accuracies: Mapping[str, Accuracy]
-) -> list[Point]:
-    """One avatar in every other way that the settings name, one thing at a time."""
-    for name in settings.get("accuracies", ()):
-        one_of("settings.accuracies", name, accuracies)
+def ways(folder: Path, settings: Mapping[str, Any]) -> list[Point]:
+    """One avatar in every other way that the settings list, one change at a time."""
     make: dict[str, Callable[[Any], tuple[str, str, Way]]] = {
-        "accuracies": lambda name: ("accuracy", name, Way(accuracy=accuracies[name])),
+        "accuracies": lambda name: ("accuracy", name, Way(accuracy=bench_common.preset(name))),
         "precisions": lambda name: ("precision", name, Way(precision=name)),
-        "scales": lambda scale: ("picture size", f"× {scale}", Way(scale=scale)),
+        "scales": lambda scale: ("image size", f"× {scale}", Way(scale=scale)),
         "backends": lambda name: ("backend", name, Way(backend=name)),
-        "windows": lambda _: ("window", "whole picture", Way(whole=True)),
+        "windows": lambda _: ("window", "whole image", Way(whole=True)),
     }
     found = [one(value) for name, one in make.items() for value in settings.get(name, ())]
     return [Point(factor, label, folder, way) for factor, label, way in found]
@@ -187,7 +251,7 @@ def load(
         avatar, found = load_avatar(folder, stored, data)
         avatars[folder] = place(avatar, bench.device, channels_last=True)
         marks |= dict.fromkeys(found)
-    frames = [frame.to(bench.device) for frame in spread(data, config.pictures, config.split)]
+    frames = [frame.to(bench.device) for frame in spread(data, config.images, config.split)]
     return [Painter(avatars[point.folder], point.way) for point in points], frames, list(marks)
 
 
@@ -310,7 +374,7 @@ def text(
     if frame.left_out.any():
         notes.append(f"{frame.left_out.sum()} scores were not finite and are not in the means")
     heading = (
-        f"{about['pictures']} images of {about['split']}; settings changed on {about['subject']}; "
+        f"{about['images']} images of {about['split']}; settings changed on {about['subject']}; "
         f"one image at a time. Front: nothing is as fast and scores as much "
         f"({QUALITIES[metric][0]})."
     )
@@ -340,7 +404,7 @@ def plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
     A metric without any score has no panel, unless none has one.
     """
     metrics = [m for m in metrics if frame[m].notna().any()] or metrics[:1]
-    figure, all_axes = common.panels(len(metrics), 6.4 * len(metrics), 5.6)
+    figure, all_axes = bench_common.panels(len(metrics), 6.4 * len(metrics), 5.6)
     for axes, metric in zip(all_axes, metrics, strict=True):
         heading, _, sign = QUALITIES[metric]
         ahead = frame.iloc[front(frame, metric)]
@@ -354,7 +418,7 @@ def plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
             )
         axes.set(xscale="log", xlabel="milliseconds per frame (whiskers: deciles)")
         axes.set_ylabel(f"{heading}, {'higher' if sign > 0 else 'lower'} is better")
-        common.plain_ticks(axes.xaxis)
+        bench_common.plain_ticks(axes.xaxis)
         axes.margins(x=0.16, y=0.1)
         if sign < 0:
             axes.invert_yaxis()
@@ -363,4 +427,8 @@ def plot(frame: pd.DataFrame, metrics: Sequence[str]) -> bytes:
             axes.text(row.ms, row[metric], f"\n   {row.label}   \n", ha=ha, va=va, fontsize=7.5)
     shown = all_axes[0].get_legend_handles_labels()
     figure.legend(*shown, loc="outside lower center", ncols=6, frameon=False)
-    return common.png(figure)
+    return bench_common.png(figure)
+
+
+if __name__ == "__main__":
+    bench_common.main("trade_off", run)

@@ -1,4 +1,4 @@
-"""``python -m gsgan.bench effects``: what each effect gains where it is called for, and costs."""
+"""The gain and cost of each effect in a scene that calls for it; options: effects.yaml."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import bench_common
 import pandas as pd
 import torch
-from hydra import compose
+from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
-from gsgan.bench import common
 from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, sentence
-from gsgan.bench.painter import evenly
 from gsgan.effects import decide as decide_effects
 from gsgan.model.runs import build_data, load_avatar, load_config
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
+from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, GsganError
 from gsgan.utils.timing import interleaved, median
 
@@ -58,7 +59,7 @@ def run(config: DictConfig, folder: Path) -> None:
     """Decides, trains what is not trained yet, times, writes tables.
 
     Args:
-        config: as conf/bench_effects.yaml.
+        config: as effects.yaml.
         folder: where everything goes; runs lie under ``runs/``.
 
     Raises:
@@ -79,7 +80,7 @@ def run(config: DictConfig, folder: Path) -> None:
             progress.advance(task)
         for name, words in trainings.items():
             progress.update(task, description=f"training {name}")
-            common.train(words, folder / "runs" / name)
+            bench_common.train(words, folder / "runs" / name)
             metrics[name] = json.loads((folder / "runs" / name / "metrics.json").read_text())
             progress.advance(task)
         for row in rows:
@@ -126,7 +127,8 @@ def rows_of(config: DictConfig) -> Iterator[Row]:
 
 def decide(row: Row, base: Sequence[str]) -> None:
     """Fills in whether `auto` turns the effect on in the scene, and its reason."""
-    config = compose("train", [*base, *row.overrides, f"effects.{row.effect}=auto"])
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("train", [*base, *row.overrides, f"effects.{row.effect}=auto"])
     decisions = decide_effects(build_data(config).info, instantiate(config.effects))
     found = getattr(decisions, row.effect)
     row.auto, row.why = found.on, found.why
@@ -151,7 +153,7 @@ def measure(row: Row, folder: Path, frames: int, repeats: int) -> None:
         data = build_data(config)
         avatar, _ = load_avatar(folder / name, config, data)
         dataset = data.dataset(row.split)
-        chosen = evenly(len(dataset), frames)
+        chosen = evenly_spaced(len(dataset), frames)
         count, shown = len(chosen), [dataset[i] for i in chosen]
         paint[state] = lambda a=avatar, shown=shown: [a.paint(frame).image for frame in shown]
         read[state] = lambda d=dataset, chosen=chosen: [d[i] for i in chosen]
@@ -212,3 +214,7 @@ def _gain(row: Row, variant: str) -> str:
 
 def _change(values: Mapping[str, float]) -> str:
     return f"{values['off']:.2f} → {values['on']:.2f}" if values else NOTHING
+
+
+if __name__ == "__main__":
+    bench_common.main("effects", run)

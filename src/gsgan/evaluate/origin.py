@@ -1,9 +1,7 @@
-"""facts.json: the method, data and code behind a set of scores."""
+"""The origin of a set of scores, as in facts.json: method, data and code."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import subprocess
 from dataclasses import asdict, dataclass
 from datetime import datetime
@@ -11,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from omegaconf import OmegaConf
 
 from gsgan import __version__
-from gsgan.model.runs import hydra_record
+from gsgan.data.fingerprint import fingerprint
+from gsgan.model.runs import choices
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
@@ -26,7 +24,7 @@ SAME = ("method", "model", "protocol", "seed", "iterations", "version", "commit"
 
 @dataclass(frozen=True)
 class Method:
-    """The method that is scored; None where unknown.
+    """A method that is scored; None where unknown.
 
     Args:
         name: of the method.
@@ -51,7 +49,7 @@ def trained(folder: Path, **training: Any) -> Method:
     return Method("gsgan", model=chosen.get("model"), data=chosen.get("data"), **training)
 
 
-def facts(method: Method, data: GsganData, device: torch.device) -> dict[str, Any]:
+def origin(method: Method, data: GsganData, device: torch.device) -> dict[str, Any]:
     """The content of facts.json."""
     commit, dirty = _commit()
     trained = asdict(method)
@@ -95,38 +93,15 @@ def _commit() -> tuple[str | None, bool | None]:
     return found.removesuffix(DIRTY) or None, found.endswith(DIRTY)
 
 
-def fingerprint(data: GsganData) -> str:
-    """A short hash of cameras, frames, splits, image size and fitted body poses, independent of the
-    contents of images and of where the files are."""
-    layout = data.layout
-    content: dict[str, Any] = {
-        "cameras": {name: list(camera.size) for name, camera in layout.cameras.items()},
-        "frames": list(layout.frames),
-        "splits": {k: [list(item) for item in items] for k, items in data.splits.items.items()},
-        "size": data.size,
-        "crop": None if data.crop is None else asdict(data.crop),
-    }
-    if layout.poses is not None and layout.poses.fitted:  # other poses are other inputs
-        content["poses"] = layout.poses.digest(layout.frames)
-    plain = json.dumps(content, sort_keys=True).encode()
-    return hashlib.sha256(plain).hexdigest()[:12]
-
-
-def choices(folder: Path) -> dict[str, Any]:
-    """The config groups' choices of a run folder as Hydra recorded them, or nothing."""
-    found = OmegaConf.select(hydra_record(folder), "hydra.runtime.choices")
-    return {} if found is None else {str(key): value for key, value in found.items()}
-
-
-def caption(facts: dict[str, Any]) -> str:
+def caption(origin: dict[str, Any]) -> str:
     """One line under a table: method, protocol, data, number of seeds, commit."""
-    data, seed = facts["data"], facts["seed"]
+    data, seed = origin["data"], origin["seed"]
     return " · ".join(
         [
-            facts["method"] if facts["model"] is None else f"{facts['method']} {facts['model']}",
-            f"protocol {facts['protocol'] or 'none'}",
+            " ".join(filter(None, (origin["method"], origin["model"]))),
+            f"protocol {origin['protocol'] or 'none'}",
             f"data {data['name'] or 'unknown'} ({data['root']}, {data['fingerprint']})",
             "seed unknown" if seed is None else f"seed {seed}",
-            f"commit {facts['commit'] or 'unknown'}" + (", changed since" * bool(facts["dirty"])),
+            f"commit {origin['commit'] or 'unknown'}" + (", changed since" * bool(origin["dirty"])),
         ]
     )

@@ -1,4 +1,4 @@
-"""``python -m gsgan.bench roofline``: the work of each stage against what the machine can do."""
+"""The work of each stage of painting against the machine's peak; options: roofline.yaml."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import bench_common
 import pandas as pd
 import torch
-from omegaconf import DictConfig, OmegaConf
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import flop_registry
 
 from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, number, sentence
-from gsgan.bench.painter import Painter, Way, without_denormals
-from gsgan.bench.speed import REST, TOTAL, load_subject, measure
+from gsgan.bench.speed import REST, TOTAL, load_subject, make_painter, measure, without_denormals
 from gsgan.model.avatar import Avatar, unwatched
 from gsgan.scene import Camera, Frame, Gaussians
 from gsgan.splat import Accuracy
@@ -34,22 +35,23 @@ def run(config: DictConfig, folder: Path) -> None:
     """Counts and times the stages of painting; writes ``roofline.md``, ``.json`` and ``.csv``.
 
     Args:
-        config: as conf/bench_roofline.yaml.
+        config: as roofline.yaml.
         folder: where they go.
 
     Raises:
         ConfigError: on a value out of range.
     """
-    check_whole(config, frames=1, warmup=0, poses=1, seed=0)
+    check_whole(config, frames=1, warmup=0, poses=1)
     bench = Bench.start("roofline", config, folder)
     tables, peak = [], peaks(bench.device)
     for size in config.sizes:
-        config.size = OmegaConf.load(config_folder() / "size" / f"{size}.yaml")
-        avatar, frames, _, _ = load_subject(config, bench.device)
+        with initialize_config_dir(str(config_folder()), version_base="1.3"):
+            speed = compose("bench_speed", [f"size={size}", *config.speed])
+        speed.poses = config.poses
+        avatar, frames, _, _ = load_subject(speed, bench.device)
         with without_denormals():
-            times = measure(
-                Painter(avatar, Way()), frames, count=config.frames, warmup=config.warmup
-            )
+            painter = make_painter(avatar)
+            times = measure(avatar, painter, frames, count=config.frames, warmup=config.warmup)
             work = [stage_work(avatar, frame) for frame in frames]
         mean = pd.concat(work).groupby(level=0, sort=False).mean()
         tables.append(against(mean, times["median"].drop(REST), peak).assign(size=size))
@@ -141,14 +143,6 @@ def composited(gaussians: Gaussians, camera: Camera, accuracy: Accuracy) -> tupl
     return pairs * (PER_PAIR + 2 * C), float(moved)
 
 
-def least(
-    gaussians: Gaussians, camera: Camera, accuracy: Accuracy, peak: dict[str, float]
-) -> float:
-    """Milliseconds that compositing takes at the machine's `peaks`."""
-    flop, moved = composited(gaussians, camera, accuracy)
-    return max(flop / peak["GFLOP/s"], moved / peak["GB/s"]) / 1e6
-
-
 def against(work: pd.DataFrame, ms: pd.Series, peak: dict[str, float]) -> pd.DataFrame:
     """The work beside its times: ``bound_ms``, the least that the peaks allow, and its share."""
     table = work.join(ms.rename("ms"), how="inner")
@@ -175,3 +169,7 @@ def text(table: pd.DataFrame, peak: dict[str, float], where: str) -> str:
     )
     found = " and ".join(f"{number(value)} {name}" for name, value in peak.items())
     return f"{where}.\n\nPeak: {found}.\n\n{markdown(shown)}"
+
+
+if __name__ == "__main__":
+    bench_common.main("roofline", run)
