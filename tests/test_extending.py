@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from gsgan.data.cameras import make_camera
 from gsgan.data.files import frame_files
-from gsgan.data.formats.common import FolderReader, one_mask_each, picture_size
+from gsgan.data.formats.common import FolderReader, image_size, one_mask_each
 from gsgan.data.layout import Found, Meta
 from gsgan.data.skeletons import make_landmarks
 from gsgan.model.body_points import SkinnedPoints
@@ -29,7 +29,7 @@ class NpzReader(FolderReader):
     contents = "cameras.npz, skeletons.npz, CAMERA/ and CAMERA_mask/"
     hint = "check that cameras.npz and skeletons.npz have the same world frame and unit"
 
-    def find(self, root, checks, smpl) -> Found:
+    def find(self, root, limits, smpl) -> Found:
         images, masks, cameras = {}, {}, {}
         file = root / "cameras.npz"
         with np.load(file) as arrays:
@@ -38,7 +38,7 @@ class NpzReader(FolderReader):
             ):
                 images[name] = frame_files(root, name, (".png",))
                 masks[name] = frame_files(root, f"{name}_mask", (".png",))
-                size = picture_size(root, images[name])
+                size = image_size(root, images[name])
                 cameras[name] = make_camera(
                     f"{file}: {name}", name, K=K, R=R, t=t, dist=None, size=size
                 )
@@ -51,7 +51,7 @@ class NpzReader(FolderReader):
             images=images,
             masks=one_mask_each(masks, "grey"),
             mask_folder="{camera}_mask",
-            landmarks=make_landmarks(ids, p, np.ones(p.shape[:2]), checks.max_reach, []),
+            landmarks=make_landmarks(ids, p, np.ones(p.shape[:2]), limits.max_reach, []),
             calibration=file,
             unit_hint="lengths must be in metres",
         )

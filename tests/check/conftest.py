@@ -41,7 +41,7 @@ def check(monkeypatch: pytest.MonkeyPatch):
     from gsgan.check.run import check_data
     from gsgan.data.datamodule import GsganData
     from gsgan.data.formats.capture import CaptureReader
-    from gsgan.data.formats.trust import Trust
+    from gsgan.data.formats.consistency import Consistency
 
     # tests of the command draw them
     monkeypatch.setattr(rig, "rig_drawing", lambda _: b"<?")
@@ -51,7 +51,7 @@ def check(monkeypatch: pytest.MonkeyPatch):
         sampling = Sampling(
             pictures=pictures, hull_frames=1, trials=100, shown=1, tile=60, size_ratio=1.4
         )
-        reader = CaptureReader(trust=Trust(min_box_iou=0.0, **(trust or {})))
+        reader = CaptureReader(consistency=Consistency(min_box_iou=0.0, **(trust or {})))
         data = GsganData(root=str(root), reader=reader)
         # the forearm of the test person grows as it is raised
         return check_data(data, sampling, Limits(limb_share=2.0, **limits))

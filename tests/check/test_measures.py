@@ -17,7 +17,7 @@ from gsgan.check.rig import axis_name, ground_axes, rig_drawing, rig_findings, r
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import complete, measure, sampled_items, subject_of
 from gsgan.data.datamodule import GsganData
-from gsgan.data.formats.trust import spread
+from gsgan.data.formats.consistency import spread
 from gsgan.effects import EffectSettings
 from gsgan.utils.errors import ConfigError
 

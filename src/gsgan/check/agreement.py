@@ -17,7 +17,7 @@ from gsgan.check.report import Finding, Table
 from gsgan.check.settings import Limits
 from gsgan.check.views import Subject, View, grouped, thickness
 from gsgan.data.crop import NEAR, project
-from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float, spread
+from gsgan.data.formats.consistency import FAR_PIXELS, Bool, Float, spread
 from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import EffectSettings
 

@@ -13,7 +13,7 @@ from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import Subject, View, best_shift, body_silhouette, grouped, moved, overlap
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import project
-from gsgan.data.formats.trust import Bool, spread
+from gsgan.data.formats.consistency import Bool, spread
 
 TOPIC = "calibration"
 MIRRORED = "mirrored images"

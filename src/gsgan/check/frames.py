@@ -15,9 +15,9 @@ from scipy.ndimage import binary_opening
 from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits
 from gsgan.check.views import Subject, View, grouped, nanmedian
-from gsgan.data.checks import spans
 from gsgan.data.files import read_arrays
-from gsgan.data.formats.trust import Bool, Float
+from gsgan.data.formats.consistency import Bool, Float
+from gsgan.data.validation import spans
 from gsgan.skeleton.template import SkeletonTemplate
 from gsgan.utils.arrays import expect_array
 

@@ -15,7 +15,7 @@ from gsgan.check.settings import Limits
 from gsgan.check.views import Subject, nanmedian
 from gsgan.data.crop import project
 from gsgan.data.files import read_arrays
-from gsgan.data.formats.trust import Bool, Float
+from gsgan.data.formats.consistency import Bool, Float
 from gsgan.data.joints import PALM, WRISTS
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.skeleton.hands import FINGER_BONES, HAND

@@ -13,7 +13,7 @@ from gsgan.data import crop as cropping
 from gsgan.data import pixels as reading
 from gsgan.data.crop import NEAR, Crop
 from gsgan.data.files import read_colour
-from gsgan.data.formats.trust import FAR_PIXELS, Bool, Float
+from gsgan.data.formats.consistency import FAR_PIXELS, Bool, Float
 from gsgan.skeleton.template import SkeletonTemplate
 from gsgan.utils.images import caption, encode
 

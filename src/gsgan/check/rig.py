@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from gsgan.check.report import Finding, Table
 from gsgan.check.settings import Limits
 from gsgan.check.views import Subject, nanmedian
-from gsgan.data.formats.trust import Float, far_cameras
+from gsgan.data.formats.consistency import Float, far_cameras
 from gsgan.skeleton.sanitise import limb_length_sum
 from gsgan.utils.palette import BLACK, COLOURS, GREY
 

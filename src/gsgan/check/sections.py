@@ -15,7 +15,7 @@ from gsgan.check.frames import doubts, frame_findings, motion_of, shortened
 from gsgan.check.hands import hand_findings
 from gsgan.check.report import Figure, Finding, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
-from gsgan.data.formats.trust import spread
+from gsgan.data.formats.consistency import spread
 from gsgan.data.skeletons import Landmarks
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.table import HEADERS, rows

@@ -24,12 +24,12 @@ from gsgan.check.settings import Sampling
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, inside, project
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.formats.trust import (
+from gsgan.data.formats.consistency import (
     FAR_PIXELS,
     TOLERANCE,
     Bool,
+    Consistency,
     Float,
-    Trust,
     joint_distance,
     mask_distance,
     spread,
@@ -64,7 +64,7 @@ class Subject:
     """
 
     layout: Layout
-    trust: Trust
+    trust: Consistency
     frames: NDArray[np.int64]
     pairs: Mapping[str, tuple[int, ...]]
     p: Float
@@ -96,10 +96,10 @@ def subject_of(data: GsganData) -> Subject:
     Raises:
         DataError: when it cannot be read.
     """
-    trust = getattr(data.reader, "trust", None) or Trust()
-    if hasattr(data.reader, "trust"):
+    trust = getattr(data.reader, "consistency", None) or Consistency()
+    if hasattr(data.reader, "consistency"):
         reader: Any = data.reader  # one of the dataclasses of gsgan.data.formats
-        data.reader = replace(reader, trust=replace(trust, frames=0))
+        data.reader = replace(reader, consistency=replace(trust, frames=0))
     layout = data.layout
     frames = np.array(layout.frames, np.int64)
     axis = layout.meta.up_axis

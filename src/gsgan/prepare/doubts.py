@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsgan.data import checks
+from gsgan.data import validation
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.joints import BODY, joint_names, known
 from gsgan.prepare.cleanse import BODY_BONES, bone_lengths
@@ -37,7 +37,7 @@ class Doubts:
     delay: float = 0.5
     delay_gain: float = 0.05
     fps: float = 0.01
-    distance: tuple[float, float] = checks.Checks.distance
+    distance: tuple[float, float] = validation.Thresholds.distance
 
 
 def doubts_about_sources(sources: Mapping[str, Source], limits: Doubts) -> list[str]:
@@ -156,4 +156,4 @@ def check_distance(cameras: Sequence[CameraEntry], p: Float, limits: Doubts, whe
     if not len(seen):
         raise DataError(f"{where}: no joint was seen by two cameras; do frame numbers agree?")
     hint = "is the calibration in another unit? Set unit=mm, cm or m"
-    checks.check_distance(where, cameras, seen, limits.distance, hint)
+    validation.check_distance(where, cameras, seen, limits.distance, hint)

@@ -10,10 +10,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsgan.data.checks import spans
 from gsgan.data.datamodule import GsganData
 from gsgan.data.fingerprint import fingerprint
 from gsgan.data.splits import SPLITS, Item
+from gsgan.data.validation import spans
 from gsgan.metrics.image import edge_scores, psnr
 from gsgan.model.avatar import Avatar, Painting
 from gsgan.model.runs import (
