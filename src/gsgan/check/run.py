@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections import Counter
 from dataclasses import asdict
@@ -20,7 +19,7 @@ from gsgan.check.settings import Limits, Sampling
 from gsgan.effects import EffectSettings
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import write_atomically
+from gsgan.utils.files import write_atomically, write_json, writing
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
@@ -98,26 +97,40 @@ def run_check(config: DictConfig) -> Report:
         if not isinstance(error.__cause__, DataError):
             raise
         report = unreadable(config.data.get("root"), error.__cause__)
-    path = Path(config.report).expanduser()
-    numbers = json.dumps(plain(report), indent=1, allow_nan=False) + "\n"
-    try:
-        write_atomically(path, page(report))
-        write_atomically(path.with_suffix(".json"), numbers)
-    except OSError as error:
-        raise ConfigError(f"report={path} cannot be written: {error.strerror}") from None
-    print_report(report, console)
-    console.print(f"report: {path}", markup=False, highlight=False, soft_wrap=True)
+    write_report(report, Path(config.report).expanduser(), console)
     return report
 
 
+def check_capture(root: Path, page: Path, console: Console) -> Report:
+    """Checks a capture with the default settings, prints the report and writes it beside ``page``.
+
+    Raises:
+        DataError: when the report cannot be written.
+    """
+    from gsgan.data.datamodule import GsganData
+    from gsgan.data.formats.capture import CaptureReader
+
+    data = GsganData(root=str(root), reader=CaptureReader())
+    report = check_data(data, Sampling(), Limits(), console=console)
+    write_report(report, page, console)
+    return report
+
+
+def write_report(report: Report, path: Path, console: Console) -> None:
+    """Writes the report as HTML, its numbers beside it as JSON, and prints it."""
+    with writing(path):
+        write_atomically(path, page(report))
+    write_json(path.with_suffix(".json"), plain(report))
+    print_report(report, console)
+    console.print(f"report: {path}", markup=False, highlight=False, soft_wrap=True)
+
+
 def plain(report: Report) -> dict[str, Any]:
-    """The report's findings and numbers for the JSON file; null stands for NaN and infinity."""
-    content = {
+    """The report's findings and numbers for the JSON file."""
+    return {
         "root": report.root,
         "errors": report.errors,
         "warnings": report.warnings,
         "findings": [asdict(finding) for finding in report.findings],
         **report.numbers,
     }
-    found: dict[str, Any] = json.loads(json.dumps(content), parse_constant=lambda _: None)
-    return found

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM, WRISTS, known
-from gsgan.prepare.rig import Bool, Float
+from gsgan.data.skeletons import bone_lengths
+from gsgan.prepare.camera_array import Bool, Float
 from gsgan.skeleton.hands import FINGER_BONES, HAND
 from gsgan.utils.checks import above, at_least
 
@@ -84,12 +85,6 @@ def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
     wrong &= known(p)
     p[wrong] = np.nan
     return p, {"too far away": int(far.sum()), "bone length": int(wrong.sum())}
-
-
-def bone_lengths(p: Float, bones: Bones) -> Float:
-    """``[F, B]`` metres, NaN where an end is missing."""
-    ends = np.array(bones)
-    return np.asarray(np.linalg.norm(p[:, ends[:, 1]] - p[:, ends[:, 0]], axis=-1))
 
 
 def _off(p: Float, bones: Bones, share: float, least: float = 0.0) -> Bool:

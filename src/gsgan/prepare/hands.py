@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.joints import HAND_PAIRS
-from gsgan.prepare.rig import Bool, Float, Rig
+from gsgan.prepare.camera_array import Bool, CameraArray, Float
 from gsgan.prepare.triangulate import (
     Triangulation,
     apply_flips,
@@ -39,7 +39,7 @@ class HandMatching:
 
 
 def match_hands(
-    rig: Rig,
+    cameras: CameraArray,
     uv: Float,
     weight: Float,
     wrists: Float,
@@ -54,7 +54,7 @@ def match_hands(
     smaller distances to the wrists is taken.
 
     Args:
-        rig: ``C`` cameras.
+        cameras: ``C`` cameras.
         uv, weight: ``[C, F, 42, 2]`` undistorted pixels, the left hand's first, NaN = not seen, and
             their confidence.
         wrists: ``[C, F, 2, 2]`` where the pose's wrists are in each view; NaN = unknown.
@@ -64,17 +64,17 @@ def match_hands(
     """
     quick = replace(triangulation, max_error=np.inf)
     weight = np.where(weight > quick.min_confidence, weight, 0.0)
-    roots, trust = (v.reshape(*v.shape[:2], 2, HAND, -1)[:, :, :, 0] for v in (uv, weight))
+    roots, certain = (v.reshape(*v.shape[:2], 2, HAND, -1)[:, :, :, 0] for v in (uv, weight))
     off = np.linalg.norm(roots[:, :, :, None] - wrists[:, :, None], axis=-1)  # [C, F, hand, wrist]
     # A hand is left out where one wrist is unknown: its distances cannot be compared.
     known = np.isfinite(off).all(-1, keepdims=True)
-    loss = np.where(known, HAND * trust * np.log1p((off / matching.wrist) ** 2), 0.0)
+    loss = np.where(known, HAND * certain * np.log1p((off / matching.wrist) ** 2), 0.0)
     kept, swapped = loss[..., 0, 0] + loss[..., 1, 1], loss[..., 0, 1] + loss[..., 1, 0]
 
     def cost_of(flips: Bool, at: NDArray[np.int64]) -> Float:
         sided, seen = (apply_flips(v[:, at], flips[..., None], [OWN_PAIRS]) for v in (uv, weight))
         far = np.where(flips, swapped[:, at], kept[:, at]).sum(0)
-        return np.asarray(points_and_cost(rig, sided, seen, quick)[1] + far)
+        return np.asarray(points_and_cost(cameras, sided, seen, quick)[1] + far)
 
     flips = cheapest_flips(cost_of, swapped < kept, matching.gain * weight.sum(-1))
     everywhere = np.arange(flips.shape[1])

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from gsgan.prepare.options import MEDIAPIPE, MediaPipe, Options
 from gsgan.prepare.sources import Source
-from gsgan.prepare.work import Advance, Work, each_camera
+from gsgan.prepare.stages import Advance, StageFolder, each_camera
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root, writing
 
@@ -35,7 +35,7 @@ def tool_key(tool: MediaPipe) -> list[object]:
 
 
 def run_tool(
-    options: Options, sources: Mapping[str, Source], work: Work, say: Callable[[str], None]
+    options: Options, sources: Mapping[str, Source], stages: StageFolder, say: Callable[[str], None]
 ) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
     """The npz of landmarks and the masks by frame number of each source; runs what is not stored.
 
@@ -48,7 +48,7 @@ def run_tool(
     results, folders = {}, {}
     for name, source in sources.items():
         key = [source.fingerprint(), source.rotate, tool_key(tool), parts, masks]
-        folders[name] = work.place(f"mediapipe-{name}", key)
+        folders[name] = stages.path(f"mediapipe-{name}", key)
         results[name] = folders[name].with_suffix(".npz")
     # The npz is written last: where it exists, the masks are complete, too.
     missing = [name for name in sources if not results[name].is_file()]

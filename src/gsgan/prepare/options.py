@@ -10,11 +10,17 @@ from typing import Any
 from gsgan.data.calibration import Calibration, find_calibration, read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.motion.points import UNITS
-from gsgan.prepare.doubts import Doubts
-from gsgan.prepare.pictures import MaskTidying, PictureFiles
-from gsgan.prepare.rig import MIN_VIEWS
+from gsgan.prepare.camera_array import MIN_VIEWS
+from gsgan.prepare.images import ImageFiles, MaskTidying
 from gsgan.prepare.solve import Settings
-from gsgan.prepare.sources import Source, find_sources, fit_size, matching_cameras, pair_cameras
+from gsgan.prepare.sources import (
+    Source,
+    find_sources,
+    fit_size,
+    matching_cameras,
+    pair_cameras,
+    recording_notes,
+)
 from gsgan.utils.checks import above, at_least, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -38,18 +44,6 @@ class MediaPipe:
         between("mediapipe.confidence", self.confidence, 0, 1)
         between("mediapipe.tracking", self.tracking, 0, 1)
         at_least("mediapipe.margin", self.margin, 0)
-
-
-@dataclass(frozen=True)
-class Overlays:
-    """Images in the report, see conf/prepare.yaml."""
-
-    frames: int = 4
-    size: int = 420
-
-    def __post_init__(self) -> None:
-        whole("overlays.frames", self.frames, 0)
-        whole("overlays.size", self.size, 1)
 
 
 @dataclass(frozen=True)
@@ -84,9 +78,7 @@ class Options:
     mediapipe: MediaPipe = field(default_factory=MediaPipe)
     solve: Settings = field(default_factory=Settings)
     mask_tidying: MaskTidying = field(default_factory=MaskTidying)
-    pictures: PictureFiles = field(default_factory=PictureFiles)
-    doubts: Doubts = field(default_factory=Doubts)
-    overlays: Overlays = field(default_factory=Overlays)
+    images: ImageFiles = field(default_factory=ImageFiles)
 
     def __post_init__(self) -> None:
         for name, what in (("source", "folder with the videos"), ("out", "folder to make")):
@@ -168,6 +160,7 @@ def read_inputs(options: Options) -> Inputs:
         notes += [] if note is None else [note]
     if unused := sorted(set(calibration.cameras) - set(pairs.values())):
         notes.append(f"calibrated without a video, left out: {', '.join(unused)}")
+    notes += recording_notes(sources)
     rates = sorted(source.fps for source in sources.values() if source.fps)
     if options.fps is None and not rates:
         raise ConfigError("images have no frame rate; give fps=<frames per second>")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.crop import NEAR
 from gsgan.data.joints import known
-from gsgan.prepare.rig import MIN_VIEWS, Bool, Float, Rig
+from gsgan.prepare.camera_array import MIN_VIEWS, Bool, CameraArray, Float
 from gsgan.utils.checks import above, at_least
 
 FAR = 1e6  # pixels: stands for an infinite error
@@ -50,17 +50,19 @@ class Triangulation:
         for name in ("scale", "max_elongation", "max_error"):
             above(f"triangulation.{name}", getattr(self, name))
 
-    def plain(self, rig: Rig, uv: Float, weight: Float) -> Float:
+    def plain(self, cameras: CameraArray, uv: Float, weight: Float) -> Float:
         """``[N, 3]`` the weighted linear (DLT) solution, NaN with fewer than two weighted views.
 
         Args:
-            rig: ``C`` cameras.
+            cameras: ``C`` cameras.
             uv: ``[C, N, 2]`` undistorted pixels, NaN allowed where the weight is 0.
             weight: ``[C, N]`` confidence, at least 0.
         """
-        return _solve(*_rows(rig, uv, weight), weight)[0]
+        return _solve(*_rows(cameras, uv, weight), weight)[0]
 
-    def points(self, rig: Rig, uv: Float, weight: Float, iterations: int = ITERATIONS) -> Points:
+    def points(
+        self, cameras: CameraArray, uv: Float, weight: Float, iterations: int = ITERATIONS
+    ) -> Points:
         """Points that most detections agree on, by reweighting from the best pair of cameras.
 
         Convention: the loss is Cauchy's, ``log(1 + (r/scale)²)`` of the reprojection error r, times
@@ -70,7 +72,7 @@ class Triangulation:
         """
         starts = range(0, max(uv.shape[1], 1), CHUNK)
         chunks = [slice(start, start + CHUNK) for start in starts]
-        parts = [_robust(rig, uv[:, at], weight[:, at], self, iterations) for at in chunks]
+        parts = [_robust(cameras, uv[:, at], weight[:, at], self, iterations) for at in chunks]
         return Points(
             p=np.concatenate([part.p for part in parts]),
             weight=np.concatenate([part.weight for part in parts], axis=1),
@@ -78,19 +80,21 @@ class Triangulation:
         )
 
 
-def _robust(rig: Rig, uv: Float, weight: Float, settings: Triangulation, iterations: int) -> Points:
+def _robust(
+    cameras: CameraArray, uv: Float, weight: Float, settings: Triangulation, iterations: int
+) -> Points:
     weight = np.where(known(uv) & (weight > settings.min_confidence), weight, 0.0)
-    a, b = _rows(rig, uv, weight)
-    p, reweighted = _best_pair(rig, uv, weight, a, b, settings.scale), weight
+    a, b = _rows(cameras, uv, weight)
+    p, reweighted = _best_pair(cameras, uv, weight, a, b, settings.scale), weight
     information = np.zeros((p.shape[0], 3, 3))
     for _ in range(iterations):
-        loss = 1 / (1 + (rig.errors(p, uv) / settings.scale) ** 2)
+        loss = 1 / (1 + (cameras.errors(p, uv) / settings.scale) ** 2)
         reweighted = weight * np.nan_to_num(loss, nan=0.0)
-        depth = np.maximum(rig.project(p)[1], NEAR)
+        depth = np.maximum(cameras.project(p)[1], NEAR)
         scaled = np.nan_to_num(reweighted / depth**2)  # rows are depth times pixels
         new, information = _solve(a, b, scaled)
         p = np.where(np.isfinite(new), new, p)
-    error = rig.errors(p, uv)
+    error = cameras.errors(p, uv)
     certainty = np.linalg.eigvalsh(information)
     missing = certainty[:, 0] * settings.max_elongation**2 < certainty[:, 2]
     missing |= _median(error, weight > 0) > settings.max_error
@@ -108,10 +112,10 @@ def robust_cost(error: Float, weight: Float, scale: float) -> Float:
     return (np.log1p((far / scale) ** 2) * weight).sum(0)
 
 
-def _rows(rig: Rig, uv: Float, weight: Float) -> tuple[Float, Float]:
+def _rows(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
     """``a [C, N, 2, 3]``, ``b [C, N, 2]``: ``a·X - b`` is depth times the error in pixels."""
     uv = np.where((weight > 0)[..., None], uv, 0.0)
-    KR, Kt = rig.K @ rig.R, np.einsum("cij,cj->ci", rig.K, rig.t)
+    KR, Kt = cameras.K @ cameras.R, np.einsum("cij,cj->ci", cameras.K, cameras.t)
     a = uv[..., None] * KR[:, None, 2:] - KR[:, None, :2]
     return a, Kt[:, None, :2] - uv * Kt[:, None, 2:]
 
@@ -129,16 +133,18 @@ def _solve(a: Float, b: Float, weight: Float) -> tuple[Float, Float]:
     return np.where(enough[:, None], p, np.nan), information
 
 
-def _best_pair(rig: Rig, uv: Float, weight: Float, a: Float, b: Float, scale: float) -> Float:
+def _best_pair(
+    cameras: CameraArray, uv: Float, weight: Float, a: Float, b: Float, scale: float
+) -> Float:
     """``[N, 3]`` of all pairs' points and the linear one, that with the smallest robust cost."""
     best = _solve(a, b, weight)[0]
-    cost = robust_cost(rig.errors(best, uv), weight, scale)
-    pairs = list(combinations(range(len(rig)), 2))
+    cost = robust_cost(cameras.errors(best, uv), weight, scale)
+    pairs = list(combinations(range(len(cameras)), 2))
     if len(pairs) > MAX_PAIRS:
         pairs = [pairs[k * PROGRESSION % len(pairs)] for k in range(MAX_PAIRS)]
     for pair in map(list, pairs):
         p = _solve(a[pair], b[pair], weight[pair])[0]
-        new = robust_cost(rig.errors(p, uv), weight, scale)
+        new = robust_cost(cameras.errors(p, uv), weight, scale)
         better = (new < cost) & np.isfinite(p).all(-1)
         best, cost = np.where(better[:, None], p, best), np.where(better, new, cost)
     return best
@@ -155,7 +161,6 @@ def _median(error: Float, used: Bool) -> Float:
 class FlipSearch:
     """How swapped sides are found, see conf/prepare.yaml."""
 
-    enabled: bool = True
     gain: float = 0.15
 
     def __post_init__(self) -> None:
@@ -163,7 +168,7 @@ class FlipSearch:
 
 
 def find_flips(
-    rig: Rig,
+    cameras: CameraArray,
     uv: Float,
     weight: Float,
     groups: Sequence[Pairs],
@@ -178,14 +183,14 @@ def find_flips(
     the whole sequence, the majority of the detections do.
 
     Args:
-        rig: ``C`` cameras.
+        cameras: ``C`` cameras.
         uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
         groups: ``G`` tuples of (left, right) joints that swap together.
         search, triangulation: thresholds, scale and limits.
     """
     quick = replace(triangulation, max_error=np.inf)
     weight = np.where(weight > quick.min_confidence, weight, 0.0)
-    found = [_group_flips(rig, uv, weight, pairs, search.gain, quick) for pairs in groups]
+    found = [_group_flips(cameras, uv, weight, pairs, search.gain, quick) for pairs in groups]
     return np.stack(found, axis=-1)
 
 
@@ -201,19 +206,19 @@ def apply_flips(values: Float, flips: Bool, groups: Sequence[Pairs]) -> Float:
 
 
 def points_and_cost(
-    rig: Rig, uv: Float, weight: Float, quick: Triangulation
+    cameras: CameraArray, uv: Float, weight: Float, quick: Triangulation
 ) -> tuple[Float, Float]:
     """``p [F, J, 3]`` of ``uv [C, F, J, 2]`` and ``weight [C, F, J]``, and its cost ``[F]``."""
     C, F, J = weight.shape
-    trust = weight.reshape(C, -1)
-    found = quick.points(rig, uv.reshape(C, -1, 2), trust, QUICK_ITERATIONS)
-    seen = np.where(np.isfinite(found.error), trust, 0.0)
+    flat = weight.reshape(C, -1)
+    found = quick.points(cameras, uv.reshape(C, -1, 2), flat, QUICK_ITERATIONS)
+    seen = np.where(np.isfinite(found.error), flat, 0.0)
     cost = robust_cost(found.error, seen, quick.scale)
     return found.p.reshape(F, J, 3), cost.reshape(F, J).sum(-1)
 
 
 def _group_flips(
-    rig: Rig, uv: Float, weight: Float, pairs: Pairs, gain: float, quick: Triangulation
+    cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs, gain: float, quick: Triangulation
 ) -> Bool:
     """``[C, F]`` for one group."""
     joints = [j for pair in pairs for j in pair]  # pairs are then adjacent: j and j ^ 1
@@ -223,8 +228,8 @@ def _group_flips(
     everywhere = np.arange(F)
 
     def points(flips: Bool, frames: NDArray[np.int64]) -> tuple[Float, Float]:
-        sided, trust = (apply_flips(v[:, frames], flips[..., None], local) for v in (uv, weight))
-        return points_and_cost(rig, sided, trust, quick)
+        sided, seen = (apply_flips(v[:, frames], flips[..., None], local) for v in (uv, weight))
+        return points_and_cost(cameras, sided, seen, quick)
 
     few = (weight > 0).sum(-1) < LEAST_JOINTS
     price = np.where(few, np.inf, gain * weight.sum(-1))

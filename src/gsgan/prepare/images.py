@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Crop, resize, take, undistort_map
 from gsgan.data.files import frame_files, last_number, read_grey
-from gsgan.prepare.sources import PICTURE_SUFFIXES, Source
-from gsgan.prepare.work import Advance
+from gsgan.data.formats.trust import spread
+from gsgan.prepare.sources import IMAGE_SUFFIXES, Source
+from gsgan.prepare.stages import Advance
 from gsgan.utils.checks import above, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import writing
@@ -40,7 +41,7 @@ class MaskTidying:
 
 
 @dataclass(frozen=True)
-class PictureFiles:
+class ImageFiles:
     """How images and masks are written, see conf/prepare.yaml."""
 
     scale: float = 1.0
@@ -48,9 +49,9 @@ class PictureFiles:
     quality: int = 95
 
     def __post_init__(self) -> None:
-        above("pictures.scale", between("pictures.scale", self.scale, 0, 1))
-        one_of("pictures.format", self.format, ("jpg", "png"))
-        whole("pictures.quality", self.quality, 1)
+        above("images.scale", between("images.scale", self.scale, 0, 1))
+        one_of("images.format", self.format, ("jpg", "png"))
+        whole("images.quality", self.quality, 1)
 
     def camera(self, camera: CameraEntry) -> CameraEntry:
         """The camera of the written images: no distortion, K at their size."""
@@ -66,15 +67,7 @@ class Written:
     """The result of writing one camera's images."""
 
     frames: list[int]  # common numbers that exist now
-    empty: int  # empty masks among them
     decoded: int | None  # images of the source; None when it was not read to its end
-
-
-def sampled(count: int, most: int) -> list[int]:
-    """At most ``most`` of ``count`` positions, evenly spaced."""
-    if not (count and most):
-        return []
-    return np.unique(((np.arange(most) + 0.5) * count / most).astype(int)).tolist()
 
 
 def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]:
@@ -86,10 +79,10 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
     found = {}
     for name in names:
         place = folder / name
-        stems = [p.stem for p in place.glob("*") if p.suffix.lower() in PICTURE_SUFFIXES]
+        stems = [p.stem for p in place.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
         of_persons = bool(stems) and all(re.fullmatch(r"\d+_\d+", stem) for stem in stems)
         number = (lambda stem: int(stem.partition("_")[0])) if of_persons else last_number
-        files = frame_files(folder, name, PICTURE_SUFFIXES, number)
+        files = frame_files(folder, name, IMAGE_SUFFIXES, number)
         if not files:
             raise DataError(f"{place} holds no masks; expected {name}/000000.png and so on")
         found[name] = {number: folder / path for number, path in files.items()}
@@ -99,7 +92,7 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
 def check_values(folder: Path, files: Mapping[int, Path]) -> None:
     """Refuses part numbers, or 0 and 1, with a DataError; one faint mask alone is legitimate."""
     paths = [files[number] for number in sorted(files)]
-    highest = max((int(read_grey(paths[i]).max()) for i in sampled(len(paths), PROBED)), default=0)
+    highest = max((int(read_grey(path).max()) for path in spread(paths, PROBED)), default=0)
     if 0 < highest < PERSON:
         raise DataError(
             f"{folder} holds masks with values up to {highest}; small numbers are labels, expected "
@@ -118,14 +111,14 @@ def tidy(mask: Bytes, settings: MaskTidying) -> Bytes:
     return np.asarray(mask * (areas >= settings.least_blob * areas.max())[labels], np.uint8)
 
 
-def write_pictures(
+def write_images(
     root: Path,
     camera: CameraEntry,
     source: Source,
     masks: Mapping[int, Path],
     frames: Collection[int],
     offset: int,
-    files: PictureFiles,
+    files: ImageFiles,
     tidying: MaskTidying,
     advance: Advance,
 ) -> Written:
@@ -149,19 +142,18 @@ def write_pictures(
             folder.mkdir(parents=True, exist_ok=True)
     window, size = Crop(0, 0, camera.size), files.camera(camera).size
     mapping = undistort_map(camera.K, camera.dist, window) if camera.distorted else None
-    written, empty, decoded, last = list[int](), 0, 0, max(frames, default=-1)
-    for number, picture in source.pictures():
+    written, decoded, last = list[int](), 0, max(frames, default=-1)
+    for number, image in source.images():
         frame = number + offset
         if frame > last:
-            return Written(written, empty, None)
+            return Written(written, None)
         decoded += 1
         if frame not in frames or number not in masks:
             continue
         written.append(frame)
         advance(len(written), len(frames))
         mask = tidy(read_grey(masks[number]), tidying)
-        empty += not mask.any()
-        for pixels, folder, kind in ((picture, images, files.format), (mask, alphas, "png")):
+        for pixels, folder, kind in ((image, images, files.format), (mask, alphas, "png")):
             if pixels.shape[:2] != camera.size:
                 where = masks[number] if pixels is mask else source.path
                 raise DataError(
@@ -170,7 +162,7 @@ def write_pictures(
                 )
             straight = resize(take(pixels, window, mapping, exact=False), size, exact=False)
             _write(folder / f"{frame:06d}.{kind}", straight, files.quality)
-    return Written(written, empty, decoded)
+    return Written(written, decoded)
 
 
 def _write(path: Path, pixels: Bytes, quality: int) -> None:

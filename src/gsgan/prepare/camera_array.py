@@ -1,4 +1,4 @@
-"""A rig of calibrated cameras: projection, undistortion, and refinement of the camera poses."""
+"""Calibrated cameras as arrays: projection, undistortion, and refinement of their poses."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Rig:
+class CameraArray:
     """``C`` cameras without lens distortion, float64."""
 
     K: Float  # [C, 3, 3] pixels, pixel centres at +0.5
@@ -41,8 +41,8 @@ class Rig:
     t: Float  # [C, 3] metres
 
     @classmethod
-    def of(cls, cameras: Sequence[CameraEntry]) -> Rig:
-        """The rig of some cameras, in their order."""
+    def of(cls, cameras: Sequence[CameraEntry]) -> CameraArray:
+        """The arrays of some cameras, in their order."""
         return cls(*(np.stack([getattr(c, key) for c in cameras]) for key in ("K", "R", "t")))
 
     def __len__(self) -> int:
@@ -58,8 +58,8 @@ class Rig:
         """``[C]`` pixels: the mean of both focal lengths."""
         return (self.K[:, 0, 0] + self.K[:, 1, 1]) / 2
 
-    def normalised(self, uv: Float) -> tuple[Rig, Float]:
-        """The rig with focal lengths of `FOCAL` pixels, and pixels ``uv [C, ..., 2]`` to match.
+    def normalised(self, uv: Float) -> tuple[CameraArray, Float]:
+        """The cameras with focal lengths of `FOCAL` pixels, and pixels ``uv [C, ..., 2]`` to match.
 
         Thresholds in such pixels hold for images of any size, and cameras of different sizes count
         alike.
@@ -69,11 +69,11 @@ class Rig:
         K[:, :2] *= ratio[:, None, None]
         return replace(self, K=K), uv * ratio.reshape(-1, *[1] * (uv.ndim - 1))
 
-    def __getitem__(self, cameras: Bool | slice) -> Rig:
-        return Rig(self.K[cameras], self.R[cameras], self.t[cameras])
+    def __getitem__(self, cameras: Bool | slice) -> CameraArray:
+        return CameraArray(self.K[cameras], self.R[cameras], self.t[cameras])
 
     def entries(self, cameras: Sequence[CameraEntry]) -> list[CameraEntry]:
-        """The cameras with this rig's R and t."""
+        """These cameras with the R and t of the arrays."""
         return [replace(c, R=self.R[i], t=self.t[i]) for i, c in enumerate(cameras)]
 
     def project(self, p: Float) -> tuple[Float, Float]:
@@ -129,10 +129,10 @@ class Refinement:
             above(f"refinement.{name}", getattr(self, name))
 
 
-def refine_rig(
-    given: Rig, start: Rig, p: Float, uv: Float, weight: Float, settings: Refinement
-) -> Rig:
-    """The rig with the smallest reprojection error that stays near the given one.
+def refine_cameras(
+    given: CameraArray, start: CameraArray, p: Float, uv: Float, weight: Float, settings: Refinement
+) -> CameraArray:
+    """The cameras with the smallest reprojection error, near the given ones.
 
     Convention: bundle adjustment of poses and points (`scipy.optimize.least_squares`); the loss is
     Cauchy's; K is fixed. Points with fewer than two views are left out.
@@ -148,41 +148,41 @@ def refine_rig(
     p, uv, weight = p[use], uv[:, use], weight[:, use]
     camera, point = np.nonzero(weight)
     uv, weight, square = uv[camera, point], weight[camera, point], settings.scale**2
-    cameras = 6 * len(start)
+    poses = 6 * len(start)
 
-    def rig_at(x: Float) -> Rig:
-        turn, move = np.moveaxis(x[:cameras].reshape(-1, 2, 3), 1, 0)
+    def cameras_at(x: Float) -> CameraArray:
+        turn, move = np.moveaxis(x[:poses].reshape(-1, 2, 3), 1, 0)
         return replace(start, R=Rotation.from_rotvec(turn).as_matrix() @ start.R, t=start.t + move)
 
-    def priors(rig: Rig) -> Float:
-        turned = _turns(given, rig) / np.radians(settings.rotation_prior)
-        return np.c_[turned, (rig.centres - given.centres) / settings.position_prior].ravel()
+    def priors(cameras: CameraArray) -> Float:
+        turned = _turns(given, cameras) / np.radians(settings.rotation_prior)
+        return np.c_[turned, (cameras.centres - given.centres) / settings.position_prior].ravel()
 
     def residuals(x: Float) -> Float:
-        rig = rig_at(x)
-        off = rig.project(p + x[cameras:].reshape(-1, 3))[0][camera, point] - uv
+        cameras = cameras_at(x)
+        off = cameras.project(p + x[poses:].reshape(-1, 3))[0][camera, point] - uv
         error = (off**2).sum(1) + LEAST_SQUARE
         off *= np.sqrt(weight * square * np.log1p(error / square) / error)[:, None]
-        return np.concatenate([off.ravel(), priors(rig)])
+        return np.concatenate([off.ravel(), priors(cameras)])
 
     found = least_squares(
         residuals,
-        np.zeros(cameras + p.size),
+        np.zeros(poses + p.size),
         jac_sparsity=_sparsity(camera, point, len(start), len(p)),
         x_scale="jac",
         ftol=SETTLED,
         max_nfev=settings.steps,
     )
     # Detections do not see a similarity of the whole world, so that search hardly moves along it.
-    rig = rig_at(found.x)
-    return _similar(rig, least_squares(lambda x: priors(_similar(rig, x)), np.zeros(7)).x)
+    cameras = cameras_at(found.x)
+    return _similar(cameras, least_squares(lambda x: priors(_similar(cameras, x)), np.zeros(7)).x)
 
 
-def _similar(rig: Rig, x: Float) -> Rig:
-    """The rig in a world turned by ``x[:3]``, shifted by ``x[3:6]`` and scaled by exp ``x[6]``."""
+def _similar(cameras: CameraArray, x: Float) -> CameraArray:
+    """The cameras in a world turned by ``x[:3]``, moved by ``x[3:6]`` and scaled by exp ``x[6]``."""
     turn = Rotation.from_rotvec(x[:3]).as_matrix()
-    R, centres = rig.R @ turn, np.exp(x[6]) * rig.centres @ turn + x[3:6]
-    return replace(rig, R=R, t=-np.einsum("cij,cj->ci", R, centres))
+    R, centres = cameras.R @ turn, np.exp(x[6]) * cameras.centres @ turn + x[3:6]
+    return replace(cameras, R=R, t=-np.einsum("cij,cj->ci", R, centres))
 
 
 def _sparsity(camera: Ints, point: Ints, cameras: int, points: int) -> sparse.csr_matrix:
@@ -198,12 +198,12 @@ def _sparsity(camera: Ints, point: Ints, cameras: int, points: int) -> sparse.cs
     return sparse.vstack([detections, priors]).tocsr()
 
 
-def camera_moves(before: Rig, after: Rig) -> tuple[Float, Float]:
+def camera_moves(before: CameraArray, after: CameraArray) -> tuple[Float, Float]:
     """How far each camera turned, ``[C]`` degrees, and moved, ``[C]`` millimetres."""
     moved = np.linalg.norm(after.centres - before.centres, axis=-1)
     return np.degrees(np.linalg.norm(_turns(before, after), axis=-1)), 1000 * moved
 
 
-def _turns(before: Rig, after: Rig) -> Float:
-    """``[C, 3]`` rotation vectors from one rig's orientations to another's."""
+def _turns(before: CameraArray, after: CameraArray) -> Float:
+    """``[C, 3]`` rotation vectors from the orientations before to those after."""
     return np.asarray(Rotation.from_matrix(after.R @ before.R.transpose(0, 2, 1)).as_rotvec())
