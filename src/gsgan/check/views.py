@@ -18,7 +18,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import Progress
 
 from gsgan.check.settings import Sampling
 from gsgan.data.cameras import CameraEntry
@@ -37,13 +36,16 @@ from gsgan.data.formats.trust import (
 from gsgan.data.layout import Layout
 from gsgan.data.splits import Item
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
+from gsgan.utils.console import progress
 from gsgan.utils.errors import DataError
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
 FAR = 0.3  # metres: distances of joints from the mask are clipped to this before they are averaged
-SMALL = 128  # pixels, longest side of the masks that calibrations are tried on and hulls carved by
+SMALL = 128  # pixels, longest side of the masks that calibrations are tried on
+LAG = 4  # frames by which a camera is tried earlier and later
+UNUSUAL = 2.5  # a mask file this many times smaller or larger than usual is decoded too
 TAILS = 20000  # files whose end is read
 TAIL = 64  # bytes: some writers append a few after the end mark
 END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}  # by first bytes
@@ -81,6 +83,11 @@ class Subject:
     def rows(self) -> dict[int, int]:
         """Row of ``p`` by frame number."""
         return {int(frame): row for row, frame in enumerate(self.frames)}
+
+    @cached_property
+    def seen_p(self) -> Float:
+        """``[F, J, 3]`` metres, NaN where a joint is not visible."""
+        return np.where(self.visible[..., None], self.p, np.nan)
 
     @cached_property
     def step(self) -> int:
@@ -123,7 +130,7 @@ class View:
         outside, tolerance: ``[J]`` metres by which joints lie outside the mask, NaN where unknown;
             metres that they may.
         fullness: area of the mask over that of the estimated silhouette.
-        lagged: ``[2 lag + 1]`` mean metres outside with the skeleton of an earlier or later frame.
+        lagged: ``[2 LAG + 1]`` mean metres outside with the skeleton of an earlier or later frame.
         colour, weight: ``[3]`` summed RGB of the person, summed mask.
         mask, to_small: ``[h, w]`` small mask; ``[3, 3]`` maps pixels of the whole image to it.
     """
@@ -174,9 +181,9 @@ def nanmedian(values: Float) -> Float:
         return np.asarray(np.nanmedian(values, axis=0))
 
 
-def sampled_items(subject: Subject, pictures: int) -> tuple[Item, ...]:
-    """At most ``pictures`` items, at least one per camera: the same moments, evenly spaced."""
-    each = max(1, pictures // len(subject.pairs))
+def sampled_items(subject: Subject, images: int) -> tuple[Item, ...]:
+    """At most ``images`` items, at least one per camera: the same moments, evenly spaced."""
+    each = max(1, images // len(subject.pairs))
     moments = set(spread([int(f) for f in subject.frames], each))
     items = []
     for name, files in subject.pairs.items():
@@ -185,11 +192,11 @@ def sampled_items(subject: Subject, pictures: int) -> tuple[Item, ...]:
     return tuple(items)
 
 
-def suspicious_items(subject: Subject, sampling: Sampling) -> tuple[Item, ...]:
-    """Items with a file that was cut off, or a mask file of unusual size; nothing is decoded.
+def suspicious_items(subject: Subject, most: int) -> tuple[Item, ...]:
+    """At most ``most`` items with a file that was cut off, and as many with an unusual mask file.
 
-    At most ``sampling.pictures`` of each; a mask is unusual when its file is
-    ``sampling.size_ratio`` times smaller or larger than its camera's median: empty or full.
+    Nothing is decoded. A mask is unusual when its file is `UNUSUAL` times smaller or larger than
+    its camera's median: empty or full.
     """
     cut, odd, layout = list[Item](), list[Item](), subject.layout
     images = sum(len(files) for files in subject.pairs.values())
@@ -198,13 +205,13 @@ def suspicious_items(subject: Subject, sampling: Sampling) -> tuple[Item, ...]:
         items = [(name, frame) for frame in files[::every]]
         masks = [[path for _, path in layout.mask_files(*item)] for item in items]
         sizes = np.array([p[0].stat().st_size if p[0].is_file() else 1 for p in masks], float)
-        usual = max(float(np.median(sizes)), 1)
-        for item, paths, size in zip(items, masks, sizes.clip(1), strict=True):
+        ratios = sizes.clip(1) / max(float(np.median(sizes)), 1)
+        for item, paths, ratio in zip(items, masks, ratios, strict=True):
             if not all(map(complete, [layout.image_path(*item), *paths])):
                 cut.append(item)
-            if max(size / usual, usual / size) > sampling.size_ratio:
+            if max(ratio, 1 / ratio) > UNUSUAL:
                 odd.append(item)
-    return (*cut[: sampling.pictures], *spread(odd, sampling.pictures))
+    return (*cut[:most], *spread(odd, most))
 
 
 def complete(path: Path) -> bool:
@@ -231,7 +238,7 @@ def measure(
         except DataError as error:
             return str(error)
 
-    bar = Progress(transient=True, console=console, disable=console is None)
+    bar = progress(console or Console(), disable=console is None)
     with ThreadPoolExecutor(sampling.workers) as pool, bar:
         unique = tuple(dict.fromkeys(items))
         found = bar.track(pool.map(one, unique), len(unique), description="checking images")
@@ -256,8 +263,8 @@ def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
         seen = subject.visible[row] & inside(entry, subject.p[row])  # not in the padding
         return joint_distance(distance, pixels, depth, seen, focal)
 
-    lagged = np.full(2 * sampling.lag + 1, np.nan)
-    for i, steps in enumerate(range(-sampling.lag, sampling.lag + 1)):
+    lagged = np.full(2 * LAG + 1, np.nan)
+    for i, steps in enumerate(range(-LAG, LAG + 1)):
         other = subject.rows.get(number + steps * subject.step)
         if other is not None and not np.isnan(metres := outside(other)).all():
             lagged[i] = np.minimum(metres[~np.isnan(metres)], FAR).mean()
@@ -317,19 +324,3 @@ def overlap(a: Bool, b: Bool) -> float:
     """Intersection over union; 0 when both are empty."""
     union = np.count_nonzero(a | b)
     return np.count_nonzero(a & b) / union if union else 0.0
-
-
-def best_shift(mask: Bool, body: Bool) -> tuple[int, int]:
-    """Whole pixels ``(dx, dy)`` by which the mask lies beside the body: largest correlation."""
-    height, width = mask.shape
-    shape = (2 * height, 2 * width)  # padded: a shift must not wrap around
-    spectrum = np.fft.rfft2(mask, shape) * np.conj(np.fft.rfft2(body, shape))
-    common = np.fft.irfft2(spectrum, shape)
-    dy, dx = np.unravel_index(int(np.argmax(common)), shape)
-    return int((dx + width) % (2 * width) - width), int((dy + height) % (2 * height) - height)
-
-
-def moved(mask: Bool, dx: int, dy: int) -> Bool:
-    """A mask moved by whole pixels, empty where nothing was."""
-    shift = np.array([[1, 0, dx], [0, 1, dy]], np.float64)
-    return cv2.warpAffine(mask.astype(np.uint8), shift, mask.shape[::-1], flags=0) > 0
