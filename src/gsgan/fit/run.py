@@ -33,10 +33,10 @@ from gsgan.data.datamodule import GsganData
 from gsgan.data.formats.capture import LANDMARKS, POSES, SHAPE, CaptureReader
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.moments import Moments
-from gsgan.prepare.pictures import sampled
 from gsgan.scene import BodyPose, Frame
 from gsgan.skeleton import MEDIAPIPE33, TEMPLATES
 from gsgan.splat import accuracy
+from gsgan.utils.arrays import sampled
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console, progress
 from gsgan.utils.errors import ConfigError, DataError

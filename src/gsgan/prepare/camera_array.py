@@ -179,7 +179,7 @@ def refine_cameras(
 
 
 def _similar(cameras: CameraArray, x: Float) -> CameraArray:
-    """The cameras in a world turned by ``x[:3]``, moved by ``x[3:6]`` and scaled by exp ``x[6]``."""
+    """The cameras in a world turned by ``x[:3]``, moved by ``x[3:6]``, scaled by exp ``x[6]``."""
     turn = Rotation.from_rotvec(x[:3]).as_matrix()
     R, centres = cameras.R @ turn, np.exp(x[6]) * cameras.centres @ turn + x[3:6]
     return replace(cameras, R=R, t=-np.einsum("cij,cj->ci", R, centres))

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
+from gsgan.check.report import Table
 from gsgan.data.joints import BODY, FACE, HANDS, known
 from gsgan.prepare.camera_array import CameraArray, camera_moves
 from gsgan.prepare.dataset import Outcome
@@ -95,15 +95,8 @@ def _notes(outcome: Outcome, detections: Mapping[str, Detections]) -> list[str]:
 def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
     """Prints the numbers of the cameras and the notes."""
     stages, cameras = numbers["error_px"], numbers["cameras"]
-    table = Table(title="Median reprojection error (px) by stage, and what was corrected")
-    hands = ("hands px", "hands swapped", "left out", "face px")
-    with_hands = any("hands" in one for one in cameras.values())
-    for title in ("camera", *stages, "turned", "moved", "swapped", "frames late", "images"):
-        table.add_column(title)
-    for title in hands if with_hands else ():
-        table.add_column(title)
-    for name, one in cameras.items():
-        row = [
+    rows = [
+        (
             name,
             *(_number(error, ".2f") for error in one["error_px"].values()),
             f"{one['turned_degrees']:.2f}°",
@@ -111,17 +104,29 @@ def print_summary(numbers: Mapping[str, Any], console: Console) -> None:
             f"{one['flipped_share']:.0%}",
             _number(one["delay_frames"], "+.2f"),
             str(one["frames_written"]),
-        ]
-        if with_hands:
-            row += [_number(one["hands"]["error_px"], ".2f")]
-            row += [
-                f"{one['hands'][key]} of {one['hands']['found']}"
-                for key in ("swapped_frames", "left_out")
-            ]
-            row += [_number(one["face"]["error_px"], ".2f")]
-        table.add_row(*row)
-    table.add_row("all", *(_number(error, ".2f") for error in stages.values()))
-    console.print(table)
+        )
+        for name, one in cameras.items()
+    ]
+    rows.append(("all", *(_number(error, ".2f") for error in stages.values())))
+    headers = ("camera", *stages, "turned", "moved", "swapped", "late", "images")
+    title = (
+        "Median error in pixels by stage; refinement, swapped sides, frames that clocks are late"
+    )
+    console.print(Table(headers, tuple(rows)).for_terminal(title))
+    parts = tuple(
+        (
+            name,
+            *(str(one["hands"][key]) for key in ("found", "swapped_frames", "left_out")),
+            _number(one["hands"]["error_px"], ".2f"),
+            str(one["face"]["found"]),
+            _number(one["face"]["error_px"], ".2f"),
+        )
+        for name, one in cameras.items()
+        if "hands" in one
+    )
+    if parts:
+        headers = ("camera", "hands", "swapped", "left out", "error px", "faces", "error px")
+        console.print(Table(headers, parts).for_terminal("Hands and faces"))
     notes = [*numbers["notes"], f"{numbers['frames']} frames at {numbers['fps']:g} per second"]
     if dropped := numbers["frames_dropped"]:
         notes.append(f"{len(dropped)} frames were dropped: no skeleton or no mask")

@@ -1,4 +1,4 @@
-"""Arrays from files: present, of the expected shape, and numbers, or one clear sentence."""
+"""Arrays: those of files, checked; evenly spaced positions."""
 
 from __future__ import annotations
 
@@ -38,3 +38,10 @@ def as_floats(raw: Any) -> NDArray[np.float64]:
         return np.array(raw, np.float64)
     except (TypeError, ValueError, OverflowError):
         return np.zeros(0)
+
+
+def sampled(count: int, most: int) -> list[int]:
+    """At most ``most`` of ``count`` positions, evenly spaced."""
+    if not (count and most):
+        return []
+    return np.unique(((np.arange(most) + 0.5) * count / most).astype(int)).tolist()
