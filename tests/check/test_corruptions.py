@@ -39,9 +39,8 @@ def test_a_good_capture_has_nothing_wrong(good, check):
     assert report.findings == ()
     cameras = report.numbers["cameras"]
     assert all(score["inside"] == 1 and score["lag"] == 0 for score in cameras.values())
-    assert all(score["overlap"] > score["rivals"][0]["overlap"] for score in cameras.values())
+    assert all(s["overlap"] > max(s["rivals"].values()) for s in cameras.values())
     assert report.numbers["camera_distance"] == pytest.approx(3.0, abs=0.1)
-    assert all(share > 0.95 for share in report.numbers["hull"].values())
 
 
 @pytest.mark.parametrize(("keys", "named"), [("Rt", "R and t"), ("RtK", "R and t")])
@@ -55,16 +54,6 @@ def test_exchanged_cameras_are_named(copy, check, keys, named):
     sentence = only(check(copy), "error")
     assert sentence.startswith("cameras cam00 and cam01 look exchanged")
     assert named in sentence
-
-
-def test_opposite_cameras_exchanged_are_named(copy, check):
-    def exchange(cameras):
-        for key in "Rt":
-            one, other = cameras["cam01"][key], cameras["cam03"][key]
-            cameras["cam01"][key], cameras["cam03"][key] = other, one
-
-    edit_json(copy / "cameras.json", exchange)
-    assert "cam01 and cam03 look exchanged" in only(check(copy), "error")
 
 
 def test_one_camera_in_millimetres_is_named(copy, check):
@@ -86,23 +75,22 @@ def test_all_cameras_in_millimetres_stop_the_reader_and_are_reported(copy, check
     report = check(copy)
     assert "check 'unit'" in only(report, "error")
     assert report.numbers == {"readable": False}
-    listed = dict(report.sections[0].tables[0].rows)
-    assert listed["images/cam00"] == "12 × .png"
 
 
-def test_moved_masks_are_named_with_their_shift(copy, check):
+def test_moved_masks_are_named(copy, check):
     move_masks(copy, "cam01", 12)
     sentence = only(check(copy), "error")
-    assert sentence.startswith("camera cam01: its masks lie +12, +0 pixels")
+    assert sentence.startswith("camera cam01: only ")
     assert "100% in the other cameras" in sentence
+    assert "a crop or resize that K does not follow" in sentence
 
 
 def test_masks_moved_in_every_camera_are_reported_once(copy, check):
     for i in range(4):
         move_masks(copy, f"cam{i:02d}", 0, -14)
     sentence = only(check(copy), "error")
-    assert sentence.startswith("in every camera the masks lie beside the skeleton")
-    assert "cam02 +0, -14" in sentence
+    assert sentence.startswith("in every camera joints lie outside the masks")
+    assert "K does not follow a crop" in sentence
 
 
 def test_mirrored_images_are_named(copy, check):
@@ -161,14 +149,14 @@ def test_a_missing_mask_is_an_error(copy, check):
 def test_a_truncated_image_is_found_though_few_are_sampled(copy, check):
     path = copy / "images" / "cam01" / "000005.png"
     path.write_bytes(path.read_bytes()[:-30])
-    report = check(copy, pictures=4)
+    report = check(copy, images=4)
     assert str(path) in only(report, "error")
 
 
 def test_an_empty_mask_is_found_though_few_are_sampled(copy, check):
     path = copy / "masks" / "cam03" / "000007.png"
     cv2.imwrite(str(path), np.zeros((96, 64), np.uint8))
-    report = check(copy, pictures=4)
+    report = check(copy, images=4)
     assert "frame 7: cam03: the mask is empty" in only(report, "warning")
     assert report.numbers["doubtful_frames"] == {"7": ["cam03: the mask is empty"]}
 
@@ -258,7 +246,7 @@ def test_a_person_of_another_size_is_reported(copy, check):
     report = check(copy)
     text = " ".join(f.sentence for f in report.findings)
     assert "limb lengths suggest a person of 0.79" in text
-    assert "in every camera the masks lie beside the skeleton" in only(report, "error")
+    assert "in every camera joints lie outside the masks" in only(report, "error")
 
 
 def test_the_wrong_up_axis_is_reported(copy, check):
@@ -269,18 +257,12 @@ def test_the_wrong_up_axis_is_reported(copy, check):
 
 @pytest.mark.parametrize(("cameras", "frames"), [(1, 1), (2, 3)])
 def test_the_smallest_captures_can_be_checked(tmp_path, check, cameras, frames):
-    import json
-
     from make import write_tiny_capture
-
-    from gsgan.check.run import plain
 
     root = write_tiny_capture(tmp_path / "tiny", cameras=cameras, frames=frames, size=(48, 64))
     report = check(root)
     assert report.errors == 0
-    assert report.numbers["hull"] is None
     assert report.numbers["cameras"]["cam00"]["outside"] == 0
-    json.dumps(plain(report), allow_nan=False)
 
 
 def test_lens_distortion_is_undone_before_anything_is_measured(tmp_path, check):
@@ -331,9 +313,7 @@ def test_focal_lengths_of_half_are_named(copy, check, names):
 
 def test_joints_just_outside_every_mask_are_reported_once(copy, check):
     scale_focal(copy, 1.12, *(f"cam{i:02d}" for i in range(4)))
-    found = [
-        f.sentence for f in check(copy, trust={"min_inside": 0.71}, outside_all=0.002).findings
-    ]
+    found = [f.sentence for f in check(copy, trust={"min_inside": 0.71}, outside=0.001).findings]
     assert sum("in most cameras joints lie" in s for s in found) == 1
 
 
@@ -343,10 +323,3 @@ def test_a_camera_that_training_refuses_is_explained_by_the_check(copy, check):
     assert report.numbers["readable"]
     assert report.errors == 1
     assert only(report, "error").startswith("camera cam01: ")
-
-
-def test_without_cameras_there_are_no_small_errors():
-    from gsgan.check.calibration import small_errors
-    from gsgan.check.settings import Limits
-
-    assert small_errors([], Limits()) == []

@@ -177,14 +177,16 @@ def calibration_findings(
             )
             found.append(Finding("error", TOPIC, text))
             named |= {one.name, other.name}
-    if len(scores) > 1 and not beaten and not big and all(s.wrong(limits) for s in scores):
+    off = [s for s in scores if not s.inside >= min_inside]
+    if len(scores) > 1 and not beaten and not big and off == scores:
         shares = listed(f"{s.name} {s.inside:.0%}" for s in scores)
         text = (
-            f"in every camera joints lie outside the masks (inside: {shares}): axes, unit or frame "
-            "numbers of the skeleton are wrong, K does not follow a crop, or the masks belong to "
+            f"in every camera joints lie outside the masks (inside: {shares}): axes, unit, "
+            "size or frame numbers of the skeleton are wrong, K does not follow a crop, or the masks belong to "
             "other images"
         )
-        return [Finding("error", TOPIC, text)]
+        wrong = any(s.wrong(limits) for s in scores)
+        return [Finding("error" if wrong else "warning", TOPIC, text)]
     for score in scores:
         if score.lag and (score not in beaten or score.name in named):
             found.append(_late(score))
