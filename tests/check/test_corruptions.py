@@ -228,16 +228,6 @@ def test_joints_that_the_source_never_has_are_no_fault(copy, check):
     assert not any("joints were seen" in f.sentence for f in check(copy).findings)
 
 
-def test_a_darker_camera_is_named(copy, check):
-    for path in (copy / "images" / "cam01").iterdir():
-        image = cv2.imread(str(path))
-        cv2.imwrite(str(path), (image * 0.6).astype(np.uint8))
-    sentence = only(check(copy), "warning")
-    assert "exposure or white balance" in sentence
-    assert "cam01 red 0.60" in sentence
-    assert "cam00" not in sentence
-
-
 def test_a_person_of_another_size_is_reported(copy, check):
     def shrink(p):
         p[:] = p * 0.5

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from make import edit_json, write_landmarks
 
-from gsgan.check.colours import colour_findings, mean_colours
 from gsgan.check.frames import reprojection_errors, skeleton_doubts
 from gsgan.check.geometry import (
     axis_name,
@@ -18,11 +16,11 @@ from gsgan.check.geometry import (
     geometry_findings,
     geometry_of,
 )
-from gsgan.check.report import counted, listed
+from gsgan.check.report import Flagged, counted, listed
+from gsgan.check.sections import colour_table, mean_colours
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import complete, measure, sampled_items, subject_of
 from gsgan.data.datamodule import GsganData
-from gsgan.effects import EffectSettings
 from gsgan.utils.errors import ConfigError
 
 SAMPLING = Sampling(images=8)
@@ -33,18 +31,10 @@ def views(subject):
     return measure(subject, sampled_items(subject, 8), SAMPLING)[0]
 
 
-@pytest.mark.parametrize(("difference", "named"), [(None, True), (0.01, False), (0.2, True)])
-def test_colours_are_named_unless_shared_surface_agrees(views, difference, named):
-    """One camera is darker; the measure on shared surface decides whether exposure is the cause."""
+def test_a_camera_of_another_colour_is_flagged(views):
     dark = [replace(v, colour=v.colour * (0.7 if v.camera == "cam01" else 1)) for v in views]
-    surface = None if difference is None else SimpleNamespace(difference=difference)
-    names = ("cam00", "cam01", "cam02", "cam03")
-    info = SimpleNamespace(surface=surface, train_cameras=names)
-    colours = mean_colours(dark)
-    found = colour_findings(colours, info, EffectSettings(), Limits(colour_ratio=1.2))
-    assert ["cam01 red 0.7" in finding.sentence for finding in found] == [True] * named
-    held_out = SimpleNamespace(surface=surface, train_cameras=("cam00", "cam02"))
-    assert colour_findings(colours, held_out, EffectSettings(), Limits(colour_ratio=1.2))
+    table = colour_table(mean_colours(dark), Limits(colour_ratio=1.2))
+    assert [row[0] for row in table.rows if isinstance(row[2], Flagged)] == ["cam01"]
 
 
 def test_images_are_the_same_moments_in_every_camera(subject):

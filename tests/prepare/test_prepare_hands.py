@@ -8,8 +8,8 @@ from capture_scenes import ring
 from make import skeletons
 
 from gsgan.data.joints import ALL, BODY, FACE, FACE_MESH, HAND_PAIRS, HANDS, LEFT, RIGHT
-from gsgan.prepare.camera_array import CameraArray, Refinement
-from gsgan.prepare.cleanse import Cleansing, cleanse
+from gsgan.prepare.camera_array import CameraArray
+from gsgan.prepare.cleanse import cleanse
 from gsgan.prepare.solve import Settings, Solution, solve
 from gsgan.prepare.triangulate import apply_flips
 from gsgan.skeleton import HOLISTIC
@@ -47,7 +47,7 @@ def seen(noise: float = 1.0) -> tuple[CameraArray, np.ndarray, np.ndarray, np.nd
 
 def solved(rig: CameraArray, uv: np.ndarray, conf: np.ndarray) -> Solution:
     conf = np.where(np.isfinite(uv).all(-1), conf, 0.0)
-    settings = Settings(refinement=Refinement(rounds=0))
+    settings = Settings(refinements=0)
     return solve(rig, np.arange(FRAMES) / 30, uv, conf, settings)
 
 
@@ -122,7 +122,7 @@ def test_wild_fingers_and_hands_off_the_wrist_are_removed():
     p[3, pip] += [0.1, 0, 0]  # both its bones are wrong
     p[5, LEFT] += [0.2, 0, 0]
     p[7, FACE.start] += [0.4, 0, 0]
-    found, removed = cleanse(p, Cleansing())
+    found, removed = cleanse(p)
     gone = {(f, j) for f, j in np.argwhere(np.isnan(found[..., 0])).tolist()}
     wrong = {(2, tip), (3, pip), (3, pip + 1), (7, FACE.start)}
     assert gone == wrong | {(5, j) for j in range(LEFT.start, LEFT.stop)}

@@ -12,8 +12,6 @@ from make import skeletons
 
 from gsgan.prepare.dataset import standing_axis
 from gsgan.prepare.images import (
-    ImageFiles,
-    MaskTidying,
     Written,
     check_values,
     find_masks,
@@ -21,7 +19,7 @@ from gsgan.prepare.images import (
     write_images,
 )
 from gsgan.prepare.sources import Source, find_sources, recording_notes
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.errors import DataError
 
 
 def source(name: str, fps: float = 30.0, count: int = 100, turned: int = 0) -> Source:
@@ -55,16 +53,13 @@ def test_the_axis_a_person_stands_along():
 def test_masks_lose_their_haze_and_their_crumbs():
     mask = np.zeros((20, 20), np.uint8)
     mask[2:12, 2:12], mask[12, 2:12], mask[15, 15], mask[18, 2:8] = 255, 128, 255, 40
-    found = tidy(mask, MaskTidying(levels=(0.3, 0.8), least_blob=0.05))
+    found = tidy(mask, (0.3, 0.8))
     assert (found[2:12, 2:12] == 255).all()
     assert found[12, 5] == round(255 * (128 / 255 - 0.3) / 0.5)
     assert found[15, 15] == 0
     assert found[18].max() == 0
-    as_is = tidy(mask, MaskTidying(levels=(0, 1), least_blob=0))
-    np.testing.assert_array_equal(as_is, mask)
-    assert tidy(np.zeros_like(mask), MaskTidying()).max() == 0
-    with pytest.raises(ConfigError, match="levels"):
-        MaskTidying(levels=(0.8, 0.3))
+    assert tidy(mask, (0, 1))[12, 5] == 128
+    assert tidy(np.zeros_like(mask), (0, 1)).max() == 0
 
 
 def test_given_masks_by_number_and_by_person(tmp_path: Path):
@@ -97,7 +92,7 @@ def test_the_images_that_were_decoded_are_counted(tmp_path: Path):
         cv2.imwrite(str(files[n]), np.zeros((4, 6, 3), np.uint8))
         cv2.imwrite(str(masks[n]), np.full((4, 6), 255, np.uint8))
     given = (tmp_path, camera, Source("cam0", tmp_path, (4, 6), 30.0, files, 7), masks)
-    rest = (0, ImageFiles(), MaskTidying(), lambda *_: None)
+    rest = (0, 1.0, "jpg", (0.3, 0.8), lambda *_: None)
     assert write_images(*given, range(9), *rest) == Written([0, 1, 2, 3], decoded=4)
     assert write_images(*given, range(2), *rest).decoded is None  # not read to the end
 

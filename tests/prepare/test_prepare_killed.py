@@ -15,7 +15,6 @@ from capture_scenes import write_project
 from rich.console import Console
 
 from gsgan.data.formats.capture import read_capture
-from gsgan.prepare.camera_array import Refinement
 from gsgan.prepare.options import Options
 from gsgan.prepare.run import prepare
 from gsgan.prepare.solve import Settings
@@ -35,7 +34,7 @@ def options(project: Path, out: Path, **more) -> Options:
         "landmarks": str(project / "pose"),
         "masks": str(project / "masks"),
         "workers": 1,
-        "solve": Settings(refinement=Refinement(rounds=0)),
+        "solve": Settings(refinements=0),
     }
     return Options(source=str(project), out=str(out), **(given | more))
 

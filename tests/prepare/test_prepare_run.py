@@ -18,7 +18,6 @@ import gsgan.prepare.mediapipe as tool
 from gsgan.data.formats.capture import read_capture
 from gsgan.prepare import images
 from gsgan.prepare.__main__ import prepare as command
-from gsgan.prepare.camera_array import Refinement
 from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.run import prepare
 from gsgan.prepare.solve import Settings
@@ -36,7 +35,7 @@ def project(tmp_path: Path) -> Path:
 def options(project: Path, **more) -> Options:
     """Quick settings; the stages themselves are tested in test_prepare_solve.py."""
     given = {
-        "solve": Settings(refinement=Refinement(rounds=0)),
+        "solve": Settings(refinements=0),
         "source": str(project),
         "out": str(project.parent / "out"),
         "landmarks": str(project / "pose"),
@@ -77,14 +76,13 @@ def test_the_numbers_have_every_stage_and_the_dataset_is_checked(project, monkey
     numbers = json.loads((out / "prepare.json").read_text())
     assert list(numbers["error_px"]) == ["plain", "robust", "flips", "refined", "smoothed"]
     assert numbers["cameras"]["cam02"]["frames_written"] == FRAMES
-    assert numbers["settings"]["solve"]["smoothing"]["seconds"] == 0.02
+    assert numbers["settings"]["solve"]["smoothing"] == 0.02
     assert (out / "check.html").read_text().count("data:image/jpeg;base64,") >= CAMERAS
     assert json.loads((out / "check.json").read_text())["errors"] == 0
 
 
 def test_images_are_undistorted_and_scaled(project: Path):
-    small = images.ImageFiles(scale=0.5, format="png")
-    out = prepare(options(project, images=small), quiet())
+    out = prepare(options(project, scale=0.5, format="png"), quiet())
     camera = read_capture(out).cameras["cam00"]
     assert camera.size == (SIZE[1] // 2, SIZE[0] // 2)
     given = json.loads((project / "cameras.json").read_text())["cam00"]
@@ -102,10 +100,9 @@ def test_the_same_again_is_left_alone_and_another_refused(project: Path):
     before = (out / "meta.json").stat().st_mtime_ns
     prepare(options(project), quiet())
     assert (out / "meta.json").stat().st_mtime_ns == before
-    small = images.ImageFiles(scale=0.5)
     with pytest.raises(DataError, match="overwrite=true"):
-        prepare(options(project, images=small), quiet())
-    prepare(options(project, images=small, overwrite=True, keep_work=False), quiet())
+        prepare(options(project, scale=0.5), quiet())
+    prepare(options(project, scale=0.5, overwrite=True, keep_work=False), quiet())
     assert read_capture(out).cameras["cam00"].size == (40, 48)
     assert [p.name for p in out.parent.iterdir() if p.name.startswith(".")] == []
 
@@ -122,11 +119,11 @@ def test_other_folders_are_never_overwritten(project: Path):
 def test_a_killed_run_leaves_no_dataset_and_resumes(project: Path, monkeypatch):
     write, written = images._write, []
 
-    def dying(path, pixels, quality):
+    def dying(path, pixels):
         if len(written) == 10:
             raise KeyboardInterrupt
         written.append(path)
-        write(path, pixels, quality)
+        write(path, pixels)
 
     monkeypatch.setattr(images, "_write", dying)
     with pytest.raises(KeyboardInterrupt):
@@ -256,7 +253,7 @@ STUB = """
 import json, pathlib, shutil, sys
 from types import SimpleNamespace
 given = SimpleNamespace(**json.loads(sys.argv[1]))
-names = "hands face rotate threads slot confidence tracking margin"
+names = "hands face rotate threads slot"
 assert set(names.split()) < set(vars(given))
 name, root = pathlib.Path(given.source).stem, pathlib.Path({root!r})
 if name == {bad!r}:
@@ -291,7 +288,7 @@ def test_the_tool_runs_once_per_camera(project: Path, monkeypatch):
     assert len(read_capture(out).frames) == FRAMES
     calls = []
     monkeypatch.setattr("gsgan.prepare.mediapipe._detect", lambda *a, **k: calls.append(a))
-    smoother = {"images": images.ImageFiles(scale=0.5), "overwrite": True}
+    smoother = {"scale": 0.5, "overwrite": True}
     prepare(Options(**(vars(given) | smoother)), quiet())
     assert calls == []
 

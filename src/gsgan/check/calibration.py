@@ -181,9 +181,9 @@ def calibration_findings(
     if len(scores) > 1 and not beaten and not big and off == scores:
         shares = listed(f"{s.name} {s.inside:.0%}" for s in scores)
         text = (
-            f"in every camera joints lie outside the masks (inside: {shares}): axes, unit, "
-            "size or frame numbers of the skeleton are wrong, K does not follow a crop, or the masks belong to "
-            "other images"
+            f"in every camera joints lie outside the masks (inside: {shares}): axes, unit, size or "
+            "frame numbers of the skeleton are wrong, K does not follow a crop, or the masks "
+            "belong to other images"
         )
         wrong = any(s.wrong(limits) for s in scores)
         return [Finding("error" if wrong else "warning", TOPIC, text)]

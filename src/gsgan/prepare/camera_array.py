@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR
 from gsgan.data.joints import known
-from gsgan.utils.checks import above
 
 MIN_VIEWS = 2
 FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
+STEPS = 30  # of the optimiser
+SCALE = 5.0  # error at which a detection counts half, thousandths of the focal length
 SETTLED = 1e-7  # relative change of the cost at which the refinement ends
 LEAST_SQUARE = 1e-12  # square pixels: keeps the residual's scaling finite at an error of 0
 
@@ -109,45 +110,33 @@ def undistort_points(camera: CameraEntry, px: Float) -> Float:
     return out
 
 
-@dataclass(frozen=True)
-class Refinement:
-    """How far camera poses may follow the landmarks, see conf/prepare.yaml.
-
-    Landmarks cannot determine the world's origin, orientation or scale; the two priors fix them by
-    the least change of the given calibration.
-    """
-
-    rounds: int = 2
-    steps: int = 30
-    frames: int = 200
-    scale: float = 5.0
-    rotation_prior: float = 2.0
-    position_prior: float = 0.05
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "frames", "scale", "rotation_prior", "position_prior"):
-            above(f"refinement.{name}", getattr(self, name))
-
-
 def refine_cameras(
-    given: CameraArray, start: CameraArray, p: Float, uv: Float, weight: Float, settings: Refinement
+    given: CameraArray,
+    start: CameraArray,
+    p: Float,
+    uv: Float,
+    weight: Float,
+    rotation_prior: float,
+    position_prior: float,
 ) -> CameraArray:
     """The cameras with the smallest reprojection error, near the given ones.
 
     Convention: bundle adjustment of poses and points (`scipy.optimize.least_squares`); the loss is
-    Cauchy's; K is fixed. Points with fewer than two views are left out.
+    Cauchy's; K is fixed. Points with fewer than two views are left out. Landmarks cannot determine
+    the world's origin, orientation or scale; the priors fix them by the least change of the given
+    calibration.
 
     Args:
         given, start: centre of the priors, and the initial value.
         p: ``[N, 3]`` metres, initial values, NaN where missing.
         uv, weight: ``[C, N, 2]`` undistorted pixels; their confidence, 0 where unseen.
-        settings: scale, priors, steps.
+        rotation_prior, position_prior: degrees and metres, standard deviations of ``given``.
     """
     weight = np.where(known(uv), weight, 0.0)
     use = known(p) & ((weight > 0).sum(0) >= MIN_VIEWS)
     p, uv, weight = p[use], uv[:, use], weight[:, use]
     camera, point = np.nonzero(weight)
-    uv, weight, square = uv[camera, point], weight[camera, point], settings.scale**2
+    uv, weight, square = uv[camera, point], weight[camera, point], SCALE**2
     poses = 6 * len(start)
 
     def cameras_at(x: Float) -> CameraArray:
@@ -155,8 +144,8 @@ def refine_cameras(
         return replace(start, R=Rotation.from_rotvec(turn).as_matrix() @ start.R, t=start.t + move)
 
     def priors(cameras: CameraArray) -> Float:
-        turned = _turns(given, cameras) / np.radians(settings.rotation_prior)
-        return np.c_[turned, (cameras.centres - given.centres) / settings.position_prior].ravel()
+        turned = _turns(given, cameras) / np.radians(rotation_prior)
+        return np.c_[turned, (cameras.centres - given.centres) / position_prior].ravel()
 
     def residuals(x: Float) -> Float:
         cameras = cameras_at(x)
@@ -171,7 +160,7 @@ def refine_cameras(
         jac_sparsity=_sparsity(camera, point, len(start), len(p)),
         x_scale="jac",
         ftol=SETTLED,
-        max_nfev=settings.steps,
+        max_nfev=STEPS,
     )
     # Detections do not see a similarity of the whole world, so that search hardly moves along it.
     cameras = cameras_at(found.x)

@@ -18,7 +18,7 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.joints import BODY, FACE, HANDS, joint_names, known
 from gsgan.prepare.camera_array import Float, Ints
-from gsgan.prepare.images import Written
+from gsgan.prepare.images import Written, scaled
 from gsgan.prepare.options import Inputs, Options
 from gsgan.prepare.solve import Solution
 from gsgan.skeleton import MEDIAPIPE33
@@ -42,7 +42,7 @@ class Outcome:
     def cameras(self) -> list[CameraEntry]:
         """The cameras of the written images."""
         refined = self.solution.cameras.entries(self.inputs.cameras)
-        return [self.options.images.camera(camera) for camera in refined]
+        return [scaled(camera, self.options.scale) for camera in refined]
 
 
 def write_files(root: Path, outcome: Outcome, key: str) -> None:
@@ -65,7 +65,7 @@ def write_files(root: Path, outcome: Outcome, key: str) -> None:
         }
         for part in (slice(BODY), HANDS, FACE)
     )
-    error = solution.error[:, :, :BODY] * outcome.options.images.scale
+    error = solution.error[:, :, :BODY] * outcome.options.scale
     seen = np.isfinite(error)
     mean = np.where(seen, error, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
     write_npz(

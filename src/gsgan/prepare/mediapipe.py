@@ -28,10 +28,9 @@ def environment_of(tool: MediaPipe) -> Path:
     return Path(tool.folder or cache_root() / "tools" / "mediapipe-0.10.21").expanduser()
 
 
-def tool_key(tool: MediaPipe) -> list[object]:
+def tool_key() -> list[str]:
     """What the detections depend on."""
-    files = SCRIPT.read_text(), REQUIREMENTS.read_text()
-    return [*files, tool.confidence, tool.tracking, tool.margin]
+    return [SCRIPT.read_text(), REQUIREMENTS.read_text()]
 
 
 def run_tool(
@@ -47,7 +46,7 @@ def run_tool(
     parts = {"hands": options.hands, "face": options.face}
     results, folders = {}, {}
     for name, source in sources.items():
-        key = [source.fingerprint(), source.rotate, tool_key(tool), parts, masks]
+        key = [source.fingerprint(), source.rotate, tool_key(), parts, masks]
         folders[name] = stages.path(f"mediapipe-{name}", key)
         results[name] = folders[name].with_suffix(".npz")
     # The npz is written last: where it exists, the masks are complete, too.
@@ -63,7 +62,7 @@ def run_tool(
                 **parts,
                 "rotate": sources[name].rotate,
                 "slot": missing.index(name) % options.workers,
-                **vars(tool),
+                "threads": tool.threads,
             }
             command = [str(python), str(SCRIPT), json.dumps(given)]
             _detect(command, sources[name].path, advance)

@@ -11,7 +11,6 @@ from gsgan.data.calibration import Calibration, find_calibration, read_calibrati
 from gsgan.data.cameras import CameraEntry
 from gsgan.motion.points import UNITS
 from gsgan.prepare.camera_array import MIN_VIEWS
-from gsgan.prepare.images import ImageFiles, MaskTidying
 from gsgan.prepare.solve import Settings
 from gsgan.prepare.sources import (
     Source,
@@ -21,7 +20,7 @@ from gsgan.prepare.sources import (
     pair_cameras,
     recording_notes,
 )
-from gsgan.utils.checks import above, at_least, between, one_of, whole
+from gsgan.utils.checks import above, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
 MEDIAPIPE = "mediapipe"
@@ -36,14 +35,6 @@ class MediaPipe:
     folder: str | None = None
     python: str | None = None
     threads: int = 1
-    confidence: float = 0.5
-    tracking: float = 0.5
-    margin: float = 0.15
-
-    def __post_init__(self) -> None:
-        between("mediapipe.confidence", self.confidence, 0, 1)
-        between("mediapipe.tracking", self.tracking, 0, 1)
-        at_least("mediapipe.margin", self.margin, 0)
 
 
 @dataclass(frozen=True)
@@ -77,8 +68,9 @@ class Options:
     keep_work: bool = True
     mediapipe: MediaPipe = field(default_factory=MediaPipe)
     solve: Settings = field(default_factory=Settings)
-    mask_tidying: MaskTidying = field(default_factory=MaskTidying)
-    images: ImageFiles = field(default_factory=ImageFiles)
+    mask_levels: tuple[float, float] = (0.3, 0.8)
+    scale: float = 1.0
+    format: str = "jpg"
 
     def __post_init__(self) -> None:
         for name, what in (("source", "folder with the videos"), ("out", "folder to make")):
@@ -92,6 +84,10 @@ class Options:
         if self.fps is not None:
             above("fps", self.fps)
         whole("workers", self.workers, 1)
+        above("scale", between("scale", self.scale, 0, 1))
+        one_of("format", self.format, ("jpg", "png"))
+        if len(self.mask_levels) != 2 or not 0 <= self.mask_levels[0] < self.mask_levels[1] <= 1:
+            raise ConfigError(f"mask_levels must rise within 0..1, got {self.mask_levels}")
         for name in ("cameras", "offsets"):
             given = getattr(self, name)
             if given is not None and not isinstance(given, Mapping):

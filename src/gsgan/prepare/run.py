@@ -25,6 +25,7 @@ from gsgan.prepare.solve import Solution, adopt, solve
 from gsgan.prepare.sources import stamp
 from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
 from gsgan.prepare.summary import print_summary, summarise
+from gsgan.prepare.triangulate import plain
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import write_json
 
@@ -82,7 +83,7 @@ def _fingerprint(options: Options, inputs: Inputs) -> list[object]:
         if getattr(options, name) not in (None, MEDIAPIPE):
             place = options.folder(name)
             parts += [stamp(p) for p in sorted((place, *place.rglob("*"))) if p.is_file()]
-    return [*parts, tool_key(options.mediapipe) if options.needs_tool else None]
+    return [*parts, tool_key() if options.needs_tool else None]
 
 
 def _read_people(
@@ -118,7 +119,7 @@ def _solved(
     cameras = CameraArray.of(inputs.cameras)
     uv = np.stack([undistort_points(c, p) for c, p in zip(inputs.cameras, px, strict=True)])
     flat = uv.reshape(len(cameras), -1, 2), conf.reshape(len(cameras), -1)
-    _check_distance(inputs, options.solve.triangulation.plain(cameras, *flat))
+    _check_distance(inputs, plain(cameras, *flat))
     with console.status("finding 3D joints and refining the cameras"):
         return frames, solve(cameras, frames / inputs.fps, uv, conf, options.solve)
 
@@ -171,6 +172,8 @@ def _write_images(
 
     def one(name: str, advance: Advance) -> Written:
         given = cameras[name], inputs.sources[name], masks[name], posed, offsets.get(name, 0)
-        return write_images(root, *given, options.images, options.mask_tidying, advance)
+        return write_images(
+            root, *given, options.scale, options.format, options.mask_levels, advance
+        )
 
     return each_camera(one, "writing images", list(cameras), options.workers)

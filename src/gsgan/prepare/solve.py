@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,28 +15,34 @@ from gsgan.prepare.camera_array import (
     CameraArray,
     Float,
     Ints,
-    Refinement,
     refine_cameras,
 )
-from gsgan.prepare.cleanse import Cleansing, Smoothing, cleanse, smooth
-from gsgan.prepare.hands import HandMatching, match_hands, misfits
-from gsgan.prepare.triangulate import FlipSearch, Points, Triangulation, apply_flips, find_flips
+from gsgan.prepare.cleanse import cleanse, smooth
+from gsgan.prepare.hands import match_hands, misfits
+from gsgan.prepare.triangulate import SCALE, Points, apply_flips, find_flips, plain, robust
 from gsgan.skeleton.hands import HAND
+from gsgan.utils.checks import above, at_least, whole
 
+REFINED = 200  # most frames that refine the cameras, evenly spaced
 FROZEN = 8  # equal positions in a row: another tool filled a gap
 LAG = 6  # frames by which clocks are compared, either way
 
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of every stage, see conf/prepare.yaml."""
+    """What the solution depends on, see conf/prepare.yaml."""
 
-    triangulation: Triangulation = field(default_factory=Triangulation)
-    flips: FlipSearch = field(default_factory=FlipSearch)
-    hands: HandMatching = field(default_factory=HandMatching)
-    refinement: Refinement = field(default_factory=Refinement)
-    cleansing: Cleansing = field(default_factory=Cleansing)
-    smoothing: Smoothing = field(default_factory=Smoothing)
+    min_confidence: float = 0.1
+    refinements: int = 2
+    rotation_prior: float = 2.0
+    position_prior: float = 0.05
+    smoothing: float = 0.02
+
+    def __post_init__(self) -> None:
+        whole("solve.refinements", self.refinements, 0)
+        above("solve.rotation_prior", self.rotation_prior)
+        above("solve.position_prior", self.position_prior)
+        at_least("solve.smoothing", self.smoothing, 0)
 
 
 @dataclass(frozen=True)
@@ -92,47 +98,46 @@ def solve(
         conf: ``[C, F, J]`` 0 = not seen.
         settings: of every stage.
     """
-    triangulation, given = settings.triangulation, cameras
+    given = cameras
     to_pixels = (given.focal / FOCAL)[:, None, None]
     cameras, scaled = cameras.normalised(uv)
-    weight = np.where(conf > triangulation.min_confidence, conf, 0.0)
+    weight = np.where(conf > settings.min_confidence, conf, 0.0)
 
     # Triangulate as detected, then with left and right corrected.
     detected = _flat(scaled), _flat(weight)
-    plain = triangulation.plain(cameras, *detected)
     stages = {
-        "plain": cameras.errors(plain, detected[0]),
-        "robust": triangulation.points(cameras, *detected).error,
+        "plain": cameras.errors(plain(cameras, *detected), detected[0]),
+        "robust": robust(cameras, *detected).error,
     }
-    found = correct(cameras, scaled, weight, settings)
+    found = correct(cameras, scaled, weight)
     stages["flips"] = found.points.error
 
     # Refine the cameras and triangulate again, in turn.
     F, J = conf.shape[1:]
-    at = np.unique(np.linspace(0, F - 1, min(F, settings.refinement.frames)).round().astype(int))
+    at = np.unique(np.linspace(0, F - 1, min(F, REFINED)).round().astype(int))
     start = cameras
-    for _ in range(settings.refinement.rounds):
+    for _ in range(settings.refinements):
         p = found.points.p.reshape(F, J, 3)[at].reshape(-1, 3)
         some = _flat(found.uv[:, at]), _flat(found.weight[:, at])
-        cameras = refine_cameras(start, cameras, p, *some, settings.refinement)
-        found = correct(cameras, scaled, weight, settings)
+        priors = settings.rotation_prior, settings.position_prior
+        cameras = refine_cameras(start, cameras, p, *some, *priors)
+        found = correct(cameras, scaled, weight)
     stages["refined"] = found.points.error
 
     # Remove impossible joints and smooth the rest.
-    p, removed = cleanse(found.points.p.reshape(F, J, 3), settings.cleansing)
+    p, removed = cleanse(found.points.p.reshape(F, J, 3))
     agreed = _mean_seen(found.points.weight.reshape(conf.shape), found.weight)
-    p = smooth(p, agreed, time, settings.smoothing.seconds)
+    p = smooth(p, agreed, time, settings.smoothing)
     error = cameras.errors(p.reshape(-1, 3), _flat(found.uv)).reshape(conf.shape)
     stages["smoothed"] = error = np.where(found.weight > 0, error, np.nan)
 
     seen, pixels = _corrected_detections(conf, uv, found)
-    body = found.uv[:, :, :BODY], seen[:, :, :BODY]
-    delay, gain = clock_errors(cameras, *body, triangulation)
+    delay, gain = clock_errors(cameras, found.uv[:, :, :BODY], found.weight[:, :, :BODY])
     return Solution(
         cameras=CameraArray(given.K, cameras.R, cameras.t),
         p=p,
         conf=np.where(known(p), _mean_seen(found.weight, found.weight), 0.0),
-        views=(np.nan_to_num(error, nan=np.inf) <= triangulation.scale).sum(0),
+        views=(np.nan_to_num(error, nan=np.inf) <= SCALE).sum(0),
         error=error * to_pixels,
         uv=pixels,
         seen=seen,
@@ -147,32 +152,31 @@ def solve(
     )
 
 
-def correct(cameras: CameraArray, uv: Float, conf: Float, settings: Settings) -> Corrected:
+def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
     """Corrects swapped sides of body and hands, leaves strange hands out, and triangulates.
 
     ``uv [C, F, J, 2]`` are in thousandths of the focal length, ``conf [C, F, J]`` is 0 where a
     joint is not seen.
     """
-    triangulation = settings.triangulation
-    flips = find_flips(cameras, uv, conf, FLIP_GROUPS, settings.flips, triangulation)
+    flips = find_flips(cameras, uv, conf, FLIP_GROUPS)
     sided, weight = (apply_flips(v, flips, FLIP_GROUPS) for v in (uv, conf))
     left_out = np.zeros((*conf.shape[:2], 2), bool)
     if uv.shape[2] != ALL:
-        points = triangulation.points(cameras, _flat(sided), _flat(weight))
+        points = robust(cameras, _flat(sided), _flat(weight))
         return Corrected(sided, weight, flips, left_out, points)
 
     # Where a camera does not see a wrist, the other cameras show where it is.
     own = np.where(weight[..., WRISTS, None] > 0, sided[:, :, WRISTS], np.nan)
-    arms = triangulation.points(cameras, _flat(own), _flat(weight[:, :, WRISTS]))
+    arms = robust(cameras, _flat(own), _flat(weight[:, :, WRISTS]))
     wrists = np.where(np.isfinite(own), own, cameras.project(arms.p)[0].reshape(own.shape))
 
     hands = sided[:, :, HANDS], weight[:, :, HANDS], wrists
-    swapped = match_hands(cameras, *hands, settings.hands, triangulation)
+    swapped = match_hands(cameras, *hands)
     sided, weight = (apply_flips(v, swapped[..., None], [HAND_PAIRS]) for v in (sided, weight))
-    points = triangulation.points(cameras, _flat(sided), _flat(weight))
-    left_out = misfits(points.error.reshape(conf.shape)[:, :, HANDS], settings.hands.max_error)
+    points = robust(cameras, _flat(sided), _flat(weight))
+    left_out = misfits(points.error.reshape(conf.shape)[:, :, HANDS])
     weight[:, :, HANDS] *= ~left_out.repeat(HAND, axis=-1)
-    points = triangulation.points(cameras, _flat(sided), _flat(weight))
+    points = robust(cameras, _flat(sided), _flat(weight))
     return Corrected(sided, weight, np.dstack([flips, swapped[..., None]]), left_out, points)
 
 
@@ -193,8 +197,8 @@ def adopt(cameras: CameraArray, time: Float, p: Float, conf: Float, settings: Se
     repeat `FROZEN` times fill gaps, and become missing.
     """
     frozen = frozen_joints(p, FROZEN)
-    p, removed = cleanse(np.where(frozen[..., None], np.nan, p), settings.cleansing)
-    p = smooth(p, conf, time, settings.smoothing.seconds)
+    p, removed = cleanse(np.where(frozen[..., None], np.nan, p))
+    p = smooth(p, conf, time, settings.smoothing)
     C, (F, J) = len(cameras), conf.shape
     unseen, unknown = np.full((C, F, J), np.nan), np.full(C, np.nan)
     return Solution(
@@ -223,9 +227,7 @@ def _mean_seen(values: Float, weight: Float) -> Float:
     return np.asarray(values.sum(0) / np.maximum((weight > 0).sum(0), 1))
 
 
-def clock_errors(
-    cameras: CameraArray, uv: Float, weight: Float, triangulation: Triangulation
-) -> tuple[Float, Float]:
+def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
     """Each camera's delay against the others, and the gain of correcting it.
 
     Convention: frames; with a positive delay the camera shows a later moment than the others at the
@@ -236,7 +238,6 @@ def clock_errors(
     Args:
         cameras: ``C`` cameras.
         uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
-        triangulation: its settings.
 
     Returns:
         ``delay [C]`` and ``gain [C]``, the share by which the median error falls.
@@ -248,7 +249,7 @@ def clock_errors(
         return delay, gain
     for c in range(C):
         others = np.arange(C) != c
-        p = triangulation.points(cameras[others], _flat(uv[others]), _flat(weight[others])).p
+        p = robust(cameras[others], _flat(uv[others]), _flat(weight[others])).p
         expected = cameras.project(p)[0][c].reshape(uv.shape[1:])
         seen = np.where((weight[c] > 0)[..., None], uv[c], np.nan)
         errors = []
