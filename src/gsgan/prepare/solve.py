@@ -21,6 +21,7 @@ from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.hands import match_hands, misfits
 from gsgan.prepare.triangulate import SCALE, Points, apply_flips, find_flips, plain, robust
 from gsgan.skeleton.hands import HAND
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, at_least, whole
 
 REFINED = 200  # most frames that refine the cameras, evenly spaced
@@ -114,7 +115,7 @@ def solve(
 
     # Refine the cameras and triangulate again, in turn.
     F, J = conf.shape[1:]
-    at = np.unique(np.linspace(0, F - 1, min(F, REFINED)).round().astype(int))
+    at = np.array(evenly_spaced(F, REFINED, ends=True))
     start = cameras
     for _ in range(settings.refinements):
         p = found.points.p.reshape(F, J, 3)[at].reshape(-1, 3)

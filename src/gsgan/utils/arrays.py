@@ -1,4 +1,4 @@
-"""Arrays: those of files, checked; evenly spaced positions."""
+"""Arrays from files: present, of the expected shape, and numbers, or one clear sentence."""
 
 from __future__ import annotations
 
@@ -40,8 +40,10 @@ def as_floats(raw: Any) -> NDArray[np.float64]:
         return np.zeros(0)
 
 
-def sampled(count: int, most: int) -> list[int]:
-    """At most ``most`` of ``count`` positions, evenly spaced."""
-    if not (count and most):
-        return []
-    return np.unique(((np.arange(most) + 0.5) * count / most).astype(int)).tolist()
+def evenly_spaced(count: int, most: int, *, ends: bool = False) -> list[int]:
+    """At most ``most`` of ``count`` positions, rising: the middles of equal parts, or with ``ends``
+    from the first to the last."""
+    if ends:
+        return sorted({round(x) for x in np.linspace(0, count - 1, min(count, most))})
+    most = min(most, count)
+    return [(2 * i + 1) * count // (2 * most) for i in range(most)]
