@@ -112,7 +112,7 @@ def test_a_camera_out_of_step_is_named(copy, check):
         for frame in range(11):
             folder = copy / kind / "cam00"
             (folder / f"{frame + 1:06d}.png").replace(folder / f"{frame:06d}.png")
-    report = check(copy, trust={"joint_tolerance": 0.02}, joint_jump=1.0)
+    report = check(copy, consistency={"joint_tolerance": 0.02}, joint_jump=1.0)
     (found,) = (f for f in report.findings if f.topic == "synchronisation")
     assert found.level == "error"
     assert found.sentence.startswith("camera cam00: its images fit the skeleton 1 frame(s) later")
@@ -285,7 +285,7 @@ def scale_focal(root: Path, factor: float, *names: str, centre: bool = False) ->
 
 def test_a_camera_that_is_nearly_right_is_named(copy, check):
     turn(copy, (0, 0, 1), 12)
-    sentences = [f.sentence for f in check(copy, trust={"min_inside": 0.71}).findings]
+    sentences = [f.sentence for f in check(copy, consistency={"min_inside": 0.71}).findings]
     assert any(s.startswith("camera cam01: joints lie") for s in sentences)
     assert not any("camera cam00" in s or "camera cam02" in s for s in sentences)
 
@@ -294,7 +294,7 @@ def test_a_camera_that_is_nearly_right_is_named(copy, check):
 def test_focal_lengths_of_half_are_named(copy, check, names):
     scale_focal(copy, 0.5, *names)
     # the tiny person is of thin discs, so all is smaller than in a capture
-    limits = {"fullness": 1.2, "trust": {"min_inside": 0.3}, "inside_error": 0.2}
+    limits = {"fullness": 1.2, "consistency": {"min_inside": 0.3}, "inside_error": 0.2}
     errors = [f.sentence for f in check(copy, **limits).findings if f.level == "error"]
     (found,) = (s for s in errors if "far larger than the body" in s)
     assert all(f"{name} " in found for name in names)
@@ -303,7 +303,9 @@ def test_focal_lengths_of_half_are_named(copy, check, names):
 
 def test_joints_just_outside_every_mask_are_reported_once(copy, check):
     scale_focal(copy, 1.12, *(f"cam{i:02d}" for i in range(4)))
-    found = [f.sentence for f in check(copy, trust={"min_inside": 0.71}, outside=0.001).findings]
+    found = [
+        f.sentence for f in check(copy, consistency={"min_inside": 0.71}, outside=0.001).findings
+    ]
     assert sum("in most cameras joints lie" in s for s in found) == 1
 
 

@@ -13,9 +13,9 @@ from make import write_tiny_capture
 from gsgan.data.datamodule import GsganData
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.layout import Layout
-from gsgan.data.measures import CHOICES, Measures
+from gsgan.data.metric_variants import CHOICES, MetricVariants
 from gsgan.data.protocol import Protocol
-from gsgan.data.splits import camera_name, make_splits, parse_frames, protocol_splits
+from gsgan.data.splits import parse_frames, protocol_splits
 from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -132,14 +132,14 @@ def test_protocols_that_cannot_be(changes: dict[str, Any], message: str) -> None
 )
 def test_measures_are_named_ones(name: str, value: object, message: str) -> None:
     with pytest.raises(ConfigError, match=f"protocol.measures.{name} {message}"):
-        Measures(**{name: value})
+        MetricVariants(**{name: value})
 
 
 def test_measures_take_what_yaml_gives() -> None:
-    assert Measures(lpips_range=[0, 1]).lpips_range == (0.0, 1.0)  # type: ignore[arg-type]
-    assert Measures(ssim_range=2).ssim_range == 2
-    assert not Measures().needs_body_box
-    assert all(getattr(Measures(), name) == choices[0] for name, choices in CHOICES.items())
+    assert MetricVariants(lpips_range=[0, 1]).lpips_range == (0.0, 1.0)  # type: ignore[arg-type]
+    assert MetricVariants(ssim_range=2).ssim_range == 2
+    assert not MetricVariants().needs_body_box
+    assert all(getattr(MetricVariants(), name) == choices[0] for name, choices in CHOICES.items())
 
 
 def test_frames_by_subject() -> None:
@@ -150,15 +150,10 @@ def test_frames_by_subject() -> None:
         replace(protocol, subject=378).frames("test")
 
 
-def test_camera_names_and_indices(layout: Layout) -> None:
-    assert camera_name(layout, 2, "p") == "cam02"
-    assert camera_name(layout, "cam02", "p") == "cam02"
-
-
 def test_departures_are_said() -> None:
     same = replace(ONE, scale=0.5)
     assert list(same.departures(lpips_net="vgg", scale=0.5)) == []
-    other = replace(ONE, measures=Measures(background="white", lpips_range=(0, 1)))
+    other = replace(ONE, measures=MetricVariants(background="white", lpips_range=(0, 1)))
     said = list(other.departures(lpips_net="alex", scale=0.25))
     assert said == [  # what the measures ask for is done
         "LPIPS backbone is alex, requested: vgg",
@@ -185,16 +180,6 @@ def test_the_data_follows_the_protocol_and_records_it(root: Path) -> None:
     cut = GsganData(str(root), size=16, crop="person", protocol=ONE).protocol_record("vgg")
     assert cut is not None
     assert len(cut["departures"]) == 1
-
-
-def test_splits_are_given_once(root: Path) -> None:
-    data = GsganData(str(root), protocol=ONE, test_cameras=["cam02"])
-    with pytest.raises(ConfigError, match="protocol one sets the splits"):
-        data.setup()
-
-
-def test_without_a_protocol_nothing_changes(layout: Layout) -> None:
-    assert make_splits(layout).train_frames == tuple(range(8))
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -162,7 +162,7 @@ def test_held_out_cameras_are_not_used(fit, fitted, people, tmp_path):
     other = shutil.copytree(people, tmp_path / "other")
     for file in (other / "masks/cam03").iterdir():
         cv2.imwrite(str(file), np.full((96, 96), 255, np.uint8))
-    trust = "data.reader.trust.frames=0"
+    trust = "data.reader.consistency.frames=0"
     changed = fit(trust, root=other, name="other")
     np.testing.assert_array_equal(plain["theta"], changed["theta"])
     assert list(plain["fitted_to"]) == ["cam00", "cam01", "cam02"]
@@ -190,7 +190,7 @@ def test_an_empty_mask_does_not_affect_other_frames(fit, people, tmp_path, capsy
             mask[50:52, 50:52] = 255
         cv2.imwrite(str(holed / f"masks/{camera}/000001.png"), mask)
     capsys.readouterr()
-    whole_pictures = ("data.crop=null", "data.reader.trust.frames=0")
+    whole_pictures = ("data.crop=null", "data.reader.consistency.frames=0")
     found = fit(*whole_pictures, root=holed)
     plain = fit(*whole_pictures, name="plain")
     assert "left out" in capsys.readouterr().out
@@ -208,7 +208,7 @@ def test_masks_without_anyone_are_refused(compose, people, tmp_path):
         run_fit(
             compose(
                 *("fit", f"data.root={empty}", f"out={tmp_path / 'a'}", *QUICK),
-                *("data.reader.trust.frames=0", "data.reader.trust.watched_masks=0"),
+                *("data.reader.consistency.frames=0", "data.reader.trust.watched_masks=0"),
             )
         )
 

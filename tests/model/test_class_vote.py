@@ -186,11 +186,11 @@ def zju(tmp_path_factory):
 
 
 def frames_of(folder, smpl):
-    from gsgan.data.checks import Checks
     from gsgan.data.dataset import CaptureDataset
     from gsgan.data.formats.zju import ZjuReader
+    from gsgan.data.validation import Thresholds
 
-    layout = ZjuReader()(folder, Checks(), str(smpl))
+    layout = ZjuReader()(folder, Thresholds(), str(smpl))
     items = [(c, f) for c, files in layout.images.items() for f in files]
     betas = () if layout.meta.body is None else layout.meta.body.betas
     return CaptureDataset(layout, items), open_body("smpl", str(smpl), betas, CIHP)

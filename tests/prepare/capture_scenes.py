@@ -98,32 +98,6 @@ def write_toml(
     return path
 
 
-def write_qca(path: Path, cameras: Sequence[CameraEntry], left: int = 0) -> Path:
-    """Qualisys XML: 1/64 pixel, millimetres, camera axes up and backwards."""
-    text = "<?xml version='1.0' encoding='ASCII'?>\n<calibration><cameras>\n"
-    for c in cameras:
-        r, C = np.diag([1, -1, -1]) @ c.R, 1000 * c.centre
-        rows = " ".join(f'r{i + 1}{j + 1}="{float(r[i, j])!r}"' for i in range(3) for j in range(3))
-        h, w = c.size
-        K = centred_at_zero(c)
-        f_u, f_v = (64 * float(K[i, i]) for i in (0, 1))
-        c_u, c_v = 64 * (float(K[0, 2]) + left), 64 * float(K[1, 2])
-        k1, k2, p1, p2, k3 = (float(v) for v in c.dist[:5])
-        text += (
-            f'<camera active="1" serial="{c.name}" model="Miqus Video" viewrotation="0">'
-            f'<fov_video left="{left}" top="0" right="{left + w - 1}" bottom="{h - 1}"/>'
-            f'<transform {rows} x="{float(C[0])!r}" y="{float(C[1])!r}" z="{float(C[2])!r}"/>'
-            f'<intrinsic focalLengthU="{f_u}" focalLengthV="{f_v}" '
-            f'centerPointU="{c_u}" centerPointV="{c_v}" '
-            f'skew="0" radialDistortion1="{k1}" radialDistortion2="{k2}" '
-            f'radialDistortion3="{k3}" tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/>'
-            "</camera>\n"
-        )
-    marker = '<camera active="1" serial="77" model="Miqus M3" viewrotation="0"/>'
-    path.write_text(text + marker + "</cameras></calibration>\n")
-    return path
-
-
 def write_own(path: Path, cameras: Sequence[CameraEntry]) -> Path:
     """cameras.json of the bring-your-own layout."""
     content = {

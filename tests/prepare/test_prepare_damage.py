@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from capture_scenes import LENS, ring, write_easymocap, write_own, write_qca, write_toml
+from capture_scenes import LENS, ring, write_easymocap, write_own, write_toml
 from make import skeletons
 from test_prepare_points3d import write_trc
 
@@ -73,27 +73,6 @@ def test_the_tool_reads_pictures_as_stored_and_by_number(tmp_path: Path, monkeyp
     (tmp_path / "11.jpg").write_bytes(b"cut")
     with pytest.raises(SystemExit, match=r"11\.jpg is damaged"):
         list(detector.open_source(tmp_path, 0)[1])
-
-
-@pytest.mark.parametrize(("tail", "refused"), [(0.0, False), (0.01, True)])
-def test_lenses_of_twelve_coefficients(tmp_path: Path, tail: float, refused: bool):
-    path = write_easymocap(tmp_path, ring(dist=LENS))
-    values = [*LENS, *[0.0] * 6, tail]
-    text = path.read_text().replace("cols: 5", "cols: 12")
-    plain = ", ".join(map(repr, LENS))
-    path.write_text(text.replace(plain, ", ".join(map(repr, values))))
-    if refused:
-        with pytest.raises(DataError, match="dist must hold 4, 5 or 8"):
-            read_calibration(path)
-    else:
-        np.testing.assert_allclose(read_calibration(path).cameras["cam0"].dist[:5], LENS)
-
-
-def test_an_infinite_height(tmp_path: Path):
-    path = write_easymocap(tmp_path, ring())
-    path.write_text(path.read_text().replace("H_cam0: 1920", "H_cam0: .Inf"))
-    with pytest.raises(DataError, match="'H_cam0' must be a number of pixels"):
-        read_calibration(path)
 
 
 def test_numbers_of_400_digits(tmp_path: Path):
@@ -198,7 +177,6 @@ READERS = {
     "intri": (read_calibration, lambda p: write_easymocap(p, ring(dist=LENS))),
     "extri": (read_calibration, extrinsics),
     "toml": (read_calibration, lambda p: write_toml(p / "Calib.toml", ring(dist=LENS))),
-    "qualisys": (read_calibration, lambda p: write_qca(p / "rig.qca.txt", ring(dist=LENS))),
     "json": (read_calibration, lambda p: write_own(p / "cameras.json", ring(dist=LENS))),
     "openpose": (lambda p: read_detections(p.parent), person),
     "npz": (read_detections, tool_npz),

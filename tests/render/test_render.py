@@ -16,7 +16,7 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from gsgan.body.shape import free_space
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import Preparation
 from gsgan.evaluate.scores import painter
 from gsgan.model.runs import CHECKPOINT, CONFIG, build_data, load, load_avatar, load_config
@@ -74,7 +74,7 @@ def expected(
     config = load_config(run)
     data = build_data(config)
     predict = painter(load_avatar(run, config, data)[0], solve=solve)
-    prepare = Preparation(Measures(background=background), None)
+    prepare = Preparation(MetricVariants(background=background), None)
     found = {}
     dataset = data.dataset(split)
     for i, item in enumerate(dataset.items):
@@ -150,7 +150,7 @@ def test_a_run_without_figure_or_dataset(render, bare, motion, tmp_path):
     assert ok.returncode == 0, ok.stderr
     old = shutil.copytree(bare, tmp_path / "old")
     checkpoint = torch.load(old / CHECKPOINT, weights_only=True)
-    del checkpoint["gsgan"]["scene"]["figure"]
+    del checkpoint["gsgan"]["scene"]["proportions"]
     torch.save(checkpoint, old / CHECKPOINT)
     result = render(f"run={old}", f"motion={motion}", "out=b", "frames=1")
     assert result.returncode == 0, result.stderr
@@ -173,7 +173,7 @@ def test_the_subjects_own_motion_is_left_alone(render, capture, tmp_path):
 def test_the_up_axis_of_a_rig_is_that_of_its_rest_pose(render, tmp_path):
     from mannequin import mannequin, write_bvh
 
-    from gsgan.synthetic.motion import Choreography
+    from gsgan.synthetic.posing import Choreography
 
     person = mannequin()
     signing = Choreography(person).at(21 + np.arange(2) / 30)

@@ -18,7 +18,7 @@ from gsgan.body.free import free_body
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.skeleton import MEDIAPIPE33, Densify
 from gsgan.splat import ACCURACY, Accuracy, Projected, project, reference
-from gsgan.synthetic.view import look_at
+from gsgan.synthetic.camera import look_at
 
 LEAST = len(MEDIAPIPE33.limbs) + 2  # Gaussians: one per part
 # How far the Gaussians are from those that an avatar starts with; about as in a trained one.

@@ -12,7 +12,7 @@ from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits
 from gsgan.check.views import Subject, View, body_silhouette, grouped, overlap
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.formats.trust import spread
+from gsgan.data.formats.consistency import spread
 
 TOPIC = "calibration"
 MIRRORED = "mirrored images"

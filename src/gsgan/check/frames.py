@@ -14,11 +14,11 @@ import numpy as np
 from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits
 from gsgan.check.views import Subject, View, grouped, nanmedian
-from gsgan.data.checks import spans
 from gsgan.data.files import read_arrays
-from gsgan.data.formats.trust import Bool, Float
+from gsgan.data.formats.consistency import Bool, Float
 from gsgan.data.joints import FLIP_GROUPS
 from gsgan.data.skeletons import bone_lengths, frozen_joints
+from gsgan.data.validation import spans
 from gsgan.skeleton.template import SkeletonTemplate
 from gsgan.utils.arrays import expect_array
 

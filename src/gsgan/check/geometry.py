@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from gsgan.check.report import Finding, Flagged, Table
 from gsgan.check.views import Subject, nanmedian
-from gsgan.data.formats.trust import Float, far_cameras
+from gsgan.data.formats.consistency import Float, far_cameras
 from gsgan.skeleton.sanitise import limb_length_sum
 from gsgan.utils.palette import BLACK, COLOURS, GREY
 
@@ -60,7 +60,7 @@ def geometry_of(subject: Subject) -> Geometry:
         up=axis,
         lean=float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
         # Of two cameras neither is the median one.
-        far=far_cameras(distances, subject.trust.far_camera) if len(distances) > 2 else {},
+        far=far_cameras(distances, subject.consistency.far_camera) if len(distances) > 2 else {},
     )
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from gsgan.check.views import Subject, View
 from gsgan.data.crop import NEAR, Crop, project, resize, take, undistort_map
 from gsgan.data.files import read_colour
-from gsgan.data.formats.trust import FAR_PIXELS, Float
+from gsgan.data.formats.consistency import FAR_PIXELS, Float
 from gsgan.data.pixels import read_mask
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.images import caption, encode

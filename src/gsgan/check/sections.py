@@ -14,7 +14,7 @@ from gsgan.check.calibration import calibration_findings, score_cameras
 from gsgan.check.frames import frame_findings, mask_doubts, shortened, skeleton_doubts
 from gsgan.check.report import Figure, Finding, Flagged, Section, Table, counted
 from gsgan.check.settings import Limits, Sampling
-from gsgan.data.formats.trust import Float, spread
+from gsgan.data.formats.consistency import Float, spread
 from gsgan.effects import EffectSettings, decide
 from gsgan.effects.table import HEADERS, rows
 from gsgan.utils.errors import DataError
@@ -95,7 +95,7 @@ class Measurements:
             "settings": {
                 "sampling": asdict(self.sampling),
                 "limits": asdict(self.limits),
-                "trust": asdict(self.subject.trust),
+                "consistency": asdict(self.subject.consistency),
             },
         }
 
@@ -174,7 +174,7 @@ def _split(data: GsganData, name: str) -> str:
 
 
 def _agreement(m: Measurements) -> Section:
-    min_inside, cells = m.subject.trust.min_inside, []
+    min_inside, cells = m.subject.consistency.min_inside, []
     for s in m.cameras:
         columns = (
             (s.name, False),

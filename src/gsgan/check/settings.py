@@ -1,6 +1,6 @@
 """How much is checked, and the thresholds; conf/check.yaml explains every field.
 
-Thresholds that a reader applies as well are those of `gsgan.data.formats.trust.Trust`.
+Thresholds that a reader applies as well are those of `gsgan.data.formats.consistency.Consistency`.
 """
 
 from __future__ import annotations

@@ -23,12 +23,12 @@ from gsgan.check.settings import Sampling
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, inside, project
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.formats.trust import (
+from gsgan.data.formats.consistency import (
     FAR_PIXELS,
     TOLERANCE,
     Bool,
+    Consistency,
     Float,
-    Trust,
     joint_distance,
     mask_distance,
     spread,
@@ -58,7 +58,7 @@ class Subject:
     """One dataset.
 
     Args:
-        layout, trust: the reader's index and thresholds.
+        layout, consistency: the reader's index and thresholds.
         frames, pairs: ``[F]`` rising frame numbers; those that exist, by camera.
         p, visible: ``[F, J, 3]`` metres, finite; ``[F, J]``.
         up: ``[3]`` unit, the world's up axis.
@@ -66,7 +66,7 @@ class Subject:
     """
 
     layout: Layout
-    trust: Trust
+    consistency: Consistency
     frames: NDArray[np.int64]
     pairs: Mapping[str, tuple[int, ...]]
     p: Float
@@ -103,16 +103,16 @@ def subject_of(data: GsganData) -> Subject:
     Raises:
         DataError: when it cannot be read.
     """
-    trust = getattr(data.reader, "trust", None) or Trust()
-    if hasattr(data.reader, "trust"):
+    consistency = getattr(data.reader, "consistency", None) or Consistency()
+    if hasattr(data.reader, "consistency"):
         reader: Any = data.reader  # one of the dataclasses of gsgan.data.formats
-        data.reader = replace(reader, trust=replace(trust, frames=0))
+        data.reader = replace(reader, consistency=replace(consistency, frames=0))
     layout = data.layout
     frames = np.array(layout.frames, np.int64)
     axis = layout.meta.up_axis
     return Subject(
         layout=layout,
-        trust=trust,
+        consistency=consistency,
         frames=frames,
         pairs={name: tuple(sorted(layout.images[name])) for name in layout.camera_names},
         p=np.stack([layout.landmarks.p[int(f)] for f in frames]),
@@ -275,7 +275,7 @@ def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
         camera=name,
         frame=number,
         outside=outside(row),
-        tolerance=max(subject.trust.joint_tolerance, TOLERANCE * metre),
+        tolerance=max(subject.consistency.joint_tolerance, TOLERANCE * metre),
         fullness=float(mask.sum() / max(1, int(body.sum()))),
         lagged=lagged,
         colour=frame.image.double().sum((0, 2, 3)).numpy(),

@@ -21,7 +21,7 @@ Bytes = NDArray[np.uint8]
 NEAR = 1e-2  # metres: points nearer than this are not seen
 
 
-class View(Protocol):
+class Pinhole(Protocol):
     """The parts of a camera that cropping needs: ``K R t`` as in `gsgan.scene`, size ``(H, W)``."""
 
     @property
@@ -49,7 +49,7 @@ class Crop:
     size: tuple[int, int]
 
 
-def project(view: View, points: Float) -> tuple[Float, Float]:
+def project(view: Pinhole, points: Float) -> tuple[Float, Float]:
     """Pixels ``[..., 2]`` (centres at +0.5) and depths ``[...]`` of world points ``[..., 3]``.
 
     Lens distortion is not applied. Points nearer than `NEAR` get finite, meaningless pixels: mask
@@ -61,7 +61,7 @@ def project(view: View, points: Float) -> tuple[Float, Float]:
     return uvw[..., :2], depth
 
 
-def inside(view: View, points: Float) -> NDArray[np.bool_]:
+def inside(view: Pinhole, points: Float) -> NDArray[np.bool_]:
     """``[...]`` whether world points ``[..., 3]`` project into the image; False for NaN."""
     pixels, depth = project(view, points)
     height, width = view.size
@@ -84,7 +84,7 @@ class PersonCrop:
         above("data.crop.margin", self.margin)
 
     def window(
-        self, view: View, joints: Float, usable: NDArray[np.bool_], dist: Float | None = None
+        self, view: Pinhole, joints: Float, usable: NDArray[np.bool_], dist: Float | None = None
     ) -> Crop:
         """The crop round the usable joints, clipped to the image, then made square.
 

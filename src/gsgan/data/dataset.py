@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -211,7 +211,7 @@ class CaptureDataset(Dataset[Frame]):
 
     @staticmethod
     def _check_size(path: Path, image: Bytes, camera: CameraEntry) -> None:
-        """Only some headers are checked at the start, see `Checks.header_stride`."""
+        """Only some headers are checked at the start, see `Thresholds.header_stride`."""
         if image.shape[:2] != camera.size:
             h, w = image.shape[:2]
             raise DataError(
@@ -259,7 +259,9 @@ class StepSampler(DistributedSampler[int]):
     def __init__(
         self, items: int, batch_size: int, steps: int, seed: int, replicas: int = 1, rank: int = 0
     ) -> None:
-        super().__init__(_Count(items), num_replicas=replicas, rank=rank, shuffle=True, seed=seed)
+        # Of its dataset, the base class needs the length alone.
+        length: Any = range(items)
+        super().__init__(length, num_replicas=replicas, rank=rank, shuffle=True, seed=seed)
         self.items, self.batch_size, self.steps = items, batch_size, steps
 
     def __len__(self) -> int:
@@ -274,16 +276,6 @@ class StepSampler(DistributedSampler[int]):
                     shuffled = draw // self.items
                     order = pass_order(self.items, self.seed, shuffled)
                 yield int(order[draw % self.items])
-
-
-class _Count(Dataset[int]):
-    """A length; `DistributedSampler` asks its dataset for nothing else."""
-
-    def __init__(self, length: int) -> None:
-        self.length = length
-
-    def __len__(self) -> int:
-        return self.length
 
 
 def pass_order(items: int, seed: int, number: int) -> torch.Tensor:

@@ -16,17 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.checks import (
-    Checks,
+from gsgan.data.pixels import MaskFile, PixelRules
+from gsgan.data.skeletons import Landmarks, Poses
+from gsgan.data.validation import (
     Index,
+    Thresholds,
     check_geometry,
     check_pictures,
     drop_frames,
     drop_unmasked,
     drop_unseen,
 )
-from gsgan.data.pixels import MaskFile, PixelRules
-from gsgan.data.skeletons import Landmarks, Poses
 from gsgan.utils.errors import DataError
 
 MaskIndex = Mapping[str, Mapping[int, tuple[MaskFile, ...]]]
@@ -174,7 +174,7 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
     return folder
 
 
-def assemble(found: Found, checks: Checks) -> Layout:
+def assemble(found: Found, checks: Thresholds) -> Layout:
     """Checks the files against each other and leaves out those that cannot be used.
 
     Raises:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gsgan.body import SkinnedBody, open_body
 from gsgan.data.files import check_picture, read_with_alpha
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
 from gsgan.metrics.regions import (
     BACKGROUNDS,
@@ -113,7 +113,7 @@ class Preparation:
         skeleton: name of the frames' skeleton.
     """
 
-    measures: Measures
+    measures: MetricVariants
     boxes: BodyBoxes | None
     skeleton: str = "mediapipe33"
 

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsgan.data.datamodule import GsganData
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.facts import Method, facts, trained
 from gsgan.evaluate.files import (
     FACTS_FILE,
@@ -244,11 +244,11 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
     return Scorer(prepare, score, reason, name, list(marks), record)
 
 
-def _measures(data: GsganData) -> Measures:
-    return Measures() if data.protocol is None else data.protocol.measures
+def _measures(data: GsganData) -> MetricVariants:
+    return MetricVariants() if data.protocol is None else data.protocol.measures
 
 
-def lpips_name(net: str, measures: Measures) -> str:
+def lpips_name(net: str, measures: MetricVariants) -> str:
     """The name of an LPIPS: backbone, input range, and order of channels and region where those are
     not the defaults."""
     low, high = measures.lpips_range

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torchmetrics.functional.classification import multiclass_confusion_matrix
 
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
 from gsgan.evaluate.pictures import grid_rows
 from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparation
@@ -63,7 +63,7 @@ def image_scores(
     box: Tensor | None = None,
     *,
     regions: Mapping[str, Tensor] | None = None,
-    measures: Measures | None = None,
+    measures: MetricVariants | None = None,
     lpips: Score | None = None,
 ) -> dict[str, float]:
     """The scores of one image, clamped to [0, 1].
@@ -79,7 +79,7 @@ def image_scores(
     Returns:
         ``{metric: score}``; a metric that was not computed is absent, an undefined one NaN.
     """
-    measures, image = measures or Measures(), image.clamp(0, 1)
+    measures, image = measures or MetricVariants(), image.clamp(0, 1)
     pooling, background = measures.psnr_pooling, BACKGROUNDS[measures.background]
     window = ssim_uniform if measures.ssim_window == "uniform" else ssim
     similarity = partial(window, value_range=measures.ssim_range)

@@ -26,11 +26,11 @@ from gsgan.body.fingers import Fingers
 from gsgan.body.measure import fit_hands, fit_offsets, fit_shape
 from gsgan.body.shape import BodyShape, shaped_body
 from gsgan.body.solve import ON_HANDS, Solver
-from gsgan.data.calibration.find import METRES
-from gsgan.data.checks import spans
+from gsgan.data.calibration import METRES
 from gsgan.data.crop import PersonCrop
 from gsgan.data.datamodule import GsganData
 from gsgan.data.formats.capture import LANDMARKS, POSES, SHAPE, CaptureReader
+from gsgan.data.validation import spans
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.moments import Moments
 from gsgan.scene import BodyPose, Frame

@@ -19,14 +19,8 @@ from gsgan.motion.rotations import Array, blend, rotation, unit
 from gsgan.utils.errors import DataError
 
 HOVER = 0.06  # legs: feet this high above the lowest of a second stand on the floor; no jump
-
-
 ROOM = 0.6  # metres from the origin that a motion may reach before its drift is subtracted
-
-
 DRIFT_SECONDS = 0.5  # standard deviation of the smoothing that separates drift from sway
-
-
 # Names of joints without side, in lower case and letters only, first choices first.
 ALIASES = {
     "Hips": "hips hip pelvis root",
@@ -39,11 +33,7 @@ ALIASES = {
     "Hand": "wrist hand",
     "Head": "head",
 }
-
-
 FINGER_ALIASES = {finger: finger.lower() for finger in FINGERS} | {"Pinky": "pinky|little"}
-
-
 PARTS = {"metacarpal": 1, "proximal": 1, "intermediate": 2, "distal": 3}
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Crop, resize, take, undistort_map
 from gsgan.data.files import frame_files, last_number, read_grey
-from gsgan.data.formats.trust import spread
+from gsgan.data.formats.consistency import spread
 from gsgan.prepare.sources import IMAGE_SUFFIXES, Source
 from gsgan.prepare.stages import Advance
 from gsgan.utils.errors import DataError

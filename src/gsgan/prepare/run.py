@@ -10,9 +10,9 @@ import numpy as np
 from rich.console import Console
 
 from gsgan.check.run import check_capture
-from gsgan.data.checks import Checks, check_distance
 from gsgan.data.joints import BODY, FACE, HANDS, known
 from gsgan.data.splits import parse_frames
+from gsgan.data.validation import Thresholds, check_distance
 from gsgan.motion.points import read_points3d
 from gsgan.prepare import landmarks
 from gsgan.prepare.camera_array import Bool, CameraArray, Float, Ints, undistort_points
@@ -140,7 +140,7 @@ def _check_distance(inputs: Inputs, p: Float) -> None:
     if not len(seen):
         raise DataError(f"{where}: no joint was seen by two cameras; do frame numbers agree?")
     hint = "is the calibration in another unit? Set unit=mm, cm or m"
-    check_distance(where, inputs.cameras, seen, Checks.distance, hint)
+    check_distance(where, inputs.cameras, seen, Thresholds.distance, hint)
 
 
 def _chosen(options: Options, frames: Ints) -> Bool:

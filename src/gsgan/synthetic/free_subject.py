@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gsgan.body.free import free_body
 from gsgan.body.skinned import vertex_normals
-from gsgan.motion.character import Character, Motion, Surface
+from gsgan.motion.character import Animation, Character, Surface
 from gsgan.motion.rig import FINGERS
 from gsgan.scene import BodyPose
 
@@ -76,7 +76,7 @@ def free_character() -> Character:
     )
 
 
-def free_pose(motion: Motion) -> BodyPose:
+def free_pose(motion: Animation) -> BodyPose:
     """The free body's pose at every moment of the motion of `free_character`."""
     body, R = free_body(), motion.rotations
     parents = np.array(body.parents)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import bilinear, lfilter
 from scipy.sparse import coo_array, csr_array
 
-from gsgan.motion.character import Character, Motion
+from gsgan.motion.character import Animation, Character
 from gsgan.motion.rotations import unit
 from gsgan.synthetic.trace import Wrinkles
 
@@ -66,7 +66,7 @@ class Moving(Protocol):
 
     duration: float
 
-    def at(self, times: Array) -> Motion: ...
+    def at(self, times: Array) -> Animation: ...
 
 
 class Secondary:

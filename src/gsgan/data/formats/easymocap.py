@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.checks import Checks, spans
 from gsgan.data.files import frame_files, natural_order, read_json_value
 from gsgan.data.formats.common import (
     IMAGES,
@@ -35,6 +34,7 @@ from gsgan.data.joints import BODY, FROM_HANDS, SETS
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import MASK_RULES, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
+from gsgan.data.validation import Thresholds, spans
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import as_floats
 from gsgan.utils.checks import one_of
@@ -76,7 +76,7 @@ class EasymocapReader(FolderReader):
         one_of("data.reader.skeleton", self.skeleton, ("auto", *SKELETONS))
         one_of("data.reader.mask_rule", self.mask_rule, MASK_RULES)
 
-    def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
+    def find(self, root: Path, checks: Thresholds, smpl: str | None) -> Found:
         """The dataset's files, each checked separately.
 
         Raises:

@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsgan.data.checks import spans
 from gsgan.data.datamodule import GsganData
 from gsgan.data.splits import SPLITS, Item
+from gsgan.data.validation import spans
 from gsgan.evaluate.facts import fingerprint
 from gsgan.evaluate.paper import NAME
 from gsgan.metrics.image import edge_scores, psnr

@@ -21,7 +21,7 @@ Index = Mapping[str, Mapping[int, str]]
 
 
 @dataclass(frozen=True)
-class Checks:
+class Thresholds:
     """What a dataset must satisfy; each threshold can be set."""
 
     min_joints: int = 12  # a frame with fewer usable joints is dropped
@@ -41,7 +41,7 @@ def drop_frames(
     images: Index,
     landmarks: Landmarks,
     poses: Poses | None,
-    checks: Checks,
+    checks: Thresholds,
     notes: list[str],
 ) -> Index:
     """The images without the frames that lack a usable skeleton or pose; notes say why.
@@ -73,7 +73,9 @@ def drop_frames(
     return {name: {f: files[f] for f in files if f not in gone} for name, files in images.items()}
 
 
-def _unusable(frame: int, landmarks: Landmarks, poses: Poses | None, checks: Checks) -> str | None:
+def _unusable(
+    frame: int, landmarks: Landmarks, poses: Poses | None, checks: Thresholds
+) -> str | None:
     if frame not in landmarks.visibility:
         return f"without a row in {landmarks.source}"
     valid = landmarks.visibility[frame] > 0
@@ -101,7 +103,7 @@ def check_geometry(
     cameras: Mapping[str, CameraEntry],
     images: Index,
     landmarks: Landmarks,
-    checks: Checks,
+    checks: Thresholds,
     calibration: Path,
     unit_hint: str,
 ) -> None:
@@ -150,7 +152,7 @@ def drop_unseen(
     cameras: Mapping[str, CameraEntry],
     images: Index,
     landmarks: Landmarks,
-    checks: Checks,
+    checks: Thresholds,
     calibration: Path,
     notes: list[str],
 ) -> Index:
@@ -186,7 +188,7 @@ def drop_unmasked(
     images: Index,
     masks: Mapping[str, Mapping[int, tuple[MaskFile, ...]]],
     expected: Mapping[str, Path],
-    checks: Checks,
+    checks: Thresholds,
     notes: list[str],
 ) -> Index:
     """The images that have a mask; a note says how many were left out.
