@@ -37,13 +37,12 @@ def copy(good: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def check(monkeypatch: pytest.MonkeyPatch):
     """Checks a folder: ``check(root, joint_jump=0.1, consistency={"min_inside": 0.7})``."""
-    from gsgan.check import geometry, overlays, views
+    from gsgan.check import geometry, overlays
     from gsgan.check.run import check_data
     from gsgan.data.datamodule import GsganData
     from gsgan.data.formats.capture import CaptureReader
     from gsgan.data.formats.consistency import Consistency
 
-    monkeypatch.setattr(views, "UNUSUAL", 1.4)  # tiny masks differ less
     # tests of the command draw them
     monkeypatch.setattr(geometry, "geometry_drawing", lambda _: b"<?")
     monkeypatch.setattr(overlays, "strip", lambda *_, **__: b"")

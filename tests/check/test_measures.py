@@ -16,7 +16,7 @@ from gsgan.check.geometry import (
     geometry_findings,
     geometry_of,
 )
-from gsgan.check.report import Flagged, counted, listed
+from gsgan.check.report import Flagged
 from gsgan.check.sections import colour_table, mean_colours
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import complete, measure, sampled_items, subject_of
@@ -93,11 +93,6 @@ def test_the_drawing_is_svg_with_every_camera(subject):
     drawing = geometry_drawing(subject)
     tree.fromstring(drawing)
     assert all(f"<!-- {name} -->".encode() in drawing for name in subject.cameras)
-
-
-def test_counts_and_lists():
-    assert (counted(1, "error"), counted(2, "error")) == ("1 error", "2 errors")
-    assert listed(range(8)) == "0, 1, 2, 3, 4, 5 and 2 more"
 
 
 @pytest.mark.parametrize(

@@ -75,16 +75,6 @@ def test_the_tool_reads_pictures_as_stored_and_by_number(tmp_path: Path, monkeyp
         list(detector.open_source(tmp_path, 0)[1])
 
 
-def test_numbers_of_400_digits(tmp_path: Path):
-    huge = "9" * 400
-    (tmp_path / "0.json").write_text(f'{{"people": [{{"pose_keypoints_2d": [{huge}, 1, 1]}}]}}')
-    with pytest.raises(DataError, match=r"0\.json"):
-        read_detections(tmp_path)
-    (tmp_path / "0.json").write_text(f'[{{"keypoints3d": [[{huge}, 1, 1]]}}]')
-    with pytest.raises(DataError, match=r"0\.json"):
-        read_points3d(tmp_path)
-
-
 @pytest.mark.parametrize("number", [0.5, np.nan])
 def test_frame_numbers_must_be_whole(tmp_path: Path, number: float):
     px, ids = np.ones((2, BODY, 2)), np.array([1, number])

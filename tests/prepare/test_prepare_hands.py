@@ -7,12 +7,11 @@ import pytest
 from capture_scenes import ring
 from make import skeletons
 
-from gsgan.data.joints import ALL, BODY, FACE, FACE_MESH, HAND_PAIRS, HANDS, LEFT, RIGHT
+from gsgan.data.joints import ALL, BODY, FACE, HAND_PAIRS, HANDS, LEFT, RIGHT
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse
 from gsgan.prepare.solve import Settings, Solution, solve
 from gsgan.prepare.triangulate import apply_flips
-from gsgan.skeleton import HOLISTIC
 from gsgan.skeleton.hands import FINGERS, HAND
 
 FRAMES = 8
@@ -127,10 +126,3 @@ def test_wild_fingers_and_hands_off_the_wrist_are_removed():
     wrong = {(2, tip), (3, pip), (3, pip + 1), (7, FACE.start)}
     assert gone == wrong | {(5, j) for j in range(LEFT.start, LEFT.stop)}
     assert removed == {"too far away": 1 + HAND, "bone length": 3}
-
-
-def test_joints_are_those_of_the_template_with_hands_and_face():
-    """In its order; the mesh's numbers are different ones."""
-    assert len(HOLISTIC.names) == ALL
-    assert tuple(FACE_MESH) == HOLISTIC.names[FACE]
-    assert len(set(FACE_MESH.values())) == len(FACE_MESH)

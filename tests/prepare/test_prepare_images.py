@@ -7,16 +7,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from capture_scenes import ring
 from make import skeletons
 
 from gsgan.prepare.dataset import standing_axis
 from gsgan.prepare.images import (
-    Written,
     check_values,
     find_masks,
     tidy,
-    write_images,
 )
 from gsgan.prepare.sources import Source, find_sources, recording_notes
 from gsgan.utils.errors import DataError
@@ -83,18 +80,6 @@ def test_masks_of_small_numbers_are_refused(tmp_path: Path, value: int, refused:
             check_values(tmp_path, files)
     else:
         check_values(tmp_path, files)
-
-
-def test_the_images_that_were_decoded_are_counted(tmp_path: Path):
-    camera, files, masks = ring(size=(6, 4))[0], {}, {}
-    for n in range(4):
-        files[n], masks[n] = tmp_path / f"{n}.png", tmp_path / f"m{n}.png"
-        cv2.imwrite(str(files[n]), np.zeros((4, 6, 3), np.uint8))
-        cv2.imwrite(str(masks[n]), np.full((4, 6), 255, np.uint8))
-    given = (tmp_path, camera, Source("cam0", tmp_path, (4, 6), 30.0, files, 7), masks)
-    rest = (0, 1.0, "jpg", (0.3, 0.8), lambda *_: None)
-    assert write_images(*given, range(9), *rest) == Written([0, 1, 2, 3], decoded=4)
-    assert write_images(*given, range(2), *rest).decoded is None  # not read to the end
 
 
 def test_sources_that_cannot_be_used(tmp_path: Path):

@@ -16,7 +16,6 @@ from test_prepare_points3d import write_trc
 
 import gsgan.prepare.mediapipe as tool
 from gsgan.data.formats.capture import read_capture
-from gsgan.prepare import images
 from gsgan.prepare.__main__ import prepare as command
 from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.run import prepare
@@ -116,25 +115,6 @@ def test_other_folders_are_never_overwritten(project: Path):
     assert (out / "thesis.txt").read_text() == "do not lose"
 
 
-def test_a_killed_run_leaves_no_dataset_and_resumes(project: Path, monkeypatch):
-    write, written = images._write, []
-
-    def dying(path, pixels):
-        if len(written) == 10:
-            raise KeyboardInterrupt
-        written.append(path)
-        write(path, pixels)
-
-    monkeypatch.setattr(images, "_write", dying)
-    with pytest.raises(KeyboardInterrupt):
-        prepare(options(project, workers=1), quiet())
-    assert not (project.parent / "out").exists()
-    monkeypatch.setattr(images, "_write", write)
-    out = prepare(options(project, workers=1), quiet())
-    assert len(list(out.glob("images/*/*"))) == CAMERAS * FRAMES
-    assert len(read_capture(out).frames) == FRAMES
-
-
 def test_a_camera_with_missing_masks_keeps_the_rest(project: Path):
     (project / "masks" / "cam01" / "000003.png").unlink()
     out = prepare(options(project, frames="1-5"), quiet())
@@ -170,6 +150,11 @@ def in_centimetres(project: Path) -> None:
     (project / "cameras.json").write_text(json.dumps(rig))
 
 
+def one_video(project: Path) -> None:
+    for name in ("cam01", "cam02"):
+        (project / "videos" / f"{name}.avi").unlink()
+
+
 def no_detections(project: Path) -> None:
     for path in (project / "pose").iterdir():
         with np.load(path) as held:
@@ -194,6 +179,7 @@ def no_detections(project: Path) -> None:
         (lambda p: None, {"cameras": {"cam00": "cam01"}}, "more than one video"),
         (lambda p: None, {"unit": "inch"}, "unit must be one of"),
         (lambda p: None, {"source": None}, "give source="),
+        (one_video, {}, "only the camera cam00"),
     ],
 )
 def test_errors_are_one_sentence(project: Path, break_it, more, what):
@@ -213,13 +199,6 @@ def test_joints_of_another_tool_take_the_place_of_detections(project: Path):
     np.testing.assert_allclose(found["p"][:, 11], skeletons(FRAMES)[:, 11], atol=1e-3)
     assert json.loads((out / "prepare.json").read_text())["error_px"] == {"smoothed": None}
     assert not (out / "landmarks2d").exists()
-
-
-def test_one_camera_is_not_enough(project: Path):
-    for name in ("cam01", "cam02"):
-        (project / "videos" / f"{name}.avi").unlink()
-    with pytest.raises(DataError, match="only the camera cam00"):
-        prepare(options(project), quiet())
 
 
 def test_every_key_of_the_config_is_understood(project: Path, compose, capsys):
@@ -304,9 +283,3 @@ def test_the_environment_is_only_made_when_asked(project: Path):
     with pytest.raises(ConfigError, match="add setup=true"):
         prepare(options(project, landmarks="mediapipe", mediapipe=missing), quiet())
     assert not (project / "nothing").exists()
-
-
-def test_a_missing_python_is_named(tmp_path: Path):
-    missing = MediaPipe(folder=str(tmp_path / "env"), python=str(tmp_path / "python9"))
-    with pytest.raises(DataError, match="python9 cannot be started"):
-        tool.ensure_environment(missing, True, print)

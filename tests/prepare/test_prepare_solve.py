@@ -77,33 +77,6 @@ def test_points_on_nearly_parallel_rays_are_missing(monkeypatch):
     assert np.isfinite(robust(rig, flat(uv), flat(conf)).p).all()
 
 
-def test_detections_that_contradict_each_other_are_missing():
-    rig, _, uv, conf = seen(ring(angles=(0.0, 1.3)), frames=2)
-    uv[0, 0, 3, 1] += 400
-    points = robust(rig, flat(uv), flat(conf))
-    assert np.isnan(points.p[3]).all()
-    assert np.isfinite(np.delete(points.p, 3, axis=0)).all()
-
-
-def test_a_point_behind_the_cameras_has_an_infinite_error():
-    rig, _, uv, conf = seen(ring(), frames=1)
-    behind = -1000 * np.ones((33, 3))
-    assert np.isinf(rig.errors(behind, flat(uv))).any()
-    assert np.isnan(rig.errors(np.full((33, 3), np.nan), flat(uv))).all()
-    assert conf.all()
-
-
-def test_chunks_and_fewer_pairs_give_the_same_points(monkeypatch):
-    rig, p, uv, conf = seen(ring(angles=np.linspace(0, 6, 9)), noise=0.5)
-    whole = robust(rig, flat(uv), flat(conf)).p
-    monkeypatch.setattr(triangulate, "CHUNK", 50)
-    chunked = robust(rig, flat(uv), flat(conf)).p
-    np.testing.assert_array_equal(whole, chunked)
-    monkeypatch.setattr(triangulate, "MAX_PAIRS", 5)
-    few = robust(rig, flat(uv), flat(conf)).p
-    np.testing.assert_allclose(few, p.reshape(-1, 3), atol=0.01)
-
-
 def planted(shape: tuple[int, int, int]) -> np.ndarray:
     flips = np.zeros(shape, bool)
     flips[1, :5] = True  # one camera, everything, at the start
@@ -123,12 +96,6 @@ def test_planted_flips_are_found_and_corrected():
     corrected = apply_flips(swapped, found, GROUPS)
     np.testing.assert_allclose(corrected[:, :, 11:], uv[:, :, 11:])
     assert p.shape[0] == 12
-
-
-def test_no_flips_where_there_are_none():
-    rig, _, uv, conf = seen(ring(), noise=3.0)
-    found = find_flips(rig, uv, conf, GROUPS)
-    assert found[..., 1:].sum() == 0
 
 
 def test_a_swap_in_all_cameras_is_found_from_the_motion():
@@ -180,13 +147,6 @@ def test_refinement_of_two_cameras_and_of_nothing_stays_finite():
     np.testing.assert_allclose(nothing.R, rig.R)
 
 
-def test_moves_are_degrees_and_millimetres():
-    rig = CameraArray.of(ring())
-    angles, distances = camera_moves(rig, turned(rig, 1, degrees=2.0, metres=0.05))
-    np.testing.assert_allclose(angles, [0, 2, 0, 0], atol=1e-9)
-    np.testing.assert_allclose(distances, [0, 50, 0, 0], atol=1e-9)
-
-
 def test_smoothing_keeps_a_parabola_and_its_gaps():
     time = np.arange(40) / 60
     p = np.stack([time, 3 * time**2, 1 - time], axis=-1)[:, None].repeat(2, axis=1)
@@ -212,12 +172,6 @@ def test_smoothing_halves_noise_and_respects_weights():
     found = smooth(noisy, weight, time, seconds=0.05)
     assert np.abs(found - truth).max() < 0.02
     assert found[:90].std() < 0.6 * noisy[:90].std()
-
-
-def test_without_smoothing_or_neighbours_points_stay():
-    p = np.random.default_rng(1).standard_normal((5, 2, 3))
-    np.testing.assert_array_equal(smooth(p, np.ones((5, 2)), np.arange(5.0), 0.0), p)
-    np.testing.assert_array_equal(smooth(p, np.ones((5, 2)), np.arange(5.0), 0.1), p)
 
 
 def test_cleansing_removes_impossible_joints():

@@ -219,16 +219,6 @@ def test_allowed_names_cannot_be_misused(tmp_path, name):
 # --- damage ------------------------------------------------------------------------------------
 
 
-def test_a_damaged_npz_is_one_sentence(tmp_path):
-    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
-        archive.writestr("poses.npy", b"\x93NUMPY")
-    with pytest.raises(DataError, match="not a valid npz file"):
-        read_npz(tmp_path / "a.npz")
-    whole = (tmp_path / "a.npz").read_bytes()
-    with pytest.raises(DataError, match=r"not a valid npz file"):
-        read_npz(write(tmp_path, whole[:-30], "cut.npz"))
-
-
 @pytest.mark.parametrize("read", [read_pickle, read_npy, read_npz])
 def test_a_missing_file_and_a_folder(tmp_path, read):
     with pytest.raises(DataError, match="does not exist"):

@@ -56,7 +56,7 @@ class Measurements:
         self.data, self.sampling, self.limits, self.effects = data, sampling, limits, effects
         self.subject = subject = views.subject_of(data)
         items = views.sampled_items(subject, sampling.images)
-        items += views.suspicious_items(subject, sampling.images)
+        items += views.cut_items(subject, sampling.images)
         self.views, broken = views.measure(subject, items, sampling, console)
         if len(broken) > LISTED_BROKEN:
             broken[LISTED_BROKEN:] = [f"{len(broken)} sampled images cannot be read"]

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,8 +46,6 @@ if TYPE_CHECKING:
 FAR = 0.3  # metres: distances of joints from the mask are clipped to this before they are averaged
 SMALL = 128  # pixels, longest side of the masks that calibrations are tried on
 LAG = 4  # frames by which a camera is tried earlier and later
-UNUSUAL = 2.5  # a mask file this many times smaller or larger than usual is decoded too
-TAILS = 20000  # files whose end is read
 TAIL = 64  # bytes: some writers append a few after the end mark
 END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}  # by first bytes
 FLESH = 0.07  # metres of body about every bone: between an arm and a thigh
@@ -192,26 +191,17 @@ def sampled_items(subject: Subject, images: int) -> tuple[Item, ...]:
     return tuple(items)
 
 
-def suspicious_items(subject: Subject, most: int) -> tuple[Item, ...]:
-    """At most ``most`` items with a file that was cut off, and as many with an unusual mask file.
-
-    Nothing is decoded. A mask is unusual when its file is `UNUSUAL` times smaller or larger than
-    its camera's median: empty or full.
-    """
-    cut, odd, layout = list[Item](), list[Item](), subject.layout
-    images = sum(len(files) for files in subject.pairs.values())
-    every = 1 + 2 * images // TAILS  # an image and its mask each
-    for name, files in subject.pairs.items():
-        items = [(name, frame) for frame in files[::every]]
-        masks = [[path for _, path in layout.mask_files(*item)] for item in items]
-        sizes = np.array([p[0].stat().st_size if p[0].is_file() else 1 for p in masks], float)
-        ratios = sizes.clip(1) / max(float(np.median(sizes)), 1)
-        for item, paths, ratio in zip(items, masks, ratios, strict=True):
-            if not all(map(complete, [layout.image_path(*item), *paths])):
-                cut.append(item)
-            if max(ratio, 1 / ratio) > UNUSUAL:
-                odd.append(item)
-    return (*cut[:most], *spread(odd, most))
+def cut_items(subject: Subject, most: int) -> tuple[Item, ...]:
+    """At most ``most`` items with an image or mask file that was cut off; nothing is decoded."""
+    layout = subject.layout
+    found = (
+        (name, frame)
+        for name, files in subject.pairs.items()
+        for frame in files
+        if not complete(layout.image_path(name, frame))
+        or not all(complete(path) for _, path in layout.mask_files(name, frame))
+    )
+    return tuple(islice(found, most))
 
 
 def complete(path: Path) -> bool:
