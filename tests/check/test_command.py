@@ -80,7 +80,7 @@ def test_something_wrong_ends_with_1(copy, command, tmp_path):
 
 
 @pytest.mark.parametrize(("strict", "ends"), [("false", 0), ("true", 1)])
-def test_warnings_end_with_1_where_that_is_asked_for(good, command, tmp_path, strict, ends):
+def test_warnings_end_with_1_where_strict(good, command, tmp_path, strict, ends):
     # at the usual limit the little man's forearm is a warning
     code, *_ = command(f"data.root={good}", f"strict={strict}", *FEW)
     numbers = json.loads((tmp_path / "work" / "check.json").read_text())

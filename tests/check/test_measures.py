@@ -107,7 +107,7 @@ def test_the_drawing_is_svg_with_every_camera(subject):
     ],
 )
 def test_complete_files_have_an_end_mark(tmp_path, content, whole):
-    path = tmp_path / "picture"
+    path = tmp_path / "image"
     path.write_bytes(content)
     assert complete(path) == whole
     assert not complete(tmp_path / "absent")

@@ -39,7 +39,7 @@ def seen(
 
 
 def turned(cameras: CameraArray, camera: int, degrees: float, metres: float) -> CameraArray:
-    """The rig with one camera turned about its vertical axis and moved sideways."""
+    """The cameras with one of them turned about its vertical axis and moved sideways."""
     turn = cv2.Rodrigues(np.radians([0.0, degrees, 0.0]))[0]
     R, t = cameras.R.copy(), cameras.t.copy()
     R[camera], t[camera] = turn @ R[camera], turn @ t[camera] + [metres, 0, 0]

@@ -57,7 +57,7 @@ def load_detector(monkeypatch):
     return module
 
 
-def test_the_tool_reads_pictures_as_stored_and_by_number(tmp_path: Path, monkeypatch):
+def test_the_tool_reads_images_as_stored_and_by_number(tmp_path: Path, monkeypatch):
     detector = load_detector(monkeypatch)
     data = cv2.imencode(".jpg", np.zeros((4, 6, 3), np.uint8))[1].tobytes()
     # orientation (0x112) 6: turned by 90 degrees
@@ -66,8 +66,8 @@ def test_the_tool_reads_pictures_as_stored_and_by_number(tmp_path: Path, monkeyp
     for name in ("10.jpg", "9.jpg"):
         (tmp_path / name).write_bytes(turned)
     assert cv2.imread(str(tmp_path / "9.jpg")).shape == (6, 4, 3)  # the tag is valid
-    count, pictures = detector.open_source(tmp_path, 0)
-    read = list(pictures)
+    count, images = detector.open_source(tmp_path, 0)
+    read = list(images)
     assert (count, [number for number, _ in read]) == (2, [9, 10])
     assert read[0][1].shape == (4, 6, 3)
     (tmp_path / "11.jpg").write_bytes(b"cut")

@@ -70,7 +70,7 @@ def test_hands_that_agree_are_left_alone():
 
 @pytest.mark.parametrize("cameras", [[1], [0, 3], [0, 1, 2, 3]])
 def test_swapped_hands_are_put_right(cameras: list[int]):
-    """In one camera, in half of them, and in all: there only the wrists know."""
+    """In one camera, in half of them, and in all, where only the wrists show it."""
     rig, p, uv, conf = seen()
     swapped = np.zeros(conf.shape[:2], bool)
     swapped[cameras, 2:5] = True

@@ -31,7 +31,7 @@ def test_openpose_body_25_keeps_the_persons_sides(tmp_path: Path):
     left_wrist, right_heel = 15, 30
     np.testing.assert_allclose(found.px[0, left_wrist], [70.5, 71.5])  # OpenPose's 7, + 0.5
     np.testing.assert_allclose(found.px[0, right_heel], [240.5, 241.5])
-    assert found.conf[0, 1] == 0  # the inner eye: OpenPose does not know it
+    assert found.conf[0, 1] == 0  # the inner eye: OpenPose does not have it
     assert np.isnan(found.px[0, 1]).all()
 
 

@@ -195,7 +195,7 @@ def test_joints_of_another_tool_take_the_place_of_detections(project: Path):
     out = prepare(options(project, landmarks="nowhere", landmarks3d=str(given)), quiet())
     assert read_capture(out).frames == tuple(range(FRAMES))
     found = np.load(out / "landmarks3d.npz")
-    assert (found["conf"][:, 1] == 0).all()  # an eye that the file does not know
+    assert (found["conf"][:, 1] == 0).all()  # an eye that the file does not have
     np.testing.assert_allclose(found["p"][:, 11], skeletons(FRAMES)[:, 11], atol=1e-3)
     assert json.loads((out / "prepare.json").read_text())["error_px"] == {"smoothed": None}
     assert not (out / "landmarks2d").exists()
@@ -278,7 +278,7 @@ def test_the_message_of_a_failing_tool_is_its_last_line(project: Path, monkeypat
     assert not (project.parent / "out").exists()
 
 
-def test_the_environment_is_only_made_when_asked(project: Path):
+def test_the_environment_is_only_made_with_setup(project: Path):
     missing = MediaPipe(folder=str(project / "nothing"))
     with pytest.raises(ConfigError, match="add setup=true"):
         prepare(options(project, landmarks="mediapipe", mediapipe=missing), quiet())

@@ -125,7 +125,7 @@ def _fit(subject: Subject, views: Sequence[View], camera: CameraEntry) -> float:
 def _lag(views: Sequence[View], limits: Limits) -> tuple[int, float, float]:
     """The best lag, and the mean metres outside without and with it.
 
-    Each lag is compared with none on the views that know both, as the first frames have none
+    Each lag is compared with none on the views that have both, as the first frames have none
     before them. Empty masks are left out.
     """
     table = np.array([view.lagged for view in views if view.mask.any()])

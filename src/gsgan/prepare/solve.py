@@ -112,21 +112,11 @@ def solve(
     }
     found = correct(cameras, scaled, weight)
     stages["flips"] = found.points.error
-
-    # Refine the cameras and triangulate again, in turn.
-    F, J = conf.shape[1:]
-    at = np.array(evenly_spaced(F, REFINED, ends=True))
-    start = cameras
-    for _ in range(settings.refinements):
-        p = found.points.p.reshape(F, J, 3)[at].reshape(-1, 3)
-        some = _flat(found.uv[:, at]), _flat(found.weight[:, at])
-        priors = settings.rotation_prior, settings.position_prior
-        cameras = refine_cameras(start, cameras, p, *some, *priors)
-        found = correct(cameras, scaled, weight)
+    cameras, found = _refined(cameras, scaled, weight, found, settings)
     stages["refined"] = found.points.error
 
     # Remove impossible joints and smooth the rest.
-    p, removed = cleanse(found.points.p.reshape(F, J, 3))
+    p, removed = cleanse(found.points.p.reshape(*conf.shape[1:], 3))
     agreed = _mean_seen(found.points.weight.reshape(conf.shape), found.weight)
     p = smooth(p, agreed, time, settings.smoothing)
     error = cameras.errors(p.reshape(-1, 3), _flat(found.uv)).reshape(conf.shape)
@@ -151,6 +141,21 @@ def solve(
         },
         removed=removed,
     )
+
+
+def _refined(
+    start: CameraArray, uv: Float, weight: Float, found: Corrected, settings: Settings
+) -> tuple[CameraArray, Corrected]:
+    """Refines the cameras and triangulates again, in turn."""
+    cameras, (F, J) = start, weight.shape[1:]
+    at = np.array(evenly_spaced(F, REFINED, ends=True))
+    priors = settings.rotation_prior, settings.position_prior
+    for _ in range(settings.refinements):
+        p = found.points.p.reshape(F, J, 3)[at].reshape(-1, 3)
+        some = _flat(found.uv[:, at]), _flat(found.weight[:, at])
+        cameras = refine_cameras(start, cameras, p, *some, *priors)
+        found = correct(cameras, uv, weight)
+    return cameras, found
 
 
 def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:

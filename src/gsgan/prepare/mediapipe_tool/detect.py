@@ -80,7 +80,7 @@ def open_source(path: Path, rotate: int) -> tuple[int, Iterator[tuple[int, Any]]
 
 
 def read_image(path: Path) -> Any:
-    """As stored: gsgan's calibration knows no EXIF rotation."""
+    """The image as stored: calibrations ignore EXIF rotation."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise SystemExit(f"{path} is damaged")
