@@ -110,7 +110,7 @@ def reprojection_errors(subject: Subject) -> Float:
     arrays = read_arrays(path, ("reproj_px", "frame_id")) if path.is_file() else {}
     if "reproj_px" in arrays:
         ids = expect_array(arrays, "frame_id", (None,), path)
-        stored = expect_array(arrays, "reproj_px", (len(ids), result.shape[1]), path)
+        stored = expect_array(arrays, "reproj_px", (len(ids), len(subject.template.names)), path)
         for number, row in zip(ids.tolist(), stored, strict=True):
             if number in subject.rows:
                 result[subject.rows[number]] = row
