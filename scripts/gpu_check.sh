@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Every check that needs CUDA, in at most 20 minutes, and docs/gpu.md from what it printed.
+# Every check that needs CUDA, in at most 20 minutes, and docs/results/gpu.md from what it printed.
 # A step that is done is not repeated: run it again after an interruption, or after
 # removing outputs/gpu_check/<step>.done.  PYTHON, OUT and PAGE replace the defaults below.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-python=${PYTHON:-.venv/bin/python} out=${OUT:-outputs/gpu_check} page=${PAGE:-docs/gpu.md}
+python=${PYTHON:-.venv/bin/python} out=${OUT:-outputs/gpu_check} page=${PAGE:-docs/results/gpu.md}
 limit=1200 # seconds of all steps together
 if ! "$python" -c 'import sys, torch; sys.exit(not torch.cuda.is_available())'; then
   echo "gpu_check: torch finds no CUDA device on this machine, so nothing was checked."
