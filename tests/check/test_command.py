@@ -113,13 +113,6 @@ def test_a_root_that_is_not_set_is_one_sentence(command):
     assert page == ""
 
 
-def test_strict_must_be_true_or_false(good, command):
-    code, output, page = command(f"data.root={good}", "strict=maybe")
-    assert code == 1
-    assert "strict must be one of True, False, got 'maybe'" in output
-    assert page == ""
-
-
 def test_a_report_that_cannot_be_written_is_reported(good, command, tmp_path):
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "taken").write_text("")

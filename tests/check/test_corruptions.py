@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -43,17 +44,14 @@ def test_a_good_capture_has_nothing_wrong(good, check):
     assert report.numbers["camera_distance"] == pytest.approx(3.0, abs=0.1)
 
 
-@pytest.mark.parametrize(("keys", "named"), [("Rt", "R and t"), ("RtK", "R and t")])
-def test_exchanged_cameras_are_named(copy, check, keys, named):
-    def exchange(cameras):
-        for key in keys:
+def test_exchanged_cameras_are_named(copy, check):
+    def exchanged(cameras):
+        for key in "Rt":
             one, other = cameras["cam00"][key], cameras["cam01"][key]
             cameras["cam00"][key], cameras["cam01"][key] = other, one
 
-    edit_json(copy / "cameras.json", exchange)
-    sentence = only(check(copy), "error")
-    assert sentence.startswith("cameras cam00 and cam01 look exchanged")
-    assert named in sentence
+    edit_json(copy / "cameras.json", exchanged)
+    assert only(check(copy), "error").startswith("cameras cam00 and cam01 look exchanged")
 
 
 def test_one_camera_in_millimetres_is_named(copy, check):
@@ -145,76 +143,56 @@ def test_a_camera_with_empty_masks_is_an_error(copy, check):
     assert only(check(copy), "error").startswith("camera cam03: its masks are empty")
 
 
-def test_frozen_joints_are_named(copy, check):
-    def freeze(p):
-        p[4:10, 15:23] = p[4, 15:23]
-
-    edit_landmarks(copy, freeze)
-    sentence = only(check(copy), "warning")
-    assert sentence.startswith("joints stand exactly still")
-    assert "in 6 of 12 frames: 4-9" in sentence
-    assert "left_wrist" in sentence
+def freeze(p):
+    p[4:10, 15:23] = p[4, 15:23]
 
 
-def test_left_and_right_exchanged_in_some_frames_are_named(copy, check):
-    def exchange(p):
-        p[5:7] = p[5:7][:, MIRROR]
+def exchange(p):
+    p[5:7] = p[5:7][:, MIRROR]
 
-    edit_landmarks(copy, exchange)
+
+def exchange_throughout(p):
+    p[:] = p[:, MIRROR]
+
+
+def jump(p):
+    p[6, 15] += [0.5, 0, 0]
+
+
+def lose(p):
+    p[8, :11] = np.nan
+
+
+def lose_throughout(p):
+    """OpenPose's 25 points leave a third of the 33 open: no fault."""
+    p[:, [1, 3, 4, 6, 9, 10, *range(17, 23)]] = np.nan
+
+
+def shrink(p):
+    p[:] = p * 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "named"),
+    [
+        (freeze, "warning", "joints stand exactly still.* in 6 of 12 frames: 4-9 .*left_wrist"),
+        (exchange, "warning", "left and right are exchanged in 2 of 12 frames: 5-6"),
+        (exchange, "warning", "nose or toes point backwards in 2 of 12 frames: 5-6"),
+        (exchange_throughout, "error", "left and right are exchanged"),
+        (jump, "warning", r"in 1 of 12 frames: 6 .frame 6: jumps: left_wrist 0.50 m"),
+        (lose, "warning", "few joints were seen in 1 of 12 frames: 8"),
+        (lose_throughout, "warning", None),
+        (shrink, "warning", "limb lengths suggest a person of 0.79"),
+    ],
+)
+def test_wrong_landmarks_are_named_with_their_frames(copy, check, change, level, named):
+    edit_landmarks(copy, change)
     report = check(copy)
-    assert report.errors == 0
-    found = {f.sentence.split(" in ")[0]: f.sentence for f in report.findings}
-    assert "2 of 12 frames: 5-6" in found["left and right are exchanged"]
-    assert "2 of 12 frames: 5-6" in found["nose or toes point backwards"]
-
-
-def test_left_and_right_exchanged_throughout_is_an_error(copy, check):
-    def exchange(p):
-        p[:] = p[:, MIRROR]
-
-    edit_landmarks(copy, exchange)
-    assert "left and right are exchanged" in only(check(copy), "error")
-
-
-def test_a_jump_is_named(copy, check):
-    def jump(p):
-        p[6, 15] += [0.5, 0, 0]
-
-    edit_landmarks(copy, jump)
-    report = check(copy)
-    assert report.errors == 0
-    jumps = [f.sentence for f in report.findings if "joints jump" in f.sentence]
-    assert len(jumps) == 1
-    assert "1 of 12 frames: 6 (frame 6: jumps: left_wrist 0.50 m)" in jumps[0]
-
-
-def test_joints_not_seen_are_named(copy, check):
-    def lose(p):
-        p[8, :11] = np.nan
-
-    edit_landmarks(copy, lose)
-    assert "few joints were seen in 1 of 12 frames: 8" in only(check(copy), "warning")
-
-
-def test_joints_that_the_source_never_has_are_no_fault(copy, check):
-    """OpenPose's 25 points leave a third of the 33 open."""
-
-    def lose(p):
-        p[:, [1, 3, 4, 6, 9, 10, *range(17, 23)]] = np.nan
-
-    edit_landmarks(copy, lose)
-    assert not any("joints were seen" in f.sentence for f in check(copy).findings)
-
-
-def test_a_person_of_another_size_is_reported(copy, check):
-    def shrink(p):
-        p[:] = p * 0.5
-
-    edit_landmarks(copy, shrink)
-    report = check(copy)
-    text = " ".join(f.sentence for f in report.findings)
-    assert "limb lengths suggest a person of 0.79" in text
-    assert report.errors > 0
+    assert report.errors == 0 or level == "error" or change is shrink
+    found = [f.sentence for f in report.findings if f.level == level]
+    assert [bool(re.search(named or "were seen", text)) for text in found].count(True) == (
+        named is not None
+    )
 
 
 def test_the_wrong_up_axis_is_reported(copy, check):
@@ -268,8 +246,8 @@ def test_a_camera_that_is_nearly_right_is_named(copy, check):
     assert not any("camera cam00" in s or "camera cam02" in s for s in sentences)
 
 
-@pytest.mark.parametrize("names", [("cam01",), ("cam01", "cam03")])
-def test_focal_lengths_of_half_are_named(copy, check, names):
+def test_focal_lengths_of_half_are_named(copy, check):
+    names = "cam01", "cam03"
     scale_focal(copy, 0.5, *names)
     # the tiny person is of thin discs, so all is smaller than in a capture
     limits = {"fullness": 1.2, "consistency": {"min_inside": 0.3}, "inside_error": 0.2}
@@ -277,14 +255,6 @@ def test_focal_lengths_of_half_are_named(copy, check, names):
     (found,) = (s for s in errors if "far larger than the body" in s)
     assert all(f"{name} " in found for name in names)
     assert not any("clock" in s or "would fit" in s for s in errors)
-
-
-def test_joints_just_outside_every_mask_are_reported_once(copy, check):
-    scale_focal(copy, 1.12, *(f"cam{i:02d}" for i in range(4)))
-    found = [
-        f.sentence for f in check(copy, consistency={"min_inside": 0.71}, outside=0.001).findings
-    ]
-    assert sum("in most cameras joints lie" in s for s in found) == 1
 
 
 def test_a_camera_that_training_refuses_is_explained_by_the_check(copy, check):

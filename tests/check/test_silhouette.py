@@ -41,9 +41,3 @@ def test_the_estimated_silhouette_covers_its_joints_and_no_more_than_a_body():
     area = body.sum() / 100**2  # square metres
     assert 0.35 < area < 0.75
     assert body[80, 60]  # the trunk is filled
-
-
-def test_unseen_joints_and_those_behind_the_camera_draw_nothing():
-    pixels = standing()
-    assert not silhouette(pixels, visible=np.zeros(33, bool)).any()
-    assert not silhouette(pixels, depth=-2.0).any()

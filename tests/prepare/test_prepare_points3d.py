@@ -64,14 +64,6 @@ def test_trc_units_axes_and_names_are_converted(tmp_path: Path, unit: str):
     assert found[2][2, 15] == 0
 
 
-def test_zeros_of_gap_filling_are_missing(tmp_path: Path):
-    p = skeletons(4)
-    p[1, 16] = 0
-    found = read_points3d(write_trc(tmp_path / "a.trc", p))
-    assert np.isnan(found[1][1, 16]).all()
-    assert found[2][1, 16] == 0
-
-
 @pytest.mark.parametrize(
     ("change", "what"),
     [
