@@ -10,7 +10,7 @@ from make import skeletons
 from gsgan.data.joints import ALL, BODY, FACE, HAND_PAIRS, HANDS, LEFT, RIGHT
 from gsgan.prepare.camera_array import CameraArray
 from gsgan.prepare.cleanse import cleanse
-from gsgan.prepare.solve import Settings, Solution, solve
+from gsgan.prepare.solve import Solution, SolveSettings, solve
 from gsgan.prepare.triangulate import apply_flips
 from gsgan.skeleton.hands import FINGERS, HAND
 
@@ -46,7 +46,7 @@ def seen(noise: float = 1.0) -> tuple[CameraArray, np.ndarray, np.ndarray, np.nd
 
 def solved(rig: CameraArray, uv: np.ndarray, conf: np.ndarray) -> Solution:
     conf = np.where(np.isfinite(uv).all(-1), conf, 0.0)
-    settings = Settings(refinements=0)
+    settings = SolveSettings(refinements=0)
     return solve(rig, np.arange(FRAMES) / 30, uv, conf, settings)
 
 

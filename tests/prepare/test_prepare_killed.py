@@ -17,7 +17,7 @@ from rich.console import Console
 from gsgan.data.formats.capture import read_capture
 from gsgan.prepare.options import Options
 from gsgan.prepare.run import prepare
-from gsgan.prepare.solve import Settings
+from gsgan.prepare.solve import SolveSettings
 from gsgan.prepare.stages import each_camera
 
 LIMIT = 120  # seconds after which the child counts as hanging
@@ -34,7 +34,7 @@ def options(project: Path, out: Path, **more) -> Options:
         "landmarks": str(project / "pose"),
         "masks": str(project / "masks"),
         "workers": 1,
-        "solve": Settings(refinements=0),
+        "solve": SolveSettings(refinements=0),
     }
     return Options(source=str(project), out=str(out), **(given | more))
 

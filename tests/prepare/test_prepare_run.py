@@ -19,7 +19,7 @@ from gsgan.data.formats.capture import read_capture
 from gsgan.prepare.__main__ import prepare as command
 from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.run import prepare
-from gsgan.prepare.solve import Settings
+from gsgan.prepare.solve import SolveSettings
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 CAMERAS, FRAMES, SIZE = 3, 6, (96, 80)
@@ -34,7 +34,7 @@ def project(tmp_path: Path) -> Path:
 def options(project: Path, **more) -> Options:
     """Quick settings; the stages themselves are tested in test_prepare_solve.py."""
     given = {
-        "solve": Settings(refinements=0),
+        "solve": SolveSettings(refinements=0),
         "source": str(project),
         "out": str(project.parent / "out"),
         "landmarks": str(project / "pose"),
@@ -48,7 +48,7 @@ def quiet() -> Console:
 
 
 def test_videos_become_a_capture_that_training_reads(project: Path):
-    out = prepare(options(project, solve=Settings()), quiet())
+    out = prepare(options(project, solve=SolveSettings()), quiet())
     layout = read_capture(out)
     assert layout.camera_names == ("cam00", "cam01", "cam02")
     assert layout.frames == tuple(range(FRAMES))

@@ -16,7 +16,7 @@ from gsgan.prepare.camera_array import (
     undistort_points,
 )
 from gsgan.prepare.cleanse import cleanse, smooth
-from gsgan.prepare.solve import Settings, clock_errors, median, solve
+from gsgan.prepare.solve import SolveSettings, clock_errors, median, solve
 from gsgan.prepare.triangulate import apply_flips, find_flips, plain, robust
 from gsgan.utils.errors import ConfigError
 
@@ -184,7 +184,7 @@ def test_all_stages_together_end_near_the_truth():
     flips[1, :5] = True
     swapped = apply_flips(uv, flips, GROUPS)
     given = turned(rig, 3, degrees=1.0, metres=0.02)
-    found = solve(given, np.arange(16) / 60, swapped, conf, Settings())
+    found = solve(given, np.arange(16) / 60, swapped, conf, SolveSettings())
     medians = {name: median(error) for name, error in found.stages.items()}
     assert list(medians) == ["plain", "robust", "flips", "refined", "smoothed"]
     assert medians["plain"] > 5
@@ -196,7 +196,7 @@ def test_all_stages_together_end_near_the_truth():
 
 def test_nobody_seen_ends_without_joints_or_warnings():
     rig, _, uv, conf = seen(ring(), frames=3)
-    found = solve(rig, np.arange(3.0), np.full_like(uv, np.nan), 0 * conf, Settings())
+    found = solve(rig, np.arange(3.0), np.full_like(uv, np.nan), 0 * conf, SolveSettings())
     assert np.isnan(found.p).all()
     assert (found.conf == 0).all()
     np.testing.assert_allclose(found.cameras.R, rig.R)
@@ -205,9 +205,9 @@ def test_nobody_seen_ends_without_joints_or_warnings():
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: Settings(rotation_prior=0),
-        lambda: Settings(refinements=-1),
-        lambda: Settings(smoothing=-1),
+        lambda: SolveSettings(rotation_prior=0),
+        lambda: SolveSettings(refinements=-1),
+        lambda: SolveSettings(smoothing=-1),
     ],
 )
 def test_settings_out_of_range_are_named(make):

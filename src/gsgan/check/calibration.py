@@ -10,7 +10,7 @@ import numpy as np
 
 from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits
-from gsgan.check.views import Subject, View, body_silhouette, grouped, overlap
+from gsgan.check.views import MaskView, Subject, body_silhouette, grouped, overlap
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.consistency import spread
 
@@ -74,7 +74,7 @@ class CameraScore:
         return [name for name, overlap in self.rivals.items() if overlap > least]
 
 
-def score_cameras(subject: Subject, views: Sequence[View], limits: Limits) -> list[CameraScore]:
+def score_cameras(subject: Subject, views: Sequence[MaskView], limits: Limits) -> list[CameraScore]:
     """Scores every camera of which an image could be read."""
     scores = []
     for name, own in grouped(views).items():
@@ -112,7 +112,7 @@ def calibrations(
             yield name, other
 
 
-def _fit(subject: Subject, views: Sequence[View], camera: CameraEntry) -> float:
+def _fit(subject: Subject, views: Sequence[MaskView], camera: CameraEntry) -> float:
     """Mean overlap of the masks with the silhouettes estimated for a camera."""
     overlaps = []
     for view in views:
@@ -122,7 +122,7 @@ def _fit(subject: Subject, views: Sequence[View], camera: CameraEntry) -> float:
     return float(np.mean(overlaps))
 
 
-def _lag(views: Sequence[View], limits: Limits) -> tuple[int, float, float]:
+def _lag(views: Sequence[MaskView], limits: Limits) -> tuple[int, float, float]:
     """The best lag, and the mean metres outside without and with it.
 
     Each lag is compared with none on the views that have both, as the first frames have none

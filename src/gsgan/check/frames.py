@@ -13,7 +13,7 @@ import numpy as np
 
 from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits
-from gsgan.check.views import Subject, View, grouped, nanmedian
+from gsgan.check.views import MaskView, Subject, grouped, nanmedian
 from gsgan.data.files import read_arrays
 from gsgan.data.formats.consistency import Bool, Float
 from gsgan.data.joints import FLIP_GROUPS
@@ -118,7 +118,7 @@ def reprojection_errors(subject: Subject) -> Float:
 
 
 def mask_doubts(
-    views: Sequence[View], limits: Limits, unfit: Collection[str] = ()
+    views: Sequence[MaskView], limits: Limits, unfit: Collection[str] = ()
 ) -> Iterable[Doubt]:
     """Reasons to doubt masks; those of ``unfit`` cameras do not fit in any frame."""
     for name, own in grouped(views).items():

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.check.views import Subject, View
+from gsgan.check.views import MaskView, Subject
 from gsgan.data.crop import NEAR, Crop, project, resize, take, undistort_map
 from gsgan.data.files import read_colour
 from gsgan.data.formats.consistency import FAR_PIXELS, Float
@@ -32,7 +32,7 @@ LEGEND = (
 
 
 def strip(
-    subject: Subject, views: Sequence[View], doubtful: Collection[int] = (), named: bool = False
+    subject: Subject, views: Sequence[MaskView], doubtful: Collection[int] = (), named: bool = False
 ) -> bytes:
     """A row of at least one tile as a JPEG; captions of ``doubtful`` frames are red.
 
@@ -48,7 +48,7 @@ def strip(
     return encode(np.concatenate(tiles[:-1], axis=1))
 
 
-def tile(subject: Subject, view: View) -> Bytes:
+def tile(subject: Subject, view: MaskView) -> Bytes:
     """``[HEIGHT, 0.75 HEIGHT, 3]`` RGB: the image about the person, with overlays."""
     camera, row = subject.cameras[view.camera], subject.rows[view.frame]
     joints, depth = project(camera, subject.p[row])
@@ -104,7 +104,7 @@ def _hands_and_face(subject: Subject, frame: int) -> list[tuple[Float, tuple[int
     return found
 
 
-def person_window(view: View, joints: Float, size: tuple[int, int]) -> Crop:
+def person_window(view: MaskView, joints: Float, size: tuple[int, int]) -> Crop:
     """The window about mask and joints ``[M, 2]``, of the tiles' aspect."""
     points = [np.clip(joints, 0, np.array(size[::-1]))]
     rows, columns = np.nonzero(view.mask)

@@ -227,7 +227,7 @@ def _effects(m: Measurements) -> Section:
     return Section(title, (Table(HEADERS, tuple(rows(decide(m.info, m.effects)))),), text=EFFECTS)
 
 
-def mean_colours(seen: Sequence[views.View]) -> dict[str, tuple[Float, Float]]:
+def mean_colours(seen: Sequence[views.MaskView]) -> dict[str, tuple[Float, Float]]:
     """``[3]`` mean RGB of the person, and its ratio to the median camera's, by camera."""
     means = {
         name: np.asarray(sum(view.colour for view in own)) / sum(view.weight for view in own)

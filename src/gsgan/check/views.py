@@ -121,7 +121,7 @@ def subject_of(data: GsganData) -> Subject:
 
 
 @dataclass(frozen=True)
-class View:
+class MaskView:
     """What one image shows.
 
     Args:
@@ -165,7 +165,7 @@ class View:
         return 1 - self.beyond.sum() / self.known.sum() if self.known.any() else np.nan
 
 
-def grouped(views: Sequence[View]) -> dict[str, list[View]]:
+def grouped(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
     """The views by camera."""
     return {
         name: [v for v in views if v.camera == name]
@@ -219,10 +219,10 @@ def complete(path: Path) -> bool:
 
 def measure(
     subject: Subject, items: Sequence[Item], sampling: Sampling, console: Console | None = None
-) -> tuple[list[View], list[str]]:
+) -> tuple[list[MaskView], list[str]]:
     """Decodes and measures images, each once; the messages of those that cannot be read."""
 
-    def one(item: Item) -> View | str:
+    def one(item: Item) -> MaskView | str:
         try:
             return _view(subject, item, sampling)
         except DataError as error:
@@ -233,11 +233,11 @@ def measure(
         unique = tuple(dict.fromkeys(items))
         found = bar.track(pool.map(one, unique), len(unique), description="checking images")
         results = list(found)
-    views = [result for result in results if isinstance(result, View)]
+    views = [result for result in results if isinstance(result, MaskView)]
     return views, [result for result in results if isinstance(result, str)]
 
 
-def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
+def _view(subject: Subject, item: Item, sampling: Sampling) -> MaskView:
     name, number = item
     entry, row = subject.cameras[name], subject.rows[number]
     frame = CaptureDataset(subject.layout, [item], min(sampling.size, max(entry.size)))[0]
@@ -261,7 +261,7 @@ def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
     factor = min(1.0, SMALL / max(mask.shape))
     small = [max(1, round(side * factor)) for side in mask.shape[::-1]]
     to_small = np.diag([*np.array(small) / mask.shape[::-1], 1]) @ camera.K @ np.linalg.inv(entry.K)
-    return View(
+    return MaskView(
         camera=name,
         frame=number,
         outside=outside(row),

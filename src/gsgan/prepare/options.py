@@ -11,7 +11,7 @@ from gsgan.data.calibration import Calibration, find_calibration, read_calibrati
 from gsgan.data.cameras import CameraEntry
 from gsgan.motion.points import UNITS
 from gsgan.prepare.camera_array import MIN_VIEWS
-from gsgan.prepare.solve import Settings
+from gsgan.prepare.solve import SolveSettings
 from gsgan.prepare.sources import (
     Source,
     find_sources,
@@ -67,7 +67,7 @@ class Options:
     overwrite: bool = False
     keep_work: bool = True
     mediapipe: MediaPipe = field(default_factory=MediaPipe)
-    solve: Settings = field(default_factory=Settings)
+    solve: SolveSettings = field(default_factory=SolveSettings)
     mask_levels: tuple[float, float] = (0.3, 0.8)
     scale: float = 1.0
     format: str = "jpg"

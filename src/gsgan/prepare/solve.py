@@ -30,7 +30,7 @@ LAG = 6  # frames by which clocks are compared, either way
 
 
 @dataclass(frozen=True)
-class Settings:
+class SolveSettings:
     """What the solution depends on, see conf/prepare.yaml."""
 
     min_confidence: float = 0.1
@@ -87,7 +87,7 @@ class Corrected:
 
 
 def solve(
-    cameras: CameraArray, time: Float, uv: Float, conf: Float, settings: Settings
+    cameras: CameraArray, time: Float, uv: Float, conf: Float, settings: SolveSettings
 ) -> Solution:
     """All stages: plain, robust, flips, refined, smoothed.
 
@@ -144,7 +144,7 @@ def solve(
 
 
 def _refined(
-    start: CameraArray, uv: Float, weight: Float, found: Corrected, settings: Settings
+    start: CameraArray, uv: Float, weight: Float, found: Corrected, settings: SolveSettings
 ) -> tuple[CameraArray, Corrected]:
     """Refines the cameras and triangulates again, in turn."""
     cameras, (F, J) = start, weight.shape[1:]
@@ -196,7 +196,9 @@ def _corrected_detections(conf: Float, uv: Float, found: Corrected) -> tuple[Flo
     return seen, pixels
 
 
-def adopt(cameras: CameraArray, time: Float, p: Float, conf: Float, settings: Settings) -> Solution:
+def adopt(
+    cameras: CameraArray, time: Float, p: Float, conf: Float, settings: SolveSettings
+) -> Solution:
     """Another tool's joints, cleansed and smoothed; the cameras stay as calibrated.
 
     ``time [F]`` is in seconds, ``p [F, 33, 3]`` in metres with ``conf [F, 33]``. Positions that
