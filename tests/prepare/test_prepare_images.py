@@ -15,12 +15,12 @@ from gsgan.prepare.images import (
     find_masks,
     tidy,
 )
-from gsgan.prepare.sources import Source, find_sources, recording_notes
+from gsgan.prepare.sources import Recording, find_sources, recording_notes
 from gsgan.utils.errors import DataError
 
 
-def source(name: str, fps: float = 30.0, count: int = 100, turned: int = 0) -> Source:
-    return Source(name, Path(name), (10, 10), fps, {}, count, turned)
+def source(name: str, fps: float = 30.0, count: int = 100, turned: int = 0) -> Recording:
+    return Recording(name, Path(name), (10, 10), fps, {}, count, turned)
 
 
 @pytest.mark.parametrize(
@@ -32,7 +32,7 @@ def source(name: str, fps: float = 30.0, count: int = 100, turned: int = 0) -> S
         (source("b", turned=90), "rotate it by 90 degrees"),
     ],
 )
-def test_sources_that_differ_are_noted(other: Source, what: str | None):
+def test_sources_that_differ_are_noted(other: Recording, what: str | None):
     found = recording_notes({"a": source("a"), "b": other})
     assert len(found) == (what is not None)
     assert what is None or what in found[0]

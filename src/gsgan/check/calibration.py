@@ -10,7 +10,7 @@ import numpy as np
 
 from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits
-from gsgan.check.views import MaskView, Subject, body_silhouette, grouped, overlap
+from gsgan.check.views import CheckedData, MaskView, body_silhouette, grouped, overlap
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.formats.consistency import spread
 
@@ -74,7 +74,9 @@ class CameraScore:
         return [name for name, overlap in self.rivals.items() if overlap > least]
 
 
-def score_cameras(subject: Subject, views: Sequence[MaskView], limits: Limits) -> list[CameraScore]:
+def score_cameras(
+    subject: CheckedData, views: Sequence[MaskView], limits: Limits
+) -> list[CameraScore]:
     """Scores every camera of which an image could be read."""
     scores = []
     for name, own in grouped(views).items():
@@ -112,7 +114,7 @@ def calibrations(
             yield name, other
 
 
-def _fit(subject: Subject, views: Sequence[MaskView], camera: CameraEntry) -> float:
+def _fit(subject: CheckedData, views: Sequence[MaskView], camera: CameraEntry) -> float:
     """Mean overlap of the masks with the silhouettes estimated for a camera."""
     overlaps = []
     for view in views:

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits
-from gsgan.check.views import MaskView, Subject, grouped, nanmedian
+from gsgan.check.views import CheckedData, MaskView, grouped, nanmedian
 from gsgan.data.files import read_arrays
 from gsgan.data.formats.consistency import Bool, Float
 from gsgan.data.joints import FLIP_GROUPS
@@ -52,7 +52,7 @@ class Doubt:
     text: str
 
 
-def skeleton_doubts(subject: Subject, limits: Limits) -> list[Doubt]:
+def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
     """Reasons to doubt the skeletons of all frames; no image is needed."""
     p, template = subject.seen_p, subject.template
     names, found = template.names, list[Doubt]()
@@ -97,7 +97,7 @@ def skeleton_doubts(subject: Subject, limits: Limits) -> list[Doubt]:
     return found
 
 
-def reprojection_errors(subject: Subject) -> Float:
+def reprojection_errors(subject: CheckedData) -> Float:
     """``[F, J]`` pixels between projected joints and 2D detections, NaN where unknown.
 
     They are ``reproj_px`` of landmarks3d.npz, the mean over cameras, as `gsgan.prepare` writes it.
@@ -139,7 +139,7 @@ def mask_doubts(
                 yield Doubt(view.frame, "mask", text)
 
 
-def frame_findings(subject: Subject, found: Sequence[Doubt], limits: Limits) -> list[Finding]:
+def frame_findings(subject: CheckedData, found: Sequence[Doubt], limits: Limits) -> list[Finding]:
     """One finding per kind of doubt; an error when left and right, or most frames, are wrong."""
     findings, count = [], len(subject.frames)
     backwards = sum(doubt.kind == "backwards" for doubt in found) / count

@@ -10,7 +10,7 @@ import torch
 from matplotlib.figure import Figure
 
 from gsgan.check.report import Finding, Flagged, Table
-from gsgan.check.views import Subject, nanmedian
+from gsgan.check.views import CheckedData, nanmedian
 from gsgan.data.formats.consistency import Float, far_cameras
 from gsgan.skeleton.sanitise import limb_length_sum
 from gsgan.utils.palette import BLACK, COLOURS, GREY
@@ -43,7 +43,7 @@ class Geometry:
         return float(np.median(list(self.distances.values())))
 
 
-def geometry_of(subject: Subject) -> Geometry:
+def geometry_of(subject: CheckedData) -> Geometry:
     """Measures the cameras and the person."""
     template, p = subject.template, subject.seen_p
     sums = limb_length_sum(torch.from_numpy(subject.p), torch.from_numpy(subject.visible), template)
@@ -70,7 +70,7 @@ def axis_name(direction: Float) -> str:
     return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
 
 
-def geometry_findings(subject: Subject, geometry: Geometry) -> list[Finding]:
+def geometry_findings(subject: CheckedData, geometry: Geometry) -> list[Finding]:
     """Implausible units, a camera in another unit, an up axis that is not up."""
     found = [Finding("error", "units", text) for text in geometry.far.values()]
     stature = geometry.stature
@@ -85,7 +85,7 @@ def geometry_findings(subject: Subject, geometry: Geometry) -> list[Finding]:
     return found
 
 
-def geometry_table(subject: Subject, geometry: Geometry) -> Table:
+def geometry_table(subject: CheckedData, geometry: Geometry) -> Table:
     """Units and sizes."""
     meta, distances = subject.layout.meta, geometry.distances.values()
     near, far = min(distances), max(distances)
@@ -99,7 +99,7 @@ def geometry_table(subject: Subject, geometry: Geometry) -> Table:
     return Table(("what", "how much"), rows)
 
 
-def lens_table(subject: Subject, geometry: Geometry) -> Table:
+def lens_table(subject: CheckedData, geometry: Geometry) -> Table:
     """Size, lens and place, one row per camera."""
     rows = []
     for name, camera in subject.cameras.items():
@@ -120,7 +120,7 @@ def lens_table(subject: Subject, geometry: Geometry) -> Table:
     return Table(headers, tuple(rows))
 
 
-def geometry_drawing(subject: Subject) -> bytes:
+def geometry_drawing(subject: CheckedData) -> bytes:
     """Cameras, viewing directions and the person's path, from above and from the side: an SVG."""
     figure = Figure((9, 4.5), layout="tight")
     first = np.roll(np.abs(subject.up), 1)  # an axis of the ground

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.check.views import MaskView, Subject
+from gsgan.check.views import CheckedData, MaskView
 from gsgan.data.crop import NEAR, Crop, project, resize, take, undistort_map
 from gsgan.data.files import read_colour
 from gsgan.data.formats.consistency import FAR_PIXELS, Float
@@ -32,7 +32,10 @@ LEGEND = (
 
 
 def strip(
-    subject: Subject, views: Sequence[MaskView], doubtful: Collection[int] = (), named: bool = False
+    subject: CheckedData,
+    views: Sequence[MaskView],
+    doubtful: Collection[int] = (),
+    named: bool = False,
 ) -> bytes:
     """A row of at least one tile as a JPEG; captions of ``doubtful`` frames are red.
 
@@ -48,7 +51,7 @@ def strip(
     return encode(np.concatenate(tiles[:-1], axis=1))
 
 
-def tile(subject: Subject, view: MaskView) -> Bytes:
+def tile(subject: CheckedData, view: MaskView) -> Bytes:
     """``[HEIGHT, 0.75 HEIGHT, 3]`` RGB: the image about the person, with overlays."""
     camera, row = subject.cameras[view.camera], subject.rows[view.frame]
     joints, depth = project(camera, subject.p[row])
@@ -91,7 +94,7 @@ def tile(subject: Subject, view: MaskView) -> Bytes:
     return canvas
 
 
-def _hands_and_face(subject: Subject, frame: int) -> list[tuple[Float, tuple[int, int, int]]]:
+def _hands_and_face(subject: CheckedData, frame: int) -> list[tuple[Float, tuple[int, int, int]]]:
     """The landmarks seen ``[N, 3]`` of the left hand, the right hand and the face, with colours."""
     found = []
     hands, face = subject.layout.hands, subject.layout.face

@@ -53,7 +53,7 @@ HEAD_RADIUS = 0.12  # metres about the middle of the face: half of a head's heig
 
 
 @dataclass(frozen=True)
-class Subject:
+class CheckedData:
     """One dataset.
 
     Args:
@@ -94,7 +94,7 @@ class Subject:
         return max(1, int(np.median(np.diff(self.frames)))) if len(self.frames) > 1 else 1
 
 
-def subject_of(data: GsganData) -> Subject:
+def subject_of(data: GsganData) -> CheckedData:
     """The dataset behind a data module, read if need be.
 
     The reader's own comparison of masks and joints is skipped: the check compares more images.
@@ -109,7 +109,7 @@ def subject_of(data: GsganData) -> Subject:
     layout = data.layout
     frames = np.array(layout.frames, np.int64)
     axis = layout.meta.up_axis
-    return Subject(
+    return CheckedData(
         layout=layout,
         consistency=consistency,
         frames=frames,
@@ -180,7 +180,7 @@ def nanmedian(values: Float) -> Float:
         return np.asarray(np.nanmedian(values, axis=0))
 
 
-def sampled_items(subject: Subject, images: int) -> tuple[Item, ...]:
+def sampled_items(subject: CheckedData, images: int) -> tuple[Item, ...]:
     """At most ``images`` items, at least one per camera: the same moments, evenly spaced."""
     each = max(1, images // len(subject.pairs))
     moments = set(spread([int(f) for f in subject.frames], each))
@@ -191,7 +191,7 @@ def sampled_items(subject: Subject, images: int) -> tuple[Item, ...]:
     return tuple(items)
 
 
-def cut_items(subject: Subject, most: int) -> tuple[Item, ...]:
+def cut_items(subject: CheckedData, most: int) -> tuple[Item, ...]:
     """At most ``most`` items with an image or mask file that was cut off; nothing is decoded."""
     layout = subject.layout
     found = (
@@ -218,7 +218,7 @@ def complete(path: Path) -> bool:
 
 
 def measure(
-    subject: Subject, items: Sequence[Item], sampling: Sampling, console: Console | None = None
+    subject: CheckedData, items: Sequence[Item], sampling: Sampling, console: Console | None = None
 ) -> tuple[list[MaskView], list[str]]:
     """Decodes and measures images, each once; the messages of those that cannot be read."""
 
@@ -237,7 +237,7 @@ def measure(
     return views, [result for result in results if isinstance(result, str)]
 
 
-def _view(subject: Subject, item: Item, sampling: Sampling) -> MaskView:
+def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
     name, number = item
     entry, row = subject.cameras[name], subject.rows[number]
     frame = CaptureDataset(subject.layout, [item], min(sampling.size, max(entry.size)))[0]

@@ -15,7 +15,7 @@ from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Crop, resize, take, undistort_map
 from gsgan.data.files import frame_files, last_number, read_grey
 from gsgan.data.formats.consistency import spread
-from gsgan.prepare.sources import IMAGE_SUFFIXES, Source
+from gsgan.prepare.sources import IMAGE_SUFFIXES, Recording
 from gsgan.prepare.stages import Advance
 from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
@@ -89,7 +89,7 @@ def tidy(mask: Bytes, levels: tuple[float, float]) -> Bytes:
 def write_images(
     root: Path,
     camera: CameraEntry,
-    source: Source,
+    source: Recording,
     masks: Mapping[int, Path],
     frames: Collection[int],
     offset: int,

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from gsgan.prepare.options import MEDIAPIPE, MediaPipe, Options
-from gsgan.prepare.sources import Source
+from gsgan.prepare.sources import Recording
 from gsgan.prepare.stages import Advance, StageFolder, each_camera
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root, writing
@@ -34,7 +34,10 @@ def tool_key() -> list[str]:
 
 
 def run_tool(
-    options: Options, sources: Mapping[str, Source], stages: StageFolder, say: Callable[[str], None]
+    options: Options,
+    sources: Mapping[str, Recording],
+    stages: StageFolder,
+    say: Callable[[str], None],
 ) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
     """The npz of landmarks and the masks by frame number of each source; runs what is not stored.
 

@@ -13,7 +13,7 @@ from gsgan.motion.points import UNITS
 from gsgan.prepare.camera_array import MIN_VIEWS
 from gsgan.prepare.solve import SolveSettings
 from gsgan.prepare.sources import (
-    Source,
+    Recording,
     find_sources,
     fit_size,
     matching_cameras,
@@ -115,7 +115,7 @@ class Options:
 class Inputs:
     """Images and the cameras that took them."""
 
-    sources: Mapping[str, Source]
+    sources: Mapping[str, Recording]
     calibration: Calibration
     cameras: tuple[CameraEntry, ...]  # in the order of the sources, with their names and sizes
     notes: tuple[str, ...]  # one sentence for each thing that was converted or left out

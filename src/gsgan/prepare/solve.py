@@ -19,7 +19,7 @@ from gsgan.prepare.camera_array import (
 )
 from gsgan.prepare.cleanse import cleanse, smooth
 from gsgan.prepare.hands import match_hands, misfits
-from gsgan.prepare.triangulate import SCALE, Points, apply_flips, find_flips, plain, robust
+from gsgan.prepare.triangulate import SCALE, Triangulated, apply_flips, find_flips, plain, robust
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, at_least, whole
@@ -83,7 +83,7 @@ class Corrected:
     weight: Float  # [C, F, J]
     flips: Bool  # [C, F, G] as in `Solution`
     left_out: Bool  # [C, F, 2]
-    points: Points  # of F * J
+    points: Triangulated  # of F * J
 
 
 def solve(
@@ -239,7 +239,7 @@ def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float,
     """Each camera's delay against the others, and the gain of correcting it.
 
     Convention: frames; with a positive delay the camera shows a later moment than the others at the
-    same number, so its numbers should grow by that much. Points are triangulated without the
+    same number, so its numbers should grow by that much. Triangulated are triangulated without the
     camera, so three cameras are needed; with two the delay is NaN. Between frames a parabola
     through the three best lags decides.
 

@@ -25,7 +25,7 @@ Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Source:
+class Recording:
     """One camera's video or folder of images."""
 
     name: str  # file stem or folder name
@@ -55,7 +55,7 @@ def stamp(path: Path) -> tuple[str, int, int]:
     return path.name, path.stat().st_size, path.stat().st_mtime_ns
 
 
-def find_sources(folder: Path, rotate: bool = False) -> dict[str, Source]:
+def find_sources(folder: Path, rotate: bool = False) -> dict[str, Recording]:
     """Every camera's images in a folder, or in videos/ or images/ inside it, in natural order.
 
     Raises:
@@ -70,15 +70,15 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Source]:
     )
 
 
-def _sources_in(folder: Path, rotate: bool) -> dict[str, Source]:
-    sources: dict[str, Source] = {}
+def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
+    sources: dict[str, Recording] = {}
     for path in sorted(folder.iterdir(), key=lambda p: natural_order(p.name)):
         if path.name.startswith("."):
             continue
         if path.is_dir() and (files := frame_files(folder, path.name, IMAGE_SUFFIXES)):
             paths = {number: folder / files[number] for number in sorted(files)}
             size = read_header(next(iter(paths.values()))).size
-            source = Source(path.name, path, size, None, paths, len(paths))
+            source = Recording(path.name, path, size, None, paths, len(paths))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             source = _video(path, rotate)
         else:
@@ -89,7 +89,7 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Source]:
     return sources
 
 
-def _video(path: Path, rotate: bool) -> Source:
+def _video(path: Path, rotate: bool) -> Recording:
     video = _open(path, rotate)
     fps = float(video.get(cv2.CAP_PROP_FPS))
     turned = int(video.get(cv2.CAP_PROP_ORIENTATION_META))
@@ -98,7 +98,7 @@ def _video(path: Path, rotate: bool) -> Source:
     if first is None:
         raise DataError(f"{path} holds no image that can be decoded; convert it to H.264 MP4")
     rate = fps if np.isfinite(fps) and fps > 0 else None
-    return Source(path.stem, path, (len(first), len(first[0])), rate, {}, count, turned, rotate)
+    return Recording(path.stem, path, (len(first), len(first[0])), rate, {}, count, turned, rotate)
 
 
 def _open(path: Path, rotate: bool) -> cv2.VideoCapture:
@@ -182,7 +182,7 @@ def fit_size(
     )
 
 
-def recording_notes(sources: Mapping[str, Source]) -> list[str]:
+def recording_notes(sources: Mapping[str, Recording]) -> list[str]:
     """Notes on frame rates and lengths that differ, and on rotation metadata."""
     found = []
     for what, values in (

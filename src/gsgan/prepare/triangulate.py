@@ -30,7 +30,7 @@ Pairs = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
-class Points:
+class Triangulated:
     """Triangulated points."""
 
     p: Float  # [N, 3] metres, NaN where missing
@@ -55,8 +55,8 @@ def robust(
     weight: Float,
     iterations: int = ITERATIONS,
     max_error: float = MAX_ERROR,
-) -> Points:
-    """Points that most detections agree on, by reweighting from the best pair of cameras.
+) -> Triangulated:
+    """Triangulated that most detections agree on, by reweighting from the best pair of cameras.
 
     Convention: the loss is Cauchy's, ``log(1 + (r/SCALE)²)`` of the reprojection error r, times
     the weight; errors are in thousandths of the focal length. A point is NaN with fewer than two
@@ -65,7 +65,7 @@ def robust(
     """
     chunks = [slice(at, at + CHUNK) for at in range(0, max(uv.shape[1], 1), CHUNK)]
     parts = [_robust(cameras, uv[:, at], weight[:, at], iterations, max_error) for at in chunks]
-    return Points(
+    return Triangulated(
         p=np.concatenate([part.p for part in parts]),
         weight=np.concatenate([part.weight for part in parts], axis=1),
         error=np.concatenate([part.error for part in parts], axis=1),
@@ -74,7 +74,7 @@ def robust(
 
 def _robust(
     cameras: CameraArray, uv: Float, weight: Float, iterations: int, max_error: float
-) -> Points:
+) -> Triangulated:
     weight = np.where(known(uv), weight, 0.0)
     a, b = _rows(cameras, uv, weight)
     p, reweighted = _best_pair(cameras, uv, weight, a, b), weight
@@ -92,7 +92,7 @@ def _robust(
     missing |= _median(error, weight > 0) > max_error
     missing |= (weight > 0).sum(0) < MIN_VIEWS
     p = np.where(missing[:, None], np.nan, p)
-    return Points(p, np.where(missing, 0.0, reweighted), np.where(missing, np.nan, error))
+    return Triangulated(p, np.where(missing, 0.0, reweighted), np.where(missing, np.nan, error))
 
 
 def robust_cost(error: Float, weight: Float) -> Float:
