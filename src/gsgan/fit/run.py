@@ -33,10 +33,10 @@ from gsgan.data.formats.capture import LANDMARKS, POSES, SHAPE, CaptureReader
 from gsgan.data.validation import spans
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.moments import Moments
-from gsgan.prepare.pictures import sampled
 from gsgan.scene import BodyPose, Frame
 from gsgan.skeleton import MEDIAPIPE33, TEMPLATES
 from gsgan.splat import accuracy
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console, progress
 from gsgan.utils.errors import ConfigError, DataError
@@ -356,7 +356,7 @@ def fit_picture(fitter: Fitter, names: Sequence[str], found: BodyPose, shown: in
     moments = fitter.moments
     rows = {
         i: {int(frame.camera_index): frame for frame in moments.pictures(i)}
-        for i in sampled(len(moments.frames), shown)
+        for i in evenly_spaced(len(moments.frames), shown)
     }
     columns = sorted(set().union(*rows.values()))
     lines = []
