@@ -150,7 +150,7 @@ def test_a_run_without_figure_or_dataset(render, bare, motion, tmp_path):
     assert ok.returncode == 0, ok.stderr
     old = shutil.copytree(bare, tmp_path / "old")
     checkpoint = torch.load(old / CHECKPOINT, weights_only=True)
-    del checkpoint["gsgan"]["scene"]["figure"]
+    del checkpoint["gsgan"]["scene"]["proportions"]
     torch.save(checkpoint, old / CHECKPOINT)
     result = render(f"run={old}", f"motion={motion}", "out=b", "frames=1")
     assert result.returncode == 0, result.stderr

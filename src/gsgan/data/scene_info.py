@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from gsgan.body import SkinnedBody, open_body
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.figure import Figure, figure_of
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
+from gsgan.data.proportions import Proportions, measure_proportions
 from gsgan.data.skeletons import body_height
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
@@ -63,7 +63,7 @@ class SceneInfo:
         darkest: brightness in [0, 1] of the person's darkest percent.
         body_inside: share of the posed body that lies inside the masks of training images; None
             without a body pose or mesh.
-        figure: the subject's proportions; None in checkpoints of older versions.
+        proportions: the subject's proportions; None where they were not measured.
         face: metres, the subject's face at rest in the head's frame, see `face_at_rest`; None for
             skeletons without a face.
     """
@@ -95,7 +95,7 @@ class SceneInfo:
     surface: SurfaceColours | None = None
     darkest: float = 0.0
     body_inside: float | None = None
-    figure: Figure | None = None
+    proportions: Proportions | None = None
     face: tuple[Vector, ...] | None = None
 
 
@@ -161,7 +161,7 @@ def scene_info(
         surface=_shared_surface(layout, dataset, tuple(entries), samples, mesh),
         darkest=darkest,
         body_inside=inside,
-        figure=figure_of(*whole.joints(frames), layout.meta.up_axis),
+        proportions=measure_proportions(*whole.joints(frames), layout.meta.up_axis),
     )
 
 

@@ -15,7 +15,14 @@ from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
 from gsgan.data.dataset import PictureCache
-from gsgan.data.figure import BODY, EXPRESSION, HAND_JOINTS, HEELS_AND_TOES, Figure, upright
+from gsgan.data.proportions import (
+    BODY,
+    EXPRESSION,
+    HAND_JOINTS,
+    HEELS_AND_TOES,
+    Proportions,
+    upright,
+)
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
 from gsgan.model.runs import (
@@ -23,7 +30,7 @@ from gsgan.model.runs import (
 )
 from gsgan.motion.clip import FPS, checked, completed, frame_times, is_own, resampled, up_axis
 from gsgan.motion.readers import Source, read_motion
-from gsgan.motion.retarget import expressed, face_in_head, joined, on_figure, placed
+from gsgan.motion.retarget import expressed, face_in_head, joined, placed, retargeted
 from gsgan.scene import BodyPose, Camera, Frame, cat
 from gsgan.skeleton import complete_skeleton
 from gsgan.utils.checks import above, one_of
@@ -110,9 +117,9 @@ def _given(config: DictConfig, run: Run, fps: float) -> Drive:
         if config.retarget is False:
             raise ConfigError("retarget=false is not supported for a list of motions")
         clips = [_from_file(config, run, str(path), fps) for path in config.motion]
-        return _joined(clips, run.figure, float(above("transition", config.transition)), fps)
+        return _joined(clips, run.proportions, float(above("transition", config.transition)), fps)
     if config.motion == REST:
-        return rest_pose(run.figure)
+        return rest_pose(run.proportions)
     if config.motion in SPLITS:
         return _held_out(config, run, config.motion)
     return _from_file(config, run, config.motion, fps)
@@ -151,34 +158,34 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
     )
 
 
-def _joined(clips: list[Drive], figure: Figure, seconds: float, fps: float) -> Drive:
+def _joined(clips: list[Drive], proportions: Proportions, seconds: float, fps: float) -> Drive:
     """Clips one after the other, with transitions of ``seconds``."""
     if not clips:
         raise ConfigError("motion=[] names no file; expected motion=[a.pose,b.pose]")
-    standard = upright(figure.up)
+    standard = upright(proportions.up)
     between = max(1, round(seconds * fps) - 1)
     joints = max(clip.p.shape[1] for clip in clips)
     parts = []
     for clip in clips:  # some with hands or a face, some without
         lacking = (0, joints - clip.p.shape[1])
         parts.append(np.pad(clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan) @ standard.T)
-    p = joined(parts, figure, between) @ standard
+    p = joined(parts, proportions, between) @ standard
     text = "; ".join(clip.text for clip in clips) + f"; {seconds:g} s from each to the next"
-    return Drive(p, _shown(p, figure), None, list(range(len(p))), text)
+    return Drive(p, _shown(p, proportions), None, list(range(len(p))), text)
 
 
-def _shown(p: Float, figure: Figure) -> Float:
+def _shown(p: Float, proportions: Proportions) -> Float:
     """``[F, J]`` visibility of retargeted joints: the body's as in training, others where known."""
     visibility = np.asarray(np.isfinite(p).all(-1), np.float64)
-    visibility[:, : len(figure.seen)] = figure.seen
+    visibility[:, : len(proportions.seen)] = proportions.seen
     return visibility
 
 
 def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
-    figure = run.figure
+    proportions = run.proportions
     smpl, skeleton = config.smpl or run.body_file, config.skeleton
     files = (None if x is None else Path(x).expanduser() for x in (smpl, skeleton))
-    source = Source(figure, *files)
+    source = Source(proportions, *files)
     motion = read_motion(Path(path).expanduser(), source)
     motion = checked(motion, float(config.min_visibility))
     rate = config.motion_fps or motion.fps
@@ -189,7 +196,7 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
         )
     up = (None if motion.file_up else config.up) or motion.up or up_axis(motion)
     choice = one_of("retarget", config.retarget, ("auto", True, False))
-    own = is_own(motion, figure) if choice == "auto" else not choice
+    own = is_own(motion, proportions) if choice == "auto" else not choice
     if choice is False and motion.detached:
         raise ConfigError(f"retarget=false is not supported for {motion.path}: leave retarget out")
     # transitions need every joint
@@ -203,15 +210,15 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
             at = torch.from_numpy(nearest)
             body = BodyPose(motion.body.theta[at], motion.body.transl[at])
     else:
-        standard = upright(figure.up)
+        standard = upright(proportions.up)
         centre = standard @ np.array(run.scene.centre)
         p = completed(motion, up)
         if p.shape[1] > EXPRESSION.start:
             p = p if motion.detached else face_in_head(p)
             p[:, EXPRESSION] = expressed(p[:, EXPRESSION], run.face)
-        p = on_figure(resampled(p, rate, fps), figure)
-        p = placed(p, figure, centre, fps, ground=config.ground, stay=config.stay) @ standard
-        visibility = _shown(p, figure)
+        p = retargeted(resampled(p, rate, fps), proportions)
+        p = placed(p, proportions, centre, fps, ground=config.ground, stay=config.stay) @ standard
+        visibility = _shown(p, proportions)
     filled = f", {_frames(motion.filled)} without shoulders or hips filled" if motion.filled else ""
     seen = [np.isfinite(p[:, hand]).all((1, 2)).sum() for hand in HAND_JOINTS.values()]
     hands = f", left hand in {seen[0]} frames, right hand in {seen[1]}" if p.shape[1] > BODY else ""
@@ -232,11 +239,11 @@ def _frames(count: int) -> str:
     return "1 frame" if count == 1 else f"{count} frames"
 
 
-def rest_pose(figure: Figure) -> Drive:
+def rest_pose(proportions: Proportions) -> Drive:
     """The subject standing in a T-pose at the world's origin, feet at height 0."""
-    standing = figure.rest - [0, 0, figure.rest[list(HEELS_AND_TOES), 2].min()]
-    p = (standing @ upright(figure.up))[None]
-    return Drive(p, np.array(figure.seen, np.float64)[None], None, [0], "the rest pose")
+    standing = proportions.rest - [0, 0, proportions.rest[list(HEELS_AND_TOES), 2].min()]
+    p = (standing @ upright(proportions.up))[None]
+    return Drive(p, np.array(proportions.seen, np.float64)[None], None, [0], "the rest pose")
 
 
 def joints_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor]:

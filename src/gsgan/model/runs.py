@@ -19,7 +19,7 @@ from omegaconf.errors import OmegaConfBaseException
 import gsgan.model.assemble as assemble
 from gsgan.body import open_body
 from gsgan.body.skinned import MarkedBody
-from gsgan.data.figure import Figure
+from gsgan.data.proportions import Proportions
 from gsgan.effects import Effects
 from gsgan.model.avatar import Avatar
 from gsgan.skeleton import HOLISTIC
@@ -182,7 +182,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 def scene_of(plain: Mapping[str, Any]) -> SceneInfo:
     """The facts about a scene that a checkpoint holds as plain values."""
-    from gsgan.data.figure import Figure
+    from gsgan.data.proportions import Proportions
     from gsgan.data.scene_info import SceneInfo
     from gsgan.data.surface_colours import SurfaceColours
 
@@ -191,8 +191,8 @@ def scene_of(plain: Mapping[str, Any]) -> SceneInfo:
     }
     if values["surface"] is not None:
         values["surface"] = SurfaceColours(**values["surface"])
-    if values.get("figure") is not None:
-        values["figure"] = Figure(**values["figure"])
+    if values.get("proportions") is not None:
+        values["proportions"] = Proportions(**values["proportions"])
     return SceneInfo(**values)
 
 
@@ -355,7 +355,7 @@ class Run:
     def scene(self) -> SceneInfo:
         """Facts about the scene; older checkpoints lack some, and need the dataset."""
         stored = self.checkpoint.get("scene")
-        if self.opened is None and stored is not None and stored.get("figure") is not None:
+        if self.opened is None and stored is not None and stored.get("proportions") is not None:
             return scene_of(stored)
         return self.data.info
 
@@ -372,10 +372,10 @@ class Run:
         return self.moved.smpl or from_start(self.folder, self.scene.body_file)
 
     @property
-    def figure(self) -> Figure:
+    def proportions(self) -> Proportions:
         """The subject's proportions."""
-        assert self.scene.figure is not None
-        return self.scene.figure
+        assert self.scene.proportions is not None
+        return self.scene.proportions
 
     @property
     def face(self) -> Float:

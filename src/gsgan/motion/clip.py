@@ -14,14 +14,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsgan.data.figure import (
+from gsgan.data.proportions import (
     BODY,
     BONES,
     EXPRESSION,
     HAND_JOINTS,
     HIPS,
     SHOULDERS,
-    Figure,
+    Proportions,
     length,
     middle,
     upright,
@@ -133,13 +133,13 @@ def mixed(a: Float, b: Float, share: Float) -> Float:
     return np.where(s > 0, np.where(s < 1, (1 - s) * a + s * b, b), a)
 
 
-def is_own(motion: Motion, figure: Figure) -> bool:
+def is_own(motion: Motion, subject: Proportions) -> bool:
     """Whether the motion's bones are as long as the subject's: it needs no retargeting."""
     with np.errstate(invalid="ignore"):
         found = [np.linalg.norm(motion.p[:, b] - motion.p[:, a], axis=-1) for a, b in BONES]
     seen = [(np.median(x[np.isfinite(x)]), bone) for x, bone in zip(found, BONES, strict=True)
             if np.isfinite(x).any()]  # fmt: skip
-    rest = figure.rest
+    rest = subject.rest
     return bool(seen) and all(abs(x / length(rest, b) - 1) <= OWN for x, b in seen)
 
 

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from gsgan.data.figure import BONES, EARS, HAND_JOINTS, HIPS, SHOULDERS, Figure, length
 from gsgan.data.joints import FACE_MESH
+from gsgan.data.proportions import BONES, EARS, HAND_JOINTS, HIPS, SHOULDERS, Proportions, length
 from gsgan.motion.clip import Motion, rate_of
 from gsgan.motion.retarget import steadied
 from gsgan.skeleton import MEDIAPIPE33
@@ -36,7 +36,7 @@ FACE_LENGTHS = tuple(
 LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))  # rigid, for the scale of axes
 
 
-def read_pose(path: Path, figure: Figure) -> Motion:
+def read_pose(path: Path, subject: Proportions) -> Motion:
     """MediaPipe's landmarks in a file of the ``pose-format`` package.
 
     Image landmarks with MediaPipe's depth, which agree with those of the hands; without any, world
@@ -91,14 +91,14 @@ def read_pose(path: Path, figure: Figure) -> Motion:
     person = visibility[:, SHOULDERS].all(1)
     if hidden := person.any() and np.median(visibility[person][:, HIPS]) < GUESSED:
         visibility[:, HIPS] = 0
-    p = _to_metres(path, p, visibility, figure, pixels=name == IMAGE)
+    p = _to_metres(path, p, visibility, subject, pixels=name == IMAGE)
     if hidden:
-        p[:, HIPS] = p[:, SHOULDERS] + (0, length(figure.rest, (11, 23)), 0)
+        p[:, HIPS] = p[:, SHOULDERS] + (0, length(subject.rest, (11, 23)), 0)
         visibility[:, HIPS] = visibility[:, SHOULDERS]
     hands = [landmarks(hand, HAND_NAMES) for hand in HANDS]
     face = landmarks(MESH, tuple(str(number) for number in range(MESH_SIZE)))
     if any(seen.any() for _, seen in (*hands, face)):
-        whole = figure.rest_with_hands
+        whole = subject.rest_with_hands
         rest = [whole[at] for at in HAND_JOINTS.values()]
         p = np.concatenate([p, *_parts_to_metres(hands, rest, HAND_LENGTHS)], axis=1)
         visibility = np.concatenate([visibility, *(seen for _, seen in hands)], axis=1)
@@ -110,7 +110,9 @@ def read_pose(path: Path, figure: Figure) -> Motion:
     return Motion(path, p, visibility, rate_of(path, pose.body.fps), None, unit, detached=True)
 
 
-def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure, pixels: bool) -> Float:
+def _to_metres(
+    path: Path, p: Float, visibility: Float, subject: Proportions, pixels: bool
+) -> Float:
     """Scales each of the three axes so that bones get the subject's lengths.
 
     The squares of the scales solve ``Σ sᵢ² dᵢ² = length²`` over all seen bones and frames, by
@@ -120,7 +122,7 @@ def _to_metres(path: Path, p: Float, visibility: Float, figure: Figure, pixels: 
     rows = []
     for a, b in LENGTHS:
         seen = (visibility[:, (a, b)] > 0.2).all(1) & np.isfinite(p[:, (a, b)]).all((1, 2))
-        rows.append((p[seen, b] - p[seen, a]) ** 2 / length(figure.rest, (a, b)) ** 2)
+        rows.append((p[seen, b] - p[seen, a]) ** 2 / length(subject.rest, (a, b)) ** 2)
     table = np.concatenate(rows)
     if not len(table):
         raise DataError(f"{path}: no frame shows two joints of a limb; expected a person")

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from gsgan.body import free_body, open_body
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.calibration.find import METRES
-from gsgan.data.figure import EXPRESSION, HIPS, SHOULDERS, Figure
 from gsgan.data.files import read_arrays, read_json, read_json_value
 from gsgan.data.formats import smpl_motion
 from gsgan.data.formats.capture import SHAPE, read_shape
+from gsgan.data.proportions import EXPRESSION, HIPS, SHOULDERS, Proportions
 from gsgan.data.skeletons import hips_below
 from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.bvh import Bvh, read_bvh
@@ -52,12 +52,12 @@ class Source:
     """What readers may need besides the file.
 
     Args:
-        figure: the subject's proportions, for formats without face, hands and scale.
+        subject: the subject's proportions, for formats without face, hands and scale.
         smpl: an SMPL or SMPL-X model file, or None.
         skeleton: the ASF file of an AMC motion, or None for the one beside it.
     """
 
-    figure: Figure
+    subject: Proportions
     smpl: Path | None = None
     skeleton: Path | None = None
 
@@ -306,12 +306,13 @@ def _rig(path: Path, bvh: Bvh, metres: float | None, source: Source) -> Motion:
     standard = standard_motion(bvh, path)
     if metres is None:
         ratios = {
-            unit: abs(np.log(standard.leg * x / source.figure.leg)) for unit, x in LEG_UNITS.items()
+            unit: abs(np.log(standard.leg * x / source.subject.leg))
+            for unit, x in LEG_UNITS.items()
         }
         unit = min(ratios, key=ratios.__getitem__)
     else:
         unit = f"units of {100 * metres:.3g} cm"
-    p = rig_landmarks(standard, source.figure)
+    p = rig_landmarks(standard, source.subject)
     seen = np.asarray(np.isfinite(p).all(-1), np.float64)
     return Motion(path, p, seen, 1 / bvh.frame_time, "z", unit, standard.up)
 
@@ -335,5 +336,5 @@ READERS: dict[str, Callable[[Path, Source], Motion]] = {
     ".bvh": read_bvh_motion,
     ".amc": read_amc_motion,
     ".trc": read_trc,
-    ".pose": lambda path, source: read_pose(path, source.figure),
+    ".pose": lambda path, source: read_pose(path, source.subject),
 }

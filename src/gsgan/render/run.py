@@ -116,7 +116,7 @@ def _cameras(config: DictConfig, run: Run, drive: Drive) -> tuple[Camera, Tensor
     name = "orbit" if config.camera is None else str(config.camera)
     if name == "orbit":
         orbit = Orbit(**OmegaConf.to_container(config.orbit))  # type: ignore[arg-type]
-        return orbit.cameras(drive.p, run.figure, run.scene, size, trained or size), None
+        return orbit.cameras(drive.p, run.proportions, run.scene, size, trained or size), None
     if (path := Path(name).expanduser()).is_file():
         return from_file(path, drive.p, size), None
     entry = of_capture(run.data.layout.cameras, name)
