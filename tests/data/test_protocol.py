@@ -242,7 +242,7 @@ def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> Non
     from gsgan.evaluate.facts import Method
     from gsgan.evaluate.run import evaluate_method
     from gsgan.evaluate.scores import painter
-    from gsgan.model.runs import build_avatar, build_data
+    from gsgan.model.assemble import build_avatar, build_data
 
     config = compose(
         "train",
@@ -252,7 +252,7 @@ def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> Non
         *("protocol.test_cameras=[2]", "lpips.net=alex"),
     )
     data = build_data(config)
-    avatar = build_avatar(config, data).eval()
+    avatar = build_avatar(config, data.info, data.labelled("train")).eval()
     text = io.StringIO()
     results = evaluate_method(
         tmp_path,

@@ -19,7 +19,7 @@ written = zju_folders.written
 def test_the_config_trains_with_segmentation_on_cihp_labels(
     compose, written: Path, smpl_file: Path
 ) -> None:
-    from gsgan.model.runs import build_avatar, build_data
+    from gsgan.model.assemble import build_avatar, build_data
 
     config = compose(
         "train",
@@ -35,9 +35,9 @@ def test_the_config_trains_with_segmentation_on_cihp_labels(
     assert data.layout.frames == (0, 1, 2)
     info = data.info
     assert (info.body, info.n_labels, info.skeleton_source) == ("smpl", 20, "smpl24 -> mediapipe33")
-    avatar = build_avatar(config, data).eval()
+    avatar = build_avatar(config, data.info, data.labelled("train")).eval()
     assert avatar.segmentation is not None
-    painting = avatar.paint(data.dataset("train")[0])
+    painting = avatar(*data.dataset("train")[0].inputs)
     assert painting.segmentation is not None
     assert "class vote over 9 images" in avatar.segmentation_why
     assert painting.segmentation.shape == (1, avatar.segmentation.classes, 32, 32)

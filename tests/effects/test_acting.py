@@ -10,8 +10,9 @@ import pytest
 import torch
 from operators import Calls
 
-from gsgan.model.painting import ColourCorrection
-from gsgan.model.runs import load_avatar, read_checkpoint
+from gsgan.model.colour import ColourCorrection
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import read_checkpoint
 from gsgan.train.run import build_training
 from gsgan.utils.errors import ConfigError
 
@@ -19,9 +20,9 @@ NONE = "effects=none"
 
 
 def calls(avatar, frame) -> Counter[str]:
-    avatar.paint(frame)  # what is built once is built
+    avatar(*frame.inputs)  # what is built once is built
     with Calls() as seen, torch.no_grad():
-        avatar.paint(frame)
+        avatar(*frame.inputs)
     return seen.count
 
 
@@ -52,10 +53,13 @@ def test_off_builds_no_parameter_and_calls_no_operator(build, effect, word, adds
 
 def test_all_off_is_the_plain_chain_operator_by_operator(build):
     """The forward pass with effects off against its parts called one after the other."""
-    from gsgan.skeleton import bone_frames
+    from gsgan.model.avatar import LINE_WIDTH
+    from gsgan.model.deformation import bounded
+    from gsgan.model.pose_graph import pose_inputs
+    from gsgan.skeleton import bone_frames, draw_skeleton
     from gsgan.splat import rasterise
 
-    _, avatar, frame = build(NONE)
+    _, avatar, frame = build(NONE, "model.window_margin=null")
     camera = frame.camera
 
     def chain():
@@ -63,11 +67,13 @@ def test_all_off_is_the_plain_chain_operator_by_operator(build):
         frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
         points = avatar.densify(p, valid, frames)
         gaussians = avatar.deformation(p, points, camera.centre, frames.hubs[:, 0], None)
-        gaussians = avatar.bounded(gaussians)
+        limit = avatar.generator.feature_bound
+        gaussians = replace(gaussians, features=bounded(gaussians.features, -limit, limit))
         raster = rasterise(gaussians, camera, settings=avatar.accuracy)
         S = avatar.segmentation(frame.body, camera)
-        p2d = avatar.draw(p, valid, camera, None)
-        g = avatar.pose_encoder(*avatar.pose_inputs(p, valid, frames, camera))
+        p2d = draw_skeleton(p, valid, camera, avatar.template, LINE_WIDTH)
+        given = p, valid, frames, camera, avatar.template, avatar.body_height
+        g = avatar.pose_encoder(*pose_inputs(*given))
         painted = avatar.generator(raster.features, S, p2d, g, raster.fine, raster.alpha)
         return painted[:, :3], painted[:, 3:]
 
@@ -91,7 +97,7 @@ def test_degree_0_looks_in_no_direction(build):
     with torch.no_grad():
         avatar.deformation.head.weight.normal_(std=0.01)
         colours = [
-            avatar(frame.skeleton, frame.visibility, c, paint=False).gaussians.features
+            avatar(frame.skeleton, frame.visibility, c, generate=False).gaussians.features
             for c in (frame.camera, moved)
         ]
     assert torch.equal(*colours)
@@ -102,7 +108,7 @@ def test_with_all_effects_off_the_model_keeps_its_segmentation(build, word):
     _, avatar, frame = build(word)
     assert {name for name, effect in avatar.effects if effect.on} == set()
     assert avatar.segmentation is not None
-    assert avatar.paint(frame).segmentation.shape[1] == avatar.segmentation.classes
+    assert avatar(*frame.inputs).segmentation.shape[1] == avatar.segmentation.classes
 
 
 @pytest.mark.parametrize("effect", ["segmentation", "depth", "hands", "face"])
@@ -158,15 +164,15 @@ def test_pictures_are_mapped_and_the_background_stays_black():
 
 def test_correction_acts_on_both_pictures_and_leaves_f_alone(build):
     _, avatar, frame = build("effects.colour_correction=on")
-    before = avatar.paint(frame)
+    before = avatar(*frame.inputs)
     assert torch.equal(before.image, before.colour)
     with torch.no_grad():
         avatar.colour.offsets[0, 0, 0] += 0.5
-    after = avatar.paint(frame)
+    after = avatar(*frame.inputs)
     assert torch.equal(after.features, before.features)
     torch.testing.assert_close(after.colour[:, 0], 1.25 * before.features[:, 0])
     torch.testing.assert_close(after.image[:, 0], 1.25 * before.image[:, 0])
-    unseen = avatar.paint(replace(frame, camera_index=torch.tensor([2])))  # cam02 is held out
+    unseen = avatar(*replace(frame, camera_index=torch.tensor([2])).inputs)  # cam02 is held out
     torch.testing.assert_close(unseen.image, before.image)
 
 
@@ -217,9 +223,9 @@ def test_degrees_above_the_active_one_are_neither_computed_nor_moved(build):
     with torch.no_grad():
         psi.head.weight[:14].normal_(std=0.01)  # all up to the constant colour
         psi.table[:, :14].normal_(std=0.1)
-    full = avatar.paint(frame).colour
+    full = avatar(*frame.inputs).colour
     psi.active_degree = 0
-    masked = avatar.paint(frame)
+    masked = avatar(*frame.inputs)
     # zeros above: the same picture, but for the rounding of a narrower product
     torch.testing.assert_close(masked.colour, full, atol=1e-5, rtol=0)
     masked.features.sum().backward()
@@ -281,7 +287,8 @@ def test_a_trained_avatar_has_what_its_checkpoint_says_not_what_the_scene_says_n
 
     from omegaconf import OmegaConf
 
-    from gsgan.model.runs import CHECKPOINT, build_data, load_config
+    from gsgan.model.assemble import build_data
+    from gsgan.model.stored import CHECKPOINT, load_config
 
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
@@ -328,10 +335,10 @@ def test_all_means_all_that_this_model_can_have(build):
     every = {"view_dependence", "antialias", "colour_correction", "random_background"}
     every |= {"body_points"}
     assert {name for name, effect in avatar.effects if effect.on} == every
-    assert torch.isfinite(avatar.paint(frame).image).all()
+    assert torch.isfinite(avatar(*frame.inputs).image).all()
     _, avatar, frame = build("effects=all", "model=image_to_image")
     assert {name for name, effect in avatar.effects if effect.on} == set()
-    assert torch.isfinite(avatar.paint(frame).image).all()
+    assert torch.isfinite(avatar(*frame.inputs).image).all()
 
 
 @pytest.mark.slow

@@ -27,7 +27,7 @@ from gsgan.fit.fitter import Fitter, _wrong
 from gsgan.fit.moments import Moments
 from gsgan.fit.run import fit_before_training, run_fit, standard_settings
 from gsgan.scene import BodyPose
-from gsgan.train.run import pose_corrections, training_record
+from gsgan.train.run import training_record
 from gsgan.utils.errors import ConfigError, DataError
 
 
@@ -302,25 +302,6 @@ def test_the_image_shows_every_camera(fit, tmp_path):
     picture = cv2.imread(str(tmp_path / "out/body_fit.png"))
     assert picture.shape[1] == 3 * 300
     assert picture.shape[0] > 2 * 300
-
-
-def test_corrections_belong_to_training_frames(fitted, compose):
-    data = GsganData(str(fitted), size=48)
-    config = compose("train", "data=capture", f"data.root={fitted}", "size=tiny")
-    from gsgan.model.runs import build_avatar
-
-    config.effects.body_points = "on"
-    avatar = build_avatar(config, data)
-    assert pose_corrections(data, avatar, 0.0) is None
-    corrections = pose_corrections(data, avatar, 1e-3)
-    frame = data.dataset("train")[1]
-    pose, prior = corrections(frame.body, frame.frame_id)
-    torch.testing.assert_close(pose.theta, frame.body.theta)
-    (pose.theta.square().sum() + pose.transl.square().sum() + prior).backward()
-    rows = corrections.theta.grad.flatten(1).norm(dim=1)
-    assert (rows > 0).tolist() == [f == int(frame.frame_id) for f in (0, 1, 2)]
-    config.effects.body_points = "off"
-    assert pose_corrections(data, build_avatar(config, data), 1e-3) is None
 
 
 @pytest.mark.parametrize(

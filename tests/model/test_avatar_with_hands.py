@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 import shutil
 
+import numpy as np
 import pytest
 import torch
 from make import write_hands
 
 from gsgan.body import free_body
 from gsgan.model.body_points import BodyPoints
+from gsgan.model.drive import Drive, inputs_of
 from gsgan.model.pose_graph import PoseGraph, PoseLinear
 from gsgan.skeleton import MEDIAPIPE33_HANDS
 
@@ -36,7 +38,7 @@ def test_every_model_takes_hands(made, model):
     assert avatar.template is MEDIAPIPE33_HANDS
     assert frame.skeleton.shape == (1, 75, 3)
     with torch.no_grad():
-        image = avatar.paint(frame).image
+        image = avatar(*frame.inputs).image
     assert image.shape == frame.image.shape
     assert image.isfinite().all()
 
@@ -47,7 +49,7 @@ def test_points_on_the_skeleton_are_on_the_fingers_too(made):
     assert avatar.densify.template is MEDIAPIPE33_HANDS
     assert avatar.deformation.from_pose.in_features == 3 * 75
     with torch.no_grad():
-        found = avatar.paint(frame).gaussians
+        found = avatar(*frame.inputs).gaussians
     assert found.means.shape[1] == avatar.densify.n_points
     assert avatar.densify.n_points > 40 * 60
     assert avatar.generator is not None
@@ -89,7 +91,9 @@ def test_a_missing_hand_rests_on_its_arm(made):
     _, avatar, frame = made("effects.body_points=on", "model.segmentation.mode=hands")
     p = frame.skeleton[0].clone()
     p[33:54] = torch.nan
-    painting = avatar.picture(p, frame.camera, maps=True)
+    drive = Drive(p[None].numpy(), np.ones((1, 75)), None, [0], "")
+    given, seen, body = inputs_of(avatar, drive, 0)
+    painting = avatar(given, seen, frame.camera, body)
     assert painting.image.isfinite().all()
     S = avatar.segmentation
     hand = S.truth_table[S.vertex_labels[avatar.body_points.points.chosen]] == 1

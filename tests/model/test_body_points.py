@@ -12,7 +12,8 @@ from gsgan.body.skinned import vertex_normals
 from gsgan.data.surface_colours import body_inside
 from gsgan.effects import EffectSettings, decide
 from gsgan.model.body_points import BodyPoints, moved_normals
-from gsgan.model.runs import CHECKPOINT, load_avatar
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import CHECKPOINT
 from gsgan.scene import BodyPose, cat
 from gsgan.train.run import build_training
 from gsgan.utils.errors import ConfigError, DataError
@@ -112,22 +113,22 @@ def test_a_vertex_without_a_face_has_no_normal():
 def test_on_the_body_nothing_is_densified_and_off_it_no_body_is_built(build):
     _, avatar, frame = build(ON)
     assert avatar.densify is None
-    painting = avatar.paint(frame)
+    painting = avatar(*frame.inputs)
     assert painting.gaussians.means.shape[1] == avatar.body_points.n_points == 500
     _, plain, frame = build("effects.body_points=off")
     assert plain.body_points is None
-    assert plain.paint(frame).gaussians.means.shape[1] == plain.densify.n_points
+    assert plain(*frame.inputs).gaussians.means.shape[1] == plain.densify.n_points
 
 
 def test_untrained_gaussians_sit_on_the_surface(build):
     _, avatar, frame = build(ON)
-    means = avatar.paint(frame).gaussians.means
+    means = avatar(*frame.inputs).gaussians.means
     torch.testing.assert_close(means, avatar.body_points(frame.body).means)
 
 
 def test_psi_gets_finite_gradients_through_sheared_frames(build):
     _, avatar, frame = build(ON, "effects.view_dependence=2")
-    avatar.paint(frame).features[:, :3].square().mean().backward()
+    avatar(*frame.inputs).features[:, :3].square().mean().backward()
     grads = [p.grad for p in avatar.deformation.parameters() if p.grad is not None]
     assert grads
     assert all(torch.isfinite(g).all() for g in grads)
@@ -141,14 +142,14 @@ def test_poses_of_a_batch_do_not_mix(build):
         for parameter in avatar.parameters():
             parameter.add_(0.02 * torch.randn_like(parameter))
         avatar.window_margin = None
-        both = avatar.paint(cat([frame, other])).features
+        both = avatar(*cat([frame, other]).inputs).features
         assert (both[0] - both[1]).abs().max() > 0.1
-        torch.testing.assert_close(both[1:], avatar.paint(other).features, atol=2e-4, rtol=1e-4)
+        torch.testing.assert_close(both[1:], avatar(*other.inputs).features, atol=2e-4, rtol=1e-4)
 
 
 def test_points_go_where_the_avatar_goes(build):
     _, avatar, frame = build(ON)
-    painting = avatar.double().paint(frame.to(torch.float64))
+    painting = avatar.double()(*frame.to(torch.float64).inputs)
     assert painting.gaussians.means.dtype == painting.image.dtype == torch.float64
     assert not [name for name in avatar.state_dict() if name.startswith("body_points")]
 
@@ -197,21 +198,6 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
         load_avatar(tmp_path, config, data)
 
 
-def test_a_run_from_before_body_points_and_low_pass_loads_as_it_was_trained(tiny, tmp_path):
-    newer = ("low_pass", "supersample", "body_points", "deformation.normals")
-    config = tiny(*(f"~model.{key}" for key in newer), "~effects.body_points")
-    data, module = build_training(config)
-    checkpoint = stored(module, tmp_path)
-    del checkpoint["gsgan"]["effects"]["body_points"]
-    torch.save(checkpoint, tmp_path / CHECKPOINT)
-    data.info = replace(data.info, body_inside=1.0)  # what would call for points on the body now
-    avatar, _ = load_avatar(tmp_path, config, data)
-    assert avatar.body_points is None
-    assert avatar.accuracy.low_pass == avatar.segmentation.accuracy.low_pass == 0.3
-    assert avatar.accuracy.supersample == 1
-    assert avatar.deformation.from_normal is None
-
-
 def test_the_figure_of_densify_says_where_the_points_are(build, tmp_path):
     from gsgan.report.figures.body import densify
     from gsgan.report.figures.layout import Settings
@@ -228,13 +214,11 @@ def test_the_figure_of_densify_says_where_the_points_are(build, tmp_path):
         assert drawing.numbers[shots[0].name]["one"]["points"] == placed.n_points
 
 
-def test_without_the_frames_body_pose_it_is_solved_and_training_says_what_is_missing(build):
+def test_without_the_frames_body_pose_it_is_solved(build):
     _, avatar, frame = build(ON)
     bare = replace(frame, body=None)
     body = avatar.body_pose(frame.skeleton, frame.visibility)
-    assert torch.equal(avatar.paint(bare).image, avatar.paint(replace(frame, body=body)).image)
-    with pytest.raises(ValueError, match="skinned body; give its body pose"):
-        avatar(frame.skeleton, frame.visibility, frame.camera)
+    assert torch.equal(avatar(*bare.inputs).image, avatar(*replace(frame, body=body).inputs).image)
 
 
 @pytest.mark.parametrize("model", ["image_to_image", "lbs_splat"])
@@ -298,7 +282,7 @@ def test_supersampling_is_the_models_and_of_F_alone(build):
     _, avatar, frame = build("model.supersample=3")
     assert avatar.accuracy.supersample == 3
     assert avatar.segmentation.accuracy.supersample == 1
-    painting = avatar.paint(frame)
+    painting = avatar(*frame.inputs)
     assert painting.features.shape[-2:] == painting.image.shape[-2:] == frame.image.shape[-2:]
     _, baseline, _ = build("model=lbs_splat", "model.supersample=3")
     assert baseline.accuracy.supersample == 3

@@ -116,7 +116,7 @@ def test_majority_ties_and_the_unseen():
     x = body.vertices[:, 0]
     assert (vote.labels[x < -0.01] == 1).all()  # the hidden plate follows the one before it
     assert (vote.labels[x > 0.01] == 2).all()
-    assert vote.pictures == 3
+    assert vote.images == 3
     assert vote.decided == pytest.approx(17 * 17 / len(body.vertices))
     tied = ClassVote()(body, [picture(left), picture(other)], 4)
     assert tied.labels.unique().tolist() == [1, 2]  # the first of equals, where none has won
@@ -152,7 +152,7 @@ def test_the_number_of_pictures_is_bounded_and_they_are_spread():
             return super().__getitem__(index)
 
     pictures = Watched([picture(torch.ones(SIZE, SIZE))] * 10)
-    assert ClassVote(vote_frames=3)(rigid(plate(2.0)), pictures, 2).pictures == 3
+    assert ClassVote(vote_frames=3)(rigid(plate(2.0)), pictures, 2).images == 3
     assert looked == [1, 5, 8]
 
 
@@ -257,7 +257,8 @@ def test_a_fitted_body_gets_the_persons_clothes(capture, tmp_path, build):
 
 
 def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_path, monkeypatch):
-    from gsgan.model.runs import CHECKPOINT, load_avatar
+    from gsgan.model.runs import load_avatar
+    from gsgan.model.stored import CHECKPOINT
     from gsgan.train.run import build_training
 
     config = tiny(f"data.root={foreign}", FEW)
@@ -268,8 +269,9 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_
     assert avatar.segmentation.classes > 2
     path = tmp_path / "run" / CHECKPOINT
     path.parent.mkdir(parents=True)
-    state = {f"avatar.{k}": v for k, v in avatar.state_dict().items()}
-    torch.save({"state_dict": state, "gsgan": {"marks": []}}, path)
+    checkpoint = {"state_dict": module.state_dict()}
+    module.on_save_checkpoint(checkpoint)
+    torch.save(checkpoint, path)
 
     monkeypatch.setattr(ClassVote, "__call__", no_vote)
     loaded, _ = load_avatar(tmp_path / "run", config, data)
@@ -281,10 +283,11 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_
 
 @pytest.mark.slow
 def test_a_resumed_run_goes_by_the_votes_it_began_with(foreign, tiny):
-    from gsgan.model.runs import build_avatar, build_data
+    from gsgan.model.assemble import build_avatar, build_data
 
     config = tiny(f"data.root={foreign}", FEW)
-    avatar = build_avatar(config, build_data(config))
+    data = build_data(config)
+    avatar = build_avatar(config, data.info, data.labelled("train"))
     state = {k: v.clone() for k, v in avatar.state_dict().items()}
     labels = state["segmentation.vertex_labels"]
     first, second = labels.unique()[:2]
@@ -296,18 +299,16 @@ def test_a_resumed_run_goes_by_the_votes_it_began_with(foreign, tiny):
 
 
 def test_votes_of_another_body_are_refused(foreign, tiny):
-    from gsgan.model.runs import build_avatar, build_data
+    from gsgan.model.assemble import build_avatar, build_data
 
     config = tiny(f"data.root={foreign}")
     with pytest.raises(DataError, match="labels of 7 vertices do not fit this free body"):
-        build_avatar(config, build_data(config), vertex_labels=torch.ones(7).long())
+        build_avatar(config, build_data(config).info, vertex_labels=torch.ones(7).long())
 
 
 def test_without_pictures_foreign_labels_are_refused(foreign, tiny):
-    from hydra.utils import instantiate
-
-    from gsgan.model.runs import build_data
+    from gsgan.model.assemble import build_avatar, build_data
 
     config = tiny(f"data.root={foreign}")
     with pytest.raises(DataError, match="no training image with labels"):
-        instantiate(config.model)(scene=build_data(config).info)
+        build_avatar(config, build_data(config).info)

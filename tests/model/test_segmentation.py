@@ -11,7 +11,8 @@ import torch
 
 from gsgan.body import free_body
 from gsgan.body.smpl_names import CIHP, CLOTHES, SMPLX_JOINTS
-from gsgan.model.runs import Moved, build_data, load_avatar, load_config
+from gsgan.model.assemble import build_data
+from gsgan.model.runs import load_avatar
 from gsgan.model.segmentation import (
     IGNORE,
     Segmentation,
@@ -19,6 +20,7 @@ from gsgan.model.segmentation import (
     segmentation_loss,
     silhouette_loss,
 )
+from gsgan.model.stored import DataPaths, load_config
 from gsgan.scene import BodyPose, Camera
 from gsgan.utils.errors import ConfigError
 
@@ -324,7 +326,7 @@ def test_null_leaves_it_out_whatever_the_effects(build):
 
 def test_hands_mode_from_the_config_paints(build):
     _, avatar, frame = build("model.segmentation.mode=hands", "model.segmentation.hands_face=true")
-    painting = avatar.paint(frame)
+    painting = avatar(*frame.inputs)
     assert painting.segmentation.shape[1] == 4
     assert avatar.segmentation.map.names[-1] == "face_neck"
     F = 5 * (1 + avatar.accuracy.supersample**2)  # averaged and as drawn
@@ -349,7 +351,7 @@ def capture_without_labels(capture, folder, frames=None):
 
 def test_a_trained_S_is_loaded_whether_or_not_labels_are_at_hand(run, capture, tmp_path):
     bare = capture_without_labels(capture, tmp_path / "bare")
-    config = load_config(run, Moved(str(bare)))
+    config = load_config(run, DataPaths(str(bare)))
     data = build_data(config)
     assert not data.info.has_labels
     avatar, _ = load_avatar(run, config, data)

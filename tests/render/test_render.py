@@ -19,7 +19,9 @@ from gsgan.body.shape import free_space
 from gsgan.data.measures import Measures
 from gsgan.evaluate.predictions import Preparation
 from gsgan.evaluate.scores import painter
-from gsgan.model.runs import CHECKPOINT, CONFIG, build_data, load, load_avatar, load_config
+from gsgan.model.assemble import build_data
+from gsgan.model.runs import load, load_avatar
+from gsgan.model.stored import CHECKPOINT, CONFIG, load_config
 from gsgan.train.run import build_training
 from gsgan.utils.provenance import SOURCE_TYPE, verify
 
@@ -219,7 +221,7 @@ def test_a_killed_render_goes_on(render, motion, tmp_path, monkeypatch):
     av = pytest.importorskip("av")
     from gsgan.model.avatar import Avatar
 
-    painted, paint = [], Avatar.picture
+    painted, paint = [], Avatar.forward
 
     def counted(self, *args, **named):
         if len(painted) == stop:
@@ -227,7 +229,7 @@ def test_a_killed_render_goes_on(render, motion, tmp_path, monkeypatch):
         painted.append(1)
         return paint(self, *args, **named)
 
-    monkeypatch.setattr(Avatar, "picture", counted)
+    monkeypatch.setattr(Avatar, "forward", counted)
     stop, given = 5, (f"motion={motion}", "out=a.mp4")
     result = render(*given)
     assert result.returncode == 130
@@ -354,11 +356,11 @@ def test_other_folders_are_not_touched(render, motion, tmp_path):
 
 
 def test_the_picture_of_the_avatar(bare, landmarks):
-    """`Avatar.render` is `Avatar.picture` on a background."""
+    """`Avatar.render` is `Avatar.forward` on a background."""
     avatar = load(bare, device="cpu")
     config = load_config(bare)
     frame = build_data(config).dataset("train")[0]
-    painting = avatar.picture(frame.skeleton, frame.camera)
+    painting = avatar(*frame.inputs[:3], maps=False)
     image = avatar.render(frame.skeleton, frame.camera)
     assert torch.equal(image, painting.image.clamp(0, 1))
     assert painting.features is None

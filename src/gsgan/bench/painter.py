@@ -61,7 +61,7 @@ class Painter:
         kind = frame.skeleton.device.type
         mixed = torch.autocast(kind, dtype=dtype or torch.bfloat16, enabled=dtype is not None)
         with changed(self.avatar, way), mixed:
-            image = self.avatar.paint(frame, maps=False).image
+            image = self.avatar(*frame.inputs, maps=False).image
         assert image is not None
         if way.scale == 1:
             return image

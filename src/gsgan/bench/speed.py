@@ -16,8 +16,10 @@ from omegaconf import DictConfig
 
 from gsgan.bench.common import Bench, check_whole, markdown, number, sentence
 from gsgan.bench.painter import Painter, Way, painting_memory, place, spread, without_denormals
+from gsgan.model.assemble import build_avatar, build_data
 from gsgan.model.avatar import Avatar, unwatched
-from gsgan.model.runs import Moved, build_avatar, build_data, load_avatar, load_config
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import DataPaths, load_config
 from gsgan.scene import Frame
 from gsgan.splat import resolve_backend
 from gsgan.utils.checks import one_of
@@ -79,7 +81,7 @@ def load_subject(
 
     The avatar of ``run`` with its held-out poses, or an untrained one of ``config.model``.
     """
-    moved = Moved(config.data_root, config.data_smpl)
+    moved = DataPaths(config.data_root, config.data_smpl)
     if config.run is not None:
         folder = Path(config.run).expanduser()
         stored = load_config(folder, moved)
@@ -89,7 +91,7 @@ def load_subject(
     else:
         moved.refuse_without_run()
         data = build_data(config)
-        avatar, name = build_avatar(config, data), "untrained avatar"
+        avatar, name = build_avatar(config, data.info, data.labelled("train")), "untrained avatar"
         marks = ["untrained weights: Gaussians are where they start, which sets what F costs"]
         size = (int(config.size.picture), int(config.size.picture))
         frames = [replace(f, camera=f.camera.resize(size)) for f in spread(data, config.poses)]
@@ -156,7 +158,7 @@ def deciles(samples: Sequence[float]) -> dict[str, float]:
 def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> dict[str, Any]:
     """What the figures depend on, by names for people."""
     height, width = frames[0].camera.size
-    windows = [avatar.window(frame) for frame in frames]
+    windows = [avatar.window(frame.skeleton, frame.camera) for frame in frames]
     pixels = sum(height * width if w is None else w.size[0] * w.size[1] for w in windows)
     found: dict[str, Any] = {
         "picture": f"{width} x {height}",

@@ -14,7 +14,7 @@ import torch
 from omegaconf import OmegaConf
 
 from gsgan import __version__
-from gsgan.model.runs import hydra_record
+from gsgan.model.stored import hydra_record
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData

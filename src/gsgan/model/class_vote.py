@@ -24,8 +24,8 @@ WIDEST = 8  # cells, largest occluder radius: one close to the camera would fill
 MOST_CELLS = 2048  # along a side of the depth map, however far the discs spread
 
 
-class Pictures(Protocol):
-    """Indexed frames: a dataset."""
+class LabelledImages(Protocol):
+    """Indexed frames with part labels: a dataset."""
 
     def __len__(self) -> int: ...
     def __getitem__(self, index: int, /) -> Frame: ...
@@ -34,14 +34,14 @@ class Pictures(Protocol):
 def labelled_body(
     scene: SceneInfo,
     vote: ClassVote,
-    pictures: Pictures | None = None,
+    images: LabelledImages | None = None,
     vertex_labels: Tensor | None = None,
 ) -> tuple[SkinnedBody | None, str]:
     """The body, and a clause on where its labels come from, or why there is no body.
 
     The body's own labels are used where they are the data's, or the data has none. Otherwise, and
     on a body fitted to a person, whose clothes end elsewhere, those of a checkpoint
-    (``vertex_labels [V]``), or of a vote over ``pictures``.
+    (``vertex_labels [V]``), or of a vote over ``images``.
 
     Raises:
         DataError: when a vote is needed and not possible, or the labels do not fit the body.
@@ -53,7 +53,7 @@ def labelled_body(
         return None, (
             f"the data's poses are of the body {scene.body!r}, of which there is no model file"
         )
-    if not scene.has_labels and vertex_labels is None:
+    if not scene.has_labels:
         guess = body.label_source == "guess"
         return body, "parts by the body's joints" if guess else "parts are the body's own"
     fitted = bool(scene.betas) and scene.body == "free"  # to a person in other clothes
@@ -67,24 +67,22 @@ def labelled_body(
     numbered = ("background", *(f"part {i}" for i in range(1, scene.n_labels)))
     names = scene.label_names or numbered
     if vertex_labels is not None:
-        if not scene.has_labels:  # voted on where there were some
-            names = tuple(f"part {i}" for i in range(int(vertex_labels.max()) + 1))
         if len(vertex_labels) != len(body.vertices) or int(vertex_labels.max()) >= len(names):
             raise DataError(
                 f"the checkpoint's labels of {len(vertex_labels)} vertices do not fit this "
                 f"{scene.body} body or its data; give the model file and the data of the training"
             )
         return body.voted(vertex_labels, names), "parts voted when training began"
-    if pictures is None or len(pictures) == 0:
+    if images is None or len(images) == 0:
         raise DataError(
             f"labels: the images' parts are {', '.join(names)}, the {scene.body} body has others, "
             "and there is no training image with labels to vote on them; choose model=wo_seg"
         )
-    votes = vote(body, pictures, len(names))
+    votes = vote(body, images, len(names))
     body = body.voted(votes.labels, names)
     missing = len(names) - 1 - len(votes.labels.unique())
     return body, (
-        f"class vote over {votes.pictures} images: {votes.decided:.0%} of the vertices decided, "
+        f"class vote over {votes.images} images: {votes.decided:.0%} of the vertices decided, "
         f"{missing} of {len(names) - 1} parts on none"
     )
 
@@ -94,7 +92,7 @@ class Votes(NamedTuple):
 
     labels: Tensor  # [V] int64, the data's label of each vertex, never 0
     decided: float  # share of the vertices with a majority; the others took the nearest one's
-    pictures: int  # number of images used
+    images: int  # number of images used
 
 
 @dataclass(frozen=True)
@@ -122,18 +120,18 @@ class ClassVote:
         above("model.class_vote.occluder_radius", self.occluder_radius)
         above("model.class_vote.depth_tolerance", self.depth_tolerance)
 
-    def __call__(self, body: SkinnedBody, pictures: Pictures, n_labels: int) -> Votes:
+    def __call__(self, body: SkinnedBody, images: LabelledImages, n_labels: int) -> Votes:
         """Votes over frames of one item each, for data with this many labels (background included).
 
         Raises:
             DataError: when an image file is damaged, or no vertex lies on a labelled pixel.
         """
-        count = min(self.vote_frames, len(pictures))
-        chosen = [(2 * i + 1) * len(pictures) // (2 * count) for i in range(count)]
+        count = min(self.vote_frames, len(images))
+        chosen = [(2 * i + 1) * len(images) // (2 * count) for i in range(count)]
         reach = self.occluder_radius * neighbour_distance(body.vertices.float(), NEIGHBOUR)
         votes = torch.zeros(len(body.vertices), n_labels, dtype=torch.int64)
         for index in chosen:
-            self._count(votes, body, reach, pictures[index])
+            self._count(votes, body, reach, images[index])
         if not votes.any():
             raise DataError(
                 f"labels: in none of {count} images does the posed body lie on a labelled pixel; "

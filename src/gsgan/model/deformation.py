@@ -110,11 +110,7 @@ class Deformation(nn.Module):
     def residuals(self, points: Points, pose: Tensor, root: Tensor) -> Residuals:
         """ΔG of posed points, from the `pose_code` and the pelvis ``root`` ``[B, 3]`` (metres)."""
         position = (points.means - root[:, None]) / self.body_height
-        normals = points.normals
-        # A corrected pose learns through the means of G, not through Ψ's inputs.
-        if self.training:
-            position, normals = position.detach(), normals.detach()
-        code = positional_encoding(position, self.position_octaves)
+        normals, code = points.normals, positional_encoding(position, self.position_octaves)
         if torch.is_grad_enabled() and not (code.requires_grad or normals.requires_grad):
             x = self._trained(code, normals, pose)
         else:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -25,9 +25,7 @@ from gsgan.data.proportions import (
 )
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
-from gsgan.model.runs import (
-    Run,
-)
+from gsgan.model.runs import Run
 from gsgan.motion.clip import FPS, checked, completed, frame_times, is_own, resampled, up_axis
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.retarget import expressed, face_in_head, joined, placed, retargeted
@@ -36,9 +34,6 @@ from gsgan.skeleton import complete_skeleton
 from gsgan.utils.checks import above, one_of
 from gsgan.utils.config import defaults_of
 from gsgan.utils.errors import ConfigError, DataError
-
-if TYPE_CHECKING:
-    pass
 
 Float = NDArray[np.float64]
 REST = "rest"

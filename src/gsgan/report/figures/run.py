@@ -16,7 +16,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
 
-from gsgan.model.runs import Moved, load_config
+from gsgan.model.stored import DataPaths, load_config
 from gsgan.report.figures import images
 from gsgan.report.figures.body import densify, segmentation
 from gsgan.report.figures.layout import Drawing, Settings, Unavailable, style
@@ -63,7 +63,7 @@ def make_figures(config: DictConfig) -> None:
     formats = [one_of("formats", name, METADATA) for name in _list(config.formats) or METADATA]
     settings: Settings = instantiate(config.settings)
     out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
-    moved = Moved.from_config(config)
+    moved = DataPaths.from_config(config)
     for folder in folders:
         load_config(folder, moved)  # refuses other folders before anything is written
     try:
