@@ -147,7 +147,6 @@ UNLISTED = (
         "training.schedule.stretch",
         "training.schedule.coarse",
     ),
-    *("training.recipes.pose", "training.pose_prior"),  # no body, or one with its own poses
     *("model.segmentation.hands_face", "training.perceptual.width", "training.recipes.psi.span"),
 )
 
