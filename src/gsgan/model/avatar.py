@@ -33,7 +33,6 @@ from gsgan.skeleton import (
     root_of,
 )
 from gsgan.splat import Accuracy, rasterise
-from gsgan.splat.checks import checks_for
 from gsgan.utils.tensors import full_precision
 
 LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in an image 512 high
@@ -242,13 +241,7 @@ class Avatar(nn.Module):
             if gaussians is not None:
                 gaussians = self.bounded(gaussians)
                 with self.stage("F"):
-                    raster = rasterise(
-                        gaussians,
-                        camera,
-                        settings=accuracy,
-                        backend=self.backend,
-                        on_invalid=checks_for(skeleton.device),
-                    )
+                    raster = rasterise(gaussians, camera, settings=accuracy, backend=self.backend)
             S = self.segment(body, camera) if paints else None  # Sec. 3.4
             p2d = self.draw(p, valid, camera, picture_height) if paints else None
             pose = self.pose_inputs(p, valid, frames, camera) if paints else None
