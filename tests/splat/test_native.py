@@ -116,7 +116,7 @@ def in_dtype(p: Projected, dtype: torch.dtype) -> Projected:
 def assert_same(
     p: Projected, size: tuple[int, int], cut: Accuracy, tolerance: float, gradient_tolerance: float
 ) -> None:
-    """Native, in the scene's dtype, against the reference in float64; gradients relative to the largest."""
+    """Native against the reference in float64; gradients relative to the largest."""
     got, got_gradients = values_and_gradients(native.composite, p, size, cut)
     want, want_gradients = values_and_gradients(
         reference.composite, in_dtype(p, torch.float64), size, cut

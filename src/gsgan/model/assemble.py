@@ -105,7 +105,7 @@ def assemble_avatar(
         vertex_labels: ``[V]`` int64, the result of an earlier vote, which is then not repeated.
         labelled: whether S was trained on part labels; None: whether the data has some.
         effects: decided when training began; None decides them here, by ``settings``.
-        options: of `Avatar`: twist, window_margin, window_multiple, window_least.
+        options: of `Avatar`: window_margin, window_multiple, window_least.
 
     Raises:
         ConfigError: on a forced effect that is not possible, or a key that is not read.
@@ -114,9 +114,7 @@ def assemble_avatar(
     """
     one_of("model.backend", backend, BACKENDS)
     template = template_of(scene.skeleton, scene.face)
-    paper22 = densify is None or densify.template.limbs == template.limbs
     for wrong, message in (
-        (not paper22 and options.get("twist", "none") != "none", "twist=hinge needs limbs=paper22"),
         ((deformation is None) != (densify is None), "densify and deformation go together"),
         ((generator is None) != (pose_encoder is None), "generator and pose_encoder go together"),
         (deformation and surface, "give a deformation or a surface, got both"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Literal, Self
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -63,7 +63,6 @@ class Avatar(nn.Module):
         colour: per-camera colour correction, where that effect is on.
         solver: of body poses that are not given, for avatars on a skinned body.
         backend: that rasterises F, see `gsgan.splat.rasterise`.
-        twist: of bone frames, see `gsgan.skeleton.bone_frames`.
         window_margin, window_multiple, window_least: of the painted window, pixels and metres; see
             `gsgan.scene.body_window`. No margin paints whole images.
 
@@ -92,7 +91,6 @@ class Avatar(nn.Module):
         colour: ColourCorrection | None = None,
         solver: Solver | None = None,
         backend: str = "auto",
-        twist: Literal["none", "hinge"] = "none",
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
         window_least: int = 32,
@@ -100,7 +98,7 @@ class Avatar(nn.Module):
         super().__init__()
         self.effects, self.accuracy, self.backend = effects, accuracy, backend
         self.limb_length_sum, self.body_height = limb_length_sum, body_height
-        self.template, self.twist = template, twist
+        self.template = template
         self.window_margin = window_margin
         self.window_multiple, self.window_least = window_multiple, window_least
         self.deformation, self.densify, self.body_points = deformation, densify, body_points
@@ -233,7 +231,7 @@ class Avatar(nn.Module):
         with full_precision(skeleton):
             with self.stage("skeleton"):
                 p, valid = skeleton, visibility > 0
-                frames = bone_frames(p, valid, self.template, twist=self.twist)
+                frames = bone_frames(p, valid, self.template)
 
             gaussians = self.splat(p, valid, frames, camera, body, pose_noise)
             raster = None
