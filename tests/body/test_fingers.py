@@ -13,9 +13,9 @@ from torch import Tensor
 
 from gsgan.body import axis_angle_to_matrix, free_body
 from gsgan.body.fingers import Fingers
-from gsgan.body.measure import fit_hands
 from gsgan.body.shape import STRETCHED, BodyShape, free_space, shaped_body
 from gsgan.body.solve import Solver, log_of
+from gsgan.fit.shape import fit_hands
 from gsgan.scene import BodyPose
 from gsgan.skeleton.hands import FINGERS, HAND
 from gsgan.synthetic.free_subject import free_character, free_pose

@@ -12,7 +12,6 @@ from writers.smpl import write_smpl
 
 from gsgan.body import free_body
 from gsgan.body.free import free_body_path
-from gsgan.body.measure import fit_shape
 from gsgan.body.shape import (
     LIMBS,
     STRETCHED,
@@ -25,6 +24,7 @@ from gsgan.body.shape import (
 )
 from gsgan.body.smpl import read_smpl
 from gsgan.body.solve import Solver
+from gsgan.fit.shape import fit_shape
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import DataError
 

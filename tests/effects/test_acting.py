@@ -64,7 +64,7 @@ def test_all_off_is_the_plain_chain_operator_by_operator(build):
 
     def chain():
         p, valid = frame.skeleton, frame.visibility > 0
-        frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
+        frames = bone_frames(p, valid, avatar.template)
         points = avatar.densify(p, valid, frames)
         face = face_code(p, frames.head, avatar.template)
         gaussians = avatar.deformation(p, points, camera.centre, frames.hubs[:, 0], None, face)

@@ -16,7 +16,6 @@ from hydra.utils import instantiate
 from make import write_hands, write_tiny_capture
 
 import gsgan.utils.compat  # noqa: F401
-from gsgan.body.measure import fit_shape
 from gsgan.body.shape import BodyShape, free_space, shaped_body
 from gsgan.body.solve import Solver
 from gsgan.data.datamodule import GsganData
@@ -24,8 +23,9 @@ from gsgan.evaluate.facts import fingerprint
 from gsgan.evaluate.run import make_scorer
 from gsgan.fit import run as running
 from gsgan.fit.fitter import Fitter, _wrong
-from gsgan.fit.moments import Moments
+from gsgan.fit.frames import MaskedFrames
 from gsgan.fit.run import fit_before_training, run_fit, standard_settings
+from gsgan.fit.shape import fit_shape
 from gsgan.scene import BodyPose
 from gsgan.train.run import training_record
 from gsgan.utils.errors import ConfigError, DataError
@@ -43,12 +43,12 @@ def with_landmarks(people: Path, to: Path, change) -> Path:
 def ready(people: Path, compose, *overrides: str, turn: float = 0.0) -> Fitter:
     """A fitter of the training frames, whose solved poses are turned by noise (radians)."""
     config = compose("fit", f"data.root={people}", *QUICK, *overrides)
-    moments = Moments(instantiate(config.data, _convert_="all"), torch.device("cpu"))
-    body = shaped_body(fit_shape(moments.skeletons, moments.visibility))
-    pose = Solver(body).solve(moments.skeletons, moments.visibility)
+    frames = MaskedFrames(instantiate(config.data, _convert_="all"), torch.device("cpu"))
+    body = shaped_body(fit_shape(frames.skeletons, frames.visibility))
+    pose = Solver(body).solve(frames.skeletons, frames.visibility)
     noise = torch.randn(pose.theta.shape, generator=torch.Generator().manual_seed(0))
     return Fitter(
-        instantiate(config.fit), moments, body, BodyPose(pose.theta + turn * noise, pose.transl)
+        instantiate(config.fit), frames, body, BodyPose(pose.theta + turn * noise, pose.transl)
     )
 
 
@@ -224,8 +224,8 @@ def test_outside_the_image_alpha_costs_nothing(people, tmp_path, compose):
     """Pixels of a window outside the camera's image are unsure, and the fit ignores them."""
     oblong = write_tiny_capture(tmp_path / "oblong", cameras=2, frames=2, size=(96, 64))
     data = GsganData(str(oblong), size=48)
-    moments = Moments(data, torch.device("cpu"))
-    frame = moments.pictures(0)[0]
+    frames = MaskedFrames(data, torch.device("cpu"))
+    frame = frames.images(0)[0]
     assert frame.unsure is not None
     beyond = frame.unsure > 0.5
     assert beyond.float().mean() == pytest.approx(1 / 3)
@@ -233,14 +233,14 @@ def test_outside_the_image_alpha_costs_nothing(people, tmp_path, compose):
     everything = torch.ones_like(frame.mask)
     assert float(_wrong(everything, frame)[beyond].max()) == 0
     inside = GsganData(str(people), size=48)
-    assert Moments(inside, torch.device("cpu")).pictures(0)[0].unsure is None
+    assert MaskedFrames(inside, torch.device("cpu")).images(0)[0].unsure is None
 
 
 def test_the_rims_of_an_undistorted_image_are_unsure(tmp_path):
     bent = write_tiny_capture(
         tmp_path / "bent", cameras=2, frames=2, size=(96, 96), dist=(0.3, 0, 0, 0, 0)
     )
-    frame = Moments(GsganData(str(bent), size=48), torch.device("cpu")).pictures(0)[0]
+    frame = MaskedFrames(GsganData(str(bent), size=48), torch.device("cpu")).images(0)[0]
     assert frame.unsure is not None
     assert float(frame.unsure[0, 0, 0, 0]) == 1
     assert float(frame.unsure[0, 0, 24, 24]) == 0
@@ -270,7 +270,7 @@ def test_a_stopped_fit_resumes_to_the_same_end(fit, fitted, monkeypatch, tmp_pat
 
 def test_a_stopped_fit_does_not_resume_with_other_masks(fit, people, monkeypatch, tmp_path, capsys):
     other = shutil.copytree(people, tmp_path / "other")
-    monkeypatch.setattr(running, "fit_picture", lambda *_: 1 / 0)
+    monkeypatch.setattr(running, "fit_sheet", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         fit(root=other)
     monkeypatch.undo()
@@ -288,7 +288,7 @@ def test_another_state_is_not_resumed(fit, fitted, monkeypatch, tmp_path, capsys
         (tmp_path / "again").mkdir()
         (tmp_path / "again/.body_fit.stopped").write_bytes(b"PK no")
     else:
-        monkeypatch.setattr(running, "fit_picture", lambda *_: 1 / 0)
+        monkeypatch.setattr(running, "fit_sheet", lambda *_: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             fit("fit.prior=0.5", name="again")
         monkeypatch.undo()

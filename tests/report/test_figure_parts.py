@@ -152,9 +152,8 @@ def test_ellipses_are_as_wide_as_the_supersampled_image_has_them():
     assert 2 * float(drawn.get_widths()[0]) == pytest.approx(2 * float(wanted[0]), rel=1e-4)
 
 
-@pytest.mark.parametrize("limbs", ["paper22", "all26"])
-def test_every_part_has_the_colour_of_its_bone(limbs):
-    densify = Densify(limbs=limbs)
+def test_every_part_has_the_colour_of_its_bone():
+    densify = Densify()
     assert len(part_colours(densify)) == int(densify.part_id.max()) + 1
 
 

@@ -95,7 +95,7 @@ def _posed(
     psi = avatar.deformation
     if psi is None:
         raise ConfigError("this avatar has no Gaussians (model=image_to_image) to export")
-    frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
+    frames = bone_frames(p, valid, avatar.template)
     points = avatar.points(p, valid, frames, body)
     root = root_of(p)
     face = face_code(p, frames.head, avatar.template)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from gsgan.body import Body, blend_transforms
 from gsgan.body.skinned import carry, vertex_normals
-from gsgan.fit.moments import Moments, around
+from gsgan.fit.frames import MaskedFrames, around
 from gsgan.model.body_points import SkinnedPoints, farthest_points, transformed
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians
 from gsgan.splat import Accuracy, rasterise
@@ -117,7 +117,7 @@ class Fitter:
 
     Args:
         settings: see `Fit`.
-        moments: frames, images and skeletons.
+        frames: images and skeletons.
         body: of the person.
         start: F poses, solved from the skeletons.
         seed: of the order of frames and cameras.
@@ -126,10 +126,10 @@ class Fitter:
     """
 
     def __init__(
-        self, settings: Fit, moments: Moments, body: Body, start: BodyPose, seed: int = 0
+        self, settings: Fit, frames: MaskedFrames, body: Body, start: BodyPose, seed: int = 0
     ) -> None:
-        self.settings, self.moments, self.seed = settings, moments, seed
-        device = moments.device
+        self.settings, self.frames, self.seed = settings, frames, seed
+        device = frames.device
         self.surface = Surface(body.to(device), settings.points, settings.accuracy).to(device)
         self.start = start.to(device)
         self.bones = start.theta.shape[1]
@@ -141,7 +141,7 @@ class Fitter:
         fixed = [i for i, n in enumerate(body.joint_names) if n.startswith(("finger", "toe"))]
         scale[fixed] = 0
         self.scale = scale
-        self.weight = moments.visibility.clone()
+        self.weight = frames.visibility.clone()
         self.weight[:, list(LOOSE_LANDMARKS)] *= LOOSE
         self.surface_optimiser = torch.optim.Adam(
             self.surface.parameters(), settings.surface_rate, BETAS
@@ -181,7 +181,7 @@ class Fitter:
         for i in order:
             pose = self.pose(torch.tensor([i]))
             share, landmarks = self._share(i, pose, chance)
-            apart = (landmarks[0] - self.moments.skeletons[i]).square().sum(-1)
+            apart = (landmarks[0] - self.frames.skeletons[i]).square().sum(-1)
             robust = (1 + apart / settings.noise**2).sqrt() - 1
             turned = (pose.theta[0] - self.start.theta[i]) / ANGLE
             loss = (
@@ -236,7 +236,7 @@ class Fitter:
         return torch.stack(wrong).sum() / area.clamp_min(1.0), landmarks
 
     def _windows(self, i: int) -> list[Frame]:
-        return [around(self.moments.skeletons[i], frame) for frame in self.moments.pictures(i)]
+        return [around(self.frames.skeletons[i], frame) for frame in self.frames.images(i)]
 
     def _set_rates(self) -> None:
         held = self.settings.hold * self.settings.sweeps

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import torch
 from hydra.utils import instantiate
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData  # loads lightning
 
 
-OPTIONS = ("backend", "twist", "window_margin", "window_multiple", "window_least")  # of `Avatar`
+OPTIONS = ("backend", "window_margin", "window_multiple", "window_least")  # of `Avatar`
 
 
 def build_data(config: DictConfig) -> GsganData:
@@ -101,7 +101,7 @@ class AvatarParts:
         pose_encoder, generator: Ω (or the flat skeleton) to g; the UNet. Without them Step I's
             colour is the image (``splat_only``).
         low_pass, supersample, backend: of F, and of S where it has them.
-        twist, window_margin, window_multiple, window_least: of `Avatar`.
+        window_margin, window_multiple, window_least: of `Avatar`.
 
     Raises:
         ValueError: on parts that do not go together.
@@ -119,7 +119,6 @@ class AvatarParts:
     low_pass: float = 0.3
     supersample: int = 1
     backend: str = "auto"
-    twist: Literal["none", "hinge"] = "none"
     window_margin: float | None = 0.25
     window_multiple: int = 16
     window_least: int = 32
@@ -167,8 +166,6 @@ def _assembled(
     of the others. ``labelled``: S's body, and where its labels come from or why there is none.
     """
     template = template_of(scene.skeleton, scene.face)
-    if parts.twist != "none" and parts.densify and parts.densify.template.limbs != template.limbs:
-        raise ValueError("twist=hinge needs limbs=paper22")
     # The stature follows from limb lengths, which no pose changes.
     body_height = float(scene.body_height) * template.stature / template.limb_length_sum
     formation: dict[str, Any] = {"low_pass": parts.low_pass, "antialias": effects.antialias.on}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
-from typing import Literal, Self
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -33,7 +33,6 @@ from gsgan.skeleton import (
     face_code,
 )
 from gsgan.splat import Accuracy, rasterise
-from gsgan.splat.checks import checks_for
 from gsgan.utils.tensors import full_precision
 
 LINE_WIDTH = 2.5  # sigma of p₂D's lines, pixels in an image 512 high
@@ -65,7 +64,6 @@ class Avatar(nn.Module):
         colour: per-camera colour correction, where that effect is on.
         solver: of body poses that are not given, for avatars on a skinned body.
         backend: that rasterises F, see `gsgan.splat.rasterise`.
-        twist: of bone frames, see `gsgan.skeleton.bone_frames`.
         window_margin, window_multiple, window_least: of the rendered window, metres and pixels; see
             `gsgan.scene.body_window`. No margin renders whole images.
 
@@ -94,7 +92,6 @@ class Avatar(nn.Module):
         colour: ColourCorrection | None = None,
         solver: Solver | None = None,
         backend: str = "auto",
-        twist: Literal["none", "hinge"] = "none",
         window_margin: float | None = 0.25,
         window_multiple: int = 16,
         window_least: int = 32,
@@ -102,7 +99,7 @@ class Avatar(nn.Module):
         super().__init__()
         self.effects, self.accuracy, self.backend = effects, accuracy, backend
         self.limb_length_sum, self.body_height = limb_length_sum, body_height
-        self.template, self.twist = template, twist
+        self.template = template
         self.window_margin = window_margin
         self.window_multiple, self.window_least = window_multiple, window_least
         self.deformation, self.densify, self.body_points = deformation, densify, body_points
@@ -257,7 +254,7 @@ class Avatar(nn.Module):
         with full_precision(p):
             with self.stage("skeleton"):
                 valid = visibility > 0
-                frames = bone_frames(p, valid, self.template, twist=self.twist)
+                frames = bone_frames(p, valid, self.template)
             gaussians = self.splat(p, valid, frames, camera, body, pose_noise)
             if gaussians is not None:
                 raster = self._rasterised(gaussians, camera, supersample)
@@ -331,7 +328,6 @@ class Avatar(nn.Module):
                 camera,
                 settings=self.accuracy if supersample else replace(self.accuracy, supersample=1),
                 backend=self.backend,
-                on_invalid=checks_for(camera.K.device),
             )
 
     def _corrected(self, rendering: Rendering, camera_index: Tensor) -> Rendering:

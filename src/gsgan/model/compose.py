@@ -72,7 +72,7 @@ class _Geometry(torch.autograd.Function):
         opacities = raw.new_empty(B, N)
         job, _held = _job(raw, fixed, numbers)
         outputs = [means, covariances, opacities]
-        native.point(job, tuple(f"out_{name}" for name in _OUTPUTS), outputs)
+        build.point(job, tuple(f"out_{name}" for name in _OUTPUTS), outputs)
         build.function("compose", raw.dtype)(ctypes.byref(job))
         ctx.save_for_backward(raw, *fixed)
         ctx.numbers = numbers
@@ -85,9 +85,9 @@ class _Geometry(torch.autograd.Function):
         raw, *fixed = ctx.saved_tensors
         job, _held = _job(raw, fixed, ctx.numbers)
         incoming = [None if g is None else g.contiguous() for g in grads]
-        native.point(job, tuple(f"g_{name}" for name in _OUTPUTS), incoming)
+        build.point(job, tuple(f"g_{name}" for name in _OUTPUTS), incoming)
         d_raw = raw.new_empty(*raw.shape[:2], RESIDUALS)
-        native.point(job, ("d_raw",), [d_raw])
+        build.point(job, ("d_raw",), [d_raw])
         build.function("compose_backward", raw.dtype)(ctypes.byref(job))
         return d_raw, *[None] * 5
 
@@ -98,7 +98,7 @@ def _job(raw: Tensor, fixed: list[Tensor], numbers: tuple[float, ...]) -> tuple[
     if rows.stride(-1) != 1 or rows.stride(0) != rows.shape[1] * rows.stride(1):
         rows = rows.contiguous()
     held = [rows, *(x.detach().contiguous() for x in fixed)]
-    threads = max(1, torch.get_num_threads())
+    threads = build.threads()
     job = _Job(rows.shape[0] * rows.shape[1], threads, rows.stride(1), *numbers)
-    native.point(job, _INPUTS, held)
+    build.point(job, _INPUTS, held)
     return job, held

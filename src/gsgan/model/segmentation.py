@@ -16,7 +16,6 @@ from gsgan.model.body_points import SkinnedGaussians, transformed
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians, Raster
 from gsgan.splat import accuracy as named_accuracy
 from gsgan.splat import rasterise
-from gsgan.splat.checks import checks_for
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import full_precision
@@ -121,11 +120,7 @@ class Segmentation(SkinnedGaussians):
         """The splatted body: features are its classes, alpha its silhouette."""
         with full_precision(pose.theta):
             return rasterise(
-                self.gaussians(pose),
-                camera,
-                settings=self.accuracy,
-                backend=self.backend,
-                on_invalid=checks_for(camera.K.device),
+                self.gaussians(pose), camera, settings=self.accuracy, backend=self.backend
             )
 
     def forward(self, pose: BodyPose, camera: Camera) -> Tensor:

@@ -52,7 +52,7 @@ class _Styled(torch.autograd.Function):
     def forward(ctx: Any, h: Tensor, modulation: Tensor, floor: float, slope: float) -> Tensor:
         h, modulation = h.contiguous(), modulation.contiguous()
         out = torch.empty_like(h)
-        native.point(job := _job(h, floor, slope), ("h", "modulation", "out"), [h, modulation, out])
+        build.point(job := _job(h, floor, slope), ("h", "modulation", "out"), [h, modulation, out])
         build.function("style", h.dtype)(ctypes.byref(job))
         ctx.save_for_backward(h, modulation, out)
         ctx.numbers = floor, slope
@@ -65,11 +65,11 @@ class _Styled(torch.autograd.Function):
         grads = [torch.empty_like(h), torch.empty_like(modulation)]
         held = [h, modulation, out, grad.contiguous(), *grads]
         job = _job(h, *ctx.numbers)
-        native.point(job, ("h", "modulation", "out", "g", "d_h", "d_modulation"), held)
+        build.point(job, ("h", "modulation", "out", "g", "d_h", "d_modulation"), held)
         build.function("style_backward", h.dtype)(ctypes.byref(job))
         return *grads, None, None
 
 
 def _job(h: Tensor, floor: float, slope: float) -> _Job:
     rows, channels = h.shape[:-1].numel(), h.shape[-1]
-    return _Job(rows, channels, max(1, torch.get_num_threads()), floor, slope)
+    return _Job(rows, channels, build.threads(), floor, slope)

@@ -20,7 +20,6 @@ from gsgan.utils.errors import ConfigError
 
 Torso = Literal["fit", "cube"]
 Sampler = Literal["even", "trimesh"]
-Limbs = Literal["paper22", "all26"]
 Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 GOLDEN = (5**0.5 - 1) / 2
@@ -79,7 +78,6 @@ class Densify(nn.Module):
             or ``cube`` (edge length: the longest distance between shoulders and hips).
         sampler: ``even`` (low discrepancy) or ``trimesh`` (shipped random surface samples; hands
             are even).
-        limbs: ``paper22``, or ``all26``: with the trunk's four edges.
         sigma: initial standard deviation divided by the mean spacing ``sqrt(area / points)``.
         torso_range: bounds of the box's edges, in multiples of the rest pose's (``fit``).
         min_length: metres, see :func:`gsgan.skeleton.bone_frames`.
@@ -116,7 +114,6 @@ class Densify(nn.Module):
         face_radius_scale: float = 1.0,
         torso: Torso = "fit",
         sampler: Sampler = "even",
-        limbs: Limbs = "paper22",
         *,
         points_per_finger_bone: int = 60,
         finger_radius_ratio: float = 0.25,
@@ -129,7 +126,6 @@ class Densify(nn.Module):
         for name, value, known in (
             ("torso", torso, Torso),
             ("sampler", sampler, Sampler),
-            ("limbs", limbs, Limbs),
         ):
             if value not in get_args(known):
                 expected = ", ".join(get_args(known))
@@ -143,8 +139,7 @@ class Densify(nn.Module):
                 "Densify: radius_ratio, face_radius_scale, finger_radius_ratio, sigma and "
                 f"min_length must be positive, got {', '.join(map(str, ratios))}"
             )
-        chosen = named_template(template)
-        self.template = chosen if limbs == "paper22" else chosen.with_torso_limbs()
+        self.template = named_template(template)
         self.counts = counts
         self.radius_ratio, self.finger_radius_ratio = radius_ratio, finger_radius_ratio
         self.face_radius_scale = face_radius_scale
@@ -228,7 +223,7 @@ class Densify(nn.Module):
         """
         valid = check_skeleton("Densify", p, valid, self.template)
         c = constants(self.template, p.device, p.dtype)
-        if frames is None or frames.limbs.shape[1] != len(self.template.limbs):
+        if frames is None:
             frames = bone_frames(p, valid, self.template, min_length=self.min_length)
         root = p[:, self.template.hips[0], None].detach()
         q = p - root

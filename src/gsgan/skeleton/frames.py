@@ -21,10 +21,7 @@ from gsgan.skeleton.face import face_code
 from gsgan.skeleton.hands import palm_frames
 from gsgan.skeleton.rotation6d import across, rotation_from_6d, rotation_to_6d, unit
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, SkeletonTemplate
-from gsgan.skeleton.tensors import FOLDED, Constants, Level, check_skeleton, constants
-from gsgan.utils.tensors import constant
-
-Twist = Literal["none", "hinge"]
+from gsgan.skeleton.tensors import FOLDED, Constants, check_skeleton, constants
 
 MIN_LENGTH = 1e-3
 """Metres: a shorter bone or baseline has no direction (1 mm, below any landmark's accuracy)."""
@@ -63,9 +60,7 @@ def bone_frames(
     valid: Tensor | None = None,
     template: SkeletonTemplate = MEDIAPIPE33,
     *,
-    twist: Twist = "none",
     min_length: float = MIN_LENGTH,
-    folded: float = FOLDED,
 ) -> BoneFrames:
     """The frames of trunk, head and limbs.
 
@@ -82,27 +77,22 @@ def bone_frames(
         p: ``[B, J, 3]`` finite joints (see :func:`gsgan.skeleton.sanitise`).
         valid: ``[B, J]`` bool, False for joints that were filled in; None: all seen.
         template: names the joints.
-        twist: ``hinge`` turns arms and legs about their bones towards the bend plane, with the
-            weight sin²(bend), 0 when straight; ``none`` keeps the swing.
         min_length: metres, below which a bone's direction fades.
-        folded: ``1 + cos`` below which two directions count as opposite.
 
     Returns:
         BoneFrames.
 
     Raises:
-        ValueError: when a shape does not match the template, or ``twist`` is unknown.
+        ValueError: when a shape does not match the template.
 
     Source: method notes, section 6 (6D bone rotations of paper Sec. 3.5, which leaves the frames
     open).
     """
-    if twist not in ("none", "hinge"):
-        raise ValueError(f"bone_frames: twist must be 'none' or 'hinge', got {twist!r}")
     valid = check_skeleton("bone_frames", p, valid, template)
     c = constants(template, p.device, p.dtype)
     # baselines are differences of nearby points: exact once the root is subtracted
     q = p - p[:, template.hips[0], None].detach()
-    trunk = _trunk(q, c, min_length, folded)
+    trunk = _trunk(q, c, min_length)
     hubs = torch.cat([trunk[:, :2], _head(q, valid, trunk[:, 1], c, min_length)], dim=1)
     if template.palms:
         hubs = torch.cat([hubs, _palms(q, trunk[:, 1:2], c)], dim=1)
@@ -116,10 +106,7 @@ def bone_frames(
     for level in c.levels:
         parent = known.index_select(1, level.parents)
         d = (directions.index_select(1, level.limbs).unsqueeze(-2) @ parent).squeeze(-2)
-        local = level.swing.to(d, folded)
-        if twist == "hinge" and level.hinge is not None:
-            upper, lower = (directions.index_select(1, limbs) for limbs in level.hinge)
-            local = local @ _towards_hinge(parent @ local, upper, lower, level)
+        local = level.swing.to(d)
         relative.append(local)
         known = torch.cat([known, parent @ local], dim=1)
     return BoneFrames(
@@ -131,7 +118,7 @@ def bone_frames(
     )
 
 
-def _trunk(q: Tensor, c: Constants, min_length: float, folded: float) -> Tensor:
+def _trunk(q: Tensor, c: Constants, min_length: float) -> Tensor:
     """``[B, 3, 3, 3]`` frames of pelvis, chest and the box between them.
 
     They share the up axis, the long baseline from hips to shoulders; the left axis comes from the
@@ -139,19 +126,19 @@ def _trunk(q: Tensor, c: Constants, min_length: float, folded: float) -> Tensor:
     """
     l_sh, r_sh, l_hip, r_hip = q.index_select(1, c.torso).unbind(1)
     spine = (l_sh + r_sh - l_hip - r_hip) * 0.5
-    up = _faded(spine, c.axes[1], min_length, folded).unsqueeze(1)
+    up = _faded(spine, c.axes[1], min_length).unsqueeze(1)
 
     lines = torch.stack([l_hip - r_hip, l_sh - r_sh], dim=1)
     lines = across(up, lines)
     least = c.axes[up.detach().abs().argmin(-1).squeeze(1)].unsqueeze(1)
     # the world's x axis unless the spine lies along it
     stray = unit(across(up, torch.where(up[..., :1].abs() < 0.9, c.axes[0], least)))
-    other = _faded(lines.flip(1), stray, min_length, folded)
-    lines = _faded(lines, other, min_length, folded)
+    other = _faded(lines.flip(1), stray, min_length)
+    lines = _faded(lines, other, min_length)
     # again: a line nearly along the spine keeps the rounding of its long part
     lines = unit(across(up, lines))
     both = lines.sum(1, keepdim=True)
-    opposed = both.square().sum(-1, keepdim=True) < 2 * folded  # facing backwards
+    opposed = both.square().sum(-1, keepdim=True) < 2 * FOLDED  # facing backwards
     left = torch.cat([lines, unit(torch.where(opposed, lines[:, :1], both))], dim=1)
     up = up.expand_as(left)
     return torch.stack([left, up, torch.linalg.cross(left, up)], dim=-1)
@@ -189,7 +176,7 @@ def _palms(q: Tensor, chest: Tensor, c: Constants) -> Tensor:
     return torch.where(lost, chest, frames)
 
 
-def _faded(v: Tensor, fallback: Tensor, min_length: float, folded: float) -> Tensor:
+def _faded(v: Tensor, fallback: Tensor, min_length: float) -> Tensor:
     """Unit v; below ``min_length`` it fades to the unit ``fallback``, which it equals at 0.
 
     No continuous map from the ball to the sphere is the identity on the surface, so one point must
@@ -197,7 +184,7 @@ def _faded(v: Tensor, fallback: Tensor, min_length: float, folded: float) -> Ten
     """
     v = v / min_length
     v = v + (1 - v.square().sum(-1, keepdim=True)).clamp_min(0) * fallback
-    lost = v.square().sum(-1, keepdim=True) < folded
+    lost = v.square().sum(-1, keepdim=True) < FOLDED
     return unit(torch.where(lost, fallback, v))
 
 
@@ -208,29 +195,6 @@ def _shortened(v: Tensor, min_length: float) -> tuple[Tensor, Tensor]:
         v * length2.clamp_min(min_length**2).rsqrt(),
         (length2 / min_length**2).clamp_max(1),
     )
-
-
-def _towards_hinge(R: Tensor, upper: Tensor, lower: Tensor, level: Level) -> Tensor:
-    """``[B, M, 3, 3]`` turns about the bone, in the limb's own frame, towards the bend plane.
-
-    The plane's normal is ``n = upper x lower``, ``|n| = sin(bend)``. The turn by the angle from
-    the hinge axis to n is mixed with no turn as unit complex numbers, weighted by ``|n|²``: no
-    angle is formed, and a straight limb, where n is noise, is left alone.
-    """
-    normal = torch.linalg.cross(upper, lower)
-    weight = normal.square().sum(-1, keepdim=True)
-    # |n| with a small lower bound, so that its slope at 0 is finite
-    sine = (weight + 1e-12).sqrt()
-    in_frame = normal.unsqueeze(-2) @ R
-    parts = (in_frame * level.across.transpose(0, 1)).sum(-1) * sine
-    turn = torch.stack([1.0 - weight.squeeze(-1) + parts[..., 0], parts[..., 1]], dim=-1)
-    norm2 = turn.square().sum(-1, keepdim=True)
-    lost = norm2 < FOLDED  # half a turn at half weight: both ways are equal
-    turn = torch.where(lost, constant((1.0, 0.0), turn), turn)
-    cos, sin = unit(turn)[..., None, None].unbind(-3)
-    cross, along = level.about
-    eye = torch.eye(3, dtype=R.dtype, device=R.device)
-    return cos * (eye - along) + along + sin * cross
 
 
 def omega(

@@ -18,11 +18,12 @@ import shutil
 import subprocess
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gsgan.utils.files import cache_root
 
@@ -69,6 +70,35 @@ def library() -> tuple[ctypes.CDLL | None, str]:
     """
     with _LOCK:  # two threads must not compile at once
         return _load_once()
+
+
+def job_type(
+    integers: Sequence[str],
+    numbers: Sequence[str],
+    addresses: Sequence[str],
+    results: Sequence[str] = (),
+) -> type[ctypes.Structure]:
+    """The type of a kernel's argument, field by field as its header in kernels/ declares it:
+    64-bit integers, doubles, addresses of tensors, and integers that the kernel sets."""
+    kinds = (
+        (integers, ctypes.c_int64),
+        (numbers, ctypes.c_double),
+        (addresses, ctypes.c_void_p),
+        (results, ctypes.c_int64),
+    )
+    fields = [(name, kind) for names, kind in kinds for name in names]
+    return type("Job", (ctypes.Structure,), {"_fields_": fields})
+
+
+def point(job: ctypes.Structure, names: Sequence[str], tensors: Sequence[Tensor | None]) -> None:
+    """Sets fields of a job to tensors' addresses; the caller keeps the tensors alive."""
+    for name, tensor in zip(names, tensors, strict=False):
+        setattr(job, name, None if tensor is None else tensor.data_ptr())
+
+
+def threads() -> int:
+    """The number of threads of a kernel."""
+    return max(1, torch.get_num_threads())
 
 
 def function(name: str, dtype: torch.dtype) -> Any:

@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsgan.scene import Camera, Gaussians
-from gsgan.splat.project import QUAT_MIN, without
+from gsgan.splat.project import QUAT_MIN
 from gsgan.splat.settings import Accuracy
 
 DEVICE = "cuda"
@@ -102,7 +102,6 @@ def draw(
     gaussians: Gaussians,
     camera: Camera,
     settings: Accuracy,
-    keep: Tensor | None,
     want_depth: bool,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Projects and blends.
@@ -114,7 +113,6 @@ def draw(
         gaussians: N >= 1 Gaussians per batch item, of at most float32.
         camera: one camera per batch item.
         settings: near, low_pass and antialias are passed on; the rest is compiled in.
-        keep: ``[B, N]`` bool; the others are not drawn, whatever their values.
         want_depth: whether to blend depths too.
 
     Returns:
@@ -123,8 +121,6 @@ def draw(
 
     Source: Ye et al., gsplat: An open-source library for Gaussian splatting (version 1.5.3).
     """
-    if keep is not None:
-        gaussians = without(gaussians, ~keep)
     (H, W), C = camera.size, gaussians.features.shape[-1]
     means, viewmats = _seen_from_the_camera(gaussians.means, camera)
     colours, alphas, _ = importlib.import_module("gsplat").rasterization(
@@ -206,7 +202,7 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
     camera = Camera(K, torch.eye(3, device=device)[None], torch.zeros(1, 3, device=device), (1, 1))
     try:
         with torch.no_grad():
-            alpha = draw(gaussians, camera, _PROBE, None, want_depth=True)[1]
+            alpha = draw(gaussians, camera, _PROBE, want_depth=True)[1]
         return float(alpha), ""
     except Exception as error:  # no compiler, unknown GPU, other version: torch is used
         line = ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]])

@@ -96,7 +96,7 @@ def pose_of(subject: Subject, shot: Shot) -> Pose:
     """The skeleton as the model gets it: p ``[1, J, 3]`` metres, valid ``[1, J]``, bone frames."""
     frame, avatar = shot.frame, subject.avatar
     p, valid = frame.skeleton, frame.visibility > 0
-    return p, valid, bone_frames(p, valid, avatar.template, twist=avatar.twist)
+    return p, valid, bone_frames(p, valid, avatar.template)
 
 
 def fit_to(axes: Axes, shot: Shot) -> None:
