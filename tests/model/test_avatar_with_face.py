@@ -73,14 +73,6 @@ def test_lips_that_move_by_5_mm_move_the_pose_codes_by_order_1(made, body_points
         assert change[:75].abs().max() < 1e-5
 
 
-def test_bodies_are_solved_without_the_face(made):
-    _, avatar, frame = made("effects.body_points=on", "model=splat_only")
-    p, seen = frame.skeleton, frame.visibility
-    with_face, without = avatar.body_pose(p, seen), avatar.body_pose(p[:, :75], seen[:, :75])
-    assert torch.equal(with_face.theta, without.theta)
-    assert torch.equal(avatar.solver.at_rest(seen), avatar.solver.at_rest(seen[:, :75]))
-
-
 def test_a_run_with_a_face_is_trained_loaded_and_driven_without(inside, signing, tmp_path):
     """The face at rest is the person's own, from the checkpoint."""
     folder = tmp_path / "run"

@@ -17,7 +17,7 @@ from gsgan.body.smpl_names import CIHP
 from gsgan.model.body_points import neighbour_distance
 from gsgan.model.class_vote import ClassVote, seen
 from gsgan.scene import BodyPose, Camera, Frame
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.errors import DataError
 
 FOCAL, SIZE = 40.0, 32
 
@@ -75,15 +75,6 @@ def test_a_plate_hides_what_lies_behind_it_and_nothing_beside_it():
     assert close_seen.all()
 
 
-def test_the_picture_size_does_not_matter():
-    points = torch.cat([plate(2.0), plate(2.3, half=0.6)])
-    reach = neighbour_distance(points, 4)
-    small = seen(points, reach, camera(), 0.03)
-    large = seen(points, reach, camera().resize((1024, 1024)), 0.03)
-    assert 0 < int(small.sum()) < len(points)
-    assert (small == large).double().mean() > 0.99  # cells begin elsewhere
-
-
 @pytest.mark.parametrize(
     "odd",
     [
@@ -135,14 +126,6 @@ def test_background_ignored_and_unknown_pixels_have_no_vote():
     assert (ClassVote()(body, [picture(labels)] * 2, 4).labels == 3).all()
 
 
-def test_wrong_pictures_are_outvoted():
-    body = rigid(plate(2.0))
-    noise = torch.randint(0, 6, (SIZE, SIZE), generator=torch.Generator().manual_seed(0))
-    votes = ClassVote()(body, [picture(noise), *[picture(torch.full((SIZE, SIZE), 4))] * 2], 6)
-    assert (votes.labels == 4).all()
-    assert votes.decided == 1
-
-
 def test_the_number_of_pictures_is_bounded_and_they_are_spread():
     looked = []
 
@@ -154,12 +137,6 @@ def test_the_number_of_pictures_is_bounded_and_they_are_spread():
     pictures = Watched([picture(torch.ones(SIZE, SIZE))] * 10)
     assert ClassVote(vote_frames=3)(rigid(plate(2.0)), pictures, 2).images == 3
     assert looked == [1, 5, 8]
-
-
-@pytest.mark.parametrize("key", ["vote_frames", "occluder_radius", "depth_tolerance"])
-def test_settings_out_of_range_are_refused(key):
-    with pytest.raises(ConfigError, match=r"model\.class_vote"):
-        ClassVote(**{key: 0})
 
 
 # --- on a dataset: SMPL's mesh, CIHP's labels -----------------------------------------------------
@@ -279,23 +256,6 @@ def test_votes_are_kept_in_the_checkpoint_and_not_held_again(foreign, tiny, tmp_
     with torch.no_grad():
         S, again = (a.segmentation(frame.body, frame.camera) for a in (avatar, loaded))
     assert torch.equal(S, again)
-
-
-@pytest.mark.slow
-def test_a_resumed_run_goes_by_the_votes_it_began_with(foreign, tiny):
-    from gsgan.model.assemble import build_avatar, build_data
-
-    config = tiny(f"data.root={foreign}", FEW)
-    data = build_data(config)
-    avatar = build_avatar(config, data.info, data.labelled("train"))
-    state = {k: v.clone() for k, v in avatar.state_dict().items()}
-    labels = state["segmentation.vertex_labels"]
-    first, second = labels.unique()[:2]
-    state["segmentation.vertex_labels"] = torch.where(labels == first, second, labels)
-    before = avatar.segmentation.one_hot.sum(0)
-    avatar.load_state_dict(state)
-    after = avatar.segmentation.one_hot.sum(0)
-    assert (float(after[0]), float(after[1])) == (0.0, float(before[0] + before[1]))
 
 
 def test_votes_of_another_body_are_refused(foreign, tiny):

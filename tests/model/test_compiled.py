@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsgan.losses import photometric
-from gsgan.model import compose, styled
+from gsgan.model import compiled
 from gsgan.model.deformation import Deformation, Residuals
 from gsgan.model.generator import Style
 from gsgan.skeleton.densify import Points
@@ -70,7 +70,7 @@ def test_geometry(monkeypatch, bound):
         loss = sum((x * w).sum() for x, w in zip(found, weights, strict=True))
         return [x.detach() for x in found] + list(torch.autograd.grad(loss, raw))
 
-    torch.testing.assert_close(*both(monkeypatch, compose, "compiled", run), **CLOSE)
+    torch.testing.assert_close(*both(monkeypatch, compiled, "has_geometry", run), **CLOSE)
 
 
 @pytest.mark.parametrize("channels", [6, 16, 37])
@@ -90,7 +90,7 @@ def test_style(monkeypatch, channels):
         inputs = [h, levels, *style.parameters()]
         return [out.detach(), *torch.autograd.grad((out * weights).sum(), inputs)]
 
-    torch.testing.assert_close(*both(monkeypatch, styled, "compiled", run), **CLOSE)
+    torch.testing.assert_close(*both(monkeypatch, compiled, "has_style", run), **CLOSE)
 
 
 @pytest.mark.parametrize(("batch", "embedding", "normals"), [(1, 4, True), (3, 0, False)])

@@ -80,13 +80,6 @@ def test_generator_with_rgb_skip_starts_at_step_one_colour_and_alpha():
         generator(rgb_skip=True)(F, S, p2d, g)
 
 
-def test_generator_without_segmentation_has_fewer_inputs():
-    F, _, p2d, g = inputs(16, 16)
-    without = Generator(5, 0, 8, 35, base=4)
-    assert without(F, None, p2d, g).shape == (2, 4, 16, 16)
-    assert without.content.stem.in_channels == generator().content.stem.in_channels - 4
-
-
 def test_generator_uses_every_input():
     """Each of F, S, p2D and g moves the picture once the style has left its zero start."""
     torch.manual_seed(1)
@@ -97,13 +90,6 @@ def test_generator_uses_every_input():
     given = [x.requires_grad_() for x in inputs(16, 16)]
     net(*given).square().sum().backward()
     assert all(x.grad is not None and float(x.grad.abs().max()) > 0 for x in given)
-
-
-def test_generator_on_empty_pixels_is_finite_with_finite_gradients():
-    F, S, p2d, g = (torch.zeros_like(x).requires_grad_() for x in inputs(16, 16))
-    net = generator()
-    net(F, S, p2d, g).sum().backward()
-    assert all(torch.isfinite(p.grad).all() for p in net.parameters() if p.grad is not None)
 
 
 def test_style_starts_as_plain_normalisation():
@@ -152,14 +138,6 @@ def test_pose_graph_spreads_along_edges_only():
     touched = omega.grad.abs().sum(-1)[0] > 0
     assert bool(touched[32])
     assert not bool(touched[19])
-
-
-def test_pose_graph_connects_face_and_body():
-    graph = PoseGraph(width=4, joint_channels=2, octaves=0)
-    reach = graph.layers[0].mask
-    for _ in range(33):
-        reach = ((reach @ reach) > 0).float()
-    assert bool((reach > 0).all())
 
 
 def test_pose_linear_has_the_papers_size():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 
 import pytest
 import torch
@@ -32,13 +31,6 @@ def test_too_many_within_the_window_do(make):
         module.skipped.add(step, ["psi"])
     with pytest.raises(GsganError, match=r"3 of the last 100 iterations .* larger training.max_sk"):
         module.skipped.add(7, ["psi"])
-
-
-def test_two_optimisers_of_one_iteration_count_once(make):
-    module = skipping(make, "training.max_skipped=2")
-    module.skipped.add(0, ["generator"])
-    module.skipped.add(0, ["discriminator"])
-    assert module.skipped.steps == deque([0])
 
 
 def test_a_resumed_run_starts_counting_anew_and_may_change_the_limit(make, tiny):

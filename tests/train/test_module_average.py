@@ -71,13 +71,3 @@ def test_the_average_is_updated_when_the_config_says(make):
     assert int(module.average.copy.n_averaged) == sum(step % 5 == 0 for step in steps)
     with pytest.raises(ConfigError, match="average_every must be a number of at least 1"):
         make("training.average_every=0")
-
-
-def test_every_variant_is_scored_by_its_moving_average(make):
-    module, trainer, data = make("model=splat_only", "training.schedule.stretch=1")
-    trainer.fit(module, data)
-    assert module.average.started
-    assert module.shown is module.average.module
-    live = dict(module.avatar.named_parameters())
-    averaged = dict(module.shown.named_parameters())
-    assert any(not torch.equal(live[name], averaged[name]) for name in live)

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from gsgan.model import compose
+from gsgan.model import compiled
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
@@ -201,9 +201,9 @@ class Deformation(nn.Module):
         parts = (residuals.means, residuals.quats, residuals.scales)
         raw = torch.cat([*parts, residuals.opacities.unsqueeze(-1)], dim=-1)
         fixed = (points.means, frames, points.scales, points.valid)
-        if compose.compiled(raw, *fixed):
+        if compiled.has_geometry(raw, *fixed):
             numbers = ((bound or 0.0) * height, height, low, high, logit, self.logit_bound)
-            return compose.geometry(raw, *fixed, numbers)
+            return compiled.geometry(raw, *fixed, numbers)
         offset = residuals.means if bound is None else bound * torch.tanh(residuals.means)
         means = points.means + (frames @ (offset * height).unsqueeze(-1)).squeeze(-1)
         scales = bounded(points.scales.log().unsqueeze(-1) + residuals.scales, low, high).exp()

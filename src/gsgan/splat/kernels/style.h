@@ -7,7 +7,7 @@
 
 extern "C" {
 
-// Mirrors model/styled.py's _Job. modulation: rows of [scale - 1, shift], 2 C numbers.
+// Mirrors model/compiled.py's _StyleJob. modulation: rows of [scale - 1, shift], 2 C numbers.
 struct StyleJob {
   int64_t rows, C, threads;
   double floor, slope;
