@@ -11,6 +11,7 @@ import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torch import Tensor, nn
+from torch.utils.data import Subset
 
 from gsgan.body import SkinnedBody, open_body
 from gsgan.body.skinned import MarkedBody
@@ -19,12 +20,13 @@ from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects, EffectSettings, ModelParts, decide
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.class_vote import ClassVote, LabelledImages, labelled_body
+from gsgan.model.class_vote import ClassVote, labelled_body
 from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
+from gsgan.scene import Frame
 from gsgan.skeleton import Densify, SkeletonTemplate, template_of
 from gsgan.splat import BACKENDS, Accuracy
 from gsgan.utils.checks import one_of
@@ -48,7 +50,7 @@ def build_data(config: DictConfig) -> GsganData:
 def build_avatar(
     config: DictConfig,
     scene: SceneInfo,
-    images: LabelledImages | None = None,
+    images: Subset[Frame] | None = None,
     *,
     effects: Effects | None = None,
     vertex_labels: Tensor | None = None,

@@ -124,10 +124,10 @@ class Avatar(nn.Module):
         return self.solver is not None
 
     def freeze(self) -> Self:
-        """Ends training, and renders faster: what depends on weights alone is computed once.
+        """Ends training and speeds up rendering: what depends on weights alone is computed once.
 
         Convention: images are the same up to rounding, and follow weights that are loaded later.
-        Weights get no gradient any more; skeleton and camera do.
+        Weights get no gradient; skeleton and camera do.
         """
         self.eval().requires_grad_(False)
         for part in self.modules():

@@ -1,47 +1,39 @@
-"""The body that S splats, with a part label per vertex: the body's own, or voted by the images."""
+"""The body that S splats, with a part label per vertex: its own, or by a vote over the images."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.data import Subset
 
 from gsgan.body import SkinnedBody, open_body
+from gsgan.data.scene_info import SceneInfo
 from gsgan.model.body_points import ROWS, neighbour_distance
 from gsgan.model.segmentation import IGNORE
 from gsgan.scene import Camera, Frame
 from gsgan.utils.checks import above, whole
 from gsgan.utils.errors import DataError
 
-if TYPE_CHECKING:
-    from gsgan.data.scene_info import SceneInfo  # loads the data package
-
-NEIGHBOUR = 4  # the neighbour whose distance measures the gaps between vertices
-CELLS = 2.0  # cells of the depth map across the median occluder's radius
-WIDEST = 8  # cells, largest occluder radius: one close to the camera would fill the map
-MOST_CELLS = 2048  # along a side of the depth map, however far the discs spread
-
-
-class LabelledImages(Protocol):
-    """Indexed frames with part labels: a dataset."""
-
-    def __len__(self) -> int: ...
-    def __getitem__(self, index: int, /) -> Frame: ...
+NEIGHBOUR = 4  # the distance to this neighbour is the gap between vertices
+CELLS = 2.0  # cells of the depth map per median occluder radius
+WIDEST = 8  # cells, the largest occluder radius: a disc close to the camera would fill the map
+MOST_CELLS = 2048  # along a side of the depth map
 
 
 def labelled_body(
     scene: SceneInfo,
     vote: ClassVote,
-    images: LabelledImages | None = None,
+    images: Subset[Frame] | None = None,
     vertex_labels: Tensor | None = None,
 ) -> tuple[SkinnedBody | None, str]:
     """The body, and a clause on where its labels come from, or why there is no body.
 
-    The body's own labels are used where they are the data's, or the data has none. Otherwise, and
-    on a body fitted to a person, whose clothes end elsewhere, those of a checkpoint
-    (``vertex_labels [V]``), or of a vote over ``images``.
+    The body keeps its own labels where the data has the same ones, or none. Otherwise, and on a
+    body fitted to a person, whose clothes end elsewhere, labels come from a checkpoint
+    (``vertex_labels [V]``) or from a vote over ``images``.
 
     Raises:
         DataError: when a vote is needed and not possible, or the labels do not fit the body.
@@ -57,7 +49,7 @@ def labelled_body(
         guess = body.label_source == "guess"
         return body, "parts by the body's joints" if guess else "parts are the body's own"
     fitted = bool(scene.betas) and scene.body == "free"  # to a person in other clothes
-    if scene.has_labels and not fitted and body.shares_labels(scene.label_names):
+    if not fitted and body.shares_labels(scene.label_names):
         if scene.n_labels > len(body.label_names):
             raise DataError(
                 f"labels: the images have {scene.n_labels} parts, the {scene.body} body has only "
@@ -99,16 +91,16 @@ class Votes(NamedTuple):
 class ClassVote:
     """Settings of the vote; call it to vote.
 
-    A vertex votes for the label at its pixel in every image in which the body itself does not hide
-    it. Background and ignored pixels do not count: there the fit is off, or the label image is
+    Each vertex gets a vote for the label at its pixel from every image in which the body does not
+    hide it. Background and ignored pixels do not count: there the fit is off, or the label image is
     empty. Vertices without a majority (never seen, or a tie) take the label of the nearest vertex
     with one, at rest. Nothing is random.
 
     Settings: conf/model/full.yaml. An occluder radius of 1 closes the gaps of an even mesh. The
-    depth tolerance is more than neighbours differ on a slanted surface, less than a limb's
-    thickness.
+    depth tolerance is larger than the differences between neighbours on a slanted surface, and
+    smaller than a limb's thickness.
 
-    Source: paper Sec. 3.4 (one class a vertex); the vote is ours.
+    Source: paper Sec. 3.4, which gives each vertex one class but not how.
     """
 
     vote_frames: int = 100
@@ -120,8 +112,8 @@ class ClassVote:
         above("model.class_vote.occluder_radius", self.occluder_radius)
         above("model.class_vote.depth_tolerance", self.depth_tolerance)
 
-    def __call__(self, body: SkinnedBody, images: LabelledImages, n_labels: int) -> Votes:
-        """Votes over frames of one item each, for data with this many labels (background included).
+    def __call__(self, body: SkinnedBody, images: Subset[Frame], n_labels: int) -> Votes:
+        """Votes over frames of one item each, for ``n_labels`` labels, background included.
 
         Raises:
             DataError: when an image file is damaged, or no vertex lies on a labelled pixel.

@@ -20,8 +20,8 @@ SLOPE = 0.2
 class Encoder(nn.Module):
     """A pyramid: a stem, then stride-2 levels; returns every level, finest first.
 
-    The stem is a 3×3 convolution; with ``patch`` > 1 one of patch × patch pixels, each of which is
-    a pixel of the finest level, and then a 3×3.
+    The stem is a 3×3 convolution. With ``patch`` > 1 it is one of patch × patch pixels with that
+    stride, followed by a 3×3.
     """
 
     def __init__(self, inputs: int, channels: Sequence[int], patch: int = 1) -> None:
@@ -64,7 +64,7 @@ class Style(nn.Module):
             start_at_zero(layer)
 
     def forward(self, h: Tensor, style: Tensor, g: Tensor) -> Tensor:
-        """``h`` ``[B, C, h, w]`` styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]``, then
+        """``h`` ``[B, C, h, w]``, styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]`` and
         activated."""
         rows = h.permute(0, 2, 3, 1)  # channels last in memory: channels of a pixel are a row
         modulation = self.from_pose(g).unsqueeze(1)
@@ -101,9 +101,8 @@ class DecoderLevel(nn.Module):
     def _join(self, h: Tensor, skip: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """A 3×3 convolution of ``h``, upsampled to the nearest, and ``skip`` as further channels.
 
-        Two of three pixels under a kernel on an upsampled image are equal: a transposed convolution
-        whose kernel has their sums does 4/9 of the arithmetic. (It has no checkerboard: that comes
-        from kernels that are not such sums.)
+        Two of three pixels under a kernel on an upsampled image are equal, so a transposed
+        convolution with the sums of their weights does the same with 4/9 of the arithmetic.
         """
         C = h.shape[1]
         kernel = derived(self, "upper", lambda: upsampled_kernel(weight[:, :C]), weight)
@@ -124,13 +123,14 @@ class Generator(nn.Module):
             beside their average; 1 for none.
         base: channels at full resolution.
         multipliers: channels of each level in units of ``base``; each level halves the resolution.
-        patch: power of 2: so many pixels each way are one pixel of the finest level, which paints
-            them as channels. The first levels of ``multipliers`` are then left out.
+        patch: a power of 2: one pixel of the finest level covers patch × patch pixels, which are
+            its channels. The first levels of ``multipliers`` are then left out.
         feature_bound: of the Gaussians' features, which `Avatar` clamps: that is cheaper than
             clamping images of them.
 
     The other settings are explained in conf/model/full.yaml. With ``rgb_skip`` the last layer
-    starts at zero, and training at Step I's image. An unclamped output can recover from black.
+    starts at zero, so training starts at Step I's image. The output is not clamped, so that it can
+    recover from black.
 
     Source: paper Sec. 3.5; sizes, style, the linear output and alpha are ours.
     """
@@ -216,7 +216,7 @@ class Generator(nn.Module):
         return painted
 
     def _stem(self, features: Tensor, others: list[Tensor], fine: Tensor | None) -> Tensor:
-        """E_c's stem on F, S, p₂D, and F's fine pixels as channels, without forming these."""
+        """E_c's stem on F, S, p₂D and F's fine pixels, without forming them as channels."""
         stem, k, C = self.content.stem, self.supersample, features.shape[1]
         if fine is None:
             padded = [self._padded(x) for x in others]
@@ -241,8 +241,8 @@ class Generator(nn.Module):
 
 
 def fine_kernel(weight: Tensor, C: int, k: int) -> Tensor:
-    """``[O, C, n k, n k]``: the part of a stem's ``weight`` that sees F, as one kernel on F's fine
-    pixels, of which its first C channels see averages and its last C k² each one."""
+    """``[O, C, n k, n k]``: the part of a stem's ``weight`` that reads F, as one kernel on F's fine
+    pixels: its first C channels read their averages, its last C k² each single one."""
     fine = weight[:, -C * k * k :].unflatten(1, (C, k, k)).permute(0, 1, 4, 2, 5, 3)
     mean = weight[:, :C, :, None, :, None] / (k * k)
     return channels_last((fine + mean).flatten(4, 5).flatten(2, 3))

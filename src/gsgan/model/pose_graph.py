@@ -56,15 +56,14 @@ class GraphLayer(nn.Module):
 
 
 class PoseGraph(nn.Module):
-    """Graph network over joint rotations Ω, pooled to one number per skeleton edge.
+    """A graph network over joint rotations Ω, read out to one number per skeleton edge.
 
     Args:
         template: the skeleton's joints and edges, or its name.
         width, joint_channels, octaves: hidden and output channels per joint, encoding of Ω.
 
-    Each number of g is read from the two joints of its edge.
-
-    Source: paper Sec. 3.5, which leaves open how joints become g.
+    Source: paper Sec. 3.5, which leaves open how joints become g: here each number of g is read
+        from the two joints of its edge.
     """
 
     edges: Tensor
@@ -142,8 +141,8 @@ def pose_inputs(
         body_height: metres.
 
     Returns:
-        Ω ``[B, J, 6]``; root-centred joints in camera axes, in body heights, the face's replaced by
-        its `face_code`, ``[B, J, 3]``.
+        Ω ``[B, J, 6]``, and joints ``[B, J, 3]`` about the root in camera axes and body heights,
+        those of the face replaced by its `face_code`.
     """
     root = root_of(p, template).unsqueeze(1)
     in_camera = (p - root) @ camera.R.mT / body_height

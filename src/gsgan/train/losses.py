@@ -33,7 +33,7 @@ class StepOneLoss:
         l1, ssim: weights (paper: 0.8, 0.2).
         feature_head, alpha: weights, see conf/training/long.yaml; 0 builds no readout of F.
 
-    Source: paper Sec. 3.5 (λ = 0.2); readout and alpha are ours.
+    Source: paper Sec. 3.5 (λ = 0.2), without readout and alpha.
     """
 
     l1: float = 0.8
@@ -56,8 +56,8 @@ class StepOneLoss:
             pixels = {"l1": self.l1, "ssim": self.ssim}
             loss = photometric(rendering.colour + behind, target, unsure=frame.unsure, **pixels)
             if head is not None:
-                # the bias weighted by alpha: the readout commutes with alpha blending
-                # as one product: a convolution with few channels is slower on a CPU
+                # The bias is weighted by alpha, so that the readout commutes with blending. One
+                # product, because a convolution with few channels is slower on a CPU.
                 seen = torch.cat([rendering.features, rendering.splat_alpha], dim=1)
                 weight = torch.cat([head.weight.flatten(1), head.bias[:, None]], dim=1)  # type: ignore[index]
                 read = (weight @ seen.flatten(2)).unflatten(2, seen.shape[2:])
@@ -96,7 +96,7 @@ class DiscriminatorMaps:
         self, discriminator: Discriminator, image: Tensor, target: Tensor, gan: str
     ) -> None:
         self.image, self.gan = image, gan
-        # a leaf: the two losses must not reach each other's parameters
+        # a leaf, so that neither loss reaches the other's parameters
         self.copy = image.detach().requires_grad_(image.requires_grad)
         with torch.enable_grad():
             self.fake = discriminate(discriminator, self.copy, gan)
@@ -122,7 +122,7 @@ class _Through(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, path: tuple[Tensor, list[Tensor]]) -> tuple[Tensor, ...]:
-        # in a tuple autograd does not see them: it would go that way as well
+        # in a tuple, which hides them from autograd: it would follow them as well
         ctx.copy, ctx.terms = path
         terms = ctx.terms
         return tuple(term.detach().clone() for term in terms)
@@ -138,8 +138,7 @@ class _Through(torch.autograd.Function):
 class StepTwoLoss:
     """Weights of the generator's loss (conf/training/long.yaml); 0 computes no term.
 
-    Source: paper Sec. 3.5 and Alg. 2, an unweighted sum of L_GAN, L_perc and L_feat; weights, the
-        other terms and the anchor are ours.
+    Source: paper Sec. 3.5 and Alg. 2, an unweighted sum of L_GAN, L_perc and L_feat.
     """
 
     l1: float = 1.0

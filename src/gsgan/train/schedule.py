@@ -43,9 +43,9 @@ class Schedule:
     ) -> Schedule:
         """The schedule of a model with these parts, stretched.
 
-        Without S its phase is left out; without a generator Step I gets Step II's iterations, and
-        without splats the other way round, so that every variant trains equally long. From masks
-        S learns two numbers, which needs fewer iterations.
+        Without S its phase is left out. Without a generator Step I gets Step II's iterations, and
+        without splats the other way round, so that every variant trains equally long. S learns only
+        two numbers from masks, which needs fewer iterations.
         """
         numbers = {name: round(getattr(self, name) * self.stretch) for name in STRETCHED}
         one, two = numbers["step_one"], numbers["step_two"]
