@@ -113,6 +113,12 @@ def hydra_record(folder: Path) -> DictConfig:
     return _read_yaml(path) if path.is_file() else OmegaConf.create()
 
 
+def choices(folder: Path) -> dict[str, Any]:
+    """The config groups' choices that Hydra recorded in a run folder; empty without a record."""
+    found = OmegaConf.select(hydra_record(folder), "hydra.runtime.choices")
+    return {} if found is None else {str(key): value for key, value in found.items()}
+
+
 def record(config: DictConfig) -> dict[str, Any]:
     """The config as plain values, without the keys that a continuation may change."""
     plain: dict[str, Any] = {
