@@ -121,8 +121,6 @@ class Fitter:
         body: of the person.
         start: F poses, solved from the skeletons.
         seed: of the order of frames and cameras.
-
-    Source: ours; as SMPL is fitted to silhouettes for published captures.
     """
 
     def __init__(

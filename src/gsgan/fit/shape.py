@@ -50,8 +50,6 @@ def fit_shape(skeletons: Tensor, visibility: Tensor) -> BodyShape:
 
     Raises:
         DataError: when no frame shows enough of shoulders, hips and limbs.
-
-    Source: ours.
     """
     reduced = _without_surface(free_space())
     p, seen = _usable(skeletons, visibility)
@@ -76,8 +74,6 @@ def fit_hands(
         The shape; as it was where no frame shows a hand. The hinge and place of a hand stay the
         body's where no frame shows it with its forearm, or where they differ by more than
         `FARTHEST`.
-
-    Source: ours.
     """
     shape, hands = replace(shape, hands=None), skeletons[:, BODY:]
     seen = (visibility[:, BODY:] > 0) & hands.isfinite().all(-1)
