@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.model import styled
 from gsgan.utils.checks import one_of
 from gsgan.utils.tensors import derived
 
@@ -78,9 +77,6 @@ class Style(nn.Module):
             modulation = modulation.unflatten(1, rows.shape[1:3])
         else:
             modulation = modulation.unsqueeze(1)
-        if styled.compiled(rows, modulation):
-            made = styled.styled(rows, modulation, NORM_FLOOR, SLOPE)
-            return made.permute(0, 3, 1, 2)
         gamma, beta = modulation.chunk(2, dim=-1)
         # In float32 at least: half precision loses squares above 256 and below 2e-4.
         wide = rows.to(torch.promote_types(h.dtype, torch.float32))
