@@ -11,23 +11,15 @@ from torch import Tensor
 from gsgan.splat import build, native
 
 RESIDUALS = 11  # mean 3, quaternion 4, scale 3, opacity 1
-_SIZES = ("count", "threads", "stride")
-_NUMBERS = ("mean_bound", "unit", "scale_low", "scale_high", "logit", "logit_bound")
 _INPUTS = ("raw", "means", "frames", "scales", "valid")
 _OUTPUTS = ("means", "covariances", "opacities")
 
 
-class _Job(ctypes.Structure):
-    """Mirrors ``struct ComposeJob`` of splat/kernels/compose.h field by field."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in _SIZES),
-        *((name, ctypes.c_double) for name in _NUMBERS),
-        *((name, ctypes.c_void_p) for name in _INPUTS),
-        *((f"out_{name}", ctypes.c_void_p) for name in _OUTPUTS),
-        *((f"g_{name}", ctypes.c_void_p) for name in _OUTPUTS),
-        ("d_raw", ctypes.c_void_p),
-    )
+_Job = build.job_type(
+    ("count", "threads", "stride"),
+    ("mean_bound", "unit", "scale_low", "scale_high", "logit", "logit_bound"),
+    (*_INPUTS, *(f"{kind}_{name}" for kind in ("out", "g") for name in _OUTPUTS), "d_raw"),
+)  # struct ComposeJob of splat/kernels/compose.h
 
 
 def compiled(raw: Tensor, *fixed: Tensor) -> bool:
@@ -92,7 +84,7 @@ class _Geometry(torch.autograd.Function):
         return d_raw, *[None] * 5
 
 
-def _job(raw: Tensor, fixed: list[Tensor], numbers: tuple[float, ...]) -> tuple[_Job, list[Tensor]]:
+def _job(raw: Tensor, fixed: list[Tensor], numbers: tuple[float, ...]) -> tuple[Any, list[Tensor]]:
     """The job without its outputs, and the tensors it points to."""
     rows = raw.detach()
     if rows.stride(-1) != 1 or rows.stride(0) != rows.shape[1] * rows.stride(1):
