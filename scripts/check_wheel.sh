@@ -28,12 +28,10 @@ if any(map(shutil.which, build.COMPILERS)):
   hydra.run.dir="$work/run"
 test -s "$work/run/metrics.json"
 "$work/venv/bin/python" -m gsgan.evaluate run="$work/run"
-"$work/venv/bin/python" -m gsgan.report run="$work/run" runs="$work/run" figures=[teaser]
+"$work/venv/bin/python" -m gsgan.report run="$work/run" runs="$work/run" figures=[strip]
 "$work/venv/bin/python" -m gsgan
 for command in prepare check fit; do
   "$work/venv/bin/python" -m gsgan.$command --help >help.txt
 done
-for subject in raster speed trade-off effects; do
-  "$work/venv/bin/python" -m gsgan.bench $subject --help >help.txt
-done
+"$work/venv/bin/python" -m gsgan.bench speed --help >help.txt
 echo "the wheel works from $work"
