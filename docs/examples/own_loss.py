@@ -29,8 +29,8 @@ class Smoothness(nn.Module):
         super().__init__()
         self.weight = weight
 
-    def forward(self, painting: Rendering, frame: Frame) -> Tensor:
-        image = painting.image  # [B, 3, H, W], as is frame.image
+    def forward(self, rendering: Rendering, frame: Frame) -> Tensor:
+        image = rendering.image  # [B, 3, H, W], as is frame.image
         return self.weight * (image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean())
 
 

@@ -1,4 +1,4 @@
-"""`gsgan.fit`: poses fill the masks better, held-out images are not used, a stopped fit resumes."""
+"""`gsgan.fit`: poses fill the masks better, and held-out images are not used."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from gsgan.body.solve import Solver
 from gsgan.data.datamodule import GsganData
 from gsgan.data.fingerprint import fingerprint
 from gsgan.evaluate.run import make_scorer
-from gsgan.fit import run as running
 from gsgan.fit.fitter import Fitter, _wrong
 from gsgan.fit.frames import MaskedFrames
 from gsgan.fit.run import fit_before_training, run_fit, standard_settings
@@ -244,57 +243,6 @@ def test_the_rims_of_an_undistorted_image_are_unsure(tmp_path):
     assert frame.unsure is not None
     assert float(frame.unsure[0, 0, 0, 0]) == 1
     assert float(frame.unsure[0, 0, 24, 24]) == 0
-
-
-def test_a_stopped_fit_resumes_to_the_same_end(fit, fitted, monkeypatch, tmp_path, capsys):
-    whole = np.load(fitted / "body_pose.npz")
-    sweep, done = Fitter.sweep, []
-
-    def stopping(self):
-        if len(done) == 2:
-            raise KeyboardInterrupt
-        done.append(self.swept)
-        return sweep(self)
-
-    monkeypatch.setattr(Fitter, "sweep", stopping)
-    with pytest.raises(KeyboardInterrupt):
-        fit(name="again")
-    assert not (tmp_path / "again/body_pose.npz").exists()
-    monkeypatch.setattr(Fitter, "sweep", sweep)
-    capsys.readouterr()
-    again = fit(name="again")
-    assert "resuming after 2 of 3 sweeps" in capsys.readouterr().out
-    np.testing.assert_array_equal(whole["theta"], again["theta"])
-    assert not list((tmp_path / "again").glob(".*"))
-
-
-def test_a_stopped_fit_does_not_resume_with_other_masks(fit, people, monkeypatch, tmp_path, capsys):
-    other = shutil.copytree(people, tmp_path / "other")
-    monkeypatch.setattr(running, "fit_sheet", lambda *_: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        fit(root=other)
-    monkeypatch.undo()
-    file = other / "masks/cam00/000001.png"
-    cv2.imwrite(str(file), cv2.dilate(cv2.imread(str(file), 0), np.ones((3, 3), np.uint8)))
-    capsys.readouterr()
-    fit("overwrite=true", root=other)
-    assert "starting again" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("left", ["other settings", "damage"])
-def test_another_state_is_not_resumed(fit, fitted, monkeypatch, tmp_path, capsys, left):
-    whole = np.load(fitted / "body_pose.npz")
-    if left == "damage":
-        (tmp_path / "again").mkdir()
-        (tmp_path / "again/.body_fit.stopped").write_bytes(b"PK no")
-    else:
-        monkeypatch.setattr(running, "fit_sheet", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            fit("fit.prior=0.5", name="again")
-        monkeypatch.undo()
-    again = fit("overwrite=true", name="again")
-    assert "starting again" in capsys.readouterr().out
-    np.testing.assert_array_equal(whole["theta"], again["theta"])
 
 
 def test_the_image_shows_every_camera(fit, tmp_path):

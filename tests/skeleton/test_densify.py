@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.util
 import math
 from pathlib import Path
@@ -11,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from skeleton_poses import REST, camera, noisy, rest, rotation
+from skeleton_poses import REST, noisy, rest, rotation
 from torch import Tensor
 
-from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames, recentre
+from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames
 from gsgan.skeleton.densify import even_box, even_cylinder, even_sphere, shipped
 from gsgan.utils.errors import ConfigError
 
@@ -203,26 +202,6 @@ def test_batch_items_do_not_mix() -> None:
         alone = d(p[b : b + 1])
         torch.testing.assert_close(together.means[b : b + 1], alone.means, atol=1e-12, rtol=0)
         torch.testing.assert_close(together.scales[b : b + 1], alone.scales, atol=1e-12, rtol=0)
-
-
-def test_float32_far_away_needs_recentring() -> None:
-    """At 1e4 m float32 has a resolution of 1 mm; recentred in float64 first, the error is 1e-6."""
-    d, p = Densify(dtype=torch.float32), noisy(2)
-    far, shift = p + 1e4, torch.full((1, 3), 1e4, dtype=F64)
-    cam = camera((64, 64))
-    far_cam = dataclasses.replace(cam, t=cam.t - (cam.R @ shift.unsqueeze(-1)).squeeze(-1))
-    near_p, near_cam, root = recentre(far, far_cam)
-    exact = densify()(p)
-    means = d(near_p.float()).means
-    torch.testing.assert_close(
-        means.double() + root.unsqueeze(1) - 1e4, exact.means, atol=2e-6, rtol=0
-    )
-    seen, _ = near_cam.to(torch.float32).project(means)
-    expected, _ = cam.project(exact.means)
-    torch.testing.assert_close(seen.double(), expected, atol=1e-3, rtol=0)
-    # without it the error is that resolution, but not more
-    direct = d(far.float()).means.double() - 1e4
-    assert 1e-4 < (direct - exact.means).abs().max() < 2e-2
 
 
 def test_even_samplers_cover_evenly() -> None:

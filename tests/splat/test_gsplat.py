@@ -238,7 +238,7 @@ def test_it_draws_with_any_settings_and_reports_the_differences(mock, backend, c
     name, reason = resolve_backend(backend, CPU, replace(STANDARD, **changes))
     assert name == "gsplat"
     assert message in reason
-    assert "may lack 0.1 of its light" in reason
+    assert "it stops pixels one layer earlier" in reason
     assert reason.endswith("backend=torch has none.")
     assert reason.count(". ") == 0  # one sentence
 
@@ -265,13 +265,6 @@ def test_the_cap_is_that_of_the_installed_version(monkeypatch):
     install(monkeypatch, StandIn(cap=0.99))
     reason = resolve_backend("gsplat", CPU, STANDARD)[1]
     assert "alpha_max is 0.99, not 0.999" in reason
-    assert "may lack 0.01 of its light" in reason  # T (1 - a) <= 1e-4 stops where T = 0.01
-
-
-def test_other_backends_can_be_requested(mock):
-    assert resolve_backend("auto", CPU, ACCURACY["exact"]) == ("reference", "")
-    assert resolve_backend("torch", CPU, STANDARD) == ("torch", "")
-    assert resolve_backend("native", CPU, STANDARD)[0] != "gsplat"
 
 
 def test_hard_cases_are_compared_only_with_its_own_cut_offs(mock):

@@ -16,7 +16,7 @@ from stability.motions import ANGLES, METRES, assert_rotation, rigid, skeletons
 CPU = torch.device("cpu")
 
 FADED = 20.0 * 1e-3 / MIN_LENGTH
-"""Frobenius norm of a frame's change over ``step / min_length``, where a baseline fades to its
+"""Frobenius norm of a frame's change over ``step / MIN_LENGTH``, where a baseline fades to its
 stand-in: between the two, ``s u + (1 - s²) f``, a direction turns at a rate of at most 3 over a
 length that stays above 0.4 on these paths, its stand-in may turn too; a frame changes by √2 of
 that, and a limb that swings from it by up to twice as much."""
@@ -99,7 +99,7 @@ def test_any_skeleton_has_rotations_for_frames_and_finite_slopes(p):
     points = densify(leaf, None, frames)
     assert points.means.isfinite().all()
     assert (points.scales > 0).all()
-    code = omega(leaf, None, None, frame="world", frames=frames)
+    code = omega(leaf, None, torch.eye(3)[None].expand(len(leaf), 3, 3), frames=frames)
     total = points.means.sum() + points.scales.sum() + (code * code.detach()).sum()
     total.backward()
     assert leaf.grad.isfinite().all()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import random
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -21,7 +20,6 @@ from gsgan.utils.errors import ConfigError
 
 BETAS = (0.9, 0.99)
 FINAL_RATE = 0.02  # of the learning rates, in the last sweep
-STATEFUL = ("surface", "moves", "surface_optimiser", "pose_optimiser")
 CONTROLS = 200  # points whose distances from the body the surface interpolates
 REACH = 0.06  # metres: the surface stays this close to the body
 SPREAD = 1.5  # of the controls' influence, in distances between them
@@ -121,8 +119,6 @@ class Fitter:
         body: of the person.
         start: F poses, solved from the skeletons.
         seed: of the order of frames and cameras.
-
-    Source: ours; as SMPL is fitted to silhouettes for published captures.
     """
 
     def __init__(
@@ -213,17 +209,6 @@ class Fitter:
                     ious.append((filled & mask).sum().item() / either)
             by_frame.append(sum(ious) / len(ious) if ious else math.nan)
         return torch.tensor(by_frame)
-
-    def state_dict(self) -> dict[str, Any]:
-        """The state from which a later process can resume."""
-        parts = {name: getattr(self, name).state_dict() for name in STATEFUL}
-        return {**parts, "shaped": self.shaped, "swept": self.swept}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores a state."""
-        for name in STATEFUL:
-            getattr(self, name).load_state_dict(state[name])
-        self.shaped, self.swept = state["shaped"], state["swept"]
 
     def _share(self, i: int, pose: BodyPose, chance: random.Random) -> tuple[Tensor, Tensor]:
         """Wrong alpha as a share of the masks, and the posed landmarks."""

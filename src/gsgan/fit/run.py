@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import copy
-import hashlib
-import io
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,10 +13,8 @@ import torch
 from hydra.utils import instantiate
 from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
-from rich.console import Console
 from torch import Tensor
 
-from gsgan import __version__
 from gsgan.body.fingers import Fingers
 from gsgan.body.shape import BodyShape, shaped_body
 from gsgan.body.solve import ON_HANDS, Solver
@@ -42,7 +36,6 @@ from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically, write_json, write_npz, writing
 from gsgan.utils.tensors import pick_device
 
-STOPPED = ".body_fit.stopped"
 SIZE, MARGIN = 128, 0.2  # pixels; metres around the person
 
 
@@ -116,8 +109,7 @@ def fit_body(
 
     The registered poses determine where on the body this person's landmarks are; hand landmarks
     determine the size and place of the hands. With these all poses are solved again, and written
-    unless the settings keep registered ones. A fit that was stopped resumes from a hidden file in
-    ``out``.
+    unless the settings keep registered ones.
 
     Args:
         data: a capture.
@@ -145,7 +137,11 @@ def fit_body(
         shape = fit_shape(*_joints(data, data.trained))
         start = _of_rows(_solve_with_fingers(data, shape), rows)
     fitter = Fitter(settings, frames, shaped_body(shape), start, seed)
-    _run(fitter, folder / STOPPED, _key(fitter, shape, seed), console)
+    with progress(console) as bars:
+        for _ in bars.track(range(settings.surface_steps), description="surface"):
+            fitter.surface_step()
+        for _ in bars.track(range(settings.sweeps), description="poses"):
+            fitter.sweep()
     with torch.no_grad():
         found = fitter.pose()
         registered = found.to(torch.device("cpu"))
@@ -160,14 +156,13 @@ def fit_body(
         write_atomically(folder / SHEET, fit_sheet(fitter, layout.camera_names, found, shown))
     write_json(folder / REPORT, report)
     _write_body(folder, data, frames, shape, poses, rows, kept)
-    (folder / STOPPED).unlink(missing_ok=True)
     lines = summary(report, folder, frames)
     console.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
     return folder
 
 
 def _folder(out: Path, overwrite: bool) -> Path:
-    attempt = out / f"{STOPPED}.try"
+    attempt = out / ".body_fit.try"
     with writing(out):  # before minutes of work, not after
         out.mkdir(parents=True, exist_ok=True)
         write_atomically(attempt, b"")
@@ -279,46 +274,3 @@ def _refined(
     for side, rows in enumerate(ON_HANDS):
         used[:, rows] = seen[:, rows] * Fingers.placed(seen[:, len(offsets) :] > 0)[:, [side]]
     return replace(shape, offsets=fit_offsets(shape, by_hands, p[:, : len(offsets)], used))
-
-
-def _key(fitter: Fitter, shape: BodyShape, seed: int) -> str:
-    """Digest of everything that a stopped fit must share with this one to be resumed."""
-    dataset = fitter.frames.dataset
-    content: list[Any] = [__version__, seed, asdict(fitter.settings), dataset.size]
-    for item in dataset.items:
-        files = [path.stat() for _, path in dataset.layout.mask_files(*item)]
-        content.append([*item, *((file.st_size, file.st_mtime_ns) for file in files)])
-    text = json.dumps(content, sort_keys=True, default=str).encode()
-    tensors = [shape.flat(), fitter.start.theta, fitter.start.transl]
-    numbers = [x.cpu().numpy().tobytes() for x in (*tensors, fitter.frames.skeletons)]
-    cameras = (dataset.layout.root / "cameras.json").read_bytes()
-    return hashlib.sha256(b"".join([text, *numbers, cameras])).hexdigest()
-
-
-def _run(fitter: Fitter, stopped: Path, key: str, console: Console) -> None:
-    """Runs the remaining steps of a fit; the state is saved after each sweep."""
-    settings = fitter.settings
-    if stopped.is_file():
-        fresh = copy.deepcopy(fitter.state_dict())  # loading copies into the same tensors
-        try:
-            state = torch.load(stopped, map_location=fitter.frames.device, weights_only=True)
-            if state["key"] != key:
-                raise ValueError
-            fitter.load_state_dict(state["fitter"])
-            console.print(f"resuming after {fitter.swept} of {settings.sweeps} sweeps")
-        except Exception:  # of another fit, or damaged: torch raises many kinds
-            console.print("an earlier fit had other settings or data: starting again")
-            fitter.load_state_dict(fresh)
-    with progress(console) as bars:
-        task = bars.add_task("surface", total=settings.surface_steps, completed=fitter.shaped)
-        while fitter.shaped < settings.surface_steps:
-            fitter.surface_step()
-            bars.advance(task)
-        task = bars.add_task("poses", total=settings.sweeps, completed=fitter.swept)
-        while fitter.swept < settings.sweeps:
-            fitter.sweep()
-            bars.advance(task)
-            stream = io.BytesIO()
-            torch.save({"key": key, "fitter": fitter.state_dict()}, stream)
-            with writing(stopped):
-                write_atomically(stopped, stream.getvalue())

@@ -109,14 +109,11 @@ def _compiled(image: Tensor, target: Tensor) -> bool:
     )
 
 
-class _Job(ctypes.Structure):
-    """Mirrors ``struct PhotometricJob`` of splat/kernels/photometric.h field by field."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("planes", "H", "W", "threads")),
-        *((name, ctypes.c_double) for name in ("l1", "l2", "ssim")),
-        *((name, ctypes.c_void_p) for name in ("image", "target", "d_image", "totals")),
-    )
+_Job = build.job_type(
+    ("planes", "H", "W", "threads"),
+    ("l1", "l2", "ssim"),
+    ("image", "target", "d_image", "totals"),
+)  # struct PhotometricJob of splat/kernels/photometric.h
 
 
 class _Photometric(torch.autograd.Function):

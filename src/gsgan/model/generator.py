@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.model import compiled
 from gsgan.utils.checks import one_of
 from gsgan.utils.tensors import derived
 
@@ -72,8 +71,6 @@ class Style(nn.Module):
         styles = style.permute(0, 2, 3, 1).flatten(1, 2)
         modulation = torch.baddbmm(modulation + self.from_map.bias, styles, weight)
         modulation = modulation.unflatten(1, rows.shape[1:3])
-        if compiled.has_style(rows, modulation):
-            return compiled.style(rows, modulation, NORM_FLOOR, SLOPE).permute(0, 3, 1, 2)
         gamma, beta = modulation.chunk(2, dim=-1)
         # In float32 at least: half precision loses squares above 256 and below 2e-4.
         wide = rows.to(torch.promote_types(h.dtype, torch.float32))

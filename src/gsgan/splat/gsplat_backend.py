@@ -8,7 +8,7 @@ Differences between gsplat and ``Accuracy``, which `given_up` describes:
 
 - Its cut-offs are those of `COMPILED_IN`, whatever the settings.
 - It stops a pixel one layer earlier, before the layer that would leave ``transmittance_min`` or
-  less. That layer's weight may be up to ``transmittance_min / (1 - alpha_max)``, see `_stop_loss`.
+  less. That layer's weight may be up to ``transmittance_min / (1 - alpha_max)``.
 - It computes in float32 throughout (the camera's position is subtracted in float64 before) with
   approximate exponentials: needles lose digits.
 - Gradients are summed in no fixed order: their last bits differ between runs.
@@ -60,14 +60,16 @@ def differences(settings: Accuracy, device: torch.device) -> list[str]:
     return [
         f"{name} is {value if isinstance(value, str) else f'{value:.6g}'}, not {want}"
         for name, value in have.items()
-        if not _equal(want := getattr(settings, name), value)
+        if not (
+            (want := getattr(settings, name)) == value
+            or (isinstance(value, float) and math.isclose(want, value, rel_tol=TOLERANCE))
+        )
     ]
 
 
 def given_up(settings: Accuracy, device: torch.device) -> str:
     """How gsplat's result differs from the settings, in one sentence."""
-    lost = _stop_loss(_measured_cap(device)[0] or 0.0)
-    found = [f"a stopped pixel may lack {lost:.2g} of its light", *differences(settings, device)]
+    found = ["it stops pixels one layer earlier", *differences(settings, device)]
     return (
         f"Drawing with gsplat, the fastest backend here; differences from the settings "
         f"{settings.name!r}: {'; '.join(found)}; backend=torch has none."
@@ -87,15 +89,6 @@ def unsuited(gaussians: Gaussians, camera: Camera) -> str:
     if torch.is_grad_enabled() and camera.K.requires_grad:
         return "gsplat has no gradient for Camera.K, which requires one."
     return ""
-
-
-def _stop_loss(cap: float) -> float:
-    """The largest share of light that a stopped pixel may lack, with alphas up to ``cap``.
-
-    A layer of alpha ``a`` stops the pixel where ``T (1 - a) <= transmittance_min``: it loses ``T``.
-    """
-    stop = float(COMPILED_IN["transmittance_min"])
-    return 1.0 if cap >= 1 else min(1.0, stop / (1 - cap))
 
 
 def draw(
@@ -210,9 +203,3 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
 
 
 _PROBE = Accuracy("probe", 1 / 255, 1e-4, "opacity", "float32")
-
-
-def _equal(a: float | str, b: float | str) -> bool:
-    if isinstance(a, str) or isinstance(b, str):
-        return a == b
-    return math.isclose(a, b, rel_tol=TOLERANCE)

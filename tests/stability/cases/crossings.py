@@ -1,7 +1,7 @@
 """Pose sequences through the singularities of the bone frames, with bounds on how fast frames turn.
 
 A frame whose baseline is ``h`` long turns by about ``step / h`` when a joint makes a step; so below
-``min_length`` (1 mm) it may turn by a few ``step / min_length``, and never by more: that is what
+`MIN_LENGTH` (1 mm) it may turn by a few ``step / MIN_LENGTH``, and never by more: that is what
 passing a singularity without a jump means. A path straight through the point where a baseline
 changes sign turns by half a turn within a few millimetres: fast, but not at once.
 """

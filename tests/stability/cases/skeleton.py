@@ -109,6 +109,7 @@ def frames_and_points(inputs: Inputs) -> dict[str, Tensor]:
     """All that is made of ``p [B, 33, 3]``: frames, points, pose code."""
     p, valid = inputs["p"], inputs.get("valid")
     frames = bone_frames(p, valid)
+    world = torch.eye(3).to(p).expand(len(p), 3, 3)
     points = few_points(p.dtype, p.device)(p, valid, frames)
     return {
         "hubs": frames.hubs,
@@ -118,7 +119,7 @@ def frames_and_points(inputs: Inputs) -> dict[str, Tensor]:
         "points": points.means,
         "sigmas": points.scales,
         "normals": points.normals,
-        "pose code": omega(p, valid, None, frame="world", frames=frames),
+        "pose code": omega(p, valid, world, frames=frames),
     }
 
 

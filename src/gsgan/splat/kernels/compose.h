@@ -7,7 +7,7 @@
 
 extern "C" {
 
-// Mirrors model/compiled.py's _GeometryJob. Rows of raw begin with RESIDUALS numbers: mean 3,
+// Mirrors model/compiled.py's _Job. Rows of raw begin with RESIDUALS numbers: mean 3,
 // quaternion 4, scale 3, opacity 1. Null gradients are zero.
 struct ComposeJob {
   int64_t count, threads;
