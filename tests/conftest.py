@@ -126,12 +126,16 @@ def tiny(compose, capture):
 @pytest.fixture
 def build(tiny):
     """(data, avatar, frame) of a tiny config: everything real, everything small."""
-    from gsgan.model.runs import build_avatar, build_data
+    from gsgan.model.assemble import build_avatar, build_data
 
     def run(*overrides: str):
         config = tiny(*overrides)
         data = build_data(config)
-        return data, build_avatar(config, data), data.dataset("train")[0]
+        return (
+            data,
+            build_avatar(config, data.info, data.labelled("train")),
+            data.dataset("train")[0],
+        )
 
     return run
 

@@ -14,9 +14,9 @@ from gsgan.data.files import frame_files
 from gsgan.data.formats.common import FolderReader, image_size, one_mask_each
 from gsgan.data.layout import Found, Meta
 from gsgan.data.skeletons import make_landmarks
+from gsgan.model.assemble import build_data
 from gsgan.model.body_points import SkinnedPoints
-from gsgan.model.painting import Painting
-from gsgan.model.runs import build_data
+from gsgan.model.rendering import Rendering
 from gsgan.scene import BodyPose, Frame, Gaussians
 from gsgan.train.run import build_training
 
@@ -64,7 +64,7 @@ class Smoothness(nn.Module):
         super().__init__()
         self.weight = weight
 
-    def forward(self, painting: Painting, frame: Frame) -> Tensor:
+    def forward(self, painting: Rendering, frame: Frame) -> Tensor:
         return self.weight * painting.image.diff(dim=-1).abs().mean()
 
 
@@ -130,7 +130,7 @@ def test_a_loss_term(tiny):
     losses = f"{{smooth: {{_target_: {HERE}.Smoothness, weight: 0.1}}}}"
     data, module = build_training(tiny(f"training.extra_losses={losses}"))
     frame = data.dataset("train")[0]
-    painting = module.avatar.paint(frame)
+    painting = module.avatar(*frame.inputs)
     terms = module.step_two_terms(painting, frame, None)
     expected = 0.1 * painting.image.diff(dim=-1).abs().mean()
     assert float(terms["smooth"]) == float(expected) > 0
@@ -140,10 +140,8 @@ def test_a_generator(build):
     keys = (
         "base",
         "multipliers",
-        "style",
         "style_share",
         "rgb_skip",
-        "output",
         "feature_bound",
         "patch",
     )
@@ -151,7 +149,7 @@ def test_a_generator(build):
         f"model.generator._target_={HERE}.OneLayer", *(f"~model.generator.{key}" for key in keys)
     )
     assert isinstance(avatar.generator, OneLayer)
-    assert avatar.paint(frame).image.shape == frame.image.shape
+    assert avatar(*frame.inputs).image.shape == frame.image.shape
 
 
 def test_a_splatting_baseline(tiny):
@@ -164,7 +162,7 @@ def test_a_splatting_baseline(tiny):
     data, module = build_training(config)
     frame = data.dataset("train")[0]
     painting = module.avatar(
-        frame.skeleton, frame.visibility, frame.camera, frame.body, paint=False
+        frame.skeleton, frame.visibility, frame.camera, frame.body, generate=False
     )
     module.step_one_loss(painting, frame).backward()
     assert float(module.avatar.surface.colour.grad.abs().max()) > 0

@@ -36,9 +36,9 @@ def test_painting_takes_as_many_operators_without_a_mouth_as_with_one(build, wit
     counts = []
     for overrides in ((), (f"data.root={without_mouth}",)):
         _, avatar, frame = build("effects=none", *overrides)
-        avatar.paint(frame)
+        avatar(*frame.inputs)
         with Calls() as seen, torch.no_grad():
-            avatar.paint(frame)
+            avatar(*frame.inputs)
         counts.append(seen.count)
     assert counts[0] == counts[1]
 

@@ -115,7 +115,7 @@ def test_bugs_keep_their_traceback_and_mistakes_get_a_sentence():
     ("override", "named"),
     [
         ("effects.view_dependence=7", "effects.view_dependence must be one of"),
-        ("model.generator.output=tanh", "output must be one of linear, sigmoid"),
+        ("model.generator.patch=3", "patch must be one of 1, 2, 4"),
         ("training.schedule.step_two=-1", "schedule.step_two must be a number of at least 0"),
         ("+model.densify.colour=1", "unexpected keyword argument 'colour'"),
         ("+model.generator.colour=1", "unexpected keyword argument 'colour'"),

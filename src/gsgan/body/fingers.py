@@ -57,8 +57,6 @@ class Fingers(nn.Module):
 
     Args:
         body: with hand landmarks, in the subject's shape.
-
-    Source: ours.
     """
 
     chains: Tensor  # [10, 4] landmarks of each finger, base to tip, the left hand's first

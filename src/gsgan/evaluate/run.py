@@ -39,14 +39,9 @@ from gsgan.evaluate.predictions import (
 from gsgan.evaluate.scores import Predict, Scorer, SplitScores, empty, painter, score_split
 from gsgan.metrics.lpips import lpips
 from gsgan.metrics.regions import BACKGROUNDS
-from gsgan.model.runs import (
-    CHECKPOINT,
-    Moved,
-    build_data,
-    load_avatar,
-    load_config,
-    read_checkpoint,
-)
+from gsgan.model.assemble import build_data
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import pick_device
@@ -87,7 +82,7 @@ def evaluate_config(config: DictConfig) -> Results:
 def evaluate_folder(config: DictConfig, console: Console, device: torch.device) -> Results:
     """Loads the avatar of ``config.run`` and scores it."""
     folder = Path(config.run).expanduser()
-    stored = load_config(folder, Moved.from_config(config))
+    stored = load_config(folder, DataPaths.from_config(config))
     data = build_data(stored)
     avatar, marks = load_avatar(folder, stored, data)
     state = read_checkpoint(folder / CHECKPOINT)["gsgan"]

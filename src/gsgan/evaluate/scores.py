@@ -37,7 +37,7 @@ from gsgan.metrics.regions import (
 )
 from gsgan.metrics.segmentation import confusion, miou
 from gsgan.model.avatar import Avatar
-from gsgan.model.painting import Painting
+from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
 
@@ -186,7 +186,7 @@ def painter(avatar: Avatar, *, solve: bool = False) -> Predict:
 
     def predict(frame: Frame, item: Item) -> Prediction:
         with torch.no_grad():
-            painting = avatar.paint(replace(frame, body=None) if solve else frame)
+            painting = avatar(*(replace(frame, body=None) if solve else frame).inputs)
         assert painting.image is not None
         images, alphas = {FULL: painting.image}, {FULL: painting.alpha}
         if painting.colour is not None:
@@ -254,7 +254,7 @@ class _Tally:
             images[name] = prepare.image(prediction, name, frame, box)
         if show:
             parts = prediction.segmentation
-            painting = Painting(images[FULL], corrected=images.get(SPLAT), segmentation=parts)
+            painting = Rendering(images[FULL], corrected=images.get(SPLAT), segmentation=parts)
             self.grid += grid_rows(replace(frame, image=target), painting)
         images[FLOOR] = torch.full_like(frame.image, prepare.background)
         for name, image in images.items():

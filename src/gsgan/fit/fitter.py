@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 import random
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from gsgan.body import Body, blend_transforms
 from gsgan.body.skinned import carry, vertex_normals
-from gsgan.fit.moments import Moments, around
+from gsgan.fit.frames import MaskedFrames, around
 from gsgan.model.body_points import SkinnedPoints, farthest_points, transformed
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians
 from gsgan.splat import Accuracy, rasterise
@@ -21,7 +20,6 @@ from gsgan.utils.errors import ConfigError
 
 BETAS = (0.9, 0.99)
 FINAL_RATE = 0.02  # of the learning rates, in the last sweep
-STATEFUL = ("surface", "moves", "surface_optimiser", "pose_optimiser")
 CONTROLS = 200  # points whose distances from the body the surface interpolates
 REACH = 0.06  # metres: the surface stays this close to the body
 SPREAD = 1.5  # of the controls' influence, in distances between them
@@ -117,19 +115,17 @@ class Fitter:
 
     Args:
         settings: see `Fit`.
-        moments: frames, images and skeletons.
+        frames: images and skeletons.
         body: of the person.
         start: F poses, solved from the skeletons.
         seed: of the order of frames and cameras.
-
-    Source: ours; as SMPL is fitted to silhouettes for published captures.
     """
 
     def __init__(
-        self, settings: Fit, moments: Moments, body: Body, start: BodyPose, seed: int = 0
+        self, settings: Fit, frames: MaskedFrames, body: Body, start: BodyPose, seed: int = 0
     ) -> None:
-        self.settings, self.moments, self.seed = settings, moments, seed
-        device = moments.device
+        self.settings, self.frames, self.seed = settings, frames, seed
+        device = frames.device
         self.surface = Surface(body.to(device), settings.points, settings.accuracy).to(device)
         self.start = start.to(device)
         self.bones = start.theta.shape[1]
@@ -141,7 +137,7 @@ class Fitter:
         fixed = [i for i, n in enumerate(body.joint_names) if n.startswith(("finger", "toe"))]
         scale[fixed] = 0
         self.scale = scale
-        self.weight = moments.visibility.clone()
+        self.weight = frames.visibility.clone()
         self.weight[:, list(LOOSE_LANDMARKS)] *= LOOSE
         self.surface_optimiser = torch.optim.Adam(
             self.surface.parameters(), settings.surface_rate, BETAS
@@ -181,7 +177,7 @@ class Fitter:
         for i in order:
             pose = self.pose(torch.tensor([i]))
             share, landmarks = self._share(i, pose, chance)
-            apart = (landmarks[0] - self.moments.skeletons[i]).square().sum(-1)
+            apart = (landmarks[0] - self.frames.skeletons[i]).square().sum(-1)
             robust = (1 + apart / settings.noise**2).sqrt() - 1
             turned = (pose.theta[0] - self.start.theta[i]) / ANGLE
             loss = (
@@ -214,17 +210,6 @@ class Fitter:
             by_frame.append(sum(ious) / len(ious) if ious else math.nan)
         return torch.tensor(by_frame)
 
-    def state_dict(self) -> dict[str, Any]:
-        """The state from which a later process can resume."""
-        parts = {name: getattr(self, name).state_dict() for name in STATEFUL}
-        return {**parts, "shaped": self.shaped, "swept": self.swept}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores a state."""
-        for name in STATEFUL:
-            getattr(self, name).load_state_dict(state[name])
-        self.shaped, self.swept = state["shaped"], state["swept"]
-
     def _share(self, i: int, pose: BodyPose, chance: random.Random) -> tuple[Tensor, Tensor]:
         """Wrong alpha as a share of the masks, and the posed landmarks."""
         frames = self._windows(i)
@@ -236,7 +221,7 @@ class Fitter:
         return torch.stack(wrong).sum() / area.clamp_min(1.0), landmarks
 
     def _windows(self, i: int) -> list[Frame]:
-        return [around(self.moments.skeletons[i], frame) for frame in self.moments.pictures(i)]
+        return [around(self.frames.skeletons[i], frame) for frame in self.frames.images(i)]
 
     def _set_rates(self) -> None:
         held = self.settings.hold * self.settings.sweeps

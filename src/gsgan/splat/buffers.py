@@ -65,13 +65,6 @@ def _take(size: int) -> NDArray[np.uint8] | None:
 
 
 def _give_back(memory: NDArray[np.uint8]) -> None:
-    same = _free.pop(memory.nbytes, None) or deque()
-    same.append(memory)
-    _free[memory.nbytes] = same  # sizes in the order of their last use
-    while kept() > KEPT:
-        for size, oldest in list(_free.items()):
-            try:
-                oldest.popleft()
-                break
-            except IndexError:  # all of this size are in use, or another thread was faster
-                _free.pop(size, None)
+    if kept() + memory.nbytes > KEPT:
+        _free.clear()
+    _free.setdefault(memory.nbytes, deque()).append(memory)

@@ -37,7 +37,6 @@ def composite(
     size: tuple[int, int],
     settings: Accuracy,
     want_depth: bool,
-    tiling: Tiling | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Blends ellipses front to back, ties by index.
 
@@ -46,7 +45,6 @@ def composite(
         size: (H, W) pixels.
         settings: alpha_min, transmittance_min, alpha_max, and the extent of ``projected``.
         want_depth: whether to blend depths too.
-        tiling: how the work is divided; by default suited to the device.
 
     Returns:
         features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``, depth ``[B, 1, H, W]`` or
@@ -54,7 +52,7 @@ def composite(
 
     Source: paper Sec. 3.1; Kerbl et al., 3D Gaussian splatting (tiles).
     """
-    tiling = tiling or Tiling.for_device(projected.means.device)
+    tiling = Tiling.for_device(projected.means.device)
     C = projected.features.shape[-1]
     # Depth and alpha are blended like features; the value of alpha is 1 in every layer.
     values = [projected.features, torch.ones_like(projected.features[..., :1])]

@@ -20,7 +20,7 @@ MARGIN = 0.25  # metres around the joints, as the avatar's windows: wider only c
 USUAL = 0.75  # quantile of the masks' areas that counts as usual: most may be nearly empty
 
 
-class Moments:
+class MaskedFrames:
     """Frames of a capture and their images by the training cameras.
 
     Held-out cameras are not used: their images are for evaluation only. Images without a person, or
@@ -66,11 +66,11 @@ class Moments:
         self.skeletons = self._stacked(layout.landmarks.p)
         self.visibility = self._stacked(layout.landmarks.visibility)
 
-    def pictures(self, i: int) -> list[Frame]:
+    def images(self, i: int) -> list[Frame]:
         """The images of the i-th frame, one per camera; ``unsure`` outside the camera's image."""
-        return [self._picture(place) for place in self._places[self.frames[i]]]
+        return [self._image(place) for place in self._places[self.frames[i]]]
 
-    def _picture(self, place: int) -> Frame:
+    def _image(self, place: int) -> Frame:
         frame, unseen = self.dataset[place], self._unseen.get(place)
         if unseen is not None:
             unsure = unseen.to(frame.mask.dtype)
@@ -90,8 +90,8 @@ class Moments:
             inside = self.dataset.inside(place)
             if inside is not None:
                 self._unseen[place] = inside < 0.5
-            picture = self._picture(place)
-            seen = around(picture.skeleton[0], picture)
+            image = self._image(place)
+            seen = around(image.skeleton[0], image)
             mask = seen.mask if seen.unsure is None else seen.mask * (1 - seen.unsure)
             depth = seen.camera.to_camera(seen.skeleton)[0, :, 2].median()
             pixel = (depth / seen.camera.K[0, 0, 0]).square()

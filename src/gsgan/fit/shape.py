@@ -37,9 +37,7 @@ SIZES, FARTHEST = (0.75, 1.35), 0.05  # a hand's, as a share of the body's; metr
 LENGTH_STEPS, STEPS, POSE_STEPS = 10, 8, 4
 
 
-def fit_shape(
-    skeletons: Tensor, visibility: Tensor, space: ShapeSpace[B] | None = None
-) -> BodyShape:
+def fit_shape(skeletons: Tensor, visibility: Tensor) -> BodyShape:
     """The shape of the person whose skeletons these are: deterministic, a second or two.
 
     First the lengths of limbs; then Gauss-Newton steps on the distances between the body's
@@ -49,14 +47,11 @@ def fit_shape(
     Args:
         skeletons: ``[F, 33, 3]`` metres; at most `FRAMES` of them are used.
         visibility: ``[F, 33]``; landmarks at 0, and those not finite, are not used.
-        space: None for the free body's.
 
     Raises:
         DataError: when no frame shows enough of shoulders, hips and limbs.
-
-    Source: ours.
     """
-    reduced = _without_surface(free_space()) if space is None else _without_surface(space)
+    reduced = _without_surface(free_space())
     p, seen = _usable(skeletons, visibility)
     x = _fit_lengths(reduced, p, seen)
     found = vars(_fit_landmarks(reduced, x, p, seen))
@@ -79,8 +74,6 @@ def fit_hands(
         The shape; as it was where no frame shows a hand. The hinge and place of a hand stay the
         body's where no frame shows it with its forearm, or where they differ by more than
         `FARTHEST`.
-
-    Source: ours.
     """
     shape, hands = replace(shape, hands=None), skeletons[:, BODY:]
     seen = (visibility[:, BODY:] > 0) & hands.isfinite().all(-1)
