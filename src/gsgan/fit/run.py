@@ -90,9 +90,9 @@ def standard_settings() -> DictConfig:
     folder = config_folder()
     settings = OmegaConf.load(folder / "fit" / "standard.yaml")
     accuracy = OmegaConf.load(folder / "accuracy" / "standard.yaml")
-    del settings["defaults"]
     merged = OmegaConf.merge({"accuracy": accuracy}, settings)
     assert isinstance(merged, DictConfig)
+    del merged["defaults"]
     return merged
 
 
