@@ -134,6 +134,7 @@ def test_levels_put_parents_first():
     ("name", "arguments"),
     [
         ("rotations", (CHAIN, (-1, 0, 1), torch.zeros(1, 2, 3, 3), torch.zeros(1, 3))),
+        ("transl", (CHAIN, (-1, 0, 1), torch.zeros(2, 3, 3, 3), torch.zeros(1, 3))),
     ],
 )
 def test_wrong_shapes_name_the_argument(name, arguments):

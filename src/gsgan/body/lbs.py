@@ -89,13 +89,18 @@ def forward_kinematics(
         ``[B, J, 4, 4]``: a rest point x moves rigidly with bone j to ``T[:, j] @ (x, 1)``.
 
     Raises:
-        ValueError: when the rotations are of another number of joints.
+        ValueError: when the shape of rotations or transl does not match.
     """
     J = len(parents)
     if rotations.ndim != 4 or rotations.shape[1:] != (J, 3, 3):
         raise ValueError(
             f"forward_kinematics: rotations must have shape [B, {J}, 3, 3], "
             f"got {list(rotations.shape)}"
+        )
+    if transl.shape != (len(rotations), 3):
+        raise ValueError(
+            f"forward_kinematics: transl must have shape [{len(rotations)}, 3], "
+            f"got {list(transl.shape)}"
         )
     R, position = _accumulate(joints, parents, rotations, transl)
     shift = position - (R @ joints.unsqueeze(-1)).squeeze(-1)

@@ -26,7 +26,8 @@ from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.hands import HAND, WRIST
 from gsgan.utils.errors import DataError
 
-# What each group's stretch scales: along the limb, or all of the part. Left and right share it.
+# Groups of bones with one stretch each, shared by left and right: limbs are scaled along their
+# axis, other parts in all directions.
 LIMBS = ("upper_arm", "forearm", "thigh", "shank")
 STRETCHED = (*LIMBS, "hand", "foot", "head", "trunk")
 GROUPS = {  # by the joint's name in the free body | in SMPL's family; the others are the trunk's
@@ -50,11 +51,11 @@ class BodyShape:
 
     Args:
         coefficients: ``[K]`` of the shape space, in standard deviations; SMPL's betas.
-        stretch: ``[8]`` factors by group, in the order of `STRETCHED`; 1 leaves it as it is.
+        stretch: ``[8]`` factors by group, in the order of `STRETCHED`; 1 changes nothing.
         offsets: ``[33, 3]`` metres at rest, from the body's landmarks to where this person's
             skeletons have them: detectors and rigs define joints differently. None means zero.
-        hands: ``[2, 2, 3]`` metres at rest, of left and right: how far the person's wrist is from
-            the body's, and by how much the hand beyond it moves. None means as the body has them.
+        hands: ``[2, 2, 3]`` metres at rest, left and right: the offset of the person's wrist from
+            the body's, and of the rest of the hand. None means zero.
 
     Raises:
         ValueError: on wrong shapes.

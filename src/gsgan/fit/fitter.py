@@ -1,4 +1,4 @@
-"""Registration to silhouettes: one surface for all frames, a pose of the body for each."""
+"""Registration of a body to silhouettes: one surface for all frames, one pose per frame."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CONTROLS = 200  # points whose distances from the body the surface interpolates
 REACH = 0.06  # metres: the surface stays this close to the body
 SPREAD = 1.5  # of the controls' influence, in distances between them
 SIGMA, OPACITY = 0.7, 0.95  # standard deviation as a share of the points' spacing
-LOOSE = 0.25  # weight of landmarks of face and palm, which detectors and bodies define differently
+LOOSE = 0.25  # weight of landmarks of face and palm, whose definitions differ
 LOOSE_LANDMARKS = (*range(11), *range(17, 23))
 ANGLE = 0.1  # radians of a joint's turn that cost as much as a landmark `noise` away
 
@@ -62,10 +62,10 @@ class Fit:
 
 
 class Surface(nn.Module):
-    """Gaussians on a body's vertices, moved along their normals alike in all frames (clothes).
+    """Gaussians on a body's vertices, moved along the normals by the same distance in each frame.
 
-    Such a surface cannot absorb errors of a pose: where it does not fill the masks, the pose is
-    wrong.
+    The distances represent clothes. Because all frames share them, they cannot absorb the error of
+    a pose: where the surface does not fill the masks, the pose is wrong.
 
     Args:
         body: of the person.
@@ -109,7 +109,7 @@ class Surface(nn.Module):
 class Fitter:
     """Turns a body's joints until its surface fills the masks of all cameras.
 
-    A frame's loss is the alpha that differs from the mask as a share of the mask's area, plus two
+    A frame's loss is the difference of alpha and mask as a share of the mask's area, plus two
     priors: landmarks stay near the skeleton's, and joints near the solved pose. Colours are not
     used.
 
@@ -131,7 +131,7 @@ class Fitter:
         self.bones = start.theta.shape[1]
         self.moves = nn.Embedding(len(start.theta), 3 * self.bones + 3, sparse=True).to(device)
         nn.init.zeros_(self.moves.weight)
-        # transl moves by less than angles: one rate for both, and a scale
+        # translations have a smaller rate than angles: one rate for both, and a scale
         scale = torch.ones(self.bones + 1, 1, device=device)
         scale[-1] = settings.transl_rate / settings.angle_rate
         fixed = [i for i, n in enumerate(body.joint_names) if n.startswith(("finger", "toe"))]
@@ -194,8 +194,8 @@ class Fitter:
 
     @torch.no_grad()
     def overlap(self, poses: BodyPose) -> Tensor:
-        """``[F]`` intersection over union of alpha and mask, mean over a frame's images; NaN where
-        all are empty."""
+        """``[F]``: mean intersection over union of alpha and mask over a frame's images; NaN where
+        all images are empty."""
         by_frame = []
         for i in range(len(poses.theta)):
             person, _ = self.surface.posed(BodyPose(poses.theta[i][None], poses.transl[i][None]))

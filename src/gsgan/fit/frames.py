@@ -15,22 +15,22 @@ from gsgan.data.dataset import CaptureDataset, ImageCache
 from gsgan.scene import Frame, body_window
 from gsgan.utils.errors import DataError
 
-NEAR = 0.01  # metres: nearer joints have no place in the image
-MARGIN = 0.25  # metres around the joints, as the avatar's windows: wider only costs time
-USUAL = 0.75  # quantile of the masks' areas that counts as usual: most may be nearly empty
+NEAR = 0.01  # metres: nearer joints are not projected
+MARGIN = 0.25  # metres around the joints, as in the avatar's windows: a wider margin costs time
+USUAL = 0.75  # quantile of the masks' areas that counts as usual: most masks may be nearly empty
 
 
 class MaskedFrames:
     """Frames of a capture and their images by the training cameras.
 
-    Held-out cameras are not used: their images are for evaluation only. Images without a person, or
-    nearly so, are left out, and frames without any other image.
+    Held-out cameras are not used: their images are for evaluation only. Images with an empty or
+    nearly empty mask are left out, and so are frames without any other image.
 
     Args:
         data: the capture.
         device: of the images.
-        least_mask: least share of the usual mask area.
-        held_out: whether frames of held-out poses are used, too.
+        least_mask: minimum share of the usual mask area.
+        held_out: whether to use frames of held-out poses too.
 
     Raises:
         DataError: when no image is left.
@@ -80,10 +80,11 @@ class MaskedFrames:
         return frame.to(self.device)
 
     def _usable(self, least: float) -> list[int]:
-        """Positions of the images whose masks hold enough of the person; also finds borders.
+        """Positions of the images whose masks hold enough of the person; also finds the pixels
+        outside the camera's image.
 
-        Areas are of the compared part, in square metres at the person: a mask shrinks with the
-        distance, and other persons are elsewhere in the image.
+        Areas are of the part that is compared, in square metres at the person's depth: masks
+        shrink with the distance, and the rest of an image may show other persons.
         """
         areas = []
         for place in range(len(self.dataset)):

@@ -91,9 +91,9 @@ def standard_settings() -> DictConfig:
     settings = OmegaConf.load(folder / "fit" / "standard.yaml")
     assert isinstance(settings, DictConfig)
     accuracy = OmegaConf.load(folder / "accuracy" / "standard.yaml")
-    del settings["defaults"]
     merged = OmegaConf.merge({"accuracy": accuracy}, settings)
     assert isinstance(merged, DictConfig)
+    del merged["defaults"]
     return merged
 
 
@@ -106,11 +106,11 @@ def fit_body(
     shown: int = 4,
     overwrite: bool = False,
 ) -> Path:
-    """Shape from skeletons, poses solved from skeletons, then registered to the masks.
+    """Fits the shape to the skeletons, solves the poses from them and registers them to the masks.
 
-    The registered poses determine where on the body this person's landmarks are; hand landmarks
-    determine the size and place of the hands. With these all poses are solved again, and written
-    unless the settings keep registered ones.
+    Registered poses determine where on the body this person's landmarks are; hand landmarks, the
+    size and place of the hands. With these all poses are solved again, and written unless the
+    settings keep registered ones.
 
     Args:
         data: a capture.
@@ -118,8 +118,8 @@ def fit_body(
         out: folder to write into; None for the capture's own.
         seed: of the order of frames and cameras.
         device: of the images; None for the CPU.
-        shown: frames in the image.
-        overwrite: whether files of an earlier fit are replaced.
+        shown: number of frames in the image.
+        overwrite: whether to replace the files of an earlier fit.
 
     Returns:
         The folder.
@@ -134,6 +134,7 @@ def fit_body(
     if frames.left_out:
         console.print(f"{frames.left_out} images with empty masks, or nearly so, are left out")
     rows = torch.tensor([layout.frames.index(frame) for frame in frames.frames])
+
     with console.status("solving poses"):
         shape = fit_shape(*_joints(data, data.trained))
         start = _of_rows(_solve_with_fingers(data, shape), rows)
@@ -164,10 +165,10 @@ def fit_body(
 
 def _folder(out: Path, overwrite: bool) -> Path:
     attempt = out / ".body_fit.try"
-    with writing(out):  # before minutes of work, not after
+    with writing(out):  # fails before minutes of work, not after
         out.mkdir(parents=True, exist_ok=True)
         write_atomically(attempt, b"")
-        attempt.unlink(missing_ok=True)  # runs in parallel try alike
+        attempt.unlink(missing_ok=True)  # another fit may have removed it
     if (out / POSES).exists():
         if not (out / SHAPE).exists():
             raise ConfigError(
@@ -205,7 +206,7 @@ def _write_body(
             theta[:, fingers] = solved.theta[:, fingers]
         name = "_hands" if hands else ""
         arrays |= {f"theta{name}": theta.numpy(), f"transl{name}": transl.numpy() / unit}
-    with writing(folder / POSES):  # a fit that is killed here leaves no poses of another shape
+    with writing(folder / POSES):  # if killed here, the fit leaves no poses of another shape
         (folder / POSES).unlink(missing_ok=True)
     write_npz(folder / SHAPE, **shape.arrays())
     write_npz(
@@ -232,7 +233,7 @@ def _joints(data: GsganData, frames: Sequence[int], hands: bool = False) -> tupl
 def _solve(
     data: GsganData, shape: BodyShape, frames: Sequence[int], hands: bool = False
 ) -> BodyPose:
-    """Poses by skeletons with or without hands."""
+    """The poses of the frames, solved from skeletons with or without hands."""
     try:
         with torch.no_grad():
             return Solver(shaped_body(shape)).solve(*_joints(data, frames, hands))
@@ -262,8 +263,10 @@ def _fingers(shape: BodyShape) -> list[int]:
 def _refined(
     data: GsganData, shape: BodyShape, frames: Sequence[int], registered: BodyPose
 ) -> BodyShape:
-    """The shape with the landmarks that this person has in registered poses, so that solving
-    approximates registration, up to what varies between frames; and with the person's hands."""
+    """The shape with this person's landmarks in registered poses, and with the person's hands.
+
+    Poses solved with it approximate the registered ones, except for what varies between frames.
+    """
     offsets = fit_offsets(shape, registered, *_joints(data, frames))
     shape = replace(shape, offsets=offsets)
     if data.layout.hands is None:
@@ -271,7 +274,7 @@ def _refined(
     p, seen = _joints(data, frames, hands=True)
     shape = fit_hands(shape, _solve(data, shape, frames), p, seen)
     by_hands = _solve(data, shape, frames, hands=True)
-    used = torch.zeros(len(p), len(offsets))  # the landmarks that 33 have of placed hands
+    used = torch.zeros(len(p), len(offsets))  # of the 33 landmarks, those on placed hands
     for side, rows in enumerate(ON_HANDS):
         used[:, rows] = seen[:, rows] * Fingers.placed(seen[:, len(offsets) :] > 0)[:, [side]]
     return replace(shape, offsets=fit_offsets(shape, by_hands, p[:, : len(offsets)], used))

@@ -1,4 +1,4 @@
-"""A person's shape from skeletons: `fit_shape`; its hands and landmarks in known poses."""
+"""Fits a person's shape to skeletons, and its hands and landmarks to known poses."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from gsgan.skeleton import MEDIAPIPE33, sanitise
 from gsgan.skeleton.hands import HAND, HAND_EDGES, WRIST
 from gsgan.utils.errors import DataError
 
-FRAMES = 24  # are enough: every frame shows the same lengths
+FRAMES = 24  # at most: every frame shows the same lengths
 # Standard deviations of the prior: coefficients have 1.
 STRETCH, OFFSET = 0.1, 0.015  # of a stretch's logarithm; metres
-# Distances of landmarks that no pose changes, or hardly, and those that poses do change; and the
-# standard deviation of their logarithm in the first guess.
+# Pairs of landmarks whose distance hardly depends on the pose, and pairs whose distance does; and
+# the standard deviations of the distance's logarithm in the first guess.
 RIGID = (
     "shoulder elbow, elbow wrist, hip knee, knee ankle, ankle heel, ankle foot_index, "
     "heel foot_index, wrist pinky, wrist index, pinky index, nose ear, nose eye, ear eye"
@@ -30,7 +30,7 @@ RIGID = (
 LOOSE = "shoulder hip, ear shoulder"
 ACROSS = "shoulder, hip, ear, eye, mouth"
 SURE, UNSURE = 0.04, 0.1
-# Frames repeat the same systematic errors: all of them count as this many.
+# Effective number of independent frames: systematic errors are the same in all of them.
 INDEPENDENT = 4.0
 FOREARMS = [[13, 15], [14, 16]]  # elbow and wrist
 SIZES, FARTHEST = (0.75, 1.35), 0.05  # a hand's, as a share of the body's; metres
@@ -40,9 +40,9 @@ LENGTH_STEPS, STEPS, POSE_STEPS = 10, 8, 4
 def fit_shape(skeletons: Tensor, visibility: Tensor) -> BodyShape:
     """The shape of the person whose skeletons these are: deterministic, a second or two.
 
-    First the lengths of limbs; then Gauss-Newton steps on the distances between the body's
-    landmarks, posed as `Solver` does, and the skeletons', in which the poses follow the shape; with
-    a Gaussian prior on coefficients, stretches and offsets.
+    The lengths of limbs are fitted first. Gauss-Newton steps then minimise the distances between
+    the landmarks of the body, posed by `Solver`, and those of the skeletons; the poses follow the
+    shape. Coefficients, stretches and offsets have a Gaussian prior.
 
     Args:
         skeletons: ``[F, 33, 3]`` metres; at most `FRAMES` of them are used.
@@ -61,8 +61,9 @@ def fit_shape(skeletons: Tensor, visibility: Tensor) -> BodyShape:
 def fit_hands(
     shape: BodyShape, poses: BodyPose, skeletons: Tensor, visibility: Tensor
 ) -> BodyShape:
-    """The free body's shape with the person's hands: their size, their hinge and their place on the
-    forearms; `fit_shape` sees three landmarks of a hand.
+    """The shape with the person's hands: their size, wrists and places on the forearms.
+
+    `fit_shape` uses three landmarks of each hand only.
 
     Args:
         shape: of the person.
@@ -71,13 +72,13 @@ def fit_hands(
         visibility: ``[F, 75]``; landmarks at 0 are not used.
 
     Returns:
-        The shape; as it was where no frame shows a hand. The hinge and place of a hand stay the
-        body's where no frame shows it with its forearm, or where they differ by more than
+        The shape, unchanged where no frame shows a hand. The wrist and place of a hand stay the
+        body's where no frame shows the hand with its forearm, or where they would move by more than
         `FARTHEST`.
     """
     shape, hands = replace(shape, hands=None), skeletons[:, BODY:]
     seen = (visibility[:, BODY:] > 0) & hands.isfinite().all(-1)
-    # Not the wrist: definitions of it differ most.
+    # Without the wrist, whose definitions differ most.
     bones = torch.tensor([edge for edge in HAND_EDGES if WRIST not in edge])
     first, last = torch.cat([bones, bones + HAND]).mT
     length = (hands[:, last] - hands[:, first]).norm(dim=-1)
@@ -108,8 +109,9 @@ def fit_hands(
 
 
 def fit_offsets(shape: BodyShape, poses: BodyPose, skeletons: Tensor, visibility: Tensor) -> Tensor:
-    """``[33, 3]`` metres: offsets with which a body in these poses has the person's landmarks:
-    medians over frames. Landmarks that no frame shows keep the shape's.
+    """``[33, 3]`` metres: offsets that give a body in these poses the person's landmarks.
+
+    Convention: medians over frames; landmarks that no frame shows keep the shape's offsets.
 
     Args:
         shape: of the person.
@@ -131,8 +133,8 @@ def _at_rest(R: Tensor, t: Tensor, points: Tensor) -> Tensor:
 
 
 def _usable(skeletons: Tensor, visibility: Tensor) -> tuple[Tensor, Tensor]:
-    """Frames that show the trunk, or without any the shoulders, evenly spaced, completed:
-    ``[f, 33, 3]`` and ``[f, 33]``."""
+    """Completed skeletons ``[f, 33, 3]`` and ``[f, 33]`` of evenly spaced frames that show the
+    trunk, or the shoulders if none does."""
     seen = (visibility > 0) & skeletons.isfinite().all(-1)
     for trunk in (MEDIAPIPE33.torso, MEDIAPIPE33.shoulders):
         if frames := seen[:, trunk].all(-1).nonzero().flatten().tolist():
@@ -223,7 +225,7 @@ def _fit_lengths(space: ShapeSpace[MarkedBody], p: Tensor, seen: Tensor) -> Tens
 
 
 def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Tensor) -> BodyShape:
-    """Shape and poses together; each pose's numbers are eliminated from the normal equations."""
+    """Fits shape and poses together; the poses are eliminated from the normal equations."""
     shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
     p = p - shift
     prior, share = _prior(space), min(1.0, INDEPENDENT / len(p))
@@ -231,6 +233,7 @@ def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Te
     symmetric = torch.func.jacfwd(partial(_offsets, space))(x[own:])
     held: tuple[Tensor, Tensor] | None = None
     for _ in range(STEPS):
+        # the poses of the current shape, and their normal equations
         with torch.no_grad():
             solver = Solver(space.shaped(_shape(space, x)))
             weight = solver.weights(seen)
@@ -240,10 +243,12 @@ def _fit_landmarks(space: ShapeSpace[MarkedBody], x: Tensor, p: Tensor, seen: Te
             at = solver.linear(q, root, p)
             _, g, H, w = solver.normal(q, at, weight)
 
+        # derivatives of the posed landmarks by the shape
         posed = partial(_posed, space, solver, q, root)
         by_body = torch.func.jacfwd(posed)(x[:own], x[own:])
         turned = solver.transforms(q, root, solver.joints)[:, solver.carrier, :3, :3]
         by_shape = torch.cat([by_body, turned @ symmetric], dim=-1).flatten(1, 2)  # [F, 99, S]
+        # the shape's normal equations after eliminating every pose
         w3 = w.repeat_interleave(3, dim=1).unsqueeze(-1)
         J = at.by_number.flatten(2).mT
         cross = J.mT @ (w3 * by_shape)

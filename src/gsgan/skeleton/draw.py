@@ -65,10 +65,10 @@ def draw_skeleton(
     ends = _segment_ends(template, p.device)
     shown = (drawn.index_select(1, ends[0]) & drawn.index_select(1, ends[1])).unsqueeze(-1)
     a, b = (pixels.index_select(1, end) for end in ends)
-    # masked before the arithmetic: pixels of unseen joints may be anything
+    # masked before the arithmetic: pixels of unseen joints are arbitrary
     a, b = torch.where(shown, a, 0.0), torch.where(shown, b, 0.0)
     distance2 = _distance2(a, b, shown, camera.size, [len(g) for _, g in template.draw_groups])
-    # below the bound the value is exactly zero: denormals would slow down everything that follows
+    # zero below the bound: denormal numbers would slow down all later operations
     exponent = (distance2 * (-0.5 / sigma**2)).clamp_min(MIN_EXPONENT)
     return exponent.exp() - math.exp(MIN_EXPONENT)
 

@@ -57,7 +57,7 @@ def sanitise(
     template: SkeletonTemplate = MEDIAPIPE33,
     body_height: Tensor | float | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Fills in unseen joints, and marks them.
+    """Fills in unseen joints and marks them.
 
     Convention: metres, world frame. A joint is unseen when a coordinate is NaN or infinite or its
     visibility is not above 0. One missing shoulder or hip is completed from the
@@ -105,8 +105,8 @@ def complete_skeleton(
 ) -> tuple[Tensor, Tensor]:
     """Joints ``[B, J, 3]`` of a template, finite, and their visibility ``[B, J]``, 0 for stand-ins.
 
-    Convention: hands and a face that a skeleton lacks are not seen; those a template lacks are left
-    out.
+    Convention: hands and a face that only the template has are marked as unseen; those that only
+    the skeleton has are left out.
 
     Args:
         skeleton: ``[J, 3]`` or ``[B, J, 3]`` metres; NaN for joints not seen.
@@ -208,7 +208,7 @@ def _filled(
         bone = (now @ at_rest.mT @ (c.rest[ends] - c.rest[starts]).unsqueeze(-1)).squeeze(-1)
         q = _put(q, valid, ends, q[:, starts] + bone * scale[:, None, None])
         if bare := [limb for limb in limbs if limb in template.bare]:
-            # the same bone under two names, as from elbow to wrist: both end at the same place
+            # two limbs for one bone, as from elbow to wrist: both end at the same place
             twins = [_twin(template, limb) for limb in bare]
             q = _put(q, valid, c.ends[bare], q[:, c.ends[twins]])
     return torch.where(valid.unsqueeze(-1), p, q + root)
@@ -239,8 +239,11 @@ def _complete_trunk(q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: 
 def _complete_face(
     q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: Tensor, scale: Tensor
 ) -> Tensor:
-    """Unseen face joints: the rest face aligned with the seen ones, else with the shoulders. Then
-    unseen landmarks of lips, brows and lids, at rest, in metres: they are the subject's own."""
+    """Places unseen joints of the face: the rest face, aligned with the seen joints, else with the
+    shoulders; then unseen landmarks of lips, brows and lids, at rest.
+
+    These landmarks are not scaled: the template has the subject's own, in metres.
+    """
     frames = bone_frames(q, valid, template)
     face = torch.tensor(template.face, device=q.device)
     seen = valid[:, face].to(q.dtype).unsqueeze(-1)

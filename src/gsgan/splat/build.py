@@ -37,7 +37,7 @@ BASE_FLAGS = (
     *("-std=c++17", "-O3", "-fPIC", "-shared", "-fopenmp-simd"),
     *("-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"),
 )
-# Tried in this order: some compilers lack OpenMP (Apple's clang), some the flags for this CPU.
+# Tried in this order: some compilers have no OpenMP (Apple's clang) or no flags for this CPU.
 _NATIVE_FLAGS = (
     ("-march=native", "-mprefer-vector-width=512", "-fopenmp"),
     ("-march=native", "-fopenmp"),
@@ -59,7 +59,7 @@ _LOCK = threading.Lock()
 
 
 class Unavailable(Exception):
-    """The kernel cannot be used; the message is one sentence with the reason."""
+    """Raised when the kernel cannot be used; the message gives the reason in one sentence."""
 
 
 def library() -> tuple[ctypes.CDLL | None, str]:
@@ -187,7 +187,7 @@ def _version(command: list[str]) -> str:
 
 
 def _cpu() -> str:
-    """The meaning of -march=native here: different machines may share a home folder."""
+    """What -march=native depends on: different machines may share a home folder."""
     lines = [platform.machine(), platform.processor()]
     info = Path("/proc/cpuinfo")
     if info.is_file():

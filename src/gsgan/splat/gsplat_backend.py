@@ -143,7 +143,7 @@ def draw(
 def _shapes(gaussians: Gaussians) -> dict[str, Tensor | None]:
     """The arguments for the Gaussians' shapes."""
     if gaussians.covariances is not None:
-        # gsplat reads the upper triangle; ours uses the symmetric part.
+        # gsplat reads the upper triangle; the other backends use the symmetric part.
         covariances = gaussians.covariances.float()
         return {"quats": None, "scales": None, "covars": (covariances + covariances.mT) / 2}
     assert gaussians.quats is not None

@@ -38,8 +38,10 @@ _Job = build.job_type(
 
 
 def available() -> bool:
-    """Whether the kernel can be used here; the first call may compile it (seconds). Programs that
-    ``torch.export`` records do not have it."""
+    """Whether the kernel can be used; the first call may compile it (seconds).
+
+    It is not available to programs that ``torch.export`` records.
+    """
     return not torch.compiler.is_compiling() and build.library()[0] is not None
 
 

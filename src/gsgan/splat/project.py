@@ -65,7 +65,7 @@ def project(gaussians: Gaussians, camera: Camera, settings: Accuracy) -> Project
     """
     dtype = torch.promote_types(gaussians.means.dtype, settings.torch_dtype)
     wide = torch.float64 if gaussians.means.device.type != "mps" else dtype
-    # Here the N Gaussians are the last dimension: contiguous vectors, few large operations.
+    # The N Gaussians are the last dimension here: contiguous vectors, few large operations.
     K, R, t = camera.K.to(wide), camera.R.to(wide), camera.t.to(wide)
     x_cam = R @ gaussians.means.to(wide).mT + t.unsqueeze(-1)
     in_front = x_cam.detach()[:, 2] > settings.near
