@@ -25,7 +25,7 @@ from gsgan.evaluate.run import make_scorer
 from gsgan.fit import run as running
 from gsgan.fit.fitter import Fitter, _wrong
 from gsgan.fit.moments import Moments
-from gsgan.fit.run import DEFAULT, run_fit
+from gsgan.fit.run import fit_before_training, run_fit, standard_settings
 from gsgan.scene import BodyPose
 from gsgan.train.run import pose_corrections, training_record
 from gsgan.utils.errors import ConfigError, DataError
@@ -153,8 +153,15 @@ def test_unseen_joints(fit, people, tmp_path):
 
 
 def test_defaults_are_those_of_the_config(compose):
-    given = instantiate(compose("fit").fit)
-    assert given == DEFAULT
+    assert instantiate(compose("fit").fit) == instantiate(standard_settings())
+
+
+def test_a_fit_before_training_returns_the_data_with_its_poses(people, compose, tmp_path):
+    data = GsganData(str(shutil.copytree(people, tmp_path / "plain")), size=48)
+    assert data.lacks_body
+    data = fit_before_training(data, compose("fit", *QUICK, "fit.sweeps=1").fit)
+    assert not data.lacks_body
+    assert data.layout.poses.fitted
 
 
 def test_held_out_cameras_are_not_used(fit, fitted, people, tmp_path):

@@ -39,7 +39,7 @@ def head_turned(p: Tensor, seed: int = 1) -> Tensor:
 
 
 def code_of(p: Tensor) -> Tensor:
-    found = face_code(p, bone_frames(p, None, T), T)
+    found = face_code(p, bone_frames(p, None, T).head, T)
     assert found is not None
     return found
 
@@ -72,7 +72,7 @@ def test_the_face_continues_the_poses_own() -> None:
 def test_a_face_at_rest_has_the_code_zero_however_the_head_is_turned() -> None:
     p = head_turned(REST) @ rotation(2).mT + 3.0
     torch.testing.assert_close(code_of(p), torch.zeros(1, 30, 3, dtype=F64), atol=1e-10, rtol=0)
-    assert face_code(p[:, :33], bone_frames(p[:, :33]), MEDIAPIPE33) is None
+    assert face_code(p[:, :33], bone_frames(p[:, :33]).head, MEDIAPIPE33) is None
 
 
 def test_a_lip_that_moves_by_5_mm_changes_the_code_by_1() -> None:

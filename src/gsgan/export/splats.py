@@ -98,7 +98,7 @@ def _posed(
     frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
     points = avatar.points(p, valid, frames, body)
     root = root_of(p)
-    face = face_code(p, frames, avatar.template)
+    face = face_code(p, frames.head, avatar.template)
     code = psi.pose_code(p, root, frames.hubs[:, 0], None, face)
     residuals = psi.residuals(points, code, root)
     return psi.compose(points, residuals, eye), residuals.sh, points.frames

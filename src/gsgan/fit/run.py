@@ -8,6 +8,7 @@ import io
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 import torch
 from hydra.utils import instantiate
 from numpy.typing import NDArray
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from torch import Tensor
 
@@ -36,8 +37,8 @@ from gsgan.fit.moments import Moments
 from gsgan.prepare.pictures import sampled
 from gsgan.scene import BodyPose, Frame
 from gsgan.skeleton import MEDIAPIPE33, TEMPLATES
-from gsgan.splat import accuracy
 from gsgan.utils.checks import whole
+from gsgan.utils.config import config_folder
 from gsgan.utils.console import make_console, progress
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically, write_json, write_npz, writing
@@ -46,7 +47,6 @@ from gsgan.utils.tensors import pick_device
 
 REPORT, SHEET, STOPPED = "body_fit.json", "body_fit.png", ".body_fit.stopped"
 PICTURE, MARGIN = 128, 0.2  # pixels; metres round the person
-DEFAULT = Fit(replace(accuracy("standard"), low_pass=0.0833))  # as conf/fit/standard.yaml
 TILE = 300  # pixels
 GREEN, ORANGE, BLUE = (60, 200, 60), (255, 140, 0), (60, 140, 255)
 BAR = (70, 70, 70)
@@ -70,8 +70,15 @@ def run_fit(config: DictConfig) -> Path:
     return fit_body(data, settings, out, config.seed, device, config.shown, config.overwrite)
 
 
-def fit_before_training(data: GsganData) -> None:
-    """Fits the body of a capture that has no body pose, with the settings of ``conf/fit``.
+def fit_before_training(data: GsganData, settings: DictConfig | None = None) -> GsganData:
+    """Fits the body of a capture that has no body poses.
+
+    Args:
+        data: the capture.
+        settings: the config group ``fit``; None for conf/fit/standard.yaml.
+
+    Returns:
+        The data, which reads the capture again, with the new poses.
 
     Raises:
         DataError: when the masks hold no person, or the folder is read-only.
@@ -85,7 +92,23 @@ def fit_before_training(data: GsganData) -> None:
         skeleton=data.skeleton,
         **data.split_keys,
     )
-    fit_body(seen, DEFAULT, device=pick_device("auto"))
+    chosen: Fit = instantiate(standard_settings() if settings is None else settings)
+    fit_body(seen, chosen, device=pick_device("auto"))
+    for name, attribute in vars(GsganData).items():
+        if isinstance(attribute, cached_property):
+            vars(data).pop(name, None)
+    return data
+
+
+def standard_settings() -> DictConfig:
+    """The config group ``fit`` as conf/fit/standard.yaml has it."""
+    folder = config_folder()
+    settings = OmegaConf.load(folder / "fit" / "standard.yaml")
+    accuracy = OmegaConf.load(folder / "accuracy" / "standard.yaml")
+    del settings["defaults"]
+    merged = OmegaConf.merge({"accuracy": accuracy}, settings)
+    assert isinstance(merged, DictConfig)
+    return merged
 
 
 def fit_body(

@@ -304,7 +304,7 @@ class Avatar(nn.Module):
             return None
         points = self.points(p, valid, frames, body)
         with self.stage("Ψ"):
-            face = face_code(p, frames, self.template)
+            face = face_code(p, frames.head, self.template)
             given = points, camera.centre, frames.hubs[:, 0], pose_noise, face
             return self.deformation(p, *given)  # Sec. 3.3: Ĝ = G + Ψ(p)
 
@@ -389,7 +389,7 @@ class Avatar(nn.Module):
         with self.stage("Ω"):
             root = root_of(p, self.template).unsqueeze(1)
             in_camera = (p - root) @ camera.R.mT / self.body_height
-            if (face := face_code(p, frames, self.template)) is not None:
+            if (face := face_code(p, frames.head, self.template)) is not None:
                 in_camera = torch.cat([in_camera[:, : -face.shape[1]], face], dim=1)
             return omega(p, valid, camera.R, self.template, frames=frames), in_camera
 

@@ -46,6 +46,11 @@ class BoneFrames:
     lengths: Tensor  # [B, L] metres, sqrt(|bone|² + min_length²)
     torso: Tensor  # [B, 3, 3] the frame of the trunk's box
 
+    @property
+    def head(self) -> Tensor:
+        """``[B, 3, 3]``: the frame of the head."""
+        return self.hubs[:, HEAD]
+
 
 def root_of(p: Tensor, template: SkeletonTemplate = MEDIAPIPE33) -> Tensor:
     """``[B, 3]`` metres: the middle of the hips of joints ``[B, J, 3]``."""
@@ -280,5 +285,5 @@ def omega(
     face = c.face_swing.to(d @ head)
     rotations = torch.cat([pelvis_chest, (chest.mT @ head).unsqueeze(1), face, f.local], dim=1)
     code = rotation_to_6d(rotations.index_select(1, c.omega_order))
-    offsets = face_code(p, f, template)
+    offsets = face_code(p, head, template)
     return code if offsets is None else torch.cat([code, pad(offsets, (0, 3))], dim=1)
