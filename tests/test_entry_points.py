@@ -268,7 +268,7 @@ def test_bad_data_ends_in_one_sentence_and_leaves_nothing(
         ("trainer.precision=3-bits", ("3-bits",)),
         ("lpips.net=squeeze", ("lpips.net", "vgg or alex")),
         ("training.step_two.gan=wgan", ("training.step_two.gan", "logistic")),
-        ("model.segmentation.accuracy=best", ("model", "best")),
+        ("accuracy@model.segmentation.accuracy=best", ("accuracy/best",)),
         ("model.deformation.width=abc", ("model:", "str")),
         ("seed=-1", ("seed", "-1")),
     ],

@@ -25,7 +25,7 @@ from gsgan.evaluate.run import make_scorer
 from gsgan.fit import run as running
 from gsgan.fit.fitter import Fitter, _wrong
 from gsgan.fit.moments import Moments
-from gsgan.fit.run import fit_before_training, run_fit, standard_settings
+from gsgan.fit.run import fit_before_training, run_fit
 from gsgan.scene import BodyPose
 from gsgan.train.run import pose_corrections, training_record
 from gsgan.utils.errors import ConfigError, DataError
@@ -150,10 +150,6 @@ def test_unseen_joints(fit, people, tmp_path):
 
     found = fit(root=with_landmarks(people, tmp_path / "hidden", hide))
     assert np.isfinite(found["theta"]).all()
-
-
-def test_defaults_are_those_of_the_config(compose):
-    assert instantiate(compose("fit").fit) == instantiate(standard_settings())
 
 
 def test_a_fit_before_training_returns_the_data_with_its_poses(people, compose, tmp_path):

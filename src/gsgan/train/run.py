@@ -140,8 +140,7 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     whole("seed", config.seed, 0)
     data = build_data(config)
     if data.lacks_body:
-        fit_before_training(data)
-        data = build_data(config)
+        data = fit_before_training(data, config.fit)
     avatar = build_avatar(config, data)
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
     with naming_group("training"):
