@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from skeleton_poses import DEGENERATE, REST, assert_rotation, camera, noisy, rest, rotation
 from torch import Tensor
@@ -145,7 +145,6 @@ def test_scales_are_the_mean_spacing() -> None:
 
 
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=20, deadline=None)
 def test_a_rigid_motion_moves_every_point_with_it(seed: int) -> None:
     d, p, R = densify(), noisy(seed, sigma=0.05), rotation(seed + 1)
     shift = torch.tensor([0.3, -4.0, 2.0], dtype=F64)

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from skeleton_poses import DEGENERATE, REST, assert_rotation, noisy, rest, rotation
 from torch import Tensor
@@ -60,7 +60,6 @@ def test_swing_is_the_shortest_rotation() -> None:
 
 
 @given(angle=st.floats(-0.05, 0.05), roll=st.floats(0, 6.28))
-@settings(max_examples=50, deadline=None)
 def test_swing_near_the_antipode_still_hits_its_target(angle: float, roll: float) -> None:
     a = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     x, y = torch.tensor([roll], dtype=torch.float64).cos(), torch.tensor([roll]).sin()
@@ -89,7 +88,6 @@ def test_degenerate_poses_stay_finite(name: str, dtype: torch.dtype, twist: Any)
 
 @pytest.mark.parametrize("twist", TWISTS)
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=20, deadline=None)
 def test_frames_turn_with_the_body(seed: int, twist: Any) -> None:
     p, R = noisy(seed, sigma=0.06), rotation(seed + 1)
     shift = torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)
