@@ -55,8 +55,8 @@ for file in (
 if any(map(shutil.which, build.COMPILERS)):
     assert native.available(), native.why_not()
 END
-"$python" -m gsgan.train experiment=demo training=smoke \
-  size=small data.source.frames=12 data.source.test_frames=4 \
+"$python" -m gsgan.train experiment=smoke \
+  data.source.frames=12 data.source.test_frames=4 data.source.rays_per_pixel=4 \
   hydra.run.dir="$folder/run"
 test -s run/metrics.json
 "$python" -m gsgan.evaluate run="$folder/run"
