@@ -96,7 +96,7 @@ def capture(shared) -> Path:
     return shared("capture", make)
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=None)
 def composed(name: str, *overrides: str) -> DictConfig:
     from hydra import compose, initialize_config_dir
 
