@@ -7,8 +7,8 @@ import re
 import pytest
 from omegaconf import OmegaConf
 
-from gsgan.evaluate.paper import IDLE, clause, departures, flat
 from gsgan.model.runs import record
+from gsgan.report.departures import IDLE, clause, departures, flat
 from gsgan.utils.config import config_folder
 
 DATA = sorted(path.stem for path in (config_folder() / "data").glob("[!_]*.yaml"))

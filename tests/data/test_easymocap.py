@@ -158,7 +158,7 @@ def test_the_config_reads_it_in_worker_processes(written: Path, smpl_file: Path,
     )  # fmt: skip
     data = instantiate(config.data)
     assert next(iter(data.train_dataloader())).image.shape == (1, 3, 16, 16)
-    assert data.info.skeleton_source == "smpl24 -> mediapipe33"
+    assert data.layout.meta.skeleton_source == "smpl24 -> mediapipe33"
     assert data.splits.test_cameras == ("10",)
 
 

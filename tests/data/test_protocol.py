@@ -239,7 +239,7 @@ def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> Non
     import torch
     from rich.console import Console
 
-    from gsgan.evaluate.facts import Method
+    from gsgan.evaluate.origin import Method
     from gsgan.evaluate.run import evaluate_method
     from gsgan.evaluate.scores import painter
     from gsgan.model.runs import build_avatar, build_data

@@ -148,7 +148,7 @@ def test_the_config_reads_it_in_worker_processes(written: Path, smplx_file: Path
     batch = next(iter(data.train_dataloader()))
     assert batch.image.shape == (1, 3, 16, 16)
     assert batch.unsure is not None
-    assert data.info.skeleton_source == "smplx -> mediapipe33"
+    assert data.layout.meta.skeleton_source == "smplx -> mediapipe33"
     assert (data.info.body, data.info.frames) == ("smplx", 3)
     assert data.eval_names == ("novel_view", "novel_pose")
 

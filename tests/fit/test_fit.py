@@ -20,7 +20,7 @@ from gsgan.body.measure import fit_shape
 from gsgan.body.shape import BodyShape, free_space, shaped_body
 from gsgan.body.solve import Solver
 from gsgan.data.datamodule import GsganData
-from gsgan.evaluate.facts import fingerprint
+from gsgan.data.fingerprint import fingerprint
 from gsgan.evaluate.run import make_scorer
 from gsgan.fit import run as running
 from gsgan.fit.fitter import Fitter, _wrong

@@ -212,22 +212,6 @@ def test_a_run_from_before_body_points_and_low_pass_loads_as_it_was_trained(tiny
     assert avatar.deformation.from_normal is None
 
 
-def test_the_figure_of_densify_says_where_the_points_are(build, tmp_path):
-    from gsgan.report.figures.body import densify
-    from gsgan.report.figures.layout import Settings
-    from gsgan.report.figures.subjects import Subject, make_shots
-    from gsgan.report.runs import Run
-
-    for word, said in (("on", "the bone that moves them most"), ("off", "Algorithm 1 puts on")):
-        data, avatar, _ = build(f"effects.body_points={word}")
-        shots = make_shots(data, "train", data.dataset("train").items[:1], 9.0)
-        subject = Subject("one", Run(tmp_path, "full", {}, 0, {}), data, avatar, [])
-        drawing = densify([subject], shots, Settings())
-        assert said in drawing.caption
-        placed = avatar.body_points or avatar.densify
-        assert drawing.numbers[shots[0].name]["one"]["points"] == placed.n_points
-
-
 def test_without_the_frames_body_pose_it_is_solved_and_training_says_what_is_missing(build):
     _, avatar, frame = build(ON)
     bare = replace(frame, body=None)

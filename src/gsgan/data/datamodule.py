@@ -31,6 +31,7 @@ from gsgan.data.splits import SPLITS, Splits, make_splits, protocol_splits
 from gsgan.scene import Frame, cat
 from gsgan.skeleton import TEMPLATES, template_of
 from gsgan.skeleton.template import Vector
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.errors import ConfigError
 
@@ -338,9 +339,7 @@ class GsganData(LightningDataModule):
         Of held-out poses, without those of held-out cameras, without those of the training split.
         """
         name = next((n for n in ("novel_pose", "novel_view") if self.splits.items[n]), "train")
-        most = len(self.dataset(name))
-        count = min(self.val_pictures, most)
-        return name, [(2 * i + 1) * most // (2 * count) for i in range(count)]
+        return name, evenly_spaced(len(self.dataset(name)), self.val_pictures)
 
     def val_dataloader(self) -> DataLoader[Frame]:
         """The images of `watched`."""

@@ -12,6 +12,7 @@ from gsgan.body import SkinnedBody, open_body
 from gsgan.model.body_points import ROWS, neighbour_distance
 from gsgan.model.segmentation import IGNORE
 from gsgan.scene import Camera, Frame
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, whole
 from gsgan.utils.errors import DataError
 
@@ -128,21 +129,20 @@ class ClassVote:
         Raises:
             DataError: when an image file is damaged, or no vertex lies on a labelled pixel.
         """
-        count = min(self.vote_frames, len(pictures))
-        chosen = [(2 * i + 1) * len(pictures) // (2 * count) for i in range(count)]
+        chosen = evenly_spaced(len(pictures), self.vote_frames)
         reach = self.occluder_radius * neighbour_distance(body.vertices.float(), NEIGHBOUR)
         votes = torch.zeros(len(body.vertices), n_labels, dtype=torch.int64)
         for index in chosen:
             self._count(votes, body, reach, pictures[index])
         if not votes.any():
             raise DataError(
-                f"labels: in none of {count} images does the posed body lie on a labelled pixel; "
+                f"labels: in none of {len(chosen)} images is the posed body on a labelled pixel; "
                 "check that labels, cameras and body poses belong together, or choose model=wo_seg"
             )
         labels, decided = _majority(votes)
         decided = decided if decided.any() else votes.any(dim=1)  # ties alone: the first label
         labels = _from_the_nearest(body.vertices.float(), labels, decided)
-        return Votes(labels, float(decided.double().mean()), count)
+        return Votes(labels, float(decided.double().mean()), len(chosen))
 
     def _count(self, votes: Tensor, body: SkinnedBody, reach: Tensor, frame: Frame) -> None:
         """Adds one image's votes to ``[V, n_labels]``."""

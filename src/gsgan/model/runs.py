@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -147,6 +147,12 @@ def hydra_record(folder: Path) -> DictConfig:
     return found
 
 
+def choices(folder: Path) -> dict[str, Any]:
+    """The config groups' choices that Hydra recorded in a run folder; empty without a record."""
+    found = OmegaConf.select(hydra_record(folder), "hydra.runtime.choices")
+    return {} if found is None else {str(key): value for key, value in found.items()}
+
+
 # -- building
 
 
@@ -181,16 +187,19 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def scene_of(plain: Mapping[str, Any]) -> SceneInfo:
-    """The facts about a scene that a checkpoint holds as plain values."""
+    """The properties of a scene that a checkpoint holds as plain values."""
     from gsgan.data.figure import Figure
     from gsgan.data.scene_info import SceneInfo
     from gsgan.data.surface_colours import SurfaceColours
 
+    known = {f.name for f in fields(SceneInfo)}  # others were dropped since training
     values: dict[str, Any] = {
-        key: tuple(value) if isinstance(value, list) else value for key, value in plain.items()
+        key: tuple(value) if isinstance(value, list) else value
+        for key, value in plain.items()
+        if key in known
     }
-    if values["surface"] is not None:
-        values["surface"] = SurfaceColours(**values["surface"])
+    if (surface := values["surface"]) is not None:
+        values["surface"] = SurfaceColours(surface["difference"], surface["residual"])
     if values.get("figure") is not None:
         values["figure"] = Figure(**values["figure"])
     return SceneInfo(**values)

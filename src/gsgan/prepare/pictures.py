@@ -16,6 +16,7 @@ from gsgan.data.crop import Crop, resize, take, undistort_map
 from gsgan.data.files import frame_files, last_number, read_grey
 from gsgan.prepare.sources import PICTURE_SUFFIXES, Source
 from gsgan.prepare.work import Advance
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import writing
@@ -72,9 +73,7 @@ class Written:
 
 def sampled(count: int, most: int) -> list[int]:
     """At most ``most`` of ``count`` positions, evenly spaced."""
-    if not (count and most):
-        return []
-    return np.unique(((np.arange(most) + 0.5) * count / most).astype(int)).tolist()
+    return evenly_spaced(count, most)
 
 
 def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]:

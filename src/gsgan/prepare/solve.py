@@ -16,6 +16,7 @@ from gsgan.prepare.landmarks import without_frozen
 from gsgan.prepare.rig import FOCAL, MIN_VIEWS, Bool, Float, Ints, Refinement, Rig, refine_rig
 from gsgan.prepare.triangulate import FlipSearch, Points, Triangulation, apply_flips, find_flips
 from gsgan.skeleton.hands import HAND
+from gsgan.utils.arrays import evenly_spaced
 
 ARRAYS = ("p", "conf", "views", "error", "uv", "seen", "flips", "left_out", "delay", "gain")
 
@@ -145,7 +146,7 @@ def solve(
     points = triangulate()
     stages["flips"] = points.error
     F, J = conf.shape[1:]
-    at = np.unique(np.linspace(0, F - 1, min(F, settings.refinement.frames)).round().astype(int))
+    at = np.array(evenly_spaced(F, settings.refinement.frames, ends=True))
     for _ in range(settings.refinement.rounds):
         p = points.p.reshape(F, J, 3)[at].reshape(-1, 3)
         detections = _flat(sided[:, at]), _flat(weight[:, at])

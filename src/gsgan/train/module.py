@@ -367,7 +367,7 @@ class AvatarTraining(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         state = checkpoint["gsgan"]
-        self.avatar.effects.check_same(state.get("effects"))
+        self.avatar.effects.check_same(state["effects"])
         self.step = state["step"]
         self.rollback.done = state["rollbacks"]
         self.seconds_before = state.get("train_seconds")

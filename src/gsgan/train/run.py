@@ -24,8 +24,8 @@ from rich.table import Table
 from gsgan.body import open_body
 from gsgan.data.datamodule import GsganData
 from gsgan.effects.table import effects_table
-from gsgan.evaluate.facts import trained, training_code
 from gsgan.evaluate.files import NAMES
+from gsgan.evaluate.origin import trained, training_code
 from gsgan.evaluate.run import evaluate_method
 from gsgan.evaluate.scores import painter
 from gsgan.fit.run import fit_before_training

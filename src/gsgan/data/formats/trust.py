@@ -20,6 +20,7 @@ from gsgan.data.checks import spans
 from gsgan.data.crop import NEAR, project
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.errors import DataError
 
 Bytes = NDArray[np.uint8]
@@ -276,9 +277,7 @@ def box_iou(a: Box, b: Box) -> float:
 
 def spread(values: Sequence[T], count: int) -> list[T]:
     """At most ``count`` of the values, evenly spaced, first and last included."""
-    if not values or count < 1:
-        return []
-    return [values[i] for i in sorted({round(x) for x in np.linspace(0, len(values) - 1, count)})]
+    return [values[i] for i in evenly_spaced(len(values), count, ends=True)]
 
 
 def watch_masks(layout: Layout, trust: Trust) -> list[str]:

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from gsgan.data.checks import spans
 from gsgan.data.datamodule import GsganData
+from gsgan.data.fingerprint import fingerprint
 from gsgan.data.splits import SPLITS, Item
-from gsgan.evaluate.facts import fingerprint
-from gsgan.evaluate.paper import NAME
 from gsgan.metrics.image import edge_scores, psnr
 from gsgan.model.avatar import Avatar, Painting
 from gsgan.model.runs import (
@@ -25,8 +24,10 @@ from gsgan.model.runs import (
     load_config,
     read_checkpoint,
 )
+from gsgan.report.departures import NAME
 from gsgan.report.runs import DATA, Run, check_same, read_run
 from gsgan.scene import Camera, Frame, Window, body_window, cat
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -94,8 +95,7 @@ def choose_items(
     held = [item for item in items if camera in (None, item[0])]
     known = sorted({frame for _, frame in held})
     if frames is None:
-        count = min(count, len(known))
-        frames = [known[(2 * i + 1) * len(known) // (2 * count)] for i in range(count)]
+        frames = [known[i] for i in evenly_spaced(len(known), count)]
     if lacking := [frame for frame in frames if frame not in known]:
         of = f"split {split}" if camera is None else f"camera {camera} in split {split}"
         raise ConfigError(f"frames: {of} lacks {spans(lacking)}; it has {spans(known)}")
@@ -135,7 +135,7 @@ class Subject:
     _painted: dict[Item, Painting] = field(default_factory=dict, repr=False)
 
     def paint(self, shot: Shot) -> Painting:
-        """What the avatar makes of a shot's whole image, rendered once, kept on the CPU.
+        """The avatar's rendering of a shot's whole image, made once and kept on the CPU.
 
         Raises:
             DataError: when the image is not finite.
@@ -150,9 +150,7 @@ class Subject:
             if not all(part is None or part.isfinite().all() for part in (image, colour, labels)):
                 where = f"{self.run.folder}: its image of {shot.name}"
                 raise DataError(f"{where} is not finite; train it again")
-            gaussians = None if painting.gaussians is None else painting.gaussians.to("cpu")
-            kept = Painting(image, features=colour, segmentation=labels, gaussians=gaussians)
-            self._painted[shot.item] = kept
+            self._painted[shot.item] = Painting(image, features=colour, segmentation=labels)
         return self._painted[shot.item]
 
     def image(self, shot: Shot) -> Tensor:
@@ -172,7 +170,8 @@ class Subject:
 def open_subjects(
     folders: Sequence[Path], names: Sequence[str] | None, moved: Moved, device: torch.device | str
 ) -> list[Subject]:
-    """The avatars of run folders; without ``names`` they have their models', with more where equal.
+    """The avatars of run folders; without ``names`` they have their models', with the folder where
+    models are equal.
 
     Raises:
         ConfigError: on wrong names, a folder given twice, or runs of different data.
@@ -188,12 +187,13 @@ def open_subjects(
     runs = [subject.run for subject in subjects]
     check_same("figures", runs, [{DATA: run.data["fingerprint"]} for run in runs])
     if names is None:
-        models = [s.name for s in subjects]
-        seeds = [f"seed {run.seed}" for run in runs]
-        places = [folder.resolve().name for folder in folders], list(map(str, folders))
-        more = next(texts for texts in (seeds, *places) if len(set(texts)) == len(texts))
-        pairs = zip(models, more, strict=True)
-        names = [m if models.count(m) < 2 else f"{m}, {text}" for m, text in pairs]
+        models = [subject.name for subject in subjects]
+        names = [
+            model if models.count(model) < 2 else f"{model}, {folder.resolve().name}"
+            for model, folder in zip(models, folders, strict=True)
+        ]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"the runs' names in print are equal ({names[0]}); give names=[…]")
     return [replace(s, name=str(name)) for s, name in zip(subjects, names, strict=True)]
 
 
