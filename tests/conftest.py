@@ -10,7 +10,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable, Iterator
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -96,7 +96,7 @@ def capture(shared) -> Path:
     return shared("capture", make)
 
 
-@lru_cache(maxsize=None)
+@cache
 def composed(name: str, *overrides: str) -> DictConfig:
     from hydra import compose, initialize_config_dir
 
