@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from gsgan.data.datamodule import GsganData
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import (
     FULL,
     JOINT_MARGIN,
@@ -56,7 +56,7 @@ def test_else_it_is_round_the_seen_joints_with_a_larger_margin_and_says_so(data)
 @pytest.mark.parametrize("background", ["black", "white"])
 def test_what_is_painted_outside_the_box_is_cleared_and_only_there(data, background):
     prepare = Preparation(
-        Measures(region="body_box_cleared", background=background), BodyBoxes(data)
+        MetricVariants(region="body_box_cleared", background=background), BodyBoxes(data)
     )
     frame = data.dataset("train")[0]
     box = prepare.box(frame)
@@ -70,14 +70,14 @@ def test_what_is_painted_outside_the_box_is_cleared_and_only_there(data, backgro
 
 def test_boxes_that_nothing_asks_for_are_not_made(data):
     frame = data.dataset("train")[0]
-    assert Preparation(Measures(), None).box(frame) is None
+    assert Preparation(MetricVariants(), None).box(frame) is None
 
 
 def test_the_truth_is_outlined_as_the_protocol_says(data):
     frame = GsganData(str(data.layout.root), size=20).dataset("train")[0]
     edge = (frame.mask > 0.05) & (frame.mask < 0.95)
     assert bool(edge.any())  # the outline of this data is soft
-    hard = Preparation(Measures(truth_outline="hard", background="white"), None).target(frame)
+    hard = Preparation(MetricVariants(truth_outline="hard", background="white"), None).target(frame)
     outside = (frame.mask < 0.5).expand_as(hard)
     assert bool((hard[outside] == 1).all())
     taken = (frame.image / frame.mask.clamp_min(1e-6)).clamp(0, 1)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import FULL, Prediction, Preparation
 from gsgan.evaluate.scores import BOX_METRICS, Scorer, score_split
 from gsgan.metrics.regions import HANDS, MOUTH, describe_boxes, hands_and_mouth
@@ -133,7 +133,7 @@ def test_a_lens_moves_the_boxes_with_the_landmarks():
 
 
 def scored(predicted: torch.Tensor, *frames: Frame, skeleton: str = NAME) -> dict:
-    scorer = Scorer(Preparation(Measures(), None, skeleton), None, "no weights", "LPIPS")
+    scorer = Scorer(Preparation(MetricVariants(), None, skeleton), None, "no weights", "LPIPS")
     items = [(("a", i), f) for i, f in enumerate(frames)]
     return score_split(items, lambda *_: Prediction({FULL: predicted}, {}), scorer).variants[FULL]
 

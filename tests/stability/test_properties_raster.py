@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gsgan.splat import ACCURACY, Accuracy, project, rasterise
 from gsgan.splat.project import rotations
-from gsgan.splat.reference import error_bound
+from gsgan.splat.reference import _alphas, _pixel_chunks, _sorted
 from stability.cases.case import Inputs, Tolerance, drawing_backends
 from stability.cases.raster import (
     raster_case,
@@ -186,6 +186,22 @@ def test_the_image_is_linear_in_the_features(backend, drawn, a, b):
         for f in (scene["features"], others, a * scene["features"] + b * others)
     )
     assert_same(mixed, a * first + b * second, 1e-12)
+
+
+def error_bound(projected, size, accuracy):
+    """Bound ``[B, 1, H, W]`` of the error of a setting's cut-offs, for features in [0, 1].
+
+    A layer that is skipped changes a pixel by at most its own weight, a capped alpha by at most the
+    weight that the cap removes; a stopped pixel lacks less than ``transmittance_min``.
+    """
+    front_to_back = _sorted(projected)
+    chunks = []
+    for pixels in _pixel_chunks(projected, size):
+        whole = _alphas(front_to_back, pixels, ACCURACY["exact"])
+        lost = whole - _alphas(front_to_back, pixels, accuracy)
+        before = torch.cat([torch.ones_like(whole[..., :1]), 1 - whole], -1).cumprod(-1)
+        chunks.append((before[..., :-1] * lost).sum(-1) + accuracy.transmittance_min)
+    return torch.cat(chunks, dim=1).unflatten(-1, size).unsqueeze(1)
 
 
 @every_backend

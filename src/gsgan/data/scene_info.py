@@ -13,9 +13,9 @@ from torch.utils.data import Subset
 
 from gsgan.body import SkinnedBody, open_body
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.figure import Figure, figure_of
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
+from gsgan.data.proportions import Proportions, measure_proportions
 from gsgan.data.skeletons import body_height
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
@@ -57,7 +57,7 @@ class SceneInfo:
         darkest: brightness in [0, 1] of the person's darkest percent.
         body_inside: share of the posed body that lies inside the masks of training images; None
             without a body pose or mesh.
-        figure: the subject's proportions.
+        proportions: the subject's proportions.
         face: metres, the subject's face at rest in the head's frame, see `face_at_rest`; None for
             skeletons without a face.
     """
@@ -84,7 +84,7 @@ class SceneInfo:
     surface: SurfaceColours | None = None
     darkest: float = 0.0
     body_inside: float | None = None
-    figure: Figure | None = None
+    proportions: Proportions | None = None
     face: tuple[Vector, ...] | None = None
 
 
@@ -133,9 +133,9 @@ def scene_info(
         surface=_shared_surface(dataset, names, samples),
         darkest=_darkest(dataset, samples),
         body_inside=_body_inside(layout, dataset, samples),
-        figure=figure_of(*whole.joints(frames), layout.meta.up_axis),
         scale_train=_scale(dataset, samples),
         scale_test=(min(s[0] for s in scales), max(s[1] for s in scales)) if scales else None,
+        proportions=measure_proportions(*whole.joints(frames), layout.meta.up_axis),
         **_lenses(layout, cameras, held_out),
     )
 

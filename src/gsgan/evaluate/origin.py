@@ -12,7 +12,7 @@ import torch
 
 from gsgan import __version__
 from gsgan.data.fingerprint import fingerprint
-from gsgan.model.runs import choices
+from gsgan.model.stored import choices
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData

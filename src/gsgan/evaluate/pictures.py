@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gsgan.metrics.segmentation import colour_labels
-from gsgan.model.avatar import Painting
+from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.utils.files import write_atomically
 
@@ -30,7 +30,7 @@ def error_heat(image: Tensor, target: Tensor) -> Tensor:
     return torch.from_numpy(np.stack(heat)).permute(0, 3, 1, 2).to(image) / 255
 
 
-def grid_rows(frame: Frame, painting: Painting) -> list[dict[str, Tensor]]:
+def grid_rows(frame: Frame, painting: Rendering) -> list[dict[str, Tensor]]:
     """One row per batch item: images ``[3, H, W]`` by caption; what was not rendered is absent."""
     assert painting.image is not None
     image, colour, parts = painting.image.clamp(0, 1), painting.colour, painting.segmentation

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from gsgan.body import SkinnedBody, open_body
-from gsgan.data.files import check_picture, read_with_alpha
-from gsgan.data.measures import Measures
+from gsgan.data.files import check_image, read_with_alpha
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
 from gsgan.metrics.regions import (
     BACKGROUNDS,
@@ -113,7 +113,7 @@ class Preparation:
         skeleton: name of the frames' skeleton.
     """
 
-    measures: Measures
+    measures: MetricVariants
     boxes: BodyBoxes | None
     skeleton: str = "mediapipe33"
 
@@ -252,7 +252,7 @@ def read_folder(
                     f"{root} has {what} twice, as {found[0]} and {found[1]}; keep one of them"
                 )
             files[camera, frame] = found[0]
-            check_picture(root / found[0], "image", size, f"the ground truth of {what}, as scored,")
+            check_image(root / found[0], "image", size, f"the ground truth of {what}, as scored,")
     if missing:
         raise DataError(
             f"{root} lacks {len(missing)} of {len(missing) + len(files)} images; the first is "
