@@ -149,7 +149,7 @@ def test_the_table_adds_up():
         "end to end": (10, 9, 12),
     }
     times = pd.DataFrame(rows, index=["median", "p10", "p90"]).T
-    settings = {"avatar": "untrained avatar", "picture": "512 x 512"}
+    settings = {"avatar": "untrained avatar", "image": "512 x 512"}
     page = text(times, None, environment(torch.device("cpu")), settings, ["untrained weights"])
     assert "| F | 6.00 | 5.00 | 7.00 | 60% |" in page
     assert "| **end to end** | 10.0 | 9.00 | 12.0 | 100.0 frames/s |" in page
@@ -180,7 +180,7 @@ def test_the_command_times_an_untrained_avatar_at_its_size(capture, tmp_path, in
     done = inside("bench", "speed", *given, "model=splat_only", f"hydra.run.dir={out}")
     assert done.returncode == 0, done.stderr
     found = json.loads((out / "speed.json").read_text())
-    assert found["settings"]["picture"] == "64 x 64"
+    assert found["settings"]["image"] == "64 x 64"
     assert "untrained weights" in found["marks"][0]
 
 

@@ -113,7 +113,7 @@ def test_windows_hold_the_joints_and_have_one_size(data):
     assert len({shot.truth.shape for shot in shots}) == 1
     for shot in shots:
         height, width = shot.window.size
-        pixels, _ = shot.camera.project(shot.frame.skeleton)
+        pixels, _ = shot.window.camera(shot.frame.camera).project(shot.frame.skeleton)
         inside = (pixels >= 0) & (pixels <= torch.tensor([width, height]))
         reach, _ = shot.frame.camera.project(shot.frame.skeleton)
         in_picture = (reach >= 0) & (reach <= 32)

@@ -106,7 +106,7 @@ def load_subject(
         moved.refuse_without_run()
         data = build_data(config)
         avatar, name = build_avatar(config, data.info, data.labelled("train")), "untrained avatar"
-        marks = ["untrained weights: Gaussians are where they start, which sets what F costs"]
+        marks = ["untrained weights: the time of F depends on the places of its Gaussians"]
         size = (int(config.size.picture), int(config.size.picture))
         frames = [replace(f, camera=f.camera.resize(size)) for f in spread(data, config.poses)]
     avatar = place(avatar, device, channels_last=config.channels_last)
@@ -242,7 +242,7 @@ def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> 
     windows = [avatar.window(frame.skeleton, frame.camera) for frame in frames]
     pixels = sum(height * width if w is None else w.size[0] * w.size[1] for w in windows)
     found: dict[str, Any] = {
-        "picture": f"{width} x {height}",
+        "image": f"{width} x {height}",
         "painted": f"{pixels / (len(windows) * height * width):.0%} of its pixels",
         "precision": config.precision,
         "memory format": "channels last" if config.channels_last else "contiguous",

@@ -87,7 +87,7 @@ def evaluate_folder(config: DictConfig, console: Console, device: torch.device) 
     avatar, marks = load_avatar(folder, stored, data)
     state = read_checkpoint(folder / CHECKPOINT)["gsgan"]
     out = folder
-    if config.background not in (None, _measures(data).background):  # others' scores stay
+    if config.background not in (None, _measures(data).background):  # the protocol's scores stay
         out = folder / f"on_{config.background}"
     if config.drive is not None:
         out, marks = out / "by_skeleton", [*marks, BY_SKELETON]

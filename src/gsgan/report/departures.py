@@ -17,6 +17,7 @@ IDLE = (
     *("training.seed", "training.log_every", "training.max_skipped", "training.skip_window"),
     *("training.rollback", "training.average_every", "training.perceptual.path"),
     *("training.schedule.epoch", "effects.impossible"),
+    *("effects.view_spread", "effects.colour_errors"),  # of earlier runs
 )
 
 
@@ -30,7 +31,7 @@ def flat(value: Any, at: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def settings_of(config: DictConfig) -> dict[str, Any]:
-    """A run's config by dotted key, without what differs between seeds, machines and continuations.
+    """A run's config by dotted key, without the keys that differ between seeds and machines.
 
     Raises:
         OmegaConfBaseException: when it cannot be resolved.

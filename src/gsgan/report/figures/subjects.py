@@ -1,4 +1,4 @@
-"""What a figure shows: images of a split, and the avatars that render them."""
+"""The content of figures: images of a split, and the avatars that render them."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from gsgan.model.runs import load_avatar
 from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.report.departures import NAME
 from gsgan.report.runs import DATA, Run, check_same, read_run
-from gsgan.scene import Camera, Frame, Window, body_window, cat
+from gsgan.scene import Frame, Window, body_window, cat
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
 
-NEAR = 0.01  # metres: with a joint nearer the camera than this, the whole image is shown
+NEAR = 0.01  # metres: with a joint nearer to the camera than this, the whole image is shown
 LEAST = 16  # pixels, the shortest side of a window
 TITLES = {  # of models, in print
     "full": "gsgan", "wo_seg": "w/o S", "wo_gcn": "w/o GCN", "wo_feat": "w/o L_feat",
@@ -46,18 +46,13 @@ class Shot:
 
     @property
     def name(self) -> str:
-        """As files of a capture are named: camera/frame."""
+        """The name of its files in a capture: camera/frame."""
         return f"{self.item[0]}/{self.item[1]:06d}"
 
     @property
     def truth(self) -> Tensor:
         """``[1, 3, h, w]`` the ground truth as shown."""
         return self.window.cut(self.frame.image)
-
-    @property
-    def camera(self) -> Camera:
-        """Of the part shown."""
-        return self.window.camera(self.frame.camera)
 
 
 def choose_items(
