@@ -66,7 +66,7 @@ def copies(monkeypatch):
     return seen
 
 
-def drawn(gaussians, camera, settings, keep, want_depth):
+def drawn(gaussians, camera, settings, want_depth):
     """What gsplat would return, empty."""
     batch, (height, width) = len(camera), camera.size
     features = gaussians.features.new_zeros(batch, gaussians.features.shape[-1], height, width)
