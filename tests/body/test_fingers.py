@@ -19,7 +19,7 @@ from gsgan.fit.shape import fit_hands
 from gsgan.scene import BodyPose
 from gsgan.skeleton.hands import FINGERS, HAND
 from gsgan.synthetic.free_subject import free_character, free_pose
-from gsgan.synthetic.motion import Choreography
+from gsgan.synthetic.posing import Choreography
 
 torch.set_num_threads(1)
 LEFT, RIGHT = slice(33, 33 + HAND), slice(33 + HAND, 33 + 2 * HAND)

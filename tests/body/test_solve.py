@@ -19,7 +19,7 @@ from gsgan.body.solve import Solver
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.synthetic.free_subject import free_character, free_pose
-from gsgan.synthetic.motion import Choreography
+from gsgan.synthetic.posing import Choreography
 
 torch.set_num_threads(1)
 index = MEDIAPIPE33.names.index

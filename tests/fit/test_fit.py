@@ -26,7 +26,7 @@ from gsgan.fit.frames import MaskedFrames
 from gsgan.fit.run import fit_before_training, run_fit, standard_settings
 from gsgan.fit.shape import fit_shape
 from gsgan.scene import BodyPose
-from gsgan.train.run import pose_corrections, training_record
+from gsgan.train.run import training_record
 from gsgan.utils.errors import ConfigError, DataError
 
 
@@ -168,7 +168,7 @@ def test_held_out_cameras_are_not_used(fit, fitted, people, tmp_path):
     other = shutil.copytree(people, tmp_path / "other")
     for file in (other / "masks/cam03").iterdir():
         cv2.imwrite(str(file), np.full((96, 96), 255, np.uint8))
-    trust = "data.reader.trust.frames=0"
+    trust = "data.reader.consistency.frames=0"
     changed = fit(trust, root=other, name="other")
     np.testing.assert_array_equal(plain["theta"], changed["theta"])
     assert list(plain["fitted_to"]) == ["cam00", "cam01", "cam02"]
@@ -196,7 +196,7 @@ def test_an_empty_mask_does_not_affect_other_frames(fit, people, tmp_path, capsy
             mask[50:52, 50:52] = 255
         cv2.imwrite(str(holed / f"masks/{camera}/000001.png"), mask)
     capsys.readouterr()
-    whole_pictures = ("data.crop=null", "data.reader.trust.frames=0")
+    whole_pictures = ("data.crop=null", "data.reader.consistency.frames=0")
     found = fit(*whole_pictures, root=holed)
     plain = fit(*whole_pictures, name="plain")
     assert "left out" in capsys.readouterr().out
@@ -214,7 +214,7 @@ def test_masks_without_anyone_are_refused(compose, people, tmp_path):
         run_fit(
             compose(
                 *("fit", f"data.root={empty}", f"out={tmp_path / 'a'}", *QUICK),
-                *("data.reader.trust.frames=0", "data.reader.trust.watched_masks=0"),
+                *("data.reader.consistency.frames=0", "data.reader.trust.watched_masks=0"),
             )
         )
 
@@ -250,25 +250,6 @@ def test_the_image_shows_every_camera(fit, tmp_path):
     picture = cv2.imread(str(tmp_path / "out/body_fit.png"))
     assert picture.shape[1] == 3 * 300
     assert picture.shape[0] > 2 * 300
-
-
-def test_corrections_belong_to_training_frames(fitted, compose):
-    data = GsganData(str(fitted), size=48)
-    config = compose("train", "data=capture", f"data.root={fitted}", "size=tiny")
-    from gsgan.model.runs import build_avatar
-
-    config.effects.body_points = "on"
-    avatar = build_avatar(config, data)
-    assert pose_corrections(data, avatar, 0.0) is None
-    corrections = pose_corrections(data, avatar, 1e-3)
-    frame = data.dataset("train")[1]
-    pose, prior = corrections(frame.body, frame.frame_id)
-    torch.testing.assert_close(pose.theta, frame.body.theta)
-    (pose.theta.square().sum() + pose.transl.square().sum() + prior).backward()
-    rows = corrections.theta.grad.flatten(1).norm(dim=1)
-    assert (rows > 0).tolist() == [f == int(frame.frame_id) for f in (0, 1, 2)]
-    config.effects.body_points = "off"
-    assert pose_corrections(data, build_avatar(config, data), 1e-3) is None
 
 
 @pytest.mark.parametrize(

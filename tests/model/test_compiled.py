@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from gsgan.losses import photometric
-from gsgan.model import compose
+from gsgan.model import compiled
 from gsgan.model.deformation import Deformation, Residuals
 from gsgan.skeleton.densify import Points
 from gsgan.splat import native
@@ -69,7 +69,7 @@ def test_geometry(monkeypatch, bound):
         loss = sum((x * w).sum() for x, w in zip(found, weights, strict=True))
         return [x.detach() for x in found] + list(torch.autograd.grad(loss, raw))
 
-    torch.testing.assert_close(*both(monkeypatch, compose, "compiled", run), **CLOSE)
+    torch.testing.assert_close(*both(monkeypatch, compiled, "has_geometry", run), **CLOSE)
 
 
 @pytest.mark.parametrize(("batch", "embedding", "normals"), [(1, 4, True), (3, 0, False)])

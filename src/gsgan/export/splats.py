@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsgan import __version__
-from gsgan.data.figure import upright
+from gsgan.data.proportions import upright
 from gsgan.model.avatar import Avatar
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import bone_frames, face_code, root_of

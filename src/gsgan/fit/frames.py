@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.data.datamodule import GsganData
-from gsgan.data.dataset import CaptureDataset, PictureCache
+from gsgan.data.dataset import CaptureDataset, ImageCache
 from gsgan.scene import Frame, body_window
 from gsgan.utils.errors import DataError
 
@@ -51,7 +51,7 @@ class MaskedFrames:
             for camera in cameras
             if frame in layout.images[camera]
         ]
-        cache = PictureCache(int(data.cache_mb * 2**20))
+        cache = ImageCache(int(data.cache_mb * 2**20))
         self.dataset = CaptureDataset(layout, items, data.size, data.crop, cache, data.lens)
         self.cameras, self.device = cameras, device
         self._unseen: dict[int, Tensor] = {}

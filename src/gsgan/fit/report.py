@@ -16,9 +16,9 @@ from gsgan.body import Body
 from gsgan.data.formats.capture import POSES, SHAPE
 from gsgan.fit.fitter import Fitter
 from gsgan.fit.frames import MaskedFrames
-from gsgan.prepare.pictures import sampled
 from gsgan.scene import BodyPose, Frame
 from gsgan.skeleton import MEDIAPIPE33
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.images import caption
 
 REPORT, SHEET = "body_fit.json", "body_fit.png"
@@ -98,7 +98,7 @@ def fit_sheet(fitter: Fitter, names: Sequence[str], found: BodyPose, shown: int)
     masked = fitter.frames
     rows = {
         i: {int(frame.camera_index): frame for frame in masked.images(i)}
-        for i in sampled(len(masked.frames), shown)
+        for i in evenly_spaced(len(masked.frames), shown)
     }
     columns = sorted(set().union(*rows.values()))
     lines = []

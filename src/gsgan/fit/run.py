@@ -18,11 +18,11 @@ from torch import Tensor
 from gsgan.body.fingers import Fingers
 from gsgan.body.shape import BodyShape, shaped_body
 from gsgan.body.solve import ON_HANDS, Solver
-from gsgan.data.calibration.find import METRES
-from gsgan.data.checks import spans
+from gsgan.data.calibration import METRES
 from gsgan.data.crop import PersonCrop
 from gsgan.data.datamodule import GsganData
 from gsgan.data.formats.capture import LANDMARKS, POSES, SHAPE, CaptureReader
+from gsgan.data.validation import spans
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.frames import MaskedFrames
 from gsgan.fit.report import REPORT, SHEET, fit_report, fit_sheet, summary
@@ -89,6 +89,7 @@ def standard_settings() -> DictConfig:
     """The config group ``fit`` as conf/fit/standard.yaml has it."""
     folder = config_folder()
     settings = OmegaConf.load(folder / "fit" / "standard.yaml")
+    assert isinstance(settings, DictConfig)
     accuracy = OmegaConf.load(folder / "accuracy" / "standard.yaml")
     merged = OmegaConf.merge({"accuracy": accuracy}, settings)
     assert isinstance(merged, DictConfig)

@@ -9,18 +9,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsgan.motion.character import Character, Motion
+from gsgan.motion.character import Animation, Character
 from gsgan.motion.rig import ARM, FINGERS, LEG, SIDES, SIGN, SPINE, Pose, Rig, frame
 from gsgan.motion.rotations import Array, rotation, unit
-from gsgan.synthetic import choreography
-from gsgan.synthetic.choreography import (
-    EVERYDAY,
-    Controls,
-    Programme,
-    controls_at,
-    passages_at,
-    smoothstep,
-)
+from gsgan.synthetic import controls
+from gsgan.synthetic.choreography import EVERYDAY
+from gsgan.synthetic.controls import Controls, Programme, controls_at, passages_at, smoothstep
 from gsgan.synthetic.footsteps import Footsteps
 
 X, Y, Z = np.eye(3)
@@ -51,12 +45,12 @@ class Choreography:
         self.duration = programme.duration
         self.steps = Footsteps(seed, programme)
 
-    def at(self, times: Array) -> Motion:
+    def at(self, times: Array) -> Animation:
         """The poses at times ``[F]``, seconds in [0, `duration`]."""
         c = controls_at(times, self.seed, self.programme)
         feet = [self.steps.at(times, foot) for foot in range(2)]
         _follow_feet(c, feet)
-        heading, scale = rotation(c.path[:, 2:] * Z), self.rig.leg / choreography.LEG
+        heading, scale = rotation(c.path[:, 2:] * Z), self.rig.leg / controls.LEG
         hips = self.rig.joint["Hips"] + scale * c.pelvis
         hips = scale * c.path * (1, 1, 0) + (heading @ hips[..., None])[..., 0]
         pose = Pose(self.rig, hips)
@@ -76,7 +70,7 @@ class Choreography:
 
     def _foot(self, pose: Pose, side: str, place: Array, height: Array, pitch: Array) -> Array:
         """Turns a foot, its toes flat while they stand; returns the ankle's position ``[F, 3]``."""
-        joint, scale = self.rig.joint, self.rig.leg / choreography.LEG
+        joint, scale = self.rig.joint, self.rig.leg / controls.LEG
         ankle = joint[side + "Foot"]
         toe = joint.get(side + "ToeBase", ankle + scale * np.array([0, -0.14, -0.06]))
         heading = rotation(place[:, 2:] * Z)
@@ -90,7 +84,7 @@ class Choreography:
     def _placed(self, pose: Pose, c: Controls, i: int, side: str) -> Placed:
         """Where the wrist has to be for the knuckle to be at its place, and the hand's turn."""
         joint, chest, sign = self.rig.joint, self.rig.chest, SIGN[side]
-        scale, mirror = self.rig.arm / choreography.ARM, np.array([sign, 1, 1])
+        scale, mirror = self.rig.arm / controls.ARM, np.array([sign, 1, 1])
         along, palm = unit(c.pointing[:, i] * mirror), c.facing[:, i] * mirror
         palm = unit(palm - (palm * along).sum(-1, keepdims=True) * along)
         turn = pose.turn(chest) @ frame(along, palm) @ frame(sign * X, -Z).T
@@ -108,7 +102,7 @@ class Choreography:
         self, pose: Pose, c: Controls, i: int, side: str, placed: Placed | None = None
     ) -> None:
         """Turns collarbone, upper arm and forearm so that the wrist comes to its target."""
-        scale, mirror = self.rig.arm / choreography.ARM, np.array([SIGN[side], 1, 1])
+        scale, mirror = self.rig.arm / controls.ARM, np.array([SIGN[side], 1, 1])
         chest, wrist = pose.turn(self.rig.chest), c.wrist[:, i]
         if placed is not None:
             away = (placed[0] - pose.position(side + "Arm")) / scale

@@ -1,4 +1,7 @@
-"""The geometry of Ĝ from Ψ's raw residuals, compiled for CPUs."""
+"""The geometry of Ĝ from Ψ's raw residuals in compiled code, on CPUs.
+
+`gsgan.model.deformation.Deformation` calls it, and defines the same by tensor operations.
+"""
 
 from __future__ import annotations
 
@@ -7,22 +10,21 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from gsgan.splat import build, native
 
 RESIDUALS = 11  # mean 3, quaternion 4, scale 3, opacity 1
-_INPUTS = ("raw", "means", "frames", "scales", "valid")
-_OUTPUTS = ("means", "covariances", "opacities")
-
-
+OUTPUTS = ("means", "covariances", "opacities")
+INPUTS = ("raw", "means", "frames", "scales", "valid")
 _Job = build.job_type(
     ("count", "threads", "stride"),
     ("mean_bound", "unit", "scale_low", "scale_high", "logit", "logit_bound"),
-    (*_INPUTS, *(f"{kind}_{name}" for kind in ("out", "g") for name in _OUTPUTS), "d_raw"),
-)  # struct ComposeJob of splat/kernels/compose.h
+    (*INPUTS, *(f"out_{name}" for name in OUTPUTS), *(f"g_{name}" for name in OUTPUTS), "d_raw"),
+)
 
 
-def compiled(raw: Tensor, *fixed: Tensor) -> bool:
+def has_geometry(raw: Tensor, *fixed: Tensor) -> bool:
     """Whether `geometry` can be used: on a CPU, where only ``raw`` needs a gradient."""
     return (
         raw.device.type == "cpu"
@@ -40,8 +42,7 @@ def geometry(
     valid: Tensor,
     numbers: tuple[float, ...],
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Means, covariances and opacities, as `gsgan.model.deformation.Deformation.compose` defines
-    them; differentiable once, in ``raw``.
+    """Means, covariances and opacities of Ĝ; differentiable once, in ``raw``.
 
     Args:
         raw: ``[B, N, 11]`` residuals of mean, quaternion, scale and opacity.
@@ -60,37 +61,35 @@ class _Geometry(torch.autograd.Function):
     def forward(ctx: Any, *arguments: Any) -> tuple[Tensor, Tensor, Tensor]:
         raw, *fixed, numbers = arguments
         B, N, _ = raw.shape
-        means, covariances = raw.new_empty(B, N, 3), raw.new_empty(B, N, 3, 3)
-        opacities = raw.new_empty(B, N)
+        outputs = raw.new_empty(B, N, 3), raw.new_empty(B, N, 3, 3), raw.new_empty(B, N)
         job, _held = _job(raw, fixed, numbers)
-        outputs = [means, covariances, opacities]
-        build.point(job, tuple(f"out_{name}" for name in _OUTPUTS), outputs)
+        build.point(job, [f"out_{name}" for name in OUTPUTS], outputs)
         build.function("compose", raw.dtype)(ctypes.byref(job))
         ctx.save_for_backward(raw, *fixed)
         ctx.numbers = numbers
         ctx.set_materialize_grads(False)
-        return means, covariances, opacities
+        return outputs
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         raw, *fixed = ctx.saved_tensors
         job, _held = _job(raw, fixed, ctx.numbers)
         incoming = [None if g is None else g.contiguous() for g in grads]
-        build.point(job, tuple(f"g_{name}" for name in _OUTPUTS), incoming)
         d_raw = raw.new_empty(*raw.shape[:2], RESIDUALS)
-        build.point(job, ("d_raw",), [d_raw])
+        build.point(job, [*(f"g_{name}" for name in OUTPUTS), "d_raw"], [*incoming, d_raw])
         build.function("compose_backward", raw.dtype)(ctypes.byref(job))
         return d_raw, *[None] * 5
 
 
-def _job(raw: Tensor, fixed: list[Tensor], numbers: tuple[float, ...]) -> tuple[Any, list[Tensor]]:
+def _job(
+    raw: Tensor, fixed: list[Tensor], numbers: tuple[float, ...]
+) -> tuple[ctypes.Structure, list[Tensor]]:
     """The job without its outputs, and the tensors it points to."""
     rows = raw.detach()
     if rows.stride(-1) != 1 or rows.stride(0) != rows.shape[1] * rows.stride(1):
         rows = rows.contiguous()
     held = [rows, *(x.detach().contiguous() for x in fixed)]
-    threads = build.threads()
-    job = _Job(rows.shape[0] * rows.shape[1], threads, rows.stride(1), *numbers)
-    build.point(job, _INPUTS, held)
+    job = _Job(rows.shape[0] * rows.shape[1], build.threads(), rows.stride(1), *numbers)
+    build.point(job, INPUTS, held)
     return job, held

@@ -22,7 +22,7 @@ CHOICES: dict[str, tuple[Any, ...]] = {
 
 
 @dataclass(frozen=True)
-class Measures:
+class MetricVariants:
     """The scored region of an image, and the variants of the metrics.
 
     Args:

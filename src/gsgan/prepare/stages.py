@@ -1,11 +1,9 @@
-"""The working folder of a run, parallel work with progress bars, safe writing of the dataset."""
+"""Results of finished stages on disk, and work on all cameras at once with progress bars."""
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
 import shutil
 import threading
 from collections.abc import Callable, Sequence
@@ -13,17 +11,13 @@ from concurrent.futures import CancelledError, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 from rich.console import Console
 
-from gsgan.data.formats.capture import read_capture
 from gsgan.utils.console import progress
-from gsgan.utils.errors import DataError
-from gsgan.utils.files import write_npz, writing
+from gsgan.utils.files import writing
 
 T = TypeVar("T")
 Advance = Callable[[int, int], None]  # takes the number of steps done and in total
-GENERATOR = "gsgan.prepare"
 KEY_LENGTH = 12
 
 
@@ -64,7 +58,7 @@ def digest(content: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:KEY_LENGTH]
 
 
-class Work:
+class StageFolder:
     """A folder with the results of finished stages; it is created when missing."""
 
     def __init__(self, folder: Path) -> None:
@@ -73,26 +67,12 @@ class Work:
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
 
-    def place(self, stage: str, key: Any) -> Path:
+    def path(self, stage: str, key: Any) -> Path:
         """Path of a stage's result; its name contains a digest of its inputs."""
         self.used[stage] = f"{stage}-{digest(key)}"
         return self.folder / self.used[stage]
 
-    def arrays(
-        self, stage: str, key: Any, make: Callable[[], dict[str, Any]]
-    ) -> dict[str, np.ndarray]:
-        """Arrays of an earlier run with the same key, or made and stored now."""
-        path = self.place(stage, key).with_suffix(".npz")
-        try:
-            with np.load(path, allow_pickle=False) as archive:
-                return dict(archive)
-        except Exception:  # missing or damaged: zip, zlib, numpy and tokenize have their own errors
-            pass
-        arrays = make()
-        write_npz(path, **arrays)
-        return {name: np.asarray(array) for name, array in arrays.items()}
-
-    def forget_others(self) -> None:
+    def remove_others(self) -> None:
         """Removes results with other keys of the stages that this run used."""
         for left in list(self.folder.iterdir()):
             stem = left.name.removesuffix(".npz")
@@ -102,40 +82,3 @@ class Work:
                 shutil.rmtree(left, ignore_errors=True)
             else:
                 left.unlink(missing_ok=True)
-
-
-def is_there(out: Path, key: str, overwrite: bool) -> bool:
-    """Whether ``out`` holds the dataset with this key.
-
-    Raises:
-        DataError: when it holds something else and may not be overwritten.
-    """
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return False
-    made_by: Any = None
-    with contextlib.suppress(OSError, ValueError, AttributeError):
-        made_by = json.loads((out / "meta.json").read_text()).get("made_by")
-    if not isinstance(made_by, dict) or made_by.get("generator") != GENERATOR:
-        raise DataError(f"{out} holds something else; choose another out")
-    if made_by.get("key") != key and not overwrite:
-        raise DataError(f"{out} was made with other settings; add overwrite=true")
-    return bool(made_by.get("key") == key)
-
-
-def publish(root: Path, out: Path) -> None:
-    """Moves the finished dataset ``root`` to ``out``; an old one is removed when that is done.
-
-    Raises:
-        DataError: when training could not read it, or it cannot be moved.
-    """
-    try:
-        read_capture(root)
-    except DataError as error:
-        raise DataError(f"nothing was made, because training could not read it: {error}") from None
-    old = out.with_name(f".{out.name}.old")
-    with writing(out):
-        if out.exists():
-            shutil.rmtree(old, ignore_errors=True)
-            os.replace(out, old)
-        os.replace(root, out)
-    shutil.rmtree(old, ignore_errors=True)

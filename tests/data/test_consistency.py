@@ -13,10 +13,9 @@ import pytest
 from make import edit_json, write_tiny_capture
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.checks import Checks
-from gsgan.data.formats.capture import LOOKED_AT, CaptureReader
-from gsgan.data.formats.trust import (
-    Trust,
+from gsgan.data.formats.capture import SKELETON_LIMITS, CaptureReader
+from gsgan.data.formats.consistency import (
+    Consistency,
     box_of,
     far_cameras,
     inside_share,
@@ -25,6 +24,7 @@ from gsgan.data.formats.trust import (
     mask_distance,
 )
 from gsgan.data.layout import Layout
+from gsgan.data.validation import Thresholds
 from gsgan.utils.errors import DataError
 
 
@@ -33,8 +33,8 @@ def root(tmp_path: Path) -> Path:
     return write_tiny_capture(tmp_path / "c", cameras=4, frames=3, size=(64, 96))
 
 
-def read(root: Path, trust: Trust = LOOKED_AT) -> Layout:
-    return CaptureReader(trust=trust)(root, Checks())
+def read(root: Path, consistency: Consistency = SKELETON_LIMITS) -> Layout:
+    return CaptureReader(consistency=consistency)(root, Thresholds())
 
 
 def turn(axis: tuple[float, float, float], degrees: float) -> Callable[[dict], None]:
@@ -84,7 +84,7 @@ def test_a_camera_that_is_wholly_wrong_is_refused(
         read(root)
     assert "\n" not in str(caught.value)
     assert str(root) in str(caught.value)
-    assert read(root, Trust(frames=0, min_box_iou=0)).notes == ()  # nothing is compared
+    assert read(root, Consistency(frames=0, min_box_iou=0)).notes == ()  # nothing is compared
 
 
 @pytest.mark.parametrize("change", [turn((0, 1, 0), 5), exchanged])
@@ -92,12 +92,12 @@ def test_a_camera_that_is_wrong_is_named_in_a_note(
     root: Path, change: Callable[[dict], None]
 ) -> None:
     edit_json(root / "cameras.json", change)
-    (note,) = read(root, Trust(min_box_iou=0, least_inside=0)).notes
+    (note,) = read(root, Consistency(min_box_iou=0, least_inside=0)).notes
     assert note.startswith("joints lie outside the masks (inside: ")
     assert "cam02" in note
     assert "cam00" not in note
     with pytest.raises(DataError, match=r"inside: .*cam02"):
-        read(root, Trust(min_box_iou=0, least_inside=0.9))
+        read(root, Consistency(min_box_iou=0, least_inside=0.9))
 
 
 def test_a_camera_whose_focal_length_alone_is_halved_is_named(root: Path) -> None:
@@ -106,11 +106,13 @@ def test_a_camera_whose_focal_length_alone_is_halved_is_named(root: Path) -> Non
             rig["cam02"]["K"][i][i] /= 2
 
     edit_json(root / "cameras.json", halve)
-    trust = Trust(min_box_iou=0, min_inside=0, least_inside=0)  # where joints stay inside as well
-    (note,) = read(root, trust).notes
+    consistency = Consistency(
+        min_box_iou=0, min_inside=0, least_inside=0
+    )  # where joints stay inside as well
+    (note,) = read(root, consistency).notes
     assert re.match(r"masks reach .* beyond all joints \(share: cam02 \d\d%; [0-3]% in the o", note)
-    assert read(root, replace(trust, max_beyond=1)).notes == ()
-    (other,) = read(root, replace(trust, min_inside=0.9)).notes
+    assert read(root, replace(consistency, max_beyond=1)).notes == ()
+    (other,) = read(root, replace(consistency, min_inside=0.9)).notes
     assert other.startswith("joints lie outside the masks (inside: cam02 ")
 
 
@@ -128,10 +130,6 @@ def test_the_share_of_a_mask_beyond_all_joints() -> None:
     assert mask_beyond(mask, camera, moved, 0.39) == pytest.approx(59 / 79, abs=0.02)
     assert np.isnan(mask_beyond(0 * mask, camera, joints, 0.3))
     assert np.isnan(mask_beyond(mask, camera, joints[2:], 0.3))
-
-
-def test_frames_are_left_out(root: Path) -> None:
-    assert CaptureReader(drop_frames="1")(root, Checks()).frames == (0, 2)
 
 
 def test_the_share_of_joints_inside_a_mask() -> None:
@@ -163,21 +161,12 @@ def test_the_config_passes_its_settings(root: Path, compose) -> None:
     from hydra.utils import instantiate
 
     edit_json(root / "cameras.json", scale_K(0.5))
-    keys = ("data.reader.trust.frames=0", "data.reader.drop_frames=1")
+    keys = ("data.reader.consistency.frames=0", "data.reader.drop_frames=1")
     config = compose("train", "data=capture", f"data.root={root}", *keys)
     assert instantiate(config.data).layout.frames == (0, 2)
     config = compose("train", "data=capture", f"data.root={root}")
     with pytest.raises(DataError, match="joints lie outside the masks"):
         _ = instantiate(config.data).layout
-
-
-def test_timestamps_are_no_frame_numbers(root: Path) -> None:
-    with np.load(root / "landmarks3d.npz") as held:
-        arrays = dict(held)
-    arrays["frame_id"] = arrays["frame_id"] + 1_700_000_000_123
-    np.savez(root / "landmarks3d.npz", **arrays)
-    with pytest.raises(DataError, match="frame_id 1700000000125 is a time stamp"):
-        read(root)
 
 
 def test_joint_distance_in_metres():

@@ -26,7 +26,7 @@ GOLDEN = (5**0.5 - 1) / 2
 
 
 @dataclass(frozen=True)
-class View:
+class SceneCamera:
     """A camera: ``K [3, 3]``, ``R [3, 3]``, ``t [3]``, ``size`` (H, W), lens ``dist`` or None."""
 
     K: Array
@@ -92,7 +92,7 @@ def pixel_offsets(rays: int) -> Array:
     return np.mod(0.5 + np.stack([k / rays, k * GOLDEN], axis=1), 1.0)
 
 
-def pixel_rays(view: View, x: Ints, y: Ints, rays: int) -> tuple[Array, Array]:
+def pixel_rays(view: SceneCamera, x: Ints, y: Ints, rays: int) -> tuple[Array, Array]:
     """Origin ``[3]`` and unit directions ``[N*rays, 3]`` of a pinhole's pixels ``x, y [N]``."""
     offset = pixel_offsets(rays)
     across = (x[:, None] + offset[:, 0]).ravel()
@@ -102,7 +102,7 @@ def pixel_rays(view: View, x: Ints, y: Ints, rays: int) -> tuple[Array, Array]:
     return view.centre, unit(directions)
 
 
-def look_at(azimuth: float, height: float, middle: Array, points: Array, size: int) -> View:
+def look_at(azimuth: float, height: float, middle: Array, points: Array, size: int) -> SceneCamera:
     """A camera at an azimuth: 0 in front of the person, growing towards the person's left."""
     offset = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0]) * RADIUS
     centre = np.array([middle[0], middle[1], height]) + offset
@@ -118,10 +118,10 @@ def look_at(azimuth: float, height: float, middle: Array, points: Array, size: i
     focal = (1 - 2 * MARGIN) * size / (high - low).max()
     principal = size / 2 - focal * (low + high) / 2
     K = np.array([[focal, 0, principal[0]], [0, focal, principal[1]], [0, 0, 1]])
-    return View(K, R, t, (size, size))
+    return SceneCamera(K, R, t, (size, size))
 
 
-def zoomed(view: View, scale: float) -> View:
+def zoomed(view: SceneCamera, scale: float) -> SceneCamera:
     """The same camera with its focal length times ``scale``, zoomed about the image's centre."""
     H, W = view.size
     K = view.K.copy()
@@ -130,7 +130,7 @@ def zoomed(view: View, scale: float) -> View:
     return replace(view, K=K)
 
 
-def through_lens(view: View, dist: Array) -> View:
+def through_lens(view: SceneCamera, dist: Array) -> SceneCamera:
     """The same camera with a lens, which is checked up to the image's corners."""
     H, W = view.size
     corners = np.array([[x, y, 1.0] for x in (0, W / 2, W) for y in (0, H / 2, H)])

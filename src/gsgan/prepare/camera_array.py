@@ -1,4 +1,4 @@
-"""A rig of calibrated cameras: projection, undistortion, and refinement of the camera poses."""
+"""Calibrated cameras as arrays: projection, undistortion, and refinement of their poses."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR
 from gsgan.data.joints import known
-from gsgan.utils.checks import above
 
 MIN_VIEWS = 2
 FOCAL = 1000.0  # pixels; errors are then thousandths of the focal length
+STEPS = 30  # of the optimiser
+SCALE = 5.0  # error at which a detection counts half, thousandths of the focal length
 SETTLED = 1e-7  # relative change of the cost at which the refinement ends
 LEAST_SQUARE = 1e-12  # square pixels: keeps the residual's scaling finite at an error of 0
 
@@ -33,7 +34,7 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Rig:
+class CameraArray:
     """``C`` cameras without lens distortion, float64."""
 
     K: Float  # [C, 3, 3] pixels, pixel centres at +0.5
@@ -41,8 +42,8 @@ class Rig:
     t: Float  # [C, 3] metres
 
     @classmethod
-    def of(cls, cameras: Sequence[CameraEntry]) -> Rig:
-        """The rig of some cameras, in their order."""
+    def of(cls, cameras: Sequence[CameraEntry]) -> CameraArray:
+        """The arrays of some cameras, in their order."""
         return cls(*(np.stack([getattr(c, key) for c in cameras]) for key in ("K", "R", "t")))
 
     def __len__(self) -> int:
@@ -58,8 +59,8 @@ class Rig:
         """``[C]`` pixels: the mean of both focal lengths."""
         return (self.K[:, 0, 0] + self.K[:, 1, 1]) / 2
 
-    def normalised(self, uv: Float) -> tuple[Rig, Float]:
-        """The rig with focal lengths of `FOCAL` pixels, and pixels ``uv [C, ..., 2]`` to match.
+    def normalised(self, uv: Float) -> tuple[CameraArray, Float]:
+        """The cameras with focal lengths of `FOCAL` pixels, and pixels ``uv [C, ..., 2]`` to match.
 
         Thresholds in such pixels hold for images of any size, and cameras of different sizes count
         alike.
@@ -69,11 +70,11 @@ class Rig:
         K[:, :2] *= ratio[:, None, None]
         return replace(self, K=K), uv * ratio.reshape(-1, *[1] * (uv.ndim - 1))
 
-    def __getitem__(self, cameras: Bool | slice) -> Rig:
-        return Rig(self.K[cameras], self.R[cameras], self.t[cameras])
+    def __getitem__(self, cameras: Bool | slice) -> CameraArray:
+        return CameraArray(self.K[cameras], self.R[cameras], self.t[cameras])
 
     def entries(self, cameras: Sequence[CameraEntry]) -> list[CameraEntry]:
-        """The cameras with this rig's R and t."""
+        """These cameras with the R and t of the arrays."""
         return [replace(c, R=self.R[i], t=self.t[i]) for i, c in enumerate(cameras)]
 
     def project(self, p: Float) -> tuple[Float, Float]:
@@ -109,80 +110,68 @@ def undistort_points(camera: CameraEntry, px: Float) -> Float:
     return out
 
 
-@dataclass(frozen=True)
-class Refinement:
-    """How far camera poses may follow the landmarks, see conf/prepare.yaml.
-
-    Landmarks cannot determine the world's origin, orientation or scale; the two priors fix them by
-    the least change of the given calibration.
-    """
-
-    rounds: int = 2
-    steps: int = 30
-    frames: int = 200
-    scale: float = 5.0
-    rotation_prior: float = 2.0
-    position_prior: float = 0.05
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "frames", "scale", "rotation_prior", "position_prior"):
-            above(f"refinement.{name}", getattr(self, name))
-
-
-def refine_rig(
-    given: Rig, start: Rig, p: Float, uv: Float, weight: Float, settings: Refinement
-) -> Rig:
-    """The rig with the smallest reprojection error that stays near the given one.
+def refine_cameras(
+    given: CameraArray,
+    start: CameraArray,
+    p: Float,
+    uv: Float,
+    weight: Float,
+    rotation_prior: float,
+    position_prior: float,
+) -> CameraArray:
+    """The cameras with the smallest reprojection error, near the given ones.
 
     Convention: bundle adjustment of poses and points (`scipy.optimize.least_squares`); the loss is
-    Cauchy's; K is fixed. Points with fewer than two views are left out.
+    Cauchy's; K is fixed. Points with fewer than two views are left out. Landmarks cannot determine
+    the world's origin, orientation or scale; the priors fix them by the least change of the given
+    calibration.
 
     Args:
         given, start: centre of the priors, and the initial value.
         p: ``[N, 3]`` metres, initial values, NaN where missing.
         uv, weight: ``[C, N, 2]`` undistorted pixels; their confidence, 0 where unseen.
-        settings: scale, priors, steps.
+        rotation_prior, position_prior: degrees and metres, standard deviations of ``given``.
     """
     weight = np.where(known(uv), weight, 0.0)
     use = known(p) & ((weight > 0).sum(0) >= MIN_VIEWS)
     p, uv, weight = p[use], uv[:, use], weight[:, use]
     camera, point = np.nonzero(weight)
-    uv, weight, square = uv[camera, point], weight[camera, point], settings.scale**2
-    cameras = 6 * len(start)
+    uv, weight, square = uv[camera, point], weight[camera, point], SCALE**2
+    poses = 6 * len(start)
 
-    def rig_at(x: Float) -> Rig:
-        turn, move = np.moveaxis(x[:cameras].reshape(-1, 2, 3), 1, 0)
+    def cameras_at(x: Float) -> CameraArray:
+        turn, move = np.moveaxis(x[:poses].reshape(-1, 2, 3), 1, 0)
         return replace(start, R=Rotation.from_rotvec(turn).as_matrix() @ start.R, t=start.t + move)
 
-    def priors(rig: Rig) -> Float:
-        turned = _turns(given, rig) / np.radians(settings.rotation_prior)
-        return np.c_[turned, (rig.centres - given.centres) / settings.position_prior].ravel()
+    def priors(cameras: CameraArray) -> Float:
+        turned = _turns(given, cameras) / np.radians(rotation_prior)
+        return np.c_[turned, (cameras.centres - given.centres) / position_prior].ravel()
 
     def residuals(x: Float) -> Float:
-        rig = rig_at(x)
-        off = rig.project(p + x[cameras:].reshape(-1, 3))[0][camera, point] - uv
+        cameras = cameras_at(x)
+        off = cameras.project(p + x[poses:].reshape(-1, 3))[0][camera, point] - uv
         error = (off**2).sum(1) + LEAST_SQUARE
         off *= np.sqrt(weight * square * np.log1p(error / square) / error)[:, None]
-        return np.concatenate([off.ravel(), priors(rig)])
+        return np.concatenate([off.ravel(), priors(cameras)])
 
     found = least_squares(
         residuals,
-        np.zeros(cameras + p.size),
+        np.zeros(poses + p.size),
         jac_sparsity=_sparsity(camera, point, len(start), len(p)),
         x_scale="jac",
         ftol=SETTLED,
-        max_nfev=settings.steps,
+        max_nfev=STEPS,
     )
     # Detections do not see a similarity of the whole world, so that search hardly moves along it.
-    rig = rig_at(found.x)
-    return _similar(rig, least_squares(lambda x: priors(_similar(rig, x)), np.zeros(7)).x)
+    cameras = cameras_at(found.x)
+    return _similar(cameras, least_squares(lambda x: priors(_similar(cameras, x)), np.zeros(7)).x)
 
 
-def _similar(rig: Rig, x: Float) -> Rig:
-    """The rig in a world turned by ``x[:3]``, shifted by ``x[3:6]`` and scaled by exp ``x[6]``."""
+def _similar(cameras: CameraArray, x: Float) -> CameraArray:
+    """The cameras in a world turned by ``x[:3]``, moved by ``x[3:6]``, scaled by exp ``x[6]``."""
     turn = Rotation.from_rotvec(x[:3]).as_matrix()
-    R, centres = rig.R @ turn, np.exp(x[6]) * rig.centres @ turn + x[3:6]
-    return replace(rig, R=R, t=-np.einsum("cij,cj->ci", R, centres))
+    R, centres = cameras.R @ turn, np.exp(x[6]) * cameras.centres @ turn + x[3:6]
+    return replace(cameras, R=R, t=-np.einsum("cij,cj->ci", R, centres))
 
 
 def _sparsity(camera: Ints, point: Ints, cameras: int, points: int) -> sparse.csr_matrix:
@@ -198,12 +187,12 @@ def _sparsity(camera: Ints, point: Ints, cameras: int, points: int) -> sparse.cs
     return sparse.vstack([detections, priors]).tocsr()
 
 
-def camera_moves(before: Rig, after: Rig) -> tuple[Float, Float]:
+def camera_moves(before: CameraArray, after: CameraArray) -> tuple[Float, Float]:
     """How far each camera turned, ``[C]`` degrees, and moved, ``[C]`` millimetres."""
     moved = np.linalg.norm(after.centres - before.centres, axis=-1)
     return np.degrees(np.linalg.norm(_turns(before, after), axis=-1)), 1000 * moved
 
 
-def _turns(before: Rig, after: Rig) -> Float:
-    """``[C, 3]`` rotation vectors from one rig's orientations to another's."""
+def _turns(before: CameraArray, after: CameraArray) -> Float:
+    """``[C, 3]`` rotation vectors from the orientations before to those after."""
     return np.asarray(Rotation.from_matrix(after.R @ before.R.transpose(0, 2, 1)).as_rotvec())

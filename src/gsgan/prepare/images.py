@@ -14,52 +14,27 @@ from numpy.typing import NDArray
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import Crop, resize, take, undistort_map
 from gsgan.data.files import frame_files, last_number, read_grey
-from gsgan.prepare.sources import PICTURE_SUFFIXES, Source
-from gsgan.prepare.work import Advance
-from gsgan.utils.arrays import evenly_spaced
-from gsgan.utils.checks import above, between, one_of, whole
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.data.formats.consistency import spread
+from gsgan.prepare.sources import IMAGE_SUFFIXES, Recording
+from gsgan.prepare.stages import Advance
+from gsgan.utils.errors import DataError
 from gsgan.utils.files import writing
 
 Bytes = NDArray[np.uint8]
 PROBED = 8  # masks per camera whose values are checked before any work is done
 PERSON = 128  # alpha that at least one pixel of them must have
+LEAST_BLOB = 0.02  # smaller pieces of a mask are removed, share of the largest
+QUALITY = 95  # of jpg, 1 to 100
 PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower
 
 
-@dataclass(frozen=True)
-class MaskTidying:
-    """How a mask becomes the person's alpha, see conf/prepare.yaml."""
-
-    levels: tuple[float, float] = (0.3, 0.8)
-    least_blob: float = 0.02
-
-    def __post_init__(self) -> None:
-        if len(self.levels) != 2 or not 0 <= self.levels[0] < self.levels[1] <= 1:
-            raise ConfigError(f"mask_tidying.levels must rise within 0..1, got {self.levels}")
-        between("mask_tidying.least_blob", self.least_blob, 0, 1)
-
-
-@dataclass(frozen=True)
-class PictureFiles:
-    """How images and masks are written, see conf/prepare.yaml."""
-
-    scale: float = 1.0
-    format: str = "jpg"
-    quality: int = 95
-
-    def __post_init__(self) -> None:
-        above("pictures.scale", between("pictures.scale", self.scale, 0, 1))
-        one_of("pictures.format", self.format, ("jpg", "png"))
-        whole("pictures.quality", self.quality, 1)
-
-    def camera(self, camera: CameraEntry) -> CameraEntry:
-        """The camera of the written images: no distortion, K at their size."""
-        h, w = (max(1, round(side * self.scale)) for side in camera.size)
-        K = camera.K.copy()
-        K[0] *= w / camera.size[1]
-        K[1] *= h / camera.size[0]
-        return replace(camera, K=K, dist=np.zeros_like(camera.dist), size=(h, w))
+def scaled(camera: CameraEntry, scale: float) -> CameraEntry:
+    """The camera of the written images: no distortion, K at their size."""
+    h, w = (max(1, round(side * scale)) for side in camera.size)
+    K = camera.K.copy()
+    K[0] *= w / camera.size[1]
+    K[1] *= h / camera.size[0]
+    return replace(camera, K=K, dist=np.zeros_like(camera.dist), size=(h, w))
 
 
 @dataclass(frozen=True)
@@ -67,13 +42,7 @@ class Written:
     """The result of writing one camera's images."""
 
     frames: list[int]  # common numbers that exist now
-    empty: int  # empty masks among them
     decoded: int | None  # images of the source; None when it was not read to its end
-
-
-def sampled(count: int, most: int) -> list[int]:
-    """At most ``most`` of ``count`` positions, evenly spaced."""
-    return evenly_spaced(count, most)
 
 
 def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]:
@@ -85,10 +54,10 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
     found = {}
     for name in names:
         place = folder / name
-        stems = [p.stem for p in place.glob("*") if p.suffix.lower() in PICTURE_SUFFIXES]
+        stems = [p.stem for p in place.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
         of_persons = bool(stems) and all(re.fullmatch(r"\d+_\d+", stem) for stem in stems)
         number = (lambda stem: int(stem.partition("_")[0])) if of_persons else last_number
-        files = frame_files(folder, name, PICTURE_SUFFIXES, number)
+        files = frame_files(folder, name, IMAGE_SUFFIXES, number)
         if not files:
             raise DataError(f"{place} holds no masks; expected {name}/000000.png and so on")
         found[name] = {number: folder / path for number, path in files.items()}
@@ -98,7 +67,7 @@ def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]
 def check_values(folder: Path, files: Mapping[int, Path]) -> None:
     """Refuses part numbers, or 0 and 1, with a DataError; one faint mask alone is legitimate."""
     paths = [files[number] for number in sorted(files)]
-    highest = max((int(read_grey(paths[i]).max()) for i in sampled(len(paths), PROBED)), default=0)
+    highest = max((int(read_grey(path).max()) for path in spread(paths, PROBED)), default=0)
     if 0 < highest < PERSON:
         raise DataError(
             f"{folder} holds masks with values up to {highest}; small numbers are labels, expected "
@@ -106,26 +75,27 @@ def check_values(folder: Path, files: Mapping[int, Path]) -> None:
         )
 
 
-def tidy(mask: Bytes, settings: MaskTidying) -> Bytes:
+def tidy(mask: Bytes, levels: tuple[float, float]) -> Bytes:
     """A mask ``[H, W]`` 0..255 with its levels stretched and small pieces removed."""
-    low, high = (255 * level for level in settings.levels)
+    low, high = (255 * level for level in levels)
     table = np.clip((np.arange(256) - low) / (high - low), 0, 1)
     mask = np.asarray(cv2.LUT(mask, np.round(255 * table).astype(np.uint8)), np.uint8)
     _, labels, stats, _ = cv2.connectedComponentsWithStats((mask > 0).astype(np.uint8))
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0  # the background
-    return np.asarray(mask * (areas >= settings.least_blob * areas.max())[labels], np.uint8)
+    return np.asarray(mask * (areas >= LEAST_BLOB * areas.max())[labels], np.uint8)
 
 
-def write_pictures(
+def write_images(
     root: Path,
     camera: CameraEntry,
-    source: Source,
+    source: Recording,
     masks: Mapping[int, Path],
     frames: Collection[int],
     offset: int,
-    files: PictureFiles,
-    tidying: MaskTidying,
+    scale: float,
+    suffix: str,
+    levels: tuple[float, float],
     advance: Advance,
 ) -> Written:
     """Writes images/{camera}/%06d and masks/{camera}/%06d.png.
@@ -136,7 +106,8 @@ def write_pictures(
         source, masks: its images, and mask files by the source's own frame number.
         frames: common frame numbers to write; those without a mask are skipped.
         offset: added to a source's number to get the common one.
-        files, tidying: settings.
+        scale, suffix: of the images; masks are always png.
+        levels: alpha that becomes 0 and 1.
         advance: called for each frame.
 
     Raises:
@@ -146,21 +117,20 @@ def write_pictures(
     for folder in (images, alphas):
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-    window, size = Crop(0, 0, camera.size), files.camera(camera).size
+    window, size = Crop(0, 0, camera.size), scaled(camera, scale).size
     mapping = undistort_map(camera.K, camera.dist, window) if camera.distorted else None
-    written, empty, decoded, last = list[int](), 0, 0, max(frames, default=-1)
-    for number, picture in source.pictures():
+    written, decoded, last = list[int](), 0, max(frames, default=-1)
+    for number, image in source.images():
         frame = number + offset
         if frame > last:
-            return Written(written, empty, None)
+            return Written(written, None)
         decoded += 1
         if frame not in frames or number not in masks:
             continue
         written.append(frame)
         advance(len(written), len(frames))
-        mask = tidy(read_grey(masks[number]), tidying)
-        empty += not mask.any()
-        for pixels, folder, kind in ((picture, images, files.format), (mask, alphas, "png")):
+        mask = tidy(read_grey(masks[number]), levels)
+        for pixels, folder, kind in ((image, images, suffix), (mask, alphas, "png")):
             if pixels.shape[:2] != camera.size:
                 where = masks[number] if pixels is mask else source.path
                 raise DataError(
@@ -168,13 +138,13 @@ def write_pictures(
                     f"expected {camera.size[1]}x{camera.size[0]}"
                 )
             straight = resize(take(pixels, window, mapping, exact=False), size, exact=False)
-            _write(folder / f"{frame:06d}.{kind}", straight, files.quality)
-    return Written(written, empty, decoded)
+            _write(folder / f"{frame:06d}.{kind}", straight)
+    return Written(written, decoded)
 
 
-def _write(path: Path, pixels: Bytes, quality: int) -> None:
+def _write(path: Path, pixels: Bytes) -> None:
     options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
     if path.suffix == ".jpg":
-        options = [cv2.IMWRITE_JPEG_QUALITY, quality]
+        options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
     with writing(path):  # in place: a run that was killed here writes all of them again
         path.write_bytes(cv2.imencode(path.suffix, pixels, options)[1].tobytes())

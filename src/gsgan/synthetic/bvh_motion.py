@@ -9,16 +9,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from gsgan.motion.bvh import read_bvh
-from gsgan.motion.character import Character, Motion
+from gsgan.motion.character import Animation, Character
 from gsgan.motion.rig import LEG, SIDES, Pose, Rig
 from gsgan.motion.rotations import Array
 from gsgan.motion.standard import drift, floor_under, standard_motion
-from gsgan.synthetic.motion import blinks
+from gsgan.synthetic.posing import blinks
 
 # A foot stands where it is this low and slow, legs and legs per second.
 CONTACT_HEIGHT, CONTACT_SPEED = 0.04, 0.3
-
-
 SECTION = 2.5  # seconds that share a passage's name
 
 
@@ -76,7 +74,7 @@ class BvhMotion:
             pose.set_hand(side, turns[side + "Hand"])
         return pose
 
-    def at(self, times: Array) -> Motion:
+    def at(self, times: Array) -> Animation:
         """The poses at times ``[F]``, seconds in [0, `duration`]."""
         times = times.clip(0, self._times[-1])
 

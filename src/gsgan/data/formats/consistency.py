@@ -1,6 +1,6 @@
 """Do cameras, joints and masks fit together? The rules, and the one set of thresholds.
 
-Readers apply them to a few images when a dataset is opened (`check_meeting`, `watch_masks`);
+Readers apply them to a few images when a dataset is opened (`check_consistency`, `watch_masks`);
 `gsgan.check` applies the same measures and thresholds to many. Pixel centres lie at +0.5.
 """
 
@@ -9,17 +9,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.checks import spans
 from gsgan.data.crop import NEAR, project
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
+from gsgan.data.validation import spans
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.errors import DataError
 
@@ -36,7 +36,7 @@ FAR_PIXELS = 1e4  # drawing coordinates are clipped to this: OpenCV's are 16 bit
 
 
 @dataclass(frozen=True)
-class Trust:
+class Consistency:
     """How many images are compared when a dataset is opened, and the thresholds.
 
     conf/data/capture.yaml explains every field.
@@ -54,8 +54,7 @@ class Trust:
     mask_jump: float = 0.5
 
 
-@dataclass(frozen=True)
-class Meeting:
+class Comparison(NamedTuple):
     """One image's mask against what its camera should see.
 
     Args:
@@ -75,15 +74,15 @@ class Meeting:
     beyond: float
 
 
-def check_meeting(
-    layout: Layout, body: Callable[[int], Float], trust: Trust, hint: str
+def check_consistency(
+    layout: Layout, body: Callable[[int], Float], limits: Consistency, hint: str
 ) -> list[str]:
     """Checks that the projected body lies where the masks are, and that not all masks are empty.
 
     Args:
         layout: the dataset.
         body: points on the body ``[N, 3]`` of a frame, metres, world.
-        trust: how many frames, and the thresholds.
+        limits: how many frames, and the thresholds.
         hint: what to check when they do not fit.
 
     Returns:
@@ -92,12 +91,18 @@ def check_meeting(
     Raises:
         DataError: naming the camera that is furthest off, or the first empty mask.
     """
-    compared = _meetings(layout, body, trust)
+    compared = [
+        _compare(layout, points, camera, frame, limits)
+        for frame in spread(list(layout.frames), limits.frames)
+        for points in [body(frame)]
+        for camera, files in layout.masks.items()
+        if frame in files
+    ]
     if not compared:
         return []
     person = np.median(layout.landmarks.seen(compared[0].frame), axis=0)
     metres = {n: float(np.linalg.norm(c.centre - person)) for n, c in layout.cameras.items()}
-    if far := far_cameras(metres, trust.far_camera):
+    if far := far_cameras(metres, limits.far_camera):
         raise DataError(f"{layout.root}: {next(iter(far.values()))}")
     if all(one.empty for one in compared):
         raise DataError(
@@ -105,31 +110,31 @@ def check_meeting(
             "compared; expected values above 0 where the person is"
         )
     known = [one for one in compared if np.isfinite(one.iou)]
-    if known and (median := float(np.median([one.iou for one in known]))) < trust.min_box_iou:
+    if known and (median := float(np.median([one.iou for one in known]))) < limits.min_box_iou:
         worst = min(known, key=lambda one: one.iou)
         raise DataError(
             f"{layout.root}: the projected body and the masks do not meet (their boxes overlap by "
-            f"{median:.2f}, expected {trust.min_box_iou:g}; worst in camera {worst.camera}, frame "
+            f"{median:.2f}, expected {limits.min_box_iou:g}; worst in camera {worst.camera}, frame "
             f"{worst.frame}: {worst.mask}); {hint}"
         )
-    return _notes(layout.root, compared, trust, hint)
+    return _notes(layout.root, compared, limits, hint)
 
 
-def _meetings(layout: Layout, body: Callable[[int], Float], trust: Trust) -> list[Meeting]:
-    """The same few moments in every camera that has them."""
-    found = []
-    for frame in spread(list(layout.frames), trust.frames):
-        points, joints = body(frame), layout.landmarks.seen(frame)
-        for name in (c for c, files in layout.masks.items() if frame in files):
-            camera = layout.cameras[name]
-            mask = read_mask(layout.mask_files(name, frame), layout.pixels)
-            expected, found_box = box_of(points, camera), mask_box(mask)
-            iou = box_iou(expected, found_box) if expected and found_box else np.nan
-            inside = inside_share(mask, camera, joints, trust.joint_tolerance)
-            beyond = mask_beyond(mask, camera, joints, trust.joint_reach)
-            path = layout.mask_path(name, frame)
-            found.append(Meeting(name, frame, path, not mask.any(), iou, inside, beyond))
-    return found
+def _compare(
+    layout: Layout, points: Float, name: str, frame: int, limits: Consistency
+) -> Comparison:
+    camera, joints = layout.cameras[name], layout.landmarks.seen(frame)
+    mask = read_mask(layout.mask_files(name, frame), layout.pixels)
+    expected, found = box_of(points, camera), mask_box(mask)
+    return Comparison(
+        camera=name,
+        frame=frame,
+        mask=layout.mask_path(name, frame),
+        empty=not mask.any(),
+        iou=box_iou(expected, found) if expected and found else np.nan,
+        inside=inside_share(mask, camera, joints, limits.joint_tolerance),
+        beyond=mask_beyond(mask, camera, joints, limits.joint_reach),
+    )
 
 
 def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
@@ -143,29 +148,29 @@ def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
     }
 
 
-def _notes(root: Path, compared: Sequence[Meeting], trust: Trust, hint: str) -> list[str]:
+def _notes(root: Path, compared: Sequence[Comparison], limits: Consistency, hint: str) -> list[str]:
     """One note on joints outside masks, one on masks beyond joints, where there are any."""
     notes = []
     inside, beyond = _means(compared, "inside"), _means(compared, "beyond")
-    outside = {name for name, share in inside.items() if share < trust.min_inside}
+    outside = {name for name, share in inside.items() if share < limits.min_inside}
     if outside:
         text = f"joints lie outside the masks (inside: {_listed(inside, outside)})"
-        if min(inside.values()) < trust.least_inside:
+        if min(inside.values()) < limits.least_inside:
             raise DataError(f"{root}: {text}; {hint}: python -m gsgan.check finds the wrong camera")
         notes.append(
             f"{text}: python -m gsgan.check finds whether calibration, skeleton or masks are wrong"
         )
-    wide = {n for n, share in beyond.items() if share > trust.max_beyond and n not in outside}
+    wide = {n for n, share in beyond.items() if share > limits.max_beyond and n not in outside}
     if wide:
         notes.append(
-            f"masks reach more than {trust.joint_reach:g} m beyond all joints (share: "
+            f"masks reach more than {limits.joint_reach:g} m beyond all joints (share: "
             f"{_listed(beyond, wide)}): focal lengths are too short, masks show more than the "
             "person, or the skeleton lacks limbs: python -m gsgan.check reports more"
         )
     return notes
 
 
-def _means(compared: Sequence[Meeting], field: str) -> dict[str, float]:
+def _means(compared: Sequence[Comparison], field: str) -> dict[str, float]:
     """The mean of each camera's finite values."""
     kept: dict[str, list[float]] = {}
     for one in compared:
@@ -280,18 +285,18 @@ def spread(values: Sequence[T], count: int) -> list[T]:
     return [values[i] for i in evenly_spaced(len(values), count, ends=True)]
 
 
-def watch_masks(layout: Layout, trust: Trust) -> list[str]:
+def watch_masks(layout: Layout, limits: Consistency) -> list[str]:
     """Notes on the frames at which the first camera's mask is empty or of an unusual area."""
     camera = next((name for name, files in layout.masks.items() if files), None)
-    if camera is None or trust.watched_masks == 0:
+    if camera is None or limits.watched_masks == 0:
         return []
-    frames = spread(sorted(layout.masks[camera]), trust.watched_masks)
+    frames = spread(sorted(layout.masks[camera]), limits.watched_masks)
     masks = (read_mask(layout.mask_files(camera, f), layout.pixels) for f in frames)
     filled, areas = np.array([(mask.any(), np.count_nonzero(mask > 127)) for mask in masks]).T
     filled = filled > 0
     usual = float(np.median(areas[filled])) if filled.any() else 0.0
-    odd = filled & (np.abs(areas - usual) > trust.mask_jump * usual)
-    off = f"mask's area is more than {trust.mask_jump:.0%} off the usual"
+    odd = filled & (np.abs(areas - usual) > limits.mask_jump * usual)
+    off = f"mask's area is more than {limits.mask_jump:.0%} off the usual"
     return [
         f"camera {camera}: the {case} at frames {spans(np.array(frames)[at].tolist())} of "
         f"{len(frames)} compared; leave bad ones out with data.reader.drop_frames"
