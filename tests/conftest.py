@@ -22,7 +22,7 @@ from omegaconf import DictConfig
 
 import gsgan.utils.compat  # noqa: F401  (before anything imports torchvision)
 from gsgan.body import free_body
-from gsgan.data.figure import figure_of
+from gsgan.data.proportions import measure_proportions
 from gsgan.scene import BodyPose
 
 for folder in ("data", "prepare", "synthetic"):  # what tests of other folders share with them
@@ -135,12 +135,16 @@ def tiny(compose, capture):
 @pytest.fixture
 def build(tiny):
     """(data, avatar, frame) of a tiny config: everything real, everything small."""
-    from gsgan.model.runs import build_avatar, build_data
+    from gsgan.model.assemble import build_avatar, build_data
 
     def run(*overrides: str):
         config = tiny(*overrides)
         data = build_data(config)
-        return data, build_avatar(config, data), data.dataset("train")[0]
+        return (
+            data,
+            build_avatar(config, data.info, data.labelled("train")),
+            data.dataset("train")[0],
+        )
 
     return run
 
@@ -221,9 +225,9 @@ def landmarks(dance) -> np.ndarray:
 
 
 @pytest.fixture(scope="session")
-def figure(landmarks):
+def proportions(landmarks):
     p = torch.from_numpy(landmarks)
-    return figure_of(p, torch.ones(p.shape[:2], dtype=torch.bool), "z")
+    return measure_proportions(p, torch.ones(p.shape[:2], dtype=torch.bool), "z")
 
 
 @pytest.fixture(scope="session")
@@ -236,4 +240,4 @@ def signing(dance) -> np.ndarray:
 
 @pytest.fixture(scope="session")
 def signer(signing):
-    return figure_of(torch.from_numpy(signing), torch.ones(signing.shape[:2]).bool(), "z")
+    return measure_proportions(torch.from_numpy(signing), torch.ones(signing.shape[:2]).bool(), "z")

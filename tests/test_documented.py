@@ -127,7 +127,7 @@ def place(capture, run, bare, model_file, tmp_path_factory) -> Callable[[str], s
     def moving(name: str) -> Path:
         from mannequin import mannequin, write_bvh
 
-        from gsgan.synthetic.motion import Choreography
+        from gsgan.synthetic.posing import Choreography
 
         person = mannequin()
         return write_bvh(folder() / name, person, Choreography(person).at(np.ones(2)), 1 / 30)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 from torch import Tensor, nn
 
 if TYPE_CHECKING:
-    from gsgan.model.painting import Painting
+    from gsgan.model.rendering import Rendering
     from gsgan.scene import Frame
 
 HERE = Path(__file__).resolve().parent
@@ -29,8 +29,8 @@ class Smoothness(nn.Module):
         super().__init__()
         self.weight = weight
 
-    def forward(self, painting: Painting, frame: Frame) -> Tensor:
-        image = painting.image  # [B, 3, H, W], as is frame.image
+    def forward(self, rendering: Rendering, frame: Frame) -> Tensor:
+        image = rendering.image  # [B, 3, H, W], as is frame.image
         return self.weight * (image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean())
 
 

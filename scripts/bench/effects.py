@@ -17,7 +17,9 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsgan.bench.common import NOTHING, Bench, check_whole, markdown, sentence
 from gsgan.effects import decide as decide_effects
-from gsgan.model.runs import build_data, load_avatar, load_config
+from gsgan.model.assemble import build_data
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import load_config
 from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
 from gsgan.utils.config import config_folder
@@ -155,7 +157,7 @@ def measure(row: Row, folder: Path, frames: int, repeats: int) -> None:
         dataset = data.dataset(row.split)
         chosen = evenly_spaced(len(dataset), frames)
         count, shown = len(chosen), [dataset[i] for i in chosen]
-        paint[state] = lambda a=avatar, shown=shown: [a.paint(frame).image for frame in shown]
+        paint[state] = lambda a=avatar, shown=shown: [a(*frame.inputs).image for frame in shown]
         read[state] = lambda d=dataset, chosen=chosen: [d[i] for i in chosen]
         row.parameters[state] = sum(p.numel() for p in avatar.parameters())
     with torch.no_grad():

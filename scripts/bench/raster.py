@@ -25,7 +25,7 @@ from gsgan.body.free import free_body
 from gsgan.scene import Camera, Gaussians, Raster
 from gsgan.skeleton import MEDIAPIPE33, Densify
 from gsgan.splat import BACKENDS, Accuracy, project, rasterise, reference, resolve_backend
-from gsgan.synthetic.view import look_at
+from gsgan.synthetic.camera import look_at
 from gsgan.utils.timing import interleaved, median
 
 # The reference holds every Gaussian at every pixel: others are compared with it, it is not timed.

@@ -113,10 +113,10 @@ def stage_work(avatar: Avatar, frame: Frame) -> pd.DataFrame:
 
         avatar.stage = stage  # type: ignore[method-assign]
         try:
-            painting = avatar.paint(frame)
+            painting = avatar(*frame.inputs)
         finally:
             avatar.stage = unwatched  # type: ignore[method-assign]
-    window = avatar.window(frame)
+    window = avatar.window(frame.skeleton, frame.camera)
     camera = frame.camera if window is None else window.camera(frame.camera)
     splatted = [("F", painting.gaussians, avatar.accuracy)]
     if avatar.segmentation is not None and frame.body is not None:

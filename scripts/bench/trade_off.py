@@ -36,8 +36,10 @@ from gsgan.bench.speed import (
 )
 from gsgan.metrics.image import edge_f1, psnr, ssim
 from gsgan.metrics.lpips import lpips
+from gsgan.model.assemble import build_data
 from gsgan.model.avatar import Avatar
-from gsgan.model.runs import CHECKPOINT, Moved, build_data, load_avatar, load_config
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import CHECKPOINT, DataPaths, load_config
 from gsgan.report.training_curve import curve
 from gsgan.scene import Frame
 from gsgan.splat import BACKENDS, Accuracy
@@ -236,7 +238,7 @@ def load(
     Raises:
         ConfigError: when the runs do not share their data, or the split has no frame.
     """
-    moved = Moved(config.data_root, config.data_smpl)
+    moved = DataPaths(config.data_root, config.data_smpl)
     configs = {point.folder: load_config(point.folder, moved) for point in points}
     first, standard = next(iter(configs.items()))
     for folder, stored in configs.items():

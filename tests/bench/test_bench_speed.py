@@ -52,10 +52,10 @@ def test_every_stage_is_timed_and_the_avatar_is_left_unwatched(small):
 def test_a_stage_that_fails_leaves_the_avatar_unwatched(small):
     _, avatar, frame = small
 
-    def fail(*_: object) -> None:
+    def fail(**_: object) -> None:
         raise ZeroDivisionError
 
-    avatar.draw = fail
+    avatar.generator.forward = fail
     with pytest.raises(ZeroDivisionError):
         measure(avatar, make_painter(avatar), [frame], count=1, warmup=0)
     assert avatar.stage is unwatched

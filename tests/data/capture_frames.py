@@ -7,8 +7,8 @@ import zlib
 from pathlib import Path
 
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.formats.capture import LOOKED_AT, read_capture
-from gsgan.data.formats.trust import Trust
+from gsgan.data.formats.capture import SKELETON_LIMITS, read_capture
+from gsgan.data.formats.consistency import Consistency
 from gsgan.data.layout import Layout
 from gsgan.scene import Frame
 
@@ -17,8 +17,10 @@ def items(layout: Layout) -> list[tuple[str, int]]:
     return [(c, f) for c in layout.cameras for f in sorted(layout.images[c])]
 
 
-def every_frame(root: Path, trust: Trust = LOOKED_AT, **kwargs: object) -> list[Frame]:
-    layout = read_capture(root, trust=trust)
+def every_frame(
+    root: Path, consistency: Consistency = SKELETON_LIMITS, **kwargs: object
+) -> list[Frame]:
+    layout = read_capture(root, consistency=consistency)
     dataset = CaptureDataset(layout, items(layout), **kwargs)  # type: ignore[arg-type]
     return [dataset[i] for i in range(len(dataset))]
 

@@ -15,13 +15,13 @@ from writers.easymocap import write_easymocap
 from writers.smplx_rig import smplx_once, smplx_subject
 from writers.thuman4 import write_thuman4
 
-from gsgan.data.checks import Checks
 from gsgan.data.formats.avatarrex import AvatarrexReader
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.formats.easymocap import EasymocapReader
 from gsgan.data.formats.thuman4 import Thuman4Reader
 from gsgan.data.formats.zju import ZjuReader
 from gsgan.data.layout import Layout
+from gsgan.data.validation import Thresholds
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Format:
 
 
 def _zju(root: Path, smpl: Path) -> Layout:
-    return ZjuReader()(root, Checks(), str(smpl))
+    return ZjuReader()(root, Thresholds(), str(smpl))
 
 
 def _odd(root: Path, subject: Subject) -> None:
@@ -64,17 +64,19 @@ FORMATS = (
     Format("zju_original", zju.write_original, _zju),
     Format("zju_313", _odd, _zju),
     Format("zju_refined", zju.write_refined, _zju),
-    Format("thuman4", _thuman4, lambda root, _: Thuman4Reader()(root, Checks(), str(smplx_once()))),
+    Format(
+        "thuman4", _thuman4, lambda root, _: Thuman4Reader()(root, Thresholds(), str(smplx_once()))
+    ),
     Format(
         "avatarrex",
         _avatarrex,
-        lambda root, _: AvatarrexReader()(root, Checks(), str(smplx_once())),
+        lambda root, _: AvatarrexReader()(root, Thresholds(), str(smplx_once())),
     ),
-    Format("easymocap", write_easymocap, lambda root, _: EasymocapReader()(root, Checks())),
+    Format("easymocap", write_easymocap, lambda root, _: EasymocapReader()(root, Thresholds())),
     Format(
         "easymocap_smpl",
         write_easymocap,
-        lambda root, smpl: EasymocapReader()(root, Checks(), str(smpl)),
+        lambda root, smpl: EasymocapReader()(root, Thresholds(), str(smpl)),
     ),
 )
 COMMON = ("capture", "zju_original", "thuman4", "easymocap")

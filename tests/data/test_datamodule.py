@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import ten_frames
 import torch
-from make import skeletons, write_landmarks, write_tiny_capture
+from make import skeletons, write_tiny_capture
 
 from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order
 from gsgan.data.formats.capture import read_capture
@@ -131,15 +131,6 @@ def test_loaders_and_datasets(capture: Path) -> None:
         data.dataset("test")
 
 
-def test_workers_load_the_same(capture: Path) -> None:
-    alone = GsganData(str(capture), size=16, batch_size=2, steps_per_epoch=2)
-    helped = GsganData(str(capture), size=16, batch_size=2, steps_per_epoch=2, workers=1)
-    for a, b in zip(alone.train_dataloader(), helped.train_dataloader(), strict=True):
-        assert torch.equal(a.image, b.image)
-        assert torch.equal(a.frame_id, b.frame_id)
-    assert alone.dataset("train").cache.maxsize // 3 == helped.dataset("train").cache.maxsize
-
-
 def test_empty_split_has_no_loader_but_a_reason(capture: Path) -> None:
     data = GsganData(str(capture), test_share=0)
     assert data.test_dataloader() == []
@@ -235,14 +226,6 @@ def test_labels_are_counted_without_the_ignore_value(tmp_path: Path) -> None:
     assert count_labels(layout, (("cam00", 1),)) == 1
     names = write_tiny_capture(tmp_path / "n", labels=True, meta={"label_names": list("abcde")})
     assert count_labels(read_capture(names), ()) == 5
-
-
-def test_body_height_passes_over_frames_with_holes(tmp_path: Path) -> None:
-    whole = GsganData(str(write_tiny_capture(tmp_path, frames=9))).info.body_height
-    p = skeletons(9)
-    p[:3, 27:] = np.nan
-    write_landmarks(tmp_path, p=p, frame_id=np.arange(9))
-    assert GsganData(str(tmp_path)).info.body_height == pytest.approx(whole, rel=0.02)
 
 
 @pytest.mark.parametrize(

@@ -9,16 +9,17 @@ import pytest
 import torch
 from operators import Calls
 
-from gsgan.model.painting import ColourCorrection
-from gsgan.model.runs import load_avatar, read_checkpoint
+from gsgan.model.colour import ColourCorrection
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import read_checkpoint
 
 NONE = "effects=none"
 
 
 def calls(avatar, frame) -> Counter[str]:
-    avatar.paint(frame)  # what is built once is built
+    avatar(*frame.inputs)  # what is built once is built
     with Calls() as seen, torch.no_grad():
-        avatar.paint(frame)
+        avatar(*frame.inputs)
     return seen.count
 
 
@@ -70,15 +71,15 @@ def test_images_are_mapped_and_the_background_stays_black():
 
 def test_correction_acts_on_both_pictures_and_leaves_f_alone(build):
     _, avatar, frame = build("effects.colour_correction=on")
-    before = avatar.paint(frame)
+    before = avatar(*frame.inputs)
     assert torch.equal(before.image, before.colour)
     with torch.no_grad():
         avatar.colour.offsets[0, 0, 0] += 0.5
-    after = avatar.paint(frame)
+    after = avatar(*frame.inputs)
     assert torch.equal(after.features, before.features)
     torch.testing.assert_close(after.colour[:, 0], 1.25 * before.features[:, 0])
     torch.testing.assert_close(after.image[:, 0], 1.25 * before.image[:, 0])
-    unseen = avatar.paint(replace(frame, camera_index=torch.tensor([2])))  # cam02 is held out
+    unseen = avatar(*replace(frame, camera_index=torch.tensor([2])).inputs)  # cam02 is held out
     torch.testing.assert_close(unseen.image, before.image)
 
 
@@ -88,9 +89,9 @@ def test_degrees_above_the_active_one_are_neither_computed_nor_moved(build):
     with torch.no_grad():
         psi.head.weight[:14].normal_(std=0.01)  # all up to the constant colour
         psi.table[:, :14].normal_(std=0.1)
-    full = avatar.paint(frame).colour
+    full = avatar(*frame.inputs).colour
     psi.active_degree = 0
-    masked = avatar.paint(frame)
+    masked = avatar(*frame.inputs)
     # zeros above: the same picture, but for the rounding of a narrower product
     torch.testing.assert_close(masked.colour, full, atol=1e-5, rtol=0)
     masked.features.sum().backward()
@@ -127,7 +128,8 @@ def test_a_trained_avatar_has_what_its_checkpoint_says_not_what_the_scene_says_n
 
     from omegaconf import OmegaConf
 
-    from gsgan.model.runs import build_data, load_config
+    from gsgan.model.assemble import build_data
+    from gsgan.model.stored import load_config
 
     copy = tmp_path / "copy"
     shutil.copytree(run, copy)
@@ -143,10 +145,10 @@ def test_all_means_all_that_this_model_can_have(build):
     every = {"view_dependence", "antialias", "colour_correction", "random_background"}
     every |= {"body_points"}
     assert {name for name, effect in avatar.effects if effect.on} == every
-    assert torch.isfinite(avatar.paint(frame).image).all()
+    assert torch.isfinite(avatar(*frame.inputs).image).all()
     _, avatar, frame = build("effects=all", "model=image_to_image")
     assert {name for name, effect in avatar.effects if effect.on} == set()
-    assert torch.isfinite(avatar.paint(frame).image).all()
+    assert torch.isfinite(avatar(*frame.inputs).image).all()
 
 
 def test_the_real_capture_calls_for_colour_correction():

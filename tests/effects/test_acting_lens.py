@@ -44,8 +44,8 @@ def test_paintings_follow_the_lens_with_every_map(build, bent):
     )
     frame = data.dataset("novel_view")[0]
     with torch.no_grad():
-        painting = avatar.paint(frame)
-        pinhole = avatar.paint(replace(frame, camera=replace(frame.camera, dist=None)))
+        painting = avatar(*frame.inputs)
+        pinhole = avatar(*replace(frame, camera=replace(frame.camera, dist=None)).inputs)
     for name in ("image", "features", "alpha", "splat_alpha"):
         assert getattr(painting, name).shape[-2:] == frame.image.shape[-2:]
         assert torch.isfinite(getattr(painting, name)).all()

@@ -115,8 +115,8 @@ def test_a_list_leaves_lenses_to_their_own_word(word):
 @pytest.mark.parametrize(
     ("model", "effect", "why"),
     [
-        (ModelParts(points=False), "body_points", "puts no points on the skeleton"),
-        (ModelParts(splats=False), "antialias", "splats nothing"),
+        (ModelParts(points=False), "body_points", "has no points on the skeleton"),
+        (ModelParts(splats=False), "antialias", "has no Gaussians"),
     ],
 )
 def test_an_effect_that_the_model_lacks_is_off_or_refused(model, effect, why):

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.files import (
     HEADER,
     IN_TERMINAL,
@@ -44,7 +44,7 @@ def results(marks=("perceptual loss: stand-in",), boxes=None):
     scores |= held if boxes else no_scores(BOX_METRICS, "no hands")
     scores["cameras"] = {"cam07": dict.fromkeys(METRICS) | {"psnr": 29.5}}
     split = {"full": dict(scores), "splat": dict(scores), "floor": dict(scores)}
-    scorer = Scorer(Preparation(Measures(), None), None, "no weights", "LPIPS", list(marks))
+    scorer = Scorer(Preparation(MetricVariants(), None), None, "no weights", "LPIPS", list(marks))
     unscored = {name: empty("no camera is held out", scorer) for name in split}
     return {"novel_view": unscored, "novel_pose": split}
 

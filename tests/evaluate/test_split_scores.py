@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
 from torchmetrics.classification import MulticlassJaccardIndex
 
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparation
 from gsgan.evaluate.scores import (
     Scorer,
@@ -23,7 +23,7 @@ from gsgan.evaluate.scores import (
     score_split,
 )
 from gsgan.metrics.image import psnr, ssim, ssim_uniform
-from gsgan.model.painting import Painting
+from gsgan.model.rendering import Rendering
 from gsgan.scene import Camera, Frame
 from gsgan.utils.errors import GsganError
 
@@ -50,8 +50,10 @@ def person(size: int = 24) -> Frame:
     return frame(0.4 * mask.expand(1, 3, -1, -1), mask)
 
 
-def scorer(measures: Measures | None = None) -> Scorer:
-    return Scorer(Preparation(measures or Measures(), None), None, "no weights", "LPIPS-VGG [-1,1]")
+def scorer(measures: MetricVariants | None = None) -> Scorer:
+    return Scorer(
+        Preparation(measures or MetricVariants(), None), None, "no weights", "LPIPS-VGG [-1,1]"
+    )
 
 
 def test_equal_images_are_kept_out_of_the_mean():
@@ -91,7 +93,7 @@ def test_only_the_inside_of_the_box_counts_where_a_protocol_says_so():
     image, target = (torch.rand(1, 3, 24, 24, generator=generator) for _ in range(2))
     box = torch.zeros(1, 1, 24, 24, dtype=torch.bool)
     box[..., 4:14, 6:20] = True
-    measures = Measures(region="body_box")
+    measures = MetricVariants(region="body_box")
     result = image_scores(image, target, box=box, measures=measures)
     part = (..., slice(4, 14), slice(6, 20))
     assert result["psnr"] == pytest.approx(float(psnr(image[part], target[part])), abs=1e-5)
@@ -105,7 +107,9 @@ def test_only_the_inside_of_the_box_counts_where_a_protocol_says_so():
 def test_the_window_of_ssim_is_the_protocols():
     generator = torch.Generator().manual_seed(0)
     image, target = (torch.rand(1, 3, 24, 24, generator=generator) for _ in range(2))
-    found = image_scores(image, target, measures=Measures(ssim_window="uniform", ssim_range=2))
+    found = image_scores(
+        image, target, measures=MetricVariants(ssim_window="uniform", ssim_range=2)
+    )
     expected = float(ssim_uniform(image, target, value_range=2))
     assert found["ssim"] == pytest.approx(expected, abs=1e-9)
     assert abs(expected - float(ssim(image, target, value_range=2))) > 1e-4
@@ -121,7 +125,7 @@ def test_the_floor_of_a_split_is_the_background_and_its_psnr_is_known():
         found = score_split(
             [(("a", 0), f)],
             lambda f, _: Prediction({FULL: f.image}, {FULL: f.mask}),
-            scorer(Measures(background=background)),
+            scorer(MetricVariants(background=background)),
         )
         assert found.variants[FLOOR]["psnr"] == pytest.approx(
             -10 * math.log10(power / 576), abs=1e-4
@@ -139,7 +143,7 @@ def test_an_opaque_image_on_black_hides_its_outline_on_white_and_says_so():
     def predict(f: Frame, _: object) -> Prediction:
         return Prediction({FULL: fat}, {}, "black")
 
-    white = score_split([(("a", 0), f)], predict, scorer(Measures(background="white")))
+    white = score_split([(("a", 0), f)], predict, scorer(MetricVariants(background="white")))
     assert white.hidden_outline
     assert white.rows[FULL][0]["psnr"] > 100
     black = score_split([(("a", 0), f)], predict, scorer())
@@ -152,9 +156,9 @@ def test_an_opaque_image_on_black_hides_its_outline_on_white_and_says_so():
 def test_each_image_of_an_avatar_is_put_on_white_by_its_own_alpha():
     """I_pred is the truth; Step I's colour is it at half the alpha: 0.3 off, 0.15 at the edge."""
     f = person()
-    painting = Painting(f.image, f.mask, features=0.5 * f.image, splat_alpha=0.5 * f.mask)
-    avatar = SimpleNamespace(paint=lambda _: painting, segmentation=None)
-    white = scorer(Measures(background="white"))
+    rendering = Rendering(f.image, f.mask, features=0.5 * f.image, splat_alpha=0.5 * f.mask)
+    avatar = Mock(return_value=rendering, segmentation=None)
+    white = scorer(MetricVariants(background="white"))
     found = score_split([(("a", 0), f)], painter(avatar), white)
     assert found.rows[FULL][0]["psnr"] == math.inf
     assert found.variants[SPLAT]["psnr"] == pytest.approx(
@@ -169,7 +173,7 @@ def test_one_variant_without_alpha_takes_the_ground_truths_mask_and_says_so():
     def predict(f: Frame, _: object) -> Prediction:
         return Prediction({FULL: 0.5 * f.image, SPLAT: f.image}, {FULL: 0.5 * f.mask})
 
-    found = score_split([(("a", 0), f)], predict, scorer(Measures(background="white")))
+    found = score_split([(("a", 0), f)], predict, scorer(MetricVariants(background="white")))
     assert found.hidden_outline
     assert found.rows[SPLAT][0]["psnr"] > 100
     assert found.rows[FULL][0]["psnr"] < 30
@@ -250,7 +254,7 @@ def test_miou_of_a_split_without_parts_is_none():
         scorer(),
     )
     assert found.variants[FULL]["miou"] is None
-    assert found.variants[FULL]["miou_reason"] == "the truth holds no part"
+    assert found.variants[FULL]["miou_reason"] == "the ground truth has no part"
 
 
 def test_lpips_in_the_persons_box_sees_that_box_alone():

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torchmetrics.image.lpip import LearnedPerceptualImagePatchSimilarity
 
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.run import lpips_name
 from gsgan.evaluate.scores import image_scores
 from gsgan.losses.perceptual import FILES
@@ -91,7 +91,7 @@ def test_the_crop_is_what_the_backbone_sees(scores, direct, pictures):
     mask[..., 60:63, 60:63] = 1  # with 50 px round it: rows and columns 10 to 63
     elsewhere = image.clone()
     elsewhere[..., :10, :] = 1 - elsewhere[..., :10, :]
-    measures = Measures(lpips_region="mask_crop_512", background="white")
+    measures = MetricVariants(lpips_region="mask_crop_512", background="white")
     found = []
     for picture in (image, elsewhere):
         own = image_scores(picture, target, mask, measures=measures, lpips=scores[RANGES[0]])
@@ -106,7 +106,7 @@ def test_channels_are_fed_in_the_order_that_is_asked_for(scores, direct, picture
     image, target = (x[:1] for x in pictures)
     found = {}
     for order in ("rgb", "bgr"):
-        measures = Measures(lpips_channels=order)
+        measures = MetricVariants(lpips_channels=order)
         own = image_scores(image, target, measures=measures, lpips=scores[RANGES[0]])
         found[order] = own["lpips"]
     with torch.no_grad():
@@ -116,7 +116,7 @@ def test_channels_are_fed_in_the_order_that_is_asked_for(scores, direct, picture
 
 
 def test_the_name_says_backbone_range_and_region():
-    assert lpips_name("vgg", Measures()) == "LPIPS-VGG [-1,1]"
-    crop = Measures(lpips_range=(0, 1), lpips_region="mask_crop_512")
-    assert lpips_name("vgg", Measures(lpips_channels="bgr")) == "LPIPS-VGG [-1,1] BGR"
+    assert lpips_name("vgg", MetricVariants()) == "LPIPS-VGG [-1,1]"
+    crop = MetricVariants(lpips_range=(0, 1), lpips_region="mask_crop_512")
+    assert lpips_name("vgg", MetricVariants(lpips_channels="bgr")) == "LPIPS-VGG [-1,1] BGR"
     assert lpips_name("alex", crop) == "LPIPS-Alex [0,1] mask crop 512"

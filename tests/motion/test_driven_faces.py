@@ -7,10 +7,10 @@ import pytest
 import torch
 from test_motion_readers import Y_DOWN, standard, write_pose
 
-from gsgan.data.figure import EXPRESSION
 from gsgan.data.joints import FACE_MESH
+from gsgan.data.proportions import EXPRESSION
 from gsgan.motion.clip import is_own
-from gsgan.motion.retarget import expressed, face_in_head, joined, on_figure, steadied
+from gsgan.motion.retarget import expressed, face_in_head, joined, retargeted, steadied
 from gsgan.motion.rotations import rotation
 from gsgan.skeleton import (
     HOLISTIC,
@@ -81,12 +81,12 @@ def write_face(path, p: np.ndarray, kept: tuple[int, ...] = tuple(range(30))):
     return write_pose(path, parts)
 
 
-def driven(path, figure, rest) -> np.ndarray:
+def driven(path, proportions, rest) -> np.ndarray:
     """``[F, 105, 3]`` the subject as `gsgan.render` drives it, in standard axes."""
-    p, motion = standard(path, figure)
+    p, motion = standard(path, proportions)
     p = p if motion.detached else face_in_head(p)
     p[:, EXPRESSION] = expressed(p[:, EXPRESSION], rest)
-    return on_figure(p, figure)
+    return retargeted(p, proportions)
 
 
 def check(found: np.ndarray, moves: np.ndarray) -> None:
@@ -167,7 +167,7 @@ def test_landmarks_with_a_face(tmp_path, talking, signer, rest, moves):
 def test_clips_with_and_without_a_face(talking, signer, rest, moves):
     p = talking.copy()
     p[:, EXPRESSION] = rest + moves[3]  # in the head's axes
-    p = on_figure(p, signer)
+    p = retargeted(p, signer)
     bare = p.copy()
     bare[:, EXPRESSION] = np.nan
     found = joined([p, p[::-1].copy(), bare], signer, 7)

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from test_motion_readers import Y_DOWN, standard, write_pose
 
-from gsgan.data.figure import HAND_JOINTS, figure_of, palm_frame, upright
+from gsgan.data.proportions import HAND_JOINTS, hand_frame, measure_proportions, upright
 from gsgan.motion.clip import is_own, up_axis
-from gsgan.motion.retarget import joined, on_figure
+from gsgan.motion.retarget import PALM, joined, retargeted
 from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, complete_skeleton, limb_length_sum
 from gsgan.skeleton.hands import FINGER_BONES, HAND_NAMES
 
@@ -48,18 +48,18 @@ def write_holistic(path, p: np.ndarray):
 def driven(path, signer) -> np.ndarray:
     """``[F, J, 3]`` the signer in a .pose file's poses, in the axes of `signing`."""
     p, motion = standard(path, signer)
-    return on_figure(p @ (upright(up_axis(motion)) @ Y_DOWN), signer)
+    return retargeted(p @ (upright(up_axis(motion)) @ Y_DOWN), signer)
 
 
-def test_the_figure_has_the_lengths_of_finger_bones(signing, signer, figure):
+def test_the_figure_has_the_lengths_of_finger_bones(signing, signer, proportions):
     rest = signer.rest_with_hands
     true = np.linalg.norm(fingers(signing), axis=-1)[0]
     np.testing.assert_allclose(np.linalg.norm(fingers(rest[None]), axis=-1)[0], true, rtol=1e-4)
-    palms = palm_frame(np.stack([rest[LEFT], rest[RIGHT]]))
+    palms = hand_frame(np.stack([rest[LEFT], rest[RIGHT]]), *PALM)
     np.testing.assert_allclose(palms[0], np.eye(3), atol=1e-9)  # along +X, palm down
     np.testing.assert_allclose(palms[1], np.diag([-1.0, 1, -1]), atol=1e-9)
-    assert figure.hands is None
-    template = figure.rest_with_hands  # of the right size, at the wrists
+    assert proportions.hands is None
+    template = proportions.rest_with_hands  # of the right size, at the wrists
     np.testing.assert_allclose(template[33:], rest[33:], atol=0.06)
     half = replace(signer, joints=tuple(map(tuple, signer.rest / 2)), hands=None)
     np.testing.assert_allclose(half.rest_with_hands, template / 2, atol=0.01)
@@ -68,7 +68,7 @@ def test_the_figure_has_the_lengths_of_finger_bones(signing, signer, figure):
 def test_a_hand_that_was_never_seen_mirrors_the_other(signing, signer):
     seen = torch.ones(signing.shape[:2]).bool()
     seen[:, LEFT] = False
-    one = figure_of(torch.from_numpy(signing), seen, "z").rest_with_hands
+    one = measure_proportions(torch.from_numpy(signing), seen, "z").rest_with_hands
     np.testing.assert_allclose(one[RIGHT], signer.rest_with_hands[RIGHT])
     away = [one[at] - one[wrist] for wrist, at in HAND_JOINTS.items()]
     np.testing.assert_allclose(away[0], away[1] * (-1, 1, 1), atol=1e-12)
@@ -81,7 +81,7 @@ def test_fingers_of_a_pose_file_keep_their_directions(tmp_path, signing, signer)
     lengths = np.linalg.norm(fingers(signer.rest_with_hands[None]), axis=-1)
     np.testing.assert_allclose(np.linalg.norm(fingers(q), axis=-1), lengths.repeat(12, 0))
     for wrist, at in HAND_JOINTS.items():
-        palms = [palm_frame(x[:, at]) for x in (q, signing)]
+        palms = [hand_frame(x[:, at], *PALM) for x in (q, signing)]
         assert angles(palms[0].mT, palms[1].mT).max() < 1
         np.testing.assert_allclose(q[:, at][:, 0], q[:, wrist], atol=0.01)
 
@@ -107,7 +107,7 @@ def test_missing_hands_are_not_seen_and_short_gaps_are_bridged(tmp_path, signing
 
 
 def test_clips_with_and_without_hands(signing, signer):
-    p = on_figure(signing, signer)
+    p = retargeted(signing, signer)
     other = p[::-1].copy()
     other[:, LEFT] = np.nan
     found = joined([p, other, p], signer, 7)
@@ -128,13 +128,7 @@ def test_landmarks_with_hands(tmp_path, signing, signer):
     assert motion.p.shape == (12, 75, 3)
     assert is_own(motion, signer)
     np.testing.assert_array_equal(motion.p, signing)
-    assert angles(fingers(on_figure(1.2 * p, signer)), fingers(signing)).max() < 1e-3
-
-
-def test_a_pose_file_is_always_retargeted(tmp_path, signing, signer):
-    """Its hands are relative to their wrists, whatever the lengths of its bones."""
-    _, motion = standard(write_holistic(tmp_path / "a.pose", signing), signer)
-    assert motion.detached
+    assert angles(fingers(retargeted(1.2 * p, signer)), fingers(signing)).max() < 1e-3
 
 
 def test_a_transition_keeps_the_place_of_the_hips(signing, signer):

@@ -12,11 +12,11 @@ import torch
 
 from gsgan.body.shape import free_space, shaped_body
 from gsgan.body.smpl import read_smpl
-from gsgan.data.figure import BONES, figure_of, upright
+from gsgan.data.proportions import BONES, measure_proportions, upright
 from gsgan.motion.asf import asf_of, read_amc
 from gsgan.motion.clip import checked, completed, is_own, resampled, up_axis
 from gsgan.motion.readers import Source, read_motion
-from gsgan.motion.retarget import on_figure
+from gsgan.motion.retarget import retargeted
 from gsgan.motion.rotations import rotation
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import DataError
@@ -30,9 +30,9 @@ def directions(p: np.ndarray) -> np.ndarray:
     return bones / np.linalg.norm(bones, axis=-1, keepdims=True)
 
 
-def standard(path: Path, figure, **source) -> tuple[np.ndarray, object]:
+def standard(path: Path, proportions, **source) -> tuple[np.ndarray, object]:
     """The file's landmarks without gaps, Z up; and the motion."""
-    motion = checked(read_motion(path, Source(figure, **source)), 0.1)
+    motion = checked(read_motion(path, Source(proportions, **source)), 0.1)
     return completed(motion, motion.up or up_axis(motion)), motion
 
 
@@ -61,27 +61,27 @@ def write_pose(
     return path
 
 
-def test_landmarks(tmp_path, landmarks, figure):
+def test_landmarks(tmp_path, landmarks, proportions):
     path = tmp_path / "a.npz"
     np.savez(path, p=1000 * landmarks[..., [0, 2, 1]] * (1, 1, -1), fps=25)
     (tmp_path / "meta.json").write_text('{"unit": "mm", "up_axis": "y"}')
-    p, motion = standard(path, figure)
+    p, motion = standard(path, proportions)
     assert motion.fps == 25
     turned = p @ (upright("y") @ np.array([[1, 0, 0], [0, 0, 1], [0, -1.0, 0]]))
     np.testing.assert_allclose(turned, landmarks, atol=1e-6)
-    assert is_own(motion, figure)
+    assert is_own(motion, proportions)
 
 
-def test_body_poses_of_the_free_body(tmp_path, dance, landmarks, figure):
+def test_body_poses_of_the_free_body(tmp_path, dance, landmarks, proportions):
     path = tmp_path / "a.npz"
     theta = dance.theta.numpy().copy()
     np.savez(path, theta=theta, transl=dance.transl.numpy(), frame_id=np.arange(len(theta)))
-    p, motion = standard(path, figure)
+    p, motion = standard(path, proportions)
     np.testing.assert_allclose(p, landmarks, atol=1e-5)
     assert motion.body is not None
     theta[3, 0, 0] = np.nan
     np.savez(path, theta=theta, transl=dance.transl.numpy())
-    p, motion = standard(path, figure)
+    p, motion = standard(path, proportions)
     assert motion.filled == 1
     for found in (p, motion.body.theta, motion.body.transl):
         assert np.isfinite(found).all()
@@ -97,7 +97,7 @@ def test_body_poses_of_a_fitted_body(tmp_path, dance):
     path = tmp_path / "body_pose.npz"
     np.savez(path, theta=dance.theta.numpy(), transl=100 * dance.transl.numpy())
     posed = shaped_body(shape).posed_landmarks(dance).double()
-    own = figure_of(posed, torch.ones(posed.shape[:2], dtype=torch.bool), "z")
+    own = measure_proportions(posed, torch.ones(posed.shape[:2], dtype=torch.bool), "z")
     p, motion = standard(path, own)
     np.testing.assert_allclose(p, posed, atol=1e-5)
     assert motion.fps == 50
@@ -109,7 +109,7 @@ def test_body_poses_of_a_fitted_body(tmp_path, dance):
 
 @pytest.mark.parametrize("kind", ["smpl", "smplx"])
 @pytest.mark.parametrize("numbers", [66, 72, 156, 165])
-def test_smpl_and_amass(tmp_path, shared, figure, kind, numbers):
+def test_smpl_and_amass(tmp_path, shared, proportions, kind, numbers):
     from writers.smpl import write_smpl
 
     end = "pkl" if kind == "smpl" else "npz"
@@ -118,8 +118,8 @@ def test_smpl_and_amass(tmp_path, shared, figure, kind, numbers):
     poses[:, 3 * 18 + 2] = 1.5  # the left elbow
     np.savez(path, poses=poses, trans=np.zeros((5, 3)), betas=np.zeros(16), mocap_framerate=120.0)
     with pytest.raises(DataError, match=r"SMPL parameters.* give smpl="):
-        standard(path, figure)
-    p, motion = standard(path, figure, smpl=model)
+        standard(path, proportions)
+    p, motion = standard(path, proportions, smpl=model)
     assert motion.fps == 120
     body = read_smpl(model)
     theta = torch.zeros(1, len(body.parents), 3, dtype=torch.float64)
@@ -132,11 +132,11 @@ def test_smpl_and_amass(tmp_path, shared, figure, kind, numbers):
     np.testing.assert_allclose(directions(p)[:1], directions(truth), atol=1e-6)
     np.savez(path, poses=poses[:, :50])
     with pytest.raises(DataError, match="50 numbers per frame"):
-        standard(path, figure, smpl=model)
+        standard(path, proportions, smpl=model)
 
 
 @pytest.mark.parametrize("style", ["python", "tasks", "bare", "lists", "npz"])
-def test_mediapipe(tmp_path, landmarks, figure, style):
+def test_mediapipe(tmp_path, landmarks, proportions, style):
     q = landmarks @ Y_DOWN.T
     frames = [[{"x": x, "y": y, "z": z, "visibility": 0.9} for x, y, z in p] for p in q.tolist()]
     content = {
@@ -154,7 +154,7 @@ def test_mediapipe(tmp_path, landmarks, figure, style):
         np.savez(path, pose_world_landmarks=np.concatenate([q, np.ones((12, 33, 1))], -1), fps=25)
     else:
         path.write_text(json.dumps(content[style]))
-    p, motion = standard(path, figure)
+    p, motion = standard(path, proportions)
     assert up_axis(motion) == "-y"
     assert motion.fps == (25 if style in ("python", "npz") else None)
     np.testing.assert_allclose(p @ (upright("-y") @ Y_DOWN), landmarks, atol=1e-9)
@@ -170,14 +170,14 @@ def test_mediapipe(tmp_path, landmarks, figure, style):
         ([{"pose_world_landmarks": None}], "none of 1 frames has shoulders and hips"),
     ],
 )
-def test_bad_json(tmp_path, figure, content, message):
+def test_bad_json(tmp_path, proportions, content, message):
     path = tmp_path / "a.json"
     path.write_text(json.dumps(content))
     with pytest.raises(DataError, match=message):
-        standard(path, figure)
+        standard(path, proportions)
 
 
-def test_pose2sim(tmp_path, landmarks, figure):
+def test_pose2sim(tmp_path, landmarks, proportions):
     names = [n for n in MEDIAPIPE33.names if "eye" not in n]
     shown = [f"{n[0].upper()}{n.split('_')[1]}" if "_" in n[4:] else n for n in names]
     shown = [n if n not in ("Lfoot", "Rfoot") else n[0] + "BigToe" for n in shown]
@@ -191,15 +191,15 @@ def test_pose2sim(tmp_path, landmarks, figure):
         lines.append(f"{i}\t{i / 50}\t{numbers}")
     path = tmp_path / "a.trc"
     path.write_text("\n".join(lines))
-    p, motion = standard(path, figure)
+    p, motion = standard(path, proportions)
     assert motion.fps == 50
     np.testing.assert_allclose(directions(p), directions(landmarks), atol=1e-6)
     path.write_text("\n".join(lines)[:700])
     with pytest.raises(DataError, match=r"a\.trc"):
-        standard(path, figure)
+        standard(path, proportions)
 
 
-def test_pose_files_with_axes_of_unknown_scale(tmp_path, landmarks, figure):
+def test_pose_files_with_axes_of_unknown_scale(tmp_path, landmarks, proportions):
     names = [n.upper() for n in MEDIAPIPE33.names]
 
     def write(path, q, layout, name="POSE_WORLD_LANDMARKS"):
@@ -207,25 +207,25 @@ def test_pose_files_with_axes_of_unknown_scale(tmp_path, landmarks, figure):
 
     path, q = tmp_path / "a.pose", landmarks @ Y_DOWN.T
     write(path, q * (687.0, 515.0, 1.07) + 250, "XYZC")
-    p, motion = standard(path, figure)
+    p, motion = standard(path, proportions)
     assert motion.fps == 25
-    assert is_own(motion, figure)
+    assert is_own(motion, proportions)
     turned = directions(p @ (upright("-y") @ Y_DOWN))
     np.testing.assert_allclose(turned, directions(landmarks), atol=0.02)
     path.write_bytes(path.read_bytes()[:4000])
     with pytest.raises(DataError, match=r"not a valid \.pose file"):
-        standard(path, figure)
+        standard(path, proportions)
     write(path, q[..., :2], "XYC", "pose_keypoints_2d")
     with pytest.raises(DataError, match="pose_keypoints_2d without depth"):
-        standard(path, figure)
+        standard(path, proportions)
 
 
-def test_people_filmed_from_the_waist_up_stand_upright(tmp_path, landmarks, figure):
+def test_people_filmed_from_the_waist_up_stand_upright(tmp_path, landmarks, proportions):
     names, q = [n.upper() for n in MEDIAPIPE33.names], landmarks @ Y_DOWN.T
     world = ("POSE_WORLD_LANDMARKS", (names, q[::-1]))
     q[:, 23:25, 2] -= 0.5  # MediaPipe's guess
     parts = {"POSE_LANDMARKS": (names, q * (640, 640, 1)), world[0]: world[1]}
-    p, _ = standard(write_pose(tmp_path / "a.pose", parts, unsure=(23, 24)), figure)
+    p, _ = standard(write_pose(tmp_path / "a.pose", parts, unsure=(23, 24)), proportions)
     spine = p[:, 11:13].mean(1) - p[:, 23:25].mean(1)
     np.testing.assert_allclose(spine[:, :2], 0, atol=1e-9)
     assert (spine[:, 2] > 0.4).all()
@@ -234,15 +234,15 @@ def test_people_filmed_from_the_waist_up_stand_upright(tmp_path, landmarks, figu
     assert (across[0] * across[1]).sum(-1).min() > 0.9  # image landmarks, not the world's
 
 
-def test_bvh(tmp_path, figure):
+def test_bvh(tmp_path, proportions):
     from mannequin import mannequin, write_bvh
 
-    from gsgan.synthetic.motion import Choreography
+    from gsgan.synthetic.posing import Choreography
 
     person = mannequin()
     signing = Choreography(person).at(21 + np.arange(30) / 30)
     path = write_bvh(tmp_path / "a.bvh", person, signing, 1 / 30, scale=100.0)
-    p, motion = standard(path, figure)
+    p, motion = standard(path, proportions)
     assert motion.unit == "centimetres"
     names = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
     at = {
@@ -258,11 +258,11 @@ def test_bvh(tmp_path, figure):
     ours, theirs = (np.arctan2(*(x[0, 23] - x[0, 24])[[1, 0]]) for x in (p, truth))
     yaw = rotation(np.array([0, 0, theirs - ours]))
     np.testing.assert_allclose(directions(p @ yaw.T), directions(truth), atol=1e-4)
-    q = on_figure(p, figure)
+    q = retargeted(p, proportions)
     assert np.isfinite(q).all()
     path.write_text(path.read_text().replace("LeftLeg", "Tentacle"))
     with pytest.raises(DataError, match="no joint found for LeftLeg"):
-        standard(path, figure)
+        standard(path, proportions)
 
 
 BONES_OF_ASF = [  # name, parent, direction, length, dof
@@ -318,7 +318,7 @@ def write_amc(folder: Path) -> Path:
     return path
 
 
-def test_amc(tmp_path, figure):
+def test_amc(tmp_path, proportions):
     path = write_amc(tmp_path)
     bvh, metres = read_amc(path, asf_of(path))
     assert metres == pytest.approx(0.0254 / 0.45)
@@ -326,7 +326,7 @@ def test_amc(tmp_path, figure):
     np.testing.assert_allclose(hand[0], [3 + 5 + 4.5, 17 + 8, 0], atol=1e-9)
     # C M C⁻¹ with C a quarter turn about y: about x in the bone's axes is about -z of the parent's
     np.testing.assert_allclose(hand[1], [3 - 4.5, 17 + 8 - 5, 0], atol=1e-9)
-    p, motion = standard(path, figure)
+    p, motion = standard(path, proportions)
     assert motion.fps == 120
     assert motion.file_up == "y"
     along = directions(p)
@@ -346,24 +346,24 @@ def test_amc(tmp_path, figure):
         ("07.asf", lambda t: t.replace("name lhand", "nome lhand"), "'name' is missing"),
     ],
 )
-def test_damaged_amc(tmp_path, figure, file, damage, message):
+def test_damaged_amc(tmp_path, proportions, file, damage, message):
     path = write_amc(tmp_path)
     (tmp_path / file).write_text(damage((tmp_path / file).read_text()))
     with pytest.raises(DataError, match=message):
-        standard(path, figure)
+        standard(path, proportions)
 
 
-def test_an_amc_without_its_skeleton(tmp_path, figure):
+def test_an_amc_without_its_skeleton(tmp_path, proportions):
     path = write_amc(tmp_path)
     (tmp_path / "07.asf").rename(tmp_path / "x.asf")
-    standard(path, figure)  # the only one there
+    standard(path, proportions)  # the only one there
     (tmp_path / "y.asf").write_text("")
     with pytest.raises(DataError, match=r"found 2 beside it; give skeleton="):
-        standard(path, figure)
-    standard(path, figure, skeleton=tmp_path / "x.asf")
+        standard(path, proportions)
+    standard(path, proportions, skeleton=tmp_path / "x.asf")
 
 
-def test_other_files(tmp_path, figure):
+def test_other_files(tmp_path, proportions):
     for name, content, message in (
         ("a.fbx", b"x", r"unknown format; expected one of \.npz"),
         ("a.npz", b"", "is empty"),
@@ -371,15 +371,15 @@ def test_other_files(tmp_path, figure):
     ):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(DataError, match=message):
-            standard(tmp_path / name, figure)
+            standard(tmp_path / name, proportions)
     with pytest.raises(DataError, match="does not exist; give a file, or novel_pose"):
-        standard(tmp_path / "c.bvh", figure)
+        standard(tmp_path / "c.bvh", proportions)
     np.savez(tmp_path / "d.npz", image=np.zeros(3))
     with pytest.raises(DataError, match="no known kind of motion"):
-        standard(tmp_path / "d.npz", figure)
+        standard(tmp_path / "d.npz", proportions)
     np.savez(tmp_path / "e.npz", p=np.zeros((0, 33, 3)))
     with pytest.raises(DataError, match="has no frames"):
-        standard(tmp_path / "e.npz", figure)
+        standard(tmp_path / "e.npz", proportions)
 
 
 def test_frame_rates(landmarks):
@@ -391,43 +391,43 @@ def test_frame_rates(landmarks):
     assert resampled(landmarks[:1], 24, 60).shape == (1, 33, 3)
 
 
-def test_frames_without_a_trunk(tmp_path, landmarks, figure):
+def test_frames_without_a_trunk(tmp_path, landmarks, proportions):
     p = landmarks.copy()
     p[0] = p[11] = p[3] = p[4, [11, 23]] = np.nan
     p[2, 12] = np.nan  # one shoulder of a neighbour
     np.savez(tmp_path / "a.npz", p=p)
-    motion = checked(read_motion(tmp_path / "a.npz", Source(figure)), 0.1)
+    motion = checked(read_motion(tmp_path / "a.npz", Source(proportions)), 0.1)
     assert motion.filled == 4
     np.testing.assert_array_equal(motion.p[0], landmarks[1])
     np.testing.assert_array_equal(motion.p[11], landmarks[10])
     np.testing.assert_allclose(motion.p[3, 15], landmarks[[2, 2, 5], 15].mean(0))
-    whole, _ = standard(tmp_path / "a.npz", figure)
+    whole, _ = standard(tmp_path / "a.npz", proportions)
     assert np.isfinite(whole).all()
     np.savez(tmp_path / "a.npz", p=np.full_like(p, np.nan))
     with pytest.raises(DataError, match="none of 12 frames has shoulders and hips"):
-        standard(tmp_path / "a.npz", figure)
+        standard(tmp_path / "a.npz", proportions)
 
 
-def test_landmarks_from_the_waist_up(tmp_path, landmarks, figure):
+def test_landmarks_from_the_waist_up(tmp_path, landmarks, proportions):
     """Hips that no frame shows are placed below the shoulders, as when a capture is opened."""
     p = landmarks.copy()
     p[:, 23:] = np.nan
     np.savez(tmp_path / "a.npz", p=p)
-    whole, motion = standard(tmp_path / "a.npz", figure)
+    whole, motion = standard(tmp_path / "a.npz", proportions)
     assert motion.filled == 0
     assert np.isfinite(whole).all()
     spine = np.linalg.norm(whole[:, [23, 24]].mean(1) - whole[:, [11, 12]].mean(1), axis=-1)
-    own = np.linalg.norm(figure.rest[[23, 24]].mean(0) - figure.rest[[11, 12]].mean(0))
+    own = np.linalg.norm(proportions.rest[[23, 24]].mean(0) - proportions.rest[[11, 12]].mean(0))
     np.testing.assert_allclose(spine, own, rtol=0.3)
 
 
-def test_joints_out_of_sight(tmp_path, landmarks, figure):
+def test_joints_out_of_sight(tmp_path, landmarks, proportions):
     p = landmarks.copy()
     p[3:6, 15] = np.nan  # a wrist for a moment: it moves evenly
     p[:, 14] = np.nan  # an elbow always: the arm hangs
     p[1:, 28] = np.nan  # an ankle that is seen once: a false guess
     np.savez(tmp_path / "a.npz", p=p)
-    whole, _ = standard(tmp_path / "a.npz", figure)
+    whole, _ = standard(tmp_path / "a.npz", proportions)
     assert np.isfinite(whole).all()
     middle = (whole[4, 15] - whole[4, 13]) - (landmarks[4, 15] - landmarks[4, 13])
     assert np.linalg.norm(middle) < 0.04
@@ -438,18 +438,18 @@ def test_joints_out_of_sight(tmp_path, landmarks, figure):
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="no motion files here")
-def test_real_files(figure):
+def test_real_files(proportions):
     for path in sorted(REAL.rglob("*.*")):
         if path.suffix in (".bvh", ".pose") or path.name in ("02_03.amc", "03_02.amc"):
             if path.name == "openpose.pose":
                 with pytest.raises(DataError, match="without depth"):
-                    standard(path, figure)
+                    standard(path, proportions)
                 continue
-            p, _ = standard(path, figure)
-            q = on_figure(p, figure)
+            p, _ = standard(path, proportions)
+            q = retargeted(p, proportions)
             assert np.isfinite(q[:, :33]).all(), path
             own = torch.from_numpy(q)
-            again = figure_of(own, torch.ones(own.shape[:2], dtype=torch.bool), "z")
-            lengths = [np.linalg.norm(f.rest[13] - f.rest[11]) for f in (again, figure)]
+            again = measure_proportions(own, torch.ones(own.shape[:2], dtype=torch.bool), "z")
+            lengths = [np.linalg.norm(f.rest[13] - f.rest[11]) for f in (again, proportions)]
             assert lengths[0] == pytest.approx(lengths[1], rel=1e-5), path
             assert (q[:, 23:25, 2].mean(1) > q[:, 29:33, 2].min(1)).all(), path

@@ -7,8 +7,17 @@ import pytest
 import torch
 from test_motion_readers import directions
 
-from gsgan.data.figure import BONES, FACE, HEELS_AND_TOES, HIPS, figure_of, length, middle, upright
-from gsgan.motion.retarget import heading, joined, on_figure, placed
+from gsgan.data.proportions import (
+    BONES,
+    HEAD_LANDMARKS,
+    HEELS_AND_TOES,
+    HIPS,
+    length,
+    measure_proportions,
+    middle,
+    upright,
+)
+from gsgan.motion.retarget import heading, joined, placed, retargeted
 from gsgan.motion.rotations import rotation
 from gsgan.skeleton import MEDIAPIPE33
 
@@ -25,21 +34,21 @@ def stretched(p: np.ndarray) -> np.ndarray:
     return 1.2 * q
 
 
-def test_a_person_is_put_on_its_own_bones_unchanged(landmarks, figure):
+def test_a_person_is_put_on_its_own_bones_unchanged(landmarks, proportions):
     """But for hands, feet and face, which are rigid, and what medians leave."""
     body = [11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28]
-    q = on_figure(landmarks, figure)
+    q = retargeted(landmarks, proportions)
     np.testing.assert_allclose(q[:, body], landmarks[:, body], atol=0.05)
     np.testing.assert_allclose(q, landmarks, atol=0.1)
 
 
-def test_another_person_keeps_directions_and_gets_the_lengths(landmarks, figure):
-    q = on_figure(stretched(landmarks), figure)
+def test_another_person_keeps_directions_and_gets_the_lengths(landmarks, proportions):
+    q = retargeted(stretched(landmarks), proportions)
     np.testing.assert_allclose(directions(q), directions(landmarks), atol=1e-9)
     for bone in BONES:
         lengths = np.linalg.norm(q[:, bone[1]] - q[:, bone[0]], axis=-1)
-        np.testing.assert_allclose(lengths, length(figure.rest, bone), rtol=1e-9)
-    face, own = q[:, FACE], figure.rest[list(FACE)]
+        np.testing.assert_allclose(lengths, length(proportions.rest, bone), rtol=1e-9)
+    face, own = q[:, HEAD_LANDMARKS], proportions.rest[list(HEAD_LANDMARKS)]
     np.testing.assert_allclose(
         np.linalg.norm(face[:, :, None] - face[:, None], axis=-1),
         np.broadcast_to(np.linalg.norm(own[:, None] - own, axis=-1), (len(q), 11, 11)),
@@ -52,11 +61,11 @@ def test_another_person_keeps_directions_and_gets_the_lengths(landmarks, figure)
     )
 
 
-def test_joined_clips_keep_their_frames_their_speed_and_the_bones(figure):
+def test_joined_clips_keep_their_frames_their_speed_and_the_bones(proportions):
     step = np.array([0.01, 0, 0])
-    p = np.stack([figure.rest + i * step for i in range(4)])
+    p = np.stack([proportions.rest + i * step for i in range(4)])
     q = p[::-1] + 50 * step
-    found = joined([p, q, p], figure, 7)
+    found = joined([p, q, p], proportions, 7)
     assert len(found) == 3 * 4 + 2 * 7
     assert np.array_equal(found[:4], p)
     assert np.array_equal(found[11:15], q)
@@ -70,8 +79,8 @@ def test_joined_clips_keep_their_frames_their_speed_and_the_bones(figure):
         assert np.ptp(length) < 1e-6
 
 
-def test_the_standard_pose_stands_upright(figure):
-    rest = figure.rest
+def test_the_standard_pose_stands_upright(proportions):
+    rest = proportions.rest
     left = [n.startswith("left") or n.endswith("left") for n in MEDIAPIPE33.names]
     assert (rest[left][:, 0] > 0).all()
     assert rest[0, 1] < rest[7, 1]  # the nose is in front (-Y) of the ears
@@ -82,30 +91,30 @@ def test_the_standard_pose_stands_upright(figure):
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
-def test_worlds_with_any_axis_up(landmarks, figure, up):
+def test_worlds_with_any_axis_up(landmarks, proportions, up):
     R = upright(up)
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1)
     axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
     np.testing.assert_allclose(R @ axis, [0, 0, 1])
-    turned = figure_of(torch.from_numpy(landmarks @ R), ALL.expand(12, 33), up)
-    np.testing.assert_allclose(turned.rest, figure.rest, atol=1e-6)
-    assert turned.ground == pytest.approx(figure.ground, abs=1e-6)
+    turned = measure_proportions(torch.from_numpy(landmarks @ R), ALL.expand(12, 33), up)
+    np.testing.assert_allclose(turned.rest, proportions.rest, atol=1e-6)
+    assert turned.ground == pytest.approx(proportions.ground, abs=1e-6)
 
 
-def test_feet_on_the_ground_and_a_walker_on_a_treadmill(figure):
-    rest = figure.rest
+def test_feet_on_the_ground_and_a_walker_on_a_treadmill(proportions):
+    rest = proportions.rest
     walk = np.repeat(rest[None] + np.array([0, 0, 5.0]), 90, axis=0)
     walk[..., 1] -= np.linspace(0, 4, 90)[:, None]  # walks 4 m
     walk[..., 2] += np.linspace(0, 0.5, 90)[:, None]  # uphill
     walk = walk @ rotation(np.array([0, 0, 2.0])).T
     centre = np.array([1.0, 2.0, 3.0])
-    on = placed(walk, figure, centre, 30, ground=True, stay=True)
-    assert heading(on[0]) == pytest.approx(figure.facing)
-    np.testing.assert_allclose(on[:, HEELS_AND_TOES, 2].min(1), figure.ground, atol=0.07)
+    on = placed(walk, proportions, centre, 30, ground=True, stay=True)
+    assert heading(on[0]) == pytest.approx(proportions.facing)
+    np.testing.assert_allclose(on[:, HEELS_AND_TOES, 2].min(1), proportions.ground, atol=0.07)
     assert np.abs(middle(on, HIPS)[:, :2] - centre[:2]).max() < 0.3
-    free = placed(walk, figure, centre, 30, ground=False, stay=False)
+    free = placed(walk, proportions, centre, 30, ground=False, stay=False)
     np.testing.assert_allclose(middle(free, HIPS)[0, :2], centre[:2], atol=1e-9)
     assert np.linalg.norm(np.ptp(middle(free, HIPS)[:, :2], axis=0)) == pytest.approx(4, abs=1e-6)
     assert np.ptp(free[:, HEELS_AND_TOES, 2].min(1)) == pytest.approx(0.5)
-    assert free[:, HEELS_AND_TOES, 2].min() == pytest.approx(figure.ground)
+    assert free[:, HEELS_AND_TOES, 2].min() == pytest.approx(proportions.ground)

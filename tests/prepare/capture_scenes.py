@@ -11,7 +11,7 @@ import numpy as np
 from make import distorted_pixels, ring_camera, skeletons, write_tiny_capture
 
 from gsgan.data.cameras import CameraEntry, make_camera
-from gsgan.prepare.rig import Rig
+from gsgan.prepare.camera_array import CameraArray
 
 ANGLES = (0.0, 1.3, 2.7, 4.2)
 LENS = (-0.05, 0.14, 0.0006, -0.0007, 0.01)
@@ -30,20 +30,20 @@ def ring(angles: Sequence[float] = ANGLES, size=(1080, 1920), dist=(0,) * 5) -> 
 
 def seen(
     cameras: Sequence[CameraEntry], frames: int = 12, noise: float = 0.0, seed: int = 0
-) -> tuple[Rig, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[CameraArray, np.ndarray, np.ndarray, np.ndarray]:
     """A rig, the true ``p [F, 33, 3]``, what it sees ``uv [C, F, 33, 2]``, and confidence 1."""
-    rig, p = Rig.of(cameras), skeletons(frames)
+    rig, p = CameraArray.of(cameras), skeletons(frames)
     uv = rig.project(p.reshape(-1, 3))[0].reshape(len(rig), frames, 33, 2)
     uv = uv + noise * np.random.default_rng(seed).standard_normal(uv.shape)
     return rig, p, uv, np.ones(uv.shape[:3])
 
 
-def turned(rig: Rig, camera: int, degrees: float, metres: float) -> Rig:
-    """The rig with one camera turned about its vertical axis and moved sideways."""
+def turned(cameras: CameraArray, camera: int, degrees: float, metres: float) -> CameraArray:
+    """The cameras with one of them turned about its vertical axis and moved sideways."""
     turn = cv2.Rodrigues(np.radians([0.0, degrees, 0.0]))[0]
-    R, t = rig.R.copy(), rig.t.copy()
+    R, t = cameras.R.copy(), cameras.t.copy()
     R[camera], t[camera] = turn @ R[camera], turn @ t[camera] + [metres, 0, 0]
-    return Rig(rig.K, R, t)
+    return CameraArray(cameras.K, R, t)
 
 
 # ------------------------------------------------ calibration files, as other tools write them
@@ -95,32 +95,6 @@ def write_toml(
         text += f"rotation = {cv2.Rodrigues(c.R)[0].ravel().tolist()}\n"
         text += f"translation = {(c.t * unit).tolist()}\n" + ("fisheye = false\n" * (lens == 4))
     path.write_text(text + "[metadata]\nadjusted = false\nerror = 0.0\n")
-    return path
-
-
-def write_qca(path: Path, cameras: Sequence[CameraEntry], left: int = 0) -> Path:
-    """Qualisys XML: 1/64 pixel, millimetres, camera axes up and backwards."""
-    text = "<?xml version='1.0' encoding='ASCII'?>\n<calibration><cameras>\n"
-    for c in cameras:
-        r, C = np.diag([1, -1, -1]) @ c.R, 1000 * c.centre
-        rows = " ".join(f'r{i + 1}{j + 1}="{float(r[i, j])!r}"' for i in range(3) for j in range(3))
-        h, w = c.size
-        K = centred_at_zero(c)
-        f_u, f_v = (64 * float(K[i, i]) for i in (0, 1))
-        c_u, c_v = 64 * (float(K[0, 2]) + left), 64 * float(K[1, 2])
-        k1, k2, p1, p2, k3 = (float(v) for v in c.dist[:5])
-        text += (
-            f'<camera active="1" serial="{c.name}" model="Miqus Video" viewrotation="0">'
-            f'<fov_video left="{left}" top="0" right="{left + w - 1}" bottom="{h - 1}"/>'
-            f'<transform {rows} x="{float(C[0])!r}" y="{float(C[1])!r}" z="{float(C[2])!r}"/>'
-            f'<intrinsic focalLengthU="{f_u}" focalLengthV="{f_v}" '
-            f'centerPointU="{c_u}" centerPointV="{c_v}" '
-            f'skew="0" radialDistortion1="{k1}" radialDistortion2="{k2}" '
-            f'radialDistortion3="{k3}" tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/>'
-            "</camera>\n"
-        )
-    marker = '<camera active="1" serial="77" model="Miqus M3" viewrotation="0"/>'
-    path.write_text(text + marker + "</cameras></calibration>\n")
     return path
 
 

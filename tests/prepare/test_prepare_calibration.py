@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,6 @@ from capture_scenes import (
     ring,
     write_easymocap,
     write_own,
-    write_qca,
     write_toml,
 )
 
@@ -37,21 +35,6 @@ def test_easymocap_pairs_by_name_though_the_orders_differ(tmp_path: Path):
     calibration = read_calibration(write_easymocap(tmp_path, cameras))
     assert calibration.format == "OpenCV YAML"
     equal(calibration.cameras, cameras)
-
-
-def test_easymocap_starts_from_either_file_and_takes_the_size_from_pictures(tmp_path: Path):
-    write_easymocap(tmp_path, ring(), sizes=False)
-    found = read_calibration(tmp_path / "extri.yml").cameras
-    assert [c.size for c in found.values()] == [(0, 0)] * 4
-
-
-def test_easymocap_refuses_two_rotations_for_one_camera(tmp_path: Path):
-    write_easymocap(tmp_path, ring())
-    text = (tmp_path / "extri.yml").read_text()
-    other = re.sub(r"(Rot_cam2:.*?data: \[ )[^,]+", r"\g<1>0.125", text, flags=re.S)
-    (tmp_path / "extri.yml").write_text(other)
-    with pytest.raises(DataError, match=r"cam2.*different rotations"):
-        read_calibration(tmp_path / "intri.yml")
 
 
 def test_easymocap_camera_without_its_other_half(tmp_path: Path):
@@ -123,14 +106,6 @@ def test_fisheye_is_refused(tmp_path: Path):
         read_calibration(path)
 
 
-@pytest.mark.parametrize("left", [0, 16])
-def test_qualisys_units_axes_and_window(tmp_path: Path, left: int):
-    cameras = ring(dist=LENS)
-    calibration = read_calibration(write_qca(tmp_path / "rig.qca.txt", cameras, left))
-    equal(calibration.cameras, cameras)
-    assert any("77" in note for note in calibration.notes)  # the marker camera is left out
-
-
 def test_own_json_has_its_unit(tmp_path: Path):
     cameras = ring(dist=LENS)
     equal(read_calibration(write_own(tmp_path / "cameras.json", cameras)).cameras, cameras)
@@ -146,9 +121,7 @@ def test_pixel_centre_is_a_setting(tmp_path: Path):
     np.testing.assert_allclose(shift, [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
 
 
-@pytest.mark.parametrize(
-    "content", ["", "hello", "%YAML:1.0\n---\nx: [", "<calibration><camera", "[a]\nmatrix = ["]
-)
+@pytest.mark.parametrize("content", ["", "hello", "%YAML:1.0\n---\nx: [", "[a]\nmatrix = ["])
 def test_errors_are_one_sentence(tmp_path: Path, content: str):
     path = tmp_path / "intri.yml"
     path.write_text(content)

@@ -152,20 +152,20 @@ def test_what_is_kept_of_a_painting_is_on_the_cpu(build):
     """Whatever of it shows; nothing else fills memory on the device that painted."""
     subject = subject_of(build)
     shot = make_shots(subject.data, "novel_pose", [("cam00", 4)], 0.2)[0]
-    paint = subject.avatar.paint
+    render = subject.avatar.forward
 
-    def painted(frame):
-        found = paint(frame)
+    def painted(*inputs):
+        found = render(*inputs)
         tinted = None if found.colour is None else found.colour * 0.5
         return replace(found, corrected=tinted)
 
-    subject.avatar.paint = painted
+    subject.avatar.forward = painted
     kept = subject.paint(shot)
     for name in ("corrected", "alpha", "splat_alpha"):
         assert getattr(kept, name) is None, name
     assert kept.features.shape[1] == 3
     assert kept.segmentation is not None
-    want = painted(shot.frame).corrected
+    want = painted(*shot.frame.inputs).corrected
     assert torch.equal(subject.colour(shot), shot.window.cut(want).clamp(0, 1))
 
 

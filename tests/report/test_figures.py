@@ -13,7 +13,9 @@ from commands import refused
 from omegaconf import OmegaConf
 
 from gsgan.metrics.image import edge_f1, psnr
-from gsgan.model.runs import build_data, load_avatar, load_config
+from gsgan.model.assemble import build_data
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import load_config
 from gsgan.report.figures.run import FIGURES
 
 FEW = ("shots.strip=2", "shots.errors=1", "shots.canny=1")
@@ -70,7 +72,7 @@ def expected(run: Path, found: dict) -> dict:
         camera, frame_id = name.split("/")
         frame = dataset[dataset.items.index((camera, int(frame_id)))]
         with torch.no_grad():
-            image = avatar.paint(frame).image.clamp(0, 1)
+            image = avatar(*frame.inputs).image.clamp(0, 1)
         score = {
             "psnr": pytest.approx(float(psnr(image, frame.image)), abs=1e-4),
             "edge_f1": pytest.approx(float(edge_f1(image, frame.image)), abs=1e-9),

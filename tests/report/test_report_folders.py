@@ -112,7 +112,8 @@ def test_it_reads_what_evaluate_writes(run):
 
 def test_scored_predictions_stand_beside_a_run(run, capture, tmp_path, inside):
     """A method's black images have exactly the floor's scores."""
-    from gsgan.model.runs import build_data, load_config
+    from gsgan.model.assemble import build_data
+    from gsgan.model.stored import load_config
 
     for camera, frame in build_data(load_config(run)).dataset("novel_pose").items:
         path = tmp_path / "black" / "novel_pose" / camera / f"{frame:06d}.png"

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsgan.splat import Accuracy
+from gsgan.splat import ACCURACY, Accuracy, project, rasterise
 from gsgan.splat.project import rotations
+from gsgan.splat.reference import _alphas, _pixel_chunks, _sorted
 from stability.cases.case import Inputs, Tolerance, assert_as_expected, drawing_backends
-from stability.cases.raster import HIGH, Size, pinhole, raster_case, render, rotation, uncut
+from stability.cases.raster import (
+    HIGH,
+    Size,
+    pinhole,
+    raster_case,
+    records,
+    render,
+    rotation,
+    uncut,
+)
 
 every_backend = pytest.mark.parametrize("backend", drawing_backends())
 
 
 @st.composite
-def scenes(draw: st.DrawFn) -> tuple[Inputs, Size]:
+def scenes(draw: st.DrawFn, log_scale: tuple[float, float] = (-6, 3)) -> tuple[Inputs, Size]:
     """Gaussians in front of, beside and behind a camera anywhere, and the image's size: sizes,
     opacities, poses and cameras from one extreme to another."""
     size = draw(st.tuples(st.integers(1, 20), st.integers(1, 20)))
@@ -33,7 +45,7 @@ def scenes(draw: st.DrawFn) -> tuple[Inputs, Size]:
     generator = torch.Generator().manual_seed(draw(st.integers(0, 2**16)))
     # Powers of ten of the largest standard deviation and of its ratio to the least, which is above
     # 1, as the quaternion of a ball has a gradient of rounding only.
-    scale, ratio = draw(st.floats(-6, 3)), draw(st.floats(0.05, 4))
+    scale, ratio = draw(st.floats(*log_scale)), draw(st.floats(0.05, 4))
     distance = 10 ** draw(st.floats(-1, 2))
     opacities = draw(st.sampled_from([(0.0, 1.0), (0.0, 0.01), (0.9, 1.0), (1.0, 1.0)]))
     n = draw(st.integers(1, 10))
@@ -112,3 +124,34 @@ def test_moving_world_and_camera_together_changes_nothing(backend, drawn, axis_a
     for name in want:
         limit = 1e-6 * max(1.0, float(want[name].abs().max()))
         torch.testing.assert_close(got[name], want[name], atol=limit, rtol=0)
+
+
+def error_bound(projected, size, accuracy):
+    """Bound ``[B, 1, H, W]`` of the error of a setting's cut-offs, for features in [0, 1].
+
+    A layer that is skipped changes a pixel by at most its own weight, a capped alpha by at most the
+    weight that the cap removes; a stopped pixel lacks less than ``transmittance_min``.
+    """
+    front_to_back = _sorted(projected)
+    chunks = []
+    for pixels in _pixel_chunks(projected, size):
+        whole = _alphas(front_to_back, pixels, ACCURACY["exact"])
+        lost = whole - _alphas(front_to_back, pixels, accuracy)
+        before = torch.cat([torch.ones_like(whole[..., :1]), 1 - whole], -1).cumprod(-1)
+        chunks.append((before[..., :-1] * lost).sum(-1) + accuracy.transmittance_min)
+    return torch.cat(chunks, dim=1).unflatten(-1, size).unsqueeze(1)
+
+
+@every_backend
+@pytest.mark.parametrize("name", ["standard", "draft"])
+@given(scenes(log_scale=(-3.0, 1.0)))
+def test_the_error_of_a_setting_stays_under_its_bound(backend, name, drawn):
+    scene, size = drawn
+    # In float64, so that no rounding takes an alpha across a cut-off.
+    accuracy = replace(ACCURACY[name], dtype="float64")
+    gaussians, camera = records(scene, size)
+    exact = ACCURACY["exact"]
+    bound = error_bound(project(gaussians, camera, exact), size, accuracy)
+    got = rasterise(gaussians, camera, settings=accuracy, backend=backend).features
+    want = rasterise(gaussians, camera, settings=exact, backend="reference").features
+    assert ((got - want).abs() <= bound + 1e-12).all()

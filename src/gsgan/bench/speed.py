@@ -17,8 +17,10 @@ from torch import Tensor
 
 from gsgan.bench.common import Bench, check_whole, markdown, number, peak_memory, sentence
 from gsgan.data.datamodule import GsganData
+from gsgan.model.assemble import build_avatar, build_data
 from gsgan.model.avatar import Avatar, unwatched
-from gsgan.model.runs import Moved, build_avatar, build_data, load_avatar, load_config
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import DataPaths, load_config
 from gsgan.scene import Frame
 from gsgan.splat import BACKENDS, resolve_backend
 from gsgan.utils.arrays import evenly_spaced
@@ -93,7 +95,7 @@ def load_subject(
 
     The avatar of ``run`` with its held-out poses, or an untrained one of ``config.model``.
     """
-    moved = Moved(config.data_root, config.data_smpl)
+    moved = DataPaths(config.data_root, config.data_smpl)
     if config.run is not None:
         folder = Path(config.run).expanduser()
         stored = load_config(folder, moved)
@@ -103,7 +105,7 @@ def load_subject(
     else:
         moved.refuse_without_run()
         data = build_data(config)
-        avatar, name = build_avatar(config, data), "untrained avatar"
+        avatar, name = build_avatar(config, data.info, data.labelled("train")), "untrained avatar"
         marks = ["untrained weights: Gaussians are where they start, which sets what F costs"]
         size = (int(config.size.picture), int(config.size.picture))
         frames = [replace(f, camera=f.camera.resize(size)) for f in spread(data, config.poses)]
@@ -154,7 +156,7 @@ def make_painter(avatar: Avatar, precision: str = "32-true", backend: str = "aut
     def paint(frame: Frame) -> Tensor:
         kind = frame.skeleton.device.type
         with torch.autocast(kind, dtype=dtype or torch.bfloat16, enabled=dtype is not None):
-            image = avatar.paint(frame, maps=False).image
+            image = avatar(*frame.inputs, maps=False).image
         assert image is not None
         return image
 
@@ -237,7 +239,7 @@ def deciles(samples: Sequence[float]) -> dict[str, float]:
 def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> dict[str, Any]:
     """The settings on which the times depend, by printed name."""
     height, width = frames[0].camera.size
-    windows = [avatar.window(frame) for frame in frames]
+    windows = [avatar.window(frame.skeleton, frame.camera) for frame in frames]
     pixels = sum(height * width if w is None else w.size[0] * w.size[1] for w in windows)
     found: dict[str, Any] = {
         "picture": f"{width} x {height}",

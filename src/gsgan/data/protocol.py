@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.utils.checks import above, between
 from gsgan.utils.errors import ConfigError
 
@@ -42,7 +42,7 @@ class Protocol:
     test_frames: Any
     train_cameras: Sequence[str | int] | None = None
     test_cameras: Sequence[str | int] | None = None
-    measures: Measures = field(default_factory=Measures)
+    measures: MetricVariants = field(default_factory=MetricVariants)
     scale: float = 1.0
     lpips_net: str = "vgg"
     source: str = ""

@@ -13,9 +13,9 @@ from torch.utils.data import Subset
 
 from gsgan.body import SkinnedBody, open_body
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.figure import Figure, figure_of
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import IGNORE_LABEL, read_labels
+from gsgan.data.proportions import Proportions, measure_proportions
 from gsgan.data.skeletons import body_height
 from gsgan.data.splits import Item, Splits
 from gsgan.data.surface_colours import SurfaceColours, body_inside, surface_colours
@@ -57,7 +57,7 @@ class SceneInfo:
         darkest: brightness in [0, 1] of the person's darkest percent.
         body_inside: share of the posed body that lies inside the masks of training images; None
             without a body pose or mesh.
-        figure: the subject's proportions.
+        proportions: the subject's proportions.
         face: metres, the subject's face at rest in the head's frame, see `face_at_rest`; None for
             skeletons without a face.
     """
@@ -84,7 +84,7 @@ class SceneInfo:
     surface: SurfaceColours | None = None
     darkest: float = 0.0
     body_inside: float | None = None
-    figure: Figure | None = None
+    proportions: Proportions | None = None
     face: tuple[Vector, ...] | None = None
 
 
@@ -114,6 +114,7 @@ def scene_info(
     x, y, z = middles.median(0).values.tolist()
     cameras = {camera for camera, _ in dataset.items}
     names = tuple(name for name in layout.cameras if name in cameras)
+    scales = [_scale(data, samples) for data in held_out if data.items]
     return SceneInfo(
         camera_names=layout.camera_names,
         n_train_cameras=len(cameras),
@@ -132,9 +133,10 @@ def scene_info(
         surface=_shared_surface(dataset, names, samples),
         darkest=_darkest(dataset, samples),
         body_inside=_body_inside(layout, dataset, samples),
-        figure=figure_of(*whole.joints(frames), layout.meta.up_axis),
+        scale_train=_scale(dataset, samples),
+        scale_test=(min(s[0] for s in scales), max(s[1] for s in scales)) if scales else None,
+        proportions=measure_proportions(*whole.joints(frames), layout.meta.up_axis),
         **_lenses(layout, cameras, held_out),
-        **_scales(dataset, held_out, samples),
     )
 
 
@@ -157,7 +159,7 @@ def count_labels(layout: Layout, items: tuple[Item, ...]) -> int:
 
 def _lenses(
     layout: Layout, cameras: set[str], held_out: Sequence[CaptureDataset]
-) -> dict[str, bool]:
+) -> dict[str, Any]:
     """The fields about distortion."""
     tested = {camera for data in held_out for camera, _ in data.items} - cameras
     entries = layout.cameras
@@ -166,15 +168,6 @@ def _lenses(
         "held_out_distortion": any(entries[name].distorted for name in tested),
         "has_rational_lens": any((entries[n].dist[5:] != 0).any() for n in cameras | tested),
     }
-
-
-def _scales(
-    dataset: CaptureDataset, held_out: Sequence[CaptureDataset], samples: int
-) -> dict[str, Any]:
-    """The fields about pixels per metre."""
-    tested = [_scale(data, samples) for data in held_out if data.items]
-    test = (min(s[0] for s in tested), max(s[1] for s in tested)) if tested else None
-    return {"scale_train": _scale(dataset, samples), "scale_test": test}
 
 
 def _scale(dataset: CaptureDataset, samples: int) -> tuple[float, float]:

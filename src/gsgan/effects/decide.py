@@ -1,4 +1,4 @@
-"""The rules: from the training split and the user's settings to one decision per effect."""
+"""The rules that make one decision per effect from the training split and the user's settings."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ class ModelParts:
             return None
         if effect == "body_points":
             if not self.points:
-                return "this model puts no points on the skeleton"
+                return "this model has no points on the skeleton"
             return None if self.body_points else "the model leaves them out"
-        return None if self.splats else "this model splats nothing"
+        return None if self.splats else "this model has no Gaussians"
 
 
 def decide(info: SceneInfo, settings: EffectSettings, model: ModelParts | None = None) -> Effects:

@@ -1,4 +1,4 @@
-"""The decisions: every effect with its value and the reason, as plain values for a checkpoint."""
+"""The decisions: the value of every effect and its reason, also as plain values."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class Scored:
 
 
 def write_scored(scored: Scored, folder: Path) -> None:
-    """Writes the four files, each whole or not at all; metrics.json last: if it is new, all are."""
+    """Writes the four files atomically; metrics.json is last, so if it is new, all of them are."""
     origin = json.dumps(scored.origin, indent=2, allow_nan=False)
     table = scored.rows.to_csv(columns=list(HEADER), index=False, lineterminator="\n")
     write_atomically(folder / SCORES_FILE, table)
@@ -86,7 +86,7 @@ def joined(now: Scored, folder: Path, splits: Iterable[str]) -> tuple[Scored, li
         origin = json.loads((folder / FACTS_FILE).read_text())
         ways = [_way(origin, results[split]["full"]) for split in others]
         ways += [_way(now.origin, scored["full"]) for scored in now.results.values()]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # damaged, or too old
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # damaged
         return now, others
     if any(way != ways[-1] for way in ways):
         return now, others
@@ -98,7 +98,7 @@ def joined(now: Scored, folder: Path, splits: Iterable[str]) -> tuple[Scored, li
 
 
 def _way(origin: dict[str, Any], scores: dict[str, Any]) -> list[Any]:
-    """How a split was scored; splits of one table share it."""
+    """How a split was scored, which must be equal for all splits of a table."""
     way = [origin["data"]["fingerprint"], *(origin[key] for key in SAME)]
     return way + [scores.get(key) for key in ("marks", "protocol", "lpips_name", "boxes")]
 
@@ -123,7 +123,7 @@ def rows(
 
 
 def notes(results: Results) -> list[str]:
-    """Every reason and mark behind the table, once each."""
+    """Every reason and mark of the table, once each."""
     found: dict[str, None] = {}
     for split, variants in results.items():
         scores = variants["full"]

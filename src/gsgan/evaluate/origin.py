@@ -12,13 +12,13 @@ import torch
 
 from gsgan import __version__
 from gsgan.data.fingerprint import fingerprint
-from gsgan.model.runs import choices
+from gsgan.model.stored import choices
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
 DIRTY = "+changes"
-# Scores that differ in one of these do not share a table.
+# Scores that differ in one of these are not in one table.
 SAME = ("method", "model", "protocol", "seed", "iterations", "version", "commit", "dirty")
 
 

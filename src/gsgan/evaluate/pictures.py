@@ -12,12 +12,12 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gsgan.metrics.segmentation import colour_labels
-from gsgan.model.avatar import Painting
+from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.utils.files import write_atomically
 
 CAPTION_HEIGHT = 22
-ERROR_GAIN = 4.0  # errors are small and shown brighter by this factor
+ERROR_GAIN = 4.0  # errors are small: they are shown brighter by this factor
 
 
 def error_heat(image: Tensor, target: Tensor) -> Tensor:
@@ -30,7 +30,7 @@ def error_heat(image: Tensor, target: Tensor) -> Tensor:
     return torch.from_numpy(np.stack(heat)).permute(0, 3, 1, 2).to(image) / 255
 
 
-def grid_rows(frame: Frame, painting: Painting) -> list[dict[str, Tensor]]:
+def grid_rows(frame: Frame, painting: Rendering) -> list[dict[str, Tensor]]:
     """One row per batch item: images ``[3, H, W]`` by caption; what was not rendered is absent."""
     assert painting.image is not None
     image, colour, parts = painting.image.clamp(0, 1), painting.colour, painting.segmentation

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import track
 
 from gsgan.data.datamodule import GsganData
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.files import (
     FACTS_FILE,
     HEADER,
@@ -39,14 +39,9 @@ from gsgan.evaluate.predictions import (
 from gsgan.evaluate.scores import Predict, Scorer, SplitScores, empty, painter, score_split
 from gsgan.metrics.lpips import lpips
 from gsgan.metrics.regions import BACKGROUNDS
-from gsgan.model.runs import (
-    CHECKPOINT,
-    Moved,
-    build_data,
-    load_avatar,
-    load_config,
-    read_checkpoint,
-)
+from gsgan.model.assemble import build_data
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import pick_device
@@ -87,7 +82,7 @@ def evaluate_config(config: DictConfig) -> Results:
 def evaluate_folder(config: DictConfig, console: Console, device: torch.device) -> Results:
     """Loads the avatar of ``config.run`` and scores it."""
     folder = Path(config.run).expanduser()
-    stored = load_config(folder, Moved.from_config(config))
+    stored = load_config(folder, DataPaths.from_config(config))
     data = build_data(stored)
     avatar, marks = load_avatar(folder, stored, data)
     state = read_checkpoint(folder / CHECKPOINT)["gsgan"]
@@ -253,11 +248,11 @@ def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Sc
     return Scorer(prepare, score, reason, name, list(marks), record)
 
 
-def _measures(data: GsganData) -> Measures:
-    return Measures() if data.protocol is None else data.protocol.measures
+def _measures(data: GsganData) -> MetricVariants:
+    return MetricVariants() if data.protocol is None else data.protocol.measures
 
 
-def lpips_name(net: str, measures: Measures) -> str:
+def lpips_name(net: str, measures: MetricVariants) -> str:
     """The name of an LPIPS: backbone, input range, and order of channels and region where those are
     not the defaults."""
     low, high = measures.lpips_range

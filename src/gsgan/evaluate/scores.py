@@ -1,4 +1,4 @@
-"""Scores of images and segmentations, and of a split: each frame predicted, prepared, scored."""
+"""Scores of images and segmentations, and of all frames of a split."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from gsgan.data.measures import Measures
+from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
 from gsgan.evaluate.pictures import grid_rows
 from gsgan.evaluate.predictions import FLOOR, FULL, SPLAT, Prediction, Preparation
@@ -37,7 +37,7 @@ from gsgan.metrics.regions import (
 )
 from gsgan.metrics.segmentation import confusion, miou
 from gsgan.model.avatar import Avatar
-from gsgan.model.painting import Painting
+from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
 
@@ -56,7 +56,7 @@ def image_scores(
     box: Tensor | None = None,
     *,
     regions: Mapping[str, Tensor] | None = None,
-    measures: Measures | None = None,
+    measures: MetricVariants | None = None,
     lpips: Score | None = None,
 ) -> dict[str, float]:
     """The scores of one image, clamped to [0, 1].
@@ -72,7 +72,7 @@ def image_scores(
     Returns:
         ``{metric: score}``; a metric that was not computed is absent, an undefined one NaN.
     """
-    measures, image = measures or Measures(), image.clamp(0, 1)
+    measures, image = measures or MetricVariants(), image.clamp(0, 1)
     pooling, background = measures.psnr_pooling, BACKGROUNDS[measures.background]
     window = ssim_uniform if measures.ssim_window == "uniform" else ssim
     similarity = partial(window, value_range=measures.ssim_range)
@@ -165,7 +165,7 @@ class SplitScores:
     Args:
         variants: ``{variant: {metric: value}}`` as in metrics.json; empty without frames.
         rows: one per variant and image.
-        hidden_outline: a ground-truth mask stood in for the alpha of a prediction.
+        hidden_outline: a ground-truth mask was used as the alpha of a prediction.
         grid: rows of images to show, from `gsgan.evaluate.pictures.grid_rows`.
     """
 
@@ -186,7 +186,7 @@ def painter(avatar: Avatar, *, solve: bool = False) -> Predict:
 
     def predict(frame: Frame, item: Item) -> Prediction:
         with torch.no_grad():
-            painting = avatar.paint(replace(frame, body=None) if solve else frame)
+            painting = avatar(*(replace(frame, body=None) if solve else frame).inputs)
         assert painting.image is not None
         images, alphas = {FULL: painting.image}, {FULL: painting.alpha}
         if painting.colour is not None:
@@ -254,7 +254,7 @@ class _Tally:
             images[name] = prepare.image(prediction, name, frame, box)
         if show:
             parts = prediction.segmentation
-            painting = Painting(images[FULL], corrected=images.get(SPLAT), segmentation=parts)
+            painting = Rendering(images[FULL], corrected=images.get(SPLAT), segmentation=parts)
             self.grid += grid_rows(replace(frame, image=target), painting)
         images[FLOOR] = torch.full_like(frame.image, prepare.background)
         for name, image in images.items():
@@ -301,7 +301,7 @@ def _variant(
     if matrices:
         parts = miou(torch.stack(list(matrices.values())).sum(0))
         result |= parts
-        result |= {f"{m}_reason": "the truth holds no part" for m in parts if parts[m] is None}
+        result |= {f"{m}_reason": "the ground truth has no part" for m in parts if parts[m] is None}
     else:
         result |= no_scores(PART_METRICS, no_parts)
     cameras = {}

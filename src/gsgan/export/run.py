@@ -63,7 +63,7 @@ def export_config(config: DictConfig) -> None:
         for i in track(numbers, "writing", console=console, transient=True):
             name = out / f"{drive.numbers[i]:06d}{ENDINGS[kind]}" if sequence else out
             splats = _splats(run, drive, i)
-            up = run.figure.up
+            up = run.proportions.up
             _write(name, ply_bytes(splats) if kind == "ply" else glb_bytes(splats, up))
         if sequence and (out / CARD).is_file():  # what is left of a longer one
             kept = {f"{number:06d}.ply" for number in drive.numbers}

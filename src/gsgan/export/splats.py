@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsgan import __version__
-from gsgan.data.figure import upright
+from gsgan.data.proportions import upright
 from gsgan.model.avatar import Avatar
 from gsgan.scene import BodyPose, Gaussians
 from gsgan.skeleton import bone_frames, face_code, root_of
@@ -95,7 +95,7 @@ def _posed(
     psi = avatar.deformation
     if psi is None:
         raise ConfigError("this avatar has no Gaussians (model=image_to_image) to export")
-    frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
+    frames = bone_frames(p, valid, avatar.template)
     points = avatar.points(p, valid, frames, body)
     root = root_of(p)
     face = face_code(p, frames.head, avatar.template)

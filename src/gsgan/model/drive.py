@@ -6,7 +6,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -14,24 +14,26 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from gsgan.data.dataset import PictureCache
-from gsgan.data.figure import BODY, EXPRESSION, HAND_JOINTS, HEELS_AND_TOES, Figure, upright
+from gsgan.data.dataset import ImageCache
+from gsgan.data.proportions import (
+    BODY,
+    EXPRESSION,
+    HAND_JOINTS,
+    HEELS_AND_TOES,
+    Proportions,
+    upright,
+)
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
-from gsgan.model.runs import (
-    Run,
-)
+from gsgan.model.runs import Run
 from gsgan.motion.clip import FPS, checked, completed, frame_times, is_own, resampled, up_axis
 from gsgan.motion.readers import Source, read_motion
-from gsgan.motion.retarget import expressed, face_in_head, joined, on_figure, placed
+from gsgan.motion.retarget import expressed, face_in_head, joined, placed, retargeted
 from gsgan.scene import BodyPose, Camera, Frame, cat
 from gsgan.skeleton import complete_skeleton
 from gsgan.utils.checks import above, one_of
 from gsgan.utils.config import defaults_of
 from gsgan.utils.errors import ConfigError, DataError
-
-if TYPE_CHECKING:
-    pass
 
 Float = NDArray[np.float64]
 REST = "rest"
@@ -48,8 +50,8 @@ class Drive:
         visibility: ``[F, J]`` in [0, 1].
         body: F poses of the skinned body, or None.
         numbers: of the frames, for their file names.
-        text: one line that describes it.
-        truth: gives the dataset's frame by index, or None.
+        text: a description in one line.
+        truth: returns the dataset's frame by index, or None.
         camera: F cameras and their indices, if the frames have their own.
     """
 
@@ -62,7 +64,7 @@ class Drive:
     camera: tuple[Camera, Tensor] | None = None
 
     def rows(self, chosen: NDArray[np.int64]) -> Drive:
-        """The frames at some indices; if an index repeats, frames are numbered from 0."""
+        """The frames at some indices, numbered from 0 if an index repeats."""
         own = len(set(chosen.tolist())) == len(chosen)
         at, truth, camera = torch.from_numpy(chosen), self.truth, self.camera
         index = chosen.tolist()
@@ -95,11 +97,12 @@ def drive_of(config: DictConfig, run: Run, fps: float) -> Drive:
     given = {key: value for key, value in config.items() if key in defaults}
     config = cast(DictConfig, OmegaConf.merge(defaults, given))
     one_of("drive", config.drive, (None, "skeleton"))
-    found = _given(config, run, fps)
+    found = _chosen(config, run, fps)
     return found if config.drive is None else replace(found, body=None)
 
 
-def _given(config: DictConfig, run: Run, fps: float) -> Drive:
+def _chosen(config: DictConfig, run: Run, fps: float) -> Drive:
+    """The motion of a config: files, a split, the rest pose, or one held-out frame."""
     if config.motion is None:
         split, _ = run.data.watched
         found = _held_out(config, run, split)
@@ -110,9 +113,9 @@ def _given(config: DictConfig, run: Run, fps: float) -> Drive:
         if config.retarget is False:
             raise ConfigError("retarget=false is not supported for a list of motions")
         clips = [_from_file(config, run, str(path), fps) for path in config.motion]
-        return _joined(clips, run.figure, float(above("transition", config.transition)), fps)
+        return _joined(clips, run.proportions, float(above("transition", config.transition)), fps)
     if config.motion == REST:
-        return rest_pose(run.figure)
+        return rest_pose(run.proportions)
     if config.motion in SPLITS:
         return _held_out(config, run, config.motion)
     return _from_file(config, run, config.motion, fps)
@@ -121,7 +124,7 @@ def _given(config: DictConfig, run: Run, fps: float) -> Drive:
 def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
     """Frames of a split, seen by one camera."""
     dataset = copy(run.data.dataset(split))
-    dataset.cache = PictureCache(CACHE)  # a run in training uses the other one at the same time
+    dataset.cache = ImageCache(CACHE)  # a run in training uses the dataset's own at the same time
     if not dataset.items:
         raise DataError(f"motion={split}: the run has no such frames ({run.data.reasons[split]})")
     names = list(dict.fromkeys(camera for camera, _ in dataset.items))
@@ -136,10 +139,7 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
         body = BodyPose(*(torch.from_numpy(x).float() for x in stacked))
     place = {item: i for i, item in enumerate(dataset.items)}
     index = torch.tensor([layout.camera_names.index(items[0][0])] * len(items))
-    seen = None
-    if own:
-        views_of = [dataset.camera(item) for item in items]
-        seen = cat(views_of), index
+    seen = (cat([dataset.camera(item) for item in items]), index) if own else None
     return Drive(
         p=np.stack([dataset.skeletons.p[f] for f in frames]),
         visibility=np.stack([dataset.skeletons.visibility[f] for f in frames]),
@@ -151,34 +151,35 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
     )
 
 
-def _joined(clips: list[Drive], figure: Figure, seconds: float, fps: float) -> Drive:
+def _joined(clips: list[Drive], proportions: Proportions, seconds: float, fps: float) -> Drive:
     """Clips one after the other, with transitions of ``seconds``."""
     if not clips:
         raise ConfigError("motion=[] names no file; expected motion=[a.pose,b.pose]")
-    standard = upright(figure.up)
+    standard = upright(proportions.up)
     between = max(1, round(seconds * fps) - 1)
     joints = max(clip.p.shape[1] for clip in clips)
     parts = []
-    for clip in clips:  # some with hands or a face, some without
+    for clip in clips:  # some may lack hands or a face
         lacking = (0, joints - clip.p.shape[1])
         parts.append(np.pad(clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan) @ standard.T)
-    p = joined(parts, figure, between) @ standard
+    p = joined(parts, proportions, between) @ standard
     text = "; ".join(clip.text for clip in clips) + f"; {seconds:g} s from each to the next"
-    return Drive(p, _shown(p, figure), None, list(range(len(p))), text)
+    return Drive(p, _shown(p, proportions), None, list(range(len(p))), text)
 
 
-def _shown(p: Float, figure: Figure) -> Float:
-    """``[F, J]`` visibility of retargeted joints: the body's as in training, others where known."""
+def _shown(p: Float, proportions: Proportions) -> Float:
+    """``[F, J]`` visibility of retargeted joints: the body's as in training, 1 for others that are
+    known."""
     visibility = np.asarray(np.isfinite(p).all(-1), np.float64)
-    visibility[:, : len(figure.seen)] = figure.seen
+    visibility[:, : len(proportions.seen)] = proportions.seen
     return visibility
 
 
 def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
-    figure = run.figure
+    proportions = run.proportions
     smpl, skeleton = config.smpl or run.body_file, config.skeleton
     files = (None if x is None else Path(x).expanduser() for x in (smpl, skeleton))
-    source = Source(figure, *files)
+    source = Source(proportions, *files)
     motion = read_motion(Path(path).expanduser(), source)
     motion = checked(motion, float(config.min_visibility))
     rate = config.motion_fps or motion.fps
@@ -189,10 +190,10 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
         )
     up = (None if motion.file_up else config.up) or motion.up or up_axis(motion)
     choice = one_of("retarget", config.retarget, ("auto", True, False))
-    own = is_own(motion, figure) if choice == "auto" else not choice
+    own = is_own(motion, proportions) if choice == "auto" else not choice
     if choice is False and motion.detached:
         raise ConfigError(f"retarget=false is not supported for {motion.path}: leave retarget out")
-    # transitions need every joint
+    # a list of motions is retargeted, because transitions need every joint
     own = own and not motion.detached and not OmegaConf.is_list(config.motion)
     times = frame_times(len(motion), rate, fps)
     nearest = np.rint(times).astype(int)
@@ -203,15 +204,15 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
             at = torch.from_numpy(nearest)
             body = BodyPose(motion.body.theta[at], motion.body.transl[at])
     else:
-        standard = upright(figure.up)
+        standard = upright(proportions.up)
         centre = standard @ np.array(run.scene.centre)
         p = completed(motion, up)
         if p.shape[1] > EXPRESSION.start:
             p = p if motion.detached else face_in_head(p)
             p[:, EXPRESSION] = expressed(p[:, EXPRESSION], run.face)
-        p = on_figure(resampled(p, rate, fps), figure)
-        p = placed(p, figure, centre, fps, ground=config.ground, stay=config.stay) @ standard
-        visibility = _shown(p, figure)
+        p = retargeted(resampled(p, rate, fps), proportions)
+        p = placed(p, proportions, centre, fps, ground=config.ground, stay=config.stay) @ standard
+        visibility = _shown(p, proportions)
     filled = f", {_frames(motion.filled)} without shoulders or hips filled" if motion.filled else ""
     seen = [np.isfinite(p[:, hand]).all((1, 2)).sum() for hand in HAND_JOINTS.values()]
     hands = f", left hand in {seen[0]} frames, right hand in {seen[1]}" if p.shape[1] > BODY else ""
@@ -232,11 +233,11 @@ def _frames(count: int) -> str:
     return "1 frame" if count == 1 else f"{count} frames"
 
 
-def rest_pose(figure: Figure) -> Drive:
+def rest_pose(proportions: Proportions) -> Drive:
     """The subject standing in a T-pose at the world's origin, feet at height 0."""
-    standing = figure.rest - [0, 0, figure.rest[list(HEELS_AND_TOES), 2].min()]
-    p = (standing @ upright(figure.up))[None]
-    return Drive(p, np.array(figure.seen, np.float64)[None], None, [0], "the rest pose")
+    standing = proportions.rest - [0, 0, proportions.rest[list(HEELS_AND_TOES), 2].min()]
+    p = (standing @ upright(proportions.up))[None]
+    return Drive(p, np.array(proportions.seen, np.float64)[None], None, [0], "the rest pose")
 
 
 def joints_of(avatar: Avatar, drive: Drive, i: int) -> tuple[Tensor, Tensor]:

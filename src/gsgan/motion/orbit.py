@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from gsgan.data.figure import Figure, upright
+from gsgan.data.proportions import Proportions, upright
 from gsgan.motion.retarget import heading
 from gsgan.scene import Camera
 from gsgan.utils.checks import above, between
@@ -36,18 +36,18 @@ class Orbit:
             above("orbit.distance", self.distance)
 
     def cameras(
-        self, p: Float, figure: Figure, scene: SceneInfo, size: int, trained: int
+        self, p: Float, subject: Proportions, scene: SceneInfo, size: int, trained: int
     ) -> Camera:
         """One camera per skeleton ``[F, 33, 3]``, on a circle round the centre of the motion.
 
         Args:
             p: metres, world frame; NaN where unknown.
-            figure: of the subject.
+            subject: the person's proportions.
             scene: sets the person's size, that of training images.
             size: pixels of the square images.
             trained: pixels of the training images.
         """
-        to_world = upright(figure.up).T
+        to_world = upright(subject.up).T
         p = np.where(np.isfinite(p), p, np.nanmean(p, axis=1, keepdims=True))
         low, high = (f((p @ to_world).reshape(-1, 3), axis=0) for f in (np.min, np.max))
         middle = (low + high) / 2
@@ -66,8 +66,8 @@ class Orbit:
             axis=1,
         )
         right = np.stack([np.cos(azimuth), np.sin(azimuth), 0 * azimuth], axis=1)
-        R = np.stack([right, np.cross(-away, right), -away], axis=1) @ upright(figure.up)
-        centres = (middle + distance * away) @ upright(figure.up)
+        R = np.stack([right, np.cross(-away, right), -away], axis=1) @ upright(subject.up)
+        centres = (middle + distance * away) @ upright(subject.up)
         K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
         t = -(R @ centres[..., None])[..., 0]
         world = [torch.from_numpy(x).float() for x in (K, R, t)]

@@ -1,6 +1,6 @@
 """Retargeting: a motion's directions with the subject's own bone lengths, hands, feet and face.
 
-Convention: standard axes (`gsgan.data.figure`), Z up, metres.
+Convention: standard axes (`gsgan.data.proportions`), Z up, metres.
 """
 
 from __future__ import annotations
@@ -14,41 +14,41 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline
 from torch import Tensor
 
-from gsgan.data.figure import (
+from gsgan.data.proportions import (
     BODY,
     BONES,
     EARS,
     EXPRESSION,
-    FACE,
     FEET,
     HAND_JOINTS,
-    HANDS,
+    HAND_LANDMARKS,
+    HEAD_LANDMARKS,
     HEELS_AND_TOES,
     HIPS,
     LEGS,
     SHOULDERS,
     TO_STANDARD,
-    Figure,
+    Proportions,
     hand_frame,
     length,
     middle,
-    palm_frame,
     part_frame,
 )
 from gsgan.motion.rotations import axis_angle, between, rotation, unit
 from gsgan.motion.standard import StandardMotion, drift, floor_under
 from gsgan.skeleton import MEDIAPIPE33, bone_frames, in_head
-from gsgan.skeleton.hands import FINGER_BONES
+from gsgan.skeleton.hands import FINGER_BONES, INDEX, PINKY, WRIST
 from gsgan.skeleton.template import CHEST, HEAD, PELVIS
 
 Float = NDArray[np.float64]
 
+PALM = (WRIST, PINKY, INDEX)  # landmarks of a hand that give its axes
 STILL = 0.001  # metres: landmarks of a face that move less count fully in its alignment
 ROUNDS = 10  # of the alignment
 NECK = 0.45  # radians, the largest bend of the neck: detectors place faces too far forward
 
 
-def on_figure(p: Float, figure: Figure, scale: float | None = None) -> Float:
+def retargeted(p: Float, subject: Proportions, scale: float | None = None) -> Float:
     """``[F, J, 3]`` the subject in the poses of another person's landmarks ``[F, J, 3]``, finite.
 
     Trunk and limbs keep their directions and get the subject's lengths; face, hands and feet are
@@ -61,14 +61,14 @@ def on_figure(p: Float, figure: Figure, scale: float | None = None) -> Float:
 
     Args:
         p: of the other person.
-        figure: the subject.
+        subject: the subject's proportions.
         scale: of the path, in place of that ratio.
     """
     whole, given, p = np.full_like(p, np.nan), p, p[:, :BODY]
-    rest, q = figure.rest, whole[:, :BODY]
+    rest, q = subject.rest, whole[:, :BODY]
     if scale is None:
         legs = [np.linalg.norm(p[:, b] - p[:, a], axis=-1) for limb in LEGS for a, b in limb]
-        scale = 2 * figure.leg / float(np.median(legs, axis=1).sum())
+        scale = 2 * subject.leg / float(np.median(legs, axis=1).sum())
     hips = middle(p, HIPS) * scale
     chest = hips + unit(middle(p, SHOULDERS) - middle(p, HIPS)) * rest[SHOULDERS[0], 2]
     for pair, centre in ((HIPS, hips), (SHOULDERS, chest)):
@@ -76,10 +76,10 @@ def on_figure(p: Float, figure: Figure, scale: float | None = None) -> Float:
         q[:, pair[0]], q[:, pair[1]] = centre + half, centre - half
     for a, b in BONES:
         q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
-    for wrist, ends in HANDS.items():
-        turn = hand_frame(p, wrist) @ hand_frame(rest, wrist).T
+    for wrist, ends in HAND_LANDMARKS.items():
+        turn = hand_frame(p, wrist, *ends[:2]) @ hand_frame(rest, wrist, *ends[:2]).T
         if given.shape[1] > BODY:
-            at, palm = _posed_hand(given[:, HAND_JOINTS[wrist]], figure, wrist)
+            at, palm = _posed_hand(given[:, HAND_JOINTS[wrist]], subject, wrist)
             whole[:, HAND_JOINTS[wrist]] = q[:, wrist, None] + at
             turn = np.where(np.isfinite(palm), palm, turn)
         q[:, ends] = q[:, wrist, None] + (rest[list(ends)] - rest[wrist]) @ turn.mT
@@ -92,7 +92,9 @@ def on_figure(p: Float, figure: Figure, scale: float | None = None) -> Float:
     most = NECK / np.maximum(np.linalg.norm(bend, axis=-1, keepdims=True), NECK)
     ears = chest + (rotation(bend * most) @ level[..., None])[..., 0]
     turn = _head_frame(p) @ _head_frame(rest[None]).mT
-    q[:, FACE] = ears[:, None] + (rest[list(FACE)] - middle(rest, EARS)) @ turn.mT
+    q[:, HEAD_LANDMARKS] = (
+        ears[:, None] + (rest[list(HEAD_LANDMARKS)] - middle(rest, EARS)) @ turn.mT
+    )
     centre = q[:, MEDIAPIPE33.head].mean(1, keepdims=True)
     whole[:, EXPRESSION] = centre + given[:, EXPRESSION] @ _head_frame(q).mT
     return whole
@@ -150,12 +152,12 @@ def _aligned(p: Tensor, onto: Tensor, weight: Tensor) -> Tensor:
     return to + size[:, None, None] * a @ U @ Vh
 
 
-def _posed_hand(p: Float, figure: Figure, wrist: int) -> tuple[Float, Float]:
+def _posed_hand(p: Float, subject: Proportions, wrist: int) -> tuple[Float, Float]:
     """The subject's hand as landmarks ``[F, 21, 3]`` show it: ``[F, 21, 3]`` from the pose's wrist,
     and the palm's rotation since the standard pose ``[F, 3, 3]``; NaN where the palm is unknown."""
-    rest = figure.rest_with_hands[HAND_JOINTS[wrist]]
-    palm = palm_frame(p) @ palm_frame(rest).T
-    q = (rest - figure.rest[wrist]) @ palm.mT
+    rest = subject.rest_with_hands[HAND_JOINTS[wrist]]
+    palm = hand_frame(p, *PALM) @ hand_frame(rest, *PALM).T
+    q = (rest - subject.rest[wrist]) @ palm.mT
     for a, b in FINGER_BONES:
         q[:, b] = q[:, a] + unit(p[:, b] - p[:, a]) * length(rest, (a, b))
     return q, palm
@@ -170,30 +172,30 @@ def _head_frame(p: Float) -> Float:
     return bone_frames(torch.from_numpy(p)).hubs[:, HEAD].numpy()
 
 
-def rig_landmarks(standard: StandardMotion, figure: Figure) -> Float:
+def rig_landmarks(standard: StandardMotion, subject: Proportions) -> Float:
     """``[F, 33, 3]`` landmarks of a rig, in standard axes and the subject's size.
 
     Shoulders, elbows, wrists, hips, knees and ankles are the rig's joints. Rigs have no landmarks
     of hands, feet and face: the subject's own are rotated as the rig's hands, feet and head.
     """
-    rest, scale = figure.rest, figure.leg / standard.leg
+    rest, scale = subject.rest, subject.leg / standard.leg
     p = np.full((len(standard.joints["Hips"]), *rest.shape), np.nan)
     for i, side in enumerate(("Left", "Right")):
         names = ("Arm", "ForeArm", "Hand", "UpLeg", "Leg", "Foot")
         for bone, landmark in zip(names, (11, 13, 15, 23, 25, 27), strict=True):
             p[:, landmark + i] = standard.joints[side + bone] * scale
-        for bone, start, ends in (("Hand", 15, HANDS), ("Foot", 27, FEET)):
+        for bone, start, ends in (("Hand", 15, HAND_LANDMARKS), ("Foot", 27, FEET)):
             points, turn = rest[list(ends[start + i])], standard.turns[side + bone]
             p[:, ends[start + i]] = p[:, start + i, None] + (points - rest[start + i]) @ turn.mT
     if "Head" in standard.turns:
         neck = middle(rest, EARS) - middle(rest, SHOULDERS)
         ears = middle(p, SHOULDERS) + (standard.turns["Neck"] @ neck)
-        face = rest[list(FACE)] - middle(rest, EARS)
-        p[:, FACE] = ears[:, None] + face @ standard.turns["Head"].mT
+        face = rest[list(HEAD_LANDMARKS)] - middle(rest, EARS)
+        p[:, HEAD_LANDMARKS] = ears[:, None] + face @ standard.turns["Head"].mT
     return p
 
 
-def joined(clips: Sequence[Float], figure: Figure, n: int) -> Float:
+def joined(clips: Sequence[Float], subject: Proportions, n: int) -> Float:
     """Clips ``[F, J, 3]`` of the subject, one after the other, with transitions of n frames.
 
     A transition is a cubic that continues the joints' speeds at both ends, on the subject's bones;
@@ -206,12 +208,12 @@ def joined(clips: Sequence[Float], figure: Figure, n: int) -> Float:
         path = CubicHermiteSpline([0, n + 1], *(np.nan_to_num(x) for x in (ends, speed)))
         known = np.isfinite(ends).all((0, 2))[:, None]
         between = np.where(known, path(np.arange(1, n + 1)), np.nan)
-        parts += [on_figure(between, figure, scale=1.0), after]
+        parts += [retargeted(between, subject, scale=1.0), after]
     return np.concatenate(parts)
 
 
 def face_in_head(p: Float) -> Float:
-    """Landmarks ``[F, J, 3]`` with those of the face as `on_figure` takes them."""
+    """Landmarks ``[F, J, 3]`` with those of the face as `retargeted` takes them."""
     body, face = torch.from_numpy(p[:, :BODY]), torch.from_numpy(p[:, EXPRESSION])
     local = in_head(face, body, bone_frames(body).hubs[:, HEAD], MEDIAPIPE33)
     return np.concatenate([p[:, : EXPRESSION.start], local.numpy()], axis=1)
@@ -224,7 +226,7 @@ def heading(p: Float) -> float:
 
 
 def placed(
-    p: Float, figure: Figure, centre: Float, fps: float, *, ground: bool, stay: bool
+    p: Float, subject: Proportions, centre: Float, fps: float, *, ground: bool, stay: bool
 ) -> Float:
     """Landmarks ``[F, J, 3]`` moved to where the subject was captured.
 
@@ -232,18 +234,18 @@ def placed(
 
     Args:
         p: standard axes.
-        figure: the subject.
+        subject: the subject's proportions.
         centre: ``[3]`` metres, standard axes: of the training frames; its height is not used.
         fps: of the frames.
         ground: keep a foot on the ground except in jumps; otherwise only the lowest foot of the
             whole motion touches it.
         stay: subtract the path of a person who walks away, as on a treadmill.
     """
-    q = p @ rotation(np.array([0, 0, figure.facing - heading(p[0])])).T
+    q = p @ rotation(np.array([0, 0, subject.facing - heading(p[0])])).T
     path = middle(q, HIPS)[:, :2]
     lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)
-    floor = floor_under(lowest, figure.leg, 1 / fps) if ground else np.full(len(q), lowest.min())
+    floor = floor_under(lowest, subject.leg, 1 / fps) if ground else np.full(len(q), lowest.min())
     gone = drift(path, 1 / fps) if stay else path[:1]
     q[..., :2] += centre[:2] - np.broadcast_to(gone, path.shape)[:, None]
-    q[..., 2] += (figure.ground - floor)[:, None]
+    q[..., 2] += (subject.ground - floor)[:, None]
     return q

@@ -13,20 +13,13 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 
-from gsgan.motion.bvh import Bvh
 from gsgan.motion.rig import FINGERS, LEG, REQUIRED, SPINE, rest_turns
 from gsgan.motion.rotations import Array, blend, rotation, unit
 from gsgan.utils.errors import DataError
 
 HOVER = 0.06  # legs: feet this high above the lowest of a second stand on the floor; no jump
-
-
 ROOM = 0.6  # metres from the origin that a motion may reach before its drift is subtracted
-
-
 DRIFT_SECONDS = 0.5  # standard deviation of the smoothing that separates drift from sway
-
-
 # Names of joints without side, in lower case and letters only, first choices first.
 ALIASES = {
     "Hips": "hips hip pelvis root",
@@ -39,18 +32,14 @@ ALIASES = {
     "Hand": "wrist hand",
     "Head": "head",
 }
-
-
 FINGER_ALIASES = {finger: finger.lower() for finger in FINGERS} | {"Pinky": "pinky|little"}
-
-
 PARTS = {"metacarpal": 1, "proximal": 1, "intermediate": 2, "distal": 3}
 
 
 def known_joints(names: tuple[str, ...]) -> dict[str, int]:
     """Mixamo's bone name → index, for joints named as by Mixamo, MakeHuman, CMU, Blender, ….
 
-    Spine, neck and collarbones are not among them: the tree says where they are.
+    Spine, neck and collarbones are not among them: they follow from the tree of joints.
     """
     found: dict[str, tuple[int, int]] = {}
     for j, name in enumerate(names):
@@ -91,6 +80,26 @@ def _stem(stem: str, sided: bool) -> tuple[str, int]:
 
 
 @dataclass(frozen=True)
+class RigMotion:
+    """The motion of a rig as a file has it: joints, parents first, and their world rotations."""
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    offsets: Array  # [J, 3] from the parent at rest, units and axes of the file
+    rotations: Array  # [F, J, 3, 3] since the rest pose, axes of the file
+    root: Array  # [F, 3] position of the first joint
+    frame_time: float  # seconds
+
+    def positions(self, rotations: Array, root: Array) -> Array:
+        """Joints ``[..., J, 3]`` for world rotations ``[..., J, 3, 3]``."""
+        p = np.zeros((*root.shape[:-1], len(self.names), 3))
+        p[..., 0, :] = root
+        for j, parent in enumerate(self.parents[1:], 1):
+            p[..., j, :] = p[..., parent, :] + rotations[..., parent, :, :] @ self.offsets[j]
+        return p
+
+
+@dataclass(frozen=True)
 class StandardMotion:
     """A file's motion in standard axes, starting towards -Y; by Mixamo's bone name."""
 
@@ -100,21 +109,21 @@ class StandardMotion:
     up: str  # the axis of the file that points up, e.g. "y"
 
 
-def standard_motion(bvh: Bvh, path: Path) -> StandardMotion:
+def standard_motion(motion: RigMotion, path: Path) -> StandardMotion:
     """The motion of a tree of joints on the bones that people have.
 
     Raises:
         DataError: when a joint of the limbs is not found.
     """
-    known = {"Hips": 0} | known_joints(bvh.names)
+    known = {"Hips": 0} | known_joints(motion.names)
     if missing := [bone for bone in REQUIRED if bone not in known]:
-        names = [name for name in bvh.names if not name.endswith(" end")]
+        names = [name for name in motion.names if not name.endswith(" end")]
         raise DataError(
             f"{path}: no joint found for {', '.join(missing)} among {', '.join(names)}; name the "
             f"joints as Mixamo does (LeftUpLeg, LeftLeg, LeftFoot, LeftArm, LeftForeArm, …)"
         )
-    unturned = np.broadcast_to(np.eye(3), (len(bvh.names), 3, 3))
-    rest = bvh.positions(unturned, np.zeros(3))
+    unturned = np.broadcast_to(np.eye(3), (len(motion.names), 3, 3))
+    rest = motion.positions(unturned, np.zeros(3))
     thighs = rest[known["LeftUpLeg"]] + rest[known["RightUpLeg"]]
     height = thighs - rest[known["LeftFoot"]] - rest[known["RightFoot"]]
     up = np.eye(3)[np.abs(height).argmax()] * np.sign(height[np.abs(height).argmax()])
@@ -122,17 +131,17 @@ def standard_motion(bvh: Bvh, path: Path) -> StandardMotion:
     left = unit(left - (left @ up) * up)
     axes = np.stack([left, np.cross(up, left), up])
     for bone in list(known):
-        ends = [j for j, parent in enumerate(bvh.parents) if parent == known[bone]]
+        ends = [j for j, parent in enumerate(motion.parents) if parent == known[bone]]
         if re.search(r"Hand\D+[23]$", bone) and ends:
             known.setdefault(bone[:-1] + str(int(bone[-1]) + 1), ends[0])
     joint = {bone: axes @ rest[j] for bone, j in known.items()}
-    R = axes @ bvh.rotations @ axes.T
+    R = axes @ motion.rotations @ axes.T
     ahead = R[0, known["Hips"]] @ (0.0, -1.0, 0.0)
     yaw = rotation(np.array([0, 0, -np.arctan2(ahead[0], -ahead[1])]))
     R, at_rest = yaw @ R, rest_turns(joint)
     turns = {bone: R[:, j] @ at_rest.get(bone, np.eye(3)) for bone, j in known.items()}
-    turns |= _trunk(bvh, known, R)
-    posed = bvh.positions(bvh.rotations, bvh.root) @ (yaw @ axes).T
+    turns |= _trunk(motion, known, R)
+    posed = motion.positions(motion.rotations, motion.root) @ (yaw @ axes).T
     hip, knee, ankle = (joint["Left" + bone] for bone in LEG)
     leg = float(np.linalg.norm(hip - knee) + np.linalg.norm(knee - ankle))
     at = int(np.abs(up).argmax())
@@ -161,14 +170,14 @@ def drift(path: Array, step: float) -> Array:
     return np.asarray(smooth[pad : pad + len(path)])
 
 
-def _trunk(bvh: Bvh, known: dict[str, int], R: Array) -> dict[str, Array]:
+def _trunk(motion: RigMotion, known: dict[str, int], R: Array) -> dict[str, Array]:
     """Turns of spine, neck and collarbones, whatever their number, by their place in the tree."""
 
     def above(bone: str) -> list[int]:
-        j = bvh.parents[known[bone]]
+        j = motion.parents[known[bone]]
         line: list[int] = []
         while j >= 0:
-            line, j = [j, *line], bvh.parents[j]
+            line, j = [j, *line], motion.parents[j]
         return line
 
     left, right, legs = above("LeftArm"), above("RightArm"), above("LeftUpLeg")

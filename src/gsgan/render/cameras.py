@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.calibration.find import read_calibration
+from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import PersonCrop, square_window
 from gsgan.scene import Camera, cat

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -48,9 +49,10 @@ def _draw(axes: Axes, rows: list[Row], i: int) -> None:
     for k, (name, line) in enumerate(lines.items()):
         at = [settings.index(setting) for setting, _ in line]
         spread = [row.cells[i].spread or 0.0 for _, row in line]
-        look = {"color": COLOURS[k % len(COLOURS)], "marker": MARKERS[k % len(MARKERS)]}
-        means = [row.cells[i].mean for _, row in line]
-        axes.errorbar(at, means, yerr=spread, label=name, ms=4, lw=1.2, capsize=3, **look)
+        means: list[Any] = [row.cells[i].mean for _, row in line]
+        marker, colour = MARKERS[k % len(MARKERS)], COLOURS[k % len(COLOURS)]
+        look: dict[str, Any] = {"marker": marker, "color": colour, "ms": 4, "lw": 1.2, "capsize": 3}
+        axes.errorbar(at, means, yerr=spread, label=name, **look)
     names = [setting.replace(", ", "\n") for setting in settings]
     axes.set_xticks(range(len(names)), names, fontsize=6.5, rotation=40, ha="right")
     axes.tick_params(axis="y", labelsize=7)

@@ -35,7 +35,7 @@ def settings_of(config: DictConfig) -> dict[str, Any]:
     Raises:
         OmegaConfBaseException: when it cannot be resolved.
     """
-    from gsgan.model.runs import record  # here: it imports torch
+    from gsgan.model.stored import record  # here: it imports torch
 
     seedless = config.copy()
     seedless.seed = 0  # data and training interpolate it

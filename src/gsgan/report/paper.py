@@ -1,4 +1,4 @@
-"""The numbers printed in the paper: when they are comparable with runs, and as rows."""
+"""The numbers printed in the paper, and when they are comparable with runs."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class PaperTable:
         return None
 
     def beside(self, columns: Sequence[tuple[str | None, str]]) -> dict[str, list[Row]]:
-        """Its rows by model; ``columns``: subject (None: the table's own) and metric of each."""
+        """The rows by model; ``columns``: subject (None: the table's own) and metric of each."""
         note = f"{MARK} in {self.title}" + (f"; {self.note}" if self.note else "")
         found: dict[str, list[Row]] = {}
         for held in self.rows:

@@ -15,7 +15,7 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsgan.model.runs import choices
+from gsgan.model.stored import choices
 from gsgan.report.departures import departures, settings_of
 from gsgan.utils.errors import ConfigError, DataError
 

@@ -1,4 +1,4 @@
-"""Tables of ``runs``: rows and columns, statistics over seeds, and what belongs below them."""
+"""Tables of ``runs``: rows and columns, statistics over seeds, and notes."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ class Part:
         return Cell(text, mean, spread, tuple(notes))
 
     def check(self, allow_dirty: bool) -> None:
-        """Raises ConfigError where a column or a row would mix what does not belong together."""
+        """Raises ConfigError where the runs of a column or a row are not comparable."""
         where = f"table {self.spec.name}, {self.split}"
         for column in self.columns:
             scored = [run for run in self.of(None, column) if run.images(self.split)]
@@ -164,7 +164,7 @@ class Part:
 
 
 def _row_facts(run: Run, split: str) -> dict[str, Any]:
-    """What the runs of one row have in common: all but the seed."""
+    """Properties that must be equal in one row: all but the seed."""
     return {
         "kind": "predictions" if run.seed is None else "a model trained here",
         "settings": run.settings,
@@ -174,7 +174,7 @@ def _row_facts(run: Run, split: str) -> dict[str, Any]:
 
 
 def _column_facts(run: Run, part: Part, mean: bool, allow_dirty: bool) -> dict[str, Any]:
-    """What the runs of one column have in common; those of a mean over subjects differ in data."""
+    """Properties that must be equal in one column; data may differ for a mean over subjects."""
     split = part.split
     record = run.protocol(split)
     facts = {
@@ -198,7 +198,7 @@ def make_tables(config: DictConfig) -> None:
     """Writes the table ``config.table`` of ``config.runs`` into ``config.out``.
 
     Raises:
-        ConfigError: on runs that do not exist or do not belong into one table, or on a page or
+        ConfigError: on runs that do not exist or are not comparable, or on a page or
             folder that cannot be written.
     """
     given = [config.runs] if isinstance(config.runs, str) else config.runs
@@ -270,7 +270,7 @@ def build(
 
 
 def _no_place(spec: TableSpec, run: Run) -> str | None:
-    """Why the table has no place for a run; raises ConfigError on another data set's."""
+    """Why the table has no row for a run; raises ConfigError for another data set."""
     if spec.data not in (None, run.data.get("name")):
         what = f"is of {spec.data}, but {run} is of {run.data_name}"
         raise ConfigError(f"table {spec.name} {what}; leave it out of runs, or use table=plain")
@@ -351,7 +351,7 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
     found = [list(row.cells) for row in rows]
     for i, metric in enumerate(part.columns.values()):
         sign = {"↑": -1, "↓": 1}.get(METRICS[metric].better)
-        means = [cells[i].mean for cells in found if cells[i].mean is not None]
+        means = [mean for cells in found if (mean := cells[i].mean) is not None]
         if len(means) < 2:
             continue
         best = min(means, key=lambda mean: abs(mean - 1) if sign is None else sign * mean)
@@ -387,7 +387,7 @@ def _lpips(run: Run, split: str) -> str | None:
 
 
 def _boxes(run: Run, part: Part) -> str | None:
-    """What a run's boxes of hands and mouth contain, if the grid has a metric in them."""
+    """The boxes of hands and mouth of a run, if the grid has a metric in them."""
     shown = {*BOX_METRICS} & {*part.columns.values()}
     scores = run.scores.get(part.split, {}).values() if shown else ()
     return next((s["boxes"] for s in scores if s.get("boxes")), None)

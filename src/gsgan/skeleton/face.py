@@ -1,8 +1,8 @@
 """Landmarks of a face: lips, brows and lids, and their offsets from the face at rest.
 
-They carry what a face adds to a sign: the mouth's shape, brows, gaze and blinks. The oval is left
-out: the pose's own ears, eyes and nose give the head's place and turn. Convention: as in
-`gsgan.skeleton.template`.
+They represent what a face adds to a sign: the mouth's shape, brows, gaze and blinks. The oval is
+left out, because the pose's own ears, eyes and nose determine the head's position and rotation.
+Convention: as in `gsgan.skeleton.template`.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ _TWINS = {
 
 
 def rest_face() -> tuple[Vector, ...]:
-    """Metres: where the face lies on the rest pose of the skeleton templates."""
+    """Positions of the landmarks in the rest pose of the skeleton templates, metres."""
 
     def place(name: str) -> Vector:
         if name in _LEFT_REST:
@@ -84,7 +84,7 @@ def face_groups(start: int) -> tuple[tuple[str, tuple[Edge, ...]], ...]:
 
 
 def face_links(start: int) -> tuple[Edge, ...]:
-    """Edges to the pose's mouth and eyes: without them lips, brows and lids are components."""
+    """Edges to the pose's mouth and eyes, which connect lips, brows and lids to the graph."""
     ends = {"mouth_left": LIPS[0], "mouth_right": LIPS[LIP_POINTS // 2]}
     for side, brow, lid in zip(SIDES, BROWS, LIDS, strict=True):
         ends |= {f"{side}_eye": brow[BROW_POINTS // 2]}

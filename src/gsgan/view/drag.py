@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gsgan.data.figure import FACE, FEET, HANDS, HIPS, SHOULDERS, middle
 from gsgan.data.joints import LEFT, RIGHT
+from gsgan.data.proportions import FEET, HAND_LANDMARKS, HEAD_LANDMARKS, HIPS, SHOULDERS, middle
 from gsgan.motion.rotations import between, unit
 from gsgan.skeleton import HOLISTIC
 
@@ -41,8 +41,8 @@ HANDLES = {
     f"{side} {name}": handle
     for side, shoulder, elbow, wrist, hip, knee, ankle, hand in SIDES
     for name, handle in {
-        "wrist": Handle((shoulder, elbow, wrist), turned=(*HANDS[wrist], *hand)),
-        "elbow": Handle((shoulder, elbow), moved=(wrist, *HANDS[wrist], *hand)),
+        "wrist": Handle((shoulder, elbow, wrist), turned=(*HAND_LANDMARKS[wrist], *hand)),
+        "elbow": Handle((shoulder, elbow), moved=(wrist, *HAND_LANDMARKS[wrist], *hand)),
         "ankle": Handle((hip, knee, ankle), turned=FEET[ankle]),
         "knee": Handle((hip, knee), moved=(ankle, *FEET[ankle])),
     }.items()
@@ -82,7 +82,7 @@ def dragged(p: Float, name: str, target: Float) -> Float:
     if name == HEAD:
         neck = middle(p, SHOULDERS)
         turn = between(p[NOSE] - neck, target - neck)
-        face = _of(p, (*FACE, *HOLISTIC.expression))
+        face = _of(p, (*HEAD_LANDMARKS, *HOLISTIC.expression))
         q[face] = neck + (p[face] - neck) @ turn.T
         return q
     handle = HANDLES[name]

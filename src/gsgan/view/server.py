@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from gsgan.data.figure import upright
+from gsgan.data.proportions import upright
 from gsgan.model.avatar import Avatar
 from gsgan.model.drive import Drive, drive_of
 from gsgan.model.runs import Run
@@ -113,10 +113,10 @@ class Viewer:
     def _camera(self, size: int) -> None:
         """Sets the first view of new browsers: the first pose from the front, as large as in
         training images."""
-        drive, scene, figure = self.show.drive, self.run.scene, self.run.figure
+        drive, scene, proportions = self.show.drive, self.run.scene, self.run.proportions
         trained = self.run.stored.data.size or size
-        camera = Orbit().cameras(drive.p[:1], figure, scene, size, trained)
-        up = upright(figure.up)[2]
+        camera = Orbit().cameras(drive.p[:1], proportions, scene, size, trained)
+        up = upright(proportions.up)[2]
         self.server.scene.set_up_direction(tuple(map(float, up)))
         self.server.initial_camera.up = up
         self.server.initial_camera.position = camera.centre[0].double().numpy()

@@ -1,7 +1,7 @@
 """Pose sequences through the singularities of the bone frames, with bounds on how fast frames turn.
 
 A frame whose baseline is ``h`` long turns by about ``step / h`` when a joint makes a step; so below
-``min_length`` (1 mm) it may turn by a few ``step / min_length``, and never by more: that is what
+`MIN_LENGTH` (1 mm) it may turn by a few ``step / MIN_LENGTH``, and never by more: that is what
 passing a singularity without a jump means. A path straight through the point where a baseline
 changes sign turns by half a turn within a few millimetres: fast, but not at once.
 """
@@ -57,7 +57,7 @@ def _bending_arm(s: Tensor, around: float = 0.0, across: float = 0.0, reach: flo
     """
     p = rest(len(s))
     upper = _vector(*MEDIAPIPE33.rest_directions[0])
-    hinge = _vector(*MEDIAPIPE33.hinge_axes[0])
+    hinge = normalize(_vector(-1, 0, 0) + upper[0] * upper, dim=0)
     front = torch.linalg.cross(hinge, upper)
     angle = (around + reach * s)[:, None]
     d = angle.cos() * upper + angle.sin() * front + across * hinge
@@ -121,7 +121,7 @@ CROSSINGS: dict[str, tuple[Path, str]] = {
     ),
     "an arm through straight": (
         _bending_arm,
-        "At most 8 times the bend's step; the hinge's weight is 0 where its axis flips.",
+        "At most 8 times the bend's step.",
     ),
     "a forearm past its fold, two degrees beside": (
         partial(_bending_arm, around=math.pi, across=0.035),
@@ -131,11 +131,6 @@ CROSSINGS: dict[str, tuple[Path, str]] = {
         partial(_bending_arm, around=math.pi),
         "The roll jumps 0.8 degrees before the fold and after it, the bone's direction does "
         "not: frames on a sphere cannot be combed without a whirl.",
-    ),
-    "an elbow bent against its hinge": (
-        partial(_bending_arm, around=-math.pi / 4, reach=0.2),
-        "With twist=hinge the turn into the bend plane is half a turn at half weight there, "
-        "and either way is as good. With twist=none nothing happens.",
     ),
     "shoulders through the spine's direction": (
         partial(_shoulders_through_the_spine, direction=(0.6, 0, 0.8)),

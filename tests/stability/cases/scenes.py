@@ -10,8 +10,8 @@ import torch
 
 from gsgan.scene import Camera
 from gsgan.skeleton import MEDIAPIPE33, recentre
-from stability.cases.case import FINITE_ONLY, REFUSED, WARNED, Case, Inputs, Tolerance
-from stability.cases.raster import SIZE, cloud, pinhole, raster_case, render
+from stability.cases.case import FINITE_ONLY, REFUSED, Case, Inputs, Tolerance
+from stability.cases.raster import SIZE, cloud, pinhole, raster_case
 
 FAR = (1e4, -2e4, 3e4)  # metres: where the origin of a survey may be
 
@@ -92,8 +92,6 @@ def cases() -> Iterator[Case]:
     for name, factor in (("mirrored camera", mirror), ("R that scales", 1.1)):
         yield _case(name, partial(_times, {"R": factor}), expect=REFUSED)
     yield _case("a mean that is NaN", _with_nan, expect=REFUSED)
-    drop = partial(render, on_invalid="drop")
-    yield _case("a mean that is NaN, dropped", _with_nan, expect=WARNED, draw=drop)
 
 
 def _times(factors: dict[str, Any]) -> Inputs:

@@ -26,7 +26,7 @@ import numpy as np
 
 from gsgan.body.shape import HANDS_SHAPE, STRETCHED, free_space
 from gsgan.body.shape import LANDMARKS as LANDMARKS_SHAPE
-from gsgan.data.calibration.find import (
+from gsgan.data.calibration import (
     METRES,
     Conventions,
     choose,
@@ -34,24 +34,24 @@ from gsgan.data.calibration.find import (
     read_conventions,
 )
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.checks import Checks
 from gsgan.data.files import frame_files, read_arrays, read_json
 from gsgan.data.formats.common import IMAGES, finish, one_mask_each
-from gsgan.data.formats.trust import Trust
+from gsgan.data.formats.consistency import Consistency
 from gsgan.data.layout import BodyModel, Found, Layout, Meta, dataset_folder
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import SKELETONS, Landmarks, Poses, make_landmarks, whole_frame_ids
+from gsgan.data.validation import Thresholds
 from gsgan.skeleton.face import FACE, FACE_NAMES
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.checks import is_number, whole
 from gsgan.utils.errors import DataError
 
-LANDMARKS, HANDS, FACES = "landmarks3d.npz", "hands3d.npz", "face3d.npz"
+LANDMARKS, HANDS_FILE, FACE_FILE = "landmarks3d.npz", "hands3d.npz", "face3d.npz"
 POSES, SHAPE = "body_pose.npz", "body_shape.npz"
 MASKS = (".png",)
 BODY_BONES = {"free": 56, "smpl": 24, "smplx": 55}
-LOOKED_AT = Trust(min_box_iou=0.0)
+SKELETON_LIMITS = Consistency(min_box_iou=0.0)
 """Landmarks lie inside the body and may lack limbs, hence min_box_iou=0."""
 
 
@@ -60,40 +60,40 @@ class CaptureReader:
     """Reads a capture in the bring-your-own layout; see conf/data/capture.yaml."""
 
     drop_frames: Any = None
-    trust: Trust = LOOKED_AT
+    consistency: Consistency = SKELETON_LIMITS
     ignore_band: int = 0
 
     def __post_init__(self) -> None:
         whole("data.reader.ignore_band", self.ignore_band, 0)
 
-    def __call__(self, root: str | Path, checks: Checks, smpl: str | None = None) -> Layout:
+    def __call__(self, root: str | Path, limits: Thresholds, smpl: str | None = None) -> Layout:
         """Reads and checks everything except most images' pixels.
 
         Args:
             root: the folder that holds cameras.json.
-            checks: thresholds.
+            limits: thresholds.
             smpl: the user's model file, for poses of an SMPL or SMPL-X body.
 
         Raises:
             DataError: for whatever is missing, damaged or contradictory, naming the file.
         """
-        found = _find(dataset_folder(root, "cameras.json, images/ and masks/"), checks, smpl, self)
+        found = _find(dataset_folder(root, "cameras.json, images/ and masks/"), limits, smpl, self)
         hint = "check that cameras, landmarks and masks belong together"
-        return finish(found, checks, self.trust, hint, self.drop_frames)
+        return finish(found, limits, self.consistency, hint, self.drop_frames)
 
 
 def read_capture(
     root: str | Path,
-    checks: Checks | None = None,
+    limits: Thresholds | None = None,
     smpl: str | None = None,
-    trust: Trust = LOOKED_AT,
+    consistency: Consistency = SKELETON_LIMITS,
     drop_frames: Any = None,
 ) -> Layout:
-    """The capture in a folder, see `CaptureReader`; ``checks`` are `Checks()` when None."""
-    return CaptureReader(drop_frames, trust)(root, checks or Checks(), smpl)
+    """The capture in a folder, see `CaptureReader`; ``limits`` are `Thresholds()` when None."""
+    return CaptureReader(drop_frames, consistency)(root, limits or Thresholds(), smpl)
 
 
-def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -> Found:
+def _find(root: Path, limits: Thresholds, smpl: str | None, reader: CaptureReader) -> Found:
     notes: list[str] = []
     cameras_json = read_json(root / "cameras.json")
     meta_path = root / "meta.json"
@@ -102,17 +102,19 @@ def _find(root: Path, checks: Checks, smpl: str | None, reader: CaptureReader) -
     conventions = read_conventions(meta_path, meta_json)
     if conventions.scale != 1.0:
         notes.append(f"lengths converted from {meta.unit} to metres")
-    cameras = read_cameras(root / "cameras.json", cameras_json, conventions, checks)
+    cameras = read_cameras(
+        root / "cameras.json", cameras_json, conventions, limits.rotation_tolerance
+    )
     images = _index_images(root, cameras)
     joints = SKELETONS[meta.skeleton]
-    skeletons = _read_landmarks(root / LANDMARKS, joints, conventions, checks, notes)
+    skeletons = _read_landmarks(root / LANDMARKS, joints, conventions, limits, notes)
     hands = None
-    if (root / HANDS).exists():
-        hands = _read_landmarks(root / HANDS, 2 * HAND, conventions, checks, notes)
+    if (root / HANDS_FILE).exists():
+        hands = _read_landmarks(root / HANDS_FILE, 2 * HAND, conventions, limits, notes)
     face = None
-    if (root / FACES).exists():
-        face = _read_landmarks(root / FACES, FACE, conventions, checks, notes)
-        _refuse_other_names(root / FACES)
+    if (root / FACE_FILE).exists():
+        face = _read_landmarks(root / FACE_FILE, FACE, conventions, limits, notes)
+        _refuse_other_names(root / FACE_FILE)
     poses = None
     if (root / POSES).exists():
         poses, meta = _read_poses(root, meta, conventions)
@@ -182,7 +184,7 @@ def _index_images(root: Path, cameras: Mapping[str, CameraEntry]) -> dict[str, d
 
 
 def _read_landmarks(
-    path: Path, joints: int, conventions: Conventions, checks: Checks, notes: list[str]
+    path: Path, joints: int, conventions: Conventions, limits: Thresholds, notes: list[str]
 ) -> Landmarks:
     """Skeletons, hands or faces of every frame."""
     arrays = read_arrays(path, ("p", "conf", "frame_id"))
@@ -191,7 +193,7 @@ def _read_landmarks(
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:
         conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
-    return make_landmarks(ids, p, conf, checks.max_reach, notes, path.name)
+    return make_landmarks(ids, p, conf, limits.max_reach, notes, path.name)
 
 
 def _refuse_other_names(path: Path) -> None:
@@ -219,8 +221,8 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
         registered = frozenset(whole_frame_ids(found, str(path)).tolist())
 
     parts = [("theta", "transl")]
-    if "theta_hands" in arrays:  # fits before 2026-11-23 share the translation
-        parts.append(("theta_hands", "transl_hands" if "transl_hands" in arrays else "transl"))
+    if "theta_hands" in arrays:
+        parts.append(("theta_hands", "transl_hands"))
     values = [
         tuple(
             expect_array(arrays, name, shape, path).astype(np.float64)

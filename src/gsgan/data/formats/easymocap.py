@@ -21,13 +21,12 @@ from numpy.typing import NDArray
 
 from gsgan.data.calibration import read_calibration
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.checks import Checks, spans
 from gsgan.data.files import frame_files, natural_order, read_json_value
 from gsgan.data.formats.common import (
     IMAGES,
     FolderReader,
     body_model,
-    picture_size,
+    image_size,
     up_axis,
 )
 from gsgan.data.formats.smpl_motion import landmarks_of, zju_motion
@@ -35,6 +34,7 @@ from gsgan.data.joints import BODY, FROM_HANDS, SETS
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import MASK_RULES, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
+from gsgan.data.validation import Thresholds, spans
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import as_floats
 from gsgan.utils.checks import one_of
@@ -76,7 +76,7 @@ class EasymocapReader(FolderReader):
         one_of("data.reader.skeleton", self.skeleton, ("auto", *SKELETONS))
         one_of("data.reader.mask_rule", self.mask_rule, MASK_RULES)
 
-    def find(self, root: Path, checks: Checks, smpl: str | None) -> Found:
+    def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """The dataset's files, each checked separately.
 
         Raises:
@@ -112,7 +112,7 @@ class EasymocapReader(FolderReader):
             images=images,
             masks=self._masks(root, names),
             mask_folder=f"{self.masks}/{{camera}}",
-            landmarks=make_landmarks(ids, p, conf, checks.max_reach, notes, source=f"{place}/"),
+            landmarks=make_landmarks(ids, p, conf, limits.max_reach, notes, source=f"{place}/"),
             poses=None if motion is None else motion.poses(f"{place}/"),
             pixels=PixelRules(threshold=self.threshold),
             calibration=root / "intri.yml and extri.yml",
@@ -152,7 +152,7 @@ class EasymocapReader(FolderReader):
         return {
             name: known[name]
             if min(known[name].size) > 0
-            else replace(known[name], size=picture_size(root, images[name]))
+            else replace(known[name], size=image_size(root, images[name]))
             for name in images
         }
 
@@ -191,7 +191,7 @@ def _camera_folders(root: Path, contents: str) -> list[str]:
 
 
 def _frame_and_person(stem: str) -> int | None:
-    """One number of both: "000012_1" is frame 12 of person 1, "000012" has no id."""
+    """One number for frame and person: "000012_1" is frame 12 of person 1, "000012" has no id."""
     match = re.fullmatch(r"(\d+)(?:_(\d{1,2}))?", stem)
     if match is None:
         return None

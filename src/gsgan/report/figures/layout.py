@@ -67,8 +67,8 @@ def draw_panels(
     notes = max(1 + panel.note.count("\n") if panel.note else 0 for row in panels for panel in row)
     tall = min(width / columns * aspect, TALLEST) + notes * FONT * LINE
     height = rows * tall + (FONT * LINE if titles else 0)
-    figure = Figure(figsize=(width, height), layout="compressed")
-    figure.get_layout_engine().set(w_pad=0.01, h_pad=0.01, wspace=0.01, hspace=0.01)  # type: ignore[union-attr]
+    figure = Figure(figsize=(width, height))
+    figure.set_layout_engine("compressed", w_pad=0.01, h_pad=0.01, wspace=0.01, hspace=0.01)
     axes = figure.subplots(rows, columns, squeeze=False)
     for i, row in enumerate(panels):
         for one, panel, image in zip(axes[i], row, shown[i], strict=True):

@@ -16,7 +16,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
 
-from gsgan.model.runs import Moved, load_config
+from gsgan.model.stored import DataPaths, load_config
 from gsgan.report.figures import images
 from gsgan.report.figures.layout import STYLE, Drawing, Unavailable
 from gsgan.report.figures.subjects import Shot, Subject, choose_items, make_shots, open_subjects
@@ -59,7 +59,7 @@ def make_figures(config: DictConfig) -> None:
     formats = [one_of("formats", name, METADATA) for name in _list(config.formats) or METADATA]
     at_least("margin", config.margin, 0)
     out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
-    moved = Moved.from_config(config)
+    moved = DataPaths.from_config(config)
     for folder in folders:
         load_config(folder, moved)  # refuses other folders before anything is written
     try:

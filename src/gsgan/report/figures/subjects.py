@@ -10,20 +10,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from gsgan.data.checks import spans
 from gsgan.data.datamodule import GsganData
 from gsgan.data.fingerprint import fingerprint
 from gsgan.data.splits import SPLITS, Item
+from gsgan.data.validation import spans
 from gsgan.metrics.image import edge_scores, psnr
-from gsgan.model.avatar import Avatar, Painting
-from gsgan.model.runs import (
-    CHECKPOINT,
-    Moved,
-    build_data,
-    load_avatar,
-    load_config,
-    read_checkpoint,
-)
+from gsgan.model.assemble import build_data
+from gsgan.model.avatar import Avatar
+from gsgan.model.rendering import Rendering
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.report.departures import NAME
 from gsgan.report.runs import DATA, Run, check_same, read_run
 from gsgan.scene import Camera, Frame, Window, body_window, cat
@@ -132,9 +128,9 @@ class Subject:
     data: GsganData
     avatar: Avatar
     marks: list[str]
-    _painted: dict[Item, Painting] = field(default_factory=dict, repr=False)
+    _painted: dict[Item, Rendering] = field(default_factory=dict, repr=False)
 
-    def paint(self, shot: Shot) -> Painting:
+    def paint(self, shot: Shot) -> Rendering:
         """The avatar's rendering of a shot's whole image, made once and kept on the CPU.
 
         Raises:
@@ -143,14 +139,14 @@ class Subject:
         if shot.item not in self._painted:
             device = next(self.avatar.parameters()).device
             with torch.no_grad():
-                painting = self.avatar.paint(shot.frame.to(device))
+                painting = self.avatar(*shot.frame.to(device).inputs)
             # of F only the colour: all channels of every shot would fill the memory
             parts = (painting.image, painting.colour, painting.segmentation)
             image, colour, labels = (None if part is None else part.cpu() for part in parts)
             if not all(part is None or part.isfinite().all() for part in (image, colour, labels)):
                 where = f"{self.run.folder}: its image of {shot.name}"
                 raise DataError(f"{where} is not finite; train it again")
-            self._painted[shot.item] = Painting(image, features=colour, segmentation=labels)
+            self._painted[shot.item] = Rendering(image, features=colour, segmentation=labels)
         return self._painted[shot.item]
 
     def image(self, shot: Shot) -> Tensor:
@@ -168,7 +164,10 @@ class Subject:
 
 
 def open_subjects(
-    folders: Sequence[Path], names: Sequence[str] | None, moved: Moved, device: torch.device | str
+    folders: Sequence[Path],
+    names: Sequence[str] | None,
+    moved: DataPaths,
+    device: torch.device | str,
 ) -> list[Subject]:
     """The avatars of run folders; without ``names`` they have their models', with the folder where
     models are equal.
@@ -197,7 +196,7 @@ def open_subjects(
     return [replace(s, name=str(name)) for s, name in zip(subjects, names, strict=True)]
 
 
-def _open(folder: Path, moved: Moved, device: torch.device | str) -> Subject:
+def _open(folder: Path, moved: DataPaths, device: torch.device | str) -> Subject:
     config = load_config(folder, moved)
     data = build_data(config)
     avatar, marks = load_avatar(folder, config, data)

@@ -1,0 +1,359 @@
+"""Calibration files, recognised by their content: cameras.json, OpenCV YAML and TOML.
+
+cameras.json is the bring-your-own layout's calibration:
+``{camera: {K 3x3, R 3x3, t 3, dist 0/4/5/8, size [w, h]}}``
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from gsgan.data.cameras import CameraEntry, make_camera, numbers
+from gsgan.data.files import read_json
+from gsgan.data.validation import Thresholds
+from gsgan.utils.arrays import as_floats
+from gsgan.utils.errors import DataError
+
+METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+HEAD_BYTES = 65536  # enough to recognise the format
+MAX_YAML_BYTES = 2**20  # some 1000 cameras
+PATTERNS = ("cameras.json", "intri.yml", "intri.yaml", "*.toml")
+KNOWN = (
+    "OpenCV YAML (intri.yml beside extri.yml), TOML of Pose2Sim, aniposelib or caliscope, or "
+    "cameras.json"
+)
+TOML_KEYS = ("size", "matrix", "distortions", "rotation", "translation")
+TOML_OTHER_TABLES = ("metadata", "capture_volume", "charuco", "checkerboard")
+
+
+@dataclass(frozen=True)
+class Conventions:
+    """How the numbers of a capture are stored.
+
+    Args:
+        scale: metres in one unit of the files.
+        pixel_centre: 0.5, or 0 when K counts from the centre of the first pixel.
+        composed: the images are already composed on black (``"background": "black"``).
+    """
+
+    scale: float = 1.0
+    pixel_centre: float = 0.5
+    composed: bool = False
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """The cameras of a calibration file.
+
+    Args:
+        path: the file.
+        format: its name in words.
+        cameras: by name, metres, K with pixel centres at +0.5; a size of (0, 0) is unknown.
+        notes: one sentence for each omission or oddity.
+        ignored: names of cameras that the file says to ignore.
+    """
+
+    path: Path
+    format: str
+    cameras: dict[str, CameraEntry]
+    notes: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()
+
+
+Cameras = Mapping[str, CameraEntry | None]
+"""Cameras by name; None is one that the file says to ignore."""
+
+
+def find_calibration(folder: Path) -> Path:
+    """The only calibration file in a capture folder, or in its subfolders named like calibration.
+
+    Raises:
+        DataError: when there is none, or more than one.
+    """
+    places = [folder, *(p for p in folder.glob("*") if p.is_dir() and "calib" in p.name.lower())]
+    found = sorted({p for place in places for pattern in PATTERNS for p in place.glob(pattern)})
+    # Other .toml files are configs.
+    found = [p for p in found if p.suffix != ".toml" or b"matrix" in p.read_bytes()]
+    if not found:
+        raise DataError(f"{folder} holds no calibration; give calibration=<file>: {KNOWN}")
+    if len(found) > 1:
+        names = ", ".join(str(p.relative_to(folder)) for p in found)
+        raise DataError(
+            f"{folder} holds more than one calibration ({names}); give calibration=<file>"
+        )
+    return found[0]
+
+
+def read_calibration(
+    path: Path, unit_scale: float | None = None, pixel_centre: float = 0.0
+) -> Calibration:
+    """Reads the cameras of a calibration file in any of the known formats.
+
+    Args:
+        path: the file; for OpenCV YAML either of the two.
+        unit_scale: metres in one unit of its lengths, None for the format's own (metres, or as
+            meta.json beside cameras.json says).
+        pixel_centre: where K puts the first pixel's centre, 0 or 0.5; not read for cameras.json.
+
+    Raises:
+        DataError: when it is none of the formats, or a value is impossible.
+    """
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(HEAD_BYTES).decode("utf-8-sig", errors="replace")
+    except OSError as error:
+        raise DataError(
+            f"{path} cannot be read ({error.strerror or error}); give the calibration file"
+        ) from None
+    for name, (fits, reader) in FORMATS.items():
+        if fits(head):
+            notes: list[str] = []
+            found = reader(path, unit_scale, pixel_centre, notes)
+            cameras = {key: camera for key, camera in found.items() if camera is not None}
+            if not cameras:
+                raise DataError(f"{path} ({name}) lists no camera that can be used")
+            ignored = tuple(key for key in found if key not in cameras)
+            return Calibration(path, name, cameras, tuple(notes), ignored)
+    raise DataError(f"{path} is not a known calibration; expected {KNOWN}")
+
+
+# -- cameras.json and meta.json
+
+
+def read_conventions(path: Path, content: Mapping[str, Any]) -> Conventions:
+    """The conventions in the content of meta.json.
+
+    Raises:
+        DataError: on a missing unit or an unknown value.
+    """
+    return Conventions(
+        scale=METRES[choose(path, content, "unit", None, tuple(METRES))],
+        pixel_centre=choose(path, content, "pixel_centre", 0.5, (0, 0.5)),
+        composed=choose(path, content, "background", "scene", ("scene", "black")) == "black",
+    )
+
+
+def choose(
+    path: Path, content: Mapping[str, Any], key: str, default: Any, allowed: tuple[Any, ...]
+) -> Any:
+    """The value of a key, which must be one of those allowed.
+
+    Raises:
+        DataError: when it is not.
+    """
+    value = content.get(key, default)
+    if isinstance(value, (list, dict)) or value not in allowed:
+        names = ", ".join(map(str, allowed))
+        raise DataError(f"{path}: '{key}' is {value!r}; expected one of {names}")
+    return value
+
+
+def read_cameras(
+    path: Path,
+    content: Mapping[str, Any],
+    conventions: Conventions,
+    rotation_tolerance: float = Thresholds.rotation_tolerance,
+) -> dict[str, CameraEntry]:
+    """The cameras of cameras.json by name, in metres, pixel centres moved to +0.5.
+
+    Raises:
+        DataError: naming the camera and the problem.
+    """
+    if not content:
+        raise DataError(f"{path} lists no camera")
+    cameras = {}
+    for name, entry in content.items():
+        where = f"{path}, camera {name}"
+        if not isinstance(entry, dict) or any(key not in entry for key in ("K", "R", "t", "size")):
+            raise DataError(f"{where}: expected an object with K, R, t, dist and size")
+        width, height = numbers(where, entry["size"], "size", (2,))
+        if width < 1 or height < 1 or width % 1 or height % 1:
+            raise DataError(
+                f"{where}: size must be [width, height] in pixels, found {entry['size']}"
+            )
+        cameras[name] = make_camera(
+            where,
+            name,
+            K=entry["K"],
+            R=entry["R"],
+            t=entry["t"],
+            dist=entry.get("dist"),
+            size=(int(height), int(width)),
+            scale=conventions.scale,
+            pixel_centre=conventions.pixel_centre,
+            rotation_tolerance=rotation_tolerance,
+        )
+    return cameras
+
+
+def _read_json(path: Path, scale: float | None, pixel_centre: float, notes: list[str]) -> Cameras:
+    """A meta.json beside the file gives its unit and pixel centre."""
+    meta = path.with_name("meta.json")
+    found = read_conventions(meta, read_json(meta)) if meta.is_file() else Conventions()
+    return read_cameras(path, read_json(path), replace(found, scale=scale or found.scale))
+
+
+# -- TOML of Pose2Sim, aniposelib and caliscope
+
+
+def _read_toml(path: Path, scale: float | None, pixel_centre: float, notes: list[str]) -> Cameras:
+    """Cameras by name: size [w, h], matrix, distortions, rotation, translation.
+
+    Convention: world to camera; the rotation is a Rodrigues vector, or a matrix; metres as Pose2Sim
+    and caliscope write them. caliscope has one table per camera in another, [cameras.0]: the number
+    is its name, and a camera that it ignores is None here. aniposelib keeps the unit of its
+    calibration board, often mm, without naming it: give it with ``unit``.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, OSError, RecursionError) as error:
+        raise DataError(f"{path} is not readable as TOML: {error}") from None
+    cameras: dict[str, CameraEntry | None] = {}
+    inner = content.get("cameras")
+    for table, entry in (inner if isinstance(inner, dict) else content).items():
+        if table in TOML_OTHER_TABLES or not isinstance(entry, dict):
+            continue
+        if entry.get("ignore"):
+            cameras[table] = None
+            continue
+        name = str(entry.get("name", table))
+        if name in cameras:
+            raise DataError(f"{path} names two cameras {name}; give each its own name")
+        cameras[name] = _toml_camera(f"{path}, [{table}]", name, entry, scale or 1.0, pixel_centre)
+    return cameras
+
+
+def _toml_camera(
+    where: str, name: str, entry: dict[str, Any], scale: float, pixel_centre: float
+) -> CameraEntry:
+    if missing := [key for key in TOML_KEYS if key not in entry]:
+        raise DataError(f"{where} lacks '{missing[0]}'; expected {', '.join(TOML_KEYS)}")
+    if entry.get("fisheye"):
+        raise DataError(
+            f"{where} is a fisheye camera, which is not supported; undistort its video and "
+            "calibrate it without distortion"
+        )
+    width, height = numbers(where, entry["size"], "size", (2,))
+    R = entry["rotation"]
+    if as_floats(R).shape != (3, 3):
+        R = cv2.Rodrigues(numbers(where, R, "rotation", (3,)))[0]
+    return make_camera(
+        where,
+        name,
+        K=entry["matrix"],
+        R=R,
+        t=entry["translation"],
+        dist=entry["distortions"],
+        size=(int(height), int(width)),
+        scale=scale,
+        pixel_centre=pixel_centre,
+    )
+
+
+# -- OpenCV YAML in two files, as EasyMocap writes it
+
+
+class _Loader(yaml.BaseLoader):
+    """YAML of text and matrices; nothing in a file is run."""
+
+
+def _matrix(loader: _Loader, node: yaml.MappingNode) -> NDArray[np.float64]:
+    """``[rows, cols]`` of an ``!!opencv-matrix``."""
+    parts = loader.construct_mapping(node, deep=True)
+    values = np.array([float(text) for text in parts["data"]], np.float64)
+    return values.reshape(int(parts["rows"]), int(parts["cols"]))
+
+
+_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _matrix)
+
+
+def read_opencv_yaml(path: Path) -> dict[str, Any]:
+    """The top level of a FileStorage file: text, lists of text, and matrices ``[rows, cols]``.
+
+    PyYAML reads it: damaged files can make OpenCV's own reader corrupt memory.
+
+    Raises:
+        DataError: when it is too large, not such a file, or damaged.
+    """
+    reason = "no keys"
+    try:
+        if path.stat().st_size > MAX_YAML_BYTES:
+            raise ValueError(f"more than {MAX_YAML_BYTES} bytes")
+        # The first line is %YAML:1.0, where YAML itself has a blank; its line number must stay.
+        text = re.sub(r"\A(\s*)%YAML.*", r"\1", path.read_text(encoding="utf-8-sig"))
+        values = yaml.load(text, _Loader)
+        if isinstance(values, dict) and all(isinstance(key, str) for key in values):
+            return values
+    except (OSError, yaml.YAMLError, ArithmeticError, LookupError, RecursionError, TypeError,
+            ValueError) as error:  # fmt: skip
+        reason = " ".join(str(error).split())[:120]
+    raise DataError(
+        f"{path} is not readable as OpenCV YAML ({reason}); it may be cut off: export it again"
+    )
+
+
+def _read_yaml(path: Path, scale: float | None, pixel_centre: float, notes: list[str]) -> Cameras:
+    """Cameras by name: K, dist (or D), H, W from intri; Rot or R (Rodrigues), T from extri.
+
+    Convention: metres; world to camera. The two files list names in different orders and with
+    "none" entries, so cameras are paired by name alone. Without H and W the size is (0, 0).
+    """
+    files = [path.with_name(re.sub("intri|extri", name, path.name)) for name in ("intri", "extri")]
+    if files[0] == files[1]:
+        raise DataError(f"{path}: expected OpenCV YAML named intri.yml beside extri.yml")
+    for file in files:
+        if not file.is_file():
+            raise DataError(f"{file} does not exist; intri.yml and extri.yml belong together")
+    intri, extri = map(read_opencv_yaml, files)
+    names = intri.get("names")
+    if not isinstance(names, list):
+        names = [key[2:] for key in intri if key.startswith("K_")]
+    cameras = {}
+    for name in (name for name in dict.fromkeys(map(str, names)) if name != "none"):
+        where = f"{files[0]}, camera {name}"
+        if f"K_{name}" not in intri:
+            raise DataError(f"{where} lacks K_{name}; export it again")
+        R = extri.get(f"Rot_{name}")
+        if R is None and f"R_{name}" in extri:
+            R = cv2.Rodrigues(numbers(where, extri[f"R_{name}"], f"R_{name}", (3,)))[0]
+        if R is None or f"T_{name}" not in extri:
+            raise DataError(
+                f"{files[1]} lacks Rot_{name} (or R_{name}) and T_{name}, but {files[0]} lists the "
+                f"camera {name}; calibrate it, or take it out of both"
+            )
+        dist = intri.get(f"dist_{name}", intri.get(f"D_{name}"))
+        if dist is None:
+            notes.append(f"{files[0]} gives no lens distortion for {name}: taken as none")
+        sides = (numbers(where, intri.get(f"{side}_{name}", 0), side, ()) for side in "HW")
+        height, width = (max(0, int(side)) for side in sides)
+        cameras[name] = make_camera(
+            where,
+            name,
+            K=intri[f"K_{name}"],
+            R=R,
+            t=extri[f"T_{name}"],
+            dist=dist,
+            size=(height, width),
+            scale=scale or 1.0,
+            pixel_centre=pixel_centre,
+        )
+    return cameras
+
+
+Reader = Callable[[Path, float | None, float, list[str]], Cameras]
+"""Cameras of a path, by metres in a unit (None: the format's own) and K's pixel centre; notes."""
+FORMATS: dict[str, tuple[Callable[[str], bool], Reader]] = {
+    "OpenCV YAML": (lambda head: head.lstrip().startswith("%YAML"), _read_yaml),
+    "cameras.json": (lambda head: head.lstrip().startswith("{"), _read_json),
+    "TOML": (lambda head: "[" in head and "matrix" in head, _read_toml),
+}

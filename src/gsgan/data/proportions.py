@@ -1,0 +1,248 @@
+"""The subject's proportions, as a skeleton in a standard pose: the target of retargeting.
+
+Convention: metres; standard axes have Z up. The standard pose is an upright T: it faces -Y, the
+person's left is +X, palms down, legs straight down, the middle of the hips at the origin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from gsgan.skeleton import HOLISTIC, MEDIAPIPE33, bone_frames, sanitise
+from gsgan.skeleton.face import FACE
+from gsgan.skeleton.hands import FINGER_BONES, HAND, INDEX, PINKY, WRIST
+from gsgan.skeleton.template import CHEST, HEAD, PELVIS
+from gsgan.utils.errors import DataError
+
+Float = NDArray[np.float64]
+
+SHOULDERS, EARS, HIPS = (11, 12), (7, 8), (23, 24)
+ARMS = ((11, 13), (13, 15)), ((12, 14), (14, 16))
+LEGS = ((23, 25), (25, 27)), ((24, 26), (26, 28))
+BONES = (*ARMS[0], *ARMS[1], *LEGS[0], *LEGS[1])  # parents first
+# By wrist: base of the little finger, of the index finger, thumb; by ankle: heel, toes.
+HAND_LANDMARKS = {15: (17, 19, 21), 16: (18, 20, 22)}
+FEET = {27: (29, 31), 28: (30, 32)}
+BODY = len(MEDIAPIPE33.names)
+HAND_JOINTS = {15: slice(BODY, BODY + HAND), 16: slice(BODY + HAND, BODY + 2 * HAND)}  # by wrist
+EXPRESSION = slice(BODY + 2 * HAND, BODY + 2 * HAND + FACE)  # lips, brows and lids
+SIDES = {15: 1.0, 16: -1.0}  # of the standard pose's x
+HEELS_AND_TOES = (29, 30, 31, 32)
+HEAD_LANDMARKS = tuple(range(11))  # nose, eyes, ears, corners of the mouth
+STANDING = 10  # percentile of a foot's heights below which it counts as standing
+TO_STANDARD = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])  # of left, up, front
+
+
+@dataclass(frozen=True)
+class Proportions:
+    """The subject's proportions; plain values, for checkpoints.
+
+    Args:
+        joints: 33 landmarks in the standard pose, median proportions of the training frames.
+        seen: per landmark, whether training frames had it (else it held a stand-in).
+        ground: metres along the world's up axis, of the lowest heel or toe of a standing person.
+        facing: radians about the up axis, 0 towards -Y of the standard axes: the mean heading.
+        up: the world's up axis, e.g. "z" or "-y".
+        hands: 42 hand landmarks in the standard pose, the left hand's first, of the training
+            frames' median proportions; None where no frame has a hand.
+    """
+
+    joints: tuple[tuple[float, float, float], ...]
+    seen: tuple[bool, ...]
+    ground: float
+    facing: float
+    up: str
+    hands: tuple[tuple[float, float, float], ...] | None = None
+
+    @property
+    def rest(self) -> Float:
+        """``[33, 3]`` the landmarks of the standard pose."""
+        return np.array(self.joints)
+
+    @property
+    def rest_with_hands(self) -> Float:
+        """``[75, 3]`` with hands: the subject's, else the template's in the subject's size."""
+        rest = self.rest
+        if self.hands is not None:
+            return np.concatenate([rest, self.hands])
+        template = np.array(HOLISTIC.rest_positions)
+        pinky, index, _ = HAND_LANDMARKS[15]
+        hands = {w: _hand(template[None, at], template[None, w]) for w, at in HAND_JOINTS.items()}
+        sizes = [np.linalg.norm(middle(p, (pinky, index)) - p[15]) for p in (rest, template)]
+        hands = {wrist: hand * sizes[0] / sizes[1] for wrist, hand in hands.items()}
+        return np.concatenate([rest, _standing_hands(rest, hands)])
+
+    @property
+    def leg(self) -> float:
+        """Length of thigh and shin, metres."""
+        return float(sum(length(self.rest, bone) for bone in LEGS[0]))
+
+
+def measure_proportions(p: Tensor, valid: Tensor, up: str) -> Proportions:
+    """Measures the proportions of a person.
+
+    Args:
+        p: ``[F, 33, 3]`` metres, world frame; anything where not valid. Or ``[F, 75, 3]`` with the
+            21 landmarks of the left hand and of the right one.
+        valid: ``[F, 33]`` or ``[F, 75]``.
+        up: the world's up axis.
+    """
+    whole, _ = sanitise(p[:, :BODY].double(), valid[:, :BODY])
+    q = whole.numpy() @ upright(up).T
+    hubs = bone_frames(torch.from_numpy(q)).hubs.numpy()
+    rest = np.zeros((BODY, 3))
+    _place_limbs(rest, q)
+    for wrist, ends in HAND_LANDMARKS.items():
+        held = _local(hand_frame(q, wrist, *ends[:2]), q[:, ends] - q[:, wrist, None])
+        rest[list(ends)] = rest[wrist] + held * (SIDES[wrist], 1.0, SIDES[wrist])
+    _place_feet(rest, q)
+    _place_head(rest, q, hubs)
+    ahead = hubs[:, PELVIS, :, 2].mean(axis=0)
+    lowest = q[:, HEELS_AND_TOES, 2].min(axis=1)
+    hands = _hands(p.double().numpy() @ upright(up).T, valid.numpy())
+    return Proportions(
+        joints=_plain(rest),
+        seen=tuple((valid[:, :BODY].double().mean(0) > 0.5).tolist()),
+        ground=float(np.percentile(lowest, STANDING)),
+        facing=float(np.arctan2(ahead[0], -ahead[1])),
+        up=up,
+        hands=_plain(_standing_hands(rest, hands)) if hands else None,
+    )
+
+
+def _place_limbs(rest: Float, q: Float) -> None:
+    """Shoulders, hips, arms and legs of the standard pose, with the median lengths of ``q``."""
+
+    def median_length(a: Float, b: Float) -> float:
+        return float(np.median(np.linalg.norm(a - b, axis=-1)))
+
+    trunk = median_length(middle(q, HIPS), middle(q, SHOULDERS))
+    for pair, height in ((HIPS, 0.0), (SHOULDERS, trunk)):
+        half = median_length(q[:, pair[0]], q[:, pair[1]]) / 2
+        rest[list(pair)] = [half, 0, height], [-half, 0, height]
+    for limbs, ways in ((ARMS, ((1, 0, 0), (-1, 0, 0))), (LEGS, ((0, 0, -1), (0, 0, -1)))):
+        for limb, way in zip(limbs, ways, strict=True):
+            for a, b in limb:
+                rest[b] = rest[a] + median_length(q[:, a], q[:, b]) * np.array(way)
+
+
+def _place_feet(rest: Float, q: Float) -> None:
+    """Heels and toes of the standard pose, as they stand on the floor in ``q [F, 33, 3]``."""
+    for ankle, (heel, toe) in FEET.items():
+        foot = [heel, toe]
+        low = q[:, foot, 2].max(axis=1)
+        stands = q[low <= np.percentile(low, STANDING)]
+        ahead = (stands[:, toe] - stands[:, heel]) * (1, 1, 0)
+        back = -ahead / np.maximum(np.linalg.norm(ahead, axis=-1, keepdims=True), 1e-9)
+        above = np.broadcast_to([0.0, 0, 1], back.shape)
+        axes = np.stack([np.cross(back, above), back, above], axis=-1)
+        rest[foot] = rest[ankle] + _local(axes, stands[:, foot] - stands[:, ankle, None])
+
+
+def _place_head(rest: Float, q: Float, hubs: Float) -> None:
+    """Face and ears of the standard pose, the gaze level, above its shoulders."""
+    ears = middle(q, EARS)
+    neck = _local(hubs[:, CHEST], (ears - middle(q, SHOULDERS))[:, None]) @ TO_STANDARD.T
+    # A level gaze turns the head's axes by this pitch: the nose lies below the ears.
+    pitch = float(np.median(np.arcsin(np.clip(hubs[:, HEAD, 2, 2], -1, 1))))
+    level = np.array(
+        [[1, 0, 0], [0, np.cos(pitch), -np.sin(pitch)], [0, np.sin(pitch), np.cos(pitch)]]
+    )
+    face = _local(hubs[:, HEAD], q[:, HEAD_LANDMARKS] - ears[:, None]) @ TO_STANDARD.T
+    rest[list(HEAD_LANDMARKS)] = middle(rest, SHOULDERS) + neck + face @ level
+
+
+def _local(frames: Float, points: Float) -> Float:
+    """``[n, 3]`` medians of points ``[F, n, 3]`` in frames ``[F, 3, 3]``."""
+    return np.asarray(np.median(points @ frames, axis=0))
+
+
+def _plain(p: Float) -> tuple[tuple[float, float, float], ...]:
+    return tuple((x, y, z) for x, y, z in p.tolist())
+
+
+def _hands(p: Float, seen: NDArray[np.bool_]) -> dict[int, Float]:
+    """Each hand of joints ``[F, J, 3]`` as `_hand` gives it, by its wrist; empty without any.
+
+    A hand that is never seen whole is the other one's mirror image.
+    """
+    found = {}
+    for wrist, hand in HAND_JOINTS.items():
+        whole = seen[:, hand].all(1) & seen[:, wrist]
+        if whole.any() and p.shape[1] > BODY:
+            found[wrist] = _hand(p[whole, hand], p[whole, wrist])
+    if len(found) == 1:
+        (other,) = found.values()
+        found = dict.fromkeys(HAND_JOINTS, other * (1, 1, -1)) | found
+    return found
+
+
+def _hand(p: Float, wrist: Float) -> Float:
+    """``[21, 3]`` medians of a hand ``[F, 21, 3]`` from the pose's wrist ``[F, 3]``, in the palm's
+    axes; fingers have the median lengths of their bones."""
+    local = (p - wrist[:, None]) @ hand_frame(p, WRIST, PINKY, INDEX)
+    median = np.median(local, axis=0)
+    held = median.copy()
+    for a, b in FINGER_BONES:
+        bone = median[b] - median[a]
+        size = np.median(np.linalg.norm(p[:, b] - p[:, a], axis=-1))
+        held[b] = held[a] + size * bone / max(float(np.linalg.norm(bone)), 1e-9)
+    return held
+
+
+def _standing_hands(rest: Float, hands: Mapping[int, Float]) -> Float:
+    """``[42, 3]`` the hands of `_hands` at the wrists of a standard pose ``[33, 3]``."""
+    return np.concatenate(
+        [rest[wrist] + hand * (SIDES[wrist], 1.0, SIDES[wrist]) for wrist, hand in hands.items()]
+    )
+
+
+def upright(up: str) -> Float:
+    """``[3, 3]`` rotation from a world whose up axis is ``up`` to standard axes, Z up.
+
+    Raises:
+        DataError: when the name is not that of an axis.
+    """
+    axis = "xyz".find(up[-1:])
+    if axis < 0 or up[:-1] not in ("", "-"):
+        raise DataError(f"up must be x, y, z, -x, -y or -z, got {up!r}")
+    above = np.eye(3)[axis] * (-1 if up[:-1] else 1)
+    first = np.eye(3)[(axis + 1) % 3]
+    return np.stack([first, np.cross(above, first), above])
+
+
+def middle(p: Float, pair: tuple[int, int]) -> Float:
+    """``[..., 3]`` the middle of two joints of ``[..., J, 3]``."""
+    return np.asarray(p[..., pair, :].mean(axis=-2))
+
+
+def length(rest: Float, bone: tuple[int, int]) -> float:
+    """Metres between two joints of ``[J, 3]``."""
+    return float(np.linalg.norm(rest[bone[1]] - rest[bone[0]]))
+
+
+def hand_frame(p: Float, wrist: int, pinky: int, index: int) -> Float:
+    """``[..., 3, 3]`` axes of a hand, see `part_frame`: along it, towards the little finger.
+
+    Convention: the second axis is opposite to that of `gsgan.skeleton.hands.palm_frames`.
+
+    Args:
+        p: ``[..., J, 3]`` landmarks.
+        wrist, pinky, index: numbers of the wrist and of the bases of two fingers.
+    """
+    along = middle(p, (pinky, index)) - p[..., wrist, :]
+    return part_frame(along, p[..., pinky, :] - p[..., index, :])
+
+
+def part_frame(along: Float, across: Float) -> Float:
+    """``[..., 3, 3]`` columns: a direction, another made orthogonal to it, their cross product."""
+    a = along / np.maximum(np.linalg.norm(along, axis=-1, keepdims=True), 1e-9)
+    b = across - (across * a).sum(-1, keepdims=True) * a
+    b = b / np.maximum(np.linalg.norm(b, axis=-1, keepdims=True), 1e-9)
+    return np.stack([a, b, np.cross(a, b)], axis=-1)
