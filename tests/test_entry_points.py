@@ -212,7 +212,6 @@ def test_an_image_that_cannot_be_read_ends_in_one_sentence(capture, tmp_path, in
         ("trainer.precision=3-bits", ("3-bits",)),
         ("lpips.net=squeeze", ("lpips.net", "vgg or alex")),
         ("training.step_two.gan=wgan", ("training.step_two.gan", "logistic")),
-        ("accuracy@model.segmentation.accuracy=best", ("accuracy/best",)),
         ("model.deformation.width=abc", ("model:", "str")),
         ("seed=-1", ("seed", "-1")),
     ],
@@ -234,5 +233,9 @@ def test_two_processes_train_together_and_one_scores(capture, tmp_path):
 def test_a_name_that_hydra_does_not_know_ends_in_a_sentence(capture, tmp_path, inside, monkeypatch):
     """Under a tracer, as for coverage, Hydra would print its developers' view."""
     monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)
-    for argument, word in (("model=huge", "model/huge"), ("modle=full", "modle")):
+    for argument, word in (
+        ("model=huge", "model/huge"),
+        ("modle=full", "modle"),
+        ("accuracy@model.segmentation.accuracy=best", "accuracy/best"),
+    ):
         refused(inside("train", *arguments(capture, tmp_path / "run"), argument), word)

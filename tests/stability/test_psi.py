@@ -8,8 +8,10 @@ from hypothesis import strategies as st
 
 from stability.cases.poses import DEGENERATE
 from stability.cases.psi import NAMES, composed, ordinary_residuals, small_psi, some_points
+from stability.cases.raster import rotation
 
 FLOAT32 = torch.float32, torch.device("cpu")
+XYZ = st.tuples(*[st.floats(-3.1, 3.1)] * 3)
 VALUES = st.one_of(st.floats(-1e3, 1e3, width=32), st.sampled_from([0.0, -1.0, 1e3, -1e3]))
 
 
@@ -40,3 +42,17 @@ def test_any_residuals_make_gaussians_within_bounds_with_finite_slopes(values, s
     assert (sigma2 <= high**2 * 1.001).all()
     sum(x.sum() for x in made.values()).backward()
     assert all(inputs[name].grad.isfinite().all() for name in NAMES)
+
+
+@given(st.fixed_dictionaries(dict.fromkeys(NAMES, VALUES)), XYZ, XYZ)
+def test_gaussians_turn_and_move_with_the_skeleton_and_the_eye(values, angles, metres):
+    inputs = ordinary_residuals(3)
+    inputs |= {name: inputs[name] + value for name, value in values.items()}
+    here, R = composed(inputs), rotation(angles)
+    shift = torch.tensor(metres, dtype=torch.float64)
+    there = composed({**inputs, **{k: inputs[k] @ R.mT + shift for k in ("p", "eye")}})
+    torch.testing.assert_close(there["means"], here["means"] @ R.mT + shift, atol=1e-9, rtol=0)
+    expected = R @ here["covariances"] @ R.mT
+    torch.testing.assert_close(there["covariances"], expected, atol=1e-6, rtol=1e-9)
+    for name in ("opacities", "features"):
+        torch.testing.assert_close(there[name], here[name], atol=1e-6, rtol=1e-9)

@@ -12,9 +12,11 @@ from gsgan.skeleton import MEDIAPIPE33, bone_frames, omega
 from gsgan.skeleton.frames import MIN_LENGTH, BoneFrames
 from stability.cases.crossings import CROSSINGS, poses
 from stability.cases.poses import DEGENERATE, noisy
+from stability.cases.raster import rotation
 from stability.cases.skeleton import few_points
 
 CPU = torch.device("cpu")
+XYZ = st.tuples(*[st.floats(-3.1, 3.1)] * 3)
 
 FADED = 20.0 * 1e-3 / MIN_LENGTH
 """Frobenius norm of a frame's change over ``step / MIN_LENGTH``, where a baseline fades to its
@@ -124,6 +126,22 @@ def test_any_skeleton_has_rotations_for_frames_and_finite_slopes(p):
     total = points.means.sum() + points.scales.sum() + (code * code.detach()).sum()
     total.backward()
     assert leaf.grad.isfinite().all()
+
+
+@given(skeletons(), XYZ, XYZ)
+def test_frames_and_points_turn_and_move_with_the_skeleton(p, angles, metres):
+    R = rotation(angles)
+    moved = p @ R.mT + torch.tensor(metres, dtype=p.dtype)
+    densify = few_points(torch.float64, CPU)
+    a, b = bone_frames(p), bone_frames(moved)
+    torch.testing.assert_close(b.limbs, R @ a.limbs, atol=1e-6, rtol=0)
+    torch.testing.assert_close(b.hubs, R @ a.hubs, atol=1e-6, rtol=0)
+    torch.testing.assert_close(b.local, a.local, atol=1e-6, rtol=0)
+    here, there = densify(p, None, a), densify(moved, None, b)
+    shift = moved - p @ R.mT
+    expected = here.means @ R.mT + shift[:, :1]
+    torch.testing.assert_close(there.means, expected, atol=1e-6, rtol=0)
+    torch.testing.assert_close(there.scales, here.scales, atol=1e-9, rtol=0)
 
 
 @given(skeletons())
