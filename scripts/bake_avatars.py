@@ -24,7 +24,7 @@ from gsgan.synthetic.glb import Glb
 from gsgan.synthetic.gltf import read_character
 
 AVATARS = {"blouse": "Hispanic_F_1_Casual.glb", "polo": "White_M_1_Casual.glb"}
-OUT = Path(__file__).parents[1] / "src" / "gsgan" / "data" / "synthetic" / "avatars"
+OUT = Path(__file__).parents[1] / "src" / "gsgan" / "synthetic" / "avatars"
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 MOUTH_SHARE = 0.2  # of the triangles of teeth and tongue are kept
 SMALLEST = 5e-5  # metres: smaller offsets of shapes are dropped

@@ -1,10 +1,10 @@
 #!/usr/bin/env bash
-# Every check that needs CUDA, in at most 20 minutes, and docs/gpu.md from what it printed.
+# Every check that needs CUDA, in at most 20 minutes, and docs/results/gpu.md from what it printed.
 # A step that is done is not repeated: run it again after an interruption, or after
 # removing outputs/gpu_check/<step>.done.  PYTHON, OUT and PAGE replace the defaults below.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-python=${PYTHON:-.venv/bin/python} out=${OUT:-outputs/gpu_check} page=${PAGE:-docs/gpu.md}
+python=${PYTHON:-.venv/bin/python} out=${OUT:-outputs/gpu_check} page=${PAGE:-docs/results/gpu.md}
 limit=1200 # seconds of all steps together
 if ! "$python" -c 'import sys, torch; sys.exit(not torch.cuda.is_available())'; then
   echo "gpu_check: torch finds no CUDA device on this machine, so nothing was checked."
@@ -43,8 +43,8 @@ count=$("$python" -c 'import torch; print(torch.cuda.device_count())')
 
 step parity 180 "$python" -m pytest -q -p no:cacheprovider tests/train/test_cuda.py
 step tests 360 "$python" -m pytest -q -p no:cacheprovider -n auto tests
-step raster 120 "$python" -m gsgan.bench raster device=cuda 'backends=[torch,gsplat]' \
-  'gaussians=[8000]' 'sizes=[512]' 'channels=[3,32]' repeats=5 hydra.run.dir="$out/raster"
+step raster 120 "$python" scripts/bench/raster.py device=cuda 'backends=[torch,gsplat]' \
+  'gaussians=[8000]' 'sizes=[512]' 'channels=[3,32]' repeats=5 out="$out/raster"
 step speed_512 60 "${speed[@]}" hydra.run.dir="$out/speed_512"
 step speed_512_bf16 60 "${speed[@]}" precision=bf16-mixed hydra.run.dir="$out/speed_512_bf16"
 step speed_1024_bf16 60 "${speed[@]}" size.picture=1024 precision=bf16-mixed \

@@ -11,7 +11,9 @@ import torch
 
 import gsgan
 from gsgan.metrics.regions import on_background
-from gsgan.model.runs import CHECKPOINT, CONFIG, build_data, load_avatar, load_config
+from gsgan.model.assemble import build_data
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import CONFIG, load_config
 from gsgan.scene import cat
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.utils.errors import DataError
@@ -24,7 +26,7 @@ def scored(run):
     data = build_data(config)
     frame = data.dataset("train")[0]
     with torch.no_grad():
-        return frame, load_avatar(run, config, data)[0].paint(frame)
+        return frame, load_avatar(run, config, data)[0](*frame.inputs)
 
 
 def test_a_loaded_avatar_renders_what_evaluation_paints(run, scored, tmp_path):
@@ -67,20 +69,6 @@ def test_a_bare_skeleton_is_enough(run, scored):
         avatar.render(swapped, frame.camera)
 
 
-def test_an_older_checkpoint_needs_the_dataset(run, tmp_path):
-    copy = tmp_path / "copy"
-    shutil.copytree(run, copy)
-    checkpoint = torch.load(copy / CHECKPOINT, weights_only=True)
-    del checkpoint["gsgan"]["scene"]
-    torch.save(checkpoint, copy / CHECKPOINT)
-    new, old = gsgan.load(run, device="cpu").state_dict(), gsgan.load(copy).cpu().state_dict()
-    assert all(torch.equal(new[name], old[name]) for name in new.keys() | old.keys())
-    text = (copy / CONFIG).read_text()
-    (copy / CONFIG).write_text(text.replace("root: /", "root: /no/longer/there/"))
-    with pytest.raises(DataError, match="does not exist, the dataset of"):
-        gsgan.load(copy)
-
-
 def test_a_folder_without_a_run_or_a_checkpoint_is_one_sentence(run, tmp_path):
     with pytest.raises(DataError, match="not a run folder"):
         gsgan.load(tmp_path)
@@ -88,17 +76,6 @@ def test_a_folder_without_a_run_or_a_checkpoint_is_one_sentence(run, tmp_path):
     shutil.copy(run / CONFIG, tmp_path / CONFIG)
     with pytest.raises(DataError, match="the run has no checkpoint yet"):
         gsgan.load(tmp_path)
-
-
-def test_a_config_of_an_older_gsgan_is_read_under_its_new_names(run, tmp_path):
-    (tmp_path / ".hydra").mkdir()
-    text = (run / CONFIG).read_text()
-    old = text.replace("gsgan.model.assemble.assemble_avatar", "gsgan.model.avatar.Avatar")
-    assert old != text
-    old = old.replace("\neffects:\n", "\neffects:\n  measure: 5\n")  # a former key
-    assert "measure" in old
-    (tmp_path / CONFIG).write_text(old.replace("gsgan.train.", "gsgan.training."))
-    assert load_config(tmp_path) == load_config(run)
 
 
 def test_importing_gsgan_is_light():

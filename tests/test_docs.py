@@ -1,51 +1,143 @@
-"""The docs say what is there."""
+"""The docs say what is there: pages, links, budgets, the comments of conf/, the website."""
 
 from __future__ import annotations
 
 import re
 import subprocess
 import sys
+from importlib.util import find_spec
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
+import yaml
 
 ROOT = Path(__file__).parents[1]
+CONF, DOCS = ROOT / "conf", ROOT / "docs"
+TOP = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")
+RESULTS = sorted((DOCS / "results").glob("*.md"))
+WRITTEN = sorted(set(DOCS.rglob("*.md")) - set(RESULTS))  # by a person
+PAGES = [*(ROOT / name for name in TOP), *WRITTEN, *RESULTS]
+COMMENT = re.compile(r"(^|\s)#\s")
 
 
-def test_options_page_is_up_to_date():
-    script = ROOT / "scripts" / "make_options.py"
-    done = subprocess.run([sys.executable, str(script), "--check"], check=False)
-    assert done.returncode == 0, "run .venv/bin/python scripts/make_options.py"
+def names(pages: list[Path]) -> list[str]:
+    return [str(page.relative_to(ROOT)) for page in pages]
 
 
-def test_options_page_shows_every_config():
-    page, conf = (ROOT / "docs" / "options.md").read_text(), ROOT / "conf"
-    for path in conf.rglob("*.yaml"):
-        assert f"\n## {path.relative_to(conf).with_suffix('')}\n" in page
+def anchors(page: Path) -> set[str]:
+    """As GitHub and mkdocs make them of headings."""
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    titles = re.findall(r"^#+ (.+)$", text, flags=re.M)
+    return {re.sub(r"[^\w -]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 
 
-@pytest.mark.parametrize(
-    "page", ["README.md", *(f"docs/{p.name}" for p in sorted((ROOT / "docs").glob("*.md")))]
-)
-def test_links_and_pictures_exist(page):
-    text = (ROOT / page).read_text()
-    for target in re.findall(r"\]\(([^)#]+)\)", text):
-        if not target.startswith("http"):
-            assert ((ROOT / page).parent / target).exists(), f"{page}: {target}"
+@pytest.mark.parametrize("page", PAGES, ids=names(PAGES))
+def test_links_and_images_exist(page):
+    text = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    for target, anchor in re.findall(r"\]\(([^)#]*)(?:#([^)]+))?\)", text):
+        if target.startswith("http"):
+            continue
+        linked = page.parent / target if target else page
+        assert linked.exists(), f"{page.name}: {target}"
+        assert not anchor or anchor in anchors(linked), f"{page.name}: {target}#{anchor}"
 
 
-def test_readme_maps_every_package_of_the_code():
-    text = (ROOT / "README.md").read_text()
+def test_pages_named_in_the_code_exist():
+    for folder in ("src", "conf", "scripts"):
+        for path in (p for p in (ROOT / folder).rglob("*") if p.suffix in (".py", ".yaml", ".sh")):
+            for page in re.findall(r"docs/[a-z_/]+\.md", path.read_text()):
+                assert (ROOT / page).exists() or page == "docs/results/gpu.md", f"{path}: {page}"
+
+
+def test_pages_are_short():
+    words = {page: len(page.read_text().split()) for page in [ROOT / "README.md", *WRITTEN]}
+    assert words[ROOT / "README.md"] <= 900
+    assert sum(words.values()) <= 25_000
+    for name in ("ablations", "performance", "trade_off"):
+        assert words[DOCS / f"{name}.md"] <= 700, name
+
+
+@pytest.mark.parametrize("page", RESULTS, ids=names(RESULTS))
+def test_results_name_commit_machine_and_date(page):
+    text = page.read_text()
+    assert re.search(r"[Cc]ommits?[: ]", text), "no commit (or: not recorded)"
+    assert re.search(r"[Mm]achine|\(cpu\)|\(cuda\)", text), "no machine (or: not recorded)"
+    assert re.search(r"20\d\d-\d\d-\d\d|date: not recorded", text), "no date (or: not recorded)"
+
+
+def test_every_page_is_in_the_website():
+    nav = (ROOT / "mkdocs.yml").read_text()
+    for page in (*WRITTEN, *RESULTS):
+        assert re.search(rf"- {page.relative_to(DOCS)}$", nav, flags=re.M), page
+
+
+def test_the_reference_lists_modules_that_exist():
+    listed = re.findall(r"^::: ([\w.]+)$", (DOCS / "reference.md").read_text(), flags=re.M)
+    for part in ("scene", "skeleton", "splat", "body", "losses", "metrics", "model", "data"):
+        assert any(name.startswith(f"gsgan.{part}") for name in listed), part
+    for name in listed:
+        assert find_spec(name) is not None, name
+
+
+@pytest.mark.slow
+def test_the_website_builds_without_a_warning(tmp_path):
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert 'id="gsgan.scene.Camera"' in (tmp_path / "reference" / "index.html").read_text()
+
+
+def keys(path: Path) -> list[tuple[str, int]]:
+    """Every public key with a value of its own, with its line, from 0; none of Hydra's."""
+    found: list[tuple[str, int]] = []
+
+    def walk(node: yaml.Node) -> None:
+        for key, value in node.value if isinstance(node, yaml.MappingNode) else ():
+            name = key.value
+            if name in ("defaults", "hydra") or name.startswith("_"):
+                continue
+            if isinstance(value, yaml.MappingNode):
+                walk(value)
+            else:
+                found.append((name, key.start_mark.line))
+
+    walk(yaml.compose(path.read_text()))
+    return found
+
+
+def has_comment(lines: list[str], number: int) -> bool:
+    """On its line, or above it in its block, which ends at an empty line."""
+    above = takewhile(str.strip, reversed(lines[:number]))
+    return bool(COMMENT.search(lines[number])) or any(x.strip().startswith("#") for x in above)
+
+
+def test_every_key_of_conf_has_a_comment():
+    explained, missing = set(), []
+    for path in sorted(CONF.rglob("*.yaml")):
+        lines = path.read_text().splitlines()
+        for name, number in keys(path):
+            if has_comment(lines, number):
+                explained.add(name)
+            else:
+                missing.append((name, f"{path.relative_to(CONF)}:{number + 1}: {name}"))
+    # a preset need not repeat what the file says that it changes
+    lacking = [where for name, where in missing if name not in explained]
+    assert not lacking, "\n".join(lacking)
+
+
+def test_the_architecture_page_maps_every_package_of_the_code():
+    text = (DOCS / "architecture.md").read_text()
     for folder in sorted((ROOT / "src" / "gsgan").iterdir()):
         if folder.is_dir() and (folder / "__init__.py").is_file():
-            assert f"{folder.name}/" in text, folder.name
+            assert f"`{folder.name}/`" in text, folder.name
 
 
-def test_make_verbs_of_the_readme_exist():
-    text = (ROOT / "README.md").read_text()
-    verbs = set(re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), flags=re.M))
-    for verb in re.findall(r"^make ([a-z-]+)|`make ([a-z-]+)", text, flags=re.M):
-        assert (verb[0] or verb[1]) in verbs, verb
+def test_make_targets_of_the_docs_exist():
+    targets = set(re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), flags=re.M))
+    for page in PAGES:
+        used = re.findall(r"^make ([a-z-]+)|`make ([a-z-]+)", page.read_text(), flags=re.M)
+        assert {first or second for first, second in used} <= targets, page.name
 
 
 def test_ci_calls_the_readmes_test_command():

@@ -1,15 +1,20 @@
 """Every command of the README and the docs runs: as written, but tiny.
 
-A line whose arguments another line of the command has too is composed, not run. Lines that are
-only in docs/ are composed, and run with the slow tests.
+A line whose arguments another line of the command has too is composed, not run. Lines that are not
+in a newcomer's first pages are composed, and run with the slow tests. `tests/test_examples.py` runs
+those of docs/examples/.
 """
 
 from __future__ import annotations
 
 import re
+import runpy
 import shutil
+import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,41 +22,33 @@ from commands import ROOT, TINY
 
 # A GPU's settings: one kind of machine runs the tests.
 ELSEWHERE = ("trainer=gpu", "trainer=ddp")
-REPORTS = ("ablation", "ablation_skeleton", "gan")  # blocks of docs/ablations.md
+REPORTS = ("ablation", "ablation_skeleton", "gan")  # blocks of docs/results/ablations.md
 SMALL_BENCH = {
-    "raster": [
-        *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "reference.gaussians=300"),
-        *("reference.size=32", "compare_at=[300]", "windows=1", "window=16"),
-        "memory=false",
-    ],
     "speed": ["size=tiny", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
-    "trade-off": [
+    "trade_off": [
         *("settings.accuracies=[draft]", "settings.scales=[0.5]", "settings.backends=[]"),
-        *("settings.precisions=[]", "settings.windows=[]", "repeats=1", "pictures=1"),
+        *("settings.precisions=[]", "settings.windows=[]", "repeats=1", "images=1"),
     ],
-    "roofline": ["sizes=[tiny]", "frames=2", "warmup=1", "poses=2", "data.root=/path/to/capture"],
-    "effects": [
-        *("train=false", "only=[distortion]"),
-        "base=['size=tiny','data.source.frames=2','data.source.test_frames=1','data.body=none',"
-        "'data.source.train_cameras=2','data.source.test_cameras=1',"
-        "'data.source.rays_per_pixel=1']",
+    "raster": [
+        *("repeats=1", "gaussians=[300]", "channels=[3]", "sizes=[32]", "windows=1", "window=16"),
     ],
 }
 
 
-SIGNING = ("skeleton=holistic", "33_hands", "sign_demo", "paper_slp")  # need hands, or a face too
+# These need hands, or a face too.
+SIGNING = ("skeleton=holistic", "33_hands", "sign_demo", "paper_slp", "data=synthetic")
 FEW = {"segmentation": 2, "step_one": 2, "step_two": 4, "discriminator_start": 1, "epoch": 4}
 
 
-README = [ROOT / "README.md"]
+FIRST = [ROOT / "README.md", *(ROOT / f"docs/{n}.md" for n in ("quickstart", "data", "train"))]
 
 
 def documented(pages: list[Path]) -> list[str]:
-    """Every ``python -m gsgan.…`` of the pages, once."""
+    """Every ``python -m gsgan.…`` and ``python scripts/…`` of the pages, once."""
     text = "\n".join(page.read_text() for page in pages)
     blocks = re.findall(r"```bash\n(.*?)```", text, flags=re.DOTALL)
     lines = [line.split("#")[0].strip() for block in blocks for line in block.splitlines()]
-    return sorted({line for line in lines if line.startswith("python -m gsgan.")})
+    return sorted({x for x in lines if x.startswith(("python -m gsgan.", "python scripts/"))})
 
 
 def is_part(line: str, lines: list[str]) -> bool:
@@ -130,7 +127,7 @@ def place(capture, run, bare, model_file, tmp_path_factory) -> Callable[[str], s
     def moving(name: str) -> Path:
         from mannequin import mannequin, write_bvh
 
-        from gsgan.synthetic.motion import Choreography
+        from gsgan.synthetic.posing import Choreography
 
         person = mannequin()
         return write_bvh(folder() / name, person, Choreography(person).at(np.ones(2)), 1 / 30)
@@ -144,10 +141,29 @@ def place(capture, run, bare, model_file, tmp_path_factory) -> Callable[[str], s
         path.write_bytes(png_bytes(Image.new("RGB", (8, 8))))
         return path
 
+    def sign(name: str) -> Path:
+        import pose_format
+        from make import skeletons
+        from pose_format.numpy import NumPyPoseBody
+        from pose_format.pose_header import PoseHeader, PoseHeaderComponent, PoseHeaderDimensions
+
+        from gsgan.skeleton import MEDIAPIPE33
+
+        p = skeletons(4)[:, None][..., [0, 2, 1]] * [1, -1, 1]  # y down
+        points = ("POSE_WORLD_LANDMARKS", [n.upper() for n in MEDIAPIPE33.names])
+        part = PoseHeaderComponent(*points, [(0, 1)], [(255, 0, 0)], "XYZC")
+        header = PoseHeader(0.1, PoseHeaderDimensions(640, 480, 0), [part])
+        path = folder() / name
+        with path.open("wb") as stream:
+            body = NumPyPoseBody(25, p, np.ones(p.shape[:3]))
+            pose_format.Pose(header, body).write(stream)
+        return path
+
     makers: dict[str, Callable[[], Path | str]] = {
         "gsgan.render run=<run folder>": lambda: f"gsgan.render run={bare}",
         "/path/to/dance.bvh": lambda: moving("dance.bvh"),
         "/path/to/walk.bvh": lambda: moving("walk.bvh"),
+        **{f"/path/to/sign_{i}.pose": partial(sign, f"sign_{i}.pose") for i in (1, 2, 3)},
         "/path/to/000000.png": rendered,
         "/path/to/run_wo_gcn": lambda: another_run("run_wo_gcn"),
         "/path/to/run_wo_seg": lambda: another_run("run_wo_seg"),
@@ -168,7 +184,7 @@ def place(capture, run, bare, model_file, tmp_path_factory) -> Callable[[str], s
         "runs=runs/ablation_gan": lambda: f"runs={run.parent}",
         "runs=runs/ablation": lambda: f"runs={run.parent}",
         "/path/to/page.md": report_page,
-        "fill=docs/ablations.md": lambda: f"fill={report_page()}",
+        "fill=docs/results/ablations.md": lambda: f"fill={report_page()}",
     }
 
     def fill(line: str) -> str:
@@ -207,42 +223,59 @@ def fixed(given: list[str], option: str) -> bool:
     return protocol and option.startswith(("data.size", "data.crop"))
 
 
-def tiny_bench(arguments: list[str], tmp_path: Path, capture: Path) -> list[str]:
-    given = []
-    for argument in arguments:
-        if argument.startswith("docs="):
-            page = tmp_path / "page.md"
-            shutil.copy(ROOT / argument.removeprefix("docs="), page)
-            given.append(f"docs={page}")
-        elif argument.split("=")[0] not in {"repeats", "gaussians", "sizes", "size"}:
-            given.append(argument.strip("'"))
-    small = (w.replace("/path/to/capture", str(capture)) for w in SMALL_BENCH.get(given[0], []))
+def tiny_bench(name: str, arguments: list[str], capture: Path) -> list[str]:
+    large = {"repeats", "gaussians", "sizes", "size"}
+    given = [a.strip("'") for a in arguments if a.split("=")[0] not in large]
+    small = (w.replace("/path/to/capture", str(capture)) for w in SMALL_BENCH[name])
     return [*given, *small]
 
 
-LINES = documented([*README, *(ROOT / "docs").glob("*.md")])
-FIRST = set(documented(README))
+LINES = documented([ROOT / "README.md", *(ROOT / "docs").rglob("*.md")])
+QUICK = set(documented(FIRST))
+WHOLE = [line for line in LINES if not is_part(line, LINES)]
 
 
-@pytest.mark.parametrize("line", [n for n in LINES if is_part(n, LINES) or n not in FIRST])
-def test_a_documented_command_composes(line, inside):
-    _, _, module, *arguments = line.replace("<run folder>", "/path/to/run").split()
+@pytest.fixture
+def execute(inside, tmp_path, monkeypatch, capfd):
+    """Runs a documented line, ``python -m gsgan.…`` or ``python scripts/…``, in this process."""
+
+    def run(line: str, arguments: list[str]):
+        program = line.split()[1]
+        if program == "-m":
+            return inside(line.split()[2].removeprefix("gsgan."), *arguments)
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [program, *arguments])
+        monkeypatch.syspath_prepend(str((ROOT / program).parent))
+        code = 0
+        try:
+            runpy.run_path(str(ROOT / program), run_name="__main__")
+        except SystemExit as end:
+            code = end.code or 0
+        out, err = capfd.readouterr()
+        return SimpleNamespace(returncode=code, stdout=out, stderr=err)
+
+    return run
+
+
+def arguments_of(line: str) -> list[str]:
+    words = line.split()
+    return words[3:] if words[1] == "-m" else words[2:]
+
+
+@pytest.mark.parametrize("line", [x for x in LINES if x not in WHOLE or x not in QUICK])
+def test_a_documented_command_composes(line, execute):
+    arguments = arguments_of(line.replace("<run folder>", "/path/to/run"))
     if "-m" in arguments:  # the last of the values that it varies
         arguments = [re.sub(r"=.*,", "=", a) if "=[" not in a else a for a in arguments]
     arguments = [a.strip("'") for a in arguments if a != "-m"]
-    result = inside(module.removeprefix("gsgan."), *arguments, "--cfg", "job")
+    result = execute(line, [*arguments, "--cfg", "job"])
     assert result.returncode == 0, result.stdout + result.stderr
 
 
 @pytest.mark.parametrize(
-    "line",
-    [
-        line if line in FIRST else pytest.param(line, marks=pytest.mark.slow)
-        for line in LINES
-        if not is_part(line, LINES)
-    ],
+    "line", [x if x in QUICK else pytest.param(x, marks=pytest.mark.slow) for x in WHOLE]
 )
-def test_every_documented_command_runs(line, place, capture, inside, tmp_path, monkeypatch):
+def test_every_documented_command_runs(line, place, capture, execute, tmp_path, monkeypatch):
     if any(word in line for word in SIGNING):
         from make import write_face, write_hands
 
@@ -250,22 +283,24 @@ def test_every_documented_command_runs(line, place, capture, inside, tmp_path, m
         write_hands(capture, 6)
         write_face(capture, 6)
         line = line.replace("/path/to/capture", str(capture))
-    _, _, module, *arguments = place(line).split()
-    name = module.removeprefix("gsgan.")
-    if name == "train":
+    line = place(line)
+    name, arguments = line.split()[2 if " -m gsgan." in line else 1], arguments_of(line)
+    if name == "gsgan.train":
         if "-m" in arguments:
             arguments = shorter_sweep(arguments, tmp_path)
         arguments = tiny_training(arguments, capture)
-    if name == "bench":
-        arguments = tiny_bench(arguments, tmp_path, capture)
-    if name == "fit":
+    if name == "gsgan.bench":
+        arguments = [arguments[0], *tiny_bench(arguments[0], arguments[1:], capture)]
+    if name.startswith("scripts/bench/"):
+        arguments = tiny_bench(Path(name).stem, arguments, capture)
+    if name == "gsgan.fit":
         arguments += ["size.picture=32", "fit.points=200", "fit.surface_steps=2"]
         arguments += ["fit.sweeps=1", "shown=1", f"out={tmp_path / 'fit'}"]
-    if name == "prepare":  # MediaPipe is not at hand: its output is given
+    if name == "gsgan.prepare":  # MediaPipe is not at hand: its output is given
         source = next(a for a in arguments if a.startswith("source=")).removeprefix("source=")
         arguments = [a for a in arguments if a != "setup=true"]
         arguments += [f"landmarks={source}/pose", f"masks={source}/masks"]
-    if name == "view":
+    if name == "gsgan.view":
         monkeypatch.setattr("gsgan.view.server.Viewer.serve", lambda viewer: None)
-    result = inside(name, *arguments)
+    result = execute(line, arguments)
     assert result.returncode == 0, result.stdout + result.stderr

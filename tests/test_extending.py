@@ -11,12 +11,12 @@ from torch import Tensor, nn
 
 from gsgan.data.cameras import make_camera
 from gsgan.data.files import frame_files
-from gsgan.data.formats.common import FolderReader, one_mask_each, picture_size
+from gsgan.data.formats.common import FolderReader, image_size, one_mask_each
 from gsgan.data.layout import Found, Meta
 from gsgan.data.skeletons import make_landmarks
+from gsgan.model.assemble import build_data
 from gsgan.model.body_points import SkinnedPoints
-from gsgan.model.painting import Painting
-from gsgan.model.runs import build_data
+from gsgan.model.rendering import Rendering
 from gsgan.scene import BodyPose, Frame, Gaussians
 from gsgan.train.run import build_training
 
@@ -29,7 +29,7 @@ class NpzReader(FolderReader):
     contents = "cameras.npz, skeletons.npz, CAMERA/ and CAMERA_mask/"
     hint = "check that cameras.npz and skeletons.npz have the same world frame and unit"
 
-    def find(self, root, checks, smpl) -> Found:
+    def find(self, root, limits, smpl) -> Found:
         images, masks, cameras = {}, {}, {}
         file = root / "cameras.npz"
         with np.load(file) as arrays:
@@ -38,7 +38,7 @@ class NpzReader(FolderReader):
             ):
                 images[name] = frame_files(root, name, (".png",))
                 masks[name] = frame_files(root, f"{name}_mask", (".png",))
-                size = picture_size(root, images[name])
+                size = image_size(root, images[name])
                 cameras[name] = make_camera(
                     f"{file}: {name}", name, K=K, R=R, t=t, dist=None, size=size
                 )
@@ -51,7 +51,7 @@ class NpzReader(FolderReader):
             images=images,
             masks=one_mask_each(masks, "grey"),
             mask_folder="{camera}_mask",
-            landmarks=make_landmarks(ids, p, np.ones(p.shape[:2]), checks.max_reach, []),
+            landmarks=make_landmarks(ids, p, np.ones(p.shape[:2]), limits.max_reach, []),
             calibration=file,
             unit_hint="lengths must be in metres",
         )
@@ -64,7 +64,7 @@ class Smoothness(nn.Module):
         super().__init__()
         self.weight = weight
 
-    def forward(self, painting: Painting, frame: Frame) -> Tensor:
+    def forward(self, painting: Rendering, frame: Frame) -> Tensor:
         return self.weight * painting.image.diff(dim=-1).abs().mean()
 
 
@@ -130,7 +130,7 @@ def test_a_loss_term(tiny):
     losses = f"{{smooth: {{_target_: {HERE}.Smoothness, weight: 0.1}}}}"
     data, module = build_training(tiny(f"training.extra_losses={losses}"))
     frame = data.dataset("train")[0]
-    painting = module.avatar.paint(frame)
+    painting = module.avatar(*frame.inputs)
     terms = module.step_two_terms(painting, frame, None)
     expected = 0.1 * painting.image.diff(dim=-1).abs().mean()
     assert float(terms["smooth"]) == float(expected) > 0
@@ -140,10 +140,8 @@ def test_a_generator(build):
     keys = (
         "base",
         "multipliers",
-        "style",
         "style_share",
         "rgb_skip",
-        "output",
         "feature_bound",
         "patch",
     )
@@ -151,7 +149,7 @@ def test_a_generator(build):
         f"model.generator._target_={HERE}.OneLayer", *(f"~model.generator.{key}" for key in keys)
     )
     assert isinstance(avatar.generator, OneLayer)
-    assert avatar.paint(frame).image.shape == frame.image.shape
+    assert avatar(*frame.inputs).image.shape == frame.image.shape
 
 
 def test_a_splatting_baseline(tiny):
@@ -164,7 +162,7 @@ def test_a_splatting_baseline(tiny):
     data, module = build_training(config)
     frame = data.dataset("train")[0]
     painting = module.avatar(
-        frame.skeleton, frame.visibility, frame.camera, frame.body, paint=False
+        frame.skeleton, frame.visibility, frame.camera, frame.body, generate=False
     )
     module.step_one_loss(painting, frame).backward()
     assert float(module.avatar.surface.colour.grad.abs().max()) > 0

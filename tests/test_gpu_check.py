@@ -9,8 +9,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
-SCRIPT = Path(__file__).parents[1] / "scripts" / "gpu_check.sh"
+ROOT = Path(__file__).parents[1]
+SCRIPT = ROOT / "scripts" / "gpu_check.sh"
 NO_CUDA = "gpu_check: torch finds no CUDA device on this machine, so nothing was checked.\n"
 FAKE = """#!/bin/bash
 mkdir -p "$OUT" # a Python that finds one device and does nothing
@@ -60,6 +62,9 @@ def test_each_step_runs_once_and_its_options_exist(tmp_path, compose):
             assert Path(words[-1]).exists()
         elif words[1] == "gsgan.bench":
             compose(f"bench_{words[2]}", *without_folder(words[3:]))
+        elif words[0].endswith("raster.py"):
+            options = OmegaConf.load(ROOT / words[0].replace(".py", ".yaml"))
+            assert {word.split("=")[0] for word in words[1:]} <= set(options)
         else:
             compose("train", *without_folder(words[2:]))
 

@@ -55,6 +55,7 @@ class Camera(TensorRecord):
         t: ``[B, 3]`` metres, ``x_cam = R @ x_world + t``.
         size: ``(H, W)`` pixels, both at least 1.
         dist: ``[B, 5]`` OpenCV lens distortion (k1 k2 p1 p2 k3), or None for a pinhole.
+        whole_height: pixels of the whole image, for the cameras of a `Window`; else None.
 
     Raises:
         ValueError: on a wrong shape, size, or batch size, naming the argument.
@@ -65,6 +66,7 @@ class Camera(TensorRecord):
     t: Tensor
     size: tuple[int, int]
     dist: Tensor | None = None
+    whole_height: int | None = None
 
     def __post_init__(self) -> None:
         _check("Camera", "K", self.K, None, 3, 3)
@@ -231,6 +233,11 @@ class Frame(TensorRecord):
     def __len__(self) -> int:
         return self.image.shape[0]
 
+    @property
+    def inputs(self) -> tuple[Tensor, Tensor, Camera, BodyPose | None, Tensor]:
+        """What an avatar renders from: skeleton, visibility, camera, body pose, camera index."""
+        return self.skeleton, self.visibility, self.camera, self.body, self.camera_index
+
 
 @dataclass(frozen=True)
 class Window:
@@ -252,7 +259,7 @@ class Window:
             camera[i : i + 1].crop(top, left, self.size)
             for i, (top, left) in enumerate(self.corners)
         ]
-        return cat(boxes)
+        return replace(cat(boxes), whole_height=self.picture[0])
 
     def cut(self, picture: Tensor) -> Tensor:
         """``[B, ..., H, W]`` reduced to the boxes."""

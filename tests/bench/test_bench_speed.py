@@ -1,19 +1,19 @@
-"""`gsgan.bench speed`: stages, spreads and ways of painting on a tiny avatar, and refusals."""
+"""`gsgan.bench speed`: stages, precision and memory of a tiny avatar, and error messages."""
 
 from __future__ import annotations
 
 import json
+import platform
 
 import pandas as pd
 import pytest
 import torch
 from commands import refused
 
-from gsgan.bench.common import environment
-from gsgan.bench.painter import Painter, Way, evenly, painting_memory, spread
-from gsgan.bench.speed import StageClock, deciles, measure, text
+from gsgan.bench.__main__ import main
+from gsgan.bench.common import cpu_name, environment, number, peak_memory, sentence
+from gsgan.bench.speed import StageClock, deciles, make_painter, measure, spread, text
 from gsgan.model.avatar import UNWATCHED, unwatched
-from gsgan.splat import accuracy
 from gsgan.utils.errors import ConfigError
 
 ALL = [
@@ -38,8 +38,8 @@ def test_the_median_and_deciles():
 def test_every_stage_is_timed_and_the_avatar_is_left_unwatched(small):
     _, avatar, frame = small
     ticks = []
-    painter = Painter(avatar, Way())
-    times = measure(painter, [frame], count=3, warmup=2, tick=lambda: ticks.append(1))
+    painter = make_painter(avatar)
+    times = measure(avatar, painter, [frame], count=3, warmup=2, tick=lambda: ticks.append(1))
     assert list(times.index) == [*ALL, "between stages", "end to end"]
     assert len(ticks) == 5
     stages = times.loc[ALL]
@@ -52,12 +52,12 @@ def test_every_stage_is_timed_and_the_avatar_is_left_unwatched(small):
 def test_a_stage_that_fails_leaves_the_avatar_unwatched(small):
     _, avatar, frame = small
 
-    def fail(*_: object) -> None:
+    def fail(**_: object) -> None:
         raise ZeroDivisionError
 
-    avatar.draw = fail
+    avatar.generator.forward = fail
     with pytest.raises(ZeroDivisionError):
-        measure(Painter(avatar, Way()), [frame], count=1, warmup=0)
+        measure(avatar, make_painter(avatar), [frame], count=1, warmup=0)
     assert avatar.stage is unwatched
 
 
@@ -73,7 +73,8 @@ def test_a_stage_that_fails_leaves_the_avatar_unwatched(small):
 def test_what_a_model_lacks_has_no_stage(build, model, absent, there):
     few = ["model.surface.points=100"] if model == "lbs_splat" else []
     _, avatar, frame = build(f"model={model}", *few)
-    stages = set(measure(Painter(avatar.eval(), Way()), [frame], count=1, warmup=0).index)
+    painter = make_painter(avatar.eval())
+    stages = set(measure(avatar, painter, [frame], count=1, warmup=0).index)
     assert there <= stages
     assert not absent & stages
 
@@ -89,62 +90,11 @@ def test_the_clock_adds_up_what_one_stage_takes_twice():
     assert clock.frame["F"] > once > 0
 
 
-@pytest.mark.slow
-def test_ways_of_painting_do_not_reach_each_other(small):
-    _, avatar, frame = small
-    plain, exact = Painter(avatar, Way()), Painter(avatar, Way(accuracy=accuracy("exact")))
-    draft = Painter(avatar, Way(accuracy=accuracy("draft"), backend="torch", whole=True))
-    before = (avatar.accuracy, avatar.window_margin, avatar.backend, avatar.segmentation.backend)
-    first = plain(frame)
-    other, exactly = draft(frame), exact(frame)
-    assert torch.equal(plain(frame), first)
-    assert not torch.equal(other, first)
-    assert (other - exactly).abs().max() > (first - exactly).abs().max()
-    after = (avatar.accuracy, avatar.window_margin, avatar.backend, avatar.segmentation.backend)
-    assert after == before
-
-
 def test_precision_reaches_the_networks_and_not_the_image_type(small):
     _, avatar, frame = small
-    full, half = Painter(avatar, Way())(frame), Painter(avatar, Way(precision="bf16-mixed"))(frame)
+    full, half = make_painter(avatar)(frame), make_painter(avatar, "bf16-mixed")(frame)
     assert half.dtype == full.dtype == torch.float32
     assert 0 < (half - full).abs().max() < 0.1
-
-
-def test_an_image_of_another_size_is_resized_to_its_own(small):
-    _, avatar, frame = small
-    full = Painter(avatar, Way())(frame)
-    for scale in (0.5, 2.0):
-        image = Painter(avatar, Way(scale=scale))(frame)
-        assert image.shape == full.shape
-        assert image.isfinite().all()
-        assert (image - full).abs().mean() < 0.2
-
-
-@pytest.mark.parametrize(
-    ("wrong", "word"),
-    [
-        ({"precision": "8-bit"}, "bf16-mixed"),
-        ({"backend": "vulkan"}, "native"),
-        ({"scale": 0}, "0"),
-    ],
-)
-def test_a_way_that_makes_no_sense_is_refused(wrong, word):
-    with pytest.raises(ConfigError, match=word):
-        Way(**wrong)
-
-
-@pytest.mark.slow
-def test_memory_of_painting_is_of_the_right_size(small):
-    """Dense float64 blending holds Gaussians times pixels: more than tiles do."""
-    _, avatar, frame = small
-    tiles = painting_memory(Painter(avatar, Way()), [frame])
-    dense = painting_memory(Painter(avatar, Way(accuracy=accuracy("exact"))), [frame])
-    if tiles is None or dense is None:
-        pytest.skip("this system does not report a peak of memory")
-    gaussians = avatar.densify.n_points
-    assert dense > 4e-6 * 8 * gaussians
-    assert dense > tiles
 
 
 def test_the_frames_are_spread_over_a_split(small):
@@ -156,9 +106,39 @@ def test_the_frames_are_spread_over_a_split(small):
         spread(data, 2, "novel_view")
 
 
-def test_frames_are_spread_evenly():
-    assert evenly(10, 2) == [2, 7]
-    assert evenly(3, 8) == [0, 1, 2]
+def test_peak_memory_is_what_an_action_takes_on_top_of_what_is_held():
+    held = torch.ones(20_000_000)  # 80 MB that must not count
+    found = peak_memory(lambda: torch.ones(5_000_000).exp(), torch.device("cpu"))
+    if found is None:
+        pytest.skip("this system does not report a peak of memory")
+    assert 20 < found < 70
+    assert held.sum() == 20_000_000
+
+
+def test_the_machine_is_described_without_its_host(tmp_path):
+    where = environment(torch.device("cpu"))
+    assert f"torch {where['versions']['torch']}" in sentence(where)
+    host = platform.node()
+    assert len(host) < 4 or host not in json.dumps(where)
+    listing = tmp_path / "cpuinfo"
+    listing.write_text("processor : 0\nmodel name : Abacus 3000\nmodel name : Second\n")
+    assert cpu_name(listing) == "Abacus 3000"
+    assert cpu_name(tmp_path / "absent") == (platform.processor() or platform.machine())
+
+
+@pytest.mark.parametrize(
+    ("value", "digits", "shown"),
+    [
+        (None, 3, "–"),
+        (float("inf"), 3, "∞"),
+        (0.0, 3, "0.00"),
+        (1.2345, 3, "1.23"),
+        (12345.6, 3, "12346"),
+        (1.26e-5, 2, "1.3e-05"),
+    ],
+)
+def test_numbers_have_their_significant_digits(value, digits, shown):
+    assert number(value, digits) == shown
 
 
 def test_the_table_adds_up():
@@ -169,7 +149,7 @@ def test_the_table_adds_up():
         "end to end": (10, 9, 12),
     }
     times = pd.DataFrame(rows, index=["median", "p10", "p90"]).T
-    settings = {"avatar": "untrained avatar", "picture": "512 x 512"}
+    settings = {"avatar": "untrained avatar", "image": "512 x 512"}
     page = text(times, None, environment(torch.device("cpu")), settings, ["untrained weights"])
     assert "| F | 6.00 | 5.00 | 7.00 | 60% |" in page
     assert "| **end to end** | 10.0 | 9.00 | 12.0 | 100.0 frames/s |" in page
@@ -200,7 +180,7 @@ def test_the_command_times_an_untrained_avatar_at_its_size(capture, tmp_path, in
     done = inside("bench", "speed", *given, "model=splat_only", f"hydra.run.dir={out}")
     assert done.returncode == 0, done.stderr
     found = json.loads((out / "speed.json").read_text())
-    assert found["settings"]["picture"] == "64 x 64"
+    assert found["settings"]["image"] == "64 x 64"
     assert "untrained weights" in found["marks"][0]
 
 
@@ -220,3 +200,10 @@ def test_the_command_times_an_untrained_avatar_at_its_size(capture, tmp_path, in
 )
 def test_what_makes_no_sense_ends_in_one_sentence(inside, given, words):
     refused(inside("bench", "speed", given), *words)
+
+
+@pytest.mark.parametrize("words", [(), ("trade-off", "run=x")])
+def test_another_subject_is_refused(monkeypatch, words):
+    monkeypatch.setattr("sys.argv", ["bench", *words])
+    with pytest.raises(SystemExit, match="the first word must be speed"):
+        main()

@@ -8,11 +8,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from writers.smpl import write_smpl
 
 from gsgan.body import free_body
 from gsgan.body.free import free_body_path
-from gsgan.body.measure import fit_shape
 from gsgan.body.shape import (
     LIMBS,
     STRETCHED,
@@ -20,11 +18,10 @@ from gsgan.body.shape import (
     free_space,
     group_of,
     limb_axes,
-    model_space,
     shaped_body,
 )
-from gsgan.body.smpl import read_smpl
 from gsgan.body.solve import Solver
+from gsgan.fit.shape import fit_shape
 from gsgan.scene import BodyPose
 from gsgan.utils.errors import DataError
 
@@ -181,18 +178,3 @@ def test_an_upper_body_has_a_shape():
     arm = [(b.landmarks[11] - b.landmarks[13]).norm() for b in (found, body)]
     torch.testing.assert_close(*arm, atol=0.01, rtol=0)
     assert stature(found) == pytest.approx(stature(body), abs=0.15)
-
-
-def test_a_models_betas_are_coefficients(tmp_path):
-    """Of an SMPL file: the space gives the body that the model gives."""
-    write_smpl(tmp_path / "model.npz")
-    model = read_smpl(tmp_path / "model.npz")
-    space = model_space(model)
-    betas = torch.tensor([1.0, -0.5, 0.3])
-    shaped = space.shaped(BodyShape(betas, torch.ones(8)))
-    direct = model.as_body(betas)
-    torch.testing.assert_close(shaped.vertices, direct.vertices, atol=1e-5, rtol=0)
-    torch.testing.assert_close(shaped.joints, direct.joints, atol=1e-5, rtol=0)
-    torch.testing.assert_close(
-        shaped.landmarks, direct.landmarks, atol=1e-5, rtol=0, equal_nan=True
-    )

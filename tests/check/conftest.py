@@ -36,22 +36,22 @@ def copy(good: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def check(monkeypatch: pytest.MonkeyPatch):
-    """Checks a folder: ``check(root, pictures=48, joint_jump=0.1, trust={"min_inside": 0.7})``."""
-    from gsgan.check import rig, sections
+    """Checks a folder: ``check(root, joint_jump=0.1, consistency={"min_inside": 0.7})``."""
+    from gsgan.check import geometry, overlays
     from gsgan.check.run import check_data
     from gsgan.data.datamodule import GsganData
     from gsgan.data.formats.capture import CaptureReader
     from gsgan.data.formats.consistency import Consistency
 
     # tests of the command draw them
-    monkeypatch.setattr(rig, "rig_drawing", lambda _: b"<?")
-    monkeypatch.setattr(sections, "_series", lambda _: b"<?")
+    monkeypatch.setattr(geometry, "geometry_drawing", lambda _: b"<?")
+    monkeypatch.setattr(overlays, "strip", lambda *_, **__: b"")
 
-    def run(root: Path, pictures: int = 48, trust: dict | None = None, **limits: float) -> Report:
-        sampling = Sampling(
-            pictures=pictures, hull_frames=1, trials=100, shown=1, tile=60, size_ratio=1.4
-        )
-        reader = CaptureReader(consistency=Consistency(min_box_iou=0.0, **(trust or {})))
+    def run(
+        root: Path, images: int = 48, consistency: dict | None = None, **limits: float
+    ) -> Report:
+        sampling = Sampling(images=images, shown=1)
+        reader = CaptureReader(consistency=Consistency(min_box_iou=0.0, **(consistency or {})))
         data = GsganData(root=str(root), reader=reader)
         # the forearm of the test person grows as it is raised
         return check_data(data, sampling, Limits(limb_share=2.0, **limits))

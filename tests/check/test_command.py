@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from make import edit_json
 
-FEW = ("sampling.pictures=16", "sampling.hull_frames=1", "sampling.shown=2", "sampling.tile=60")
+FEW = ("sampling.images=16", "sampling.shown=2")
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real_capture"
 
 
@@ -56,8 +56,8 @@ def test_a_good_capture_passes_and_leaves_a_report(good, command, tmp_path):
     strips = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', page)
     assert len(strips) == 4  # one per camera
     strip = cv2.imdecode(np.frombuffer(base64.b64decode(strips[0]), np.uint8), 1)
-    assert strip.shape == (60 + 18, 45 + 4 + 45, 3)
-    assert page.count("data:image/svg+xml;base64,") == 2  # the cameras and the series
+    assert strip.shape == (360 + 18, 270 + 4 + 270, 3)
+    assert page.count("data:image/svg+xml;base64,") == 1  # the cameras
     for camera in ("cam00", "cam01", "cam02", "cam03"):
         assert f"camera {camera}" in page
     numbers = json.loads((tmp_path / "work" / "check.json").read_text())
@@ -80,7 +80,7 @@ def test_something_wrong_ends_with_1(copy, command, tmp_path):
 
 
 @pytest.mark.parametrize(("strict", "ends"), [("false", 0), ("true", 1)])
-def test_warnings_end_with_1_where_that_is_asked_for(good, command, tmp_path, strict, ends):
+def test_warnings_end_with_1_where_strict(good, command, tmp_path, strict, ends):
     # at the usual limit the little man's forearm is a warning
     code, *_ = command(f"data.root={good}", f"strict={strict}", *FEW)
     numbers = json.loads((tmp_path / "work" / "check.json").read_text())
@@ -95,7 +95,6 @@ def test_data_that_cannot_be_read_leave_a_report_too(copy, command):
     assert code == 1
     assert "Traceback" not in output
     assert "meta.json is not valid JSON" in page
-    assert "images/cam00" in page
 
 
 def test_names_from_the_data_are_escaped(copy, command):
@@ -114,42 +113,25 @@ def test_a_root_that_is_not_set_is_one_sentence(command):
     assert page == ""
 
 
-def test_settings_that_make_no_sense_are_one_sentence(good, command):
-    code, output, _ = command(f"data.root={good}", "limits.shift=-1")
-    assert code == 1
-    assert "limits.shift must be a number above 0" in output
-    assert "Traceback" not in output
-
-
-def test_strict_must_be_true_or_false(good, command):
-    code, output, page = command(f"data.root={good}", "strict=maybe")
-    assert code == 1
-    assert "strict must be one of True, False, got 'maybe'" in output
-    assert page == ""
-
-
 def test_a_report_that_cannot_be_written_is_reported(good, command, tmp_path):
     (tmp_path / "work").mkdir()
     (tmp_path / "work" / "taken").write_text("")
     code, output, _ = command(f"data.root={good}", *FEW, report="taken/check.html")
     assert code == 1
-    assert "report=taken/check.html cannot be written" in " ".join(output.split())
+    assert "taken/check.html cannot be written" in " ".join(output.split())
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(not (REAL / "cameras.json").is_file(), reason=f"no real capture at {REAL}")
 def test_the_real_capture_has_what_is_known_of_it(command, tmp_path):
-    code, output, _ = command(f"data.root={REAL}", "sampling.pictures=40", "sampling.shown=1")
+    code, output, _ = command(f"data.root={REAL}", "sampling.images=40", "sampling.shown=1")
     assert code == 0
-    assert "0 errors, 2 warnings" in output
+    assert "0 errors, 1 warning" in output
     numbers = json.loads((tmp_path / "work" / "check.json").read_text())
     found = {finding["topic"]: finding["sentence"] for finding in numbers["findings"]}
-    assert "exposure or white balance" in found["colour"]  # cam02 is dark, cam04 bright
-    assert "cam02" in found["colour"]
-    assert "cam04" in found["colour"]
+    assert "far from their 2D detections" in found["frames"]
     assert set(numbers["doubtful_frames"]) == {"64", "65"}  # the right foot, found flipped
     for camera in numbers["cameras"].values():
         assert camera["inside"] > 0.98
-        assert camera["overlap"] > camera["rivals"][0]["overlap"] + 0.2
-    assert all(share > 0.95 for share in numbers["hull"].values())
+        assert camera["overlap"] > max(camera["rivals"].values()) + 0.2
     assert 3 < numbers["camera_distance"] < 3.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -39,32 +40,18 @@ def test_a_good_capture_has_nothing_wrong(good, check):
     assert report.findings == ()
     cameras = report.numbers["cameras"]
     assert all(score["inside"] == 1 and score["lag"] == 0 for score in cameras.values())
-    assert all(score["overlap"] > score["rivals"][0]["overlap"] for score in cameras.values())
+    assert all(s["overlap"] > max(s["rivals"].values()) for s in cameras.values())
     assert report.numbers["camera_distance"] == pytest.approx(3.0, abs=0.1)
-    assert all(share > 0.95 for share in report.numbers["hull"].values())
 
 
-@pytest.mark.parametrize(("keys", "named"), [("Rt", "R and t"), ("RtK", "R and t")])
-def test_exchanged_cameras_are_named(copy, check, keys, named):
-    def exchange(cameras):
-        for key in keys:
+def test_exchanged_cameras_are_named(copy, check):
+    def exchanged(cameras):
+        for key in "Rt":
             one, other = cameras["cam00"][key], cameras["cam01"][key]
             cameras["cam00"][key], cameras["cam01"][key] = other, one
 
-    edit_json(copy / "cameras.json", exchange)
-    sentence = only(check(copy), "error")
-    assert sentence.startswith("cameras cam00 and cam01 look exchanged")
-    assert named in sentence
-
-
-def test_opposite_cameras_exchanged_are_named(copy, check):
-    def exchange(cameras):
-        for key in "Rt":
-            one, other = cameras["cam01"][key], cameras["cam03"][key]
-            cameras["cam01"][key], cameras["cam03"][key] = other, one
-
-    edit_json(copy / "cameras.json", exchange)
-    assert "cam01 and cam03 look exchanged" in only(check(copy), "error")
+    edit_json(copy / "cameras.json", exchanged)
+    assert only(check(copy), "error").startswith("cameras cam00 and cam01 look exchanged")
 
 
 def test_one_camera_in_millimetres_is_named(copy, check):
@@ -86,23 +73,14 @@ def test_all_cameras_in_millimetres_stop_the_reader_and_are_reported(copy, check
     report = check(copy)
     assert "check 'unit'" in only(report, "error")
     assert report.numbers == {"readable": False}
-    listed = dict(report.sections[0].tables[0].rows)
-    assert listed["images/cam00"] == "12 × .png"
 
 
-def test_moved_masks_are_named_with_their_shift(copy, check):
+def test_moved_masks_are_named(copy, check):
     move_masks(copy, "cam01", 12)
     sentence = only(check(copy), "error")
-    assert sentence.startswith("camera cam01: its masks lie +12, +0 pixels")
+    assert sentence.startswith("camera cam01: only ")
     assert "100% in the other cameras" in sentence
-
-
-def test_masks_moved_in_every_camera_are_reported_once(copy, check):
-    for i in range(4):
-        move_masks(copy, f"cam{i:02d}", 0, -14)
-    sentence = only(check(copy), "error")
-    assert sentence.startswith("in every camera the masks lie beside the skeleton")
-    assert "cam02 +0, -14" in sentence
+    assert "a crop or resize that K does not follow" in sentence
 
 
 def test_mirrored_images_are_named(copy, check):
@@ -124,7 +102,7 @@ def test_a_camera_out_of_step_is_named(copy, check):
         for frame in range(11):
             folder = copy / kind / "cam00"
             (folder / f"{frame + 1:06d}.png").replace(folder / f"{frame:06d}.png")
-    report = check(copy, trust={"joint_tolerance": 0.02}, joint_jump=1.0)
+    report = check(copy, consistency={"joint_tolerance": 0.02}, joint_jump=1.0)
     (found,) = (f for f in report.findings if f.topic == "synchronisation")
     assert found.level == "error"
     assert found.sentence.startswith("camera cam00: its images fit the skeleton 1 frame(s) later")
@@ -152,25 +130,11 @@ def test_missing_images_are_a_warning(copy, check):
     assert sentence == "camera cam02 lacks 2 of the 12 frames: 3-4"
 
 
-def test_a_missing_mask_is_an_error(copy, check):
-    (copy / "masks" / "cam02" / "000003.png").unlink()
-    sentence = only(check(copy), "error")
-    assert str(copy / "masks" / "cam02" / "000003.png") in sentence
-
-
 def test_a_truncated_image_is_found_though_few_are_sampled(copy, check):
     path = copy / "images" / "cam01" / "000005.png"
     path.write_bytes(path.read_bytes()[:-30])
-    report = check(copy, pictures=4)
+    report = check(copy, images=4)
     assert str(path) in only(report, "error")
-
-
-def test_an_empty_mask_is_found_though_few_are_sampled(copy, check):
-    path = copy / "masks" / "cam03" / "000007.png"
-    cv2.imwrite(str(path), np.zeros((96, 64), np.uint8))
-    report = check(copy, pictures=4)
-    assert "frame 7: cam03: the mask is empty" in only(report, "warning")
-    assert report.numbers["doubtful_frames"] == {"7": ["cam03: the mask is empty"]}
 
 
 def test_a_camera_with_empty_masks_is_an_error(copy, check):
@@ -179,86 +143,56 @@ def test_a_camera_with_empty_masks_is_an_error(copy, check):
     assert only(check(copy), "error").startswith("camera cam03: its masks are empty")
 
 
-def test_frozen_joints_are_named(copy, check):
-    def freeze(p):
-        p[4:10, 15:23] = p[4, 15:23]
-
-    edit_landmarks(copy, freeze)
-    sentence = only(check(copy), "warning")
-    assert sentence.startswith("joints stand exactly still")
-    assert "in 6 of 12 frames: 4-9" in sentence
-    assert "left_wrist" in sentence
+def freeze(p):
+    p[4:10, 15:23] = p[4, 15:23]
 
 
-def test_left_and_right_exchanged_in_some_frames_are_named(copy, check):
-    def exchange(p):
-        p[5:7] = p[5:7][:, MIRROR]
+def exchange(p):
+    p[5:7] = p[5:7][:, MIRROR]
 
-    edit_landmarks(copy, exchange)
+
+def exchange_throughout(p):
+    p[:] = p[:, MIRROR]
+
+
+def jump(p):
+    p[6, 15] += [0.5, 0, 0]
+
+
+def lose(p):
+    p[8, :11] = np.nan
+
+
+def lose_throughout(p):
+    """OpenPose's 25 points leave a third of the 33 open: no fault."""
+    p[:, [1, 3, 4, 6, 9, 10, *range(17, 23)]] = np.nan
+
+
+def shrink(p):
+    p[:] = p * 0.5
+
+
+@pytest.mark.parametrize(
+    ("change", "level", "named"),
+    [
+        (freeze, "warning", "joints stand exactly still.* in 6 of 12 frames: 4-9 .*left_wrist"),
+        (exchange, "warning", "left and right are exchanged in 2 of 12 frames: 5-6"),
+        (exchange, "warning", "nose or toes point backwards in 2 of 12 frames: 5-6"),
+        (exchange_throughout, "error", "left and right are exchanged"),
+        (jump, "warning", r"in 1 of 12 frames: 6 .frame 6: jumps: left_wrist 0.50 m"),
+        (lose, "warning", "few joints were seen in 1 of 12 frames: 8"),
+        (lose_throughout, "warning", None),
+        (shrink, "warning", "limb lengths suggest a person of 0.79"),
+    ],
+)
+def test_wrong_landmarks_are_named_with_their_frames(copy, check, change, level, named):
+    edit_landmarks(copy, change)
     report = check(copy)
-    assert report.errors == 0
-    found = {f.sentence.split(" in ")[0]: f.sentence for f in report.findings}
-    assert "2 of 12 frames: 5-6" in found["left and right are exchanged"]
-    assert "2 of 12 frames: 5-6" in found["nose or toes point backwards"]
-
-
-def test_left_and_right_exchanged_throughout_is_an_error(copy, check):
-    def exchange(p):
-        p[:] = p[:, MIRROR]
-
-    edit_landmarks(copy, exchange)
-    assert "left and right are exchanged" in only(check(copy), "error")
-
-
-def test_a_jump_is_named(copy, check):
-    def jump(p):
-        p[6, 15] += [0.5, 0, 0]
-
-    edit_landmarks(copy, jump)
-    report = check(copy)
-    assert report.errors == 0
-    jumps = [f.sentence for f in report.findings if "joints jump" in f.sentence]
-    assert len(jumps) == 1
-    assert "1 of 12 frames: 6 (frame 6: jumps: left_wrist 0.50 m)" in jumps[0]
-
-
-def test_joints_not_seen_are_named(copy, check):
-    def lose(p):
-        p[8, :11] = np.nan
-
-    edit_landmarks(copy, lose)
-    assert "few joints were seen in 1 of 12 frames: 8" in only(check(copy), "warning")
-
-
-def test_joints_that_the_source_never_has_are_no_fault(copy, check):
-    """OpenPose's 25 points leave a third of the 33 open."""
-
-    def lose(p):
-        p[:, [1, 3, 4, 6, 9, 10, *range(17, 23)]] = np.nan
-
-    edit_landmarks(copy, lose)
-    assert not any("joints were seen" in f.sentence for f in check(copy).findings)
-
-
-def test_a_darker_camera_is_named(copy, check):
-    for path in (copy / "images" / "cam01").iterdir():
-        image = cv2.imread(str(path))
-        cv2.imwrite(str(path), (image * 0.6).astype(np.uint8))
-    sentence = only(check(copy), "warning")
-    assert "exposure or white balance" in sentence
-    assert "cam01 red 0.60" in sentence
-    assert "cam00" not in sentence
-
-
-def test_a_person_of_another_size_is_reported(copy, check):
-    def shrink(p):
-        p[:] = p * 0.5
-
-    edit_landmarks(copy, shrink)
-    report = check(copy)
-    text = " ".join(f.sentence for f in report.findings)
-    assert "limb lengths suggest a person of 0.79" in text
-    assert "in every camera the masks lie beside the skeleton" in only(report, "error")
+    assert report.errors == 0 or level == "error" or change is shrink
+    found = [f.sentence for f in report.findings if f.level == level]
+    assert [bool(re.search(named or "were seen", text)) for text in found].count(True) == (
+        named is not None
+    )
 
 
 def test_the_wrong_up_axis_is_reported(copy, check):
@@ -269,18 +203,12 @@ def test_the_wrong_up_axis_is_reported(copy, check):
 
 @pytest.mark.parametrize(("cameras", "frames"), [(1, 1), (2, 3)])
 def test_the_smallest_captures_can_be_checked(tmp_path, check, cameras, frames):
-    import json
-
     from make import write_tiny_capture
-
-    from gsgan.check.run import plain
 
     root = write_tiny_capture(tmp_path / "tiny", cameras=cameras, frames=frames, size=(48, 64))
     report = check(root)
     assert report.errors == 0
-    assert report.numbers["hull"] is None
     assert report.numbers["cameras"]["cam00"]["outside"] == 0
-    json.dumps(plain(report), allow_nan=False)
 
 
 def test_lens_distortion_is_undone_before_anything_is_measured(tmp_path, check):
@@ -313,28 +241,20 @@ def scale_focal(root: Path, factor: float, *names: str, centre: bool = False) ->
 
 def test_a_camera_that_is_nearly_right_is_named(copy, check):
     turn(copy, (0, 0, 1), 12)
-    sentences = [f.sentence for f in check(copy, trust={"min_inside": 0.71}).findings]
+    sentences = [f.sentence for f in check(copy, consistency={"min_inside": 0.71}).findings]
     assert any(s.startswith("camera cam01: joints lie") for s in sentences)
     assert not any("camera cam00" in s or "camera cam02" in s for s in sentences)
 
 
-@pytest.mark.parametrize("names", [("cam01",), ("cam01", "cam03")])
-def test_focal_lengths_of_half_are_named(copy, check, names):
+def test_focal_lengths_of_half_are_named(copy, check):
+    names = "cam01", "cam03"
     scale_focal(copy, 0.5, *names)
     # the tiny person is of thin discs, so all is smaller than in a capture
-    limits = {"fullness": 1.2, "trust": {"min_inside": 0.3}, "inside_error": 0.2}
+    limits = {"fullness": 1.2, "consistency": {"min_inside": 0.3}, "inside_error": 0.2}
     errors = [f.sentence for f in check(copy, **limits).findings if f.level == "error"]
     (found,) = (s for s in errors if "far larger than the body" in s)
     assert all(f"{name} " in found for name in names)
     assert not any("clock" in s or "would fit" in s for s in errors)
-
-
-def test_joints_just_outside_every_mask_are_reported_once(copy, check):
-    scale_focal(copy, 1.12, *(f"cam{i:02d}" for i in range(4)))
-    found = [
-        f.sentence for f in check(copy, trust={"min_inside": 0.71}, outside_all=0.002).findings
-    ]
-    assert sum("in most cameras joints lie" in s for s in found) == 1
 
 
 def test_a_camera_that_training_refuses_is_explained_by_the_check(copy, check):
@@ -343,10 +263,3 @@ def test_a_camera_that_training_refuses_is_explained_by_the_check(copy, check):
     assert report.numbers["readable"]
     assert report.errors == 1
     assert only(report, "error").startswith("camera cam01: ")
-
-
-def test_without_cameras_there_are_no_small_errors():
-    from gsgan.check.calibration import small_errors
-    from gsgan.check.settings import Limits
-
-    assert small_errors([], Limits()) == []

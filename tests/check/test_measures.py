@@ -1,27 +1,29 @@
-"""Hull, colours, units and settings."""
+"""Colours, units and settings."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 from make import edit_json, write_landmarks
 
-from gsgan.check.agreement import colour_findings, hull_findings, mean_colours, score_hulls
-from gsgan.check.frames import motion_of
-from gsgan.check.report import counted, listed
-from gsgan.check.rig import axis_name, ground_axes, rig_drawing, rig_findings, rig_of
+from gsgan.check.frames import reprojection_errors, skeleton_doubts
+from gsgan.check.geometry import (
+    axis_name,
+    geometry_drawing,
+    geometry_findings,
+    geometry_of,
+)
+from gsgan.check.report import Flagged
+from gsgan.check.sections import colour_table, mean_colours
 from gsgan.check.settings import Limits, Sampling
 from gsgan.check.views import complete, measure, sampled_items, subject_of
 from gsgan.data.datamodule import GsganData
-from gsgan.data.formats.consistency import spread
-from gsgan.effects import EffectSettings
 from gsgan.utils.errors import ConfigError
 
-SAMPLING = Sampling(pictures=8, hull_frames=1)
+SAMPLING = Sampling(images=8)
 
 
 @pytest.fixture
@@ -29,41 +31,13 @@ def views(subject):
     return measure(subject, sampled_items(subject, 8), SAMPLING)[0]
 
 
-def test_the_hull_of_good_masks_fills_them(subject, views):
-    score = score_hulls(subject, views, 1)
-    assert all(share > 0.95 for share, _ in score.values())
-    assert hull_findings(score, Limits()) == []
-
-
-def test_a_mask_of_elsewhere_is_named_by_the_hull_alone(subject, views):
-    wrong = [
-        replace(view, mask=np.roll(view.mask, 12, axis=1)) if view.camera == "cam02" else view
-        for view in views
-    ]
-    (finding,) = hull_findings(score_hulls(subject, wrong, 1), Limits())
-    assert "without camera cam02" in finding.sentence
-
-
-def test_two_cameras_cannot_show_which_is_wrong(subject, views):
-    two = [view for view in views if view.camera in ("cam00", "cam01")]
-    assert score_hulls(subject, two, 1) == {}
-
-
-@pytest.mark.parametrize(("difference", "named"), [(None, True), (0.01, False), (0.2, True)])
-def test_colours_are_named_unless_shared_surface_agrees(views, difference, named):
-    """One camera is darker; the measure on shared surface decides whether exposure is the cause."""
+def test_a_camera_of_another_colour_is_flagged(views):
     dark = [replace(v, colour=v.colour * (0.7 if v.camera == "cam01" else 1)) for v in views]
-    surface = None if difference is None else SimpleNamespace(difference=difference)
-    names = ("cam00", "cam01", "cam02", "cam03")
-    info = SimpleNamespace(surface=surface, train_cameras=names)
-    colours = mean_colours(dark)
-    found = colour_findings(colours, info, EffectSettings(), Limits(colour_ratio=1.2))
-    assert ["cam01 red 0.7" in finding.sentence for finding in found] == [True] * named
-    held_out = SimpleNamespace(surface=surface, train_cameras=("cam00", "cam02"))
-    assert colour_findings(colours, held_out, EffectSettings(), Limits(colour_ratio=1.2))
+    table = colour_table(mean_colours(dark), Limits(colour_ratio=1.2))
+    assert [row[0] for row in table.rows if isinstance(row[2], Flagged)] == ["cam01"]
 
 
-def test_pictures_are_the_same_moments_in_every_camera(subject):
+def test_images_are_the_same_moments_in_every_camera(subject):
     items = sampled_items(subject, 12)
     frames = {camera: [f for c, f in items if c == camera] for camera in subject.cameras}
     assert set(map(tuple, frames.values())) == {(0, 6, 11)}
@@ -80,62 +54,45 @@ def test_joints_below_the_image_are_not_outside_its_mask(copy):
     assert views[0].known.sum() > 12
 
 
-def test_values_are_spread():
-    assert spread((3, 4, 5), 5) == [3, 4, 5]
-    assert spread(range(10), 3) == [0, 4, 9]
-    assert spread(range(10), 1) == [0]
-    assert spread([], 3) == []
-
-
 def test_joints_far_from_their_detections_are_named(copy):
     with np.load(copy / "landmarks3d.npz") as held:
         arrays = {key: held[key].copy() for key in held.files}
     arrays["reproj_px"][3, 15] = 40.0
     write_landmarks(copy, **{key: value[::-1] for key, value in arrays.items()})
     subject = subject_of(GsganData(root=str(copy)))
-    motion = motion_of(subject, Limits())
-    assert motion.reprojection[3, 15] == pytest.approx(40)
-    assert np.nanmedian(motion.reprojection) == pytest.approx(0.2)
-    (doubt,) = (doubt for doubt in motion.doubts if doubt.kind == "detections")
+    errors = reprojection_errors(subject)
+    assert errors[3, 15] == pytest.approx(40)
+    assert np.nanmedian(errors) == pytest.approx(0.2)
+    found = skeleton_doubts(subject, Limits())
+    (doubt,) = (doubt for doubt in found if doubt.kind == "detections")
     assert (doubt.frame, doubt.text[:14]) == (subject.frames[3], "left_wrist 40 ")
 
 
 def test_units_of_a_good_capture(subject):
-    rig = rig_of(subject)
-    assert rig.distances == pytest.approx(dict.fromkeys(subject.cameras, 3.0), abs=0.15)
-    assert rig.stature == pytest.approx(1.6, abs=0.2)
-    assert rig.lean < 5
-    assert rig_findings(subject, rig, Limits()) == []
+    found = geometry_of(subject)
+    assert found.distances == pytest.approx(dict.fromkeys(subject.cameras, 3.0), abs=0.15)
+    assert found.stature == pytest.approx(1.6, abs=0.2)
+    assert found.lean < 5
+    assert geometry_findings(subject, found) == []
 
 
 def test_a_person_of_ten_metres_is_an_error(subject):
-    rig = replace(rig_of(subject), stature=10.0)
-    (finding,) = rig_findings(subject, rig, Limits())
+    tall = replace(geometry_of(subject), stature=10.0)
+    (finding,) = geometry_findings(subject, tall)
     assert finding.level == "error"
     assert "10 m" in finding.sentence
 
 
-@pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_ground_axes_are_right_handed_with_up(axis, sign):
-    up = np.zeros(3)
-    up[axis] = sign
-    first, second = ground_axes(up)
-    assert np.cross(first, second) == pytest.approx(up)
-    assert axis_name(up) == ("" if sign > 0 else "-") + "xyz"[axis]
+def test_the_nearest_axis_is_named():
+    assert axis_name(np.array([0.1, -0.9, 0.3])) == "-y"
 
 
 def test_the_drawing_is_svg_with_every_camera(subject):
     import xml.etree.ElementTree as tree
 
-    drawing = rig_drawing(subject)
+    drawing = geometry_drawing(subject)
     tree.fromstring(drawing)
     assert all(f"<!-- {name} -->".encode() in drawing for name in subject.cameras)
-
-
-def test_counts_and_lists():
-    assert (counted(1, "error"), counted(2, "error")) == ("1 error", "2 errors")
-    assert listed(range(8)) == "0, 1, 2, 3, 4, 5 and 2 more"
 
 
 @pytest.mark.parametrize(
@@ -150,7 +107,7 @@ def test_counts_and_lists():
     ],
 )
 def test_complete_files_have_an_end_mark(tmp_path, content, whole):
-    path = tmp_path / "picture"
+    path = tmp_path / "image"
     path.write_bytes(content)
     assert complete(path) == whole
     assert not complete(tmp_path / "absent")
@@ -159,8 +116,8 @@ def test_complete_files_have_an_end_mark(tmp_path, content, whole):
 @pytest.mark.parametrize(
     ("make", "named"),
     [
-        (lambda: Sampling(pictures=0), r"sampling\.pictures must be a number above 0"),
-        (lambda: Limits(shift="wide"), r"limits\.shift must be a number above 0"),
+        (lambda: Sampling(images=0), r"sampling\.images must be a number above 0"),
+        (lambda: Limits(outside="wide"), r"limits\.outside must be a number above 0"),
     ],
 )
 def test_settings_out_of_range_are_refused(make, named):

@@ -7,16 +7,16 @@ import pytest
 from make import skeletons
 
 from gsgan.check.frames import (
-    body_parts,
+    PARTS,
     facing,
     frozen,
     jump_distance,
     jumped,
     length_change,
-    limb_lengths,
     measured_joints,
     swapped,
 )
+from gsgan.data.skeletons import bone_lengths
 from gsgan.skeleton.template import MEDIAPIPE33
 
 MIRROR = list(MEDIAPIPE33.mirror)
@@ -27,90 +27,67 @@ def p():
     return skeletons(20) + np.random.default_rng(1).normal(0, 0.002, (20, 33, 3))
 
 
-@pytest.fixture
-def seen():
-    return np.ones((20, 33), bool)
-
-
-def test_a_steady_motion_is_no_jump(seen):
+def test_a_steady_motion_is_no_jump():
     line = np.zeros((20, 33, 3))
     line[..., 0] = 3.0 * np.arange(20)[:, None]
-    distance = jump_distance(line, seen)
+    distance = jump_distance(line)
     assert np.nanmax(distance) == 0
     assert np.isnan(distance[[0, -1]]).all()
 
 
-def test_a_stray_frame_is_named_and_its_neighbours_are_not(p, seen):
+def test_a_stray_frame_is_named_and_its_neighbours_are_not(p):
     p[7, 3, 2] += 0.6
-    distance = jump_distance(p, seen)
+    distance = jump_distance(p)
     assert distance[7, 3] == pytest.approx(0.6, abs=0.02)
     assert distance[6, 3] == pytest.approx(0.3, abs=0.02)
     assert np.argwhere(jumped(distance, 0.2)).tolist() == [[7, 3]]
 
 
-def test_unseen_joints_do_not_jump(p, seen):
-    p[7, 3], seen[7, 3] = 100, False
-    assert not jumped(jump_distance(p, seen), 0.2).any()
-
-
-def test_length_changes_are_shares_of_the_median(p, seen):
-    lengths = limb_lengths(p, seen, MEDIAPIPE33)
+def test_length_changes_are_shares_of_the_median(p):
+    lengths = bone_lengths(p, MEDIAPIPE33.limbs)
     thigh = MEDIAPIPE33.limbs.index((23, 25))
     lengths[4, thigh] *= 1.5
     assert length_change(lengths)[4, thigh] == pytest.approx(0.5, abs=0.02)
 
 
-def test_limbs_without_both_ends_are_not_judged(p, seen):
-    seen[:, 25] = False
-    lengths = limb_lengths(p, seen, MEDIAPIPE33)
-    assert np.isnan(lengths[:, MEDIAPIPE33.limbs.index((23, 25))]).all()
-    assert np.isnan(length_change(lengths)[:, MEDIAPIPE33.limbs.index((23, 25))]).all()
-
-
-def test_frozen_joints_are_found_from_their_first_frame_to_their_last(p, seen):
+def test_frozen_joints_are_found_from_their_first_frame_to_their_last(p):
     p[5:10, 15] = p[5, 15]
     p[12:14, 16] = p[12, 16]
-    held = frozen(p, seen, least=5)
+    held = frozen(p, least=5)
     assert np.flatnonzero(held[:, 15]).tolist() == [5, 6, 7, 8, 9]
     assert held.sum() == 5
-    assert not frozen(p, seen, least=6).any()
+    assert not frozen(p, least=6).any()
 
 
-def test_only_joints_with_bones_that_change_are_measured(seen):
+def test_only_joints_with_bones_that_change_are_measured():
     p = skeletons(20)  # of a computed skeleton only the raised forearm changes
-    change = length_change(limb_lengths(p, seen, MEDIAPIPE33))
-    measured = measured_joints(change, MEDIAPIPE33, share=0.05)
+    change = length_change(bone_lengths(p, MEDIAPIPE33.limbs))
+    measured = measured_joints(change, MEDIAPIPE33)
     assert measured[[13, 15]].all()
     assert not measured[23:].any()
 
 
 @pytest.mark.parametrize("part", ["face", "arms", "legs"])
-def test_an_exchange_of_one_part_is_found_in_that_part_only(p, seen, part):
+def test_an_exchange_of_one_part_is_found_in_that_part_only(p, part):
     p[..., 0] += np.linspace(0, 0.3, 20)[:, None]
-    parts = body_parts(MEDIAPIPE33)
-    for left, right in parts[part]:
+    for left, right in PARTS[part]:
         p[8:11, [left, right]] = p[8:11, [right, left]]
-    for name, pairs in parts.items():
-        found = np.flatnonzero(swapped(p, seen, pairs, metres=0.03))
+    for name, pairs in PARTS.items():
+        found = np.flatnonzero(swapped(p, pairs, metres=0.03))
         assert found.tolist() == ([8, 9, 10] if name == part else [])
 
 
-def test_every_joint_with_a_side_belongs_to_one_part():
-    pairs = [pair for part in body_parts(MEDIAPIPE33).values() for pair in part]
-    assert sorted(j for pair in pairs for j in pair) == list(range(1, 33))
-
-
-def test_an_exchange_is_found_across_unseen_frames(p, seen):
-    legs = body_parts(MEDIAPIPE33)["legs"]
-    seen[8, 23:] = False
+def test_an_exchange_is_found_across_unseen_frames(p):
+    legs = PARTS["legs"]
+    p[8, 23:] = np.nan
     p[9:12] = p[9:12][:, MIRROR]
-    assert np.flatnonzero(swapped(p, seen, legs)).tolist() == [9, 10, 11]
+    assert np.flatnonzero(swapped(p, legs)).tolist() == [9, 10, 11]
 
 
-def test_facing_turns_with_exchanged_sides_and_not_with_the_person(p, seen):
-    assert (facing(p, seen, MEDIAPIPE33) > 0).all()
+def test_facing_turns_with_exchanged_sides_and_not_with_the_person(p):
+    assert (facing(p, MEDIAPIPE33) > 0).all()
     turned = p * [-1, -1, 1]
-    assert (facing(turned, seen, MEDIAPIPE33) > 0).all()
-    assert (facing(p[:, MIRROR], seen, MEDIAPIPE33) < 0).all()
-    seen[0, 11] = False
-    assert np.isnan(facing(p, seen, MEDIAPIPE33)[0])
+    assert (facing(turned, MEDIAPIPE33) > 0).all()
+    assert (facing(p[:, MIRROR], MEDIAPIPE33) < 0).all()
+    p[0, 11] = np.nan
+    assert np.isnan(facing(p, MEDIAPIPE33)[0])

@@ -13,8 +13,8 @@ import torch
 from capture_frames import every_frame, items, png
 from make import edit_json, ring_camera, skeletons, write_landmarks, write_tiny_capture
 
-from gsgan.data.dataset import CaptureDataset, Picture, PictureCache
-from gsgan.data.files import cut_off, read_header
+from gsgan.data.dataset import CaptureDataset, ImageCache
+from gsgan.data.files import cut_off
 from gsgan.data.formats.capture import CaptureReader, read_capture
 from gsgan.data.formats.consistency import Consistency
 from gsgan.data.skeletons import fill_missing
@@ -78,15 +78,6 @@ def test_millimetres_become_metres_and_it_is_said(tmp_path: Path) -> None:
         assert b.body is not None
         assert torch.allclose(a.body.transl, b.body.transl)
     assert "lengths converted from mm to metres" in read_capture(root).notes
-
-
-def test_pixel_centres_at_whole_numbers_are_moved(tmp_path: Path) -> None:
-    root = write_tiny_capture(tmp_path)
-    before = read_capture(root).cameras["cam00"].K
-    edit_json(root / "meta.json", lambda meta: meta.update(pixel_centre=0))
-    assert np.allclose(
-        read_capture(root).cameras["cam00"].K - before, [[0, 0, 0.5], [0, 0, 0.5], [0] * 3]
-    )
 
 
 def test_frames_pair_by_number_not_by_position(tmp_path: Path) -> None:
@@ -198,18 +189,6 @@ def test_an_upper_body_without_hips_is_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(landmarks.p[0][[23, 24], 2], truth[0, [23, 24], 2])
 
 
-def test_frames_without_landmarks_or_pose_are_dropped_and_counted(tmp_path: Path) -> None:
-    root = write_tiny_capture(tmp_path, frames=4, body_pose=True)
-    write_landmarks(root, p=skeletons(4)[:3], frame_id=np.array([1, 2, 3]))
-    theta = np.zeros((4, 56, 3))
-    theta[2, 0] = np.nan
-    np.savez(root / "body_pose.npz", theta=theta, transl=np.zeros((4, 3)), frame_id=np.arange(4))
-    layout = read_capture(root)
-    assert layout.frames == (1, 3)
-    assert any("without a row in landmarks3d.npz: 0" in n for n in layout.notes)
-    assert any("without a finite row in body_pose.npz: 2" in n for n in layout.notes)
-
-
 def test_landmarks_without_pictures_are_noted(tmp_path: Path) -> None:
     root = write_tiny_capture(tmp_path, frames=2)
     write_landmarks(root, p=skeletons(5), frame_id=np.arange(5))
@@ -246,15 +225,6 @@ def test_bilevel_and_grey_files_are_read(tmp_path: Path) -> None:
     assert torch.allclose(frame.image, torch.tensor(0.2))
 
 
-def test_headers_tell_the_size_without_decoding(tmp_path: Path) -> None:
-    for suffix in ("png", "jpg"):
-        path = tmp_path / f"x.{suffix}"
-        cv2.imwrite(str(path), np.zeros((20, 30, 3), np.uint8))
-        header = read_header(path)
-        assert (header.size, header.depth, header.channels) == ((20, 30), 8, 3)
-        assert header.jpeg == (suffix == "jpg")
-
-
 def test_a_jpeg_without_its_end_is_found_whatever_the_decoder_says(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 255, (32, 32, 3), dtype=np.uint8)
     data = cv2.imencode(".jpg", noise)[1].tobytes()
@@ -280,7 +250,7 @@ def test_an_exif_rotation_is_not_applied(tmp_path: Path) -> None:
 
 def test_cache_keeps_within_its_bound_and_changes_nothing(tmp_path: Path) -> None:
     layout = read_capture(write_tiny_capture(tmp_path, frames=4))
-    cache = PictureCache(3 * 24 * 32 * 4)
+    cache = ImageCache(3 * 24 * 32 * 4)
     cached = CaptureDataset(layout, items(layout), cache=cache)
     plain = CaptureDataset(layout, items(layout))
     for i in (0, 1, 2, 3, 4, 1, 0, 0):
@@ -291,20 +261,6 @@ def test_cache_keeps_within_its_bound_and_changes_nothing(tmp_path: Path) -> Non
     assert cached[0].image.shape == (1, 3, 24, 32)  # the last one used is still held
     with pytest.raises(DataError, match="does not exist"):
         cached[2]
-
-
-def test_cache_lets_go_of_the_longest_unused() -> None:
-    def picture() -> Picture:
-        return Picture(np.zeros((3, 2, 2), np.uint8), np.zeros((2, 2), np.uint8), None)
-
-    cache = PictureCache(32)
-    cache["a", 0] = picture()
-    cache["a", 1] = picture()
-    assert cache.get(("a", 0)) is not None
-    cache["a", 2] = picture()
-    assert cache.get(("a", 1)) is None
-    assert cache.get(("a", 0)) is not None
-    assert cache.currsize == 32
 
 
 def test_spans() -> None:

@@ -67,14 +67,6 @@ def test_a_point_in_space_stays_on_its_spot(
     assert torch.allclose(centroid(frame.image[0]), expected[0, 0], atol=0.1)
 
 
-def test_distortion_matters_in_that_test(tmp_path: Path) -> None:
-    root = spot_capture(tmp_path, (160, 120), LENS)
-    edit_json(root / "cameras.json", lambda rig: rig["cam00"].update(dist=[0] * 5))
-    (frame,) = every_frame(root)
-    expected, _ = frame.camera.project(torch.from_numpy(SPOT).float()[None, None])
-    assert (centroid(frame.image[0]) - expected[0, 0]).norm() > 0.5
-
-
 def test_lens_folding_back_shows_nothing(tmp_path: Path) -> None:
     K, dist = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), np.array([-0.3, *[0.0] * 7])
     mapping = undistort_map(K, dist, Crop(0, -150, (100, 400)))
@@ -138,13 +130,6 @@ def test_crop_without_joints_in_front_is_the_whole_picture(tmp_path: Path) -> No
     assert window == square_window((24, 32)) == Crop(-4, 0, (32, 32))
 
 
-def test_full_frames_of_uneven_cameras_share_one_size(tmp_path: Path) -> None:
-    for frame in every_frame(write_tiny_capture(tmp_path), size=16):
-        assert frame.image.shape[-2:] == (16, 16)
-        assert torch.allclose(frame.camera.K[:, 0, 0], frame.camera.K[:, 1, 1])
-        assert (frame.mask[..., :2, :] == 0).all()  # 4 of 32 rows padded above, halved
-
-
 def test_a_skewed_K_is_kept_and_undistorted_with_its_skew(tmp_path: Path) -> None:
     """A dot drawn where lens and skew put a point is found where the pinhole camera puts it."""
     root = write_tiny_capture(tmp_path, size=(200, 160), cameras=1)
@@ -175,11 +160,6 @@ def test_bad_sizes(tmp_path: Path, size: object) -> None:
     layout = read_capture(write_tiny_capture(tmp_path))
     with pytest.raises(ConfigError, match=r"data.size must be a whole number"):
         CaptureDataset(layout, items(layout), size=size)  # type: ignore[arg-type]
-
-
-def test_bad_margin() -> None:
-    with pytest.raises(ConfigError, match=r"data.crop.margin must be a number above 0"):
-        PersonCrop(0)
 
 
 def test_real_joints_lie_on_the_person_in_the_crop(real_capture: Path) -> None:

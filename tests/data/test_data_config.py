@@ -47,13 +47,13 @@ def test_capture_config_builds_and_reads(capture: Path) -> None:
 
 def test_synthetic_config_reads_what_the_generator_would_make(capture: Path) -> None:
     """The generator is not run here: its parameters are checked, its folder replaced."""
-    from gsgan.synthetic.scene_setup import Settings
+    from gsgan.synthetic.scene_setup import SceneSettings
 
     data = instantiate(conf("synthetic", "size=48", "source.frames=12", "source.test_frames=3"))
     assert data.source.func.__name__ == "ensure_synthetic"
     given = dict(data.source.keywords)
     assert given.pop("workers") == 2
-    assert Settings(**given) == Settings(size=48, frames=12, test_frames=3)
+    assert SceneSettings(**given) == SceneSettings(size=48, frames=12, test_frames=3)
     made = instantiate(conf("synthetic", f"root={capture}", "skeleton=mediapipe33"))
     assert made.dataset("train")[0].image.shape[-2:] == (128, 128)
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import ten_frames
 import torch
-from make import skeletons, write_landmarks, write_tiny_capture
+from make import skeletons, write_tiny_capture
 
 from gsgan.data.datamodule import GsganData, StepSampler, count_labels, pass_order
 from gsgan.data.formats.capture import read_capture
@@ -131,15 +131,6 @@ def test_loaders_and_datasets(capture: Path) -> None:
         data.dataset("test")
 
 
-def test_workers_load_the_same(capture: Path) -> None:
-    alone = GsganData(str(capture), size=16, batch_size=2, steps_per_epoch=2)
-    helped = GsganData(str(capture), size=16, batch_size=2, steps_per_epoch=2, workers=1)
-    for a, b in zip(alone.train_dataloader(), helped.train_dataloader(), strict=True):
-        assert torch.equal(a.image, b.image)
-        assert torch.equal(a.frame_id, b.frame_id)
-    assert alone.dataset("train").cache.maxsize // 3 == helped.dataset("train").cache.maxsize
-
-
 def test_empty_split_has_no_loader_but_a_reason(capture: Path) -> None:
     data = GsganData(str(capture), test_share=0)
     assert data.test_dataloader() == []
@@ -193,15 +184,11 @@ def test_scene_info(capture: Path) -> None:
     assert info.has_body_pose
     assert info.body is None
     assert info.skeleton == "mediapipe33"
-    assert (info.up_axis, info.fps, info.frames) == ("z", 30.0, 8)
+    assert info.frames == 8
     expected = skeletons(10)[:8].mean(1)
     assert np.allclose(info.centre, np.median(expected, axis=0), atol=0.02)
     # arms and legs of the stick figure: (0.278 + 0.224 + 0.45 + 0.4) metres a side, hands and feet
     assert 3.0 < info.body_height < 4.5
-    assert set(info.foreground) == {"cam00", "cam01"}
-    red, _, blue = info.foreground["cam00"]
-    assert red == pytest.approx(200 / 255, abs=0.03)
-    assert blue == pytest.approx(60 / 255, abs=0.03)
     json.dumps(asdict(info))  # plain values, so that a checkpoint can hold it
 
 
@@ -241,14 +228,6 @@ def test_labels_are_counted_without_the_ignore_value(tmp_path: Path) -> None:
     assert count_labels(read_capture(names), ()) == 5
 
 
-def test_body_height_passes_over_frames_with_holes(tmp_path: Path) -> None:
-    whole = GsganData(str(write_tiny_capture(tmp_path, frames=9))).info.body_height
-    p = skeletons(9)
-    p[:3, 27:] = np.nan
-    write_landmarks(tmp_path, p=p, frame_id=np.arange(9))
-    assert GsganData(str(tmp_path)).info.body_height == pytest.approx(whole, rel=0.02)
-
-
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
@@ -283,8 +262,7 @@ def test_real_capture_splits_and_scene(real_capture: Path) -> None:
     assert len(data.dataset("novel_pose")) == 4 * 14
     assert data.info.n_train_cameras == 4
     assert 3.4 < data.info.body_height < 4.8  # 2.4 times the stature, about
-    colours = np.array(list(data.info.foreground.values()))
-    assert np.ptp(colours, axis=0).max() > 0.02  # white balance differs between the cameras
+    assert data.info.surface.difference > 0.03  # white balance differs between the cameras
 
 
 def test_a_picture_damaged_under_a_worker_process_is_one_sentence(tmp_path: Path) -> None:

@@ -2,32 +2,35 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import easymocap_folders
 import numpy as np
 import pytest
-import torch
-from easymocap_folders import read, refused
 from writers.common import Subject, write_picture
-from writers.easymocap import NAMES, body_25, hand_joints, write_calibration, write_easymocap
+from writers.easymocap import (
+    NAMES,
+    body_25,
+    hand_joints,
+    write_calibration,
+    write_easymocap,
+    write_people,
+)
 
-from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import read_colour
 from gsgan.data.formats.consistency import Consistency
 from gsgan.data.formats.easymocap import EasymocapReader
-from gsgan.data.formats.smpl_motion import Motion, posed
+from gsgan.data.formats.smpl_motion import SmplMotion, posed
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
 from gsgan.data.validation import Thresholds
 from gsgan.skeleton.smpl import to_mediapipe33
-from gsgan.utils.errors import ConfigError
+from gsgan.utils.errors import ConfigError, DataError
 
 pytestmark = pytest.mark.usefixtures("model_once")
-written = easymocap_folders.written
-root = easymocap_folders.root
 
 # MediaPipe's landmark to OpenPose's BODY_25, by hand: nose, eyes, ears, limbs, feet.
 LANDMARKS = {
@@ -35,6 +38,40 @@ LANDMARKS = {
     25: 13, 26: 10, 27: 14, 28: 11, 29: 21, 30: 24, 31: 19, 32: 22,
 }  # fmt: skip
 NO_LOOK = Consistency(frames=0, watched_masks=0)
+
+
+def read(root: Path, smpl: Path | None = None, **settings: Any) -> Layout:
+    return EasymocapReader(**settings)(root, Thresholds(), None if smpl is None else str(smpl))
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory, subject: Subject) -> Path:
+    """Keypoints and fits; do not write into it."""
+    return write_easymocap(tmp_path_factory.mktemp("easymocap") / "take", subject)
+
+
+@pytest.fixture
+def root(written: Path, tmp_path: Path) -> Path:
+    """The same to damage."""
+    return Path(shutil.copytree(written, tmp_path / "take"))
+
+
+def edit_people(
+    root: Path, change: Callable[[list[Any]], object], kind: str = "keypoints3d", frame: int = 1
+) -> Path:
+    path = root / kind / f"{frame:06d}.json"
+    people = json.loads(path.read_text())
+    change(people)
+    write_people(path, people)
+    return path
+
+
+def refused(root: Path, *parts: str, smpl: Path | None = None, **settings: Any) -> None:
+    with pytest.raises(DataError) as caught:
+        read(root, smpl, **settings)
+    assert "\n" not in str(caught.value)
+    for part in parts:
+        assert part in str(caught.value), caught.value
 
 
 def check_cameras(layout: Layout, subject: Subject) -> None:
@@ -102,7 +139,7 @@ def test_fits_give_skeletons_and_poses(written: Path, subject: Subject, smpl_fil
         for held in (layout.poses.theta, layout.poses.transl)
     )
     betas = np.repeat(subject.shapes[None], len(theta), 0)
-    motion = Motion(np.array(subject.frames), theta, transl, betas)
+    motion = SmplMotion(np.array(subject.frames), theta, transl, betas)
     assert np.allclose(posed(subject.model, motion)[0], subject.vertices, atol=1e-6)
     assert layout.meta.skeleton_source == "smpl24 -> mediapipe33"
     assert layout.meta.body is not None
@@ -134,21 +171,6 @@ def test_pictures_and_masks_are_those_that_were_written(written: Path, subject: 
             assert np.abs(image - subject.images[i][c]).mean() < 12
 
 
-def test_pictures_are_undistorted(written: Path, subject: Subject) -> None:
-    """The body's vertices, projected without a lens, land on the mask seen through one."""
-    frame = CaptureDataset(read(written), [("10", 1)])[0]
-    points = torch.from_numpy(subject.vertices[1]).float()[None]
-    u, v = frame.camera.project(points)[0][0].floor().long().T
-    assert frame.mask[0, 0][v.clamp(0, 39), u.clamp(0, 39)].mean() > 0.9
-
-
-def test_sizes_come_from_images_if_absent(subject: Subject, tmp_path: Path) -> None:
-    root = write_easymocap(tmp_path / "e", subject)
-    write_calibration(root, subject, sizes=False)
-    sizes = {camera.size for camera in EasymocapReader()(root, Thresholds()).cameras.values()}
-    assert sizes == {(40, 40)}
-
-
 def test_the_config_reads_it_in_worker_processes(written: Path, smpl_file: Path, compose) -> None:
     from hydra.utils import instantiate
 
@@ -158,8 +180,52 @@ def test_the_config_reads_it_in_worker_processes(written: Path, smpl_file: Path,
     )  # fmt: skip
     data = instantiate(config.data)
     assert next(iter(data.train_dataloader())).image.shape == (1, 3, 16, 16)
-    assert data.info.skeleton_source == "smpl24 -> mediapipe33"
+    assert data.layout.meta.skeleton_source == "smpl24 -> mediapipe33"
     assert data.splits.test_cameras == ("10",)
+
+
+def test_omissions_are_noted(root: Path, subject: Subject) -> None:
+    shutil.rmtree(root / "images/2")
+    edit_people(root, lambda people: people[0].update(id=5), frame=1)
+    (root / "keypoints3d/000002.json").unlink()
+    intri = root / "intri.yml"
+    intri.write_text(intri.read_text().replace("dist_10:", "other_10:"))
+    elsewhere = body_25(subject, 0)
+    elsewhere[:, 0] += 5
+    other = {"id": 1, "keypoints3d": elsewhere.tolist()}
+    edit_people(root, lambda people: people.insert(0, other), frame=3)
+    layout = read(root)
+    assert (layout.camera_names, layout.frames) == (("1", "10"), (0, 3))
+    assert np.allclose(layout.landmarks.p[3][11], body_25(subject, 3)[5, :3])
+    assert not layout.cameras["10"].distorted
+    for note in (
+        "no lens distortion for 10",
+        "lists cameras without images, left out: 2",
+        "lacks person 0 at frames 1",
+        "more people than person 0 at frames 3",
+        "without a row in keypoints3d/: 1-2",
+    ):
+        assert any(note in held for held in layout.notes), note
+    refused(root, "has no person 7 in the 3 of its 3 files", "(found: 0, 1, 5)", person=7)
+
+
+def test_joints_without_confidence_are_unknown(root: Path) -> None:
+    """EasyMocap writes zeros with confidence 0, or below, where it saw nothing."""
+
+    def change(people: list[Any]) -> None:
+        people[0]["keypoints3d"][7] = [0, 0, 0, 0]
+        people[0]["keypoints3d"][4] = [0, 0, 0, -1]
+        people[0]["keypoints3d"][6] = [float("nan"), 0, 0, 1]
+
+    def without_confidence(people: list[Any]) -> None:
+        people[0]["keypoints3d"] = [joint[:3] for joint in people[0]["keypoints3d"]]
+
+    edit_people(root, change)
+    edit_people(root, without_confidence, frame=2)
+    landmarks = read(root).landmarks
+    assert landmarks.visibility[1][[13, 15, 16]].tolist() == [0, 0, 0]
+    assert np.allclose(landmarks.p[1][15], landmarks.p[0][15])  # as in the frame before
+    assert set(landmarks.visibility[2]) == {0, 1}
 
 
 # --- masks --------------------------------------------------------------------------------------

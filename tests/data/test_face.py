@@ -99,11 +99,3 @@ def test_damaged_files_are_named(root: Path, damage: dict, message: str) -> None
     write_face(root, 4, **damage)
     with pytest.raises(DataError, match=rf"face3d.npz: .*{message}"):
         read_capture(root)
-
-
-def test_a_truncated_file_is_named(root: Path) -> None:
-    write_face(root, 4)
-    path = root / "face3d.npz"
-    path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(DataError, match=r"face3d.npz"):
-        read_capture(root)

@@ -8,15 +8,11 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
-import torch
 from make import write_tiny_capture
-from torch.utils.data import DataLoader, Dataset
 
-from gsgan.data.datamodule import GsganData, _quiet_worker
-from gsgan.data.dataset import CaptureDataset, PictureCache
+from gsgan.data.dataset import CaptureDataset, ImageCache
 from gsgan.data.formats.capture import read_capture
 from gsgan.data.layout import Layout
-from gsgan.scene import Frame
 
 MIB = 2**20
 STATM = Path("/proc/self/statm")  # Linux; elsewhere what Python itself allocates is measured
@@ -46,7 +42,7 @@ def long_dataset(layout: Layout, count: int) -> CaptureDataset:
     """A dataset of ``count`` pictures: far more than the cache holds."""
     items = [(c, f) for c, files in layout.images.items() for f in files]
     repeated = (items * -(-count // len(items)))[:count]
-    return CaptureDataset(layout, repeated, 256, cache=PictureCache(CACHE))
+    return CaptureDataset(layout, repeated, 256, cache=ImageCache(CACHE))
 
 
 def test_memory_does_not_grow_with_the_pictures_read(layout: Layout) -> None:
@@ -60,15 +56,6 @@ def test_memory_does_not_grow_with_the_pictures_read(layout: Layout) -> None:
     assert read > 150 * MIB  # else nothing is proved
     assert resident() - before < 24 * MIB
     assert 0 < dataset.cache.currsize <= CACHE
-
-
-def test_the_measurement_sees_pictures_that_are_kept(layout: Layout) -> None:
-    dataset = long_dataset(layout, WARM)
-    before = resident()
-    # in one piece: small ones may go where memory was freed before
-    kept = torch.cat([dataset[i].image for i in range(WARM) for _ in range(3)])
-    assert kept.nbytes > 40 * MIB
-    assert resident() - before > 40 * MIB
 
 
 def index_bytes(root: Path) -> int:
@@ -88,49 +75,3 @@ def test_the_index_takes_a_kilobyte_a_picture(tmp_path: Path) -> None:
     index_bytes(few)  # what is imported or made once
     grown = index_bytes(many) - index_bytes(few)
     assert 0 < grown / 200 < 1500  # a picture on the disk has 50 000 and more
-
-
-class Watched(Dataset[tuple[Frame, torch.Tensor]]):
-    """The items of a dataset, each with the process that read it and that process's memory."""
-
-    def __init__(self, dataset: CaptureDataset) -> None:
-        self.dataset = dataset
-
-    def __len__(self) -> int:
-        return len(self.dataset)
-
-    def __getitem__(self, index: int) -> tuple[Frame, torch.Tensor]:
-        frame = self.dataset[index]
-        return frame, torch.tensor([os.getpid(), resident(), self.dataset.cache.currsize])
-
-
-def test_workers_keep_no_more_than_their_cache_and_read_the_same(layout: Layout) -> None:
-    dataset = long_dataset(layout, WARM + READ)
-    loader = DataLoader(
-        Watched(dataset), batch_size=None, num_workers=2, worker_init_fn=_quiet_worker
-    )
-    memory: dict[int, list[int]] = {}
-    for i, (frame, seen) in enumerate(loader):
-        process, held, cached = seen.tolist()
-        memory.setdefault(process, []).append(held)
-        assert cached <= CACHE
-        if i < 12:
-            assert torch.equal(frame.image, dataset[i].image)
-    assert len(memory) == 2
-    assert os.getpid() not in memory
-    for held in memory.values():
-        assert len(held) == (WARM + READ) / 2
-        assert held[-1] - held[WARM // 2] < 24 * MIB
-
-
-def test_an_epoch_in_workers_is_that_of_one_process(layout: Layout) -> None:
-    one, two = (
-        GsganData(str(layout.root), size=32, batch_size=2, steps_per_epoch=6, workers=workers)
-        for workers in (0, 2)
-    )
-    pairs = zip(one.train_dataloader(), two.train_dataloader(), strict=True)
-    for own, helped in pairs:
-        assert torch.equal(own.frame_id, helped.frame_id)
-        assert torch.equal(own.camera_index, helped.camera_index)
-        assert torch.equal(own.image, helped.image)
-        assert torch.equal(own.skeleton, helped.skeleton)

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 
-from gsgan.data.files import read_colour
 from gsgan.data.pixels import (
     MaskFile,
     PixelRules,
@@ -41,11 +40,6 @@ def grey(tmp_path: Path) -> Path:
 )
 def test_mask_rules(grey: Path, rule: str, expected: object) -> None:
     assert np.array_equal(read_mask([(rule, grey)], RULES), expected)
-
-
-def test_the_threshold_is_a_setting(grey: Path) -> None:
-    mask = read_mask([("threshold", grey)], PixelRules(threshold=201))
-    assert np.array_equal(mask, [[0, 0, 0], [0, 0, 255]])
 
 
 def test_masks_are_joined_by_their_maximum_and_must_agree_in_size(
@@ -94,13 +88,6 @@ def test_the_ringing_of_a_jpeg_is_no_person(tmp_path: Path) -> None:
     assert mask_file("label", "m.jpg").rule == "label"
 
 
-def test_masks_of_floats_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "m.tiff"
-    cv2.imwrite(str(path), np.ones((4, 4), np.float32))
-    with pytest.raises(DataError, match=r"m.tiff holds float32 values; expected 8 bits"):
-        read_mask([("nonzero", path)], PixelRules())
-
-
 def test_labels_go_through_their_table(grey: Path) -> None:
     table = [255] * 256
     table[0], table[1], table[200] = 0, 2, 1
@@ -108,12 +95,6 @@ def test_labels_go_through_their_table(grey: Path) -> None:
     assert np.array_equal(labels, [[0, 2, 255], [255, 1, 255]])
     with pytest.raises(DataError, match=r"grey.png holds the label 200; CIHP names 2 labels"):
         read_labels(grey, RULES, ["none", "a"], "CIHP")
-
-
-def test_colours_come_red_first(tmp_path: Path) -> None:
-    path = tmp_path / "red.png"
-    cv2.imwrite(str(path), np.array([[[0, 0, 255]]], np.uint8))  # OpenCV: red last
-    assert read_colour(path)[0, 0].tolist() == [255, 0, 0]
 
 
 def test_the_band_lies_on_both_sides_of_the_outline() -> None:

@@ -15,7 +15,7 @@ from gsgan.data.formats.capture import read_capture
 from gsgan.data.layout import Layout
 from gsgan.data.metric_variants import CHOICES, MetricVariants
 from gsgan.data.protocol import Protocol
-from gsgan.data.splits import camera_name, make_splits, parse_frames, protocol_splits
+from gsgan.data.splits import parse_frames, protocol_splits
 from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError, DataError
 
@@ -150,11 +150,6 @@ def test_frames_by_subject() -> None:
         replace(protocol, subject=378).frames("test")
 
 
-def test_camera_names_and_indices(layout: Layout) -> None:
-    assert camera_name(layout, 2, "p") == "cam02"
-    assert camera_name(layout, "cam02", "p") == "cam02"
-
-
 def test_departures_are_said() -> None:
     same = replace(ONE, scale=0.5)
     assert list(same.departures(lpips_net="vgg", scale=0.5)) == []
@@ -185,16 +180,6 @@ def test_the_data_follows_the_protocol_and_records_it(root: Path) -> None:
     cut = GsganData(str(root), size=16, crop="person", protocol=ONE).protocol_record("vgg")
     assert cut is not None
     assert len(cut["departures"]) == 1
-
-
-def test_splits_are_given_once(root: Path) -> None:
-    data = GsganData(str(root), protocol=ONE, test_cameras=["cam02"])
-    with pytest.raises(ConfigError, match="protocol one sets the splits"):
-        data.setup()
-
-
-def test_without_a_protocol_nothing_changes(layout: Layout) -> None:
-    assert make_splits(layout).train_frames == tuple(range(8))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -230,48 +215,3 @@ def test_the_frames_of_zju_are_those_that_were_scored(compose) -> None:
     config = compose("train", "data=capture", "protocol=zju_humannerf")
     counts = {k: len(parse_frames(v, k)) for k, v in config.protocol.test_frames.items()}
     assert counts == {377: 19, 386: 18, 387: 18, 392: 19, 393: 22, 394: 16}
-
-
-def test_scores_carry_their_protocol(compose, root: Path, tmp_path: Path) -> None:
-    """metrics.json and the table name the protocol, what it asked for, and what differs from it."""
-    import io
-
-    import torch
-    from rich.console import Console
-
-    from gsgan.evaluate.facts import Method
-    from gsgan.evaluate.run import evaluate_method
-    from gsgan.evaluate.scores import painter
-    from gsgan.model.runs import build_avatar, build_data
-
-    config = compose(
-        "train",
-        *("size=tiny", "training=smoke", "model=splat_only", "data=capture"),
-        *(f"data.root={root}", "protocol=zju_gauhuman", "protocol.train_cameras=[1]"),
-        *("data.size=16", "protocol.train_frames=0-9:5", "protocol.test_frames=0-5:5"),
-        *("protocol.test_cameras=[2]", "lpips.net=alex"),
-    )
-    data = build_data(config)
-    avatar = build_avatar(config, data).eval()
-    text = io.StringIO()
-    results = evaluate_method(
-        tmp_path,
-        config,
-        Console(file=text, width=200),
-        data,
-        painter(avatar),
-        method=Method("gsgan"),
-        device=torch.device("cpu"),
-    )
-    written = json.loads((tmp_path / "metrics.json").read_text())
-    assert written == json.loads(json.dumps(results))
-    assert written["novel_view"]["full"]["images"] == 2
-    record = written["novel_view"]["full"]["protocol"]
-    assert (record["name"], record["train_cameras"]) == ("zju_gauhuman", [1])
-    assert record["measures"]["region"] == "body_box_cleared"
-    assert any("20 cm round the joints" in said for said in record["departures"])  # no mesh here
-    assert any("LPIPS backbone is alex" in said for said in record["departures"])
-    assert "protocol: zju_gauhuman (GauHuman's public code)" in text.getvalue()
-    assert "departs from zju_gauhuman: LPIPS backbone is alex" in (
-        (tmp_path / "metrics.md").read_text()
-    )

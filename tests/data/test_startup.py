@@ -32,23 +32,13 @@ def without_mouth(capture, tmp_path):
     return root
 
 
-def test_a_mouth_that_no_frame_has_is_put_in_place_once(build, without_mouth):
-    data, _, frame = build(f"data.root={without_mouth}")
-    whole = data.dataset("train").skeletons.p
-    assert set(whole) == set(data.layout.frames)
-    assert all(np.isfinite(p).all() for p in whole.values())
-    assert float(frame.visibility[0, MOUTH].max()) == 0
-    head = frame.skeleton[0, MEDIAPIPE33.nose]
-    assert float((frame.skeleton[0, MOUTH] - head).norm(dim=-1).max()) < 0.2  # metres
-
-
 def test_painting_takes_as_many_operators_without_a_mouth_as_with_one(build, without_mouth):
     counts = []
     for overrides in ((), (f"data.root={without_mouth}",)):
         _, avatar, frame = build("effects=none", *overrides)
-        avatar.paint(frame)
+        avatar(*frame.inputs)
         with Calls() as seen, torch.no_grad():
-            avatar.paint(frame)
+            avatar(*frame.inputs)
         counts.append(seen.count)
     assert counts[0] == counts[1]
 

@@ -2,32 +2,56 @@
 
 from __future__ import annotations
 
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import thuman4_folders
-import torch
-from thuman4_folders import edit_params, read
 from writers.common import write_picture
 from writers.smplx_rig import SmplxSubject
+from writers.thuman4 import write_thuman4
 
 from gsgan.data.dataset import CaptureDataset
 from gsgan.data.files import read_colour
 from gsgan.data.formats.consistency import Consistency
-from gsgan.data.formats.smpl_motion import Motion, posed
-from gsgan.data.formats.smplx_rig import read_motion
+from gsgan.data.formats.smpl_motion import SmplMotion, posed
+from gsgan.data.formats.smplx_rig import read_missing
 from gsgan.data.formats.thuman4 import Thuman4Reader
+from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask, read_unsure
+from gsgan.data.validation import Thresholds
 from gsgan.skeleton.smpl import to_mediapipe33
 from gsgan.utils.errors import ConfigError
 
 pytestmark = pytest.mark.usefixtures("model_once")
-written = thuman4_folders.written
-root = thuman4_folders.root
 
 NO_LOOK = Consistency(frames=0, watched_masks=0)
+
+
+def read(root: Path, smplx: Path | None, **settings: Any) -> Layout:
+    return Thuman4Reader(**settings)(root, Thresholds(), None if smplx is None else str(smplx))
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory, smplx_subject: SmplxSubject) -> Path:
+    """A subject with nothing missing; do not write into it."""
+    return write_thuman4(tmp_path_factory.mktemp("thuman4") / "subject00", smplx_subject)
+
+
+@pytest.fixture
+def root(written: Path, tmp_path: Path) -> Path:
+    """The same to damage."""
+    return Path(shutil.copytree(written, tmp_path / "subject00"))
+
+
+def edit_params(root: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Applies ``change`` to the arrays of smpl_params.npz, in place."""
+    with np.load(root / "smpl_params.npz") as archive:
+        arrays = dict(archive)
+    change(arrays)
+    np.savez(root / "smpl_params.npz", **arrays)
 
 
 def test_cameras_are_those_that_were_written(
@@ -60,7 +84,7 @@ def test_skeletons_and_poses_are_those_that_were_written(
         assert np.array_equal(layout.landmarks.visibility[frame], conf)
         face = s.params["expression"][i : i + 1].astype(np.float64)
         theta, transl = layout.poses.theta[frame][None], layout.poses.transl[frame][None]
-        motion = Motion(np.array([frame]), theta, transl, s.params["betas"].astype(float), face)
+        motion = SmplMotion(np.array([frame]), theta, transl, s.params["betas"].astype(float), face)
         assert np.allclose(posed(s.model, motion)[0][0], s.vertices[i], atol=1e-6)
     meta = layout.meta
     assert (meta.skeleton_source, meta.up_axis, meta.fps) == ("smplx -> mediapipe33", "-z", 30)
@@ -82,19 +106,6 @@ def test_pictures_and_masks_are_those_that_were_written(
             assert set(np.unique(mask)) <= {0, 255}
             image = read_colour(layout.image_path(name, frame)).astype(int)
             assert np.abs(image - smplx_subject.images[i][c]).mean() < 12  # chroma of a small JPEG
-
-
-def test_the_projected_body_lies_on_the_mask(
-    written: Path, smplx_subject: SmplxSubject, smplx_file: Path
-) -> None:
-    layout = read(written, smplx_file)
-    frame = CaptureDataset(layout, [("cam01", 2)])[0]
-    points = torch.from_numpy(smplx_subject.vertices[2]).float()[None]
-    u, v = frame.camera.project(points)[0][0].floor().long().T
-    on = frame.mask[0, 0][v.clamp(0, 43), u.clamp(0, 51)]
-    assert on.mean() > 0.97
-    assert frame.body is not None
-    assert frame.body.theta.shape == (1, 55, 3)
 
 
 def test_hands_move_their_landmarks(root: Path, smplx_file: Path) -> None:
@@ -121,19 +132,44 @@ def test_only_the_first_row_of_betas_counts(
     assert np.allclose(meta.body.betas, betas[0])
 
 
-def test_joints_as_triples_are_the_same(
-    root: Path, smplx_subject: SmplxSubject, tmp_path: Path
+def test_listed_files_are_left_out(
+    tmp_path: Path, smplx_subject: SmplxSubject, smplx_file: Path
 ) -> None:
-    before = read_motion(root / "smpl_params.npz", [0, 1, 2, 3], smplx_subject.model, [])
-    edit_params(root, lambda a: a.update(body_pose=a["body_pose"].reshape(4, 21, 3)))
-    after = read_motion(root / "smpl_params.npz", [0, 1, 2, 3], smplx_subject.model, [])
-    assert np.array_equal(before.theta, after.theta)
+    listed = ("images\\cam01\\00000002.jpg", "./cam02/00000003.jpg", "", "cam00/00000099.jpg")
+    root = write_thuman4(tmp_path / "s", smplx_subject, listed)
+    layout = read(root, smplx_file)
+    named = read_missing(root / "missing_img_files.txt", layout.cameras)
+    assert named == {("cam01", 2), ("cam02", 3), ("cam00", 99)}
+    assert (2 in layout.images["cam01"], 3 in layout.images["cam02"]) == (False, False)
+    assert "3 images named in" in layout.notes[0]
+    assert "2 of them with a file" in layout.notes[0]
+    (root / "missing_img_files.txt").unlink()
+    assert "every image in the folders is used" in read(root, smplx_file).notes[0]
 
 
-def test_frames_can_be_left_out(root: Path, smplx_file: Path) -> None:
-    assert read(root, smplx_file, drop_frames="1-2").frames == (0, 3)
-    with pytest.raises(ConfigError, match="leaves no frame"):
-        read(root, smplx_file, drop_frames="0-9")
+def test_a_lens_is_not_applied_but_noted(
+    tmp_path: Path, smplx_subject: SmplxSubject, smplx_file: Path
+) -> None:
+    root = write_thuman4(tmp_path / "s", smplx_subject, distCoeff=[0.1, 0, 0, 0, 0])
+    layout = read(root, smplx_file)
+    assert not any(camera.distorted for camera in layout.cameras.values())
+    assert any("gives 3 cameras lens distortion" in note for note in layout.notes)
+    assert read(root, smplx_file, undistort=True).cameras["cam00"].dist[0] == 0.1
+
+
+def test_frames_without_finite_parameters_are_dropped_and_named(
+    root: Path, smplx_file: Path
+) -> None:
+    def change(arrays: dict[str, Any]) -> None:
+        arrays["body_pose"][1, 7] = np.nan
+        for key in arrays.keys() - {"betas"}:
+            arrays[key] = arrays[key][:3]
+
+    edit_params(root, change)
+    layout = read(root, smplx_file)
+    assert layout.frames == (0, 2)
+    assert any("NaN or infinity at frames 1" in note for note in layout.notes)
+    assert any("without a row in smpl_params.npz: 1, 3" in note for note in layout.notes)
 
 
 def test_the_config_reads_it_in_worker_processes(written: Path, smplx_file: Path, compose) -> None:
@@ -148,7 +184,7 @@ def test_the_config_reads_it_in_worker_processes(written: Path, smplx_file: Path
     batch = next(iter(data.train_dataloader()))
     assert batch.image.shape == (1, 3, 16, 16)
     assert batch.unsure is not None
-    assert data.info.skeleton_source == "smplx -> mediapipe33"
+    assert data.layout.meta.skeleton_source == "smplx -> mediapipe33"
     assert (data.info.body, data.info.frames) == ("smplx", 3)
     assert data.eval_names == ("novel_view", "novel_pose")
 

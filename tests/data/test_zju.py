@@ -2,35 +2,52 @@
 
 from __future__ import annotations
 
+import json
 import pickle
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
-import zju_folders
 from writers import zju as writers
 from writers.common import Subject, make_subject, write_object, write_picture
-from zju_folders import frame_of, read
 
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.dataset import CaptureDataset
-from gsgan.data.files import frame_files, natural_order
 from gsgan.data.formats.consistency import Consistency, box_iou, mask_box
-from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
-from gsgan.data.formats.zju import camera_folders, frame_number, read_annots
+from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, posed
+from gsgan.data.formats.zju import ZjuReader, camera_folders, frame_number, read_annots
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_labels, read_mask
+from gsgan.data.validation import Thresholds
+from gsgan.scene import Frame
 from gsgan.skeleton.smpl import to_mediapipe33
-from gsgan.utils.errors import DataError
 
 pytestmark = pytest.mark.usefixtures("model_once")
-written = zju_folders.written
-original = zju_folders.original
+
+
+def read(root: Path, smpl: Path | None, **settings: Any) -> Layout:
+    return ZjuReader(**settings)(root, Thresholds(), None if smpl is None else str(smpl))
+
+
+def frame_of(layout: Layout, camera: int, frame: int) -> Frame:
+    return CaptureDataset(layout, [(layout.camera_names[camera], frame)])[0]
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory, subject: Subject) -> Path:
+    """The original release; do not write into it."""
+    return writers.write_original(tmp_path_factory.mktemp("zju") / "CoreView_377", subject)
+
+
+@pytest.fixture
+def original(written: Path, tmp_path: Path) -> Path:
+    """The same to damage."""
+    return Path(shutil.copytree(written, tmp_path / "CoreView_377"))
 
 
 def check_cameras(layout: Layout, subject: Subject) -> None:
@@ -62,11 +79,11 @@ def check_poses(layout: Layout, subject: Subject, blend: bool = True) -> None:
         for held in (layout.poses.theta, layout.poses.transl)
     )
     betas = np.repeat(subject.shapes[None], len(theta), 0)
-    motion = Motion(np.array(subject.frames), theta, transl, betas)
+    motion = SmplMotion(np.array(subject.frames), theta, transl, betas)
     assert np.allclose(posed(subject.model, motion, blend)[0], subject.vertices, atol=1e-6)
 
 
-def check_pictures(layout: Layout, subject: Subject) -> None:
+def check_images(layout: Layout, subject: Subject) -> None:
     for i, frame in enumerate(subject.frames):
         for c, name in enumerate(layout.camera_names):
             labels = subject.labels[i][c]
@@ -89,7 +106,7 @@ def test_the_original_release_is_read_as_it_was_written(
     check_cameras(layout, subject)
     check_skeletons(layout, subject)
     check_poses(layout, subject)
-    check_pictures(layout, subject)
+    check_images(layout, subject)
     assert layout.notes == ("lengths of the cameras converted from mm to metres",)
     meta = layout.meta
     assert (meta.skeleton_source, meta.up_axis) == ("smpl24 -> mediapipe33", "-z")
@@ -97,33 +114,6 @@ def test_the_original_release_is_read_as_it_was_written(
     assert (meta.body.kind, meta.body.file) == ("smpl", str(smpl_file))
     assert np.allclose(meta.body.betas, subject.shapes)
     assert meta.label_names == CIHP
-
-
-def test_the_mouth_that_smpl_does_not_know_is_masked_and_not_zero(
-    written: Path, smpl_file: Path
-) -> None:
-    frame = frame_of(read(written, smpl_file), 0, 0)
-    assert frame.visibility[0, 9:11].tolist() == [0, 0]
-    assert (frame.skeleton[0, 9:11].norm(dim=-1) > 0.1).all()
-    assert (frame.visibility[0, [11, 12, 23, 24]] == 1).all()
-
-
-def test_undistorted_pictures_meet_the_pinhole_camera(
-    written: Path, subject: Subject, smpl_file: Path
-) -> None:
-    """The body's vertices, projected without a lens, land on the mask that was seen through one."""
-    layout = read(written, smpl_file)
-    for c in range(3):
-        frame = frame_of(layout, c, 1)
-        assert frame.camera.dist is None
-        vertices = torch.from_numpy(subject.vertices[1]).float()[None]
-        pixels, _ = frame.camera.project(vertices)
-        u, v = pixels[0].floor().long().clamp(0, 39).unbind(-1)
-        near = torch.nn.functional.max_pool2d(frame.mask, 3, 1, 1)[0, 0]
-        assert near[v, u].mean() > 0.99
-        assert set(frame.mask.unique().tolist()) <= {0.0, 1.0}  # nearest: no value is invented
-        assert frame.labels is not None
-        assert set(frame.labels.unique().tolist()) <= {*range(20), 255}
 
 
 def test_the_outline_of_the_labels_is_ignored_as_wide_as_asked(
@@ -149,7 +139,7 @@ def test_one_of_the_two_masks_is_enough(
     layout = read(root, smpl_file)
     assert bool(layout.labels) == (masks == "mask_cihp")
     assert (layout.meta.label_names is None) == (masks == "mask")
-    check_pictures(layout, subject)
+    check_images(layout, subject)
 
 
 def test_masks_are_joined_and_small_labels_are_not_thresholded(
@@ -199,7 +189,7 @@ def test_subjects_313_and_315(smpl_file: Path, tmp_path: Path, renamed: bool) ->
     assert layout.frames == (1, 2, 3, 4)
     check_cameras(layout, odd)
     check_skeletons(layout, odd)
-    check_pictures(layout, odd)
+    check_images(layout, odd)
 
 
 def test_frame_numbers_of_long_names() -> None:
@@ -216,11 +206,9 @@ def test_21_cameras_keep_their_own_numbers(tmp_path: Path) -> None:
         (tmp_path / f"Camera ({n})").mkdir()
     cams = {key: [np.eye(3).tolist()] * 21 for key in "KRTD"}
     ims = [{"ims": [f"Camera ({n})/0001.jpg" for n in numbers]}]
-    for listed in (ims, []):  # with and without the list of pictures
-        write_object(tmp_path / "annots.npy", {"cams": cams, "ims": listed})
-        names = list(camera_folders(tmp_path, read_annots(tmp_path), []))
-        assert (names[19], names[20]) == ("Camera (22)", "Camera (23)")
-    assert sorted(["Camera_B10", "Camera_B2"], key=natural_order) == ["Camera_B2", "Camera_B10"]
+    write_object(tmp_path / "annots.npy", {"cams": cams, "ims": ims})
+    names = list(camera_folders(tmp_path, read_annots(tmp_path)))
+    assert (names[19], names[20]) == ("Camera (22)", "Camera (23)")
 
 
 @pytest.mark.parametrize("listed", ["backslash", "slash", "none"])
@@ -233,16 +221,15 @@ def test_the_refined_release(
     check_cameras(layout, subject)
     check_skeletons(layout, subject)
     check_poses(layout, subject)
-    check_pictures(layout, subject)
+    check_images(layout, subject)
     assert not layout.labels
-    assert any("rebuilt" in note for note in layout.notes) == (listed == "none")
 
 
 def test_landmarks_from_few_vertices_are_those_of_all(subject: Subject) -> None:
     betas = np.repeat(subject.shapes[None], 4, 0)
     theta = subject.poses.reshape(4, 24, 3).copy()
     theta[:, 0] = subject.Rh
-    motion = Motion(np.arange(4), theta, subject.Th, betas)
+    motion = SmplMotion(np.arange(4), theta, subject.Th, betas)
     for blend in (True, False):
         vertices, joints = posed(subject.model, motion, blend)
         expected, conf = to_mediapipe33(joints, vertices)
@@ -260,41 +247,12 @@ def test_the_index_is_small_and_goes_to_worker_processes(written: Path, smpl_fil
     assert torch.equal(again.image, frame_of(layout, 1, 3).image)
 
 
-def test_frames_pair_by_number(original: Path, subject: Subject, smpl_file: Path) -> None:
-    """A picture that is gone from one camera shifts nothing."""
-    for folder in ("Camera_B2", "mask/Camera_B2", "mask_cihp/Camera_B2"):
-        for file in (original / folder).glob("000001.*"):
-            file.unlink()
-    layout = read(original, smpl_file)
-    assert sorted(layout.images["Camera_B2"]) == [0, 2, 3]
-    assert frame_of(layout, 1, 2).frame_id.item() == 2
-    check_skeletons(layout, subject)
-    assert any("Camera_B2 3" in note for note in layout.notes)
-
-
-def test_frames_without_parameters_are_dropped_and_named(original: Path, smpl_file: Path) -> None:
-    (original / "new_params/2.npy").unlink()
-    layout = read(original, smpl_file)
-    assert layout.frames == (0, 1, 3)
-    assert "1 of 4 frames dropped, without a row in new_params/: 2" in layout.notes
-
-
 def test_a_camera_without_pictures_keeps_its_index(original: Path, smpl_file: Path) -> None:
     shutil.rmtree(original / "Camera_B2")
     layout = read(original, smpl_file)
     assert layout.camera_names == ("Camera_B1", "Camera_B2", "Camera_B3")
     assert not layout.images["Camera_B2"]
     assert any("1 of 3 cameras have no images here: Camera_B2" in n for n in layout.notes)
-
-
-def test_some_missing_masks_are_left_out_and_counted(original: Path, smpl_file: Path) -> None:
-    for kind in ("mask", "mask_cihp"):
-        (original / kind / "Camera_B3/000001.png").unlink()
-    layout = read(original, smpl_file)
-    assert 1 not in layout.images["Camera_B3"]
-    assert any("1 of 12 images have no mask and are left out" in n for n in layout.notes)
-    with pytest.raises(DataError, match=r"000001.png does not exist.*8% of all 12 images"):
-        read(original, smpl_file, max_missing_masks=0.05)
 
 
 def test_a_mask_of_odd_area_is_noted_and_can_be_left_out(original: Path, smpl_file: Path) -> None:
@@ -332,10 +290,62 @@ def test_boxes() -> None:
     assert mask_box(mask) == (5, 2, 7, 4)
 
 
-def test_files_are_found_by_number(tmp_path: Path) -> None:
-    assert frame_files(tmp_path, "none", (".png",)) == {}
-    (tmp_path / "a").mkdir()
-    for name in ("f_10.png", "f_2.PNG", ".f_3.png", "f_4.txt"):
-        (tmp_path / "a" / name).touch()
-    assert frame_files(tmp_path, "a", (".png",)) == {10: "a/f_10.png", 2: "a/f_2.PNG"}
-    assert re.fullmatch(r"a/f_\d+\.\w+", frame_files(tmp_path, "a", (".png",))[2])
+# -- runs
+
+
+def test_the_config_trains_with_segmentation_on_cihp_labels(
+    compose, written: Path, smpl_file: Path
+) -> None:
+    from gsgan.model.runs import build_avatar, build_data
+
+    config = compose(
+        "train",
+        "size=tiny",
+        "training=smoke",
+        "data=zju_mocap",
+        f"data.root={written}",
+        f"data.smpl={smpl_file}",
+        "data.size=32",
+        "data.reader.drop_frames=3",
+    )
+    data = build_data(config)
+    assert data.layout.frames == (0, 1, 2)
+    info = data.info
+    assert (info.body, info.n_labels) == ("smpl", 20)
+    avatar = build_avatar(config, data).eval()
+    assert avatar.segmentation is not None
+    painting = avatar.paint(data.dataset("train")[0])
+    assert painting.segmentation is not None
+    assert "class vote over 9 images" in avatar.segmentation_why
+    assert painting.segmentation.shape == (1, avatar.segmentation.classes, 32, 32)
+    assert set(avatar.segmentation.map.names) < set(CIHP)
+    assert painting.image is not None
+    assert torch.isfinite(painting.image).all()
+
+
+@pytest.mark.slow
+def test_a_run_is_scored_with_its_model_file_elsewhere(
+    written: Path, smpl_file: Path, tmp_path: Path, inside
+) -> None:
+    first, now, run = (
+        tmp_path / smpl_file.name,
+        tmp_path / "moved" / smpl_file.name,
+        tmp_path / "run",
+    )
+    shutil.copy(smpl_file, first)
+    trained = inside(
+        "train", "size=tiny", "training=smoke", "data=zju_mocap", f"data.root={written}",
+        f"data.smpl={first}", "data.size=32", "data.reader.drop_frames=3", f"hydra.run.dir={run}",
+    )  # fmt: skip
+    assert trained.returncode == 0, trained.stderr
+    before = (run / "metrics.json").read_text()
+    now.parent.mkdir()
+    first.rename(now)
+    gone = inside("evaluate", f"run={run}")
+    assert gone.returncode != 0
+    assert f"{first} does not exist, the body model file of" in " ".join(gone.stderr.split())
+    assert "data_smpl=<where it is now>" in " ".join(gone.stderr.split())
+    (run / "metrics.json").unlink()
+    found = inside("evaluate", f"run={run}", f"data_smpl={now}")
+    assert found.returncode == 0, found.stderr
+    assert json.loads((run / "metrics.json").read_text()) == json.loads(before)

@@ -62,33 +62,28 @@ def test_light_from_one_side_is_no_tint():
     frames = moments()
     means = [float(f.image.sum() / f.mask.sum()) for f in frames[0]]
     assert max(means) - min(means) > 0.3  # what a mean over the person would fall for
-    seen = surface_colours(frames, None)
+    seen = surface_colours(frames)
     assert seen is not None
-    assert seen.source == "hull"
     assert seen.difference < 0.02
     assert seen.residual < 0.05
 
 
 def test_a_tint_is_measured():
     tint = [(1.0, 1.0, 1.0), (1.0, 1.0, 0.8), (1.0, 1.0, 1.0)]
-    seen = surface_colours(moments(tint=tint), None)
+    seen = surface_colours(moments(tint=tint))
     assert seen is not None
     # blue 0.7 x light, a fifth less of it: light on shared surface is 0.3 to 0.7
     assert 0.04 < seen.difference < 0.1
-    assert seen.error < 0.01
-    assert seen.difference > 3 * seen.error
 
 
 def test_highlights_are_what_is_left():
-    matt, glossy = (surface_colours(moments(gloss=g), None) for g in (0.0, 0.5))
+    matt, glossy = (surface_colours(moments(gloss=g)) for g in (0.0, 0.5))
     assert matt is not None
     assert glossy is not None
     assert glossy.residual > 2 * matt.residual
 
 
-@pytest.mark.parametrize(
-    "damage", ["far apart", "coarse", "few moments", "empty masks", "none", "astray", "unseen"]
-)
+@pytest.mark.parametrize("damage", ["far apart", "coarse", "few moments", "empty masks", "astray"])
 def test_without_shared_surface_nothing_is_claimed(damage):
     from dataclasses import replace
 
@@ -105,8 +100,4 @@ def test_without_shared_surface_nothing_is_claimed(damage):
         joints = frames[0][0].skeleton.clone()
         joints[0, 0, 0] = 1000.0
         frames = [[replace(f, skeleton=joints) for f in m] for m in frames]
-    if damage == "unseen":
-        frames = [[replace(f, visibility=f.visibility * 0) for f in m] for m in frames]
-    if damage == "none":
-        frames = []
-    assert surface_colours(frames, None) is None
+    assert surface_colours(frames) is None

@@ -97,15 +97,6 @@ def test_a_repeated_image_is_named(tmp_path):
         read(tmp_path)
 
 
-def test_other_files_and_linked_folders(tmp_path):
-    extra = ("notes.txt", "novel_pose/cam1/000008.png", "novel_pose/cam1/0.png", "train/cam1/0.png")
-    touch(tmp_path / "held", *ALL, *extra)
-    (tmp_path / "links").mkdir()
-    for split in EXPECTED:
-        (tmp_path / "links" / split).symlink_to(tmp_path / "held" / split)
-    assert sorted(read(tmp_path / "links").files.values()) == sorted(ALL)
-
-
 def frame() -> Frame:
     mask = torch.zeros(1, 1, *SIZE)
     mask[..., 2:4, 2:5] = 1

@@ -9,7 +9,8 @@ import pandas as pd
 import pytest
 
 from gsgan.evaluate.files import HEADER, Scored, joined, read_rows, write_scored
-from gsgan.evaluate.scores import METRICS, no_scores
+from gsgan.evaluate.scores import no_scores
+from gsgan.metrics.names import METRICS
 
 
 def variant(protocol: str | None = None) -> dict:

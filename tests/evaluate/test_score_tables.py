@@ -20,7 +20,8 @@ from gsgan.evaluate.files import (
     write_scored,
 )
 from gsgan.evaluate.predictions import Preparation
-from gsgan.evaluate.scores import BOX_METRICS, METRICS, Scorer, empty, no_scores
+from gsgan.evaluate.scores import Scorer, empty, no_scores
+from gsgan.metrics.names import BOX_METRICS, METRICS
 
 FACTS = {
     "method": "gsgan", "model": "wo_seg", "protocol": "zju_gauhuman", "seed": 3,
@@ -102,7 +103,7 @@ def test_notes_say_each_thing_once():
 
 
 def test_a_caption_names_what_is_not_known():
-    from gsgan.evaluate.facts import caption
+    from gsgan.evaluate.origin import caption
 
     unknown = FACTS | {"model": None, "protocol": None, "seed": None, "commit": None, "dirty": None}
     said = caption(unknown)

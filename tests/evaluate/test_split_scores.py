@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -23,7 +23,7 @@ from gsgan.evaluate.scores import (
     score_split,
 )
 from gsgan.metrics.image import psnr, ssim, ssim_uniform
-from gsgan.model.painting import Painting
+from gsgan.model.rendering import Rendering
 from gsgan.scene import Camera, Frame
 from gsgan.utils.errors import GsganError
 
@@ -156,8 +156,8 @@ def test_an_opaque_image_on_black_hides_its_outline_on_white_and_says_so():
 def test_each_image_of_an_avatar_is_put_on_white_by_its_own_alpha():
     """I_pred is the truth; Step I's colour is it at half the alpha: 0.3 off, 0.15 at the edge."""
     f = person()
-    painting = Painting(f.image, f.mask, features=0.5 * f.image, splat_alpha=0.5 * f.mask)
-    avatar = SimpleNamespace(paint=lambda _: painting, segmentation=None)
+    rendering = Rendering(f.image, f.mask, features=0.5 * f.image, splat_alpha=0.5 * f.mask)
+    avatar = Mock(return_value=rendering, segmentation=None)
     white = scorer(MetricVariants(background="white"))
     found = score_split([(("a", 0), f)], painter(avatar), white)
     assert found.rows[FULL][0]["psnr"] == math.inf
@@ -254,7 +254,7 @@ def test_miou_of_a_split_without_parts_is_none():
         scorer(),
     )
     assert found.variants[FULL]["miou"] is None
-    assert found.variants[FULL]["miou_reason"] == "the truth holds no part"
+    assert found.variants[FULL]["miou_reason"] == "the ground truth has no part"
 
 
 def test_lpips_in_the_persons_box_sees_that_box_alone():

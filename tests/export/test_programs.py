@@ -12,7 +12,7 @@ from safetensors.torch import save_file
 import gsgan
 from gsgan.export.programs import Painter, onnx_program, torch_program, unfrozen
 from gsgan.export.weights import load_weights, weights_bytes
-from gsgan.model.runs import read_checkpoint
+from gsgan.model.stored import read_checkpoint
 from gsgan.utils.errors import ConfigError, DataError
 
 PARITY = 1e-3
@@ -36,7 +36,7 @@ def painted(build):
     """``painted(overrides…)``: a frozen avatar whose layers all add something, and a frame."""
 
     def run(*overrides: str):
-        _, avatar, frame = build(*overrides)
+        _, avatar, frame = build("model.window_margin=null", *overrides)
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
             for parameter in avatar.parameters():
@@ -53,14 +53,14 @@ def unet_inputs(avatar, frame) -> tuple[dict[str, torch.Tensor], list[torch.Tens
     def pose(_, given):
         found.update(zip(("omega", "joints"), given, strict=True))
 
-    def unet(_, given):
-        names = ("features", "segmentation", "skeleton", None, "fine", "splat_alpha")
+    def unet(_, __, given):
+        names = {"F": "features", "S": "segmentation", "p2d": "skeleton", "alpha": "splat_alpha"}
         if avatar.splat_channels == 0:
-            names = ("skeleton", "segmentation", None, None)
-        found.update(zip(names, given, strict=False))
+            names = {"F": "skeleton", "S": "segmentation"}
+        found.update({names.get(name, name): value for name, value in given.items()})
 
     hooks = [avatar.pose_encoder.register_forward_pre_hook(pose)]
-    hooks += [avatar.generator.register_forward_pre_hook(unet)]
+    hooks += [avatar.generator.register_forward_pre_hook(unet, with_kwargs=True)]
     with torch.no_grad():
         painting = avatar(frame.skeleton, frame.visibility, frame.camera, frame.body)
     for hook in hooks:

@@ -1,4 +1,4 @@
-"""`gsgan.fit`: poses fill the masks better, held-out images are not used, a stopped fit resumes."""
+"""`gsgan.fit`: poses fill the masks better, and held-out images are not used."""
 
 from __future__ import annotations
 
@@ -16,18 +16,17 @@ from hydra.utils import instantiate
 from make import write_hands, write_tiny_capture
 
 import gsgan.utils.compat  # noqa: F401
-from gsgan.body.measure import fit_shape
 from gsgan.body.shape import BodyShape, free_space, shaped_body
 from gsgan.body.solve import Solver
 from gsgan.data.datamodule import GsganData
-from gsgan.evaluate.facts import fingerprint
+from gsgan.data.fingerprint import fingerprint
 from gsgan.evaluate.run import make_scorer
-from gsgan.fit import run as running
 from gsgan.fit.fitter import Fitter, _wrong
-from gsgan.fit.moments import Moments
-from gsgan.fit.run import DEFAULT, run_fit
+from gsgan.fit.frames import MaskedFrames
+from gsgan.fit.run import fit_before_training, run_fit
+from gsgan.fit.shape import fit_shape
 from gsgan.scene import BodyPose
-from gsgan.train.run import pose_corrections, training_record
+from gsgan.train.run import training_record
 from gsgan.utils.errors import ConfigError, DataError
 
 
@@ -43,12 +42,12 @@ def with_landmarks(people: Path, to: Path, change) -> Path:
 def ready(people: Path, compose, *overrides: str, turn: float = 0.0) -> Fitter:
     """A fitter of the training frames, whose solved poses are turned by noise (radians)."""
     config = compose("fit", f"data.root={people}", *QUICK, *overrides)
-    moments = Moments(instantiate(config.data, _convert_="all"), torch.device("cpu"))
-    body = shaped_body(fit_shape(moments.skeletons, moments.visibility))
-    pose = Solver(body).solve(moments.skeletons, moments.visibility)
+    frames = MaskedFrames(instantiate(config.data, _convert_="all"), torch.device("cpu"))
+    body = shaped_body(fit_shape(frames.skeletons, frames.visibility))
+    pose = Solver(body).solve(frames.skeletons, frames.visibility)
     noise = torch.randn(pose.theta.shape, generator=torch.Generator().manual_seed(0))
     return Fitter(
-        instantiate(config.fit), moments, body, BodyPose(pose.theta + turn * noise, pose.transl)
+        instantiate(config.fit), frames, body, BodyPose(pose.theta + turn * noise, pose.transl)
     )
 
 
@@ -152,9 +151,12 @@ def test_unseen_joints(fit, people, tmp_path):
     assert np.isfinite(found["theta"]).all()
 
 
-def test_defaults_are_those_of_the_config(compose):
-    given = instantiate(compose("fit").fit)
-    assert given == DEFAULT
+def test_a_fit_before_training_returns_the_data_with_its_poses(people, compose, tmp_path):
+    data = GsganData(str(shutil.copytree(people, tmp_path / "plain")), size=48)
+    assert data.lacks_body
+    data = fit_before_training(data, compose("fit", *QUICK, "fit.sweeps=1").fit)
+    assert not data.lacks_body
+    assert data.layout.poses.fitted
 
 
 def test_held_out_cameras_are_not_used(fit, fitted, people, tmp_path):
@@ -208,7 +210,7 @@ def test_masks_without_anyone_are_refused(compose, people, tmp_path):
         run_fit(
             compose(
                 *("fit", f"data.root={empty}", f"out={tmp_path / 'a'}", *QUICK),
-                *("data.reader.consistency.frames=0", "data.reader.trust.watched_masks=0"),
+                *("data.reader.consistency.frames=0", "data.reader.consistency.watched_masks=0"),
             )
         )
 
@@ -217,8 +219,8 @@ def test_outside_the_image_alpha_costs_nothing(people, tmp_path, compose):
     """Pixels of a window outside the camera's image are unsure, and the fit ignores them."""
     oblong = write_tiny_capture(tmp_path / "oblong", cameras=2, frames=2, size=(96, 64))
     data = GsganData(str(oblong), size=48)
-    moments = Moments(data, torch.device("cpu"))
-    frame = moments.pictures(0)[0]
+    frames = MaskedFrames(data, torch.device("cpu"))
+    frame = frames.images(0)[0]
     assert frame.unsure is not None
     beyond = frame.unsure > 0.5
     assert beyond.float().mean() == pytest.approx(1 / 3)
@@ -226,68 +228,17 @@ def test_outside_the_image_alpha_costs_nothing(people, tmp_path, compose):
     everything = torch.ones_like(frame.mask)
     assert float(_wrong(everything, frame)[beyond].max()) == 0
     inside = GsganData(str(people), size=48)
-    assert Moments(inside, torch.device("cpu")).pictures(0)[0].unsure is None
+    assert MaskedFrames(inside, torch.device("cpu")).images(0)[0].unsure is None
 
 
 def test_the_rims_of_an_undistorted_image_are_unsure(tmp_path):
     bent = write_tiny_capture(
         tmp_path / "bent", cameras=2, frames=2, size=(96, 96), dist=(0.3, 0, 0, 0, 0)
     )
-    frame = Moments(GsganData(str(bent), size=48), torch.device("cpu")).pictures(0)[0]
+    frame = MaskedFrames(GsganData(str(bent), size=48), torch.device("cpu")).images(0)[0]
     assert frame.unsure is not None
     assert float(frame.unsure[0, 0, 0, 0]) == 1
     assert float(frame.unsure[0, 0, 24, 24]) == 0
-
-
-def test_a_stopped_fit_resumes_to_the_same_end(fit, fitted, monkeypatch, tmp_path, capsys):
-    whole = np.load(fitted / "body_pose.npz")
-    sweep, done = Fitter.sweep, []
-
-    def stopping(self):
-        if len(done) == 2:
-            raise KeyboardInterrupt
-        done.append(self.swept)
-        return sweep(self)
-
-    monkeypatch.setattr(Fitter, "sweep", stopping)
-    with pytest.raises(KeyboardInterrupt):
-        fit(name="again")
-    assert not (tmp_path / "again/body_pose.npz").exists()
-    monkeypatch.setattr(Fitter, "sweep", sweep)
-    capsys.readouterr()
-    again = fit(name="again")
-    assert "resuming after 2 of 3 sweeps" in capsys.readouterr().out
-    np.testing.assert_array_equal(whole["theta"], again["theta"])
-    assert not list((tmp_path / "again").glob(".*"))
-
-
-def test_a_stopped_fit_does_not_resume_with_other_masks(fit, people, monkeypatch, tmp_path, capsys):
-    other = shutil.copytree(people, tmp_path / "other")
-    monkeypatch.setattr(running, "fit_picture", lambda *_: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        fit(root=other)
-    monkeypatch.undo()
-    file = other / "masks/cam00/000001.png"
-    cv2.imwrite(str(file), cv2.dilate(cv2.imread(str(file), 0), np.ones((3, 3), np.uint8)))
-    capsys.readouterr()
-    fit("overwrite=true", root=other)
-    assert "starting again" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("left", ["other settings", "damage"])
-def test_another_state_is_not_resumed(fit, fitted, monkeypatch, tmp_path, capsys, left):
-    whole = np.load(fitted / "body_pose.npz")
-    if left == "damage":
-        (tmp_path / "again").mkdir()
-        (tmp_path / "again/.body_fit.stopped").write_bytes(b"PK no")
-    else:
-        monkeypatch.setattr(running, "fit_picture", lambda *_: 1 / 0)
-        with pytest.raises(ZeroDivisionError):
-            fit("fit.prior=0.5", name="again")
-        monkeypatch.undo()
-    again = fit("overwrite=true", name="again")
-    assert "starting again" in capsys.readouterr().out
-    np.testing.assert_array_equal(whole["theta"], again["theta"])
 
 
 def test_the_image_shows_every_camera(fit, tmp_path):
@@ -295,25 +246,6 @@ def test_the_image_shows_every_camera(fit, tmp_path):
     picture = cv2.imread(str(tmp_path / "out/body_fit.png"))
     assert picture.shape[1] == 3 * 300
     assert picture.shape[0] > 2 * 300
-
-
-def test_corrections_belong_to_training_frames(fitted, compose):
-    data = GsganData(str(fitted), size=48)
-    config = compose("train", "data=capture", f"data.root={fitted}", "size=tiny")
-    from gsgan.model.runs import build_avatar
-
-    config.effects.body_points = "on"
-    avatar = build_avatar(config, data)
-    assert pose_corrections(data, avatar, 0.0) is None
-    corrections = pose_corrections(data, avatar, 1e-3)
-    frame = data.dataset("train")[1]
-    pose, prior = corrections(frame.body, frame.frame_id)
-    torch.testing.assert_close(pose.theta, frame.body.theta)
-    (pose.theta.square().sum() + pose.transl.square().sum() + prior).backward()
-    rows = corrections.theta.grad.flatten(1).norm(dim=1)
-    assert (rows > 0).tolist() == [f == int(frame.frame_id) for f in (0, 1, 2)]
-    config.effects.body_points = "off"
-    assert pose_corrections(data, build_avatar(config, data), 1e-3) is None
 
 
 @pytest.mark.parametrize(

@@ -148,13 +148,6 @@ def test_an_error_in_a_hands_box_counts_there_alone():
     assert found["boxes"] == describe_boxes(NAME)
 
 
-def test_hands_are_pooled_by_their_pixels():
-    f = signer()
-    found = scored(f.image + 0.1 * RIGHT_BOX, f)
-    share = RIGHT_BOX.sum() / (LEFT_BOX | RIGHT_BOX).sum()
-    assert found["psnr_hands"] == pytest.approx(20 - 10 * math.log10(share), abs=1e-4)
-
-
 def test_an_error_outside_does_not_count_in_the_boxes():
     f = signer()
     found = scored(f.image + 0.1 * rectangle((80, 100), (0, 120)), f)

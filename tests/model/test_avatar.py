@@ -7,12 +7,13 @@ import dataclasses
 import pytest
 import torch
 
+from gsgan.model.assemble import build_avatar
 from gsgan.skeleton import sanitise
 
 
 def test_paints_every_part(build):
     _, avatar, frame = build()
-    painting = avatar.paint(frame)
+    painting = avatar(*frame.inputs)
     assert painting.image.shape == frame.image.shape
     assert painting.features.shape[1] == 3 + avatar.deformation.features
     assert painting.segmentation.shape[1] == avatar.segmentation.classes
@@ -30,10 +31,10 @@ def test_paints_every_part(build):
 
 def test_the_window_changes_nothing_about_step_one(build):
     _, avatar, frame = build()
-    inside = avatar.paint(frame)
+    inside = avatar(*frame.inputs)
     avatar.window_margin = None
-    whole = avatar.paint(frame)
-    box = build()[1].window(frame)
+    whole = avatar(*frame.inputs)
+    box = build()[1].window(frame.skeleton, frame.camera)
     seen = box.paste(torch.ones(1, 1, *box.size)) > 0
     assert box.size != frame.camera.size or seen.all()
     difference = ((inside.colour - whole.colour).abs() * seen).max()
@@ -45,7 +46,7 @@ def test_gradients_reach_every_trained_part(build):
     with torch.no_grad():  # leave the zero starts, behind which gradients cannot pass
         for parameter in avatar.parameters():
             parameter.add_(0.02 * torch.randn_like(parameter))
-    avatar.paint(frame).image.square().sum().backward()
+    avatar(*frame.inputs).image.square().sum().backward()
     for part in ("deformation", "pose_encoder", "generator"):
         grads = [p.grad for p in getattr(avatar, part).parameters()]
         assert any(g is not None and float(g.abs().max()) > 0 for g in grads), part
@@ -57,17 +58,17 @@ def test_a_missing_joint_still_paints(build):
     skeleton, visibility = frame.skeleton.clone(), frame.visibility.clone()
     skeleton[0, 15], visibility[0, 15] = float("nan"), 0
     skeleton, _ = sanitise(skeleton, visibility)
-    painting = avatar.paint(dataclasses.replace(frame, skeleton=skeleton, visibility=visibility))
+    painting = avatar(*dataclasses.replace(frame, skeleton=skeleton, visibility=visibility).inputs)
     assert torch.isfinite(painting.image).all()
 
 
 def test_a_missing_body_pose_is_solved_from_the_skeleton(build):
     _, avatar, frame = build()
     solved = avatar.body_pose(frame.skeleton, frame.visibility)
-    given, bare = (avatar.paint(dataclasses.replace(frame, body=b)) for b in (solved, None))
+    given, bare = (avatar(*dataclasses.replace(frame, body=b).inputs) for b in (solved, None))
     assert avatar.needs_body
     assert torch.equal(bare.segmentation, given.segmentation)
-    assert (bare.segmentation != avatar.paint(frame).segmentation).any()
+    assert (bare.segmentation != avatar(*frame.inputs).segmentation).any()
 
 
 @pytest.mark.parametrize(
@@ -82,7 +83,7 @@ def test_what_is_off_builds_no_parameter(build, model, absent):
     names = [name for name, _ in avatar.named_parameters()]
     for part in absent:
         assert not any(name.startswith(part) for name in names)
-    painting = avatar.paint(frame)
+    painting = avatar(*frame.inputs)
     assert painting.segmentation is None
     assert painting.image is not None
     assert avatar.segmentation is None
@@ -96,25 +97,24 @@ def test_data_without_body_pose_builds_no_segmentation(build, tmp_path):
     _, avatar, frame = build(f"data.root={root}")
     assert avatar.segmentation is None
     assert avatar.segmentation_why == "the data has no body pose"
-    assert torch.isfinite(avatar.paint(frame).image).all()
+    assert torch.isfinite(avatar(*frame.inputs).image).all()
 
 
 def test_segmentation_of_a_model_file(build, tiny, tmp_path):
-    from hydra.utils import instantiate
     from writers.smpl import write_smpl
 
     write_smpl(tmp_path / "smpl.pkl", vertices=500)
     data, _, frame = build()
     bare = {"body": "smpl", "label_names": (), "n_labels": 0, "has_labels": False}
     scene = dataclasses.replace(data.info, **bare, body_file=str(tmp_path / "smpl.pkl"))
-    avatar = instantiate(tiny().model)(scene=scene)
+    avatar = build_avatar(tiny(), scene)
     assert avatar.segmentation_why == "parts by the body's joints"
     assert avatar.segmentation.common is not None  # this data has no labels to learn from
     pose = dataclasses.replace(frame.body, theta=torch.zeros(1, 24, 3))
-    painting = avatar.paint(dataclasses.replace(frame, body=pose))
+    painting = avatar(*dataclasses.replace(frame, body=pose).inputs)
     assert painting.segmentation.shape[1] == 12  # no joint has hair
     assert avatar.segmentation.map.absent == ("hair",)
-    without = instantiate(tiny().model)(scene=dataclasses.replace(data.info, **bare))
+    without = build_avatar(tiny("effects.body_points=off"), dataclasses.replace(data.info, **bare))
     assert without.segmentation is None
     assert "no model file" in without.segmentation_why
 
@@ -128,8 +128,8 @@ def test_batches_are_independent(build):
         for parameter in avatar.parameters():
             parameter.add_(0.02 * torch.randn_like(parameter))
         avatar.window_margin = None
-        both = avatar.paint(cat([frame, other])).image
-        torch.testing.assert_close(both[1:], avatar.paint(other).image, atol=2e-4, rtol=1e-4)
+        both = avatar(*cat([frame, other]).inputs).image
+        torch.testing.assert_close(both[1:], avatar(*other.inputs).image, atol=2e-4, rtol=1e-4)
 
 
 def test_the_deformation_follows_the_pose(build):
@@ -139,7 +139,8 @@ def test_the_deformation_follows_the_pose(build):
     assert not torch.equal(other.skeleton, frame.skeleton)
     moved = dataclasses.replace(frame, skeleton=other.skeleton, body=other.body)
     assert (
-        float((avatar.paint(frame).image - avatar.paint(moved).image).abs().max().detach()) > 0.01
+        float((avatar(*frame.inputs).image - avatar(*moved.inputs).image).abs().max().detach())
+        > 0.01
     )
 
 
@@ -147,6 +148,6 @@ def test_stability_overflowing_features_are_bounded(build):
     _, avatar, frame = build("model.generator.feature_bound=10.0", "size.rgb_skip=false")
     with torch.no_grad():
         avatar.deformation.table.fill_(1e30)
-        painting = avatar.paint(frame)
+        painting = avatar(*frame.inputs)
     assert float(painting.gaussians.features.max()) == 10
     assert torch.isfinite(painting.image).all()

@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 import shutil
 
+import numpy as np
 import pytest
 import torch
 from make import write_hands
 
 from gsgan.body import free_body
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.pose_graph import PoseGraph, PoseLinear
+from gsgan.model.drive import Drive, inputs_of
 from gsgan.skeleton import MEDIAPIPE33_HANDS
 
 HANDS = slice(33, 75)
@@ -36,21 +37,9 @@ def test_every_model_takes_hands(made, model):
     assert avatar.template is MEDIAPIPE33_HANDS
     assert frame.skeleton.shape == (1, 75, 3)
     with torch.no_grad():
-        image = avatar.paint(frame).image
+        image = avatar(*frame.inputs).image
     assert image.shape == frame.image.shape
     assert image.isfinite().all()
-
-
-def test_points_on_the_skeleton_are_on_the_fingers_too(made):
-    _, avatar, frame = made("effects.body_points=off")
-    assert avatar.body_points is None
-    assert avatar.densify.template is MEDIAPIPE33_HANDS
-    assert avatar.deformation.from_pose.in_features == 3 * 75
-    with torch.no_grad():
-        found = avatar.paint(frame).gaussians
-    assert found.means.shape[1] == avatar.densify.n_points
-    assert avatar.densify.n_points > 40 * 60
-    assert avatar.generator is not None
 
 
 def test_fingers_move_what_is_on_the_body(made):
@@ -89,7 +78,9 @@ def test_a_missing_hand_rests_on_its_arm(made):
     _, avatar, frame = made("effects.body_points=on", "model.segmentation.mode=hands")
     p = frame.skeleton[0].clone()
     p[33:54] = torch.nan
-    painting = avatar.picture(p, frame.camera, maps=True)
+    drive = Drive(p[None].numpy(), np.ones((1, 75)), None, [0], "")
+    given, seen, body = inputs_of(avatar, drive, 0)
+    painting = avatar(given, seen, frame.camera, body)
     assert painting.image.isfinite().all()
     S = avatar.segmentation
     hand = S.truth_table[S.vertex_labels[avatar.body_points.points.chosen]] == 1
@@ -102,10 +93,3 @@ def test_a_missing_hand_rests_on_its_arm(made):
     seen = (left > 0.3).nonzero().flip(1) + 0.5
     reach = 0.25 * frame.camera.K[0, 0, 0] / depth
     assert (seen - wrist).norm(dim=-1).max() < reach
-
-
-def test_pose_encoders_have_a_number_per_edge():
-    name = "mediapipe33_hands"
-    for encoder in (PoseGraph(name, width=8, joint_channels=4), PoseLinear(name)):
-        assert encoder.channels == 77
-        assert encoder(torch.randn(2, 75, 6), torch.randn(2, 75, 3)).shape == (2, 77)

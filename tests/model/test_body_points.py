@@ -10,12 +10,12 @@ import torch
 from gsgan.body import open_body
 from gsgan.body.skinned import vertex_normals
 from gsgan.data.surface_colours import body_inside
-from gsgan.effects import EffectSettings, decide
 from gsgan.model.body_points import BodyPoints, moved_normals
-from gsgan.model.runs import CHECKPOINT, load_avatar
-from gsgan.scene import BodyPose, cat
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import CHECKPOINT
+from gsgan.scene import BodyPose
 from gsgan.train.run import build_training
-from gsgan.utils.errors import ConfigError, DataError
+from gsgan.utils.errors import DataError
 
 ON = "effects.body_points=on"
 
@@ -51,21 +51,6 @@ def test_a_turned_body_turns_points_and_frames(body):
     torch.testing.assert_close(
         after.means[0] - after.means[0, :1], between @ quarter.mT, atol=1e-5, rtol=0
     )
-
-
-def test_normals_are_the_surfaces_and_turn_with_it(body):
-    placed = BodyPoints(body, 1.7, points=200)
-    pose = rest(body)
-    before = placed(pose).normals[0]
-    torch.testing.assert_close(before.norm(dim=-1), torch.ones(200), atol=1e-4, rtol=0)
-    height = body.vertices[:, 2]
-    top = (placed.points.means[:, 2] - height.max()).abs().argmin()
-    assert before[top, 2] > 0.7  # the crown of the head looks up
-    theta = pose.theta.clone()
-    theta[0, 0, 2] = torch.pi / 2
-    quarter = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    after = placed(replace(pose, theta=theta)).normals[0]
-    torch.testing.assert_close(after, before @ quarter.mT, atol=1e-6, rtol=0)
 
 
 def test_normals_point_out_of_the_posed_body(body):
@@ -112,57 +97,17 @@ def test_a_vertex_without_a_face_has_no_normal():
 def test_on_the_body_nothing_is_densified_and_off_it_no_body_is_built(build):
     _, avatar, frame = build(ON)
     assert avatar.densify is None
-    painting = avatar.paint(frame)
+    painting = avatar(*frame.inputs)
     assert painting.gaussians.means.shape[1] == avatar.body_points.n_points == 500
     _, plain, frame = build("effects.body_points=off")
     assert plain.body_points is None
-    assert plain.paint(frame).gaussians.means.shape[1] == plain.densify.n_points
+    assert plain(*frame.inputs).gaussians.means.shape[1] == plain.densify.n_points
 
 
 def test_untrained_gaussians_sit_on_the_surface(build):
     _, avatar, frame = build(ON)
-    means = avatar.paint(frame).gaussians.means
+    means = avatar(*frame.inputs).gaussians.means
     torch.testing.assert_close(means, avatar.body_points(frame.body).means)
-
-
-def test_psi_gets_finite_gradients_through_sheared_frames(build):
-    _, avatar, frame = build(ON, "effects.view_dependence=2")
-    avatar.paint(frame).features[:, :3].square().mean().backward()
-    grads = [p.grad for p in avatar.deformation.parameters() if p.grad is not None]
-    assert grads
-    assert all(torch.isfinite(g).all() for g in grads)
-    assert float(avatar.deformation.table.grad.abs().max()) > 0
-
-
-def test_poses_of_a_batch_do_not_mix(build):
-    data, avatar, frame = build(ON, "effects.view_dependence=1")
-    other = data.dataset("train")[5]
-    with torch.no_grad():
-        for parameter in avatar.parameters():
-            parameter.add_(0.02 * torch.randn_like(parameter))
-        avatar.window_margin = None
-        both = avatar.paint(cat([frame, other])).features
-        assert (both[0] - both[1]).abs().max() > 0.1
-        torch.testing.assert_close(both[1:], avatar.paint(other).features, atol=2e-4, rtol=1e-4)
-
-
-def test_points_go_where_the_avatar_goes(build):
-    _, avatar, frame = build(ON)
-    painting = avatar.double().paint(frame.to(torch.float64))
-    assert painting.gaussians.means.dtype == painting.image.dtype == torch.float64
-    assert not [name for name in avatar.state_dict() if name.startswith("body_points")]
-
-
-@pytest.mark.parametrize(
-    ("word", "said"),
-    [
-        ("size.body_points=0", "points must be a whole number of at least 1, got 0"),
-        ("model.body_points.sigma=-1", "sigma must be a number above 0, got -1"),
-    ],
-)
-def test_numbers_out_of_range_are_refused_in_one_sentence(build, word, said):
-    with pytest.raises(ConfigError, match=said):
-        build(ON, word)
 
 
 def stored(module, folder):
@@ -197,74 +142,11 @@ def test_a_trained_avatar_without_its_body_is_refused_in_one_sentence(
         load_avatar(tmp_path, config, data)
 
 
-def test_a_run_from_before_body_points_and_low_pass_loads_as_it_was_trained(tiny, tmp_path):
-    newer = ("low_pass", "supersample", "body_points", "deformation.normals")
-    config = tiny(*(f"~model.{key}" for key in newer), "~effects.body_points")
-    data, module = build_training(config)
-    checkpoint = stored(module, tmp_path)
-    del checkpoint["gsgan"]["effects"]["body_points"]
-    torch.save(checkpoint, tmp_path / CHECKPOINT)
-    data.info = replace(data.info, body_inside=1.0)  # what would call for points on the body now
-    avatar, _ = load_avatar(tmp_path, config, data)
-    assert avatar.body_points is None
-    assert avatar.accuracy.low_pass == avatar.segmentation.accuracy.low_pass == 0.3
-    assert avatar.accuracy.supersample == 1
-    assert avatar.deformation.from_normal is None
-
-
-def test_the_figure_of_densify_says_where_the_points_are(build, tmp_path):
-    from gsgan.report.figures.body import densify
-    from gsgan.report.figures.layout import Settings
-    from gsgan.report.figures.subjects import Subject, make_shots
-    from gsgan.report.runs import Run
-
-    for word, said in (("on", "the bone that moves them most"), ("off", "Algorithm 1 puts on")):
-        data, avatar, _ = build(f"effects.body_points={word}")
-        shots = make_shots(data, "train", data.dataset("train").items[:1], 9.0)
-        subject = Subject("one", Run(tmp_path, "full", {}, 0, {}), data, avatar, [])
-        drawing = densify([subject], shots, Settings())
-        assert said in drawing.caption
-        placed = avatar.body_points or avatar.densify
-        assert drawing.numbers[shots[0].name]["one"]["points"] == placed.n_points
-
-
-def test_without_the_frames_body_pose_it_is_solved_and_training_says_what_is_missing(build):
+def test_without_the_frames_body_pose_it_is_solved(build):
     _, avatar, frame = build(ON)
     bare = replace(frame, body=None)
     body = avatar.body_pose(frame.skeleton, frame.visibility)
-    assert torch.equal(avatar.paint(bare).image, avatar.paint(replace(frame, body=body)).image)
-    with pytest.raises(ValueError, match="skinned body; give its body pose"):
-        avatar(frame.skeleton, frame.visibility, frame.camera)
-
-
-@pytest.mark.parametrize("model", ["image_to_image", "lbs_splat"])
-def test_models_without_psi_refuse_it_in_one_sentence(build, model):
-    with pytest.raises(ConfigError, match=r"effects\.body_points=on is not possible"):
-        build(ON, f"model={model}")
-
-
-@pytest.mark.parametrize(
-    ("inside", "value", "why"),
-    [
-        (1.0, "on", "100 % of the posed body"),
-        (0.95, "on", "95 %"),
-        (0.9, "off", "the skeleton fits better"),
-        (None, "off", "mesh cannot be read"),
-    ],
-)
-def test_auto_trusts_a_pose_that_fits_the_masks(build, inside, value, why):
-    data, _, _ = build()
-    effect = decide(replace(data.info, body_inside=inside), EffectSettings()).body_points
-    assert effect.value == value
-    assert why in effect.why
-
-
-def test_without_a_body_pose_it_is_off_and_forcing_it_an_error(build):
-    data, _, _ = build()
-    bare = replace(data.info, has_body_pose=False)
-    assert not decide(bare, EffectSettings()).body_points.on
-    with pytest.raises(ConfigError, match="the data has no body pose"):
-        decide(bare, EffectSettings(body_points="on"))
+    assert torch.equal(avatar(*bare.inputs).image, avatar(*replace(frame, body=body).inputs).image)
 
 
 def test_a_fitting_body_lies_in_its_mask_and_a_shifted_one_leaves_it(body):
@@ -292,16 +174,6 @@ def synthetic_frame():
     )  # fmt: skip
     data = GsganData(root=root, size=64)
     return data.dataset("train")[0]
-
-
-def test_supersampling_is_the_models_and_of_F_alone(build):
-    _, avatar, frame = build("model.supersample=3")
-    assert avatar.accuracy.supersample == 3
-    assert avatar.segmentation.accuracy.supersample == 1
-    painting = avatar.paint(frame)
-    assert painting.features.shape[-2:] == painting.image.shape[-2:] == frame.image.shape[-2:]
-    _, baseline, _ = build("model=lbs_splat", "model.supersample=3")
-    assert baseline.accuracy.supersample == 3
 
 
 def test_low_pass_is_the_models_for_F_and_S_whatever_the_accuracy(build):

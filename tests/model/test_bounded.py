@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
+from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import Deformation, bounded
-from gsgan.model.painting import ColourCorrection
 from gsgan.skeleton import Points
 
 X = torch.tensor([-3.0, -1.0, 0.0, 1.0, 3.0])

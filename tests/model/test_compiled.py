@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from gsgan.losses import photometric
-from gsgan.model import compose, styled
+from gsgan.model import compiled
 from gsgan.model.deformation import Deformation, Residuals
-from gsgan.model.generator import Style
 from gsgan.skeleton.densify import Points
 from gsgan.splat import native
 
@@ -70,27 +69,7 @@ def test_geometry(monkeypatch, bound):
         loss = sum((x * w).sum() for x, w in zip(found, weights, strict=True))
         return [x.detach() for x in found] + list(torch.autograd.grad(loss, raw))
 
-    torch.testing.assert_close(*both(monkeypatch, compose, "compiled", run), **CLOSE)
-
-
-@pytest.mark.parametrize("channels", [6, 16, 37])
-def test_style(monkeypatch, channels):
-    torch.manual_seed(0)
-    style = Style(channels, 4, 35).double()
-    for parameter in style.parameters():
-        torch.nn.init.normal_(parameter)
-    h = torch.randn(2, channels, 5, 7, dtype=torch.float64, requires_grad=True)
-    h.data[0, :, 0, 0] = 0  # an empty pixel
-    levels = torch.randn(2, 4, 5, 7, dtype=torch.float64, requires_grad=True)
-    g = torch.randn(2, 35, dtype=torch.float64)
-    weights = torch.randn(2, channels, 5, 7, dtype=torch.float64)
-
-    def run():
-        out = style(h, levels, g)
-        inputs = [h, levels, *style.parameters()]
-        return [out.detach(), *torch.autograd.grad((out * weights).sum(), inputs)]
-
-    torch.testing.assert_close(*both(monkeypatch, styled, "compiled", run), **CLOSE)
+    torch.testing.assert_close(*both(monkeypatch, compiled, "has_geometry", run), **CLOSE)
 
 
 @pytest.mark.parametrize(("batch", "embedding", "normals"), [(1, 4, True), (3, 0, False)])

@@ -9,7 +9,6 @@ import torch
 
 from gsgan.model.deformation import Deformation, _unit_quat
 from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames
-from gsgan.utils.errors import ConfigError
 
 HEIGHT = 1.7
 
@@ -49,23 +48,6 @@ def test_step_zero_is_exactly_the_initial_gaussians(densify):
     assert (gaussians.features[..., 3:] == 0).all()
 
 
-def test_residuals_turn_with_the_part(densify):
-    """A rigid motion of the skeleton moves every Gaussian rigidly, whatever Ψ's residuals."""
-    psi = small(densify, free_table=True).double()
-    densify = densify.double()
-    torch.manual_seed(0)
-    with torch.no_grad():
-        psi.table.normal_(0, 0.3)  # residuals that do not depend on the pose code
-    p = rest().double()
-    turn = torch.linalg.qr(torch.randn(3, 3, dtype=torch.float64)).Q
-    turn = turn * turn.det().sign()
-    before, after = run(psi, densify, p), run(psi, densify, p @ turn.T + 2.0)
-    torch.testing.assert_close(after.means, before.means @ turn.T + 2.0, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(
-        after.covariances, turn @ before.covariances @ turn.T, rtol=1e-8, atol=1e-12
-    )
-
-
 def test_invisible_parts_have_no_opacity(densify):
     p = rest()
     valid = torch.ones(1, 33, dtype=torch.bool)
@@ -78,48 +60,11 @@ def test_invisible_parts_have_no_opacity(densify):
     assert 0 < int((~points.valid).sum()) < densify.n_points
 
 
-@pytest.mark.parametrize("raw", [1e3, -1e3, 60.0, -1.0, 0.0])
-def test_saturated_residuals_stay_finite_with_finite_gradients(densify, raw):
-    """Saturated tanh, exp overflow of scales, logits at ±1e3, q0 + δq ≈ 0."""
-    psi = small(densify)
-    with torch.no_grad():
-        psi.table.fill_(raw)
-        if raw == -1.0:
-            psi.table[:, 3:7] = torch.tensor([-1.0, 0.0, 0.0, 0.0])
-    gaussians = run(psi, densify, rest())
-    total = sum(
-        x.square().sum()
-        for x in (gaussians.means, gaussians.covariances, gaussians.opacities, gaussians.features)
-    )
-    total.backward()
-    assert torch.isfinite(total)
-    assert all(torch.isfinite(p.grad).all() for p in psi.parameters() if p.grad is not None)
-    scales = torch.linalg.eigvalsh(gaussians.covariances.double()).clamp_min(0).sqrt()
-    assert float(scales.detach().max()) <= 0.06 * HEIGHT * 1.001
-    offset = (gaussians.means - densify(rest()).means).norm(dim=-1)
-    assert float(offset.detach().max()) <= 0.25 * HEIGHT * 3**0.5 * 1.001
-    assert ((gaussians.opacities > 0) & (gaussians.opacities < 1)).all()
-
-
 def test_unit_quat_is_identity_at_zero_and_unit_elsewhere():
     residual = torch.tensor([[0.0, 0, 0, 0], [3.0, 1, -2, 0.5]])
     quats = _unit_quat(residual)
     torch.testing.assert_close(quats[0], torch.tensor([1.0, 0, 0, 0]))
     torch.testing.assert_close(quats.norm(dim=-1), torch.ones(2))
-
-
-def test_pelvis_code_does_not_know_the_heading(densify):
-    psi = small(densify, pose_frame="pelvis").double()
-    p = rest().double()
-    angle = torch.tensor(1.1, dtype=torch.float64)
-    turn = torch.eye(3, dtype=torch.float64)
-    turn[0, 0] = turn[2, 2] = angle.cos()
-    turn[0, 2], turn[2, 0] = angle.sin(), -angle.sin()
-    codes = []
-    for q in (p, p @ turn.T + 1.0):
-        frames = bone_frames(q, torch.ones(1, 33, dtype=torch.bool))
-        codes.append(psi.pose_code(q, q[:, 23:25].mean(1), frames.hubs[:, 0], None))
-    torch.testing.assert_close(codes[0], codes[1], atol=1e-9, rtol=0)
 
 
 def test_psi_is_told_where_the_surface_looks_unless_it_shall_not_be(densify):
@@ -149,7 +94,15 @@ def test_noise_reaches_only_the_pose_code(densify):
     assert not torch.equal(run(psi, densify, p, noise).means, run(psi, densify, p).means)
 
 
-@pytest.mark.parametrize("options", [{"sh_degree": 4}, {"pose_frame": "sky"}, {"layers": 1}])
-def test_unknown_options_are_refused(densify, options):
-    with pytest.raises(ConfigError, match=next(iter(options))):
-        small(densify, **options)
+def test_pelvis_code_does_not_know_the_heading(densify):
+    psi = small(densify, pose_frame="pelvis").double()
+    p = rest().double()
+    angle = torch.tensor(1.1, dtype=torch.float64)
+    turn = torch.eye(3, dtype=torch.float64)
+    turn[0, 0] = turn[2, 2] = angle.cos()
+    turn[0, 2], turn[2, 0] = angle.sin(), -angle.sin()
+    codes = []
+    for q in (p, p @ turn.T + 1.0):
+        frames = bone_frames(q, torch.ones(1, 33, dtype=torch.bool))
+        codes.append(psi.pose_code(q, q[:, 23:25].mean(1), frames.hubs[:, 0], None))
+    torch.testing.assert_close(codes[0], codes[1], atol=1e-9, rtol=0)

@@ -29,11 +29,11 @@ def psnr(a, b) -> float:
 @pytest.mark.parametrize(("model", "effects"), MODELS)
 def test_the_image_is_that_of_training(build, model, effects):
     _, avatar, frame = build(f"model={model}", f"effects={effects}")
-    trained = left_of_zero(avatar).paint(frame)
+    trained = left_of_zero(avatar)(*frame.inputs)
     frozen = copy.deepcopy(avatar).freeze()
     for _ in range(2):  # computed, then kept
         with torch.inference_mode():
-            painting = frozen.paint(frame)
+            painting = frozen(*frame.inputs)
         assert psnr(painting.image, trained.image.detach()) > 90
     assert not any(p.requires_grad for p in frozen.parameters())
     assert trained.image.requires_grad
@@ -43,24 +43,24 @@ def test_it_follows_the_weights(build):
     _, avatar, frame = build("size.rgb_skip=false")
     frozen = copy.deepcopy(left_of_zero(avatar)).freeze()
     with torch.inference_mode():
-        before = frozen.paint(frame).image
+        before = frozen(*frame.inputs).image
     with torch.no_grad():
         for parameter in avatar.parameters():
             parameter.mul_(1.1)
-    expected = avatar.paint(frame).image.detach()
+    expected = avatar(*frame.inputs).image.detach()
     assert psnr(before, expected) < 60
     frozen.load_state_dict(avatar.state_dict())
     with torch.inference_mode():
-        assert psnr(frozen.paint(frame).image, expected) > 90
+        assert psnr(frozen(*frame.inputs).image, expected) > 90
     again = copy.deepcopy(avatar).freeze()
-    assert torch.equal(again.paint(frame).image, frozen.paint(frame).image)
+    assert torch.equal(again(*frame.inputs).image, frozen(*frame.inputs).image)
 
 
 def test_gradients_still_reach_the_skeleton(build):
     _, avatar, frame = build()
     frozen = left_of_zero(avatar).freeze()
     with torch.inference_mode():
-        frozen.paint(frame)  # what is kept from here on can be used with gradients
+        frozen(*frame.inputs)  # what is kept from here on can be used with gradients
     p = frame.skeleton.clone().requires_grad_()
     frozen(p, frame.visibility, frame.camera, frame.body).image.sum().backward()
     assert float(p.grad.abs().max()) > 0

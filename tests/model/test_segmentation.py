@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from gsgan.body import free_body
-from gsgan.body.smpl_names import CIHP, CLOTHES, SMPLX_JOINTS
-from gsgan.model.runs import Moved, build_data, load_avatar, load_config
+from gsgan.body.smpl_names import CIHP, CLOTHES
+from gsgan.model.assemble import build_data
+from gsgan.model.runs import load_avatar
 from gsgan.model.segmentation import (
     IGNORE,
     Segmentation,
@@ -19,6 +20,7 @@ from gsgan.model.segmentation import (
     segmentation_loss,
     silhouette_loss,
 )
+from gsgan.model.stored import DataPaths, load_config
 from gsgan.scene import BodyPose, Camera
 from gsgan.utils.errors import ConfigError
 
@@ -57,36 +59,6 @@ def test_left_hand_is_on_the_picture_right():
     columns = torch.arange(SIZE).float()
     centre = [float((S[0, i].sum(0) * columns).sum() / S[0, i].sum()) for i in (left, right)]
     assert centre[0] > SIZE / 2 > centre[1]
-
-
-def test_translation_moves_the_map():
-    segmentation = Segmentation(free_body(), points=1000)
-    pose = rest_pose()
-    moved = BodyPose(pose.theta, pose.transl + torch.tensor([[0.5, 0.0, 0.0]]))
-    columns = torch.arange(SIZE).float()
-
-    def centre(p: BodyPose) -> float:
-        person = 1 - segmentation(p, facing_camera())[0, 0]
-        return float((person.sum(0) * columns).sum() / person.sum())
-
-    pixels = 0.5 * FOCAL / 3
-    assert math.isclose(centre(moved) - centre(pose), pixels, abs_tol=0.5)
-
-
-def test_a_few_steps_lower_the_loss():
-    torch.manual_seed(0)
-    segmentation = Segmentation(free_body(), points=400, scale=0.3)
-    with torch.no_grad():
-        labels = Segmentation(free_body(), points=1500)(rest_pose(), facing_camera()).argmax(1)
-    optimiser = torch.optim.Adam(segmentation.parameters(), lr=2e-2)
-    losses = []
-    for _ in range(15):
-        loss = segmentation_loss(segmentation(rest_pose(), facing_camera()), labels)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss))
-    assert losses[-1] < 0.95 * losses[0]
 
 
 def test_loss_is_finite_where_a_class_was_never_hit_and_ignores_255():
@@ -154,15 +126,6 @@ def test_common_is_added_to_all_log_scales_and_all_logits():
     assert not torch.allclose(a.opacities, without_labels().gaussians(rest_pose()).opacities)
 
 
-def test_with_labels_there_is_no_common_number_and_all_is_trained():
-    segmentation = Segmentation(free_body(), points=100)
-    assert segmentation.common is None
-    assert "common" not in segmentation.state_dict()
-    trained = [p for parameters, _ in segmentation.parameter_groups() for p in parameters]
-    assert {id(p) for p in trained} == {id(p) for p in segmentation.parameters()}
-    assert all(p.requires_grad for p in trained)
-
-
 def test_silhouette_loss_is_binary_cross_entropy_of_the_sure_pixels():
     generator = torch.Generator().manual_seed(0)
     alpha, mask = (torch.rand(2, 1, 5, 7, generator=generator) for _ in range(2))
@@ -190,18 +153,6 @@ def test_stability_silhouette_loss_where_alpha_is_0_or_1(value, truth):
     assert torch.isfinite(alpha.grad).all()
     if value != truth:  # there is a way back
         assert bool((alpha.grad.sign() == (1 if value > truth else -1)).all())
-
-
-@pytest.mark.parametrize("common", [(0.0, -60.0), (2.0, 60.0)])
-def test_stability_common_numbers_of_an_empty_or_opaque_body_get_finite_gradients(common):
-    segmentation = without_labels()
-    with torch.no_grad():
-        segmentation.common.copy_(torch.tensor(common))
-    alpha = segmentation.raster(rest_pose(), facing_camera()).alpha
-    loss = silhouette_loss(alpha, body_mask())
-    loss.backward()
-    assert torch.isfinite(loss)
-    assert torch.isfinite(segmentation.common.grad).all()
 
 
 # --- classes -------------------------------------------------------------------------------------
@@ -246,17 +197,6 @@ def test_the_trunk_hides_a_hand_behind_it():
     assert float(behind.sum()) < 0.02 * float(before.sum())
 
 
-def test_background_learns_from_the_body_in_hands_mode():
-    """Opacities of the trunk get a gradient, finite, where it is in the way of a hand."""
-    segmentation = Segmentation(free_body(), points=2000, mode="hands")
-    S = segmentation(rest_pose(), facing_camera())
-    labels = segmentation.truth(torch.full((1, SIZE, SIZE), 7))
-    loss = segmentation_loss(S, labels)
-    loss.backward()
-    assert all(torch.isfinite(p.grad).all() for p in segmentation.parameters())
-    assert float(segmentation.logit_opacities.grad.abs().max()) > 0
-
-
 def test_classes_of_modes_and_labels_without_a_vertex():
     names = ("background", "hat", "left_hand", "coat", "right_hand", "face")
     vertices = torch.tensor([2, 4, 4, 3])
@@ -270,14 +210,6 @@ def test_classes_of_modes_and_labels_without_a_vertex():
     assert hands.names == ("background", "left_hand", "right_hand", "face_neck")
     assert hands.table == (0, 0, 1, 0, 2, 3)
     assert (hands.absent, hands.truth_classes) == ((), 4)
-
-
-def test_finger_joints_belong_to_their_hand():
-    names = ("background", *SMPLX_JOINTS)
-    table = class_map(names, torch.tensor([1]), "hands").table
-    named = {name: table[i] for i, name in enumerate(names)}
-    assert (named["left_index2"], named["left_wrist"], named["right_thumb3"]) == (1, 1, 2)
-    assert (named["left_elbow"], named["head"], named["background"]) == (0, 0, 0)
 
 
 @pytest.mark.parametrize(
@@ -313,18 +245,9 @@ def test_a_class_without_a_vertex_is_not_learned_and_scored_as_missed():
     assert not (scored.argmax(1) == to_find)[:, 1:].any()
 
 
-def test_null_leaves_it_out_whatever_the_effects(build):
-    _, avatar, _ = build("model.segmentation=null")
-    assert avatar.segmentation is None
-    assert avatar.segmentation_why == "the model leaves it out"
-    _, avatar, _ = build("effects=none")
-    assert avatar.segmentation.common is None  # this data has labels
-    assert "own" in avatar.segmentation_why
-
-
 def test_hands_mode_from_the_config_paints(build):
     _, avatar, frame = build("model.segmentation.mode=hands", "model.segmentation.hands_face=true")
-    painting = avatar.paint(frame)
+    painting = avatar(*frame.inputs)
     assert painting.segmentation.shape[1] == 4
     assert avatar.segmentation.map.names[-1] == "face_neck"
     F = 5 * (1 + avatar.accuracy.supersample**2)  # averaged and as drawn
@@ -349,7 +272,7 @@ def capture_without_labels(capture, folder, frames=None):
 
 def test_a_trained_S_is_loaded_whether_or_not_labels_are_at_hand(run, capture, tmp_path):
     bare = capture_without_labels(capture, tmp_path / "bare")
-    config = load_config(run, Moved(str(bare)))
+    config = load_config(run, DataPaths(str(bare)))
     data = build_data(config)
     assert not data.info.has_labels
     avatar, _ = load_avatar(run, config, data)

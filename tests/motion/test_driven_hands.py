@@ -131,12 +131,6 @@ def test_landmarks_with_hands(tmp_path, signing, signer):
     assert angles(fingers(retargeted(1.2 * p, signer)), fingers(signing)).max() < 1e-3
 
 
-def test_a_pose_file_is_always_retargeted(tmp_path, signing, signer):
-    """Its hands are relative to their wrists, whatever the lengths of its bones."""
-    _, motion = standard(write_holistic(tmp_path / "a.pose", signing), signer)
-    assert motion.detached
-
-
 def test_a_transition_keeps_the_place_of_the_hips(signing, signer):
     """Interpolated legs shorten; the path must not be scaled with them."""
     far = signing[:1] + np.array([2.0, 3.0, 0.0])

@@ -238,7 +238,7 @@ def test_people_filmed_from_the_waist_up_stand_upright(tmp_path, landmarks, prop
 def test_bvh(tmp_path, proportions):
     from mannequin import mannequin, write_bvh
 
-    from gsgan.synthetic.motion import Choreography
+    from gsgan.synthetic.posing import Choreography
 
     person = mannequin()
     signing = Choreography(person).at(21 + np.arange(30) / 30)

@@ -11,7 +11,7 @@ import numpy as np
 from make import distorted_pixels, ring_camera, skeletons, write_tiny_capture
 
 from gsgan.data.cameras import CameraEntry, make_camera
-from gsgan.prepare.rig import Rig
+from gsgan.prepare.camera_array import CameraArray
 
 ANGLES = (0.0, 1.3, 2.7, 4.2)
 LENS = (-0.05, 0.14, 0.0006, -0.0007, 0.01)
@@ -30,20 +30,20 @@ def ring(angles: Sequence[float] = ANGLES, size=(1080, 1920), dist=(0,) * 5) -> 
 
 def seen(
     cameras: Sequence[CameraEntry], frames: int = 12, noise: float = 0.0, seed: int = 0
-) -> tuple[Rig, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[CameraArray, np.ndarray, np.ndarray, np.ndarray]:
     """A rig, the true ``p [F, 33, 3]``, what it sees ``uv [C, F, 33, 2]``, and confidence 1."""
-    rig, p = Rig.of(cameras), skeletons(frames)
+    rig, p = CameraArray.of(cameras), skeletons(frames)
     uv = rig.project(p.reshape(-1, 3))[0].reshape(len(rig), frames, 33, 2)
     uv = uv + noise * np.random.default_rng(seed).standard_normal(uv.shape)
     return rig, p, uv, np.ones(uv.shape[:3])
 
 
-def turned(rig: Rig, camera: int, degrees: float, metres: float) -> Rig:
-    """The rig with one camera turned about its vertical axis and moved sideways."""
+def turned(cameras: CameraArray, camera: int, degrees: float, metres: float) -> CameraArray:
+    """The cameras with one of them turned about its vertical axis and moved sideways."""
     turn = cv2.Rodrigues(np.radians([0.0, degrees, 0.0]))[0]
-    R, t = rig.R.copy(), rig.t.copy()
+    R, t = cameras.R.copy(), cameras.t.copy()
     R[camera], t[camera] = turn @ R[camera], turn @ t[camera] + [metres, 0, 0]
-    return Rig(rig.K, R, t)
+    return CameraArray(cameras.K, R, t)
 
 
 # ------------------------------------------------ calibration files, as other tools write them

@@ -37,12 +37,6 @@ def test_easymocap_pairs_by_name_though_the_orders_differ(tmp_path: Path):
     equal(calibration.cameras, cameras)
 
 
-def test_easymocap_starts_from_either_file_and_takes_the_size_from_pictures(tmp_path: Path):
-    write_easymocap(tmp_path, ring(), sizes=False)
-    found = read_calibration(tmp_path / "extri.yml").cameras
-    assert [c.size for c in found.values()] == [(0, 0)] * 4
-
-
 def test_easymocap_camera_without_its_other_half(tmp_path: Path):
     write_easymocap(tmp_path, ring())
     text = (tmp_path / "extri.yml").read_text().replace("T_cam1", "T_camX")

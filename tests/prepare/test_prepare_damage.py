@@ -21,13 +21,11 @@ import gsgan.prepare.mediapipe as tool
 from gsgan.data.calibration import read_calibration
 from gsgan.data.joints import BODY
 from gsgan.motion.points import read_points3d
-from gsgan.prepare.doubts import Doubts, doubts_about_pictures
+from gsgan.prepare.camera_array import undistort_points
+from gsgan.prepare.dataset import publish
 from gsgan.prepare.landmarks import read_detections
 from gsgan.prepare.options import MediaPipe, Options
-from gsgan.prepare.pictures import MaskTidying, PictureFiles, Written, check_values, write_pictures
-from gsgan.prepare.rig import undistort_points
-from gsgan.prepare.sources import Source
-from gsgan.prepare.work import Work, publish
+from gsgan.prepare.stages import StageFolder
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 
@@ -49,42 +47,6 @@ def test_a_half_made_environment_is_made_again(tmp_path: Path):
     assert (place / tool.MARKER).is_file()
 
 
-@pytest.mark.parametrize(("value", "refused"), [(1, True), (19, True), (0, False), (255, False)])
-def test_masks_of_small_numbers_are_refused(tmp_path: Path, value: int, refused: bool):
-    for number, highest in enumerate((0, value, 0)):
-        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((4, 4), highest, np.uint8))
-    files = {number: tmp_path / f"{number}.png" for number in range(3)}
-    if refused:
-        with pytest.raises(DataError, match=f"up to {value}; small numbers are labels"):
-            check_values(tmp_path, files)
-    else:
-        check_values(tmp_path, files)
-
-
-def test_short_videos_and_empty_masks_are_reported(tmp_path: Path):
-    camera = ring(size=(6, 4))[0]
-    files, masks = {}, {}
-    for n in range(4):
-        files[n], masks[n] = tmp_path / f"{n}.png", tmp_path / f"m{n}.png"
-        cv2.imwrite(str(files[n]), np.zeros((4, 6, 3), np.uint8))
-        cv2.imwrite(str(masks[n]), np.full((4, 6), 255 * (n > 0), np.uint8))
-    source = Source("cam0", tmp_path, (4, 6), 30.0, files, 7)
-    given = (tmp_path, camera, source, masks)
-    rest = (0, PictureFiles(), MaskTidying(), lambda *_: None)
-    whole = Written([0, 1, 2, 3], empty=1, decoded=4)
-    assert write_pictures(*given, range(9), *rest) == whole
-    assert write_pictures(*given, range(9), *rest) == whole  # all exist already
-    assert write_pictures(*given, range(2), *rest).decoded is None  # not read to the end
-    limits = Doubts()
-    found = doubts_about_pictures({"cam0": source}, {"cam0": whole}, limits)
-    assert found == [
-        "cam0: only 4 of 7 frames can be decoded: is it damaged?",
-        "cam0: 25% of the written masks are empty",
-    ]
-    good = Written([0, 1, 2, 3, 4, 5, 6], empty=1, decoded=7)
-    assert doubts_about_pictures({"cam0": source}, {"cam0": good}, limits) == []
-
-
 def load_detector(monkeypatch):
     monkeypatch.setitem(sys.modules, "mediapipe", SimpleNamespace())
     spec = importlib.util.spec_from_file_location("detect_tool", tool.SCRIPT)
@@ -95,7 +57,7 @@ def load_detector(monkeypatch):
     return module
 
 
-def test_the_tool_reads_pictures_as_stored_and_by_number(tmp_path: Path, monkeypatch):
+def test_the_tool_reads_images_as_stored_and_by_number(tmp_path: Path, monkeypatch):
     detector = load_detector(monkeypatch)
     data = cv2.imencode(".jpg", np.zeros((4, 6, 3), np.uint8))[1].tobytes()
     # orientation (0x112) 6: turned by 90 degrees
@@ -104,23 +66,13 @@ def test_the_tool_reads_pictures_as_stored_and_by_number(tmp_path: Path, monkeyp
     for name in ("10.jpg", "9.jpg"):
         (tmp_path / name).write_bytes(turned)
     assert cv2.imread(str(tmp_path / "9.jpg")).shape == (6, 4, 3)  # the tag is valid
-    count, pictures = detector.open_source(tmp_path, 0)
-    read = list(pictures)
+    count, images = detector.open_source(tmp_path, 0)
+    read = list(images)
     assert (count, [number for number, _ in read]) == (2, [9, 10])
     assert read[0][1].shape == (4, 6, 3)
     (tmp_path / "11.jpg").write_bytes(b"cut")
     with pytest.raises(SystemExit, match=r"11\.jpg is damaged"):
         list(detector.open_source(tmp_path, 0)[1])
-
-
-def test_numbers_of_400_digits(tmp_path: Path):
-    huge = "9" * 400
-    (tmp_path / "0.json").write_text(f'{{"people": [{{"pose_keypoints_2d": [{huge}, 1, 1]}}]}}')
-    with pytest.raises(DataError, match=r"0\.json"):
-        read_detections(tmp_path)
-    (tmp_path / "0.json").write_text(f'[{{"keypoints3d": [[{huge}, 1, 1]]}}]')
-    with pytest.raises(DataError, match=r"0\.json"):
-        read_points3d(tmp_path)
 
 
 @pytest.mark.parametrize("number", [0.5, np.nan])
@@ -135,30 +87,14 @@ def test_frame_numbers_must_be_whole(tmp_path: Path, number: float):
         read_points3d(path)
 
 
-def test_damaged_results_are_made_again_and_a_full_disk_is_reported(tmp_path: Path, monkeypatch):
-    work = Work(tmp_path)
-    assert work.arrays("a", 1, lambda: {"x": np.arange(3)})["x"].tolist() == [0, 1, 2]
-    path = work.place("a", 1).with_suffix(".npz")
-    path.write_bytes(path.read_bytes()[:40])
-    assert work.arrays("a", 1, lambda: {"x": np.arange(2)})["x"].tolist() == [0, 1]
-    assert work.arrays("a", 1, dict)["x"].tolist() == [0, 1]  # kept
-
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("gsgan.utils.files.write_atomically", full)
-    with pytest.raises(DataError, match=r"cannot be written \(No space left"):
-        work.arrays("a", 2, lambda: {"x": np.arange(2)})
-
-
 def test_results_with_other_keys_are_removed_by_stage(tmp_path: Path):
     for stage in ("tool-a", "tool-a-b", "solution"):
         for key in (1, 2):
-            Work(tmp_path).arrays(stage, key, lambda: {"x": np.zeros(1)})
-            Work(tmp_path).place(stage, key).mkdir()
-    work = Work(tmp_path)
-    kept = work.place("tool-a", 2)
-    work.forget_others()
+            StageFolder(tmp_path).path(stage, key).mkdir()
+            StageFolder(tmp_path).path(stage, key).with_suffix(".npz").touch()
+    stages = StageFolder(tmp_path)
+    kept = stages.path("tool-a", 2)
+    stages.remove_others()
     left = {p.name for p in tmp_path.iterdir() if p.name.startswith("tool-a-")}
     assert {name for name in left if "tool-a-b-" not in name} == {kept.name, f"{kept.name}.npz"}
     assert len(list(tmp_path.iterdir())) == 10  # stages that the run did not use stay
@@ -176,14 +112,15 @@ def test_an_old_dataset_stays_when_the_new_one_cannot_be_moved(tmp_path: Path, m
         replace(start, end)
 
     monkeypatch.setattr(os, "replace", failing)
-    monkeypatch.setattr("gsgan.prepare.work.read_capture", lambda _: None)
+    monkeypatch.setattr("gsgan.prepare.dataset.read_capture", lambda _: None)
     with pytest.raises(DataError, match="cannot be written"):
         publish(new, out)
     assert (tmp_path / ".out.old" / "out").is_file()
 
 
 @pytest.mark.parametrize(
-    "more", [{"fps": "abc"}, {"workers": "x"}, {"offsets": {"a": "b"}}, {"cameras": "a"}]
+    "more",
+    [{"fps": "abc"}, {"workers": "x"}, {"offsets": {"a": "b"}}, {"mask_levels": (0.8, 0.3)}],
 )
 def test_options_of_the_wrong_kind(more: dict):
     with pytest.raises(ConfigError, match=next(iter(more))):

@@ -15,12 +15,10 @@ from capture_scenes import write_project
 from rich.console import Console
 
 from gsgan.data.formats.capture import read_capture
-from gsgan.prepare.options import Options, Overlays
-from gsgan.prepare.rig import Refinement
+from gsgan.prepare.options import Options
 from gsgan.prepare.run import prepare
-from gsgan.prepare.solve import Settings
-from gsgan.prepare.triangulate import FlipSearch
-from gsgan.prepare.work import each_camera
+from gsgan.prepare.solve import SolveSettings
+from gsgan.prepare.stages import each_camera
 
 LIMIT = 120  # seconds after which the child counts as hanging
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork, no child to kill")
@@ -36,8 +34,7 @@ def options(project: Path, out: Path, **more) -> Options:
         "landmarks": str(project / "pose"),
         "masks": str(project / "masks"),
         "workers": 1,
-        "solve": Settings(flips=FlipSearch(enabled=False), refinement=Refinement(rounds=0)),
-        "overlays": Overlays(frames=1, size=64),
+        "solve": SolveSettings(refinements=0),
     }
     return Options(source=str(project), out=str(out), **(given | more))
 
@@ -80,17 +77,14 @@ def killed(run: Callable[[], object], stop: Callable[[Path, int], bool]) -> bool
     return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
 
 
-def pictures(out: Path) -> dict[str, bytes]:
+def images(out: Path) -> dict[str, bytes]:
     paths = sorted((out / "images").rglob("*")) + sorted((out / "masks").rglob("*"))
     return {str(p.relative_to(out)): p.read_bytes() for p in paths if p.is_file()}
 
 
 STAGES: dict[str, Callable[[Path, int], bool]] = {
-    "solving": lambda place, _: place.name.startswith("solution-"),
-    "the first picture": lambda place, _: "images" in place.parts,
-    "a mask, its picture written": lambda place, n: "masks" in place.parts and n > 8,
-    "the landmarks": lambda place, _: place.name == "landmarks3d.npz",
-    "the report": lambda place, _: place.name == "report.html",
+    "a mask, its image written": lambda place, n: "masks" in place.parts and n > 8,
+    "the numbers": lambda place, _: place.name == "prepare.json",
     "the whole dataset": lambda place, _: place.name == "out",
 }
 
@@ -98,7 +92,7 @@ STAGES: dict[str, Callable[[Path, int], bool]] = {
 @pytest.fixture(scope="module")
 def whole(project: Path) -> dict[str, bytes]:
     """The images of an undisturbed run."""
-    return pictures(prepare(options(project, project.parent / "undisturbed"), quiet()))
+    return images(prepare(options(project, project.parent / "undisturbed"), quiet()))
 
 
 @pytest.mark.parametrize("stage", STAGES)
@@ -110,7 +104,7 @@ def test_a_killed_process_leaves_nothing_incomplete_and_is_resumed(
     assert killed(lambda: prepare(given, quiet()), STAGES[stage])
     assert not out.exists()
     assert prepare(given, quiet()) == out
-    assert pictures(out) == whole
+    assert images(out) == whole
     assert [p for p in out.rglob("*") if p.name.endswith(".part")] == []
     assert len(read_capture(out).frames) == 4
 
@@ -121,12 +115,12 @@ def test_an_earlier_dataset_outlives_a_kill(
     out = tmp_path / "out"
     prepare(options(project, out, frames="0-2"), quiet())
     again = options(project, out, overwrite=True)
-    assert killed(lambda: prepare(again, quiet()), STAGES["the report"])
+    assert killed(lambda: prepare(again, quiet()), STAGES["the numbers"])
     assert len(read_capture(out).frames) == 3  # the earlier one is still there
     assert killed(lambda: prepare(again, quiet()), lambda place, _: place == out)
     assert len(read_capture(tmp_path / ".out.old").frames) == 3  # moved aside, not lost
     prepare(again, quiet())
-    assert pictures(out) == whole
+    assert images(out) == whole
     assert not (tmp_path / ".out.old").exists()
 
 

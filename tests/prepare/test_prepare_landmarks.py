@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gsgan.data.joints import BODY, FACE, FACE_MESH, LEFT, RIGHT, SETS
+from gsgan.data.joints import BODY, FACE, FACE_MESH, RIGHT, SETS
 from gsgan.prepare.landmarks import find_landmarks, gather, inside, read_detections
 from gsgan.skeleton.hands import HAND, hand_names
 from gsgan.skeleton.template import MEDIAPIPE33
@@ -31,7 +31,7 @@ def test_openpose_body_25_keeps_the_persons_sides(tmp_path: Path):
     left_wrist, right_heel = 15, 30
     np.testing.assert_allclose(found.px[0, left_wrist], [70.5, 71.5])  # OpenPose's 7, + 0.5
     np.testing.assert_allclose(found.px[0, right_heel], [240.5, 241.5])
-    assert found.conf[0, 1] == 0  # the inner eye: OpenPose does not know it
+    assert found.conf[0, 1] == 0  # the inner eye: OpenPose does not have it
     assert np.isnan(found.px[0, 1]).all()
 
 
@@ -44,15 +44,6 @@ def test_every_set_maps_left_to_left(count: int):
     assert {11, 12, 23, 24} <= set(mapping)
 
 
-def test_hands_of_openpose_stand_in_for_the_bodys_hand_joints(tmp_path: Path):
-    person = {"pose_keypoints_2d": triples(25), "hand_left_keypoints_2d": triples(21, 1000)}
-    write_people(tmp_path / "a", 0, person)
-    found = read_detections(tmp_path / "a")
-    np.testing.assert_allclose(found.px[0, LEFT][5], [1050.5, 1051.5])
-    np.testing.assert_allclose(found.px[0, 19], [1050.5, 1051.5])  # left index
-    assert (found.conf[0, RIGHT] == 0).all()
-
-
 def test_zero_confidence_is_missing_and_the_best_seen_person_is_taken(tmp_path: Path):
     faint = {"pose_keypoints_2d": [5.0, 5.0, 0.1] * 17}
     clear = {"pose_keypoints_2d": [8.0, 8.0, 0.9] * 16 + [0, 0, 0]}
@@ -63,14 +54,6 @@ def test_zero_confidence_is_missing_and_the_best_seen_person_is_taken(tmp_path: 
     np.testing.assert_allclose(found.px[0, 11], [8.5, 8.5])
     assert np.isnan(found.px[0, 28]).all()  # the right ankle, written as zeros
     assert (found.conf[1] == 0).all()
-
-
-def test_easymocap_rows(tmp_path: Path):
-    (tmp_path / "a").mkdir()
-    person = {"keypoints": np.reshape(triples(25), (25, 3)).tolist(), "personID": 0}
-    (tmp_path / "a" / "000003.json").write_text(json.dumps({"height": 1, "annots": [person]}))
-    found = read_detections(tmp_path / "a")
-    np.testing.assert_allclose(found.px[0, 0], [0.5, 1.5])
 
 
 def test_npz_of_the_tool(tmp_path: Path):

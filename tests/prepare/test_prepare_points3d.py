@@ -11,7 +11,6 @@ from make import skeletons
 
 from gsgan.data.joints import SETS
 from gsgan.motion.points import read_points3d
-from gsgan.prepare.landmarks import without_frozen
 from gsgan.utils.errors import DataError
 
 MARKERS = {
@@ -63,23 +62,6 @@ def test_trc_units_axes_and_names_are_converted(tmp_path: Path, unit: str):
     assert np.isnan(found[1][:, unknown]).all()
     assert (found[2][:, unknown] == 0).all()
     assert found[2][2, 15] == 0
-
-
-def test_zeros_of_gap_filling_are_missing(tmp_path: Path):
-    p = skeletons(4)
-    p[1, 16] = 0
-    found = read_points3d(write_trc(tmp_path / "a.trc", p))
-    assert np.isnan(found[1][1, 16]).all()
-    assert found[2][1, 16] == 0
-
-
-def test_repeated_values_of_gap_filling_are_removed():
-    p = np.random.default_rng(0).standard_normal((20, 2, 3))
-    p[5:13, 1], p[15:18, 0] = p[5, 1], p[15, 0]
-    found, count = without_frozen(p, frames=8)
-    assert count == 7
-    assert np.isnan(found[6:13, 1]).all()
-    assert np.isfinite(found).sum() == p.size - 3 * 7
 
 
 @pytest.mark.parametrize(

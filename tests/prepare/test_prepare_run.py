@@ -16,13 +16,10 @@ from test_prepare_points3d import write_trc
 
 import gsgan.prepare.mediapipe as tool
 from gsgan.data.formats.capture import read_capture
-from gsgan.prepare import pictures
 from gsgan.prepare.__main__ import prepare as command
-from gsgan.prepare.options import MediaPipe, Options, Overlays
-from gsgan.prepare.rig import Refinement
+from gsgan.prepare.options import MediaPipe, Options
 from gsgan.prepare.run import prepare
-from gsgan.prepare.solve import Settings
-from gsgan.prepare.triangulate import FlipSearch
+from gsgan.prepare.solve import SolveSettings
 from gsgan.utils.errors import ConfigError, DataError, GsganError
 
 CAMERAS, FRAMES, SIZE = 3, 6, (96, 80)
@@ -37,8 +34,7 @@ def project(tmp_path: Path) -> Path:
 def options(project: Path, **more) -> Options:
     """Quick settings; the stages themselves are tested in test_prepare_solve.py."""
     given = {
-        "solve": Settings(flips=FlipSearch(enabled=False), refinement=Refinement(rounds=0)),
-        "overlays": Overlays(frames=1, size=64),
+        "solve": SolveSettings(refinements=0),
         "source": str(project),
         "out": str(project.parent / "out"),
         "landmarks": str(project / "pose"),
@@ -52,7 +48,7 @@ def quiet() -> Console:
 
 
 def test_videos_become_a_capture_that_training_reads(project: Path):
-    out = prepare(options(project, solve=Settings()), quiet())
+    out = prepare(options(project, solve=SolveSettings()), quiet())
     layout = read_capture(out)
     assert layout.camera_names == ("cam00", "cam01", "cam02")
     assert layout.frames == tuple(range(FRAMES))
@@ -70,20 +66,22 @@ def test_videos_become_a_capture_that_training_reads(project: Path):
     assert (hands["conf"] == 0).all()
 
 
-def test_the_report_has_every_stage_and_overlays(project: Path):
-    out = prepare(options(project), quiet())
-    numbers = json.loads((out / "report.json").read_text())
+def test_the_numbers_have_every_stage_and_the_dataset_is_checked(project, monkeypatch, check):
+    monkeypatch.setattr("gsgan.prepare.run.check_capture", check)
+    console = Console(file=io.StringIO(), width=100)
+    out = prepare(options(project), console)
+    assert "check.html" in console.file.getvalue()
+    assert "smoothed" in console.file.getvalue()
+    numbers = json.loads((out / "prepare.json").read_text())
     assert list(numbers["error_px"]) == ["plain", "robust", "flips", "refined", "smoothed"]
     assert numbers["cameras"]["cam02"]["frames_written"] == FRAMES
-    assert numbers["settings"]["solve"]["smoothing"]["seconds"] == 0.02
-    html = (out / "report.html").read_text()
-    assert html.count("data:image/jpeg;base64,") == CAMERAS
-    assert "http" not in html
+    assert numbers["settings"]["solve"]["smoothing"] == 0.02
+    assert (out / "check.html").read_text().count("data:image/jpeg;base64,") >= CAMERAS
+    assert json.loads((out / "check.json").read_text())["errors"] == 0
 
 
-def test_pictures_are_undistorted_and_scaled(project: Path):
-    small = pictures.PictureFiles(scale=0.5, format="png")
-    out = prepare(options(project, pictures=small), quiet())
+def test_images_are_undistorted_and_scaled(project: Path):
+    out = prepare(options(project, scale=0.5, format="png"), quiet())
     camera = read_capture(out).cameras["cam00"]
     assert camera.size == (SIZE[1] // 2, SIZE[0] // 2)
     given = json.loads((project / "cameras.json").read_text())["cam00"]
@@ -101,10 +99,9 @@ def test_the_same_again_is_left_alone_and_another_refused(project: Path):
     before = (out / "meta.json").stat().st_mtime_ns
     prepare(options(project), quiet())
     assert (out / "meta.json").stat().st_mtime_ns == before
-    small = pictures.PictureFiles(scale=0.5)
     with pytest.raises(DataError, match="overwrite=true"):
-        prepare(options(project, pictures=small), quiet())
-    prepare(options(project, pictures=small, overwrite=True, keep_work=False), quiet())
+        prepare(options(project, scale=0.5), quiet())
+    prepare(options(project, scale=0.5, overwrite=True, keep_work=False), quiet())
     assert read_capture(out).cameras["cam00"].size == (40, 48)
     assert [p.name for p in out.parent.iterdir() if p.name.startswith(".")] == []
 
@@ -116,26 +113,6 @@ def test_other_folders_are_never_overwritten(project: Path):
     with pytest.raises(DataError, match="something else"):
         prepare(options(project, overwrite=True), quiet())
     assert (out / "thesis.txt").read_text() == "do not lose"
-
-
-def test_a_killed_run_leaves_no_dataset_and_resumes(project: Path, monkeypatch):
-    write, written = pictures._write, []
-
-    def dying(path, pixels, quality):
-        if len(written) == 10:
-            raise KeyboardInterrupt
-        written.append(path)
-        write(path, pixels, quality)
-
-    monkeypatch.setattr(pictures, "_write", dying)
-    with pytest.raises(KeyboardInterrupt):
-        prepare(options(project, workers=1), quiet())
-    assert not (project.parent / "out").exists()
-    monkeypatch.setattr(pictures, "_write", write)
-    monkeypatch.setattr("gsgan.prepare.run.solve", None)  # found again, not solved again
-    out = prepare(options(project, workers=1), quiet())
-    assert len(list(out.glob("images/*/*"))) == CAMERAS * FRAMES
-    assert len(read_capture(out).frames) == FRAMES
 
 
 def test_a_camera_with_missing_masks_keeps_the_rest(project: Path):
@@ -156,7 +133,7 @@ def test_offsets_move_a_cameras_numbers(project: Path):
         prepare(options(project, offsets={"cam09": 1}, out=str(project / "x")), quiet())
 
 
-def test_folders_of_pictures_need_a_frame_rate(project: Path):
+def test_folders_of_images_need_a_frame_rate(project: Path):
     for video in (project / "videos").iterdir():
         video.unlink()
     (project / "videos").rmdir()
@@ -171,6 +148,11 @@ def in_centimetres(project: Path) -> None:
     for camera in rig.values():
         camera["t"] = [100 * x for x in camera["t"]]
     (project / "cameras.json").write_text(json.dumps(rig))
+
+
+def one_video(project: Path) -> None:
+    for name in ("cam01", "cam02"):
+        (project / "videos" / f"{name}.avi").unlink()
 
 
 def no_detections(project: Path) -> None:
@@ -197,6 +179,7 @@ def no_detections(project: Path) -> None:
         (lambda p: None, {"cameras": {"cam00": "cam01"}}, "more than one video"),
         (lambda p: None, {"unit": "inch"}, "unit must be one of"),
         (lambda p: None, {"source": None}, "give source="),
+        (one_video, {}, "only the camera cam00"),
     ],
 )
 def test_errors_are_one_sentence(project: Path, break_it, more, what):
@@ -212,17 +195,10 @@ def test_joints_of_another_tool_take_the_place_of_detections(project: Path):
     out = prepare(options(project, landmarks="nowhere", landmarks3d=str(given)), quiet())
     assert read_capture(out).frames == tuple(range(FRAMES))
     found = np.load(out / "landmarks3d.npz")
-    assert (found["conf"][:, 1] == 0).all()  # an eye that the file does not know
+    assert (found["conf"][:, 1] == 0).all()  # an eye that the file does not have
     np.testing.assert_allclose(found["p"][:, 11], skeletons(FRAMES)[:, 11], atol=1e-3)
-    assert json.loads((out / "report.json").read_text())["error_px"] == {"smoothed": None}
+    assert json.loads((out / "prepare.json").read_text())["error_px"] == {"smoothed": None}
     assert not (out / "landmarks2d").exists()
-
-
-def test_one_camera_is_not_enough(project: Path):
-    for name in ("cam01", "cam02"):
-        (project / "videos" / f"{name}.avi").unlink()
-    with pytest.raises(DataError, match="only the camera cam00"):
-        prepare(options(project), quiet())
 
 
 def test_every_key_of_the_config_is_understood(project: Path, compose, capsys):
@@ -256,7 +232,7 @@ STUB = """
 import json, pathlib, shutil, sys
 from types import SimpleNamespace
 given = SimpleNamespace(**json.loads(sys.argv[1]))
-names = "hands face rotate threads slot confidence tracking margin"
+names = "hands face rotate threads slot"
 assert set(names.split()) < set(vars(given))
 name, root = pathlib.Path(given.source).stem, pathlib.Path({root!r})
 if name == {bad!r}:
@@ -291,7 +267,7 @@ def test_the_tool_runs_once_per_camera(project: Path, monkeypatch):
     assert len(read_capture(out).frames) == FRAMES
     calls = []
     monkeypatch.setattr("gsgan.prepare.mediapipe._detect", lambda *a, **k: calls.append(a))
-    smoother = {"pictures": pictures.PictureFiles(scale=0.5), "overwrite": True}
+    smoother = {"scale": 0.5, "overwrite": True}
     prepare(Options(**(vars(given) | smoother)), quiet())
     assert calls == []
 
@@ -302,14 +278,8 @@ def test_the_message_of_a_failing_tool_is_its_last_line(project: Path, monkeypat
     assert not (project.parent / "out").exists()
 
 
-def test_the_environment_is_only_made_when_asked(project: Path):
+def test_the_environment_is_only_made_with_setup(project: Path):
     missing = MediaPipe(folder=str(project / "nothing"))
     with pytest.raises(ConfigError, match="add setup=true"):
         prepare(options(project, landmarks="mediapipe", mediapipe=missing), quiet())
     assert not (project / "nothing").exists()
-
-
-def test_a_missing_python_is_named(tmp_path: Path):
-    missing = MediaPipe(folder=str(tmp_path / "env"), python=str(tmp_path / "python9"))
-    with pytest.raises(DataError, match="python9 cannot be started"):
-        tool.ensure_environment(missing, True, print)

@@ -19,7 +19,9 @@ from gsgan.body.shape import free_space
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.evaluate.predictions import Preparation
 from gsgan.evaluate.scores import painter
-from gsgan.model.runs import CHECKPOINT, CONFIG, build_data, load, load_avatar, load_config
+from gsgan.model.assemble import build_data
+from gsgan.model.runs import load, load_avatar
+from gsgan.model.stored import CHECKPOINT, CONFIG, load_config
 from gsgan.render import run as render_run
 from gsgan.train.run import build_training
 from gsgan.utils.provenance import SOURCE_TYPE, verify
@@ -142,21 +144,12 @@ def test_clips_become_one_motion(render, motion, landmarks, tmp_path):
     refused(render(f"motion=[{motion},gone.pose]", "out=none"), "gone.pose does not exist")
 
 
-def test_a_run_without_figure_or_dataset(render, bare, motion, tmp_path):
-    """The dataset is not needed; for a checkpoint without proportions it is."""
+def test_a_run_without_its_dataset(render, bare, motion, tmp_path):
     copy = shutil.copytree(bare, tmp_path / "copy")
     config = copy / ".hydra" / "config.yaml"
     config.write_text(config.read_text().replace("root: /", "root: /no/longer/there/"))
     ok = render(f"run={copy}", f"motion={motion}", "out=a", "frames=1")
     assert ok.returncode == 0, ok.stderr
-    old = shutil.copytree(bare, tmp_path / "old")
-    checkpoint = torch.load(old / CHECKPOINT, weights_only=True)
-    del checkpoint["gsgan"]["scene"]["proportions"]
-    torch.save(checkpoint, old / CHECKPOINT)
-    result = render(f"run={old}", f"motion={motion}", "out=b", "frames=1")
-    assert result.returncode == 0, result.stderr
-    (a,), (b,) = ((tmp_path / x).glob("*.png") for x in "ab")
-    np.testing.assert_array_equal(read(a), read(b))
 
 
 def test_the_subjects_own_motion_is_left_alone(render, capture, tmp_path):
@@ -174,7 +167,7 @@ def test_the_subjects_own_motion_is_left_alone(render, capture, tmp_path):
 def test_the_up_axis_of_a_rig_is_that_of_its_rest_pose(render, tmp_path):
     from mannequin import mannequin, write_bvh
 
-    from gsgan.synthetic.motion import Choreography
+    from gsgan.synthetic.posing import Choreography
 
     person = mannequin()
     signing = Choreography(person).at(21 + np.arange(2) / 30)
@@ -220,7 +213,7 @@ def test_a_killed_render_goes_on(render, motion, tmp_path, monkeypatch):
     av = pytest.importorskip("av")
     from gsgan.model.avatar import Avatar
 
-    painted, paint = [], Avatar.picture
+    painted, paint = [], Avatar.forward
 
     def counted(self, *args, **named):
         if len(painted) == stop:
@@ -228,7 +221,7 @@ def test_a_killed_render_goes_on(render, motion, tmp_path, monkeypatch):
         painted.append(1)
         return paint(self, *args, **named)
 
-    monkeypatch.setattr(Avatar, "picture", counted)
+    monkeypatch.setattr(Avatar, "forward", counted)
     stop, given = 5, (f"motion={motion}", "out=a.mp4")
     result = render(*given)
     assert result.returncode == 130
@@ -355,11 +348,12 @@ def test_other_folders_are_not_touched(render, motion, tmp_path):
 
 
 def test_the_picture_of_the_avatar(bare, landmarks):
-    """`Avatar.render` is `Avatar.picture` on a background."""
+    """`Avatar.render` is `Avatar.forward` on a background."""
     avatar = load(bare, device="cpu")
     config = load_config(bare)
     frame = build_data(config).dataset("train")[0]
-    painting = avatar.picture(frame.skeleton, frame.camera)
+    with torch.no_grad():
+        painting = avatar(frame.skeleton, torch.ones(1, 33), frame.camera, maps=False)
     image = avatar.render(frame.skeleton, frame.camera)
     assert torch.equal(image, painting.image.clamp(0, 1))
     assert painting.features is None

@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from gsgan.metrics.names import METRICS
 from gsgan.report.paper import read_paper
 from gsgan.report.runs import find_runs, read_runs
-from gsgan.report.spec import METRICS, TableSpec
+from gsgan.report.spec import TableSpec
 from gsgan.report.table import build
 from gsgan.report.write import Grid, Report, Row
 

@@ -95,21 +95,6 @@ def test_models_and_variants_are_lines_of_their_own(tmp_path, monkeypatch):
     ]
 
 
-def test_without_a_score_to_show_there_are_no_curves(tmp_path, inside):
-    swept(tmp_path / "s", 0.5, 0, 30.0)
-    given = [f"runs=[{tmp_path / 's'}]", f"table.by=[{KEY}]", "table.metrics=[lpips]", "out=t"]
-    result = inside("report", *given)
-    assert result.returncode == 0, result.stderr
-    assert not (tmp_path / "t" / "report.png").exists()
-    assert "report.png" not in result.stdout
-
-
-def test_values_that_differ_late_keep_rows_of_their_own(tmp_path):
-    runs = [swept(tmp_path, weight, 0, 30.0) for weight in (0.1234567, 0.1234568)]
-    (grid,) = report_of(table(by=[KEY]), *runs).grids
-    assert len([r for r in grid.rows if r.kind == "run"]) == 2
-
-
 def test_the_command_writes_the_curves_beside_the_tables(tmp_path, inside):
     runs = [swept(tmp_path / "s", w, 0, 30 + w) for w in (0, 0.5)]
     assert len(runs) == 2

@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from report_folders import protocol, report_of, row, table, texts, variant, write_run, zju
 
 from gsgan.report.runs import read_run
+from gsgan.report.spec import written
 from gsgan.report.table import build
 from gsgan.utils.config import config_folder
 from gsgan.utils.errors import ConfigError
@@ -31,10 +32,11 @@ def test_mean_spread_seeds_and_floor(tmp_path):
     full = row(grid, "full")
     assert texts(full) == ["31.00 ± 1.00", "n/a"]
     assert full.cells[1].notes == ("n/a: weights are not available",)
-    assert full.cells[0].numbers["seeds"] == {"0": 30.0, "1": 32.0, "2": 31.0}
+    assert (full.cells[0].mean, full.cells[0].spread) == (31.0, 1.0)  # divided by n - 1
     assert full.origin == ("3", "synthetic, person", "none", "abc123")
     floor = row(grid, "all background (floor)")
     assert (texts(floor), floor.kind) == (["15.50", "n/a"], "floor")
+    assert floor.cells[0].spread is None  # one value for all seeds
 
 
 def test_one_seed_has_no_spread(tmp_path):
@@ -43,19 +45,12 @@ def test_one_seed_has_no_spread(tmp_path):
     assert "one seed has no spread" in report.grids[0].remarks[0]
 
 
-def test_the_floor_has_no_seed_and_one_value(tmp_path):
-    report = report_of(table(), *seeds(tmp_path))
-    numbers = row(report.grids[0], "all background (floor)").cells[0].numbers
-    assert (numbers["n"], numbers["spread"]) == (1, None)
-
-
 def test_a_value_that_some_seeds_lack_is_counted_and_explained(tmp_path):
     runs = [*seeds(tmp_path, values=(30.0, 31.0), lpips=0.1)]
     runs.append(write_run(tmp_path / "x", "full", 2, psnr=32.0))
     full = row(report_of(table(), *runs).grids[0], "full")
     assert texts(full) == ["31.00 ± 1.00", "0.1000 ± 0.0000"]
     assert full.cells[1].notes == ("seed 2: weights are not available",)
-    assert full.cells[1].numbers["n"] == 2
 
 
 def test_marks_departures_and_left_out_images_are_noted(tmp_path):
@@ -299,3 +294,25 @@ def test_a_mean_over_subjects_refuses_other_protocols(tmp_path):
     three = write_run(tmp_path / "c", data=zju(386), seed=1, psnr=30.0, record=protocol("q"))
     with pytest.raises(ConfigError, match="protocol: p and q"):
         report_of(table(**SUBJECTS), one, three)
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(1.006, "1.01"), (-1.5, "−1.50"), (-0.001, "0.00"), (2.0, "2.00")]
+)
+def test_signs_and_digits(value, text):
+    assert written("psnr", value) == text
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("metrics", [], "metrics must be a list of at least one"),
+        ("metrics", ["fid"], "metrics must be one of psnr, .*got 'fid'"),
+        ("splits", "novel_pose", "splits must be one of train, novel_view, novel_pose"),
+        ("variants", ["floor"], "variants must be one of full, splat, got 'floor'"),
+        ("rows", [{"run": "full", "variant": "floor"}], "variants must be one of"),
+    ],
+)
+def test_a_wrong_value_is_refused_by_key(key, value, message):
+    with pytest.raises(ConfigError, match=f"table.{message}"):
+        table(**{key: value})

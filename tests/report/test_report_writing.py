@@ -1,11 +1,11 @@
-"""Markdown, LaTeX, HTML and JSON of one report: escaped, complete, well formed."""
+"""Markdown, LaTeX and CSV of one report: escaped, complete, well formed."""
 
 from __future__ import annotations
 
-import json
+import io
 import re
-from html.parser import HTMLParser
 
+import pandas as pd
 import pytest
 from rich.console import Console
 from rich.markdown import Markdown
@@ -19,14 +19,16 @@ ORIGIN = ("3", "data_set, my_377", "none", "abc123")
 
 @pytest.fixture
 def report():
-    best = Cell("31.00 ± 1.00", {"mean": 31.0}, best=True)
+    best = Cell("31.00 ± 1.00", 31.0, 1.0, best=True)
     rows = [
-        Row(NASTY, [best, Cell("n/a", {}, (NASTY,))], ORIGIN),
+        Row(NASTY, [best, Cell("n/a", notes=(NASTY,))], ORIGIN),
         Row("GAN (paper)", [Cell("34.16"), Cell("n/a")], ("n/a",) * 4, "paper"),
-        Row("floor", [Cell("15.00"), Cell("n/a", {}, ("no parts",))], ORIGIN, "floor", ("a note",)),
+        Row(
+            "floor", [Cell("15.00"), Cell("n/a", notes=("no parts",))], ORIGIN, "floor", ("a note",)
+        ),
     ]
     grid = Grid("novel_pose: 100% [f00d]", ["PSNR ↑", "mIoU [a] ↑"], rows, ("Row − full.",))
-    return Report("t", "A & B", [grid], [{"folder": "folder_a"}], {"bad_run": "damaged <x>"})
+    return Report("A & B", [grid], {"bad_run": "damaged <x>"})
 
 
 def test_notes_are_numbered_in_the_order_of_appearance(report):
@@ -34,7 +36,7 @@ def test_notes_are_numbered_in_the_order_of_appearance(report):
 
 
 def test_markdown_tables_have_as_many_cells_in_every_row(report):
-    text = write.pages(report)["report.md"]
+    text = write.files_of(report)["report.md"]
     lines = [line for line in text.splitlines() if line.startswith("|")]
     counts = [len(re.findall(r"(?<!\\)\|", line)) for line in lines]
     assert counts == [8] * 5
@@ -46,7 +48,7 @@ def test_markdown_tables_have_as_many_cells_in_every_row(report):
 
 
 def test_latex_is_escaped_balanced_and_rectangular(report):
-    text = write.pages(report)["report.tex"]
+    text = write.files_of(report)["report.tex"]
     for name in ("table", "tabular"):
         begins, ends = (text.count(rf"\{word}{{{name}}}") for word in ("begin", "end"))
         assert begins == ends == 1
@@ -78,49 +80,6 @@ def test_latex_escapes(raw, spelled):
     assert write.LATEX.escape(raw) == spelled
 
 
-class Tags(HTMLParser):
-    def __init__(self):
-        super().__init__()
-        self.open, self.seen, self.text = [], [], ""
-
-    def handle_starttag(self, tag, attrs):
-        self.seen.append(tag)
-        assert not {"src", "href", "onclick"} & {name for name, _ in attrs}
-        if tag != "meta":
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        self.text += data
-
-
-def test_html_is_well_formed_escaped_and_fetches_nothing(report):
-    tags = Tags()
-    tags.feed(write.pages(report)["report.html"])
-    assert not tags.open
-    assert not {"script", "link", "img", "b"} & set(tags.seen)
-    assert NASTY in tags.text
-    assert "damaged <x>" in tags.text
-    assert "<em>GAN (paper)</em>" in write.pages(report)["report.html"]
-
-
-def test_html_does_not_cut_long_texts_off():
-    long = "x" * 200
-    grid = Grid("g", ["a"], [Row(long, [Cell(long)])])
-    assert write.HTML.grid(grid, {}).count(long) == 2
-
-
-def test_json_holds_every_number(report):
-    held = json.loads(write.pages(report)["report.json"])
-    first = held["grids"][0]["rows"][0]
-    assert first["cells"]["PSNR ↑"] == {"text": "31.00 ± 1.00", "mean": 31.0, "notes": []}
-    assert first["commit"] == "abc123"
-    assert held["runs"] == [{"folder": "folder_a"}]
-    assert held["left_out"] == [{"folder": "bad_run", "reason": "damaged <x>"}]
-
-
 def test_the_terminal_shows_it_all_without_markup(report):
     console = Console(record=True, width=160)
     console.print(Markdown(write.TERMINAL.body(report)))
@@ -135,3 +94,9 @@ def test_the_terminal_shows_it_all_without_markup(report):
         "mIoU [a]",
     ):
         assert word in text
+
+
+def test_csv_has_every_number(report):
+    frame = pd.read_csv(io.StringIO(write.files_of(report)["report.csv"]))
+    assert len(frame) == 6
+    assert frame.iloc[0].tolist()[2:] == ["PSNR ↑", "31.00 ± 1.00", 31.0, 1.0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import importlib.util
 import math
 from pathlib import Path
@@ -11,14 +10,13 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from skeleton_poses import DEGENERATE, REST, assert_rotation, camera, noisy, rest, rotation
+from skeleton_poses import REST, noisy, rest, rotation
 from torch import Tensor
 
-from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames, recentre
+from gsgan.skeleton import MEDIAPIPE33, Densify, bone_frames
 from gsgan.skeleton.densify import even_box, even_cylinder, even_sphere, shipped
-from gsgan.skeleton.template import HEAD
 from gsgan.utils.errors import ConfigError
 
 F64 = torch.float64
@@ -39,7 +37,6 @@ def test_counts_and_layout() -> None:
     assert points.rotations.shape == (2, 24, 3, 3)
     assert points.scales.shape == points.valid.shape == (2, 5400)
     assert bool(points.valid.all())
-    assert densify(limbs="all26").n_points == 6200
     assert sorted(d.state_dict()) == ["normals", "part_id", "rest_points", "template_points"]
 
 
@@ -145,7 +142,6 @@ def test_scales_are_the_mean_spacing() -> None:
 
 
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=20, deadline=None)
 def test_a_rigid_motion_moves_every_point_with_it(seed: int) -> None:
     d, p, R = densify(), noisy(seed, sigma=0.05), rotation(seed + 1)
     shift = torch.tensor([0.3, -4.0, 2.0], dtype=F64)
@@ -201,21 +197,6 @@ def test_unseen_joints_mark_their_points() -> None:
     assert parts[3] == []
 
 
-@pytest.mark.parametrize("dtype", [F64, torch.float32])
-@pytest.mark.parametrize("name", DEGENERATE)
-def test_degenerate_poses_stay_finite(name: str, dtype: torch.dtype) -> None:
-    d = Densify(dtype=dtype, limbs="all26")
-    p = DEGENERATE[name].clone().to(dtype).requires_grad_()
-    points = d(p)
-    assert points.means.isfinite().all()
-    assert points.scales.isfinite().all()
-    assert points.scales.min() > 0
-    assert_rotation(points.rotations.detach(), 1e-5)
-    ((points.means * d.normals).sum() + points.scales.sum() + points.rotations.sum()).backward()
-    assert p.grad is not None
-    assert p.grad.isfinite().all()
-
-
 @pytest.mark.parametrize("torso", ["fit", "cube"])
 def test_gradcheck(torso: Any) -> None:
     d = densify(points_per_limb=2, face_points=3, torso_points=3, torso=torso)
@@ -235,37 +216,6 @@ def test_batch_items_do_not_mix() -> None:
         alone = d(p[b : b + 1])
         torch.testing.assert_close(together.means[b : b + 1], alone.means, atol=1e-12, rtol=0)
         torch.testing.assert_close(together.scales[b : b + 1], alone.scales, atol=1e-12, rtol=0)
-
-
-def test_given_frames_are_used() -> None:
-    d, p = densify(), noisy(8)
-    torch.testing.assert_close(d(p, None, bone_frames(p)).means, d(p).means)
-    turned = bone_frames(p @ rotation(1).mT)
-    assert (d(p, None, turned).means - d(p).means).abs().max() > 0.01
-    # the head's frame of the 26 limb skeleton is not the 22 limb one's: computed again
-    d26 = densify(limbs="all26")
-    torch.testing.assert_close(d26(p, None, bone_frames(p)).means, d26(p).means)
-    torch.testing.assert_close(d26(p).rotations[:, 26], bone_frames(p).hubs[:, HEAD])
-
-
-def test_float32_far_away_needs_recentring() -> None:
-    """At 1e4 m float32 has a resolution of 1 mm; recentred in float64 first, the error is 1e-6."""
-    d, p = Densify(dtype=torch.float32), noisy(2)
-    far, shift = p + 1e4, torch.full((1, 3), 1e4, dtype=F64)
-    cam = camera((64, 64))
-    far_cam = dataclasses.replace(cam, t=cam.t - (cam.R @ shift.unsqueeze(-1)).squeeze(-1))
-    near_p, near_cam, root = recentre(far, far_cam)
-    exact = densify()(p)
-    means = d(near_p.float()).means
-    torch.testing.assert_close(
-        means.double() + root.unsqueeze(1) - 1e4, exact.means, atol=2e-6, rtol=0
-    )
-    seen, _ = near_cam.to(torch.float32).project(means)
-    expected, _ = cam.project(exact.means)
-    torch.testing.assert_close(seen.double(), expected, atol=1e-3, rtol=0)
-    # without it the error is that resolution, but not more
-    direct = d(far.float()).means.double() - 1e4
-    assert 1e-4 < (direct - exact.means).abs().max() < 2e-2
 
 
 def test_even_samplers_cover_evenly() -> None:
@@ -313,7 +263,6 @@ def test_shipped_templates_can_be_made_again() -> None:
     [
         ({"torso": "ball"}, "torso must be one of fit, cube, got 'ball'"),
         ({"sampler": "random"}, "sampler must be one of even, trimesh, got 'random'"),
-        ({"limbs": "all"}, "limbs must be one of paper22, all26, got 'all'"),
         ({"face_points": 0}, r"at least one point, got \(200, 0, 500, 60\)"),
         ({"radius_ratio": 0.0}, "must be positive, got 0.0"),
         ({"sampler": "trimesh", "points_per_limb": 64}, "has 200 cylinder points.*64"),

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from skeleton_poses import DEGENERATE, REST, assert_rotation, noisy, rest, rotation
 from torch import Tensor
@@ -16,8 +16,8 @@ from gsgan.skeleton.frames import BoneFrames
 from gsgan.skeleton.template import CHEST, HEAD, N_HUBS, PELVIS
 from gsgan.skeleton.tensors import Swing, constants
 
+EYE = torch.eye(3, dtype=torch.float64)[None]
 LIMB = {limb: k for k, limb in enumerate(MEDIAPIPE33.limbs)}
-TWISTS: tuple[Any, ...] = ("none", "hinge")
 
 
 def all_rotations(f: BoneFrames) -> Tensor:
@@ -43,7 +43,7 @@ def test_limb_frames_point_along_the_bones() -> None:
 
 
 def test_local_rotation_is_relative_to_the_parent() -> None:
-    f = bone_frames(noisy(1), twist="hinge")
+    f = bone_frames(noisy(1))
     frames = torch.cat([f.hubs, f.limbs], dim=1)
     parents = frames[:, list(MEDIAPIPE33.limb_parents)]
     torch.testing.assert_close(parents @ f.local, frames[:, N_HUBS:])
@@ -60,7 +60,6 @@ def test_swing_is_the_shortest_rotation() -> None:
 
 
 @given(angle=st.floats(-0.05, 0.05), roll=st.floats(0, 6.28))
-@settings(max_examples=50, deadline=None)
 def test_swing_near_the_antipode_still_hits_its_target(angle: float, roll: float) -> None:
     a = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
     x, y = torch.tensor([roll], dtype=torch.float64).cos(), torch.tensor([roll]).sin()
@@ -72,12 +71,11 @@ def test_swing_near_the_antipode_still_hits_its_target(angle: float, roll: float
     torch.testing.assert_close((R @ a.unsqueeze(-1))[0, :, :, 0], b, atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("twist", TWISTS)
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 @pytest.mark.parametrize("name", DEGENERATE)
-def test_degenerate_poses_stay_finite(name: str, dtype: torch.dtype, twist: Any) -> None:
+def test_degenerate_poses_stay_finite(name: str, dtype: torch.dtype) -> None:
     p = DEGENERATE[name].clone().to(dtype).requires_grad_()
-    f = bone_frames(p, twist=twist)
+    f = bone_frames(p)
     code = omega(p, None, rotation(0).to(dtype).unsqueeze(0), frames=f)
     assert_rotation(all_rotations(f).detach(), 1e-5)
     assert_rotation(rotation_from_6d(code.detach()), 1e-5)
@@ -87,13 +85,11 @@ def test_degenerate_poses_stay_finite(name: str, dtype: torch.dtype, twist: Any)
     assert p.grad.isfinite().all()
 
 
-@pytest.mark.parametrize("twist", TWISTS)
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=20, deadline=None)
-def test_frames_turn_with_the_body(seed: int, twist: Any) -> None:
+def test_frames_turn_with_the_body(seed: int) -> None:
     p, R = noisy(seed, sigma=0.06), rotation(seed + 1)
     shift = torch.tensor([3.0, -2.0, 5.0], dtype=torch.float64)
-    a, b = bone_frames(p, twist=twist), bone_frames(p @ R.mT + shift, twist=twist)
+    a, b = bone_frames(p), bone_frames(p @ R.mT + shift)
     torch.testing.assert_close(b.limbs, R @ a.limbs, atol=1e-9, rtol=0)
     torch.testing.assert_close(b.hubs, R @ a.hubs, atol=1e-9, rtol=0)
     torch.testing.assert_close(b.torso, R @ a.torso, atol=1e-9, rtol=0)
@@ -116,7 +112,7 @@ def test_omega_layout() -> None:
     p, R_cam = noisy(8), rotation(9).unsqueeze(0)
     f = bone_frames(p)
     code = rotation_from_6d(omega(p, None, R_cam))[0]
-    world = rotation_from_6d(omega(p, None, None, frame="world"))[0]
+    world = rotation_from_6d(omega(p, None, EYE))[0]
     for j in (11, 12):
         torch.testing.assert_close(code[j], R_cam[0] @ f.hubs[0, CHEST])
         torch.testing.assert_close(world[j], f.hubs[0, CHEST])
@@ -138,7 +134,7 @@ def test_omega_is_identity_without_swing() -> None:
     for (a, b), d in zip(MEDIAPIPE33.limbs, MEDIAPIPE33.rest_directions, strict=True):
         if (a, b) not in ((17, 19), (18, 20), (29, 31), (30, 32)):
             p[0, b] = p[0, a] + 0.2 * torch.tensor(d, dtype=torch.float64)
-    code = rotation_from_6d(omega(p, None, None, frame="world"))[0]
+    code = rotation_from_6d(omega(p, None, EYE))[0]
     eye = torch.eye(3, dtype=torch.float64).expand_as(code)
     torch.testing.assert_close(code, eye, atol=1e-9, rtol=0)
 
@@ -173,79 +169,15 @@ def test_zero_length_bone_keeps_its_parents_frame() -> None:
     assert f.lengths[0, LIMB[(13, 15)]] == pytest.approx(1e-3)
 
 
-def test_a_bone_through_zero_length_does_not_jump() -> None:
-    """The elbow's bone shrinks, reverses its direction and grows: frames step by step."""
-    s = torch.linspace(-0.01, 0.01, 2001, dtype=torch.float64)
-    p = rest(len(s))
-    p[:, 15] = p[:, 13] + s[:, None] * torch.tensor([0.0, 0.6, 0.8], dtype=torch.float64)
-    f = bone_frames(p)
-    turn = (all_rotations(f)[1:] - all_rotations(f)[:-1]).flatten(2).norm(dim=-1).max()
-    assert turn < 5 * 1e-5 / 1e-3  # a step over min_length
-
-
-@pytest.mark.parametrize("twist", TWISTS)
-def test_gradcheck(twist: Any) -> None:
+def test_gradcheck() -> None:
     p = noisy(11, sigma=0.05).requires_grad_()
     R_cam = rotation(1).unsqueeze(0)
 
     def values(p: Tensor) -> tuple[Tensor, ...]:
-        f = bone_frames(p, twist=twist)
+        f = bone_frames(p)
         return f.hubs, f.limbs, f.lengths, f.torso, omega(p, None, R_cam, frames=f)
 
     assert torch.autograd.gradcheck(values, (p,), fast_mode=True)
-
-
-@pytest.mark.parametrize("twist", TWISTS)
-def test_roll_is_continuous_on_a_random_walk(twist: Any) -> None:
-    """Small steps of the joints make small steps of every frame."""
-    generator = torch.Generator().manual_seed(4)
-    step, steps = 1e-3, 300
-    noise = step * torch.randn(steps, 33, 3, generator=generator, dtype=torch.float64)
-    walk = REST + noise.cumsum(0).clamp(-0.1, 0.1)
-    f = bone_frames(walk, twist=twist)
-    shortest = f.lengths.min()
-    turn = (all_rotations(f)[1:] - all_rotations(f)[:-1]).flatten(2).norm(dim=-1).max()
-    # a joint's step (about 5 step at most) over the shortest bone, gathered over three levels
-    assert turn < 3 * 2**0.5 * 10 * step / shortest
-
-
-def test_an_arm_near_the_fold_moves_without_a_jump() -> None:
-    """The forearm sweeps past its antipode at 2 degrees: frames move by bounded steps."""
-    t = torch.linspace(-0.5, 0.5, 2001, dtype=torch.float64)
-    p = rest(len(t))
-    back = torch.nn.functional.normalize(p[:, 11] - p[:, 13], dim=-1)
-    side = torch.nn.functional.normalize(
-        torch.linalg.cross(back, torch.tensor([[0.0, 0.0, 1.0]]).to(back).expand_as(back)), dim=-1
-    )
-    front = torch.linalg.cross(side, back)
-    d = back + 0.035 * side + t[:, None] * front
-    p[:, 15] = p[:, 13] + 0.25 * torch.nn.functional.normalize(d, dim=-1)
-    R = bone_frames(p).limbs[:, LIMB[(13, 15)]]
-    turn = (R[1:] - R[:-1]).flatten(1).norm(dim=-1).max()
-    assert turn < 2 * 2**0.5 * 5e-4 / 0.035 * 1.5  # 2 x the path's angular step round the antipode
-
-
-def test_hinge_twist_follows_the_bend_plane() -> None:
-    """Elbow bent square: the upper arm's hinge axis is along the bend normal."""
-    p = rest()
-    p[0, 13] = p[0, 11] + 0.28 * torch.tensor([0.6, -0.6, 0.5], dtype=torch.float64)
-    upper = torch.nn.functional.normalize(p[0, 13] - p[0, 11], dim=0)
-    axis = torch.tensor(MEDIAPIPE33.hinge_axes[0], dtype=torch.float64)
-    for angle in torch.linspace(-2.5, 2.5, 7, dtype=torch.float64):
-        n = axis * angle.cos() + torch.linalg.cross(upper, axis) * angle.sin()
-        p[0, 15] = p[0, 13] + 0.25 * torch.linalg.cross(n, upper)
-        f = bone_frames(p, twist="hinge")
-        torch.testing.assert_close(f.limbs[0, LIMB[(11, 13)]] @ axis, n, atol=1e-6, rtol=0)
-        torch.testing.assert_close(f.limbs[0, LIMB[(13, 15)]] @ axis, n, atol=1e-6, rtol=0)
-        untwisted = bone_frames(p).limbs[0, LIMB[(11, 13)]] @ axis
-        torch.testing.assert_close(untwisted, axis, atol=1e-6, rtol=0)
-
-
-def test_hinge_does_not_turn_a_straight_limb() -> None:
-    p = DEGENERATE["straight"]
-    torch.testing.assert_close(
-        bone_frames(p, twist="hinge").limbs, bone_frames(p).limbs, atol=1e-6, rtol=0
-    )
 
 
 def test_float32_far_from_the_origin_matches_its_own_quantised_input() -> None:
@@ -273,7 +205,6 @@ def test_constants_from_inference_mode_can_be_used_for_training() -> None:
         ({"p": torch.zeros(1, 33, 3, dtype=torch.int64)}, r"p must be a float.*int64"),
         ({"valid": torch.ones(1, 33)}, r"valid must be a bool.*float32"),
         ({"valid": torch.ones(2, 33, dtype=torch.bool)}, r"valid must.*\[2, 33\]"),
-        ({"twist": "free"}, r"twist must be 'none' or 'hinge', got 'free'"),
     ],
 )
 def test_misuse_is_named(change: dict[str, Any], message: str) -> None:
@@ -282,7 +213,5 @@ def test_misuse_is_named(change: dict[str, Any], message: str) -> None:
 
 
 def test_omega_misuse_is_named() -> None:
-    with pytest.raises(ValueError, match=r"R_cam must have shape \[1, 3, 3\], got None"):
-        omega(rest(), None, None)
-    with pytest.raises(ValueError, match="frame must be 'camera' or 'world', got 'body'"):
-        omega(rest(), None, None, frame="body")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"R_cam must have shape \[1, 3, 3\], got \[3, 3\]"):
+        omega(rest(), None, EYE[0])

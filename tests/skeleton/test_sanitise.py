@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from skeleton_poses import NAMES, REST, joint, noisy, rest, rotation
 
@@ -85,10 +85,8 @@ def test_the_face_is_aligned_with_its_seen_joints() -> None:
 def test_invisible_joints_are_filled_in() -> None:
     p, visibility = noisy(1), torch.ones(1, 33)
     visibility[0, 13], visibility[0, 14], visibility[0, 16] = 0.0, NAN, 0.2
-    _, valid = sanitise(p, visibility)
+    q, valid = sanitise(p, visibility)
     assert (~valid[0]).nonzero().flatten().tolist() == [13, 14]
-    q, valid = sanitise(p, visibility, min_visibility=0.5)
-    assert (~valid[0]).nonzero().flatten().tolist() == [13, 14, 16]
     assert torch.equal(q[valid], p[valid])
     assert not torch.equal(q[~valid], p[~valid])
 
@@ -97,7 +95,6 @@ def test_invisible_joints_are_filled_in() -> None:
     seed=st.integers(0, 1000),
     lost=st.sets(st.sampled_from([j for j in range(33) if j not in (11, 12, 23)])),
 )
-@settings(max_examples=40, deadline=None)
 def test_filled_in_joints_move_with_the_body(seed: int, lost: set[int]) -> None:
     p, R = noisy(seed), rotation(seed + 1)
     q, valid = sanitise(lose(p, sorted(lost)))
@@ -148,8 +145,6 @@ def test_a_skeleton_without_a_trunk_is_refused() -> None:
         ValueError, match=r"in 1 of 3 skeletons .*item 1: left_shoulder, right_hip\)"
     ):
         sanitise(p)
-    with pytest.raises(ValueError, match="needs 4 of the four shoulders and hips"):
-        sanitise(lose(noisy(0), [11]), min_trunk_joints=4)
 
 
 def test_estimated_hips_hold_a_trunk_of_which_only_the_shoulders_are_seen() -> None:
@@ -172,8 +167,6 @@ def test_misuse_is_named() -> None:
         sanitise(torch.zeros(1, 24, 3))
     with pytest.raises(ValueError, match=r"visibility must have shape \[1, 33\], got \[33\]"):
         sanitise(noisy(0), torch.ones(33))
-    with pytest.raises(ValueError, match="min_trunk_joints must be 3 or 4, got 2"):
-        sanitise(lose(noisy(0), [0]), min_trunk_joints=2)
 
 
 def test_limb_length_sum() -> None:

@@ -65,16 +65,6 @@ def test_kept_memory_is_bounded(monkeypatch):
     assert 0 < buffers.kept() <= 5 << 20
 
 
-def test_least_recently_used_sizes_are_freed_first(monkeypatch):
-    monkeypatch.setattr(buffers, "KEPT", 5 << 20)
-    for channels in (8, 8, 9, 7):  # 2, 2, 2.25 and 1.75 MB, one after the other
-        buffers.zeros((1, channels, 256, 256), torch.float32)
-        gc.collect()
-    assert sum(len(memories) for memories in buffers._free.values()) == 2
-    where = next(m for m in buffers._free.values() if m)[0].nbytes
-    assert where > 9 * 256 * 256 * 4
-
-
 def test_memory_may_be_freed_in_other_threads():
     def draw(_: int) -> bool:
         clean = True

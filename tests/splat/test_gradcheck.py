@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from splat_scenes import BACKENDS, camera, cloud, with_covariances
+from splat_scenes import BACKENDS, camera, cloud, needs_native, with_covariances
 
 from gsgan.scene import Camera
-from gsgan.splat import ACCURACY, project, rasterise, sh_to_colour
+from gsgan.splat import ACCURACY, native_project, project, rasterise, sh_to_colour
 
 EXACT = ACCURACY["exact"]
-DRAWN = ("means", "factors", "opacities", "features", "depths")
+DRAWN = ("means", "factors", "opacities", "depths")
 
 every_backend = pytest.mark.parametrize("backend", BACKENDS)
 every_shape = pytest.mark.parametrize("shape", ["quats", "covariances"])
@@ -81,19 +81,22 @@ def test_antialiased_batches(backend, shape):
     assert checked(image, *(getattr(gaussians, name) for name in names), cam.K, cam.R, cam.t)
 
 
+@pytest.mark.parametrize(
+    "projection", [project, pytest.param(native_project.project, marks=needs_native)]
+)
 @every_shape
 @pytest.mark.parametrize("antialias", [False, True])
-def test_projection_alone(shape, antialias):
+def test_projection_alone(projection, shape, antialias):
     gaussians, cam, names = scene(shape)
     # The second is where the Jacobian is clamped: its gradient reaches K through the field of view.
     gaussians.means[0, 1] = torch.tensor([4.0, -3.0, 2.0])
     settings = replace(EXACT, antialias=antialias)
-    assert project(gaussians, cam, settings).visible.all()
+    assert projection(gaussians, cam, settings).visible.all()
 
     def ellipses(*tensors):
         given = replace(gaussians, **dict(zip(names, tensors, strict=False)))
         K, R, t = tensors[len(names) :]
-        projected = project(given, replace(cam, K=K, R=R, t=t), settings)
+        projected = projection(given, replace(cam, K=K, R=R, t=t), settings)
         return tuple(getattr(projected, name) for name in DRAWN)
 
     assert checked(ellipses, *(getattr(gaussians, name) for name in names), cam.K, cam.R, cam.t)

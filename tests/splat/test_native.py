@@ -1,4 +1,4 @@
-"""The compiled kernel against a dense float64 composite."""
+"""The compiled kernel: cut-offs, the exponential, threads, memory; see also test_backends.py."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from gsgan.splat import native
+from gsgan.splat import native, reference
 from gsgan.splat.project import Projected
 from gsgan.splat.settings import ACCURACY, Accuracy
 
-needs_kernel = pytest.mark.skipif(not native.available(), reason=native.why_not() or "available")
+pytestmark = pytest.mark.skipif(not native.available(), reason=native.why_not() or "available")
 
 
 EXACT, HIGH, STANDARD, DRAFT = (ACCURACY[n] for n in ("exact", "high", "standard", "draft"))
@@ -28,37 +28,6 @@ def _one_thread() -> Iterator[None]:
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
-
-
-def dense(
-    p: Projected, size: tuple[int, int], cut: Accuracy, want_depth: bool
-) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Every Gaussian at every pixel, one at a time."""
-    H, W = size
-    rows, columns = (torch.arange(n, dtype=p.means.dtype) + 0.5 for n in size)
-    y, x = torch.meshgrid(rows, columns, indexing="ij")
-    values = torch.cat([p.features, p.depths.unsqueeze(-1)], dim=-1)
-    images, alphas = [], []
-    for b in range(len(p.means)):
-        left = torch.ones(H, W, dtype=p.means.dtype)
-        image = torch.zeros(values.shape[-1], H, W, dtype=p.means.dtype)
-        for i in p.depths[b].detach().argsort(stable=True).tolist():
-            dx, dy = x - p.means[b, i, 0], y - p.means[b, i, 1]
-            P, K, R = p.factors[b, i]
-            q = (P * (dx + K * dy)) ** 2 + (R * dy) ** 2
-            raw = p.opacities[b, i] * torch.exp(-0.5 * q)
-            drawn = p.visible[b, i] & (raw >= cut.alpha_min)
-            if cut.extent == "sigma":
-                near = (dx.abs() <= p.extents[b, i, 0]) & (dy.abs() <= p.extents[b, i, 1])
-                drawn = drawn & near
-            drawn = drawn & (left >= cut.transmittance_min)
-            alpha = torch.where(drawn, raw.clamp(max=cut.alpha_max), 0.0)
-            image = image + values[b, i][:, None, None] * alpha * left
-            left = left * (1 - alpha)
-        images.append(image)
-        alphas.append(1 - left)
-    image = torch.stack(images)
-    return image[:, :-1], torch.stack(alphas)[:, None], image[:, -1:] if want_depth else None
 
 
 def scene(
@@ -147,9 +116,11 @@ def in_dtype(p: Projected, dtype: torch.dtype) -> Projected:
 def assert_same(
     p: Projected, size: tuple[int, int], cut: Accuracy, tolerance: float, gradient_tolerance: float
 ) -> None:
-    """Native, in the scene's dtype, against dense in float64; gradients relative to the largest."""
+    """Native against the reference in float64; gradients relative to the largest."""
     got, got_gradients = values_and_gradients(native.composite, p, size, cut)
-    want, want_gradients = values_and_gradients(dense, in_dtype(p, torch.float64), size, cut)
+    want, want_gradients = values_and_gradients(
+        reference.composite, in_dtype(p, torch.float64), size, cut
+    )
     for name, x, y in zip(("features", "alpha", "depth"), got, want, strict=True):
         error = (x.double() - y).abs().max().item()
         assert error <= tolerance, f"{name}: {error:.2e}"
@@ -159,51 +130,12 @@ def assert_same(
         assert error <= gradient_tolerance * largest + 1e-300, f"gradient of {name}: {error:.2e}"
 
 
-@needs_kernel
-@pytest.mark.parametrize("cut", [EXACT, HIGH, STANDARD, DRAFT])
-def test_every_setting_and_batches(cut: Accuracy) -> None:
-    p = scene(B=2, N=50, cut=cut)
-    assert_same(p, (21, 35), cut, 1e-13, 1e-13)
-
-
-@needs_kernel
-@pytest.mark.parametrize("cut", [EXACT, HIGH])
-def test_float32(cut: Accuracy) -> None:
-    p = scene(N=60, cut=cut, dtype=torch.float32)
-    # No value is within float32 rounding of a cut-off: 1e-6 is below it.
-    assert_same(p, (21, 35), cut, 4e-6, 1e-5)
-
-
-@needs_kernel
-def test_needles_reach_every_tile_they_cross() -> None:
-    p = scene(N=20, size=(70, 90), cut=STANDARD, sigmas=(0.3, 30.0), seed=3)
-    assert_same(p, (70, 90), STANDARD, 1e-13, 1e-12)
-
-
-@needs_kernel
 def test_box_extent_is_a_per_pixel_cut_off() -> None:
     p = scene(N=20, seed=4)
     p = replace(p, extents=torch.full_like(p.extents, 3.5))
     assert_same(p, (21, 35), replace(EXACT, extent="sigma"), 1e-13, 1e-13)
 
 
-@needs_kernel
-def test_gradcheck() -> None:
-    p = scene(N=7, C=2, size=(9, 18), sigmas=(1.0, 4.0))
-    # Equal depths would be reordered by the finite differences.
-    apart = torch.tensor([[4.0, 2.0, 7.0, 1.0, 5.0, 3.0, 6.0]], dtype=torch.float64)
-    p = replace(p, depths=apart)
-    leaves, _ = with_leaves(p)
-
-    def images(*values: Tensor) -> tuple[Tensor, ...]:
-        q = replace(p, **dict(zip(LEAVES, values, strict=True)))
-        out = native.composite(q, (9, 18), EXACT, True)
-        return tuple(x for x in out if x is not None)
-
-    assert torch.autograd.gradcheck(images, leaves)
-
-
-@needs_kernel
 @pytest.mark.parametrize(
     ("dtype", "ulps"), [(torch.float32, 4), (torch.float64, 4)], ids=["float32", "float64"]
 )
@@ -224,7 +156,6 @@ def test_accuracy_of_the_exponential(dtype: torch.dtype, ulps: int) -> None:
     assert (relative <= allowed).all()
 
 
-@needs_kernel
 def test_cap_stops_value_and_gradient() -> None:
     leaves, q = with_leaves(one((0.5, 0.5), 1.0, 3.0))
     features, alpha, *_ = native.composite(q, (1, 1), replace(EXACT, alpha_max=0.9), False)
@@ -235,38 +166,6 @@ def test_cap_stops_value_and_gradient() -> None:
     assert gradients[3].item() == pytest.approx(0.9)
 
 
-@needs_kernel
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_depth_order_of_any_sign(dtype: torch.dtype) -> None:
-    depths = torch.tensor([[3.0, -1.0, 0.0, -0.0, 1e-30, -2.5, 1e30]], dtype=torch.float64)
-    p = one((0.5, 0.5), 0.5, 3.0, n=7, dtype=dtype)
-    p = replace(p, features=torch.eye(7, dtype=dtype)[None], depths=depths)
-    features = native.composite(p, (1, 1), EXACT, False)[0].flatten()
-    assert features.argsort(descending=True).tolist() == [5, 1, 2, 3, 4, 0, 6]
-
-
-@needs_kernel
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("opacity", [0.001, 0.5])
-def test_five_thousand_layers(dtype: torch.dtype, opacity: float) -> None:
-    # Equal layers: C = 1 - (1 - o)^n, dC/do of layer i = T_i (1 - colour behind it).
-    n = 5000
-    p = one((0.5, 0.5), opacity, 3.0, n=n, dtype=dtype)
-    leaves, q = with_leaves(p)
-    features = native.composite(q, (1, 1), EXACT, False)[0]
-    rounded = p.opacities[0, 0].double()
-    log_left = torch.log1p(-rounded)
-    tolerance = 1e-12 if dtype == torch.float64 else 2e-4
-    assert features.item() == pytest.approx(-torch.expm1(n * log_left).item(), rel=tolerance)
-    _, _, opacities, colours = torch.autograd.grad(features.sum(), leaves[:4])
-    i = torch.arange(n, dtype=torch.float64)
-    want = torch.exp((n - 1) * log_left).expand(n)
-    torch.testing.assert_close(opacities[0].double(), want, rtol=tolerance, atol=1e-7)
-    want = rounded * torch.exp(i * log_left)
-    torch.testing.assert_close(colours[0, :, 0].double(), want, rtol=tolerance, atol=1e-37)
-
-
-@needs_kernel
 def test_stop_is_by_incoming_transmittance() -> None:
     # T before each layer: 1, 0.5, 0.25, 0.125; a bound of 0.25 keeps three, 0.26 keeps two.
     p = one((0.5, 0.5), 0.5, 3.0, n=9)
@@ -278,15 +177,6 @@ def test_stop_is_by_incoming_transmittance() -> None:
         assert (g[0] != 0).sum() == (3 if bound == 0.25 else 2)
 
 
-@needs_kernel
-def test_opacity_zero_draws_nothing_but_has_a_gradient() -> None:
-    leaves, q = with_leaves(one((0.5, 0.5), 0.0, 3.0))
-    features = native.composite(q, (1, 1), EXACT, False)[0]
-    assert features.item() == 0
-    assert torch.autograd.grad(features.sum(), leaves[2])[0].item() == 1
-
-
-@needs_kernel
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_bits_do_not_depend_on_threads(dtype: torch.dtype) -> None:
     p = scene(B=2, N=3000, C=5, size=(60, 70), cut=HIGH, dtype=dtype)
@@ -299,7 +189,6 @@ def test_bits_do_not_depend_on_threads(dtype: torch.dtype) -> None:
         assert all(torch.equal(x, y) for x, y in zip(results[0], other, strict=True))
 
 
-@needs_kernel
 def test_memory_budget_of_the_backward_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     p = scene(B=2, N=50, size=(64, 80), sigmas=(2.0, 20.0))
     whole = values_and_gradients(native.composite, p, (64, 80), EXACT)[1]
@@ -309,7 +198,6 @@ def test_memory_budget_of_the_backward_changes_no_bit(monkeypatch: pytest.Monkey
         assert all(torch.equal(x, y) for x, y in zip(whole, parts, strict=True))
 
 
-@needs_kernel
 def test_gradient_of_one_output_only_and_twice() -> None:
     leaves, q = with_leaves(scene(N=10))
     features, alpha, depth, _ = native.composite(q, (21, 35), EXACT, True)
@@ -322,7 +210,6 @@ def test_gradient_of_one_output_only_and_twice() -> None:
         assert not native.composite(q, (21, 35), EXACT, False)[0].requires_grad
 
 
-@needs_kernel
 def test_strided_inputs_and_gradients() -> None:
     p = scene(B=2, N=10)
     strided = Projected(
@@ -339,7 +226,6 @@ def test_strided_inputs_and_gradients() -> None:
     assert torch.equal(strange, plain)
 
 
-@needs_kernel
 @pytest.mark.parametrize("name", ["means", "factors", "opacities", "depths"])
 def test_values_that_are_not_finite_are_refused(name: str) -> None:
     p = scene(B=2, N=5)
@@ -352,20 +238,6 @@ def test_values_that_are_not_finite_are_refused(name: str) -> None:
     assert native.composite(hidden, (21, 35), HIGH, False)[0].isfinite().all()
 
 
-@needs_kernel
-def test_misuse_is_named() -> None:
-    p = scene(N=5)
-    with pytest.raises(ValueError, match=r"factors must be \[1, 5, 3\], got \[1, 5, 4\]"):
-        native.composite(replace(p, factors=torch.zeros(1, 5, 4)), (4, 4), HIGH, False)
-    with pytest.raises(ValueError, match=r"depths must be torch\.float64, got torch\.float32"):
-        native.composite(replace(p, depths=p.depths.float()), (4, 4), HIGH, False)
-    with pytest.raises(ValueError, match="float32 or float64"):
-        native.composite(in_dtype(p, torch.float16), (4, 4), HIGH, False)
-    with pytest.raises(ValueError, match="size"):
-        native.composite(p, (0, 4), HIGH, False)
-
-
-@needs_kernel
 def test_extents_without_bound() -> None:
     p = scene(N=6)
     p = replace(p, extents=torch.full_like(p.extents, float("inf")))

@@ -27,9 +27,9 @@ def test_geometry_and_rasteriser_stay_in_float32_under_autocast(build, half):
     """F, alpha, S and Ĝ bit for bit; the image to the type's own rounding."""
     _, avatar, frame = build("size.rgb_skip=false")  # else the image starts as F itself
     with torch.no_grad():
-        plain = avatar.paint(frame)
+        plain = avatar(*frame.inputs)
         with torch.autocast("cpu", dtype=half):
-            mixed = avatar.paint(frame)
+            mixed = avatar(*frame.inputs)
     for name in ("features", "splat_alpha", "segmentation"):
         assert torch.equal(getattr(mixed, name), getattr(plain, name)), name
     assert torch.equal(mixed.gaussians.means, plain.gaussians.means)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsgan.motion.character import Character, Motion
+from gsgan.motion.character import Animation, Character
 from gsgan.motion.rotations import between, rotation
 
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
@@ -20,7 +20,7 @@ LIMBS = ("UpLeg", "Leg", "Foot", "ToeBase", "Shoulder", "Arm", "ForeArm", "Hand"
 def write_bvh(
     path: Path,
     character: Character,
-    motion: Motion,
+    motion: Animation,
     step: float,
     *,
     name: Callable[[str], str] = str,
@@ -221,7 +221,7 @@ class Convention:
     roots: tuple[str, ...] = ()
     ends: bool = True
 
-    def write(self, path: Path, character: Character, motion: Motion, step: float) -> Path:
+    def write(self, path: Path, character: Character, motion: Animation, step: float) -> Path:
         """The motion as a file."""
         return write_bvh(
             path,

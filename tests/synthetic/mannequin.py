@@ -11,7 +11,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from scipy.spatial.transform import Rotation
 
-from gsgan.motion.character import Character, Motion
+from gsgan.motion.character import Animation, Character
 
 TRUNK = {
     "Hips": (None, (0, 0.02, 0.98)),
@@ -88,7 +88,7 @@ def mannequin(without: Callable[[str], bool] = lambda bone: False) -> Character:
     )
 
 
-def reposed(character: Character, motion: Motion, frame: int) -> Character:
+def reposed(character: Character, motion: Animation, frame: int) -> Character:
     """The character with one pose of a motion as its rest pose."""
     R, joints = motion.rotations[frame], motion.joints[frame]
     vertices, normals = character.skinned(R, joints)
@@ -117,7 +117,7 @@ def inside(points: np.ndarray, vertices: np.ndarray, faces: np.ndarray) -> np.nd
 def write_bvh(
     path: Path,
     character: Character,
-    motion: Motion,
+    motion: Animation,
     step: float,
     *,
     name: Callable[[str], str] = str,

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from mannequin import mannequin, write_bvh
 
-from gsgan.motion.character import Motion
+from gsgan.motion.character import Animation
 from gsgan.motion.rig import REQUIRED
 from gsgan.motion.rotations import axis_angle, rotation
 from gsgan.motion.standard import ROOM, known_joints
-from gsgan.synthetic.motion import Choreography
-from gsgan.synthetic.motion_file import BvhMotion
+from gsgan.synthetic.bvh_motion import BvhMotion
+from gsgan.synthetic.posing import Choreography
 from gsgan.utils.errors import DataError
 
 STEP = 1 / 30
@@ -45,13 +45,13 @@ def whole(tmp_path_factory, person, signing):
     return write_bvh(tmp_path_factory.mktemp("bvh") / "a.bvh", person, signing, STEP).read_text()
 
 
-def travelling(person, metres: float) -> Motion:
+def travelling(person, metres: float) -> Animation:
     """A body that glides over the floor at a constant speed, without moving a joint."""
     frames = 60
     joints = np.repeat(person.joints[None], frames, axis=0)
     joints[..., 1] -= np.linspace(0, metres, frames)[:, None]
     eye = np.broadcast_to(np.eye(3), (frames, len(person.bones), 3, 3))
-    return Motion(eye, joints, {}, ("glide",) * frames)
+    return Animation(eye, joints, {}, ("glide",) * frames)
 
 
 def angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -170,14 +170,12 @@ def test_a_file_without_a_required_joint(tmp_path, person, signing):
     [
         (lambda text: text[: len(text) // 2], "numbers found"),
         (lambda text: text[:300], "HIERARCHY and MOTION"),
-        (lambda text: text.replace("Frames: 60", "Frames: 0"), "0 frames"),
         (lambda text: text.replace("Frames: 60", "Frames: 61"), "61 frames"),
         (lambda text: text.replace("Frame Time: 0.0", "Frame Time: nan 0.0"), "numbers found"),
         (lambda text: text[:-30] + " nan" + text[-20:], "numbers found|not finite|could not"),
         (lambda text: text.replace("OFFSET 0.000000", "OFFSET nan", 1), "not finite"),
-        (lambda text: text.replace("CHANNELS 3", "CHANNELS 99", 1), "is no whole BVH file"),
-        (lambda text: text.replace("Zrotation", "Wrotation", 1), "is no whole BVH file"),
-        (lambda text: "glTF" + text, "HIERARCHY"),
+        (lambda text: text.replace("CHANNELS 3", "CHANNELS 99", 1), "is not a complete BVH file"),
+        (lambda text: text.replace("Zrotation", "Wrotation", 1), "is not a complete BVH file"),
         (lambda text: "", "HIERARCHY"),
     ],
 )
@@ -187,8 +185,3 @@ def test_damaged_files_end_in_one_sentence(tmp_path, person, whole, damage, mess
     with pytest.raises(DataError, match=message) as error:
         BvhMotion(person, path)
     assert "a.bvh" in str(error.value)
-
-
-def test_a_missing_file(tmp_path, person):
-    with pytest.raises(DataError, match=r"none\.bvh cannot be read"):
-        BvhMotion(person, tmp_path / "none.bvh")

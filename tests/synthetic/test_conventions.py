@@ -7,20 +7,20 @@ import pytest
 from conventions import CONVENTIONS
 from mannequin import mannequin
 
-from gsgan.motion.character import Motion
+from gsgan.motion.character import Animation
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.rotations import axis_angle
-from gsgan.synthetic.motion import Choreography
-from gsgan.synthetic.motion_file import BvhMotion
+from gsgan.synthetic.bvh_motion import BvhMotion
+from gsgan.synthetic.posing import Choreography
 
 STEP = 1 / 30
 
 
-def neutral(person, frames: int) -> Motion:
+def neutral(person, frames: int) -> Animation:
     """The rest pose, as which many recordings begin."""
     eye = np.broadcast_to(np.eye(3), (frames, len(person.bones), 3, 3))
     joints = np.broadcast_to(person.joints, (frames, *person.joints.shape))
-    return Motion(eye, joints, {}, ("rest",) * frames)
+    return Animation(eye, joints, {}, ("rest",) * frames)
 
 
 @pytest.fixture(scope="module")
@@ -29,10 +29,10 @@ def person():
 
 
 @pytest.fixture(scope="module")
-def acted(person) -> Motion:
+def acted(person) -> Animation:
     """Three frames of rest, then frames of the whole choreography."""
     rest, moves = neutral(person, 3), Choreography(person).at(np.linspace(0, 40, 60))
-    return Motion(
+    return Animation(
         np.concatenate([rest.rotations, moves.rotations]),
         np.concatenate([rest.joints, moves.joints]),
         {},

@@ -9,10 +9,10 @@ from scipy.spatial import cKDTree
 
 from gsgan.motion.rig import SIDES
 from gsgan.motion.rotations import axis_angle, twist
-from gsgan.synthetic.choreography import frame_times
+from gsgan.synthetic.controls import frame_times
 from gsgan.synthetic.gltf import avatar_path, read_character
-from gsgan.synthetic.motion import Choreography
-from gsgan.synthetic.scene_setup import VERSION, Scene, Settings, dataset_key
+from gsgan.synthetic.posing import Choreography
+from gsgan.synthetic.scene_setup import VERSION, Scene, SceneSettings, dataset_key
 from gsgan.synthetic.signs import HELD_OUT, SIGNS, split_signs
 from gsgan.utils.errors import ConfigError
 
@@ -50,9 +50,9 @@ def signing(polo):
 
 def test_other_scenes_are_what_they_were():
     assert VERSION == 2
-    assert dataset_key(Settings()) == "polo-128-c1f9a02e2386"
-    assert dataset_key(Settings(size=256)) == "polo-256-d319f51dfd30"
-    assert dataset_key(Settings(motion="signs")) != dataset_key(Settings())
+    assert dataset_key(SceneSettings()) == "polo-128-c1f9a02e2386"
+    assert dataset_key(SceneSettings(size=256)) == "polo-256-d319f51dfd30"
+    assert dataset_key(SceneSettings(motion="signs")) != dataset_key(SceneSettings())
 
 
 def test_signs_are_short_and_some_are_held_out_whole():
@@ -120,7 +120,7 @@ def test_hands_touch_and_do_not_pass_through_each_other(polo):
 
 
 def test_a_scene_of_signs_is_split_by_sign_before_frontal_cameras():
-    scene = Scene(Settings(**TINY))
+    scene = Scene(SceneSettings(**TINY))
     names = np.array(scene.motion.passages)
     assert set(names[scene.test_frames]) <= set(HELD_OUT)
     assert not set(names[scene.train_frames]) & set(HELD_OUT)

@@ -7,24 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from mannequin import SHAPES, inside, mannequin, reposed
 
-from gsgan.body.free import free_body
 from gsgan.motion.rig import SIDES, Pose, Rig, two_bone
 from gsgan.motion.rotations import axis_angle, between, blend, rotation, twist
-from gsgan.synthetic.choreography import (
-    COMBINATION,
-    DURATION,
-    PASSAGES,
-    frame_times,
-    held_out,
-    passages_at,
-)
+from gsgan.synthetic.choreography import COMBINATION, EVERYDAY, PASSAGES, held_out
+from gsgan.synthetic.controls import frame_times, passages_at
 from gsgan.synthetic.footsteps import Footsteps
-from gsgan.synthetic.free_subject import free_character, free_pose
-from gsgan.synthetic.motion import Choreography
-from gsgan.synthetic.scene_setup import Scene, Settings
+from gsgan.synthetic.free_subject import free_character
+from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.signs import SIGNS
 
 # Largest rotation of a bone against its parent since a T pose, degrees. Arms and legs reach
@@ -43,7 +34,7 @@ def person():
 @pytest.fixture(scope="module")
 def dense(person):
     """The whole choreography at 50 frames per second: times and motion."""
-    times = np.arange(0, DURATION, 0.02)
+    times = np.arange(0, EVERYDAY.duration, 0.02)
     return times, Choreography(person).at(times)
 
 
@@ -64,7 +55,7 @@ def local(person, motion, name):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_joints_stay_within_their_limits(person, seed):
-    moves = Choreography(person, seed).at(frame_times(350))
+    moves = Choreography(person, seed).at(frame_times(350, EVERYDAY.duration))
     for bone, limit in LIMITS.items():
         for name in (bone,) if bone in person.bones else ("Left" + bone, "Right" + bone):
             angle = np.degrees(np.linalg.norm(axis_angle(local(person, moves, name)), axis=-1))
@@ -105,8 +96,8 @@ def test_bones_keep_their_lengths(person, dense):
 
 @pytest.mark.parametrize("seed", [0, 1])
 def test_standing_feet_do_not_slide(person, seed):
-    times = np.arange(0, DURATION, 0.02)
-    moves, steps, walked = Choreography(person, seed).at(times), Footsteps(seed), 0
+    times = np.arange(0, EVERYDAY.duration, 0.02)
+    moves, steps, walked = Choreography(person, seed).at(times), Footsteps(seed, EVERYDAY), 0
     for foot, side in enumerate(SIDES):
         _, height, pitch, _ = steps.at(times, foot)
         toe, ankle = joint(person, moves, side + "ToeBase"), joint(person, moves, side + "Foot")
@@ -121,7 +112,7 @@ def test_standing_feet_do_not_slide(person, seed):
 
 def test_soles_stay_on_the_floor(person, free):
     for body, frames in ((person, 350), (free, 40)):
-        moves = Choreography(body).at(frame_times(frames))
+        moves = Choreography(body).at(frame_times(frames, EVERYDAY.duration))
         for R, joints in zip(moves.rotations, moves.joints, strict=True):
             assert -0.005 < body.skinned(R, joints)[0][:, 2].min() < 0.015
 
@@ -142,7 +133,7 @@ def arms_in_trunk(body, moves) -> np.ndarray:
 
 
 def test_arms_do_not_pass_through_the_trunk(free):
-    moves = Choreography(free).at(frame_times(70))
+    moves = Choreography(free).at(frame_times(70, EVERYDAY.duration))
     assert (arms_in_trunk(free, moves) > 0.005).mean() <= 0.02
     signs = Choreography(free, programme=SIGNS).at(frame_times(40, SIGNS.duration))
     assert arms_in_trunk(free, signs).max() < 0.02
@@ -158,9 +149,14 @@ def test_arms_do_not_pass_through_the_trunk(free):
 def test_rest_poses_do_not_matter(person):
     """An A pose, or any other, leads to the poses that the T pose leads to."""
     choreography = Choreography(person)
-    standing = choreography.at(np.array([DURATION - 1e-3]))  # arms down, knees bent slightly
+    standing = choreography.at(
+        np.array([EVERYDAY.duration - 1e-3])
+    )  # arms down, knees bent slightly
     down = reposed(person, standing, 0)
-    moves = (choreography.at(frame_times(40)), Choreography(down).at(frame_times(40)))
+    moves = (
+        choreography.at(frame_times(40, EVERYDAY.duration)),
+        Choreography(down).at(frame_times(40, EVERYDAY.duration)),
+    )
     for name in ("LeftForeArm", "RightHand", "LeftLeg", "RightFoot", "Head"):
         a, b = (joint(person, m, name) for m in moves)
         np.testing.assert_allclose(a, b, atol=0.03)
@@ -204,48 +200,13 @@ def test_fingers_and_face_move_while_signing(person, dense):
 )
 def test_rigs_without_some_bones(missing):
     plain = mannequin(lambda bone: re.search(missing, bone) is not None)
-    moves = Choreography(plain).at(frame_times(30))
+    moves = Choreography(plain).at(frame_times(30, EVERYDAY.duration))
     assert np.isfinite(moves.joints).all()
     assert moves.rotations.shape == (30, len(plain.bones), 3, 3)
 
 
-def test_the_free_body_follows(free):
-    moves = Choreography(free, seed=3).at(frame_times(20))
-    posed = free_body().posed_vertices(free_pose(moves))
-    vertices, _ = free.skinned(moves.rotations[7], moves.joints[7])
-    np.testing.assert_allclose(posed[7].numpy(), vertices, atol=1e-4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "seed", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(2, marks=pytest.mark.slow)]
-)
-def test_every_camera_sees_the_whole_motion(seed):
-    """Cameras are placed by fewer moments than this: those between them must fit as well."""
-    scene = Scene(
-        Settings(avatar="free_body", secondary=False, frames=350, test_frames=60, seed=seed)
-    )
-    for frame in range(0, 350, 5):
-        vertices = scene.mesh(frame)[0][::23]
-        for view in scene.views.values():
-            pixels = view.project(vertices)
-            assert pixels.min() > 1
-            assert pixels.max() < 127
-
-
-def test_freestyle_has_poses_of_no_other_passage(person, dense):
-    _, moves = dense
-    R = torch.from_numpy(moves.rotations[::5])
-    turned = (R[:, :1].mT @ R[:, 1:]).flatten(1)
-    free = torch.tensor([name == "freestyle" for name in moves.passages[::5]])
-    named = turned[~free]
-    nearest = torch.cdist(turned[free], named).amin(dim=1)
-    within = torch.cdist(named, named).fill_diagonal_(torch.inf).amin(dim=1)
-    assert nearest.median() > 3 * within.median()
-
-
 def test_held_out_frames_are_blocks_and_one_whole_passage():
-    names = passages_at(frame_times(84))
+    names = passages_at(frame_times(84, EVERYDAY.duration), EVERYDAY)
     test = held_out(names, 21)
     assert len(test) == len(set(test)) == 21
     combination = [i for i, n in enumerate(names) if n == COMBINATION]
@@ -259,7 +220,7 @@ def test_held_out_frames_are_blocks_and_one_whole_passage():
 @pytest.mark.parametrize("frames", [1, 2, 7, 30])
 def test_held_out_count_is_exact(frames):
     for count in range(frames):
-        test = held_out(passages_at(frame_times(frames)), count)
+        test = held_out(passages_at(frame_times(frames, EVERYDAY.duration), EVERYDAY), count)
         assert len(set(test)) == count
         assert set(test) < set(range(frames))
 

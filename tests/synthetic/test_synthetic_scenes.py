@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
-from gsgan.data.crop import Crop, distort, take, undistort_map
+from gsgan.data.crop import distort
 from gsgan.data.datamodule import GsganData
-from gsgan.synthetic.scene_setup import AVATARS, Scene, Settings, dataset_key
+from gsgan.synthetic.camera import undistort
+from gsgan.synthetic.scene_setup import Scene, SceneSettings, dataset_key
 from gsgan.synthetic.scenes import ensure_scene
 from gsgan.synthetic.tint import Tint, make_tints
-from gsgan.synthetic.view import undistort
 from gsgan.utils.errors import ConfigError
 
 LENS = (-0.28, 0.09, 0.001, -0.0008, -0.01)
@@ -43,7 +43,7 @@ def scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def stage():
-    return Scene(Settings(**TINY))
+    return Scene(SceneSettings(**TINY))
 
 
 def images(root, kind, camera):
@@ -55,9 +55,9 @@ def images(root, kind, camera):
 
 
 def test_options_without_effect_give_the_default_persons_folder():
-    nothing = Settings(**TINY, lens=[0.0] * 5, tint=0, gloss=0, test_scale=[])
-    assert nothing == Settings(**TINY)
-    assert dataset_key(nothing) == dataset_key(Settings(**TINY))
+    nothing = SceneSettings(**TINY, lens=[0.0] * 5, tint=0, gloss=0, test_scale=[])
+    assert nothing == SceneSettings(**TINY)
+    assert dataset_key(nothing) == dataset_key(SceneSettings(**TINY))
 
 
 def test_person_and_motion_of_a_variant_are_the_default_ones(scene):
@@ -79,20 +79,8 @@ def test_undistort_inverts_distort():
     assert undistort(np.zeros((0, 2)), dist).shape == (0, 2)
 
 
-def test_distort_is_opencvs_model():
-    k1, k2, p1, p2, k3 = LENS
-    x, y = 0.4, -0.3
-    r2 = x * x + y * y
-    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
-    expected = (
-        x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-        y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
-    )
-    np.testing.assert_allclose(distort(np.array([[x, y]]), np.array(LENS))[0], expected, atol=1e-15)
-
-
 def test_the_ray_of_a_points_pixel_hits_the_point(stage):
-    views = Scene(Settings(**TINY, lens=LENS)).views
+    views = Scene(SceneSettings(**TINY, lens=LENS)).views
     points = stage.mesh(0)[0][::700]
     for view in views.values():
         assert view.dist is not None
@@ -101,31 +89,6 @@ def test_the_ray_of_a_points_pixel_hits_the_point(stage):
         rays = view.bend(pinhole / np.linalg.norm(pinhole, axis=1, keepdims=True))
         off = np.linalg.norm(np.cross(points - view.centre, rays), axis=1)
         assert off.max() < 1e-8
-
-
-@pytest.mark.slow
-def test_distorted_images_undistort_to_those_of_the_pinholes():
-    """At a size at which textures are several pixels wide: undistorting averages neighbours."""
-    lens = (-0.5, 0.15, 0.003, -0.002, -0.01)
-    settings = {**TINY, "size": 160, "avatar": AVATARS[0]}  # of textures
-    straight = Scene(Settings(**settings))
-    bent = Scene(Settings(**settings, lens=lens))
-    person = straight.posed(1)
-    image, alpha, _ = person.render(straight.views["cam00"], 9)
-    view = bent.views["cam00"]
-    raw, raw_alpha, _ = person.render(view, 9)
-    window = Crop(0, 0, view.size)
-    mapping = undistort_map(view.K, np.pad(view.dist, (0, 3)), window)
-    undone, undone_alpha = (
-        take((255 * x).astype(np.uint8), window, mapping, exact=False) / 255
-        for x in (raw, raw_alpha)
-    )
-    grey = [x.mean(axis=-1) for x in (image, undone, raw)]
-    shift, shift_raw = (np.hypot(*cv2.phaseCorrelate(grey[0], g)[0]) for g in grey[1:])
-    assert shift < 0.1  # pixels, over the whole person: no half pixel is lost
-    assert shift_raw > 0.5
-    outline = np.abs(alpha - undone_alpha).sum() / np.abs(alpha - raw_alpha).sum()
-    assert outline < 0.5
 
 
 def test_the_reader_finds_the_lens(scene):
@@ -138,7 +101,7 @@ def test_the_reader_finds_the_lens(scene):
 @pytest.mark.parametrize("lens", [(-2.0, 0, 0, 0, 0), (0, 0, 0, 0, -9.0)])
 def test_a_lens_that_folds_back_is_refused(lens):
     with pytest.raises(ConfigError, match="folds back"):
-        Scene(Settings(**TINY, lens=lens))
+        Scene(SceneSettings(**TINY, lens=lens))
 
 
 # ---------------------------------------------------------------- tints
@@ -205,7 +168,7 @@ def test_scaled_test_cameras_see_the_person_at_their_scale(scene, stage):
     data = GsganData(root=str(root))
     layout, p = data.layout, stage.mesh(0)[0][::500]
     middle = np.array([24.0, 24.0])
-    views = Scene(Settings(**TINY, test_scale=(0.5, 2.0))).views
+    views = Scene(SceneSettings(**TINY, test_scale=(0.5, 2.0))).views
     for scale in (0.5, 2.0):
         twin = f"cam03_x{scale:g}"
         assert layout.cameras[twin].K[0, 0] == scale * layout.cameras["cam03"].K[0, 0]

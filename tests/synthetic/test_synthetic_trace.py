@@ -11,17 +11,15 @@ from tiny_characters import character, from_above, from_front, plain, square
 
 from gsgan.motion.character import Surface
 from gsgan.synthetic import trace
+from gsgan.synthetic.camera import SceneCamera, pixel_offsets, pixel_rays
 from gsgan.synthetic.textures import Textures, linear
 from gsgan.synthetic.trace import (
     Appearance,
     Light,
     PosedCharacter,
-    Tracer,
     Wrinkles,
     encode,
-    majority,
 )
-from gsgan.synthetic.view import View, pixel_offsets, pixel_rays
 
 GREY = 0.21586  # linear light of sRGB 128
 MATT = Light(direction=(0, 3, 4), sun=(0.4, 0.3, 0.2), sky=(0.3,) * 3, ground=(0.1,) * 3,
@@ -66,7 +64,7 @@ def test_shading_matches_the_formula():
 
 
 def test_the_back_of_cloth_is_lit_on_its_own_side():
-    below = View(from_above().K, np.eye(3), np.array([0, 0, 1.0]), (20, 20))
+    below = SceneCamera(from_above().K, np.eye(3), np.array([0, 0, 1.0]), (20, 20))
     image, alpha, _ = posed(character([square(1.0, 0.5)])).render(below, 1)
     assert alpha[10, 10] == 1
     np.testing.assert_allclose(image[10, 10], encode(np.full(3, GREY * 0.1)), rtol=2e-4)
@@ -284,60 +282,6 @@ def test_a_camera_that_sees_nothing():
             assert not out.any()
 
 
-def test_a_person_around_the_camera():
-    ball = trimesh.creation.icosphere(subdivisions=1, radius=2.0)
-    c = character([(ball.vertices, ball.faces, np.zeros((len(ball.vertices), 2)))])
-    image, alpha, labels = posed(c).render(from_front(16, 0.5), 4)
-    assert alpha.all()
-    assert labels.all()
-    assert np.isfinite(image).all()
-
-
-def test_image_is_premultiplied():
-    image, alpha, _ = posed(character([square(1.0, 0.52)])).render(from_above(), 16)
-    edge = (alpha > 0) & (alpha < 1)
-    assert edge.any()
-    full = image[10, 10]
-    np.testing.assert_allclose(image[edge], alpha[edge][:, None] * full, rtol=0.02)
-
-
-def first_hits(triangles, origins, directions):
-    """Every ray against every triangle (Möller and Trumbore): face and (u, v) of the nearest."""
-    corner, edges = triangles[:, 0], triangles[:, 1:] - triangles[:, :1]
-    p = np.cross(directions[:, None], edges[None, :, 1])
-    determinant = (p * edges[:, 0]).sum(-1)
-    offset = origins[:, None] - corner
-    q = np.cross(offset, edges[None, :, 0])
-    u, v = (offset * p).sum(-1) / determinant, (q * directions[:, None]).sum(-1) / determinant
-    distance = (q * edges[:, 1]).sum(-1) / determinant
-    hit = (u >= 0) & (v >= 0) & (u + v <= 1) & (distance > 0)
-    distance = np.where(hit, distance, np.inf)
-    nearest, rows = distance.argmin(axis=1), np.arange(len(origins))
-    face = np.where(hit.any(axis=1), nearest, -1)
-    u, v = u[rows, nearest], v[rows, nearest]
-    return face, np.stack([1 - u - v, u, v], axis=1)
-
-
-def test_the_tracer_finds_the_first_face():
-    rng = np.random.default_rng(0)
-    v, faces = rng.normal(size=(120, 3)), np.arange(120).reshape(40, 3)
-    origins = rng.normal(size=(200, 3)) * 4
-    directions = -origins + rng.normal(size=(200, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    o, d = origins.astype(np.float32), directions.astype(np.float32)
-    face, weights = Tracer(v, faces).first(o, d)
-    expected, expected_weights = first_hits(v[faces], origins, directions)
-    assert (face >= 0).sum() > 50
-    assert np.array_equal(face, expected)
-    assert np.array_equal(Tracer(v, faces).blocked(o, d), expected >= 0)
-    np.testing.assert_allclose(weights[face >= 0], expected_weights[face >= 0], atol=1e-4)
-    solid = Tracer(v, faces, lambda f, w: f % 2 == 0)  # odd faces are not there
-    expected, _ = first_hits(v[faces[::2]], origins, directions)
-    face, _ = solid.first(o, d)
-    assert np.array_equal(face, np.where(expected >= 0, 2 * expected, -1))
-    assert np.array_equal(solid.blocked(o, d), expected >= 0)
-
-
 @pytest.mark.parametrize("rays", [1, 4, 9, 16])
 def test_rays_are_spread_about_pixel_centres(rays):
     offsets = pixel_offsets(rays)
@@ -350,8 +294,3 @@ def test_rays_are_spread_about_pixel_centres(rays):
     origin, directions = pixel_rays(view, np.array([3]), np.array([4]), rays)
     pixel = view.project(origin + directions)
     np.testing.assert_allclose(pixel - [3, 4], offsets, atol=1e-9)
-
-
-def test_majority_of_rays():
-    part = np.array([[0, 0, 2, 2], [0, 0, 0, 2], [1, 2, 2, 0], [2, 1, 1, 2]])
-    assert majority(part, 3).tolist() == [2, 0, 2, 1]

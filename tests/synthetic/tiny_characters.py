@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsgan.motion.character import Character, Surface
-from gsgan.synthetic.view import View
+from gsgan.synthetic.camera import SceneCamera
 
 LABELS = ("background", "hair", "upper_clothes", "face_neck")
 
@@ -66,11 +66,11 @@ def smooth_normals(v, faces):
 def from_above(size=20, height=3.0, focal=20.0):
     """A camera that looks straight down: +x is right, +y is up in its image."""
     K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
-    return View(K, np.diag([1.0, -1.0, -1.0]), np.array([0, 0, height]), (size, size))
+    return SceneCamera(K, np.diag([1.0, -1.0, -1.0]), np.array([0, 0, height]), (size, size))
 
 
 def from_front(size=64, distance=3.0, focal=64.0, height=0.0):
     """A camera in front of the person, looking along +y."""
     K = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     R = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    return View(K, R, -R @ np.array([0, -distance, height]), (size, size))
+    return SceneCamera(K, R, -R @ np.array([0, -distance, height]), (size, size))

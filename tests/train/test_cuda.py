@@ -35,10 +35,10 @@ def test_the_rasteriser_draws_the_same_and_has_the_same_gradients(name):
 def test_an_avatar_paints_the_same(build):
     _, avatar, frame = build()
     with torch.no_grad():
-        image = avatar.eval().paint(frame).image
-        on_cuda = avatar.cuda().paint(frame.to(torch.device("cuda"))).image.cpu()
+        image = avatar.eval()(*frame.inputs).image
+        on_cuda = avatar.cuda()(*frame.to(torch.device("cuda")).inputs).image.cpu()
         with torch.autocast("cuda", dtype=torch.bfloat16):
-            half = avatar.paint(frame.to(torch.device("cuda"))).image.float().cpu()
+            half = avatar(*frame.to(torch.device("cuda")).inputs).image.float().cpu()
     assert float((on_cuda - image).abs().max()) < 1e-2  # TF32
     assert float((half - image).abs().mean()) < 2e-2
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from gsgan.model.painting import Painting
+from gsgan.model.rendering import Rendering
 from gsgan.train.losses import StepOneLoss, StepTwoLoss
 
 
@@ -31,7 +31,7 @@ def test_step_two_compares_on_white_by_alpha_and_mask():
     weights = StepTwoLoss(l1=0.5, l2=3.0, ssim=0.0, alpha=2.0)
 
     def terms(loss: StepTwoLoss) -> dict[str, torch.Tensor]:
-        painting = Painting(image, alpha)
+        painting = Rendering(image, alpha)
         return loss.terms(painting, frame, anchor=None, perceptual=None, maps=None, step=0)
 
     found = terms(weights)
@@ -50,7 +50,7 @@ def test_the_generators_fourth_channel_learns_from_alpha_alone(make):
     module, _, data = make("size.rgb_skip=false", "training.step_two.perceptual_every=1")
     frame = data.dataset("train")[0]
     last = module.avatar.generator.paint.weight
-    painting = module.avatar.paint(frame)
+    painting = module.avatar(*frame.inputs)
     maps = module.step_two.discriminator_maps(module.discriminator, painting, frame)
     terms = module.step_two_terms(painting, frame, maps)
     assert {"alpha", "photometric", "anchor", "adversarial"} <= set(terms)
@@ -69,7 +69,7 @@ def test_the_generators_fourth_channel_learns_from_alpha_alone(make):
 def test_on_black_step_one_compares_the_splats_alpha_with_the_mask():
     features, alpha = leaves(5, 1)
     frame, colour = seen_person(), torch.tensor([0.2, 0.9, 0.5]).view(1, 3, 1, 1)
-    painting = Painting(None, features=features, splat_alpha=alpha)
+    painting = Rendering(None, features=features, splat_alpha=alpha)
     with_alpha, without = StepOneLoss(alpha=0.3), StepOneLoss(alpha=0.0)
     on_black = with_alpha(painting, frame, None, None)
     (slope,) = torch.autograd.grad(on_black, alpha)
@@ -89,7 +89,7 @@ def test_step_one_teaches_the_splats_alpha_with_and_without_a_random_background(
     """On black and without a weight, a black person could as well be transparent."""
     module, _, data = make(f"effects.random_background={word}", "training.step_one.feature_head=0")
     frame = data.dataset("train")[0]
-    painting = module.avatar.paint(frame)
+    painting = module.avatar(*frame.inputs)
     alpha = painting.splat_alpha.detach().requires_grad_()
     seen = replace(painting, splat_alpha=alpha)
     (slope,) = torch.autograd.grad(module.step_one_loss(seen, frame), alpha)

@@ -28,7 +28,7 @@ def test_the_average_is_scored_and_comes_back_from_a_checkpoint(make, tmp_path, 
     config = tiny("training.average=0.9", "training.schedule.step_one=0")
     loaded, _ = load_avatar(tmp_path / "run", config, data)
     with torch.no_grad():
-        expected, found = module.shown.paint(frame).image, loaded.paint(frame).image
+        expected, found = module.shown(*frame.inputs).image, loaded(*frame.inputs).image
     torch.testing.assert_close(found, expected)
 
 
@@ -38,7 +38,7 @@ def test_the_average_follows_its_formula():
     values = []
     for step in range(4):
         torch.nn.init.constant_(layer.weight, float(step))
-        average.update(layer)
+        average.update(layer, step)
         values.append(float(average.module.weight.detach()))
     # a copy first; then decay min(0.5, (1 + n) / (10 + n)) with n = 1, 2, 3
     expected = [0.0]
@@ -52,14 +52,13 @@ def test_an_average_of_every_fourth_iteration_forgets_as_fast():
     layer = torch.nn.Linear(1, 1)
     torch.nn.init.constant_(layer.weight, 1.0)
     often, seldom = MovingAverage(layer, 0.99), MovingAverage(layer, 0.99, every=4)
-    for average, updates in ((often, 4000), (seldom, 1000)):  # past the quick start
-        for _ in range(updates):
-            average.update(layer)
+    for average in (often, seldom):  # past the quick start
+        for step in range(4000):
+            average.update(layer, step)
     torch.nn.init.constant_(layer.weight, 2.0)
     for step in range(40):
-        often.update(layer)
-        if step % 4 == 0:
-            seldom.update(layer)
+        often.update(layer, step)
+        seldom.update(layer, step)
     expected = 2 - 0.99**40
     for average in (often, seldom):
         assert float(average.module.weight.detach()) == pytest.approx(expected, abs=1e-5)
@@ -72,13 +71,3 @@ def test_the_average_is_updated_when_the_config_says(make):
     assert int(module.average.copy.n_averaged) == sum(step % 5 == 0 for step in steps)
     with pytest.raises(ConfigError, match="average_every must be a number of at least 1"):
         make("training.average_every=0")
-
-
-def test_every_variant_is_scored_by_its_moving_average(make):
-    module, trainer, data = make("model=splat_only", "training.schedule.stretch=1")
-    trainer.fit(module, data)
-    assert module.average.started
-    assert module.shown is module.average.module
-    live = dict(module.avatar.named_parameters())
-    averaged = dict(module.shown.named_parameters())
-    assert any(not torch.equal(live[name], averaged[name]) for name in live)

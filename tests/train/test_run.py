@@ -13,13 +13,3 @@ def test_starting_over_removes_an_earlier_runs_results_and_logs(tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
     remove_old_results(tmp_path)
     assert [path.name for path in tmp_path.rglob("*") if path.is_file()] == ["notes.txt"]
-
-
-def test_starting_over_leaves_what_is_not_a_runs_log(tmp_path):
-    kept = ("logs/mine.txt", "logs_old/metrics.csv", "logs_000150/events.1")
-    for name in (*kept, "logs/metrics.csv", "logs_000150/metrics.csv"):
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text("step\n")
-    remove_old_results(tmp_path)
-    left = {str(p.relative_to(tmp_path)) for p in tmp_path.rglob("*") if p.is_file()}
-    assert left == set(kept)

@@ -56,3 +56,23 @@ def test_impossible_rates_are_refused(wrong):
 def test_rate_warms_up():
     rate = Rate(peak=1.0, hold=1.0, warmup=3)
     assert [rate.at(i, 10, 20) for i in range(10, 15)] == [0.25, 0.5, 0.75, 1.0, 1.0]
+
+
+def test_the_degree_is_raised_by_the_schedule():
+    schedule = Schedule(10, 30, 30, degree_every=20)
+    assert [schedule.degree(s, 3) for s in (0, 9, 29, 30, 49, 50, 69)] == [0, 0, 0, 1, 1, 2, 2]
+    assert schedule.degree(69, 1) == 1
+    assert Schedule(10, 30, 30).degree(0, 3) == 3  # 0: all at once
+    with pytest.raises(ConfigError, match="degree_every"):
+        Schedule(1, 1, 1, degree_every=-1)
+
+
+def test_f_is_supersampled_after_the_coarse_iterations_of_step_one():
+    schedule = Schedule(segmentation=10, step_one=30, step_two=30, coarse=20, stretch=0.5)
+    fitted = schedule.fitted(segmentation=True, from_masks=False, splats=True, generator=True)
+    assert [fitted.fine(step) for step in (9, 10, 19, 20, 25, 39)] == [
+        True,
+        False,
+        False,
+        *[True] * 3,
+    ]

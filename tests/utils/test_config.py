@@ -17,7 +17,7 @@ SRC = Path(__file__).parents[2] / "src" / "gsgan"
 
 
 def options(group: str) -> list[str]:
-    return sorted(path.stem for path in (config_folder() / group).glob("*.yaml"))
+    return sorted(path.stem for path in (config_folder() / group).glob("[!_]*.yaml"))
 
 
 GROUPS = ("model", "data", "effects", "trainer", "logger", "size", "training", "accuracy")
@@ -35,13 +35,6 @@ def test_every_option_composes(compose):
     for experiment in options("experiment"):
         config = compose("train", f"experiment={experiment}")
         OmegaConf.to_container(config.training, resolve=True)
-
-
-def test_the_names_that_the_readme_promises_exist():
-    assert {"full", "wo_seg", "wo_gcn", "wo_feat", "splat_only"} <= set(options("model"))
-    assert {"synthetic", "capture", "zju_mocap", "thuman4"} <= set(options("data"))
-    assert {"cpu", "gpu", "ddp"} <= set(options("trainer"))
-    assert "demo" in options("experiment")
 
 
 def differences(a, b, at: str = "") -> set[str]:
@@ -85,7 +78,7 @@ def test_every_top_level_key_is_read_by_code(compose):
     for name in ("train", "evaluate"):
         for key in compose(name):
             named = rf'(config|stored)\.({key}\b|get\("{key}"\))'
-            read = re.search(named, code) or f"${{{key}" in yaml
+            read = re.search(named, code) or re.search(rf"\$\{{(oc\.select:)?{key}\b", yaml)
             assert read, f"conf/{name}.yaml: {key} is read by nothing"
 
 
@@ -95,7 +88,7 @@ def test_every_size_key_is_used(compose):
     for key in keys:
         assert re.search(rf"\$\{{.*\bsize\.{key}\b", yaml), f"size.{key} is read by nothing"
     for size in options("size"):
-        assert set(OmegaConf.load(config_folder() / "size" / f"{size}.yaml")) <= keys, size
+        assert set(compose("train", f"size={size}").size) == keys, size
 
 
 def test_unknown_keys_do_not_pass_silently(tiny):
@@ -128,7 +121,7 @@ def test_bugs_keep_their_traceback_and_mistakes_get_a_sentence():
     ("override", "named"),
     [
         ("effects.view_dependence=7", "effects.view_dependence must be one of"),
-        ("model.generator.output=tanh", "output must be one of linear, sigmoid"),
+        ("model.generator.patch=3", "patch must be one of 1, 2, 4"),
         ("training.schedule.step_two=-1", "schedule.step_two must be a number of at least 0"),
         ("+model.densify.colour=1", "unexpected keyword argument 'colour'"),
         ("+model.generator.colour=1", "unexpected keyword argument 'colour'"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from gsgan.utils import timing
-from gsgan.utils.timing import interleaved, median
+from gsgan.utils.timing import interleaved
 
 
 class Clock:
@@ -44,19 +44,3 @@ def test_what_takes_longer_than_the_patience_is_called_twice_and_the_shorter_cou
     samples = interleaved(actions, 3, patience=5.0)
     assert samples == {"slow": [9000.0], "fast": [1000.0] * 3}
     assert clock.calls.count("slow") == 2
-
-
-def test_every_call_ticks(clock):
-    ticks = []
-    interleaved({"a": clock.action("a", 1.0)}, 2, tick=lambda: ticks.append(clock.now))
-    assert ticks == [1.0, 2.0, 3.0]
-
-
-def test_no_rounds_are_refused():
-    with pytest.raises(ValueError, match="repeats must be at least 1, got 0"):
-        interleaved({}, 0)
-
-
-def test_one_disturbance_does_not_change_the_median():
-    assert median([1.0, 2.0, 900.0]) == 2.0
-    assert median([]) is None

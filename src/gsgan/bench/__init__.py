@@ -1,1 +1,1 @@
-"""What things cost: the subjects of ``python -m gsgan.bench``."""
+"""The time that an avatar takes: ``python -m gsgan.bench speed``."""

@@ -1,4 +1,4 @@
-"""What all benches share: the machine, tables, files, memory, training runs, plots."""
+"""What benchmarks share: a description of the machine, their files, and peak memory."""
 
 from __future__ import annotations
 
@@ -6,13 +6,10 @@ import contextlib
 import ctypes
 import gc
 import importlib.metadata
-import io
 import json
 import os
 import platform
-import subprocess
-import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
@@ -20,10 +17,6 @@ from typing import Any
 
 import pandas as pd
 import torch
-from matplotlib.axes import Axes
-from matplotlib.axis import Axis
-from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -32,15 +25,14 @@ from gsgan.splat import buffers
 from gsgan.utils import pages
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
-from gsgan.utils.errors import GsganError
 from gsgan.utils.files import write_atomically
 from gsgan.utils.tensors import pick_device
 
-NOTHING = "–"  # what was not measured
+NOTHING = "–"  # for a value that was not measured
 
 
 def environment(device: torch.device) -> dict[str, Any]:
-    """Device, hardware, threads, date, versions and load, without which figures mean nothing."""
+    """Device, hardware, threads, date, versions and load, on which the results depend."""
     versions = {"Python": platform.python_version()}
     for name in ("gsgan", "torch", "gsplat"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -56,7 +48,7 @@ def environment(device: torch.device) -> dict[str, Any]:
 
 
 def cpu_name(source: Path = Path("/proc/cpuinfo")) -> str:
-    """The processor's name, as well as the system knows it."""
+    """The processor's name as the operating system reports it."""
     with contextlib.suppress(OSError):
         for line in source.read_text().splitlines():
             key, _, value = line.partition(":")
@@ -66,7 +58,7 @@ def cpu_name(source: Path = Path("/proc/cpuinfo")) -> str:
 
 
 def sentence(where: Mapping[str, Any]) -> str:
-    """One line about the machine."""
+    """One line about the machine, from `environment`."""
     versions = ", ".join(f"{name} {version}" for name, version in where["versions"].items())
     load = "" if where["load"] is None else f", load {where['load']:.1f} at the start"
     threads = f"{where['threads']} thread{'s' * (where['threads'] != 1)}"
@@ -75,7 +67,7 @@ def sentence(where: Mapping[str, Any]) -> str:
 
 
 def number(value: float | None, digits: int = 3) -> str:
-    """``digits`` significant ones, an exponent only where it helps; a dash for None and NaN."""
+    """The value with so many significant digits; a dash for None and NaN."""
     if value is None or pd.isna(value):
         return NOTHING
     if value == float("inf"):
@@ -91,31 +83,31 @@ def markdown(frame: pd.DataFrame) -> str:
 
 
 def records(frame: pd.DataFrame) -> list[dict[str, Any]]:
-    """The rows as JSON values: JSON has no NaN and no infinity."""
+    """The rows as JSON values, with null for NaN and infinity."""
     rows: list[dict[str, Any]] = json.loads(frame.to_json(orient="records", double_precision=15))
     return rows
 
 
 def check_whole(config: DictConfig, **least: int) -> None:
-    """Raises ConfigError for keys that are not whole numbers of at least so much."""
+    """Raises ConfigError for keys that are not whole numbers of at least the given value."""
     for name, low in least.items():
         whole(name, config[name], low)
 
 
 @dataclass(frozen=True)
 class Bench:
-    """One bench at work."""
+    """A benchmark: ``name`` of its files and (with - for _) of its block in a Markdown page."""
 
-    name: str  # of its files, and with - for _ of its block in the page
-    folder: Path  # of its files
+    name: str
+    folder: Path
     console: Console
     device: torch.device
-    where: dict[str, Any]  # it measures; see `environment`
-    page: Path | None  # a Markdown page that gets the result
+    where: dict[str, Any]  # from `environment`
+    page: Path | None
 
     @classmethod
     def start(cls, name: str, config: DictConfig, folder: Path) -> Bench:
-        """Sets threads, finds the device, and prints where it measures.
+        """Sets the number of threads, selects the device and prints a line about the machine.
 
         Raises:
             ConfigError: on an unusable device, or a page without the block.
@@ -125,18 +117,18 @@ class Bench:
             torch.set_num_threads(config.threads)
         device, page = pick_device(config.get("device", "cpu")), config.docs and Path(config.docs)
         bench = cls(name, folder, make_console(), device, environment(device), page)
-        if page is not None:  # now, not after measuring for an hour
+        if page is not None:  # before anything is measured
             pages.check_block(page, *bench.markers, key="docs")
         bench.console.print(sentence(bench.where), highlight=False)
         return bench
 
     @property
     def markers(self) -> tuple[str, str]:
-        """Of the block in the page."""
+        """The comments around the block in the page."""
         return f"<!-- bench:{self.name.replace('_', '-')} -->", "<!-- end -->"
 
     def progress(self) -> Progress:
-        """A bar with a description."""
+        """A progress bar with a description."""
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn())
         return Progress(*columns, TimeElapsedColumn(), console=self.console, transient=True)
 
@@ -175,7 +167,7 @@ def peak_memory(action: Callable[[], object], device: torch.device) -> float | N
     """Megabytes by which the peak of this process grows while ``action`` runs a second time.
 
     Convention: free memory is returned to the system first, and the system's record of the peak is
-    reset (``VmHWM`` of Linux); on CUDA it is the allocator's peak. None where neither is known.
+    reset (``VmHWM`` of Linux); on CUDA it is the allocator's peak. None where neither is available.
     """
     action()  # builds what is built once
     gc.collect()
@@ -194,69 +186,10 @@ def peak_memory(action: Callable[[], object], device: torch.device) -> float | N
 
 
 def _peak(device: torch.device) -> float | None:
-    """Bytes: the most that was held since the reset."""
+    """The peak since the reset, in bytes."""
     if device.type == "cuda":
         return float(torch.cuda.max_memory_allocated(device))
     with contextlib.suppress(OSError, StopIteration), open("/proc/self/status") as stream:
         line = next(line for line in stream if line.startswith("VmHWM:"))
         return 1024.0 * int(line.split()[1])
     return None
-
-
-def train(overrides: Sequence[str], run: Path) -> None:
-    """Runs `gsgan.train` in another process; resumes an interrupted run, skips a finished one.
-
-    Args:
-        overrides: of its config.
-        run: its folder; what it prints goes to ``<run>.log`` beside it.
-
-    Raises:
-        GsganError: with the last line of its output.
-    """
-    quoted = str(run).replace("\\", "\\\\").replace("'", "\\'")
-    log = run.with_name(f"{run.name}.log")
-    log.parent.mkdir(parents=True, exist_ok=True)
-    code = launch([*overrides, f"hydra.run.dir='{quoted}'"], log)
-    if code:
-        lines = [x.strip() for x in log.read_text(errors="replace").splitlines() if x.strip()]
-        last = lines[-1] if lines else f"it ended with {code}"
-        raise GsganError(f"training {run.name} failed: {last.removeprefix('gsgan: ')} (see {log})")
-
-
-def launch(arguments: Sequence[str], log: Path) -> int:
-    """The exit status of `gsgan.train` with these arguments."""
-    command = [sys.executable, "-m", "gsgan.train", *arguments]
-    wide = {**os.environ, "COLUMNS": "1000"}  # one message, one line
-    with log.open("w") as stream:
-        process = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT, env=wide)
-        try:
-            return process.wait()
-        except BaseException:  # Ctrl-C reaches it as well: it saves a checkpoint
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                process.wait(timeout=30)
-            process.kill()
-            raise
-
-
-def panels(count: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
-    """A figure of panels side by side, sizes in inches."""
-    figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
-    axes = list(figure.subplots(1, count, squeeze=False)[0])
-    for one in axes:
-        one.grid(visible=True, which="major", alpha=0.3)
-        one.spines[["top", "right"]].set_visible(False)
-    return figure, axes
-
-
-def plain_ticks(axis: Axis) -> None:
-    """1, 2, 5, 10 in place of powers on a logarithmic axis."""
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
-
-
-def png(figure: Figure) -> bytes:
-    """The figure as PNG bytes."""
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", metadata={"Software": ""})
-    return stream.getvalue()

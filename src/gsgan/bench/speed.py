@@ -13,24 +13,38 @@ import numpy as np
 import pandas as pd
 import torch
 from omegaconf import DictConfig
+from torch import Tensor
 
-from gsgan.bench.common import Bench, check_whole, markdown, number, sentence
-from gsgan.bench.painter import Painter, Way, painting_memory, place, spread, without_denormals
+from gsgan.bench.common import Bench, check_whole, markdown, number, peak_memory, sentence
+from gsgan.data.datamodule import GsganData
+from gsgan.model.assemble import build_avatar, build_data
 from gsgan.model.avatar import Avatar, unwatched
-from gsgan.model.runs import Moved, build_avatar, build_data, load_avatar, load_config
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import DataPaths, load_config
 from gsgan.scene import Frame
-from gsgan.splat import resolve_backend
+from gsgan.splat import BACKENDS, resolve_backend
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
+from gsgan.utils.errors import ConfigError
 from gsgan.utils.timing import timed, wait
 
 TOTAL, REST = "end to end", "between stages"
+# Lightning's names, as in conf/trainer.
+PRECISIONS: dict[str, torch.dtype | None] = {
+    "32-true": None,
+    "bf16-mixed": torch.bfloat16,
+    "16-mixed": torch.float16,
+}
+SPLITS = ("novel_pose", "novel_view", "train")  # frames come from the first that has any
+MEMORY_FRAMES = 4  # over which peak memory is taken
+Painter = Callable[[Frame], Tensor]
 
 
 def run(config: DictConfig, folder: Path) -> None:
     """Times an avatar; writes ``speed.md`` and ``speed.json``.
 
     Convention: one image at a time; poses, cameras and images stay on the device, so reading and
-    showing are not in it.
+    displaying them is not included.
 
     Args:
         config: as conf/bench_speed.yaml.
@@ -42,14 +56,16 @@ def run(config: DictConfig, folder: Path) -> None:
     """
     check_whole(config, frames=1, warmup=0, poses=1, seed=0)
     one_of("channels_last", config.channels_last, (True, False))
-    way = Way(precision=config.precision, backend=config.backend)
+    one_of("precision", config.precision, PRECISIONS)
+    one_of("backend", config.backend, BACKENDS)
     bench = Bench.start("speed", config, folder)
     avatar, frames, name, marks = load_subject(config, bench.device)
-    painter = Painter(avatar, way)
+    painter = make_painter(avatar, config.precision, config.backend)
     with without_denormals():
         with bench.progress() as progress:
             task = progress.add_task("painting", total=config.warmup + config.frames)
             times = measure(
+                avatar,
                 painter,
                 frames,
                 count=config.frames,
@@ -79,7 +95,7 @@ def load_subject(
 
     The avatar of ``run`` with its held-out poses, or an untrained one of ``config.model``.
     """
-    moved = Moved(config.data_root, config.data_smpl)
+    moved = DataPaths(config.data_root, config.data_smpl)
     if config.run is not None:
         folder = Path(config.run).expanduser()
         stored = load_config(folder, moved)
@@ -89,16 +105,82 @@ def load_subject(
     else:
         moved.refuse_without_run()
         data = build_data(config)
-        avatar, name = build_avatar(config, data), "untrained avatar"
-        marks = ["untrained weights: Gaussians are where they start, which sets what F costs"]
+        avatar, name = build_avatar(config, data.info, data.labelled("train")), "untrained avatar"
+        marks = ["untrained weights: the time of F depends on the places of its Gaussians"]
         size = (int(config.size.picture), int(config.size.picture))
         frames = [replace(f, camera=f.camera.resize(size)) for f in spread(data, config.poses)]
     avatar = place(avatar, device, channels_last=config.channels_last)
     return avatar, [frame.to(device) for frame in frames], name, marks
 
 
+def spread(data: GsganData, count: int, split: str | None = None) -> list[Frame]:
+    """At most ``count`` frames, evenly over a split; None selects the first of `SPLITS` with any.
+
+    Raises:
+        ConfigError: when the split has no frame.
+    """
+    names = SPLITS if split is None else (split,)
+    name = next((n for n in names if len(data.dataset(n))), None)
+    if name is None:
+        why = data.reasons.get(names[0], "it has no frames")
+        raise ConfigError(f"no frame to paint in {', '.join(names)}: {why}; choose another split")
+    dataset = data.dataset(name)
+    return [dataset[i] for i in evenly_spaced(len(dataset), count)]
+
+
+def place(avatar: Avatar, device: torch.device, *, channels_last: bool) -> Avatar:
+    """The frozen avatar on a device, its weights with channels last or not."""
+    layout = torch.channels_last if channels_last else torch.contiguous_format
+    return avatar.freeze().to(device=device, memory_format=layout)  # type: ignore[call-overload]
+
+
+def set_backend(avatar: Avatar, backend: str) -> None:
+    """Selects the rasteriser of F and S."""
+    avatar.backend = backend
+    if avatar.segmentation is not None:
+        avatar.segmentation.backend = backend
+
+
+def make_painter(avatar: Avatar, precision: str = "32-true", backend: str = "auto") -> Painter:
+    """A function of a frame that returns I_pred ``[B, 3, H, W]``, not clamped.
+
+    Args:
+        avatar: in eval mode.
+        precision: of the networks, one of `PRECISIONS`.
+        backend: of both rasterisations.
+    """
+    set_backend(avatar, backend)
+    dtype = PRECISIONS[precision]
+
+    @torch.inference_mode()
+    def paint(frame: Frame) -> Tensor:
+        kind = frame.skeleton.device.type
+        with torch.autocast(kind, dtype=dtype or torch.bfloat16, enabled=dtype is not None):
+            image = avatar(*frame.inputs, maps=False).image
+        assert image is not None
+        return image
+
+    return paint
+
+
+@contextmanager
+def without_denormals() -> Iterator[None]:
+    """Flushes denormals, as in training: a black background decays into them, which is slow."""
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)
+
+
+def painting_memory(painter: Painter, frames: Sequence[Frame]) -> float | None:
+    """Megabytes that painting takes on top of the avatar and its inputs; None where unavailable."""
+    few = frames[:MEMORY_FRAMES]
+    return peak_memory(lambda: [painter(frame) for frame in few], frames[0].skeleton.device)
+
+
 class StageClock:
-    """Takes the place of ``Avatar.stage`` while stages are timed; waits for the device."""
+    """Replaces ``Avatar.stage`` while stages are timed; synchronises the device."""
 
     def __init__(self, device: torch.device) -> None:
         self.device = device
@@ -115,6 +197,7 @@ class StageClock:
 
 
 def measure(
+    avatar: Avatar,
     painter: Painter,
     frames: Sequence[Frame],
     *,
@@ -126,7 +209,7 @@ def measure(
 
     Returns:
         ``median p10 p90`` in milliseconds by stage, then ``between stages`` (of the frames timed by
-        stage, what no stage took) and ``end to end`` (without waiting between stages).
+        stage, the time outside all stages) and ``end to end`` (without waiting between stages).
     """
     device = frames[0].skeleton.device
     samples: dict[str, list[float]] = {}
@@ -136,11 +219,11 @@ def measure(
         tick()
         if i < 0:
             continue
-        painter.avatar.stage = clock
+        avatar.stage = clock
         try:
             staged = timed(lambda frame=frame: painter(frame), device)  # type: ignore[misc]
         finally:
-            painter.avatar.stage = unwatched
+            avatar.stage = unwatched
         rest = staged - sum(clock.frame.values())
         for name, took in {**clock.frame, REST: rest, TOTAL: total}.items():
             samples.setdefault(name, []).append(took)
@@ -154,12 +237,12 @@ def deciles(samples: Sequence[float]) -> dict[str, float]:
 
 
 def settings_of(config: DictConfig, avatar: Avatar, frames: Sequence[Frame]) -> dict[str, Any]:
-    """What the figures depend on, by names for people."""
+    """The settings on which the times depend, by printed name."""
     height, width = frames[0].camera.size
-    windows = [avatar.window(frame) for frame in frames]
+    windows = [avatar.window(frame.skeleton, frame.camera) for frame in frames]
     pixels = sum(height * width if w is None else w.size[0] * w.size[1] for w in windows)
     found: dict[str, Any] = {
-        "picture": f"{width} x {height}",
+        "image": f"{width} x {height}",
         "painted": f"{pixels / (len(windows) * height * width):.0%} of its pixels",
         "precision": config.precision,
         "memory format": "channels last" if config.channels_last else "contiguous",

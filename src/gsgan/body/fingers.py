@@ -1,4 +1,4 @@
-"""Finger joints of a body, and where its hands are, from the 21 landmarks of each hand.
+"""Finger joints and positions of a body's hands, from the 21 landmarks of each hand.
 
 Convention: metres, radians; a joint's turn is its axis-angle in `BodyPose.theta`.
 """
@@ -15,27 +15,27 @@ from gsgan.body.free import Body
 from gsgan.body.lbs import axis_angle_to_matrix, left_jacobian, shortest_turn
 from gsgan.skeleton.hands import FINGERS, HAND, PALM, PINKY, SHORT, palm_frames
 
-# By number, for the thumb and for fingers: flexion, turn to the side and twist of the first joint;
-# flexion and turn to the side of the next one, which stands for the last two where a body has no
-# third. Standard deviation about rest; the least and the most, of a finger's flexion from straight.
+# Per number, for the thumb and for the fingers: flexion, turn to the side and twist of the first
+# joint; flexion and turn to the side of the second, which represents the last two where a body has
+# no third. Standard deviation about rest, minimum and maximum; flexion is from a straight finger.
 SPREAD = ((0.7, 0.5, 0.4, 0.8, 0.15), (0.8, 0.2, 0.2, 1.0, 0.03))
 LEAST = ((-0.8, -0.8, -0.8, -0.6, -0.3), (-0.6, -0.45, -0.4, -0.2, -0.1))
 MOST = ((1.2, 0.8, 0.8, 2.0, 0.3), (1.75, 0.45, 0.4, 2.6, 0.1))
 NOISE = 0.004  # metres, standard deviation of a landmark
 ROUNDS = (1, 2)  # Gauss-Newton steps of the fingers per round; each round then places the hand
 PLACING = 3  # Gauss-Newton steps of a hand's rotation
-TRACE = 1e-4  # of a bone at rest, added to the seen one: a bone that vanishes rests
+TRACE = 1e-4  # of a bone at rest, added to the observed one: a bone of no length rests
 
 
 class Hands(NamedTuple):
-    """What hand landmarks show of B frames.
+    """What the hand landmarks of B frames determine.
 
     Args:
         turns: ``[B, 20, 3]`` of `Fingers.joints`.
-        shown: ``[B, 20]`` bool: the turns that landmarks show; others are finite but arbitrary.
-        rotations, shifts: ``[B, 2, 3, 3]`` and ``[B, 2, 3]`` metres: of each hand since rest, where
-            it is nearest to all its landmarks.
-        placed: ``[B, 2]`` bool: the hands that landmarks show; others are finite but arbitrary.
+        shown: ``[B, 20]`` bool: those that landmarks determine; others are finite but arbitrary.
+        rotations, shifts: ``[B, 2, 3, 3]`` and ``[B, 2, 3]`` metres: each hand's rigid motion from
+            rest to where it is nearest to all its landmarks.
+        placed: ``[B, 2]`` bool: those that landmarks determine; others are finite but arbitrary.
     """
 
     turns: Tensor
@@ -46,19 +46,17 @@ class Hands(NamedTuple):
 
 
 class Fingers(nn.Module):
-    """Turns of a body's finger joints, two per finger, in which its bones point as the landmarks',
-    and where the hand is then nearest to all of them.
+    """Fits the turns of a body's finger joints, two per finger, and the positions of its hands.
 
     Landmarks are compared in the hand's axes and with the body's own bone lengths, so that neither
     the person's proportions nor an error of the solved wrist bends a finger. The shortest turns to
-    the bones' directions, then Gauss-Newton steps on the distances and a prior, within anatomical
-    limits: fingers bend, their second joints are hinges. The hand's axes are first the palm's, then
-    those of the rigid motion onto its landmarks: bodies and detectors define knuckles differently.
+    the bones' directions are the first guess; Gauss-Newton steps on the distances and a prior
+    follow, within anatomical limits: fingers bend, and their second joints are hinges. The hand's
+    axes are the palm's at first, and then those of the rigid motion onto its landmarks, because
+    bodies and detectors define knuckles differently.
 
     Args:
         body: with hand landmarks, in the subject's shape.
-
-    Source: ours.
     """
 
     chains: Tensor  # [10, 4] landmarks of each finger, base to tip, the left hand's first
@@ -132,11 +130,11 @@ class Fingers(nn.Module):
 
     @staticmethod
     def placed(seen: Tensor) -> Tensor:
-        """``[B, 2]`` bool: the hands whose palms landmarks ``seen [B, 42]`` bool show."""
+        """``[B, 2]`` bool: the hands whose palms have all their landmarks ``seen [B, 42]`` bool."""
         return seen.unflatten(1, (2, HAND))[:, :, PALM].all(-1)
 
     def shown(self, seen: Tensor) -> Tensor:
-        """``[B, 20]`` bool: the joints that landmarks ``seen [B, 42]`` bool show."""
+        """``[B, 20]`` bool: the joints that the landmarks ``seen [B, 42]`` bool determine."""
         base, middle, *beyond = seen[:, self.chains].unbind(-1)
         first = base & middle & self.placed(seen).repeat_interleave(len(FINGERS), dim=1)
         return torch.cat([first, first & (beyond[0] | beyond[1])], dim=1)
@@ -147,7 +145,7 @@ class Fingers(nn.Module):
         return first.sum(2), second.sum(2)
 
     def _start(self, bones: Tensor, weight: Tensor) -> Tensor:
-        """``[B, 10, 5]`` by the shortest turns to the bones' directions, one after the other."""
+        """``[B, 10, 5]``: the first guess, by the shortest turns to the bones' directions."""
         seen = (weight > 0).unsqueeze(-1)
         rests, nows = (
             [(x * seen)[:, :, part].sum(2) for part in (slice(0, 1), slice(1, None))]
@@ -163,6 +161,7 @@ class Fingers(nn.Module):
 
     def _step(self, numbers: Tensor, bones: Tensor, weight: Tensor) -> Tensor:
         """``[B, 10, 5]``: what a Gauss-Newton step subtracts."""
+        # landmarks as posed, and their distances from the observed ones
         turns = self._turns(numbers)
         first, second = (axis_angle_to_matrix(turn) for turn in turns)
         middle = self.bones[:, :1] @ first.mT
@@ -170,6 +169,7 @@ class Fingers(nn.Module):
         x = torch.cat([middle, middle + beyond], dim=2)
         seen, further = bones.split([1, 2], dim=2)
         r = x - torch.cat([seen, seen + further], dim=2)  # [B, 10, 3, 3], by landmark
+        # derivatives by the five numbers
         arms = x, torch.cat([torch.zeros_like(middle), beyond], dim=2)
         own, others = self.axes.split([3, 2], dim=1)
         axes = own @ left_jacobian(turns[0]).mT, others @ (first @ left_jacobian(turns[1])).mT
@@ -178,6 +178,7 @@ class Fingers(nn.Module):
             for axis, arm in zip(axes, arms, strict=True)
         ]
         J = torch.cat(moved, dim=2)  # [B, 10, 5, 3, 3]
+        # the normal equations
         weighted = (J * weight[:, :, None, :, None]).flatten(3)
         H = weighted @ J.flatten(3).mT + torch.diag_embed(self.prior)
         g = (weighted @ r.flatten(2).unsqueeze(-1)).squeeze(-1) + self.prior * numbers
@@ -185,9 +186,9 @@ class Fingers(nn.Module):
 
 
 def _placed(x: Tensor, hands: Tensor, seen: Tensor, R: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotations ``[B, 2, 3, 3]`` and shifts ``[B, 2, 3]`` that take ``x [B, 42, 3]`` nearest to the
-    landmarks seen: Gauss-Newton steps from ``R``, whose gradients are finite where an SVD's are
-    not."""
+    """Rotations ``[B, 2, 3, 3]`` and shifts ``[B, 2, 3]`` that move ``x [B, 42, 3]`` nearest to the
+    landmarks seen, by Gauss-Newton steps from ``R``. Their gradients are always finite, unlike
+    those of an SVD."""
     x, y, w = (v.unflatten(1, (2, HAND)) for v in (x, hands, seen.to(hands).unsqueeze(-1)))
     share = w / w.sum(2, keepdim=True).clamp_min(1)
     centre, goal = ((share * v).sum(2) for v in (x, y))

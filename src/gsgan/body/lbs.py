@@ -89,14 +89,9 @@ def forward_kinematics(
         ``[B, J, 4, 4]``: a rest point x moves rigidly with bone j to ``T[:, j] @ (x, 1)``.
 
     Raises:
-        ValueError: when shapes do not match, naming the argument.
+        ValueError: when the shape of rotations or transl does not match.
     """
     J = len(parents)
-    if joints.shape not in ((J, 3), (len(rotations), J, 3)):
-        raise ValueError(
-            f"forward_kinematics: joints must have shape [{J}, 3] (one per parent) or "
-            f"[{len(rotations)}, {J}, 3], got {list(joints.shape)}"
-        )
     if rotations.ndim != 4 or rotations.shape[1:] != (J, 3, 3):
         raise ValueError(
             f"forward_kinematics: rotations must have shape [B, {J}, 3, 3], "

@@ -1,4 +1,4 @@
-"""The joints of a body as anatomy: which way each one turns, and what the turns share.
+"""How the joints of a body turn, and the degrees of freedom that their turns share.
 
 Convention: radians; axes are those of the rest pose. A *turn* is a rotation ``exp(v)`` at a joint,
 its axis-angle v linear in the body's numbers; a joint has one or more, applied in order. A *number*
@@ -20,7 +20,8 @@ from gsgan.skeleton.template import CHEST, PELVIS
 
 Chain = tuple[tuple[str, float], ...]  # joints, and the share of a number that each one takes
 Axes = tuple[Tensor, Tensor, Tensor]  # along a limb's upper bone, across it, along its lower
-# By role. Twist turns less near the trunk than at the far end, in the forearm up to the wrist.
+# Per role. A limb's twist is smaller near the trunk than at its far end; the forearm's ends at the
+# wrist.
 FREE: dict[str, Chain] = {
     "spine": (("spine05", 1 / 3), ("spine03", 1 / 3), ("spine01", 1 / 3)),
     "neck": (("neck01", 0.5), ("head", 0.5)),
@@ -48,7 +49,7 @@ SMPL: dict[str, Chain] = {
     "toe": (("{}_foot", 1.0),),
 }
 # Standard deviation of each number about the rest pose: wide where a joint turns freely, narrow
-# across hinges and where 33 landmarks do not see the turn.
+# across hinges and where 33 landmarks do not determine the turn.
 SPREAD = {
     "spine": 0.25,
     "neck": 0.5,
@@ -72,7 +73,7 @@ SPREAD = {
 }
 LEAST = {"knee": -0.1, "elbow": -0.7}  # a hinge does not bend backwards; elbows are bent at rest
 SIDES = {"left": "L", "right": "R"}
-BENT = 0.15  # sine: a rest pose's elbow that is bent more shows where its hinge is
+BENT = 0.15  # sine: an elbow that is bent more at rest determines its hinge
 AT_JOINT = 1e-4  # metres
 XYZ = ("x", "y", "z")
 
@@ -243,7 +244,7 @@ def _rig(body: MarkedBody, turns: _Turns, limbs: dict[str, Axes]) -> Rig:
     turn, number, axis = (list(column) for column in zip(*entries, strict=True))
     joints = torch.tensor([joint for joint, _ in ordered])
     carriers = torch.tensor([carrier(int(j)) for j in body.landmark_bone])
-    # a landmark at a joint does not move with it
+    # a joint's turn does not move a landmark at the joint
     there = (body.landmarks[:, None] - body.joints[joints]).norm(dim=-1) < AT_JOINT
     moved = (ancestors(torch.tensor(parents))[carriers] & ~there).mT  # [T, 33]
     reaches = torch.zeros(len(names), len(carriers), dtype=torch.bool)

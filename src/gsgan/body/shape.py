@@ -20,13 +20,14 @@ from torch import Tensor
 from gsgan.body.free import Body, free_body, free_body_path
 from gsgan.body.lbs import blend_transforms, skin
 from gsgan.body.skinned import MarkedBody
-from gsgan.body.smpl import SkinnedModel, read_smpl
-from gsgan.body.smpl_names import Parts, fitting_parts
+from gsgan.body.smpl import read_smpl
+from gsgan.body.smpl_names import fitting_parts
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.hands import HAND, WRIST
 from gsgan.utils.errors import DataError
 
-# What each group's stretch scales: along the limb, or all of the part. Left and right share it.
+# Groups of bones with one stretch each, shared by left and right: limbs are scaled along their
+# axis, other parts in all directions.
 LIMBS = ("upper_arm", "forearm", "thigh", "shank")
 STRETCHED = (*LIMBS, "hand", "foot", "head", "trunk")
 GROUPS = {  # by the joint's name in the free body | in SMPL's family; the others are the trunk's
@@ -50,11 +51,11 @@ class BodyShape:
 
     Args:
         coefficients: ``[K]`` of the shape space, in standard deviations; SMPL's betas.
-        stretch: ``[8]`` factors by group, in the order of `STRETCHED`; 1 leaves it as it is.
+        stretch: ``[8]`` factors by group, in the order of `STRETCHED`; 1 changes nothing.
         offsets: ``[33, 3]`` metres at rest, from the body's landmarks to where this person's
             skeletons have them: detectors and rigs define joints differently. None means zero.
-        hands: ``[2, 2, 3]`` metres at rest, of left and right: how far the person's wrist is from
-            the body's, and by how much the hand beyond it moves. None means as the body has them.
+        hands: ``[2, 2, 3]`` metres at rest, left and right: the offset of the person's wrist from
+            the body's, and of the rest of the hand. None means zero.
 
     Raises:
         ValueError: on wrong shapes.
@@ -107,7 +108,7 @@ class BodyShape:
 
 @dataclass(frozen=True)
 class ShapeSpace(Generic[B]):
-    """A body and how its points vary: the free body's space, or that of an SMPL model.
+    """A body and how its points vary.
 
     Args:
         body: at coefficients of zero.
@@ -244,26 +245,6 @@ def free_space() -> ShapeSpace[Body]:
             f"{path} is missing or cannot be read ({error}): reinstall gsgan, or bake it with "
             "scripts/bake_body_space.py"
         ) from error
-
-
-def model_space(model: SkinnedModel, parts: Parts = "clothes") -> ShapeSpace[MarkedBody]:
-    """The shape space of a body model file: its betas are the coefficients.
-
-    Args:
-        model: of the user's file.
-        parts: see `SkinnedModel.as_body`.
-    """
-    shown, (joints, shape, _) = model.shapedirs, model.joint_shapes
-    origin, _ = model.landmarks(torch.zeros_like(model.v_template), torch.zeros_like(joints))
-    landmarks = torch.stack(
-        [
-            model.landmarks(v, j)[0] - origin
-            for v, j in zip(shown.unbind(-1), shape.unbind(-1), strict=True)
-        ],
-        dim=-1,
-    )
-    found = {"vertices": shown, "joints": shape, "landmarks": landmarks}
-    return ShapeSpace(model.as_body(parts=parts), {n: d.float() for n, d in found.items()})
 
 
 def shaped_body(shape: BodyShape) -> Body:

@@ -20,26 +20,25 @@ from gsgan.body.rig import ancestors, build_rig, spreads
 from gsgan.body.skinned import MarkedBody
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, MEDIAPIPE33_HANDS, TEMPLATES, bone_frames, sanitise
-from gsgan.skeleton.hands import HAND
-from gsgan.skeleton.hands import PALM as SPAN
+from gsgan.skeleton.hands import HAND, PALM
 from gsgan.skeleton.sides import refuse_swapped
 from gsgan.utils.tensors import constant
 
 BODY, ALL = len(MEDIAPIPE33.names), len(MEDIAPIPE33_HANDS.names)
 SIZES = [len(template.names) for template in TEMPLATES.values()]
-BEYOND = 0.05  # standard deviation beyond the least value of a number
-# Metres, standard deviation of a landmark: detectors place face and palm less well.
-NOISE, FACE_NOISE, PALM_NOISE = 0.004, 0.008, 0.007
-PALM = slice(17, 23)
-ON_HANDS = ((17, 19, 21), (18, 20, 22))  # of 33: landmarks that hand landmarks replace
-HELD = 0.05  # the same of hips that are estimates: nothing else keeps a trunk from nodding
-ROBUST = 5.0  # standard deviations: landmarks further off pull no more than that
+BEYOND = 0.05  # standard deviation of a number below its least value
+# Metres, standard deviations of landmarks: detectors locate those of face and palm less well.
+NOISE, FACE_NOISE, KNUCKLE_NOISE = 0.004, 0.008, 0.007
+KNUCKLES = slice(17, 23)  # of 33 landmarks: pinky, index and thumb of both hands
+ON_HANDS = ((17, 19, 21), (18, 20, 22))  # the 33 landmarks that hand landmarks replace
+HELD = 0.05  # the same of estimated hips: nothing else keeps the trunk from tilting
+ROBUST = 5.0  # standard deviations at which the loss of a landmark becomes linear
 STEPS, CONVERGED = 10, 1e-3  # of the cost
-GRADIENT_STEPS = 8  # leave a few percent where the surface hardly depends on a landmark
+GRADIENT_STEPS = 8  # error of gradients: a few percent where a landmark hardly matters
 DAMPING, EASIER, HARDER = 1e-3, 0.2, 20.0
 FLOOR = 1e-3  # on the diagonal: the root has no prior
-CHUNK = 64  # frames at a time: their matrices fit a processor's cache
-STRAIGHT, SHARP = 0.1, 0.4  # radians: below a bend says nothing of the twist, above all
+CHUNK = 64  # frames at a time: their matrices fit into a processor's cache
+STRAIGHT, SHARP = 0.1, 0.4  # radians: between these bends the twist's weight rises from 0 to 1
 
 
 class Linear(NamedTuple):
@@ -50,23 +49,21 @@ class Linear(NamedTuple):
 
 
 class Solver(nn.Module):
-    """The pose of one body in which its landmarks are nearest to a skeleton's.
+    """Solves the poses in which a body's landmarks are nearest to those of skeletons.
 
-    A first guess from the frames of trunk and head and the directions of limbs; then
-    Levenberg-Marquardt steps on the distances to the landmarks and a prior on the turns, which
-    decides what 33 landmarks do not show: knees and elbows are hinges, ankles hardly turn, twist
-    spreads along limbs. A few more steps at the solution carry gradients.
-    Deterministic; the result of a frame does not depend on the others. Where hand landmarks are
-    given and the body has hands, fingers follow them, and the hand is placed by all of them
-    (`gsgan.body.fingers`) instead of by the few that 33 landmarks have.
+    The first guess comes from the frames of trunk and head and the directions of the limbs.
+    Levenberg-Marquardt steps then minimise the distances to the landmarks plus a prior on the
+    turns. The prior determines what 33 landmarks do not show: knees and elbows are hinges, ankles
+    hardly turn, and twist spreads along limbs. A few more steps at the solution carry gradients.
+    The result is deterministic, and that of a frame does not depend on the others. With hand
+    landmarks, and a body that has hands, fingers follow these landmarks, and all of them place the
+    hand (`gsgan.body.fingers`) instead of the three that 33 landmarks have.
 
     Args:
         body: of the subject's shape.
 
     Raises:
         ValueError: when the joints are neither the free body's nor those of SMPL's family.
-
-    Source: ours.
     """
 
     joints: Tensor  # [J, 3] rest
@@ -95,7 +92,7 @@ class Solver(nn.Module):
         self.fingers = Fingers(body) if isinstance(body, Body) else None
         known = body.landmarks.isfinite().all(-1)
         if isinstance(body, Body):
-            palms = [i + start for start in (0, HAND) for i in SPAN]
+            palms = [i + start for start in (0, HAND) for i in PALM]
             body = replace(
                 body,
                 landmarks=torch.cat([body.landmarks, body.hand_landmarks[palms]]),
@@ -131,7 +128,7 @@ class Solver(nn.Module):
     def solve(self, skeleton: Tensor, visibility: Tensor) -> BodyPose:
         """The pose of each skeleton; differentiable in the skeleton and in the body.
 
-        Convention: joints that no seen landmark shows stay at rest, see `at_rest`.
+        Convention: joints that no visible landmark determines stay at rest, see `at_rest`.
 
         Args:
             skeleton: ``[B, J, 3]`` metres, world: of a template. With 75 joints or more the fingers
@@ -148,6 +145,7 @@ class Solver(nn.Module):
                 f"Solver: the skeleton must have {', '.join(map(str, SIZES))} joints, got "
                 f"{skeleton.shape[1]}"
             )
+        # the 33 landmarks, about the middle of the hips
         hands, seen = skeleton[:, BODY:ALL], visibility[:, BODY:ALL]
         skeleton, visibility = skeleton[:, :BODY], visibility[:, :BODY]
         p, valid = sanitise(skeleton, visibility)
@@ -155,11 +153,12 @@ class Solver(nn.Module):
         shift = p[:, MEDIAPIPE33.hips].mean(1, keepdim=True)
         weight = (self.weights(valid) * torch.where(valid, visibility, 1).clamp(0, 1)).to(p)
         p, found = p - shift, None
+        # hands: their fingers, and three more landmarks each where the hand is placed
         if self.fingers is not None and hands.shape[1]:
             seen = (seen > 0) & hands.isfinite().all(-1)
             found = self.fingers(torch.where(seen.unsqueeze(-1), hands - shift, 0.0), seen)
             replaced = (found.placed.unsqueeze(-1) & self.replaced).any(1)
-            held = found.placed.repeat_interleave(len(SPAN), dim=1).to(weight) / NOISE**2
+            held = found.placed.repeat_interleave(len(PALM), dim=1).to(weight) / NOISE**2
             weight = torch.cat([weight.masked_fill(replaced, 0), held], dim=1)
             own = self.landmarks[BODY:].unflatten(0, (2, -1))
             at = own @ found.rotations.mT + found.shifts.unsqueeze(-2)
@@ -186,12 +185,13 @@ class Solver(nn.Module):
         return self.precision * valid + held * ~valid[:, hips].any(1, keepdim=True)
 
     def at_rest(self, visibility: Tensor) -> Tensor:
-        """``[B, joints]`` bool: joints that no seen landmark shows: `solve` leaves them at rest."""
+        """``[B, joints]`` bool: joints that no visible landmark determines, which `solve` leaves at
+        rest."""
         seen, hands = visibility[:, :BODY] > 0, visibility[:, BODY:ALL] > 0
         if self.fingers is not None and hands.shape[1]:
             placed = self.fingers.placed(hands)
             seen = seen & ~(placed.unsqueeze(-1) & self.replaced).any(1)
-            seen = torch.cat([seen, placed.repeat_interleave(len(SPAN), dim=1)], dim=1)
+            seen = torch.cat([seen, placed.repeat_interleave(len(PALM), dim=1)], dim=1)
         seen, n = seen & self.known[: seen.shape[1]], seen.shape[1]
         shown = (seen.to(self.prior) @ self.reaches[:, :n].to(self.prior).mT) > 0
         shown[:, :6] = True
@@ -332,8 +332,8 @@ class Solver(nn.Module):
         return best[0], best[1]
 
     def _last_steps(self, q: Tensor, root: Tensor, p: Tensor, weight: Tensor) -> Tensor:
-        """Steps with a fixed matrix, which move a solution by next to nothing; the derivative of
-        their result approaches the solution's own, whose matrix is not Gauss-Newton's."""
+        """Steps with a fixed matrix: they hardly move a solution. The derivative of their result
+        approaches that of the exact solution, whose matrix is not Gauss-Newton's."""
         with torch.no_grad():
             H = self.normal(q, self.linear(q, root, p), weight)[2]
         live = torch.is_grad_enabled() and any(
@@ -347,7 +347,7 @@ class Solver(nn.Module):
 def _noise() -> Tensor:
     """``[33]`` metres."""
     noise = torch.full((len(MEDIAPIPE33.names),), NOISE)
-    noise[list(MEDIAPIPE33.face)], noise[PALM] = FACE_NOISE, PALM_NOISE
+    noise[list(MEDIAPIPE33.face)], noise[KNUCKLES] = FACE_NOISE, KNUCKLE_NOISE
     return noise
 
 

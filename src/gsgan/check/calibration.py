@@ -1,29 +1,21 @@
-"""How well each camera's calibration fits its masks, whether another would fit better, and why."""
+"""How well each camera's calibration fits its masks, and whether another would fit better."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from gsgan.check.report import Finding, listed
-from gsgan.check.settings import Limits, Sampling
-from gsgan.check.views import Subject, View, best_shift, body_silhouette, grouped, moved, overlap
+from gsgan.check.settings import Limits
+from gsgan.check.views import CheckedData, MaskView, body_silhouette, grouped, overlap
 from gsgan.data.cameras import CameraEntry
-from gsgan.data.crop import project
-from gsgan.data.formats.consistency import Bool, spread
+from gsgan.data.formats.consistency import spread
 
 TOPIC = "calibration"
 MIRRORED = "mirrored images"
-EXTRINSICS = "R and t of"
-WHOLE = "the whole calibration of"
-ADVICE = {
-    MIRRORED: "mirror its images and masks back",
-    EXTRINSICS: "check its R, t and folder name",
-    WHOLE: "check its calibration and folder name",
-}
 TRIED = 8  # images per camera on which calibrations are tried, at most
 LEAST_VIEWS = 3  # at a lag in time, for it to count
 LAG_METRES = 0.002  # that a lag must gain: less is noise
@@ -31,18 +23,7 @@ LAG_LEFT = 0.01  # metres that it may leave: good captures have 0.001
 CREDIBLE_OVERLAP = 0.35  # the right calibration has 0.6 to 0.7, with slim masks 0.4
 SHARE_OF_ANY_CAMERA = 0.5  # of a standing person's joints lie in the mask from any camera
 OUTSIDE_RATIO = 3.0  # times the other cameras' distance: noisy landmarks are off in all of them
-
-
-@dataclass(frozen=True)
-class Rival:
-    """Another calibration that a camera may have, and the mean overlap with it.
-
-    ``kind`` is a key of `ADVICE`, ``other`` the camera whose calibration it takes, or empty.
-    """
-
-    kind: str
-    other: str
-    overlap: float
+OUTSIDE_ALL = 2.0  # times the limit of one camera, where all are off
 
 
 @dataclass(frozen=True)
@@ -53,10 +34,8 @@ class CameraScore:
         name, inside: the camera; mean share of joints inside the mask.
         overlap: mean overlap of mask and estimated silhouette.
         fullness: median area of the mask over that of the estimated silhouette.
-        rivals: other calibrations, best first.
-        shift, shift_metres: ``(dx, dy)`` pixels of the whole image by which masks lie beside the
-            skeleton; its length at the person.
-        shift_overlap: mean overlap once the masks are moved back.
+        rivals: the mean overlap with other calibrations, best first; by the name of their camera,
+            or `MIRRORED`.
         lag: frames by which the skeleton must be moved to fit best; 0 when nothing is gained.
         outside, lag_outside: metres, mean distance of the joints from the mask, without and with
             the lag.
@@ -66,27 +45,19 @@ class CameraScore:
     inside: float
     overlap: float
     fullness: float
-    rivals: tuple[Rival, ...]
-    shift: tuple[float, float]
-    shift_metres: float
-    shift_overlap: float
+    rivals: dict[str, float]
     lag: int
     outside: float
     lag_outside: float
 
     @property
-    def shift_text(self) -> str:
-        """Pixels right, down."""
-        return f"{self.shift[0]:+.0f}, {self.shift[1]:+.0f}"
+    def best_rival(self) -> float:
+        """The overlap with the best other calibration."""
+        return max(self.rivals.values())
 
     def beaten(self, limits: Limits) -> bool:
         """Whether another calibration fits the masks better, and well."""
-        return self.rivals[0].overlap > max(self.overlap + limits.better_fit, CREDIBLE_OVERLAP)
-
-    def shifted(self, limits: Limits) -> bool:
-        """Whether the masks lie beside the skeleton, by more than bodies and skeletons differ."""
-        gain = self.shift_overlap - self.overlap
-        return self.shift_metres > limits.shift and gain > limits.better_fit
+        return self.best_rival > max(self.overlap + limits.better_fit, CREDIBLE_OVERLAP)
 
     def oversized(self, limits: Limits) -> bool:
         """Whether the masks are far larger than the body, and most of the body lies in them."""
@@ -97,32 +68,29 @@ class CameraScore:
         outside = not self.inside >= limits.inside_error
         return outside or self.beaten(limits) or self.oversized(limits)
 
-    def unfit(self, limits: Limits) -> bool:
-        """Whether the masks do not fit the skeleton, for any reason."""
-        return self.wrong(limits) or self.shifted(limits) or self.lag != 0
+    def close_rivals(self, limits: Limits) -> list[str]:
+        """The other calibrations that fit about as well as the best."""
+        least = self.best_rival - limits.better_fit
+        return [name for name, overlap in self.rivals.items() if overlap > least]
 
 
 def score_cameras(
-    subject: Subject, views: Sequence[View], limits: Limits, sampling: Sampling
+    subject: CheckedData, views: Sequence[MaskView], limits: Limits
 ) -> list[CameraScore]:
     """Scores every camera of which an image could be read."""
-    by_camera = grouped(views)
-    count = min(TRIED, max(1, sampling.trials // (2 * len(by_camera) ** 2 or 1)))
     scores = []
-    for name, own in by_camera.items():
-        chosen, camera = spread(own, count), subject.cameras[name]
-        rivals = [
-            Rival(*what, _fit(subject, chosen, other))
-            for what, other in calibrations(camera, subject.cameras).items()
-        ]
+    for name, own in grouped(views).items():
+        chosen, camera = spread(own, TRIED), subject.cameras[name]
+        rivals = dict[str, float]()
+        for rival, other in calibrations(camera, subject.cameras):
+            rivals[rival] = max(rivals.get(rival, 0.0), _fit(subject, chosen, other))
         scores.append(
             CameraScore(
                 name,
-                known_mean([view.inside for view in own if view.mask.any()]),
+                known_mean(view.inside for view in own if view.mask.any()),
                 _fit(subject, chosen, camera),
                 float(np.median([view.fullness for view in own])),
-                tuple(sorted(rivals, key=lambda rival: -rival.overlap)),
-                *_shift(subject, camera, chosen),
+                dict(sorted(rivals.items(), key=lambda rival: -rival[1])),
                 *_lag(own, limits),
             )
         )
@@ -131,46 +99,35 @@ def score_cameras(
 
 def calibrations(
     own: CameraEntry, cameras: Mapping[str, CameraEntry]
-) -> dict[tuple[str, str], CameraEntry]:
-    """Other calibrations that a camera may have, by (kind, other camera)."""
+) -> Iterator[tuple[str, CameraEntry]]:
+    """Other calibrations that a camera may have: mirrored, and those of other cameras.
+
+    Of another camera either R and t are exchanged, or the whole calibration.
+    """
     mirror = own.K.copy()
     mirror[0] = -mirror[0]
     mirror[0, 2] += own.size[1]
-    found = {(MIRRORED, ""): replace(own, K=mirror)}
+    yield MIRRORED, replace(own, K=mirror)
     for name, other in cameras.items():
         if name != own.name:
-            found[EXTRINSICS, name] = replace(own, R=other.R, t=other.t)
-            found[WHOLE, name] = other
-    return found
+            yield name, replace(own, R=other.R, t=other.t)
+            yield name, other
 
 
-def _body(subject: Subject, view: View, camera: CameraEntry) -> Bool:
-    row = subject.rows[view.frame]
-    small = view.small(camera)
-    return body_silhouette(small, subject.p[row], subject.visible[row], subject.template)
+def _fit(subject: CheckedData, views: Sequence[MaskView], camera: CameraEntry) -> float:
+    """Mean overlap of the masks with the silhouettes estimated for a camera."""
+    overlaps = []
+    for view in views:
+        row = subject.rows[view.frame]
+        skeleton = subject.p[row], subject.visible[row], subject.template
+        overlaps.append(overlap(view.mask, body_silhouette(view.small(camera), *skeleton)))
+    return float(np.mean(overlaps))
 
 
-def _fit(subject: Subject, views: Sequence[View], camera: CameraEntry) -> float:
-    return float(np.mean([overlap(v.mask, _body(subject, v, camera)) for v in views]))
-
-
-def _shift(
-    subject: Subject, camera: CameraEntry, views: Sequence[View]
-) -> tuple[tuple[float, float], float, float]:
-    """The median shift in whole-image pixels, its length in metres, the overlap without it."""
-    pairs = [(view.mask, _body(subject, view, camera)) for view in views]
-    dx, dy = np.median([best_shift(*pair) for pair in pairs], axis=0).round().astype(int)
-    after = float(np.mean([overlap(mask, moved(body, dx, dy)) for mask, body in pairs]))
-    pixels = np.array([dx, dy]) / np.diag(views[0].to_small)[:2]
-    depth = float(project(camera, subject.p[subject.visible])[1].mean())
-    metres = float(np.linalg.norm(pixels / np.diag(camera.K)[:2])) * depth
-    return (float(pixels[0]), float(pixels[1])), metres, after
-
-
-def _lag(views: Sequence[View], limits: Limits) -> tuple[int, float, float]:
+def _lag(views: Sequence[MaskView], limits: Limits) -> tuple[int, float, float]:
     """The best lag, and the mean metres outside without and with it.
 
-    Each lag is compared with none on the views that know both, as the first frames have none
+    Each lag is compared with none on the views that have both, as the first frames have none
     before them. Empty masks are left out.
     """
     table = np.array([view.lagged for view in views if view.mask.any()])
@@ -191,7 +148,7 @@ def _lag(views: Sequence[View], limits: Limits) -> tuple[int, float, float]:
 
 
 def known_mean(values: Iterable[float]) -> float:
-    """Mean without the NaN; NaN when nothing is left."""
+    """Mean without NaN; NaN when nothing is left."""
     kept = [v for v in values if not np.isnan(v)]
     return float(np.mean(kept)) if kept else np.nan
 
@@ -212,100 +169,83 @@ def calibration_findings(
         scores = [s for s in scores if s not in big]
     beaten = [s for s in scores if s.beaten(limits)]
     for one, other in combinations(beaten, 2):
-        ours, theirs = _rival_of(one, other, limits), _rival_of(other, one, limits)
-        if ours and theirs and not {one.name, other.name} & named:
-            what = "R and t" if ours.kind == EXTRINSICS else "calibration"
+        close = other.name in one.close_rivals(limits) and one.name in other.close_rivals(limits)
+        if close and not {one.name, other.name} & named:
             text = (
-                f"cameras {one.name} and {other.name} look exchanged: the {what} of the other "
-                f"would fit the masks better (overlap {ours.overlap:.2f} and {theirs.overlap:.2f}, "
-                f"its own {one.overlap:.2f} and {other.overlap:.2f}); exchange them in the "
-                "calibration, or rename the folders"
+                f"cameras {one.name} and {other.name} look exchanged: the R and t of the other "
+                f"would fit the masks better (overlap {one.rivals[other.name]:.2f} and "
+                f"{other.rivals[one.name]:.2f}, its own {one.overlap:.2f} and {other.overlap:.2f});"
+                " exchange them in the calibration, or rename the folders"
             )
             found.append(Finding("error", TOPIC, text))
             named |= {one.name, other.name}
-    if len(scores) > 1 and not big and (finding := _of_all(scores, limits)):
-        return [finding]
+    off = [s for s in scores if not s.inside >= min_inside]
+    if len(scores) > 1 and not beaten and not big and off == scores:
+        shares = listed(f"{s.name} {s.inside:.0%}" for s in scores)
+        text = (
+            f"in every camera joints lie outside the masks (inside: {shares}): axes, unit, size or "
+            "frame numbers of the skeleton are wrong, K does not follow a crop, or the masks "
+            "belong to other images"
+        )
+        wrong = any(s.wrong(limits) for s in scores)
+        return [Finding("error" if wrong else "warning", TOPIC, text)]
     for score in scores:
         if score.lag and (score not in beaten or score.name in named):
-            when = "later" if score.lag > 0 else "earlier"
-            text = (
-                f"camera {score.name}: its images fit the skeleton {abs(score.lag)} frame(s) "
-                f"{when} better (joints {100 * score.lag_outside:.1f} cm outside the masks instead "
-                f"of {100 * score.outside:.1f}); its clock or numbering is off: add {score.lag:+d}"
-            )
-            found.append(Finding("error", "synchronisation", text))
-        elif score.name not in named:
-            found += _of_one(score, scores, limits, min_inside)
-    named |= {s.name for s in scores if s.unfit(limits)}
+            found.append(_late(score))
+            named.add(score.name)
+        elif score.name not in named and (finding := _of_one(score, scores, limits, min_inside)):
+            found.append(finding)
+            named.add(score.name)
     return found + small_errors([s for s in scores if s.name not in named], limits)
 
 
-def _rival_of(score: CameraScore, other: CameraScore, limits: Limits) -> Rival | None:
-    """The other camera's calibration, where it fits the masks about as well as the best."""
-    least = score.rivals[0].overlap - limits.better_fit
-    return next((r for r in score.rivals if r.other == other.name and r.overlap > least), None)
-
-
-def _of_all(scores: Sequence[CameraScore], limits: Limits) -> Finding | None:
-    """One finding when every camera is wrong."""
-    wrong = [s for s in scores if s.wrong(limits)]
-    if all(s.shifted(limits) for s in scores):
-        shifts = listed(f"{s.name} {s.shift_text}" for s in scores)
-        text = (
-            f"in every camera the masks lie beside the skeleton, by pixels right, down: {shifts}; "
-            "the skeleton is moved or of another size, or K does not follow a crop"
-        )
-        return Finding("error" if wrong else "warning", TOPIC, text)
-    if len(wrong) == len(scores) and not any(s.beaten(limits) for s in scores):
-        shares = listed(f"{s.name} {s.inside:.0%}" for s in scores)
-        text = (
-            f"in every camera joints lie outside the masks (inside: {shares}): axes, unit or frame "
-            "numbers of the skeleton are wrong, or the masks belong to other images"
-        )
-        return Finding("error", TOPIC, text)
-    return None
+def _late(score: CameraScore) -> Finding:
+    when = "later" if score.lag > 0 else "earlier"
+    text = (
+        f"camera {score.name}: its images fit the skeleton {abs(score.lag)} frame(s) {when} better "
+        f"(joints {100 * score.lag_outside:.1f} cm outside the masks instead of "
+        f"{100 * score.outside:.1f}); its clock or numbering is off: add {score.lag:+d}"
+    )
+    return Finding("error", "synchronisation", text)
 
 
 def _of_one(
     score: CameraScore, scores: Sequence[CameraScore], limits: Limits, min_inside: float
-) -> list[Finding]:
+) -> Finding | None:
     """What is wrong with one camera, if anything."""
     seen = f"{score.inside:.0%} of the joints lie inside its masks"
     if len(scores) > 1:
-        others = known_mean([s.inside for s in scores if s is not score])
+        others = known_mean(s.inside for s in scores if s is not score)
         seen += f", {others:.0%} in the other cameras"
     error = not score.inside >= limits.inside_error
     if score.beaten(limits):
-        error, best = True, score.rivals[0]
-        close = [r for r in score.rivals if r.overlap > best.overlap - limits.better_fit]
-        what = dict.fromkeys(f"{r.kind} {r.other}".strip() for r in close)
-        advice = [ADVICE[kind] for kind in ADVICE if kind in {rival.kind for rival in close}]
+        error, rivals = True, score.close_rivals(limits)
+        names = " or ".join(n if n == MIRRORED else f"the calibration of {n}" for n in rivals)
+        advice = "check its R, t and folder name"
+        if MIRRORED in rivals:
+            advice = "mirror its images and masks back" + (f", or {advice}" if rivals[1:] else "")
         text = (
-            f"{' or '.join(what)} would fit its masks better (overlap {best.overlap:.2f}) than "
-            f"its own calibration ({score.overlap:.2f}); {seen}; {', or '.join(advice)}"
+            f"{names} would fit its masks better (overlap {score.best_rival:.2f}) than its own "
+            f"calibration ({score.overlap:.2f}); {seen}; {advice}"
         )
     elif np.isnan(score.inside):
         text = "its masks are empty, or no joint lies in its images; check both folders and K"
-    elif score.shifted(limits):
-        text = (
-            f"its masks lie {score.shift_text} pixels (right, down) beside the skeleton; {seen}. "
-            "A crop or resize that K does not follow, or masks of other images, do this"
-        )
     elif not score.inside >= min_inside:
         text = (
-            f"only {seen}. One camera alone points to its extrinsics, to exchanged folder names, "
-            "to lens distortion left out, or to masks of other images; see its overlays"
+            f"only {seen}. One camera alone points to its extrinsics, to a crop or resize that K "
+            "does not follow, to exchanged folder names, to lens distortion left out, or to masks "
+            "of other images; see its overlays"
         )
     else:
-        return []
-    return [Finding("error" if error else "warning", TOPIC, f"camera {score.name}: {text}")]
+        return None
+    return Finding("error" if error else "warning", TOPIC, f"camera {score.name}: {text}")
 
 
 def small_errors(scores: Sequence[CameraScore], limits: Limits) -> list[Finding]:
     """Cameras, of those without other findings, whose joints lie just outside the masks."""
     metres = {s.name: s.outside for s in scores if np.isfinite(s.outside)}
     middle = float(np.median(list(metres.values()) or [0]))
-    if middle > limits.outside_all:
+    if middle > OUTSIDE_ALL * limits.outside:
         text = (
             f"in most cameras joints lie {100 * middle:.1f} cm outside the masks on average (good "
             "captures: 0.1): focal lengths or unit slightly off, tight masks, or noisy landmarks"

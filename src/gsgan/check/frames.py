@@ -1,7 +1,7 @@
 """Doubtful frames, and the reasons: the skeleton over time, and masks of single images.
 
-Convention: ``p [F, J, 3]`` metres, ``visible [F, J]``, frames in rising order. What cannot be
-measured (too few neighbours, joints not visible) is not flagged.
+Convention: ``p [F, J, 3]`` metres, NaN where a joint is not visible, frames in rising order. What
+cannot be measured (too few neighbours, joints not visible) is not flagged.
 """
 
 from __future__ import annotations
@@ -10,13 +10,14 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import binary_opening
 
 from gsgan.check.report import Finding, listed
 from gsgan.check.settings import Limits
-from gsgan.check.views import Subject, View, grouped, nanmedian
+from gsgan.check.views import CheckedData, MaskView, grouped, nanmedian
 from gsgan.data.files import read_arrays
 from gsgan.data.formats.consistency import Bool, Float
+from gsgan.data.joints import FLIP_GROUPS
+from gsgan.data.skeletons import bone_lengths, frozen_joints
 from gsgan.data.validation import spans
 from gsgan.skeleton.template import SkeletonTemplate
 from gsgan.utils.arrays import expect_array
@@ -32,6 +33,7 @@ KINDS = {
     "unseen": "few joints were seen",
     "detections": "joints lie far from their 2D detections",
 }
+PARTS = dict(zip(("face", "arms", "legs"), FLIP_GROUPS, strict=True))
 JUMP_RATIO = 4.0  # a jump exceeds the upper quartile of all by this: low frame rates pass
 LIMB_METRES = 0.06  # that a limb must be off as well: noise moves the ends of short bones
 RIGID = 0.05  # a joint whose bones change less is a computed one, which may stand still
@@ -50,28 +52,9 @@ class Doubt:
     text: str
 
 
-@dataclass(frozen=True)
-class Motion:
-    """What the skeleton does over time, ``F`` frames.
-
-    Args:
-        jump: ``[F, J]`` metres from the midpoint of the neighbours in time.
-        facing: ``[F]`` below 0 where the front points backwards.
-        seen: ``[F]`` share of the joints that any frame has.
-        reprojection: ``[F, J]`` of `reprojection_errors`.
-        doubts: by kind.
-    """
-
-    jump: Float
-    facing: Float
-    seen: Float
-    reprojection: Float
-    doubts: tuple[Doubt, ...]
-
-
-def motion_of(subject: Subject, limits: Limits) -> Motion:
-    """Measures the skeletons of all frames; no image is needed."""
-    p, visible, template = subject.p, subject.visible, subject.template
+def skeleton_doubts(subject: CheckedData, limits: Limits) -> list[Doubt]:
+    """Reasons to doubt the skeletons of all frames; no image is needed."""
+    p, template = subject.seen_p, subject.template
     names, found = template.names, list[Doubt]()
 
     def doubt(kind: str, what: str, flags: Bool, text: Callable[[int, int], str]) -> None:
@@ -80,41 +63,41 @@ def motion_of(subject: Subject, limits: Limits) -> Motion:
             texts = listed([text(row, i) for i in np.flatnonzero(flags[row]).tolist()], 3)
             found.append(Doubt(int(subject.frames[row]), kind, f"{what}{texts}"))
 
-    jump = jump_distance(p, visible)
+    jump = jump_distance(p)
     gap = np.diff(subject.frames) != subject.step
     jump[1:][gap] = jump[:-1][gap] = np.nan  # neighbours in the list, not in time
     usual = float(np.quantile(np.nan_to_num(jump), 0.75))
-    jumps = jumped(jump, limits.joint_jump) & (np.nan_to_num(jump) > JUMP_RATIO * usual)
+    jumps = jumped(jump, max(limits.joint_jump, JUMP_RATIO * usual))
     doubt("jump", "jumps: ", jumps, lambda row, j: f"{names[j]} {jump[row, j]:.2f} m")
-    lengths = limb_lengths(p, visible, template)
+
+    lengths = bone_lengths(p, template.limbs)
     change = length_change(lengths)
     bones = [f"{names[a]} to {names[b]}" for a, b in template.limbs]
     odd = (change > limits.limb_share) & (change * nanmedian(lengths) > LIMB_METRES)
     doubt("limb", "length off its median: ", odd, lambda f, i: f"{bones[i]} {change[f, i]:.0%}")
-    still = frozen(p, visible, int(limits.frozen_frames))
-    whole = np.asarray((still | ~visible).all(1) & still.any(1))
-    still &= measured_joints(change, template, RIGID) | whole[:, None]
+
+    still = frozen(p, int(limits.frozen_frames))
+    whole = np.asarray((still | ~subject.visible).all(1) & still.any(1))
+    still &= measured_joints(change, template) | whole[:, None]
     doubt("frozen", "frozen: ", still, lambda _, j: names[j])
-    parts = body_parts(template)
-    exchanged = np.stack([swapped(p, visible, pairs) for pairs in parts.values()], 1)
-    doubt("exchanged", "left and right exchanged: ", exchanged, lambda _, i: list(parts)[i])
-    front = facing(p, visible, template)
-    doubt("backwards", "", front[:, None] < 0, lambda *_: "nose or toes point backwards")
-    seen = visible.sum(1) / max(int(visible.any(0).sum()), 1)
+
+    exchanged = np.stack([swapped(p, pairs) for pairs in PARTS.values()], 1)
+    doubt("exchanged", "left and right exchanged: ", exchanged, lambda _, i: list(PARTS)[i])
+    backwards = facing(p, template)[:, None] < 0
+    doubt("backwards", "", backwards, lambda *_: "nose or toes point backwards")
+
+    seen = subject.visible.sum(1) / max(int(subject.visible.any(0).sum()), 1)
     few = seen[:, None] < limits.seen_share
     doubt("unseen", "", few, lambda row, _: f"{seen[row]:.0%} of the joints seen")
     pixels = reprojection_errors(subject)
     focal = float(np.median([camera.K[0, 0] for camera in subject.cameras.values()]))
-    off = pixels > limits.reprojection_joint * focal
-    away = "px from 2D detections"
-    doubt("detections", "", off, lambda row, j: f"{names[j]} {pixels[row, j]:.0f} {away}")
-    median = nanmedian(pixels.T)
-    many = (median > limits.reprojection_frame * focal) & ~off.any(1)
-    doubt("detections", "", many[:, None], lambda row, _: f"joints {median[row]:.0f} {away}")
-    return Motion(jump, front, seen, pixels, tuple(found))
+    off = pixels > limits.reprojection * focal
+    text = "{} {:.0f} px from 2D detections"
+    doubt("detections", "", off, lambda row, j: text.format(names[j], pixels[row, j]))
+    return found
 
 
-def reprojection_errors(subject: Subject) -> Float:
+def reprojection_errors(subject: CheckedData) -> Float:
     """``[F, J]`` pixels between projected joints and 2D detections, NaN where unknown.
 
     They are ``reproj_px`` of landmarks3d.npz, the mean over cameras, as `gsgan.prepare` writes it.
@@ -124,58 +107,42 @@ def reprojection_errors(subject: Subject) -> Float:
     """
     result = np.full(subject.visible.shape, np.nan)
     path = subject.layout.root / "landmarks3d.npz"
-    if not path.is_file():
-        return result
-    arrays = read_arrays(path, ("reproj_px", "frame_id"))
+    arrays = read_arrays(path, ("reproj_px", "frame_id")) if path.is_file() else {}
     if "reproj_px" in arrays:
         ids = expect_array(arrays, "frame_id", (None,), path)
-        stored = expect_array(arrays, "reproj_px", (len(ids), subject.p.shape[1]), path)
-        for number, row in zip(ids, stored, strict=True):
-            if int(number) in subject.rows:
-                result[subject.rows[int(number)]] = row
-    return np.where(subject.visible & np.isfinite(result), result, np.nan)
+        stored = expect_array(arrays, "reproj_px", (len(ids), len(subject.template.names)), path)
+        for number, row in zip(ids.tolist(), stored, strict=True):
+            if number in subject.rows:
+                result[subject.rows[number]] = row
+    return np.where(subject.visible, result, np.nan)
 
 
-def doubts(
-    subject: Subject,
-    views: Sequence[View],
-    motion: Motion,
-    limits: Limits,
-    unfit: Collection[str] = (),
-) -> list[Doubt]:
-    """Every reason to doubt a frame, in order of frames.
-
-    Masks of ``unfit`` cameras are not used: they do not fit in any frame.
-    """
-    found = list(motion.doubts)
+def mask_doubts(
+    views: Sequence[MaskView], limits: Limits, unfit: Collection[str] = ()
+) -> Iterable[Doubt]:
+    """Reasons to doubt masks; those of ``unfit`` cameras do not fit in any frame."""
     for name, own in grouped(views).items():
         full = [view.fullness for view in own if view.mask.any()]
         usual = float(np.median(full)) if full else 0.0
         for view in own if name not in unfit else ():
-            found += [Doubt(view.frame, *doubt) for doubt in _of_view(view, usual, limits)]
-    return sorted(found, key=lambda doubt: doubt.frame)
+            known, out = int(view.known.sum()), int(view.beyond.sum())
+            if not view.mask.any():
+                yield Doubt(view.frame, "mask", f"{name}: the mask is empty")
+                continue
+            if known and out / known > limits.frame_outside:
+                text = f"{name}: {out} of {known} joints outside the mask"
+                yield Doubt(view.frame, "outside", text)
+            change = view.fullness / usual - 1 if usual else 0.0
+            # With few joints the estimated silhouette is too incomplete to compare the mask with.
+            if known >= limits.seen_share * len(view.known) and abs(change) > limits.area_jump:
+                text = f"{name}: mask area {change:+.0%} off the usual for the pose"
+                yield Doubt(view.frame, "mask", text)
 
 
-def _of_view(view: View, usual: float, limits: Limits) -> Iterable[tuple[str, str]]:
-    known, out = int(view.known.sum()), int(view.beyond.sum())
-    if not view.mask.any():
-        yield "mask", f"{view.camera}: the mask is empty"
-        return
-    if known and out / known > limits.frame_outside:
-        yield "outside", f"{view.camera}: {out} of {known} joints outside the mask"
-    change = view.fullness / usual - 1 if usual else 0.0
-    # else the estimated silhouette is too incomplete to compare the mask with
-    if known >= limits.seen_share * len(view.known) and abs(change) > limits.area_jump:
-        yield "mask", f"{view.camera}: mask area {change:+.0%} off the usual for the pose"
-
-
-def frame_findings(
-    subject: Subject, found: Sequence[Doubt], motion: Motion, limits: Limits
-) -> list[Finding]:
+def frame_findings(subject: CheckedData, found: Sequence[Doubt], limits: Limits) -> list[Finding]:
     """One finding per kind of doubt; an error when left and right, or most frames, are wrong."""
-    findings = []
-    known = motion.facing[~np.isnan(motion.facing)]
-    backwards = float((known < 0).mean()) if len(known) else 0.0
+    findings, count = [], len(subject.frames)
+    backwards = sum(doubt.kind == "backwards" for doubt in found) / count
     mirrored = backwards > MIRRORED
     if mirrored:
         text = (
@@ -188,12 +155,12 @@ def frame_findings(
         if some and not (mirrored and kind == "backwards"):
             frames = sorted({doubt.frame for doubt in some})
             text = (
-                f"{what} in {len(frames)} of {len(subject.frames)} frames: {shortened(frames)} "
+                f"{what} in {len(frames)} of {count} frames: {shortened(frames)} "
                 f"(frame {some[0].frame}: {some[0].text})"
             )
             findings.append(Finding("warning", "frames", text))
-    share = len({doubt.frame for doubt in found}) / len(subject.frames)
-    if share > limits.distrust and not mirrored:
+    share = len({doubt.frame for doubt in found}) / count
+    if share > limits.doubtful and not mirrored:
         text = f"{share:.0%} of the frames are doubtful; training on them is not worth its time"
         findings.append(Finding("error", "frames", text))
     return findings
@@ -205,16 +172,13 @@ def shortened(frames: Sequence[int], most: int = 8) -> str:
     return ", ".join(ranges[:most]) + (" …" if len(ranges) > most else "")
 
 
-def jump_distance(p: Float, visible: Bool) -> Float:
+def jump_distance(p: Float) -> Float:
     """``[F, J]`` metres from the midpoint of the joint's two neighbours in time; NaN if unknown.
 
     A steady motion gives 0 at any speed; the first and last frame are unknown.
     """
     distance = np.full(p.shape[:2], np.nan)
-    if len(p) > 2:
-        middle = (p[:-2] + p[2:]) / 2
-        seen = visible[:-2] & visible[1:-1] & visible[2:]
-        distance[1:-1] = np.where(seen, np.linalg.norm(p[1:-1] - middle, axis=-1), np.nan)
+    distance[1:-1] = np.linalg.norm(p[1:-1] - (p[:-2] + p[2:]) / 2, axis=-1)
     return distance
 
 
@@ -223,17 +187,9 @@ def jumped(distance: Float, limit: float) -> Bool:
 
     A stray frame also moves its neighbours' midpoints, by half as much; only the peak counts.
     """
-    known = np.nan_to_num(distance)
-    before, after = np.zeros_like(known), np.zeros_like(known)
-    before[1:], after[:-1] = known[:-1], known[1:]
-    return (known > limit) & (known >= before) & (known >= after)
-
-
-def limb_lengths(p: Float, visible: Bool, template: SkeletonTemplate) -> Float:
-    """``[F, L]`` metres, NaN where an end is not visible."""
-    a, b = np.array(template.limbs).T
-    lengths = np.linalg.norm(p[:, a] - p[:, b], axis=-1)
-    return np.where(visible[:, a] & visible[:, b], lengths, np.nan)
+    known = np.pad(np.nan_to_num(distance), ((1, 1), (0, 0)))
+    before, here, after = known[:-2], known[1:-1], known[2:]
+    return np.asarray((here > limit) & (here >= before) & (here >= after))
 
 
 def length_change(lengths: Float) -> Float:
@@ -242,72 +198,52 @@ def length_change(lengths: Float) -> Float:
     return np.asarray(np.abs(lengths - typical) / np.maximum(typical, STILL))
 
 
-def measured_joints(change: Float, template: SkeletonTemplate, share: float) -> Bool:
-    """``[J]`` joints with a bone whose `length_change` exceeds ``share`` in some frame.
+def measured_joints(change: Float, template: SkeletonTemplate) -> Bool:
+    """``[J]`` joints with a bone whose `length_change` exceeds `RIGID` in some frame.
 
     The bones of a posed body model keep their length, measured ones do not.
     """
     measured = np.zeros(len(template.names), bool)
-    measured[np.array(template.limbs)[(np.nan_to_num(change) > share).any(0)]] = True
+    measured[np.array(template.limbs)[(np.nan_to_num(change) > RIGID).any(0)]] = True
     return measured
 
 
-def frozen(p: Float, visible: Bool, least: int) -> Bool:
+def frozen(p: Float, least: int) -> Bool:
     """``[F, J]`` joints that stand exactly still for at least ``least`` frames in a row.
 
     Gap filling and copied frames do this; measured joints never do, computed ones may.
     """
-    same = np.zeros(visible.shape, bool)
-    same[1:] = np.linalg.norm(p[1:] - p[:-1], axis=-1) < STILL
-    same[1:] &= visible[1:] & visible[:-1]
-    # an opening keeps runs of equal steps; a run of n joins n + 1 frames
-    held = binary_opening(same, np.ones((max(1, least - 1), 1)))
-    held[:-1] |= held[1:].copy()
-    return np.asarray(held)
+    held = frozen_joints(p, least, STILL)
+    held[:-1] |= held[1:].copy()  # the first frame of each run
+    return held
 
 
-def body_parts(template: SkeletonTemplate) -> dict[str, tuple[tuple[int, int], ...]]:
-    """(left, right) joints that would be exchanged together, by the part's name."""
-    parts = {"face": set(template.face)}
-    for name, roots in (("arms", template.shoulders), ("legs", template.hips)):
-        parts[name] = set(roots)
-        for _ in template.limbs:  # every joint that hangs on the roots
-            parts[name] |= {b for a, b in template.limbs if a in parts[name]}
-    pairs = [(a, b) for a, b in enumerate(template.mirror) if "left" in template.names[a]]
-    return {name: tuple(p for p in pairs if p[0] in joints) for name, joints in parts.items()}
-
-
-def swapped(
-    p: Float, visible: Bool, pairs: tuple[tuple[int, int], ...], metres: float = SWAP_METRES
-) -> Bool:
+def swapped(p: Float, pairs: tuple[tuple[int, int], ...], metres: float = SWAP_METRES) -> Bool:
     """``[F]`` frames in which a body part's left and right are exchanged.
 
     From frame to frame the part is exchanged where exchanging brings it nearer to where it was:
     mean distance `SWAP_RATIO` times and ``metres`` less. The smaller half of the frames that
     these exchanges separate counts as wrong. ``pairs`` are (left, right) joints of the part.
     """
-    state = np.zeros(len(p), bool)
-    if not pairs or len(p) < 3:
-        return state
-    sides = np.array(pairs).T
-    both = visible[:, sides[0]] & visible[:, sides[1]]
-    last: int | None = None
-    for f in range(len(p)):
-        if last is not None:
-            state[f] = state[last]
-        if not both[f].any():
+    state, sides = np.zeros(len(p), bool), p[:, np.array(pairs)]  # [F, N, 2, 3]
+    last = None
+    for f, now in enumerate(sides):
+        state[f] = state[f - 1] if f else False
+        if not np.isfinite(now).all((1, 2)).any():
             continue
-        if last is not None and (shared := both[f] & both[last]).any():
-            now, then = p[f, sides[:, shared]], p[last, sides[:, shared]]
-            straight = np.linalg.norm(now - then, axis=-1).sum(0)
-            across = np.linalg.norm(now - then[::-1], axis=-1).sum(0)
-            gain = (straight - across).mean() / 2
-            state[f] ^= straight.mean() > SWAP_RATIO * across.mean() and gain > metres
-        last = f
+        if last is not None:
+            straight = np.linalg.norm(now - last, axis=-1).sum(-1)
+            across = np.linalg.norm(now - last[:, ::-1], axis=-1).sum(-1)
+            shared = np.isfinite(straight)
+            if shared.any():
+                straight, across = straight[shared].mean(), across[shared].mean()
+                nearer = straight > SWAP_RATIO * across and (straight - across) / 2 > metres
+                state[f] ^= nearer
+        last = now
     return state if state.mean() <= 0.5 else ~state
 
 
-def facing(p: Float, visible: Bool, template: SkeletonTemplate) -> Float:
+def facing(p: Float, template: SkeletonTemplate) -> Float:
     """``[F]`` positive where nose and toes lie before the trunk, negative behind; NaN unknown.
 
     The trunk's front follows from its left and right; nose against ears and toes against ankles
@@ -315,14 +251,11 @@ def facing(p: Float, visible: Bool, template: SkeletonTemplate) -> Float:
     """
     l_sh, r_sh, l_hip, r_hip = (p[:, j] for j in template.torso)
     front = np.cross(l_sh - r_sh, l_sh + r_sh - l_hip - r_hip)
-    trunk = visible[:, list(template.torso)].all(1)
     index = template.names.index
     ends = [(list(template.ears), template.nose)]
     ends += [([index(f"{s}_ankle")], index(f"{s}_foot_index")) for s in ("left", "right")]
-    votes = np.full((len(ends), len(p)), np.nan)
-    for vote, (behind, ahead) in zip(votes, ends, strict=True):
-        seen = trunk & visible[:, [*behind, ahead]].all(1)
-        direction = p[:, ahead] - p[:, behind].mean(1)
-        vote[seen] = np.sign((direction * front).sum(-1))[seen]
-    count = (~np.isnan(votes)).sum(0)
-    return np.where(count > 0, np.nansum(votes, axis=0) / np.maximum(count, 1), np.nan)
+    ahead = np.stack([p[:, tip] - p[:, behind].mean(1) for behind, tip in ends])
+    votes = np.sign((ahead * front).sum(-1))
+    known = np.isfinite(votes)
+    votes = np.where(known, votes, 0.0).sum(0) / known.sum(0).clip(1)
+    return np.where(known.any(0), votes, np.nan)

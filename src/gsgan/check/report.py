@@ -17,7 +17,7 @@ STYLES = {"error": "bold red", "warning": "yellow"}
 PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{{ report.title }}</title><style>
+<title>Check of a dataset</title><style>
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 1180px; margin: 0 auto;
   padding: 1.2em; background: #fafafa; overflow-wrap: anywhere; }
 h1 { font-size: 1.5em; margin-bottom: .1em; } h2 { font-size: 1.15em; margin: 1.8em 0 .5em; }
@@ -25,24 +25,22 @@ li, .verdict { padding: .5em .8em; margin: .4em 0; border-radius: 4px; list-styl
 ul { padding: 0; } strong, .verdict { font-weight: 600; }
 .good { background: #d3f9d8; } .warning { background: #fff3bf; } .error { background: #ffc9c9; }
 table { border-collapse: collapse; background: #fff; margin: .6em 0; }
-caption { text-align: left; font-weight: 600; padding: .3em 0; }
 th, td { border: 1px solid #ddd; padding: .25em .6em; text-align: left; vertical-align: top; }
 th { background: #f1f3f5; }
 figure { margin: .8em 0; } figcaption, .root { color: #555; font-size: .9em; }
 img { max-width: 100%; border: 1px solid #ddd; } .wide { overflow-x: auto; }
 </style></head><body>
-<h1>{{ report.title }}</h1><p class="root">{{ report.root }}</p>
+<h1>Check of a dataset</h1><p class="root">{{ report.root }}</p>
 <p class="verdict {{ colour }}">{{ report.verdict }}</p>
 <ul>{% for f in report.findings %}
 <li class="{{ f.level }}"><strong>{{ f.level }}, {{ f.topic }}:</strong> {{ f.sentence }}</li>
 {% endfor %}</ul>
 {% for section in report.sections %}<h2>{{ section.title }}</h2>
-{% for line in section.aside + section.text %}<p>{{ line }}</p>{% endfor %}
+{% if section.text %}<p>{{ section.text }}</p>{% endif %}
 {% for table in section.tables %}<div class="wide"><table>
-{% if table.title %}<caption>{{ table.title }}</caption>{% endif %}
 <tr>{% for header in table.headers %}<th>{{ header }}</th>{% endfor %}</tr>
-{% for row in table.rows %}{% set i = loop.index0 %}<tr>{% for cell in row %}
-<td{% if (i, loop.index0) in table.flagged %} class="error"{% endif %}>{{ cell }}</td>
+{% for row in table.rows %}<tr>{% for cell in row %}
+<td{% if cell is flagged %} class="error"{% endif %}>{{ cell }}</td>
 {% endfor %}</tr>{% endfor %}</table></div>{% endfor %}
 {% for figure in section.figures %}<figure>
 <img alt="{{ figure.caption }}" src="{{ figure.source }}">
@@ -63,14 +61,26 @@ class Finding:
     sentence: str
 
 
+class Flagged(str):
+    """The text of a table's cell whose value is out of bounds."""
+
+
 @dataclass(frozen=True)
 class Table:
-    """Rows of text; ``flagged`` holds (row, column) of the cells that are out of bounds."""
+    """Rows of text."""
 
     headers: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
-    flagged: frozenset[tuple[int, int]] = frozenset()
-    title: str = ""
+
+    def for_terminal(self, title: str | None = None) -> RichTable:
+        """The table as rich prints it, flagged cells in red."""
+        drawn = RichTable(title=title, title_justify="left", title_style="bold")
+        for header in self.headers:
+            drawn.add_column(header, overflow="fold")
+        for row in self.rows:
+            styles = (STYLES["error"] if isinstance(cell, Flagged) else "" for cell in row)
+            drawn.add_row(*map(Text, row, styles))
+        return drawn
 
 
 @dataclass(frozen=True)
@@ -78,25 +88,24 @@ class Figure:
     """An encoded image, JPEG or SVG, and the caption below it."""
 
     caption: str
-    picture: bytes
+    image: bytes
 
     @property
     def source(self) -> str:
         """A data URL, for the page."""
-        kind = "svg+xml" if self.picture.startswith(b"<?") else "jpeg"
-        return f"data:image/{kind};base64,{base64.b64encode(self.picture).decode()}"
+        kind = "svg+xml" if self.image.startswith(b"<?") else "jpeg"
+        return f"data:image/{kind};base64,{base64.b64encode(self.image).decode()}"
 
 
 @dataclass(frozen=True)
 class Section:
-    """One part of a report; ``aside`` are explanations, which the terminal leaves out."""
+    """One part of a report; ``text`` explains it on the page."""
 
     title: str
-    text: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
-    figures: tuple[Figure, ...] = ()
     findings: tuple[Finding, ...] = ()
-    aside: tuple[str, ...] = ()
+    figures: tuple[Figure, ...] = ()
+    text: str = ""
 
 
 @dataclass(frozen=True)
@@ -106,7 +115,6 @@ class Report:
     root: str
     sections: tuple[Section, ...]
     numbers: dict[str, object] = field(default_factory=dict)
-    title: str = "Check of a dataset"
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -146,30 +154,19 @@ def listed(names: Iterable[object], most: int = 6) -> str:
 
 def page(report: Report) -> str:
     """The report as one HTML file: no scripts, images embedded, nothing fetched."""
-    template = Environment(autoescape=True, trim_blocks=True).from_string(PAGE)
+    environment = Environment(autoescape=True, trim_blocks=True)
+    environment.tests["flagged"] = lambda cell: isinstance(cell, Flagged)
     colour = "error" if report.errors else "warning" if report.warnings else "good"
-    return template.render(report=report, colour=colour)
+    return environment.from_string(PAGE).render(report=report, colour=colour)
 
 
 def print_report(report: Report, console: Console) -> None:
     """Prints the tables of every section, then the findings, errors last, near the prompt."""
     for section in report.sections:
-        if section.tables or section.text:
-            console.rule(Text(section.title), align="left", style="dim")
-        for table in section.tables:
-            drawn = RichTable(title=table.title or None, title_justify="left", title_style="bold")
-            for header in table.headers:
-                drawn.add_column(header, overflow="fold")
-            for i, row in enumerate(table.rows):
-                styles = ["bold red" if (i, j) in table.flagged else "" for j in range(len(row))]
-                drawn.add_row(*map(Text, row, styles))
-            console.print(drawn)
-        for line in section.text:
-            console.print(Text(line))
-    if report.findings:
-        console.rule(Text("Findings"), align="left", style="dim")
+        for i, table in enumerate(section.tables):
+            console.print(table.for_terminal(None if i else section.title))
     for finding in reversed(report.findings):
         start = Text(f"{finding.level}, {finding.topic}: ", STYLES[finding.level])
         console.print(start.append(finding.sentence, "default not bold"))
-    style = "bold red" if report.errors else "bold"
-    console.print(Text(f"{report.title}: {report.verdict}", style))
+    style = STYLES["error"] if report.errors else "bold"
+    console.print(Text(f"Check of a dataset: {report.verdict}", style))

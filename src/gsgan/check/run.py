@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from collections import Counter
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rich.console import Console
 
-from gsgan.check.report import Finding, Report, Section, Table, page, print_report
-from gsgan.check.sections import Measured, sections
+from gsgan.check.report import Finding, Report, Section, page, print_report
+from gsgan.check.sections import Measurements, sections
 from gsgan.check.settings import Limits, Sampling
 from gsgan.effects import EffectSettings
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
-from gsgan.utils.files import write_atomically
+from gsgan.utils.files import write_atomically, write_json, writing
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
-
-LISTED_FOLDERS = 60  # of a dataset that cannot be read
 
 
 def check_data(
@@ -51,43 +47,42 @@ def check_data(
         ConfigError: when the data's config is wrong.
     """
     try:
-        measured = Measured(data, sampling, limits, effects or EffectSettings(), console)
+        measured = Measurements(data, sampling, limits, effects or EffectSettings(), console)
     except DataError as error:
         return unreadable(data.root, error)
     return Report(str(measured.subject.layout.root), sections(measured), measured.numbers())
 
 
 def unreadable(root: str | None, error: DataError) -> Report:
-    """Why the reader refuses a dataset, and the files of its folder."""
-    folder = None if root is None else Path(root).expanduser()
+    """Why the reader refuses a dataset."""
     section = Section(
         "The dataset cannot be read",
-        text=("Nothing further could be checked. Correct this, then check again.",),
-        tables=(inventory(folder),) if folder is not None and folder.is_dir() else (),
         findings=(Finding("error", "reading", str(error)),),
+        text="Nothing further could be checked. Correct this, then check again.",
     )
     return Report(str(root), (section,), {"readable": False})
 
 
-def inventory(root: Path) -> Table:
-    """The files of a folder and of two levels of folders below it, counted by suffix."""
-    rows = []
-    for folder in [root, *sorted((*root.glob("*/"), *root.glob("*/*/")))][:LISTED_FOLDERS]:
-        kinds = Counter(p.suffix.lower() or p.name for p in folder.iterdir() if p.is_file())
-        text = ", ".join(f"{n} × {kind}" for kind, n in sorted(kinds.items())) or "no files"
-        rows.append((str(folder.relative_to(root)), text))
-    return Table(("folder", "files"), tuple(rows), title="Files of the folder")
+def check_capture(root: Path, path: Path, console: Console) -> Report:
+    """Checks a capture with the default settings, see `write_report`."""
+    from gsgan.data.datamodule import GsganData
+    from gsgan.data.formats.capture import CaptureReader
+
+    data = GsganData(root=str(root), reader=CaptureReader())
+    report = check_data(data, Sampling(), Limits(), console=console)
+    write_report(report, path, console)
+    return report
 
 
 def run_check(config: DictConfig) -> Report:
-    """Checks the dataset of a config, prints the report and writes it as HTML and JSON.
+    """Checks the dataset of a config, see `write_report`.
 
     Raises:
         ConfigError: on a config value that does not fit.
     """
     if not config.report:
         raise ConfigError("report is not set: give the HTML file to write, e.g. report=check.html")
-    # the reader's notes are part of the report
+    # The reader's notes are part of the report.
     logging.getLogger("gsgan.data").setLevel(logging.ERROR)
     console = make_console()
     sampling, limits = instantiate(config.sampling), instantiate(config.limits)
@@ -98,20 +93,16 @@ def run_check(config: DictConfig) -> Report:
         if not isinstance(error.__cause__, DataError):
             raise
         report = unreadable(config.data.get("root"), error.__cause__)
-    path = Path(config.report).expanduser()
-    numbers = json.dumps(plain(report), indent=1, allow_nan=False) + "\n"
-    try:
-        write_atomically(path, page(report))
-        write_atomically(path.with_suffix(".json"), numbers)
-    except OSError as error:
-        raise ConfigError(f"report={path} cannot be written: {error.strerror}") from None
-    print_report(report, console)
-    console.print(f"report: {path}", markup=False, highlight=False, soft_wrap=True)
+    write_report(report, Path(config.report).expanduser(), console)
     return report
 
 
-def plain(report: Report) -> dict[str, Any]:
-    """The report's findings and numbers for the JSON file; null stands for NaN and infinity."""
+def write_report(report: Report, path: Path, console: Console) -> None:
+    """Prints a report, and writes it as HTML and its numbers beside it as JSON.
+
+    Raises:
+        DataError: when a file cannot be written.
+    """
     content = {
         "root": report.root,
         "errors": report.errors,
@@ -119,5 +110,8 @@ def plain(report: Report) -> dict[str, Any]:
         "findings": [asdict(finding) for finding in report.findings],
         **report.numbers,
     }
-    found: dict[str, Any] = json.loads(json.dumps(content), parse_constant=lambda _: None)
-    return found
+    with writing(path):
+        write_atomically(path, page(report))
+    write_json(path.with_suffix(".json"), content)
+    print_report(report, console)
+    console.print(f"report: {path}", markup=False, highlight=False, soft_wrap=True)

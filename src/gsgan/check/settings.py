@@ -18,14 +18,9 @@ class Sampling:
         ConfigError: when a value is not a number above 0.
     """
 
-    pictures: int = 200
+    images: int = 200
     size: int = 384
-    trials: int = 6000
-    size_ratio: float = 2.5
-    hull_frames: int = 4
-    lag: int = 4
     shown: int = 6
-    tile: int = 360
     workers: int = 2
 
     def __post_init__(self) -> None:
@@ -44,24 +39,17 @@ class Limits:
     inside_error: float = 0.7
     fullness: float = 2.0
     better_fit: float = 0.05
-    shift: float = 0.06
     lag_gain: float = 0.3
     outside: float = 0.004
-    outside_all: float = 0.008
-    hull_warning: float = 0.9
-    height_warning_low: float = 1.2
-    height_warning_high: float = 2.1
-    lean: float = 50.0
     frame_outside: float = 0.3
     area_jump: float = 0.35
     joint_jump: float = 0.2
     limb_share: float = 0.3
     frozen_frames: int = 5
     seen_share: float = 0.7
-    reprojection_frame: float = 0.02
-    reprojection_joint: float = 0.05
+    reprojection: float = 0.05
     colour_ratio: float = 1.15
-    distrust: float = 0.5
+    doubtful: float = 0.5
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():

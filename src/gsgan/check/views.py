@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
-from rich.progress import Progress
 
 from gsgan.check.settings import Sampling
 from gsgan.data.cameras import CameraEntry
@@ -37,14 +37,15 @@ from gsgan.data.formats.consistency import (
 from gsgan.data.layout import Layout
 from gsgan.data.splits import Item
 from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
+from gsgan.utils.console import progress
 from gsgan.utils.errors import DataError
 
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
 FAR = 0.3  # metres: distances of joints from the mask are clipped to this before they are averaged
-SMALL = 128  # pixels, longest side of the masks that calibrations are tried on and hulls carved by
-TAILS = 20000  # files whose end is read
+SMALL = 128  # pixels, longest side of the masks that calibrations are tried on
+LAG = 4  # frames by which a camera is tried earlier and later
 TAIL = 64  # bytes: some writers append a few after the end mark
 END_MARKS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}  # by first bytes
 FLESH = 0.07  # metres of body about every bone: between an arm and a thigh
@@ -52,11 +53,11 @@ HEAD_RADIUS = 0.12  # metres about the middle of the face: half of a head's heig
 
 
 @dataclass(frozen=True)
-class Subject:
+class CheckedData:
     """One dataset.
 
     Args:
-        layout, trust: the reader's index and thresholds.
+        layout, consistency: the reader's index and thresholds.
         frames, pairs: ``[F]`` rising frame numbers; those that exist, by camera.
         p, visible: ``[F, J, 3]`` metres, finite; ``[F, J]``.
         up: ``[3]`` unit, the world's up axis.
@@ -64,7 +65,7 @@ class Subject:
     """
 
     layout: Layout
-    trust: Consistency
+    consistency: Consistency
     frames: NDArray[np.int64]
     pairs: Mapping[str, tuple[int, ...]]
     p: Float
@@ -83,12 +84,17 @@ class Subject:
         return {int(frame): row for row, frame in enumerate(self.frames)}
 
     @cached_property
+    def seen_p(self) -> Float:
+        """``[F, J, 3]`` metres, NaN where a joint is not visible."""
+        return np.where(self.visible[..., None], self.p, np.nan)
+
+    @cached_property
     def step(self) -> int:
         """Frame numbers from one frame to the next: the median gap."""
         return max(1, int(np.median(np.diff(self.frames)))) if len(self.frames) > 1 else 1
 
 
-def subject_of(data: GsganData) -> Subject:
+def subject_of(data: GsganData) -> CheckedData:
     """The dataset behind a data module, read if need be.
 
     The reader's own comparison of masks and joints is skipped: the check compares more images.
@@ -96,16 +102,16 @@ def subject_of(data: GsganData) -> Subject:
     Raises:
         DataError: when it cannot be read.
     """
-    trust = getattr(data.reader, "consistency", None) or Consistency()
+    consistency = getattr(data.reader, "consistency", None) or Consistency()
     if hasattr(data.reader, "consistency"):
         reader: Any = data.reader  # one of the dataclasses of gsgan.data.formats
-        data.reader = replace(reader, consistency=replace(trust, frames=0))
+        data.reader = replace(reader, consistency=replace(consistency, frames=0))
     layout = data.layout
     frames = np.array(layout.frames, np.int64)
     axis = layout.meta.up_axis
-    return Subject(
+    return CheckedData(
         layout=layout,
-        trust=trust,
+        consistency=consistency,
         frames=frames,
         pairs={name: tuple(sorted(layout.images[name])) for name in layout.camera_names},
         p=np.stack([layout.landmarks.p[int(f)] for f in frames]),
@@ -115,7 +121,7 @@ def subject_of(data: GsganData) -> Subject:
 
 
 @dataclass(frozen=True)
-class View:
+class MaskView:
     """What one image shows.
 
     Args:
@@ -123,7 +129,7 @@ class View:
         outside, tolerance: ``[J]`` metres by which joints lie outside the mask, NaN where unknown;
             metres that they may.
         fullness: area of the mask over that of the estimated silhouette.
-        lagged: ``[2 lag + 1]`` mean metres outside with the skeleton of an earlier or later frame.
+        lagged: ``[2 LAG + 1]`` mean metres outside with the skeleton of an earlier or later frame.
         colour, weight: ``[3]`` summed RGB of the person, summed mask.
         mask, to_small: ``[h, w]`` small mask; ``[3, 3]`` maps pixels of the whole image to it.
     """
@@ -159,7 +165,7 @@ class View:
         return 1 - self.beyond.sum() / self.known.sum() if self.known.any() else np.nan
 
 
-def grouped(views: Sequence[View]) -> dict[str, list[View]]:
+def grouped(views: Sequence[MaskView]) -> dict[str, list[MaskView]]:
     """The views by camera."""
     return {
         name: [v for v in views if v.camera == name]
@@ -174,9 +180,9 @@ def nanmedian(values: Float) -> Float:
         return np.asarray(np.nanmedian(values, axis=0))
 
 
-def sampled_items(subject: Subject, pictures: int) -> tuple[Item, ...]:
-    """At most ``pictures`` items, at least one per camera: the same moments, evenly spaced."""
-    each = max(1, pictures // len(subject.pairs))
+def sampled_items(subject: CheckedData, images: int) -> tuple[Item, ...]:
+    """At most ``images`` items, at least one per camera: the same moments, evenly spaced."""
+    each = max(1, images // len(subject.pairs))
     moments = set(spread([int(f) for f in subject.frames], each))
     items = []
     for name, files in subject.pairs.items():
@@ -185,26 +191,17 @@ def sampled_items(subject: Subject, pictures: int) -> tuple[Item, ...]:
     return tuple(items)
 
 
-def suspicious_items(subject: Subject, sampling: Sampling) -> tuple[Item, ...]:
-    """Items with a file that was cut off, or a mask file of unusual size; nothing is decoded.
-
-    At most ``sampling.pictures`` of each; a mask is unusual when its file is
-    ``sampling.size_ratio`` times smaller or larger than its camera's median: empty or full.
-    """
-    cut, odd, layout = list[Item](), list[Item](), subject.layout
-    images = sum(len(files) for files in subject.pairs.values())
-    every = 1 + 2 * images // TAILS  # an image and its mask each
-    for name, files in subject.pairs.items():
-        items = [(name, frame) for frame in files[::every]]
-        masks = [[path for _, path in layout.mask_files(*item)] for item in items]
-        sizes = np.array([p[0].stat().st_size if p[0].is_file() else 1 for p in masks], float)
-        usual = max(float(np.median(sizes)), 1)
-        for item, paths, size in zip(items, masks, sizes.clip(1), strict=True):
-            if not all(map(complete, [layout.image_path(*item), *paths])):
-                cut.append(item)
-            if max(size / usual, usual / size) > sampling.size_ratio:
-                odd.append(item)
-    return (*cut[: sampling.pictures], *spread(odd, sampling.pictures))
+def cut_items(subject: CheckedData, most: int) -> tuple[Item, ...]:
+    """At most ``most`` items with an image or mask file that was cut off; nothing is decoded."""
+    layout = subject.layout
+    found = (
+        (name, frame)
+        for name, files in subject.pairs.items()
+        for frame in files
+        if not complete(layout.image_path(name, frame))
+        or not all(complete(path) for _, path in layout.mask_files(name, frame))
+    )
+    return tuple(islice(found, most))
 
 
 def complete(path: Path) -> bool:
@@ -221,26 +218,26 @@ def complete(path: Path) -> bool:
 
 
 def measure(
-    subject: Subject, items: Sequence[Item], sampling: Sampling, console: Console | None = None
-) -> tuple[list[View], list[str]]:
+    subject: CheckedData, items: Sequence[Item], sampling: Sampling, console: Console | None = None
+) -> tuple[list[MaskView], list[str]]:
     """Decodes and measures images, each once; the messages of those that cannot be read."""
 
-    def one(item: Item) -> View | str:
+    def one(item: Item) -> MaskView | str:
         try:
             return _view(subject, item, sampling)
         except DataError as error:
             return str(error)
 
-    bar = Progress(transient=True, console=console, disable=console is None)
+    bar = progress(console or Console(), disable=console is None)
     with ThreadPoolExecutor(sampling.workers) as pool, bar:
         unique = tuple(dict.fromkeys(items))
         found = bar.track(pool.map(one, unique), len(unique), description="checking images")
         results = list(found)
-    views = [result for result in results if isinstance(result, View)]
+    views = [result for result in results if isinstance(result, MaskView)]
     return views, [result for result in results if isinstance(result, str)]
 
 
-def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
+def _view(subject: CheckedData, item: Item, sampling: Sampling) -> MaskView:
     name, number = item
     entry, row = subject.cameras[name], subject.rows[number]
     frame = CaptureDataset(subject.layout, [item], min(sampling.size, max(entry.size)))[0]
@@ -256,19 +253,19 @@ def _view(subject: Subject, item: Item, sampling: Sampling) -> View:
         seen = subject.visible[row] & inside(entry, subject.p[row])  # not in the padding
         return joint_distance(distance, pixels, depth, seen, focal)
 
-    lagged = np.full(2 * sampling.lag + 1, np.nan)
-    for i, steps in enumerate(range(-sampling.lag, sampling.lag + 1)):
+    lagged = np.full(2 * LAG + 1, np.nan)
+    for i, steps in enumerate(range(-LAG, LAG + 1)):
         other = subject.rows.get(number + steps * subject.step)
         if other is not None and not np.isnan(metres := outside(other)).all():
             lagged[i] = np.minimum(metres[~np.isnan(metres)], FAR).mean()
     factor = min(1.0, SMALL / max(mask.shape))
     small = [max(1, round(side * factor)) for side in mask.shape[::-1]]
     to_small = np.diag([*np.array(small) / mask.shape[::-1], 1]) @ camera.K @ np.linalg.inv(entry.K)
-    return View(
+    return MaskView(
         camera=name,
         frame=number,
         outside=outside(row),
-        tolerance=max(subject.trust.joint_tolerance, TOLERANCE * metre),
+        tolerance=max(subject.consistency.joint_tolerance, TOLERANCE * metre),
         fullness=float(mask.sum() / max(1, int(body.sum()))),
         lagged=lagged,
         colour=frame.image.double().sum((0, 2, 3)).numpy(),
@@ -317,19 +314,3 @@ def overlap(a: Bool, b: Bool) -> float:
     """Intersection over union; 0 when both are empty."""
     union = np.count_nonzero(a | b)
     return np.count_nonzero(a & b) / union if union else 0.0
-
-
-def best_shift(mask: Bool, body: Bool) -> tuple[int, int]:
-    """Whole pixels ``(dx, dy)`` by which the mask lies beside the body: largest correlation."""
-    height, width = mask.shape
-    shape = (2 * height, 2 * width)  # padded: a shift must not wrap around
-    spectrum = np.fft.rfft2(mask, shape) * np.conj(np.fft.rfft2(body, shape))
-    common = np.fft.irfft2(spectrum, shape)
-    dy, dx = np.unravel_index(int(np.argmax(common)), shape)
-    return int((dx + width) % (2 * width) - width), int((dy + height) % (2 * height) - height)
-
-
-def moved(mask: Bool, dx: int, dy: int) -> Bool:
-    """A mask moved by whole pixels, empty where nothing was."""
-    shift = np.array([[1, 0, dx], [0, 1, dy]], np.float64)
-    return cv2.warpAffine(mask.astype(np.uint8), shift, mask.shape[::-1], flags=0) > 0

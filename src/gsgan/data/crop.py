@@ -21,7 +21,7 @@ Bytes = NDArray[np.uint8]
 NEAR = 1e-2  # metres: points nearer than this are not seen
 
 
-class View(Protocol):
+class Pinhole(Protocol):
     """The parts of a camera that cropping needs: ``K R t`` as in `gsgan.scene`, size ``(H, W)``."""
 
     @property
@@ -49,7 +49,7 @@ class Crop:
     size: tuple[int, int]
 
 
-def project(view: View, points: Float) -> tuple[Float, Float]:
+def project(view: Pinhole, points: Float) -> tuple[Float, Float]:
     """Pixels ``[..., 2]`` (centres at +0.5) and depths ``[...]`` of world points ``[..., 3]``.
 
     Lens distortion is not applied. Points nearer than `NEAR` get finite, meaningless pixels: mask
@@ -61,7 +61,7 @@ def project(view: View, points: Float) -> tuple[Float, Float]:
     return uvw[..., :2], depth
 
 
-def inside(view: View, points: Float) -> NDArray[np.bool_]:
+def inside(view: Pinhole, points: Float) -> NDArray[np.bool_]:
     """``[...]`` whether world points ``[..., 3]`` project into the image; False for NaN."""
     pixels, depth = project(view, points)
     height, width = view.size
@@ -84,7 +84,7 @@ class PersonCrop:
         above("data.crop.margin", self.margin)
 
     def window(
-        self, view: View, joints: Float, usable: NDArray[np.bool_], dist: Float | None = None
+        self, view: Pinhole, joints: Float, usable: NDArray[np.bool_], dist: Float | None = None
     ) -> Crop:
         """The crop round the usable joints, clipped to the image, then made square.
 
@@ -119,17 +119,17 @@ def square_window(size: tuple[int, int]) -> Crop:
     return Crop((size[0] - side) // 2, (size[1] - side) // 2, (side, side))
 
 
-def cut(picture: Bytes, crop: Crop) -> Bytes:
+def cut(image: Bytes, crop: Crop) -> Bytes:
     """``[h, w, ...]`` the crop of an image ``[H, W, ...]``, zero beyond the border."""
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     h, w = crop.size
-    result = np.zeros((h, w, *picture.shape[2:]), picture.dtype)
+    result = np.zeros((h, w, *image.shape[2:]), image.dtype)
     top, left = max(crop.top, 0), max(crop.left, 0)
     bottom, right = min(crop.top + h, height), min(crop.left + w, width)
     if bottom > top and right > left:
         rows = slice(top - crop.top, bottom - crop.top)
         columns = slice(left - crop.left, right - crop.left)
-        result[rows, columns] = picture[top:bottom, left:right]
+        result[rows, columns] = image[top:bottom, left:right]
     return result
 
 
@@ -212,38 +212,38 @@ def fold_radius(K: Float, dist: Float, crop: Crop, samples: int = 256) -> float 
     return float(radii[folded[0]]) if len(folded) else None
 
 
-def take(picture: Bytes, crop: Crop, mapping: NDArray[np.float32] | None, exact: bool) -> Bytes:
+def take(image: Bytes, crop: Crop, mapping: NDArray[np.float32] | None, exact: bool) -> Bytes:
     """A crop of an image, undistorted where a mapping is given, zero beyond the border.
 
     Args:
-        picture: ``[H, W]`` or ``[H, W, C]``.
+        image: ``[H, W]`` or ``[H, W, C]``.
         mapping: `undistort_map` of the same crop, or None for a pinhole camera.
         exact: take the nearest value (labels) instead of interpolating.
     """
     if mapping is None:
-        return cut(picture, crop)
+        return cut(image, crop)
     mode = cv2.INTER_NEAREST if exact else cv2.INTER_LINEAR
     maps = (mapping[..., 0], mapping[..., 1])
     taken = cv2.remap(
-        picture, *maps, interpolation=mode, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+        image, *maps, interpolation=mode, borderMode=cv2.BORDER_CONSTANT, borderValue=0
     )
     return np.asarray(taken, np.uint8)
 
 
-def resize(picture: Bytes, size: tuple[int, int], exact: bool) -> Bytes:
+def resize(image: Bytes, size: tuple[int, int], exact: bool) -> Bytes:
     """An image resampled to ``(H, W)``; its borders stay, so K scales with the size alone.
 
     Shrinking averages areas, enlarging interpolates linearly, ``exact`` takes the nearest value.
     """
-    if picture.shape[:2] == size:
-        return picture
+    if image.shape[:2] == size:
+        return image
     if exact:
         mode = cv2.INTER_NEAREST_EXACT
-    elif size[0] < picture.shape[0]:
+    elif size[0] < image.shape[0]:
         mode = cv2.INTER_AREA
     else:
         mode = cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(picture, size[::-1], interpolation=mode), np.uint8)
+    return np.asarray(cv2.resize(image, size[::-1], interpolation=mode), np.uint8)
 
 
 def black_out(image: Bytes, mask: Bytes, composed: bool) -> Bytes:

@@ -20,7 +20,7 @@ from lightning import LightningDataModule
 from torch.utils.data import DataLoader, Dataset, Subset
 
 from gsgan.data.crop import PersonCrop
-from gsgan.data.dataset import CaptureDataset, Lens, PictureCache, StepSampler, pass_order
+from gsgan.data.dataset import CaptureDataset, ImageCache, Lens, StepSampler, pass_order
 from gsgan.data.formats.capture import FACE_FILE, HANDS_FILE, CaptureReader
 from gsgan.data.layout import Layout
 from gsgan.data.protocol import Protocol
@@ -31,6 +31,7 @@ from gsgan.data.validation import Thresholds
 from gsgan.scene import Frame, cat
 from gsgan.skeleton import TEMPLATES, template_of
 from gsgan.skeleton.template import Vector
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.errors import ConfigError
 
@@ -71,13 +72,14 @@ class GsganData(LightningDataModule):
         skeleton: ``mediapipe33``; ``mediapipe33_hands``, with the hands of hands3d.npz: 75 joints;
             or ``holistic``, also with the face of face3d.npz: 105 joints.
         protocol: the splits of a publication; None takes those of the dataset or the keys below.
-        train_cameras, test_cameras, train_frames, test_frames, test_share: see `make_splits`.
         workers: loading processes; 0 loads in this one; None is 0 without a GPU, else up to
             `MOST_WORKERS`, one per processor that each GPU has.
         cache_mb: bound on decoded images kept in memory, over all loading processes.
         distortion: ``auto`` and ``undistort`` undistort images on reading; ``off`` treats them as
             a pinhole's; ``project`` keeps the distortion, with the lens in ``camera.dist``.
         wanted: description of the root, for the message when it is not set.
+        split_keys: train_cameras, test_cameras, train_frames, test_frames and test_share, see
+            `make_splits`.
 
     Raises:
         ConfigError: when neither root nor source is given, or a number is out of range.
@@ -95,11 +97,6 @@ class GsganData(LightningDataModule):
         size: int | None = None,
         crop: PersonCrop | str | None = None,
         batch_size: int = 1,
-        train_cameras: Any = None,
-        test_cameras: Any = None,
-        train_frames: Any = None,
-        test_frames: Any = None,
-        test_share: float = 0.2,
         val_pictures: int = 24,
         steps_per_epoch: int | None = None,
         workers: int | None = None,
@@ -109,6 +106,7 @@ class GsganData(LightningDataModule):
         min_joints: int = Thresholds.min_joints,
         distortion: str = "auto",
         wanted: str = "a capture in the bring-your-own layout",
+        **split_keys: Any,
     ) -> None:
         super().__init__()
         if root is None and source is None:
@@ -116,25 +114,15 @@ class GsganData(LightningDataModule):
                 f"data.root is not set: give the folder of {wanted}, e.g. "
                 "data.root=/path/to/capture"
             )
-        self.root = root
-        self.source = source
-        self.reader = CaptureReader() if reader is None else reader
-        self.smpl = smpl
-        self.body = one_of("data.body", body, BODY)
-        self.skeleton = one_of("data.skeleton", skeleton, TEMPLATES)
-        self.protocol = protocol
-        self.size = size
         if not (crop in (None, "person") or isinstance(crop, PersonCrop)):
             raise ConfigError(f"data.crop must be null or person, got {crop!r}")
-        self.crop = PersonCrop() if isinstance(crop, str) else crop
+        self.root, self.source, self.smpl = root, source, smpl
+        self.reader = CaptureReader() if reader is None else reader
+        self.body = one_of("data.body", body, BODY)
+        self.skeleton = one_of("data.skeleton", skeleton, TEMPLATES)
+        self.protocol, self.split_keys = protocol, split_keys
+        self.size, self.crop = size, PersonCrop() if isinstance(crop, str) else crop
         self.batch_size = whole("data.batch_size", batch_size, 1)
-        self.split_keys = {
-            "train_cameras": train_cameras,
-            "test_cameras": test_cameras,
-            "train_frames": train_frames,
-            "test_frames": test_frames,
-            "test_share": test_share,
-        }
         if steps_per_epoch is not None:
             whole("data.steps_per_epoch", steps_per_epoch, 1)
         self.steps_per_epoch = steps_per_epoch
@@ -143,7 +131,7 @@ class GsganData(LightningDataModule):
         self.seed = whole("data.seed", seed, 0)
         self.cache_mb = at_least("data.cache_mb", cache_mb, 0)
         self.info_samples = whole("data.info_samples", info_samples, 1)
-        self.checks = replace(Thresholds(), min_joints=whole("data.min_joints", min_joints, 1))
+        self.limits = replace(Thresholds(), min_joints=whole("data.min_joints", min_joints, 1))
         self.lens = LENSES[one_of("effects.distortion", distortion, LENSES)]
 
     def prepare_data(self) -> None:
@@ -164,7 +152,7 @@ class GsganData(LightningDataModule):
     @cached_property
     def layout(self) -> Layout:
         """The capture, read on first use."""
-        layout = self.reader(self._folder(), self.checks, self.smpl)
+        layout = self.reader(self._folder(), self.limits, self.smpl)
         skeleton = TEMPLATES[self.skeleton]
         for wanted, held, file, other in (
             (skeleton.palms, layout.hands, HANDS_FILE, "mediapipe33"),
@@ -252,7 +240,7 @@ class GsganData(LightningDataModule):
                 f"{self.batch_size} cannot be made; set data.size (e.g. 512) or data.batch_size=1"
             )
         # every process has its own, and training and validation start their own workers
-        cache = PictureCache(int(self.cache_mb * 2**20) // (2 * self.workers + 1))
+        cache = ImageCache(int(self.cache_mb * 2**20) // (2 * self.workers + 1))
         template = template_of(self.skeleton, self.face)
         skeletons = complete_skeletons(
             layout.landmarks, layout.frames, self.trained, template, layout.hands, layout.face
@@ -335,12 +323,10 @@ class GsganData(LightningDataModule):
     def watched(self) -> tuple[str, list[int]]:
         """The split and indices of the images rendered while training, evenly spaced.
 
-        Of held-out poses, without those of held-out cameras, without those of the training split.
+        The split is novel_pose, else novel_view, else train.
         """
         name = next((n for n in ("novel_pose", "novel_view") if self.splits.items[n]), "train")
-        most = len(self.dataset(name))
-        count = min(self.val_pictures, most)
-        return name, [(2 * i + 1) * most // (2 * count) for i in range(count)]
+        return name, evenly_spaced(len(self.dataset(name)), self.val_pictures)
 
     def val_dataloader(self) -> DataLoader[Frame]:
         """The images of `watched`."""

@@ -1,11 +1,11 @@
-"""A capture as a torch dataset of `Frame`, one camera and one moment per item; their order."""
+"""A capture as a torch dataset of `Frame`, one camera and frame per item; its sampling order."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ Lens = Literal["undistort", "ignore", "raw"]
 
 
 @dataclass(frozen=True)
-class Picture:
+class DecodedImage:
     """Decoded, undistorted, cropped and resized pixels, still bytes, as cached.
 
     Args:
@@ -49,7 +49,7 @@ class Picture:
     unsure: Bytes | None = None
 
 
-class PictureCache(LRUCache[Item, Picture]):
+class ImageCache(LRUCache[Item, DecodedImage]):
     """The most recently used images.
 
     Args:
@@ -60,7 +60,7 @@ class PictureCache(LRUCache[Item, Picture]):
         super().__init__(maxsize=limit)
 
     @staticmethod
-    def getsizeof(value: Picture) -> int:
+    def getsizeof(value: DecodedImage) -> int:
         """Bytes held."""
         parts = (value.image, value.mask, value.labels, value.unsure)
         return sum(part.nbytes for part in parts if part is not None)
@@ -95,7 +95,7 @@ class CaptureDataset(Dataset[Frame]):
         items: Sequence[Item],
         size: int | None = None,
         crop: PersonCrop | None = None,
-        cache: PictureCache | None = None,
+        cache: ImageCache | None = None,
         lens: Lens = "undistort",
         skeletons: Landmarks | None = None,
     ) -> None:
@@ -104,7 +104,7 @@ class CaptureDataset(Dataset[Frame]):
         self.size = None if size is None else whole("data.size", size, 1)
         self.crop = crop
         self.lens = lens
-        self.cache = PictureCache(0) if cache is None else cache
+        self.cache = ImageCache(0) if cache is None else cache
         self.skeletons = layout.landmarks if skeletons is None else skeletons
         self._indices = {name: i for i, name in enumerate(layout.camera_names)}
 
@@ -184,7 +184,7 @@ class CaptureDataset(Dataset[Frame]):
             return None
         return cropping.undistort_map(camera.K, camera.dist, window)
 
-    def _load(self, item: Item) -> Picture:
+    def _load(self, item: Item) -> DecodedImage:
         camera, window = self.layout.cameras[item[0]], self.window(item)
         rules = self.layout.pixels
         mapping = self._mapping(camera, window)
@@ -201,13 +201,13 @@ class CaptureDataset(Dataset[Frame]):
         self._check_size(self.layout.mask_path(*item), mask, camera)
         # Blacked out before anything is interpolated, so that no background bleeds in.
         image = fit(cropping.black_out(image, mask, rules.composed), exact=False)
-        labels = self._label_picture(item)
+        labels = self._label_image(item)
         if labels is not None:
             labels = fit(pixels.with_ignored_border(labels, mask, rules.ignore_band), exact=True)
         if unsure is not None:
             unsure = fit(unsure, exact=True)
         mask = fit(mask, exact=rules.mask_sampling == "nearest")
-        return Picture(np.ascontiguousarray(image.transpose(2, 0, 1)), mask, labels, unsure)
+        return DecodedImage(np.ascontiguousarray(image.transpose(2, 0, 1)), mask, labels, unsure)
 
     @staticmethod
     def _check_size(path: Path, image: Bytes, camera: CameraEntry) -> None:
@@ -219,7 +219,7 @@ class CaptureDataset(Dataset[Frame]):
                 f"{camera.size[1]}x{camera.size[0]}; scale one of them so that they agree"
             )
 
-    def _label_picture(self, item: Item) -> Bytes | None:
+    def _label_image(self, item: Item) -> Bytes | None:
         if not self.layout.labels:
             return None
         path, camera = self.layout.label_path(*item), self.layout.cameras[item[0]]
@@ -259,7 +259,9 @@ class StepSampler(DistributedSampler[int]):
     def __init__(
         self, items: int, batch_size: int, steps: int, seed: int, replicas: int = 1, rank: int = 0
     ) -> None:
-        super().__init__(_Count(items), num_replicas=replicas, rank=rank, shuffle=True, seed=seed)
+        # Of its dataset, the base class needs the length alone.
+        length: Any = range(items)
+        super().__init__(length, num_replicas=replicas, rank=rank, shuffle=True, seed=seed)
         self.items, self.batch_size, self.steps = items, batch_size, steps
 
     def __len__(self) -> int:
@@ -274,16 +276,6 @@ class StepSampler(DistributedSampler[int]):
                     shuffled = draw // self.items
                     order = pass_order(self.items, self.seed, shuffled)
                 yield int(order[draw % self.items])
-
-
-class _Count(Dataset[int]):
-    """A length; `DistributedSampler` asks its dataset for nothing else."""
-
-    def __init__(self, length: int) -> None:
-        self.length = length
-
-    def __len__(self) -> int:
-        return self.length
 
 
 def pass_order(items: int, seed: int, number: int) -> torch.Tensor:

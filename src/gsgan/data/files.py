@@ -66,7 +66,7 @@ def read_header(path: Path) -> Header:
     raise DataError(f"{path} is not a valid PNG or JPEG file; copy or export it again")
 
 
-def check_picture(path: Path, kind: str, size: tuple[int, int], expected_by: str) -> None:
+def check_image(path: Path, kind: str, size: tuple[int, int], expected_by: str) -> None:
     """Refuses an image whose header does not fit its use, without decoding it.
 
     Args:

@@ -8,7 +8,7 @@ one missing image must not shift the others.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from gsgan.data.validation import (
     Index,
     Thresholds,
     check_geometry,
-    check_pictures,
+    check_images,
     drop_frames,
     drop_unmasked,
     drop_unseen,
@@ -174,7 +174,7 @@ def dataset_folder(root: str | Path, expected: str) -> Path:
     return folder
 
 
-def assemble(found: Found, checks: Thresholds) -> Layout:
+def assemble(found: Found, limits: Thresholds) -> Layout:
     """Checks the files against each other and leaves out those that cannot be used.
 
     Raises:
@@ -182,11 +182,11 @@ def assemble(found: Found, checks: Thresholds) -> Layout:
     """
     root, cameras, marks, notes = found.root, found.cameras, found.landmarks, list(found.notes)
     calibration = found.calibration
-    images = drop_frames(root, found.images, marks, found.poses, checks, notes)
-    check_geometry(root, cameras, images, marks, checks, calibration, found.unit_hint)
-    images = drop_unseen(cameras, images, marks, checks, calibration, notes)
+    images = drop_frames(root, found.images, marks, found.poses, limits, notes)
+    check_geometry(root, cameras, images, marks, limits, calibration, found.unit_hint)
+    images = drop_unseen(cameras, images, marks, limits, calibration, notes)
     folders = {name: root / found.mask_folder.format(camera=name) for name in cameras}
-    images = drop_unmasked(images, found.masks, folders, checks, notes)
+    images = drop_unmasked(images, found.masks, folders, limits, notes)
     masks = {c: {f: found.masks[c][f] for f in files} for c, files in images.items()}
     labels = {
         c: {f: p for f, p in found.labels.get(c, {}).items() if f in files}
@@ -196,19 +196,7 @@ def assemble(found: Found, checks: Thresholds) -> Layout:
     labels = labels if labelled else {}
     if 0 < labelled < count:
         notes.append(f"{count - labelled} of {count} images have no labels, they count as 'ignore'")
-    check_pictures(root, cameras, images, masks, labels, checks.header_stride, calibration)
-    return Layout(
-        root=root,
-        meta=found.meta,
-        cameras=cameras,
-        frames=tuple(sorted({f for files in images.values() for f in files})),
-        images=images,
-        masks=masks,
-        labels=labels,
-        landmarks=marks,
-        hands=found.hands,
-        face=found.face,
-        poses=found.poses,
-        pixels=found.pixels,
-        notes=tuple(notes),
-    )
+    check_images(root, cameras, images, masks, labels, limits.header_stride, calibration)
+    kept = {one.name: getattr(found, one.name) for one in fields(_Contents)}
+    kept |= {"images": images, "masks": masks, "labels": labels, "notes": tuple(notes)}
+    return Layout(**kept, frames=tuple(sorted({f for files in images.values() for f in files})))

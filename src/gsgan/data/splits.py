@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -70,29 +70,14 @@ def make_splits(
     """
     if not 0 <= test_share < 1:
         raise ConfigError(f"data.test_share must be in [0, 1), got {test_share}")
-    meta = layout.meta.splits
-    cameras = _pair(
-        layout.camera_names,
-        (train_cameras, test_cameras),
-        (meta.get("train_cameras"), meta.get("test_cameras")),
-        default=(layout.camera_names, ()),
-        parse=parse_names,
-        name="cameras",
-    )
+    given = {"cameras": (train_cameras, test_cameras), "frames": (train_frames, test_frames)}
+    cut = len(layout.frames) - int(len(layout.frames) * test_share)
+    everyone, default = layout.camera_names, (layout.frames[:cut], layout.frames[cut:])
+    cameras = _pair(layout, "cameras", given, everyone, (everyone, ()), parse_names)
+    frames = _pair(layout, "frames", given, layout.frames, default, parse_frames)
     for camera in (*cameras[0], *cameras[1]):
         if camera not in layout.cameras:
-            raise DataError(
-                f"{layout.root} has no camera {camera}; it has {', '.join(layout.camera_names)}"
-            )
-    cut = len(layout.frames) - int(len(layout.frames) * test_share)
-    frames = _pair(
-        layout.frames,
-        (train_frames, test_frames),
-        (meta.get("train_frames"), meta.get("test_frames")),
-        default=(layout.frames[:cut], layout.frames[cut:]),
-        parse=parse_frames,
-        name="frames",
-    )
+            raise DataError(f"{layout.root} has no camera {camera}; it has {', '.join(everyone)}")
     train, test, notes = _usable(layout, frames, "of the splits")
     items = {
         "train": _items(layout, cameras[0], train),
@@ -205,18 +190,19 @@ def camera_name(layout: Layout, camera: str | int, protocol: str) -> str:
 
 
 def _pair(
+    layout: Layout,
+    name: str,
+    given: Mapping[str, tuple[Any, Any]],
     everything: tuple[T, ...],
-    config: tuple[Any, Any],
-    meta: tuple[Any, Any],
     default: tuple[tuple[T, ...], tuple[T, ...]],
     parse: Callable[[Any, str], tuple[T, ...]],
-    name: str,
 ) -> tuple[tuple[T, ...], tuple[T, ...]]:
-    """The train and test side of cameras or of frames, both from the first source that has any."""
-    for values, where in ((config, "data."), (meta, "meta.json, splits.")):
+    """The train and test side of ``name``, cameras or frames, from the first source of both."""
+    meta = tuple(layout.meta.splits.get(f"{side}_{name}") for side in SIDES)
+    for values, where in ((given[name], "data."), (meta, "meta.json, splits.")):
         train, test = (
             None if value is None else parse(value, f"{where}{side}_{name}")
-            for value, side in zip(values, ("train", "test"), strict=True)
+            for value, side in zip(values, SIDES, strict=True)
         )
         if train is None and test is None:
             continue

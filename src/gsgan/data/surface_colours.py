@@ -1,9 +1,9 @@
 """Whether training cameras agree on the colour of surface that two of them see.
 
 Mean colours of the whole person are not comparable: light from one side makes one camera's image
-brighter. So colours are compared on the same surface at the same moment: that of the skinned body
-where its mesh is available, else that of the visual hull. The median difference of two cameras is
-due to the cameras; the residual about that median is highlights, and noise of an inexact surface.
+brighter. So colours are compared on the same surface in the same frame, that of the visual hull.
+The median difference of two cameras is due to the cameras; the residual about that median is due
+to highlights and to errors of the hull.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 VOXEL = 0.025  # metres, of the hull and of the occlusion test
-AIR = 0.3  # metres of space round the joints that is carved
-WIDEST = 4.0  # metres: a wider skeleton has a stray joint
+AIR = 0.3  # metres of space around the joints that is carved
+WIDEST = 4.0  # metres: a wider skeleton has a stray joint, and its box would not fit into memory
 BLUR = 0.03  # metres: accuracy of the surface, over which colours are averaged
 WHOLE = 0.95  # share of the blur in the mask: outlines mix with the background
-LEAST_POINTS = 30  # shared by two cameras at a moment: fewer lie at outlines, at grazing angles
-LEAST_MOMENTS = 3
+LEAST_POINTS = 30  # that two cameras share in a frame: fewer lie at outlines, at grazing angles
+LEAST_FRAMES = 3
 COARSEST = 0.03  # metres per pixel: in coarser images every colour is a mixture
 SLACK = 0.03  # metres by which a body may leave the mask: masks cut off feet and hair that far
 RESIDUAL = 0.95  # the quantile: highlights cover little of a person
@@ -43,31 +43,22 @@ class SurfaceColours:
 
     Args:
         difference: the largest median difference of two cameras, in any channel.
-        error: its standard error over the moments.
         residual: 95th percentile of the difference in brightness about those medians.
-        points: number compared.
-        source: ``body`` or ``hull``.
     """
 
     difference: float
-    error: float
     residual: float
-    points: int
-    source: str
 
 
-def surface_colours(
-    moments: Sequence[Sequence[Frame]], body: SkinnedBody | None
-) -> SurfaceColours | None:
+def surface_colours(moments: Sequence[Sequence[Frame]]) -> SurfaceColours | None:
     """Compares cameras pairwise.
 
     Args:
-        moments: each with one frame per camera, the same cameras in the same order. Only one frame
-            is held at a time, so sequences that read from disk need little memory.
-        body: the mesh that the frames' poses move; None: the visual hull.
+        moments: each with one frame per camera, the same cameras in the same order. Frames are
+            read one at a time, so sequences that read from disk need little memory.
 
     Returns:
-        None where no two cameras share enough, or images are too coarse.
+        None where no two cameras share enough surface, or images are too coarse.
     """
     if not moments or any(
         float(f.camera.to_camera(f.skeleton)[..., 2].median()) / float(f.camera.K[0, 0, 0])
@@ -76,26 +67,22 @@ def surface_colours(
     ):
         return None
     found: dict[tuple[int, int], list[Float]] = {}
-    with torch.no_grad():
-        for frames in moments:
-            points = _hull(frames) if body is None else _skin(body, frames[0])
-            seen = [_colours(frame, points) for frame in frames]
-            for i, j in combinations(range(len(frames)), 2):
-                both = ~np.isnan(seen[i][:, 0] + seen[j][:, 0])
-                if np.count_nonzero(both) >= LEAST_POINTS:
-                    found.setdefault((i, j), []).append(seen[i][both] - seen[j][both])
-    pairs = [pair for pair in found.values() if len(pair) >= LEAST_MOMENTS]
+    for frames in moments:
+        points = _hull(frames)
+        seen = [_colours(frame, points) for frame in frames]
+        for i, j in combinations(range(len(frames)), 2):
+            both = ~np.isnan(seen[i][:, 0] + seen[j][:, 0])
+            if np.count_nonzero(both) >= LEAST_POINTS:
+                found.setdefault((i, j), []).append(seen[i][both] - seen[j][both])
+    pairs = [np.concatenate(pair) for pair in found.values() if len(pair) >= LEAST_FRAMES]
     if not pairs:
         return None
-    worst, error = max((_difference(pair) for pair in pairs), key=lambda found: found[0])
-    left = [np.concatenate(pair) - np.median(np.concatenate(pair), axis=0) for pair in pairs]
+    medians = [np.median(pair, axis=0) for pair in pairs]
+    left = [pair - median for pair, median in zip(pairs, medians, strict=True)]
     brightness = np.abs(np.concatenate(left).mean(axis=1))
     return SurfaceColours(
-        difference=worst,
-        error=error,
+        difference=float(np.abs(medians).max()),
         residual=float(np.quantile(brightness, RESIDUAL)),
-        points=len(brightness),
-        source="hull" if body is None else "body",
     )
 
 
@@ -104,8 +91,10 @@ def body_inside(frame: Frame, body: SkinnedBody) -> float | None:
 
     None where the image shows none of them, or its mask is empty.
     """
+    assert frame.body is not None
     with torch.no_grad():
-        pixels, inside, depth = _place(frame, _skin(body, frame))
+        vertices = body.to(torch.float32).posed_vertices(frame.body)[0].double().numpy()
+    pixels, inside, depth = _place(frame, vertices)
     empty = (frame.mask[0, 0].numpy() <= 0.5).astype(np.uint8)
     if not inside.any() or empty.all():
         return None
@@ -113,20 +102,6 @@ def body_inside(frame: Frame, body: SkinnedBody) -> float | None:
     reach = np.ceil(SLACK * float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside])))
     distance = cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return float((distance[pixels[inside, 1], pixels[inside, 0]] <= reach).mean())
-
-
-def _difference(pair: list[Float]) -> tuple[float, float]:
-    """The largest median over the channels, and its standard error over the moments."""
-    median = np.median(np.concatenate(pair), axis=0)
-    channel = int(np.abs(median).argmax())
-    each = np.array([np.median(moment[:, channel]) for moment in pair])
-    return float(abs(median[channel])), float(each.std(ddof=1) / np.sqrt(len(each)))
-
-
-def _skin(body: SkinnedBody, frame: Frame) -> Float:
-    """``[V, 3]`` metres: the vertices in the frame's pose."""
-    assert frame.body is not None
-    return body.to(torch.float32).posed_vertices(frame.body)[0].double().numpy()
 
 
 def _hull(frames: Sequence[Frame]) -> Float:
@@ -157,20 +132,22 @@ def _place(frame: Frame, points: Float) -> tuple[NDArray[np.int64], NDArray[np.b
 
 
 def _colours(frame: Frame, points: Float) -> Float:
-    """``[V, 3]`` RGB about each point, NaN where hidden, outside the image or at an outline."""
+    """``[V, 3]`` RGB around each point, NaN where hidden, outside the image or at an outline."""
     result = np.full((len(points), 3), np.nan)
     pixels, inside, depth = _place(frame, points)
     if not inside.any():
         return result
     height, width = frame.camera.size
     metre = float(frame.camera.K[0, 0, 0]) / float(np.median(depth[inside]))  # in pixels
-    # points are sparser than pixels: depths are compared on a grid of their spacing
+    # Hidden points: points are sparser than pixels, so depths are compared on a grid of their
+    # spacing.
     cell = max(1, int(np.ceil(1.5 * VOXEL * metre)))
     flat = (pixels[:, 1] // cell) * width + pixels[:, 0] // cell
     nearest = np.full(height * width, np.inf)
     np.minimum.at(nearest, flat[inside], depth[inside])
     front = inside.copy()
     front[inside] = depth[inside] < nearest[flat[inside]] + 1.5 * VOXEL
+    # Colours: means over the mask, without points near its outline.
     sigma = max(0.5, BLUR * metre)
     side = 2 * int(2 * sigma) + 1
     soft, image = (

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.crop import NEAR, inside, project
-from gsgan.data.files import check_picture
+from gsgan.data.files import check_image
 from gsgan.data.pixels import MaskFile
 from gsgan.data.skeletons import HUBS, Landmarks, Poses
 from gsgan.utils.errors import DataError
@@ -32,7 +32,7 @@ class Thresholds:
     # metres, minimum and maximum median distance from the cameras to the person
     distance: tuple[float, float] = (0.3, 30.0)
     max_behind: float = 0.05  # share of joints behind a camera above which its pose is wrong
-    max_missing_masks: float = 0.0  # share of images left out for want of a mask
+    max_missing_masks: float = 0.0  # largest share of images without a mask
     header_stride: int = 1  # of images whose header is read on opening, 0.1 ms each; 1 reads all
 
 
@@ -41,7 +41,7 @@ def drop_frames(
     images: Index,
     landmarks: Landmarks,
     poses: Poses | None,
-    checks: Thresholds,
+    limits: Thresholds,
     notes: list[str],
 ) -> Index:
     """The images without the frames that lack a usable skeleton or pose; notes say why.
@@ -52,7 +52,7 @@ def drop_frames(
     frames = sorted({frame for files in images.values() for frame in files})
     dropped: dict[str, list[int]] = {}
     for frame in frames:
-        if reason := _unusable(frame, landmarks, poses, checks):
+        if reason := _unusable(frame, landmarks, poses, limits):
             dropped.setdefault(reason, []).append(frame)
     for reason, ids in dropped.items():
         notes.append(f"{len(ids)} of {len(frames)} frames dropped, {reason}: {spans(ids)}")
@@ -74,18 +74,18 @@ def drop_frames(
 
 
 def _unusable(
-    frame: int, landmarks: Landmarks, poses: Poses | None, checks: Thresholds
+    frame: int, landmarks: Landmarks, poses: Poses | None, limits: Thresholds
 ) -> str | None:
     if frame not in landmarks.visibility:
         return f"without a row in {landmarks.source}"
     valid = landmarks.visibility[frame] > 0
-    if valid.sum() < checks.min_joints:
-        return f"with fewer than {checks.min_joints} joints (NaN or confidence 0)"
+    if valid.sum() < limits.min_joints:
+        return f"with fewer than {limits.min_joints} joints (NaN or confidence 0)"
     trunk = valid[list(HUBS)]
     left, right = landmarks.p[frame][list(HUBS[2:])]
     estimated = trunk[:2].all() and (left != right).any()  # see `gsgan.data.skeletons.hips_below`
-    if trunk.sum() < checks.min_hubs and not estimated:
-        return f"with fewer than {checks.min_hubs} of the shoulders and hips"
+    if trunk.sum() < limits.min_hubs and not estimated:
+        return f"with fewer than {limits.min_hubs} of the shoulders and hips"
     if poses is not None and frame not in poses.theta:
         return f"without a finite row in {poses.source}"
     return None
@@ -103,7 +103,7 @@ def check_geometry(
     cameras: Mapping[str, CameraEntry],
     images: Index,
     landmarks: Landmarks,
-    checks: Thresholds,
+    limits: Thresholds,
     calibration: Path,
     unit_hint: str,
 ) -> None:
@@ -115,11 +115,11 @@ def check_geometry(
     frames = sorted({f for files in images.values() for f in files})
     joints = np.stack([landmarks.p[f] for f in frames])
     valid = np.stack([landmarks.visibility[f] for f in frames]) > 0
-    check_distance(root, list(cameras.values()), joints[valid], checks.distance, unit_hint)
+    check_distance(root, list(cameras.values()), joints[valid], limits.distance, unit_hint)
     for camera in cameras.values():
         depth = project(camera, joints)[1][valid]
         behind = float((depth <= NEAR).mean())
-        if behind > checks.max_behind:
+        if behind > limits.max_behind:
             raise DataError(
                 f"{calibration}, camera {camera.name}: {behind:.0%} of the joints lie "
                 "behind it; R and t must map world to camera (x_cam = R x + t), z forward"
@@ -152,7 +152,7 @@ def drop_unseen(
     cameras: Mapping[str, CameraEntry],
     images: Index,
     landmarks: Landmarks,
-    checks: Thresholds,
+    limits: Thresholds,
     calibration: Path,
     notes: list[str],
 ) -> Index:
@@ -168,17 +168,17 @@ def drop_unseen(
             continue
         seen = inside(cameras[name], np.stack([landmarks.p[f] for f in frames]))
         seen &= np.stack([landmarks.visibility[f] for f in frames]) > 0
-        enough = seen.sum(1) >= checks.min_joints_in_view
+        enough = seen.sum(1) >= limits.min_joints_in_view
         if not enough.any():
             raise DataError(
-                f"{calibration}, camera {name}: no frame has {checks.min_joints_in_view} joints "
+                f"{calibration}, camera {name}: no frame has {limits.min_joints_in_view} joints "
                 "inside the image; check K, and that R and t map world to camera (x_cam = R x + t)"
             )
         if not enough.all():
             lost = [f for f, ok in zip(frames, enough, strict=True) if not ok]
             notes.append(
                 f"camera {name}: {len(lost)} frames dropped, fewer than "
-                f"{checks.min_joints_in_view} joints in view: {spans(lost)}"
+                f"{limits.min_joints_in_view} joints in view: {spans(lost)}"
             )
         kept[name] = {f: files[f] for f, ok in zip(frames, enough, strict=True) if ok}
     return kept
@@ -188,7 +188,7 @@ def drop_unmasked(
     images: Index,
     masks: Mapping[str, Mapping[int, tuple[MaskFile, ...]]],
     expected: Mapping[str, Path],
-    checks: Thresholds,
+    limits: Thresholds,
     notes: list[str],
 ) -> Index:
     """The images that have a mask; a note says how many were left out.
@@ -200,13 +200,13 @@ def drop_unmasked(
     if not lost:
         return images
     (camera, frame), count = lost[0], sum(len(files) for files in images.values())
-    if len(lost) > checks.max_missing_masks * count:
+    if len(lost) > limits.max_missing_masks * count:
         path = (expected[camera] / Path(images[camera][frame]).name).with_suffix(".png")
         here = sum(c == camera for c, _ in lost)
         raise DataError(
             f"{path} does not exist; every image needs a mask, and {here} of the "
             f"{len(images[camera])} of camera {camera} are missing: {len(lost) / count:.0%} of all "
-            f"{count} images have no mask, allowed are {checks.max_missing_masks:.0%}"
+            f"{count} images have no mask, allowed are {limits.max_missing_masks:.0%}"
         )
     notes.append(
         f"{len(lost)} of {count} images have no mask and are left out "
@@ -215,7 +215,7 @@ def drop_unmasked(
     return {c: {f: p for f, p in files.items() if masks[c].get(f)} for c, files in images.items()}
 
 
-def check_pictures(
+def check_images(
     root: Path,
     cameras: Mapping[str, CameraEntry],
     images: Index,
@@ -233,9 +233,9 @@ def check_pictures(
         size = cameras[name].size
         for frame in list(files)[::stride]:
             image = root / files[frame]
-            check_picture(image, "image", size, str(calibration))
+            check_image(image, "image", size, str(calibration))
             by = f"the image {image}"
             for mask in masks[name][frame]:
-                check_picture(root / mask.path, "mask", size, by)
+                check_image(root / mask.path, "mask", size, by)
             if label := labels.get(name, {}).get(frame):
-                check_picture(root / label, "labels", size, by)
+                check_image(root / label, "labels", size, by)

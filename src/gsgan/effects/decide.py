@@ -1,4 +1,4 @@
-"""The rules: from the training split and the user's settings to one decision per effect."""
+"""The rules that make one decision per effect from the training split and the user's settings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RATIONAL = (
 
 @dataclass(frozen=True)
 class ModelParts:
-    """The parts of a model that effects act on; the default is the full model.
+    """The parts of a model that effects need; the default is the full model.
 
     Args:
         splats: it renders Gaussians.
@@ -41,18 +41,18 @@ class ModelParts:
             return None
         if effect == "body_points":
             if not self.points:
-                return "this model puts no points on the skeleton"
+                return "this model has no points on the skeleton"
             return None if self.body_points else "the model leaves them out"
-        return None if self.splats else "this model splats nothing"
+        return None if self.splats else "this model has no Gaussians"
 
 
 def decide(info: SceneInfo, settings: EffectSettings, model: ModelParts | None = None) -> Effects:
     """The effects of a run, decided once from the training split.
 
     Args:
-        info: facts about the scene, measured on the training split.
+        info: properties of the scene, computed from the training split.
         settings: requested values and thresholds.
-        model: what the model can have; None: everything.
+        model: the parts that the model has; None: all.
 
     Raises:
         ConfigError: when a forced effect is not possible in this scene or model.
@@ -99,10 +99,8 @@ def _impossible(name: str, info: SceneInfo, requested: str | int) -> str | None:
 
 def _view_dependence(info: SceneInfo, settings: EffectSettings) -> Effect:
     cameras, degree = info.n_train_cameras, most_degree(info, settings)
-    if degree == 0 and cameras < settings.degree_cameras[0]:
-        return Effect(0, f"{cameras} training camera sees each moment from one side only")
     if degree == 0:
-        return Effect(0, f"the training cameras are within {info.spread:.0f} degrees")
+        return Effect(0, f"{cameras} training camera sees each moment from one side only")
     if info.surface is None:
         return Effect(0, TOO_LITTLE)
     left, limit = info.surface.residual, settings.view_residual
@@ -113,9 +111,7 @@ def _view_dependence(info: SceneInfo, settings: EffectSettings) -> Effect:
 
 
 def most_degree(info: SceneInfo, settings: EffectSettings) -> int:
-    """The highest degree, 0 to 3, that this number and spread of cameras can resolve."""
-    if info.spread < settings.view_spread:
-        return 0
+    """The highest degree, 0 to 3, that this number of training cameras can resolve."""
     return sum(info.n_train_cameras >= count for count in settings.degree_cameras)
 
 
@@ -139,12 +135,12 @@ def _colour_correction(info: SceneInfo, settings: EffectSettings) -> Effect:
     if seen is None:
         return Effect(OFF, TOO_LITTLE)
     measured = f"two cameras differ by {seen.difference:.3f} on shared surface"
-    noise = max(settings.colour_share * seen.residual, settings.colour_errors * seen.error)
+    highlights = settings.colour_share * seen.residual
     if seen.difference < settings.colour_difference:
         return Effect(OFF, f"{measured} at most (limit {settings.colour_difference:g})")
-    if seen.difference < noise:
-        return Effect(OFF, f"{measured}, within highlights and noise (limit {noise:.3f})")
-    return Effect("on", f"{measured} (limit {max(noise, settings.colour_difference):.3f})")
+    if seen.difference < highlights:
+        return Effect(OFF, f"{measured}, which highlights can cause (limit {highlights:.3f})")
+    return Effect("on", f"{measured} (limit {max(highlights, settings.colour_difference):.3f})")
 
 
 def _body_points(info: SceneInfo, settings: EffectSettings) -> Effect:

@@ -1,4 +1,4 @@
-"""The decisions: every effect with its value and the reason, as plain values for a checkpoint."""
+"""The decisions: the value of every effect and its reason, also as plain values."""
 
 from __future__ import annotations
 
@@ -71,21 +71,16 @@ class Effects:
 
     @classmethod
     def from_plain(cls, values: Mapping[str, Any]) -> Effects:
-        """The inverse of `plain`; effects that are unknown are dropped, missing ones are off."""
-        found = {name: Effect(**values[name]) for name in NAMES if name in values}
-        return cls(**found, cameras=tuple(values.get("cameras", ())))
+        """The inverse of `plain`."""
+        found = {name: Effect(**values[name]) for name in NAMES}
+        return cls(**found, cameras=tuple(values["cameras"]))
 
-    def check_same(self, stored: Mapping[str, Any] | None) -> None:
-        """Refuses to resume a run that began with other effects.
-
-        Args:
-            stored: of `plain`, when the run began; None where it was not stored.
+    def check_same(self, stored: Mapping[str, Any]) -> None:
+        """Refuses to resume a run that began with other effects, stored as of `plain`.
 
         Raises:
-            ConfigError: naming the effect and how to go on.
+            ConfigError: naming the effect and what to do.
         """
-        if stored is None:
-            return
         before = Effects.from_plain(stored)
         for name, effect in self:
             was: Effect = getattr(before, name)

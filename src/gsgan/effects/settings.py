@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 
 from gsgan.utils.checks import at_least, one_of
 from gsgan.utils.errors import ConfigError
@@ -19,8 +19,8 @@ CHOICES: dict[str, tuple[str | int, ...]] = {
     "random_background": ON_OFF,
 }
 LEAST = {  # smallest value of each threshold
-    **dict.fromkeys(("view_residual", "colour_difference", "colour_share", "colour_errors"), 0),
-    **dict.fromkeys(("dark", "body_inside"), 0),
+    **dict.fromkeys(("view_residual", "colour_difference", "colour_share", "body_inside"), 0),
+    "dark": 0,
     "scale_ratio": 1,
 }
 
@@ -45,16 +45,16 @@ class EffectSettings:
     only: Sequence[str] | None = None
     impossible: str | bool = "error"
     view_residual: float = 0.09
-    view_spread: float = 20.0
     degree_cameras: Sequence[int] = (2, 4, 8)
     colour_difference: float = 0.03
     colour_share: float = 0.5
-    colour_errors: float = 3.0
     scale_ratio: float = 1.3
     dark: float = 0.25
     body_inside: float = 0.95
+    view_spread: InitVar[object] = None  # both: in configs of earlier runs, ignored
+    colour_errors: InitVar[object] = None
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, *_: object) -> None:
         for name in CHOICES:
             value = getattr(self, name)
             if isinstance(value, bool):
@@ -77,6 +77,6 @@ class EffectSettings:
         value: str | int = getattr(self, name)
         if self.only is None:
             return value
-        if name not in self.only:  # a lens belongs to the camera: it is not a choice
+        if name not in self.only:  # distortion is a property of the camera, not an option
             return value if name == "distortion" else "off"
         return "on" if value in (AUTO, "off", 0) else value

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,8 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from gsgan.evaluate.facts import SAME, caption
-from gsgan.evaluate.scores import METRICS
+from gsgan.evaluate.origin import SAME, caption
+from gsgan.metrics.names import METRICS
 from gsgan.utils import pages
 from gsgan.utils.files import write_atomically
 
@@ -25,26 +25,6 @@ PLACE = {"split": str, "variant": str, "camera": str, "frame": int}
 HEADER = (*PLACE, *METRICS)
 Results = dict[str, dict[str, dict[str, Any]]]
 TITLE = "Held-out cameras (novel_view) and poses (novel_pose)"
-COLUMNS = {  # heading and number of decimals
-    "psnr": ("PSNR ↑", 2),
-    "psnr_person": ("in box ↑", 2),
-    "psnr_inside": ("off the outline ↑", 2),
-    "ssim": ("SSIM ↑", 4),
-    "ssim_person": ("SSIM in box ↑", 4),
-    "lpips": ("LPIPS ↓", 4),
-    "lpips_person": ("LPIPS in box ↓", 4),
-    "edge_f1": ("edge F1 ↑", 3),
-    "edge_f1_person": ("edge F1 in box ↑", 3),
-    "edge_ratio": ("edges →1", 2),
-    "edge_ratio_person": ("edges in box →1", 2),
-    "high_frequencies": ("detail →1", 2),
-    "psnr_hands": ("hands ↑", 2),
-    "ssim_hands": ("SSIM hands ↑", 4),
-    "psnr_mouth": ("mouth ↑", 2),
-    "ssim_mouth": ("SSIM mouth ↑", 4),
-    "miou": ("mIoU ↑", 3),
-    "miou_with_background": ("with background ↑", 3),
-}
 IN_TERMINAL = (  # narrow; metrics.md has all metrics
     *("psnr", "psnr_person", "ssim", "lpips", "edge_f1", "edge_ratio", "high_frequencies", "miou"),
 )
@@ -62,21 +42,21 @@ class Scored:
     Args:
         results: ``{split: {variant: {metric: value}}}``, as in metrics.json.
         rows: per image, with the columns `HEADER`; an undefined score is NaN.
-        facts: as in facts.json.
+        origin: as in facts.json.
     """
 
     results: Results
     rows: pd.DataFrame
-    facts: dict[str, Any]
+    origin: dict[str, Any]
 
 
 def write_scored(scored: Scored, folder: Path) -> None:
-    """Writes the four files, each whole or not at all; metrics.json last: if it is new, all are."""
-    facts = json.dumps(scored.facts, indent=2, allow_nan=False)
+    """Writes the four files atomically; metrics.json is last, so if it is new, all of them are."""
+    origin = json.dumps(scored.origin, indent=2, allow_nan=False)
     table = scored.rows.to_csv(columns=list(HEADER), index=False, lineterminator="\n")
     write_atomically(folder / SCORES_FILE, table)
-    write_atomically(folder / TABLE_FILE, markdown(scored.results, scored.facts))
-    write_atomically(folder / FACTS_FILE, facts)
+    write_atomically(folder / TABLE_FILE, markdown(scored.results, scored.origin))
+    write_atomically(folder / FACTS_FILE, origin)
     results = json.dumps(scored.results, indent=2, allow_nan=False)
     write_atomically(folder / METRICS_FILE, results)
 
@@ -103,10 +83,10 @@ def joined(now: Scored, folder: Path, splits: Iterable[str]) -> tuple[Scored, li
         results: Results = json.loads((folder / METRICS_FILE).read_text())
         others = [split for split in results if split not in now.results]
         rows = read_rows(folder / SCORES_FILE)
-        facts = json.loads((folder / FACTS_FILE).read_text())
-        ways = [_way(facts, results[split]["full"]) for split in others]
-        ways += [_way(now.facts, scored["full"]) for scored in now.results.values()]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # damaged, or too old
+        origin = json.loads((folder / FACTS_FILE).read_text())
+        ways = [_way(origin, results[split]["full"]) for split in others]
+        ways += [_way(now.origin, scored["full"]) for scored in now.results.values()]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # damaged
         return now, others
     if any(way != ways[-1] for way in ways):
         return now, others
@@ -114,12 +94,12 @@ def joined(now: Scored, folder: Path, splits: Iterable[str]) -> tuple[Scored, li
     rows = pd.concat([rows[rows["split"].isin(others)], now.rows])
     order = [split for split in splits if split in results]
     rows = pd.concat([rows[rows["split"] == split] for split in order])
-    return Scored({split: results[split] for split in order}, rows, now.facts), []
+    return Scored({split: results[split] for split in order}, rows, now.origin), []
 
 
-def _way(facts: dict[str, Any], scores: dict[str, Any]) -> list[Any]:
-    """How a split was scored; splits of one table share it."""
-    way = [facts["data"]["fingerprint"], *(facts[key] for key in SAME)]
+def _way(origin: dict[str, Any], scores: dict[str, Any]) -> list[Any]:
+    """How a split was scored, which must be equal for all splits of a table."""
+    way = [origin["data"]["fingerprint"], *(origin[key] for key in SAME)]
     return way + [scores.get(key) for key in ("marks", "protocol", "lpips_name", "boxes")]
 
 
@@ -127,12 +107,13 @@ def _way(facts: dict[str, Any], scores: dict[str, Any]) -> list[Any]:
 
 
 def rows(
-    results: Results, metrics: tuple[str, ...] = METRICS, *, cameras: bool = False
+    results: Results, metrics: Sequence[str] = tuple(METRICS), *, cameras: bool = False
 ) -> Iterator[list[str]]:
     """One formatted row per split and variant, and per camera if ``cameras``; None is ``n/a``."""
 
     def formatted(values: dict[str, Any]) -> list[str]:
-        return ["n/a" if (v := values[m]) is None else f"{v:.{COLUMNS[m][1]}f}" for m in metrics]
+        held = [(values[m], METRICS[m].digits) for m in metrics]
+        return ["n/a" if value is None else f"{value:.{digits}f}" for value, digits in held]
 
     for split, variants in results.items():
         for variant, scores in variants.items():
@@ -142,7 +123,7 @@ def rows(
 
 
 def notes(results: Results) -> list[str]:
-    """Every reason and mark behind the table, once each."""
+    """Every reason and mark of the table, once each."""
     found: dict[str, None] = {}
     for split, variants in results.items():
         scores = variants["full"]
@@ -168,14 +149,14 @@ def notes(results: Results) -> list[str]:
     return list(found)
 
 
-def print_table(results: Results, facts: dict[str, Any], console: Console) -> None:
+def print_table(results: Results, origin: dict[str, Any], console: Console) -> None:
     """Prints the table, its caption and its notes."""
     table = Table(title=TITLE, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     table.add_column("variant", no_wrap=True)
     hands = any(scores["full"]["psnr_hands"] is not None for scores in results.values())
     shown = WITH_HANDS if hands else IN_TERMINAL
     for metric in shown:
-        table.add_column(COLUMNS[metric][0], justify="right", no_wrap=True)
+        table.add_column(METRICS[metric].short_heading, justify="right", no_wrap=True)
     previous = None
     for split, variant, images, *scores in rows(results, shown):
         if split != previous:  # a column for the split would not fit a narrow terminal
@@ -184,16 +165,16 @@ def print_table(results: Results, facts: dict[str, Any], console: Console) -> No
             previous = split
         table.add_row(variant, *scores)
     console.print(table)
-    for line in (caption(facts), *notes(results)):
+    for line in (caption(origin), *notes(results)):
         console.print(f"  {line}", markup=False, highlight=False)
 
 
-def markdown(results: Results, facts: dict[str, Any]) -> str:
+def markdown(results: Results, origin: dict[str, Any]) -> str:
     """The table in Markdown with its caption and every metric, and again by camera."""
-    header = ["split", "variant", "images", *(COLUMNS[m][0] for m in METRICS)]
+    header = ["split", "variant", "images", *(METRICS[m].short_heading for m in METRICS)]
     by_split, by_camera = (
         pages.markdown(header, list(rows(results, cameras=each))) for each in (False, True)
     )
     listed = "\n".join(f"- {note}" for note in notes(results))
-    parts = (f"# {TITLE}", caption(facts), by_split, listed, "## By camera", by_camera)
+    parts = (f"# {TITLE}", caption(origin), by_split, listed, "## By camera", by_camera)
     return "\n\n".join(filter(None, parts)) + "\n"

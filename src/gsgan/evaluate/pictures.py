@@ -11,28 +11,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gsgan.model.avatar import Painting
+from gsgan.metrics.segmentation import colour_labels
+from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.utils.files import write_atomically
 
 CAPTION_HEIGHT = 22
-ERROR_GAIN = 4.0  # errors are small and shown brighter by this factor
-# Background, then twelve body parts; further classes repeat them.
-PALETTE = torch.tensor(
-    [
-        [0, 0, 0], [110, 70, 40], [240, 200, 170], [60, 120, 220], [50, 60, 110],
-        [230, 120, 60], [250, 190, 60], [200, 50, 80], [250, 110, 150], [60, 160, 90],
-        [140, 210, 110], [120, 80, 170], [190, 150, 230],
-    ]
-)  # fmt: skip
-
-
-def colour_labels(labels: Tensor) -> Tensor:
-    """``[B, H, W]`` part labels as images ``[B, 3, H, W]``; 255 (ignore) is white."""
-    index = torch.where(labels == 0, 0, 1 + (labels - 1) % (len(PALETTE) - 1))
-    image = PALETTE.to(labels.device)[index].float() / 255
-    image = torch.where((labels == 255).unsqueeze(-1), 1.0, image)
-    return image.permute(0, 3, 1, 2)
+ERROR_GAIN = 4.0  # errors are small: they are shown brighter by this factor
 
 
 def error_heat(image: Tensor, target: Tensor) -> Tensor:
@@ -45,7 +30,7 @@ def error_heat(image: Tensor, target: Tensor) -> Tensor:
     return torch.from_numpy(np.stack(heat)).permute(0, 3, 1, 2).to(image) / 255
 
 
-def grid_rows(frame: Frame, painting: Painting) -> list[dict[str, Tensor]]:
+def grid_rows(frame: Frame, painting: Rendering) -> list[dict[str, Tensor]]:
     """One row per batch item: images ``[3, H, W]`` by caption; what was not rendered is absent."""
     assert painting.image is not None
     image, colour, parts = painting.image.clamp(0, 1), painting.colour, painting.segmentation

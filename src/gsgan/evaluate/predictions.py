@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from gsgan.body import SkinnedBody, open_body
-from gsgan.data.files import check_picture, read_with_alpha
+from gsgan.data.files import check_image, read_with_alpha
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
 from gsgan.metrics.regions import (
@@ -34,12 +34,12 @@ from gsgan.utils.errors import ConfigError, DataError
 if TYPE_CHECKING:
     from gsgan.data.datamodule import GsganData
 
-VERTEX_MARGIN = 0.05  # metres round the body's vertices, as in published scoring scripts
-JOINT_MARGIN = 0.2  # metres round joints, which lie inside the flesh; as in `PersonCrop`
+VERTEX_MARGIN = 0.05  # metres around the body's vertices, as in published scoring scripts
+JOINT_MARGIN = 0.2  # metres around joints, which are inside the body; as in `PersonCrop`
 FULL, SPLAT, FLOOR = "full", "splat", "floor"  # the floor is the all-background image
 HIDDEN_OUTLINE = (
-    "pictures without alpha are put on the protocol's background by the truth's mask, which hides "
-    "what they paint outside it"
+    "images without alpha are moved to the protocol's background by the ground truth's mask, which "
+    "hides their content outside it"
 )
 FIELDS = ("split", "camera", "camera_index", "frame")
 FIELD = re.compile(r"\{(.*?)\}")
@@ -49,7 +49,7 @@ CLOSE = 0.05  # of the range: below it a pixel counts as black, within it of 1 a
 
 @dataclass(frozen=True)
 class Prediction:
-    """What a method predicts for one frame.
+    """The prediction of a method for one frame.
 
     Args:
         images: by variant, ``[B, 3, H, W]``.
@@ -67,12 +67,12 @@ class Prediction:
     background: str = "black"
     segmentation: Tensor | None = None
     labels: Tensor | None = None
-    no_parts: str = "predictions are pictures, not a segmentation"
+    no_parts: str = "predictions are images, not a segmentation"
 
 
 class BodyBoxes:
-    """The body's projected 3D box: round its vertices, or, without a mesh, round its joints with a
-    larger margin."""
+    """The body's projected 3D box: around its vertices, or, without a mesh, around its joints with
+    a larger margin."""
 
     def __init__(self, data: GsganData) -> None:
         found = data.layout.meta.body
@@ -82,12 +82,12 @@ class BodyBoxes:
 
     @property
     def departures(self) -> list[str]:
-        """What tables must state when there is no mesh."""
+        """Notes for tables when there is no mesh."""
         if self.body is not None:
             return []
         return [
-            f"the body's box is {100 * JOINT_MARGIN:g} cm round the joints, asked for: "
-            f"{100 * VERTEX_MARGIN:g} cm round the vertices, of which this data has none"
+            f"the body's box is {100 * JOINT_MARGIN:g} cm around the joints; the protocol requires "
+            f"{100 * VERTEX_MARGIN:g} cm around the vertices, but this data has no body mesh"
         ]
 
     def corners(self, frame: Frame, index: int) -> Tensor:
@@ -105,11 +105,11 @@ class BodyBoxes:
 
 @dataclass(frozen=True)
 class Preparation:
-    """What a protocol does to images before they are scored.
+    """The processing of images before they are scored, by a protocol.
 
     Args:
         measures: of the protocol.
-        boxes: where the measures need the body's box, else None.
+        boxes: None unless the measures need the body's box.
         skeleton: name of the frames' skeleton.
     """
 
@@ -119,11 +119,11 @@ class Preparation:
 
     @property
     def background(self) -> float:
-        """Its grey value."""
+        """The grey value of the background."""
         return BACKGROUNDS[self.measures.background]
 
     def target(self, frame: Frame) -> Tensor:
-        """``[B, 3, H, W]`` the ground truth, which the data has on black."""
+        """``[B, 3, H, W]`` the ground truth, which is on black in the data."""
         image, mask = frame.image, frame.mask
         if self.measures.truth_outline == "hard":
             image, mask = hard_outline(image, mask), (mask >= 0.5).to(mask)
@@ -165,7 +165,7 @@ class Preparation:
 
 @dataclass(frozen=True)
 class PredictionFolder:
-    """A folder that holds every expected image once.
+    """A folder with every expected image once.
 
     Args:
         root: the folder.
@@ -249,10 +249,10 @@ def read_folder(
                 continue
             if len(found) > 1:
                 raise DataError(
-                    f"{root} holds {what} twice, as {found[0]} and {found[1]}; keep one of them"
+                    f"{root} has {what} twice, as {found[0]} and {found[1]}; keep one of them"
                 )
             files[camera, frame] = found[0]
-            check_picture(root / found[0], "image", size, f"the ground truth of {what}, as scored,")
+            check_image(root / found[0], "image", size, f"the ground truth of {what}, as scored,")
     if missing:
         raise DataError(
             f"{root} lacks {len(missing)} of {len(missing) + len(files)} images; the first is "

@@ -6,6 +6,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import torch
@@ -16,7 +17,6 @@ from rich.progress import track
 
 from gsgan.data.datamodule import GsganData
 from gsgan.data.metric_variants import MetricVariants
-from gsgan.evaluate.facts import Method, facts, trained
 from gsgan.evaluate.files import (
     FACTS_FILE,
     HEADER,
@@ -26,6 +26,7 @@ from gsgan.evaluate.files import (
     print_table,
     write_scored,
 )
+from gsgan.evaluate.origin import Method, origin, trained
 from gsgan.evaluate.pictures import write_grid
 from gsgan.evaluate.predictions import (
     FLOOR,
@@ -38,14 +39,9 @@ from gsgan.evaluate.predictions import (
 from gsgan.evaluate.scores import Predict, Scorer, SplitScores, empty, painter, score_split
 from gsgan.metrics.lpips import lpips
 from gsgan.metrics.regions import BACKGROUNDS
-from gsgan.model.runs import (
-    CHECKPOINT,
-    Moved,
-    build_data,
-    load_avatar,
-    load_config,
-    read_checkpoint,
-)
+from gsgan.model.assemble import build_data
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import pick_device
@@ -86,12 +82,12 @@ def evaluate_config(config: DictConfig) -> Results:
 def evaluate_folder(config: DictConfig, console: Console, device: torch.device) -> Results:
     """Loads the avatar of ``config.run`` and scores it."""
     folder = Path(config.run).expanduser()
-    stored = load_config(folder, Moved.from_config(config))
+    stored = load_config(folder, DataPaths.from_config(config))
     data = build_data(stored)
     avatar, marks = load_avatar(folder, stored, data)
     state = read_checkpoint(folder / CHECKPOINT)["gsgan"]
     out = folder
-    if config.background not in (None, _measures(data).background):  # others' scores stay
+    if config.background not in (None, _measures(data).background):  # the protocol's scores stay
         out = folder / f"on_{config.background}"
     if config.drive is not None:
         out, marks = out / "by_skeleton", [*marks, BY_SKELETON]
@@ -189,6 +185,24 @@ def evaluate_method(
         frames = ((dataset.items[i], dataset[i].to(device)) for i in order)
         shown = {round((i + 0.5) * count / rows - 0.5) for i in range(rows)}
         scores[split] = score_split(frames, predict, scorer, shown)
+    for split, found in scores.items():
+        if found.grid:
+            write_grid(found.grid, folder / "pictures" / f"{split}.png")
+    now = _joined_splits(scores, scorer, data, origin(method, data, device))
+    whole, dropped = joined(now, folder, SPLITS)
+    if dropped:
+        names = ", ".join(dropped)
+        console.print(f"earlier scores of {names} were made in another way and are left out")
+    write_scored(whole, folder)
+    print_table(whole.results, whole.origin, console)
+    console.print(f"scores: {folder}", markup=False, highlight=False, soft_wrap=True)
+    return whole.results
+
+
+def _joined_splits(
+    scores: dict[str, SplitScores], scorer: Scorer, data: GsganData, origin: dict[str, Any]
+) -> Scored:
+    """The scores of all splits, with the protocol's record and reasons for empty splits."""
     record = scorer.protocol
     if record is not None and any(found.hidden_outline for found in scores.values()):
         record = record | {"departures": [*record["departures"], HIDDEN_OUTLINE]}
@@ -197,8 +211,6 @@ def evaluate_method(
     for split, found in scores.items():
         reason = data.reasons.get(split, "no frames")
         held = found.variants or {name: empty(reason, scorer) for name in variants}
-        if found.grid:
-            write_grid(found.grid, folder / "pictures" / f"{split}.png")
         results[split] = {name: values | {"protocol": record} for name, values in held.items()}
     table = (
         {"split": split, "variant": variant, **row}
@@ -206,15 +218,7 @@ def evaluate_method(
         for variant, of_variant in found.rows.items()
         for row in of_variant
     )
-    now = Scored(results, pd.DataFrame(table, columns=HEADER), facts(method, data, device))
-    whole, dropped = joined(now, folder, SPLITS)
-    if dropped:
-        names = ", ".join(dropped)
-        console.print(f"earlier scores of {names} were made in another way and are left out")
-    write_scored(whole, folder)
-    print_table(whole.results, whole.facts, console)
-    console.print(f"scores: {folder}", markup=False, highlight=False, soft_wrap=True)
-    return whole.results
+    return Scored(results, pd.DataFrame(table, columns=HEADER), origin)
 
 
 def make_scorer(config: DictConfig, data: GsganData, marks: Sequence[str]) -> Scorer:

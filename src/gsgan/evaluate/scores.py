@@ -1,4 +1,4 @@
-"""Scores of images and segmentations, and of a split: each frame predicted, prepared, scored."""
+"""Scores of images and segmentations, and of all frames of a split."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torchmetrics.functional.classification import multiclass_confusion_matrix
 
 from gsgan.data.metric_variants import MetricVariants
 from gsgan.data.splits import Item
@@ -28,30 +27,24 @@ from gsgan.metrics.image import (
     ssim_uniform,
     ssim_where,
 )
+from gsgan.metrics.names import BOX_METRICS, IMAGE_METRICS, METRICS, PART_METRICS
 from gsgan.metrics.regions import (
     BACKGROUNDS,
-    HANDS,
-    MOUTH,
     cleared,
     describe_boxes,
     mask_crop,
     rectangle,
 )
+from gsgan.metrics.segmentation import confusion, miou
 from gsgan.model.avatar import Avatar
-from gsgan.model.painting import Painting
-from gsgan.model.segmentation import IGNORE
+from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.utils.errors import GsganError
 
-BOX_METRICS = tuple(f"{metric}_{part}" for part in (HANDS, MOUTH) for metric in ("psnr", "ssim"))
-IMAGE_METRICS = (
-    *("psnr", "psnr_person", "psnr_inside", "ssim", "ssim_person", "lpips", "lpips_person"),
-    *("edge_f1", "edge_f1_person", "edge_ratio", "edge_ratio_person", "high_frequencies"),
-    *BOX_METRICS,
-)
-PART_METRICS = ("miou", "miou_with_background")
-METRICS = (*IMAGE_METRICS, *PART_METRICS)
 LPIPS_LEAST = 64  # pixels: AlexNet's last map is empty below
+NO_LABELS = "the data has no part labels"
+NO_PARTS_OF_SPLAT = "Step I's colour is not a segmentation"
+NO_PARTS_OF_FLOOR = "an all-background image is not a segmentation"
 Predict = Callable[[Frame, Item], Prediction]
 Row = dict[str, Any]  # "camera", "frame", and a score by metric
 
@@ -136,33 +129,10 @@ def means(rows: Sequence[Mapping[str, Any]], lpips_reason: str = "") -> dict[str
         if left_out := len(scores) - len(finite):
             result[f"{metric}_left_out"] = left_out
         if not finite:
-            no_score = "no picture had a finite score" if left_out else "no picture"
+            no_score = "no image has a finite score" if left_out else "no image"
             missing = lpips_reason if metric.startswith("lpips") else ""
             result[f"{metric}_reason"] = missing or no_score
     return result
-
-
-def confusion(segmentation: Tensor, labels: Tensor) -> Tensor:
-    """``[classes, classes]`` pixels of S ``[B, classes, H, W]``, rows by labels ``[B, H, W]``."""
-    return multiclass_confusion_matrix(
-        segmentation.argmax(dim=1), labels, segmentation.shape[1], ignore_index=IGNORE
-    ).cpu()
-
-
-def miou(matrix: Tensor) -> dict[str, float | None]:
-    """Mean intersection over union of the ground truth's classes, without and with background.
-
-    Args:
-        matrix: from `confusion`; background is class 0.
-    """
-    matrix = matrix.double()
-    truth, union = matrix.sum(1), matrix.sum(0) + matrix.sum(1) - matrix.diag()
-    present = truth > 0
-    iou = torch.where(present, matrix.diag() / union.clamp_min(1), torch.nan)
-    return {
-        "miou": float(iou[1:][present[1:]].mean()) if present[1:].any() else None,
-        "miou_with_background": float(iou[present].mean()) if present.any() else None,
-    }
 
 
 # -- a split
@@ -195,7 +165,7 @@ class SplitScores:
     Args:
         variants: ``{variant: {metric: value}}`` as in metrics.json; empty without frames.
         rows: one per variant and image.
-        hidden_outline: a ground-truth mask stood in for the alpha of a prediction.
+        hidden_outline: a ground-truth mask was used as the alpha of a prediction.
         grid: rows of images to show, from `gsgan.evaluate.pictures.grid_rows`.
     """
 
@@ -216,7 +186,7 @@ def painter(avatar: Avatar, *, solve: bool = False) -> Predict:
 
     def predict(frame: Frame, item: Item) -> Prediction:
         with torch.no_grad():
-            painting = avatar.paint(replace(frame, body=None) if solve else frame)
+            painting = avatar(*(replace(frame, body=None) if solve else frame).inputs)
         assert painting.image is not None
         images, alphas = {FULL: painting.image}, {FULL: painting.alpha}
         if painting.colour is not None:
@@ -252,14 +222,28 @@ def score_split(
     Raises:
         GsganError: when a prediction is not finite, naming camera and frame.
     """
-    prepare, hidden, no_parts = scorer.prepare, False, ""
-    rows: dict[str, list[Row]] = {}
-    grid: list[dict[str, Tensor]] = []
-    matrices: dict[str, Tensor] = {}  # by camera
-    for i, ((camera, number), frame) in enumerate(items):
+    tally = _Tally(scorer)
+    for i, (item, frame) in enumerate(items):
+        tally.add(item, frame, predict(frame, item), show=i in shown)
+    return tally.result()
+
+
+@dataclass
+class _Tally:
+    """The scores of the frames so far."""
+
+    scorer: Scorer
+    rows: dict[str, list[Row]] = field(default_factory=dict)
+    grid: list[dict[str, Tensor]] = field(default_factory=list)
+    matrices: dict[str, Tensor] = field(default_factory=dict)  # by camera
+    hidden: bool = False
+    no_parts: str = ""
+
+    def add(self, item: Item, frame: Frame, prediction: Prediction, *, show: bool) -> None:
+        """Scores one frame."""
+        prepare, (camera, number) = self.scorer.prepare, item
         target, box, regions = prepare.target(frame), prepare.box(frame), prepare.regions(frame)
-        prediction = predict(frame, (camera, number))
-        hidden = hidden or prepare.hides_outline(prediction)
+        self.hidden = self.hidden or prepare.hides_outline(prediction)
         images = {}
         for name, image in prediction.images.items():
             if bad := int((~torch.isfinite(image)).sum()):
@@ -268,10 +252,10 @@ def score_split(
                     "finite; it cannot be scored"
                 )
             images[name] = prepare.image(prediction, name, frame, box)
-        parts = prediction.segmentation
-        if i in shown:
-            painting = Painting(images[FULL], corrected=images.get(SPLAT), segmentation=parts)
-            grid += grid_rows(replace(frame, image=target), painting)
+        if show:
+            parts = prediction.segmentation
+            painting = Rendering(images[FULL], corrected=images.get(SPLAT), segmentation=parts)
+            self.grid += grid_rows(replace(frame, image=target), painting)
         images[FLOOR] = torch.full_like(frame.image, prepare.background)
         for name, image in images.items():
             own = image_scores(
@@ -281,26 +265,30 @@ def score_split(
                 box,
                 regions=regions,
                 measures=prepare.measures,
-                lpips=scorer.lpips,
+                lpips=self.scorer.lpips,
             )
-            rows.setdefault(name, []).append({"camera": camera, "frame": number, **own})
+            self.rows.setdefault(name, []).append({"camera": camera, "frame": number, **own})
+        self._add_parts(camera, frame, prediction)
+
+    def _add_parts(self, camera: str, frame: Frame, prediction: Prediction) -> None:
+        """Counts the pixels of a segmentation, where there is one."""
+        parts = prediction.segmentation
         if parts is None or frame.labels is None:
-            no_parts = "the data has no part labels" if parts is not None else prediction.no_parts
-            continue
+            self.no_parts = NO_LABELS if parts is not None else prediction.no_parts
+            return
         labels = frame.labels if prediction.labels is None else prediction.labels
         matrix = confusion(parts, labels)
-        matrices[camera] = matrices.get(camera, torch.zeros_like(matrix)) + matrix
-        rows[FULL][-1] |= miou(matrix)
-    reasons = {
-        FULL: no_parts,
-        SPLAT: "Step I's colour is not a segmentation",
-        FLOOR: "an all-background picture is not a segmentation",
-    }
-    variants = {
-        name: _variant(own, matrices if name == FULL else {}, reasons[name], scorer)
-        for name, own in rows.items()
-    }
-    return SplitScores(variants, rows, hidden, grid)
+        self.matrices[camera] = self.matrices.get(camera, torch.zeros_like(matrix)) + matrix
+        self.rows[FULL][-1] |= miou(matrix)
+
+    def result(self) -> SplitScores:
+        """The scores of the split."""
+        reasons = {FULL: self.no_parts, SPLAT: NO_PARTS_OF_SPLAT, FLOOR: NO_PARTS_OF_FLOOR}
+        variants = {
+            name: _variant(own, self.matrices if name == FULL else {}, reasons[name], self.scorer)
+            for name, own in self.rows.items()
+        }
+        return SplitScores(variants, self.rows, self.hidden, self.grid)
 
 
 def _variant(
@@ -313,7 +301,7 @@ def _variant(
     if matrices:
         parts = miou(torch.stack(list(matrices.values())).sum(0))
         result |= parts
-        result |= {f"{m}_reason": "the truth holds no part" for m in parts if parts[m] is None}
+        result |= {f"{m}_reason": "the ground truth has no part" for m in parts if parts[m] is None}
     else:
         result |= no_scores(PART_METRICS, no_parts)
     cameras = {}

@@ -39,6 +39,7 @@ class Whole(nn.Module):
     def __init__(self, avatar: Avatar, size: tuple[int, int]) -> None:
         super().__init__()
         self.avatar, self.size = avatar, size
+        avatar.window_margin = None
 
     def forward(
         self,
@@ -101,7 +102,7 @@ class Painter(nn.Module):
     Its inputs, by name: ``features`` F ``[1, C, H, W]``, ``fine`` F before it was averaged, where
     the avatar supersamples; ``splat_alpha`` of F ``[1, 1, H, W]``; ``segmentation`` S ``[1,
     classes, H, W]``, where it has one; ``skeleton`` p₂D ``[1, groups, H, W]``; ``omega`` Ω ``[1, J,
-    6]`` and ``joints`` ``[1, J, 3]``, see `Avatar.pose_inputs`.
+    6]`` and ``joints`` ``[1, J, 3]``, see `gsgan.model.pose_graph.pose_inputs`.
 
     Args:
         avatar: unfrozen, with a generator.

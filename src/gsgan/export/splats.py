@@ -95,10 +95,10 @@ def _posed(
     psi = avatar.deformation
     if psi is None:
         raise ConfigError("this avatar has no Gaussians (model=image_to_image) to export")
-    frames = bone_frames(p, valid, avatar.template, twist=avatar.twist)
+    frames = bone_frames(p, valid, avatar.template)
     points = avatar.points(p, valid, frames, body)
     root = root_of(p)
-    face = face_code(p, frames, avatar.template)
+    face = face_code(p, frames.head, avatar.template)
     code = psi.pose_code(p, root, frames.hubs[:, 0], None, face)
     residuals = psi.residuals(points, code, root)
     return psi.compose(points, residuals, eye), residuals.sh, points.frames

@@ -9,7 +9,8 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from gsgan.model.avatar import Avatar
-from gsgan.model.runs import avatar_of, read_config
+from gsgan.model.runs import avatar_of
+from gsgan.model.stored import read_config
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.tensors import pick_device
 

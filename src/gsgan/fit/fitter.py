@@ -1,18 +1,17 @@
-"""Registration to silhouettes: one surface for all frames, a pose of the body for each."""
+"""Registration of a body to silhouettes: one surface for all frames, one pose per frame."""
 
 from __future__ import annotations
 
 import math
 import random
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from gsgan.body import Body, blend_transforms
 from gsgan.body.skinned import carry, vertex_normals
-from gsgan.fit.moments import Moments, around
+from gsgan.fit.frames import MaskedFrames, around
 from gsgan.model.body_points import SkinnedPoints, farthest_points, transformed
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians
 from gsgan.splat import Accuracy, rasterise
@@ -21,12 +20,11 @@ from gsgan.utils.errors import ConfigError
 
 BETAS = (0.9, 0.99)
 FINAL_RATE = 0.02  # of the learning rates, in the last sweep
-STATEFUL = ("surface", "moves", "surface_optimiser", "pose_optimiser")
 CONTROLS = 200  # points whose distances from the body the surface interpolates
 REACH = 0.06  # metres: the surface stays this close to the body
 SPREAD = 1.5  # of the controls' influence, in distances between them
 SIGMA, OPACITY = 0.7, 0.95  # standard deviation as a share of the points' spacing
-LOOSE = 0.25  # weight of landmarks of face and palm, which detectors and bodies define differently
+LOOSE = 0.25  # weight of landmarks of face and palm, whose definitions differ
 LOOSE_LANDMARKS = (*range(11), *range(17, 23))
 ANGLE = 0.1  # radians of a joint's turn that cost as much as a landmark `noise` away
 
@@ -64,10 +62,10 @@ class Fit:
 
 
 class Surface(nn.Module):
-    """Gaussians on a body's vertices, moved along their normals alike in all frames (clothes).
+    """Gaussians on a body's vertices, moved along the normals by the same distance in each frame.
 
-    Such a surface cannot absorb errors of a pose: where it does not fill the masks, the pose is
-    wrong.
+    The distances represent clothes. Because all frames share them, they cannot absorb the error of
+    a pose: where the surface does not fill the masks, the pose is wrong.
 
     Args:
         body: of the person.
@@ -111,37 +109,35 @@ class Surface(nn.Module):
 class Fitter:
     """Turns a body's joints until its surface fills the masks of all cameras.
 
-    A frame's loss is the alpha that differs from the mask as a share of the mask's area, plus two
+    A frame's loss is the difference of alpha and mask as a share of the mask's area, plus two
     priors: landmarks stay near the skeleton's, and joints near the solved pose. Colours are not
     used.
 
     Args:
         settings: see `Fit`.
-        moments: frames, images and skeletons.
+        frames: images and skeletons.
         body: of the person.
         start: F poses, solved from the skeletons.
         seed: of the order of frames and cameras.
-
-    Source: ours; as SMPL is fitted to silhouettes for published captures.
     """
 
     def __init__(
-        self, settings: Fit, moments: Moments, body: Body, start: BodyPose, seed: int = 0
+        self, settings: Fit, frames: MaskedFrames, body: Body, start: BodyPose, seed: int = 0
     ) -> None:
-        self.settings, self.moments, self.seed = settings, moments, seed
-        device = moments.device
+        self.settings, self.frames, self.seed = settings, frames, seed
+        device = frames.device
         self.surface = Surface(body.to(device), settings.points, settings.accuracy).to(device)
         self.start = start.to(device)
         self.bones = start.theta.shape[1]
         self.moves = nn.Embedding(len(start.theta), 3 * self.bones + 3, sparse=True).to(device)
         nn.init.zeros_(self.moves.weight)
-        # transl moves by less than angles: one rate for both, and a scale
+        # translations have a smaller rate than angles: one rate for both, and a scale
         scale = torch.ones(self.bones + 1, 1, device=device)
         scale[-1] = settings.transl_rate / settings.angle_rate
         fixed = [i for i, n in enumerate(body.joint_names) if n.startswith(("finger", "toe"))]
         scale[fixed] = 0
         self.scale = scale
-        self.weight = moments.visibility.clone()
+        self.weight = frames.visibility.clone()
         self.weight[:, list(LOOSE_LANDMARKS)] *= LOOSE
         self.surface_optimiser = torch.optim.Adam(
             self.surface.parameters(), settings.surface_rate, BETAS
@@ -181,7 +177,7 @@ class Fitter:
         for i in order:
             pose = self.pose(torch.tensor([i]))
             share, landmarks = self._share(i, pose, chance)
-            apart = (landmarks[0] - self.moments.skeletons[i]).square().sum(-1)
+            apart = (landmarks[0] - self.frames.skeletons[i]).square().sum(-1)
             robust = (1 + apart / settings.noise**2).sqrt() - 1
             turned = (pose.theta[0] - self.start.theta[i]) / ANGLE
             loss = (
@@ -198,8 +194,8 @@ class Fitter:
 
     @torch.no_grad()
     def overlap(self, poses: BodyPose) -> Tensor:
-        """``[F]`` intersection over union of alpha and mask, mean over a frame's images; NaN where
-        all are empty."""
+        """``[F]``: mean intersection over union of alpha and mask over a frame's images; NaN where
+        all images are empty."""
         by_frame = []
         for i in range(len(poses.theta)):
             person, _ = self.surface.posed(BodyPose(poses.theta[i][None], poses.transl[i][None]))
@@ -214,17 +210,6 @@ class Fitter:
             by_frame.append(sum(ious) / len(ious) if ious else math.nan)
         return torch.tensor(by_frame)
 
-    def state_dict(self) -> dict[str, Any]:
-        """The state from which a later process can resume."""
-        parts = {name: getattr(self, name).state_dict() for name in STATEFUL}
-        return {**parts, "shaped": self.shaped, "swept": self.swept}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restores a state."""
-        for name in STATEFUL:
-            getattr(self, name).load_state_dict(state[name])
-        self.shaped, self.swept = state["shaped"], state["swept"]
-
     def _share(self, i: int, pose: BodyPose, chance: random.Random) -> tuple[Tensor, Tensor]:
         """Wrong alpha as a share of the masks, and the posed landmarks."""
         frames = self._windows(i)
@@ -236,7 +221,7 @@ class Fitter:
         return torch.stack(wrong).sum() / area.clamp_min(1.0), landmarks
 
     def _windows(self, i: int) -> list[Frame]:
-        return [around(self.moments.skeletons[i], frame) for frame in self.moments.pictures(i)]
+        return [around(self.frames.skeletons[i], frame) for frame in self.frames.images(i)]
 
     def _set_rates(self) -> None:
         held = self.settings.hold * self.settings.sweeps

@@ -39,7 +39,7 @@ def discriminator_loss(real: Maps, fake: Maps, form: str = "logistic") -> Tensor
         real, fake: the discriminator's maps of a real and a generated image.
         form: ``logistic`` (non-saturating), ``hinge``, ``lsgan`` or ``relativistic``: compares
             the logits of the pair at each position (the paired form, RpGAN, of
-            Jolicoeur-Martineau 2019; that both show the same frame is ours). What both share
+            Jolicoeur-Martineau 2019; here both show the same frame). What both share
             cancels, so use it where generated images are close to the ground truth.
 
     Raises:

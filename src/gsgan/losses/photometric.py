@@ -109,14 +109,11 @@ def _compiled(image: Tensor, target: Tensor) -> bool:
     )
 
 
-class _Job(ctypes.Structure):
-    """Mirrors ``struct PhotometricJob`` of splat/kernels/photometric.h field by field."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in ("planes", "H", "W", "threads")),
-        *((name, ctypes.c_double) for name in ("l1", "l2", "ssim")),
-        *((name, ctypes.c_void_p) for name in ("image", "target", "d_image", "totals")),
-    )
+_Job = build.job_type(
+    ("planes", "H", "W", "threads"),
+    ("l1", "l2", "ssim"),
+    ("image", "target", "d_image", "totals"),
+)  # struct PhotometricJob of splat/kernels/photometric.h
 
 
 class _Photometric(torch.autograd.Function):
@@ -131,8 +128,8 @@ class _Photometric(torch.autograd.Function):
         gradient = torch.empty_like(held[0]) if ctx.needs_input_grad[0] else None
         planes, (height, width) = held[0].shape[:-2].numel(), held[0].shape[-2:]
         totals = torch.empty(planes, dtype=torch.float64)
-        job = _Job(planes, height, width, max(1, torch.get_num_threads()), l1, l2, ssim)
-        native.point(job, ("image", "target", "d_image", "totals"), [*held, gradient, totals])
+        job = _Job(planes, height, width, build.threads(), l1, l2, ssim)
+        build.point(job, ("image", "target", "d_image", "totals"), [*held, gradient, totals])
         if build.function("photometric", image.dtype)(ctypes.byref(job)):
             raise MemoryError("photometric: out of memory")
         ctx.gradient = gradient

@@ -46,7 +46,7 @@ def psnr_where(image: Tensor, target: Tensor, where: Tensor, pooling: str = "pic
 
 
 def person_box(mask: Tensor) -> Tensor:
-    """``[B, 1, H, W]`` bool: the smallest box round the mask's pixels of at least one half."""
+    """``[B, 1, H, W]`` bool: the smallest box around the mask's pixels of at least one half."""
     person = mask >= 0.5
     box = torch.ones_like(person)
     for along, across in ((-1, -2), (-2, -1)):  # rows, columns from the first to the last
@@ -57,7 +57,7 @@ def person_box(mask: Tensor) -> Tensor:
 
 def psnr_inside(image: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     """PSNR in the person's box without the pixels within `OUTLINE` of the mask's outline, whose
-    error is the mask's own where masks are uneven; NaN where the mask is empty. Ours."""
+    error is due to the mask where masks are uneven; NaN where the mask is empty."""
     person = (mask >= 0.5).to(mask)
     side = 2 * OUTLINE + 1
     dilated, shrunk = (s * functional.max_pool2d(s * person, side, 1, OUTLINE) for s in (1, -1))
@@ -74,7 +74,7 @@ def ssim_where(image: Tensor, target: Tensor, *regions: Tensor) -> list[Tensor]:
 def ssim(image: Tensor, target: Tensor, *, value_range: float = 1.0) -> Tensor:
     """Structural similarity as torchmetrics defines it (Gaussian window 11, sigma 1.5).
 
-    Its arithmetic differs: in float32 torchmetrics gives two equal grey images 0.9991.
+    The arithmetic differs: in float32 torchmetrics gives two equal grey images 0.9991.
 
     Args:
         image, target: images; NaN where a side is shorter than `LEAST_SIDE`.

@@ -48,7 +48,7 @@ def lpips(
     found = check_lpips(net, path)
     if found is None:
         backbone = _BACKBONES[net]
-        return None, f"{backbone} weights are not at hand: {how_to_get(backbone)}"
+        return None, f"{backbone} weights are not available: {how_to_get(backbone)}"
     load_weights(found)  # refuses anything but a plain state dict before torchvision reads it
     metric = _build_lpips(net, found, scale=tuple(value_range) == (-1.0, 1.0))
 

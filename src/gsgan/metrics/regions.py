@@ -1,7 +1,7 @@
 """Images as they are scored: background, 8 bits, regions, boxes of the body, hands and mouth.
 
 Convention: images ``[B, 3, H, W]`` RGB in [0, 1]; masks ``[B, 1, H, W]``; a background is a grey
-value, 0 black or 1 white.
+value, 0 for black or 1 for white.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ CUT_SLACK = 1e-3  # of 1/255: values that are 8-bit already must not drop by one
 NEAR = 1e-2  # metres; nearer parts of the body's box are cut off
 PAIRS = torch.combinations(torch.arange(8))
 HANDS, MOUTH = "hands", "mouth"
-# On every side, of the longer side of the box round the projected landmarks.
+# On every side, relative to the longer side of the box around the projected landmarks.
 HAND_MARGIN, LIP_MARGIN = 0.15, 0.25
 MOUTH_SIDE = 1.5  # of the mouth's box without lip landmarks, relative to the mouth's width
 LEAST_BOX = 11  # pixels: SSIM's window
@@ -39,7 +39,8 @@ def on_background(image: Tensor, alpha: Tensor, background: float) -> Tensor:
 def moved_background(image: Tensor, mask: Tensor, old: float, new: float) -> Tensor:
     """Moves an opaque image from one background to another by the ground truth's mask.
 
-    What the image shows outside the mask leaves [0, 1] and is lost: errors of the outline hide.
+    The content of the image outside the mask leaves [0, 1] and is lost, so errors of the outline
+    are hidden.
     """
     return (image + (1 - mask) * (new - old)).clamp(0, 1)
 
@@ -64,7 +65,7 @@ def cleared(image: Tensor, keep: Tensor, background: float) -> Tensor:
 
 
 def rectangle(where: Tensor, least: int = 1) -> tuple[slice, slice] | None:
-    """Rows and columns of the smallest rectangle round ``where [1, H, W]``; None if it is empty.
+    """Rows and columns of the smallest rectangle around ``where [1, H, W]``; None if it is empty.
 
     Args:
         where: bool.
@@ -99,7 +100,7 @@ def mask_crop(
         image: ``[3, H, W]``.
         mask: ``[1, H, W]``; its box contains the pixels of at least one half.
         background: fills the square.
-        margin: pixels round the box, limited by the image.
+        margin: pixels around the box, limited by the image.
         size: side in pixels of the result ``[3, size, size]``, which is None for an empty mask.
 
     Source: the scoring script of THuman4.0's protocol.
@@ -123,7 +124,7 @@ def mask_crop(
 
 
 def box_corners(points: Tensor, margin: float) -> Tensor:
-    """``[8, 3]`` corners of the box round points ``[M, 3]``, metres, world axes."""
+    """``[8, 3]`` corners of the box around points ``[M, 3]``, metres, world axes."""
     low, high = points.amin(0) - margin, points.amax(0) + margin
     choice = torch.cartesian_prod(*[torch.arange(2, device=points.device)] * 3)
     return torch.where(choice == 1, high, low)
@@ -187,7 +188,7 @@ def inside_hull(hull: Tensor, points: Tensor) -> Tensor:
 def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tensor]:
     """The pixels in the boxes of both hands, `HANDS`, and of the mouth, `MOUTH`.
 
-    Convention: a box is round the projected landmarks with a margin, at least `LEAST_BOX` pixels
+    Convention: a box surrounds the projected landmarks with a margin, at least `LEAST_BOX` pixels
     wide and high, and clipped to the image. Landmarks of visibility 0 or behind the camera do not
     count. A hand or mouth without a landmark in the image has no box, nor has the mouth of a head
     that faces away from the camera; a hand hidden by the body has one.
@@ -198,8 +199,6 @@ def hands_and_mouth(frame: Frame, template: SkeletonTemplate) -> dict[str, Tenso
 
     Returns:
         ``[B, 1, H, W]`` bool each; nothing for a skeleton without hands.
-
-    Source: ours.
     """
     if not template.palms:
         return {}
@@ -234,7 +233,7 @@ def describe_boxes(skeleton: str) -> str | None:
 
 
 def lip_landmarks(template: SkeletonTemplate) -> list[int]:
-    """The joints round the lips; none where the skeleton has no face landmarks."""
+    """The joints around the lips; none where the skeleton has no face landmarks."""
     return [i for i, name in enumerate(template.names) if name.startswith("mouth_outer")]
 
 
@@ -244,8 +243,11 @@ def mouth_corners(template: SkeletonTemplate) -> list[int]:
 
 
 def mouth_square(corners: Tensor, camera: Camera) -> Tensor:
-    """``[B, 4, 2]`` pixels at the sides of a square across the view round the mouth's corners ``[B,
-    2, 3]``, whose size does not depend on the direction of the head."""
+    """``[B, 4, 2]`` pixels at the sides of a square across the view.
+
+    The square is around the mouth's corners ``[B, 2, 3]``; its size does not depend on the
+    direction of the head.
+    """
     left, right = corners.unbind(1)
     half = MOUTH_SIDE / 2 * (left - right).norm(dim=-1)[:, None, None] * camera.R[:, :2]
     middle = corners.mean(dim=1, keepdim=True)
@@ -253,7 +255,7 @@ def mouth_square(corners: Tensor, camera: Camera) -> Tensor:
 
 
 def landmark_box(pixels: Tensor, seen: Tensor, size: tuple[int, int], margin: float) -> Tensor:
-    """The pixels whose centre is in the box round landmarks.
+    """The pixels whose centre is in the box around landmarks.
 
     Args:
         pixels: ``[B, M, 2]`` of the landmarks.

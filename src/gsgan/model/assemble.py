@@ -1,48 +1,74 @@
-"""Builds an avatar: the parts of a config, sized to a scene."""
+"""Builds the data module and the avatar of a config."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from torch import Tensor, nn
+from torch.utils.data import Subset
 
-from gsgan.body import open_body
+from gsgan.body import SkinnedBody, open_body
 from gsgan.body.skinned import MarkedBody
 from gsgan.body.solve import Solver
+from gsgan.data.scene_info import SceneInfo
 from gsgan.effects import Effects, EffectSettings, ModelParts, decide
 from gsgan.model.avatar import Avatar
 from gsgan.model.body_points import BodyPoints
-from gsgan.model.class_vote import ClassVote, Pictures, labelled_body
+from gsgan.model.class_vote import ClassVote, labelled_body
+from gsgan.model.colour import ColourCorrection
 from gsgan.model.deformation import Deformation
 from gsgan.model.generator import Generator
-from gsgan.model.painting import ColourCorrection
 from gsgan.model.segmentation import Segmentation
 from gsgan.model.surface import SurfaceGaussians
-from gsgan.skeleton import Densify, template_of
+from gsgan.scene import Frame
+from gsgan.skeleton import Densify, SkeletonTemplate, template_of
 from gsgan.splat import BACKENDS, Accuracy
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
-    from gsgan.data.scene_info import SceneInfo  # loads the data package
+    from gsgan.data.datamodule import GsganData  # loads lightning
+
+
+OPTIONS = ("backend", "window_margin", "window_multiple", "window_least")  # of `Avatar`
+
+
+def build_data(config: DictConfig) -> GsganData:
+    """The data module of a config, its dataset made if need be, read and checked."""
+    data: GsganData = instantiate(config.data, distortion=_effect_settings(config).distortion)
+    data.prepare_data()
+    data.setup()
+    return data
 
 
 def build_avatar(
     config: DictConfig,
     scene: SceneInfo,
-    pictures: Pictures | None = None,
+    images: Subset[Frame] | None = None,
     *,
-    vertex_labels: Tensor | None = None,
     effects: Effects | None = None,
-    labelled: bool | None = None,
+    vertex_labels: Tensor | None = None,
 ) -> Avatar:
-    """The untrained avatar of a config, its weights from ``config.seed``; see `assemble_avatar`."""
+    """The untrained avatar of a config, its weights from ``config.seed``.
+
+    Args:
+        config: of a run.
+        scene: facts about the training split.
+        images: training frames with part labels, for the class vote.
+        effects: decided when training began; None decides them now.
+        vertex_labels: ``[V]`` int64, the result of an earlier vote, which is then not repeated.
+
+    Raises:
+        ConfigError: on a forced effect that is not possible, on parts that do not go together, or
+            on a key that is not read.
+        DataError: when the data lacks the body that the model needs.
+    """
     if config.model.get("densify") is not None and "_target_" not in config.model.densify:
         raise ConfigError(
             "experiment=paper changes parts that this model does not have; it goes with "
@@ -50,157 +76,165 @@ def build_avatar(
         )
     torch.manual_seed(config.seed)
     with naming_group("model"):
-        avatar: Avatar = instantiate(config.model)(
-            scene=scene,
-            pictures=pictures,
-            vertex_labels=vertex_labels,
-            labelled=labelled,
-            effects=effects,
-            settings=effect_settings(config),
-        )
-    return avatar
+        parts: AvatarParts = instantiate(config.model)()
+        effects = effects or decide(scene, _effect_settings(config), parts.in_effects)
+        labelled: tuple[SkinnedBody | None, str] = None, "the model leaves it out"
+        if parts.segmentation is not None:
+            labelled = labelled_body(scene, parts.class_vote, images, vertex_labels)
+        return _assembled(parts, scene, effects, labelled, config.seed)
 
 
-def assemble_avatar(
-    scene: SceneInfo,
-    densify: Densify | None,
-    deformation: Callable[..., Deformation] | None,
-    segmentation: Callable[..., Segmentation] | None,
-    pose_encoder: nn.Module | None,
-    generator: Callable[..., Generator] | None,
-    accuracy: Accuracy,
-    surface: Callable[..., SurfaceGaussians] | None = None,
-    body_points: Callable[..., BodyPoints] | None = None,
-    low_pass: float = 0.3,
-    supersample: int = 1,
-    backend: str = "auto",
-    class_vote: ClassVote | None = None,
-    pictures: Pictures | None = None,
-    vertex_labels: Tensor | None = None,
-    labelled: bool | None = None,
-    effects: Effects | None = None,
-    settings: EffectSettings | None = None,
-    **options: Any,
-) -> Avatar:
-    """Builds each part with its sizes and puts them together (keys: conf/model/full.yaml).
+@dataclass(frozen=True)
+class AvatarParts:
+    """The config group ``model`` (keys: conf/model/full.yaml).
 
-    Convention: parts whose sizes depend on the scene arrive as functions of those sizes
-    (``_partial_`` in the config). Each group of parts draws from its own seed, so leaving one out
-    does not change the start of the others.
+    Convention: parts whose sizes depend on the scene are functions of those sizes (``_partial_`` in
+    the config).
 
     Args:
-        scene: facts about the training split.
-        densify, deformation: skeleton to points; Ψ, given rest points, height, joints, SH degree.
-        segmentation: S, given a body; None leaves it out (``wo_seg``).
-        pose_encoder, generator: Ω (or the flat skeleton) to g; the UNet, given its channel counts.
-            Without them Step I's colour is the image.
         accuracy: the rasteriser's settings for F.
-        surface: in place of Ψ, any Gaussians that move with the body (``lbs_splat``), given the
-            body, its height and the SH degree. Without either nothing is splatted and the UNet
-            paints the drawn skeleton alone (``image_to_image``).
-        body_points: in place of densify where that effect is on, given the body and its height.
-        low_pass, supersample, backend: of F, and of S where it has them.
+        densify, deformation: skeleton to points; Ψ.
+        body_points: in place of densify where that effect is on.
+        surface: in place of Ψ, any Gaussians that move with the body (``lbs_splat``). Without
+            either nothing is splatted and the UNet paints the drawn skeleton alone
+            (``image_to_image``).
+        segmentation: S; None leaves it out (``wo_seg``).
         class_vote: gives S's vertices their parts where the data's labels are not the body's own.
-        pictures: training frames with labels, for that vote.
-        vertex_labels: ``[V]`` int64, the result of an earlier vote, which is then not repeated.
-        labelled: whether S was trained on part labels; None: whether the data has some.
-        effects: decided when training began; None decides them here, by ``settings``.
-        options: of `Avatar`: twist, window_margin, window_multiple, window_least.
+        pose_encoder, generator: Ω (or the flat skeleton) to g; the UNet. Without them Step I's
+            colour is the image (``splat_only``).
+        low_pass, supersample, backend: of F, and of S where it has them.
+        window_margin, window_multiple, window_least: of `Avatar`.
 
     Raises:
-        ConfigError: on a forced effect that is not possible, or a key that is not read.
-        DataError: when the data lacks the body that the model needs.
         ValueError: on parts that do not go together.
     """
-    one_of("model.backend", backend, BACKENDS)
-    template = template_of(scene.skeleton, scene.face)
-    paper22 = densify is None or densify.template.limbs == template.limbs
-    for wrong, message in (
-        (not paper22 and options.get("twist", "none") != "none", "twist=hinge needs limbs=paper22"),
-        ((deformation is None) != (densify is None), "densify and deformation go together"),
-        ((generator is None) != (pose_encoder is None), "generator and pose_encoder go together"),
-        (deformation and surface, "give a deformation or a surface, got both"),
-        (
-            not (deformation or surface or generator),
-            "nothing paints; give a deformation, a surface or a generator",
-        ),
-    ):
-        if wrong:
-            raise ValueError(message)
-    if effects is None:
-        model = ModelParts(
-            splats=densify is not None or surface is not None,
-            points=densify is not None,
-            body_points=body_points is not None,
+
+    accuracy: Accuracy
+    densify: Densify | None
+    deformation: Callable[..., Deformation] | None
+    segmentation: Callable[..., Segmentation] | None
+    pose_encoder: nn.Module | None
+    generator: Callable[..., Generator] | None
+    surface: Callable[..., SurfaceGaussians] | None = None
+    body_points: Callable[..., BodyPoints] | None = None
+    class_vote: ClassVote = field(default_factory=ClassVote)
+    low_pass: float = 0.3
+    supersample: int = 1
+    backend: str = "auto"
+    window_margin: float | None = 0.25
+    window_multiple: int = 16
+    window_least: int = 32
+
+    def __post_init__(self) -> None:
+        one_of("model.backend", self.backend, BACKENDS)
+        for wrong, message in (
+            (
+                (self.deformation is None) != (self.densify is None),
+                "densify and deformation go together",
+            ),
+            (
+                (self.generator is None) != (self.pose_encoder is None),
+                "generator and pose_encoder go together",
+            ),
+            (self.deformation and self.surface, "give a deformation or a surface, got both"),
+            (
+                not (self.deformation or self.surface or self.generator),
+                "nothing paints; give a deformation, a surface or a generator",
+            ),
+        ):
+            if wrong:
+                raise ValueError(message)
+
+    @property
+    def in_effects(self) -> ModelParts:
+        """The parts that effects act on."""
+        return ModelParts(
+            splats=self.densify is not None or self.surface is not None,
+            points=self.densify is not None,
+            body_points=self.body_points is not None,
         )
-        effects = decide(scene, settings or EffectSettings(), model)
-    formation: dict[str, Any] = {"low_pass": low_pass, "antialias": effects.antialias.on}
-    # Stature, from limb lengths: the skeleton measures it and no pose changes it.
+
+
+def _assembled(
+    parts: AvatarParts,
+    scene: SceneInfo,
+    effects: Effects,
+    labelled: tuple[SkinnedBody | None, str],
+    seed: int,
+) -> Avatar:
+    """Sizes the parts to the scene and puts them together.
+
+    Each group of parts draws from its own seed, so that leaving one out does not change the start
+    of the others. ``labelled``: S's body, and where its labels come from or why there is none.
+    """
+    template = template_of(scene.skeleton, scene.face)
+    # The stature follows from limb lengths, which no pose changes.
     body_height = float(scene.body_height) * template.stature / template.limb_length_sum
-    sizes = {"body_height": body_height, "sh_degree": effects.degree}
+    formation: dict[str, Any] = {"low_pass": parts.low_pass, "antialias": effects.antialias.on}
 
-    seed = torch.initial_seed()
     torch.manual_seed(seed + 1)
-    on_body = None
-    if densify is not None and body_points is not None and effects.body_points.on:
-        held = _body_of(scene, "effects.body_points=on")
-        on_body = body_points(body=held, body_height=body_height)
-    psi = None
-    if densify is not None and deformation is not None:
-        rest, joints = (on_body or densify).rest_points, len(template.names)
-        psi = deformation(rest_points=rest, joints=joints, **sizes)
-    skin = None if surface is None else surface(body=_body_of(scene, "model.surface"), **sizes)
-    splats: Deformation | SurfaceGaussians | None = psi or skin
-    S, why = None, "the model leaves it out"
-    if segmentation is not None:
-        body, why = labelled_body(scene, class_vote or ClassVote(), pictures, vertex_labels)
-        if body is not None:
-            S = segmentation(body=body, labelled=scene.has_labels if labelled is None else labelled)
-            S.accuracy, S.backend = replace(S.accuracy, **formation), backend
-
-    on_a_body = on_body is not None or skin is not None or S is not None
-    solver = Solver(_body_of(scene, "the model")) if on_a_body else None
+    body_points = None
+    if parts.densify and parts.body_points and effects.body_points.on:
+        body = _required_body(scene, "effects.body_points=on")
+        body_points = parts.body_points(body=body, body_height=body_height)
+    sizes = {"body_height": body_height, "sh_degree": effects.degree}
+    deformation = surface = None
+    if parts.deformation and (points := body_points or parts.densify):
+        rest, joints = points.rest_points, len(template.names)
+        deformation = parts.deformation(rest_points=rest, joints=joints, **sizes)
+    if parts.surface:
+        surface = parts.surface(body=_required_body(scene, "model.surface"), **sizes)
+    segmentation = None
+    if parts.segmentation and labelled[0] is not None:
+        segmentation = parts.segmentation(body=labelled[0], labelled=scene.has_labels)
+        segmentation.accuracy = replace(segmentation.accuracy, **formation)
+        segmentation.backend = parts.backend
+    on_a_body = any(part is not None for part in (body_points, surface, segmentation))
 
     torch.manual_seed(seed + 2)
-    unet, drawn = None, len(template.draw_groups)
-    if generator is not None and pose_encoder is not None:
-        unet = generator(
-            feature_channels=drawn if splats is None else 3 + splats.features,
-            segmentation_channels=S.classes if S else 0,
-            skeleton_channels=drawn if splats else 0,
-            pose_channels=pose_encoder.channels,
-            supersample=supersample if splats else 1,
-        )
-    colour = None
-    if effects.colour_correction.on:
-        colour = ColourCorrection(effects.cameras, scene.camera_names)
+    colours = effects.colour_correction.on
     return Avatar(
         effects=effects,
         template=template,
-        accuracy=replace(accuracy, supersample=supersample, **formation),
+        accuracy=replace(parts.accuracy, supersample=parts.supersample, **formation),
         limb_length_sum=float(scene.body_height),
         body_height=body_height,
-        deformation=psi,
-        densify=None if on_body else densify,
-        body_points=on_body,
-        surface=skin,
-        segmentation=S,
-        segmentation_why=why,
-        pose_encoder=pose_encoder,
-        generator=unet,
-        colour=colour,
-        solver=solver,
-        backend=backend,
-        **options,
+        deformation=deformation,
+        densify=None if body_points else parts.densify,
+        body_points=body_points,
+        surface=surface,
+        segmentation=segmentation,
+        segmentation_why=labelled[1],
+        pose_encoder=parts.pose_encoder,
+        generator=_generator(parts, template, deformation or surface, segmentation),
+        colour=ColourCorrection(effects.cameras, scene.camera_names) if colours else None,
+        solver=Solver(_required_body(scene, "the model")) if on_a_body else None,
+        **{name: getattr(parts, name) for name in OPTIONS},
     )
 
 
-def effect_settings(config: DictConfig) -> EffectSettings:
-    """The effects group of a config; the defaults for runs older than that group."""
-    if config.get("effects") is None:
-        return EffectSettings()
-    settings: EffectSettings = instantiate(config.effects)
-    return settings
+def _generator(
+    parts: AvatarParts,
+    template: SkeletonTemplate,
+    splats: Deformation | SurfaceGaussians | None,
+    segmentation: Segmentation | None,
+) -> Generator | None:
+    """The UNet; where nothing is splatted the drawn skeleton takes F's place."""
+    if parts.generator is None or parts.pose_encoder is None:
+        return None
+    drawn = len(template.draw_groups)
+    return parts.generator(
+        feature_channels=3 + splats.features if splats else drawn,
+        segmentation_channels=segmentation.classes if segmentation else 0,
+        skeleton_channels=drawn if splats else 0,
+        pose_channels=parts.pose_encoder.channels,
+        supersample=parts.supersample if splats else 1,
+    )
+
+
+def _effect_settings(config: DictConfig) -> EffectSettings:
+    """The effects group of a config; commands that score other methods have none."""
+    return instantiate(config.effects) if "effects" in config else EffectSettings()
 
 
 @contextmanager
@@ -212,7 +246,7 @@ def naming_group(group: str) -> Iterator[None]:
         raise ConfigError(f"{group}: {error}") from error
 
 
-def _body_of(scene: SceneInfo, part: str) -> MarkedBody:
+def _required_body(scene: SceneInfo, part: str) -> MarkedBody:
     if not scene.has_body_pose:
         raise DataError(
             f"{part} cannot be built: the data lacks a body pose for every frame; choose "

@@ -17,7 +17,7 @@ from gsgan.skeleton import Points
 from gsgan.utils.checks import above, whole
 from gsgan.utils.tensors import derived
 
-NORMAL_FLOOR = 1e-2  # below it rounding errors dominate where skinning is flat
+NORMAL_FLOOR = 1e-2  # share of the area at rest, below which rounding errors dominate a normal
 ROWS = 1024  # points compared with all others at a time
 
 
@@ -63,7 +63,7 @@ class SkinnedPoints(nn.Module):
     def blend(self, pose: BodyPose) -> tuple[Tensor, Tensor]:
         """The affine map of each point: ``A [B, N, 3, 3]`` and ``t [B, N, 3]``.
 
-        A blends rotations and is none itself: transform shapes as covariances ``A Σ Aᵀ``.
+        A blend of rotations is not a rotation, so shapes are transformed as covariances ``A Σ Aᵀ``.
         """
         bones = forward_kinematics(
             self.joints, self.parents, axis_angle_to_matrix(pose.theta), pose.transl
@@ -106,18 +106,16 @@ class SkinnedGaussians(nn.Module):
 
 
 class BodyPoints(nn.Module):
-    """Replaces densify: each point moves with its vertex by linear blend skinning.
+    """Points of G on a skinned body, in place of densify.
 
-    A body pose holds what 33 landmarks lack: how the trunk bends and forearms turn. Ψ then learns
-    shape, colour and pose-dependent change, not where the surface is.
+    A body pose has what 33 landmarks lack: how the trunk bends and how forearms turn. Ψ then learns
+    shape, colour and changes with the pose, but not where the surface is.
 
     Args:
         body: vertices, weights and joints.
         body_height: metres, the length scale of Ψ's input.
         points: vertices used, spread evenly over the surface; None for all.
         sigma: initial standard deviation, as a share of the distance to the nearest neighbour.
-
-    Source: ours; the paper's G is Alg. 1's (`gsgan.skeleton.Densify`).
     """
 
     rest_points: Tensor
@@ -169,8 +167,8 @@ def transformed(A: Tensor, t: Tensor, points: Tensor) -> Tensor:
 def moved_normals(A: Tensor, normals: Tensor) -> Tensor:
     """``[B, N, 3]`` normals of a surface that linear maps ``A`` ``[B, N, 3, 3]`` move.
 
-    By the cofactors: det(A) A⁻ᵀ without the division. Where skinning flattens a point's
-    neighbourhood the normal fades to zero, from about NORMAL_FLOOR of the area at rest.
+    Normals are transformed by the cofactors of A, det(A) A⁻ᵀ without the division. Where skinning
+    flattens a point's neighbourhood to about NORMAL_FLOOR of its area, the normal fades to zero.
     """
     x, y, z = A.unbind(-1)
     cofactors = [torch.linalg.cross(a, b) for a, b in ((y, z), (z, x), (x, y))]
@@ -197,7 +195,7 @@ def farthest_points(vertices: Tensor, count: int) -> Tensor:
 
 
 def neighbour_distance(points: Tensor, k: int = 1) -> Tensor:
-    """``[V]`` metres from each point to its k-th nearest other point, or the farthest there is."""
+    """``[V]`` metres from each point to its k-th nearest other point, or to the farthest one."""
     k, found = min(k, max(1, len(points) - 1)), []
     for start in range(0, len(points), ROWS):
         distance = torch.cdist(points[start : start + ROWS], points)

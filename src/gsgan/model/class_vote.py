@@ -1,47 +1,40 @@
-"""The body that S splats, with a part label per vertex: the body's own, or voted by the images."""
+"""The body that S splats, with a part label per vertex: its own, or by a vote over the images."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.utils.data import Subset
 
 from gsgan.body import SkinnedBody, open_body
+from gsgan.data.scene_info import SceneInfo
 from gsgan.model.body_points import ROWS, neighbour_distance
 from gsgan.model.segmentation import IGNORE
 from gsgan.scene import Camera, Frame
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import above, whole
 from gsgan.utils.errors import DataError
 
-if TYPE_CHECKING:
-    from gsgan.data.scene_info import SceneInfo  # loads the data package
-
-NEIGHBOUR = 4  # the neighbour whose distance measures the gaps between vertices
-CELLS = 2.0  # cells of the depth map across the median occluder's radius
-WIDEST = 8  # cells, largest occluder radius: one close to the camera would fill the map
-MOST_CELLS = 2048  # along a side of the depth map, however far the discs spread
-
-
-class Pictures(Protocol):
-    """Indexed frames: a dataset."""
-
-    def __len__(self) -> int: ...
-    def __getitem__(self, index: int, /) -> Frame: ...
+NEIGHBOUR = 4  # the distance to this neighbour is the gap between vertices
+CELLS = 2.0  # cells of the depth map per median occluder radius
+WIDEST = 8  # cells, the largest occluder radius: a disc close to the camera would fill the map
+MOST_CELLS = 2048  # along a side of the depth map
 
 
 def labelled_body(
     scene: SceneInfo,
     vote: ClassVote,
-    pictures: Pictures | None = None,
+    images: Subset[Frame] | None = None,
     vertex_labels: Tensor | None = None,
 ) -> tuple[SkinnedBody | None, str]:
     """The body, and a clause on where its labels come from, or why there is no body.
 
-    The body's own labels are used where they are the data's, or the data has none. Otherwise, and
-    on a body fitted to a person, whose clothes end elsewhere, those of a checkpoint
-    (``vertex_labels [V]``), or of a vote over ``pictures``.
+    The body keeps its own labels where the data has the same ones, or none. Otherwise, and on a
+    body fitted to a person, whose clothes end elsewhere, labels come from a checkpoint
+    (``vertex_labels [V]``) or from a vote over ``images``.
 
     Raises:
         DataError: when a vote is needed and not possible, or the labels do not fit the body.
@@ -53,11 +46,11 @@ def labelled_body(
         return None, (
             f"the data's poses are of the body {scene.body!r}, of which there is no model file"
         )
-    if not scene.has_labels and vertex_labels is None:
+    if not scene.has_labels:
         guess = body.label_source == "guess"
         return body, "parts by the body's joints" if guess else "parts are the body's own"
     fitted = bool(scene.betas) and scene.body == "free"  # to a person in other clothes
-    if scene.has_labels and not fitted and body.shares_labels(scene.label_names):
+    if not fitted and body.shares_labels(scene.label_names):
         if scene.n_labels > len(body.label_names):
             raise DataError(
                 f"labels: the images have {scene.n_labels} parts, the {scene.body} body has only "
@@ -67,24 +60,22 @@ def labelled_body(
     numbered = ("background", *(f"part {i}" for i in range(1, scene.n_labels)))
     names = scene.label_names or numbered
     if vertex_labels is not None:
-        if not scene.has_labels:  # voted on where there were some
-            names = tuple(f"part {i}" for i in range(int(vertex_labels.max()) + 1))
         if len(vertex_labels) != len(body.vertices) or int(vertex_labels.max()) >= len(names):
             raise DataError(
                 f"the checkpoint's labels of {len(vertex_labels)} vertices do not fit this "
                 f"{scene.body} body or its data; give the model file and the data of the training"
             )
         return body.voted(vertex_labels, names), "parts voted when training began"
-    if pictures is None or len(pictures) == 0:
+    if images is None or len(images) == 0:
         raise DataError(
             f"labels: the images' parts are {', '.join(names)}, the {scene.body} body has others, "
             "and there is no training image with labels to vote on them; choose model=wo_seg"
         )
-    votes = vote(body, pictures, len(names))
+    votes = vote(body, images, len(names))
     body = body.voted(votes.labels, names)
     missing = len(names) - 1 - len(votes.labels.unique())
     return body, (
-        f"class vote over {votes.pictures} images: {votes.decided:.0%} of the vertices decided, "
+        f"class vote over {votes.images} images: {votes.decided:.0%} of the vertices decided, "
         f"{missing} of {len(names) - 1} parts on none"
     )
 
@@ -94,23 +85,23 @@ class Votes(NamedTuple):
 
     labels: Tensor  # [V] int64, the data's label of each vertex, never 0
     decided: float  # share of the vertices with a majority; the others took the nearest one's
-    pictures: int  # number of images used
+    images: int  # number of images used
 
 
 @dataclass(frozen=True)
 class ClassVote:
     """Settings of the vote; call it to vote.
 
-    A vertex votes for the label at its pixel in every image in which the body itself does not hide
-    it. Background and ignored pixels do not count: there the fit is off, or the label image is
+    Each vertex gets a vote for the label at its pixel from every image in which the body does not
+    hide it. Background and ignored pixels do not count: there the fit is off, or the label image is
     empty. Vertices without a majority (never seen, or a tie) take the label of the nearest vertex
     with one, at rest. Nothing is random.
 
     Settings: conf/model/full.yaml. An occluder radius of 1 closes the gaps of an even mesh. The
-    depth tolerance is more than neighbours differ on a slanted surface, less than a limb's
-    thickness.
+    depth tolerance is larger than the differences between neighbours on a slanted surface, and
+    smaller than a limb's thickness.
 
-    Source: paper Sec. 3.4 (one class a vertex); the vote is ours.
+    Source: paper Sec. 3.4, which gives each vertex one class but not how.
     """
 
     vote_frames: int = 100
@@ -122,27 +113,26 @@ class ClassVote:
         above("model.class_vote.occluder_radius", self.occluder_radius)
         above("model.class_vote.depth_tolerance", self.depth_tolerance)
 
-    def __call__(self, body: SkinnedBody, pictures: Pictures, n_labels: int) -> Votes:
-        """Votes over frames of one item each, for data with this many labels (background included).
+    def __call__(self, body: SkinnedBody, images: Subset[Frame], n_labels: int) -> Votes:
+        """Votes over frames of one item each, for ``n_labels`` labels, background included.
 
         Raises:
             DataError: when an image file is damaged, or no vertex lies on a labelled pixel.
         """
-        count = min(self.vote_frames, len(pictures))
-        chosen = [(2 * i + 1) * len(pictures) // (2 * count) for i in range(count)]
+        chosen = evenly_spaced(len(images), self.vote_frames)
         reach = self.occluder_radius * neighbour_distance(body.vertices.float(), NEIGHBOUR)
         votes = torch.zeros(len(body.vertices), n_labels, dtype=torch.int64)
         for index in chosen:
-            self._count(votes, body, reach, pictures[index])
+            self._count(votes, body, reach, images[index])
         if not votes.any():
             raise DataError(
-                f"labels: in none of {count} images does the posed body lie on a labelled pixel; "
+                f"labels: in none of {len(chosen)} images is the posed body on a labelled pixel; "
                 "check that labels, cameras and body poses belong together, or choose model=wo_seg"
             )
         labels, decided = _majority(votes)
         decided = decided if decided.any() else votes.any(dim=1)  # ties alone: the first label
         labels = _from_the_nearest(body.vertices.float(), labels, decided)
-        return Votes(labels, float(decided.double().mean()), count)
+        return Votes(labels, float(decided.double().mean()), len(chosen))
 
     def _count(self, votes: Tensor, body: SkinnedBody, reach: Tensor, frame: Frame) -> None:
         """Adds one image's votes to ``[V, n_labels]``."""

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from gsgan.model import compose
+from gsgan.model import compiled
 from gsgan.scene import Gaussians
 from gsgan.skeleton import Points, root_of
 from gsgan.splat.sh import sh_to_colour
@@ -52,7 +52,7 @@ class Deformation(nn.Module):
 
     The other settings are explained in conf/model/full.yaml.
 
-    Source: paper Sec. 3.3; the table beside the MLP is ours.
+    Source: paper Sec. 3.3, without the table.
     """
 
     rest_code: Tensor
@@ -110,11 +110,7 @@ class Deformation(nn.Module):
     def residuals(self, points: Points, pose: Tensor, root: Tensor) -> Residuals:
         """ΔG of posed points, from the `pose_code` and the pelvis ``root`` ``[B, 3]`` (metres)."""
         position = (points.means - root[:, None]) / self.body_height
-        normals = points.normals
-        # A corrected pose learns through the means of G, not through Ψ's inputs.
-        if self.training:
-            position, normals = position.detach(), normals.detach()
-        code = positional_encoding(position, self.position_octaves)
+        normals, code = points.normals, positional_encoding(position, self.position_octaves)
         if torch.is_grad_enabled() and not (code.requires_grad or normals.requires_grad):
             x = self._trained(code, normals, pose)
         else:
@@ -144,7 +140,7 @@ class Deformation(nn.Module):
         return derived(self, "point part", make, layer.weight, layer.bias, own, self.rest_code)
 
     def _trained(self, code: Tensor, normals: Tensor, pose: Tensor) -> Tensor:
-        """The trunk's output, its layers as one operation, which computes no unused gradient."""
+        """The trunk's output; its layers are one operation, which computes no unused gradient."""
         given, weights = [self.rest_code, code], [self.from_position.weight]
         from_rest, from_embedding = self.from_point.weight.split(
             [self.rest_code.shape[-1], self.embedding.shape[-1]], dim=-1
@@ -198,16 +194,16 @@ class Deformation(nn.Module):
     def _geometry(
         self, points: Points, frames: Tensor, residuals: Residuals
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Means, covariances and opacities; on a CPU in one pass, of the same definition."""
+        """Means, covariances and opacities; in compiled code where that is possible."""
         bound, height = self.mean_bound, self.body_height
         low, high = (math.log(limit * height) for limit in self.scale_range)
         logit = math.log(self.opacity / (1 - self.opacity))
         parts = (residuals.means, residuals.quats, residuals.scales)
         raw = torch.cat([*parts, residuals.opacities.unsqueeze(-1)], dim=-1)
         fixed = (points.means, frames, points.scales, points.valid)
-        if compose.compiled(raw, *fixed):
+        if compiled.has_geometry(raw, *fixed):
             numbers = ((bound or 0.0) * height, height, low, high, logit, self.logit_bound)
-            return compose.geometry(raw, *fixed, numbers)
+            return compiled.geometry(raw, *fixed, numbers)
         offset = residuals.means if bound is None else bound * torch.tanh(residuals.means)
         means = points.means + (frames @ (offset * height).unsqueeze(-1)).squeeze(-1)
         scales = bounded(points.scales.log().unsqueeze(-1) + residuals.scales, low, high).exp()
@@ -232,8 +228,8 @@ class Deformation(nn.Module):
             root: ``[B, 3]`` metres.
             pelvis: ``[B, 3, 3]`` the pelvis frame (columns are its axes).
             noise: ``[B, J, 3]`` in the code's units, or None.
-            face: ``[B, E, 3]`` in place of the last E joints: in body heights, in the world's axes,
-                an expression would be a hundredth of the code. None: E is 0.
+            face: ``[B, E, 3]`` in place of the last E joints, since an expression in body heights
+                would be a hundredth of the code; None: E is 0.
         """
         code = (p - root[:, None]) / self.body_height
         if self.pose_frame == "pelvis":
@@ -289,7 +285,7 @@ def positional_encoding(x: Tensor, octaves: int) -> Tensor:
     Returns:
         ``[..., D * (1 + 2 * octaves)]``: x, then all sines, then all cosines.
 
-    Source: ours, as NeRF has it (Mildenhall et al., 2020).
+    Source: NeRF (Mildenhall et al., 2020).
     """
     if octaves == 0:
         return x
@@ -304,7 +300,7 @@ def encoded_size(dimensions: int, octaves: int) -> int:
 
 
 class _Trunk(torch.autograd.Function):
-    """Linear layers with ReLU; no gradient of what is ``known``, the largest part of the input."""
+    """Linear layers with ReLU, without a gradient of ``known``, the largest part of the input."""
 
     @staticmethod
     def forward(
@@ -358,10 +354,8 @@ def bounded(x: Tensor, low: float, high: float) -> Tensor:
     """``x`` clamped to [low, high], with a gradient that leads back.
 
     Convention: beyond a bound the gradient is 0 where a step against it would lead further out, and
-    passes where it leads back in. A plain clamp has none there: a parameter that once crossed the
-    bound would never learn again.
-
-    Source: ours.
+    passes where it leads back. With a plain clamp, a parameter that crossed its bound would never
+    learn again.
     """
     bounded_x: Tensor = _Bounded.apply(x, low, high)
     return bounded_x

@@ -16,10 +16,10 @@ class PatchDiscriminator(nn.Module):
     Args:
         base: channels of the first layer.
         layers: feature layers; all but the last halve the resolution.
-        norm: ``instance``, or ``none``. Instance normalisation equalises the contrast of every
-            channel, and so hides how sharp the image is (measured in docs/ablations.md).
+        norm: ``instance`` or ``none``. Instance normalisation equalises the contrast of every
+            channel, which hides how sharp the image is (docs/ablations.md).
 
-    Source: ours, after pix2pixHD (Wang et al., 2018).
+    Source: pix2pixHD (Wang et al., 2018).
     """
 
     def __init__(self, base: int = 64, layers: int = 4, norm: str = "instance") -> None:

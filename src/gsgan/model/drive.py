@@ -6,7 +6,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from omegaconf import DictConfig, OmegaConf
 from torch import Tensor
 
-from gsgan.data.dataset import PictureCache
+from gsgan.data.dataset import ImageCache
 from gsgan.data.proportions import (
     BODY,
     EXPRESSION,
@@ -25,9 +25,7 @@ from gsgan.data.proportions import (
 )
 from gsgan.data.splits import SPLITS
 from gsgan.model.avatar import Avatar
-from gsgan.model.runs import (
-    Run,
-)
+from gsgan.model.runs import Run
 from gsgan.motion.clip import FPS, checked, completed, frame_times, is_own, resampled, up_axis
 from gsgan.motion.readers import Source, read_motion
 from gsgan.motion.retarget import expressed, face_in_head, joined, placed, retargeted
@@ -36,9 +34,6 @@ from gsgan.skeleton import complete_skeleton
 from gsgan.utils.checks import above, one_of
 from gsgan.utils.config import defaults_of
 from gsgan.utils.errors import ConfigError, DataError
-
-if TYPE_CHECKING:
-    pass
 
 Float = NDArray[np.float64]
 REST = "rest"
@@ -55,8 +50,8 @@ class Drive:
         visibility: ``[F, J]`` in [0, 1].
         body: F poses of the skinned body, or None.
         numbers: of the frames, for their file names.
-        text: one line that describes it.
-        truth: gives the dataset's frame by index, or None.
+        text: a description in one line.
+        truth: returns the dataset's frame by index, or None.
         camera: F cameras and their indices, if the frames have their own.
     """
 
@@ -69,7 +64,7 @@ class Drive:
     camera: tuple[Camera, Tensor] | None = None
 
     def rows(self, chosen: NDArray[np.int64]) -> Drive:
-        """The frames at some indices; if an index repeats, frames are numbered from 0."""
+        """The frames at some indices, numbered from 0 if an index repeats."""
         own = len(set(chosen.tolist())) == len(chosen)
         at, truth, camera = torch.from_numpy(chosen), self.truth, self.camera
         index = chosen.tolist()
@@ -102,11 +97,12 @@ def drive_of(config: DictConfig, run: Run, fps: float) -> Drive:
     given = {key: value for key, value in config.items() if key in defaults}
     config = cast(DictConfig, OmegaConf.merge(defaults, given))
     one_of("drive", config.drive, (None, "skeleton"))
-    found = _given(config, run, fps)
+    found = _chosen(config, run, fps)
     return found if config.drive is None else replace(found, body=None)
 
 
-def _given(config: DictConfig, run: Run, fps: float) -> Drive:
+def _chosen(config: DictConfig, run: Run, fps: float) -> Drive:
+    """The motion of a config: files, a split, the rest pose, or one held-out frame."""
     if config.motion is None:
         split, _ = run.data.watched
         found = _held_out(config, run, split)
@@ -128,7 +124,7 @@ def _given(config: DictConfig, run: Run, fps: float) -> Drive:
 def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
     """Frames of a split, seen by one camera."""
     dataset = copy(run.data.dataset(split))
-    dataset.cache = PictureCache(CACHE)  # a run in training uses the other one at the same time
+    dataset.cache = ImageCache(CACHE)  # a run in training uses the dataset's own at the same time
     if not dataset.items:
         raise DataError(f"motion={split}: the run has no such frames ({run.data.reasons[split]})")
     names = list(dict.fromkeys(camera for camera, _ in dataset.items))
@@ -143,10 +139,7 @@ def _held_out(config: DictConfig, run: Run, split: str) -> Drive:
         body = BodyPose(*(torch.from_numpy(x).float() for x in stacked))
     place = {item: i for i, item in enumerate(dataset.items)}
     index = torch.tensor([layout.camera_names.index(items[0][0])] * len(items))
-    seen = None
-    if own:
-        views_of = [dataset.camera(item) for item in items]
-        seen = cat(views_of), index
+    seen = (cat([dataset.camera(item) for item in items]), index) if own else None
     return Drive(
         p=np.stack([dataset.skeletons.p[f] for f in frames]),
         visibility=np.stack([dataset.skeletons.visibility[f] for f in frames]),
@@ -166,7 +159,7 @@ def _joined(clips: list[Drive], proportions: Proportions, seconds: float, fps: f
     between = max(1, round(seconds * fps) - 1)
     joints = max(clip.p.shape[1] for clip in clips)
     parts = []
-    for clip in clips:  # some with hands or a face, some without
+    for clip in clips:  # some may lack hands or a face
         lacking = (0, joints - clip.p.shape[1])
         parts.append(np.pad(clip.p, ((0, 0), lacking, (0, 0)), constant_values=np.nan) @ standard.T)
     p = joined(parts, proportions, between) @ standard
@@ -175,7 +168,8 @@ def _joined(clips: list[Drive], proportions: Proportions, seconds: float, fps: f
 
 
 def _shown(p: Float, proportions: Proportions) -> Float:
-    """``[F, J]`` visibility of retargeted joints: the body's as in training, others where known."""
+    """``[F, J]`` visibility of retargeted joints: the body's as in training, 1 for others that are
+    known."""
     visibility = np.asarray(np.isfinite(p).all(-1), np.float64)
     visibility[:, : len(proportions.seen)] = proportions.seen
     return visibility
@@ -199,7 +193,7 @@ def _from_file(config: DictConfig, run: Run, path: str, fps: float) -> Drive:
     own = is_own(motion, proportions) if choice == "auto" else not choice
     if choice is False and motion.detached:
         raise ConfigError(f"retarget=false is not supported for {motion.path}: leave retarget out")
-    # transitions need every joint
+    # a list of motions is retargeted, because transitions need every joint
     own = own and not motion.detached and not OmegaConf.is_list(config.motion)
     times = frame_times(len(motion), rate, fps)
     nearest = np.rint(times).astype(int)

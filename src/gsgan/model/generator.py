@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from gsgan.model import styled
 from gsgan.utils.checks import one_of
 from gsgan.utils.tensors import derived
 
@@ -20,8 +19,8 @@ SLOPE = 0.2
 class Encoder(nn.Module):
     """A pyramid: a stem, then stride-2 levels; returns every level, finest first.
 
-    The stem is a 3×3 convolution; with ``patch`` > 1 one of patch × patch pixels, each of which is
-    a pixel of the finest level, and then a 3×3.
+    The stem is a 3×3 convolution. With ``patch`` > 1 it is one of patch × patch pixels with that
+    stride, followed by a 3×3.
     """
 
     def __init__(self, inputs: int, channels: Sequence[int], patch: int = 1) -> None:
@@ -54,33 +53,24 @@ class Style(nn.Module):
 
     Normalising over channels at each pixel (not over the image) keeps colours independent of how
     much of the image is background. Both maps start at zero: the style starts as the identity.
-    Without style channels only g scales and shifts.
     """
 
     def __init__(self, channels: int, style_channels: int, pose_channels: int) -> None:
         super().__init__()
-        self.from_map = nn.Conv2d(style_channels, 2 * channels, 1) if style_channels else None
+        self.from_map = nn.Conv2d(style_channels, 2 * channels, 1)
         self.from_pose = nn.Linear(pose_channels, 2 * channels)
         for layer in (self.from_map, self.from_pose):
-            if layer is not None:
-                start_at_zero(layer)
+            start_at_zero(layer)
 
-    def forward(self, h: Tensor, style: Tensor | None, g: Tensor) -> Tensor:
-        """``h`` ``[B, C, h, w]`` styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]``, then
+    def forward(self, h: Tensor, style: Tensor, g: Tensor) -> Tensor:
+        """``h`` ``[B, C, h, w]``, styled by ``style`` ``[B, Cs, h, w]`` and ``g`` ``[B, 35]`` and
         activated."""
         rows = h.permute(0, 2, 3, 1)  # channels last in memory: channels of a pixel are a row
         modulation = self.from_pose(g).unsqueeze(1)
-        if self.from_map is not None:
-            assert style is not None
-            weight = self.from_map.weight.flatten(1).mT.expand(len(h), -1, -1)
-            styles = style.permute(0, 2, 3, 1).flatten(1, 2)
-            modulation = torch.baddbmm(modulation + self.from_map.bias, styles, weight)
-            modulation = modulation.unflatten(1, rows.shape[1:3])
-        else:
-            modulation = modulation.unsqueeze(1)
-        if styled.compiled(rows, modulation):
-            made = styled.styled(rows, modulation, NORM_FLOOR, SLOPE)
-            return made.permute(0, 3, 1, 2)
+        weight = self.from_map.weight.flatten(1).mT.expand(len(h), -1, -1)
+        styles = style.permute(0, 2, 3, 1).flatten(1, 2)
+        modulation = torch.baddbmm(modulation + self.from_map.bias, styles, weight)
+        modulation = modulation.unflatten(1, rows.shape[1:3])
         gamma, beta = modulation.chunk(2, dim=-1)
         # In float32 at least: half precision loses squares above 256 and below 2e-4.
         wide = rows.to(torch.promote_types(h.dtype, torch.float32))
@@ -99,7 +89,7 @@ class DecoderLevel(nn.Module):
         )
         self.styles = nn.ModuleList(Style(channels, style_channels, pose) for _ in range(2))
 
-    def forward(self, h: Tensor, skip: Tensor, style: Tensor | None, g: Tensor) -> Tensor:
+    def forward(self, h: Tensor, skip: Tensor, style: Tensor, g: Tensor) -> Tensor:
         first, second = self.convs
         h = self._join(self.reduce(h), skip, first.weight, first.bias)  # type: ignore[arg-type]
         h = self.styles[0](h, style, g)
@@ -108,9 +98,8 @@ class DecoderLevel(nn.Module):
     def _join(self, h: Tensor, skip: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
         """A 3×3 convolution of ``h``, upsampled to the nearest, and ``skip`` as further channels.
 
-        Two of three pixels under a kernel on an upsampled image are equal: a transposed convolution
-        whose kernel has their sums does 4/9 of the arithmetic. (It has no checkerboard: that comes
-        from kernels that are not such sums.)
+        Two of three pixels under a kernel on an upsampled image are equal, so a transposed
+        convolution with the sums of their weights does the same with 4/9 of the arithmetic.
         """
         C = h.shape[1]
         kernel = derived(self, "upper", lambda: upsampled_kernel(weight[:, :C]), weight)
@@ -131,15 +120,16 @@ class Generator(nn.Module):
             beside their average; 1 for none.
         base: channels at full resolution.
         multipliers: channels of each level in units of ``base``; each level halves the resolution.
-        patch: power of 2: so many pixels each way are one pixel of the finest level, which paints
-            them as channels. The first levels of ``multipliers`` are then left out.
+        patch: a power of 2: one pixel of the finest level covers patch × patch pixels, which are
+            its channels. The first levels of ``multipliers`` are then left out.
         feature_bound: of the Gaussians' features, which `Avatar` clamps: that is cheaper than
             clamping images of them.
 
     The other settings are explained in conf/model/full.yaml. With ``rgb_skip`` the last layer
-    starts at zero, and training at Step I's image. An unclamped output can recover from black.
+    starts at zero, so training starts at Step I's image. The output is not clamped, so that it can
+    recover from black.
 
-    Source: paper Sec. 3.5; sizes, style, the linear output and alpha are ours where it is silent.
+    Source: paper Sec. 3.5; sizes, style, the linear output and alpha are ours.
     """
 
     def __init__(
@@ -153,29 +143,22 @@ class Generator(nn.Module):
         base: int = 32,
         multipliers: Sequence[int] = (1, 2, 4, 8, 8),
         patch: int = 1,
-        style: str = "film",
         style_share: float = 0.5,
         rgb_skip: bool = False,
-        output: str = "linear",
         feature_bound: float = 1e3,
     ) -> None:
         super().__init__()
-        one_of("model.generator.output", output, ("linear", "sigmoid"))
-        one_of("model.generator.style", style, ("film", "pose"))
-        if rgb_skip and output == "sigmoid":
-            raise ValueError("Generator: rgb_skip adds to a colour, so output must be linear")
         one_of("model.generator.patch", patch, [2**i for i in range(len(multipliers))])
         self.patch, self.stride = patch, 2 ** (len(multipliers) - 1)
         channels = [base * m for m in multipliers][patch.bit_length() - 1 :]
-        mapped = style == "film"
-        widths = [max(1, round(style_share * c)) if mapped else 0 for c in channels]
+        widths = [max(1, round(style_share * c)) for c in channels]
         inputs = feature_channels + segmentation_channels + skeleton_channels
         self.supersample = supersample
         if supersample > 1:
             inputs += feature_channels * supersample**2
-        self.rgb_skip, self.output, self.feature_bound = rgb_skip, output, feature_bound
+        self.rgb_skip, self.feature_bound = rgb_skip, feature_bound
         self.content = Encoder(inputs, channels, patch)
-        self.style = Encoder(feature_channels, widths, patch) if mapped else None
+        self.style = Encoder(feature_channels, widths, patch)
         self.mid = nn.ModuleList(nn.Conv2d(channels[-1], channels[-1], 3, padding=1) for _ in "ab")
         self.mid_style = nn.ModuleList(Style(channels[-1], widths[-1], pose_channels) for _ in "ab")
         self.up = nn.ModuleList(
@@ -216,7 +199,7 @@ class Generator(nn.Module):
         features = self._padded(F)
         others = [x for x in (S, p2d) if x is not None]
         skips = self.content.levels(self._stem(features, others, fine))
-        styles = self.style(features) if self.style else [None] * len(skips)
+        styles = self.style(features)
         h = skips[-1]
         for conv, style in zip(self.mid, self.mid_style, strict=True):
             h = style(conv(h), styles[-1], g)
@@ -227,10 +210,10 @@ class Generator(nn.Module):
             if alpha is None:
                 raise ValueError("Generator: built with rgb_skip=True, so alpha must be given")
             return torch.cat([F[:, :3], alpha], dim=1) + painted
-        return torch.sigmoid(painted) if self.output == "sigmoid" else painted
+        return painted
 
     def _stem(self, features: Tensor, others: list[Tensor], fine: Tensor | None) -> Tensor:
-        """E_c's stem on F, S, p₂D, and F's fine pixels as channels, without forming these."""
+        """E_c's stem on F, S, p₂D and F's fine pixels, without forming them as channels."""
         stem, k, C = self.content.stem, self.supersample, features.shape[1]
         if fine is None:
             padded = [self._padded(x) for x in others]
@@ -255,8 +238,8 @@ class Generator(nn.Module):
 
 
 def fine_kernel(weight: Tensor, C: int, k: int) -> Tensor:
-    """``[O, C, n k, n k]``: the part of a stem's ``weight`` that sees F, as one kernel on F's fine
-    pixels, of which its first C channels see averages and its last C k² each one."""
+    """``[O, C, n k, n k]``: the part of a stem's ``weight`` that reads F, as one kernel on F's fine
+    pixels: its first C channels read their averages, its last C k² each single one."""
     fine = weight[:, -C * k * k :].unflatten(1, (C, k, k)).permute(0, 1, 4, 2, 5, 3)
     mean = weight[:, :C, :, None, :, None] / (k * k)
     return channels_last((fine + mean).flatten(4, 5).flatten(2, 3))

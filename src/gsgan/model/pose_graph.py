@@ -9,8 +9,16 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from gsgan.model.deformation import encoded_size, positional_encoding
-from gsgan.skeleton import MEDIAPIPE33, SkeletonTemplate, named_template
-from gsgan.utils.checks import one_of
+from gsgan.scene import Camera
+from gsgan.skeleton import (
+    MEDIAPIPE33,
+    BoneFrames,
+    SkeletonTemplate,
+    face_code,
+    named_template,
+    omega,
+    root_of,
+)
 
 READOUT_START = 0.8  # initial standard deviation of g for joint channels of 1
 
@@ -25,7 +33,7 @@ class GraphLayer(nn.Module):
         inputs, outputs: channels.
         neighbour: initial weight of an edge; the diagonal starts at 1.
 
-    Source: ours, after the graph layers of DANBO (Su et al., 2022).
+    Source: after the graph layers of DANBO (Su et al., 2022).
     """
 
     mask: Tensor
@@ -48,14 +56,14 @@ class GraphLayer(nn.Module):
 
 
 class PoseGraph(nn.Module):
-    """Graph network over joint rotations Ω, pooled to one number per skeleton edge.
+    """A graph network over joint rotations Ω, read out to one number per skeleton edge.
 
     Args:
         template: the skeleton's joints and edges, or its name.
         width, joint_channels, octaves: hidden and output channels per joint, encoding of Ω.
-        readout: ``edge`` (each number of g from the two joints of its edge) or ``linear``.
 
-    Source: paper Sec. 3.5, which leaves open how joints become g.
+    Source: paper Sec. 3.5, which leaves open how joints become g: here each number of g is read
+        from the two joints of its edge.
     """
 
     edges: Tensor
@@ -67,10 +75,8 @@ class PoseGraph(nn.Module):
         width: int = 128,
         joint_channels: int = 32,
         octaves: int = 5,
-        readout: str = "edge",
     ) -> None:
         super().__init__()
-        one_of("model.pose_encoder.readout", readout, ("edge", "linear"))
         template = named_template(template)
         joints = len(template.names)
         mask = torch.eye(joints)
@@ -88,8 +94,7 @@ class PoseGraph(nn.Module):
         )
         self.register_buffer("edges", torch.tensor(template.edges).long(), persistent=False)
         self.channels = len(template.edges)
-        self.by_edge = readout == "edge"
-        inputs = (2 if self.by_edge else joints) * joint_channels
+        inputs = 2 * joint_channels
         start = torch.randn(self.channels, inputs) * (READOUT_START / math.sqrt(inputs))
         self.readout = nn.Parameter(start)
         self.readout_bias = nn.Parameter(torch.zeros(self.channels))
@@ -100,8 +105,6 @@ class PoseGraph(nn.Module):
         for layer in self.layers[:-1]:
             h = functional.relu(layer(h))
         h = self.layers[-1](h)
-        if not self.by_edge:
-            return functional.linear(h.flatten(1), self.readout, self.readout_bias)
         pairs = torch.cat([h[:, self.edges[:, 0]], h[:, self.edges[:, 1]]], dim=-1)
         return (pairs * self.readout).sum(-1) + self.readout_bias
 
@@ -118,3 +121,31 @@ class PoseLinear(nn.Module):
     def forward(self, omega: Tensor, pose: Tensor) -> Tensor:
         """g ``[B, 35]`` from ``pose`` ``[B, J, 3]`` (camera axes, body heights); Ω is unused."""
         return self.linear(pose.flatten(1))
+
+
+def pose_inputs(
+    p: Tensor,
+    valid: Tensor,
+    frames: BoneFrames,
+    camera: Camera,
+    template: SkeletonTemplate,
+    body_height: float,
+) -> tuple[Tensor, Tensor]:
+    """The inputs of both encoders.
+
+    Args:
+        p, valid: ``[B, J, 3]`` metres, world; ``[B, J]`` bool.
+        frames: of the bones.
+        camera: B cameras.
+        template: of the skeleton.
+        body_height: metres.
+
+    Returns:
+        Ω ``[B, J, 6]``, and joints ``[B, J, 3]`` about the root in camera axes and body heights,
+        those of the face replaced by its `face_code`.
+    """
+    root = root_of(p, template).unsqueeze(1)
+    in_camera = (p - root) @ camera.R.mT / body_height
+    if (face := face_code(p, frames.head, template)) is not None:
+        in_camera = torch.cat([in_camera[:, : -face.shape[1]], face], dim=1)
+    return omega(p, valid, camera.R, template, frames=frames), in_camera

@@ -14,9 +14,7 @@ from gsgan.body import SkinnedBody
 from gsgan.body.smpl_names import group_of_part
 from gsgan.model.body_points import SkinnedGaussians, transformed
 from gsgan.scene import BodyPose, Camera, Frame, Gaussians, Raster
-from gsgan.splat import accuracy as named_accuracy
-from gsgan.splat import rasterise
-from gsgan.splat.checks import checks_for
+from gsgan.splat import ACCURACY, Accuracy, rasterise
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
 from gsgan.utils.tensors import full_precision
@@ -29,10 +27,9 @@ FACE = "face_neck"
 class Segmentation(SkinnedGaussians):
     """Canonical Gaussians on a body's vertices, moved by LBS, rendered as class probabilities.
 
-    Learned: quats, scales, opacities. Fixed: positions, skinning weights, the one-hot class of
-    each vertex. Blends of bone transforms are no rotations, so deformed shapes are covariances.
-    Vertices of no class (all but the hands, with ``mode=hands``) are splatted too: they occlude,
-    and count as background.
+    Quats, scales and opacities are learned. Positions, skinning weights and the one-hot class of
+    each vertex are fixed. Vertices without a class (all but the hands, with ``mode=hands``) are
+    splatted too: they occlude, and count as background.
 
     Args:
         body: vertices, weights, joints and part labels.
@@ -40,11 +37,11 @@ class Segmentation(SkinnedGaussians):
         points, opacity, scale: see `SkinnedGaussians`.
         accuracy: the rasteriser's settings.
         labelled: whether the data has part labels, from which every shape and opacity learns.
-            Without them one factor on all scales and one on all opacities learn from the masks:
-            free shapes would fit the silhouette by growing over each other's parts (default person,
-            held-out poses, 800 iterations: mIoU 0.54 for 0.75; untrained 0.62, from labels 0.90).
+            Without them only a factor on all scales and one on all opacities learn, from the
+            masks: free shapes would grow over each other's parts to fit the silhouette (mIoU on
+            held-out poses 0.54, with two factors 0.75, from labels 0.90).
 
-    Source: paper Sec. 3.4; learning from masks is ours.
+    Source: paper Sec. 3.4, which learns from labels only.
     """
 
     one_hot: Tensor
@@ -61,11 +58,11 @@ class Segmentation(SkinnedGaussians):
         points: int | None = None,
         opacity: float = 0.9,
         scale: float = 0.7,
-        accuracy: str = "standard",
+        accuracy: Accuracy = ACCURACY["standard"],
         labelled: bool = True,
     ) -> None:
         super().__init__(body, points, opacity, scale)
-        self.accuracy = named_accuracy(accuracy)
+        self.accuracy = accuracy
         self.map = class_map(body.label_names, body.vertex_labels, mode, hands_face)
         # Voted labels are saved, so that the vote is not repeated; the body's own are not.
         self.voted = body.label_source == "vote"
@@ -121,11 +118,7 @@ class Segmentation(SkinnedGaussians):
         """The splatted body: features are its classes, alpha its silhouette."""
         with full_precision(pose.theta):
             return rasterise(
-                self.gaussians(pose),
-                camera,
-                settings=self.accuracy,
-                backend=self.backend,
-                on_invalid=checks_for(camera.K.device),
+                self.gaussians(pose), camera, settings=self.accuracy, backend=self.backend
             )
 
     def forward(self, pose: BodyPose, camera: Camera) -> Tensor:
@@ -141,7 +134,7 @@ class Segmentation(SkinnedGaussians):
             alpha = self.raster(frame.body, frame.camera).alpha
             return silhouette_loss(alpha, frame.mask, frame.unsure)
         labels = torch.full_like(frame.mask[:, 0], IGNORE, dtype=torch.long)
-        if frame.labels is not None:  # else nothing is learned from this image
+        if frame.labels is not None:  # nothing is learned from an image without labels
             labels = self.truth(frame.labels)
         return segmentation_loss(self(frame.body, frame.camera), labels)
 
@@ -156,14 +149,12 @@ def segmentation_loss(segmentation: Tensor, labels: Tensor, floor: float = 1e-6)
     """Cross-entropy of rendered probabilities: mean of -log(P of the true class + floor).
 
     There is no softmax: the maps are probabilities. Pixels whose label has no channel (255, and
-    classes that no vertex has) are left out; with no other pixel the loss is 0.
+    classes that no vertex has) are left out. Without any other pixel the loss is 0.
 
     Args:
         segmentation: ``[B, classes, H, W]``.
         labels: ``[B, H, W]`` int64, see `Segmentation.truth`.
         floor: added inside the logarithm, so that a class without splats has a gradient.
-
-    Source: ours; the maps are those of paper Sec. 3.4.
     """
     labels = torch.where(labels < segmentation.shape[1], labels, IGNORE)
     log = (segmentation + floor).log()
@@ -184,8 +175,6 @@ def silhouette_loss(
 
     Returns:
         The mean over the other pixels; 0 where there are none.
-
-    Source: ours.
     """
     loss = -(mask * (alpha + floor).log() + (1 - mask) * (1 - alpha + floor).log())
     sure = torch.ones_like(loss) if unsure is None else (unsure <= 0).to(loss)

@@ -17,7 +17,7 @@ from gsgan.utils.checks import one_of
 class SurfaceGaussians(SkinnedGaussians):
     """Canonical Gaussians with learned offsets from the body, shapes and colours.
 
-    Only the skinning depends on the pose: the family of GauHuman and 3DGS-Avatar, without their
+    Only the skinning depends on the pose, as in GauHuman and 3DGS-Avatar without their
     pose-dependent networks.
 
     Args:

@@ -1,6 +1,6 @@
 """Motion capture in Acclaim's formats: ASF (skeleton) and AMC (motion).
 
-Convention: as `gsgan.motion.bvh.Bvh`: a joint is the start of a bone. An ASF bone has axes
+Convention: as `RigMotion`: a joint is the start of a bone. An ASF bone has axes
 of its own, C; the angles M of a frame turn it by ``C M C⁻¹`` relative to its parent.
 
 Source: the description of the formats that the CMU motion capture database refers to.
@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsgan.motion.bvh import Bvh
 from gsgan.motion.rotations import Array, rotation
+from gsgan.motion.standard import RigMotion
 from gsgan.utils.errors import DataError
 
 INCH = 0.0254
@@ -39,7 +39,7 @@ def asf_of(amc: Path) -> Path:
     return named[0]
 
 
-def read_amc(amc: Path, asf: Path) -> tuple[Bvh, float]:
+def read_amc(amc: Path, asf: Path) -> tuple[RigMotion, float]:
     """A motion on its skeleton, and the metres in its unit of length.
 
     Raises:
@@ -122,7 +122,9 @@ def _skeleton(path: Path) -> tuple[dict[str, _Bone], dict[str, str], float, floa
     return bones, parents, INCH / float(units["length"][0]), radians
 
 
-def _motion(path: Path, bones: dict[str, _Bone], parents: dict[str, str], radians: float) -> Bvh:
+def _motion(
+    path: Path, bones: dict[str, _Bone], parents: dict[str, str], radians: float
+) -> RigMotion:
     names = [ROOT]  # parents first
     while len(names) < len(bones):
         more = [n for n, parent in parents.items() if parent in names and n not in names]
@@ -162,7 +164,7 @@ def _motion(path: Path, bones: dict[str, _Bone], parents: dict[str, str], radian
     # CMU's wrist bone is the lower half of the forearm: the hand starts at the hand bone.
     plain = [re.sub("wrist$", "lowerforearmtwist", name) for name in names]
     ends = [name for name in names if name not in parents.values()]
-    return Bvh(
+    return RigMotion(
         names=(*plain, *(f"{name} end" for name in ends)),
         parents=(-1, *(index[parents[name]] for name in names[1:]), *(index[n] for n in ends)),
         offsets=np.concatenate([offsets, [bones[name].end for name in ends]]),

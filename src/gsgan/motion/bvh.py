@@ -1,149 +1,109 @@
-"""Motion capture in the BVH format, on any character.
-
-Convention: that of :mod:`gsgan.motion.rig`. A file's up axis and left side are found
-from its rest pose, lengths follow from the legs.
-"""
+"""Reads motion capture in the BVH format."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from gsgan.motion.rotations import Array, rotation
+from gsgan.motion.standard import RigMotion
 from gsgan.utils.errors import DataError
 
 
-@dataclass(frozen=True)
-class Bvh:
-    """A parsed file: joints, parents first, and their world rotations since the zero pose.
+@dataclass
+class _Joint:
+    """A joint of the hierarchy; ``parent`` is -1 for the root."""
 
-    Args:
-        names: of the J joints; end sites are called "<joint> end".
-        parents: ``[J]``, -1 for roots.
-        offsets: ``[J, 3]`` from the parent in the zero pose, units and axes of the file.
-        rotations: ``[F, J, 3, 3]`` world, axes of the file.
-        root: ``[F, 3]`` position of the first joint.
-        frame_time: seconds.
-        local: ``[F, J, 3]`` positions in the parent's axes, in place of the offsets, or None where
-            only the root has position channels.
-    """
-
-    names: tuple[str, ...]
-    parents: tuple[int, ...]
-    offsets: Array
-    rotations: Array
-    root: Array
-    frame_time: float
-    local: Array | None = None
-
-    def zero_pose(self) -> Array:
-        """Joints ``[J, 3]`` without any rotation, the first one at the origin."""
-        p = np.zeros((len(self.names), 3))
-        for j, parent in enumerate(self.parents[1:], 1):
-            p[j] = p[parent] + self.offsets[j] if parent >= 0 else self.offsets[j]
-        return p
-
-    def posed(self) -> Array:
-        """Joints ``[F, J, 3]`` of all frames, units and axes of the file."""
-        p = np.zeros((*self.root.shape[:-1], len(self.names), 3))
-        p[:, 0] = self.root
-        for j, parent in enumerate(self.parents[1:], 1):
-            offset = self.offsets[j] if self.local is None else self.local[:, j]
-            if parent < 0:
-                p[:, j] = offset
-            else:
-                p[:, j] = p[:, parent] + (self.rotations[:, parent] @ offset[..., None])[..., 0]
-        return p
+    name: str
+    parent: int
+    offset: Array = field(default_factory=lambda: np.zeros(3))
+    channels: list[str] = field(default_factory=list)
 
 
-def read_bvh(path: Path) -> Bvh:
+def read_bvh(path: Path) -> RigMotion:
     """Reads a BVH file.
 
     Raises:
-        DataError: when it cannot be read, or is not a whole BVH file.
+        DataError: when it cannot be read, or is not a complete BVH file.
     """
     try:
         words = path.read_text(errors="replace").split()
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror}; give a .bvh file") from error
     try:
-        return _parse(words)
+        if words[:1] != ["HIERARCHY"] or "MOTION" not in words:
+            raise ValueError("HIERARCHY and MOTION are expected")
+        split = words.index("MOTION")
+        joints = _read_hierarchy(words[1:split])
+        values, frame_time = _read_values(words[split + 1 :], sum(len(j.channels) for j in joints))
+        return _rig_motion(joints, values, frame_time)
     except (ValueError, IndexError, StopIteration) as error:
         reason = error if isinstance(error, ValueError) else "it ends early"
-        raise DataError(f"{path} is no whole BVH file ({reason}): export it again") from error
+        raise DataError(f"{path} is not a complete BVH file ({reason}): export it again") from error
 
 
-def _parse(words: list[str]) -> Bvh:
-    if words[:1] != ["HIERARCHY"] or "MOTION" not in words:
-        raise ValueError("HIERARCHY and MOTION are expected")
-    names: list[str] = []
-    parents: list[int] = []
-    offsets: list[Array] = []
-    channels: list[list[str]] = []
-    open_joints: list[int] = []
-    split = words.index("MOTION")
-    tree = iter(words[1:split])
-    for word in tree:
+def _read_hierarchy(words: list[str]) -> list[_Joint]:
+    """The joints between HIERARCHY and MOTION, parents first; end sites are called "... end"."""
+    joints: list[_Joint] = []
+    above: list[int] = []
+    rest = iter(words)
+    for word in rest:
         if word in ("ROOT", "JOINT", "End"):
-            if (word == "ROOT") == bool(open_joints):
-                raise ValueError(f"the {word} {next(tree)} is out of place")
-            names.append(next(tree) + " end" * (word == "End"))
-            parents.append(open_joints[-1] if open_joints else -1)
-            channels.append([])
-            offsets.append(np.zeros(3))
-            open_joints.append(len(names) - 1)
-            while (word := next(tree)) != "{":
-                names[-1] += " " + word
+            if (word == "ROOT") == bool(above):
+                raise ValueError(f"the {word} {next(rest)} is out of place")
+            joint = _Joint(next(rest) + " end" * (word == "End"), above[-1] if above else -1)
+            while (word := next(rest)) != "{":
+                joint.name += " " + word
+            above.append(len(joints))
+            joints.append(joint)
         elif word == "OFFSET":
-            offsets[open_joints[-1]] = np.array([float(next(tree)) for _ in range(3)])
+            joints[above[-1]].offset = np.array([float(next(rest)) for _ in range(3)])
         elif word == "CHANNELS":
-            channels[open_joints[-1]] = [next(tree) for _ in range(int(next(tree)))]
+            joints[above[-1]].channels = [next(rest) for _ in range(int(next(rest)))]
         elif word == "}":
-            open_joints.pop()
-    head, numbers = words[split + 1 : split + 6], words[split + 6 :]
+            above.pop()
+    return joints
+
+
+def _read_values(words: list[str], columns: int) -> tuple[Array, float]:
+    """``[F, columns]`` numbers after MOTION, and the seconds between two frames."""
+    head, numbers = words[:5], words[5:]
     if head[0] != "Frames:" or head[2:4] != ["Frame", "Time:"]:
         raise ValueError("'Frames:' and 'Frame Time:' are expected after MOTION")
-    frames, frame_time, columns = int(head[1]), float(head[4]), sum(len(c) for c in channels)
+    frames, frame_time = int(head[1]), float(head[4])
     if frames < 1 or not frame_time > 0 or len(numbers) != frames * columns:
         raise ValueError(
             f"{frames} frames of {columns} numbers, {frame_time:g} s apart, are announced, "
             f"{len(numbers)} numbers found"
         )
-    values = np.array(numbers, dtype=float).reshape(frames, columns)
+    return np.array(numbers, dtype=float).reshape(frames, columns), frame_time
+
+
+def _rig_motion(joints: list[_Joint], values: Array, frame_time: float) -> RigMotion:
+    """World rotations and the root's path from the channels' values ``[F, columns]``."""
+    offsets = np.array([joint.offset for joint in joints])
     if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
         raise ValueError("a number is not finite")
-    rotations = np.empty((frames, len(names), 3, 3))
-    local = np.broadcast_to(np.array(offsets), (frames, len(names), 3)).copy()
-    column = 0
-    for j, parent in enumerate(parents):
-        R = np.eye(3) if parent < 0 else rotations[:, parent]
-        given: list[int] = []  # axes with a position channel
-        for channel in channels[j]:
-            axis = "XYZ".index(channel[0].upper())
+    rotations = np.empty((len(values), len(joints), 3, 3))
+    local = np.broadcast_to(offsets, (len(values), *offsets.shape)).copy()
+    local[:, 0] = 0.0
+    columns = iter(values.T)
+    for j, joint in enumerate(joints):
+        R = np.eye(3) if joint.parent < 0 else rotations[:, joint.parent]
+        moves = np.zeros(len(values), bool)
+        for channel in joint.channels:
+            axis, column = "XYZ".index(channel[0].upper()), next(columns)
             if channel.lower().endswith("rotation"):
-                R = R @ rotation(np.radians(values[:, column, None]) * np.eye(3)[axis])
+                R = R @ rotation(np.radians(column[:, None]) * np.eye(3)[axis])
             else:
-                local[:, j, axis] = values[:, column]
-                given.append(axis)
-            column += 1
-        if parent >= 0 and not local[:, j, given].any():  # some writers count from the offset
+                local[:, j, axis], moves = column, moves | (column != 0)
+        if joint.parent >= 0 and not moves.any():  # some programs count from the offset
             local[:, j] = offsets[j]
         rotations[:, j] = R
-    moving = any(p >= 0 and (local[:, j] != offsets[j]).any() for j, p in enumerate(parents))
-    root = np.where(np.isin(range(3), _axes(channels[0])), local[:, 0], 0.0)
-    return Bvh(
-        tuple(names),
-        tuple(parents),
-        np.array(offsets),
-        rotations,
-        root,
-        frame_time,
-        local if moving or parents.count(-1) > 1 else None,
+    names, parents = zip(*((joint.name, joint.parent) for joint in joints), strict=True)
+    moving = parents.count(-1) > 1 or (local[:, 1:] != offsets[1:]).any()
+    return RigMotion(
+        *(names, parents, offsets, rotations, local[:, 0], frame_time), local if moving else None
     )
-
-
-def _axes(channels: list[str]) -> list[int]:
-    """The axes of a joint's position channels."""
-    return ["XYZ".index(c[0].upper()) for c in channels if c.lower().endswith("position")]

@@ -88,7 +88,7 @@ class Character:
 
 
 @dataclass(frozen=True)
-class Motion:
+class Animation:
     """A character's poses at F moments."""
 
     rotations: Array  # [F, J, 3, 3] world rotations of the bones since the rest pose

@@ -26,6 +26,7 @@ from gsgan.data.proportions import (
     middle,
     upright,
 )
+from gsgan.data.skeletons import bone_lengths
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33, sanitise
 from gsgan.skeleton.sanitise import MIN_TRUNK_JOINTS
@@ -44,7 +45,7 @@ PARENT = {b: a for a, b in MEDIAPIPE33.limbs if b not in TRUNK}
 
 
 @dataclass(frozen=True)
-class Motion:
+class Clip:
     """A person in motion.
 
     Args:
@@ -77,7 +78,7 @@ class Motion:
         return len(self.p)
 
 
-def checked(motion: Motion, least_visibility: float) -> Motion:
+def checked(motion: Clip, least_visibility: float) -> Clip:
     """The motion with unseen landmarks set to NaN.
 
     Shoulders and hips are kept wherever they are finite: without them there is no skeleton. Frames
@@ -133,17 +134,17 @@ def mixed(a: Float, b: Float, share: Float) -> Float:
     return np.where(s > 0, np.where(s < 1, (1 - s) * a + s * b, b), a)
 
 
-def is_own(motion: Motion, subject: Proportions) -> bool:
+def is_own(motion: Clip, subject: Proportions) -> bool:
     """Whether the motion's bones are as long as the subject's: it needs no retargeting."""
     with np.errstate(invalid="ignore"):
-        found = [np.linalg.norm(motion.p[:, b] - motion.p[:, a], axis=-1) for a, b in BONES]
+        found = bone_lengths(motion.p, BONES).T
     seen = [(np.median(x[np.isfinite(x)]), bone) for x, bone in zip(found, BONES, strict=True)
             if np.isfinite(x).any()]  # fmt: skip
     rest = subject.rest
     return bool(seen) and all(abs(x / length(rest, b) - 1) <= OWN for x, b in seen)
 
 
-def up_axis(motion: Motion) -> str:
+def up_axis(motion: Clip) -> str:
     """The axis nearest to the median direction from hips to shoulders, e.g. "-y"."""
     known = np.nan_to_num(motion.p)
     spine = np.median(middle(known, SHOULDERS) - middle(known, HIPS), axis=0)
@@ -151,7 +152,7 @@ def up_axis(motion: Motion) -> str:
     return ("-" if spine[axis] < 0 else "") + AXES[axis]
 
 
-def completed(motion: Motion, up: str) -> Float:
+def completed(motion: Clip, up: str) -> Float:
     """``[F, J, 3]`` every landmark in standard axes, Z up.
 
     Gaps of a joint are interpolated linearly, relative to its parent joint. A joint that fewer than

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from scipy.optimize import nnls
 
 from gsgan.data.joints import FACE_MESH
 from gsgan.data.proportions import BONES, EARS, HAND_JOINTS, HIPS, SHOULDERS, Proportions, length
-from gsgan.motion.clip import Motion, rate_of
+from gsgan.motion.clip import Clip, rate_of
 from gsgan.motion.retarget import steadied
 from gsgan.skeleton import MEDIAPIPE33
 from gsgan.skeleton.face import rest_face
@@ -36,7 +37,7 @@ FACE_LENGTHS = tuple(
 LENGTHS = (*BONES, SHOULDERS, HIPS, EARS, (11, 23), (12, 24))  # rigid, for the scale of axes
 
 
-def read_pose(path: Path, subject: Proportions) -> Motion:
+def read_pose(path: Path, subject: Proportions) -> Clip:
     """MediaPipe's landmarks in a file of the ``pose-format`` package.
 
     Image landmarks with MediaPipe's depth, which agree with those of the hands; without any, world
@@ -51,43 +52,14 @@ def read_pose(path: Path, subject: Proportions) -> Motion:
     Raises:
         DataError: when the package is missing, the file is damaged or has no depth.
     """
-    try:
-        from pose_format import Pose
-    except ImportError:
+    file = _PoseFile(path)
+    name = next((n for n in (IMAGE, WORLD) if n in file.parts), None)
+    if name is None or "Z" not in file.parts[name][2]:
         raise DataError(
-            f"{path} needs the package pose-format: pip install 'gsgan[render]'"
-        ) from None
-    try:
-        pose = Pose.read(path.read_bytes())
-        data = np.ma.getdata(pose.body.data).astype(np.float64)
-        conf = np.asarray(pose.body.confidence, np.float64)
-    except Exception as error:  # its parser raises many kinds
-        raise DataError(f"{path} is not a valid .pose file ({type(error).__name__})") from error
-    if data.ndim != 4 or 0 in data.shape[:2]:
-        raise DataError(f"{path} has no frames with a person; expected a motion")
-    starts, parts = 0, {}
-    for part in pose.header.components:
-        parts[part.name] = (slice(starts, starts + len(part.points)), part.points, part.format)
-        starts += len(part.points)
-    name = next((n for n in (IMAGE, WORLD) if n in parts), None)
-    if name is None or "Z" not in parts[name][2]:
-        raise DataError(
-            f"{path} has {', '.join(parts)} without depth; expected MediaPipe's "
+            f"{path} has {', '.join(file.parts)} without depth; expected MediaPipe's "
             f"{WORLD} or {IMAGE} in 3D"
         )
-
-    def landmarks(part: str, names: tuple[str, ...]) -> tuple[Float, Float]:
-        """``[F, n, 3]`` the points of a part by name, and their confidence ``[F, n]``."""
-        p, seen = np.full((len(data), len(names), 3), np.nan), np.zeros((len(data), len(names)))
-        place, points, layout = parts.get(part, (slice(0), [], ""))
-        for k, point in enumerate(points if "Z" in layout else ()):
-            if (known := point.lower().replace("_finger", "")) in names:
-                j = names.index(known)
-                p[:, j], seen[:, j] = data[:, 0, place][:, k], conf[:, 0, place][:, k]
-        return p, seen
-
-    p, visibility = landmarks(name, MEDIAPIPE33.names)
-    unit = f"{name.lower().replace('_', ' ')}, scaled to the subject"
+    p, visibility = file.landmarks(name, MEDIAPIPE33.names)
     person = visibility[:, SHOULDERS].all(1)
     if hidden := person.any() and np.median(visibility[person][:, HIPS]) < GUESSED:
         visibility[:, HIPS] = 0
@@ -95,8 +67,8 @@ def read_pose(path: Path, subject: Proportions) -> Motion:
     if hidden:
         p[:, HIPS] = p[:, SHOULDERS] + (0, length(subject.rest, (11, 23)), 0)
         visibility[:, HIPS] = visibility[:, SHOULDERS]
-    hands = [landmarks(hand, HAND_NAMES) for hand in HAND_PARTS]
-    face = landmarks(MESH, tuple(str(number) for number in range(MESH_SIZE)))
+    hands = [file.landmarks(hand, HAND_NAMES) for hand in HAND_PARTS]
+    face = file.landmarks(MESH, tuple(str(number) for number in range(MESH_SIZE)))
     if any(seen.any() for _, seen in (*hands, face)):
         whole = subject.rest_with_hands
         rest = [whole[at] for at in HAND_JOINTS.values()]
@@ -107,7 +79,44 @@ def read_pose(path: Path, subject: Proportions) -> Motion:
         ours = list(FACE_MESH.values())
         p = np.concatenate([p, steadied(mesh)[:, ours]], axis=1)
         visibility = np.concatenate([visibility, face[1][:, ours]], axis=1)
-    return Motion(path, p, visibility, rate_of(path, pose.body.fps), None, unit, detached=True)
+    unit = f"{name.lower().replace('_', ' ')}, scaled to the subject"
+    return Clip(path, p, visibility, rate_of(path, file.fps), None, unit, detached=True)
+
+
+class _PoseFile:
+    """A .pose file: ``parts`` has the columns, points and layout of each part by name."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            from pose_format import Pose
+        except ImportError:
+            raise DataError(
+                f"{path} needs the package pose-format: pip install 'gsgan[render]'"
+            ) from None
+        try:
+            pose = Pose.read(path.read_bytes())
+            self.data = np.ma.getdata(pose.body.data).astype(np.float64)
+            self.confidence = np.asarray(pose.body.confidence, np.float64)
+        except Exception as error:  # its parser raises many kinds
+            raise DataError(f"{path} is not a valid .pose file ({type(error).__name__})") from error
+        if self.data.ndim != 4 or 0 in self.data.shape[:2]:
+            raise DataError(f"{path} has no frames with a person; expected a motion")
+        self.fps, self.parts, start = pose.body.fps, dict[str, Any](), 0
+        for part in pose.header.components:
+            columns = slice(start, start := start + len(part.points))
+            self.parts[part.name] = columns, part.points, part.format
+
+    def landmarks(self, part: str, names: tuple[str, ...]) -> tuple[Float, Float]:
+        """``[F, n, 3]`` the points of a part by name, NaN where absent; confidence ``[F, n]``."""
+        shape = len(self.data), len(names)
+        p, seen = np.full((*shape, 3), np.nan), np.zeros(shape)
+        columns, points, layout = self.parts.get(part, (slice(0), [], ""))
+        for k, point in enumerate(points if "Z" in layout else ()):
+            if (known := point.lower().replace("_finger", "")) in names:
+                j = names.index(known)
+                p[:, j] = self.data[:, 0, columns][:, k]
+                seen[:, j] = self.confidence[:, 0, columns][:, k]
+        return p, seen
 
 
 def _to_metres(

@@ -21,15 +21,15 @@ from gsgan.data.formats.capture import SHAPE, read_shape
 from gsgan.data.proportions import EXPRESSION, HIPS, SHOULDERS, Proportions
 from gsgan.data.skeletons import hips_below
 from gsgan.motion.asf import asf_of, read_amc
-from gsgan.motion.bvh import Bvh, read_bvh
-from gsgan.motion.clip import Motion, rate_of
+from gsgan.motion.bvh import read_bvh
+from gsgan.motion.clip import Clip, rate_of
 from gsgan.motion.points import read_points3d
 from gsgan.motion.pose_files import read_pose
 from gsgan.motion.retarget import rig_landmarks
-from gsgan.motion.standard import standard_motion
+from gsgan.motion.standard import RigMotion, standard_motion
 from gsgan.scene import BodyPose
 from gsgan.skeleton import MEDIAPIPE33
-from gsgan.utils.arrays import expect_array
+from gsgan.utils.arrays import as_floats, expect_array
 from gsgan.utils.errors import ConfigError, DataError
 
 Float = NDArray[np.float64]
@@ -46,6 +46,7 @@ ROOT_KEYS = ("Rh", "root_orient", "global_orient")
 MOVE_KEYS = ("trans", "transl", "smpl_trans", "Th")
 SHAPE_KEYS = ("betas", "shapes")
 WITHOUT_ROOT = (63, 69, 153, 162)  # numbers of poses of SMPL-X's body, SMPL, SMPL-H, SMPL-X
+LANDMARK = ("x", "y", "z", "visibility")
 RATE_KEYS = ("fps", "mocap_framerate", "mocap_frame_rate")
 SMPL_BODY = 22  # joints that SMPL, SMPL-H and SMPL-X share
 LEG_UNITS = {"metres": 1.0, "decimetres": 0.1, "centimetres": 0.01, "inches": 0.0254}
@@ -67,7 +68,7 @@ class Source:
     skeleton: Path | None = None
 
 
-def read_motion(path: Path, source: Source) -> Motion:
+def read_motion(path: Path, source: Source) -> Clip:
     """The motion in a file; its suffix decides the format.
 
     Raises:
@@ -89,7 +90,7 @@ def read_motion(path: Path, source: Source) -> Motion:
 # -- numpy's npz: landmarks, body poses, SMPL, MediaPipe
 
 
-def read_npz(path: Path, source: Source) -> Motion:
+def read_npz(path: Path, source: Source) -> Clip:
     """A motion in an npz file; the names of its arrays decide the kind."""
     keys = ("p", "conf", "theta", "visibility", *WORLD_KEYS, *POSE_KEYS, *PART_KEYS, *ROOT_KEYS)
     arrays = read_arrays(path, (*keys, *MOVE_KEYS, *SHAPE_KEYS, *RATE_KEYS))
@@ -102,7 +103,7 @@ def read_npz(path: Path, source: Source) -> Motion:
     for key in WORLD_KEYS:
         if key in arrays:
             p = _with_visibility(path, arrays[key], arrays.get("visibility"))
-            return Motion(path, p[..., :3], p[..., 3], fps, None, "metres")
+            return Clip(path, p[..., :3], p[..., 3], fps, None, "metres")
     if _first(arrays, POSE_KEYS) is not None:
         return _smpl(path, arrays, fps, source)
     raise DataError(
@@ -122,7 +123,7 @@ def _beside(path: Path) -> dict[str, Any]:
     return read_json(meta) if meta.is_file() else {}
 
 
-def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Motion:
+def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Clip:
     meta = _beside(path)
     hands, face = EXPRESSION.start, EXPRESSION.stop
     if arrays["p"].shape[1:] not in ((JOINTS, 3), (hands, 3), (face, 3)):
@@ -143,10 +144,10 @@ def _landmarks(path: Path, arrays: dict[str, Any], fps: float | None) -> Motion:
             p[hung, hip], conf[hung, hip] = placed[hung, hip], conf[hung, shoulder]
     scale = METRES.get(meta.get("unit", "m"), 1.0)
     rate, up = fps or meta.get("fps"), meta.get("up_axis")
-    return Motion(path, p * scale, conf, rate, up, "metres")
+    return Clip(path, p * scale, conf, rate, up, "metres")
 
 
-def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Motion:
+def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Clip:
     theta = expect_array(arrays, "theta", (None, None, 3), path)
     arrays = arrays | {k: arrays[name] for k, name in (("transl", "trans"),) if name in arrays}
     meta = _beside(path)
@@ -162,10 +163,10 @@ def _body_pose(path: Path, arrays: dict[str, Any], fps: float | None, source: So
     body = BodyPose(*(torch.from_numpy(np.nan_to_num(x)).float() for x in (theta, transl)))
     p = subject.posed_landmarks(body).double().numpy()
     p[~np.isfinite(theta).all((1, 2)) | ~np.isfinite(transl).all(1)] = np.nan
-    return Motion(path, p, np.ones(p.shape[:2]), fps, up or "z", "metres", body=body)
+    return Clip(path, p, np.ones(p.shape[:2]), fps, up or "z", "metres", body=body)
 
 
-def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Motion:
+def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source) -> Clip:
     if source.smpl is None:
         raise DataError(
             f"{path} holds SMPL parameters, which give joints only together with the body model: "
@@ -187,10 +188,10 @@ def _smpl(path: Path, arrays: dict[str, Any], fps: float | None, source: Source)
         J0 = model.rest_joints(torch.from_numpy(betas[None]))[0, 0].numpy()
         theta[:, 0], moves = from_zju(theta[:, 0], moves, J0)
     shapes = np.repeat(betas[None], len(poses), axis=0)
-    motion = smpl_motion.Motion(np.arange(len(poses)), theta, moves, shapes)
+    motion = smpl_motion.SmplMotion(np.arange(len(poses)), theta, moves, shapes)
     p, conf = smpl_motion.landmarks_of(model, motion)
     p[~good] = np.nan
-    return Motion(path, p, conf, fps, None, "metres")
+    return Clip(path, p, conf, fps, None, "metres")
 
 
 def _smpl_poses(path: Path, arrays: dict[str, Any]) -> Float:
@@ -243,62 +244,51 @@ def _for_model(theta: Float, model: SkinnedModel) -> Float:
 # -- MediaPipe's world landmarks as JSON
 
 
-def read_mediapipe_json(path: Path, source: Source) -> Motion:
+def read_mediapipe_json(path: Path, source: Source) -> Clip:
     """MediaPipe's results per frame, as its Python, JavaScript or Android API returns them.
 
     A frame is an object with one of `WORLD_KEYS`, or the 33 landmarks themselves; a landmark is
     ``{x, y, z, visibility}`` or a list of these numbers.
     """
-    content = read_json_value(path)
-    fps = content.get("fps") if isinstance(content, dict) else None
-    frames = content
-    if isinstance(content, dict):
-        lists = [
-            v for k, v in content.items() if isinstance(v, list) and k in ("frames", *WORLD_KEYS)
-        ]
-        frames = lists[0] if lists else []
+    frames, fps = read_json_value(path), None
+    if isinstance(frames, dict):
+        fps = frames.get("fps")
+        frames = next((frames[key] for key in ("frames", *WORLD_KEYS) if key in frames), None)
     if not isinstance(frames, list) or not frames:
         raise DataError(
             f"{path} holds no frames; expected a list, or an object with 'frames', of MediaPipe's "
             "pose_world_landmarks"
         )
-    rows = [_landmark_row(path, number, frame) for number, frame in enumerate(frames)]
-    p = np.stack(rows)
-    return Motion(
-        path, p[..., :3], p[..., 3], None if fps is None else rate_of(path, fps), None, "metres"
-    )
+    p = np.stack([_landmark_row(f"{path}, frame {i}", frame) for i, frame in enumerate(frames)])
+    rate = None if fps is None else rate_of(path, fps)
+    return Clip(path, p[..., :3], p[..., 3], rate, None, "metres")
 
 
-def _landmark_row(path: Path, number: int, frame: Any) -> Float:
+def _landmark_row(where: str, frame: Any) -> Float:
     """``[33, 4]`` x, y, z, visibility of a frame; NaN and 0 where no person was detected."""
     found = frame
     if isinstance(frame, dict):
         key = next((key for key in WORLD_KEYS if key in frame), None)
-        found = frame.get(key)
         if key is None:
             raise DataError(
-                f"{path}, frame {number}: no pose_world_landmarks; MediaPipe's other "
-                "landmarks are in image coordinates, without metric depth"
+                f"{where}: no pose_world_landmarks; MediaPipe's other landmarks are in image "
+                "coordinates, without metric depth"
             )
+        found = frame[key]
     if isinstance(found, dict):
         found = found.get("landmark", found.get("landmarks"))
     if isinstance(found, list) and len(found) == 1:
         found = found[0]  # the Tasks API returns a list of people
     if not found:
-        return np.concatenate([np.full((JOINTS, 3), np.nan), np.zeros((JOINTS, 1))], axis=1)
+        return np.repeat([[np.nan, np.nan, np.nan, 0]], JOINTS, axis=0)
     try:
-        rows = [
-            [p["x"], p["y"], p["z"], p.get("visibility", 1.0)] if isinstance(p, dict)
-            else [*p[:3], p[3] if len(p) > 3 else 1.0]
-            for p in found
-        ]  # fmt: skip
-        row = np.array(rows, np.float64)
-    except (KeyError, TypeError, ValueError, IndexError):
-        row = np.zeros(0)
-    if row.shape != (JOINTS, 4):
-        raise DataError(
-            f"{path}, frame {number}: expected {JOINTS} landmarks with x, y, z; found {len(found)}"
-        )
+        rows = [[p.get(k, 1.0 if k == "visibility" else None) for k in LANDMARK]
+                if isinstance(p, dict) else [*p, 1.0][:4] for p in found]  # fmt: skip
+    except TypeError:
+        rows = []
+    row = as_floats(rows)
+    if row.shape != (JOINTS, 4) or np.isnan(row).any():
+        raise DataError(f"{where}: expected {JOINTS} landmarks with x, y, z; found {len(rows)}")
     return row
 
 
@@ -319,20 +309,18 @@ def _with_visibility(path: Path, points: NDArray[Any], visibility: Any) -> Float
 # -- rigs
 
 
-def read_bvh_motion(path: Path, source: Source) -> Motion:
+def read_bvh_motion(path: Path, source: Source) -> Clip:
     """A BVH file of a person; the unit is inferred from the length of the legs."""
-    bvh = read_bvh(path)
-    return _rig(path, bvh, None, source)
+    return _rig(path, read_bvh(path), None, source)
 
 
-def read_amc_motion(path: Path, source: Source) -> Motion:
+def read_amc_motion(path: Path, source: Source) -> Clip:
     """An AMC file and its ASF skeleton."""
-    asf = source.skeleton or asf_of(path)
-    return _rig(path, *read_amc(path, asf), source)
+    return _rig(path, *read_amc(path, source.skeleton or asf_of(path)), source)
 
 
-def _rig(path: Path, bvh: Bvh, metres: float | None, source: Source) -> Motion:
-    standard = standard_motion(bvh, path)
+def _rig(path: Path, motion: RigMotion, metres: float | None, source: Source) -> Clip:
+    standard = standard_motion(motion, path)
     if metres is None:
         ratios = {
             unit: abs(np.log(standard.leg * x / source.subject.leg))
@@ -343,23 +331,23 @@ def _rig(path: Path, bvh: Bvh, metres: float | None, source: Source) -> Motion:
         unit = f"units of {100 * metres:.3g} cm"
     p = rig_landmarks(standard, source.subject)
     seen = np.asarray(np.isfinite(p).all(-1), np.float64)
-    return Motion(path, p, seen, 1 / bvh.frame_time, "z", unit, standard.up)
+    return Clip(path, p, seen, 1 / motion.frame_time, "z", unit, standard.up)
 
 
 # -- triangulated and detected points
 
 
-def read_trc(path: Path, source: Source) -> Motion:
+def read_trc(path: Path, source: Source) -> Clip:
     """Markers triangulated by Pose2Sim; other marker sets are not supported."""
     _, p, conf = read_points3d(path)
     fps = None
     with suppress(ValueError, IndexError):  # read_points3d has read the header
         names, values = (line.split() for line in path.read_text().splitlines()[1:3])
         fps = rate_of(path, float(values[names.index("DataRate")]))
-    return Motion(path, p, conf, fps, None, "metres")
+    return Clip(path, p, conf, fps, None, "metres")
 
 
-READERS: dict[str, Callable[[Path, Source], Motion]] = {
+READERS: dict[str, Callable[[Path, Source], Clip]] = {
     ".npz": read_npz,
     ".json": read_mediapipe_json,
     ".bvh": read_bvh_motion,

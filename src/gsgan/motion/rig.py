@@ -13,7 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gsgan.motion.character import Character, Motion
+from gsgan.motion.character import Animation, Character
 from gsgan.motion.rotations import Array, between, rotation, twist, unit
 
 SIDES = ("Left", "Right")
@@ -107,7 +107,7 @@ def finger_hinges(
 
 
 class Rig:
-    """What posing needs of a character: its bones by name, limb lengths, rest turns and soles."""
+    """The properties of a character that posing uses: bones, limb lengths, rest turns and soles."""
 
     def __init__(self, character: Character) -> None:
         self.character = character
@@ -230,13 +230,13 @@ class Pose:
                 heights.append(self.position(bone)[:, 2] + up.min(axis=-1))
         return np.min(heights, axis=0)
 
-    def motion(self, shapes: Mapping[str, Array], passages: tuple[str, ...]) -> Motion:
+    def motion(self, shapes: Mapping[str, Array], passages: tuple[str, ...]) -> Animation:
         """The finished poses, with the face shapes that the character has."""
         character = self.rig.character
         rotations = np.stack([self.rotation(bone) for bone in character.bones], axis=1)
         joints = np.stack([self.position(bone) for bone in character.bones], axis=1)
         known = {name: weight for name, weight in shapes.items() if name in character.shapes}
-        return Motion(rotations, joints, known, passages)
+        return Animation(rotations, joints, known, passages)
 
 
 def two_bone(target: Array, pole: Array, upper: float, lower: float) -> tuple[Array, Array, Array]:

@@ -14,7 +14,6 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d, minimum_filter1d
 from scipy.spatial.transform import Rotation
 
-from gsgan.motion.bvh import Bvh
 from gsgan.motion.rig import ARM, FINGERS, LEG, REQUIRED, SIDES, SPINE, limb_axes, rest_turns
 from gsgan.motion.rotations import Array, between, blend, rotation, unit
 from gsgan.utils.errors import DataError
@@ -29,8 +28,6 @@ BENT = 0.15  # mean sine of the bend from which a limb's plane is known
 HOVER = 0.06  # legs: feet this high above the lowest of a second stand on the floor; no jump
 ROOM = 0.6  # metres from the origin that a motion may reach before its drift is subtracted
 DRIFT_SECONDS = 0.5  # standard deviation of the smoothing that separates drift from sway
-
-
 # Names of joints without side, in lower case and letters only, first choices first.
 ALIASES = {
     "Hips": "hips hip pelvis root",
@@ -50,7 +47,7 @@ PARTS = {"metacarpal": 1, "proximal": 1, "intermediate": 2, "distal": 3}
 def known_joints(names: tuple[str, ...]) -> dict[str, int]:
     """Mixamo's bone name → index, for joints named as by Mixamo, MakeHuman, CMU, Blender, ….
 
-    Spine, neck and collarbones are not among them: the tree says where they are.
+    Spine, neck and collarbones are not among them: they follow from the tree of joints.
     """
     found: dict[str, tuple[int, int]] = {}
     for j, name in enumerate(names):
@@ -91,6 +88,50 @@ def _stem(stem: str, sided: bool) -> tuple[str, int]:
 
 
 @dataclass(frozen=True)
+class RigMotion:
+    """The motion of a rig as a file has it: joints, parents first, and their world rotations since
+    the zero pose.
+
+    Args:
+        names: of the J joints; end sites are called "<joint> end".
+        parents: ``[J]``, -1 for roots.
+        offsets: ``[J, 3]`` from the parent in the zero pose, units and axes of the file.
+        rotations: ``[F, J, 3, 3]`` world, axes of the file.
+        root: ``[F, 3]`` position of the first joint.
+        frame_time: seconds.
+        local: ``[F, J, 3]`` positions in the parent's axes, in place of the offsets, or None where
+            only the root has position channels.
+    """
+
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    offsets: Array
+    rotations: Array
+    root: Array
+    frame_time: float
+    local: Array | None = None
+
+    def zero_pose(self) -> Array:
+        """Joints ``[J, 3]`` without any rotation, the first one at the origin."""
+        p = np.zeros((len(self.names), 3))
+        for j, parent in enumerate(self.parents[1:], 1):
+            p[j] = p[parent] + self.offsets[j] if parent >= 0 else self.offsets[j]
+        return p
+
+    def posed(self) -> Array:
+        """Joints ``[F, J, 3]`` of all frames, units and axes of the file."""
+        p = np.zeros((*self.root.shape[:-1], len(self.names), 3))
+        p[:, 0] = self.root
+        for j, parent in enumerate(self.parents[1:], 1):
+            offset = self.offsets[j] if self.local is None else self.local[:, j]
+            if parent < 0:
+                p[:, j] = offset
+            else:
+                p[:, j] = p[:, parent] + (self.rotations[:, parent] @ offset[..., None])[..., 0]
+        return p
+
+
+@dataclass(frozen=True)
 class StandardMotion:
     """A file's motion in standard axes, starting towards -Y; by Mixamo's bone name."""
 
@@ -120,7 +161,7 @@ class Reference:
     neutral: bool
 
 
-def standard_motion(bvh: Bvh, path: Path) -> StandardMotion:
+def standard_motion(rig: RigMotion, path: Path) -> StandardMotion:
     """The motion of a tree of joints on the bones that people have.
 
     The joints' own axes are calibrated by the zero pose where that is a standing person, else by
@@ -130,20 +171,20 @@ def standard_motion(bvh: Bvh, path: Path) -> StandardMotion:
     Raises:
         DataError: when a joint of the limbs is not found, or the file holds two people.
     """
-    known = body_joints(bvh, path)
-    posed = bvh.posed()
+    known = body_joints(rig, path)
+    posed = rig.posed()
     up = upward(posed, known)
     known = _by_side(posed, known, up)
-    reference = _reference(bvh, posed, known, up)
+    reference = _reference(rig, posed, known, up)
     same = reference.zero and np.allclose(reference.axes[0, 2], up)
     axes = reference.axes[0] if same else person_axes(posed[:1], known, up)[0]
-    R, turns = _turns(bvh, axes, known, reference)
+    R, turns = _turns(rig, axes, known, reference)
     if not reference.zero:
         _bend_in_plane(turns, {bone: posed[:, j] @ axes.T for bone, j in known.items()})
     ahead = turns["Hips"][0] @ (0.0, -1.0, 0.0)
     yaw = rotation(np.array([0, 0, -np.arctan2(ahead[0], -ahead[1])]))
     turns = {bone: yaw @ turn for bone, turn in turns.items()}
-    turns |= _trunk(bvh, known, yaw @ R)
+    turns |= _trunk(rig, known, yaw @ R)
     joints = {bone: posed[:, j] @ (yaw @ axes).T for bone, j in known.items()}
     hip, knee, ankle = (joints["Left" + bone] for bone in LEG)
     thigh, shin = (np.linalg.norm(a - b, axis=1) for a, b in ((hip, knee), (knee, ankle)))
@@ -152,35 +193,35 @@ def standard_motion(bvh: Bvh, path: Path) -> StandardMotion:
     return StandardMotion(turns, joints, float(np.median(thigh) + np.median(shin)), name)
 
 
-def body_joints(bvh: Bvh, path: Path) -> dict[str, int]:
+def body_joints(rig: RigMotion, path: Path) -> dict[str, int]:
     """Mixamo's bone name → index, with the fingers' ends.
 
     Raises:
         DataError: when a joint of the limbs is not found, or the file holds two people.
     """
-    known = known_joints(bvh.names)
+    known = known_joints(rig.names)
     if missing := [bone for bone in REQUIRED if bone not in known and bone != "Hips"]:
-        names = [name for name in bvh.names if not name.endswith(" end")]
+        names = [name for name in rig.names if not name.endswith(" end")]
         raise DataError(
             f"{path}: no joint found for {', '.join(missing)} among {', '.join(names)}; name the "
             f"joints as Mixamo does (LeftUpLeg, LeftLeg, LeftFoot, LeftArm, LeftForeArm, …)"
         )
-    lines = [_line(bvh, known[side + "UpLeg"]) for side in SIDES]
+    lines = [_line(rig, known[side + "UpLeg"]) for side in SIDES]
     shared = [j for j in lines[0] if j in lines[1]]
     if not shared:
         raise DataError(f"{path}: its legs belong to different roots; give a file of one person")
     known.setdefault("Hips", shared[-1])
     for bone in list(known):
-        ends = [j for j, parent in enumerate(bvh.parents) if parent == known[bone]]
+        ends = [j for j, parent in enumerate(rig.parents) if parent == known[bone]]
         if re.search(r"Hand\D+[23]$", bone) and ends:
             known.setdefault(bone[:-1] + str(int(bone[-1]) + 1), ends[0])
     return known
 
 
-def _line(bvh: Bvh, j: int) -> list[int]:
+def _line(rig: RigMotion, j: int) -> list[int]:
     """The joints above a joint, the root first."""
     line: list[int] = []
-    while (j := bvh.parents[j]) >= 0:
+    while (j := rig.parents[j]) >= 0:
         line.insert(0, j)
     return line
 
@@ -238,12 +279,12 @@ def tilts(p: Array, known: dict[str, int], up: Array) -> Array:
     return np.arccos(np.stack(cosines, axis=-1).clip(-1, 1))
 
 
-def _reference(bvh: Bvh, posed: Array, known: dict[str, int], up: Array) -> Reference:
+def _reference(rig: RigMotion, posed: Array, known: dict[str, int], up: Array) -> Reference:
     """The zero pose, if that is a standing person; else frames."""
-    zero = bvh.zero_pose()
+    zero = rig.zero_pose()
     own = upward(zero[None], known)
     if tilts(zero, known, own).max() < STANDING:
-        eye = np.broadcast_to(np.eye(3), (1, *bvh.rotations.shape[1:]))
+        eye = np.broadcast_to(np.eye(3), (1, *rig.rotations.shape[1:]))
         return Reference(eye, person_axes(zero[None], known, own), zero[None], True, True)
     tilt = tilts(posed, known, up)
     score = tilt.max(axis=-1)
@@ -255,11 +296,11 @@ def _reference(bvh: Bvh, posed: Array, known: dict[str, int], up: Array) -> Refe
         chosen = np.flatnonzero(tilt[:, 0] < max(UPRIGHT, float(tilt[:, 0].min()) + SAME))
     chosen = chosen[:: max(1, len(chosen) // MOST)]
     p = posed[chosen]
-    return Reference(bvh.rotations[chosen], person_axes(p, known, up), p, False, neutral)
+    return Reference(rig.rotations[chosen], person_axes(p, known, up), p, False, neutral)
 
 
 def _turns(
-    bvh: Bvh, axes: Array, known: dict[str, int], reference: Reference
+    rig: RigMotion, axes: Array, known: dict[str, int], reference: Reference
 ) -> tuple[Array, dict[str, Array]]:
     """Turns ``[F, J, 3, 3]`` of all joints, and of the known bones with their turns at rest."""
     back = reference.axes.mT
@@ -270,7 +311,7 @@ def _turns(
     ]
     if not reference.neutral:
         _follow_positions(at_rest, known, reference)
-    R = axes @ bvh.rotations
+    R = axes @ rig.rotations
     turns = {}
     for bone, j in known.items():
         if bone.endswith("4"):  # a finger's tip follows its last bone
@@ -339,10 +380,10 @@ def drift(path: Array, step: float) -> Array:
     return np.asarray(smooth[pad : pad + len(path)])
 
 
-def _trunk(bvh: Bvh, known: dict[str, int], R: Array) -> dict[str, Array]:
+def _trunk(rig: RigMotion, known: dict[str, int], R: Array) -> dict[str, Array]:
     """Turns of spine, neck and collarbones, whatever their number, by their place in the tree."""
 
-    left, right, legs = (_line(bvh, known[b]) for b in ("LeftArm", "RightArm", "LeftUpLeg"))
+    left, right, legs = (_line(rig, known[b]) for b in ("LeftArm", "RightArm", "LeftUpLeg"))
     spine = [j for j in left if j in right and j not in (*legs, known["Hips"])]
     chain, turns = [R[:, j] for j in (known["Hips"], *spine)], {}
     for k, bone in enumerate(SPINE, 1):
@@ -350,7 +391,7 @@ def _trunk(bvh: Bvh, known: dict[str, int], R: Array) -> dict[str, Array]:
         low = int(at)
         turns[bone] = blend(chain[low], chain[min(low + 1, len(spine))], at - low)
     if "Head" in known:
-        neck = [j for j in _line(bvh, known["Head"]) if j not in left]
+        neck = [j for j in _line(rig, known["Head"]) if j not in left]
         turns["Neck"] = R[:, neck[0]] if neck else blend(chain[-1], R[:, known["Head"]], 0.5)
     for side, line, other in (("Left", left, right), ("Right", right, left)):
         if collar := [j for j in line if j not in other]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from gsgan.data.joints import ALL, BODY, FACE, HANDS, PALM, WRISTS, known
-from gsgan.prepare.rig import Bool, Float
+from gsgan.data.skeletons import bone_lengths
+from gsgan.prepare.camera_array import Bool, Float
 from gsgan.skeleton.hands import FINGER_BONES, HAND
-from gsgan.utils.checks import above, at_least
 
 Bones = tuple[tuple[int, int], ...]
 # Bones of constant length, as (inner, outer) joint: the outer one is removed when it differs.
@@ -21,37 +19,15 @@ HAND_ROOTS = [BODY, BODY + HAND]
 HAND_BONES = tuple((start, start + knuckle) for start in HAND_ROOTS for knuckle in PALM)
 FINGERS = tuple((start + a, start + b) for start in HAND_ROOTS for a, b in FINGER_BONES)
 FINGER_NOISE = 0.02  # metres by which noise alone changes the length of a finger's bone
+MAX_REACH = 1.5  # metres from the median joint of the frame
+BONE, HAND_BONE, FINGER_BONE = 0.3, 0.3, 0.5  # shares by which a length may differ from its median
+WRIST = 0.1  # metres from the pose's wrist to the hand's, at most
+FACE_RADIUS = 0.15  # metres from the middle of the face, at most
 DEGREE = 2  # of the polynomial that smooths
 REACH = 3  # standard deviations at which the smoothing kernel ends
 
 
-@dataclass(frozen=True)
-class Cleansing:
-    """What counts as impossible, see conf/prepare.yaml."""
-
-    max_reach: float = 1.5
-    bone: float = 0.3
-    hand_bone: float = 0.3
-    finger_bone: float = 0.5
-    wrist: float = 0.1
-    face: float = 0.15
-
-    def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            above(f"cleansing.{name}", value)
-
-
-@dataclass(frozen=True)
-class Smoothing:
-    """How trajectories are smoothed, see conf/prepare.yaml."""
-
-    seconds: float = 0.02
-
-    def __post_init__(self) -> None:
-        at_least("smoothing.seconds", self.seconds, 0)
-
-
-def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
+def cleanse(p: Float) -> tuple[Float, dict[str, int]]:
     """Points ``p [F, J, 3]`` with the impossible ones set to NaN; how many, by reason.
 
     Convention: of a bone with the wrong length the outer end is removed; of a hand with most palm
@@ -62,34 +38,28 @@ def cleanse(p: Float, settings: Cleansing) -> tuple[Float, dict[str, int]]:
     centre = np.full((len(p), 1, 3), np.nan)
     rows = seen.any(1)
     centre[rows, 0] = np.nanmedian(p[rows], axis=1)
-    far = seen & (np.linalg.norm(p - centre, axis=-1) > settings.max_reach)
+    far = seen & (np.linalg.norm(p - centre, axis=-1) > MAX_REACH)
     if p.shape[1] == ALL:
         gap = np.linalg.norm(p[:, HAND_ROOTS] - p[:, WRISTS], axis=-1)
-        far[:, HANDS] |= (gap > settings.wrist).repeat(HAND, axis=1)
+        far[:, HANDS] |= (gap > WRIST).repeat(HAND, axis=1)
         rows = seen[:, FACE].any(1)
         middle = np.nanmedian(p[rows, FACE], axis=1, keepdims=True)
-        far[rows, FACE] |= np.linalg.norm(p[rows, FACE] - middle, axis=-1) > settings.face
+        far[rows, FACE] |= np.linalg.norm(p[rows, FACE] - middle, axis=-1) > FACE_RADIUS
     far &= seen
     p[far] = np.nan
     wrong = np.zeros(far.shape, bool)
-    for (_, joint), bad in zip(BODY_BONES, _off(p, BODY_BONES, settings.bone).T, strict=True):
+    for (_, joint), bad in zip(BODY_BONES, _off(p, BODY_BONES, BONE).T, strict=True):
         wrong[:, joint] |= bad
     if p.shape[1] == ALL:
-        palms = _off(p, HAND_BONES, settings.hand_bone).reshape(len(p), 2, len(PALM))
+        palms = _off(p, HAND_BONES, HAND_BONE).reshape(len(p), 2, len(PALM))
         most = palms.sum(-1) * 2 > len(PALM)
         wrong[:, HANDS] |= most.repeat(HAND, axis=1)
-        fingers = _off(p, FINGERS, settings.finger_bone, FINGER_NOISE).T
+        fingers = _off(p, FINGERS, FINGER_BONE, FINGER_NOISE).T
         for (_, joint), bad in zip(FINGERS, fingers, strict=True):
             wrong[:, joint] |= bad
     wrong &= known(p)
     p[wrong] = np.nan
     return p, {"too far away": int(far.sum()), "bone length": int(wrong.sum())}
-
-
-def bone_lengths(p: Float, bones: Bones) -> Float:
-    """``[F, B]`` metres, NaN where an end is missing."""
-    ends = np.array(bones)
-    return np.asarray(np.linalg.norm(p[:, ends[:, 1]] - p[:, ends[:, 0]], axis=-1))
 
 
 def _off(p: Float, bones: Bones, share: float, least: float = 0.0) -> Bool:

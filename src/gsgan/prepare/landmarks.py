@@ -13,7 +13,7 @@ from gsgan.data.files import read_arrays, read_json
 from gsgan.data.joints import ALL, BODY, FACE, FACE_MESH, FROM_HANDS, LEFT, RIGHT, SETS, known
 from gsgan.data.skeletons import whole_frame_ids
 from gsgan.motion.points import Numbered, json_files
-from gsgan.prepare.rig import Float, Ints
+from gsgan.prepare.camera_array import Float, Ints
 from gsgan.skeleton.hands import HAND
 from gsgan.utils.arrays import expect_array
 from gsgan.utils.errors import DataError
@@ -162,18 +162,3 @@ def _person(person: Mapping[str, Any], keys: tuple[str, ...]) -> tuple[Float, Fl
         if conf[target] == 0:
             px[target], conf[target] = px[origin], conf[origin]
     return px, conf
-
-
-def without_frozen(p: Float, frames: int) -> tuple[Float, int]:
-    """Points ``p [F, J, 3]`` without gaps that another tool filled, and how many were removed.
-
-    Of a run of exactly equal points, ``frames`` long or longer, only the first stays.
-    """
-    same = np.zeros(p.shape[:2], bool)
-    same[1:] = (np.diff(p, axis=0) == 0).all(-1)
-    frozen = np.zeros_like(same)
-    for j in range(p.shape[1]):
-        edges = np.flatnonzero(np.diff(np.r_[False, same[:, j], False]))
-        for start, end in edges.reshape(-1, 2):
-            frozen[start:end, j] = end - start + 1 >= frames
-    return np.where(frozen[..., None], np.nan, p), int(frozen.sum())

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from gsgan.prepare.options import MEDIAPIPE, MediaPipe, Options
-from gsgan.prepare.sources import Source
-from gsgan.prepare.work import Advance, Work, each_camera
+from gsgan.prepare.sources import Recording
+from gsgan.prepare.stages import Advance, StageFolder, each_camera
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root, writing
 
@@ -28,14 +28,16 @@ def environment_of(tool: MediaPipe) -> Path:
     return Path(tool.folder or cache_root() / "tools" / "mediapipe-0.10.21").expanduser()
 
 
-def tool_key(tool: MediaPipe) -> list[object]:
+def tool_key() -> list[str]:
     """What the detections depend on."""
-    files = SCRIPT.read_text(), REQUIREMENTS.read_text()
-    return [*files, tool.confidence, tool.tracking, tool.margin]
+    return [SCRIPT.read_text(), REQUIREMENTS.read_text()]
 
 
 def run_tool(
-    options: Options, sources: Mapping[str, Source], work: Work, say: Callable[[str], None]
+    options: Options,
+    sources: Mapping[str, Recording],
+    stages: StageFolder,
+    say: Callable[[str], None],
 ) -> tuple[dict[str, Path], dict[str, dict[int, Path]]]:
     """The npz of landmarks and the masks by frame number of each source; runs what is not stored.
 
@@ -47,8 +49,8 @@ def run_tool(
     parts = {"hands": options.hands, "face": options.face}
     results, folders = {}, {}
     for name, source in sources.items():
-        key = [source.fingerprint(), source.rotate, tool_key(tool), parts, masks]
-        folders[name] = work.place(f"mediapipe-{name}", key)
+        key = [source.fingerprint(), source.rotate, tool_key(), parts, masks]
+        folders[name] = stages.path(f"mediapipe-{name}", key)
         results[name] = folders[name].with_suffix(".npz")
     # The npz is written last: where it exists, the masks are complete, too.
     missing = [name for name in sources if not results[name].is_file()]
@@ -63,7 +65,7 @@ def run_tool(
                 **parts,
                 "rotate": sources[name].rotate,
                 "slot": missing.index(name) % options.workers,
-                **vars(tool),
+                "threads": tool.threads,
             }
             command = [str(python), str(SCRIPT), json.dumps(given)]
             _detect(command, sources[name].path, advance)

@@ -10,12 +10,17 @@ from typing import Any
 from gsgan.data.calibration import Calibration, find_calibration, read_calibration
 from gsgan.data.cameras import CameraEntry
 from gsgan.motion.points import UNITS
-from gsgan.prepare.doubts import Doubts
-from gsgan.prepare.pictures import MaskTidying, PictureFiles
-from gsgan.prepare.rig import MIN_VIEWS
-from gsgan.prepare.solve import Settings
-from gsgan.prepare.sources import Source, find_sources, fit_size, matching_cameras, pair_cameras
-from gsgan.utils.checks import above, at_least, between, one_of, whole
+from gsgan.prepare.camera_array import MIN_VIEWS
+from gsgan.prepare.solve import SolveSettings
+from gsgan.prepare.sources import (
+    Recording,
+    find_sources,
+    fit_size,
+    matching_cameras,
+    pair_cameras,
+    recording_notes,
+)
+from gsgan.utils.checks import above, between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
 MEDIAPIPE = "mediapipe"
@@ -30,26 +35,6 @@ class MediaPipe:
     folder: str | None = None
     python: str | None = None
     threads: int = 1
-    confidence: float = 0.5
-    tracking: float = 0.5
-    margin: float = 0.15
-
-    def __post_init__(self) -> None:
-        between("mediapipe.confidence", self.confidence, 0, 1)
-        between("mediapipe.tracking", self.tracking, 0, 1)
-        at_least("mediapipe.margin", self.margin, 0)
-
-
-@dataclass(frozen=True)
-class Overlays:
-    """Images in the report, see conf/prepare.yaml."""
-
-    frames: int = 4
-    size: int = 420
-
-    def __post_init__(self) -> None:
-        whole("overlays.frames", self.frames, 0)
-        whole("overlays.size", self.size, 1)
 
 
 @dataclass(frozen=True)
@@ -82,11 +67,10 @@ class Options:
     overwrite: bool = False
     keep_work: bool = True
     mediapipe: MediaPipe = field(default_factory=MediaPipe)
-    solve: Settings = field(default_factory=Settings)
-    mask_tidying: MaskTidying = field(default_factory=MaskTidying)
-    pictures: PictureFiles = field(default_factory=PictureFiles)
-    doubts: Doubts = field(default_factory=Doubts)
-    overlays: Overlays = field(default_factory=Overlays)
+    solve: SolveSettings = field(default_factory=SolveSettings)
+    mask_levels: tuple[float, float] = (0.3, 0.8)
+    scale: float = 1.0
+    format: str = "jpg"
 
     def __post_init__(self) -> None:
         for name, what in (("source", "folder with the videos"), ("out", "folder to make")):
@@ -100,6 +84,10 @@ class Options:
         if self.fps is not None:
             above("fps", self.fps)
         whole("workers", self.workers, 1)
+        above("scale", between("scale", self.scale, 0, 1))
+        one_of("format", self.format, ("jpg", "png"))
+        if len(self.mask_levels) != 2 or not 0 <= self.mask_levels[0] < self.mask_levels[1] <= 1:
+            raise ConfigError(f"mask_levels must rise within 0..1, got {self.mask_levels}")
         for name in ("cameras", "offsets"):
             given = getattr(self, name)
             if given is not None and not isinstance(given, Mapping):
@@ -127,7 +115,7 @@ class Options:
 class Inputs:
     """Images and the cameras that took them."""
 
-    sources: Mapping[str, Source]
+    sources: Mapping[str, Recording]
     calibration: Calibration
     cameras: tuple[CameraEntry, ...]  # in the order of the sources, with their names and sizes
     notes: tuple[str, ...]  # one sentence for each thing that was converted or left out
@@ -168,6 +156,7 @@ def read_inputs(options: Options) -> Inputs:
         notes += [] if note is None else [note]
     if unused := sorted(set(calibration.cameras) - set(pairs.values())):
         notes.append(f"calibrated without a video, left out: {', '.join(unused)}")
+    notes += recording_notes(sources)
     rates = sorted(source.fps for source in sources.values() if source.fps)
     if options.fps is None and not rates:
         raise ConfigError("images have no frame rate; give fps=<frames per second>")

@@ -2,36 +2,38 @@
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 
+from gsgan.check.run import check_capture
 from gsgan.data.joints import BODY, FACE, HANDS, known
 from gsgan.data.splits import parse_frames
+from gsgan.data.validation import Thresholds, check_distance
 from gsgan.motion.points import read_points3d
-from gsgan.prepare import doubts, landmarks
+from gsgan.prepare import landmarks
+from gsgan.prepare.camera_array import Bool, CameraArray, Float, Ints, undistort_points
+from gsgan.prepare.dataset import Outcome, exists, publish, write_files
+from gsgan.prepare.images import Written, check_values, find_masks, write_images
 from gsgan.prepare.landmarks import Detections
 from gsgan.prepare.mediapipe import run_tool, tool_key
 from gsgan.prepare.options import MEDIAPIPE, Inputs, Options, read_inputs
-from gsgan.prepare.pictures import Written, check_values, find_masks, write_pictures
-from gsgan.prepare.report import Outcome, write_report, write_small_files
-from gsgan.prepare.rig import Bool, Ints, Rig, camera_moves, undistort_points
 from gsgan.prepare.solve import Solution, adopt, solve
 from gsgan.prepare.sources import stamp
-from gsgan.prepare.work import Advance, Work, digest, each_camera, is_there, publish
+from gsgan.prepare.stages import Advance, StageFolder, digest, each_camera
+from gsgan.prepare.summary import print_summary, summarise
+from gsgan.prepare.triangulate import plain
 from gsgan.utils.errors import DataError
+from gsgan.utils.files import write_json
 
-STAGE_VERSION = 4  # incremented when the same settings begin to give another result
+STAGE_VERSION = 5  # incremented when the same settings begin to give another result
 
 
 def prepare(options: Options, console: Console) -> Path:
-    """Makes the dataset ``options.out``; the same dataset that exists already is left alone.
+    """Makes the dataset ``options.out`` and checks it; the same dataset that exists is left alone.
 
     Returns:
         Its folder.
@@ -42,36 +44,30 @@ def prepare(options: Options, console: Console) -> Path:
     out = options.folder("out")
     inputs = read_inputs(options)
     key = digest([STAGE_VERSION, options.record(), _fingerprint(options, inputs)])
-    if is_there(out, key, options.overwrite):
+    if exists(out, key, options.overwrite):
         console.print(f"{out} exists already, made from the same images and settings")
         return out
-    work = Work(out.parent / f".{out.name}.prepare")
-    detections, masks = _read_people(options, inputs, work, console)
+    stages = StageFolder(out.parent / f".{out.name}.prepare")
+    detections, masks = _read_people(options, inputs, stages, console)
     if options.landmarks3d is None:
-        frames, solution = _solved(options, inputs, detections, work, console)
+        frames, solution = _solved(options, inputs, detections, console)
     else:
         frames, solution = _adopted(options, inputs)
-    root = work.place("dataset", key)
+    root = stages.path("dataset", key)
     shutil.rmtree(root, ignore_errors=True)  # of a run that was killed
-    written = _write_pictures(options, inputs, masks, frames, solution, root)
+    written = _write_images(options, inputs, masks, frames, solution, root)
     outcome = Outcome(options, inputs, frames, solution, written)
-    write_small_files(root, outcome, key)
-    moves, limits = camera_moves(Rig.of(inputs.cameras), solution.rig), options.doubts
-    names, clocks = list(inputs.sources), (solution.delay, solution.gain)
-    found = [
-        *doubts.doubts_about_sources(inputs.sources, limits),
-        *doubts.doubts_about_pictures(inputs.sources, written, limits),
-        *doubts.doubts_about_detections(detections, limits),
-        *doubts.doubts_about_solution(solution, names, *moves, *clocks, limits),
-    ]
-    write_report(root, outcome, found, console)
+    write_files(root, outcome, key)
+    numbers = summarise(outcome, detections)
+    write_json(root / "prepare.json", numbers)
     publish(root, out)
-    work.forget_others()
+    stages.remove_others()
     if not options.keep_work:
-        shutil.rmtree(work.folder, ignore_errors=True)
+        shutil.rmtree(stages.folder, ignore_errors=True)
+    check_capture(out, out / "check.html", console)
+    print_summary(numbers, console)
     lines = (
-        f"{out} is ready; look at {out / 'report.html'}, then",
-        f"python -m gsgan.check data=capture data.root={out}",
+        f"{out} is ready; look at {out / 'check.html'}, then",
         f"python -m gsgan.fit data=capture data.root={out}",
         f"python -m gsgan.train data=capture data.root={out}",
     )
@@ -87,17 +83,17 @@ def _fingerprint(options: Options, inputs: Inputs) -> list[object]:
         if getattr(options, name) not in (None, MEDIAPIPE):
             place = options.folder(name)
             parts += [stamp(p) for p in sorted((place, *place.rglob("*"))) if p.is_file()]
-    return [*parts, tool_key(options.mediapipe) if options.needs_tool else None]
+    return [*parts, tool_key() if options.needs_tool else None]
 
 
 def _read_people(
-    options: Options, inputs: Inputs, work: Work, console: Console
+    options: Options, inputs: Inputs, stages: StageFolder, console: Console
 ) -> tuple[dict[str, Detections], dict[str, dict[int, Path]]]:
     """2D landmarks, none where 3D joints are given, and masks by the camera's own frame numbers."""
     names, found = list(inputs.sources), dict[str, Path]()
     masks: dict[str, dict[int, Path]] = {}
     if options.needs_tool:
-        found, masks = run_tool(options, inputs.sources, work, console.print)
+        found, masks = run_tool(options, inputs.sources, stages, console.print)
     if options.masks != MEDIAPIPE:
         masks = find_masks(options.folder("masks"), names)
         for name, files in masks.items():
@@ -110,13 +106,9 @@ def _read_people(
 
 
 def _solved(
-    options: Options,
-    inputs: Inputs,
-    detections: Mapping[str, Detections],
-    work: Work,
-    console: Console,
+    options: Options, inputs: Inputs, detections: Mapping[str, Detections], console: Console
 ) -> tuple[Ints, Solution]:
-    """Triangulates 2D landmarks, or loads the result of an earlier run on the same ones."""
+    """The joints and cameras that fit the 2D landmarks of the chosen frames."""
     frames, px, conf = landmarks.gather(detections, options.offsets or {})
     chosen = _chosen(options, frames)
     joints = slice(None if options.hands or options.face else BODY)
@@ -124,20 +116,12 @@ def _solved(
     for part, wanted in ((HANDS, options.hands), (FACE, options.face)):
         conf[:, :, part] *= wanted
     px, conf = landmarks.inside(px, conf, np.array([c.size[::-1] for c in inputs.cameras]))
-    time, rig, lag = frames / inputs.fps, Rig.of(inputs.cameras), options.doubts.lag
+    cameras = CameraArray.of(inputs.cameras)
     uv = np.stack([undistort_points(c, p) for c, p in zip(inputs.cameras, px, strict=True)])
-    flat = uv.reshape(len(rig), -1, 2), conf.reshape(len(rig), -1)
-    rough = options.solve.triangulation.plain(rig, *flat)
-    doubts.check_distance(inputs.cameras, rough, options.doubts, inputs.calibration.path)
-    arrays = (rig.K, rig.R, rig.t, uv, conf, time)
-    hashes = [hashlib.sha256(array.tobytes()).hexdigest() for array in arrays]
-    key = [STAGE_VERSION, options.record()["solve"], lag, hashes]
-
-    def make() -> dict[str, NDArray[Any]]:
-        with console.status("finding 3D joints and refining the cameras"):
-            return solve(rig, time, uv, conf, options.solve, lag).to_arrays()
-
-    return frames, Solution.from_arrays(work.arrays("solution", key, make))
+    flat = uv.reshape(len(cameras), -1, 2), conf.reshape(len(cameras), -1)
+    _check_distance(inputs, plain(cameras, *flat))
+    with console.status("finding 3D joints and refining the cameras"):
+        return frames, solve(cameras, frames / inputs.fps, uv, conf, options.solve)
 
 
 def _adopted(options: Options, inputs: Inputs) -> tuple[Ints, Solution]:
@@ -145,10 +129,18 @@ def _adopted(options: Options, inputs: Inputs) -> tuple[Ints, Solution]:
     frames, p, conf = read_points3d(options.folder("landmarks3d"))
     chosen = _chosen(options, frames)
     frames, p, conf = frames[chosen], p[chosen], conf[chosen]
-    where, limits = inputs.calibration.path, options.doubts
-    doubts.check_distance(inputs.cameras, p.reshape(-1, 3), limits, where)
-    rig, time = Rig.of(inputs.cameras), frames / inputs.fps
-    return frames, adopt(rig, time, p, conf, options.solve, limits.frozen_frames)
+    _check_distance(inputs, p.reshape(-1, 3))
+    cameras = CameraArray.of(inputs.cameras)
+    return frames, adopt(cameras, frames / inputs.fps, p, conf, options.solve)
+
+
+def _check_distance(inputs: Inputs, p: Float) -> None:
+    """Refuses a capture whose cameras are implausibly near or far; NaN in ``p [N, 3]``: missing."""
+    where, seen = inputs.calibration.path, p[known(p)]
+    if not len(seen):
+        raise DataError(f"{where}: no joint was seen by two cameras; do frame numbers agree?")
+    hint = "is the calibration in another unit? Set unit=mm, cm or m"
+    check_distance(where, inputs.cameras, seen, Thresholds.distance, hint)
 
 
 def _chosen(options: Options, frames: Ints) -> Bool:
@@ -161,7 +153,7 @@ def _chosen(options: Options, frames: Ints) -> Bool:
     return chosen
 
 
-def _write_pictures(
+def _write_images(
     options: Options,
     inputs: Inputs,
     masks: Mapping[str, Mapping[int, Path]],
@@ -180,6 +172,8 @@ def _write_pictures(
 
     def one(name: str, advance: Advance) -> Written:
         given = cameras[name], inputs.sources[name], masks[name], posed, offsets.get(name, 0)
-        return write_pictures(root, *given, options.pictures, options.mask_tidying, advance)
+        return write_images(
+            root, *given, options.scale, options.format, options.mask_levels, advance
+        )
 
     return each_camera(one, "writing images", list(cameras), options.workers)

@@ -2,49 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from gsgan.data.joints import ALL, BODY, FLIP_GROUPS, HAND_PAIRS, HANDS, WRISTS, known
-from gsgan.prepare.cleanse import Cleansing, Smoothing, cleanse, smooth
-from gsgan.prepare.hands import HandMatching, match_hands, misfits
-from gsgan.prepare.landmarks import without_frozen
-from gsgan.prepare.rig import FOCAL, MIN_VIEWS, Bool, Float, Ints, Refinement, Rig, refine_rig
-from gsgan.prepare.triangulate import FlipSearch, Points, Triangulation, apply_flips, find_flips
+from gsgan.data.skeletons import frozen_joints
+from gsgan.prepare.camera_array import (
+    FOCAL,
+    MIN_VIEWS,
+    Bool,
+    CameraArray,
+    Float,
+    Ints,
+    refine_cameras,
+)
+from gsgan.prepare.cleanse import cleanse, smooth
+from gsgan.prepare.hands import match_hands, misfits
+from gsgan.prepare.triangulate import SCALE, Triangulated, apply_flips, find_flips, plain, robust
 from gsgan.skeleton.hands import HAND
+from gsgan.utils.arrays import evenly_spaced
+from gsgan.utils.checks import above, at_least, whole
 
-ARRAYS = ("p", "conf", "views", "error", "uv", "seen", "flips", "left_out", "delay", "gain")
+REFINED = 200  # most frames that refine the cameras, evenly spaced
+FROZEN = 8  # equal positions in a row: another tool filled a gap
+LAG = 6  # frames by which clocks are compared, either way
 
 
 @dataclass(frozen=True)
-class Settings:
-    """The settings of every stage."""
+class SolveSettings:
+    """What the solution depends on, see conf/prepare.yaml."""
 
-    triangulation: Triangulation = field(default_factory=Triangulation)
-    flips: FlipSearch = field(default_factory=FlipSearch)
-    hands: HandMatching = field(default_factory=HandMatching)
-    refinement: Refinement = field(default_factory=Refinement)
-    cleansing: Cleansing = field(default_factory=Cleansing)
-    smoothing: Smoothing = field(default_factory=Smoothing)
+    min_confidence: float = 0.1
+    refinements: int = 2
+    rotation_prior: float = 2.0
+    position_prior: float = 0.05
+    smoothing: float = 0.02
+
+    def __post_init__(self) -> None:
+        whole("solve.refinements", self.refinements, 0)
+        above("solve.rotation_prior", self.rotation_prior)
+        above("solve.position_prior", self.position_prior)
+        at_least("solve.smoothing", self.smoothing, 0)
 
 
 @dataclass(frozen=True)
 class Solution:
     """Joints, cameras, and how well they agree; NaN = missing or not seen."""
 
-    rig: Rig  # refined
+    cameras: CameraArray  # refined
     p: Float  # [F, J, 3] metres
     conf: Float  # [F, J] mean confidence of the cameras that see the joint, 0 where missing
     views: Ints  # [F, J] cameras whose detection lies within the triangulation's scale
     error: Float  # [C, F, J] final reprojection error, full-size undistorted pixels
-    uv: Float  # [C, F, J, 2] undistorted detections with the sides corrected
+    uv: Float  # [C, F, J, 2] undistorted detections, left and right corrected
     seen: Float  # [C, F, J] their confidence
-    flips: Bool  # [C, F, G] sides that were swapped: of `FLIP_GROUPS`, then of the hands
-    left_out: Bool  # [C, F, 2] detected hands that are none of the person's two, or a repeat
+    flips: Bool  # [C, F, G] where left and right were swapped: `FLIP_GROUPS`, then the hands
+    left_out: Bool  # [C, F, 2] detected hands that are not the person's, or are repeats
     delay: Float  # [C] of each camera's clock, see `clock_errors`
     gain: Float  # [C] the same
     stages: dict[str, Float]  # name of each stage and its body errors [C, F, 33]
@@ -52,7 +66,7 @@ class Solution:
 
     @property
     def swapped(self) -> Bool:
-        """``[C, F]`` where sides of the body were swapped."""
+        """``[C, F]`` where left and right of the body were swapped."""
         return np.asarray(self.flips[..., : len(FLIP_GROUPS)].any(-1))
 
     @property
@@ -60,119 +74,66 @@ class Solution:
         """``[C, F]`` where the hands were swapped."""
         return np.asarray(self.flips[..., len(FLIP_GROUPS) :].any(-1))
 
-    def off(self, limit: float) -> Bool:
-        """``[C]`` cameras whose median error, of all landmarks, is above the limit, in thousandths
-        of the focal length: those of a body alone are vague where it is near."""
-        errors = np.array([median(error) for error in self.error])
-        return np.asarray(errors > limit * self.rig.focal / FOCAL)
 
-    def to_arrays(self) -> dict[str, NDArray[Any]]:
-        """All of it as plain arrays."""
-        return {
-            **{name: getattr(self, name) for name in ARRAYS},
-            **{f"rig {name}": value for name, value in vars(self.rig).items()},
-            **{f"stage {name}": value for name, value in self.stages.items()},
-            **{f"removed {name}": np.array(count) for name, count in self.removed.items()},
-        }
+@dataclass(frozen=True)
+class Corrected:
+    """Detections with left and right corrected, and the points triangulated from them."""
 
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Solution:
-        """The inverse of `to_arrays`."""
-
-        def group(start: str) -> dict[str, NDArray[Any]]:
-            return {
-                key.removeprefix(start): a for key, a in arrays.items() if key.startswith(start)
-            }
-
-        return cls(
-            rig=Rig(**group("rig ")),
-            stages=group("stage "),
-            removed={name: int(count) for name, count in group("removed ").items()},
-            **{name: arrays[name] for name in ARRAYS},
-        )
+    uv: Float  # [C, F, J, 2]
+    weight: Float  # [C, F, J]
+    flips: Bool  # [C, F, G] as in `Solution`
+    left_out: Bool  # [C, F, 2]
+    points: Triangulated  # of F * J
 
 
 def solve(
-    rig: Rig, time: Float, uv: Float, conf: Float, settings: Settings, lag: int = 0
+    cameras: CameraArray, time: Float, uv: Float, conf: Float, settings: SolveSettings
 ) -> Solution:
     """All stages: plain, robust, flips, refined, smoothed.
 
     Args:
-        rig: as calibrated.
+        cameras: as calibrated.
         time: ``[F]`` seconds.
         uv: ``[C, F, J, 2]`` undistorted pixels, NaN = not seen; J is 33, or 105 with hands
             and face.
         conf: ``[C, F, J]`` 0 = not seen.
         settings: of every stage.
-        lag: frames tried either way when clocks are compared; 0 skips it.
     """
-    triangulation, given, pixels, full = settings.triangulation, rig, uv, conf
-    hands = uv.shape[2] == ALL
-    groups = (*FLIP_GROUPS, HAND_PAIRS) if hands else FLIP_GROUPS
-    rig, uv = rig.normalised(uv)
-    start, conf = rig, np.where(conf > triangulation.min_confidence, conf, 0.0)
-    flips = np.zeros((*conf.shape[:2], len(groups)), bool)
-    left_out = np.zeros((*conf.shape[:2], 2), bool)
-    sided, weight = uv, conf
-
-    def triangulate() -> Points:
-        nonlocal flips, left_out, sided, weight
-        sided, weight = uv, conf
-        if settings.flips.enabled:
-            body = find_flips(rig, uv, conf, FLIP_GROUPS, settings.flips, triangulation)
-            flips[..., : len(FLIP_GROUPS)] = body
-            sided, weight = (apply_flips(v, body, FLIP_GROUPS) for v in (uv, conf))
-        if hands:
-            own = np.where(weight[..., WRISTS, None] > 0, sided[:, :, WRISTS], np.nan)
-            arms = triangulation.points(rig, _flat(own), _flat(weight[:, :, WRISTS]))
-            far = rig.project(arms.p)[0].reshape(own.shape)
-            wrists = np.where(np.isfinite(own), own, far)  # unseen: where other cameras see it
-            found = sided[:, :, HANDS], weight[:, :, HANDS], wrists
-            flips[..., -1] = match_hands(rig, *found, settings.hands, triangulation)
-            sided, weight = (apply_flips(v, flips, groups) for v in (uv, conf))
-        points = triangulation.points(rig, _flat(sided), _flat(weight))
-        if hands:
-            error = points.error.reshape(conf.shape)[:, :, HANDS]
-            left_out = misfits(error, settings.hands.max_error)
-            weight = weight.copy()
-            weight[:, :, HANDS] *= ~left_out.repeat(HAND, axis=-1)
-            points = triangulation.points(rig, _flat(sided), _flat(weight))
-        return points
-
-    plain = triangulation.plain(rig, _flat(uv), _flat(conf))
-    robust = triangulation.points(rig, _flat(uv), _flat(conf))
-    stages = {"plain": rig.errors(plain, _flat(uv)), "robust": robust.error}
-    points = triangulate()
-    stages["flips"] = points.error
-    F, J = conf.shape[1:]
-    at = np.unique(np.linspace(0, F - 1, min(F, settings.refinement.frames)).round().astype(int))
-    for _ in range(settings.refinement.rounds):
-        p = points.p.reshape(F, J, 3)[at].reshape(-1, 3)
-        detections = _flat(sided[:, at]), _flat(weight[:, at])
-        rig = refine_rig(start, rig, p, *detections, settings.refinement)
-        points = triangulate()
-    stages["refined"] = points.error
-    p, removed = cleanse(points.p.reshape(*conf.shape[1:], 3), settings.cleansing)
-    agreed = _mean_seen(points.weight.reshape(conf.shape), weight)
-    p = smooth(p, agreed, time, settings.smoothing.seconds)
-    error = rig.errors(p.reshape(-1, 3), _flat(sided)).reshape(conf.shape)
-    stages["smoothed"] = error = np.where(weight > 0, error, np.nan)
-    trust, pixels = (apply_flips(v, flips, groups) for v in (full, pixels))
-    if hands:
-        gone = left_out.repeat(HAND, axis=-1)
-        trust[:, :, HANDS][gone], pixels[:, :, HANDS][gone] = 0.0, np.nan
-    delay, gain = clock_errors(rig, sided[:, :, :BODY], trust[:, :, :BODY], triangulation, lag)
+    given = cameras
     to_pixels = (given.focal / FOCAL)[:, None, None]
+    cameras, scaled = cameras.normalised(uv)
+    weight = np.where(conf > settings.min_confidence, conf, 0.0)
+
+    # Triangulate as detected, then with left and right corrected.
+    detected = _flat(scaled), _flat(weight)
+    stages = {
+        "plain": cameras.errors(plain(cameras, *detected), detected[0]),
+        "robust": robust(cameras, *detected).error,
+    }
+    found = correct(cameras, scaled, weight)
+    stages["flips"] = found.points.error
+    cameras, found = _refined(cameras, scaled, weight, found, settings)
+    stages["refined"] = found.points.error
+
+    # Remove impossible joints and smooth the rest.
+    p, removed = cleanse(found.points.p.reshape(*conf.shape[1:], 3))
+    agreed = _mean_seen(found.points.weight.reshape(conf.shape), found.weight)
+    p = smooth(p, agreed, time, settings.smoothing)
+    error = cameras.errors(p.reshape(-1, 3), _flat(found.uv)).reshape(conf.shape)
+    stages["smoothed"] = error = np.where(found.weight > 0, error, np.nan)
+
+    seen, pixels = _corrected_detections(conf, uv, found)
+    delay, gain = clock_errors(cameras, found.uv[:, :, :BODY], found.weight[:, :, :BODY])
     return Solution(
-        rig=Rig(given.K, rig.R, rig.t),
+        cameras=CameraArray(given.K, cameras.R, cameras.t),
         p=p,
-        conf=np.where(known(p), _mean_seen(weight, weight), 0.0),
-        views=(np.nan_to_num(error, nan=np.inf) <= triangulation.scale).sum(0),
+        conf=np.where(known(p), _mean_seen(found.weight, found.weight), 0.0),
+        views=(np.nan_to_num(error, nan=np.inf) <= SCALE).sum(0),
         error=error * to_pixels,
         uv=pixels,
-        seen=trust,
-        flips=flips,
-        left_out=left_out,
+        seen=seen,
+        flips=found.flips,
+        left_out=found.left_out,
         delay=delay,
         gain=gain,
         stages={
@@ -182,21 +143,74 @@ def solve(
     )
 
 
+def _refined(
+    start: CameraArray, uv: Float, weight: Float, found: Corrected, settings: SolveSettings
+) -> tuple[CameraArray, Corrected]:
+    """Refines the cameras and triangulates again, in turn."""
+    cameras, (F, J) = start, weight.shape[1:]
+    at = np.array(evenly_spaced(F, REFINED, ends=True))
+    priors = settings.rotation_prior, settings.position_prior
+    for _ in range(settings.refinements):
+        p = found.points.p.reshape(F, J, 3)[at].reshape(-1, 3)
+        some = _flat(found.uv[:, at]), _flat(found.weight[:, at])
+        cameras = refine_cameras(start, cameras, p, *some, *priors)
+        found = correct(cameras, uv, weight)
+    return cameras, found
+
+
+def correct(cameras: CameraArray, uv: Float, conf: Float) -> Corrected:
+    """Corrects swapped sides of body and hands, leaves strange hands out, and triangulates.
+
+    ``uv [C, F, J, 2]`` are in thousandths of the focal length, ``conf [C, F, J]`` is 0 where a
+    joint is not seen.
+    """
+    flips = find_flips(cameras, uv, conf, FLIP_GROUPS)
+    sided, weight = (apply_flips(v, flips, FLIP_GROUPS) for v in (uv, conf))
+    left_out = np.zeros((*conf.shape[:2], 2), bool)
+    if uv.shape[2] != ALL:
+        points = robust(cameras, _flat(sided), _flat(weight))
+        return Corrected(sided, weight, flips, left_out, points)
+
+    # Where a camera does not see a wrist, the other cameras show where it is.
+    own = np.where(weight[..., WRISTS, None] > 0, sided[:, :, WRISTS], np.nan)
+    arms = robust(cameras, _flat(own), _flat(weight[:, :, WRISTS]))
+    wrists = np.where(np.isfinite(own), own, cameras.project(arms.p)[0].reshape(own.shape))
+
+    hands = sided[:, :, HANDS], weight[:, :, HANDS], wrists
+    swapped = match_hands(cameras, *hands)
+    sided, weight = (apply_flips(v, swapped[..., None], [HAND_PAIRS]) for v in (sided, weight))
+    points = robust(cameras, _flat(sided), _flat(weight))
+    left_out = misfits(points.error.reshape(conf.shape)[:, :, HANDS])
+    weight[:, :, HANDS] *= ~left_out.repeat(HAND, axis=-1)
+    points = robust(cameras, _flat(sided), _flat(weight))
+    return Corrected(sided, weight, np.dstack([flips, swapped[..., None]]), left_out, points)
+
+
+def _corrected_detections(conf: Float, uv: Float, found: Corrected) -> tuple[Float, Float]:
+    """Confidence and pixels of all detections, also those of little confidence."""
+    groups = (*FLIP_GROUPS, HAND_PAIRS)[: found.flips.shape[-1]]
+    seen, pixels = (apply_flips(v, found.flips, groups) for v in (conf, uv))
+    if uv.shape[2] == ALL:
+        gone = found.left_out.repeat(HAND, axis=-1)
+        seen[:, :, HANDS][gone], pixels[:, :, HANDS][gone] = 0.0, np.nan
+    return seen, pixels
+
+
 def adopt(
-    rig: Rig, time: Float, p: Float, conf: Float, settings: Settings, frozen: int
+    cameras: CameraArray, time: Float, p: Float, conf: Float, settings: SolveSettings
 ) -> Solution:
     """Another tool's joints, cleansed and smoothed; the cameras stay as calibrated.
 
-    ``time [F]`` is in seconds, ``p [F, 33, 3]`` in metres with ``conf [F, 33]``; for ``frozen`` see
-    `without_frozen`.
+    ``time [F]`` is in seconds, ``p [F, 33, 3]`` in metres with ``conf [F, 33]``. Positions that
+    repeat `FROZEN` times fill gaps, and become missing.
     """
-    p, stuck = without_frozen(p, frozen)
-    p, removed = cleanse(p, settings.cleansing)
-    p = smooth(p, conf, time, settings.smoothing.seconds)
-    C, (F, J) = len(rig), conf.shape
+    frozen = frozen_joints(p, FROZEN)
+    p, removed = cleanse(np.where(frozen[..., None], np.nan, p))
+    p = smooth(p, conf, time, settings.smoothing)
+    C, (F, J) = len(cameras), conf.shape
     unseen, unknown = np.full((C, F, J), np.nan), np.full(C, np.nan)
     return Solution(
-        rig=rig,
+        cameras=cameras,
         p=p,
         conf=np.where(known(p), conf, 0.0),
         views=np.zeros((F, J), np.int64),
@@ -208,7 +222,7 @@ def adopt(
         delay=unknown,
         gain=unknown,
         stages={"smoothed": unseen},
-        removed=removed | {"frozen": stuck},
+        removed=removed | {"frozen": int(frozen.sum())},
     )
 
 
@@ -221,33 +235,30 @@ def _mean_seen(values: Float, weight: Float) -> Float:
     return np.asarray(values.sum(0) / np.maximum((weight > 0).sum(0), 1))
 
 
-def clock_errors(
-    rig: Rig, uv: Float, weight: Float, triangulation: Triangulation, lag: int
-) -> tuple[Float, Float]:
+def clock_errors(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
     """Each camera's delay against the others, and the gain of correcting it.
 
     Convention: frames; with a positive delay the camera shows a later moment than the others at the
-    same number, so its numbers should grow by that much. Points are triangulated without the
+    same number, so its numbers should grow by that much. Triangulated are triangulated without the
     camera, so three cameras are needed; with two the delay is NaN. Between frames a parabola
     through the three best lags decides.
 
     Args:
-        rig: ``C`` cameras.
+        cameras: ``C`` cameras.
         uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
-        triangulation, lag: its settings, and the frames tried either way.
 
     Returns:
         ``delay [C]`` and ``gain [C]``, the share by which the median error falls.
     """
     C, F, _ = weight.shape
-    delay, gain, lag = np.full(C, np.nan), np.full(C, np.nan), min(lag, F - 1)
-    rig, uv = rig.normalised(uv)
+    delay, gain, lag = np.full(C, np.nan), np.full(C, np.nan), min(LAG, F - 1)
+    cameras, uv = cameras.normalised(uv)
     if C <= MIN_VIEWS or lag < 1:
         return delay, gain
     for c in range(C):
         others = np.arange(C) != c
-        p = triangulation.points(rig[others], _flat(uv[others]), _flat(weight[others])).p
-        expected = rig.project(p)[0][c].reshape(uv.shape[1:])
+        p = robust(cameras[others], _flat(uv[others]), _flat(weight[others])).p
+        expected = cameras.project(p)[0][c].reshape(uv.shape[1:])
         seen = np.where((weight[c] > 0)[..., None], uv[c], np.nan)
         errors = []
         for s in range(-lag, lag + 1):  # the camera's frame f against the others' frame f - s

@@ -16,14 +16,16 @@ from gsgan.data.files import frame_files, natural_order, read_colour, read_heade
 from gsgan.utils.errors import DataError
 
 VIDEO_SUFFIXES = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mts", ".mpg", ".mpeg")
-PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 INSIDE = ("videos", "images")  # where EasyMocap and Pose2Sim projects keep them
+
+DIFFERENT = 0.01  # share by which frame rates or lengths must differ to be noted
 
 Bytes = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class Source:
+class Recording:
     """One camera's video or folder of images."""
 
     name: str  # file stem or folder name
@@ -35,7 +37,7 @@ class Source:
     turned: int = 0  # degrees of rotation in the video's metadata
     rotate: bool = False  # whether that rotation is applied
 
-    def pictures(self) -> Iterator[tuple[int, Bytes]]:
+    def images(self) -> Iterator[tuple[int, Bytes]]:
         """(number, BGR image ``[H, W, 3]``), in order; a video's are numbered from 0."""
         if not self.files:
             yield from enumerate(_decoded(_open(self.path, self.rotate)))
@@ -53,7 +55,7 @@ def stamp(path: Path) -> tuple[str, int, int]:
     return path.name, path.stat().st_size, path.stat().st_mtime_ns
 
 
-def find_sources(folder: Path, rotate: bool = False) -> dict[str, Source]:
+def find_sources(folder: Path, rotate: bool = False) -> dict[str, Recording]:
     """Every camera's images in a folder, or in videos/ or images/ inside it, in natural order.
 
     Raises:
@@ -64,19 +66,19 @@ def find_sources(folder: Path, rotate: bool = False) -> dict[str, Source]:
             return sources
     raise DataError(
         f"{folder} holds no videos ({' '.join(VIDEO_SUFFIXES)}) and no folders of images "
-        f"({' '.join(PICTURE_SUFFIXES)}); expected one per camera"
+        f"({' '.join(IMAGE_SUFFIXES)}); expected one per camera"
     )
 
 
-def _sources_in(folder: Path, rotate: bool) -> dict[str, Source]:
-    sources: dict[str, Source] = {}
+def _sources_in(folder: Path, rotate: bool) -> dict[str, Recording]:
+    sources: dict[str, Recording] = {}
     for path in sorted(folder.iterdir(), key=lambda p: natural_order(p.name)):
         if path.name.startswith("."):
             continue
-        if path.is_dir() and (files := frame_files(folder, path.name, PICTURE_SUFFIXES)):
+        if path.is_dir() and (files := frame_files(folder, path.name, IMAGE_SUFFIXES)):
             paths = {number: folder / files[number] for number in sorted(files)}
             size = read_header(next(iter(paths.values()))).size
-            source = Source(path.name, path, size, None, paths, len(paths))
+            source = Recording(path.name, path, size, None, paths, len(paths))
         elif path.suffix.lower() in VIDEO_SUFFIXES:
             source = _video(path, rotate)
         else:
@@ -87,7 +89,7 @@ def _sources_in(folder: Path, rotate: bool) -> dict[str, Source]:
     return sources
 
 
-def _video(path: Path, rotate: bool) -> Source:
+def _video(path: Path, rotate: bool) -> Recording:
     video = _open(path, rotate)
     fps = float(video.get(cv2.CAP_PROP_FPS))
     turned = int(video.get(cv2.CAP_PROP_ORIENTATION_META))
@@ -96,7 +98,7 @@ def _video(path: Path, rotate: bool) -> Source:
     if first is None:
         raise DataError(f"{path} holds no image that can be decoded; convert it to H.264 MP4")
     rate = fps if np.isfinite(fps) and fps > 0 else None
-    return Source(path.stem, path, (len(first), len(first[0])), rate, {}, count, turned, rotate)
+    return Recording(path.stem, path, (len(first), len(first[0])), rate, {}, count, turned, rotate)
 
 
 def _open(path: Path, rotate: bool) -> cv2.VideoCapture:
@@ -178,3 +180,21 @@ def fit_size(
     return fitted, (
         f"{name}: {w}x{h} pixels, calibrated as {W}x{H}; treated as cut at the right and bottom"
     )
+
+
+def recording_notes(sources: Mapping[str, Recording]) -> list[str]:
+    """Notes on frame rates and lengths that differ, and on rotation metadata."""
+    found = []
+    for what, values in (
+        ("frame rates", {name: s.fps for name, s in sources.items() if s.fps}),
+        ("numbers of frames", {name: s.count for name, s in sources.items()}),
+    ):
+        if values and max(values.values()) > (1 + DIFFERENT) * min(values.values()):
+            text = ", ".join(f"{name} {value:g}" for name, value in values.items())
+            found.append(f"{what} differ ({text}); frames are paired by number")
+    return found + [
+        f"{name}: its metadata rotate it by {source.turned} degrees, which is not applied; set "
+        "apply_rotation=true if it was calibrated that way"
+        for name, source in sources.items()
+        if source.turned and not source.rotate
+    ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 
 from gsgan.data.crop import NEAR
 from gsgan.data.joints import known
-from gsgan.prepare.rig import MIN_VIEWS, Bool, Float, Rig
-from gsgan.utils.checks import above, at_least
+from gsgan.prepare.camera_array import MIN_VIEWS, Bool, CameraArray, Float
 
+# Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
+SCALE = 3.5  # error at which a detection counts half (Cauchy's weight)
+MAX_ERROR = 35.0  # median error beyond which detections contradict each other
+MAX_ELONGATION = 20.0  # a point's uncertainty along over across the rays; more: too parallel
+FLIP_GAIN = 0.15  # mean loss per detection that a swap must save; an error of SCALE costs 0.7
 FAR = 1e6  # pixels: stands for an infinite error
 FLAT = 1e-15  # determinant over trace³: below it the equations are singular in float64
 ITERATIONS, QUICK_ITERATIONS = 10, 3  # of reweighting; the search for swapped sides needs fewer
@@ -26,7 +30,7 @@ Pairs = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True)
-class Points:
+class Triangulated:
     """Triangulated points."""
 
     p: Float  # [N, 3] metres, NaN where missing
@@ -34,84 +38,76 @@ class Points:
     error: Float  # [C, N] reprojection error in undistorted pixels, NaN where nothing was seen
 
 
-@dataclass(frozen=True)
-class Triangulation:
-    """Settings of the triangulation, see conf/prepare.yaml.
+def plain(cameras: CameraArray, uv: Float, weight: Float) -> Float:
+    """``[N, 3]`` the weighted linear (DLT) solution, NaN with fewer than two weighted views.
 
-    Errors are in thousandths of the focal length: pixels, at a focal length of 1000 pixels.
+    Args:
+        cameras: ``C`` cameras.
+        uv: ``[C, N, 2]`` undistorted pixels, NaN allowed where the weight is 0.
+        weight: ``[C, N]`` confidence, at least 0.
     """
-
-    min_confidence: float = 0.1
-    scale: float = 3.5
-    max_elongation: float = 20.0
-    max_error: float = 35.0
-
-    def __post_init__(self) -> None:
-        for name in ("scale", "max_elongation", "max_error"):
-            above(f"triangulation.{name}", getattr(self, name))
-
-    def plain(self, rig: Rig, uv: Float, weight: Float) -> Float:
-        """``[N, 3]`` the weighted linear (DLT) solution, NaN with fewer than two weighted views.
-
-        Args:
-            rig: ``C`` cameras.
-            uv: ``[C, N, 2]`` undistorted pixels, NaN allowed where the weight is 0.
-            weight: ``[C, N]`` confidence, at least 0.
-        """
-        return _solve(*_rows(rig, uv, weight), weight)[0]
-
-    def points(self, rig: Rig, uv: Float, weight: Float, iterations: int = ITERATIONS) -> Points:
-        """Points that most detections agree on, by reweighting from the best pair of cameras.
-
-        Convention: the loss is Cauchy's, ``log(1 + (r/scale)²)`` of the reprojection error r, times
-        the weight. A point is NaN with fewer than two weighted views, with rays too parallel
-        (``max_elongation``), or when its detections contradict each other (``max_error``).
-        Arguments as for `plain`; ``iterations`` of reweighting.
-        """
-        starts = range(0, max(uv.shape[1], 1), CHUNK)
-        chunks = [slice(start, start + CHUNK) for start in starts]
-        parts = [_robust(rig, uv[:, at], weight[:, at], self, iterations) for at in chunks]
-        return Points(
-            p=np.concatenate([part.p for part in parts]),
-            weight=np.concatenate([part.weight for part in parts], axis=1),
-            error=np.concatenate([part.error for part in parts], axis=1),
-        )
+    return _solve(*_rows(cameras, uv, weight), weight)[0]
 
 
-def _robust(rig: Rig, uv: Float, weight: Float, settings: Triangulation, iterations: int) -> Points:
-    weight = np.where(known(uv) & (weight > settings.min_confidence), weight, 0.0)
-    a, b = _rows(rig, uv, weight)
-    p, reweighted = _best_pair(rig, uv, weight, a, b, settings.scale), weight
+def robust(
+    cameras: CameraArray,
+    uv: Float,
+    weight: Float,
+    iterations: int = ITERATIONS,
+    max_error: float = MAX_ERROR,
+) -> Triangulated:
+    """Triangulated that most detections agree on, by reweighting from the best pair of cameras.
+
+    Convention: the loss is Cauchy's, ``log(1 + (r/SCALE)²)`` of the reprojection error r, times
+    the weight; errors are in thousandths of the focal length. A point is NaN with fewer than two
+    weighted views, with rays too parallel (`MAX_ELONGATION`), or when its detections contradict
+    each other (``max_error``). Arguments as for `plain`; ``iterations`` of reweighting.
+    """
+    chunks = [slice(at, at + CHUNK) for at in range(0, max(uv.shape[1], 1), CHUNK)]
+    parts = [_robust(cameras, uv[:, at], weight[:, at], iterations, max_error) for at in chunks]
+    return Triangulated(
+        p=np.concatenate([part.p for part in parts]),
+        weight=np.concatenate([part.weight for part in parts], axis=1),
+        error=np.concatenate([part.error for part in parts], axis=1),
+    )
+
+
+def _robust(
+    cameras: CameraArray, uv: Float, weight: Float, iterations: int, max_error: float
+) -> Triangulated:
+    weight = np.where(known(uv), weight, 0.0)
+    a, b = _rows(cameras, uv, weight)
+    p, reweighted = _best_pair(cameras, uv, weight, a, b), weight
     information = np.zeros((p.shape[0], 3, 3))
     for _ in range(iterations):
-        loss = 1 / (1 + (rig.errors(p, uv) / settings.scale) ** 2)
+        loss = 1 / (1 + (cameras.errors(p, uv) / SCALE) ** 2)
         reweighted = weight * np.nan_to_num(loss, nan=0.0)
-        depth = np.maximum(rig.project(p)[1], NEAR)
+        depth = np.maximum(cameras.project(p)[1], NEAR)
         scaled = np.nan_to_num(reweighted / depth**2)  # rows are depth times pixels
         new, information = _solve(a, b, scaled)
         p = np.where(np.isfinite(new), new, p)
-    error = rig.errors(p, uv)
+    error = cameras.errors(p, uv)
     certainty = np.linalg.eigvalsh(information)
-    missing = certainty[:, 0] * settings.max_elongation**2 < certainty[:, 2]
-    missing |= _median(error, weight > 0) > settings.max_error
+    missing = certainty[:, 0] * MAX_ELONGATION**2 < certainty[:, 2]
+    missing |= _median(error, weight > 0) > max_error
     missing |= (weight > 0).sum(0) < MIN_VIEWS
     p = np.where(missing[:, None], np.nan, p)
-    return Points(p, np.where(missing, 0.0, reweighted), np.where(missing, np.nan, error))
+    return Triangulated(p, np.where(missing, 0.0, reweighted), np.where(missing, np.nan, error))
 
 
-def robust_cost(error: Float, weight: Float, scale: float) -> Float:
+def robust_cost(error: Float, weight: Float) -> Float:
     """``[N]`` weighted Cauchy loss over the cameras, of ``error`` and ``weight [C, N]``.
 
     Detections with weight 0 cost nothing; a point that was not found costs as one far away.
     """
     far = np.nan_to_num(error, nan=FAR, posinf=FAR)
-    return (np.log1p((far / scale) ** 2) * weight).sum(0)
+    return (np.log1p((far / SCALE) ** 2) * weight).sum(0)
 
 
-def _rows(rig: Rig, uv: Float, weight: Float) -> tuple[Float, Float]:
+def _rows(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
     """``a [C, N, 2, 3]``, ``b [C, N, 2]``: ``a·X - b`` is depth times the error in pixels."""
     uv = np.where((weight > 0)[..., None], uv, 0.0)
-    KR, Kt = rig.K @ rig.R, np.einsum("cij,cj->ci", rig.K, rig.t)
+    KR, Kt = cameras.K @ cameras.R, np.einsum("cij,cj->ci", cameras.K, cameras.t)
     a = uv[..., None] * KR[:, None, 2:] - KR[:, None, :2]
     return a, Kt[:, None, :2] - uv * Kt[:, None, 2:]
 
@@ -129,16 +125,16 @@ def _solve(a: Float, b: Float, weight: Float) -> tuple[Float, Float]:
     return np.where(enough[:, None], p, np.nan), information
 
 
-def _best_pair(rig: Rig, uv: Float, weight: Float, a: Float, b: Float, scale: float) -> Float:
+def _best_pair(cameras: CameraArray, uv: Float, weight: Float, a: Float, b: Float) -> Float:
     """``[N, 3]`` of all pairs' points and the linear one, that with the smallest robust cost."""
     best = _solve(a, b, weight)[0]
-    cost = robust_cost(rig.errors(best, uv), weight, scale)
-    pairs = list(combinations(range(len(rig)), 2))
+    cost = robust_cost(cameras.errors(best, uv), weight)
+    pairs = list(combinations(range(len(cameras)), 2))
     if len(pairs) > MAX_PAIRS:
         pairs = [pairs[k * PROGRESSION % len(pairs)] for k in range(MAX_PAIRS)]
     for pair in map(list, pairs):
         p = _solve(a[pair], b[pair], weight[pair])[0]
-        new = robust_cost(rig.errors(p, uv), weight, scale)
+        new = robust_cost(cameras.errors(p, uv), weight)
         better = (new < cost) & np.isfinite(p).all(-1)
         best, cost = np.where(better[:, None], p, best), np.where(better, new, cost)
     return best
@@ -151,25 +147,7 @@ def _median(error: Float, used: Bool) -> Float:
     return np.asarray(np.nanmedian(masked, axis=0))
 
 
-@dataclass(frozen=True)
-class FlipSearch:
-    """How swapped sides are found, see conf/prepare.yaml."""
-
-    enabled: bool = True
-    gain: float = 0.15
-
-    def __post_init__(self) -> None:
-        at_least("flips.gain", self.gain, 0)
-
-
-def find_flips(
-    rig: Rig,
-    uv: Float,
-    weight: Float,
-    groups: Sequence[Pairs],
-    search: FlipSearch,
-    triangulation: Triangulation,
-) -> Bool:
+def find_flips(cameras: CameraArray, uv: Float, weight: Float, groups: Sequence[Pairs]) -> Bool:
     """``[C, F, G]`` which camera swapped which group of joints in which frame.
 
     Detectors confuse left and right, mostly when a person is seen from behind. Per frame, one
@@ -178,15 +156,11 @@ def find_flips(
     the whole sequence, the majority of the detections do.
 
     Args:
-        rig: ``C`` cameras.
+        cameras: ``C`` cameras.
         uv, weight: ``[C, F, J, 2]`` undistorted pixels and their confidence.
         groups: ``G`` tuples of (left, right) joints that swap together.
-        search, triangulation: thresholds, scale and limits.
     """
-    quick = replace(triangulation, max_error=np.inf)
-    weight = np.where(weight > quick.min_confidence, weight, 0.0)
-    found = [_group_flips(rig, uv, weight, pairs, search.gain, quick) for pairs in groups]
-    return np.stack(found, axis=-1)
+    return np.stack([_group_flips(cameras, uv, weight, pairs) for pairs in groups], axis=-1)
 
 
 def apply_flips(values: Float, flips: Bool, groups: Sequence[Pairs]) -> Float:
@@ -200,21 +174,17 @@ def apply_flips(values: Float, flips: Bool, groups: Sequence[Pairs]) -> Float:
     return out
 
 
-def points_and_cost(
-    rig: Rig, uv: Float, weight: Float, quick: Triangulation
-) -> tuple[Float, Float]:
+def points_and_cost(cameras: CameraArray, uv: Float, weight: Float) -> tuple[Float, Float]:
     """``p [F, J, 3]`` of ``uv [C, F, J, 2]`` and ``weight [C, F, J]``, and its cost ``[F]``."""
     C, F, J = weight.shape
-    trust = weight.reshape(C, -1)
-    found = quick.points(rig, uv.reshape(C, -1, 2), trust, QUICK_ITERATIONS)
-    seen = np.where(np.isfinite(found.error), trust, 0.0)
-    cost = robust_cost(found.error, seen, quick.scale)
+    flat = weight.reshape(C, -1)
+    found = robust(cameras, uv.reshape(C, -1, 2), flat, QUICK_ITERATIONS, np.inf)
+    seen = np.where(np.isfinite(found.error), flat, 0.0)
+    cost = robust_cost(found.error, seen)
     return found.p.reshape(F, J, 3), cost.reshape(F, J).sum(-1)
 
 
-def _group_flips(
-    rig: Rig, uv: Float, weight: Float, pairs: Pairs, gain: float, quick: Triangulation
-) -> Bool:
+def _group_flips(cameras: CameraArray, uv: Float, weight: Float, pairs: Pairs) -> Bool:
     """``[C, F]`` for one group."""
     joints = [j for pair in pairs for j in pair]  # pairs are then adjacent: j and j ^ 1
     local = [tuple((2 * i, 2 * i + 1) for i in range(len(pairs)))]
@@ -223,11 +193,11 @@ def _group_flips(
     everywhere = np.arange(F)
 
     def points(flips: Bool, frames: NDArray[np.int64]) -> tuple[Float, Float]:
-        sided, trust = (apply_flips(v[:, frames], flips[..., None], local) for v in (uv, weight))
-        return points_and_cost(rig, sided, trust, quick)
+        sided, seen = (apply_flips(v[:, frames], flips[..., None], local) for v in (uv, weight))
+        return points_and_cost(cameras, sided, seen)
 
     few = (weight > 0).sum(-1) < LEAST_JOINTS
-    price = np.where(few, np.inf, gain * weight.sum(-1))
+    price = np.where(few, np.inf, FLIP_GAIN * weight.sum(-1))
     flips = cheapest_flips(lambda f, at: points(f, at)[1], np.zeros((C, F), bool), price)
     flips = flips ^ _exchanged(points(flips, everywhere)[0])
     votes = weight.sum(-1)

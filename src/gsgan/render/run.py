@@ -14,8 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
 from torch import Tensor
 
-from gsgan.model.drive import Drive, drive_of
-from gsgan.model.runs import CHECKPOINT, Run
+from gsgan.model.drive import Drive, drive_of, inputs_of
+from gsgan.model.runs import Run
+from gsgan.model.stored import CHECKPOINT
 from gsgan.motion.orbit import Orbit
 from gsgan.render.cameras import from_file, of_capture, of_entry, refuse_inside
 from gsgan.render.output import Output
@@ -145,15 +146,11 @@ def _image(
     """``[H, W, 3 or 4]`` one frame, with the ground truth at its left if requested."""
     at = slice(i, i + 1) if len(cameras) > 1 else slice(0, 1)
     camera = cameras[at]
-    painting = run.avatar.picture(
-        torch.from_numpy(drive.p[i]),
-        camera,
-        visibility=torch.from_numpy(drive.visibility[i]),
-        body=None if drive.body is None else drive.body[i : i + 1],
-        camera_index=None if index is None else index[at],
-    )
-    assert painting.image is not None and painting.alpha is not None  # noqa: PT018
-    tiles = [(painting.image[0].cpu(), painting.alpha[0].cpu())]
+    with torch.no_grad():
+        p, visibility, body = inputs_of(run.avatar, drive, i)
+        colours = None if index is None else index[at].to(p.device)
+        found = run.avatar(p, visibility, camera.to(p.device), body, colours, maps=False)
+    tiles = [(found.image[0].cpu(), found.alpha[0].cpu())]
     if config.compare is not None:
         assert drive.truth is not None
         frame = drive.truth(i)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-import math
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -20,12 +20,11 @@ def curves(report: Report) -> bytes | None:
     panels = []
     for grid in report.grids:
         for i, column in enumerate(grid.columns):
-            rows = [r for r in grid.rows if r.kind == "run" and "mean" in r.cells[i].numbers]
+            rows = [r for r in grid.rows if r.kind == "run" and r.cells[i].mean is not None]
             panels += [(f"{grid.title}\n{column}", rows, i)] if rows else []
     if not panels:
         return None
-    across = min(len(panels), COLUMNS)
-    down = math.ceil(len(panels) / across)
+    across, down = min(len(panels), COLUMNS), -(-len(panels) // COLUMNS)
     figure = Figure((PANEL[0] * across, PANEL[1] * down + 0.5), dpi=120, layout="constrained")
     for place, (title, rows, i) in enumerate(panels, start=1):
         axes = figure.add_subplot(down, across, place)
@@ -48,17 +47,12 @@ def _draw(axes: Axes, rows: list[Row], i: int) -> None:
         lines.setdefault(f"{model}{colon}{variant}", []).append((setting, row))
     settings = list(dict.fromkeys(setting for line in lines.values() for setting, _ in line))
     for k, (name, line) in enumerate(lines.items()):
-        axes.errorbar(
-            [settings.index(setting) for setting, _ in line],
-            [row.cells[i].numbers["mean"] for _, row in line],
-            yerr=[row.cells[i].numbers["spread"] or 0.0 for _, row in line],
-            color=COLOURS[k % len(COLOURS)],
-            marker=MARKERS[k % len(MARKERS)],
-            markersize=4,
-            lw=1.2,
-            capsize=3,
-            label=name,
-        )
+        at = [settings.index(setting) for setting, _ in line]
+        spread = [row.cells[i].spread or 0.0 for _, row in line]
+        means: list[Any] = [row.cells[i].mean for _, row in line]
+        marker, colour = MARKERS[k % len(MARKERS)], COLOURS[k % len(COLOURS)]
+        look: dict[str, Any] = {"marker": marker, "color": colour, "ms": 4, "lw": 1.2, "capsize": 3}
+        axes.errorbar(at, means, yerr=spread, label=name, **look)
     names = [setting.replace(", ", "\n") for setting in settings]
     axes.set_xticks(range(len(names)), names, fontsize=6.5, rotation=40, ha="right")
     axes.tick_params(axis="y", labelsize=7)

@@ -1,4 +1,4 @@
-"""The numbers printed in the paper: when they are comparable with runs, and as rows."""
+"""The numbers printed in the paper, and when they are comparable with runs."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from gsgan.metrics.names import METRICS
 from gsgan.report.runs import Run
-from gsgan.report.spec import METRICS, heading, subject_of
+from gsgan.report.spec import subject_of
 from gsgan.report.write import NOT_HAD, Cell, Grid, Row
 from gsgan.utils.errors import ConfigError
 
@@ -51,7 +52,7 @@ class PaperTable:
         return None
 
     def beside(self, columns: Sequence[tuple[str | None, str]]) -> dict[str, list[Row]]:
-        """Its rows by model; ``columns``: subject (None: the table's own) and metric of each."""
+        """The rows by model; ``columns``: subject (None: the table's own) and metric of each."""
         note = f"{MARK} in {self.title}" + (f"; {self.note}" if self.note else "")
         found: dict[str, list[Row]] = {}
         for held in self.rows:
@@ -69,10 +70,10 @@ class PaperTable:
         remarks = [f"Not beside the scores above: {why}."]
         remarks += [f"{self.note[:1].upper()}{self.note[1:]}."] if self.note else []
         title = f"As printed, not measured here: {self.title}"
-        return Grid(title, [heading(m) for m in shown], rows, remarks)
+        return Grid(title, [METRICS[m].heading for m in shown], rows, remarks)
 
     def _row(self, label: str, texts: Sequence[str | None], notes: tuple[str, ...] = ()) -> Row:
-        cells = [Cell(NOT_HAD) if t is None else Cell(t, {"paper": float(t)}) for t in texts]
+        cells = [Cell(NOT_HAD) if t is None else Cell(t) for t in texts]
         read = f", read as {self.protocol}" if self.protocol else ""
         origin = (NOT_HAD, self.data, f"the paper's{read}", NOT_HAD)
         return Row(f"{label} ({MARK})", cells, origin, "paper", notes)

@@ -1,4 +1,4 @@
-"""Run folders: which there are, what they hold, and whether two may stand together."""
+"""Run folders: finding and reading them, and whether two of them are comparable."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import glob
 import json
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,9 +15,8 @@ import yaml
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from gsgan.evaluate.facts import choices
-from gsgan.evaluate.paper import departures, settings_of
-from gsgan.report.spec import METRICS
+from gsgan.model.stored import choices
+from gsgan.report.departures import departures, settings_of
 from gsgan.utils.errors import ConfigError, DataError
 
 METRICS_FILE, FACTS_FILE = "metrics.json", "facts.json"
@@ -171,13 +170,16 @@ def read_run(folder: Path, *, scored: bool = True) -> Run:
     for name in (METRICS_FILE, FACTS_FILE) if scored else ():
         if not (folder / name).is_file():
             raise DataError(f"{folder}: no {name}; the run is not finished, or was not scored")
-    scores = _read_json(folder / METRICS_FILE, _check_scores) if scored else {}
-    facts = {}
-    if (folder / FACTS_FILE).is_file():
-        facts = _read_json(folder / FACTS_FILE, lambda facts: facts["data"].get("name"))
-    settings, chosen = _read_config(folder)
-    name = facts.get("model") or facts.get("method") or chosen.get("model") or folder.name
-    data = facts.get("data", {"name": chosen.get("data")})
+    try:
+        scores = json.loads((folder / METRICS_FILE).read_text()) if scored else {}
+        found = folder / FACTS_FILE
+        facts = json.loads(found.read_text()) if found.is_file() else {}
+        settings, chosen = _read_config(folder)
+        name = facts.get("model") or facts.get("method") or chosen.get("model") or folder.name
+        data = dict(facts.get("data", {"name": chosen.get("data")}))
+    except (OSError, ValueError, TypeError, yaml.YAMLError, OmegaConfBaseException) as error:
+        reason = str(error).splitlines()[0]
+        raise DataError(f"{folder}: damaged ({reason}); score the run again") from None
     run = Run(folder, str(name), data, facts.get("seed"), scores, settings, facts)
     done, planned = facts.get("iterations"), run.planned(segmentation=False)
     if scored and done is not None and done < planned:
@@ -185,35 +187,14 @@ def read_run(folder: Path, *, scored: bool = True) -> Run:
     return run
 
 
-def _read_json(path: Path, check: Callable[[Any], object]) -> dict[str, Any]:
-    try:
-        found: dict[str, Any] = json.loads(path.read_text())
-        check(found)
-    except (OSError, AttributeError, LookupError, TypeError, ValueError, RecursionError) as error:
-        raise DataError(
-            f"{path}: damaged ({type(error).__name__}: {error}); score the run again"
-        ) from None
-    return found
-
-
-def _check_scores(found: dict[str, dict[str, dict[str, Any]]]) -> None:
-    for scores in (scores for variants in found.values() for scores in variants.values()):
-        numbers = [scores[m] for m in METRICS if scores.get(m) is not None]
-        if not all(math.isfinite(number) for number in (scores["images"], *numbers)):
-            raise ValueError("a score is not finite")
-
-
 def _read_config(folder: Path) -> tuple[dict[str, Any] | None, dict[str, Any]]:
     """The settings by dotted key, and the groups' choices; (None, {}) for predictions."""
     if not (folder / CONFIG).is_file():
         return None, {}
-    try:
-        config = OmegaConf.create((folder / CONFIG).read_text())
-        if not isinstance(config, DictConfig):
-            raise ValueError("not a config")
-        return settings_of(config), choices(folder)
-    except (OSError, ValueError, yaml.YAMLError, OmegaConfBaseException) as error:
-        raise DataError(f"{folder / '.hydra'}: damaged ({str(error).splitlines()[0]})") from None
+    config = OmegaConf.load(folder / CONFIG)
+    if not isinstance(config, DictConfig):
+        raise ValueError(f"{CONFIG} is not a config")
+    return settings_of(config), choices(folder)
 
 
 def by_settings(run: Run, keys: Sequence[str]) -> Run:

@@ -1,54 +1,19 @@
-"""What a table shows, as set in ``conf/table``, and how each metric is written."""
+"""The content of a table, as set in ``conf/table``."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from gsgan.data.splits import SPLITS
+from gsgan.metrics.names import METRICS
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError
 
 PAINTED, SPLAT, FLOOR = "full", "splat", "floor"  # variants in metrics.json
 MEAN = "mean"  # the column over subjects
-IN_BOXES = ("psnr_hands", "ssim_hands", "psnr_mouth", "ssim_mouth")
-
-
-class Metric(NamedTuple):
-    """A metric's heading, digits after the point, and better: ``↑``, ``↓`` or ``→1`` (near 1)."""
-
-    heading: str
-    digits: int
-    better: str
-
-
-METRICS = {
-    "psnr": Metric("PSNR dB", 2, "↑"),
-    "psnr_person": Metric("PSNR dB in box", 2, "↑"),
-    "psnr_inside": Metric("PSNR dB in box off the outline", 2, "↑"),
-    "ssim": Metric("SSIM", 4, "↑"),
-    "ssim_person": Metric("SSIM in box", 4, "↑"),
-    "lpips": Metric("LPIPS", 4, "↓"),
-    "lpips_person": Metric("LPIPS in box", 4, "↓"),
-    "edge_f1": Metric("edge F1", 3, "↑"),
-    "edge_f1_person": Metric("edge F1 in box", 3, "↑"),
-    "edge_ratio": Metric("edges", 3, "→1"),
-    "edge_ratio_person": Metric("edges in box", 3, "→1"),
-    "high_frequencies": Metric("detail", 3, "→1"),
-    "psnr_hands": Metric("PSNR dB hands", 2, "↑"),
-    "ssim_hands": Metric("SSIM hands", 4, "↑"),
-    "psnr_mouth": Metric("PSNR dB mouth", 2, "↑"),
-    "ssim_mouth": Metric("SSIM mouth", 4, "↑"),
-    "miou": Metric("mIoU", 4, "↑"),
-    "miou_with_background": Metric("mIoU with background", 4, "↑"),
-}
-
-
-def heading(metric: str) -> str:
-    """A column's heading with the direction that is better."""
-    return f"{METRICS[metric].heading} {METRICS[metric].better}"
 
 
 def written(metric: str, value: float) -> str:

@@ -1,32 +1,31 @@
-"""Tables of ``runs``: rows and columns, statistics over seeds, and what belongs below them."""
+"""Tables of ``runs``: rows and columns, statistics over seeds, and notes."""
 
 from __future__ import annotations
 
 import os
-import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rich.markdown import Markdown
 
-from gsgan.evaluate.paper import NAME, clause
+from gsgan.metrics.names import BOX_METRICS, METRICS
+from gsgan.report.departures import NAME, clause
 from gsgan.report.paper import PaperTable, read_paper
 from gsgan.report.runs import DATA, Run, by_settings, check_same, find_runs, read_runs
 from gsgan.report.spec import (
     FLOOR,
-    IN_BOXES,
     MEAN,
-    METRICS,
     PAINTED,
     SPLAT,
     RowSpec,
     TableSpec,
-    heading,
     natural,
     subject_of,
     written,
@@ -40,8 +39,8 @@ from gsgan.report.write import (
     Grid,
     Report,
     Row,
-    common,
-    pages,
+    files_of,
+    join_unique,
 )
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
@@ -56,11 +55,10 @@ SPREAD = (
     "no spread."
 )
 SPLIT_TITLES = {"novel_view": " (held-out cameras)", "novel_pose": " (held-out poses)"}
-FACTS = ("version", "iterations", "train_seconds", "device", "torch", "date")
 PER_SUBJECT = ("subject", "train_frames", "test_frames")  # of a protocol, differ by subject
 DIRTY = "uncommitted changes of the code (allow_dirty=true allows them)"
 NO_SEED = "None"  # of predictions and of the all-background image
-Values = dict[str, tuple[float | None, str | None]]  # by seed: value, why missing or incomplete
+NO_MEAN = "no mean over subjects: not all have scores of these seeds"
 
 
 @dataclass(frozen=True)
@@ -81,8 +79,8 @@ class Part:
 
     def heading(self, metric: str) -> str:
         """Of a metric; LPIPS with its backbone and region, where runs have it."""
-        named = common(_lpips(run, self.split) or "" for run in self.runs)
-        return f"{named} ↓" if metric == "lpips" and named else heading(metric)
+        named = join_unique(_lpips(run, self.split) or "" for run in self.runs)
+        return f"{named} ↓" if metric == "lpips" and named else METRICS[metric].heading
 
     def of(self, name: str | None, column: str = MEAN) -> list[Run]:
         """The runs of a model or method (None: of all) that a column shows."""
@@ -104,31 +102,53 @@ class Part:
             if any(run.of(self.split, variant) for run in self.of(name))
         ]
 
-    def values(self, name: str | None, variant: str, column: str) -> Values:
-        """One cell's scores by seed; the all-background image (name None) has one for all runs."""
-        if column == MEAN:
-            return self._over_subjects(name, variant)
-        metric, runs = self.columns[column], self.of(name, column)
-        found = {str(run.seed): _value(run, self.split, variant, metric) for run in runs}
-        if name is None and found:  # one for all: they are of the same data
-            scored = [pair for pair in found.values() if pair[0] is not None]
-            return {NO_SEED: (scored or list(found.values()))[0]}
-        return found
+    @cached_property
+    def scores(self) -> pd.DataFrame:
+        """One row per run, variant and column: ``name variant column seed value note``.
 
-    def _over_subjects(self, name: str | None, variant: str) -> Values:
-        """The mean over subjects, seed by seed."""
-        held = [self.values(name, variant, subject) for subject in self.spec.subjects or ()]
-        scores = [
-            {seed: value for seed, (value, _) in found.items() if value is not None}
-            for found in held
+        The all-background image is of the data, not of a model or seed, so it has one row per
+        column, without a name.
+        """
+        rows = [
+            (run.name, variant, column, str(run.seed), *_value(run, self.split, variant, metric))
+            for column, metric in self.columns.items()
+            if column != MEAN
+            for run in self.of(None, column)
+            for variant in (PAINTED, SPLAT, FLOOR)
         ]
-        seeds = scores[0].keys()
-        if not seeds or any(found.keys() != seeds for found in scores):
-            return {NO_SEED: (None, "no mean over subjects: not all have scores of these seeds")}
-        return {s: (statistics.fmean(found[s] for found in scores), None) for s in seeds}
+        names = ["name", "variant", "column", "seed", "value", "note"]
+        frame = pd.DataFrame(rows, columns=names)
+        frame.loc[frame.variant == FLOOR, ["name", "seed"]] = "", NO_SEED
+        frame = frame.sort_values("value", kind="stable", na_position="last")
+        frame = frame.drop_duplicates(names[:4]).sort_index()
+        if self.metric is None:
+            return frame
+        # The mean over subjects, seed by seed, where all subjects have scores of the same seeds.
+        wide = frame.pivot(index=[*names[:2], "seed"], columns="column", values="value")
+        means = wide.reindex(columns=self.spec.subjects).mean(axis=1, skipna=False)
+        whole = means.groupby(level=names[:2]).transform(lambda own: own.notna().all())
+        mean = means.where(whole).rename("value").reset_index().assign(column=MEAN)
+        mean["note"] = mean.value.map(lambda value: NO_MEAN if pd.isna(value) else None)
+        return pd.concat([frame, mean])
+
+    def cell(self, name: str, variant: str, column: str) -> Cell:
+        """Mean ± sample standard deviation (n - 1) over seeds; one seed has no spread."""
+        at, metric = self.scores, self.columns[column]
+        own = at[(at["name"] == name) & (at.variant == variant) & (at.column == column)]
+        notes = [
+            note if len(few) == len(own) else f"seed {', '.join(few.seed)}: {note}"
+            for note, few in own.groupby("note", sort=False)
+        ]
+        values = own.value.dropna()
+        if values.empty:
+            notes = [f"{NOT_HAD}: {note}" for note in notes or ["no scored run"]]
+            return Cell(NOT_HAD, notes=tuple(notes))
+        mean, spread = float(values.mean()), float(values.std()) if len(values) > 1 else None
+        text = written(metric, mean) + ("" if spread is None else f" ± {written(metric, spread)}")
+        return Cell(text, mean, spread, tuple(notes))
 
     def check(self, allow_dirty: bool) -> None:
-        """Raises ConfigError where a column or a row would mix what does not belong together."""
+        """Raises ConfigError where the runs of a column or a row are not comparable."""
         where = f"table {self.spec.name}, {self.split}"
         for column in self.columns:
             scored = [run for run in self.of(None, column) if run.images(self.split)]
@@ -144,7 +164,7 @@ class Part:
 
 
 def _row_facts(run: Run, split: str) -> dict[str, Any]:
-    """What the runs of one row have in common: all but the seed."""
+    """Properties that must be equal in one row: all but the seed."""
     return {
         "kind": "predictions" if run.seed is None else "a model trained here",
         "settings": run.settings,
@@ -154,7 +174,7 @@ def _row_facts(run: Run, split: str) -> dict[str, Any]:
 
 
 def _column_facts(run: Run, part: Part, mean: bool, allow_dirty: bool) -> dict[str, Any]:
-    """What the runs of one column have in common; those of a mean over subjects differ in data."""
+    """Properties that must be equal in one column; data may differ for a mean over subjects."""
     split = part.split
     record = run.protocol(split)
     facts = {
@@ -178,7 +198,7 @@ def make_tables(config: DictConfig) -> None:
     """Writes the table ``config.table`` of ``config.runs`` into ``config.out``.
 
     Raises:
-        ConfigError: on runs that do not exist or do not belong into one table, or on a page or
+        ConfigError: on runs that do not exist or are not comparable, or on a page or
             folder that cannot be written.
     """
     given = [config.runs] if isinstance(config.runs, str) else config.runs
@@ -192,7 +212,7 @@ def make_tables(config: DictConfig) -> None:
     report = build(spec, runs, left_out, paper, allow_dirty=config.allow_dirty)
     now = f"{datetime.now():%Y-%m-%d_%H-%M-%S}"
     folder = Path(str(config.out or f"runs/report/{now}")).expanduser()
-    files: dict[str, str | bytes] = dict(pages(report))
+    files: dict[str, str | bytes] = dict(files_of(report))
     if spec.by:
         from gsgan.report.curves import curves  # here: it imports matplotlib
 
@@ -245,18 +265,12 @@ def build(
     folders = [*(run.folder for run in taken), *left_out]
     shared = os.path.commonpath([folder.parent for folder in folders])
     names = {folder: os.path.relpath(folder, shared) for folder in folders}
-    records = [
-        {"folder": names[run.folder], "name": run.name, "seed": run.seed, "data": run.data}
-        | {"protocol": run.protocol()["name"], "commit": run.commit}
-        | {key: run.facts.get(key) for key in FACTS}
-        for run in taken
-    ]
     left = {names[folder]: reason for folder, reason in left_out.items()}
-    return Report(spec.name, spec.title, _grids(parts, paper), records, left)
+    return Report(spec.title, _grids(parts, paper), left)
 
 
 def _no_place(spec: TableSpec, run: Run) -> str | None:
-    """Why the table has no place for a run; raises ConfigError on another data set's."""
+    """Why the table has no row for a run; raises ConfigError for another data set."""
     if spec.data not in (None, run.data.get("name")):
         what = f"is of {spec.data}, but {run} is of {run.data_name}"
         raise ConfigError(f"table {spec.name} {what}; leave it out of runs, or use table=plain")
@@ -291,10 +305,10 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
         if spec.variant == PAINTED:
             rows += printed.pop(spec.run, [])
     rows = _with_best([*rows, *(row for left in printed.values() for row in left)], part)
-    floor = [mean_cell(m, part.values(None, FLOOR, c)) for c, m in columns.items()]
+    floor = [part.cell("", FLOOR, c) for c in columns]
     rows.append(Row(FLOOR_LABEL, floor, (NOT_HAD, *_origin(part.runs)), "floor"))
     title = f"{part.split}{SPLIT_TITLES.get(part.split, '')}"
-    boxes = common(_boxes(run, part) or "" for run in part.runs)
+    boxes = join_unique(_boxes(run, part) or "" for run in part.runs)
     remarks = [SPREAD, f"Boxes: {boxes}."] if boxes else [SPREAD]
     if part.metric is None:
         return Grid(title, [part.heading(m) for m in columns], rows, remarks)
@@ -304,7 +318,7 @@ def _grid(part: Part, paper: PaperTable | None) -> Grid:
 def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
     runs, label, shown = part.of(spec.run), spec.label or spec.run, (spec.run, spec.variant)
     if not runs:
-        cells = [Cell(NO_RUN, {"n": 0}) for _ in part.columns]
+        cells = [Cell(NO_RUN) for _ in part.columns]
         return Row(label, cells, ("0", NO_RUN, NO_RUN, NO_RUN), notes=("no scored run",))
     notes = list(dict.fromkeys(_marks(runs, part.split)))
     if beside_paper:  # named as the paper's method where all runs are
@@ -317,29 +331,8 @@ def _row(part: Part, spec: RowSpec, *, beside_paper: bool) -> Row:
             label = NAME if shown == ("full", PAINTED) else f"{NAME}, {label}"
     counts = [len(part.of(spec.run, column)) for column in part.columns if column != MEAN]
     seeds = " to ".join(map(str, dict.fromkeys((min(counts), max(counts)))))
-    cells = [mean_cell(m, part.values(*shown, c)) for c, m in part.columns.items()]
+    cells = [part.cell(*shown, c) for c in part.columns]
     return Row(label, cells, (seeds, *_origin(runs)), notes=tuple(notes))
-
-
-def mean_cell(metric: str, found: Values) -> Cell:
-    """Mean ± sample standard deviation (n − 1) over seeds; one seed has no spread."""
-    by_note: dict[str, list[str]] = {}
-    for seed, (_, note) in found.items():
-        if note is not None:
-            by_note.setdefault(note, []).append(seed)
-    notes = [
-        note if len(seeds) == len(found) else f"seed {', '.join(seeds)}: {note}"
-        for note, seeds in by_note.items()
-    ]
-    values = {seed: value for seed, (value, _) in found.items() if value is not None}
-    if not values:
-        notes = [f"{NOT_HAD}: {note}" for note in notes or ["no scored run"]]
-        return Cell(NOT_HAD, {"n": 0}, tuple(notes))
-    mean = statistics.fmean(values.values())
-    spread = statistics.stdev(values.values()) if len(values) > 1 else None
-    text = written(metric, mean) + ("" if spread is None else f" ± {written(metric, spread)}")
-    numbers = {"mean": mean, "spread": spread, "n": len(values), "seeds": values}
-    return Cell(text, numbers, tuple(notes))
 
 
 def _value(run: Run, split: str, variant: str, metric: str) -> tuple[float | None, str | None]:
@@ -358,12 +351,12 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
     found = [list(row.cells) for row in rows]
     for i, metric in enumerate(part.columns.values()):
         sign = {"↑": -1, "↓": 1}.get(METRICS[metric].better)
-        means = [cells[i].numbers["mean"] for cells in found if "mean" in cells[i].numbers]
+        means = [mean for cells in found if (mean := cells[i].mean) is not None]
         if len(means) < 2:
             continue
         best = min(means, key=lambda mean: abs(mean - 1) if sign is None else sign * mean)
         for cells in found:
-            mean = cells[i].numbers.get("mean")
+            mean = cells[i].mean
             equal = mean is not None and written(metric, mean) == written(metric, best)
             cells[i] = replace(cells[i], best=equal)
     return [replace(row, cells=cells) for row, cells in zip(rows, found, strict=True)]
@@ -371,10 +364,11 @@ def _with_best(rows: Sequence[Row], part: Part) -> list[Row]:
 
 def _origin(runs: Sequence[Run]) -> tuple[str, ...]:
     """Data, protocol and commit of a row."""
-    data = common(run.data_name for run in runs)
+    data = join_unique(run.data_name for run in runs)
     if len(roots := {run.data.get("root") for run in runs}) > 1:
         data = f"{runs[0].data['name']}, {len(roots)} subjects"
-    return data, common(r.protocol()["name"] for r in runs), common(r.commit for r in runs)
+    protocols, commits = [run.protocol()["name"] for run in runs], [run.commit for run in runs]
+    return data, join_unique(protocols), join_unique(commits)
 
 
 def _marks(runs: Sequence[Run], split: str) -> Iterator[str]:
@@ -393,7 +387,7 @@ def _lpips(run: Run, split: str) -> str | None:
 
 
 def _boxes(run: Run, part: Part) -> str | None:
-    """What a run's boxes of hands and mouth contain, if the grid has a metric in them."""
-    shown = {*IN_BOXES} & {*part.columns.values()}
+    """The boxes of hands and mouth of a run, if the grid has a metric in them."""
+    shown = {*BOX_METRICS} & {*part.columns.values()}
     scores = run.scores.get(part.split, {}).values() if shown else ()
     return next((s["boxes"] for s in scores if s.get("boxes")), None)

@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+
+import pandas as pd
 
 from gsgan.utils.errors import DataError
 
-SECONDS, QUALITY, COLOUR = "val/seconds", "val/psnr", "val/psnr_splat"
-
-
-class Point(NamedTuple):
-    """One validation: seconds of training, dB of the image and of Step I's colour, iteration."""
-
-    seconds: float
-    psnr: float
-    colour: float | None
-    step: float
+COLUMNS = ["val/seconds", "val/psnr", "val/psnr_splat", "step"]
 
 
 @dataclass(frozen=True)
@@ -48,52 +39,29 @@ def curve(label: str, run: Path) -> Curve | None:
     Raises:
         DataError: when a log cannot be read.
     """
-    points: list[Point] = []
+    whole = pd.DataFrame(columns=COLUMNS, dtype=float)
     for log in sorted(run.glob("logs*/metrics.csv"), key=lambda path: path.parent.name):
         part = _validations(log)
-        if part:
-            start, began = _start(log), part[0].seconds
-            points = [p for p in points if p.seconds < began and p.step < start] + part
-    if len(points) < 2:
+        if len(part):
+            start = log.parent.name.rpartition("_")[2]  # of logs_000250, the first iteration
+            earlier = whole.step < (float(start) if start.isdecimal() else math.inf)
+            earlier &= whole["val/seconds"] < part["val/seconds"].iloc[0]
+            whole = pd.concat([whole[earlier], part])
+    if len(whole) < 2:
         return None
-    colour = tuple(p.colour for p in points if p.colour is not None)
-    return Curve(
-        label,
-        tuple(p.seconds for p in points),
-        tuple(p.psnr for p in points),
-        colour if len(colour) == len(points) else (),
-    )
+    seconds, psnr, colour = (tuple(whole[name].tolist()) for name in COLUMNS[:3])
+    return Curve(label, seconds, psnr, () if whole["val/psnr_splat"].isna().any() else colour)
 
 
-def _validations(log: Path) -> list[Point]:
+def _validations(log: Path) -> pd.DataFrame:
     """Each validation; an incomplete last line is skipped."""
     try:
-        text = log.read_text(encoding="utf-8")
-        rows = list(csv.DictReader(text[: text.rfind("\n") + 1].splitlines()))
-    except (OSError, UnicodeError, csv.Error) as error:
+        table = pd.read_csv(log, on_bad_lines="skip", dtype=str).reindex(columns=COLUMNS)
+        complete = log.read_text(encoding="utf-8").endswith("\n")
+    except (OSError, UnicodeError, ValueError) as error:
         raise DataError(
             f"{log}: not a readable log of a training ({type(error).__name__}); remove it to go on "
             "without it"
         ) from error
-    found: list[Point] = []
-    for row in rows:
-        seconds, psnr = _number(row, SECONDS), _number(row, QUALITY)
-        if seconds is not None and psnr is not None:
-            colour, step = _number(row, COLOUR), _number(row, "step")
-            found.append(Point(seconds, psnr, colour, step or 0.0))
-    return found
-
-
-def _start(log: Path) -> float:
-    """First iteration of a resumed part, from its folder's name, e.g. ``logs_000250``."""
-    number = log.parent.name.rpartition("_")[2]
-    return float(number) if number.isdecimal() else math.inf
-
-
-def _number(row: dict[str, str], key: str) -> float | None:
-    """A finite number, or None."""
-    try:
-        value = float(row.get(key) or "nan")
-    except ValueError:
-        return None
-    return value if math.isfinite(value) else None
+    table = table.apply(pd.to_numeric, errors="coerce").iloc[: None if complete else -1]
+    return table.dropna(subset=COLUMNS[:2]).fillna({"step": 0.0})

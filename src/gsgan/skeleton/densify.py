@@ -14,17 +14,17 @@ from torch import Tensor, nn
 
 from gsgan.skeleton.frames import MIN_LENGTH, BoneFrames, bone_frames
 from gsgan.skeleton.holistic import named_template
-from gsgan.skeleton.template import HEAD, MEDIAPIPE33, SkeletonTemplate
+from gsgan.skeleton.template import MEDIAPIPE33, SkeletonTemplate
 from gsgan.skeleton.tensors import Swing, check_skeleton, constants
 from gsgan.utils.errors import ConfigError
 
 Torso = Literal["fit", "cube"]
 Sampler = Literal["even", "trimesh"]
-Limbs = Literal["paper22", "all26"]
 Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 GOLDEN = (5**0.5 - 1) / 2
 PLASTIC = 1.32471795724474602596  # root of x³ = x + 1, the two-dimensional golden ratio
+TORSO_RANGE = (0.25, 4.0)  # of the box's edges (``fit``), in multiples of the rest pose's
 
 
 @dataclass(frozen=True)
@@ -79,10 +79,7 @@ class Densify(nn.Module):
             or ``cube`` (edge length: the longest distance between shoulders and hips).
         sampler: ``even`` (low discrepancy) or ``trimesh`` (shipped random surface samples; hands
             are even).
-        limbs: ``paper22``, or ``all26``: with the trunk's four edges.
         sigma: initial standard deviation divided by the mean spacing ``sqrt(area / points)``.
-        torso_range: bounds of the box's edges, in multiples of the rest pose's (``fit``).
-        min_length: metres, see :func:`gsgan.skeleton.bone_frames`.
         dtype: of the buffers; torch's default by default.
 
     Raises:
@@ -116,20 +113,16 @@ class Densify(nn.Module):
         face_radius_scale: float = 1.0,
         torso: Torso = "fit",
         sampler: Sampler = "even",
-        limbs: Limbs = "paper22",
         *,
         points_per_finger_bone: int = 60,
         finger_radius_ratio: float = 0.25,
         sigma: float = 0.6,
-        torso_range: tuple[float, float] = (0.25, 4.0),
-        min_length: float = MIN_LENGTH,
         dtype: torch.dtype | None = None,
     ) -> None:
         super().__init__()
         for name, value, known in (
             ("torso", torso, Torso),
             ("sampler", sampler, Sampler),
-            ("limbs", limbs, Limbs),
         ):
             if value not in get_args(known):
                 expected = ", ".join(get_args(known))
@@ -137,19 +130,18 @@ class Densify(nn.Module):
         counts = (points_per_limb, face_points, torso_points, points_per_finger_bone)
         if min(counts) < 1:
             raise ConfigError(f"Densify: every part must have at least one point, got {counts}")
-        ratios = (radius_ratio, face_radius_scale, finger_radius_ratio, sigma, min_length)
+        ratios = (radius_ratio, face_radius_scale, finger_radius_ratio, sigma)
         if min(ratios) <= 0:
             raise ConfigError(
-                "Densify: radius_ratio, face_radius_scale, finger_radius_ratio, sigma and "
-                f"min_length must be positive, got {', '.join(map(str, ratios))}"
+                "Densify: radius_ratio, face_radius_scale, finger_radius_ratio and sigma must be "
+                f"positive, got {', '.join(map(str, ratios))}"
             )
-        chosen = named_template(template)
-        self.template = chosen if limbs == "paper22" else chosen.with_torso_limbs()
+        self.template = named_template(template)
         self.counts = counts
         self.radius_ratio, self.finger_radius_ratio = radius_ratio, finger_radius_ratio
         self.face_radius_scale = face_radius_scale
         self.torso = torso
-        self.sigma, self.torso_range, self.min_length = sigma, tuple(torso_range), min_length
+        self.sigma = sigma
         self._make_buffers(sampler, dtype or torch.get_default_dtype())
 
     @property
@@ -228,12 +220,12 @@ class Densify(nn.Module):
         """
         valid = check_skeleton("Densify", p, valid, self.template)
         c = constants(self.template, p.device, p.dtype)
-        if frames is None or frames.limbs.shape[1] != len(self.template.limbs):
-            frames = bone_frames(p, valid, self.template, min_length=self.min_length)
+        if frames is None:
+            frames = bone_frames(p, valid, self.template)
         root = p[:, self.template.hips[0], None].detach()
         q = p - root
         face, torso = q.index_select(1, self._face), q.index_select(1, c.torso)
-        head_R, trunk_R = frames.hubs[:, HEAD], frames.torso
+        head_R, trunk_R = frames.head, frames.torso
         centres = torch.stack([face.mean(1), torso.mean(1)], dim=1)
         origins = torch.cat([q.index_select(1, c.starts), centres], dim=1)
         radius = self._longest(q, self._face_pairs) * self.face_radius_scale
@@ -271,7 +263,7 @@ class Densify(nn.Module):
     def _longest(self, q: Tensor, pairs: Tensor) -> Tensor:
         """``[B]`` metres: the longest distance over pairs of joints, never zero."""
         d = q.index_select(1, pairs[0]) - q.index_select(1, pairs[1])
-        return (d.square().sum(-1).amax(-1) + self.min_length**2).sqrt()
+        return (d.square().sum(-1).amax(-1) + MIN_LENGTH**2).sqrt()
 
     def _torso_edges(self, q: Tensor, torso: Tensor) -> Tensor:
         """``[B, 3]`` metres: left-right, up, front."""
@@ -279,9 +271,9 @@ class Densify(nn.Module):
             return self._longest(q, self._torso_pairs).unsqueeze(1).expand(-1, 3)
         l_sh, r_sh, l_hip, r_hip = torso.unbind(1)
         lines = torch.stack([l_sh - r_sh, l_hip - r_hip, (l_sh + r_sh - l_hip - r_hip) * 0.5], 1)
-        lengths = (lines.square().sum(-1) + self.min_length**2).sqrt()
+        lengths = (lines.square().sum(-1) + MIN_LENGTH**2).sqrt()
         width, height = lengths[:, :2].amax(1), lengths[:, 2]
-        low, high = self.torso_range
+        low, high = TORSO_RANGE
         edges = torch.stack([width, height, 0.5 * width], dim=1)
         return edges.clamp(self._torso_rest * low, self._torso_rest * high)
 

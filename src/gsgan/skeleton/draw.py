@@ -16,6 +16,8 @@ from gsgan.utils.tensors import constant
 
 MIN_SEGMENT_PX = 1e-2
 """Pixels: a shorter segment is drawn as a point, with a finite slope."""
+MIN_SIGMA = 0.8
+"""Pixels: the least line width."""
 MIN_EXPONENT = -60.0
 """Below this exponent a line is exactly zero: at 1e-26, eleven sigmas away."""
 
@@ -27,15 +29,12 @@ def draw_skeleton(
     template: SkeletonTemplate = MEDIAPIPE33,
     sigma_px: float = 2.5,
     near: float = 0.01,
-    downscale: int = 1,
-    *,
-    min_sigma_px: float = 0.8,
 ) -> Tensor:
     """Draws the skeleton as the camera sees it.
 
     Convention: a channel is the maximum of ``exp(-d² / 2 sigma²)`` over its group's segments, d the
     distance of the pixel's centre in pixels; 1 on the bone. ``sigma = sigma_px H / 512``, at least
-    ``min_sigma_px`` pixels of the grid it is computed on. Segments with an end that is unseen or
+    `MIN_SIGMA` pixels. Segments with an end that is unseen or
     nearer than ``near`` are not drawn. Joints are distorted by the camera's lens, bones stay
     straight. Differentiable in p and the camera.
 
@@ -46,41 +45,32 @@ def draw_skeleton(
         template: defines the groups; MediaPipe's are head, torso, left and right arm, hand, leg.
         sigma_px: line width at an image height of 512.
         near: metres.
-        downscale: computes at 1/downscale of the size and upsamples bilinearly.
-        min_sigma_px: lower bound of the line width.
 
     Returns:
         ``[B, groups, H, W]`` in [0, 1].
 
     Raises:
-        ValueError: on a wrong shape, batch size or ``downscale``.
+        ValueError: on a wrong shape or batch size.
 
     Source: paper Sec. 3.5 (p₂D is not specified there); method notes, section 4.
     """
     valid = check_skeleton("draw_skeleton", p, valid, template)
     if len(camera) != len(p):
         raise ValueError(f"draw_skeleton: camera must hold {len(p)} cameras, got {len(camera)}")
-    if downscale < 1:
-        raise ValueError(f"draw_skeleton: downscale must be at least 1, got {downscale}")
-    H, W = camera.size
-    h, w = -(-H // downscale), -(-W // downscale)
-    grid = camera.resize((h, w)) if downscale > 1 else camera
-    sigma = max(sigma_px * H / 512 / downscale, min_sigma_px)
+    sigma = max(sigma_px * camera.size[0] / 512, MIN_SIGMA)
 
-    pixels, depth = grid.project(p, near)
+    # the ends of the segments that are drawn
+    pixels, depth = camera.project(p, near)
     drawn = valid & (depth > near)
     ends = _segment_ends(template, p.device)
     shown = (drawn.index_select(1, ends[0]) & drawn.index_select(1, ends[1])).unsqueeze(-1)
     a, b = (pixels.index_select(1, end) for end in ends)
-    # masked before the arithmetic: pixels of unseen joints may be anything
+    # masked before the arithmetic: pixels of unseen joints are arbitrary
     a, b = torch.where(shown, a, 0.0), torch.where(shown, b, 0.0)
-    distance2 = _distance2(a, b, shown, (h, w), [len(g) for _, g in template.draw_groups])
-    # below the bound the value is exactly zero: denormals would slow down everything that follows
+    distance2 = _distance2(a, b, shown, camera.size, [len(g) for _, g in template.draw_groups])
+    # zero below the bound: denormal numbers would slow down all later operations
     exponent = (distance2 * (-0.5 / sigma**2)).clamp_min(MIN_EXPONENT)
-    image = exponent.exp() - math.exp(MIN_EXPONENT)
-    if downscale > 1:
-        image = F.interpolate(image, size=(H, W), mode="bilinear", align_corners=False)
-    return image
+    return exponent.exp() - math.exp(MIN_EXPONENT)
 
 
 @lru_cache(maxsize=64)

@@ -1,22 +1,18 @@
 """Landmarks of a face: lips, brows and lids, and their offsets from the face at rest.
 
-They carry what a face adds to a sign: the mouth's shape, brows, gaze and blinks. The oval is left
-out: the pose's own ears, eyes and nose give the head's place and turn. Convention: as in
-`gsgan.skeleton.template`.
+They represent what a face adds to a sign: the mouth's shape, brows, gaze and blinks. The oval is
+left out, because the pose's own ears, eyes and nose determine the head's position and rotation.
+Convention: as in `gsgan.skeleton.template`.
 """
 
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from gsgan.skeleton.template import HEAD, MEDIAPIPE33, Edge, SkeletonTemplate, Vector
+from gsgan.skeleton.template import MEDIAPIPE33, Edge, SkeletonTemplate, Vector
 from gsgan.skeleton.tensors import constants
-
-if TYPE_CHECKING:
-    from gsgan.skeleton.frames import BoneFrames  # loads this module
 
 LIP_POINTS = 12  # round the outer edge: 0 left corner, 3 top, 6 right corner, 9 bottom
 BROW_POINTS = 5  # from the nose outwards
@@ -60,7 +56,7 @@ _TWINS = {
 
 
 def rest_face() -> tuple[Vector, ...]:
-    """Metres: where the face lies on the rest pose of the skeleton templates."""
+    """Positions of the landmarks in the rest pose of the skeleton templates, metres."""
 
     def place(name: str) -> Vector:
         if name in _LEFT_REST:
@@ -88,7 +84,7 @@ def face_groups(start: int) -> tuple[tuple[str, tuple[Edge, ...]], ...]:
 
 
 def face_links(start: int) -> tuple[Edge, ...]:
-    """Edges to the pose's mouth and eyes: without them lips, brows and lids are components."""
+    """Edges to the pose's mouth and eyes, which connect lips, brows and lids to the graph."""
     ends = {"mouth_left": LIPS[0], "mouth_right": LIPS[LIP_POINTS // 2]}
     for side, brow, lid in zip(SIDES, BROWS, LIDS, strict=True):
         ends |= {f"{side}_eye": brow[BROW_POINTS // 2]}
@@ -110,7 +106,7 @@ def in_head(points: Tensor, p: Tensor, head: Tensor, template: SkeletonTemplate)
     return (points - p.index_select(1, c.head_points).mean(1, keepdim=True)) @ head
 
 
-def face_code(p: Tensor, frames: BoneFrames, template: SkeletonTemplate) -> Tensor | None:
+def face_code(p: Tensor, head: Tensor, template: SkeletonTemplate) -> Tensor | None:
     """``[B, E, 3]`` offsets of the face's landmarks from the face at rest, in units of `OFFSET`.
 
     Convention: in the head's axes; zero for a face at rest, however the head turns, and so for one
@@ -118,13 +114,11 @@ def face_code(p: Tensor, frames: BoneFrames, template: SkeletonTemplate) -> Tens
 
     Args:
         p: ``[B, J, 3]`` finite joints, metres, world frame.
-        frames: of these skeletons.
+        head: ``[B, 3, 3]`` the head's frame, see `gsgan.skeleton.bone_frames`.
         template: of the joints.
-
-    Source: ours; the paper leaves the face's part in the pose open.
     """
     if not template.expression:
         return None
     c = constants(template, p.device, p.dtype)
-    found = in_head(p.index_select(1, c.expression), p, frames.hubs[:, HEAD], template)
+    found = in_head(p.index_select(1, c.expression), p, head, template)
     return (found - c.face_rest) / OFFSET

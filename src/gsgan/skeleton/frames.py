@@ -11,7 +11,6 @@ values and gradients stay finite on straight, folded and vanishing bones.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from torch import Tensor
@@ -21,10 +20,7 @@ from gsgan.skeleton.face import face_code
 from gsgan.skeleton.hands import palm_frames
 from gsgan.skeleton.rotation6d import across, rotation_from_6d, rotation_to_6d, unit
 from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, SkeletonTemplate
-from gsgan.skeleton.tensors import FOLDED, Constants, Level, check_skeleton, constants
-from gsgan.utils.tensors import constant
-
-Twist = Literal["none", "hinge"]
+from gsgan.skeleton.tensors import FOLDED, Constants, check_skeleton, constants
 
 MIN_LENGTH = 1e-3
 """Metres: a shorter bone or baseline has no direction (1 mm, below any landmark's accuracy)."""
@@ -43,8 +39,13 @@ class BoneFrames:
     hubs: Tensor
     limbs: Tensor  # [B, L, 3, 3]
     local: Tensor  # [B, L, 3, 3] the same relative to the parent's frame
-    lengths: Tensor  # [B, L] metres, sqrt(|bone|² + min_length²)
+    lengths: Tensor  # [B, L] metres, sqrt(|bone|² + MIN_LENGTH²)
     torso: Tensor  # [B, 3, 3] the frame of the trunk's box
+
+    @property
+    def head(self) -> Tensor:
+        """``[B, 3, 3]``: the frame of the head."""
+        return self.hubs[:, HEAD]
 
 
 def root_of(p: Tensor, template: SkeletonTemplate = MEDIAPIPE33) -> Tensor:
@@ -57,64 +58,51 @@ def bone_frames(
     p: Tensor,
     valid: Tensor | None = None,
     template: SkeletonTemplate = MEDIAPIPE33,
-    *,
-    twist: Twist = "none",
-    min_length: float = MIN_LENGTH,
-    folded: float = FOLDED,
 ) -> BoneFrames:
     """The frames of trunk, head and limbs.
 
     Convention: metres, world frame; everything but the last fallbacks rotates with the skeleton.
     The head's frame comes from nose and ears, else from nose and eyes, else from the chest. Where
     shoulders or hips are in line with the spine, the other baseline is used, then a world axis.
-    Below ``min_length`` a bone's swing fades to none and a baseline to its fallback, so that bones
+    Below `MIN_LENGTH` a bone's swing fades to none and a baseline to its fallback, so that bones
     that vanish and grow again do not jump: a joint's step moves a frame by at most a few times
-    ``step / min_length``. Four cases must jump, because no continuous choice exists: a limb folded
+    ``step / MIN_LENGTH``. Four cases must jump, because no continuous choice exists: a limb folded
     back onto itself, shoulders facing backwards over the hips, a baseline that passes the exact
-    opposite of its fallback below ``min_length``, and the world axis for a trunk without width.
+    opposite of its fallback below `MIN_LENGTH`, and the world axis for a trunk without width.
 
     Args:
         p: ``[B, J, 3]`` finite joints (see :func:`gsgan.skeleton.sanitise`).
         valid: ``[B, J]`` bool, False for joints that were filled in; None: all seen.
         template: names the joints.
-        twist: ``hinge`` turns arms and legs about their bones towards the bend plane, with the
-            weight sin²(bend), 0 when straight; ``none`` keeps the swing.
-        min_length: metres, below which a bone's direction fades.
-        folded: ``1 + cos`` below which two directions count as opposite.
 
     Returns:
         BoneFrames.
 
     Raises:
-        ValueError: when a shape does not match the template, or ``twist`` is unknown.
+        ValueError: when a shape does not match the template.
 
     Source: method notes, section 6 (6D bone rotations of paper Sec. 3.5, which leaves the frames
     open).
     """
-    if twist not in ("none", "hinge"):
-        raise ValueError(f"bone_frames: twist must be 'none' or 'hinge', got {twist!r}")
     valid = check_skeleton("bone_frames", p, valid, template)
     c = constants(template, p.device, p.dtype)
     # baselines are differences of nearby points: exact once the root is subtracted
     q = p - p[:, template.hips[0], None].detach()
-    trunk = _trunk(q, c, min_length, folded)
-    hubs = torch.cat([trunk[:, :2], _head(q, valid, trunk[:, 1], c, min_length)], dim=1)
+    trunk = _trunk(q, c)
+    hubs = torch.cat([trunk[:, :2], _head(q, valid, trunk[:, 1], c)], dim=1)
     if template.palms:
         hubs = torch.cat([hubs, _palms(q, trunk[:, 1:2], c)], dim=1)
 
     bones = q.index_select(1, c.ends) - q.index_select(1, c.starts)
     length2 = bones.square().sum(-1, keepdim=True)
-    directions, _ = _shortened(bones, min_length)
-    lengths = (length2.squeeze(-1) + min_length**2).sqrt()
+    directions, _ = _shortened(bones)
+    lengths = (length2.squeeze(-1) + MIN_LENGTH**2).sqrt()
 
     known, relative = hubs, []
     for level in c.levels:
         parent = known.index_select(1, level.parents)
         d = (directions.index_select(1, level.limbs).unsqueeze(-2) @ parent).squeeze(-2)
-        local = level.swing.to(d, folded)
-        if twist == "hinge" and level.hinge is not None:
-            upper, lower = (directions.index_select(1, limbs) for limbs in level.hinge)
-            local = local @ _towards_hinge(parent @ local, upper, lower, level)
+        local = level.swing.to(d)
         relative.append(local)
         known = torch.cat([known, parent @ local], dim=1)
     return BoneFrames(
@@ -126,7 +114,7 @@ def bone_frames(
     )
 
 
-def _trunk(q: Tensor, c: Constants, min_length: float, folded: float) -> Tensor:
+def _trunk(q: Tensor, c: Constants) -> Tensor:
     """``[B, 3, 3, 3]`` frames of pelvis, chest and the box between them.
 
     They share the up axis, the long baseline from hips to shoulders; the left axis comes from the
@@ -134,37 +122,37 @@ def _trunk(q: Tensor, c: Constants, min_length: float, folded: float) -> Tensor:
     """
     l_sh, r_sh, l_hip, r_hip = q.index_select(1, c.torso).unbind(1)
     spine = (l_sh + r_sh - l_hip - r_hip) * 0.5
-    up = _faded(spine, c.axes[1], min_length, folded).unsqueeze(1)
+    up = _faded(spine, c.axes[1]).unsqueeze(1)
 
     lines = torch.stack([l_hip - r_hip, l_sh - r_sh], dim=1)
     lines = across(up, lines)
     least = c.axes[up.detach().abs().argmin(-1).squeeze(1)].unsqueeze(1)
     # the world's x axis unless the spine lies along it
     stray = unit(across(up, torch.where(up[..., :1].abs() < 0.9, c.axes[0], least)))
-    other = _faded(lines.flip(1), stray, min_length, folded)
-    lines = _faded(lines, other, min_length, folded)
+    other = _faded(lines.flip(1), stray)
+    lines = _faded(lines, other)
     # again: a line nearly along the spine keeps the rounding of its long part
     lines = unit(across(up, lines))
     both = lines.sum(1, keepdim=True)
-    opposed = both.square().sum(-1, keepdim=True) < 2 * folded  # facing backwards
+    opposed = both.square().sum(-1, keepdim=True) < 2 * FOLDED  # facing backwards
     left = torch.cat([lines, unit(torch.where(opposed, lines[:, :1], both))], dim=1)
     up = up.expand_as(left)
     return torch.stack([left, up, torch.linalg.cross(left, up)], dim=-1)
 
 
-def _head(q: Tensor, valid: Tensor, chest: Tensor, c: Constants, min_length: float) -> Tensor:
+def _head(q: Tensor, valid: Tensor, chest: Tensor, c: Constants) -> Tensor:
     """``[B, 1, 3, 3]`` from ears and nose, else eyes and nose, else the chest's frame.
 
-    A baseline that shrinks below ``min_length`` fades to the next frame.
+    A baseline that shrinks below `MIN_LENGTH` fades to the next frame.
     """
     points = q.index_select(1, c.head_points)
     seen = valid.index_select(1, c.head_points)
     pairs, nose = points[:, :4].unflatten(1, (2, 2)), points[:, 4:]
     seen_pair = seen[:, :4].unflatten(1, (2, 2)).all(-1) & seen[:, 4:]
 
-    left, wide = _shortened(pairs[:, :, 0] - pairs[:, :, 1], min_length)
+    left, wide = _shortened(pairs[:, :, 0] - pairs[:, :, 1])
     front = nose - (pairs[:, :, 0] + pairs[:, :, 1]) * 0.5
-    front, deep = _shortened(across(left, front), min_length)
+    front, deep = _shortened(across(left, front))
     frames = torch.stack([left, torch.linalg.cross(front, left), front], dim=-1)
     share = torch.where(seen_pair.unsqueeze(-1), wide * deep, 0.0).unsqueeze(-1)
 
@@ -184,59 +172,34 @@ def _palms(q: Tensor, chest: Tensor, c: Constants) -> Tensor:
     return torch.where(lost, chest, frames)
 
 
-def _faded(v: Tensor, fallback: Tensor, min_length: float, folded: float) -> Tensor:
-    """Unit v; below ``min_length`` it fades to the unit ``fallback``, which it equals at 0.
+def _faded(v: Tensor, fallback: Tensor) -> Tensor:
+    """Unit v; below `MIN_LENGTH` it fades to the unit ``fallback``, which it equals at 0.
 
     No continuous map from the ball to the sphere is the identity on the surface, so one point must
     jump: here the v opposite to the fallback, where the two cancel.
     """
-    v = v / min_length
+    v = v / MIN_LENGTH
     v = v + (1 - v.square().sum(-1, keepdim=True)).clamp_min(0) * fallback
-    lost = v.square().sum(-1, keepdim=True) < folded
+    lost = v.square().sum(-1, keepdim=True) < FOLDED
     return unit(torch.where(lost, fallback, v))
 
 
-def _shortened(v: Tensor, min_length: float) -> tuple[Tensor, Tensor]:
-    """v divided by the larger of its length and ``min_length``, and the squared result's length."""
+def _shortened(v: Tensor) -> tuple[Tensor, Tensor]:
+    """v divided by the larger of its length and `MIN_LENGTH`, and the squared result's length."""
     length2 = v.square().sum(-1, keepdim=True)
     return (
-        v * length2.clamp_min(min_length**2).rsqrt(),
-        (length2 / min_length**2).clamp_max(1),
+        v * length2.clamp_min(MIN_LENGTH**2).rsqrt(),
+        (length2 / MIN_LENGTH**2).clamp_max(1),
     )
-
-
-def _towards_hinge(R: Tensor, upper: Tensor, lower: Tensor, level: Level) -> Tensor:
-    """``[B, M, 3, 3]`` turns about the bone, in the limb's own frame, towards the bend plane.
-
-    The plane's normal is ``n = upper x lower``, ``|n| = sin(bend)``. The turn by the angle from
-    the hinge axis to n is mixed with no turn as unit complex numbers, weighted by ``|n|²``: no
-    angle is formed, and a straight limb, where n is noise, is left alone.
-    """
-    normal = torch.linalg.cross(upper, lower)
-    weight = normal.square().sum(-1, keepdim=True)
-    # |n| with a small lower bound, so that its slope at 0 is finite
-    sine = (weight + 1e-12).sqrt()
-    in_frame = normal.unsqueeze(-2) @ R
-    parts = (in_frame * level.across.transpose(0, 1)).sum(-1) * sine
-    turn = torch.stack([1.0 - weight.squeeze(-1) + parts[..., 0], parts[..., 1]], dim=-1)
-    norm2 = turn.square().sum(-1, keepdim=True)
-    lost = norm2 < FOLDED  # half a turn at half weight: both ways are equal
-    turn = torch.where(lost, constant((1.0, 0.0), turn), turn)
-    cos, sin = unit(turn)[..., None, None].unbind(-3)
-    cross, along = level.about
-    eye = torch.eye(3, dtype=R.dtype, device=R.device)
-    return cos * (eye - along) + along + sin * cross
 
 
 def omega(
     p: Tensor,
     valid: Tensor | None,
-    R_cam: Tensor | None,
+    R_cam: Tensor,
     template: SkeletonTemplate = MEDIAPIPE33,
-    frame: Literal["camera", "world"] = "camera",
     *,
     frames: BoneFrames | None = None,
-    min_length: float = MIN_LENGTH,
 ) -> Tensor:
     """The 6D pose code Ω, incoming-bone convention.
 
@@ -249,36 +212,29 @@ def omega(
     Args:
         p: ``[B, J, 3]`` finite joints, metres, world frame.
         valid: ``[B, J]`` bool or None.
-        R_cam: ``[B, 3, 3]`` world to camera; unused (None allowed) when ``frame`` is world.
+        R_cam: ``[B, 3, 3]`` world to camera.
         template: names the joints.
-        frame: axes of the hubs.
         frames: of the same skeletons, if computed already.
-        min_length: metres, below which the swing of a face joint fades.
 
     Returns:
         ``[B, J, 6]``, see :func:`rotation_to_6d`.
 
     Raises:
-        ValueError: on a wrong shape, an unknown ``frame``, or a missing ``R_cam``.
+        ValueError: on a wrong shape.
 
     Source: method notes, section 6; pose code of paper Sec. 3.5 (DANBO's input).
     """
     valid = check_skeleton("omega", p, valid, template)
-    if frame not in ("camera", "world"):
-        raise ValueError(f"omega: frame must be 'camera' or 'world', got {frame!r}")
-    f = frames or bone_frames(p, valid, template, min_length=min_length)
+    if R_cam.shape != (len(p), 3, 3):
+        raise ValueError(f"omega: R_cam must have shape [{len(p)}, 3, 3], got {list(R_cam.shape)}")
+    f = frames or bone_frames(p, valid, template)
     c = constants(template, p.device, p.dtype)
-    pelvis_chest, chest, head = f.hubs[:, :HEAD], f.hubs[:, CHEST], f.hubs[:, HEAD]
-    if frame == "camera":
-        if R_cam is None or R_cam.shape != (len(p), 3, 3):
-            got = None if R_cam is None else list(R_cam.shape)
-            raise ValueError(f"omega: R_cam must have shape [{len(p)}, 3, 3], got {got}")
-        pelvis_chest = R_cam.unsqueeze(1) @ pelvis_chest
+    pelvis_chest, chest, head = R_cam.unsqueeze(1) @ f.hubs[:, :HEAD], f.hubs[:, CHEST], f.head
     ears = p.index_select(1, c.head_points[:2])
     d = (p.index_select(1, c.face_turned) - ears[:, :1]) - (ears[:, 1:] - ears[:, :1]) * 0.5
-    d = d * d.square().sum(-1, keepdim=True).clamp_min(min_length**2).rsqrt()
+    d = d * d.square().sum(-1, keepdim=True).clamp_min(MIN_LENGTH**2).rsqrt()
     face = c.face_swing.to(d @ head)
     rotations = torch.cat([pelvis_chest, (chest.mT @ head).unsqueeze(1), face, f.local], dim=1)
     code = rotation_to_6d(rotations.index_select(1, c.omega_order))
-    offsets = face_code(p, f, template)
+    offsets = face_code(p, head, template)
     return code if offsets is None else torch.cat([code, pad(offsets, (0, 3))], dim=1)

@@ -11,7 +11,7 @@ from torch.nn.functional import pad
 from gsgan.scene import Camera
 from gsgan.skeleton.frames import bone_frames
 from gsgan.skeleton.holistic import TEMPLATES
-from gsgan.skeleton.template import CHEST, HEAD, MEDIAPIPE33, SkeletonTemplate
+from gsgan.skeleton.template import CHEST, MEDIAPIPE33, SkeletonTemplate
 from gsgan.skeleton.tensors import check_skeleton, constants
 
 SIZES = {len(t.names) for t in TEMPLATES.values()}
@@ -56,14 +56,11 @@ def sanitise(
     visibility: Tensor | None = None,
     template: SkeletonTemplate = MEDIAPIPE33,
     body_height: Tensor | float | None = None,
-    *,
-    min_visibility: float = 0.0,
-    min_trunk_joints: int = MIN_TRUNK_JOINTS,
 ) -> tuple[Tensor, Tensor]:
-    """Fills in unseen joints, and marks them.
+    """Fills in unseen joints and marks them.
 
     Convention: metres, world frame. A joint is unseen when a coordinate is NaN or infinite or its
-    visibility is not above ``min_visibility``. One missing shoulder or hip is completed from the
+    visibility is not above 0. One missing shoulder or hip is completed from the
     other three; two unseen hips keep finite positions, as estimates; a joint or landmark of the
     face is placed by the head's frame; any other joint at the end of its rest bone in its parent's
     frame. Filled-in joints move with the seen ones and pass gradients to them. Seen joints are
@@ -95,11 +92,11 @@ def sanitise(
                 f"sanitise: visibility must have shape {list(valid.shape)}, "
                 f"got {list(visibility.shape)}"
             )
-        valid = valid & (visibility > min_visibility)
+        valid = valid & (visibility > 0)
     if bool(valid.all()):
         return p, valid
     placed = valid | _estimated_hips(p, valid, template)
-    _refuse_without_trunk(placed, template, min_trunk_joints)
+    _refuse_without_trunk(placed, template)
     return _filled(p, placed, template, body_height), valid
 
 
@@ -108,8 +105,8 @@ def complete_skeleton(
 ) -> tuple[Tensor, Tensor]:
     """Joints ``[B, J, 3]`` of a template, finite, and their visibility ``[B, J]``, 0 for stand-ins.
 
-    Convention: hands and a face that a skeleton lacks are not seen; those a template lacks are left
-    out.
+    Convention: hands and a face that only the template has are marked as unseen; those that only
+    the skeleton has are left out.
 
     Args:
         skeleton: ``[J, 3]`` or ``[B, J, 3]`` metres; NaN for joints not seen.
@@ -164,19 +161,18 @@ def _estimated_hips(p: Tensor, valid: Tensor, template: SkeletonTemplate) -> Ten
     return estimated
 
 
-def _refuse_without_trunk(valid: Tensor, template: SkeletonTemplate, least: int) -> None:
-    if least not in (3, 4):
-        raise ValueError(f"sanitise: min_trunk_joints must be 3 or 4, got {least}")
+def _refuse_without_trunk(valid: Tensor, template: SkeletonTemplate) -> None:
     trunk = valid[:, list(template.torso)]
-    bad = (trunk.sum(-1) < least).nonzero().flatten().tolist()
+    bad = (trunk.sum(-1) < MIN_TRUNK_JOINTS).nonzero().flatten().tolist()
     if bad:
         names = (
             ", ".join(template.names[j] for j in template.torso if not valid[b, j]) for b in bad
         )
         lost = "; ".join(f"item {b}: {missing}" for b, missing in zip(bad, names, strict=True))
         raise ValueError(
-            f"sanitise: p needs {least} of the four shoulders and hips, but in {len(bad)} of "
-            f"{len(valid)} skeletons too many are NaN or invisible ({lost}); leave these frames out"
+            f"sanitise: p needs {MIN_TRUNK_JOINTS} of the four shoulders and hips, but in "
+            f"{len(bad)} of {len(valid)} skeletons too many are NaN or invisible "
+            f"({lost}); leave these frames out"
         )
 
 
@@ -212,7 +208,7 @@ def _filled(
         bone = (now @ at_rest.mT @ (c.rest[ends] - c.rest[starts]).unsqueeze(-1)).squeeze(-1)
         q = _put(q, valid, ends, q[:, starts] + bone * scale[:, None, None])
         if bare := [limb for limb in limbs if limb in template.bare]:
-            # the same bone under two names, as from elbow to wrist: both end at the same place
+            # two limbs for one bone, as from elbow to wrist: both end at the same place
             twins = [_twin(template, limb) for limb in bare]
             q = _put(q, valid, c.ends[bare], q[:, c.ends[twins]])
     return torch.where(valid.unsqueeze(-1), p, q + root)
@@ -243,9 +239,12 @@ def _complete_trunk(q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: 
 def _complete_face(
     q: Tensor, valid: Tensor, template: SkeletonTemplate, rest: Tensor, scale: Tensor
 ) -> Tensor:
-    """Unseen face joints: the rest face aligned with the seen ones, else with the shoulders. Then
-    unseen landmarks of lips, brows and lids, at rest, in metres: they are the subject's own."""
-    hubs = bone_frames(q, valid, template).hubs
+    """Places unseen joints of the face: the rest face, aligned with the seen joints, else with the
+    shoulders; then unseen landmarks of lips, brows and lids, at rest.
+
+    These landmarks are not scaled: the template has the subject's own, in metres.
+    """
+    frames = bone_frames(q, valid, template)
     face = torch.tensor(template.face, device=q.device)
     seen = valid[:, face].to(q.dtype).unsqueeze(-1)
     anchored = seen.any(1)  # [B, 1]
@@ -253,9 +252,9 @@ def _complete_face(
     shoulders = list(template.shoulders)
     now = torch.where(anchored, (q[:, face] * weight).sum(1), q[:, shoulders].mean(1))
     at_rest = torch.where(anchored, (rest[face] * weight).sum(1), rest[shoulders].mean(0))
-    R = torch.where(anchored.unsqueeze(-1), hubs[:, HEAD], hubs[:, CHEST])
+    R = torch.where(anchored.unsqueeze(-1), frames.head, frames.hubs[:, CHEST])
     offset = (rest[face] - at_rest.unsqueeze(1)) @ R.mT
     q = _put(q, valid, face, now.unsqueeze(1) + offset * scale[:, None, None])
     c = constants(template, q.device, q.dtype)
     centre = q.index_select(1, c.head_points).mean(1, keepdim=True)
-    return _put(q, valid, c.expression, centre + c.face_rest @ hubs[:, HEAD].mT)
+    return _put(q, valid, c.expression, centre + c.face_rest @ frames.head.mT)

@@ -1,4 +1,4 @@
-"""Left and right of a skeleton: whether they are swapped."""
+"""Detects skeletons whose left and right are swapped."""
 
 from __future__ import annotations
 

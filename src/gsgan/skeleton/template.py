@@ -38,8 +38,6 @@ class SkeletonTemplate:
     # per limb, unit, in its parent's frame; not the rest pose: chosen so that the opposite
     # direction, where the swing is undefined, is out of reach
     rest_directions: tuple[Vector, ...]
-    hinges: tuple[Edge, ...]  # (upper limb, lower limb) pairs that bend about one axis
-    hinge_axes: tuple[Vector, ...]  # unit, in the upper limb's frame, across its rest direction
     rest_positions: tuple[Vector, ...]  # J points of an A-pose on the ground y = 0
     stature: float  # metres, sole to crown of the rest pose
     shoulders: Edge
@@ -120,19 +118,6 @@ class SkeletonTemplate:
         moved = np.asarray(at_rest) + rest[list(self.head)].mean(0)
         kept = self.rest_positions[: -len(self.expression)]
         return replace(self, rest_positions=(*kept, *((x, y, z) for x, y, z in moved.tolist())))
-
-    def with_torso_limbs(self) -> SkeletonTemplate:
-        """The same skeleton with a cylinder on the four trunk edges too (``all26``)."""
-        (l_sh, r_sh), (l_hip, r_hip) = self.shoulders, self.hips
-        extra = ((l_sh, r_sh), (l_sh, l_hip), (r_sh, r_hip), (l_hip, r_hip))
-        rest = np.asarray(self.rest_positions)
-        return replace(
-            self,
-            limbs=self.limbs + extra,
-            limb_parents=(*self.limb_parents, CHEST, CHEST, CHEST, PELVIS),
-            rest_directions=self.rest_directions
-            + tuple(_unit(*(rest[j] - rest[i]).tolist()) for i, j in extra),
-        )
 
 
 def _unit(x: float, y: float, z: float) -> Vector:
@@ -258,29 +243,12 @@ def _mediapipe33() -> SkeletonTemplate:
         base = {17: 15, 18: 16, 29: 27, 30: 28}.get(a, a)
         return N_HUBS + next(i for (_, b), i in index.items() if b == base)
 
-    arm_l, arm_r = directions[(11, 13)], directions[(12, 14)]
     return SkeletonTemplate(
         names=_NAMES,
         edges=_EDGES,
         limbs=_LIMBS,
         limb_parents=tuple(parent(limb) for limb in _LIMBS),
         rest_directions=tuple(directions[limb] for limb in _LIMBS),
-        hinges=tuple(
-            (index[a], index[b])
-            for a, b in (
-                ((11, 13), (13, 15)),
-                ((12, 14), (14, 16)),
-                ((23, 25), (25, 27)),
-                ((24, 26), (26, 28)),
-            )
-        ),
-        # upper x lower: elbows bend forwards (-x), knees backwards (+x)
-        hinge_axes=(
-            _across((-1.0, 0.0, 0.0), arm_l),
-            _across((-1.0, 0.0, 0.0), arm_r),
-            (1.0, 0.0, 0.0),
-            (1.0, 0.0, 0.0),
-        ),
         rest_positions=_rest_positions(),
         stature=1.7,
         shoulders=(11, 12),

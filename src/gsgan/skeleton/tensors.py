@@ -27,18 +27,18 @@ class Swing(NamedTuple):
         half_turn_rest = _half_turn(rest)
         return cls(rest, half_turn_rest, half_turn_rest @ _half_turn(orthogonal_to(rest)))
 
-    def to(self, d: Tensor, folded: float = FOLDED) -> Tensor:
+    def to(self, d: Tensor) -> Tensor:
         """``[B, M, 3, 3]`` rotations from ``rest`` to the directions ``d [B, M, 3]``.
 
         A d shorter than 1 gives a part of the rotation, a zero d none.
 
         The swing is composed of two half turns, about ``rest`` and about the bisector of ``rest``
-        and ``d``, without a division by ``1 + cos``. Where ``1 + cos < folded`` the bisector is
+        and ``d``, without a division by ``1 + cos``. Where ``1 + cos < FOLDED`` the bisector is
         undefined and a third half turn, about a fixed axis orthogonal to ``rest``, goes first: the
         result still maps ``rest`` exactly to ``d``, with an arbitrary but fixed roll.
         """
         cos = (self.rest * d).sum(-1, keepdim=True)
-        is_folded = cos + 1.0 < folded
+        is_folded = cos + 1.0 < FOLDED
         w = d + torch.where(is_folded, -self.rest, self.rest)
         first = torch.where(is_folded.unsqueeze(-1), self.folded, self.straight)
         return _half_turn(w) @ first
@@ -57,9 +57,6 @@ class Level(NamedTuple):
     limbs: Tensor  # [M] into the template's limbs
     parents: Tensor  # [M] into the frames so far: hubs, then limbs by level
     swing: Swing
-    hinge: tuple[Tensor, Tensor] | None  # (upper, lower) limbs [M]; a limb without one has itself
-    across: Tensor  # [2, M, 3] hinge axis h, and rest x h
-    about: tuple[Tensor, Tensor]  # [M, 3, 3] cross-product matrix of rest, and rest restᵀ
 
 
 class Constants(NamedTuple):
@@ -93,10 +90,6 @@ def constants(template: SkeletonTemplate, device: torch.device, dtype: torch.dty
 
 
 def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) -> Constants:
-    def number(values: object) -> Tensor:
-        # in float64 first: constants are then correct to the last bit of their dtype
-        return torch.tensor(values, dtype=torch.float64)
-
     def index(values: object) -> Tensor:
         return torch.tensor(values, dtype=torch.int64, device=device)
 
@@ -106,54 +99,39 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
     def swing(rest: Tensor) -> Swing:
         return Swing(*(cast(part) for part in Swing.of(rest)))
 
-    eye = torch.eye(3, dtype=torch.float64)
-    rest = number(t.rest_positions)
-    directions = number(t.rest_directions)
-    sorted_limbs = [limb for level in t.levels for limb in level]
-    known = {hub: hub for hub in range(t.n_hubs)}
-    known |= {t.n_hubs + limb: t.n_hubs + k for k, limb in enumerate(sorted_limbs)}
-    hinge_of = {limb: pair for pair in t.hinges for limb in pair}
-    axis_of = {limb: a for pair, a in zip(t.hinges, t.hinge_axes, strict=True) for limb in pair}
+    # In float64 first: constants are then correct to the last bit of their dtype.
+    rest = torch.tensor(t.rest_positions, dtype=torch.float64)
+    directions = torch.tensor(t.rest_directions, dtype=torch.float64)
 
-    levels = []
-    for limbs in t.levels:
-        a = directions[list(limbs)]
-        h = number([axis_of.get(limb, (0.0, 0.0, 0.0)) for limb in limbs])
-        pairs = [hinge_of.get(limb, (limb, limb)) for limb in limbs]
-        has_hinge = any(limb in hinge_of for limb in limbs)
-        levels.append(
-            Level(
-                limbs=index(limbs),
-                parents=index([known[t.limb_parents[limb]] for limb in limbs]),
-                swing=swing(a),
-                hinge=(index([p[0] for p in pairs]), index([p[1] for p in pairs]))
-                if has_hinge
-                else None,
-                across=cast(torch.stack([h, torch.linalg.cross(a, h)])),
-                about=(
-                    cast(torch.linalg.cross(a.unsqueeze(1), eye.unsqueeze(0)).mT),
-                    cast(a.unsqueeze(-1) * a.unsqueeze(-2)),
-                ),
-            )
+    # Limbs by level, each with the position of its parent's frame.
+    ordered = [limb for level in t.levels for limb in level]
+    position = {hub: hub for hub in range(t.n_hubs)}
+    position |= {t.n_hubs + limb: t.n_hubs + k for k, limb in enumerate(ordered)}
+    levels = tuple(
+        Level(
+            limbs=index(limbs),
+            parents=index([position[t.limb_parents[limb]] for limb in limbs]),
+            swing=swing(directions[list(limbs)]),
         )
+        for limbs in t.levels
+    )
 
-    left, right = t.eyes
-    across_eyes = unit(rest[left] - rest[right])
-    front = unit(across(across_eyes, rest[t.nose] - (rest[left] + rest[right]) / 2))
-    eye_frame = torch.stack([across_eyes, torch.linalg.cross(front, across_eyes), front], dim=-1)
+    # The face's joints but the nose turn with their line from the middle of the ears.
     turned = [j for j in t.face if j != t.nose]
     from_ears = rest[turned] - rest[list(t.ears)].mean(0)
-    n_turned, incoming = len(turned), t.incoming
+
+    # Where omega finds each joint's rotation: among pelvis, chest, head, face and limbs.
     place = dict.fromkeys(t.hips, PELVIS) | dict.fromkeys(t.shoulders, CHEST) | {t.nose: HEAD}
     place |= {joint: N_HUBS + k for k, joint in enumerate(turned)}
-    place |= {joint: N_HUBS + n_turned + limb for joint, limb in incoming.items()}
+    place |= {joint: N_HUBS + len(turned) + limb for joint, limb in t.incoming.items()}
+
     return Constants(
         rest=cast(rest),
         starts=index([a for a, _ in t.limbs]),
         ends=index([b for _, b in t.limbs]),
-        levels=tuple(levels),
-        limb_order=index([sorted_limbs.index(limb) for limb in range(len(t.limbs))]),
-        head_from_eyes=cast(eye_frame.mT.contiguous()),
+        levels=levels,
+        limb_order=index([ordered.index(limb) for limb in range(len(t.limbs))]),
+        head_from_eyes=cast(_eye_frame(t, rest).mT.contiguous()),
         head_points=index(t.head),
         torso=index(t.torso),
         palms=index([joint for palm in t.palms for joint in palm]),
@@ -164,8 +142,16 @@ def _constants(t: SkeletonTemplate, device: torch.device, dtype: torch.dtype) ->
         expression=index(t.expression),
         face_rest=cast(rest[list(t.expression)] - rest[list(t.head)].mean(0)),
         omega_order=index([place[j] for j in range(len(t.names)) if j not in t.expression]),
-        axes=cast(eye),
+        axes=cast(torch.eye(3, dtype=torch.float64)),
     )
+
+
+def _eye_frame(t: SkeletonTemplate, rest: Tensor) -> Tensor:
+    """``[3, 3]``: the frame of eyes and nose at rest, whose head frame is the identity."""
+    left, right = t.eyes
+    across_eyes = unit(rest[left] - rest[right])
+    front = unit(across(across_eyes, rest[t.nose] - (rest[left] + rest[right]) / 2))
+    return torch.stack([across_eyes, torch.linalg.cross(front, across_eyes), front], dim=-1)
 
 
 def check_skeleton(

@@ -1,7 +1,7 @@
-"""Reuses the memory of images: fresh memory costs as much as drawing on it.
+"""Reuses the memory of large images.
 
-An image of 32 channels and 512 x 512 pixels is 8192 pages, which the system maps and clears in
-every call when they are new; clearing memory that is already mapped takes a fraction of that.
+The system maps and clears new memory page by page, which takes 12 to 20 % of the time of drawing an
+image of 512² pixels with supersampling. Clearing memory that is already mapped is much faster.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 CACHE_LINE = 64  # bytes; rows of tiles are whole cache lines
 LARGE = 1 << 20  # bytes from which memory is reused
-KEPT = 1 << 28  # most bytes of unused memory that a process keeps
+KEPT = 1 << 28  # maximum bytes of unused memory that a process keeps
 
 _NAMES = {torch.float32: "float32", torch.float64: "float64"}
 # By size in bytes. A deque's append and pop are atomic: finalisers run in any thread, at any time.
@@ -65,13 +65,6 @@ def _take(size: int) -> NDArray[np.uint8] | None:
 
 
 def _give_back(memory: NDArray[np.uint8]) -> None:
-    same = _free.pop(memory.nbytes, None) or deque()
-    same.append(memory)
-    _free[memory.nbytes] = same  # sizes in the order of their last use
-    while kept() > KEPT:
-        for size, oldest in list(_free.items()):
-            try:
-                oldest.popleft()
-                break
-            except IndexError:  # all of this size are in use, or another thread was faster
-                _free.pop(size, None)
+    if kept() + memory.nbytes > KEPT:
+        _free.clear()
+    _free.setdefault(memory.nbytes, deque()).append(memory)

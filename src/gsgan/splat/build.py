@@ -2,8 +2,8 @@
 
 The shared library is compiled by the system's compiler into a user cache (``GSGAN_CACHE``, else
 ``$XDG_CACHE_HOME/gsgan``, else ``~/.cache/gsgan``; subfolder ``native``) and loaded from there
-later. A file's name contains hashes of its sources and of its content, so that no stale or damaged
-file is loaded. ``GSGAN_MARCH`` (e.g. ``x86-64``) compiles for that processor instead of this one.
+later. A file's name is a hash of all that it depends on, so that no stale file is loaded.
+``GSGAN_MARCH`` (e.g. ``x86-64``) compiles for that processor instead of this one.
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ import shutil
 import subprocess
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from gsgan.utils.files import cache_root
 
@@ -36,7 +37,7 @@ BASE_FLAGS = (
     *("-std=c++17", "-O3", "-fPIC", "-shared", "-fopenmp-simd"),
     *("-fno-math-errno", "-fno-trapping-math", "-ffp-contract=fast"),
 )
-# Tried in this order: some compilers lack OpenMP (Apple's clang), some the flags for this CPU.
+# Tried in this order: some compilers have no OpenMP (Apple's clang) or no flags for this CPU.
 _NATIVE_FLAGS = (
     ("-march=native", "-mprefer-vector-width=512", "-fopenmp"),
     ("-march=native", "-fopenmp"),
@@ -51,14 +52,14 @@ DTYPES = {torch.float32: "float32", torch.float64: "float64"}
 # Functions of the library, one per dtype; each takes a job and at most one more pointer.
 _FUNCTIONS = (
     *("forward", "backward", "free", "project", "project_backward"),
-    *("compose", "compose_backward", "photometric", "style", "style_backward"),
+    *("compose", "compose_backward", "photometric"),
 )
 
 _LOCK = threading.Lock()
 
 
 class Unavailable(Exception):
-    """The kernel cannot be used; the message is one sentence with the reason."""
+    """Raised when the kernel cannot be used; the message gives the reason in one sentence."""
 
 
 def library() -> tuple[ctypes.CDLL | None, str]:
@@ -69,6 +70,35 @@ def library() -> tuple[ctypes.CDLL | None, str]:
     """
     with _LOCK:  # two threads must not compile at once
         return _load_once()
+
+
+def job_type(
+    integers: Sequence[str],
+    numbers: Sequence[str],
+    addresses: Sequence[str],
+    results: Sequence[str] = (),
+) -> type[ctypes.Structure]:
+    """The type of a kernel's argument, field by field as its header in kernels/ declares it:
+    64-bit integers, doubles, addresses of tensors, and integers that the kernel sets."""
+    kinds = (
+        (integers, ctypes.c_int64),
+        (numbers, ctypes.c_double),
+        (addresses, ctypes.c_void_p),
+        (results, ctypes.c_int64),
+    )
+    fields = [(name, kind) for names, kind in kinds for name in names]
+    return type("Job", (ctypes.Structure,), {"_fields_": fields})
+
+
+def point(job: ctypes.Structure, names: Sequence[str], tensors: Sequence[Tensor | None]) -> None:
+    """Sets fields of a job to tensors' addresses; the caller keeps the tensors alive."""
+    for name, tensor in zip(names, tensors, strict=False):
+        setattr(job, name, None if tensor is None else tensor.data_ptr())
+
+
+def threads() -> int:
+    """The number of threads of a kernel."""
+    return max(1, torch.get_num_threads())
 
 
 def function(name: str, dtype: torch.dtype) -> Any:
@@ -88,11 +118,11 @@ def _load_once() -> tuple[ctypes.CDLL | None, str]:
     try:
         command = compiler()
         folder, key = _cache_folder(), cache_key(command)
-        for path in _cached(folder, key):
-            loaded = open_library(path)
-            if loaded is not None:
-                return loaded, ""
-        loaded = open_library(_build(command, folder, key))
+        path = folder / f"{key}.so"
+        if path.is_file() and (loaded := open_library(path)) is not None:
+            return loaded, ""
+        _build(command, path)
+        loaded = open_library(path)
     except Unavailable as reason:
         return None, str(reason)
     except OSError as error:
@@ -157,7 +187,7 @@ def _version(command: list[str]) -> str:
 
 
 def _cpu() -> str:
-    """The meaning of -march=native here: different machines may share a home folder."""
+    """What -march=native depends on: different machines may share a home folder."""
     lines = [platform.machine(), platform.processor()]
     info = Path("/proc/cpuinfo")
     if info.is_file():
@@ -168,38 +198,20 @@ def _cpu() -> str:
     return "\n".join(lines)
 
 
-def _cached(folder: Path, key: str) -> Iterator[Path]:
-    """Intact files of that key. A file's name ends with its own hash; damaged files, which would
-    crash the process when loaded, are deleted."""
-    for path in sorted(folder.glob(f"{key}-*.so")):
-        if path.stem.rpartition("-")[2] == _digest(path):
-            yield path
-        else:
-            path.unlink(missing_ok=True)
-
-
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:24]
-
-
-def _build(command: list[str], folder: Path, key: str) -> Path:
+def _build(command: list[str], library: Path) -> None:
     """Compiles under a temporary name and renames when complete.
-
-    Returns:
-        The shared library.
 
     Raises:
         Unavailable: when no set of flags compiles.
     """
     message = ""
-    with tempfile.TemporaryDirectory(dir=folder, prefix="build-") as work:
+    with tempfile.TemporaryDirectory(dir=library.parent, prefix="build-") as work:
         target = Path(work) / "native.so"
         for flags in _flags():
             done = _run([*command, *BASE_FLAGS, *flags, str(SOURCE), "-o", str(target)])
             if done.returncode == 0 and target.is_file():
-                final = folder / f"{key}-{_digest(target)}.so"
-                os.replace(target, final)
-                return final
+                os.replace(target, library)
+                return
             message = message or _first_error(done.stderr)
     raise Unavailable(f"The compiler {shlex.join(command)!r} failed on the native kernel{message}.")
 

@@ -3,54 +3,25 @@
 from __future__ import annotations
 
 import math
-import warnings
 
 import torch
 from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians
-from gsgan.splat.settings import Accuracy
+
+ROTATION = 1e-3  # largest difference of an entry of R Rᵀ from the identity's
 
 
-def check(
-    gaussians: Gaussians,
-    camera: Camera,
-    settings: Accuracy,
-    on_invalid: str,
-    rotation_tolerance: float,
-) -> Tensor | None:
-    """Checks the arguments of ``rasterise``.
-
-    Returns:
-        None when all Gaussians are valid; else, for ``drop``, ``[B, N]`` bool, True where valid.
+def check(gaussians: Gaussians, camera: Camera) -> None:
+    """Checks the arguments of ``rasterise``; values on a CPU only: elsewhere the host would wait.
 
     Raises:
         ValueError: naming the argument, the expectation and the value.
     """
-    for name, value, kind in (
-        ("gaussians", gaussians, Gaussians),
-        ("camera", camera, Camera),
-        ("settings", settings, Accuracy),
-    ):
-        if not isinstance(value, kind):
-            raise ValueError(
-                f"rasterise: {name} must be {kind.__name__}, got {type(value).__name__}"
-            )
-    if on_invalid not in ("error", "drop", "unchecked"):
-        raise ValueError(
-            f"rasterise: on_invalid must be error, drop or unchecked, got {on_invalid!r}"
-        )
     _check_types(gaussians, camera)
-    if on_invalid == "unchecked":
-        return None
-    _check_camera(camera, rotation_tolerance)
-    return _check_gaussians(gaussians, on_invalid)
-
-
-def checks_for(device: torch.device) -> str:
-    """``on_invalid`` for a model's output: ``error`` on a CPU, ``unchecked`` where the host would
-    have to wait for the device."""
-    return "error" if device.type == "cpu" else "unchecked"
+    if gaussians.means.device.type == "cpu":
+        _check_camera(camera)
+        _check_gaussians(gaussians)
 
 
 def _tensors(record: Gaussians | Camera) -> dict[str, Tensor]:
@@ -79,10 +50,9 @@ def _check_types(gaussians: Gaussians, camera: Camera) -> None:
                 )
 
 
-def _check_camera(camera: Camera, tolerance: float) -> None:
-    """K is a pinhole's, R a rotation; one transfer to the host for all checks."""
-    wide = torch.float64 if camera.K.device.type != "mps" else camera.K.dtype
-    K, R, t = (x.detach().to(wide) for x in (camera.K, camera.R, camera.t))
+def _check_camera(camera: Camera) -> None:
+    """K is a pinhole's, R a rotation."""
+    K, R, t = (x.detach().double() for x in (camera.K, camera.R, camera.t))
     identity = torch.eye(3, dtype=R.dtype, device=R.device)
     rows = [
         (K[:, 0, 0], K[:, 1, 1]),
@@ -104,10 +74,10 @@ def _check_camera(camera: Camera, tolerance: float) -> None:
                 f"rasterise: Camera.K of item {i} must be [fx s cx; 0 fy cy; 0 0 1], "
                 f"got {camera.K[i].tolist()}"
             )
-        if off > tolerance:
+        if off > ROTATION:
             raise ValueError(
                 f"rasterise: Camera.R of item {i} must be a rotation, but R Rᵀ differs from the "
-                f"identity by {off:.3g} (tolerance {tolerance:.3g})"
+                f"identity by {off:.3g} (tolerance {ROTATION:.3g})"
             )
         if det < 0:
             raise ValueError(
@@ -116,12 +86,11 @@ def _check_camera(camera: Camera, tolerance: float) -> None:
             )
 
 
-def _check_gaussians(gaussians: Gaussians, on_invalid: str) -> Tensor | None:
-    """The second half of :func:`check`, with its result."""
-    if gaussians.means.shape[1] == 0 or len(gaussians) == 0 or _all_valid(gaussians):
-        return None
+def _check_gaussians(gaussians: Gaussians) -> None:
+    """Numbers are finite and in their ranges."""
     B, N = gaussians.means.shape[:2]
-    keep = torch.ones(B, N, dtype=torch.bool, device=gaussians.means.device)
+    if B * N == 0 or _all_valid(gaussians):
+        return
     for name, value in _shape_tensors(gaussians).items():
         value = value.detach().reshape(B, N, -1)
         good, expected = value.isfinite(), "finite"
@@ -129,19 +98,12 @@ def _check_gaussians(gaussians: Gaussians, on_invalid: str) -> Tensor | None:
             good, expected = good & (value > 0), "finite and > 0"
         if name == "Gaussians.opacities":
             good, expected = good & (value >= 0) & (value <= 1), "in [0, 1]"
-        if on_invalid == "error" and not good.all():
+        if not good.all():
             b, n, k = (~good).nonzero()[0].tolist()
             raise ValueError(
                 f"rasterise: {name} must be {expected}, got {value[b, n, k].item():.4g} at item "
-                f"{b}, Gaussian {n} ({int((~good).any(-1).sum())} of {B * N} are not); correct "
-                "them, or pass on_invalid='drop'"
+                f"{b}, Gaussian {n} ({int((~good).any(-1).sum())} of {B * N} are not)"
             )
-        keep &= good.all(-1)
-    dropped = int((~keep).sum())
-    if not dropped:
-        return None
-    warnings.warn(f"rasterise: dropped {dropped} of {B * N} invalid Gaussians", stacklevel=4)
-    return keep
 
 
 def _shape_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
@@ -153,13 +115,10 @@ def _shape_tensors(gaussians: Gaussians) -> dict[str, Tensor]:
 
 
 def _all_valid(gaussians: Gaussians) -> bool:
-    """A sum is finite only where all its terms are: one pass, one transfer to the host."""
+    """A sum is finite only where all its terms are: one pass."""
     used = {name: value.detach() for name, value in _shape_tensors(gaussians).items()}
-    scales = used.get("Gaussians.scales")
-    opacities = used["Gaussians.opacities"]
-    wide = torch.float64 if opacities.device.type != "mps" else torch.float32
-    finite = torch.stack([value.sum(dtype=wide) for value in used.values()]).sum()
-    least = opacities.new_ones(()) if scales is None else scales.amin()
-    numbers = [finite, least.to(wide), *(x.to(wide) for x in torch.aminmax(opacities))]
-    total, least_scale, low, high = torch.stack(numbers).tolist()
-    return abs(total) < float("inf") and least_scale > 0 and low >= 0 and high <= 1
+    scales, opacities = used.get("Gaussians.scales"), used["Gaussians.opacities"]
+    total = sum(float(value.sum(dtype=torch.float64)) for value in used.values())
+    low, high = torch.aminmax(opacities)
+    positive = scales is None or float(scales.amin()) > 0
+    return math.isfinite(total) and positive and float(low) >= 0 and float(high) <= 1

@@ -8,7 +8,7 @@ Differences between gsplat and ``Accuracy``, which `given_up` describes:
 
 - Its cut-offs are those of `COMPILED_IN`, whatever the settings.
 - It stops a pixel one layer earlier, before the layer that would leave ``transmittance_min`` or
-  less. That layer's weight may be up to ``transmittance_min / (1 - alpha_max)``, see `_stop_loss`.
+  less. That layer's weight may be up to ``transmittance_min / (1 - alpha_max)``.
 - It computes in float32 throughout (the camera's position is subtracted in float64 before) with
   approximate exponentials: needles lose digits.
 - Gradients are summed in no fixed order: their last bits differ between runs.
@@ -26,7 +26,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from gsgan.scene import Camera, Gaussians
-from gsgan.splat.project import QUAT_MIN, without
+from gsgan.splat.project import QUAT_MIN
 from gsgan.splat.settings import Accuracy
 
 DEVICE = "cuda"
@@ -60,14 +60,16 @@ def differences(settings: Accuracy, device: torch.device) -> list[str]:
     return [
         f"{name} is {value if isinstance(value, str) else f'{value:.6g}'}, not {want}"
         for name, value in have.items()
-        if not _equal(want := getattr(settings, name), value)
+        if not (
+            (want := getattr(settings, name)) == value
+            or (isinstance(value, float) and math.isclose(want, value, rel_tol=TOLERANCE))
+        )
     ]
 
 
 def given_up(settings: Accuracy, device: torch.device) -> str:
     """How gsplat's result differs from the settings, in one sentence."""
-    lost = _stop_loss(_measured_cap(device)[0] or 0.0)
-    found = [f"a stopped pixel may lack {lost:.2g} of its light", *differences(settings, device)]
+    found = ["it stops pixels one layer earlier", *differences(settings, device)]
     return (
         f"Drawing with gsplat, the fastest backend here; differences from the settings "
         f"{settings.name!r}: {'; '.join(found)}; backend=torch has none."
@@ -89,20 +91,10 @@ def unsuited(gaussians: Gaussians, camera: Camera) -> str:
     return ""
 
 
-def _stop_loss(cap: float) -> float:
-    """The largest share of light that a stopped pixel may lack, with alphas up to ``cap``.
-
-    A layer of alpha ``a`` stops the pixel where ``T (1 - a) <= transmittance_min``: it loses ``T``.
-    """
-    stop = float(COMPILED_IN["transmittance_min"])
-    return 1.0 if cap >= 1 else min(1.0, stop / (1 - cap))
-
-
 def draw(
     gaussians: Gaussians,
     camera: Camera,
     settings: Accuracy,
-    keep: Tensor | None,
     want_depth: bool,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Projects and blends.
@@ -114,7 +106,6 @@ def draw(
         gaussians: N >= 1 Gaussians per batch item, of at most float32.
         camera: one camera per batch item.
         settings: near, low_pass and antialias are passed on; the rest is compiled in.
-        keep: ``[B, N]`` bool; the others are not drawn, whatever their values.
         want_depth: whether to blend depths too.
 
     Returns:
@@ -123,8 +114,6 @@ def draw(
 
     Source: Ye et al., gsplat: An open-source library for Gaussian splatting (version 1.5.3).
     """
-    if keep is not None:
-        gaussians = without(gaussians, ~keep)
     (H, W), C = camera.size, gaussians.features.shape[-1]
     means, viewmats = _seen_from_the_camera(gaussians.means, camera)
     colours, alphas, _ = importlib.import_module("gsplat").rasterization(
@@ -154,7 +143,7 @@ def draw(
 def _shapes(gaussians: Gaussians) -> dict[str, Tensor | None]:
     """The arguments for the Gaussians' shapes."""
     if gaussians.covariances is not None:
-        # gsplat reads the upper triangle; ours uses the symmetric part.
+        # gsplat reads the upper triangle; the other backends use the symmetric part.
         covariances = gaussians.covariances.float()
         return {"quats": None, "scales": None, "covars": (covariances + covariances.mT) / 2}
     assert gaussians.quats is not None
@@ -206,7 +195,7 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
     camera = Camera(K, torch.eye(3, device=device)[None], torch.zeros(1, 3, device=device), (1, 1))
     try:
         with torch.no_grad():
-            alpha = draw(gaussians, camera, _PROBE, None, want_depth=True)[1]
+            alpha = draw(gaussians, camera, _PROBE, want_depth=True)[1]
         return float(alpha), ""
     except Exception as error:  # no compiler, unknown GPU, other version: torch is used
         line = ": ".join([type(error).__name__, *str(error).strip().splitlines()[:1]])
@@ -214,9 +203,3 @@ def _measured_cap(device: torch.device) -> tuple[float | None, str]:
 
 
 _PROBE = Accuracy("probe", 1 / 255, 1e-4, "opacity", "float32")
-
-
-def _equal(a: float | str, b: float | str) -> bool:
-    if isinstance(a, str) or isinstance(b, str):
-        return a == b
-    return math.isclose(a, b, rel_tol=TOLERANCE)

@@ -1,4 +1,4 @@
-"""Lenses for rasterisers that support pinholes only, and the inverse of a lens.
+"""Applies lens distortion to Gaussians, because rasterisers support pinholes only; and inverts it.
 
 Convention: OpenCV's model (k1 k2 p1 p2 k3), see `gsgan.scene.distort`.
 """
@@ -14,8 +14,8 @@ from gsgan.scene import RIM, Camera, Gaussians, distort, fold_radius
 from gsgan.splat.project import rotations
 from gsgan.utils.tensors import constant
 
-ITERATIONS = 20  # of Newton's method: a usable lens takes 4, points near its fold more
-FOUND = 1e-9  # of x/z, in float64: largest error of a point that counts as found
+ITERATIONS = 20  # of Newton's method: usually 4 are enough; points near a lens's fold need more
+FOUND = 1e-9  # of x/z, in float64: maximum error of a solution
 
 
 def as_pinhole_sees(gaussians: Gaussians, camera: Camera, near: float) -> tuple[Gaussians, Camera]:
@@ -115,9 +115,9 @@ def undistort(points: Tensor, dist: Tensor, iterations: int = ITERATIONS) -> tup
         step = torch.stack(
             [d * error[..., 0] - b * error[..., 1], a * error[..., 1] - c * error[..., 0]], dim=-1
         )
-        x = x - (step / det.unsqueeze(-1)).clamp(-0.5, 0.5)  # its slope misleads far out
+        x = x - (step / det.unsqueeze(-1)).clamp(-0.5, 0.5)  # far out the slope is misleading
     bent, jacobian = distort(x, lens)
-    # past the fold the polynomial mirrors: a solution there is not what the lens shows
+    # beyond the fold the polynomial mirrors: a solution there is not what the lens shows
     upright = torch.linalg.det(jacobian) > 0
     upright &= x.norm(dim=-1) < fold_radius(lens).unsqueeze(-1)
     found = ((bent - target).abs().amax(dim=-1) < FOUND) & upright

@@ -21,7 +21,6 @@
 #include "kernels/forward.h"
 #include "kernels/photometric.h"
 #include "kernels/project.h"
-#include "kernels/style.h"
 
 #ifdef _OPENMP
 #include <omp.h>
@@ -131,12 +130,6 @@ int gsgan_compose_backward_float32(const ComposeJob* job) {
 }
 int gsgan_compose_backward_float64(const ComposeJob* job) {
   return gsgan::compose_backward<double>(*job);
-}
-int gsgan_style_float32(const StyleJob* job) { return gsgan::style<float>(*job); }
-int gsgan_style_float64(const StyleJob* job) { return gsgan::style<double>(*job); }
-int gsgan_style_backward_float32(const StyleJob* job) { return gsgan::style_backward<float>(*job); }
-int gsgan_style_backward_float64(const StyleJob* job) {
-  return gsgan::style_backward<double>(*job);
 }
 int gsgan_photometric_float32(const PhotometricJob* job) { return gsgan::photometric<float>(*job); }
 int gsgan_photometric_float64(const PhotometricJob* job) {

@@ -6,7 +6,6 @@ When it cannot be built, ``available()`` is False and ``why_not()`` has the reas
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -24,30 +23,25 @@ SLOT_BYTES = 1 << 28
 
 _OUT_OF_MEMORY, _NOT_FINITE = 1, 2
 
-_SIZES = ("B", "N", "C", "H", "W", "threads", "keep", "box", "slot_bytes", "times")
 _INPUTS = ("means", "factors", "opacities", "features", "depths", "extents")
-_WIDE = ("means", "factors", "depths")  # always float64, see Projected
 _OUTPUTS = ("out_features", "out_alpha", "out_depth", "out_average")
 _GRADS_OUT = ("g_features", "g_alpha", "g_depth", "g_average")
-AVERAGES = (1, 2, 4, 8)  # supersampling that is averaged here: divisors of a tile
 _GRADS_IN = ("d_means", "d_factors", "d_opacities", "d_features", "d_depths")
+AVERAGES = (1, 2, 4, 8)  # supersampling that is averaged here: divisors of a tile
 
-
-class _Job(ctypes.Structure):
-    """Mirrors ``struct Job`` of native.cpp field by field."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in _SIZES),
-        *((name, ctypes.c_double) for name in ("alpha_min", "transmittance_min", "alpha_max")),
-        *((name, ctypes.c_void_p) for name in (*_INPUTS, "visible", *_OUTPUTS)),
-        *((name, ctypes.c_void_p) for name in (*_GRADS_OUT, *_GRADS_IN)),
-        ("bad", ctypes.c_int64),
-    )
+_Job = build.job_type(
+    ("B", "N", "C", "H", "W", "threads", "keep", "box", "slot_bytes", "times"),
+    ("alpha_min", "transmittance_min", "alpha_max"),
+    (*_INPUTS, "visible", *_OUTPUTS, *_GRADS_OUT, *_GRADS_IN),
+    ("bad",),
+)  # struct Job of kernels/job.h
 
 
 def available() -> bool:
-    """Whether the kernel can be used here; the first call may compile it (seconds). Programs that
-    ``torch.export`` records do not have it."""
+    """Whether the kernel can be used; the first call may compile it (seconds).
+
+    It is not available to programs that ``torch.export`` records.
+    """
     return not torch.compiler.is_compiling() and build.library()[0] is not None
 
 
@@ -89,13 +83,10 @@ def composite(
         output.
 
     Raises:
-        ValueError: on another device or dtype, on mixed ones, and on a visible Gaussian that is not
-            finite.
-        RuntimeError: when ``available()`` is False.
+        ValueError: on a visible Gaussian that is not finite.
 
     Source: paper Sec. 3.1; tiles after 3D Gaussian splatting, gradients derived in native.cpp.
     """
-    _check(projected, size)
     composed: tuple[Tensor, Tensor, Tensor | None, Tensor | None] = _Composite.apply(
         projected.means,
         projected.factors,
@@ -107,38 +98,6 @@ def composite(
         *(size, settings, want_depth, times, torch.is_grad_enabled()),
     )
     return composed
-
-
-def _check(projected: Projected, size: tuple[int, int]) -> None:
-    B, N = projected.depths.shape
-    C = projected.features.shape[-1]
-    shapes = {
-        "means": (B, N, 2),
-        "factors": (B, N, 3),
-        "opacities": (B, N),
-        "features": (B, N, C),
-        "depths": (B, N),
-        "extents": (B, N, 2),
-        "visible": (B, N),
-    }
-    dtype = projected.features.dtype
-    if dtype not in build.DTYPES:
-        raise ValueError(f"composite: features must be float32 or float64, got {dtype}")
-    for name, shape in shapes.items():
-        value: Tensor = getattr(projected, name)
-        if tuple(value.shape) != shape:
-            raise ValueError(f"composite: {name} must be {list(shape)}, got {list(value.shape)}")
-        if value.device.type != "cpu":
-            raise ValueError(
-                f"composite: the native backend needs {name} on the CPU, got {value.device}"
-            )
-        want = {"visible": torch.bool} | dict.fromkeys(_WIDE, torch.float64)
-        if value.dtype != want.get(name, dtype):
-            raise ValueError(
-                f"composite: {name} must be {want.get(name, dtype)}, got {value.dtype}"
-            )
-    if len(size) != 2 or min(size) < 1:
-        raise ValueError(f"composite: size must be (H, W) with both at least 1, got {size}")
 
 
 class _Plan:
@@ -188,7 +147,7 @@ class _Composite(torch.autograd.Function):
         ]
         job = _job(size, settings, inputs, shown, times)
         job.keep = grad_enabled and any(ctx.needs_input_grad)
-        point(job, _OUTPUTS, outputs)
+        build.point(job, _OUTPUTS, outputs)
         plan = _Plan(dtype)
         run = build.function("forward", dtype)
         _raise_for(run(ctypes.byref(job), ctypes.byref(plan.pointer)), job)
@@ -208,12 +167,12 @@ class _Composite(torch.autograd.Function):
         incoming = [None if g is None else g.contiguous() for g in grads]
         if ctx.times > 1 and grads[0] is not None:
             incoming[0] = grads[0].contiguous(memory_format=torch.channels_last)
-        point(job, _GRADS_OUT, incoming)
+        build.point(job, _GRADS_OUT, incoming)
         with_depth = incoming[2] is not None
         outgoing: list[Tensor | None] = [
             torch.zeros_like(x) for x in inputs[: 5 if with_depth else 4]
         ]
-        point(job, _GRADS_IN, outgoing)
+        build.point(job, _GRADS_IN, outgoing)
         run = build.function("backward", inputs[3].dtype)
         _raise_for(run(ctypes.byref(job), ctx.plan.pointer), job)
         if not with_depth:
@@ -226,21 +185,22 @@ class _Composite(torch.autograd.Function):
 
 def _job(
     size: tuple[int, int], settings: Accuracy, inputs: list[Tensor], visible: Tensor, times: int
-) -> _Job:
-    threads = max(1, torch.get_num_threads())
-    sizes = (*inputs[3].shape, *size, threads, 0, settings.extent == "sigma", SLOT_BYTES, times)
+) -> Any:
+    sizes = (
+        *inputs[3].shape,
+        *size,
+        build.threads(),
+        0,
+        settings.extent == "sigma",
+        SLOT_BYTES,
+        times,
+    )
     job = _Job(*sizes, settings.alpha_min, settings.transmittance_min, settings.alpha_max)
-    point(job, (*_INPUTS, "visible"), [*inputs, visible])
+    build.point(job, (*_INPUTS, "visible"), [*inputs, visible])
     return job
 
 
-def point(job: ctypes.Structure, names: tuple[str, ...], tensors: Sequence[Tensor | None]) -> None:
-    """Sets fields of a job to tensors' addresses; the caller keeps the tensors alive."""
-    for name, tensor in zip(names, tensors, strict=False):
-        setattr(job, name, None if tensor is None else tensor.data_ptr())
-
-
-def _raise_for(status: int, job: _Job) -> None:
+def _raise_for(status: int, job: Any) -> None:
     if status == 0:
         return
     if status == _NOT_FINITE:

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from gsgan.scene import Camera, Gaussians
 from gsgan.splat import build
-from gsgan.splat.native import point
 from gsgan.splat.project import (
     EXP_UNDERFLOW,
     EXTENT_MARGIN,
@@ -28,33 +27,22 @@ from gsgan.splat.settings import Accuracy
 _INPUTS = ("means", "quats", "scales", "covariances", "opacities")
 _CAMERA = ("K", "R", "t", "limits")
 _OUTPUTS = ("means", "factors", "opacities", "depths")
-_SIZES = ("B", "N", "H", "W", "threads", "antialias")
-_NUMBERS = ("near", "low_pass", "alpha_min", "reach", "extent_margin", "quat_min")
+
+_Job = build.job_type(
+    ("B", "N", "H", "W", "threads", "antialias"),
+    ("near", "low_pass", "alpha_min", "reach", "extent_margin", "quat_min"),
+    (
+        *(*_INPUTS, *_CAMERA, *(f"out_{name}" for name in (*_OUTPUTS, "extents")), "visible"),
+        *(f"g_{name}" for name in _OUTPUTS),
+        *(f"d_{name}" for name in (*_INPUTS, *_CAMERA)),
+    ),
+)  # struct ProjectJob of kernels/ewa.h
 
 
-class _Job(ctypes.Structure):
-    """Mirrors ``struct ProjectJob`` of kernels/ewa.h field by field."""
-
-    _fields_ = (
-        *((name, ctypes.c_int64) for name in _SIZES),
-        *((name, ctypes.c_double) for name in _NUMBERS),
-        *((name, ctypes.c_void_p) for name in (*_INPUTS, "keep", *_CAMERA)),
-        *((f"out_{name}", ctypes.c_void_p) for name in (*_OUTPUTS, "extents")),
-        ("visible", ctypes.c_void_p),
-        *((f"g_{name}", ctypes.c_void_p) for name in _OUTPUTS),
-        *((f"d_{name}", ctypes.c_void_p) for name in (*_INPUTS, *_CAMERA)),
-    )
-
-
-def project(
-    gaussians: Gaussians, camera: Camera, settings: Accuracy, keep: Tensor | None = None
-) -> Projected:
+def project(gaussians: Gaussians, camera: Camera, settings: Accuracy) -> Projected:
     """``gsgan.splat.project.project`` on the CPU, with the same arguments.
 
     Convention: differentiable once. The result is bit-identical for any number of threads.
-
-    Raises:
-        RuntimeError: when the kernel is not available.
 
     Source: gradients derived in kernels/ewa.h.
     """
@@ -67,7 +55,7 @@ def project(
     inputs = (gaussians.means, *shape, gaussians.opacities)
     outputs = _Project.apply(
         *(None if x is None else x.to(dtype) for x in inputs),
-        *(K, R, t, limits, keep, camera.size, settings),
+        *(K, R, t, limits, camera.size, settings),
     )
     means, factors, opacities, depths, extents, visible = outputs
     features = gaussians.features.to(dtype)
@@ -90,8 +78,8 @@ class _Project(torch.autograd.Function):
             means.new_empty(B, N, 2),
         ]
         visible = torch.empty(B, N, dtype=torch.bool)
-        point(job, tuple(f"out_{name}" for name in (*_OUTPUTS, "extents")), outputs)
-        point(job, ("visible",), [visible])
+        build.point(job, tuple(f"out_{name}" for name in (*_OUTPUTS, "extents")), outputs)
+        build.point(job, ("visible",), [visible])
         build.function("project", means.dtype)(ctypes.byref(job))
         ctx.save_for_backward(*tensors)
         ctx.size, ctx.settings = size, settings
@@ -104,14 +92,14 @@ class _Project(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
         job, held = _job(ctx.saved_tensors, ctx.size, ctx.settings)
         incoming = [None if g is None else g.contiguous() for g in grads[: len(_OUTPUTS)]]
-        point(job, tuple(f"g_{name}" for name in _OUTPUTS), incoming)
+        build.point(job, tuple(f"g_{name}" for name in _OUTPUTS), incoming)
         needed = ctx.needs_input_grad
         # The camera's gradients are few numbers: always computed, returned where needed.
         outgoing = [
             None if x is None or not (need or i >= len(_INPUTS)) else torch.zeros_like(x)
-            for i, (x, need) in enumerate(zip(held[:-1], needed, strict=False))
+            for i, (x, need) in enumerate(zip(held, needed, strict=False))
         ]
-        point(job, tuple(f"d_{name}" for name in (*_INPUTS, *_CAMERA)), outgoing)
+        build.point(job, tuple(f"d_{name}" for name in (*_INPUTS, *_CAMERA)), outgoing)
         assert held[0] is not None
         if build.function("project_backward", held[0].dtype)(ctypes.byref(job)):
             raise MemoryError("project: out of memory")
@@ -121,17 +109,17 @@ class _Project(torch.autograd.Function):
 
 def _job(
     tensors: Any, size: tuple[int, int], settings: Accuracy
-) -> tuple[_Job, list[Tensor | None]]:
+) -> tuple[Any, list[Tensor | None]]:
     """The job without its outputs, and the tensors it points to."""
     held = [None if x is None else x.detach().contiguous() for x in tensors]
     opacities = held[len(_INPUTS) - 1]
     assert opacities is not None
     reach, margin = _reach(settings)
     job = _Job(
-        *(*opacities.shape, *size, max(1, torch.get_num_threads()), settings.antialias),
+        *(*opacities.shape, *size, build.threads(), settings.antialias),
         *(settings.near, settings.low_pass, settings.alpha_min, reach, margin, QUAT_MIN),
     )
-    point(job, (*_INPUTS, *_CAMERA, "keep"), held)
+    build.point(job, (*_INPUTS, *_CAMERA), held)
     return job, held
 
 

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -45,9 +44,7 @@ class Projected:
     visible: Tensor  # [B, N] bool
 
 
-def project(
-    gaussians: Gaussians, camera: Camera, settings: Accuracy, keep: Tensor | None = None
-) -> Projected:
+def project(gaussians: Gaussians, camera: Camera, settings: Accuracy) -> Projected:
     """Projects Gaussians onto the image.
 
     Convention: differentiable in means, quats, scales, covariances, opacities, features, K, R, t.
@@ -60,7 +57,6 @@ def project(
         gaussians: N Gaussians per batch item.
         camera: one camera per batch item.
         settings: cut-offs, see ``Accuracy``.
-        keep: ``[B, N]`` bool; the others become invisible, whatever their values.
 
     Returns:
         The ellipses; invisible ones get exactly zero gradients.
@@ -69,14 +65,10 @@ def project(
     """
     dtype = torch.promote_types(gaussians.means.dtype, settings.torch_dtype)
     wide = torch.float64 if gaussians.means.device.type != "mps" else dtype
-    if keep is not None:
-        gaussians = without(gaussians, ~keep)
-    # Here the N Gaussians are the last dimension: contiguous vectors, few large operations.
+    # The N Gaussians are the last dimension here: contiguous vectors, few large operations.
     K, R, t = camera.K.to(wide), camera.R.to(wide), camera.t.to(wide)
     x_cam = R @ gaussians.means.to(wide).mT + t.unsqueeze(-1)
     in_front = x_cam.detach()[:, 2] > settings.near
-    if keep is not None:
-        in_front = in_front & keep
     x_cam = torch.where(in_front.unsqueeze(1), x_cam, constant(((0.0,), (0.0,), (1.0,)), x_cam))
     depths = x_cam[:, 2]
     ratios = x_cam[:, :2] / depths.unsqueeze(1)
@@ -133,16 +125,6 @@ def _rotation_entries(quats: Tensor, dim: int) -> list[Tensor]:
         *(two * (xy + wz), 1 - two * (xx + zz), two * (yz - wx)),
         *(two * (xz - wy), two * (yz + wx), 1 - two * (xx + yy)),
     ]
-
-
-def without(gaussians: Gaussians, invalid: Tensor) -> Gaussians:
-    """Harmless numbers in place of the invalid ones, through which no gradient flows."""
-    changes: dict[str, Any] = {}
-    for name, value in vars(gaussians).items():
-        if value is not None:
-            mask = invalid.reshape(invalid.shape + (1,) * (value.ndim - 2))
-            changes[name] = torch.where(mask, 1.0 if name == "scales" else 0.0, value)
-    return replace(gaussians, **changes)
 
 
 def _covariance_2d(gaussians: Gaussians, JW: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -29,8 +29,6 @@ def rasterise(
     settings: Accuracy | str = "high",
     backend: str = "auto",
     depth: bool = False,
-    on_invalid: str = "error",
-    rotation_tolerance: float = 1e-3,
 ) -> Raster:
     """Draws Gaussians as a camera sees them.
 
@@ -46,24 +44,21 @@ def rasterise(
             once), ``reference``, ``torch``, ``native`` or ``gsplat``. A backend that cannot be used
             is replaced by ``torch``, and the reason is logged once.
         depth: whether to return the depth (metres times alpha).
-        on_invalid: ``error`` raises on Gaussians that are not finite or have a scale <= 0; ``drop``
-            omits them and warns with their number; ``unchecked`` skips the checks of Gaussians and
-            camera, which transfer numbers to the host and so wait for a GPU.
-        rotation_tolerance: largest difference of an entry of ``R Rᵀ`` from the identity's.
 
     Returns:
         features ``[B, C, H, W]``, alpha ``[B, 1, H, W]`` and depth, in the Gaussians' dtype; with
         supersampling also the features before averaging.
 
     Raises:
-        ValueError: naming the argument, the expectation and the value.
+        ValueError: naming the argument, the expectation and the value; values are checked on a CPU
+            only.
 
     Source: paper Sec. 3.1.
     """
     settings = accuracy(settings) if isinstance(settings, str) else settings
     if torch.compiler.is_compiling():
         return _recorded(gaussians, camera, settings, backend, depth)
-    keep = checks.check(gaussians, camera, settings, on_invalid, rotation_tolerance)
+    checks.check(gaussians, camera)
     if camera.dist is not None:
         gaussians, camera = as_pinhole_sees(gaussians, camera, settings.near)
     name, reason = resolve_backend(backend, gaussians.means.device, settings)
@@ -77,7 +72,7 @@ def rasterise(
     if times > 1:
         drawn = camera.resize((camera.size[0] * times, camera.size[1] * times))
     with tiles.full_precision(gaussians.means.device):
-        features, alpha, z, average = _draw(name, gaussians, drawn, settings, keep, depth)
+        features, alpha, z, average = _draw(name, gaussians, drawn, settings, depth)
         if times > 1:
             fine = features.to(out)
             if average is None:
@@ -123,18 +118,17 @@ def _draw(
     gaussians: Gaussians,
     camera: Camera,
     settings: Accuracy,
-    keep: Tensor | None,
     depth: bool,
 ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None]:
     """Features, alpha and depth by one backend; where it averages what is supersampled, alpha is
     averaged, and averaged features follow."""
     if name == "gsplat":
-        return *gsplat_backend.draw(gaussians, camera, settings, keep, depth), None
+        return *gsplat_backend.draw(gaussians, camera, settings, depth), None
     if name == "native":
-        projected = native_project.project(gaussians, camera, settings, keep)
+        projected = native_project.project(gaussians, camera, settings)
         times = settings.supersample if settings.supersample in native.AVERAGES else 1
         return native.composite(projected, camera.size, settings, depth, times)
-    projected = project(gaussians, camera, settings, keep)
+    projected = project(gaussians, camera, settings)
     composite = reference.composite if name == "reference" else tiles.composite
     return *composite(projected, camera.size, settings, depth), None
 

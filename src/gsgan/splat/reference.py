@@ -43,27 +43,6 @@ def composite(
     return image[:, :C], image[:, -1:], image[:, C : C + 1] if want_depth else None
 
 
-def error_bound(projected: Projected, size: tuple[int, int], settings: Accuracy) -> Tensor:
-    """Bound ``[B, 1, H, W]`` of the error that a setting's cut-offs cause.
-
-    Convention: for features in [0, 1]; without the rounding of the arithmetic. ``projected``
-    without cut-offs.
-
-    Removing a layer changes a pixel by at most its own weight, so skipped layers cost at most the
-    sum of their weights; capping an alpha costs at most the weight that the cap removes; a stopped
-    pixel lacks less than ``transmittance_min``.
-    """
-    front_to_back = _sorted(projected)
-    chunks = []
-    with torch.no_grad():
-        for pixels in _pixel_chunks(projected, size):
-            whole = _alphas(front_to_back, pixels, None)
-            lost = whole - _alphas(front_to_back, pixels, settings)
-            before = torch.cat([torch.ones_like(whole[..., :1]), 1 - whole], -1).cumprod(-1)
-            chunks.append((before[..., :-1] * lost).sum(-1) + settings.transmittance_min)
-    return torch.cat(chunks, dim=1).unflatten(-1, size).unsqueeze(1)
-
-
 def _sorted(projected: Projected) -> Projected:
     order = projected.depths.detach().argsort(dim=1, stable=True)
 
@@ -82,20 +61,18 @@ def _pixel_chunks(projected: Projected, size: tuple[int, int]) -> tuple[Tensor, 
     return torch.stack([x, y], dim=-1).to(projected.features).reshape(-1, 2).split(per_chunk)
 
 
-def _alphas(projected: Projected, pixels: Tensor, settings: Accuracy | None) -> Tensor:
-    """``[B, P, N]``; without settings, no cut-off but visibility."""
+def _alphas(projected: Projected, pixels: Tensor, settings: Accuracy) -> Tensor:
+    """``[B, P, N]``."""
     d = pixels[:, None] - projected.means.to(pixels).unsqueeze(1)
     dx, dy = d.unbind(-1)
     p, k, r = (x.unsqueeze(1) for x in projected.factors.to(pixels).unbind(-1))
     q = (p * (dx + k * dy)).square() + (r * dy).square()
     # Masked before exp: invisible Gaussians then get exactly zero gradients, never 0 * inf.
     drawn = projected.visible.unsqueeze(1).expand_as(q)
-    if settings is not None and settings.extent == "sigma":
+    if settings.extent == "sigma":
         drawn = drawn & (d.detach().abs() <= projected.extents.unsqueeze(1)).all(-1)
     q = torch.where(drawn, q, 0.0)
     alpha = torch.where(drawn, projected.opacities.unsqueeze(1), 0.0) * torch.exp(-0.5 * q)
-    if settings is None:
-        return alpha
     alpha = torch.where(alpha >= settings.alpha_min, alpha, 0.0)
     return alpha.clamp(max=settings.alpha_max)
 

@@ -37,7 +37,6 @@ def composite(
     size: tuple[int, int],
     settings: Accuracy,
     want_depth: bool,
-    tiling: Tiling | None = None,
 ) -> tuple[Tensor, Tensor, Tensor | None]:
     """Blends ellipses front to back, ties by index.
 
@@ -46,7 +45,6 @@ def composite(
         size: (H, W) pixels.
         settings: alpha_min, transmittance_min, alpha_max, and the extent of ``projected``.
         want_depth: whether to blend depths too.
-        tiling: how the work is divided; by default suited to the device.
 
     Returns:
         features ``[B, C, H, W]`` premultiplied, alpha ``[B, 1, H, W]``, depth ``[B, 1, H, W]`` or
@@ -54,7 +52,7 @@ def composite(
 
     Source: paper Sec. 3.1; Kerbl et al., 3D Gaussian splatting (tiles).
     """
-    tiling = tiling or Tiling.for_device(projected.means.device)
+    tiling = Tiling.for_device(projected.means.device)
     C = projected.features.shape[-1]
     # Depth and alpha are blended like features; the value of alpha is 1 in every layer.
     values = [projected.features, torch.ones_like(projected.features[..., :1])]
@@ -160,8 +158,8 @@ class _Walk:
         y, x = (axis_.flatten() for axis_ in torch.meshgrid(axis, axis, indexing="ij"))
         self.xy = torch.stack([x, y])
         # u and v are linear in the pixel's position in the tile: a small matrix product gives each.
-        # As one polynomial in x and y, q would cancel: a narrow ellipse far from the centre of its
-        # tile would lose the square of the digits that u and v lose.
+        # As one polynomial in x and y, the terms of q would cancel: a narrow ellipse far from the
+        # centre of its tile would lose twice as many digits as u and v do.
         self.basis = torch.stack([torch.ones_like(x), x, y])
         tile = lists.tiles % (lists.grid[0] * lists.grid[1])
         corner = torch.stack([tile % lists.grid[1], tile // lists.grid[1]], dim=-1)
@@ -170,8 +168,8 @@ class _Walk:
         self.least_exponent = math.log(torch.finfo(dtype).tiny)
         # threshold() keeps greater values; alphas equal to alpha_min must be kept.
         self.below_alpha_min = _next_below(settings.alpha_min, dtype)
-        # On a CPU, opaque tiles are skipped. On a GPU the host would have to wait for the device;
-        # their further layers have no weight either way.
+        # On a CPU, opaque tiles are skipped. On a GPU the host would have to wait for the device,
+        # and the remaining layers of such tiles have no weight either way.
         self.stops = settings.transmittance_min > 0 and device.type == "cpu"
         self.sums = self.values.new_zeros(len(self.values), 6)
         self.values_grad = torch.zeros_like(self.values)
@@ -219,7 +217,7 @@ class _Walk:
     def backward(self, chunk: slice, blocks: list[tuple[Tensor, Tensor]], grad: Tensor) -> None:
         """Adds a chunk's part of the gradients; ``grad [T, V, P]`` is that of its sums."""
         starts, counts = self.lists.starts[chunk], self.lists.counts[chunk]
-        # The values behind the blocks processed so far, times the gradient.
+        # Blocks are processed from back to front: the values behind them, times the gradient.
         behind = torch.zeros_like(grad[:, 0])
         for number, (rows, before) in reversed(list(enumerate(blocks))):
             ids = self._ids(starts[rows], counts[rows], number * self.tiling.layers)

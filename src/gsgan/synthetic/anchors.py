@@ -22,7 +22,7 @@ THUMB = ("cmc", "mcp", "ip", "tip")
 # Thumb to pinky: first joint, step to the next, offset to the thumb's side, in hand lengths.
 ABSENT_FINGERS = ((0.2, 0.13, 0.35), (0.5, 0.15, 0.18), (0.5, 0.17, 0.05), (0.5, 0.15, -0.08),
                   (0.45, 0.13, -0.2))  # fmt: skip
-STEP = 0.0005  # metres between the rays that look at the face
+STEP = 0.0005  # metres between the rays cast at the face
 Anchors = dict[str, tuple[int, int]]  # landmark → joint and vertex, one of them -1
 
 
@@ -32,7 +32,7 @@ def with_anchors(c: Character) -> Character:
     Body and hands are joints where bones exist. Eyes, lids, brows, lips, nose and ears are
     vertices: found with rays from the front, from the eyeballs' bones, the colours of the brows
     and lips, and the slit that the shape ``mouth_open`` opens; in their absence from the
-    proportions of a face. Ours.
+    proportions of a face.
     """
     main = c.dominant_bones()
     found: Anchors = {}
@@ -124,9 +124,6 @@ class _Face:
             eyes = c.joints[[c.bones.index(f"{side}Eye") for side in SIDES]]
             if np.linalg.norm(eyes[0] - eyes[1]) > 0.03:  # some rigs put both at the head's joint
                 return eyes
-        if {"blink_left", "blink_right"} <= c.shapes.keys():
-            moved = [np.linalg.norm(c.shapes[f"blink_{s}"], axis=1) for s in ("left", "right")]
-            return np.array([np.average(c.vertices, axis=0, weights=m**2) for m in moved])
         head, x = c.joints[self.head], c.vertices[self.skin]
         height = head[2] + 0.45 * (c.vertices[:, 2].max() - head[2])
         return np.array([[head[0] + s * 0.033, x[:, 1].min() + 0.03, height] for s in (1, -1)])

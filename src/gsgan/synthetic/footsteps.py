@@ -1,6 +1,6 @@
 """Steps that follow the choreography: feet stand still, or swing to where they will be needed.
 
-Convention: that of :mod:`gsgan.synthetic.choreography`.
+Convention: that of :mod:`gsgan.synthetic.controls`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from gsgan.synthetic.choreography import EVERYDAY, STANCE, Array, Programme, controls_at, smoothstep
+from gsgan.synthetic.controls import STANCE, Array, Programme, controls_at, smoothstep
 
 PERIOD, SWING, STAND = 1.0, 0.42, 0.58  # seconds: from step to step of a foot, its two parts
 SHORTEST = (0.03, 0.12)  # metres and radians: a standing foot this near to its goal stays
@@ -22,7 +22,7 @@ class Footsteps:
     stand, unless it is there already.
     """
 
-    def __init__(self, seed: int, programme: Programme = EVERYDAY) -> None:
+    def __init__(self, seed: int, programme: Programme) -> None:
         turns = np.arange(0, programme.duration, PERIOD)
         self.start: list[Array] = []  # per foot [K] seconds
         self.shift: list[Array] = []  # per foot [K, 3] x, y, heading

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gsgan.body.free import free_body
 from gsgan.body.skinned import vertex_normals
-from gsgan.motion.character import Character, Motion, Surface
+from gsgan.motion.character import Animation, Character, Surface
 from gsgan.motion.rig import FINGERS
 from gsgan.scene import BodyPose
 
@@ -76,8 +76,8 @@ def free_character() -> Character:
     )
 
 
-def free_pose(motion: Motion) -> BodyPose:
-    """The free body's pose at every moment of the motion of `free_character`."""
+def free_pose(motion: Animation) -> BodyPose:
+    """The free body's pose in every frame of the animation of `free_character`."""
     body, R = free_body(), motion.rotations
     parents = np.array(body.parents)
     local = np.where((parents < 0)[:, None, None], R, np.swapaxes(R[:, parents], -1, -2) @ R)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -18,11 +17,7 @@ from gsgan.utils.errors import DataError
 KINDS = {5120: "i1", 5121: "u1", 5122: "i2", 5123: "u2", 5125: "u4", 5126: "f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 # Required by a file, these would change what is read here; all others concern looks only.
-UNSUPPORTED = {
-    "KHR_draco_mesh_compression": "Draco compression",
-    "KHR_texture_basisu": "Basis textures",
-    "KHR_meshopt_compression": "KHR meshopt compression",
-}
+UNSUPPORTED = ("KHR_draco_mesh_compression", "KHR_texture_basisu", "KHR_meshopt_compression")
 LARGEST_IMAGE = 2048  # pixels a side
 
 
@@ -30,25 +25,17 @@ class Glb:
     """A .glb file; ``doc`` is pygltflib's document.
 
     Raises:
-        DataError: It is no complete .glb or is compressed in an unsupported way.
+        DataError: It is no .glb or is compressed in an unsupported way.
     """
 
     def __init__(self, path: Path) -> None:
         data = path.read_bytes()
         if data[:4] != b"glTF":
             raise DataError(f"{path}: not a binary glTF file; export the character as .glb")
-        declared = int.from_bytes(data[8:12], "little")
-        if len(data) < declared:
-            raise DataError(
-                f"{path}: truncated, {len(data)} of {declared} bytes; copy or export it again"
-            )
-        self.path = path
-        self.doc = pygltflib.GLTF2.load_from_bytes(data)
+        self.path, self.doc = path, pygltflib.GLTF2.load_from_bytes(data)
         for name in self.doc.extensionsRequired or ():
             if name in UNSUPPORTED:
-                raise DataError(
-                    f"{path}: {UNSUPPORTED[name]} ({name}) is not supported; export it without"
-                )
+                raise DataError(f"{path}: {name} is not supported; export it without")
         self._blob = self.doc.binary_blob() or b""
         self._views: dict[int, tuple[Any, int]] = {}
 
@@ -106,25 +93,22 @@ class Glb:
             self._views[index] = (self._decompressed(data, packed) if packed else data, stride)
         return self._views[index]
 
-    @cached_property
-    def _decoder(self) -> Any:
+    def _decompressed(self, data: bytes, packed: dict[str, Any]) -> Bytes:
+        """The bytes of a view of EXT_meshopt_compression."""
         try:
             from meshoptimizer import decoder
         except ImportError:
             raise DataError(
                 f"{self.path} is compressed (EXT_meshopt_compression): pip install 'gsgan[gltf]'"
             ) from None
-        return decoder
-
-    def _decompressed(self, data: bytes, packed: dict[str, Any]) -> Bytes:
         count, stride, mode = packed["count"], packed["byteStride"], packed["mode"]
         if mode != "ATTRIBUTES":
             name = "decode_index_buffer" if mode == "TRIANGLES" else "decode_index_sequence"
-            decoded = getattr(self._decoder, name)(count, stride, data).view(np.uint8)
+            decoded = getattr(decoder, name)(count, stride, data).view(np.uint8)
             return cast(Bytes, decoded[: count * stride])  # short integers, packed at its start
-        decoded = self._decoder.decode_vertex_buffer(count, stride, data).view(np.uint8).ravel()
+        decoded = decoder.decode_vertex_buffer(count, stride, data).view(np.uint8).ravel()
         filters = {"OCTAHEDRAL": "oct", "QUATERNION": "quat", "EXPONENTIAL": "exp"}
         if packed.get("filter", "NONE") != "NONE":
             name = f"decode_filter_{filters[packed['filter']]}"
-            decoded = getattr(self._decoder, name)(decoded, count, stride)
+            decoded = getattr(decoder, name)(decoded, count, stride)
         return cast(Bytes, decoded)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,6 @@ from gsgan.synthetic.humanoid import (
     canonical_shapes,
     humanoid_bones,
     plain_shape,
-    vrm_shapes,
 )
 from gsgan.synthetic.parts import LABEL_NAMES, face_labels
 from gsgan.synthetic.textures import linear, srgb
@@ -63,7 +62,7 @@ def read_character(path: Path) -> Character:
     All skinned meshes are merged, and unskinned ones that hang on a bone; textures keep their
     resolution up to 2048 pixels a side. The person is turned to face -Y, put on z = 0 with the
     hips over the origin, and scaled to metres: by the file's likeliest unit if that makes 1.2 to
-    2.3 m, else to 1.7 m. Ours.
+    2.3 m, else to 1.7 m.
 
     Args:
         path: a binary glTF 2 file whose bones are named as Mixamo's (with or without prefix) or
@@ -149,97 +148,87 @@ def _local(node: Any) -> Array:
     return matrix
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Part:
-    """Vertices in world axes, and the faces of all primitives that share them."""
+    """The triangles of one primitive, in world axes."""
 
-    name: str  # of the mesh's node
+    name: str  # of the node and its mesh
+    material: int
     vertices: Array
     normals: Array
     uv: Array
+    faces: Ints
     bone_index: Ints
     bone_weight: Array
     shapes: dict[str, Array]
-    faces: list[tuple[int, Ints]] = field(default_factory=list)  # material, [F, 3]
 
 
 def _parts(glb: Glb, rig: _Rig) -> list[_Part]:
-    """The vertices and faces of all meshes that hang on bones."""
-    parts: dict[Any, _Part] = {}
-    binds = vrm_shapes(glb.doc.extensions or {})
-    for i, node in enumerate(rig.nodes):
-        if node.mesh is None or (node.skin is None and rig.bone_above(i) < 0):
-            continue  # what hangs on no bone is no part of the person
-        mesh = glb.doc.meshes[node.mesh]
-        for primitive in mesh.primitives:
-            if primitive.mode not in (None, TRIANGLES):
-                continue
-            attributes = {k: v for k, v in vars(primitive.attributes).items() if v is not None}
-            base = _base_texture(glb, primitive.material)
-            key = i, *attributes.items(), str(base)
-            if key not in parts:
-                names = (mesh.extras or primitive.extras or {}).get("targetNames", ())
-                wanted = [(plain, k, 1.0) for k, name in enumerate(names)
-                          if (plain := plain_shape(name)) in WANTED]  # fmt: skip
-                wanted += [(name, k, weight) for name, of_node, number, k, weight in binds
-                           if number == (i if of_node else node.mesh)]  # fmt: skip
-                targets = [(name, primitive.targets[k], weight) for name, k, weight in wanted
-                           if k < len(primitive.targets or ())]  # fmt: skip
-                parts[key] = _part(glb, rig, i, attributes, base, targets)
-            if primitive.indices is None:
-                corners = np.arange(len(parts[key].vertices))
-            else:
-                corners = glb.accessor(primitive.indices)[:, 0].astype(np.int64)
-            faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
-            if len(faces) and faces.max() >= len(parts[key].vertices):
-                raise ValueError("a face names a vertex that is not there")
-            material = -1 if primitive.material is None else primitive.material
-            parts[key].faces.append((material, faces))
-    return list(parts.values())
+    """All triangles that hang on bones; others are no part of the person."""
+    return [
+        _part(glb, rig, i, primitive)
+        for i, node in enumerate(rig.nodes)
+        if node.mesh is not None and (node.skin is not None or rig.bone_above(i) >= 0)
+        for primitive in glb.doc.meshes[node.mesh].primitives
+        if primitive.mode in (None, TRIANGLES)
+    ]
 
 
-def _part(
-    glb: Glb,
-    rig: _Rig,
-    node: int,
-    attributes: dict[str, int],
-    base: dict[str, Any],
-    targets: list[tuple[str, Any, float]],
-) -> _Part:
+def _part(glb: Glb, rig: _Rig, number: int, primitive: Any) -> _Part:
+    node = rig.nodes[number]
+    mesh = glb.doc.meshes[node.mesh]
+    attributes = {k: v for k, v in vars(primitive.attributes).items() if v is not None}
     position = glb.accessor(attributes["POSITION"])
-    if rig.nodes[node].skin is None:
-        index = np.full((len(position), 4), rig.bone_above(node))
-        weight = np.tile([1.0, 0, 0, 0], (len(position), 1))
-        matrix = np.broadcast_to(rig.world(node), (len(position), 4, 4))
-    else:
-        skin = glb.doc.skins[rig.nodes[node].skin]
-        slots, weight = _four_largest(glb, attributes)
-        index = np.array([rig.number[joint] for joint in skin.joints])[slots]
-        matrices = np.array([rig.world(joint) for joint in skin.joints])
-        if skin.inverseBindMatrices is not None:
-            bind = glb.accessor(skin.inverseBindMatrices).reshape(-1, 4, 4)[: len(matrices)]
-            matrices = matrices @ bind.transpose(0, 2, 1)
-        matrix = np.einsum("vk,vkij->vij", weight, matrices[slots])
+    index, weight, matrix = _bound(glb, rig, number, attributes, len(position))
     linear = matrix[:, :3, :3]
     normals = np.zeros_like(position)  # of files without any: made of the faces later
     if "NORMAL" in attributes:
         upright = np.linalg.inv(linear).transpose(0, 2, 1)
         normals = np.einsum("vij,vj->vi", upright, glb.accessor(attributes["NORMAL"]))
     shapes: dict[str, Array] = {}
-    for name, target, share in targets:
+    names = (mesh.extras or primitive.extras or {}).get("targetNames", ())
+    for name, target in zip(map(plain_shape, names), primitive.targets or (), strict=False):
         entry = target if isinstance(target, dict) else vars(target)
-        if entry.get("POSITION") is not None:
+        if name in WANTED and entry.get("POSITION") is not None:
             offsets = np.einsum("vij,vj->vi", linear, glb.accessor(entry["POSITION"]))
-            shapes[name] = shapes.get(name, 0) + share * offsets
+            shapes[name] = shapes.get(name, 0) + offsets
+    corners = np.arange(len(position))
+    if primitive.indices is not None:
+        corners = glb.accessor(primitive.indices)[:, 0].astype(np.int64)
+    if len(corners) and corners.max() >= len(position):
+        raise ValueError("a face names a vertex that is not there")
+    base = _base_texture(glb, primitive.material)
+    uv = attributes.get(f"TEXCOORD_{(base and base.texCoord) or 0}")
     return _Part(
-        name=f"{rig.nodes[node].name} {glb.doc.meshes[rig.nodes[node].mesh].name}",
+        name=f"{node.name} {mesh.name}",
+        material=-1 if primitive.material is None else primitive.material,
         vertices=np.einsum("vij,vj->vi", linear, position) + matrix[:, :3, 3],
         normals=normals,
-        uv=_texture_coordinates(glb, attributes, base, len(position)),
+        uv=np.zeros((len(position), 2)) if uv is None else glb.accessor(uv),
+        faces=corners[: len(corners) // 3 * 3].reshape(-1, 3),
         bone_index=index,
         bone_weight=weight,
         shapes=shapes,
     )
+
+
+def _bound(
+    glb: Glb, rig: _Rig, number: int, attributes: dict[str, int], count: int
+) -> tuple[Ints, Array, Array]:
+    """Bones and weights ``[V, 4]``, and matrices ``[V, 4, 4]`` to world axes."""
+    node = rig.nodes[number]
+    if node.skin is None:
+        index, weight = np.full((count, 4), rig.bone_above(number)), np.zeros((count, 4))
+        weight[:, 0] = 1
+        return index, weight, np.broadcast_to(rig.world(number), (count, 4, 4))
+    skin = glb.doc.skins[node.skin]
+    slots, weight = _four_largest(glb, attributes)
+    matrices = np.array([rig.world(joint) for joint in skin.joints])
+    if skin.inverseBindMatrices is not None:
+        bind = glb.accessor(skin.inverseBindMatrices).reshape(-1, 4, 4)[: len(matrices)]
+        matrices = matrices @ bind.transpose(0, 2, 1)
+    index = np.array([rig.number[joint] for joint in skin.joints])[slots]
+    return index, weight, np.einsum("vk,vkij->vij", weight, matrices[slots])
 
 
 def _four_largest(glb: Glb, attributes: dict[str, int]) -> tuple[Ints, Array]:
@@ -254,26 +243,10 @@ def _four_largest(glb: Glb, attributes: dict[str, int]) -> tuple[Ints, Array]:
     return slots, weight / weight.sum(1, keepdims=True)
 
 
-def _base_texture(glb: Glb, material: int | None) -> dict[str, Any]:
-    """The base colour's texture info with its KHR_texture_transform, {} without a texture."""
-    if material is None:
-        return {}
-    shader = glb.doc.materials[material].pbrMetallicRoughness
-    info = shader.baseColorTexture if shader else None
-    if info is None:
-        return {}
-    transform = (info.extensions or {}).get("KHR_texture_transform", {})
-    return {"index": info.index, "texCoord": info.texCoord or 0, **transform}
-
-
-def _texture_coordinates(
-    glb: Glb, attributes: dict[str, int], base: dict[str, Any], count: int
-) -> Array:
-    name = f"TEXCOORD_{base.get('texCoord', 0)}"
-    uv = glb.accessor(attributes[name]) if name in attributes else np.zeros((count, 2))
-    cos, sin = np.cos(base.get("rotation", 0.0)), np.sin(base.get("rotation", 0.0))
-    turn = np.array([[cos, sin], [-sin, cos]])
-    return uv * base.get("scale", (1, 1)) @ turn.T + base.get("offset", (0, 0))
+def _base_texture(glb: Glb, material: int | None) -> Any:
+    """The base colour's texture info, None without a texture."""
+    shader = None if material is None else glb.doc.materials[material].pbrMetallicRoughness
+    return shader and shader.baseColorTexture
 
 
 def _surface(glb: Glb, material: int) -> Surface:
@@ -282,7 +255,7 @@ def _surface(glb: Glb, material: int) -> Surface:
     entry, base = glb.doc.materials[material], _base_texture(glb, material)
     shader = entry.pbrMetallicRoughness
     factor = np.array((shader and shader.baseColorFactor) or (1, 1, 1, 1), np.float64)
-    colour = glb.image(base["index"]) if base else np.full((1, 1, 4), 255, np.uint8)
+    colour = glb.image(base.index) if base else np.full((1, 1, 4), 255, np.uint8)
     if (factor != 1).any():  # the factor scales linear light
         table = np.arange(256) / 255
         scaled = np.clip(linear(table)[:, None] * factor[:3], 0, 1)
@@ -326,14 +299,11 @@ def _unit_normals(normals: Array, vertices: Array, faces: Ints) -> Array:
 
 
 def _character(glb: Glb, rig: _Rig) -> Character:
-    parts = _parts(glb, rig)
-    first = np.cumsum([0, *(len(part.vertices) for part in parts)]).tolist()
-    groups = [(part.name, material, start + faces)
-              for start, part in zip(first, parts, strict=False)
-              for material, faces in part.faces if len(faces)]  # fmt: skip
-    if not groups:
+    parts = [part for part in _parts(glb, rig) if len(part.faces)]
+    if not parts:
         raise DataError(f"{glb.path}: no triangles on its bones; export the character's meshes")
-    faces = np.concatenate([corners for *_, corners in groups])
+    first = np.cumsum([0, *(len(part.vertices) for part in parts)]).tolist()
+    faces = np.concatenate([i + part.faces for i, part in zip(first, parts, strict=False)])
     vertices = np.concatenate([part.vertices for part in parts])
     turn, scale, origin = _standing(rig, vertices)
     vertices, joints = (scale * x @ turn.T - origin for x in (vertices, rig.joints))
@@ -343,15 +313,15 @@ def _character(glb: Glb, rig: _Rig) -> Character:
             total = shapes.setdefault(name, np.zeros_like(vertices))
             total[start : start + len(offsets)] = scale * offsets @ turn.T
     normals = np.concatenate([part.normals for part in parts]) @ turn.T
-    materials = sorted({material for _, material, _ in groups})
-    counts = [len(corners) for *_, corners in groups]
+    materials = sorted({part.material for part in parts})
+    counts = [len(part.faces) for part in parts]
     character = Character(
         name=glb.path.stem,
         vertices=vertices,
         normals=_unit_normals(normals, vertices, faces),
         uv=np.concatenate([part.uv for part in parts]),
         faces=faces,
-        material=np.repeat([materials.index(material) for _, material, _ in groups], counts),
+        material=np.repeat([materials.index(part.material) for part in parts], counts),
         labels=np.ones(len(faces), np.int64),
         label_names=LABEL_NAMES,
         surfaces=tuple(_surface(glb, material) for material in materials),
@@ -365,5 +335,5 @@ def _character(glb: Glb, rig: _Rig) -> Character:
         anchor_joint=np.zeros(0, np.int64),
         anchor_vertex=np.zeros(0, np.int64),
     )
-    names = np.repeat([name for name, *_ in groups], counts)
+    names = np.repeat([part.name for part in parts], counts)
     return with_anchors(replace(character, labels=face_labels(character, names)))

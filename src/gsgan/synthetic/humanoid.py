@@ -93,24 +93,22 @@ def plain_shape(name: str) -> str:
 
 
 # What a canonical shape is made of, best choice first: names as `plain_shape` writes them, of
-# gsgan's own avatars (always the first choice), VALID, ARKit, Ready Player Me, VRM and VRoid.
+# gsgan's own avatars (always the first choice), VALID, ARKit, Ready Player Me and VRoid.
 SHAPES = _choices("""
-    mouth_open: jawopen, mouthopen, vrm.aa, fclmtha
-    mouth_round: kiss, mouthpucker, vrm.ou, fclmthu
-    mouth_wide: tdi, mouthstretchleft+mouthstretchright, vrm.ih, fclmthi
+    mouth_open: jawopen, mouthopen, fclmtha
+    mouth_round: kiss, mouthpucker, fclmthu
+    mouth_wide: tdi, mouthstretchleft+mouthstretchright, fclmthi
     lips_pressed: mpbup+mpbdown, mouthpressleft+mouthpressright, fclmthclose
-    smile: {S}smileclose, mouthsmile{side}, 0.5*mouthsmile, 0.5*vrm.happy, 0.5*fclmthjoy
-    frown: {S}mouthsad, mouthfrown{side}, 0.5*vrm.sad, 0.5*fclmthsorrow
+    smile: {S}smileclose, mouthsmile{side}, 0.5*mouthsmile, 0.5*fclmthjoy
+    frown: {S}mouthsad, mouthfrown{side}, 0.5*fclmthsorrow
     puff: {S}blow, 0.5*cheekpuff
-    blink: {S}eyeclose, eyeblink{side}, vrm.blink{side}, fcleyeclose{S}, 0.5*vrm.blink
+    blink: {S}eyeclose, eyeblink{side}, fcleyeclose{S}
     wide: {S}eyeopen, eyewide{side}
     squint: {S}squint, eyesquint{side}
     brow_up: {S}browup+{S}{S}browup, browouterup{side}+0.5*browinnerup, 0.5*fclbrwsurprised
     brow_down: {S}browdown+{S}{S}browdown, browdown{side}, 0.5*fclbrwangry
 """)
 WANTED = {name for choices in SHAPES.values() for choice in choices for name in choice}
-VRM0_PRESETS = {"a": "aa", "i": "ih", "u": "ou", "joy": "happy", "sorrow": "sad"}
-VRM0_PRESETS |= {"blink_l": "blinkleft", "blink_r": "blinkright"}
 
 
 def canonical_shapes(found: Mapping[str, Array]) -> dict[str, Array]:
@@ -124,20 +122,3 @@ def canonical_shapes(found: Mapping[str, Array]) -> dict[str, Array]:
                     shapes[shape] = total
                 break
     return shapes
-
-
-def vrm_shapes(extensions: Mapping[str, Any]) -> list[tuple[str, bool, int, int, float]]:
-    """Name, whether the next number is a node (else a mesh), that number, target and weight."""
-    rows: list[tuple[str, bool, int, int, float]] = []
-    groups = extensions.get("VRM", {}).get("blendShapeMaster", {}).get("blendShapeGroups", ())
-    for group in groups:
-        preset = str(group.get("presetName", "")).lower()
-        name = "vrm." + VRM0_PRESETS.get(preset, preset)
-        for bind in group.get("binds") or ():
-            rows.append((name, False, bind["mesh"], bind["index"], bind["weight"] / 100))
-    presets = (extensions.get("VRMC_vrm", {}).get("expressions") or {}).get("preset") or {}
-    for preset, expression in presets.items():
-        for bind in expression.get("morphTargetBinds") or ():
-            name = f"vrm.{preset.lower()}"
-            rows.append((name, True, bind["node"], bind["index"], bind["weight"]))
-    return rows

@@ -7,9 +7,9 @@ from typing import cast
 
 import cv2
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import trimesh
 from scipy.spatial import cKDTree
+from trimesh.graph import connected_component_labels
 
 from gsgan.motion.character import Character, Ints
 from gsgan.motion.rotations import Array
@@ -52,9 +52,9 @@ CHEST = 0.16  # metres below the shoulders: skin above is the neck's, below the 
 def face_labels(character: Character, names: np.ndarray) -> Ints:
     """``[F]`` the part of each face, at least 1.
 
-    A material or mesh named after a part or a garment decides. Elsewhere the bones say which limb
-    a face is on, and its colour whether it is skin, hair or cloth; pieces of cloth (connected
-    vertices) are then upper or lower clothes or a shoe as a whole. Ours.
+    A material or mesh named after a part or a garment decides. Elsewhere bones decide which limb a
+    face is on, and its colour whether it is skin, hair or cloth; pieces of cloth (connected
+    vertices) are then upper or lower clothes or a shoe as a whole.
 
     Args:
         character: its ``labels`` are not read.
@@ -65,13 +65,15 @@ def face_labels(character: Character, names: np.ndarray) -> Ints:
     bone = c.dominant_bones()[corner]
     cloth, skin, root = (rows[bone] for rows in _bone_labels(c))
     lab = _lab(c)
-    centre, area = _centres(c)
+    corners = c.vertices[c.faces]
+    centre, area = corners.mean(1), trimesh.triangles.area(corners)
     shoulders = c.joints[_numbers(c, ("LeftArm", "RightArm")), 2].min()
     low = (skin == FACE) & (root == "Spine") & (centre[:, 2] < shoulders - CHEST)
     skin = np.where(low, UPPER, skin)
 
-    head = root == "Head"
-    front = head & (c.normals[corner, 1] < -0.6) & (np.abs(centre[:, 2] - _cheeks(c)) < 0.05)
+    head, neck = root == "Head", c.joints[c.bones.index("Head"), 2]
+    cheeks = float(neck + 0.35 * (c.vertices[:, 2].max() - neck))
+    front = head & (c.normals[corner, 1] < -0.6) & (np.abs(centre[:, 2] - cheeks) < 0.05)
     tone = np.median(lab[front] if front.any() else lab, 0)
     bare = _voted(c, np.linalg.norm(lab - tone, axis=1) < SKIN_DISTANCE)
     labels = np.where(bare, skin, cloth)
@@ -154,33 +156,10 @@ def _lab(c: Character) -> Array:
     return lab * np.array([0.5, 1, 1])
 
 
-def _centres(c: Character) -> tuple[Array, Array]:
-    corners = c.vertices[c.faces]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return corners.mean(1), np.linalg.norm(normal, axis=1) / 2
-
-
-def _cheeks(c: Character) -> float:
-    """Height of the cheeks, metres."""
-    head = c.joints[c.bones.index("Head"), 2]
-    return float(head + 0.35 * (c.vertices[:, 2].max() - head))
-
-
 def _neighbours(c: Character) -> Ints:
     """``[E, 2]`` pairs of faces with a common edge, vertices at one place taken as one."""
     _, place = np.unique(np.round(c.vertices, 5), axis=0, return_inverse=True)
-    faces = place.reshape(-1)[c.faces]
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), 1)
-    owner = np.tile(np.arange(len(faces)), 3)
-    order = np.lexsort(edges.T)
-    edges, owner = edges[order], owner[order]
-    same = (edges[1:] == edges[:-1]).all(1)
-    return np.stack([owner[:-1][same], owner[1:][same]], 1)
-
-
-def _components(pairs: Ints, count: int) -> Ints:
-    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
-    return connected_components(graph, directed=False)[1]
+    return trimesh.graph.face_adjacency(faces=place.reshape(-1)[c.faces])
 
 
 def _voted(c: Character, flag: np.ndarray, rounds: int = 4) -> np.ndarray:
@@ -207,10 +186,10 @@ def _hair(c: Character, lab: Array, others: Array, near: np.ndarray, centre: Arr
     to_others, _ = cKDTree(others).query(lab)
     like = _voted(c, (near & (to_hair < to_others)) | crown, 2) & near
     pairs = _neighbours(c)
-    parts = _components(pairs[like[pairs].all(1)], len(like))
+    parts = connected_component_labels(pairs[like[pairs].all(1)], len(like))
     hair = like & np.isin(parts, np.unique(parts[crown & like]))
     # small islands within the hair are hair: highlights, and shadows of strands
-    rest = _components(pairs[~hair[pairs].any(1)], len(like))
+    rest = connected_component_labels(pairs[~hair[pairs].any(1)], len(like))
     edge = pairs[hair[pairs].sum(1) == 1]
     touching = np.unique(rest[edge[~hair[edge]]])
     sizes = np.bincount(rest[~hair], minlength=rest.max() + 1)
@@ -221,7 +200,7 @@ def _hair(c: Character, lab: Array, others: Array, near: np.ndarray, centre: Arr
 def _whole_garments(c: Character, labels: Ints, shoes: Ints, free: np.ndarray, area: Array) -> Ints:
     """Each piece of cloth gets the label of most of its area."""
     edges = np.concatenate([c.faces[:, [0, 1]], c.faces[:, [1, 2]]])
-    piece = _components(edges, len(c.vertices))[c.faces[:, 0]]
+    piece = connected_component_labels(edges, len(c.vertices))[c.faces[:, 0]]
     kind = np.select([labels == UPPER, labels == LOWER, np.isin(labels, SHOES)], [0, 1, 2], -1)
     cloth = (kind >= 0) & free
     total = np.zeros((piece.max() + 1, 3))

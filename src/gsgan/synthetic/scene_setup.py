@@ -1,12 +1,13 @@
 """The synthetic scene in numbers: its parameters, cameras, character and motion.
 
-Everything here follows from :class:`Settings` alone: worker processes rebuild the scene from them.
+Everything here follows from :class:`SceneSettings` alone: workers rebuild the scene from them.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -17,16 +18,19 @@ from numpy.typing import NDArray
 from gsgan.body.free import free_body
 from gsgan.data.cameras import DISTORTION_LENGTHS
 from gsgan.motion.character import Character
-from gsgan.synthetic.choreography import EVERYDAY, frame_times, held_out
+from gsgan.synthetic.bvh_motion import BvhMotion
+from gsgan.synthetic.camera import SceneCamera, look_at, through_lens, zoomed
+from gsgan.synthetic.choreography import EVERYDAY, held_out
+from gsgan.synthetic.controls import frame_times
 from gsgan.synthetic.free_subject import free_character, free_pose
 from gsgan.synthetic.gltf import avatar_names, avatar_path, read_character
-from gsgan.synthetic.motion import Choreography
-from gsgan.synthetic.motion_file import BvhMotion
+from gsgan.synthetic.posing import Choreography
 from gsgan.synthetic.secondary import Moving, Secondary
 from gsgan.synthetic.signs import SIGNS, split_signs
 from gsgan.synthetic.tint import make_tints
 from gsgan.synthetic.trace import Appearance, Light, PosedCharacter, Wrinkles
-from gsgan.synthetic.view import View, look_at, through_lens, zoomed
+from gsgan.utils.arrays import as_floats
+from gsgan.utils.checks import between, one_of, whole
 from gsgan.utils.errors import ConfigError, DataError
 
 Array = NDArray[np.float64]
@@ -38,24 +42,18 @@ AVATARS = avatar_names()
 DEFAULT, FREE_BODY, CHOREOGRAPHY, SIGNING = "polo", "free_body", "choreography", "signs"
 PROGRAMMES = {CHOREOGRAPHY: EVERYDAY, SIGNING: SIGNS}
 ARC = math.radians(150)  # round the front of a person who signs
-WHOLE, NUMBER, LIST = "a whole number", "a number", "a list of numbers"
-# Kind and range of each parameter; those that are not whole numbers may be None.
-RANGES = {
-    "size": (WHOLE, 8, math.inf),
-    **dict.fromkeys(("train_cameras", "frames", "rays_per_pixel"), (WHOLE, 1, math.inf)),
-    **dict.fromkeys(("test_cameras", "test_frames", "seed"), (WHOLE, 0, math.inf)),
-    "lens": (LIST, -math.inf, math.inf),
-    "tint": (NUMBER, 0, 0.3),
-    "gloss": (NUMBER, 0, 1),
-    "test_scale": (LIST, 0.25, 4),
-}
+# Least value of each whole number, and the ranges of those that may be None.
+LEAST = {"size": 8, "train_cameras": 1, "frames": 1, "rays_per_pixel": 1}
+LEAST |= {"test_cameras": 0, "test_frames": 0, "seed": 0}
+NUMBERS = {"tint": (0.0, 0.3), "gloss": (0.0, 1.0)}
+LISTS = {"lens": (-math.inf, math.inf), "test_scale": (0.25, 4)}
 
 
 @dataclass(frozen=True)
-class Settings:
+class SceneSettings:
     """The parameters of a synthetic dataset, as in conf/data/synthetic.yaml.
 
-    Together with `VERSION` they determine every byte. Effects without effect are stored as None.
+    Together with `VERSION` they determine every byte. Disabled effects are stored as None.
 
     Raises:
         ConfigError: naming the parameter that is out of range.
@@ -77,24 +75,21 @@ class Settings:
     test_scale: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        for name, (kind, low, high) in RANGES.items():
+        for name, least in LEAST.items():
+            whole(f"data.source.{name}", getattr(self, name), least)
+        for name, bounds in NUMBERS.items():
+            if (value := getattr(self, name)) is not None:
+                between(f"data.source.{name}", value, *bounds)
+            object.__setattr__(self, name, float(value) if value else None)
+        for name, (low, high) in LISTS.items():
             raw = getattr(self, name)
-            if raw is None and kind != WHOLE:
-                continue
-            try:
-                values = np.array(raw, dtype=float)
-            except (TypeError, ValueError):
-                values = np.array(math.nan)
-            good = np.isfinite(values) & (values >= low) & (values <= high)
-            typed = not isinstance(raw, bool) and (kind != WHOLE or isinstance(raw, int))
+            values = as_floats([] if raw is None else raw)
             _require(
-                typed and values.ndim == (kind == LIST) and bool(good.all()),
-                f"{name} must be {kind} in [{low:g}, {high:g}], got {raw!r}",
+                (raw is None or (isinstance(raw, Sequence) and len(values) == len(raw)))
+                and bool((np.isfinite(values) & (values >= low) & (values <= high)).all()),
+                f"{name} must be a list of numbers in [{low:g}, {high:g}], got {raw!r}",
             )
-            if kind != WHOLE:
-                numbers = values.tolist()
-                stored = tuple(numbers) if kind == LIST else numbers
-                object.__setattr__(self, name, stored if values.any() else None)
+            object.__setattr__(self, name, tuple(values.tolist()) if values.any() else None)
         named = (*AVATARS, FREE_BODY)
         _require(
             self.avatar in named or str(self.avatar).endswith(".glb"),
@@ -104,10 +99,7 @@ class Settings:
             self.motion in tuple(PROGRAMMES) or str(self.motion).endswith(".bvh"),
             f"motion must be {', '.join(PROGRAMMES)} or the path of a .bvh, got {self.motion!r}",
         )
-        _require(
-            isinstance(self.secondary, bool),
-            f"secondary must be true or false, got {self.secondary!r}",
-        )
+        one_of("data.source.secondary", self.secondary, (True, False))
         _require(
             self.test_frames < self.frames,
             f"test_frames must be less than frames = {self.frames}, got {self.test_frames}",
@@ -130,10 +122,10 @@ class Settings:
 
 def _require(holds: bool, message: str) -> None:
     if not holds:
-        raise ConfigError(f"synthetic data: {message}")
+        raise ConfigError(f"data.source.{message}")
 
 
-def dataset_key(settings: Settings) -> str:
+def dataset_key(settings: SceneSettings) -> str:
     """Name of a dataset in the cache: its main parameters and a hash of all of them.
 
     Files count by their content, not by their path.
@@ -179,7 +171,7 @@ class Scene:
         DataError: when the avatar's or the motion's file cannot be used.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: SceneSettings) -> None:
         self.settings, self.light = settings, Light(gloss=settings.gloss or 0.0)
         self.character = character = load_character(settings.avatar)
         self.appearance = Appearance(character)
@@ -281,7 +273,7 @@ def extent(
     return np.concatenate([thinned.skinned(R, joints)[0] for R, joints in poses])
 
 
-def ring(settings: Settings, points: Array) -> list[View]:
+def ring(settings: SceneSettings, points: Array) -> list[SceneCamera]:
     """Cameras around the person, training cameras first, zoomed to keep ``points`` in view."""
     n, low, high = settings.train_cameras, points.min(axis=0), points.max(axis=0)
     middle = (low + high) / 2
@@ -293,7 +285,7 @@ def ring(settings: Settings, points: Array) -> list[View]:
     return [look_at(a, h, middle, points, settings.size) for a, h in train + test]
 
 
-def front(settings: Settings, points: Array) -> list[View]:
+def front(settings: SceneSettings, points: Array) -> list[SceneCamera]:
     """Cameras on an arc before the person, training cameras first, zoomed to ``points``."""
     n, middle = settings.train_cameras, (points.min(axis=0) + points.max(axis=0)) / 2
     step = ARC / n

@@ -1,9 +1,9 @@
 """Writes the synthetic dataset, once, into a cache folder.
 
 The layout is that of a capture: cameras.json, images/{cam}/%06d.png, masks/, labels/,
-landmarks3d.npz, hands3d.npz, face3d.npz, meta.json. Every image is written whole, and meta.json
-last: a dataset whose making was interrupted is not taken for complete, and continued. Tints are
-written nowhere: a model has to estimate them.
+landmarks3d.npz, hands3d.npz, face3d.npz, meta.json. Every image is written atomically, and
+meta.json last: a dataset that was interrupted is incomplete and is continued. Tints are not
+written to any file: a model has to estimate them.
 
 Workers are separate programs rather than children of multiprocessing, which would import the
 user's main script again, and fail where it is a notebook or lacks a ``__main__`` guard.
@@ -30,9 +30,9 @@ from numpy.typing import NDArray
 import gsgan
 from gsgan.body.free import free_body
 from gsgan.data.joints import BODY, FACE, HANDS
+from gsgan.synthetic.camera import SceneCamera
 from gsgan.synthetic.free_subject import free_pose
-from gsgan.synthetic.scene_setup import FREE_BODY, Scene, Settings, dataset_key
-from gsgan.synthetic.view import View
+from gsgan.synthetic.scene_setup import FREE_BODY, Scene, SceneSettings, dataset_key
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import cache_root, write_atomically
 
@@ -52,7 +52,7 @@ def ensure_synthetic(
         cache: cache folder, :func:`gsgan.utils.files.cache_root` by default.
         workers: processes that trace; 1 traces in this one. Does not change the result.
         progress: whether to draw a progress bar.
-        parameters: of :class:`gsgan.synthetic.scene_setup.Settings`.
+        parameters: of :class:`gsgan.synthetic.scene_setup.SceneSettings`.
 
     Returns:
         The dataset's folder.
@@ -61,12 +61,12 @@ def ensure_synthetic(
         ConfigError: on an unknown parameter or one out of range.
         DataError: when the folder cannot be written.
     """
-    known = [field.name for field in fields(Settings)]
+    known = [field.name for field in fields(SceneSettings)]
     if unknown := sorted(set(parameters) - set(known)):
         raise ConfigError(
             f"synthetic data: unknown parameter {unknown[0]!r}; known are {', '.join(known)}"
         )
-    settings = Settings(**parameters)
+    settings = SceneSettings(**parameters)
     root = (cache or cache_root()) / "data" / "synthetic" / dataset_key(settings)
     if not _is_complete(root):
         try:
@@ -102,7 +102,7 @@ def _locked(lock: Path) -> Iterator[None]:
         yield
 
 
-def _write(root: Path, settings: Settings, workers: int, progress: bool) -> None:
+def _write(root: Path, settings: SceneSettings, workers: int, progress: bool) -> None:
     from rich.console import Console
     from rich.progress import Progress
 
@@ -124,7 +124,7 @@ def _write(root: Path, settings: Settings, workers: int, progress: bool) -> None
     write_atomically(root / "meta.json", json.dumps(_meta(scene), indent=1) + "\n")
 
 
-def _trace_in_processes(root: Path, settings: Settings, workers: int) -> Iterator[None]:
+def _trace_in_processes(root: Path, settings: SceneSettings, workers: int) -> Iterator[None]:
     """Divides the frames among processes; yields from time to time until all are done.
 
     Raises:
@@ -161,7 +161,7 @@ def trace_share() -> None:
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     root, parameters, first, step = sys.argv[1:]
-    settings = Settings(**json.loads(parameters))
+    settings = SceneSettings(**json.loads(parameters))
     trace_frames(Path(root), Scene(settings), range(int(first), settings.frames, int(step)))
 
 
@@ -187,7 +187,7 @@ def _bytes(x: NDArray[np.float64]) -> NDArray[np.uint8]:
     return np.floor(255 * np.clip(x, 0, 1) + 0.5).astype(np.uint8)
 
 
-def _calibration(view: View) -> dict[str, Any]:
+def _calibration(view: SceneCamera) -> dict[str, Any]:
     return {
         "K": view.K.tolist(),
         "R": view.R.tolist(),

@@ -1,6 +1,6 @@
 """Secondary motion: sway of loose cloth and hair, and wrinkles near bent joints.
 
-What linear blend skinning cannot do: the sway depends on the motion before a moment, the wrinkles
+Linear blend skinning cannot do these: the sway depends on the motion before a moment, the wrinkles
 on the pose. Both are smooth over the mesh, and the same whichever moments are requested.
 
 Convention: metres, seconds, world frame, Z up.
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.signal import bilinear, lfilter
 from scipy.sparse import coo_array, csr_array
 
-from gsgan.motion.character import Character, Motion
+from gsgan.motion.character import Animation, Character
 from gsgan.motion.rotations import unit
 from gsgan.synthetic.trace import Wrinkles
 
@@ -62,18 +62,15 @@ FLANK = 0.05  # metres from a limb's axis at which folds are fully one-sided
 
 
 class Moving(Protocol):
-    """A motion that can be asked for poses at any times ``[F]`` in seconds from 0 to duration."""
+    """A motion with poses at any times ``[F]``, in seconds from 0 to ``duration``."""
 
     duration: float
 
-    def at(self, times: Array) -> Motion: ...
+    def at(self, times: Array) -> Animation: ...
 
 
 class Secondary:
-    """What is added to the skinned vertices and normals of a character in motion.
-
-    Source: ours.
-    """
+    """Offsets of the skinned vertices and normals of a character in motion."""
 
     def __init__(self, character: Character, motion: Moving) -> None:
         self.character = character

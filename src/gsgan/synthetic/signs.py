@@ -1,6 +1,6 @@
 """Sign language in front of chest and face: twelve signs, of which three are never trained on.
 
-Convention: that of :mod:`gsgan.synthetic.choreography`; knuckles are the middle fingers', in
+Convention: that of :mod:`gsgan.synthetic.controls`; knuckles are the middle fingers', in
 mirrored chest axes from the middle of the shoulders: the mouth is at (0, -0.18, 0.16). The signs
 are gestures with the hand shapes, contacts and occlusions of signs, and have no meaning.
 """
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gsgan.synthetic.choreography import TAU, Array, Controls, Programme, Style, smoothstep
+from gsgan.synthetic.controls import TAU, Array, Controls, Programme, Style, smoothstep
 from gsgan.utils.errors import ConfigError
 
 # Hand shapes: curl of each finger, thumb first; bend of its first joint besides; spread.

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gsgan.motion.character import Character
+from gsgan.synthetic.camera import SceneCamera, pixel_rays
 from gsgan.synthetic.textures import Textures, srgb
-from gsgan.synthetic.view import View, pixel_rays
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.floating[Any]]  # float32: enough for light, and twice as fast
@@ -194,7 +194,7 @@ class PosedCharacter:
         waves = [] if wrinkles is None else [wrinkles.phase, wrinkles.slope, wrinkles.across]
         self.attributes = np.column_stack([X, N, sky, appearance.uv, *waves]).astype(np.float32)
 
-    def render(self, view: View, rays: int) -> tuple[Array, Array, Ints]:
+    def render(self, view: SceneCamera, rays: int) -> tuple[Array, Array, Ints]:
         """Image ``[H,W,3]``, alpha ``[H,W]`` and labels ``[H,W]`` seen by a camera.
 
         Casts ``rays`` per pixel that the person can touch. A pixel's label is the one that most of
@@ -219,7 +219,7 @@ class PosedCharacter:
             labels[y, x] = majority(part, len(self.appearance.character.label_names))
         return image, alpha, labels
 
-    def _touched(self, view: View) -> Bools:
+    def _touched(self, view: SceneCamera) -> Bools:
         """Pixels ``[H, W]`` that the person may touch: faces' edges and what is between them."""
         H, W = view.size
         if (self.vertices @ view.R[2] + view.t[2]).min() <= 0:  # partly behind the camera
@@ -242,7 +242,7 @@ class PosedCharacter:
         return touched
 
     def _shoot(
-        self, view: View, origin: Array, directions: Array, rays: int
+        self, view: SceneCamera, origin: Array, directions: Array, rays: int
     ) -> tuple[Ints, Floats]:
         """Face ``[N]`` and linear light ``[N, 3]`` of each ray."""
         towards = directions.astype(np.float32)

@@ -1,4 +1,4 @@
-"""Output of a run while it trains: image grids, a line per validation, viewer, checkpoints."""
+"""The output of a run while it trains: image grids, progress lines, viewer, checkpoints."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ class LiveViewer(Callback):
 
 
 class AtomicCheckpoints(TorchCheckpointIO):
-    """Writes beside the old checkpoint and renames, so that a kill leaves one of them whole."""
+    """Writes a new file and renames it, so that a killed run leaves a whole checkpoint."""
 
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: Any, storage_options: Any | None = None

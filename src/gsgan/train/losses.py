@@ -18,8 +18,8 @@ from gsgan.losses.adversarial import (
 )
 from gsgan.losses.perceptual import Perceptual
 from gsgan.losses.photometric import photometric, without_unsure
-from gsgan.model.avatar import Painting
 from gsgan.model.discriminator import Discriminator
+from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.utils.checks import at_least, one_of
 from gsgan.utils.tensors import full_precision
@@ -33,7 +33,7 @@ class StepOneLoss:
         l1, ssim: weights (paper: 0.8, 0.2).
         feature_head, alpha: weights, see conf/training/long.yaml; 0 builds no readout of F.
 
-    Source: paper Sec. 3.5 (λ = 0.2); readout and alpha are ours.
+    Source: paper Sec. 3.5 (λ = 0.2), without readout and alpha.
     """
 
     l1: float = 0.8
@@ -42,23 +42,23 @@ class StepOneLoss:
     alpha: float = 0.1
 
     def __call__(
-        self, painting: Painting, frame: Frame, background: Tensor | None, head: nn.Conv2d | None
+        self, rendering: Rendering, frame: Frame, background: Tensor | None, head: nn.Conv2d | None
     ) -> Tensor:
-        """The loss of a painting of ``frame`` over ``background [B, 3, 1, 1]``, None for black;
+        """The loss of a rendering of ``frame`` over ``background [B, 3, 1, 1]``, None for black;
         ``head`` is the linear readout of F. In full precision, autocast or not."""
         with full_precision(frame.image):
-            assert painting.features is not None and painting.splat_alpha is not None  # noqa: PT018
-            assert painting.colour is not None
+            assert rendering.features is not None and rendering.splat_alpha is not None  # noqa: PT018
+            assert rendering.colour is not None
             target, behind = frame.image, frame.image.new_zeros(())
             if background is not None:
                 target = frame.image + (1 - frame.mask) * background
-                behind = (1 - painting.splat_alpha) * background
+                behind = (1 - rendering.splat_alpha) * background
             pixels = {"l1": self.l1, "ssim": self.ssim}
-            loss = photometric(painting.colour + behind, target, unsure=frame.unsure, **pixels)
+            loss = photometric(rendering.colour + behind, target, unsure=frame.unsure, **pixels)
             if head is not None:
-                # the bias weighted by alpha: the readout commutes with alpha blending
-                # as one product: a convolution with few channels is slower on a CPU
-                seen = torch.cat([painting.features, painting.splat_alpha], dim=1)
+                # The bias is weighted by alpha, so that the readout commutes with blending. One
+                # product, because a convolution with few channels is slower on a CPU.
+                seen = torch.cat([rendering.features, rendering.splat_alpha], dim=1)
                 weight = torch.cat([head.weight.flatten(1), head.bias[:, None]], dim=1)  # type: ignore[index]
                 read = (weight @ seen.flatten(2)).unflatten(2, seen.shape[2:])
                 loss = loss + self.feature_head * photometric(
@@ -66,7 +66,7 @@ class StepOneLoss:
                 )
             if background is None and self.alpha:
                 matte = photometric(
-                    painting.splat_alpha, frame.mask, l1=1.0, ssim=0.0, unsure=frame.unsure
+                    rendering.splat_alpha, frame.mask, l1=1.0, ssim=0.0, unsure=frame.unsure
                 )
                 loss = loss + self.alpha * matte
             return loss
@@ -83,7 +83,7 @@ def discriminate(discriminator: Discriminator, image: Tensor, gan: str) -> list[
 
 
 class DiscriminatorMaps:
-    """The discriminator's maps of a frame and of its painting, computed once for the generator's
+    """The discriminator's maps of a frame and of its rendering, computed once for the generator's
     loss and for the discriminator's.
 
     Args:
@@ -96,10 +96,10 @@ class DiscriminatorMaps:
         self, discriminator: Discriminator, image: Tensor, target: Tensor, gan: str
     ) -> None:
         self.image, self.gan = image, gan
-        # a leaf: the two losses must not reach each other's parameters
-        self.painted = image.detach().requires_grad_(image.requires_grad)
+        # a leaf, so that neither loss reaches the other's parameters
+        self.copy = image.detach().requires_grad_(image.requires_grad)
         with torch.enable_grad():
-            self.fake = discriminate(discriminator, self.painted, gan)
+            self.fake = discriminate(discriminator, self.copy, gan)
             self.real = discriminate(discriminator, target.detach(), gan)
 
     def terms(self, adversarial: float, matching: float) -> dict[str, Tensor]:
@@ -109,7 +109,7 @@ class DiscriminatorMaps:
             terms["adversarial"] = adversarial * generator_loss(self.real, self.fake, self.gan)
         if matching:
             terms["feature_matching"] = matching * feature_matching(self.real, self.fake)
-        found = _Through.apply(self.image, (self.painted, list(terms.values())))
+        found = _Through.apply(self.image, (self.copy, list(terms.values())))
         return dict(zip(terms, found, strict=True))
 
     def loss(self) -> Tensor:
@@ -122,7 +122,7 @@ class _Through(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, image: Tensor, path: tuple[Tensor, list[Tensor]]) -> tuple[Tensor, ...]:
-        # in a tuple autograd does not see them: it would go that way as well
+        # in a tuple, which hides them from autograd: it would follow them as well
         ctx.copy, ctx.terms = path
         terms = ctx.terms
         return tuple(term.detach().clone() for term in terms)
@@ -138,8 +138,7 @@ class _Through(torch.autograd.Function):
 class StepTwoLoss:
     """Weights of the generator's loss (conf/training/long.yaml); 0 computes no term.
 
-    Source: paper Sec. 3.5 and Alg. 2, an unweighted sum of L_GAN, L_perc and L_feat; weights, the
-        other terms and the anchor are ours.
+    Source: paper Sec. 3.5 and Alg. 2, an unweighted sum of L_GAN, L_perc and L_feat.
     """
 
     l1: float = 1.0
@@ -152,19 +151,18 @@ class StepTwoLoss:
     feature_matching: float = 10.0
     gan: str = "logistic"
     anchor: float = 1.0
-    detach_features: bool = False
 
     def __post_init__(self) -> None:
         one_of("training.step_two.gan", self.gan, FORMS)
         at_least("training.step_two.perceptual_every", self.perceptual_every, 1)
 
     def discriminator_maps(
-        self, discriminator: Discriminator, painting: Painting, frame: Frame
+        self, discriminator: Discriminator, rendering: Rendering, frame: Frame
     ) -> DiscriminatorMaps:
-        """The discriminator's maps of a painting of ``frame``."""
-        assert painting.image is not None
-        target = without_unsure(frame.image, painting.image, frame.unsure)
-        return DiscriminatorMaps(discriminator, painting.image, target, self.gan)
+        """The discriminator's maps of a rendering of ``frame``."""
+        assert rendering.image is not None
+        target = without_unsure(frame.image, rendering.image, frame.unsure)
+        return DiscriminatorMaps(discriminator, rendering.image, target, self.gan)
 
     @property
     def adversarial_terms(self) -> bool:
@@ -173,7 +171,7 @@ class StepTwoLoss:
 
     def terms(
         self,
-        painting: Painting,
+        rendering: Rendering,
         frame: Frame,
         *,
         anchor: Tensor | None,
@@ -184,14 +182,14 @@ class StepTwoLoss:
         """The generator's losses, weighted, by name.
 
         Args:
-            painting: I_pred and its alpha.
+            rendering: I_pred and its alpha.
             frame: the ground truth.
-            anchor: L_Ψ of the same painting; None leaves it out.
+            anchor: L_Ψ of the same rendering; None leaves it out.
             perceptual: L_perc; None leaves it out.
             maps: the discriminator's maps; None before the GAN starts.
             step: the iteration, for ``perceptual_every``.
         """
-        image, alpha = painting.image, painting.alpha
+        image, alpha = rendering.image, rendering.alpha
         assert image is not None and alpha is not None  # noqa: PT018
         target = without_unsure(frame.image, image, frame.unsure)
         by_pixel = partial(photometric, l1=self.l1, l2=self.l2, ssim=self.ssim)

@@ -15,19 +15,18 @@ from torch import Tensor, nn
 
 from gsgan.losses.perceptual import Perceptual
 from gsgan.metrics.image import psnr
-from gsgan.model.avatar import Avatar, Painting
+from gsgan.model.avatar import Avatar
 from gsgan.model.discriminator import Discriminator
+from gsgan.model.rendering import Rendering
 from gsgan.scene import Frame
 from gsgan.train.losses import DiscriminatorMaps, StepOneLoss, StepTwoLoss
-from gsgan.train.optimisers import MovingAverage, Recipe, clip, parameter_groups
-from gsgan.train.pose import PoseCorrections
+from gsgan.train.optimisers import MovingAverage, Recipe, check_recipes, clip, parameter_groups
 from gsgan.train.rollback import Rollback, SkippedSteps
-from gsgan.train.schedule import SEGMENTATION, STEP_ONE, STEP_TWO, Schedule
+from gsgan.train.schedule import SEGMENTATION, SPLATTING, STEP_ONE, Schedule
 from gsgan.utils.checks import at_least
 from gsgan.utils.errors import ConfigError, GsganError
 
 PSNR_CAP = 100.0  # dB: one image equal to the ground truth would make the mean infinite
-SPLATTING = ("psi", "colour", "pose")  # optimisers of the parts that make Step I's image
 SEED_STRIDE = 1_000_003  # a prime: (seed, step) pairs do not meet
 
 
@@ -39,16 +38,14 @@ class AvatarTraining(LightningModule):
         discriminator: None, or no adversarial weight, leaves the GAN out.
         perceptual: L_perc; None leaves it out.
         schedule: iterations of each phase, see `Schedule.fitted`.
-        recipes: optimisers by name: segmentation, psi, colour, pose, generator, discriminator.
+        recipes: optimisers by name: segmentation, psi, colour, generator, discriminator.
         step_one, step_two: loss weights.
         seed: with the iteration it determines every random number drawn here, so a resumed run
             draws the same ones.
         pose_noise, max_skipped, skip_window, log_every, average, average_every: see
             conf/training/long.yaml.
         rollback: recovers from a collapse of the rendered person.
-        pose: corrections of the body's pose in training frames; None leaves it as the data has it.
-        pose_prior: weight of their mean square.
-        extra_losses: further terms of Step II by name: modules of a painting and its frame.
+        extra_losses: further terms of Step II by name: modules of a rendering and its frame.
         record: plain config values stored with every checkpoint.
         scene: facts about the scene as plain values, likewise, for `gsgan.load`.
 
@@ -73,51 +70,57 @@ class AvatarTraining(LightningModule):
         average: float | None = None,
         average_every: int = 1,
         rollback: Rollback | None = None,
-        pose: PoseCorrections | None = None,
-        pose_prior: float = 0.0,
         extra_losses: dict[str, nn.Module] | None = None,
         record: dict[str, Any] | None = None,
         scene: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.automatic_optimization = False
-        self.avatar = avatar
-        paints = avatar.generator is not None
-        self.discriminator = discriminator if paints and step_two.adversarial_terms else None
-        self.perceptual = perceptual if paints and step_two.perceptual else None
+        self.avatar, S = avatar, avatar.segmentation
+        generates = avatar.generator is not None
+        self.discriminator = discriminator if generates and step_two.adversarial_terms else None
+        self.perceptual = perceptual if generates and step_two.perceptual else None
         self.extra_losses = nn.ModuleDict(extra_losses or {})
         self.schedule = schedule.fitted(
-            segmentation=avatar.segmentation is not None,
-            from_masks=avatar.segmentation is not None and avatar.segmentation.common is not None,
+            segmentation=S is not None,
+            from_masks=S is not None and S.common is not None,
             splats=avatar.splats is not None,
-            generator=avatar.generator is not None,
+            generator=generates,
         )
-        self.pose, self.pose_prior = pose, at_least("training.pose_prior", pose_prior, 0)
         self.recipes, self.step_one, self.step_two = recipes, step_one, step_two
-        self.pose_noise, self.seed, self.log_every = pose_noise, seed, log_every
-        at_least("training.log_every", log_every, 1)
-        at_least("training.average_every", average_every, 1)
+        self.pose_noise, self.seed = pose_noise, seed
+        self.log_every = at_least("training.log_every", log_every, 1)
         self.skipped = SkippedSteps(max_skipped, skip_window)
-        self.record, self.scene = record or {}, scene
         self.rollback = rollback or Rollback()
-        self.average, self.average_every = None, average_every
-        if average is not None:
-            self.average = MovingAverage(avatar, average, average_every)
+        self.record, self.scene = record or {}, scene
+        self.average = None if average is None else MovingAverage(avatar, average, average_every)
         # Step I over a random colour, so that black clothes do not become transparent.
         self.random_background = avatar.effects.random_background.on
         reads = step_one.feature_head and avatar.splat_channels > 3
         self.feature_head = nn.Conv2d(avatar.splat_channels, 3, 1) if reads else None
         self.step = 0  # iterations done: Lightning's global_step counts every optimiser's steps
         self.code: list[str] = []  # commits of the code, several where a run was resumed
-        self.seconds_before: float | None = 0.0  # None: unknown, of an earlier part
+        self.seconds_before = 0.0  # of earlier parts of the run
         self._began: float | None = None
 
     @property
-    def train_seconds(self) -> float | None:
-        """Wall clock of the training, earlier parts of the run included; None when unknown."""
-        if self.seconds_before is None or self._began is None:
-            return self.seconds_before
-        return self.seconds_before + time.monotonic() - self._began
+    def train_seconds(self) -> float:
+        """Wall clock of the training, earlier parts of the run included."""
+        now = 0.0 if self._began is None else time.monotonic() - self._began
+        return self.seconds_before + now
+
+    @property
+    def marks(self) -> list[str]:
+        """Notes that must accompany the scores of this run."""
+        mark = self.perceptual.mark if self.perceptual is not None else None
+        return [mark] if mark else []
+
+    @property
+    def shown(self) -> Avatar:
+        """The avatar that is validated and scored: the average, once there is one."""
+        if self.average is None or not self.average.started:
+            return self.avatar
+        return self.average.module.eval()  # type: ignore[return-value]
 
     def on_fit_start(self) -> None:
         """Refuses float16: gradients would be clipped before unscaling."""
@@ -133,30 +136,99 @@ class AvatarTraining(LightningModule):
     def on_train_end(self) -> None:
         self.seconds_before, self._began = self.train_seconds, None
 
-    @property
-    def marks(self) -> list[str]:
-        """Notes that must accompany the scores of this run."""
-        mark = self.perceptual.mark if self.perceptual is not None else None
-        return [mark] if mark else []
+    # -- one iteration
+
+    def training_step(self, frame: Frame, batch_idx: int) -> None:
+        if self.step >= self.schedule.total:
+            return
+        if self.avatar.splats is not None:
+            self.avatar.splats.active_degree = self.schedule.degree(
+                self.step, self.avatar.splats.sh_degree
+            )
+        window = self.avatar.window(frame.skeleton, frame.camera)
+        frame = frame if window is None else window.frame(frame)
+        phase = self.schedule.phase(self.step)
+        if phase == SEGMENTATION:
+            assert self.avatar.segmentation is not None
+            loss = self.avatar.segmentation.loss(frame)
+            self._descend(loss, "segmentation")
+            self._log("segmentation/nll", loss)
+        elif phase == STEP_ONE:
+            self._train_step_one(frame)
+        else:
+            self._train_step_two(frame)
+        self.step += 1
+
+    def _train_step_one(self, frame: Frame) -> None:
+        loss = self.step_one_loss(self._rendered(frame, generate=False), frame)
+        self._descend(loss, *self._splatting())
+        if self.average is not None and self.avatar.generator is None:  # this is its last step
+            self.average.update(self.avatar, self.step)
+        self._log("step_one/loss", loss)
+
+    def _train_step_two(self, frame: Frame) -> None:
+        rendering = self._rendered(frame, generate=True)
+        maps = None
+        if self.discriminator is not None and self.schedule.adversarial(self.step):
+            maps = self.step_two.discriminator_maps(self.discriminator, rendering, frame)
+        terms = self.step_two_terms(rendering, frame, maps)
+        self._descend(torch.stack(list(terms.values())).sum(), *self._splatting(), "generator")
+        if self.average is not None:
+            self.average.update(self.avatar, self.step)
+        for name, term in terms.items():
+            self._log(f"step_two/{name}", term)
+        if maps is not None:
+            loss = maps.loss()
+            self._descend(loss, "discriminator")
+            self._log("step_two/discriminator", loss)
+
+    def _rendered(self, frame: Frame, *, generate: bool) -> Rendering:
+        rendering: Rendering = self.avatar(
+            *frame.inputs,
+            pose_noise=self._pose_noise(frame.skeleton),
+            generate=generate,
+            supersample=self.schedule.fine(self.step),
+        )
+        if rendering.splat_alpha is not None:
+            self.rollback.watch(rendering.splat_alpha, frame.mask)
+        return rendering
+
+    # -- losses
+
+    def step_one_loss(self, rendering: Rendering, frame: Frame) -> Tensor:
+        """L_Ψ of Step I's colour, and of the linear readout of F."""
+        return self.step_one(rendering, frame, self._background(frame), self.feature_head)
+
+    def step_two_terms(
+        self, rendering: Rendering, frame: Frame, maps: DiscriminatorMaps | None
+    ) -> dict[str, Tensor]:
+        """The generator's losses, weighted, by name."""
+        anchored = self.step_two.anchor and rendering.features is not None
+        terms = self.step_two.terms(
+            rendering,
+            frame,
+            anchor=self.step_one_loss(rendering, frame) if anchored else None,
+            perceptual=self.perceptual,
+            maps=maps,
+            step=self.step,
+        )
+        return terms | {name: loss(rendering, frame) for name, loss in self.extra_losses.items()}
 
     # -- optimisers
 
     def configure_optimizers(self) -> list[torch.optim.Optimizer]:
-        groups = parameter_groups(self.avatar, self.feature_head, self.discriminator, self.pose)
-        missing = sorted(set(groups) - set(self.recipes))
-        if missing:
-            raise ConfigError(f"training.recipes lacks {', '.join(missing)}")
-        for name in set(groups) - set(SPLATTING):
-            if self.recipes[name].span != "both":
-                raise ConfigError(
-                    f"training.recipes.{name}.span is read for psi, colour and pose only"
-                )
+        groups = parameter_groups(self.avatar, self.feature_head, self.discriminator)
+        check_recipes(self.recipes, groups)
         self._names = list(groups)
         return [self.recipes[name].build(groups[name]) for name in self._names]
 
     def _optimisers(self) -> dict[str, Any]:
         found = self.optimizers()
         return dict(zip(self._names, found if isinstance(found, list) else [found], strict=True))
+
+    def _splatting(self) -> list[str]:
+        """The optimisers of the parts that make Step I's image."""
+        return [name for name in SPLATTING if name in self._names]
 
     def _descend(self, loss: Tensor, *names: str) -> None:
         """One backward pass and one step of each named optimiser; none if a gradient is not
@@ -178,91 +250,9 @@ class AvatarTraining(LightningModule):
             optimiser.step()
 
     def _rate(self, name: str) -> float:
-        start, end = self.schedule.bounds(SEGMENTATION if name == "segmentation" else STEP_TWO)
-        if name in SPLATTING:  # one span over both steps: restarting the rate costs quality
-            start, end_one = self.schedule.bounds(STEP_ONE)
-            end = end_one if self.recipes[name].span == "step_one" else end
-        elif name == "discriminator":
-            start, end = self.schedule.adversarial_span
-        rate = self.recipes[name].rate.at(self.step, start, end)
+        recipe = self.recipes[name]
+        rate = recipe.rate.at(self.step, *self.schedule.span(name, recipe.span))
         return rate * self.rollback.rate if name == "psi" else rate
-
-    # -- one iteration
-
-    def training_step(self, frame: Frame, batch_idx: int) -> None:
-        if self.step >= self.schedule.total:
-            return
-        if self.avatar.splats is not None:
-            self.avatar.splats.active_degree = self.schedule.degree(
-                self.step, self.avatar.splats.sh_degree
-            )
-        window = self.avatar.window(frame)
-        height = frame.camera.size[0]
-        frame = frame if window is None else window.frame(frame)
-        phase = self.schedule.phase(self.step)
-        if phase == SEGMENTATION:
-            assert self.avatar.segmentation is not None
-            loss = self.avatar.segmentation.loss(frame)
-            self._descend(loss, "segmentation")
-            self._log("segmentation/nll", loss)
-        elif phase == STEP_ONE:
-            self._train_step_one(frame, height)
-        else:
-            self._train_step_two(frame, height)
-        self.step += 1
-
-    def _train_step_one(self, frame: Frame, height: int) -> None:
-        painting, prior = self._paint(frame, height, paint=False)
-        loss = self.step_one_loss(painting, frame) + self.pose_prior * prior
-        self._descend(loss, *self._splatting())
-        if self.avatar.generator is None:  # this is its last step
-            self._update_average()
-        self._log("step_one/loss", loss)
-
-    def _train_step_two(self, frame: Frame, height: int) -> None:
-        painting, prior = self._paint(frame, height, paint=True)
-        maps = None
-        if self.discriminator is not None and self.schedule.adversarial(self.step):
-            maps = self.step_two.discriminator_maps(self.discriminator, painting, frame)
-        terms = self.step_two_terms(painting, frame, maps)
-        if self.pose is not None:
-            terms["pose"] = self.pose_prior * prior
-        self._descend(torch.stack(list(terms.values())).sum(), *self._splatting(), "generator")
-        self._update_average()
-        for name, term in terms.items():
-            self._log(f"step_two/{name}", term)
-        if maps is not None:
-            loss = maps.loss()
-            self._descend(loss, "discriminator")
-            self._log("step_two/discriminator", loss)
-
-    def _update_average(self) -> None:
-        if self.average is not None and self.step % self.average_every == 0:
-            self.average.update(self.avatar)
-
-    def _splatting(self) -> tuple[str, ...]:
-        """The optimisers of the parts that make Step I's image."""
-        return tuple(name for name in SPLATTING if name in self._names)
-
-    def _paint(self, frame: Frame, height: int, *, paint: bool) -> tuple[Painting, Tensor | float]:
-        body, prior = frame.body, 0.0
-        if self.pose is not None:
-            body, prior = self.pose(frame.body, frame.frame_id)
-        painting: Painting = self.avatar(
-            frame.skeleton,
-            frame.visibility,
-            frame.camera,
-            body,
-            pose_noise=self._pose_noise(frame.skeleton),
-            paint=paint,
-            supersample=self.schedule.fine(self.step),
-            detach_features=self.step_two.detach_features,
-            picture_height=height,
-            camera_index=frame.camera_index,
-        )
-        if painting.splat_alpha is not None:
-            self.rollback.watch(painting.splat_alpha, frame.mask)
-        return painting, prior
 
     def on_train_epoch_end(self) -> None:
         """Restores the last good state when the person has vanished, before it is saved."""
@@ -284,28 +274,6 @@ class AvatarTraining(LightningModule):
             f"{self.rollback.rate:g} ({self.rollback.done} of at most {self.rollback.most})"
         )
 
-    # -- losses
-
-    def step_one_loss(self, painting: Painting, frame: Frame) -> Tensor:
-        """L_Ψ of Step I's colour, and of the linear readout of F."""
-        return self.step_one(painting, frame, self._background(frame), self.feature_head)
-
-    def step_two_terms(
-        self, painting: Painting, frame: Frame, maps: DiscriminatorMaps | None
-    ) -> dict[str, Tensor]:
-        """The generator's losses, weighted, by name."""
-        assert painting.image is not None
-        anchored = self.step_two.anchor and painting.features is not None
-        terms = self.step_two.terms(
-            painting,
-            frame,
-            anchor=self.step_one_loss(painting, frame) if anchored else None,
-            perceptual=self.perceptual,
-            maps=maps,
-            step=self.step,
-        )
-        return terms | {name: loss(painting, frame) for name, loss in self.extra_losses.items()}
-
     # -- randomness: from (seed, iteration, rank), so that resuming changes nothing
 
     def _random(self, salt: int) -> torch.Generator:
@@ -324,29 +292,21 @@ class AvatarTraining(LightningModule):
         noise = torch.randn(skeleton.shape, generator=self._random(1))
         return self.pose_noise * noise.to(skeleton)
 
-    # -- validation and checkpoints
+    # -- validation, logs and checkpoints
 
     def validation_step(  # type: ignore[override]
         self, frame: Frame, batch_idx: int
-    ) -> Painting:
-        painting: Painting = self.shown.paint(frame)
-        for name, image in (("psnr", painting.image), ("psnr_splat", painting.colour)):
-            if image is None:
-                continue
-            score = psnr(image.clamp(0, 1), frame.image).clamp_max(PSNR_CAP).mean()
-            self.log(f"val/{name}", score, batch_size=len(frame), sync_dist=True)
-        return painting
-
-    @property
-    def shown(self) -> Avatar:
-        """The avatar that is validated and scored: the average, once there is one."""
-        if self.average is None or not self.average.started:
-            return self.avatar
-        return self.average.module.eval()  # type: ignore[return-value]
+    ) -> Rendering:
+        rendering: Rendering = self.shown(*frame.inputs)
+        for name, image in (("psnr", rendering.image), ("psnr_splat", rendering.colour)):
+            if image is not None:
+                score = psnr(image.clamp(0, 1), frame.image).clamp_max(PSNR_CAP).mean()
+                self.log(f"val/{name}", score, batch_size=len(frame), sync_dist=True)
+        return rendering
 
     def on_validation_epoch_end(self) -> None:
-        if self.train_seconds is not None:  # the time axis of every curve
-            self.log("val/seconds", self.train_seconds, sync_dist=True)
+        # the time axis of every curve
+        self.log("val/seconds", self.train_seconds, sync_dist=True)
 
     def _log(self, name: str, value: Tensor) -> None:
         if self.step % self.log_every == 0 and self._trainer is not None:
@@ -367,8 +327,8 @@ class AvatarTraining(LightningModule):
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         state = checkpoint["gsgan"]
-        self.avatar.effects.check_same(state.get("effects"))
+        self.avatar.effects.check_same(state["effects"])
         self.step = state["step"]
         self.rollback.done = state["rollbacks"]
-        self.seconds_before = state.get("train_seconds")
-        self.code = list(dict.fromkeys([*state.get("code", []), *self.code]))
+        self.seconds_before = state["train_seconds"]
+        self.code = list(dict.fromkeys([*state["code"], *self.code]))

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel
 
 from gsgan.model.avatar import Avatar
-from gsgan.train.pose import PoseCorrections
-from gsgan.train.schedule import Rate
-from gsgan.utils.checks import between, one_of
+from gsgan.train.schedule import SPLATTING, Rate
+from gsgan.utils.checks import at_least, between, one_of
+from gsgan.utils.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,8 @@ class Recipe:
         rate: learning rate over the phases of the optimiser.
         betas, eps: Adam's. A second beta of 0.99 keeps Ψ from a collapse (`Rollback`).
         clip: largest gradient norm; None leaves gradients alone.
-        span: of psi, colour and pose: the rate's shares are of ``both`` steps, or of ``step_one``,
-            after which the rate stays.
+        span: of psi and colour: the rate's shares are of ``both`` steps, or of ``step_one``, after
+            which the rate stays.
     """
 
     rate: Rate
@@ -48,10 +48,7 @@ class Recipe:
 
 
 def parameter_groups(
-    avatar: Avatar,
-    feature_head: nn.Module | None,
-    discriminator: nn.Module | None,
-    pose: PoseCorrections | None = None,
+    avatar: Avatar, feature_head: nn.Module | None, discriminator: nn.Module | None
 ) -> dict[str, list[tuple[list[nn.Parameter], float]]]:
     """Groups of (parameters, rate multiplier) by optimiser, for the parts that are built."""
     groups = {}
@@ -62,14 +59,21 @@ def parameter_groups(
         groups["psi"] = [*avatar.splats.parameter_groups(), (head, 1.0)]
     if avatar.colour is not None:
         groups["colour"] = [(list(avatar.colour.parameters()), 1.0)]
-    if pose is not None:
-        groups["pose"] = pose.parameter_groups()
     if avatar.generator is not None and avatar.pose_encoder is not None:
         encoder = avatar.pose_encoder.parameters()
         groups["generator"] = [([*avatar.generator.parameters(), *encoder], 1.0)]
     if discriminator is not None:
         groups["discriminator"] = [(list(discriminator.parameters()), 1.0)]
     return groups
+
+
+def check_recipes(recipes: dict[str, Recipe], names: Iterable[str]) -> None:
+    """Raises a ConfigError where an optimiser has no recipe, or a span that is not read."""
+    for name in names:
+        if name not in recipes:
+            raise ConfigError(f"training.recipes lacks {name}")
+        if name not in SPLATTING and recipes[name].span != "both":
+            raise ConfigError(f"training.recipes.{name}.span is read for psi and colour only")
 
 
 def clip(optimiser: torch.optim.Optimizer, largest: float | None) -> Tensor:
@@ -84,14 +88,13 @@ class MovingAverage(nn.Module):
     Convention: the average starts as a copy at the first update and forgets it quickly: the decay
     at update n is ``min(decay ** every, (1 + n) / (10 + n))``. Buffers are copied, not
     averaged.
-
-    Source: ours; the usual average of a generator's weights.
     """
 
     def __init__(self, module: nn.Module, decay: float, every: int = 1) -> None:
         super().__init__()
         between("training.average", decay, 0, 1)
-        self.decay = decay**every
+        at_least("training.average_every", every, 1)
+        self.decay, self.every = decay**every, every
         self.copy = AveragedModel(module, multi_avg_fn=self._blend)
         self.copy.requires_grad_(False)
 
@@ -105,9 +108,10 @@ class MovingAverage(nn.Module):
         """Whether there was an update."""
         return int(self.copy.n_averaged) > 0
 
-    def update(self, module: nn.Module) -> None:
-        """Adds the module's present weights to the average."""
-        self.copy.update_parameters(module)
+    def update(self, module: nn.Module, step: int) -> None:
+        """Adds the module's present weights to the average, at every ``every``-th iteration."""
+        if step % self.every == 0:
+            self.copy.update_parameters(module)
 
     def _blend(self, averaged: Any, current: Any, count: Tensor | int) -> None:
         n = int(count)

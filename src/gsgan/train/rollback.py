@@ -1,4 +1,4 @@
-"""Guards of a training: skipped steps, and the way back from a collapse."""
+"""Guards of the training: skipped steps, and the return from a collapse."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from gsgan.utils.errors import GsganError
 class Rollback:
     """Restores the last good state when the rendered person vanishes.
 
-    Every opacity can fall to 0 for good without a non-finite gradient: then the rendered alpha
-    falls far below the masks'.
+    All opacities can fall to 0 for good while gradients stay finite. The rendered alpha then falls
+    far below the masks'.
 
-    Convention: both are averaged over recent iterations, so that a fall within an epoch shows.
-    Optimisers restart after a restoration: their momenta point into the collapse.
+    Convention: both are averaged over recent iterations, so that a fall within an epoch is seen.
+    Optimisers restart after a restoration, because their momenta point into the collapse.
 
-    Settings: conf/training/long.yaml. Source: ours.
+    Settings: conf/training/long.yaml.
     """
 
     collapse: float = 0.05

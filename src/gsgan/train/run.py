@@ -21,36 +21,26 @@ from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.table import Table
 
-from gsgan.body import open_body
 from gsgan.data.datamodule import GsganData
 from gsgan.effects.table import effects_table
-from gsgan.evaluate.facts import trained, training_code
 from gsgan.evaluate.files import NAMES
+from gsgan.evaluate.origin import trained, training_code
 from gsgan.evaluate.run import evaluate_method
 from gsgan.evaluate.scores import painter
 from gsgan.fit.run import fit_before_training
 from gsgan.metrics.lpips import check_lpips
-from gsgan.model.assemble import naming_group
-from gsgan.model.avatar import Avatar
-from gsgan.model.runs import (
-    CHECKPOINT,
-    as_resumed,
-    build_avatar,
-    build_data,
-    read_checkpoint,
-    record,
-)
+from gsgan.model.assemble import build_avatar, build_data, naming_group
+from gsgan.model.stored import CHECKPOINT, read_checkpoint, record
 from gsgan.splat import resolve_backend
 from gsgan.train.callbacks import AtomicCheckpoints, LiveViewer, PictureGrid, ProgressLines
 from gsgan.train.module import AvatarTraining
-from gsgan.train.pose import PoseCorrections
 from gsgan.utils.checks import whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError
 
 # A training iteration takes this many times as long as rendering: arithmetic of the networks at
 # 512² with VGG-16 and the discriminator. With small ones at 128² it was 3.4.
-STEP_PER_PAINTING = 10
+STEP_PER_RENDERING = 10
 DISCRIMINATOR_SALT = 1000
 
 
@@ -75,13 +65,9 @@ def run_training(config: DictConfig) -> None:
     seed_everything(config.seed, workers=True, verbose=False)
     resume = checkpoint_to_resume(folder, module.record, module.marks) if config.resume else None
     done = 0 if resume is None else int(read_checkpoint(resume)["gsgan"]["step"])
-    scores = folder / "metrics.json"
     if resume is None:
         remove_old_results(folder)
-    elif done >= module.schedule.total and (
-        not config.evaluate
-        or (scores.is_file() and scores.stat().st_mtime >= resume.stat().st_mtime)
-    ):
+    elif done >= module.schedule.total and (not config.evaluate or _is_scored(folder, resume)):
         console.print(
             f"{folder}: trained and scored before; nothing to do (gsgan.evaluate scores it again)",
             soft_wrap=True,
@@ -91,44 +77,14 @@ def run_training(config: DictConfig) -> None:
     refuse_long_cpu_run(config, data, module, module.schedule.total - done)
     module.code = training_code()
     describe(console, folder, config, data, module)
-    if resume is not None:
-        console.print(f"resuming from {resume}", soft_wrap=True)
     module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     logs = "logs" if resume is None else f"logs_{done:06d}"
     trainer = build_trainer(config, folder, module, data, console, logs)
-    try:
-        if resume is None:  # curves start at the untrained avatar
-            trainer.validate(module, data, verbose=False)
-        trainer.fit(module, data, ckpt_path=None if resume is None else str(resume))
-    except SystemExit:  # Lightning's answer to Ctrl-C
-        console.print(
-            f"interrupted at iteration {module.step}; the same command with "
-            f"hydra.run.dir={folder} resumes from its last checkpoint",
-            soft_wrap=True,
-        )
-        raise
-    if not trainer.is_global_zero:
-        return
-    if config.evaluate:
-        module.to(trainer.strategy.root_device)  # Lightning leaves it on the CPU
-        method = trained(
-            folder,
-            seed=config.seed,
-            iterations=module.step,
-            train_seconds=module.train_seconds,
-            trained_by=module.code,
-        )
-        evaluate_method(
-            folder,
-            config,
-            console,
-            data,
-            painter(module.shown.eval()),
-            method=method,
-            device=trainer.strategy.root_device,
-            marks=module.marks,
-        )
-    console.print(f"run folder: {folder}", soft_wrap=True)
+    _fit(trainer, module, data, resume, folder, console)
+    if trainer.is_global_zero:
+        if config.evaluate:
+            _evaluate(trainer, module, data, config, folder, console)
+        console.print(f"run folder: {folder}", soft_wrap=True)
 
 
 def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
@@ -140,40 +96,78 @@ def build_training(config: DictConfig) -> tuple[GsganData, AvatarTraining]:
     whole("seed", config.seed, 0)
     data = build_data(config)
     if data.lacks_body:
-        fit_before_training(data)
-        data = build_data(config)
-    avatar = build_avatar(config, data)
+        data = fit_before_training(data, config.fit)
+    avatar = build_avatar(config, data.info, data.labelled("train"))
     torch.manual_seed(config.seed + DISCRIMINATOR_SALT)  # the same start beside every avatar
     with naming_group("training"):
         return data, instantiate(config.training)(
             avatar,
-            pose=pose_corrections(data, avatar, config.training.recipes.pose.rate.peak),
             record=training_record(config, data),
             scene=json.loads(json.dumps(asdict(data.info))),
         )
 
 
-def pose_corrections(data: GsganData, avatar: Avatar, rate: float) -> PoseCorrections | None:
-    """For an avatar whose G moves with poses that `gsgan.fit` registered, where they have a
-    learning rate; None for all others."""
-    poses = data.layout.poses
-    if not rate or poses is None or not poses.registered:
-        return None
-    if avatar.body_points is None and avatar.surface is None:
-        return None
-    body = open_body(data.info.body, data.info.body_file, data.info.betas)
-    assert body is not None  # the avatar is built on it
-    return PoseCorrections(sorted({f for _, f in data.splits.items["train"]}), body.joint_names)
+def _is_scored(folder: Path, checkpoint: Path) -> bool:
+    """Whether a run folder has scores that are newer than its checkpoint."""
+    scores = folder / "metrics.json"
+    return scores.is_file() and scores.stat().st_mtime >= checkpoint.stat().st_mtime
+
+
+def _fit(
+    trainer: Trainer,
+    module: AvatarTraining,
+    data: GsganData,
+    resume: Path | None,
+    folder: Path,
+    console: Console,
+) -> None:
+    """Trains, from the checkpoint ``resume`` if there is one."""
+    try:
+        if resume is None:  # curves start at the untrained avatar
+            trainer.validate(module, data, verbose=False)
+        else:
+            console.print(f"resuming from {resume}", soft_wrap=True)
+        trainer.fit(module, data, ckpt_path=None if resume is None else str(resume))
+    except SystemExit:  # Lightning's answer to Ctrl-C
+        console.print(
+            f"interrupted at iteration {module.step}; the same command with "
+            f"hydra.run.dir={folder} resumes from its last checkpoint",
+            soft_wrap=True,
+        )
+        raise
+
+
+def _evaluate(
+    trainer: Trainer,
+    module: AvatarTraining,
+    data: GsganData,
+    config: DictConfig,
+    folder: Path,
+    console: Console,
+) -> None:
+    """Scores the trained avatar on the held-out splits."""
+    device = trainer.strategy.root_device
+    module.to(device)  # Lightning leaves it on the CPU
+    method = trained(
+        folder,
+        seed=config.seed,
+        iterations=module.step,
+        train_seconds=module.train_seconds,
+        trained_by=module.code,
+    )
+    predict, marks = painter(module.shown.eval()), module.marks
+    evaluate_method(
+        folder, config, console, data, predict, method=method, device=device, marks=marks
+    )
 
 
 def training_record(config: DictConfig, data: GsganData) -> dict[str, Any]:
-    """What two parts of one run must share: the settings, and the poses that `gsgan.fit` made,
-    whose file may be overwritten under the same name."""
-    held = record(config)
-    poses = data.layout.poses
+    """What must not change when a run is resumed: the settings, and the poses that `gsgan.fit`
+    made, whose file may be overwritten under the same name."""
+    settings, poses = record(config), data.layout.poses
     if poses is not None and poses.fitted:
-        held["fitted poses"] = poses.digest(data.layout.frames)
-    return held
+        settings["fitted poses"] = poses.digest(data.layout.frames)
+    return settings
 
 
 def checkpoint_to_resume(folder: Path, now: Mapping[str, Any], marks: list[str]) -> Path | None:
@@ -192,7 +186,7 @@ def checkpoint_to_resume(folder: Path, now: Mapping[str, Any], marks: list[str])
             f"{marks or 'none'}; set training.perceptual.weights as it was, or resume=false to "
             "start over there"
         )
-    changed = sorted(set(_differences(as_resumed(state["record"]), now)))
+    changed = sorted(set(_differences(state["record"], now)))
     if changed:
         shown = ", ".join(changed[:5]) + (" …" if len(changed) > 5 else "")
         raise ConfigError(
@@ -219,11 +213,11 @@ def refuse_long_cpu_run(
         return
     frame = data.dataset("train")[0]
     with torch.no_grad():
-        module.avatar.paint(frame)  # warm-up
+        module.avatar(*frame.inputs)  # warm-up
         began = time.perf_counter()
-        module.avatar.paint(frame)
+        module.avatar(*frame.inputs)
         seconds = time.perf_counter() - began
-    hours = STEP_PER_PAINTING * seconds * iterations / 3600
+    hours = STEP_PER_RENDERING * seconds * iterations / 3600
     if hours > config.cpu_hours:
         raise ConfigError(
             f"no GPU is found, and on this CPU {iterations:,} iterations would take about "
@@ -299,7 +293,6 @@ def describe(
         "pose encoder": avatar.pose_encoder,
         "generator": avatar.generator,
         "discriminator": module.discriminator,
-        "pose corrections": module.pose,
         "segmentation S": avatar.segmentation,
     }
     for name, part in parts.items():

@@ -10,6 +10,7 @@ from gsgan.utils.errors import ConfigError
 
 SEGMENTATION, STEP_ONE, STEP_TWO = "segmentation", "step I", "step II"
 STRETCHED = ("step_one", "step_two", "discriminator_start", "degree_every", "coarse")
+SPLATTING = ("psi", "colour")  # optimisers of the parts that make Step I's image
 FROM_MASKS = 800  # iterations of S, at most, where two numbers learn from masks (docs/effects.md)
 
 
@@ -42,9 +43,9 @@ class Schedule:
     ) -> Schedule:
         """The schedule of a model with these parts, stretched.
 
-        Without S its phase is left out; without a generator Step I gets Step II's iterations, and
-        without splats the other way round, so that every variant trains equally long. From masks
-        S learns two numbers, which needs fewer iterations.
+        Without S its phase is left out. Without a generator Step I gets Step II's iterations, and
+        without splats the other way round, so that every variant trains equally long. S learns only
+        two numbers from masks, which needs fewer iterations.
         """
         numbers = {name: round(getattr(self, name) * self.stretch) for name in STRETCHED}
         one, two = numbers["step_one"], numbers["step_two"]
@@ -88,6 +89,18 @@ class Schedule:
             STEP_TWO: (self.segmentation + self.step_one, self.total),
         }
         return ends[phase]
+
+    def span(self, optimiser: str, recipe_span: str = "both") -> tuple[int, int]:
+        """First iteration of an optimiser, and the first after its last, see `Recipe`."""
+        if optimiser == "segmentation":
+            return self.bounds(SEGMENTATION)
+        if optimiser == "discriminator":
+            return self.adversarial_span
+        start, end = self.bounds(STEP_TWO)
+        if optimiser not in SPLATTING:
+            return start, end
+        first, end_one = self.bounds(STEP_ONE)  # restarting the rate in Step II costs quality
+        return first, end_one if recipe_span == "step_one" else end
 
     @property
     def adversarial_span(self) -> tuple[int, int]:

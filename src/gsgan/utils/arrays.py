@@ -38,3 +38,12 @@ def as_floats(raw: Any) -> NDArray[np.float64]:
         return np.array(raw, np.float64)
     except (TypeError, ValueError, OverflowError):
         return np.zeros(0)
+
+
+def evenly_spaced(count: int, most: int, *, ends: bool = False) -> list[int]:
+    """At most ``most`` of ``count`` positions, rising: the middles of equal parts, or with ``ends``
+    from the first to the last."""
+    if ends:
+        return sorted({round(x) for x in np.linspace(0, count - 1, min(count, most))})
+    most = min(most, count)
+    return [(2 * i + 1) * count // (2 * most) for i in range(most)]

@@ -1,4 +1,4 @@
-"""Writing files so that a killed run leaves the old one or the new one, never a half."""
+"""Files that are written completely or not at all, also by a run that is killed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images of a render: backgrounds, and 8-bit pixels."""
+"""8-bit images: backgrounds, compositing, captions, JPEG."""
 
 from __future__ import annotations
 
@@ -14,13 +14,19 @@ from torch import Tensor
 
 from gsgan.utils.errors import ConfigError
 
-Bytes = NDArray[np.uint8]
+BAR = 18  # pixels of the caption above a tile
+QUALITY = 88  # of the JPEG
 
+Bytes = NDArray[np.uint8]
 Background = Tensor | None
 
 
 def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background]:
-    """A function that gives the background ``[3, H, W]`` of an image size, or None to keep alpha.
+    """A function from an image's ``(H, W)`` to its background ``[3, H, W]``, or None to keep alpha.
+
+    Args:
+        name: a colour, an image file, or ``alpha``.
+        video: whether the images become a video.
 
     Raises:
         ConfigError: when it is neither a colour nor an image, or is alpha in a video.
@@ -33,10 +39,10 @@ def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background
     if path.is_file():
         try:
             with Image.open(path) as opened:
-                picture = opened.convert("RGB")
+                image = opened.convert("RGB")
         except OSError as error:
             raise ConfigError(f"background={name} cannot be read as an image ({error})") from None
-        return lambda size: _unit(np.asarray(ImageOps.fit(picture, size[::-1])))
+        return lambda size: _unit(np.asarray(ImageOps.fit(image, size[::-1])))
     try:
         colour = torch.tensor(ImageColor.getrgb(name)[:3]).float() / 255
     except ValueError:
@@ -47,11 +53,11 @@ def background(name: str, video: bool) -> Callable[[tuple[int, int]], Background
     return lambda size: colour[:, None, None].expand(3, *size)
 
 
-def _unit(image: NDArray[np.uint8]) -> Tensor:
+def _unit(image: Bytes) -> Tensor:
     return torch.from_numpy(image.copy()).permute(2, 0, 1).float() / 255
 
 
-def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> NDArray[np.uint8]:
+def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> Bytes:
     """An image ``[3, H, W]`` on black, composited over a background: ``[H, W, 3]``; without a
     background, with straight alpha: ``[H, W, 4]``."""
     image, alpha = image.clamp(0, 1), alpha.clamp(0, 1)
@@ -62,12 +68,6 @@ def eight_bits(image: Tensor, alpha: Tensor, behind: Background) -> NDArray[np.u
     else:
         image = (image + (1 - alpha) * behind).clamp(0, 1)
     return (image * 255).round().byte().permute(1, 2, 0).numpy()
-
-
-BAR = 18  # pixels of the caption above a tile
-
-
-QUALITY = 88  # of the JPEG
 
 
 def caption(image: Bytes, text: str, colour: tuple[int, int, int]) -> Bytes:

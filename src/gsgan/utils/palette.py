@@ -7,6 +7,5 @@ BLUE, VERMILLION, PURPLE = "#0072b2", "#d55e00", "#cc79a7"
 GREY = "#777777"
 
 COLOURS = (BLUE, VERMILLION, GREEN, PURPLE, ORANGE, SKY, BLACK)  # in the order of use
-# Ten markers and seven colours: pairs repeat late.
+# Ten markers and seven colours: 70 different pairs.
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "h")
-DASHES = ("-", "--", ":", "-.")

@@ -1,15 +1,15 @@
-"""Reads pickled data, such as SMPL files and ``annots.npy``, without running it.
+"""Reads pickled data, such as SMPL files and ``annots.npy``, without running code from the file.
 
-A pickle is a program. `_Unpickler` lets it build dicts, lists, numbers, text and numpy arrays, and
-name the classes in `ALLOWED`, which are replaced by the stand-ins below; any other name is refused.
+A pickle is a program that may call any function. `_Unpickler` gives it only the names in
+`ALLOWED`: they build numpy arrays, and stand-ins for the classes of chumpy and scipy.
 """
 
 from __future__ import annotations
 
+import copyreg
 import io
 import math
 import pickle
-import re
 import zipfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -21,9 +21,7 @@ from numpy.typing import NDArray
 
 from gsgan.utils.errors import DataError
 
-NDARRAY = "numpy.ndarray"  # pickles only name the class
 LARGEST_ARRAY = 2**30  # bytes of one array, unpacked
-DTYPE = re.compile(r"[<>|=]?([?bBhHiIlLqQefdgFDG]|[biufcSU][0-9]{1,6}|O8?)")
 
 
 class _Refused(pickle.UnpicklingError):
@@ -36,26 +34,46 @@ def _expect(condition: bool, otherwise: str) -> None:
 
 
 class _DType:
-    """``numpy.dtype``, of plain numbers, text and objects; its state only sets the byte order."""
+    """Stands in for ``numpy.dtype``: numbers, text and objects; its state sets the byte order."""
 
-    def __init__(self, name: Any, *_align_and_copy: Any) -> None:
-        known = isinstance(name, str) and DTYPE.fullmatch(name) is not None
-        _expect(known, f"it holds arrays of type {str(name)[:40]!r}")
+    def __init__(self, name: str, *_align_and_copy: Any) -> None:
         self.value = np.dtype(name)
+        _expect(self.value.kind in "biufcSUO", f"it holds arrays of type {name!r}")
 
     def __setstate__(self, state: Any) -> None:
         if state[1] in ("<", ">"):
             self.value = self.value.newbyteorder(state[1])
 
 
+class _Array(np.ndarray):
+    """Checks the pickled state first: numpy reads beyond it, or takes bytes for pointers."""
+
+    def __setstate__(self, state: Any) -> None:
+        shape, dtype, fortran, content = state[-4:]
+        objects = dtype.value.hasobject
+        content = content if objects else _bytes(content)
+        _expect(isinstance(content, list) or not objects, "an array of objects has no list of them")
+        count = math.prod(shape) * (1 if objects else dtype.value.itemsize)
+        _expect(
+            min(shape, default=0) >= 0 and len(content) == count,
+            f"an array of shape {shape} has other content",
+        )
+        super().__setstate__((1, shape, dtype.value, fortran, content))
+
+    def __reduce__(self) -> Any:
+        return np.asarray(self).__reduce__()
+
+
 def _bytes(content: Any) -> bytes:
     return content.encode("latin1") if isinstance(content, str) else bytes(content)  # str: Python 2
 
 
+def _reconstruct(*_class_shape_and_code: Any) -> NDArray[Any]:
+    return _Array((0,), np.uint8)
+
+
 def _from_buffer(content: Any, dtype: _DType, shape: Any, order: Any) -> NDArray[Any]:
-    """How protocol 5 writes arrays."""
-    flat = np.frombuffer(content, dtype.value).astype(dtype.value.newbyteorder("="))
-    return flat.reshape(shape, order=order)
+    return np.frombuffer(content, dtype.value).reshape(shape, order=order).copy()
 
 
 def _scalar(dtype: _DType, content: Any) -> Any:
@@ -63,92 +81,59 @@ def _scalar(dtype: _DType, content: Any) -> Any:
 
 
 def _encode(text: str, _encoding: str) -> bytes:
-    """How Python 3 writes bytes for Python 2."""
     return text.encode("latin1")
 
 
-def _reconstruct(kind: Any, *_shape_and_code: Any) -> _Array:
-    _expect(kind is NDARRAY, "it builds an array of an unknown class")
-    return _Array()
+class _Chumpy:
+    """Stands in for ``chumpy.ch.Ch``, an array."""
 
+    state: dict[str, Any]
 
-def _reconstructor(kind: Any, base: Any, _state: Any) -> Any:
-    """How protocols 0 and 1 make objects."""
-    known = isinstance(kind, type) and issubclass(kind, _StandIn) and base is object
-    _expect(known, "it builds an object of an unknown class")
-    return kind()
-
-
-class _StandIn:
-    """Keeps the state of an object that is not built while reading: here chumpy's array."""
-
-    def __init__(self, *_arguments: Any) -> None:
-        self.state: dict[str, Any] = {}
-
-    def __setstate__(self, state: Any) -> None:
-        self.state = dict(state)
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.state = state
 
     def array(self) -> NDArray[Any]:
         """The array that the object stands for."""
-        return _numbers(self.state["x"])
+        return _array(self.state["x"])
 
 
-class _Array(_StandIn):
-    """``numpy.ndarray``, which does not check all of its state itself."""
-
-    def __setstate__(self, state: Any) -> None:
-        self.state = dict(zip(("shape", "dtype", "fortran", "content"), state[-4:], strict=True))
+class _Select(_Chumpy):
+    """Stands in for ``chumpy.reordering.Select``, some entries of another array."""
 
     def array(self) -> NDArray[Any]:
-        shape, dtype, fortran, content = self.state.values()
-        order: Any = "F" if fortran else "C"
-        if not dtype.value.hasobject:
-            return _from_buffer(_bytes(content), dtype, shape, order)
-        _expect(isinstance(content, list), "an array of objects has no list of them")
-        flat = np.empty(len(content), object)
-        flat[:] = content
-        return flat.reshape(shape, order=order)
-
-
-class _Select(_StandIn):
-    """``chumpy.reordering.Select``: some entries of another array."""
-
-    def array(self) -> NDArray[Any]:
-        chosen = _numbers(self.state["a"]).ravel()[_numbers(self.state["idxs"])]
+        chosen = _array(self.state["a"]).ravel()[_array(self.state["idxs"])]
         return chosen.reshape(self.state.get("preferred_shape") or chosen.shape)
 
 
-class _Sparse(_StandIn):
-    """``scipy.sparse.csc_matrix``, as a dense array."""
+class _Sparse(_Chumpy):
+    """Stands in for ``scipy.sparse.csc_matrix``, whose own class does not check what it reads."""
 
     def array(self) -> NDArray[Any]:
-        import scipy.sparse  # takes long, and few files need it
+        import scipy.sparse  # here: the import takes long, and few files need it
 
-        shape = self.state["_shape" if "_shape" in self.state else "shape"]
+        shape = self.state.get("_shape") or self.state["shape"]
         _expect(math.prod(shape) * 8 <= LARGEST_ARRAY, f"a sparse matrix of shape {shape}")
-        parts = [_numbers(self.state[key]) for key in ("data", "indices", "indptr")]
-        matrix = scipy.sparse.csc_matrix(tuple(parts), shape)
+        parts = tuple(_array(self.state[key]) for key in ("data", "indices", "indptr"))
+        matrix = scipy.sparse.csc_matrix(parts, shape)
         matrix.check_format(full_check=True)
         return np.asarray(matrix.toarray(), np.float64)
 
 
-def _numbers(value: Any) -> NDArray[Any]:
-    array = value.array() if isinstance(value, _StandIn) else np.asarray(value)
-    _expect(not array.dtype.hasobject, "an array of numbers holds objects")
-    return array
+def _array(value: Any) -> NDArray[Any]:
+    return value.array() if isinstance(value, _Chumpy) else np.asarray(value)
 
 
 ALLOWED: dict[tuple[str, str], Any] = {
-    ("numpy", "ndarray"): NDARRAY,
+    ("numpy", "ndarray"): "numpy.ndarray",  # pickles only name the class
     ("numpy", "dtype"): _DType,
     ("numpy.core.multiarray", "_reconstruct"): _reconstruct,
     ("numpy.core.multiarray", "scalar"): _scalar,
     ("numpy.core.numeric", "_frombuffer"): _from_buffer,
     ("_codecs", "encode"): _encode,
-    ("copyreg", "_reconstructor"): _reconstructor,
+    ("copyreg", "_reconstructor"): copyreg._reconstructor,  # type: ignore[attr-defined]
     ("builtins", "object"): object,
     ("builtins", "set"): set,
-    ("chumpy.ch", "Ch"): _StandIn,
+    ("chumpy.ch", "Ch"): _Chumpy,
     ("chumpy.reordering", "Select"): _Select,
     ("scipy.sparse.csc", "csc_matrix"): _Sparse,
 }
@@ -171,26 +156,11 @@ class _Unpickler(pickle._Unpickler):
         return ALLOWED[known]
 
 
-def _load(data: bytes) -> Any:
-    return _plain(_Unpickler(io.BytesIO(data), encoding="latin1").load(), {})
-
-
-def _plain(value: Any, done: dict[int, tuple[Any, Any]]) -> Any:
-    """The same with arrays in place of stand-ins; ``done`` holds (value, result) by identity."""
-    if not isinstance(value, _StandIn | dict | list | tuple):
-        return value
-    if id(value) in done:
-        return done[id(value)][1]
-    result = value.array() if isinstance(value, _StandIn) else value
-    done[id(value)] = value, result
-    if isinstance(result, tuple):
-        result = tuple(_plain(entry, done) for entry in result)
-        done[id(value)] = value, result
-    elif isinstance(result, dict | list) or result.dtype.hasobject:
-        flat = result.reshape(-1) if isinstance(result, np.ndarray) else result
-        for key in list(flat) if isinstance(flat, dict) else range(len(flat)):
-            flat[key] = _plain(flat[key], done)
-    return result
+def _load(stream: BinaryIO) -> Any:
+    content = _Unpickler(stream, encoding="latin1").load()
+    if isinstance(content, dict):
+        return {k: v.array() if isinstance(v, _Chumpy) else v for k, v in content.items()}
+    return _array(content) if isinstance(content, _Chumpy) else content
 
 
 @contextmanager
@@ -208,21 +178,21 @@ def _as_data_error(path: Path, what: str) -> Iterator[None]:
             "was run: save its content as plain arrays with numpy.savez"
         ) from None
     except Exception as error:
-        reason = f"it has no {error}" if isinstance(error, KeyError) else str(error)
-        reason = " ".join(reason.split())[:160] or type(error).__name__
+        reason = " ".join(str(error).split())[:160] or type(error).__name__
         raise DataError(f"{path} is not a valid {what} ({reason}); export it again") from None
 
 
 def read_pickle(path: Path) -> Any:
-    """The content of a .pkl file, with sparse matrices and chumpy's values as plain arrays.
+    """The content of a .pkl file.
 
-    Convention: text and bytes of Python 2 are read as latin1.
+    Convention: text and bytes of Python 2 are read as latin1. The values of a dict that are arrays
+    of chumpy or sparse matrices become plain arrays.
 
     Raises:
         DataError: when the file is missing, damaged, or names a class that is not allowed.
     """
     with _as_data_error(path, "pickle"):
-        return _load(path.read_bytes())
+        return _load(io.BytesIO(path.read_bytes()))
 
 
 def read_npy(path: Path) -> Any:
@@ -251,8 +221,7 @@ def read_npz(
         for name in members if names is None else members.keys() & set(names):
             size = members[name].file_size
             _expect(size <= LARGEST_ARRAY, f"{name} would unpack to {size} bytes")
-            stream = io.BytesIO(archive.read(members[name]))
-            found[name] = _read_array(stream, objects)
+            found[name] = _read_array(io.BytesIO(archive.read(members[name])), objects)
         return found
 
 
@@ -264,5 +233,5 @@ def _read_array(stream: BinaryIO, objects: bool = True) -> Any:
             raise
     if not objects:
         raise _Refused("pickled Python objects")
-    content = _load(stream.read())  # the header has been read
+    content = _load(io.BytesIO(stream.read()))  # the header has been read
     return content.item() if isinstance(content, np.ndarray) and content.ndim == 0 else content

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from gsgan.model.avatar import Avatar
-from gsgan.model.painting import Painting
+from gsgan.model.rendering import Rendering
 from gsgan.scene import Camera
 from gsgan.splat import rasterise
 from gsgan.utils.images import eight_bits
@@ -40,7 +40,7 @@ def layers(avatar: Avatar, truth: bool) -> tuple[str, ...]:
 
 def shown(
     layer: str,
-    painting: Painting,
+    painting: Rendering,
     camera: Camera,
     avatar: Avatar,
     behind: Tensor,
@@ -76,10 +76,9 @@ def shown(
     return eight_bits(image, alpha, behind)
 
 
-def _depth(painting: Painting, camera: Camera, avatar: Avatar) -> Bytes:
+def _depth(painting: Rendering, camera: Camera, avatar: Avatar) -> Bytes:
     assert painting.gaussians is not None
-    gaussians = avatar.bounded(painting.gaussians)
-    raster = rasterise(gaussians, camera, settings=avatar.accuracy, depth=True)
+    raster = rasterise(painting.gaussians, camera, settings=avatar.accuracy, depth=True)
     assert raster.depth is not None
     alpha = raster.alpha[0, 0].cpu()
     metres = raster.depth[0, 0].cpu() / alpha.clamp_min(1e-6)

@@ -254,7 +254,8 @@ class Session:
         camera = self.camera(share) if truth is None else truth.camera
         p, visibility, body = inputs_of(avatar, current, 0)
         maps = layer != IMAGE or self.splats.value
-        painting = avatar.picture(p, camera, visibility=visibility, body=body, maps=maps)
+        with torch.no_grad():
+            painting = avatar(p, visibility, camera.to(p.device), body, maps=maps)
         behind = self.show.behind(camera.size)
         image = shown(layer, painting, camera, avatar, behind, int(self.channel.value), truth)
         self.image = image

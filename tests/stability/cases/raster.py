@@ -60,17 +60,9 @@ def raster_case(
     return Case(subject, name, scene, run, settings, **options)
 
 
-def render(
-    inputs: Inputs, backend: str, *, size: Size, settings: Accuracy, on_invalid: str = "error"
-) -> dict[str, Tensor]:
+def render(inputs: Inputs, backend: str, *, size: Size, settings: Accuracy) -> dict[str, Tensor]:
     """Features, alpha and depth of a scene."""
-    raster = rasterise(
-        *records(inputs, size),
-        settings=settings,
-        backend=backend,
-        depth=True,
-        on_invalid=on_invalid,
-    )
+    raster = rasterise(*records(inputs, size), settings=settings, backend=backend, depth=True)
     assert raster.depth is not None
     return {"features": raster.features, "alpha": raster.alpha, "depth": raster.depth}
 

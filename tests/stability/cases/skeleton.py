@@ -106,20 +106,20 @@ def few_points(dtype: torch.dtype, device: torch.device) -> Densify:
 
 
 def frames_and_points(inputs: Inputs) -> dict[str, Tensor]:
-    """All that is made of ``p [B, 33, 3]``: frames with both kinds of twist, points, pose code."""
+    """All that is made of ``p [B, 33, 3]``: frames, points, pose code."""
     p, valid = inputs["p"], inputs.get("valid")
-    hinged, frames = (bone_frames(p, valid, twist=twist) for twist in ("hinge", "none"))
+    frames = bone_frames(p, valid)
+    world = torch.eye(3).to(p).expand(len(p), 3, 3)
     points = few_points(p.dtype, p.device)(p, valid, frames)
     return {
         "hubs": frames.hubs,
         "limbs": frames.limbs,
-        "limbs with hinges": hinged.limbs,
         "lengths": frames.lengths,
         "torso": frames.torso,
         "points": points.means,
         "sigmas": points.scales,
         "normals": points.normals,
-        "pose code": omega(p, valid, None, frame="world", frames=frames),
+        "pose code": omega(p, valid, world, frames=frames),
     }
 
 

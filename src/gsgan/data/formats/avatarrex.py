@@ -24,4 +24,3 @@ class AvatarrexReader(SmplxRigReader):
     images: ClassVar[str] = "{camera}"
     masks: ClassVar[str] = "{camera}/mask/pha"
     lists_missing: ClassVar[bool] = False
-    camera_folders: ClassVar[str] = "*/mask"

@@ -66,34 +66,34 @@ class CaptureReader:
     def __post_init__(self) -> None:
         whole("data.reader.ignore_band", self.ignore_band, 0)
 
-    def __call__(self, root: str | Path, checks: Thresholds, smpl: str | None = None) -> Layout:
+    def __call__(self, root: str | Path, limits: Thresholds, smpl: str | None = None) -> Layout:
         """Reads and checks everything except most images' pixels.
 
         Args:
             root: the folder that holds cameras.json.
-            checks: thresholds.
+            limits: thresholds.
             smpl: the user's model file, for poses of an SMPL or SMPL-X body.
 
         Raises:
             DataError: for whatever is missing, damaged or contradictory, naming the file.
         """
-        found = _find(dataset_folder(root, "cameras.json, images/ and masks/"), checks, smpl, self)
+        found = _find(dataset_folder(root, "cameras.json, images/ and masks/"), limits, smpl, self)
         hint = "check that cameras, landmarks and masks belong together"
-        return finish(found, checks, self.consistency, hint, self.drop_frames)
+        return finish(found, limits, self.consistency, hint, self.drop_frames)
 
 
 def read_capture(
     root: str | Path,
-    checks: Thresholds | None = None,
+    limits: Thresholds | None = None,
     smpl: str | None = None,
     consistency: Consistency = SKELETON_LIMITS,
     drop_frames: Any = None,
 ) -> Layout:
-    """The capture in a folder, see `CaptureReader`; ``checks`` are `Thresholds()` when None."""
-    return CaptureReader(drop_frames, consistency)(root, checks or Thresholds(), smpl)
+    """The capture in a folder, see `CaptureReader`; ``limits`` are `Thresholds()` when None."""
+    return CaptureReader(drop_frames, consistency)(root, limits or Thresholds(), smpl)
 
 
-def _find(root: Path, checks: Thresholds, smpl: str | None, reader: CaptureReader) -> Found:
+def _find(root: Path, limits: Thresholds, smpl: str | None, reader: CaptureReader) -> Found:
     notes: list[str] = []
     cameras_json = read_json(root / "cameras.json")
     meta_path = root / "meta.json"
@@ -103,17 +103,17 @@ def _find(root: Path, checks: Thresholds, smpl: str | None, reader: CaptureReade
     if conventions.scale != 1.0:
         notes.append(f"lengths converted from {meta.unit} to metres")
     cameras = read_cameras(
-        root / "cameras.json", cameras_json, conventions, checks.rotation_tolerance
+        root / "cameras.json", cameras_json, conventions, limits.rotation_tolerance
     )
     images = _index_images(root, cameras)
     joints = SKELETONS[meta.skeleton]
-    skeletons = _read_landmarks(root / LANDMARKS, joints, conventions, checks, notes)
+    skeletons = _read_landmarks(root / LANDMARKS, joints, conventions, limits, notes)
     hands = None
     if (root / HANDS_FILE).exists():
-        hands = _read_landmarks(root / HANDS_FILE, 2 * HAND, conventions, checks, notes)
+        hands = _read_landmarks(root / HANDS_FILE, 2 * HAND, conventions, limits, notes)
     face = None
     if (root / FACE_FILE).exists():
-        face = _read_landmarks(root / FACE_FILE, FACE, conventions, checks, notes)
+        face = _read_landmarks(root / FACE_FILE, FACE, conventions, limits, notes)
         _refuse_other_names(root / FACE_FILE)
     poses = None
     if (root / POSES).exists():
@@ -184,7 +184,7 @@ def _index_images(root: Path, cameras: Mapping[str, CameraEntry]) -> dict[str, d
 
 
 def _read_landmarks(
-    path: Path, joints: int, conventions: Conventions, checks: Thresholds, notes: list[str]
+    path: Path, joints: int, conventions: Conventions, limits: Thresholds, notes: list[str]
 ) -> Landmarks:
     """Skeletons, hands or faces of every frame."""
     arrays = read_arrays(path, ("p", "conf", "frame_id"))
@@ -193,7 +193,7 @@ def _read_landmarks(
     conf = np.ones(p.shape[:2])
     if "conf" in arrays:
         conf = expect_array(arrays, "conf", p.shape[:2], path).astype(np.float64)
-    return make_landmarks(ids, p, conf, checks.max_reach, notes, path.name)
+    return make_landmarks(ids, p, conf, limits.max_reach, notes, path.name)
 
 
 def _refuse_other_names(path: Path) -> None:
@@ -221,8 +221,8 @@ def _read_poses(root: Path, meta: Meta, conventions: Conventions) -> tuple[Poses
         registered = frozenset(whole_frame_ids(found, str(path)).tolist())
 
     parts = [("theta", "transl")]
-    if "theta_hands" in arrays:  # fits before 2026-11-23 share the translation
-        parts.append(("theta_hands", "transl_hands" if "transl_hands" in arrays else "transl"))
+    if "theta_hands" in arrays:
+        parts.append(("theta_hands", "transl_hands"))
     values = [
         tuple(
             expect_array(arrays, name, shape, path).astype(np.float64)

@@ -12,7 +12,7 @@ import numpy as np
 from gsgan.body.smpl import SkinnedModel, read_smpl
 from gsgan.data.cameras import CameraEntry
 from gsgan.data.files import read_header
-from gsgan.data.formats.consistency import Consistency, check_meeting, watch_masks
+from gsgan.data.formats.consistency import Consistency, check_consistency, watch_masks
 from gsgan.data.layout import Found, Layout, assemble, dataset_folder
 from gsgan.data.pixels import MaskFile, mask_file
 from gsgan.data.splits import parse_frames
@@ -44,28 +44,28 @@ class FolderReader:
     hint: ClassVar[str]
     """What to check when body and masks do not agree."""
 
-    def __call__(self, root: str | Path, checks: Thresholds, smpl: str | None = None) -> Layout:
+    def __call__(self, root: str | Path, limits: Thresholds, smpl: str | None = None) -> Layout:
         """Reads and checks everything except most images' pixels.
 
         Args:
             root: the dataset's folder.
-            checks: thresholds of all formats.
+            limits: thresholds of all formats.
             smpl: the user's SMPL or SMPL-X model file.
 
         Raises:
             DataError: for whatever is missing, damaged or contradictory, naming the file.
         """
         folder = dataset_folder(root, self.contents)
-        checks = replace(
-            checks,
+        limits = replace(
+            limits,
             distance=(self.distance[0], self.distance[1]),
             max_missing_masks=self.max_missing_masks,
             header_stride=self.header_stride,
         )
-        found = self.find(folder, checks, smpl)
-        return finish(found, checks, self.consistency, self.hint, self.drop_frames)
+        found = self.find(folder, limits, smpl)
+        return finish(found, limits, self.consistency, self.hint, self.drop_frames)
 
-    def find(self, root: Path, checks: Thresholds, smpl: str | None) -> Found:
+    def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """The dataset's files, each checked separately.
 
         Raises:
@@ -75,13 +75,13 @@ class FolderReader:
 
 
 def finish(
-    found: Found, checks: Thresholds, consistency: Consistency, hint: str, drop_frames: Any = None
+    found: Found, limits: Thresholds, consistency: Consistency, hint: str, drop_frames: Any = None
 ) -> Layout:
     """Checks the files against each other and a few masks against the body.
 
     Args:
         found: by a reader.
-        checks: thresholds.
+        limits: thresholds.
         consistency: which images are compared.
         hint: what to check when body and masks do not agree.
         drop_frames: frames to leave out, or None.
@@ -99,8 +99,8 @@ def finish(
         if not any(images.values()):
             raise ConfigError(f"data.reader.drop_frames={drop_frames} leaves no frame")
         found = replace(found, images=images)
-    layout = assemble(found, checks)
-    doubts = check_meeting(layout, found.points or layout.landmarks.seen, consistency, hint)
+    layout = assemble(found, limits)
+    doubts = check_consistency(layout, found.points or layout.landmarks.seen, consistency, hint)
     return replace(layout, notes=(*layout.notes, *doubts, *watch_masks(layout, consistency)))
 
 
@@ -149,7 +149,7 @@ def up_axis(cameras: Iterable[CameraEntry]) -> str:
     return ("-" if up[axis] < 0 else "") + AXES[axis]
 
 
-def picture_size(root: Path, files: Mapping[int, str]) -> tuple[int, int]:
+def image_size(root: Path, files: Mapping[int, str]) -> tuple[int, int]:
     """``(H, W)`` of a camera's first image.
 
     Raises:

@@ -1,6 +1,6 @@
 """Do cameras, joints and masks fit together? The rules, and the one set of thresholds.
 
-Readers apply them to a few images when a dataset is opened (`check_meeting`, `watch_masks`);
+Readers apply them to a few images when a dataset is opened (`check_consistency`, `watch_masks`);
 `gsgan.check` applies the same measures and thresholds to many. Pixel centres lie at +0.5.
 """
 
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -20,6 +20,7 @@ from gsgan.data.crop import NEAR, project
 from gsgan.data.layout import Layout
 from gsgan.data.pixels import read_mask
 from gsgan.data.validation import spans
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.errors import DataError
 
 Bytes = NDArray[np.uint8]
@@ -53,8 +54,7 @@ class Consistency:
     mask_jump: float = 0.5
 
 
-@dataclass(frozen=True)
-class Meeting:
+class Comparison(NamedTuple):
     """One image's mask against what its camera should see.
 
     Args:
@@ -74,7 +74,7 @@ class Meeting:
     beyond: float
 
 
-def check_meeting(
+def check_consistency(
     layout: Layout, body: Callable[[int], Float], limits: Consistency, hint: str
 ) -> list[str]:
     """Checks that the projected body lies where the masks are, and that not all masks are empty.
@@ -91,7 +91,13 @@ def check_meeting(
     Raises:
         DataError: naming the camera that is furthest off, or the first empty mask.
     """
-    compared = _meetings(layout, body, limits)
+    compared = [
+        _compare(layout, points, camera, frame, limits)
+        for frame in spread(list(layout.frames), limits.frames)
+        for points in [body(frame)]
+        for camera, files in layout.masks.items()
+        if frame in files
+    ]
     if not compared:
         return []
     person = np.median(layout.landmarks.seen(compared[0].frame), axis=0)
@@ -114,21 +120,21 @@ def check_meeting(
     return _notes(layout.root, compared, limits, hint)
 
 
-def _meetings(layout: Layout, body: Callable[[int], Float], limits: Consistency) -> list[Meeting]:
-    """The same few moments in every camera that has them."""
-    found = []
-    for frame in spread(list(layout.frames), limits.frames):
-        points, joints = body(frame), layout.landmarks.seen(frame)
-        for name in (c for c, files in layout.masks.items() if frame in files):
-            camera = layout.cameras[name]
-            mask = read_mask(layout.mask_files(name, frame), layout.pixels)
-            expected, found_box = box_of(points, camera), mask_box(mask)
-            iou = box_iou(expected, found_box) if expected and found_box else np.nan
-            inside = inside_share(mask, camera, joints, limits.joint_tolerance)
-            beyond = mask_beyond(mask, camera, joints, limits.joint_reach)
-            path = layout.mask_path(name, frame)
-            found.append(Meeting(name, frame, path, not mask.any(), iou, inside, beyond))
-    return found
+def _compare(
+    layout: Layout, points: Float, name: str, frame: int, limits: Consistency
+) -> Comparison:
+    camera, joints = layout.cameras[name], layout.landmarks.seen(frame)
+    mask = read_mask(layout.mask_files(name, frame), layout.pixels)
+    expected, found = box_of(points, camera), mask_box(mask)
+    return Comparison(
+        camera=name,
+        frame=frame,
+        mask=layout.mask_path(name, frame),
+        empty=not mask.any(),
+        iou=box_iou(expected, found) if expected and found else np.nan,
+        inside=inside_share(mask, camera, joints, limits.joint_tolerance),
+        beyond=mask_beyond(mask, camera, joints, limits.joint_reach),
+    )
 
 
 def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
@@ -142,7 +148,7 @@ def far_cameras(metres: Mapping[str, float], factor: float) -> dict[str, str]:
     }
 
 
-def _notes(root: Path, compared: Sequence[Meeting], limits: Consistency, hint: str) -> list[str]:
+def _notes(root: Path, compared: Sequence[Comparison], limits: Consistency, hint: str) -> list[str]:
     """One note on joints outside masks, one on masks beyond joints, where there are any."""
     notes = []
     inside, beyond = _means(compared, "inside"), _means(compared, "beyond")
@@ -164,7 +170,7 @@ def _notes(root: Path, compared: Sequence[Meeting], limits: Consistency, hint: s
     return notes
 
 
-def _means(compared: Sequence[Meeting], field: str) -> dict[str, float]:
+def _means(compared: Sequence[Comparison], field: str) -> dict[str, float]:
     """The mean of each camera's finite values."""
     kept: dict[str, list[float]] = {}
     for one in compared:
@@ -276,9 +282,7 @@ def box_iou(a: Box, b: Box) -> float:
 
 def spread(values: Sequence[T], count: int) -> list[T]:
     """At most ``count`` of the values, evenly spaced, first and last included."""
-    if not values or count < 1:
-        return []
-    return [values[i] for i in sorted({round(x) for x in np.linspace(0, len(values) - 1, count)})]
+    return [values[i] for i in evenly_spaced(len(values), count, ends=True)]
 
 
 def watch_masks(layout: Layout, limits: Consistency) -> list[str]:

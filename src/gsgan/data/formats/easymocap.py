@@ -26,7 +26,7 @@ from gsgan.data.formats.common import (
     IMAGES,
     FolderReader,
     body_model,
-    picture_size,
+    image_size,
     up_axis,
 )
 from gsgan.data.formats.smpl_motion import landmarks_of, zju_motion
@@ -76,7 +76,7 @@ class EasymocapReader(FolderReader):
         one_of("data.reader.skeleton", self.skeleton, ("auto", *SKELETONS))
         one_of("data.reader.mask_rule", self.mask_rule, MASK_RULES)
 
-    def find(self, root: Path, checks: Thresholds, smpl: str | None) -> Found:
+    def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """The dataset's files, each checked separately.
 
         Raises:
@@ -112,7 +112,7 @@ class EasymocapReader(FolderReader):
             images=images,
             masks=self._masks(root, names),
             mask_folder=f"{self.masks}/{{camera}}",
-            landmarks=make_landmarks(ids, p, conf, checks.max_reach, notes, source=f"{place}/"),
+            landmarks=make_landmarks(ids, p, conf, limits.max_reach, notes, source=f"{place}/"),
             poses=None if motion is None else motion.poses(f"{place}/"),
             pixels=PixelRules(threshold=self.threshold),
             calibration=root / "intri.yml and extri.yml",
@@ -152,7 +152,7 @@ class EasymocapReader(FolderReader):
         return {
             name: known[name]
             if min(known[name].size) > 0
-            else replace(known[name], size=picture_size(root, images[name]))
+            else replace(known[name], size=image_size(root, images[name]))
             for name in images
         }
 
@@ -191,7 +191,7 @@ def _camera_folders(root: Path, contents: str) -> list[str]:
 
 
 def _frame_and_person(stem: str) -> int | None:
-    """One number of both: "000012_1" is frame 12 of person 1, "000012" has no id."""
+    """One number for frame and person: "000012_1" is frame 12 of person 1, "000012" has no id."""
     match = re.fullmatch(r"(\d+)(?:_(\d{1,2}))?", stem)
     if match is None:
         return None

@@ -24,7 +24,7 @@ ZJU_SIZES = {"poses": (72, 69), "shapes": (10,), "Rh": (3,), "Th": (3,)}  # 69: 
 
 
 @dataclass(frozen=True)
-class Motion:
+class SmplMotion:
     """Parameters of F frames in the model's own convention (`gsgan.body.smpl`).
 
     Args:
@@ -50,15 +50,15 @@ class Motion:
             source,
         )
 
-    def rows(self, chosen: slice | list[int]) -> Motion:
+    def rows(self, chosen: slice | list[int]) -> SmplMotion:
         """The motion at some rows."""
         face = None if self.expression is None else self.expression[chosen]
-        return Motion(
+        return SmplMotion(
             self.ids[chosen], self.theta[chosen], self.transl[chosen], self.betas[chosen], face
         )
 
 
-def posed(model: SkinnedModel, motion: Motion, pose_blend: bool = True) -> tuple[Float, Float]:
+def posed(model: SkinnedModel, motion: SmplMotion, pose_blend: bool = True) -> tuple[Float, Float]:
     """Vertices ``[F, V, 3]`` and joints ``[F, J, 3]``, metres, world; for few frames at a time."""
     face = None if motion.expression is None else torch.from_numpy(motion.expression)
     vertices, joints = model.pose(
@@ -72,7 +72,7 @@ def posed(model: SkinnedModel, motion: Motion, pose_blend: bool = True) -> tuple
 
 
 def landmarks_of(
-    model: SkinnedModel, motion: Motion, pose_blend: bool = True
+    model: SkinnedModel, motion: SmplMotion, pose_blend: bool = True
 ) -> tuple[Float, Float]:
     """MediaPipe's 33 landmarks ``p [F, 33, 3]`` (NaN = unknown) and ``conf [F, 33]``.
 
@@ -116,7 +116,7 @@ def _only(model: SkinnedModel, vertices: list[int]) -> SkinnedModel:
 
 def zju_motion(
     entries: Mapping[int, tuple[str, Any]], model: SkinnedModel, notes: list[str]
-) -> Motion:
+) -> SmplMotion:
     """A motion from ZJU-MoCap's parameters, which EasyMocap writes too.
 
     Convention: the files' pose is ``R(Rh) x + Th`` of the body with an unrotated root, about the
@@ -154,7 +154,7 @@ def zju_motion(
     theta = poses.reshape(len(rows), -1, 3)
     theta[:, 0], transl = from_zju(Rh, Th, J0)
     ids = np.array(list(entries), np.int64)
-    return Motion(ids, theta, transl, np.repeat(shape[None], len(ids), axis=0))
+    return SmplMotion(ids, theta, transl, np.repeat(shape[None], len(ids), axis=0))
 
 
 def _parameter(content: Any, key: str, sizes: tuple[int, ...], where: str) -> Float:

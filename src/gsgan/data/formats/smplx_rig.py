@@ -22,11 +22,11 @@ from gsgan.data.formats.common import (
     IMAGES,
     FolderReader,
     body_model,
+    image_size,
     one_mask_each,
-    picture_size,
     up_axis,
 )
-from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed
+from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, posed
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import PixelRules
 from gsgan.data.skeletons import make_landmarks
@@ -53,7 +53,6 @@ POSES = {  # in the order of SMPL-X's joints: numbers per frame of each
 }
 NEEDED = ("global_orient", "body_pose", "transl", "betas")
 HAND_POSES = ("left_hand_pose", "right_hand_pose")
-SMPL_BODY = 69
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,8 +72,6 @@ class SmplxRigReader(FolderReader):
     images: ClassVar[str]
     masks: ClassVar[str]
     """Folder of a camera's files, with ``{camera}``."""
-    camera_folders: ClassVar[str]
-    """Pattern whose ``*`` is the name of a camera that has files."""
     lists_missing: ClassVar[bool]
     """The release always has a missing_img_files.txt."""
     hint: ClassVar[str] = (
@@ -91,7 +88,7 @@ class SmplxRigReader(FolderReader):
                 f"[5, 250], got {list(alpha)}"
             )
 
-    def find(self, root: Path, checks: Thresholds, smpl: str | None) -> Found:
+    def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """The subject's files, each checked separately.
 
         Raises:
@@ -106,11 +103,10 @@ class SmplxRigReader(FolderReader):
         file, model = body_model(root, smpl, "smplx")
         path = root / self.calibration
         entries = read_json(path)
-        self._check_folders(root, path, entries)
         images = _index(root, entries, self.images, "images")
         masks = _index(root, entries, self.masks, "masks")
         _leave_out(images, root / MISSING, self.lists_missing, notes)
-        cameras = self._cameras(root, path, entries, images, checks, notes)
+        cameras = self._cameras(root, path, entries, images, limits, notes)
         frames = {f for files in images.values() for f in files}
         motion = read_motion(root / PARAMETERS, frames, model, notes)
         row = {int(f): i for i, f in enumerate(motion.ids)}
@@ -128,7 +124,7 @@ class SmplxRigReader(FolderReader):
             images=images,
             masks=one_mask_each(masks, "threshold"),
             mask_folder=self.masks,
-            landmarks=make_landmarks(motion.ids, p, conf, checks.max_reach, notes, PARAMETERS),
+            landmarks=make_landmarks(motion.ids, p, conf, limits.max_reach, notes, PARAMETERS),
             poses=motion.poses(PARAMETERS),
             pixels=PixelRules(
                 threshold=self.threshold,
@@ -141,27 +137,13 @@ class SmplxRigReader(FolderReader):
             notes=tuple(notes),
         )
 
-    def _check_folders(self, root: Path, path: Path, entries: Mapping[str, Any]) -> None:
-        """Cameras and folders are the same ones."""
-        at = PurePosixPath(self.camera_folders).parts.index("*")
-        found = root.glob(self.camera_folders)
-        folders = {p.relative_to(root).parts[at] for p in found if p.is_dir()}
-        counts = (
-            f"{path} lists {len(entries)} cameras, but {len(folders)} have a folder "
-            f"({root / self.camera_folders})"
-        )
-        if lacking := [name for name in entries if name not in folders]:
-            raise DataError(f"{counts}: {', '.join(lacking[:5])} lacks one; copy it")
-        if unknown := sorted(folders - set(entries)):
-            raise DataError(f"{counts}: {', '.join(unknown[:5])} is not calibrated")
-
     def _cameras(
         self,
         root: Path,
         path: Path,
         entries: Mapping[str, Any],
         images: Files,
-        checks: Thresholds,
+        limits: Thresholds,
         notes: list[str],
     ) -> dict[str, CameraEntry]:
         """The cameras in the calibration's order."""
@@ -170,11 +152,7 @@ class SmplxRigReader(FolderReader):
             where = f"{path}, camera {name}"
             if not isinstance(entry, dict) or any(key not in entry for key in "KRT"):
                 held = ", ".join(entry) if isinstance(entry, dict) else type(entry).__name__
-                raise DataError(f"{where}: expected K, R, T and imgSize, found {held}")
-            size = picture_size(root, images[name])
-            if "imgSize" in entry:
-                w, h = (int(x) for x in numbers(where, entry["imgSize"], "imgSize", (2,)))
-                size = h, w
+                raise DataError(f"{where}: expected K, R and T, found {held}")
             cameras[name] = make_camera(
                 where,
                 name,
@@ -182,9 +160,9 @@ class SmplxRigReader(FolderReader):
                 R=numbers(where, entry["R"], "R", (9,)).reshape(3, 3),
                 t=entry["T"],
                 dist=entry.get("distCoeff"),
-                size=size,
+                size=image_size(root, images[name]),
                 pixel_centre=self.pixel_centre,
-                rotation_tolerance=checks.rotation_tolerance,
+                rotation_tolerance=limits.rotation_tolerance,
             )
         bent = [name for name, camera in cameras.items() if camera.distorted]
         if bent and not self.undistort:
@@ -227,12 +205,8 @@ def read_missing(path: Path, cameras: Mapping[str, Any]) -> set[tuple[str, int]]
     Raises:
         DataError: on a line that names no image of a camera.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError):
-        raise DataError(f"{path} cannot be read as text; expected one image per line") from None
     found = set()
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(path.read_text(errors="replace").splitlines(), 1):
         if not line.strip():
             continue
         parts = PurePosixPath(line.strip().replace("\\", "/"))
@@ -249,7 +223,7 @@ def read_missing(path: Path, cameras: Mapping[str, Any]) -> set[tuple[str, int]]
 
 def read_motion(
     path: Path, frames: Collection[int], model: SkinnedModel, notes: list[str]
-) -> Motion:
+) -> SmplMotion:
     """The parameters of the frames that have any, in the model's own convention.
 
     Args:
@@ -291,7 +265,7 @@ def read_motion(
         )
     if lost := [f for f in there if not finite[f]]:
         notes.append(f"{path}: NaN or infinity at frames {spans(lost)}")
-    return Motion(
+    return SmplMotion(
         ids=ids,
         theta=theta.reshape(count, -1, 3)[ids],
         transl=transl[ids],
@@ -305,20 +279,16 @@ def _rows(
 ) -> Float:
     """``[N, width]`` of an array ``[N, ...]``; N is ``count`` where that is given."""
     values = as_floats(arrays[key])
-    values = (
-        values.reshape(len(values), -1) if values.ndim > 1 and values.size else np.zeros((0, 0))
-    )
-    found = values.shape[1]
-    if values.size and width in (None, found) and count in (None, len(values)):
-        return values
-    hint = ""
-    if key == "body_pose" and found == SMPL_BODY:
-        hint = "; 69 are those of SMPL: fit SMPL-X to the sequence, or use its own smpl_params.npz"
-    elif key in HAND_POSES and 0 < found < POSES[key]:
-        hint = "; fewer look like PCA coefficients (expected use_pca=False)"
+    if values.ndim > 1 and values.size:
+        values = values.reshape(len(values), -1)
+        if width in (None, values.shape[1]) and count in (None, len(values)):
+            return values
     shape = getattr(arrays[key], "shape", type(arrays[key]).__name__)
     expected = f"({count or 'frames'}, {width or 'any'})"
-    raise DataError(f"{path}: '{key}' must hold numbers of shape {expected}, found {shape}{hint}")
+    raise DataError(
+        f"{path}: '{key}' must hold numbers of shape {expected}, found {shape}; "
+        "they must be SMPL-X's, without PCA"
+    )
 
 
 def _coefficients(

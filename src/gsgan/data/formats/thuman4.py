@@ -24,4 +24,3 @@ class Thuman4Reader(SmplxRigReader):
     images: ClassVar[str] = "images/{camera}"
     masks: ClassVar[str] = "masks/{camera}"
     lists_missing: ClassVar[bool] = True
-    camera_folders: ClassVar[str] = "images/*"

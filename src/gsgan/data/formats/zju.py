@@ -22,9 +22,9 @@ import numpy as np
 from gsgan.body.smpl import SkinnedModel
 from gsgan.body.smpl_names import CIHP
 from gsgan.data.cameras import CameraEntry, make_camera
-from gsgan.data.files import frame_files, frame_of, last_number, natural_order
-from gsgan.data.formats.common import IMAGES, FolderReader, body_model, picture_size, up_axis
-from gsgan.data.formats.smpl_motion import Motion, landmarks_of, posed, zju_motion
+from gsgan.data.files import frame_files, frame_of, last_number
+from gsgan.data.formats.common import IMAGES, FolderReader, body_model, image_size, up_axis
+from gsgan.data.formats.smpl_motion import SmplMotion, landmarks_of, posed, zju_motion
 from gsgan.data.layout import BodyModel, Found, Meta
 from gsgan.data.pixels import IGNORE_LABEL, MaskFile, PixelRules, mask_file
 from gsgan.data.skeletons import make_landmarks
@@ -37,10 +37,8 @@ Files = dict[str, dict[int, str]]
 """Paths relative to the root, by camera and frame."""
 
 ANNOTS = ("annots.npy", "annots_new.npy")
-CACHES = ("mesh_infos.pkl", "cam_params.json")  # of HumanNeRF and of ARAH
 MILLIMETRES = 1e-3
 NAMED_FRAME = re.compile(r"\)_(\d+)")  # CoreView_313_Camera_(1)_0001_2019-08-23_16-08-50.592
-CAMERA_FOLDER = re.compile(r"(Camera[_ ]?\(?B?\d+\)?|\d{1,3})")
 MASKS = {"mask_cihp": "label", "mask": "nonzero"}
 # Files may hold stray numbers beyond CIHP's.
 CIHP_TABLE = tuple(i if i < len(CIHP) else IGNORE_LABEL for i in range(256))
@@ -68,7 +66,7 @@ class ZjuReader(FolderReader):
         one_of("data.reader.masks", self.masks, ("both", *MASKS))
         one_of("data.reader.fit", self.fit, ("auto", *FITS))
 
-    def find(self, root: Path, checks: Thresholds, smpl: str | None) -> Found:
+    def find(self, root: Path, limits: Thresholds, smpl: str | None) -> Found:
         """The subject's files, each checked separately.
 
         Raises:
@@ -77,9 +75,9 @@ class ZjuReader(FolderReader):
         annots = read_annots(root)
         file, model = body_model(root, smpl, "smpl")
         notes = ["lengths of the cameras converted from mm to metres"]
-        folders = camera_folders(root, annots, notes)
+        folders = camera_folders(root, annots)
         images = _index_images(root, folders, notes)
-        cameras = self._cameras(root, annots, images, checks)
+        cameras = self._cameras(root, annots, images, limits)
         fit, params = self._fit(root)
         frames = {f for files in images.values() for f in files}
         motion = _read_motion(root, params, frames, model, notes)
@@ -101,7 +99,7 @@ class ZjuReader(FolderReader):
             images=images,
             masks=masks,
             labels=labels,
-            landmarks=make_landmarks(motion.ids, p, conf, checks.max_reach, notes, f"{params}/"),
+            landmarks=make_landmarks(motion.ids, p, conf, limits.max_reach, notes, f"{params}/"),
             poses=motion.poses(f"{params}/"),
             pixels=PixelRules(
                 mask_sampling="nearest", label_table=CIHP_TABLE, ignore_band=self.ignore_band
@@ -113,7 +111,7 @@ class ZjuReader(FolderReader):
         )
 
     def _cameras(
-        self, root: Path, annots: Annots, images: Files, checks: Thresholds
+        self, root: Path, annots: Annots, images: Files, limits: Thresholds
     ) -> dict[str, CameraEntry]:
         """By name, in the order of annots.npy."""
         some = next(files for files in images.values() if files)
@@ -126,10 +124,10 @@ class ZjuReader(FolderReader):
                 R=annots.R[i],
                 t=annots.T[i],
                 dist=annots.D[i],
-                size=picture_size(root, files or some),
+                size=image_size(root, files or some),
                 scale=MILLIMETRES,
                 pixel_centre=self.pixel_centre,
-                rotation_tolerance=checks.rotation_tolerance,
+                rotation_tolerance=limits.rotation_tolerance,
             )
         length = float(np.median([np.linalg.norm(camera.t) for camera in cameras.values()]))
         low, high = self.translation
@@ -170,43 +168,45 @@ class ZjuReader(FolderReader):
 
 
 class Annots(NamedTuple):
-    """annots.npy: its path, one K, R, T and D per camera, and the cameras' image folders.
-
-    Folders are relative to the root; None where the file lists no images.
-    """
+    """annots.npy: its path, and one K, R, T, D and image folder (as listed) per camera."""
 
     path: Path
     K: Sequence[Any]
     R: Sequence[Any]
     T: Sequence[Any]
     D: Sequence[Any]
-    folders: tuple[str, ...] | None
+    folders: Sequence[str]
 
 
 def read_annots(root: Path) -> Annots:
-    """The first of `ANNOTS` that exists.
+    """The content of the first of `ANNOTS` that exists; that of some copies lists no images.
 
     Raises:
         DataError: when there is none, it is damaged, or its cameras are not complete.
     """
     path = next((root / name for name in ANNOTS if (root / name).exists()), None)
     if path is None:
-        if any((root / name).exists() for name in CACHES):
-            raise DataError(
-                f"{root} is a copy of a ZJU-MoCap subject that HumanNeRF or ARAH prepared, which "
-                "is not supported; give the original ZJU-MoCap folder, which has annots.npy"
-            )
-        raise DataError(f"{root} is not a ZJU-MoCap subject: it has no annots.npy")
+        raise DataError(
+            f"{root} is not a ZJU-MoCap subject: it has no annots.npy (copies that other projects "
+            "prepared are not supported)"
+        )
     content = read_npy(path)
     cams = content.get("cams") if isinstance(content, dict) else None
     if not isinstance(cams, dict):
         raise DataError(f"{path} has no 'cams'; expected a dict with cams and ims")
-    lists = [_entries(cams.get(key)) for key in "KRTD"]
-    if len({len(entries) for entries in lists}) != 1 or not lists[0]:
-        found = ", ".join(f"{len(n)} {key}" for key, n in zip("KRTD", lists, strict=True))
-        raise DataError(f"{path}: cams must hold one K, R, T and D per camera, found {found}")
-    K, R, T, D = lists
-    return Annots(path, K, R, T, D, _folders(path, content.get("ims"), len(K)))
+    ims = _entries(content.get("ims"))
+    names = _entries(ims[0].get("ims")) if ims and isinstance(ims[0], Mapping) else []
+    folders = [str(PurePosixPath(str(name).replace("\\", "/")).parent) for name in names]
+    if not ims:
+        folders = [f"images/{p.name}" for p in sorted(root.glob("images/*")) if p.is_dir()]
+    lists = [*(_entries(cams.get(key)) for key in "KRTD"), folders]
+    if len({len(entries) for entries in lists}) != 1 or not folders:
+        counts = zip(lists, (*"KRTD", "image folders"), strict=True)
+        found = ", ".join(f"{len(entries)} {key}" for entries, key in counts)
+        raise DataError(
+            f"{path} must hold one K, R, T, D and image folder per camera, found {found}"
+        )
+    return Annots(path, *lists)
 
 
 def _entries(value: Any) -> list[Any]:
@@ -215,52 +215,17 @@ def _entries(value: Any) -> list[Any]:
     return list(value) if array or isinstance(value, (list, tuple)) else []
 
 
-def _folders(path: Path, ims: Any, cameras: int) -> tuple[str, ...] | None:
-    """The folder of each camera, the same in every frame, or None without a list of images."""
-    first: tuple[str, ...] | None = None
-    for number, entry in enumerate(_entries(ims)):
-        names = _entries(entry.get("ims")) if isinstance(entry, Mapping) else []
-        folders = tuple(str(PurePosixPath(str(name).replace("\\", "/")).parent) for name in names)
-        if len(folders) != cameras:
-            raise DataError(
-                f"{path}: ims[{number}] lists {len(folders)} images, but cams has {cameras} "
-                f"cameras; the images' folders are {', '.join(folders[:30])}"
-            )
-        first = first or folders
-        if folders != first:
-            other = next(i for i in range(cameras) if folders[i] != first[i])
-            raise DataError(
-                f"{path}: ims[{number}] has {folders[other]} where ims[0] has {first[other]}; "
-                "images must be listed in the order of the cameras"
-            )
-    if first is not None and len(set(first)) != len(first):
-        raise DataError(f"{path}: two cameras share the image folder {first[0]}")
-    return first
-
-
-def camera_folders(root: Path, annots: Annots, notes: list[str]) -> dict[str, str]:
-    """Image folder by camera name, in the order of annots.npy.
-
-    A camera's name is its folder's name. Folders come from the list of images; where that is
-    empty, from the existing folders, which must be as many as the cameras.
+def camera_folders(root: Path, annots: Annots) -> dict[str, str]:
+    """Image folder by camera name (the folder's own), in the order of annots.npy.
 
     Raises:
-        DataError: when cameras and folders cannot be matched, listing both.
+        DataError: when a folder is not one of the subject's, or two cameras share one.
     """
-    if annots.folders is not None:
-        places = [_place(root, folder) for folder in annots.folders]
-        return {PurePosixPath(place).name: place for place in places}
-    base = "images/" if (root / "images").is_dir() else ""
-    names = [p.name for p in (root / base).iterdir() if p.is_dir()]
-    names = sorted((n for n in names if CAMERA_FOLDER.fullmatch(n)), key=natural_order)
-    if len(names) != len(annots.K):
-        raise DataError(
-            f"{annots.path} has {len(annots.K)} cameras and lists no images, but there are "
-            f"{len(names)} image folders ({', '.join(names) or 'none'}); get the "
-            "annots.npy that lists them"
-        )
-    notes.append(f"{annots.path.name} lists no images; the index is rebuilt from the folders")
-    return {name: base + name for name in names}
+    places = [_place(root, folder) for folder in annots.folders]
+    named = {PurePosixPath(place).name: place for place in places}
+    if len(named) != len(places):
+        raise DataError(f"{annots.path}: two cameras share an image folder: {', '.join(places)}")
+    return named
 
 
 def _place(root: Path, folder: str) -> str:
@@ -298,7 +263,7 @@ def _index_images(root: Path, folders: Mapping[str, str], notes: list[str]) -> F
 
 def _read_motion(
     root: Path, folder: str, frames: Iterable[int], model: SkinnedModel, notes: list[str]
-) -> Motion:
+) -> SmplMotion:
     """The parameters of the frames that have any, in the model's own convention."""
     files = frame_files(root, folder, (".npy",))
     ids = sorted(set(frames) & set(files))

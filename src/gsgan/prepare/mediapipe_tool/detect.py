@@ -2,9 +2,8 @@
 
 Runs in its own environment (requirements.txt beside it). `gsgan.prepare.mediapipe` starts it with a
 JSON object: source, out, masks (a folder, or empty), hands, face, rotate, threads (processors; 0 is
-all), slot (number among those that run at once), confidence and tracking (lowest), margin (of the
-mask's crop, share of the person's height). Prints a line ``<images done> <images in total>`` per
-image. Writes an npz:
+all), slot (number among those that run at once). Prints a line ``<images done> <images in total>``
+per image. Writes an npz:
 
     px (F,33,2), conf (F,33)     pixels of the image as stored, first pixel's centre at (0.5, 0.5)
     left, right (F,21,2)         the person's hands; NaN = not found
@@ -29,8 +28,9 @@ import cv2
 import mediapipe as mp
 import numpy as np
 
-PICTURES = (".jpg", ".jpeg", ".png")
+SUFFIXES = (".jpg", ".jpeg", ".png")
 JOINTS, HAND, FACE = 33, 21, 468
+MARGIN = 0.15  # of the mask's crop beyond the joints, share of the person's height
 
 
 def main() -> None:
@@ -42,17 +42,17 @@ def main() -> None:
         chosen = {allowed[(first + i) % len(allowed)] for i in range(options.threads)}
         os.sched_setaffinity(0, chosen)
     cv2.setNumThreads(options.threads or -1)
-    count, pictures = open_source(Path(options.source), options.rotate)
+    count, images = open_source(Path(options.source), options.rotate)
     folder = Path(options.masks) if options.masks else None
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, list[Any]] = {}
     detector = Detector(options)
-    for done, (frame, picture) in enumerate(pictures, start=1):
-        landmarks = detector.landmarks(picture)
+    for done, (frame, image) in enumerate(images, start=1):
+        landmarks = detector.landmarks(image)
         for name, value in (*landmarks.items(), ("frame_id", frame)):
             found.setdefault(name, []).append(value)
-        if folder and (mask := detector.mask(picture, landmarks["px"])) is not None:
+        if folder and (mask := detector.mask(image, landmarks["px"])) is not None:
             cv2.imwrite(str(folder / f"{frame:06d}.png"), mask)
         print(done, max(done, count), flush=True)
     if not found:
@@ -71,20 +71,20 @@ def open_source(path: Path, rotate: int) -> tuple[int, Iterator[tuple[int, Any]]
         files = {
             int(re.findall(r"[0-9]+", p.stem)[-1]): p
             for p in path.iterdir()
-            if p.suffix.lower() in PICTURES and not p.name.startswith(".")
+            if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")
         }
-        return len(files), ((frame, read_picture(files[frame])) for frame in sorted(files))
+        return len(files), ((frame, read_image(files[frame])) for frame in sorted(files))
     video = cv2.VideoCapture(str(path))
     video.set(cv2.CAP_PROP_ORIENTATION_AUTO, int(rotate))
     return int(video.get(cv2.CAP_PROP_FRAME_COUNT)), enumerate(read_video(video))
 
 
-def read_picture(path: Path) -> Any:
-    """As stored: gsgan's calibration knows no EXIF rotation."""
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if picture is None:
+def read_image(path: Path) -> Any:
+    """The image as stored: calibrations ignore EXIF rotation."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
         raise SystemExit(f"{path} is damaged")
-    return picture
+    return image
 
 
 def read_video(video: cv2.VideoCapture) -> Iterator[Any]:
@@ -97,23 +97,15 @@ class Detector:
 
     def __init__(self, options: SimpleNamespace) -> None:
         solutions = mp.solutions
-        common = {
-            "model_complexity": 1,  # its weights come with the package
-            "min_detection_confidence": options.confidence,
-            "min_tracking_confidence": options.tracking,
-        }
-        self.margin = options.margin
         # Smoothing here would lag; gsgan smooths in 3D.
         holistic = options.hands or options.face
         kind = solutions.holistic.Holistic if holistic else solutions.pose.Pose
-        self.body = kind(smooth_landmarks=False, **common)
-        self.segmenter = solutions.pose.Pose(
-            static_image_mode=True, enable_segmentation=True, **common
-        )
+        self.body = kind(smooth_landmarks=False)
+        self.segmenter = solutions.pose.Pose(static_image_mode=True, enable_segmentation=True)
 
-    def landmarks(self, picture: Any) -> dict[str, Any]:
-        found = self.body.process(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB))
-        size = picture.shape[1], picture.shape[0]
+    def landmarks(self, image: Any) -> dict[str, Any]:
+        found = self.body.process(cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+        size = image.shape[1], image.shape[0]
         pose = found.pose_landmarks
         visibility = [p.visibility for p in pose.landmark] if pose else [0.0] * JOINTS
         return {
@@ -124,18 +116,18 @@ class Detector:
             "face": pixels(getattr(found, "face_landmarks", None), size, FACE),
         }
 
-    def mask(self, picture: Any, px: Any) -> Any:
+    def mask(self, image: Any, px: Any) -> Any:
         """0..255 of the whole image, found in a crop around the person; None: nobody there."""
         if not np.isfinite(px).all():
             return None
-        height, width = picture.shape[:2]
+        height, width = image.shape[:2]
         low, high = px.min(0), px.max(0)
-        reach = self.margin * (high - low).max()
+        reach = MARGIN * (high - low).max()
         left, top = np.clip(low - reach, 0, [width - 1, height - 1]).astype(int)
         right, bottom = np.clip(high + reach, 1, [width, height]).astype(int)
         if right - left < 2 or bottom - top < 2:
             return None
-        crop = cv2.cvtColor(picture[top:bottom, left:right], cv2.COLOR_BGR2RGB)
+        crop = cv2.cvtColor(image[top:bottom, left:right], cv2.COLOR_BGR2RGB)
         alpha = self.segmenter.process(crop).segmentation_mask
         if alpha is None:
             return None

@@ -1,4 +1,4 @@
-"""Figures of images side by side, and of training: all but densify and segmentation."""
+"""Each figure: images side by side, and quality against training time."""
 
 from __future__ import annotations
 
@@ -6,11 +6,9 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize, to_rgb
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from torch import Tensor
@@ -18,76 +16,48 @@ from torch.nn import functional
 
 from gsgan.metrics.image import canny as canny_edges
 from gsgan.metrics.image import psnr
-from gsgan.report.figures.body import draw_bones, pose_of
+from gsgan.metrics.segmentation import colour_labels, confusion, miou
 from gsgan.report.figures.layout import (
-    BAR_FOOT,
+    COLUMN,
+    SMALL,
     Drawing,
     Panel,
-    Settings,
-    Sheet,
     Unavailable,
-    legend_foot,
+    draw_panels,
     written,
 )
 from gsgan.report.figures.subjects import Numbers, Shot, Subject, finite, measure
 from gsgan.report.training_curve import curve
 from gsgan.utils.errors import DataError
-from gsgan.utils.palette import BLACK, COLOURS, MARKERS, SKY, VERMILLION
+from gsgan.utils.palette import COLOURS, MARKERS, VERMILLION
 
-FOUND, MISSED, INVENTED = BLACK, SKY, VERMILLION  # edges
-NEAR = 1  # pixels an edge may be off, as in edge F1
 ERROR_COLOURS = "magma_r"  # pale is no error; even steps of lightness, in grey print too
 DETAIL = 0.35  # sides of the ablation's box, as a share of the image's
 STEP_ONE = "Step I's colour"
 Images = list[dict[str, Tensor]]  # per shot, by name
 
 
-def teaser(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
-    """Skeletons above the first run's images, each with its own camera.
-
-    Source: the paper's teaser.
-    """
-    subject = subjects[0]
-    images, numbers = _measured([subject], shots)
-    below = [Panel(image) for held in images for image in held.values()]
-    panels = [[Panel(None, framed=True)] * len(shots), below]
-    sheet = Sheet(panels, settings, width=settings.page, names=["skeleton", "image"])
-    for axes, shot in zip(sheet.axes[0], shots, strict=True):
-        draw_bones(axes, pose_of(subject, shot), shot)
-    each = ", ".join(_decibels(numbers[shot.name][subject.name]) for shot in shots)
-    caption = (
-        f"Skeletons and cameras (above) and the images that {subject.name} makes of them (below); "
-        f"PSNR from left to right {each}."
-    )
-    return Drawing(sheet.figure, caption, numbers)
-
-
-def strip(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
-    """One camera over time: a row for the ground truth and one per run, PSNR below each image.
-
-    Source: the paper's strip of the sign language sequence.
-    """
+def strip(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
+    """One camera over time: a row for the ground truth and one per run, PSNR below each image."""
     images, numbers = _measured(subjects, shots)
     panels = [[Panel(shot.truth) for shot in shots]]
     for name in images[0]:
         notes = [_decibels(numbers[shot.name][name]) for shot in shots]
         panels.append([Panel(x[name], note) for x, note in zip(images, notes, strict=True)])
     titles, names = [f"frame {shot.item[1]}" for shot in shots], ["truth", *images[0]]
-    sheet = Sheet(panels, settings, width=settings.page, titles=titles, names=names)
+    figure, _ = draw_panels(panels, titles=titles, names=names)
     caption = "One camera over time: the ground truth and each run's images, with PSNR."
-    return Drawing(sheet.figure, caption, numbers)
+    return Drawing(figure, caption, numbers)
 
 
 def comparison(
-    subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings, *, detail: bool = False
+    subjects: Sequence[Subject], shots: Sequence[Shot], *, detail: bool = False
 ) -> Drawing:
     """A row per shot: the ground truth and each run's image, with PSNR and edge F1.
 
     With ``detail`` a second row magnifies the box in which the runs differ most: where the variance
-    between their images is largest. The ground truth has no part in it, so it favours no run.
-
-    Source: the paper's comparison figure; with ``detail`` its ablation triplet (full, w/o GCN,
-    w/o S).
+    between their images is largest. The box is chosen without the ground truth, so it favours no
+    run.
     """
     images, numbers = _measured(subjects, shots)
     panels: list[list[Panel]] = []
@@ -101,13 +71,13 @@ def comparison(
                 found["psnr_detail"] = finite(psnr(image[..., *box], shot.truth[..., *box]))
                 below.append(Panel(image[..., *box], written(found["psnr_detail"], 2, " dB")))
         panels += [above, below] if detail else [above]
-    sheet = Sheet(panels, settings, width=settings.page, titles=["truth", *images[0]])
+    figure, axes = draw_panels(panels, titles=["truth", *images[0]])
     caption = "The ground truth and each run's image, with PSNR and the F1 of Canny edges"
     if not detail:
-        return Drawing(sheet.figure, f"{caption}.", numbers)
+        return Drawing(figure, f"{caption}.", numbers)
     for i, (rows, columns) in enumerate(boxes):
         size = columns.stop - columns.start, rows.stop - rows.start
-        for whole, magnified in zip(sheet.axes[2 * i], sheet.axes[2 * i + 1], strict=True):
+        for whole, magnified in zip(axes[2 * i], axes[2 * i + 1], strict=True):
             frame = Rectangle((columns.start, rows.start), *size, fill=False, ec=VERMILLION, lw=0.8)
             whole.add_patch(frame)
             magnified.spines[:].set(visible=True, color=VERMILLION, linewidth=1.6)
@@ -115,7 +85,7 @@ def comparison(
         "; below, magnified, the box in which the runs' images differ most from each other, with "
         "PSNR in the box."
     )
-    return Drawing(sheet.figure, caption, numbers)
+    return Drawing(figure, caption, numbers)
 
 
 def most_disputed(images: Tensor, share: float) -> tuple[slice, slice]:
@@ -130,111 +100,97 @@ def most_disputed(images: Tensor, share: float) -> tuple[slice, slice]:
     return slice(top, top + size[0]), slice(left, left + size[1])
 
 
-def canny(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
-    """Canny edges of the ground truth and of each image, with edge ratio and edge F1.
-
-    Missing and invented edges have colours of their own.
-
-    Source: the paper's Canny figure; edge ratio and F1 are ours.
-    """
+def canny(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
+    """Canny edges of the ground truth and of each image, with edge ratio and edge F1."""
     images, numbers = _measured(subjects, shots, splatting=True)
+    look = {"cmap": "gray_r", "vmin": 0, "vmax": 1}
     panels = []
     for shot, held in zip(shots, images, strict=True):
         truth = canny_edges(shot.truth[0])
-        panels.append([Panel(paint_edges(truth, truth), f"{truth.sum()} px", framed=True)])
+        panels.append([Panel(truth, f"{truth.sum()} px", framed=True, look=look)])
         for name, image in held.items():
             found = numbers[shot.name][name]
             note = f"ratio {written(found['edge_ratio'], 2)}\nF1 {written(found['edge_f1'], 3)}"
-            panels[-1].append(Panel(paint_edges(canny_edges(image[0]), truth), note, framed=True))
-    titles, foot = ["truth", *images[0]], legend_foot(1, settings)
-    width = settings.column if len(titles) <= 3 else settings.page
-    sheet = Sheet(panels, settings, width=width, titles=titles, foot=foot)
-    sheet.legend({"edge": FOUND, "missing": MISSED, "not in the truth": INVENTED}, columns=3)
+            panels[-1].append(Panel(canny_edges(image[0]), note, framed=True, look=look))
+    figure, _ = draw_panels(panels, titles=["truth", *images[0]])
     caption = (
         "Canny edges (thresholds 100 and 200 on 8-bit grey); below the ground truth, their number "
-        f"of pixels. Ratio: edge pixels over the ground truth's. F1: of edges, {NEAR} px off "
-        "allowed."
+        "of pixels. Ratio: edge pixels over the ground truth's. F1: of edges at most one pixel off."
     )
-    return Drawing(sheet.figure, caption, numbers)
+    return Drawing(figure, caption, numbers)
 
 
-def paint_edges(edges: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Edges ``[h, w]`` as an RGB image ``[h, w, 3]`` of bytes on white.
-
-    As in edge F1, an edge is found where the other image has one within `NEAR` pixels.
-    """
-    kernel = np.ones((2 * NEAR + 1, 2 * NEAR + 1), np.uint8)
-    near_truth, near_edges = (cv2.dilate(e.astype(np.uint8), kernel) > 0 for e in (truth, edges))
-    painted = np.full((*edges.shape, 3), 255, np.uint8)
-    for colour, where in (
-        (MISSED, truth & ~near_edges),
-        (FOUND, edges & near_truth),
-        (INVENTED, edges & ~near_truth),
-    ):
-        painted[where] = np.round(255 * np.array(to_rgb(colour)))
-    return painted
-
-
-def errors(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
-    """Ground truth, images and their absolute errors; one scale, the mean below each map.
-
-    Raises:
-        Unavailable: when there is nothing to compare with.
-
-    Source: the paper's error maps of GaussianGAN and splatting alone.
-    """
+def errors(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
+    """The ground truth and each image's absolute error on one scale, the mean below each map."""
     images, numbers = _measured(subjects, shots, splatting=True)
-    names = list(images[0])
-    if len(names) < 2:
-        raise Unavailable(f"{names[0]} has no second image; add a run as compare=[<folder>]")
     maps = [
-        {name: error_levels(image, shot.truth) for name, image in held.items()}
+        {name: (image - shot.truth).abs().mean(dim=1)[0] * 255 for name, image in held.items()}
         for shot, held in zip(shots, images, strict=True)
     ]
     every = torch.cat([error.flatten() for held in maps for error in held.values()])
-    top = scale_end(every)
-    how: dict[str, Any] = {"cmap": ERROR_COLOURS, "norm": Normalize(0, top)}
+    top = 5 * max(1, math.ceil(float(np.percentile(every.numpy(), 99.5)) / 5))
+    look = {"cmap": ERROR_COLOURS, "norm": Normalize(0, top)}
     panels = []
-    for shot, held, found in zip(shots, images, maps, strict=True):
+    for shot, held in zip(shots, maps, strict=True):
         panels.append([Panel(shot.truth)])
-        for name, image in held.items():
-            numbers[shot.name][name]["error_mean"] = float(found[name].mean())
-            panels[-1].append(Panel(image, _decibels(numbers[shot.name][name])))
-        panels[-1] += [
-            Panel(error.numpy(), f"mean {error.mean():.2f}", framed=True, how=how)
-            for error in found.values()
-        ]
-    titles = ["truth", *(f"{name}\n{what}" for what in ("image", "error") for name in names)]
-    sheet = Sheet(panels, settings, width=settings.page, titles=titles, foot=BAR_FOOT)
-    label = "absolute error, mean of R, G and B (levels of 255)"
-    sheet.bar(ScalarMappable(how["norm"], ERROR_COLOURS), label, over=bool((every > top).any()))
+        for name, error in held.items():
+            numbers[shot.name][name]["error_mean"] = float(error.mean())
+            note = f"mean {error.mean():.2f}"
+            panels[-1].append(Panel(error.numpy(), note, framed=True, look=look))
+    figure, _ = draw_panels(panels, titles=["truth", *images[0]])
     caption = (
         "Absolute error of each pixel, mean over the three channels, in levels of 255; one scale "
-        f"for all maps, which ends at {top:g}. The mean over the window is below each map."
+        f"for all maps, from pale (0) to dark ({top} or more). The mean is below each map."
     )
-    return Drawing(sheet.figure, caption, numbers)
+    return Drawing(figure, caption, numbers)
 
 
-def error_levels(image: Tensor, truth: Tensor) -> Tensor:
-    """``[h, w]``: |image - truth| of ``[1, 3, h, w]``, mean over channels, levels of 255."""
-    return (image - truth).abs().mean(dim=1)[0].double() * 255
+def segmentation(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
+    """The image, its true parts, and each run's segmentation S with its mIoU.
+
+    Raises:
+        Unavailable: without part labels, or where a run has no S.
+    """
+    for subject in subjects:
+        if subject.avatar.segmentation is None:
+            why = subject.avatar.segmentation_why
+            raise Unavailable(f"{subject.name} has no segmentation S: {why}")
+    panels = []
+    numbers: dict[str, dict[str, Numbers]] = {}
+    for shot in shots:
+        cut, labels, row = shot.window.cut, shot.frame.labels, [Panel(shot.truth)]
+        if labels is None:
+            raise Unavailable("the data has no part labels")
+        numbers[shot.name] = {}
+        for subject in subjects:
+            parts, module = subject.paint(shot).segmentation, subject.avatar.segmentation
+            assert parts is not None
+            assert module is not None
+            parts, truth = module.to_score(cut(parts), cut(labels))
+            found = miou(confusion(parts, truth))["miou"]
+            row += [] if len(row) > 1 else [Panel(colour_labels(truth))]
+            note = f"mIoU {written(found, 3)}"
+            row.append(Panel(colour_labels(parts.argmax(dim=1)), note))
+            numbers[shot.name][subject.name] = {"miou": found}
+        panels.append(row)
+    titles = ["image", "true parts", *(subject.name for subject in subjects)]
+    caption = (
+        "The true parts and each run's segmentation S (most probable part). mIoU: mean over the "
+        "parts present, without the background."
+    )
+    return Drawing(draw_panels(panels, titles=titles)[0], caption, numbers)
 
 
-def scale_end(values: Tensor) -> float:
-    """The 99.5th percentile, rounded up to five levels."""
-    high = float(np.percentile(values.numpy(), 99.5, method="inverted_cdf"))
-    return max(5.0, 5.0 * math.ceil(high / 5.0))
-
-
-def training(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Settings) -> Drawing:
+def training(subjects: Sequence[Subject], shots: Sequence[Shot]) -> Drawing:
     """PSNR of the watched images against minutes, a line per run, Step I's colour dashed.
 
     Raises:
         Unavailable: when a run has no log that can be read.
     """
-    figure = Figure((settings.column, 0.75 * settings.column), layout="constrained")
+    figure = Figure((COLUMN, 0.75 * COLUMN), layout="constrained")
     axes = figure.add_subplot()
-    shown, solid, numbers = [], [], {}
+    shown: list[float] = []
+    numbers: dict[str, Any] = {}
     for k, subject in enumerate(subjects):
         try:
             found = curve(subject.name, subject.run.folder)
@@ -250,23 +206,21 @@ def training(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setti
         minutes = [second / 60 for second in found.seconds]
         look: dict[str, Any] = {"color": COLOURS[k % len(COLOURS)], "lw": 1.0}
         marker = MARKERS[k % len(MARKERS)]
-        solid += axes.plot(minutes, found.psnr, marker=marker, markersize=3, **look)
+        axes.plot(minutes, found.psnr, marker=marker, markersize=3, label=subject.name, **look)
         lines = [found.psnr]
         if subject.avatar.generator is not None and found.colour:
             axes.plot(minutes, found.colour, ls="--", **look)
             lines.append(found.colour)
         # without the untrained start, many dB below the rest
         shown += [v for line in lines for m, v in zip(minutes, line, strict=True) if m > 0]
-    small = settings.font - 1
-    axes.set_xlabel("minutes of training", fontsize=small)
-    axes.set_ylabel("PSNR of watched images, dB", fontsize=small)
-    axes.tick_params(labelsize=small)
+    axes.set_xlabel("minutes of training", fontsize=SMALL)
+    axes.set_ylabel("PSNR of watched images, dB", fontsize=SMALL)
+    axes.tick_params(labelsize=SMALL)
     room = 0.08 * max(max(shown) - min(shown), 0.1)
     axes.set(xlim=(0, None), ylim=(min(shown) - room, max(shown) + room))
     axes.grid(visible=True, alpha=0.25)
-    legend = axes.legend(solid, [""] * len(solid), fontsize=small, frameon=False, loc=4)
-    for text, name in zip(legend.get_texts(), numbers, strict=True):
-        text.set(text=name, parse_math=False)
+    for text in axes.legend(fontsize=SMALL, frameon=False, loc=4).get_texts():
+        text.set_parse_math(False)
     caption = (
         f"PSNR of the {len(shots)} held-out images that were watched while training, against "
         "minutes of training; dashed, Step I's colour of the same model."
@@ -277,7 +231,7 @@ def training(subjects: Sequence[Subject], shots: Sequence[Shot], settings: Setti
 def _measured(
     subjects: Sequence[Subject], shots: Sequence[Shot], *, splatting: bool = False
 ) -> tuple[Images, dict[str, dict[str, Numbers]]]:
-    """Images of each shot by run, and their measures.
+    """Images of each shot by run, and their scores.
 
     Args:
         splatting: add Step I's colour of the first run, unless a run is of splatting alone.

@@ -1,4 +1,4 @@
-"""Figures of ``run``: draws those that the runs allow, and reports the others with the reason."""
+"""Draws the figures of ``run`` that the runs allow, and reports the reasons for the others."""
 
 from __future__ import annotations
 
@@ -11,17 +11,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import torch
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from rich.progress import track
 
-from gsgan.model.runs import Moved, load_config
+from gsgan.model.stored import DataPaths, load_config
 from gsgan.report.figures import images
-from gsgan.report.figures.body import densify, segmentation
-from gsgan.report.figures.layout import Drawing, Settings, Unavailable, style
+from gsgan.report.figures.layout import STYLE, Drawing, Unavailable
 from gsgan.report.figures.subjects import Shot, Subject, choose_items, make_shots, open_subjects
-from gsgan.utils.checks import one_of, whole
+from gsgan.utils.checks import at_least, one_of, whole
 from gsgan.utils.console import make_console
 from gsgan.utils.errors import ConfigError, DataError
 from gsgan.utils.files import write_atomically
@@ -32,20 +31,17 @@ METADATA: dict[str, dict[str, Any]] = {  # no dates: the same figure gives the s
     "png": {"Software": ""},
     "pdf": {"CreationDate": None},
 }
-
-
 # Each draws shots of subjects, the first one leading.
-FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot], Settings], Drawing]] = {
-    "teaser": images.teaser,
-    "densify": densify,
-    "segmentation": segmentation,
-    "canny": images.canny,
-    "errors": images.errors,
-    "strip": images.strip,
+FIGURES: dict[str, Callable[[Sequence[Subject], Sequence[Shot]], Drawing]] = {
     "comparison": images.comparison,
     "ablation": partial(images.comparison, detail=True),
+    "strip": images.strip,
+    "canny": images.canny,
+    "errors": images.errors,
+    "segmentation": images.segmentation,
     "training": images.training,
 }
+TRIMMED: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.02}
 COMPARE = ("comparison", "ablation")  # need a second run
 
 
@@ -61,9 +57,9 @@ def make_figures(config: DictConfig) -> None:
     if not names:
         names = [name for name in FIGURES if len(folders) > 1 or name not in COMPARE]
     formats = [one_of("formats", name, METADATA) for name in _list(config.formats) or METADATA]
-    settings: Settings = instantiate(config.settings)
+    at_least("margin", config.margin, 0)
     out = folders[0] / "figures" if config.out is None else Path(config.out).expanduser()
-    moved = Moved.from_config(config)
+    moved = DataPaths.from_config(config)
     for folder in folders:
         load_config(folder, moved)  # refuses other folders before anything is written
     try:
@@ -72,41 +68,32 @@ def make_figures(config: DictConfig) -> None:
         raise ConfigError(f"out={out}: cannot be written to ({error.strerror})") from error
     logging.getLogger("fontTools").setLevel(logging.WARNING)  # it logs every glyph of a PDF
     subjects = open_subjects(folders, config.names, moved, pick_device(config.device))
-    console, left_out = make_console(), {}
-    made: dict[str, dict[str, Any]] = {}
-    with style(settings):
+    console, lines = make_console(), []
+    made: dict[str, Drawing] = {}
+    with matplotlib.rc_context(STYLE):
         for name in track(list(dict.fromkeys(names)), "drawing", console=console, transient=True):
             try:
-                drawing = _draw(name, subjects, config, settings)
+                made[name] = _draw(name, subjects, config)
             except Unavailable as reason:
-                left_out[name] = f"{name}: left out, {reason}"
+                lines.append(f"{name}: left out, {reason}")
                 continue
             for kind in formats:
                 stream = io.BytesIO()
-                drawing.figure.savefig(stream, format=kind, metadata=METADATA[kind])
+                made[name].figure.savefig(stream, format=kind, metadata=METADATA[kind], **TRIMMED)
                 write_atomically(out / f"{name}.{kind}", stream.getvalue())
-            panels = [panel for held in drawing.numbers.values() for panel in held]
-            shown = [subject for subject in subjects if subject.name in panels]
-            made[name] = {
-                "caption": drawing.caption,
-                "numbers": drawing.numbers,
-                "runs": {subject.name: str(subject.run.folder) for subject in shown},
-                "marks": sorted({mark for subject in shown for mark in subject.marks}),
-                "files": [f"{name}.{kind}" for kind in formats],
-            }
-            _write_record(out, made)  # now, so that a stopped command leaves no stale numbers
     if not made:
-        raise ConfigError(f"no figure could be made: {'; '.join(left_out.values())}")
-    lines = [f"{name}: {', '.join(entry['files'])}" for name, entry in made.items()]
-    marks = sorted({mark for entry in made.values() for mark in entry["marks"]})
-    lines += [*left_out.values(), *(f"marked: {mark}" for mark in marks)]
-    lines.append(f"figures: {out} ({CAPTIONS} has their captions, {RECORD} their numbers)")
+        raise ConfigError(f"no figure could be made: {'; '.join(lines)}")
+    marks = sorted({mark for subject in subjects for mark in subject.marks})
+    _write_record(out, made, subjects, marks)
+    lines += [f"marked: {mark}" for mark in marks]
+    lines.append(
+        f"figures: {out}: {', '.join(made)} ({CAPTIONS} has their captions, {RECORD} their numbers)"
+    )
     console.print("\n".join(lines), soft_wrap=True, markup=False, highlight=False)
 
 
-def _draw(
-    name: str, subjects: Sequence[Subject], config: DictConfig, settings: Settings
-) -> Drawing:
+def _draw(name: str, subjects: Sequence[Subject], config: DictConfig) -> Drawing:
+    """One figure with its whole caption."""
     data = subjects[0].data
     if name in COMPARE and len(subjects) < 2:
         raise Unavailable("there is one run; add others as compare=[<folder>,…]")
@@ -129,7 +116,20 @@ def _draw(
             count=whole(f"shots.{name}", config.shots.get(name), 1),
             one_camera=name == "strip",
         )
-    shots = make_shots(data, split, items, settings.margin)
+    shots = make_shots(data, split, items, config.margin)
+    _check_same_pixels(subjects, split, shots)
+    drawing = FIGURES[name](subjects, shots)
+    about = ""
+    if name != "training":
+        about = (
+            f" Images: {', '.join(shot.name for shot in shots)}. Numbers are of the windows shown, "
+            f"which reach at least {config.margin:g} m beyond the joints, not of whole images."
+        )
+    return replace(drawing, caption=f"{drawing.caption}{about} Split {split}.")
+
+
+def _check_same_pixels(subjects: Sequence[Subject], split: str, shots: Sequence[Shot]) -> None:
+    """Refuses runs whose data has other images, cameras or skeletons under the same names."""
     for subject in subjects[1:]:
         dataset = subject.data.dataset(split)
         for shot in shots:
@@ -140,14 +140,6 @@ def _draw(
                     f"figures: {subjects[0].run} and {subject.run} differ in the image, camera or "
                     f"skeleton of {shot.name}; leave one of them out"
                 )
-    drawing = FIGURES[name](subjects, shots, settings)
-    about = ""
-    if name != "training":
-        about = (
-            f" Images: {', '.join(shot.name for shot in shots)}. Numbers are of the windows shown, "
-            f"which reach at least {settings.margin:g} m beyond the joints, not of whole images."
-        )
-    return replace(drawing, caption=f"{drawing.caption}{about} Split {split}.")
 
 
 def _list(value: Any) -> list[Any]:
@@ -157,17 +149,15 @@ def _list(value: Any) -> list[Any]:
     return [] if value is None else [value]
 
 
-def _write_record(out: Path, made: dict[str, dict[str, Any]]) -> None:
-    """Numbers as JSON and captions as Markdown, beside those of figures made here before."""
-    try:
-        record = {**json.loads((out / RECORD).read_text()), **made}
-    except (OSError, ValueError):
-        record = made
-    record = {name: record[name] for name in FIGURES if name in record}
+def _write_record(
+    out: Path, made: dict[str, Drawing], subjects: Sequence[Subject], marks: Sequence[str]
+) -> None:
+    """Numbers as JSON and captions as Markdown."""
+    runs = {subject.name: str(subject.run.folder) for subject in subjects}
+    figures = {name: {"caption": d.caption, "numbers": d.numbers} for name, d in made.items()}
+    record = {"runs": runs, "marks": marks, "figures": figures}
     write_atomically(out / RECORD, json.dumps(record, indent=1, allow_nan=False) + "\n")
-    parts = ["# Captions"]
-    for name, entry in record.items():
-        runs = "; ".join(f"{title}: `{folder}`" for title, folder in entry["runs"].items())
-        marked = f"\n\nMarked: {'; '.join(entry['marks'])}." if entry["marks"] else ""
-        parts.append(f"## {name}\n\n{entry['caption']}\n\nRuns: {runs}{marked}")
+    parts = ["# Captions", *(f"## {name}\n\n{d.caption}" for name, d in made.items())]
+    parts += ["## Runs\n\n" + "\n".join(f"- {name}: `{folder}`" for name, folder in runs.items())]
+    parts += [f"Marked: {'; '.join(marks)}."] if marks else []
     write_atomically(out / CAPTIONS, "\n\n".join(parts) + "\n")

@@ -1,4 +1,4 @@
-"""What a figure shows: images of a split, and the avatars that render them."""
+"""The content of figures: images of a split, and the avatars that render them."""
 
 from __future__ import annotations
 
@@ -11,26 +11,23 @@ import torch
 from torch import Tensor
 
 from gsgan.data.datamodule import GsganData
+from gsgan.data.fingerprint import fingerprint
 from gsgan.data.splits import SPLITS, Item
 from gsgan.data.validation import spans
-from gsgan.evaluate.facts import fingerprint
-from gsgan.evaluate.paper import NAME
 from gsgan.metrics.image import edge_scores, psnr
-from gsgan.model.avatar import Avatar, Painting
-from gsgan.model.runs import (
-    CHECKPOINT,
-    Moved,
-    build_data,
-    load_avatar,
-    load_config,
-    read_checkpoint,
-)
+from gsgan.model.assemble import build_data
+from gsgan.model.avatar import Avatar
+from gsgan.model.rendering import Rendering
+from gsgan.model.runs import load_avatar
+from gsgan.model.stored import CHECKPOINT, DataPaths, load_config, read_checkpoint
+from gsgan.report.departures import NAME
 from gsgan.report.runs import DATA, Run, check_same, read_run
-from gsgan.scene import Camera, Frame, Window, body_window, cat
+from gsgan.scene import Frame, Window, body_window, cat
+from gsgan.utils.arrays import evenly_spaced
 from gsgan.utils.checks import one_of
 from gsgan.utils.errors import ConfigError, DataError
 
-NEAR = 0.01  # metres: with a joint nearer the camera than this, the whole image is shown
+NEAR = 0.01  # metres: with a joint nearer to the camera than this, the whole image is shown
 LEAST = 16  # pixels, the shortest side of a window
 TITLES = {  # of models, in print
     "full": "gsgan", "wo_seg": "w/o S", "wo_gcn": "w/o GCN", "wo_feat": "w/o L_feat",
@@ -49,18 +46,13 @@ class Shot:
 
     @property
     def name(self) -> str:
-        """As files of a capture are named: camera/frame."""
+        """The name of its files in a capture: camera/frame."""
         return f"{self.item[0]}/{self.item[1]:06d}"
 
     @property
     def truth(self) -> Tensor:
         """``[1, 3, h, w]`` the ground truth as shown."""
         return self.window.cut(self.frame.image)
-
-    @property
-    def camera(self) -> Camera:
-        """Of the part shown."""
-        return self.window.camera(self.frame.camera)
 
 
 def choose_items(
@@ -94,8 +86,7 @@ def choose_items(
     held = [item for item in items if camera in (None, item[0])]
     known = sorted({frame for _, frame in held})
     if frames is None:
-        count = min(count, len(known))
-        frames = [known[(2 * i + 1) * len(known) // (2 * count)] for i in range(count)]
+        frames = [known[i] for i in evenly_spaced(len(known), count)]
     if lacking := [frame for frame in frames if frame not in known]:
         of = f"split {split}" if camera is None else f"camera {camera} in split {split}"
         raise ConfigError(f"frames: {of} lacks {spans(lacking)}; it has {spans(known)}")
@@ -132,10 +123,10 @@ class Subject:
     data: GsganData
     avatar: Avatar
     marks: list[str]
-    _painted: dict[Item, Painting] = field(default_factory=dict, repr=False)
+    _painted: dict[Item, Rendering] = field(default_factory=dict, repr=False)
 
-    def paint(self, shot: Shot) -> Painting:
-        """What the avatar makes of a shot's whole image, rendered once, kept on the CPU.
+    def paint(self, shot: Shot) -> Rendering:
+        """The avatar's rendering of a shot's whole image, made once and kept on the CPU.
 
         Raises:
             DataError: when the image is not finite.
@@ -143,16 +134,14 @@ class Subject:
         if shot.item not in self._painted:
             device = next(self.avatar.parameters()).device
             with torch.no_grad():
-                painting = self.avatar.paint(shot.frame.to(device))
+                painting = self.avatar(*shot.frame.to(device).inputs)
             # of F only the colour: all channels of every shot would fill the memory
             parts = (painting.image, painting.colour, painting.segmentation)
             image, colour, labels = (None if part is None else part.cpu() for part in parts)
             if not all(part is None or part.isfinite().all() for part in (image, colour, labels)):
                 where = f"{self.run.folder}: its image of {shot.name}"
                 raise DataError(f"{where} is not finite; train it again")
-            gaussians = None if painting.gaussians is None else painting.gaussians.to("cpu")
-            kept = Painting(image, features=colour, segmentation=labels, gaussians=gaussians)
-            self._painted[shot.item] = kept
+            self._painted[shot.item] = Rendering(image, features=colour, segmentation=labels)
         return self._painted[shot.item]
 
     def image(self, shot: Shot) -> Tensor:
@@ -170,9 +159,13 @@ class Subject:
 
 
 def open_subjects(
-    folders: Sequence[Path], names: Sequence[str] | None, moved: Moved, device: torch.device | str
+    folders: Sequence[Path],
+    names: Sequence[str] | None,
+    moved: DataPaths,
+    device: torch.device | str,
 ) -> list[Subject]:
-    """The avatars of run folders; without ``names`` they have their models', with more where equal.
+    """The avatars of run folders; without ``names`` they have their models', with the folder where
+    models are equal.
 
     Raises:
         ConfigError: on wrong names, a folder given twice, or runs of different data.
@@ -188,16 +181,17 @@ def open_subjects(
     runs = [subject.run for subject in subjects]
     check_same("figures", runs, [{DATA: run.data["fingerprint"]} for run in runs])
     if names is None:
-        models = [s.name for s in subjects]
-        seeds = [f"seed {run.seed}" for run in runs]
-        places = [folder.resolve().name for folder in folders], list(map(str, folders))
-        more = next(texts for texts in (seeds, *places) if len(set(texts)) == len(texts))
-        pairs = zip(models, more, strict=True)
-        names = [m if models.count(m) < 2 else f"{m}, {text}" for m, text in pairs]
+        models = [subject.name for subject in subjects]
+        names = [
+            model if models.count(model) < 2 else f"{model}, {folder.resolve().name}"
+            for model, folder in zip(models, folders, strict=True)
+        ]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"the runs' names in print are equal ({names[0]}); give names=[…]")
     return [replace(s, name=str(name)) for s, name in zip(subjects, names, strict=True)]
 
 
-def _open(folder: Path, moved: Moved, device: torch.device | str) -> Subject:
+def _open(folder: Path, moved: DataPaths, device: torch.device | str) -> Subject:
     config = load_config(folder, moved)
     data = build_data(config)
     avatar, marks = load_avatar(folder, config, data)

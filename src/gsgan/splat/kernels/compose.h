@@ -7,8 +7,8 @@
 
 extern "C" {
 
-// Mirrors model/compose.py's _Job. Rows of raw begin with RESIDUALS numbers: mean 3, quaternion 4,
-// scale 3, opacity 1. Null gradients are zero.
+// Mirrors model/compiled.py's _Job. Rows of raw begin with RESIDUALS numbers: mean 3,
+// quaternion 4, scale 3, opacity 1. Null gradients are zero.
 struct ComposeJob {
   int64_t count, threads;
   int64_t stride;                         // numbers in a row of raw

@@ -17,7 +17,6 @@ struct ProjectJob {
   double extent_margin;  // by which reach is enlarged
   double quat_min;
   const void *means, *quats, *scales, *covariances, *opacities;
-  const uint8_t* keep;
   const double *K, *R, *t, *limits;  // [B, 3, 3] twice, [B, 3], [B, 4]: bounds of x/z and y/z
   double *out_means, *out_factors;
   void* out_opacities;

@@ -21,7 +21,7 @@ template <class T> Vec3 in_camera(const ProjectJob& job, const Camera& camera, i
 }
 
 inline bool usable(const ProjectJob& job, int64_t i, double z) {
-  return z > job.near && (!job.keep || job.keep[i]);
+  return z > job.near;
 }
 
 template <class T> Blurred blurred(const ProjectJob& job, int64_t i, const View& view) {

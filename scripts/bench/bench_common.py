@@ -1,0 +1,112 @@
+"""What the benchmark scripts share: their options, presets, training runs and plots."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from hydra.utils import instantiate
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gsgan.splat import Accuracy
+from gsgan.utils.config import config_folder
+from gsgan.utils.errors import GsganError
+
+HERE = Path(__file__).parent
+
+
+def main(name: str, run: Callable[[DictConfig, Path], None]) -> None:
+    """Runs a benchmark with the options of ``<name>.yaml``, changed by ``key=value`` arguments; any
+    other argument, such as ``--help``, prints the options."""
+    options = OmegaConf.load(HERE / f"{name}.yaml")
+    OmegaConf.set_struct(options, value=True)
+    changes = [word for word in sys.argv[1:] if "=" in word]
+    try:
+        config = OmegaConf.merge(options, OmegaConf.from_cli(changes))
+        assert isinstance(config, DictConfig)
+        if len(changes) < len(sys.argv[1:]):
+            print(OmegaConf.to_yaml(config))
+        else:
+            run(config, Path(config.out))
+    except OmegaConfBaseException as error:
+        sys.exit(f"gsgan: {str(error).splitlines()[0]}")
+    except GsganError as error:
+        sys.exit(f"gsgan: {error}")
+
+
+def preset(name: str) -> Accuracy:
+    """An accuracy setting of ``conf/accuracy``.
+
+    Raises:
+        GsganError: on an unknown name.
+    """
+    path = config_folder() / "accuracy" / f"{name}.yaml"
+    if not path.is_file():
+        known = ", ".join(sorted(other.stem for other in path.parent.glob("*.yaml")))
+        raise GsganError(f"accuracy {name} is not one of {known}")
+    setting: Accuracy = instantiate(OmegaConf.load(path))
+    return setting
+
+
+def train(overrides: Sequence[str], run: Path) -> None:
+    """Runs `gsgan.train` in another process; resumes an interrupted run, skips a finished one.
+
+    Args:
+        overrides: of its config.
+        run: its folder; the output goes to ``<run>.log`` beside it.
+
+    Raises:
+        GsganError: with the last line of the output.
+    """
+    quoted = str(run).replace("\\", "\\\\").replace("'", "\\'")
+    log = run.with_name(f"{run.name}.log")
+    log.parent.mkdir(parents=True, exist_ok=True)
+    command = [sys.executable, "-m", "gsgan.train", *overrides, f"hydra.run.dir='{quoted}'"]
+    with log.open("w") as stream:
+        wide = {**os.environ, "COLUMNS": "1000"}  # one line per message
+        process = subprocess.Popen(command, stdout=stream, stderr=subprocess.STDOUT, env=wide)
+        try:
+            code = process.wait()
+        except BaseException:  # Ctrl-C reaches it as well: it saves a checkpoint
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(timeout=30)
+            process.kill()
+            raise
+    if code:
+        lines = [x.strip() for x in log.read_text(errors="replace").splitlines() if x.strip()]
+        last = lines[-1] if lines else f"it ended with {code}"
+        raise GsganError(f"training {run.name} failed: {last.removeprefix('gsgan: ')} (see {log})")
+
+
+def panels(count: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """A figure of panels side by side, sizes in inches."""
+    figure = Figure(figsize=(width, height), dpi=120, layout="constrained")
+    axes = list(figure.subplots(1, count, squeeze=False)[0])
+    for one in axes:
+        one.grid(visible=True, which="major", alpha=0.3)
+        one.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Labels 1, 2, 5, 10 instead of powers on a logarithmic axis."""
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def png(figure: Figure) -> bytes:
+    """The figure as PNG bytes."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", metadata={"Software": ""})
+    return stream.getvalue()

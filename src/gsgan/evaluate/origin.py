@@ -1,0 +1,107 @@
+"""The origin of a set of scores, as in facts.json: method, data and code."""
+
+from __future__ import annotations
+
+import subprocess
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from gsgan import __version__
+from gsgan.data.fingerprint import fingerprint
+from gsgan.model.stored import choices
+
+if TYPE_CHECKING:
+    from gsgan.data.datamodule import GsganData
+
+DIRTY = "+changes"
+# Scores that differ in one of these are not in one table.
+SAME = ("method", "model", "protocol", "seed", "iterations", "version", "commit", "dirty")
+
+
+@dataclass(frozen=True)
+class Method:
+    """A method that is scored; None where unknown.
+
+    Args:
+        name: of the method.
+        model, data: choices of these config groups.
+        seed, iterations: of the training.
+        train_seconds: wall clock over all parts of a resumed run.
+        trained_by: commits that trained it, one per part of a resumed run.
+    """
+
+    name: str
+    model: str | None = None
+    data: str | None = None
+    seed: int | None = None
+    iterations: int | None = None
+    train_seconds: float | None = None
+    trained_by: list[str] | None = None
+
+
+def trained(folder: Path, **training: Any) -> Method:
+    """The method of a run folder, with the fields of ``training``."""
+    chosen = choices(folder)
+    return Method("gsgan", model=chosen.get("model"), data=chosen.get("data"), **training)
+
+
+def origin(method: Method, data: GsganData, device: torch.device) -> dict[str, Any]:
+    """The content of facts.json."""
+    commit, dirty = _commit()
+    trained = asdict(method)
+    return {
+        "version": __version__,
+        "commit": commit,
+        "dirty": dirty,
+        "date": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "method": trained.pop("name"),
+        "data": {
+            "name": trained.pop("data"),
+            "root": Path(data.layout.root).resolve().name,
+            "fingerprint": fingerprint(data),
+        },
+        "protocol": None if data.protocol is None else data.protocol.name,
+        **trained,
+        "device": str(device),
+        "torch": torch.__version__,
+    }
+
+
+def training_code() -> list[str]:
+    """The commit that a checkpoint records; empty if unknown."""
+    commit, dirty = _commit()
+    return [] if commit is None else [commit + (DIRTY if dirty else "")]
+
+
+def _commit() -> tuple[str | None, bool | None]:
+    """``git describe`` of this checkout, and whether tracked files differ from it; (None, None)
+    outside a checkout or without git."""
+    root = Path(__file__).resolve().parents[3]
+    if not (root / ".git").exists():
+        return None, None
+    options = ("--always", "--tags", "--abbrev=12", f"--dirty={DIRTY}")
+    command = ["git", "-C", str(root), "describe", *options]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30)
+    except (OSError, subprocess.SubprocessError):
+        return None, None
+    found = done.stdout.strip()
+    return found.removesuffix(DIRTY) or None, found.endswith(DIRTY)
+
+
+def caption(origin: dict[str, Any]) -> str:
+    """One line under a table: method, protocol, data, number of seeds, commit."""
+    data, seed = origin["data"], origin["seed"]
+    return " · ".join(
+        [
+            " ".join(filter(None, (origin["method"], origin["model"]))),
+            f"protocol {origin['protocol'] or 'none'}",
+            f"data {data['name'] or 'unknown'} ({data['root']}, {data['fingerprint']})",
+            "seed unknown" if seed is None else f"seed {seed}",
+            f"commit {origin['commit'] or 'unknown'}" + (", changed since" * bool(origin["dirty"])),
+        ]
+    )

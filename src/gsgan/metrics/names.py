@@ -1,0 +1,57 @@
+"""The metrics of an evaluation by their key in metrics.json, as tables print them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Metric(NamedTuple):
+    """How a metric is printed.
+
+    Args:
+        name: in tables of several methods.
+        short: in the narrow table of one method.
+        digits: after the point.
+        better: ``↑``, ``↓`` or ``→1`` (near 1).
+    """
+
+    name: str
+    short: str
+    digits: int
+    better: str
+
+    @property
+    def heading(self) -> str:
+        """A column's heading with the direction that is better."""
+        return f"{self.name} {self.better}"
+
+    @property
+    def short_heading(self) -> str:
+        """The same, narrow."""
+        return f"{self.short} {self.better}"
+
+
+IMAGE_METRICS = {
+    "psnr": Metric("PSNR dB", "PSNR", 2, "↑"),
+    "psnr_person": Metric("PSNR dB in box", "in box", 2, "↑"),
+    "psnr_inside": Metric("PSNR dB in box off the outline", "off the outline", 2, "↑"),
+    "ssim": Metric("SSIM", "SSIM", 4, "↑"),
+    "ssim_person": Metric("SSIM in box", "SSIM in box", 4, "↑"),
+    "lpips": Metric("LPIPS", "LPIPS", 4, "↓"),
+    "lpips_person": Metric("LPIPS in box", "LPIPS in box", 4, "↓"),
+    "edge_f1": Metric("edge F1", "edge F1", 3, "↑"),
+    "edge_f1_person": Metric("edge F1 in box", "edge F1 in box", 3, "↑"),
+    "edge_ratio": Metric("edges", "edges", 3, "→1"),
+    "edge_ratio_person": Metric("edges in box", "edges in box", 3, "→1"),
+    "high_frequencies": Metric("detail", "detail", 3, "→1"),
+    "psnr_hands": Metric("PSNR dB hands", "hands", 2, "↑"),
+    "ssim_hands": Metric("SSIM hands", "SSIM hands", 4, "↑"),
+    "psnr_mouth": Metric("PSNR dB mouth", "mouth", 2, "↑"),
+    "ssim_mouth": Metric("SSIM mouth", "SSIM mouth", 4, "↑"),
+}
+BOX_METRICS = ("psnr_hands", "ssim_hands", "psnr_mouth", "ssim_mouth")
+PART_METRICS = {
+    "miou": Metric("mIoU", "mIoU", 4, "↑"),
+    "miou_with_background": Metric("mIoU with background", "with background", 4, "↑"),
+}
+METRICS = IMAGE_METRICS | PART_METRICS

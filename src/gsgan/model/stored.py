@@ -1,0 +1,165 @@
+"""What a run folder stores: its config and its checkpoint."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from gsgan.data.proportions import Proportions
+from gsgan.data.scene_info import SceneInfo
+from gsgan.data.surface_colours import SurfaceColours
+from gsgan.utils.errors import ConfigError, DataError
+
+CHECKPOINT = Path("checkpoints") / "last.ckpt"
+CONFIG = Path(".hydra") / "config.yaml"
+# Keys that may differ between a run and its continuation: they do not change what it learns.
+FREE_KEYS = (
+    *("trainer", "logger", "resume", "evaluate", "grid_rows", "lpips", "cpu_hours", "viewer"),
+    *("data.root", "data.smpl", "data.workers", "data.cache_mb", "data.val_pictures"),
+    *("data.source.workers", "training.max_skipped", "training.skip_window", "model.backend"),
+)
+
+
+# -- config
+
+
+@dataclass(frozen=True)
+class DataPaths:
+    """Paths of a run's dataset and body model file; None where they have not moved."""
+
+    root: str | None = None
+    smpl: str | None = None
+
+    @classmethod
+    def from_config(cls, config: DictConfig) -> DataPaths:
+        """The paths ``data_root`` and ``data_smpl`` of a command's config."""
+        return cls(config.data_root, config.data_smpl)
+
+    def refuse_without_run(self) -> None:
+        """Raises a ConfigError where a path is given without a run."""
+        if self != DataPaths():
+            raise ConfigError("data_root and data_smpl require run=")
+
+
+def read_config(folder: Path) -> DictConfig:
+    """The config that a run was started with.
+
+    Raises:
+        DataError: when the folder holds no run, or its config is damaged.
+    """
+    path = folder / CONFIG
+    if not path.is_file():
+        raise DataError(
+            f"{folder}: not a run folder (no {CONFIG}); give the folder that gsgan.train printed"
+        )
+    config = _read_yaml(path)
+    if not {"data", "model"} <= config.keys():
+        raise DataError(f"{path}: expected the config of a run with data and model")
+    return config
+
+
+def _read_yaml(path: Path) -> DictConfig:
+    try:
+        config = OmegaConf.load(path)
+    except (UnicodeDecodeError, yaml.YAMLError, OmegaConfBaseException) as error:
+        raise DataError(f"{path}: damaged ({str(error).splitlines()[0]})") from None
+    if not isinstance(config, DictConfig):
+        raise DataError(f"{path}: expected the config of a run with data and model")
+    return config
+
+
+def load_config(folder: Path, paths: DataPaths | None = None) -> DictConfig:
+    """`read_config` with absolute paths of dataset and body model file, which must exist."""
+    config, paths = read_config(folder), paths or DataPaths()
+    if paths.smpl is not None and OmegaConf.select(config, "data.smpl") is None:
+        # skeletons from SMPL fits are others: the scores would be of another model
+        raise ConfigError(f"data_smpl: {folder} was trained without a body model file")
+    for key, what in (("root", "dataset"), ("smpl", "body model file")):
+        now = getattr(paths, key)
+        stored = OmegaConf.select(config, f"data.{key}")
+        place = absolute_path(folder, stored) if now is None else now
+        if place is None:
+            continue
+        if not Path(place).expanduser().exists():
+            raise DataError(
+                f"{place} does not exist, the {what} of {folder}; give data_{key}=<where it is now>"
+            )
+        OmegaConf.update(config, f"data.{key}", place)
+    return config
+
+
+def absolute_path(folder: Path, path: str | None) -> str | None:
+    """A path of a run's config; a relative one counts from where the run was started."""
+    if path is None or Path(path).expanduser().is_absolute():
+        return path
+    start = OmegaConf.select(hydra_record(folder), "hydra.runtime.cwd")
+    return path if start is None else str(Path(start) / path)
+
+
+def hydra_record(folder: Path) -> DictConfig:
+    """Hydra's record of a run's start; empty where that file is missing.
+
+    Raises:
+        DataError: when it is damaged.
+    """
+    path = folder / ".hydra" / "hydra.yaml"
+    return _read_yaml(path) if path.is_file() else OmegaConf.create()
+
+
+def choices(folder: Path) -> dict[str, Any]:
+    """The config groups' choices that Hydra recorded in a run folder; empty without a record."""
+    found = OmegaConf.select(hydra_record(folder), "hydra.runtime.choices")
+    return {} if found is None else {str(key): value for key, value in found.items()}
+
+
+def record(config: DictConfig) -> dict[str, Any]:
+    """The config as plain values, without the keys that a continuation may change."""
+    plain: dict[str, Any] = {
+        str(key): OmegaConf.to_container(value, resolve=True)
+        if OmegaConf.is_config(value := config[key])
+        else value
+        for key in config
+        if key not in FREE_KEYS
+    }
+    for key in FREE_KEYS:
+        *groups, last = key.split(".")
+        node: Any = plain
+        for group in groups:
+            node = node.get(group) if isinstance(node, dict) else None
+        if isinstance(node, dict):
+            node.pop(last, None)
+    return plain
+
+
+# -- checkpoint
+
+
+def read_checkpoint(path: Path) -> dict[str, Any]:
+    """A checkpoint of gsgan, read without unrestricted pickle; a DataError when damaged."""
+    try:
+        checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise DataError(f"{path}: no such file; the run has no checkpoint yet") from error
+    except Exception as error:
+        raise DataError(f"{path}: not a readable checkpoint; remove it to start over") from error
+    if not isinstance(checkpoint, dict) or "gsgan" not in checkpoint:
+        raise DataError(f"{path}: not a checkpoint of gsgan (it has no 'gsgan' entry)")
+    return checkpoint
+
+
+def stored_scene(plain: Mapping[str, Any]) -> SceneInfo:
+    """The facts about a scene that a checkpoint holds as plain values."""
+    values: dict[str, Any] = {
+        key: tuple(value) if isinstance(value, list) else value for key, value in plain.items()
+    }
+    for key, kind in (("surface", SurfaceColours), ("proportions", Proportions)):
+        if values[key] is not None:
+            values[key] = kind(**values[key])
+    return SceneInfo(**values)

@@ -1,0 +1,152 @@
+"""The dataset's files beside the images, and its place on disk."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import gsgan
+from gsgan.data.cameras import CameraEntry
+from gsgan.data.formats.capture import read_capture
+from gsgan.data.joints import BODY, FACE, HANDS, joint_names, known
+from gsgan.prepare.camera_array import Float, Ints
+from gsgan.prepare.images import Written, scaled
+from gsgan.prepare.options import Inputs, Options
+from gsgan.prepare.solve import Solution
+from gsgan.skeleton import MEDIAPIPE33
+from gsgan.utils.errors import DataError
+from gsgan.utils.files import write_json, write_npz, writing
+
+GENERATOR = "gsgan.prepare"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that a preparation found: ``frames [F]`` numbers, the images written by camera."""
+
+    options: Options
+    inputs: Inputs
+    frames: Ints
+    solution: Solution
+    written: Mapping[str, Written]
+
+    @property
+    def cameras(self) -> list[CameraEntry]:
+        """The cameras of the written images."""
+        refined = self.solution.cameras.entries(self.inputs.cameras)
+        return [scaled(camera, self.options.scale) for camera in refined]
+
+
+def write_files(root: Path, outcome: Outcome, key: str) -> None:
+    """Writes cameras, landmarks and metadata, in metres and pixels."""
+    solution, frames, p = outcome.solution, outcome.frames, outcome.solution.p
+    write_json(
+        root / "cameras.json",
+        {
+            camera.name: {key: getattr(camera, key).tolist() for key in ("K", "R", "t")}
+            | {"dist": [0.0] * 5, "size": list(camera.size[::-1])}
+            for camera in outcome.cameras
+        },
+    )
+    body, hands, face = (
+        {
+            "p": p[:, part].astype(np.float32),
+            "conf": solution.conf[:, part].astype(np.float32),
+            "frame_id": frames,
+            "names": np.array(joint_names()[part]),
+        }
+        for part in (slice(BODY), HANDS, FACE)
+    )
+    error = solution.error[:, :, :BODY] * outcome.options.scale
+    seen = np.isfinite(error)
+    mean = np.where(seen, error, 0.0).sum(0) / np.maximum(seen.sum(0), 1)
+    write_npz(
+        root / "landmarks3d.npz",
+        **body,
+        reproj_px=np.where(seen.any(0), mean, np.nan).astype(np.float32),
+        n_views=solution.views[:, :BODY].astype(np.int16),
+        edges=np.array(MEDIAPIPE33.edges),
+    )
+    wanted = {"hands": outcome.options.hands, "face": outcome.options.face}
+    for name, part in (("hands", hands), ("face", face)):
+        if wanted[name] and p.shape[1] > BODY:
+            write_npz(root / f"{name}3d.npz", **part)
+    for c, camera in enumerate(outcome.cameras) if solution.seen.any() else ():
+        ratio = np.diag(camera.K)[:2] / np.diag(solution.cameras.K[c])[:2]
+        uv = (solution.uv[c] * ratio).astype(np.float32)
+        write_npz(
+            root / "landmarks2d" / f"{camera.name}.npz",
+            p=uv[:, :BODY],
+            conf=solution.seen[c, :, :BODY].astype(np.float32),
+            **({"hands": uv[:, HANDS], "face": uv[:, FACE]} if uv.shape[1] > BODY else {}),
+            frame_id=frames,
+            undistorted=np.array(True),
+        )
+    meta = {
+        "fps": outcome.inputs.fps,
+        "unit": "m",
+        "up_axis": outcome.options.up_axis or standing_axis(p),
+        "skeleton": "mediapipe33",
+        "pixel_centre": 0.5,
+        "made_by": {"generator": GENERATOR, "version": gsgan.__version__, "key": key},
+    }
+    write_json(root / "meta.json", meta)
+
+
+def standing_axis(p: Float) -> str:
+    """The world axis along which a person ``p [F, J, 3]`` stands: "z", "-y", ...; unknown is "z".
+
+    It is the direction from ankles to nose and from hips to shoulders; where these are never seen,
+    from shoulders to ears. NaN = missing.
+    """
+    legs = np.concatenate([p[:, 0] - (p[:, 27] + p[:, 28]) / 2, (p[:, 11] - p[:, 23])])
+    head = p[:, [7, 8]].mean(1) - p[:, [11, 12]].mean(1)
+    above = next((a for a in (legs[known(legs)], head[known(head)]) if len(a)), legs[:0])
+    up = np.median(above, axis=0) if len(above) else np.array([0.0, 0.0, 1.0])
+    axis = int(np.abs(up).argmax())
+    return ("-" if up[axis] < 0 else "") + "xyz"[axis]
+
+
+def exists(out: Path, key: str, overwrite: bool) -> bool:
+    """Whether ``out`` holds the dataset with this key.
+
+    Raises:
+        DataError: when it holds something else and may not be overwritten.
+    """
+    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
+        return False
+    made_by: Any = None
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        made_by = json.loads((out / "meta.json").read_text()).get("made_by")
+    if not isinstance(made_by, dict) or made_by.get("generator") != GENERATOR:
+        raise DataError(f"{out} holds something else; choose another out")
+    if made_by.get("key") != key and not overwrite:
+        raise DataError(f"{out} was made with other settings; add overwrite=true")
+    return bool(made_by.get("key") == key)
+
+
+def publish(root: Path, out: Path) -> None:
+    """Moves the finished dataset ``root`` to ``out``; an old one is removed when that is done.
+
+    Raises:
+        DataError: when training could not read it, or it cannot be moved.
+    """
+    try:
+        read_capture(root)
+    except DataError as error:
+        raise DataError(f"nothing was made, because training could not read it: {error}") from None
+    old = out.with_name(f".{out.name}.old")
+    with writing(out):
+        if out.exists():
+            shutil.rmtree(old, ignore_errors=True)
+            os.replace(out, old)
+        os.replace(root, out)
+    shutil.rmtree(old, ignore_errors=True)

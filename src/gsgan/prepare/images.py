@@ -1,0 +1,150 @@
+"""Images and masks of the finished capture: found, cleaned, undistorted, scaled, written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from gsgan.data.cameras import CameraEntry
+from gsgan.data.crop import Crop, resize, take, undistort_map
+from gsgan.data.files import frame_files, last_number, read_grey
+from gsgan.data.formats.consistency import spread
+from gsgan.prepare.sources import IMAGE_SUFFIXES, Recording
+from gsgan.prepare.stages import Advance
+from gsgan.utils.errors import DataError
+from gsgan.utils.files import writing
+
+Bytes = NDArray[np.uint8]
+PROBED = 8  # masks per camera whose values are checked before any work is done
+PERSON = 128  # alpha that at least one pixel of them must have
+LEAST_BLOB = 0.02  # smaller pieces of a mask are removed, share of the largest
+QUALITY = 95  # of jpg, 1 to 100
+PNG_COMPRESSION = 3  # 0..9; higher is smaller and slower
+
+
+def scaled(camera: CameraEntry, scale: float) -> CameraEntry:
+    """The camera of the written images: no distortion, K at their size."""
+    h, w = (max(1, round(side * scale)) for side in camera.size)
+    K = camera.K.copy()
+    K[0] *= w / camera.size[1]
+    K[1] *= h / camera.size[0]
+    return replace(camera, K=K, dist=np.zeros_like(camera.dist), size=(h, w))
+
+
+@dataclass(frozen=True)
+class Written:
+    """The result of writing one camera's images."""
+
+    frames: list[int]  # common numbers that exist now
+    decoded: int | None  # images of the source; None when it was not read to its end
+
+
+def find_masks(folder: Path, names: Iterable[str]) -> dict[str, dict[int, Path]]:
+    """Given masks by camera and frame number: <camera>/%06d.png, or %06d_<person>.png.
+
+    Raises:
+        DataError: when a camera has none.
+    """
+    found = {}
+    for name in names:
+        place = folder / name
+        stems = [p.stem for p in place.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
+        of_persons = bool(stems) and all(re.fullmatch(r"\d+_\d+", stem) for stem in stems)
+        number = (lambda stem: int(stem.partition("_")[0])) if of_persons else last_number
+        files = frame_files(folder, name, IMAGE_SUFFIXES, number)
+        if not files:
+            raise DataError(f"{place} holds no masks; expected {name}/000000.png and so on")
+        found[name] = {number: folder / path for number, path in files.items()}
+    return found
+
+
+def check_values(folder: Path, files: Mapping[int, Path]) -> None:
+    """Refuses part numbers, or 0 and 1, with a DataError; one faint mask alone is legitimate."""
+    paths = [files[number] for number in sorted(files)]
+    highest = max((int(read_grey(path).max()) for path in spread(paths, PROBED)), default=0)
+    if 0 < highest < PERSON:
+        raise DataError(
+            f"{folder} holds masks with values up to {highest}; small numbers are labels, expected "
+            "alpha from 0 to 255"
+        )
+
+
+def tidy(mask: Bytes, levels: tuple[float, float]) -> Bytes:
+    """A mask ``[H, W]`` 0..255 with its levels stretched and small pieces removed."""
+    low, high = (255 * level for level in levels)
+    table = np.clip((np.arange(256) - low) / (high - low), 0, 1)
+    mask = np.asarray(cv2.LUT(mask, np.round(255 * table).astype(np.uint8)), np.uint8)
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((mask > 0).astype(np.uint8))
+    areas = stats[:, cv2.CC_STAT_AREA].copy()
+    areas[0] = 0  # the background
+    return np.asarray(mask * (areas >= LEAST_BLOB * areas.max())[labels], np.uint8)
+
+
+def write_images(
+    root: Path,
+    camera: CameraEntry,
+    source: Recording,
+    masks: Mapping[int, Path],
+    frames: Collection[int],
+    offset: int,
+    scale: float,
+    suffix: str,
+    levels: tuple[float, float],
+    advance: Advance,
+) -> Written:
+    """Writes images/{camera}/%06d and masks/{camera}/%06d.png.
+
+    Args:
+        root: the dataset.
+        camera: as calibrated, lens included.
+        source, masks: its images, and mask files by the source's own frame number.
+        frames: common frame numbers to write; those without a mask are skipped.
+        offset: added to a source's number to get the common one.
+        scale, suffix: of the images; masks are always png.
+        levels: alpha that becomes 0 and 1.
+        advance: called for each frame.
+
+    Raises:
+        DataError: when an image or mask is damaged or of the wrong size, or the disk is full.
+    """
+    images, alphas = root / "images" / camera.name, root / "masks" / camera.name
+    for folder in (images, alphas):
+        with writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+    window, size = Crop(0, 0, camera.size), scaled(camera, scale).size
+    mapping = undistort_map(camera.K, camera.dist, window) if camera.distorted else None
+    written, decoded, last = list[int](), 0, max(frames, default=-1)
+    for number, image in source.images():
+        frame = number + offset
+        if frame > last:
+            return Written(written, None)
+        decoded += 1
+        if frame not in frames or number not in masks:
+            continue
+        written.append(frame)
+        advance(len(written), len(frames))
+        mask = tidy(read_grey(masks[number]), levels)
+        for pixels, folder, kind in ((image, images, suffix), (mask, alphas, "png")):
+            if pixels.shape[:2] != camera.size:
+                where = masks[number] if pixels is mask else source.path
+                raise DataError(
+                    f"{where}: frame {number} is {pixels.shape[1]}x{pixels.shape[0]} pixels, "
+                    f"expected {camera.size[1]}x{camera.size[0]}"
+                )
+            straight = resize(take(pixels, window, mapping, exact=False), size, exact=False)
+            _write(folder / f"{frame:06d}.{kind}", straight)
+    return Written(written, decoded)
+
+
+def _write(path: Path, pixels: Bytes) -> None:
+    options = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
+    if path.suffix == ".jpg":
+        options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+    with writing(path):  # in place: a run that was killed here writes all of them again
+        path.write_bytes(cv2.imencode(path.suffix, pixels, options)[1].tobytes())

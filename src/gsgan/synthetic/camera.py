@@ -1,0 +1,138 @@
+"""Cameras of the synthetic scene and the rays of their pixels.
+
+Convention: metres, world frame; OpenCV cameras and lenses, pixel centres at +0.5.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gsgan.data.crop import distort
+from gsgan.motion.rotations import unit
+from gsgan.utils.errors import ConfigError
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+RADIUS = 2.8  # metres from the middle of the scene to the cameras
+MARGIN = 0.02  # share of the image kept free at each edge, over all frames and cameras
+EXACT = 1e-10  # residual of x/z up to which an undistorted point counts as found
+FURTHEST = 10.0  # bound of x/z in the search
+GOLDEN = (5**0.5 - 1) / 2
+
+
+@dataclass(frozen=True)
+class SceneCamera:
+    """A camera: ``K [3, 3]``, ``R [3, 3]``, ``t [3]``, ``size`` (H, W), lens ``dist`` or None."""
+
+    K: Array
+    R: Array
+    t: Array
+    size: tuple[int, int]
+    dist: Array | None = None  # [4, 5 or 8] OpenCV's coefficients
+
+    @property
+    def centre(self) -> Array:
+        return -self.R.T @ self.t
+
+    def project(self, points: Array) -> Array:
+        """``[N, 2]`` pixels of world points ``[N, 3]``, all in front of the camera."""
+        x = points @ self.R.T + self.t
+        if self.dist is not None:
+            shown = distort(x[:, :2] / x[:, 2:], self.dist)
+            return shown @ self.K[:2, :2].T + self.K[:2, 2]
+        x = x @ self.K.T
+        return x[:, :2] / x[:, 2:]
+
+    def bend(self, directions: Array) -> Array:
+        """The unit world rays ``[N, 3]`` seen where a pinhole sees the unit ``directions``.
+
+        Raises:
+            ConfigError: when the distortion cannot be inverted there.
+        """
+        if self.dist is None:
+            return directions
+        rays = directions @ self.R.T
+        straight = undistort(rays[:, :2] / rays[:, 2:], self.dist)
+        return unit(np.concatenate([straight, np.ones((len(rays), 1))], axis=1) @ self.R)
+
+
+def undistort(points: Array, dist: Array, iterations: int = 200) -> Array:
+    """The inverse of `gsgan.data.crop.distort` on ``[N, 2]``, exact to `EXACT`, by fixed point.
+
+    Raises:
+        ConfigError: when a point has no inverse: the distortion folds back.
+    """
+    found = points
+    for _ in range(iterations):
+        error = points - distort(found, dist)
+        if not np.abs(error).max(initial=0) >= EXACT:
+            break
+        found = np.clip(found + error, -FURTHEST, FURTHEST)
+    lost = ~(np.abs(points - distort(found, dist)) < EXACT).all(axis=1)
+    if lost.any():
+        x, y = points[lost][0]
+        raise ConfigError(
+            f"synthetic data: lens {dist.tolist()} folds back near x/z = {x:.2f}, y/z = {y:.2f}, "
+            "within the image; give weaker coefficients"
+        )
+    return found
+
+
+def pixel_offsets(rays: int) -> Array:
+    """``[rays, 2]`` positions in a pixel, in [0, 1): the golden-ratio lattice about its centre.
+
+    At edges of any direction its error is half that of random or R2 points.
+    """
+    k = np.arange(rays) - (rays - 1) / 2
+    return np.mod(0.5 + np.stack([k / rays, k * GOLDEN], axis=1), 1.0)
+
+
+def pixel_rays(view: SceneCamera, x: Ints, y: Ints, rays: int) -> tuple[Array, Array]:
+    """Origin ``[3]`` and unit directions ``[N*rays, 3]`` of a pinhole's pixels ``x, y [N]``."""
+    offset = pixel_offsets(rays)
+    across = (x[:, None] + offset[:, 0]).ravel()
+    down = (y[:, None] + offset[:, 1]).ravel()
+    pixel = np.stack([across, down, np.ones_like(across)], axis=1)
+    directions = pixel @ (np.linalg.inv(view.K).T @ view.R)
+    return view.centre, unit(directions)
+
+
+def look_at(azimuth: float, height: float, middle: Array, points: Array, size: int) -> SceneCamera:
+    """A camera at an azimuth: 0 in front of the person, growing towards the person's left."""
+    offset = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0]) * RADIUS
+    centre = np.array([middle[0], middle[1], height]) + offset
+    forward = middle - centre
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    R = np.stack([right, np.cross(forward, right), forward])
+    t = -R @ centre
+    x = points @ R.T + t
+    rays = x[:, :2] / x[:, 2:]
+    low, high = rays.min(axis=0), rays.max(axis=0)
+    focal = (1 - 2 * MARGIN) * size / (high - low).max()
+    principal = size / 2 - focal * (low + high) / 2
+    K = np.array([[focal, 0, principal[0]], [0, focal, principal[1]], [0, 0, 1]])
+    return SceneCamera(K, R, t, (size, size))
+
+
+def zoomed(view: SceneCamera, scale: float) -> SceneCamera:
+    """The same camera with its focal length times ``scale``, zoomed about the image's centre."""
+    H, W = view.size
+    K = view.K.copy()
+    K[:2, :2] *= scale
+    K[:2, 2] = scale * (K[:2, 2] - [W / 2, H / 2]) + [W / 2, H / 2]
+    return replace(view, K=K)
+
+
+def through_lens(view: SceneCamera, dist: Array) -> SceneCamera:
+    """The same camera with a lens, which is checked up to the image's corners."""
+    H, W = view.size
+    corners = np.array([[x, y, 1.0] for x in (0, W / 2, W) for y in (0, H / 2, H)])
+    undistort((corners @ np.linalg.inv(view.K).T)[:, :2], dist)
+    return replace(view, dist=dist)

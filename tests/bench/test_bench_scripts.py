@@ -1,0 +1,96 @@
+"""The scripts of scripts/bench run tiny and write their tables."""
+
+from __future__ import annotations
+
+import json
+import runpy
+import shutil
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from commands import ROOT
+
+from gsgan.utils.errors import GsganError
+
+SCRIPTS = ROOT / "scripts" / "bench"
+SCENE = [
+    *("size=tiny", "data.source.frames=2", "data.source.test_frames=1", "data.body=none"),
+    *("data.source.train_cameras=2", "data.source.test_cameras=1", "data.source.rays_per_pixel=1"),
+]
+
+
+@pytest.fixture
+def script(monkeypatch, tmp_path):
+    """Runs a script with ``key=value`` arguments; returns its message, "" if it succeeded."""
+    monkeypatch.setattr(sys, "path", [str(SCRIPTS), *sys.path])
+    monkeypatch.chdir(tmp_path)
+
+    def call(name: str, *arguments: str) -> str:
+        monkeypatch.setattr(sys, "argv", [name, f"out={tmp_path / 'out'}", *arguments])
+        try:
+            runpy.run_path(str(SCRIPTS / f"{name}.py"), run_name="__main__")
+        except SystemExit as end:
+            return str(end.code)
+        return ""
+
+    return call
+
+
+def read(folder: Path, name: str) -> dict:
+    assert (folder / "out" / f"{name}.md").is_file()
+    return json.loads((folder / "out" / f"{name}.json").read_text())
+
+
+def test_raster_measures_time_and_error(script, tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("<!-- bench:raster -->\nold\n<!-- end -->\n")
+    grid = ["gaussians=[300]", "channels=[3]", "sizes=[64]", "exact_upto.torch=300", "repeats=1"]
+    assert not script("raster", *grid, "windows=2", "window=16", f"docs={page}")
+    rows = pd.DataFrame(read(tmp_path, "raster")["rows"]).query("backend == 'torch'")
+    worst = rows.set_index("setting").value_max
+    assert worst["exact"] < 1e-6 < worst["high"] < worst["draft"]
+    assert (rows[["forward_ms", "both_ms"]] > 0).all(axis=None)
+    assert "| torch | draft |" in page.read_text()
+
+
+def test_roofline_measures_each_stage(script, tmp_path, capture):
+    words = ["sizes=[tiny]", "frames=1", "warmup=0", "poses=1"]
+    assert not script("roofline", *words, f"speed=[data.root={capture}]")
+    table = pd.read_csv(tmp_path / "out" / "roofline.csv").set_index("stage")
+    assert (table.drop("paste")[["flop", "bytes"]] > 0).all(axis=None)
+    assert table.loc["UNet", "flop"] < table.loc["end to end", "flop"]
+
+
+def test_trade_off_compares_a_multirun(script, tmp_path, run):
+    for name in ("one", "two"):
+        shutil.copytree(run, tmp_path / "sweep" / name)
+    words = tmp_path / "sweep" / "two" / ".hydra" / "overrides.yaml"
+    words.write_text(words.read_text() + "- twist=odd\n")
+    given = [f"runs={tmp_path / 'sweep'}", "repeats=1", "images=1", "settings.scales=[0.5]"]
+    given += ["settings.accuracies=[draft]", "settings.backends=[]", "settings.precisions=[]"]
+    assert not script("trade_off", *given)
+    found = read(tmp_path, "trade_off")["rows"]
+    assert [row["label"] for row in found] == ["base", "odd", "draft", "× 0.5", "whole image"]
+    assert all(row["psnr"] > 5 and row["ms"] > 0 for row in found)
+    assert (tmp_path / "out" / "trade_off.png").is_file()
+    assert "give either run=" in script("trade_off")
+    assert "is not in struct" in script("trade_off", "colour=1")
+
+
+def test_effects_decides_without_training(script, tmp_path):
+    words = ["train=false", "only=[distortion]", f"base=[{','.join(SCENE)}]"]
+    assert not script("effects", *words)
+    called, default = read(tmp_path, "effects")["rows"]
+    assert called["auto"]
+    assert not default["auto"]
+
+
+def test_a_failed_training_is_reported_with_its_last_line(script, tmp_path):
+    assert script("raster", "repeats=0")
+    import bench_common
+
+    with pytest.raises(GsganError, match=r"^training one failed: .* \(see .*one\.log\)$"):
+        bench_common.train(["size=nosuch"], tmp_path / "runs" / "one")
+    assert "nosuch" in (tmp_path / "runs" / "one.log").read_text()

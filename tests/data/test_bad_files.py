@@ -1,0 +1,388 @@
+"""Damaged files of every format: one sentence that names the file, one case for each message."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from capture_frames import items, png
+from make import edit_json, skeletons, write_landmarks, write_tiny_capture
+from PIL import Image
+from writers.common import write_object
+from writers.easymocap import write_easymocap
+from writers.smpl import write_smpl
+from writers.smplx_rig import smplx_once, smplx_subject
+from writers.thuman4 import write_thuman4
+from writers.zju import write_original
+
+from gsgan.data.dataset import CaptureDataset
+from gsgan.data.files import last_number
+from gsgan.data.formats.capture import read_capture
+from gsgan.data.formats.easymocap import EasymocapReader
+from gsgan.data.formats.thuman4 import Thuman4Reader
+from gsgan.data.formats.zju import ZjuReader
+from gsgan.data.layout import Layout
+from gsgan.data.validation import Thresholds
+from gsgan.utils.errors import ConfigError, DataError
+
+pytestmark = pytest.mark.usefixtures("model_once")
+Damage = Callable[[Path], object]
+NEVER = Path("/tmp/never")
+
+
+# -- damages of any folder
+
+
+def write(name: str, data: bytes) -> Damage:
+    def damage(root: Path) -> None:
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).write_bytes(data)
+
+    return damage
+
+
+def remove(*names: str) -> Damage:
+    def damage(root: Path) -> None:
+        for path in (root / name for name in names):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+
+    return damage
+
+
+def empty(name: str) -> Damage:
+    return lambda root: [path.unlink() for path in (root / name).iterdir()]
+
+
+def cut(name: str, keep: float) -> Damage:
+    def damage(root: Path) -> None:
+        data = (root / name).read_bytes()
+        (root / name).write_bytes(data[: int(len(data) * keep)])
+
+    return damage
+
+
+def image(pattern: str, array: np.ndarray) -> Damage:
+    return lambda root: [cv2.imwrite(str(path), array) for path in sorted(root.glob(pattern))]
+
+
+def replaced(name: str, old: str, new: str) -> Damage:
+    return lambda root: (root / name).write_text((root / name).read_text().replace(old, new))
+
+
+def edited(name: str, change: Callable[[Any], object]) -> Damage:
+    return lambda root: edit_json(root / name, change)
+
+
+def arrays(name: str, change: Callable[[dict[str, Any]], object]) -> Damage:
+    """Changes the arrays of an npz file."""
+
+    def damage(root: Path) -> None:
+        with np.load(root / name) as archive:
+            held = dict(archive)
+        change(held)
+        np.savez(root / name, **held)
+
+    return damage
+
+
+def objects(pattern: str, change: Callable[[Any], object]) -> Damage:
+    """Changes the pickled objects of npy files."""
+
+    def damage(root: Path) -> None:
+        for path in root.glob(pattern):
+            content = np.load(path, allow_pickle=True).item()
+            change(content)
+            write_object(path, content)
+
+    return damage
+
+
+class Evil:
+    def __reduce__(self) -> Any:
+        return os.system, (f"touch {NEVER}",)
+
+
+# -- the bring-your-own layout
+
+
+def camera(**changes: object) -> Damage:
+    return edited("cameras.json", lambda rig: rig["cam01"].update(changes))
+
+
+def meta(**changes: object) -> Damage:
+    return edited("meta.json", lambda content: content.update(changes))
+
+
+def landmarks(**changed: object) -> Damage:
+    defaults = {"p": skeletons(4), "frame_id": np.arange(4)}
+    return lambda root: write_landmarks(root, **(defaults | changed))  # type: ignore[arg-type]
+
+
+def poses(**changed: object) -> Damage:
+    held = {"theta": np.zeros((4, 56, 3)), "transl": np.zeros((4, 3)), "frame_id": np.arange(4)}
+    return lambda root: np.savez(root / "body_pose.npz", **(held | changed))  # type: ignore[arg-type]
+
+
+def turned_round(rig: dict) -> None:
+    turn = np.diag([-1.0, 1.0, -1.0])
+    R, t = np.array(rig["cam01"]["R"]), np.array(rig["cam01"]["t"])
+    rig["cam01"].update(R=(turn @ R).tolist(), t=(turn @ t).tolist())
+
+
+def cmyk(root: Path) -> None:
+    (root / "images/cam01/000000.png").unlink()
+    Image.new("CMYK", (32, 24)).save(root / "images/cam01/000000.jpg")
+
+
+GREY = np.zeros((24, 32), np.uint8)
+CAPTURE: dict[str, Damage] = {
+    "cameras.json does not exist": remove("cameras.json"),
+    "cameras.json is not valid JSON.*line 1": write("cameras.json", b'{"cam00": '),
+    "must hold a JSON object, found list": write("cameras.json", b"[]"),
+    "lists no camera": write("cameras.json", b"{}"),
+    "cam00: expected an object with K, R, t": write("cameras.json", b'{"cam00": 3}'),
+    r"images/cam01 does not exist; there are cam00": remove("images/cam01"),
+    "has the camera cam07, which .*lists cam00, cam01": write("images/cam07/000000.png", b""),
+    "images does not exist": remove("images"),
+    "images/cam00 holds no frames": empty("images/cam00"),
+    r"'K' must hold finite numbers of shape \(3, 3\)": camera(K=[[1], [2, 3]]),
+    "K must be .*found": camera(K=[[30, 0, 0], [0, 30, 0], [16, 12, 1]]),
+    "cam01: the focal lengths in K": camera(K=[[-30, 0, 16], [0, 30, 12], [0, 0, 1]]),
+    "cam01: R is not a rotation.*by 0.21": camera(R=np.diag([1.0, 1.1, 1.0]).tolist()),
+    "R mirrors": camera(R=np.diag([1, 1, -1]).tolist()),
+    "dist must hold 4, 5 or 8 finite numbers": camera(dist=[0.1, 0.2, 0.3]),
+    r"size must be \[width, height\] in pixels": camera(size=[32.5, 24]),
+    "000000.png is 32x24 pixels.*cameras.json has 24x32": camera(size=[24, 32]),
+    "cam01: 100% of the joints lie behind it": edited("cameras.json", turned_round),
+    "cam01: no frame has 4 joints": camera(K=[[30, 0, 900], [0, 30, 12], [0, 0, 1]]),
+    "meta.json does not exist": remove("meta.json"),
+    "'unit' is None; expected one of m, cm, mm": meta(unit=None),
+    "cameras stand 0.003.* m from the person.*check 'unit'": meta(unit="mm"),
+    "'fps' is 0; expected a number above 0": meta(fps=0),
+    "'splits' must be an object": meta(splits=[1]),
+    "'label_names' must list": meta(label_names="a"),
+    "landmarks3d.npz is not a valid npz": write("landmarks3d.npz", b"PK\x03\x04" + bytes(40)),
+    "asks for pickled Python objects.*nothing was run": landmarks(p=np.array([[Evil()]])),
+    r"'p' must have shape \(any, 33, 3\)": landmarks(p=np.zeros((4, 25, 3))),
+    "'p' must hold numbers, found <U1": landmarks(p=np.full((4, 33, 3), "a")),
+    "frame_id 1 appears more than once": landmarks(frame_id=np.array([0, 1, 1, 2])),
+    "'frame_id' must hold whole numbers": landmarks(frame_id=np.arange(4) + 0.5),
+    "frame_id .* is a time stamp": landmarks(frame_id=np.arange(4) + 1_700_000_000_123),
+    "has no array 'frame_id'": lambda root: np.savez(root / "landmarks3d.npz", p=skeletons(4)),
+    "no usable frame: 4 with fewer than 12 joints": landmarks(p=np.full((4, 33, 3), np.nan)),
+    "no usable frame: 4 without a row in landmarks3d": landmarks(frame_id=np.arange(100, 104)),
+    r"'theta' must have shape \(4, any, 3\)": poses(theta=np.zeros((4, 168))),
+    "masks/cam00/000000.png shows no person, nor": image("masks/*/*.png", GREY),
+    "000001.png has 16 bits a channel": image("masks/cam00/000001.png", GREY.astype(np.uint16)),
+    "123456.png has no frame number up to": write("images/cam00/20240131120000123456.png", b""),
+    "000002.png does not exist; every image needs a mask": remove("masks/cam01/000002.png"),
+    "000001.png is 16x12 pixels .*the image": image("masks/cam01/000001.png", GREY[::2, ::2]),
+    "000001.png is not a valid PNG or JPEG": write("images/cam00/000001.png", b""),
+    "000000.jpg is a CMYK JPEG": cmyk,
+    "is a palette PNG": write("masks/cam00/000001.png", png(32, 24, 8, 3, bytes(32))),
+    "holds frame 1 twice, as 000001.png and 0001.png": write("images/cam00/0001.png", b""),
+}
+
+
+# -- published formats
+
+
+def annots(change: Callable[[Any], object]) -> Damage:
+    return objects("annots.npy", change)
+
+
+def params(**values: Any) -> Damage:
+    return objects("new_params/2.npy", lambda content: content.update(values))
+
+
+def T_times(factor: float) -> Damage:
+    return annots(lambda c: c["cams"].update(T=[factor * np.array(T) for T in c["cams"]["T"]]))
+
+
+def out_of_the_folder(content: Any) -> None:
+    content["ims"][0].update(ims=["../x/0.jpg", *content["ims"][0]["ims"][1:]])
+
+
+ZJU: dict[str, Damage] = {
+    "is not a ZJU-MoCap subject: it has no annots.npy": remove("annots.npy"),
+    "annots.npy is not a valid .npy file": cut("annots.npy", 0.5),
+    r"annots.npy asks for (posix|nt|os)\.system": lambda root: write_object(
+        root / "annots.npy", {"cams": Evil()}
+    ),
+    "annots.npy has no 'cams'": annots(lambda c: c.pop("cams")),
+    "found 3 K, 3 R, 3 T, 0 D, 3 image folders": annots(lambda c: c["cams"].pop("D")),
+    "3 D, 0 image folders": annots(lambda c: c.update(ims=[])),
+    "no camera folder holds images": remove("Camera_B1", "Camera_B2", "Camera_B3"),
+    r"annots.npy: T is 0.00\d+ m long .*expected 0.05-20 m": T_times(1e-3),
+    "has no SMPL parameters; expected one of .*new_params/": remove("new_params"),
+    "new_params has no parameters of any frame": lambda root: [
+        path.rename(path.with_name(f"9{path.name}")) for path in (root / "new_params").iterdir()
+    ],
+    "2.npy: 'poses' must hold 72 or 69 numbers": params(poses=np.zeros((1, 66))),
+    "2.npy: the first 3 numbers of 'poses' must be 0": params(poses=np.full((1, 72), 0.1)),
+    "'Rh' must hold finite numbers": params(Rh=np.full((1, 3), np.nan)),
+    "2.npy has no 'Rh'": objects("new_params/2.npy", lambda c: c.pop("Rh")),
+    "the projected body and the masks do not meet .*check that cameras": objects(
+        "new_params/*.npy", lambda c: c.update(Th=c["Th"] + [[0.6, 0.8, 0.0]])
+    ),
+    "100% of all 12 images have no mask": remove("mask", "mask_cihp"),
+    "which is not a folder in it": annots(out_of_the_folder),
+}
+
+
+def people(change: Callable[[list[Any]], object], kind: str = "keypoints3d") -> Damage:
+    return edited(f"{kind}/000001.json", change)
+
+
+EASYMOCAP: dict[str, Damage] = {
+    "extri.yml lacks .*T_10": replaced("extri.yml", "T_10:", "T_11:"),
+    "extri.yml does not exist; a folder of EasyMocap holds": remove("extri.yml"),
+    "images/4 is not a camera of .*lists 1, 2, 10": lambda root: shutil.copytree(
+        root / "images/1", root / "images/4"
+    ),
+    "images holds no folder of a camera.*extract the frames": remove("images"),
+    "images/2 holds no images": empty("images/2"),
+    "images/2/000000.jpg is 40x40.*80x40": replaced("intri.yml", "W_2: 40", "W_2: 80"),
+    "person 0: 'keypoints3d' must have shape": people(lambda p: p[0].pop("keypoints3d")),
+    "needs a whole 'id' that no other has, found 0": people(lambda p: p.append(p[0])),
+    "must hold a list of people": people(lambda p: p.append(3)),
+    "000001.json is not valid JSON": write("keypoints3d/000001.json", b"[" * 5000),
+    "do not meet.*one person": image("mask/*/*.png", np.eye(40, dtype=np.uint8) * 255),
+    "mask does not exist; every image needs a mask": remove("mask"),
+}
+
+
+def fitted(**values: Any) -> Damage:
+    return arrays("smpl_params.npz", lambda held: held.update(values))
+
+
+THUMAN4: dict[str, Damage] = {
+    "line 1: expected an image such as cam00/00000012.jpg": write(
+        "missing_img_files.txt", b"\xffnothing here\n"
+    ),
+    "leaves no image of camera cam01": write(
+        "missing_img_files.txt", b"".join(b"cam01/%08d.jpg\n" % i for i in range(4))
+    ),
+    "images/cam01 holds no images": remove("images/cam01"),
+    "calibration.json does not exist; a folder of THuman4.0 holds": remove("calibration.json"),
+    "camera cam02: expected K, R and T": edited("calibration.json", lambda c: c["cam02"].pop("R")),
+    r"cam02: 'K' must hold finite numbers of shape \(9,\)": edited(
+        "calibration.json", lambda c: c["cam02"].update(K=[1, 2])
+    ),
+    r"shape \(4, 63\), found \(4, 69\)": fitted(body_pose=np.zeros((4, 69))),
+    r"\(4, 45\), found .*without PCA": fitted(left_hand_pose=np.zeros((4, 12))),
+    "smpl_params.npz has no array transl": arrays("smpl_params.npz", lambda a: a.pop("transl")),
+    "has 30 coefficients, the model file 10": fitted(betas=np.ones((1, 30))),
+    "'betas' must hold finite numbers": fitted(betas=np.full((1, 10), np.nan)),
+    "no finite one of a frame that has images": fitted(transl=np.full((4, 3), np.inf)),
+    "smpl_params.npz asks for .*system.*nothing was run": fitted(betas=np.array(Evil())),
+}
+
+
+FORMATS: dict[str, tuple[dict[str, Damage], Callable[[Path], object]]] = {
+    "capture": (CAPTURE, read_capture),
+    "zju": (ZJU, lambda root: ZjuReader()(root, Thresholds(), str(SMPL["smpl"]))),
+    "easymocap": (EASYMOCAP, lambda root: EasymocapReader()(root, Thresholds())),
+    "thuman4": (THUMAN4, lambda root: Thuman4Reader()(root, Thresholds(), str(smplx_once()))),
+}
+SMPL: dict[str, Path] = {}
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory, subject, smpl_file) -> dict[str, Path]:
+    """A folder in every format; do not write into it."""
+    SMPL["smpl"], root = smpl_file, tmp_path_factory.mktemp("formats")
+    write_tiny_capture(root / "capture")
+    write_original(root / "zju", subject)
+    write_easymocap(root / "easymocap", subject)
+    write_thuman4(root / "thuman4", smplx_subject(smplx_once()))
+    return {name: root / name for name in FORMATS}
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"), [(kind, message) for kind, (bad, _) in FORMATS.items() for message in bad]
+)
+def test_damage_is_refused_in_one_sentence(
+    written: dict[str, Path], tmp_path: Path, kind: str, message: str
+) -> None:
+    root = Path(shutil.copytree(written[kind], tmp_path / kind))
+    FORMATS[kind][0][message](root)
+    with pytest.raises(DataError, match=message) as caught:
+        FORMATS[kind][1](root)
+    assert "\n" not in str(caught.value)
+    assert str(root) in str(caught.value)
+    assert not NEVER.exists()
+
+
+BAD_WHEN_DECODED: dict[str, Damage] = {
+    "images/cam00/000001.jpg is damaged": cut("images/cam00/000001.jpg", 0.995),
+    "masks/cam00/000001.png is damaged": cut("masks/cam00/000001.png", 0.6),
+    "images/cam00/000001.jpg does not exist": remove("images/cam00/000001.jpg"),
+    "is 16x12 pixels .*cam00 has 32x24": image("images/cam00/000001.jpg", GREY[::2, ::2]),
+    "000001.png holds 0 and 1; expected alpha": image("masks/cam00/000001.png", GREY + 1),
+    "000001.png holds the label 3; meta.json names 3": image("labels/cam00/000001.png", GREY + 3),
+}
+
+
+@pytest.mark.parametrize("message", BAD_WHEN_DECODED)
+def test_a_damaged_image_is_refused_when_it_is_read(tmp_path: Path, message: str) -> None:
+    names = {"label_names": ["background", "upper", "lower"]}
+    layout = read_capture(write_tiny_capture(tmp_path, suffix="jpg", labels=True, meta=names))
+    dataset = CaptureDataset(layout, items(layout))
+    BAD_WHEN_DECODED[message](tmp_path)
+    assert dataset[0].frame_id == 0
+    with pytest.raises(DataError, match=message) as caught:
+        dataset[1]
+    assert "\n" not in str(caught.value)
+
+
+# -- the model file, folders and settings
+
+
+def zju(root: Path, smpl: Path | None, **settings: Any) -> Layout:
+    return ZjuReader(**settings)(root, Thresholds(), None if smpl is None else str(smpl))
+
+
+def test_model_files_that_do_not_fit(written: dict[str, Path], tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"SMPL parameters but no joints.*data.smpl=/path"):
+        zju(written["zju"], None)
+    with pytest.raises(ConfigError, match=r"data.smpl=.*none.pkl does not exist"):
+        zju(written["zju"], tmp_path / "none.pkl")
+    write_smpl(tmp_path / "x.npz", "smplx", vertices=60)
+    with pytest.raises(DataError, match=r"x.npz is a model of 55 joints.*SMPL \(24 joints\)"):
+        zju(written["zju"], tmp_path / "x.npz")
+    write_smpl(tmp_path / "small.pkl", vertices=60)
+    with pytest.raises(DataError, match=r"small.pkl has 60 vertices; expected the 6890 of SMPL"):
+        zju(written["zju"], tmp_path / "small.pkl")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"masks": "all"}, "data.reader.masks must be one of both, mask_cihp, mask, got 'all'"),
+        ({"drop_frames": "a-b"}, "data.reader.drop_frames must be frame numbers"),
+        ({"drop_frames": "0-9"}, "leaves no frame"),
+    ],
+)
+def test_settings_that_cannot_be(
+    written: dict[str, Path], settings: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigError, match=message):
+        zju(written["zju"], SMPL["smpl"], **settings)
+
+
+def test_wrong_folders_and_frame_numbers(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"nowhere does not exist; expected the folder"):
+        read_capture(tmp_path / "nowhere")
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match="file is a file, not a folder"):
+        read_capture(tmp_path / "file")
+    assert last_number("frame_0000000000000012") == 12
+    assert last_number("1000000001") is None
+    assert last_number("9" * 5000) is None

@@ -1,0 +1,196 @@
+"""Joints, cameras and masks that do not belong together are refused or named when data are read."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from make import edit_json, write_tiny_capture
+
+from gsgan.data.cameras import CameraEntry
+from gsgan.data.formats.capture import SKELETON_LIMITS, CaptureReader
+from gsgan.data.formats.consistency import (
+    Consistency,
+    box_of,
+    far_cameras,
+    inside_share,
+    joint_distance,
+    mask_beyond,
+    mask_distance,
+)
+from gsgan.data.layout import Layout
+from gsgan.data.validation import Thresholds
+from gsgan.utils.errors import DataError
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return write_tiny_capture(tmp_path / "c", cameras=4, frames=3, size=(64, 96))
+
+
+def read(root: Path, consistency: Consistency = SKELETON_LIMITS) -> Layout:
+    return CaptureReader(consistency=consistency)(root, Thresholds())
+
+
+def turn(axis: tuple[float, float, float], degrees: float) -> Callable[[dict], None]:
+    def change(rig: dict) -> None:
+        r = cv2.Rodrigues(np.radians(degrees) * np.array(axis))[0]
+        camera = rig["cam02"]
+        camera["R"] = (r @ camera["R"]).tolist()
+        camera["t"] = (r @ camera["t"]).tolist()
+
+    return change
+
+
+def scale_K(factor: float) -> Callable[[dict], None]:
+    def change(rig: dict) -> None:
+        K = np.array(rig["cam02"]["K"])
+        K[:2] *= factor
+        rig["cam02"]["K"] = K.tolist()
+
+    return change
+
+
+def in_mm(rig: dict) -> None:
+    rig["cam02"]["t"] = [1000 * x for x in rig["cam02"]["t"]]
+
+
+def exchanged(rig: dict) -> None:
+    for key in "Rt":
+        rig["cam01"][key], rig["cam02"][key] = rig["cam02"][key], rig["cam01"][key]
+
+
+def test_a_good_capture_needs_no_note(root: Path) -> None:
+    assert read(root).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (scale_K(0.5), r"inside: cam02 \d%; 100% in the other cameras\).*gsgan.check finds"),
+        (in_mm, r"camera cam02 stands 3\.13e\+03 m from the person, the median camera 3 m"),
+    ],
+)
+def test_a_camera_that_is_wholly_wrong_is_refused(
+    root: Path, change: Callable[[dict], None], message: str
+) -> None:
+    edit_json(root / "cameras.json", change)
+    with pytest.raises(DataError, match=message) as caught:
+        read(root)
+    assert "\n" not in str(caught.value)
+    assert str(root) in str(caught.value)
+    assert read(root, Consistency(frames=0, min_box_iou=0)).notes == ()  # nothing is compared
+
+
+@pytest.mark.parametrize("change", [turn((0, 1, 0), 5), exchanged])
+def test_a_camera_that_is_wrong_is_named_in_a_note(
+    root: Path, change: Callable[[dict], None]
+) -> None:
+    edit_json(root / "cameras.json", change)
+    (note,) = read(root, Consistency(min_box_iou=0, least_inside=0)).notes
+    assert note.startswith("joints lie outside the masks (inside: ")
+    assert "cam02" in note
+    assert "cam00" not in note
+    with pytest.raises(DataError, match=r"inside: .*cam02"):
+        read(root, Consistency(min_box_iou=0, least_inside=0.9))
+
+
+def test_a_camera_whose_focal_length_alone_is_halved_is_named(root: Path) -> None:
+    def halve(rig: dict) -> None:
+        for i in (0, 1):
+            rig["cam02"]["K"][i][i] /= 2
+
+    edit_json(root / "cameras.json", halve)
+    consistency = Consistency(
+        min_box_iou=0, min_inside=0, least_inside=0
+    )  # where joints stay inside as well
+    (note,) = read(root, consistency).notes
+    assert re.match(r"masks reach .* beyond all joints \(share: cam02 \d\d%; [0-3]% in the o", note)
+    assert read(root, replace(consistency, max_beyond=1)).notes == ()
+    (other,) = read(root, replace(consistency, min_inside=0.9)).notes
+    assert other.startswith("joints lie outside the masks (inside: cam02 ")
+
+
+def test_the_share_of_a_mask_beyond_all_joints() -> None:
+    K = np.array([[100.0, 0, 50], [0, 200, 50], [0, 0, 1]])
+    camera = CameraEntry("c", K, np.eye(3), np.zeros(3), np.zeros(8), (100, 100))
+    mask = np.zeros((100, 100), np.uint8)
+    mask[50, 50:90] = 255
+    joints = np.array([[0.01, 0.005, 2], [5.0, 0, 2], [0, 0, -2]])
+    # at 2 m a pixel is 2 cm wide: 20 of 40 pixels lie within 0.39 m of the first joint
+    assert mask_beyond(mask, camera, joints, 0.39) == pytest.approx(20 / 40)
+    mask[50:90, 50] = 255  # and 1 cm high: those all do
+    assert mask_beyond(mask, camera, joints, 0.395) == pytest.approx(20 / 79)
+    moved = joints + np.array([0.8, 0, 0])
+    assert mask_beyond(mask, camera, moved, 0.39) == pytest.approx(59 / 79, abs=0.02)
+    assert np.isnan(mask_beyond(0 * mask, camera, joints, 0.3))
+    assert np.isnan(mask_beyond(mask, camera, joints[2:], 0.3))
+
+
+def test_the_share_of_joints_inside_a_mask() -> None:
+    K = np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]])
+    camera = CameraEntry("c", K, np.eye(3), np.zeros(3), np.zeros(8), (100, 100))
+    mask = np.zeros((100, 100), np.uint8)
+    mask[40:60, 40:60] = 255
+    # at 2 m a pixel is 2 cm: 5 px, 11 px (1 px outside), 20 px and far off the middle
+    joints = np.array([[0.1, 0, 2], [0.22, 0, 2], [0.4, 0, 2], [9.0, 0, 2], [0, 0, -2]])
+    assert inside_share(mask, camera, joints, 0.05) == pytest.approx(2 / 3)
+    assert inside_share(mask, camera, joints, 0.5) == 1
+    assert np.isnan(inside_share(0 * mask, camera, joints, 0.05))
+    assert np.isnan(inside_share(mask, camera, joints[3:], 0.05))
+
+
+def test_boxes_follow_skew_and_lens(root: Path) -> None:
+    K = np.array([[100.0, 30, 50], [0, 100, 50], [0, 0, 1]])
+    dist = np.array([-0.1, *[0.0] * 7])
+    camera = CameraEntry("c", K, np.eye(3), np.zeros(3), dist, (100, 100))
+    x, y = 0.2, 0.3
+    bend = 1 - 0.1 * (x * x + y * y)
+    u, v = (K @ [x * bend, y * bend, 1])[:2]
+    points = np.array([[0.0, 0, 2], [2 * x, 2 * y, 2]])
+    assert box_of(points, camera) == pytest.approx((50, 50, u, v))
+    assert box_of(points * [1, 1, -1], camera) is None
+
+
+def test_the_config_passes_its_settings(root: Path, compose) -> None:
+    from hydra.utils import instantiate
+
+    edit_json(root / "cameras.json", scale_K(0.5))
+    keys = ("data.reader.consistency.frames=0", "data.reader.drop_frames=1")
+    config = compose("train", "data=capture", f"data.root={root}", *keys)
+    assert instantiate(config.data).layout.frames == (0, 2)
+    config = compose("train", "data=capture", f"data.root={root}")
+    with pytest.raises(DataError, match="joints lie outside the masks"):
+        _ = instantiate(config.data).layout
+
+
+def test_joint_distance_in_metres():
+    mask = np.zeros((40, 60), bool)
+    mask[10:20, 20:40] = True
+    distance = mask_distance(mask)
+    pixels = np.array([[30.5, 15.5], [44.5, 15.5], [30.5, 29.5], [-5, 15], [np.nan, 3], [45, 15]])
+    depth = np.array([2.0, 2.0, 4.0, 2.0, 2.0, -1.0])
+    seen = np.ones(6, bool)
+    metres = joint_distance(distance, pixels, depth, seen, focal=100.0)
+    assert metres[:3] == pytest.approx([0, 5 * 2 / 100, 10 * 4 / 100])
+    assert np.isnan(metres[3:]).all()  # off the picture, unknown, behind the camera
+
+
+def test_unseen_joints_are_not_judged_and_an_empty_mask_is_infinitely_far():
+    distance = mask_distance(np.zeros((8, 8), bool))
+    pixels = np.full((2, 2), 4.0)
+    metres = joint_distance(distance, pixels, np.ones(2), np.array([True, False]), 10.0)
+    assert metres[0] == np.inf
+    assert np.isnan(metres[1])
+
+
+def test_far_cameras_are_those_beyond_the_factor() -> None:
+    metres = {"a": 3.0, "b": 3.2, "c": 31.0, "d": 0.2, "e": 2.9}
+    found = far_cameras(metres, 10.0)
+    assert list(found) == ["c", "d"]
+    assert found["c"].startswith("camera c stands 31 m from the person, the median camera 3 m")

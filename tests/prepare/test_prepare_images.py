@@ -1,0 +1,95 @@
+"""The images of a dataset: sources, masks, undistortion, and what is noted about them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from make import skeletons
+
+from gsgan.prepare.dataset import standing_axis
+from gsgan.prepare.images import (
+    check_values,
+    find_masks,
+    tidy,
+)
+from gsgan.prepare.sources import Recording, find_sources, recording_notes
+from gsgan.utils.errors import DataError
+
+
+def source(name: str, fps: float = 30.0, count: int = 100, turned: int = 0) -> Recording:
+    return Recording(name, Path(name), (10, 10), fps, {}, count, turned)
+
+
+@pytest.mark.parametrize(
+    ("other", "what"),
+    [
+        (source("b"), None),
+        (source("b", fps=29.0), "frame rates differ"),
+        (source("b", count=97), "numbers of frames differ"),
+        (source("b", turned=90), "rotate it by 90 degrees"),
+    ],
+)
+def test_sources_that_differ_are_noted(other: Recording, what: str | None):
+    found = recording_notes({"a": source("a"), "b": other})
+    assert len(found) == (what is not None)
+    assert what is None or what in found[0]
+
+
+def test_the_axis_a_person_stands_along():
+    p = skeletons(3)
+    assert standing_axis(p) == "z"
+    assert standing_axis(p[..., [0, 2, 1]] * [1, -1, 1]) == "-y"
+    p[:, 0] = np.nan
+    assert standing_axis(p) == "z"
+    assert standing_axis(np.full_like(p, np.nan)) == "z"
+
+
+def test_masks_lose_their_haze_and_their_crumbs():
+    mask = np.zeros((20, 20), np.uint8)
+    mask[2:12, 2:12], mask[12, 2:12], mask[15, 15], mask[18, 2:8] = 255, 128, 255, 40
+    found = tidy(mask, (0.3, 0.8))
+    assert (found[2:12, 2:12] == 255).all()
+    assert found[12, 5] == round(255 * (128 / 255 - 0.3) / 0.5)
+    assert found[15, 15] == 0
+    assert found[18].max() == 0
+    assert tidy(mask, (0, 1))[12, 5] == 128
+    assert tidy(np.zeros_like(mask), (0, 1)).max() == 0
+
+
+def test_given_masks_by_number_and_by_person(tmp_path: Path):
+    for name in ("a/000001.png", "a/000007.png", "b/000001_0.png", "b/000002_0.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    found = find_masks(tmp_path, ["a", "b"])
+    assert sorted(found["a"]) == [1, 7]
+    assert sorted(found["b"]) == [1, 2]
+    with pytest.raises(DataError, match="holds no masks"):
+        find_masks(tmp_path, ["c"])
+
+
+@pytest.mark.parametrize(("value", "refused"), [(1, True), (19, True), (0, False), (255, False)])
+def test_masks_of_small_numbers_are_refused(tmp_path: Path, value: int, refused: bool):
+    for number, highest in enumerate((0, value, 0)):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), np.full((4, 4), highest, np.uint8))
+    files = {number: tmp_path / f"{number}.png" for number in range(3)}
+    if refused:
+        with pytest.raises(DataError, match=f"up to {value}; small numbers are labels"):
+            check_values(tmp_path, files)
+    else:
+        check_values(tmp_path, files)
+
+
+def test_sources_that_cannot_be_used(tmp_path: Path):
+    (tmp_path / "cam").mkdir()
+    cv2.imwrite(str(tmp_path / "cam" / "1.png"), np.zeros((4, 6, 3), np.uint8))
+    assert find_sources(tmp_path)["cam"].size == (4, 6)
+    (tmp_path / "cam.mp4").write_bytes(b"none")
+    with pytest.raises(DataError, match=r"cam\.mp4 cannot be opened"):
+        find_sources(tmp_path)
+    (tmp_path / "cam.mp4").unlink()
+    (tmp_path / "cam").rename(tmp_path / "other")
+    with pytest.raises(DataError, match="no videos"):
+        find_sources(tmp_path / "other")

@@ -1,0 +1,68 @@
+"""The scripts of docs/examples/ run, on tiny data; the commands they start run in this process."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+from commands import ROOT
+from PIL import Image
+
+FOLDER = ROOT / "docs" / "examples"
+TINY = ["size=tiny", "data.size=32", "data.body=none"]
+FEW = ["segmentation=2", "step_one=2", "step_two=4", "discriminator_start=1", "epoch=4"]
+EACH_STEP = ["training.log_every=1", "+trainer.log_every_n_steps=1"]
+SHORT = [*TINY, *(f"training.schedule.{phase}" for phase in FEW)]
+
+
+@pytest.fixture
+def script(inside, monkeypatch):
+    """Imports an example by its name."""
+
+    def run(command: list[str], check: bool, env: dict[str, str] | None = None) -> None:
+        assert check
+        result = inside(command[2].removeprefix("gsgan."), *command[3:])
+        assert result.returncode == 0, result.stdout + result.stderr
+
+    def example(name: str) -> ModuleType:
+        module = importlib.import_module(name)
+        monkeypatch.setattr(module, "subprocess", SimpleNamespace(run=run), raising=False)
+        return module
+
+    monkeypatch.syspath_prepend(str(FOLDER))
+    return example
+
+
+def test_your_own_cameras_then_live(script, tmp_path, capfd):
+    own, live = script("own_cameras"), script("drive_live")
+    own.main(tmp_path, ["training=smoke", *SHORT])
+    with Image.open(tmp_path / "new_view.png") as image:
+        assert image.size == (own.SIZE, own.SIZE)
+        assert "trainedAlgorithmicMedia" in str(image.info)
+        assert np.asarray(image).min() < 250  # somebody is there, before white
+
+    landmarks = tmp_path / "capture" / "landmarks3d.npz"
+    live.main(tmp_path / "run", landmarks, tmp_path / "live", 64)
+    assert f"{own.FRAMES} images" in capfd.readouterr().out
+    frames = [np.asarray(Image.open(path)) for path in sorted((tmp_path / "live").glob("*.png"))]
+    assert len(frames) == own.FRAMES
+    assert (frames[0] != frames[3]).any()
+
+
+def test_a_loss_and_an_ablation_of_your_own(script, capture, tmp_path):
+    own = script("own_loss")
+    own.main(["data=capture", f"data.root={capture}", *EACH_STEP, *SHORT])
+    logs = list((tmp_path / "runs" / "own_loss").glob("*/logs/metrics.csv"))
+    assert len(logs) == 2
+    assert all("smooth" in path.read_text().partition("\n")[0] for path in logs)
+    table = (tmp_path / "runs" / "own_loss_table" / "report.md").read_text()
+    assert "wo_normals" in table
+
+
+def test_the_page_lists_the_scripts():
+    page = (FOLDER / "README.md").read_text()
+    for path in FOLDER.glob("*.py"):
+        assert re.search(rf"^python docs/examples/{path.name}", page, flags=re.M), path.name
