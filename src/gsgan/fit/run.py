@@ -23,6 +23,7 @@ from gsgan.data.calibration import METRES
 from gsgan.data.crop import PersonCrop
 from gsgan.data.datamodule import GsganData
 from gsgan.data.formats.capture import LANDMARKS, POSES, SHAPE, CaptureReader
+from gsgan.data.scene_info import refuse_swapped_sides
 from gsgan.data.validation import spans
 from gsgan.fit.fitter import Fit, Fitter
 from gsgan.fit.frames import MaskedFrames
@@ -123,6 +124,7 @@ def fit_body(
     rows = torch.tensor([layout.frames.index(frame) for frame in frames.frames])
 
     with console.status("solving poses"):
+        refuse_swapped_sides(layout, data.trained)
         shape = fit_shape(*_joints(data, data.trained))
         start = _of_rows(_solve_with_fingers(data, shape), rows)
     fitter = Fitter(settings, frames, shaped_body(shape), start, seed)
