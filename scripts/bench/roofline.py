@@ -135,7 +135,7 @@ def composited(gaussians: Gaussians, camera: Camera, accuracy: Accuracy) -> tupl
     once, images written once. Pixels that fill up early make it an upper bound."""
     k, C = accuracy.supersample, gaussians.features.shape[-1]
     size = (camera.size[0] * k, camera.size[1] * k)
-    p = project(gaussians, camera.resize(size), accuracy, None)
+    p = project(gaussians, camera.resize(size), accuracy)
     reach = 2 * (p.opacities / max(accuracy.alpha_min, 1e-6)).clamp_min(1).log()
     area = math.pi * reach / (p.factors[..., 0] * p.factors[..., 2])
     pairs = float((area.clamp_max(size[0] * size[1]) * p.visible).sum())
